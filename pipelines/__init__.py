@@ -1,0 +1,1 @@
+"""The GeoRefGS library: every stage and building block, importable without the command line."""

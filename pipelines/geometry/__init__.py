@@ -1,0 +1,1 @@
+"""Rotations, similarities, cameras and rays. Plain numpy, float64."""

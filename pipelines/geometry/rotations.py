@@ -1,0 +1,63 @@
+"""Rotations: quaternions, matrices, exponential map, and the gimbal's yaw, pitch, roll.
+
+All functions are batched over leading dimensions and work in float64. Quaternions carry their order in the name.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from pipelines.products import FloatArray
+
+# Columns: the gimbal's forward, right and down axes seen from a camera (x right, y down, z forward).
+_CAM_FROM_GIMBAL = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
+_ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+
+
+def matrix_from_quat_xyzw(quat_xyzw: ArrayLike) -> FloatArray:
+    """Rotation matrices (…, 3, 3) of quaternions (…, 4); they need not be of unit length."""
+    quat = np.asarray(quat_xyzw, dtype=np.float64)
+    return np.asarray(Rotation.from_quat(quat.reshape(-1, 4)).as_matrix()).reshape(*quat.shape[:-1], 3, 3)
+
+
+def quat_xyzw_from_matrix(rotation: ArrayLike) -> FloatArray:
+    """Unit quaternions (…, 4) with w ≥ 0 of rotation matrices (…, 3, 3)."""
+    matrix = np.asarray(rotation, dtype=np.float64)
+    quat = Rotation.from_matrix(matrix.reshape(-1, 3, 3)).as_quat(canonical=True)
+    return np.asarray(quat).reshape(*matrix.shape[:-2], 4)
+
+
+def exp_so3(rotation_vector: ArrayLike) -> FloatArray:
+    """Rotation matrices (…, 3, 3) of rotation vectors (…, 3) in radians."""
+    vector = np.asarray(rotation_vector, dtype=np.float64)
+    return np.asarray(Rotation.from_rotvec(vector.reshape(-1, 3)).as_matrix()).reshape(*vector.shape[:-1], 3, 3)
+
+
+def log_so3(rotation: ArrayLike) -> FloatArray:
+    """Rotation vectors (…, 3) in radians, of length ≤ π, of rotation matrices (…, 3, 3)."""
+    matrix = np.asarray(rotation, dtype=np.float64)
+    return np.asarray(Rotation.from_matrix(matrix.reshape(-1, 3, 3)).as_rotvec()).reshape(matrix.shape[:-1])
+
+
+def skew(vector: ArrayLike) -> FloatArray:
+    """Cross-product matrices (…, 3, 3): `skew(a) @ b = a × b`."""
+    v = np.asarray(vector, dtype=np.float64)
+    matrix = np.zeros((*v.shape[:-1], 3, 3))
+    matrix[..., 0, 1], matrix[..., 0, 2] = -v[..., 2], v[..., 1]
+    matrix[..., 1, 0], matrix[..., 1, 2] = v[..., 2], -v[..., 0]
+    matrix[..., 2, 0], matrix[..., 2, 1] = -v[..., 1], v[..., 0]
+    return matrix
+
+
+def geo_from_cam(yaw_pitch_roll_deg: ArrayLike) -> FloatArray:
+    """Rotation camera → East-North-Up of gimbal angles (…, 3) in degrees.
+
+    The angles turn North-East-Down into the gimbal's forward-right-down axes, in the order Z-Y-X (yaw, pitch,
+    roll). Pitch −90 looks straight down; the camera looks along the gimbal's forward axis.
+    """
+    angles = np.asarray(yaw_pitch_roll_deg, dtype=np.float64)
+    ned_from_gimbal = Rotation.from_euler("ZYX", angles.reshape(-1, 3), degrees=True).as_matrix()
+    rotation = _ENU_FROM_NED @ np.asarray(ned_from_gimbal) @ _CAM_FROM_GIMBAL.T
+    return rotation.reshape(*angles.shape[:-1], 3, 3)

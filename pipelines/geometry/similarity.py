@@ -1,0 +1,137 @@
+"""Similarities of space: p_to = s R p_from + t, with composition, inverse and uncertainty."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from pipelines.errors import DegenerateGeometryError
+from pipelines.geometry.rotations import matrix_from_quat_xyzw, quat_xyzw_from_matrix, skew
+from pipelines.products import FloatArray, SimilarityRecord
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """`to_from_from`: scale (> 0), rotation (3, 3), translation (3,), in float64."""
+
+    scale: float = 1.0
+    rotation: FloatArray = field(default_factory=lambda: np.eye(3))
+    translation: FloatArray = field(default_factory=lambda: np.zeros(3))
+
+    def apply(self, points: ArrayLike) -> FloatArray:
+        """Map points (…, 3)."""
+        return self.scale * np.asarray(points, dtype=np.float64) @ self.rotation.T + self.translation
+
+    def __matmul__(self, other: Similarity) -> Similarity:
+        """Composition: `c_from_b @ b_from_a = c_from_a`."""
+        return Similarity(self.scale * other.scale, self.rotation @ other.rotation, self.apply(other.translation))
+
+    def inverse(self) -> Similarity:
+        """The similarity that undoes this one."""
+        rotation = self.rotation.T
+        return Similarity(1.0 / self.scale, rotation, -rotation @ self.translation / self.scale)
+
+    def matrix(self) -> FloatArray:
+        """As a 4×4 matrix for homogeneous points."""
+        matrix = np.eye(4)
+        matrix[:3, :3] = self.scale * self.rotation
+        matrix[:3, 3] = self.translation
+        return matrix
+
+    @classmethod
+    def from_record(cls, record: SimilarityRecord) -> Similarity:
+        """From its stored form."""
+        return cls(record.scale, matrix_from_quat_xyzw(record.quat_xyzw), np.array(record.translation))
+
+    def to_record(
+        self,
+        from_frame: str,
+        to_frame: str,
+        *,
+        covariance: FloatArray | None = None,
+        pivot: ArrayLike = (0.0, 0.0, 0.0),
+    ) -> SimilarityRecord:
+        """Stored form; see `SimilarityRecord` for the meaning of covariance (7, 7) and pivot."""
+        cov = np.zeros((7, 7)) if covariance is None else covariance
+        return SimilarityRecord(
+            from_frame=from_frame,
+            to_frame=to_frame,
+            scale=float(self.scale),
+            quat_xyzw=_tuple(quat_xyzw_from_matrix(self.rotation)),
+            translation=_tuple(self.translation),
+            pivot=_tuple(np.asarray(pivot)),
+            covariance=tuple(_tuple(row) for row in cov),
+        )
+
+
+def jacobian_at(points: ArrayLike, pivot: ArrayLike) -> FloatArray:
+    """∂p'/∂(δ ln s, δω, δt) at points (N, 3) in the target frame, for a perturbation about `pivot`: (N, 3, 7)."""
+    arm = np.asarray(points, dtype=np.float64) - np.asarray(pivot, dtype=np.float64)
+    identity = np.broadcast_to(np.eye(3), (*arm.shape, 3))
+    return np.concatenate([arm[..., None], -skew(arm), identity], axis=-1)
+
+
+def covariance_at(points: ArrayLike, covariance: ArrayLike, pivot: ArrayLike) -> FloatArray:
+    """Covariance (N, 3, 3) that a similarity's uncertainty causes at points (N, 3) in the target frame."""
+    jacobian = jacobian_at(points, pivot)
+    return jacobian @ np.asarray(covariance, dtype=np.float64) @ np.swapaxes(jacobian, -1, -2)
+
+
+def moved_pivot(covariance: ArrayLike, pivot: ArrayLike, new_pivot: ArrayLike) -> FloatArray:
+    """The same uncertainty (7, 7), expressed about another pivot."""
+    transfer = np.eye(7)
+    arm = np.asarray(new_pivot, dtype=np.float64) - np.asarray(pivot, dtype=np.float64)
+    transfer[4:, 0], transfer[4:, 1:4] = arm, -skew(arm)
+    return transfer @ np.asarray(covariance, dtype=np.float64) @ transfer.T
+
+
+def umeyama(source: ArrayLike, target: ArrayLike, weights: ArrayLike | None = None) -> Similarity:
+    """Least-squares similarity that maps source (N, 3) onto target (N, 3), weighted by `weights` (N,).
+
+    GeoRefGS eqs 16–21 (doi 10.3390/drones10030195); the reflection guard is that of Umeyama
+    (doi 10.1109/34.88573). The scale is the trace form, which is the least-squares one also for noisy points;
+    the paper's ratio of spreads (eq. 18) is `spread_ratio_similarity`.
+
+    Raises:
+        DegenerateGeometryError: fewer than 3 points, or all on one line.
+    """
+    p, q, w = _checked(source, target, weights)
+    p0, q0 = p - w @ p, q - w @ q
+    u, singular, vt = np.linalg.svd((p0 * w[:, None]).T @ q0)  # eq. 19: H = Σ (p−p̄)(q−q̄)ᵀ = U Σ Vᵀ
+    if singular[1] <= 1e-12 * max(singular[0], np.finfo(float).tiny):
+        raise DegenerateGeometryError("the points lie on one line: the rotation about it is not determined")
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(vt.T @ u.T))])
+    rotation = vt.T @ np.diag(sign) @ u.T  # eq. 20
+    scale = float((singular * sign).sum() / (w @ (p0**2).sum(axis=1)))
+    return Similarity(scale, rotation, w @ q - scale * rotation @ (w @ p))  # eq. 21
+
+
+def spread_ratio_similarity(source: ArrayLike, target: ArrayLike) -> Similarity:
+    """The paper's closed form: scale from the ratio of spreads (eq. 18), rotation and translation as `umeyama`.
+
+    Raises:
+        DegenerateGeometryError: as `umeyama`.
+    """
+    fitted = umeyama(source, target)
+    p, q, w = _checked(source, target, None)
+    p0, q0 = p - w @ p, q - w @ q
+    scale = float(np.sqrt((q0**2).sum() / (p0**2).sum()))
+    return Similarity(scale, fitted.rotation, w @ q - scale * fitted.rotation @ (w @ p))
+
+
+def _checked(
+    source: ArrayLike, target: ArrayLike, weights: ArrayLike | None
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    p, q = np.asarray(source, dtype=np.float64), np.asarray(target, dtype=np.float64)
+    if p.shape != q.shape or p.ndim != 2 or p.shape[1] != 3:
+        raise ValueError(f"expected two arrays of shape (N, 3), got {p.shape} and {q.shape}")
+    if len(p) < 3:
+        raise DegenerateGeometryError(f"a similarity needs 3 points, there are {len(p)}")
+    w = np.ones(len(p)) if weights is None else np.asarray(weights, dtype=np.float64)
+    return p, q, w / w.sum()
+
+
+def _tuple(values: ArrayLike) -> tuple:
+    return tuple(float(value) for value in np.asarray(values))

@@ -1,0 +1,1 @@
+"""Geographic losses, their weighting, the learnable similarity and camera corrections."""

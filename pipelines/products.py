@@ -1,0 +1,304 @@
+"""Typed products: what the stages hand to each other, and how each is stored.
+
+JSON products are pydantic models (validated on load: a product can be replaced by hand), arrays are NPZ
+without pickle. Frames and units are those of docs/conventions.md: `geo` is East-North-Up metres at the survey's
+origin, `local` the SfM model's frame, `model` the metric, origin-shifted frame in which the Gaussians live.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from pipelines.errors import InputError
+
+FORMAT_VERSION = 1
+
+FloatArray = NDArray[np.float64]
+Vector3 = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+Matrix3 = tuple[Vector3, Vector3, Vector3]
+
+
+class Product(BaseModel):
+    """Base of the JSON products: immutable, no unknown keys, no NaN."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class Origin(Product):
+    """Origin of the `geo` frame: WGS84 degrees and ellipsoidal metres."""
+
+    lat_deg: float = Field(ge=-90, le=90)
+    lon_deg: float = Field(ge=-180, le=180)
+    alt_m: float
+
+
+class VerticalDatum(Product):
+    """What the input heights refer to, and whether the user (or file) said so or it was assumed."""
+
+    name: str
+    stated: bool
+    note: str = ""
+
+
+class CameraPrior(Product):
+    """Intrinsics before SfM. `params` are COLMAP's for `model`, in pixels of the full image."""
+
+    camera_id: int = Field(ge=1)
+    model: str
+    width: int = Field(gt=0)
+    height: int = Field(gt=0)
+    params: tuple[float, ...]
+    focal_source: Literal["exif", "option", "assumed", "calibrated"]
+    make_model: str = ""
+
+
+class Fix(Product):
+    """Measured position of a camera centre.
+
+    `position_in_geo` in metres; `cov_in_geo` 3×3 in m²; `sigma_source` tells who gave σ.
+    """
+
+    position_in_geo: Vector3
+    cov_in_geo: Matrix3
+    source: Literal["exif", "csv", "geo.txt", "bag"]
+    sigma_source: Literal["file", "option", "default"]
+
+
+class Attitude(Product):
+    """Measured rotation of a camera: `p_geo = R(quat_xyzw) p_cam + centre`, σ per axis in degrees."""
+
+    quat_xyzw: Quaternion
+    sigma_deg: float = Field(gt=0)
+    source: Literal["gimbal", "csv", "geo.txt", "bag"]
+
+
+class SurveyImage(Product):
+    """One photograph. `name` is relative to the survey's `image_dir`; `sha256` is of the file."""
+
+    name: str
+    camera_id: int
+    sha256: str
+    timestamp_s: float | None = None
+    fix: Fix | None = None
+    attitude: Attitude | None = None
+    split: Literal["train", "test"] = "train"
+
+
+class Mark(Product):
+    """Where a surveyed point is seen: full-image pixels, centre of the top-left pixel (0.5, 0.5)."""
+
+    image: str
+    x_px: float
+    y_px: float
+    sigma_px: float = Field(gt=0)
+
+
+class SurveyedPoint(Product):
+    """A control or check point: position in geo (m), covariance (m²), its marks."""
+
+    name: str
+    position_in_geo: Vector3
+    cov_in_geo: Matrix3
+    marks: tuple[Mark, ...]
+
+
+class Survey(Product):
+    """Product of `ingest`: everything that was measured, in one frame."""
+
+    format_version: Literal[1] = 1
+    origin: Origin
+    source_crs: str
+    vertical: VerticalDatum
+    image_dir: str
+    cameras: tuple[CameraPrior, ...]
+    images: tuple[SurveyImage, ...]
+    control_points: tuple[SurveyedPoint, ...] = ()
+    check_points: tuple[SurveyedPoint, ...] = ()
+    assumptions: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+    def image(self, name: str) -> SurveyImage | None:
+        """The image of that name, or None."""
+        return next((image for image in self.images if image.name == name), None)
+
+    def names(self, split: Literal["train", "test"]) -> tuple[str, ...]:
+        """Names of the images in a split, in order."""
+        return tuple(image.name for image in self.images if image.split == split)
+
+
+class SimilarityRecord(Product):
+    """A similarity `p_to = scale · R(quat_xyzw) p_from + translation` with its uncertainty.
+
+    `covariance` is 7×7 over (δ ln s, δω [rad], δt [m]) of a perturbation applied in the target frame about
+    `pivot`: `p' = pivot + δt + e^{δ ln s} Exp(δω) (p − pivot)`.
+    """
+
+    from_frame: str
+    to_frame: str
+    scale: float = Field(gt=0)
+    quat_xyzw: Quaternion
+    translation: Vector3
+    pivot: Vector3 = (0.0, 0.0, 0.0)
+    covariance: Annotated[tuple[tuple[float, ...], ...], Field(min_length=7, max_length=7)]
+
+
+class ResidualStats(Product):
+    """Residuals of a fit in metres. Not an accuracy."""
+
+    count: int
+    mean_h_m: float | None
+    rmse_e_m: float | None
+    rmse_n_m: float | None
+    rmse_h_m: float | None
+    rmse_v_m: float | None
+    rmse_3d_m: float | None
+    max_3d_m: float | None
+
+
+class InitialSimilarity(Product):
+    """Product of `init-sim3`: `geo_from_local`, how it was found and how well it is determined."""
+
+    format_version: Literal[1] = 1
+    geo_from_local: SimilarityRecord
+    method: Literal["robust", "paper"]
+    correspondences: dict[str, int]
+    inliers: dict[str, int]
+    gnss_outliers: tuple[str, ...] = ()
+    residuals: dict[str, ResidualStats]
+    condition_number: float
+    layout: Literal["volume", "plane", "line"]
+    attitude_used: bool
+
+
+class TrainedCamera(Product):
+    """A camera after training: `cam_from_model` as quaternion and translation; corrected or as SfM left it."""
+
+    name: str
+    split: Literal["train", "test"]
+    quat_xyzw: Quaternion
+    translation: Vector3
+    corrected: bool
+
+
+class TrainedIntrinsics(Product):
+    """The undistorted pinhole camera of the training images, in pixels."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+
+class TrainedModel(Product):
+    """Product of `train` beside the Gaussians: frames, cameras and what was optimised."""
+
+    format_version: Literal[1] = 1
+    geo_from_model: SimilarityRecord
+    model_from_local: SimilarityRecord
+    intrinsics: dict[str, TrainedIntrinsics]
+    camera_of: dict[str, str]
+    cameras: tuple[TrainedCamera, ...]
+    background: Vector3
+    sh_degree: int
+    iterations: int
+    gaussians: int
+    backend: Literal["cpu", "cuda"]
+    gnss_outliers: tuple[str, ...] = ()
+
+
+ProductT = TypeVar("ProductT", bound=BaseModel)
+
+
+def save_json(product: BaseModel, path: Path) -> None:
+    """Write a JSON product, indented, UTF-8."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(product.model_dump_json(indent=1) + "\n", encoding="utf-8")
+
+
+def load_json(product_type: type[ProductT], path: Path) -> ProductT:
+    """Read and validate a JSON product.
+
+    Raises:
+        InputError: not JSON, or not of that form; names file and field.
+    """
+    try:
+        return product_type.model_validate_json(path.read_text(encoding="utf-8"))
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise InputError(first["msg"], path=path, field=where or None) from error
+    except UnicodeDecodeError as error:
+        raise InputError("not a UTF-8 text file", path=path) from error
+
+
+def dump_json(document: Any) -> str:
+    """JSON text of a plain document: no NaN, stable order."""
+    return json.dumps(document, indent=1, allow_nan=False)
+
+
+@dataclass(frozen=True)
+class GeolocatedPoints:
+    """Product of `geolocate`: N SfM points intersected in the geo frame.
+
+    Attributes:
+        point_id: (N,) int64, ids in the COLMAP model.
+        position_in_geo: (N, 3) float64, metres; NaN where rays did not intersect.
+        cov_in_geo: (N, 3, 3) float64, m².
+        ray_count: (N,) int32, rays that were used.
+        max_angle_deg: (N,) float64, largest angle between two of its rays.
+        condition: (N,) float64, condition number of the normal matrix.
+        inlier: (N,) bool.
+        rotation_source: where the rays' rotations came from: "recorded" or "sfm".
+    """
+
+    point_id: NDArray[np.int64]
+    position_in_geo: FloatArray
+    cov_in_geo: FloatArray
+    ray_count: NDArray[np.int32]
+    max_angle_deg: FloatArray
+    condition: FloatArray
+    inlier: NDArray[np.bool_]
+    rotation_source: str
+
+    def save(self, path: Path) -> None:
+        """Write as NPZ."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        arrays: dict[str, Any] = {field.name: np.asarray(getattr(self, field.name)) for field in fields(self)}
+        np.savez(path, **arrays)
+
+    @classmethod
+    def load(cls, path: Path) -> GeolocatedPoints:
+        """Read from NPZ.
+
+        Raises:
+            InputError: not an NPZ file of that form.
+        """
+        arrays = load_npz(path, tuple(field.name for field in fields(cls)))
+        source = str(arrays.pop("rotation_source"))
+        return cls(**arrays, rotation_source=source)
+
+
+def load_npz(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
+    """Read the named arrays of an NPZ file, without pickle.
+
+    Raises:
+        InputError: unreadable, or an array is missing.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            missing = [name for name in names if name not in archive]
+            if missing:
+                raise InputError(f"array {missing[0]!r} is missing", path=path)
+            return {name: archive[name] for name in names}
+    except (OSError, ValueError, EOFError) as error:
+        raise InputError(f"not a readable NPZ file: {error}", path=path) from error

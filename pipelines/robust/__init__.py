@@ -1,0 +1,1 @@
+"""Robust losses, RANSAC and statistics. Plain numpy, float64."""

@@ -1,0 +1,1 @@
+"""The Gaussians: model, spherical harmonics, losses, densification, metrics."""

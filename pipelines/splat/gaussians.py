@@ -1,0 +1,54 @@
+"""The Gaussians as tensors: one row a Gaussian, in the form in which they are optimised and stored."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+
+@dataclass
+class Gaussians:
+    """N Gaussians in the `model` frame, float32 on one device.
+
+    Attributes:
+        means: (N, 3) centres in metres.
+        quats_wxyz: (N, 4) rotations (model ← principal axes), not necessarily of unit length.
+        log_scales: (N, 3) natural logarithm of the standard deviations along the principal axes, in metres.
+        logit_opacities: (N,) logit of the opacity.
+        sh: (N, K, 3) spherical-harmonic coefficients, K = (degree + 1)²; colour = 0.5 + Σ SH, clamped at 0.
+    """
+
+    means: Tensor
+    quats_wxyz: Tensor
+    log_scales: Tensor
+    logit_opacities: Tensor
+    sh: Tensor
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def sh_degree(self) -> int:
+        """Degree of the stored spherical harmonics."""
+        return round(self.sh.shape[1] ** 0.5) - 1
+
+    def tensors(self) -> dict[str, Tensor]:
+        """The tensors by name, in order."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    def detached(self) -> Gaussians:
+        """The same values without gradient history."""
+        return Gaussians(**{name: tensor.detach() for name, tensor in self.tensors().items()})
+
+    def select(self, index: Tensor) -> Gaussians:
+        """The rows that `index` (bool mask or integer) picks."""
+        return Gaussians(**{name: tensor[index] for name, tensor in self.tensors().items()})
+
+    @staticmethod
+    def concatenate(parts: list[Gaussians]) -> Gaussians:
+        """All rows of `parts`, in order."""
+        return Gaussians(
+            **{name: torch.cat([part.tensors()[name] for part in parts]) for name in parts[0].tensors()}
+        )

@@ -1,0 +1,116 @@
+"""One interface to every rasteriser: Gaussians and a camera in, colour, alpha and depth out, all differentiable.
+
+The blending is that of 3D Gaussian Splatting (doi 10.1145/3592433), with gsplat's conventions: pixel centres at
+(0.5, 0.5), screen covariance dilated by `dilation_px2`, contributions below alpha 1/255 left out, alpha at most
+0.999, a pixel is done when its transmittance would fall to 1e-4.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal, Protocol
+
+from torch import Tensor
+
+from pipelines.errors import BackendUnavailableError
+from pipelines.splat.gaussians import Gaussians
+
+ALPHA_MIN = 1.0 / 255.0
+ALPHA_MAX = 0.999
+TRANSMITTANCE_MIN = 1e-4
+
+BackendName = Literal["cpu", "cuda"]
+
+
+@dataclass(frozen=True)
+class Pinhole:
+    """Undistorted camera: size and intrinsics in pixels."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+
+@dataclass(frozen=True)
+class RasterSettings:
+    """How to render.
+
+    Attributes:
+        sh_degree: degree of the spherical harmonics in use (≤ the stored one).
+        background: colour behind everything.
+        near_m: Gaussians whose centre is nearer are left out.
+        dilation_px2: added to the diagonal of the screen covariance, in px².
+        depth: whether to compute depths (colour and alpha always are).
+    """
+
+    sh_degree: int = 3
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    near_m: float = 0.05
+    dilation_px2: float = 0.3
+    depth: bool = False
+
+
+@dataclass
+class ScreenStats:
+    """What densification needs to know of one render.
+
+    Attributes:
+        visible: (M,) int64 rows of the Gaussians that touched the image.
+        radius_px: (M,) float32, three standard deviations along the longer axis, on the screen.
+        mean_gradient: (M, 2) float32, ∂L/∂(projected centre) in 1/pixel; filled by the backward pass.
+    """
+
+    visible: Tensor
+    radius_px: Tensor
+    mean_gradient: Tensor | None = field(default=None)
+
+
+@dataclass
+class Render:
+    """One rendered view of H × W pixels.
+
+    Attributes:
+        colour: (H, W, 3), linear in the Gaussians' colours, background blended in.
+        alpha: (H, W), 1 − final transmittance.
+        expected_depth: (H, W), Σ w z / Σ w along the camera's z axis in metres, 0 where alpha is 0; or None.
+        median_depth: (H, W), z of the Gaussian at which the transmittance falls to one half, 0 where it never
+            does; not differentiable; or None.
+        stats: for densification.
+    """
+
+    colour: Tensor
+    alpha: Tensor
+    expected_depth: Tensor | None
+    median_depth: Tensor | None
+    stats: ScreenStats
+
+
+class Rasterizer(Protocol):
+    """A backend."""
+
+    name: BackendName
+
+    def render(
+        self, gaussians: Gaussians, cam_from_model: Tensor, camera: Pinhole, settings: RasterSettings
+    ) -> Render:
+        """Render `gaussians` from `cam_from_model` (4, 4), differentiable in both."""
+
+
+def rasterizer(name: Literal["auto", "cpu", "cuda"]) -> Rasterizer:
+    """The backend of that name; `auto` takes cuda where a device and gsplat are present.
+
+    Raises:
+        BackendUnavailableError: `cuda` without a device or without gsplat.
+    """
+    from pipelines.splat.raster.cuda import CudaRasterizer, cuda_available
+
+    if name == "cuda" or (name == "auto" and cuda_available()):
+        return CudaRasterizer()
+    if name not in ("auto", "cpu"):
+        raise BackendUnavailableError(f"no rasteriser is called {name!r}: use auto, cpu or cuda")
+    from pipelines.splat.raster.cpu import CpuRasterizer
+
+    return CpuRasterizer()
