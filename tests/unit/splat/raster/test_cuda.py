@@ -1,0 +1,137 @@
+"""The gsplat backend without a GPU: what it says when it cannot run, and what it makes of gsplat's results.
+
+A stand-in plays gsplat on the CPU: it renders by the reference and lists intersections by brute force, in the
+shapes and the order of gsplat 1.5.3. What the real kernels return is for a machine that has a GPU.
+"""
+
+from __future__ import annotations
+
+import sys
+from types import ModuleType
+
+import pytest
+import torch
+
+from pipelines.errors import BackendUnavailableError
+from pipelines.splat.gaussians import Gaussians
+from pipelines.splat.raster import cuda
+from pipelines.splat.raster.api import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, RasterSettings, rasterizer
+from pipelines.splat.raster.reference import project, render_reference, view_colours
+
+BACKGROUND = (0.1, 0.7, 0.4)
+
+
+class StandIn:
+    """gsplat's two functions that the backend calls."""
+
+    def rasterization(self, means, quats, scales, opacities, colors, viewmats, Ks, width, height, **options):
+        assert options["packed"] and viewmats.shape == (1, 4, 4) and Ks.shape == (1, 3, 3)
+        assert options["backgrounds"].tolist() == [pytest.approx(BACKGROUND)]
+        gaussians = Gaussians(means, quats, scales.log(), torch.logit(opacities), colors)
+        camera = self.camera
+        assert (width, height, Ks[0, 0, 2].item()) == (camera.width, camera.height, camera.cx)
+        depth = options["render_mode"] == "RGB+ED"
+        settings = RasterSettings(options["sh_degree"], BACKGROUND, options["near_plane"], options["eps2d"], depth)
+        render = render_reference(gaussians, viewmats[0], camera, settings)
+        rows = render.stats.visible
+        seen, pose = gaussians.select(rows), viewmats[0]
+        in_cam = seen.means @ pose[:3, :3].T + pose[:3, 3]
+        means2d, cov = project(seen, in_cam, pose, camera, options["eps2d"])
+        inverse = torch.linalg.inv(cov)
+        conics = torch.stack([inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 1, 1]], dim=-1)
+        meta = {"means2d": means2d, "conics": conics, "opacities": opacities[rows], "depths": in_cam[:, 2]}
+        meta |= {"gaussian_ids": rows, "tile_size": 16, "isect_offsets": None, "flatten_ids": None}
+        image = render.colour + 0 * (means2d.sum() + view_colours(seen, pose, 0).sum())
+        if depth:
+            image = torch.cat([image, render.expected_depth[..., None]], dim=-1)
+        return image[None], render.alpha[None, ..., None], meta
+
+    def rasterize_to_indices_in_range(
+        self, start, end, transmittances, means2d, conics, opacities, width, height, *_
+    ):
+        assert start == 0 and end > 1_000_000 and transmittances.shape == (1, height, width)
+        found = []
+        order = torch.argsort(self.depths(means2d))
+        for pixel in range(width * height):
+            left = 1.0
+            for index in order.tolist():
+                dx, dy = means2d[0, index] - torch.tensor([pixel % width + 0.5, pixel // width + 0.5])
+                a, b, c = conics[0, index]
+                alpha = min(
+                    ALPHA_MAX,
+                    (opacities[0, index] * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)).item(),
+                )
+                if alpha < ALPHA_MIN:
+                    continue
+                left *= 1 - alpha
+                if left <= TRANSMITTANCE_MIN:
+                    break
+                found.append((index, pixel))
+        gaussian, pixel = torch.tensor(found).T
+        return gaussian, pixel, torch.zeros_like(pixel)
+
+
+@pytest.fixture
+def backend(monkeypatch):
+    stand_in = StandIn()
+    monkeypatch.setattr(cuda, "_import_gsplat", lambda: stand_in)
+    return cuda.CudaRasterizer(), stand_in
+
+
+def test_no_device(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert not cuda.cuda_available()
+    with pytest.raises(BackendUnavailableError, match="no CUDA device found"):
+        rasterizer("cuda")
+    assert rasterizer("auto").name == "cpu"
+
+
+def test_no_gsplat(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setitem(sys.modules, "gsplat", None)
+    with pytest.raises(BackendUnavailableError, match=r"pip install 'georefgs\[cuda\]'"):
+        cuda.CudaRasterizer()
+
+
+def test_gsplat_without_kernels(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    package, folder, module = ModuleType("gsplat"), ModuleType("gsplat.cuda"), ModuleType("gsplat.cuda._backend")
+    module._C = None
+    package.cuda, folder._backend = folder, module
+    for part in (package, folder, module):
+        monkeypatch.setitem(sys.modules, part.__name__, part)
+    with pytest.raises(BackendUnavailableError, match="nvcc"):
+        cuda.CudaRasterizer()
+
+
+def test_images_statistics_and_median(make_scene, leaves, camera, backend):
+    rasteriser, stand_in = backend
+    (gaussians, pose), settings = (
+        leaves(make_scene(12, seed=4), torch.float32),
+        RasterSettings(0, BACKGROUND, depth=True),
+    )
+    small = type(camera)(20, 14, 18.0, 18.0, 10.0, 7.0)
+    stand_in.camera = small
+    truth = render_reference(gaussians, pose, small, settings)
+    in_cam = gaussians.means.detach() @ pose[:3, :3].T.float() + pose[:3, 3].float()
+    stand_in.depths = lambda means2d: in_cam[truth.stats.visible, 2]
+    render = rasteriser.render(gaussians, pose, small, settings)
+    torch.testing.assert_close(render.colour, truth.colour, rtol=0, atol=1e-5)
+    torch.testing.assert_close(render.alpha, truth.alpha, rtol=0, atol=1e-5)
+    torch.testing.assert_close(render.median_depth, truth.median_depth, rtol=0, atol=1e-5)
+    assert (truth.median_depth > 0).any() and (truth.median_depth == 0).any()
+    assert torch.equal(render.stats.visible, truth.stats.visible)
+    torch.testing.assert_close(render.stats.radius_px, truth.stats.radius_px, rtol=1e-4, atol=1e-4)
+    render.colour.sum().backward()
+    assert render.stats.mean_gradient.shape == (len(render.stats.visible), 2)
+
+
+def test_without_depth_there_is_none(make_scene, camera, backend):
+    rasteriser, stand_in = backend
+    stand_in.camera = camera
+    gaussians, pose = make_scene(12, seed=4)
+    gaussians = Gaussians(*(tensor.float() for tensor in gaussians.tensors().values()))
+    render = rasteriser.render(gaussians, pose, camera, RasterSettings(0, BACKGROUND))
+    assert render.colour.shape == (45, 70, 3)
+    assert render.expected_depth is None
+    assert render.median_depth is None
