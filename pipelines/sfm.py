@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -33,7 +34,6 @@ _EXHAUSTIVE_UP_TO = 20
 _IMAGES_A_CHUNK = 4
 _PAIRS_A_CHUNK = 48
 _FEW_REGISTERED = 0.8
-_PINHOLE_PARAMS = 4
 # COLMAP writes one line a step; only its errors are of use here.
 _COLMAP_ERRORS_ONLY = 2
 
@@ -49,7 +49,8 @@ def run(stage: StageRun, config: SfmConfig) -> Summary:
         if config.import_model is not None:
             model = import_model(colmap, config.import_model, survey)
         else:
-            model = reconstruct(colmap, survey, images, stage.out, config, stage.progress)
+            job = SfmJob(survey, images, stage.out / "database.db", config)
+            model = reconstruct(colmap, job, stage.progress)
         sparse.mkdir()
         model.write_binary(str(sparse))
     return _summarise(model, survey)
@@ -68,32 +69,44 @@ def quiet_colmap() -> Iterator[Any]:
         pycolmap.logging.minloglevel = level
 
 
-def reconstruct(colmap: Any, survey: Survey, images: Path, out: Path, config: SfmConfig, progress: Progress) -> Any:
-    """Features, matches and mapping; continues on the database that it finds in `out`.
+@dataclass(frozen=True)
+class SfmJob:
+    """What to reconstruct.
+
+    Attributes:
+        survey: the photographs, what is known of their cameras and places.
+        images: folder that the survey's image names are relative to.
+        database: COLMAP's database; one that is there is continued.
+        config: options.
+    """
+
+    survey: Survey
+    images: Path
+    database: Path
+    config: SfmConfig
+
+
+def reconstruct(colmap: Any, job: SfmJob, progress: Progress) -> Any:
+    """Features, matches and mapping.
 
     Args:
         colmap: the pycolmap module.
-        images: folder that the survey's image names are relative to.
-        out: folder for the database and the mapper's models.
 
     Returns:
         The largest `pycolmap.Reconstruction`.
 
     Raises:
         InputError: a photograph is gone.
-        DegenerateGeometryError: fewer than 3 images could be registered.
+        DegenerateGeometryError: no two images could be tied together.
     """
-    missing = [image.name for image in survey.images if not (images / image.name).is_file()]
+    names = [image.name for image in job.survey.images]
+    missing = [name for name in names if not (job.images / name).is_file()]
     if missing:
-        raise InputError(f"{len(missing)} photographs of the survey are gone", path=images / missing[0])
-    colmap.set_random_seed(config.seed)
-    database = out / "database.db"
-    _extract(colmap, _Job(survey, images, database, config), progress)
-    pairs = candidate_pairs(survey, config)
-    names = [image.name for image in survey.images]
-    _match(colmap, database, [(names[i], names[j]) for i, j in pairs], config, progress)
-    models = _map(colmap, _Job(survey, images, database, config), out / "models", progress)
-    shutil.rmtree(out / "models", ignore_errors=True)
+        raise InputError(f"{len(missing)} photographs of the survey are gone", path=job.images / missing[0])
+    colmap.set_random_seed(job.config.seed)
+    _extract(colmap, job, progress)
+    _match(colmap, job, [(names[i], names[j]) for i, j in candidate_pairs(job.survey, job.config)], progress)
+    models = _map(colmap, job, progress)
     if not models:
         raise DegenerateGeometryError(
             "no two photographs could be tied together: is there enough overlap and texture? "
@@ -103,14 +116,6 @@ def reconstruct(colmap: Any, survey: Survey, images: Path, out: Path, config: Sf
         sizes = sorted((model.num_reg_images() for model in models), reverse=True)
         log.warning("the survey fell apart into %d models of %s images; the largest is used", len(models), sizes)
     return max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()))
-
-
-@dataclass(frozen=True)
-class _Job:
-    survey: Survey
-    images: Path
-    database: Path
-    config: SfmConfig
 
 
 def candidate_pairs(survey: Survey, config: SfmConfig) -> NDArray[np.int64]:
@@ -133,7 +138,7 @@ def candidate_pairs(survey: Survey, config: SfmConfig) -> NDArray[np.int64]:
     return select_pairs(Views(position, axis), config.max_neighbors)
 
 
-def _extract(colmap: Any, job: _Job, progress: Progress) -> None:
+def _extract(colmap: Any, job: SfmJob, progress: Progress) -> None:
     """Detect features camera by camera, a few images at a time: what is done survives an interruption."""
     options = colmap.FeatureExtractionOptions()
     options.max_image_size = job.config.max_image_size
@@ -156,7 +161,7 @@ def _extract(colmap: Any, job: _Job, progress: Progress) -> None:
                 task.advance(len(chunk))
 
 
-def _add_camera(colmap: Any, job: _Job, prior: CameraPrior) -> None:
+def _add_camera(colmap: Any, job: SfmJob, prior: CameraPrior) -> None:
     """Put the camera into the database unless an interrupted run already did."""
     with colmap.Database.open(job.database) as database:
         if database.exists_camera(prior.camera_id):
@@ -182,27 +187,30 @@ def _copy_shared_params(colmap: Any, prior: CameraPrior, camera: Any) -> None:
     camera.params = params
 
 
-def _match(
-    colmap: Any, database: Path, pairs: list[tuple[str, str]], config: SfmConfig, progress: Progress
-) -> None:
+def _match(colmap: Any, job: SfmJob, pairs: list[tuple[str, str]], progress: Progress) -> None:
     matching, pairing = colmap.FeatureMatchingOptions(), colmap.ImportedPairingOptions()
-    matching.num_threads = config.threads
+    matching.num_threads = job.config.threads
     verification = colmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = config.seed
-    listing = database.with_name("pairs.txt")
+    verification.ransac.random_seed = job.config.seed
+    if any(" " in name for pair in pairs for name in pair):
+        log.warning("file names with blanks cannot be listed for COLMAP: all pairs are matched")
+        colmap.match_exhaustive(job.database, matching, verification_options=verification)
+        return
+    listing = job.database.with_name("pairs.txt")
     with progress.task("matching", len(pairs)) as task:
         for chunk in _chunks(pairs, _PAIRS_A_CHUNK):
             listing.write_text("".join(f"{a} {b}\n" for a, b in chunk), encoding="utf-8")
             pairing.match_list_path = listing
-            colmap.match_image_pairs(database, matching, pairing, verification)
+            colmap.match_image_pairs(job.database, matching, pairing, verification)
             task.advance(len(chunk))
-    listing.unlink()
+    listing.unlink(missing_ok=True)
 
 
-def _map(colmap: Any, job: _Job, out: Path, progress: Progress) -> list[Any]:
-    shutil.rmtree(out, ignore_errors=True)
-    out.mkdir()
-    with progress.task("mapping", len(job.survey.images)) as task:
+def _map(colmap: Any, job: SfmJob, progress: Progress) -> list[Any]:
+    with (
+        progress.task("mapping", len(job.survey.images)) as task,
+        TemporaryDirectory(dir=job.database.parent) as out,
+    ):
         if job.config.mapper == "global":
             options = colmap.GlobalPipelineOptions()
             options.num_threads, options.random_seed = job.config.threads, job.config.seed

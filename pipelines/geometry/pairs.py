@@ -45,16 +45,16 @@ def select_pairs(views: Views, max_neighbors: int) -> NDArray[np.int64]:
     count = len(position)
     known = np.flatnonzero(np.isfinite(position).all(axis=1))
     chosen = {(i, i + 1) for i in range(count - 1)}
-    for i in np.flatnonzero(~np.isfinite(position).all(axis=1)):
+    for i in map(int, np.flatnonzero(~np.isfinite(position).all(axis=1))):
         chosen.update((min(i, j), max(i, j)) for j in range(count) if j != i)
     if len(known) > 1:
         tree = cKDTree(position[known])
         reach = min(len(known), max_neighbors * _CANDIDATES_PER_NEIGHBOR + 1)
-        for i in known:
+        for i in map(int, known):
             near = known[tree.query(position[i], k=reach)[1]]
             near = near[(near != i) & _look_alike(views.axis_in_geo, i, near)]
             for j in _spread(position[near] - position[i], max_neighbors):
-                chosen.add((min(i, near[j]), max(i, near[j])))
+                chosen.add((min(i, int(near[j])), max(i, int(near[j]))))
     return np.array(sorted(chosen), dtype=np.int64).reshape(-1, 2)
 
 
