@@ -52,3 +52,14 @@ class Gaussians:
         return Gaussians(
             **{name: torch.cat([part.tensors()[name] for part in parts]) for name in parts[0].tensors()}
         )
+
+
+def rotation_matrices(quats_wxyz: Tensor) -> Tensor:
+    """Rotation matrices (N, 3, 3) of quaternions (N, 4) of any length."""
+    w, x, y, z = (quats_wxyz / quats_wxyz.norm(dim=1, keepdim=True)).unbind(1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, dim=1).reshape(-1, 3, 3)
