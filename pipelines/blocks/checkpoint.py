@@ -42,7 +42,5 @@ def prefixed(prefix: str, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
 def unprefixed(prefix: str, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Those tensors that `prefixed` put under `prefix`, under their own names."""
     return {
-        name.removeprefix(f"{prefix}/"): tensor
-        for name, tensor in state.items()
-        if name.startswith(f"{prefix}/")
+        name.removeprefix(f"{prefix}/"): tensor for name, tensor in state.items() if name.startswith(f"{prefix}/")
     }

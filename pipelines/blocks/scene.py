@@ -146,36 +146,34 @@ def _fixes(scene: Scene, survey: Survey) -> Fixes | None:
 
 def _control_marks(scene: Scene, survey: Survey) -> ControlMarks | None:
     """Marks of the control points in training images, where a point has two or more of them."""
-    index = scene.sparse.image_index()
-    trained = set(map(int, scene.train))
-    kept: list[tuple[SurveyedPoint, list[tuple[int, FloatArray, float]]]] = []
-    for point in survey.control_points:
-        marks = []
-        for mark in point.marks:
-            camera_index = index.get(mark.image)
-            if camera_index is None or camera_index not in trained:
-                continue
-            camera = scene.sparse.camera_of(camera_index)
-            ray = np.append(undistort(camera, np.array([mark.x_px, mark.y_px])), 1.0)
-            marks.append((camera_index, ray / np.linalg.norm(ray), mark.sigma_px / float(camera.params[0])))
-        if len(marks) >= 2:
-            kept.append((point, marks))
+    kept = [(point, found) for point in survey.control_points if len(found := _rays(scene, point)) >= 2]
     if not kept:
         return None
-    flat = [(j, *mark) for j, (_, marks) in enumerate(kept) for mark in marks]
-    position = np.array([point.position_in_geo for point, _ in kept])
+    flat = [(j, *ray) for j, (_, rays) in enumerate(kept) for ray in rays]
     marks = ControlMarks(
         point=torch.tensor([row[0] for row in flat]),
         camera=torch.tensor([row[1] for row in flat]),
         bearing_in_cam=torch.from_numpy(np.array([row[2] for row in flat])),
         sigma_rad=torch.tensor([row[3] for row in flat], dtype=torch.float64),
-        position_in_geo=torch.from_numpy(position),
+        position_in_geo=torch.tensor([point.position_in_geo for point, _ in kept], dtype=torch.float64),
         root_information=torch.eye(3, dtype=torch.float64).repeat(len(kept), 1, 1),
     )
-    survey_cov = np.array([point.cov_in_geo for point, _ in kept])
-    return replace(
-        marks, root_information=torch.from_numpy(root_information(survey_cov + _mark_covariance(scene, marks)))
-    )
+    covariance = np.array([point.cov_in_geo for point, _ in kept]) + _mark_covariance(scene, marks)
+    return replace(marks, root_information=torch.from_numpy(root_information(covariance)))
+
+
+def _rays(scene: Scene, point: SurveyedPoint) -> list[tuple[int, FloatArray, float]]:
+    """Of each mark in a training image: camera index, bearing (3,) in the camera, angular σ."""
+    index, trained = scene.sparse.image_index(), set(map(int, scene.train))
+    rays = []
+    for mark in point.marks:
+        camera_index = index.get(mark.image)
+        if camera_index is None or camera_index not in trained:
+            continue
+        camera = scene.sparse.camera_of(camera_index)
+        ray = np.append(undistort(camera, np.array([mark.x_px, mark.y_px])), 1.0)
+        rays.append((camera_index, ray / np.linalg.norm(ray), mark.sigma_px / float(camera.params[0])))
+    return rays
 
 
 def _mark_covariance(scene: Scene, marks: ControlMarks) -> FloatArray:
@@ -189,9 +187,9 @@ def _mark_covariance(scene: Scene, marks: ControlMarks) -> FloatArray:
     projector = np.eye(3) - direction[:, :, None] * direction[:, None, :]
     normal = np.zeros((len(position), 3, 3))
     np.add.at(normal, point, weight[:, None, None] * projector)
-    return np.linalg.inv(normal)
+    return np.asarray(np.linalg.inv(normal))
 
 
 def root_information(covariance: FloatArray) -> FloatArray:
     """W (N, 3, 3) with WᵀW = Σ⁻¹."""
-    return np.linalg.inv(np.linalg.cholesky(covariance))
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))

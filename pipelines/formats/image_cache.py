@@ -72,7 +72,7 @@ class ImageCache:
     def __init__(self, folder: Path, photographs: list[Photograph], max_size_px: int) -> None:
         self._folder = folder
         self._photographs = photographs
-        self._max_size_px = max_size_px
+        self.max_size_px = max_size_px
         self._maps: dict[bytes, tuple[NDArray[np.float32], NDArray[np.bool_]]] = {}
 
     def __len__(self) -> int:
@@ -80,7 +80,7 @@ class ImageCache:
 
     def pinhole(self, index: int) -> PinholeImage:
         """Camera of an undistorted image."""
-        return pinhole_of(self._photographs[index].camera, self._max_size_px)
+        return pinhole_of(self._photographs[index].camera, self.max_size_px)
 
     def build(self, progress: Progress = SILENT) -> None:
         """Make what is not there yet.
@@ -113,7 +113,7 @@ class ImageCache:
         camera = photograph.camera
         key = (
             f"{photograph.name}|{stat.st_size}|{stat.st_mtime_ns}|{camera.model}|{camera.width}x{camera.height}|"
-            f"{camera.params.tobytes().hex()}|{self._max_size_px}"
+            f"{camera.params.tobytes().hex()}|{self.max_size_px}"
         )
         return self._folder / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.npy"
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -111,7 +112,7 @@ def _linearise(network: Network) -> _Linearised:
         rows = np.flatnonzero(camera_of == key)
         local = in_cam[rows]
         residual[rows] = project(camera, local) - network.obs_xy_px[rows]
-        by_cam[rows] = _differences(lambda p, c=camera: project(c, p), local)
+        by_cam[rows] = _differences(partial(project, camera), local)
         for index in range(len(camera.params)):
             by_intrinsics[rows, :, index] = _by_parameter(camera, index, local)
     by_point = by_cam @ rotation
@@ -185,9 +186,7 @@ def _scatter(blocks: FloatArray, column_block: IntArray, count: int) -> csr_matr
 def _whitened(network: Network, information: FloatArray) -> FloatArray:
     center = network.cam_center_in_world
     n = len(center)
-    distance = np.linalg.norm(
-        network.point_in_world[network.obs_point] - center[network.obs_image], axis=1
-    )
+    distance = np.linalg.norm(network.point_in_world[network.obs_point] - center[network.obs_image], axis=1)
     typical = float(np.median(distance))
     unit = np.tile([1 / typical] * 3 + [1.0] * 3, n)  # rotations in metres at the scene, so that units agree
     scaled = information * unit[:, None] * unit

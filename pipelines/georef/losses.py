@@ -106,9 +106,7 @@ def intersect(cameras: CameraCorrections, marks: ControlMarks) -> Tensor:
 
 
 def _sum_by_point(terms: Tensor, marks: ControlMarks) -> Tensor:
-    total = torch.zeros(
-        (len(marks.position_in_geo), *terms.shape[1:]), dtype=terms.dtype, device=terms.device
-    )
+    total = torch.zeros((len(marks.position_in_geo), *terms.shape[1:]), dtype=terms.dtype, device=terms.device)
     return total.index_add(0, marks.point, terms)
 
 

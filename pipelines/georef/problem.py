@@ -69,12 +69,13 @@ class GeoProblem(torch.nn.Module):
             absolute = absolute_loss(self.similarity, self.cameras, self.fixes, self.weighting)
         if self.marks is not None:
             control = control_point_loss(self.similarity, self.cameras, self.marks, self.weighting)
-        return GeoTerms(absolute, control, self._prior() / max(self._fix_count(), 1))
+        return GeoTerms(absolute, control, self._prior() / self._normaliser())
 
     def loss(self) -> Tensor:
         """L_abs + λ_gcp L_gcp + the cameras' own term; scalar.
 
-        Whitened: every χ² counts alike, so λ_gcp is the ratio of control points to fixes. Paper: λ_gcp = 1.
+        Whitened: every χ² counts alike, so λ_gcp is the ratio of control points to fixes. Paper: λ_gcp = 1, and
+        no term of the cameras'.
         """
         terms = self.terms()
         total = terms.cameras if self.weighting == "whitened" else 0.0 * terms.cameras
@@ -82,7 +83,7 @@ class GeoProblem(torch.nn.Module):
             total = total + terms.absolute
         if terms.control is not None and self.marks is not None:
             count = len(self.marks.position_in_geo)
-            weight = count / max(self._fix_count(), 1) if self.weighting == "whitened" else 1.0
+            weight = count / self._normaliser() if self.weighting == "whitened" else 1.0
             total = total + weight * terms.control
         return total
 
@@ -90,8 +91,9 @@ class GeoProblem(torch.nn.Module):
         prior = self.cameras.z.square().sum()
         return prior + self.similarity.y.square().sum() if self.hold_prior else prior
 
-    def _fix_count(self) -> int:
-        return 0 if self.fixes is None else len(self.fixes.camera)
+    def _normaliser(self) -> int:
+        """N of the means: the fixes, or the cameras where there is none."""
+        return len(self.cameras.center) if self.fixes is None else len(self.fixes.camera)
 
     def forward(self) -> Tensor:
         """Whitened residuals (F + J, 3) of the fixes, then of the control points."""
@@ -114,7 +116,7 @@ class GeoProblem(torch.nn.Module):
 
         def residuals(y: Tensor, z: Tensor) -> Tensor:
             state = {"similarity.y": y, "cameras.z": z}
-            return torch.func.functional_call(self, state, ())  # type: ignore[no-any-return]
+            return torch.func.functional_call(self, state, ())
 
         by_y, by_z = torch.func.jacrev(residuals, argnums=(0, 1), chunk_size=64)(y, z)
         with torch.no_grad():

@@ -61,6 +61,11 @@ class LearnableSimilarity(torch.nn.Module):
         move = Similarity(grow, turn, self.pivot_in_geo + delta[4:].numpy() - grow * turn @ self.pivot_in_geo)
         return move @ self.base
 
+    def prior_covariance(self) -> FloatArray:
+        """Covariance (7, 7) of the initial estimate."""
+        root = self.root.cpu().numpy()
+        return np.asarray(root @ root.T)
+
 
 def _root(covariance: FloatArray) -> FloatArray:
     """A square root of a positive semi-definite matrix; a direction without uncertainty keeps a tiny one."""
