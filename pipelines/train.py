@@ -21,11 +21,11 @@ import torch
 
 from pipelines.blocks.checkpoint import load_checkpoint, save_checkpoint
 from pipelines.blocks.scene import Scene, geo_problem, initial_scene, photographs
+from pipelines.blocks.trained import write_gaussians
 from pipelines.blocks.trainer import JointOptions, JointTrainer, StepReport, Views
 from pipelines.config import TrainConfig
 from pipelines.formats.colmap import read_sparse
 from pipelines.formats.image_cache import ImageCache
-from pipelines.formats.splat_ply import write_splat
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
 from pipelines.georef.problem import GeoProblem
 from pipelines.interrupts import deferred_interrupts
@@ -222,7 +222,7 @@ def _save(trainer: JointTrainer, scene: Scene, out: Path, seconds: float) -> Sum
         backend=trainer.rasterizer.name,
         gnss_outliers=outliers,
     )
-    write_splat(out / "gaussians.ply", gaussians)
+    write_gaussians(out / "gaussians.ply", gaussians)
     save_json(model, out / "model.json")
     rows = [json.loads(row) for row in (out / _METRICS).read_text(encoding="utf-8").splitlines()]
     psnr = float(np.mean([row["psnr"] for row in rows[-20:]]))
