@@ -1,12 +1,14 @@
-"""Image quality as the splatting literature reports it: PSNR and SSIM of images as they are shown."""
+"""Image quality as the splatting literature reports it: PSNR, SSIM and LPIPS of images as they are shown."""
 
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 from torch import Tensor
 
 from pipelines.splat.losses import image_similarity
+from pipelines.splat.lpips import Lpips
 
 
 def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
@@ -41,6 +43,17 @@ def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
     """
     _check(image, target, mask)
     return image_similarity(image.detach().clamp(0, 1), target, mask).ssim
+
+
+def lpips(weights: Path | None) -> Lpips | str:
+    """The perceptual distance, or the reason why there is none.
+
+    Raises:
+        InputError: `weights` is not an NPZ file of LPIPS weights.
+    """
+    if weights is None:
+        return "no weights were given: they are not part of the package (--lpips-weights FILE.npz)"
+    return Lpips(weights)
 
 
 def _check(image: Tensor, target: Tensor, mask: Tensor | None) -> None:

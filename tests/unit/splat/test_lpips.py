@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from pipelines.errors import InputError
 from pipelines.splat.lpips import Lpips
+from pipelines.splat.metrics import lpips as lpips_or_reason
 
 VGG16 = (64, 64, "M", 128, 128, "M", 256, 256, 256, "M", 512, 512, 512, "M", 512, 512, 512)
 TAKEN = (3, 8, 15, 22, 29)  # the last ReLU before each pooling
@@ -70,6 +71,12 @@ def test_distance_is_that_of_the_definition(network: tuple[nn.Sequential, list[T
     assert lpips(image, image) == 0
     with pytest.raises(ValueError, match="16 px"):
         lpips(image[:8], target[:8])
+
+
+def test_without_weights_there_is_a_reason() -> None:
+    reason = lpips_or_reason(None)
+    assert isinstance(reason, str)
+    assert "--lpips-weights" in reason
 
 
 def test_files_that_are_no_weights_are_refused(tmp_path: Path) -> None:
