@@ -8,6 +8,8 @@ origin, `local` the SfM model's frame, `model` the metric, origin-shifted frame 
 from __future__ import annotations
 
 import json
+import zipfile
+import zlib
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -289,5 +291,5 @@ def load_npz(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
             if missing:
                 raise InputError(f"array {missing[0]!r} is missing", path=path)
             return {name: archive[name] for name in names}
-    except (OSError, ValueError, EOFError) as error:
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise InputError(f"not a readable NPZ file: {error}", path=path) from error

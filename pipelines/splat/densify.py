@@ -124,11 +124,12 @@ class DefaultStrategy:
         if stats.mean_gradient is None:
             raise ValueError("the render has no screen gradients yet: call backward() first")
         # Threshold and 3DGS are in normalised device coordinates: 2 units across the image.
-        half_size = stats.mean_gradient.new_tensor([camera.width / 2, camera.height / 2])
-        length = (stats.mean_gradient * half_size).norm(dim=1)
-        rows = stats.visible.to(self._gradient_sum.device)
-        self._gradient_sum.index_add_(0, rows, length.to(self._gradient_sum))
-        self._observations.index_add_(0, rows, torch.ones_like(rows, dtype=self._observations.dtype))
+        x, y = stats.mean_gradient.unbind(dim=1)
+        length = torch.hypot(x * (camera.width / 2), y * (camera.height / 2)).float()
+        self._gradient_sum = self._gradient_sum.to(length.device)
+        self._observations = self._observations.to(length.device)
+        self._gradient_sum.index_add_(0, stats.visible, length)
+        self._observations.index_add_(0, stats.visible, torch.ones_like(length))
 
     def update(self, iteration: int, optimizer: GaussianAdam) -> Change:
         """See `Strategy.update`."""

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 
@@ -41,6 +44,15 @@ class Gaussians:
     def detached(self) -> Gaussians:
         """The same values without gradient history."""
         return Gaussians(**{name: tensor.detach() for name, tensor in self.tensors().items()})
+
+    def arrays(self) -> dict[str, NDArray[np.float32]]:
+        """The values as numpy arrays by name, for files."""
+        return {name: tensor.detach().cpu().numpy() for name, tensor in self.tensors().items()}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[np.float32]]) -> Gaussians:
+        """From arrays by the names of the attributes; copied."""
+        return cls(**{field.name: torch.tensor(arrays[field.name]) for field in fields(cls)})
 
     def select(self, index: Tensor) -> Gaussians:
         """The rows that `index` (bool mask or integer) picks."""
