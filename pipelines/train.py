@@ -21,7 +21,6 @@ import torch
 
 from pipelines.blocks.checkpoint import load_checkpoint, save_checkpoint
 from pipelines.blocks.scene import Scene, geo_problem, initial_scene, photographs
-from pipelines.blocks.trained import write_gaussians
 from pipelines.blocks.trainer import JointOptions, JointTrainer, StepReport, Views
 from pipelines.config import TrainConfig
 from pipelines.formats.colmap import read_sparse
@@ -42,6 +41,7 @@ from pipelines.splat.densify import DefaultSettings, DefaultStrategy
 from pipelines.splat.initialise import InitialisationOptions, gaussians_from_points, scene_extent
 from pipelines.splat.optimizer import GaussianAdam
 from pipelines.splat.raster.api import rasterizer
+from pipelines.splat.storage import write_splat
 from pipelines.stages import SIM3, SPARSE, SURVEY
 from pipelines.workspace import StageRun, Summary
 
@@ -222,7 +222,7 @@ def _save(trainer: JointTrainer, scene: Scene, out: Path, seconds: float) -> Sum
         backend=trainer.rasterizer.name,
         gnss_outliers=outliers,
     )
-    write_gaussians(out / "gaussians.ply", gaussians)
+    write_splat(out / "gaussians.ply", gaussians)
     save_json(model, out / "model.json")
     rows = [json.loads(row) for row in (out / _METRICS).read_text(encoding="utf-8").splitlines()]
     psnr = float(np.mean([row["psnr"] for row in rows[-20:]]))

@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
-import torch
 
 from pipelines.errors import InputError
 from pipelines.formats.colmap import SparseModel, read_sparse
-from pipelines.formats.splat_ply import SplatArrays, read_splat_ply, write_splat_ply
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.similarity import Similarity
 from pipelines.georef.cameras import CameraPoses
 from pipelines.products import Survey, TrainedModel, load_json
 from pipelines.splat.gaussians import Gaussians
+from pipelines.splat.storage import read_splat
 from pipelines.stages import GAUSSIANS, MODEL, SPARSE, SURVEY
 from pipelines.workspace import Workspace
-
-FIELDS = tuple(field.name for field in fields(Gaussians))
 
 
 @dataclass(frozen=True)
@@ -70,21 +66,5 @@ def load_trained(workspace: Workspace) -> Trained:
         sparse=sparse,
         model=model,
         poses=CameraPoses(rotation, -np.einsum("nji,nj->ni", rotation, translation)),
-        gaussians=read_gaussians(workspace.path(GAUSSIANS)),
+        gaussians=read_splat(workspace.path(GAUSSIANS)),
     )
-
-
-def write_gaussians(path: Path, gaussians: Gaussians) -> None:
-    """Write Gaussians as a 3DGS PLY, in the frame that they are in."""
-    arrays = {name: tensor.detach().cpu().numpy() for name, tensor in gaussians.tensors().items()}
-    write_splat_ply(path, SplatArrays(**arrays))
-
-
-def read_gaussians(path: Path) -> Gaussians:
-    """Read Gaussians from a 3DGS PLY.
-
-    Raises:
-        InputError: not such a file.
-    """
-    arrays = read_splat_ply(path)
-    return Gaussians(**{name: torch.from_numpy(np.array(getattr(arrays, name))) for name in FIELDS})
