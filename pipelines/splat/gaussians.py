@@ -58,6 +58,10 @@ class Gaussians:
         """The rows that `index` (bool mask or integer) picks."""
         return Gaussians(**{name: tensor[index] for name, tensor in self.tensors().items()})
 
+    def to(self, device: torch.device) -> Gaussians:
+        """The same Gaussians on a device."""
+        return Gaussians(**{name: tensor.to(device) for name, tensor in self.tensors().items()})
+
     @staticmethod
     def concatenate(parts: list[Gaussians]) -> Gaussians:
         """All rows of `parts`, in order."""
