@@ -220,7 +220,7 @@ def _with_heights(rows: PoseTable, photos: Sequence[Photo], crs: PointCrs, notes
         xyz[lacking, 2] = [_or_nan(altitude.get(rows.names[row])) for row in lacking]
     filled = complete(xyz)
     if filled[lacking].any():
-        notes.assume(f"{int(filled[lacking].sum())} heights that {rows.path.name} lacks are from EXIF")
+        notes.assume(f"heights that {rows.path.name} lacks are from EXIF ({int(filled[lacking].sum())})")
     places = [f"{rows.path.name}:{line}" for line in rows.lines[~filled]]
     notes.warn_counted(places, "row has no height and was left out", "rows have no height and were left out")
     if not filled.any():
@@ -279,15 +279,14 @@ def _with_defaults(
         result[:, :2] = options.sigma_h_m
     if options.sigma_v_m is not None:
         result[:, 2] = options.sigma_v_m
-    overridden = options.sigma_h_m is not None or options.sigma_v_m is not None
-    complete_override = options.sigma_h_m is not None and options.sigma_v_m is not None
     for kind in sorted(set(kinds)):
         rows = known & ~from_file & np.array([one == kind for one in kinds])
-        if rows.any() and not complete_override:
-            h, v = SIGMA_M[kind]
-            notes.assume(
-                f"σ of {int(rows.sum())} positions without one: {h:g} m horizontal, {v:g} m vertical ({kind})"
-            )
+        h, v = SIGMA_M[kind]
+        parts = [f"{h:g} m horizontal"] if options.sigma_h_m is None else []
+        parts += [f"{v:g} m vertical"] if options.sigma_v_m is None else []
+        if rows.any() and parts:
+            notes.assume(f"σ of positions without one ({int(rows.sum())}): {', '.join(parts)} ({kind})")
+    overridden = options.sigma_h_m is not None or options.sigma_v_m is not None
     sources: list[SigmaSource] = ["option" if overridden else "file" if one else "default" for one in from_file]
     return result, tuple(sources)
 
