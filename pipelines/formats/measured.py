@@ -18,7 +18,7 @@ from pipelines.formats.photo_folder import Photo
 from pipelines.formats.poses import PoseTable, complete, interpolate, match_by_name
 from pipelines.formats.xmp import RTK_FIXED, RTK_FLOAT
 from pipelines.geodesy.crs import WGS84, PointCrs, parse_crs
-from pipelines.geodesy.enu import ecef_from_lla, lla_from_ecef
+from pipelines.geodesy.enu import ecef_from_lla, lla_from_ecef, median_lla
 from pipelines.geodesy.vertical import VerticalChoice, assumed_ellipsoidal
 from pipelines.geometry.rotations import geo_from_cam, quat_xyzw_from_matrix
 from pipelines.products import FloatArray, VerticalDatum
@@ -34,6 +34,7 @@ SIGMA_M = {
 }
 # Vertical over horizontal σ of a fix that states only the horizontal one.
 _VERTICAL_RATIO = 2.0
+_DISAGREEMENT_M = 2_000.0
 _EXIF_NOTE = "EXIF altitude, which is often above a geoid or barometric, taken as ellipsoidal: see --vertical"
 
 
@@ -130,6 +131,7 @@ def from_table(table: PoseTable, photos: Sequence[Photo], options: PoseOptions, 
     rows = _with_heights(rows, photos, crs, notes) if rows.names is not None else rows
     lla = crs.lla_from_xyz(rows.xyz, path=table.path, lines=rows.lines.tolist())
     note_operation(crs, lla, notes)
+    _compare_with_exif(median_lla(lla), photos, table.path, notes)
     cartesian = replace(rows, xyz=ecef_from_lla(lla))
     if rows.names is not None:
         at = np.array([images.index(name) for name in rows.names])
@@ -207,6 +209,19 @@ def _crs_of(table: PoseTable, options: PoseOptions, notes: Notes) -> PointCrs:
     if options.vertical is not None and crs.states_vertical and crs.vertical.name != options.vertical.name:
         raise InputError(f"contradicts --crs {crs.name}, whose heights are {crs.vertical.name}", field="--vertical")
     return crs
+
+
+def _compare_with_exif(middle: FloatArray, photos: Sequence[Photo], path: Path, notes: Notes) -> None:
+    """Tell when a table and EXIF disagree by kilometres: a wrong zone passes all other checks."""
+    found = [(tags.gps.lat_deg, tags.gps.lon_deg, 0.0) for tags in (photo.tags for photo in photos) if tags.gps]
+    if not found:
+        return
+    exif, table = ecef_from_lla(np.stack([median_lla(found), middle * [1.0, 1.0, 0.0]]))
+    distance_m = float(np.linalg.norm(exif - table))
+    if distance_m > _DISAGREEMENT_M:
+        notes.warn(
+            f"positions in {path.name} are {distance_m / 1000:.0f} km from those in EXIF: wrong CRS or zone?"
+        )
 
 
 def _with_heights(rows: PoseTable, photos: Sequence[Photo], crs: PointCrs, notes: Notes) -> PoseTable:

@@ -112,7 +112,10 @@ def test_a_table_by_name_wins_over_exif_and_does_not_mix_with_it() -> None:
     assert found.located.tolist() == [True, True, False]
     np.testing.assert_allclose(found.lla[1], [46.02, 7.7502, 1622.0], rtol=0, atol=1e-9)
     assert found.time_s.tolist() == [100.0, 101.0, 5.0]
-    assert notes.warnings == ["1 image has no position in t.csv: 2.jpg"]
+    assert notes.warnings == [
+        "positions in t.csv are 3927 km from those in EXIF: wrong CRS or zone?",
+        "1 image has no position in t.csv: 2.jpg",
+    ]
     assert "latitude and longitude in t.csv are WGS84 (EPSG:4326)" in notes.assumptions
     np.testing.assert_allclose(found.sigma_enu_m[0], np.array(SIGMA_M["unknown receiver"])[[0, 0, 1]])
 
