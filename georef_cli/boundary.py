@@ -129,21 +129,19 @@ def _attached(handler: logging.Handler, level: int) -> Iterator[None]:
 
 
 def _terminal_handler() -> logging.Handler:
-    from rich.logging import RichHandler
+    from georef_cli.display import ConsoleHandler, stderr_console
 
-    from georef_cli.display import stderr_console
-
-    return RichHandler(console=stderr_console(), show_path=False, show_level=True, log_time_format="%H:%M:%S")
+    return ConsoleHandler(stderr_console())
 
 
 def _line_handler() -> logging.Handler:
     handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(_LineFormatter())
+    handler.setFormatter(LineFormatter())
     return handler
 
 
-class _LineFormatter(logging.Formatter):
-    """`message`, or `warning: message`: plain lines for files and pipes."""
+class LineFormatter(logging.Formatter):
+    """`message`, or `warning: message`."""
 
     def format(self, record: logging.LogRecord) -> str:
         text = super().format(record)

@@ -115,5 +115,17 @@ class TestBars:
             task.advance()
 
 
+def test_log_lines_on_a_terminal_are_marked_and_verbatim() -> None:
+    console = Console(file=io.StringIO(), force_terminal=True, width=140, color_system="standard")
+    handler = display.ConsoleHandler(console)
+    for level, text in [(logging.INFO, "sfm: started"), (logging.WARNING, "only [red]30[/red] of 48")]:
+        handler.handle(logging.LogRecord("pipelines.sfm", level, "", 0, text, None, None))
+    assert isinstance(console.file, io.StringIO)
+    plain, marked = console.file.getvalue().splitlines()
+    assert plain == "sfm: started"
+    assert "warning: only [red]30[/red] of 48" in marked
+    assert marked.startswith("\x1b[33m")
+
+
 def test_quiet_is_silent() -> None:
     assert display.progress_for(Manners(quiet=True)) is SILENT
