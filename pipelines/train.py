@@ -25,7 +25,6 @@ from pipelines.blocks.trainer import JointOptions, JointTrainer, StepReport, Vie
 from pipelines.config import TrainConfig
 from pipelines.formats.colmap import read_sparse
 from pipelines.formats.image_cache import ImageCache
-from pipelines.formats.splat_ply import write_splat
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
 from pipelines.georef.problem import GeoProblem
 from pipelines.interrupts import deferred_interrupts
@@ -42,6 +41,7 @@ from pipelines.splat.densify import DefaultSettings, DefaultStrategy
 from pipelines.splat.initialise import InitialisationOptions, gaussians_from_points, scene_extent
 from pipelines.splat.optimizer import GaussianAdam
 from pipelines.splat.raster.api import rasterizer
+from pipelines.splat.storage import write_splat
 from pipelines.stages import SIM3, SPARSE, SURVEY
 from pipelines.workspace import StageRun, Summary
 

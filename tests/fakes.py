@@ -1,12 +1,13 @@
 """A pipeline without photographs: stages that write small files, to test what surrounds the stages.
 
-Every product of a fake stage holds one text: the stage's name, its options, and a digest of what it read. A
-workspace is consistent when each stage's products hold the text that its manifest tells.
+Every product of a fake stage holds one text, in JSON: the stage's name, its options, and a digest of what it read.
+A workspace is consistent when each stage's products hold the text that its manifest tells.
 """
 
 from __future__ import annotations
 
 import hashlib
+import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -42,7 +43,8 @@ def fake_run(spec: StageSpec) -> Run:
 
     def run(stage: StageRun, config: StageConfig) -> Summary:
         read = "".join(read_products(stage.workspace, s)[0] for s in PIPELINE if _reads(spec, s))
-        text = f"{spec.name} {config.model_dump_json()} {hashlib.sha256(read.encode()).hexdigest()[:8]}"
+        told = {"stage": spec.name, "options": config.model_dump(mode="json"), "read": _digest(read)}
+        text = json.dumps(told, separators=(",", ":"))
         with stage.progress.task(spec.name, 2) as task:
             task.advance(note="half")
             task.advance()
@@ -66,6 +68,10 @@ def photographs(folder: Path) -> Path:
     for name in ("a.jpg", "b.jpg"):
         (folder / name).write_bytes(name.encode())
     return folder
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _reads(spec: StageSpec, other: StageSpec) -> bool:

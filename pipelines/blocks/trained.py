@@ -8,12 +8,12 @@ import numpy as np
 
 from pipelines.errors import InputError
 from pipelines.formats.colmap import SparseModel, read_sparse
-from pipelines.formats.splat_ply import read_splat
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.similarity import Similarity
 from pipelines.georef.cameras import CameraPoses
 from pipelines.products import Survey, TrainedModel, load_json
 from pipelines.splat.gaussians import Gaussians
+from pipelines.splat.storage import read_splat
 from pipelines.stages import GAUSSIANS, MODEL, SPARSE, SURVEY
 from pipelines.workspace import Workspace
 
