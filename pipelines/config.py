@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic.fields import FieldInfo
 
 from pipelines.errors import InputError
 
@@ -147,13 +148,33 @@ class ExportPlyConfig(StageConfig):
 ConfigT = TypeVar("ConfigT", bound=StageConfig)
 
 
+def flag_name(config_type: type[StageConfig], name: str) -> str:
+    """The command-line flag of a field: its name with dashes, or what the field says."""
+    info = config_type.model_fields.get(name)
+    extra = info.json_schema_extra if info is not None else None
+    stated = extra.get("flag") if isinstance(extra, dict) else None
+    return str(stated) if stated else "--" + name.replace("_", "-")
+
+
+def input_paths(config: StageConfig) -> dict[str, Path]:
+    """The paths among a config's values whose content decides the stage's result, by field."""
+    fields = type(config).model_fields
+    return {
+        name: Path(value)
+        for name, info in fields.items()
+        if _is_input(info) and (value := getattr(config, name)) is not None
+    }
+
+
 def resolve(config_type: type[ConfigT], table: Mapping[str, Any], flags: Mapping[str, Any], toml: Path) -> ConfigT:
     """Merge default < `table` of `toml` < `flags` into a validated config.
+
+    Relative paths in the table are relative to the folder of `toml`.
 
     Raises:
         InputError: an unknown key or a value out of range; names the file (or flag) and the key.
     """
-    merged = {**table, **flags}
+    merged = {**_anchored(config_type, table, toml.parent), **flags}
     try:
         return config_type.model_validate(merged)
     except ValidationError as error:
@@ -162,7 +183,7 @@ def resolve(config_type: type[ConfigT], table: Mapping[str, Any], flags: Mapping
         from_file = key in table and key not in flags
         known = ", ".join(sorted(config_type.model_fields))
         hint = f"unknown key; known keys: {known}" if first["type"] == "extra_forbidden" else first["msg"]
-        name = key if from_file else "--" + key.replace("_", "-")
+        name = key if from_file else flag_name(config_type, key)
         raise InputError(hint, path=toml if from_file else None, field=name) from error
 
 
@@ -178,9 +199,27 @@ def load_toml(path: Path, stages: Mapping[str, type[StageConfig]]) -> dict[str, 
         document = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"not valid TOML: {error}", path=path) from error
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror}", path=path) from error
     for name, table in document.items():
         if name not in stages:
             raise InputError(f"unknown table; the stages are {', '.join(stages)}", path=path, field=name)
         if not isinstance(table, dict):
             raise InputError("expected a table of options", path=path, field=name)
     return document
+
+
+def _is_input(info: FieldInfo) -> bool:
+    """Whether a field is an `InputPath`, also where `InputPath | None` hides the marker in a union's member."""
+    members = getattr(info.annotation, "__args__", ())
+    marks = [*info.metadata, *(mark for member in members for mark in getattr(member, "__metadata__", ()))]
+    return any(isinstance(mark, InputMarker) for mark in marks)
+
+
+def _anchored(config_type: type[StageConfig], table: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """The table with its input paths made absolute."""
+    fields = config_type.model_fields
+    return {
+        key: str(folder / value) if isinstance(value, str) and key in fields and _is_input(fields[key]) else value
+        for key, value in table.items()
+    }

@@ -229,7 +229,7 @@ def load_json(product_type: type[ProductT], path: Path) -> ProductT:
     """Read and validate a JSON product.
 
     Raises:
-        InputError: not JSON, or not of that form; names file and field.
+        InputError: unreadable, not JSON, or not of that form; names file and field.
     """
     try:
         return product_type.model_validate_json(path.read_text(encoding="utf-8"))
@@ -239,6 +239,8 @@ def load_json(product_type: type[ProductT], path: Path) -> ProductT:
         raise InputError(first["msg"], path=path, field=where or None) from error
     except UnicodeDecodeError as error:
         raise InputError("not a UTF-8 text file", path=path) from error
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror}", path=path) from error
 
 
 def dump_json(document: Any) -> str:
