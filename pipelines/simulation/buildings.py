@@ -7,23 +7,27 @@ from itertools import pairwise
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipelines.products import FloatArray
 from pipelines.simulation.mesh import Color, Finish, Material, MeshBuilder
 
 Roof = Literal["flat", "gable", "hip"]
 SpotKind = Literal["ground", "roof", "wall"]
+_TARGET_LIFT_M = 0.03
 _FOOT_M = 2.5  # walls go on below the ground, which is not level
 
 PLASTERS: tuple[Color, ...] = (
-    (0.62, 0.55, 0.42), (0.70, 0.66, 0.58), (0.55, 0.36, 0.24), (0.48, 0.50, 0.46), (0.60, 0.44, 0.30), (0.36, 0.42, 0.47),
+    (0.62, 0.55, 0.42), (0.70, 0.66, 0.58), (0.55, 0.36, 0.24), (0.48, 0.50, 0.46), (0.60, 0.44, 0.30),
+    (0.36, 0.42, 0.47),
 )  # fmt: skip
 STONES: tuple[Color, ...] = ((0.42, 0.20, 0.13), (0.50, 0.40, 0.28), (0.36, 0.31, 0.26), (0.47, 0.26, 0.17))
 TILES: tuple[Color, ...] = ((0.36, 0.13, 0.07), (0.28, 0.12, 0.08), (0.17, 0.15, 0.15), (0.42, 0.20, 0.11))
 SHEETS: tuple[Color, ...] = ((0.24, 0.23, 0.22), (0.36, 0.34, 0.30), (0.17, 0.18, 0.19))
 FRAMES: tuple[Color, ...] = ((0.75, 0.74, 0.70), (0.20, 0.14, 0.09), (0.12, 0.16, 0.14), (0.55, 0.52, 0.48))
 CARS: tuple[Color, ...] = (
-    (0.60, 0.60, 0.62), (0.04, 0.04, 0.05), (0.45, 0.05, 0.04), (0.06, 0.11, 0.32), (0.20, 0.21, 0.22), (0.70, 0.70, 0.66),
+    (0.60, 0.60, 0.62), (0.04, 0.04, 0.05), (0.45, 0.05, 0.04), (0.06, 0.11, 0.32), (0.20, 0.21, 0.22),
+    (0.70, 0.70, 0.66),
 )  # fmt: skip
 CROWNS: tuple[Color, ...] = ((0.09, 0.16, 0.04), (0.13, 0.19, 0.05), (0.06, 0.12, 0.04), (0.19, 0.20, 0.06))
 
@@ -35,6 +39,11 @@ class Spot:
     position: FloatArray
     normal: FloatArray
     kind: SpotKind
+
+    @property
+    def target_position(self) -> FloatArray:
+        """Centre (3,) of a target's face: the board stands a little off the surface that it is fixed to."""
+        return np.asarray(self.position + _TARGET_LIFT_M * self.normal)
 
 
 @dataclass(frozen=True)
@@ -147,7 +156,12 @@ def _add_solar(builder: MeshBuilder, house: House, place: tuple[float, float], r
     x, y, top = place[0] * house.length_m / 2, place[1] * house.width_m / 2, house.height_m
     finish = builder.finish(Finish((0.02, 0.03, 0.07), shift_m=shift(rng)))
     low, high, reach = top + 0.2, top + 0.9, min(2.5, house.length_m / 8)
-    corners = [(x - reach, y - 0.8, low), (x + reach, y - 0.8, low), (x + reach, y + 0.8, high), (x - reach, y + 0.8, high)]
+    corners = [
+        (x - reach, y - 0.8, low),
+        (x + reach, y - 0.8, low),
+        (x + reach, y + 0.8, high),
+        (x - reach, y + 0.8, high),
+    ]
     builder.quad([house.at(*corner) for corner in corners], Material.SOLAR, finish)
 
 
@@ -187,7 +201,7 @@ def _add_hip(builder: MeshBuilder, corners: tuple[FloatArray, FloatArray, FloatA
     builder.triangles(np.array([[a, b, peak]]), Material.TILES, tile, (a, along, up / np.linalg.norm(up)))
 
 
-def _ball() -> tuple[FloatArray, FloatArray]:
+def _ball() -> tuple[FloatArray, NDArray[np.intp]]:
     """A sphere of 80 triangles: an octahedron's cousin, the icosahedron, divided once."""
     golden = (1 + 5**0.5) / 2
     vertices = np.array(
@@ -218,7 +232,8 @@ def add_tree(builder: MeshBuilder, foot: FloatArray, height_m: float, rng: np.ra
     leaf = builder.finish(Finish(color, tuple(2.1 * part for part in color), shift_m=shift(rng)))  # type: ignore[arg-type]
     for _ in range(3):
         radius = height_m * rng.uniform(0.2, 0.3)
-        middle = foot + [*rng.normal(0, 0.12 * height_m, 2), height_m * rng.uniform(0.55, 0.78)]
+        aside, above = rng.normal(0, 0.12 * height_m, 2), height_m * rng.uniform(0.55, 0.78)
+        middle = foot + np.array([*aside, above])
         lumps = radius * rng.uniform(0.8, 1.2, (len(_BALL_VERTICES), 1)) * _BALL_VERTICES
         frame = (np.zeros(3), np.array([0.8, 0.3, 0.52]), np.array([-0.35, 0.85, 0.39]))
         corners = (middle + lumps)[_BALL_FACES]

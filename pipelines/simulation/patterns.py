@@ -6,13 +6,16 @@ of the pixel on the surface and filters itself (box filter for stripes, fading f
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from pipelines.simulation.mesh import Float32Array
 
 _LATTICE, _UPSAMPLE = 128, 4
+Image = NDArray[np.uint8] | Float32Array
 _WIDTH = 256  # the samples are laid out as an image of this width for cv2.remap
 
 
@@ -29,7 +32,7 @@ def _noise_table() -> Float32Array:
 _NOISE = _noise_table()
 
 
-def sample(image: NDArray[np.generic], x: Float32Array, y: Float32Array, *, wrap: bool) -> Float32Array:
+def sample(image: Image, x: Float32Array, y: Float32Array, *, wrap: bool) -> Float32Array:
     """Bilinear samples of an image at pixel coordinates (N,), as float32 (N,) or (N, channels)."""
     count = len(x)
     rows = -(-count // _WIDTH)
@@ -84,25 +87,25 @@ def cell_random(i: Float32Array, j: Float32Array, salt: int) -> Float32Array:
     return (bits >> np.uint32(8)).astype(np.float32) * np.float32(2**-24)
 
 
-def stripes(
-    x: Float32Array, period: Float32Array | float, width: Float32Array | float, pixel: Float32Array
-) -> Float32Array:
+def stripes(x: Float32Array, period: ArrayLike, width: ArrayLike, pixel: Float32Array) -> Float32Array:
     """Share of the pixel covered by stripes [0, width) of every period: (N,), box-filtered exactly."""
-    period, width = np.float32(period), np.float32(width)
-    reach = np.maximum(pixel, np.float32(1e-4))
+    every, wide = np.asarray(period, dtype=np.float32), np.asarray(width, dtype=np.float32)
+    reach = np.maximum(pixel, np.float32(1e-4)).astype(np.float32)
 
-    def covered(end: Float32Array) -> Float32Array:
-        whole = np.floor(end / period)
-        return np.asarray(whole * width + np.minimum(end - whole * period, width))
+    def covered(end: NDArray[np.floating[Any]]) -> Float32Array:
+        whole = np.floor(end / every)
+        return np.asarray(whole * wide + np.minimum(end - whole * every, wide))
 
-    low, high = covered(x - reach / 2), covered(x + reach / 2)
+    low, high = covered(x - reach / np.float32(2)), covered(x + reach / np.float32(2))
     return np.clip((high - low) / reach, 0.0, 1.0).astype(np.float32)
 
 
-def band(x: Float32Array, low: Float32Array | float, high: Float32Array | float, pixel: Float32Array) -> Float32Array:
+def band(x: Float32Array, low: ArrayLike, high: ArrayLike, pixel: Float32Array) -> Float32Array:
     """Share of the pixel that lies in low…high: (N,), box-filtered exactly."""
     reach = np.maximum(pixel, np.float32(1e-4))
-    inside = np.minimum(x + reach / 2, high) - np.maximum(x - reach / 2, low)
+    half = reach / np.float32(2)
+    low, high = np.asarray(low, dtype=np.float32), np.asarray(high, dtype=np.float32)
+    inside = np.minimum(x + half, high) - np.maximum(x - half, low)
     return np.clip(inside / reach, 0.0, 1.0).astype(np.float32)
 
 

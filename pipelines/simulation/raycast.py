@@ -48,9 +48,7 @@ class Raycaster:
         self._mesh = mesh
         self._scene = EmbreeScene(robust=True)
         corners = np.ascontiguousarray(mesh.corners.reshape(-1, 3), dtype=np.float32)
-        self._geometry = TriangleMesh(
-            self._scene, corners, np.arange(len(corners), dtype=np.int32).reshape(-1, 3)
-        )
+        self._geometry = TriangleMesh(self._scene, corners, np.arange(len(corners), dtype=np.int32).reshape(-1, 3))
 
     def first_hits(self, origins: ArrayLike, directions: ArrayLike) -> Hits:
         """First hit of rays from origins (N, 3) along directions (N, 3)."""

@@ -16,10 +16,11 @@ from pipelines.simulation.scene import Scene
 from pipelines.simulation.textures import Surface, albedo
 
 _CHUNK = 1 << 17
+_RAYS_KEPT = 1 << 24
 _SUN = np.array([3.0, 2.78, 2.45], dtype=np.float32)
 _SKY = np.array([0.52, 0.62, 0.80], dtype=np.float32)
 _BOUNCE = np.array([0.22, 0.20, 0.17], dtype=np.float32)
-_HAZE_M = 2500.0
+_HAZE_M = 1300.0
 _SHADOW_LIFT_M = 0.02
 
 
@@ -59,15 +60,18 @@ class Renderer:
         self._scene, self._lens = scene, lens
         self.raycaster = Raycaster(scene.mesh)
         self._samples = samples
-        self._directions = lens.directions(_sample_pixels(lens, samples)).astype(np.float32)
-        self._centers = lens.directions(_sample_pixels(lens, 1))
+        rows = max(1, _CHUNK // (lens.width * samples))
+        self._bands = [(top, min(top + rows, lens.height)) for top in range(0, lens.height, rows)]
+        # Kept for all photographs while they fit; the rays of a large one are made anew for each.
+        keep = lens.width * lens.height * samples <= _RAYS_KEPT
+        self._kept = [self._rays(band) for band in self._bands] if keep else []
 
     def photograph(self, pose: Pose, sensor: Sensor, rng: np.random.Generator) -> NDArray[np.uint8]:
         """The photograph (H, W, 3), RGB."""
         light = self.radiance(pose)
         height, width = light.shape[:2]
-        y, x = np.mgrid[-1 : 1 : height * 1j, -1 : 1 : width * 1j].astype(np.float32)
-        falloff = 1 - np.float32(sensor.vignetting / 2) * (x * x + y * y)
+        across, down = np.linspace(-1, 1, width), np.linspace(-1, 1, height)
+        falloff = (1 - sensor.vignetting / 2 * (across**2 + down[:, None] ** 2)).astype(np.float32)
         exposed = light * (falloff[..., None] * np.float32(sensor.gain)) * np.array(sensor.tint, dtype=np.float32)
         # Photon noise grows with the root of the signal; the rest is read-out noise.
         spread = np.float32(sensor.noise) * np.sqrt(np.float32(6e-5) * np.maximum(exposed, 0) + np.float32(2.5e-6))
@@ -77,21 +81,29 @@ class Renderer:
     def radiance(self, pose: Pose) -> Float32Array:
         """Linear light (H, W, 3), about 0…1, before exposure."""
         rotation = pose.geo_from_cam.astype(np.float32)
-        parts = [
-            self._shade(pose, self._directions[i : i + _CHUNK] @ rotation.T, rotation)
-            for i in range(0, len(self._directions), _CHUNK)
-        ]
-        light = np.concatenate(parts).reshape(self._lens.height, self._lens.width, self._samples, 3)
-        # Clipped first: a highlight inside a pixel must not outshine the rest of it.
-        return np.asarray(np.minimum(light, np.float32(1.5)).mean(axis=2))
+        parts = []
+        for k, band in enumerate(self._bands):
+            rays = self._kept[k] if self._kept else self._rays(band)
+            light = self._shade(pose, rays @ rotation.T, rotation)
+            # Clipped first: a highlight inside a pixel must not outshine the rest of it.
+            light = np.minimum(light, np.float32(1.5)).reshape(-1, self._lens.width, self._samples, 3)
+            parts.append(light.mean(axis=2))
+        return np.concatenate(parts)
 
     def depth(self, pose: Pose) -> Float32Array:
         """Depth (H, W) along the camera's z axis at the centre of every pixel, in metres; 0 is the sky."""
-        directions = self._centers @ pose.geo_from_cam.T
-        hits = self.raycaster.first_hits(pose.center, directions)
-        # The directions have z = 1 in the camera, so that the distance along them is the depth.
-        distance = self.raycaster.exact_distance(pose.center, directions, hits)
-        return np.nan_to_num(distance, nan=0.0).astype(np.float32).reshape(self._lens.height, self._lens.width)
+        parts = []
+        for band in self._bands:
+            directions = self._lens.directions(_sample_pixels(self._lens, band, 1)) @ pose.geo_from_cam.T
+            hits = self.raycaster.first_hits(pose.center, directions)
+            # The directions have z = 1 in the camera, so that the distance along them is the depth.
+            distance = self.raycaster.exact_distance(pose.center, directions, hits)
+            parts.append(np.nan_to_num(distance, nan=0.0).astype(np.float32).reshape(-1, self._lens.width))
+        return np.concatenate(parts)
+
+    def _rays(self, band: tuple[int, int]) -> Float32Array:
+        """Directions (rows · W · samples, 3) of depth 1 in the camera."""
+        return self._lens.directions(_sample_pixels(self._lens, band, self._samples)).astype(np.float32)
 
     def _shade(self, pose: Pose, rays: Float32Array, rotation: Float32Array) -> Float32Array:
         """Linear light (N, 3) that comes along rays (N, 3) whose depth is 1."""
@@ -102,7 +114,7 @@ class Renderer:
         if len(seen):
             found = Hits(hits.triangle[seen], hits.distance[seen], hits.barycentric[seen])
             color = self._surface_light(pose, rays[seen], found, rotation)
-            haze = 1 - np.exp(-np.square(found.distance / np.float32(_HAZE_M)) * 4 - found.distance / np.float32(6000))
+            haze = 1 - np.exp(-np.square(found.distance / np.float32(_HAZE_M)))
             light[seen] = mix(color, light[seen], haze)
         return light
 
@@ -149,14 +161,14 @@ class Renderer:
         )
 
 
-def _sample_pixels(lens: Lens, samples: int) -> FloatArray:
-    """Pixel coordinates (H · W · samples, 2): a turned grid inside each pixel, the pixel's own centre for one."""
+def _sample_pixels(lens: Lens, band: tuple[int, int], samples: int) -> FloatArray:
+    """Pixel coordinates (rows · W · samples, 2): a turned grid inside each pixel, its own centre for one."""
     side = round(samples**0.5)
     grid = (np.arange(side) + 0.5) / side - 0.5
     dx, dy = (part.ravel() for part in np.meshgrid(grid, grid))
     turn = np.arctan(0.5) if side > 1 else 0.0
     offset = np.stack([dx * np.cos(turn) - dy * np.sin(turn), dx * np.sin(turn) + dy * np.cos(turn)], axis=1)
-    y, x = np.mgrid[0 : lens.height, 0 : lens.width] + 0.5
+    y, x = np.mgrid[band[0] : band[1], 0 : lens.width] + 0.5
     centers = np.stack([x.ravel(), y.ravel()], axis=1)
     return np.asarray((centers[:, None] + offset).reshape(-1, 2))
 

@@ -13,8 +13,6 @@ from pipelines.simulation.mesh import Finish, Material, Mesh, MeshBuilder
 from pipelines.simulation.terrain import Terrain, add_terrain, make_terrain
 from pipelines.simulation.textures import GroundPlan
 
-_TARGET_LIFT_M = 0.03
-
 
 @dataclass(frozen=True)
 class Scene:
@@ -89,11 +87,6 @@ def _ground_spots(terrain: Terrain, rng: np.random.Generator) -> list[Spot]:
     return [Spot(position, normal, "ground") for position, normal in zip(positions, normals, strict=True)]
 
 
-def target_position(spot: Spot) -> FloatArray:
-    """Centre (3,) of a target's face: the board stands a little off the surface that it is fixed to."""
-    return np.asarray(spot.position + _TARGET_LIFT_M * spot.normal)
-
-
 def with_targets(scene: Scene, spots: list[Spot], width_m: float) -> Scene:
     """The scene with a black and white board of `width_m` at every spot."""
     if not spots:
@@ -105,7 +98,7 @@ def with_targets(scene: Scene, spots: list[Spot], width_m: float) -> Scene:
         u_axis = np.cross(side, spot.normal)
         u_axis /= np.linalg.norm(u_axis)
         v_axis = np.cross(spot.normal, u_axis)
-        middle, half = target_position(spot), width_m / 2
+        middle, half = spot.target_position, width_m / 2
         a, b, c, d = (middle + half * (i * u_axis + j * v_axis) for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1)))
         builder.triangles(np.array([[a, b, c], [a, c, d]]), Material.TARGET, finish, (middle, u_axis, v_axis))
     boards = builder.build()

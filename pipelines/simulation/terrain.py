@@ -39,10 +39,9 @@ class Terrain:
 
     def normal(self, xy: FloatArray) -> FloatArray:
         """Upward unit normals (N, 3) at places (N, 2)."""
-        step = 0.5
-        east = self.height(xy + [step, 0.0]) - self.height(xy - [step, 0.0])
-        north = self.height(xy + [0.0, step]) - self.height(xy - [0.0, step])
-        normal = np.stack([-east, -north, np.full(len(xy), 2 * step)], axis=1)
+        step = 0.5 * np.eye(2)
+        east, north = (self.height(xy + aside) - self.height(xy - aside) for aside in step)
+        normal = np.stack([-east, -north, np.ones(len(xy))], axis=1)
         return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
 
 
@@ -52,7 +51,9 @@ def make_terrain(relief_m: float, rng: np.random.Generator) -> Terrain:
     bearing = rng.uniform(0, 2 * np.pi, len(lengths))
     waves = 2 * np.pi / lengths[:, None] * np.stack([np.sin(bearing), np.cos(bearing)], axis=1)
     shares = np.array([0.5, 0.3, 0.15, 0.05])
-    return Terrain(waves, rng.uniform(0, 2 * np.pi, len(lengths)), relief_m * shares, np.array([16.0, 9.0, 3.0, 0.5]))
+    return Terrain(
+        waves, rng.uniform(0, 2 * np.pi, len(lengths)), relief_m * shares, np.array([16.0, 9.0, 3.0, 0.5])
+    )
 
 
 def add_terrain(builder: MeshBuilder, terrain: Terrain, axes: FloatArray, finish: Finish) -> None:

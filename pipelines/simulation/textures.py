@@ -61,7 +61,9 @@ def _grime(s: Surface) -> Float32Array:
     return np.asarray(np.float32(0.42) * blotches + np.float32(0.22) * streaks)
 
 
-def _masonry(s: Surface, length: float, height: float, joint: float, salt: int) -> tuple[Float32Array, Float32Array]:
+def _masonry(
+    s: Surface, length: float, height: float, joint: float, salt: int
+) -> tuple[Float32Array, Float32Array]:
     """Tone of each stone, and the share of joints."""
     row = np.floor(s.v / np.float32(height))
     along = s.u + np.float32(0.5 * length) * np.mod(row, 2)
@@ -76,9 +78,7 @@ def wall(s: Surface) -> Float32Array:
     stones = s.finish[:, STYLE] == 1
     if stones.any():
         tone, joints = _masonry(s, 0.8, 0.4, 0.035, 1)
-        color = np.where(
-            stones[:, None], mix(_tinted(color, 0.75 * tone), color * np.float32(0.55), joints), color
-        )
+        color = np.where(stones[:, None], mix(_tinted(color, 0.75 * tone), color * np.float32(0.55), joints), color)
     panels = s.finish[:, STYLE] == 2
     if panels.any():
         tone, joints = _masonry(s, 3.0, 1.5, 0.05, 2)
