@@ -124,7 +124,7 @@ def _add_walls(builder: MeshBuilder, house: House, wall: Finish, rng: np.random.
         a, b, c, d = start - _FOOT_M * up, end - _FOOT_M * up, end + top * up, start + top * up
         builder.triangles(np.array([[a, b, c], [a, c, d]]), Material.WALL, finish, (start, along, up))
         normal = np.cross(along, up)
-        for share in np.arange(1.5, length - 1.2, 4.0):
+        for share in np.arange(1.2, length - 1.0, 1.9):
             height = float(rng.uniform(1.5, max(1.6, house.height_m - 1.0)))
             spots.append(Spot(start + along * share + up * height, normal, "wall"))
     return spots

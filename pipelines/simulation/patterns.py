@@ -35,7 +35,7 @@ _NOISE = _noise_table()
 def sample(image: Image, x: Float32Array, y: Float32Array, *, wrap: bool) -> Float32Array:
     """Bilinear samples of an image at pixel coordinates (N,), as float32 (N,) or (N, channels)."""
     count = len(x)
-    rows = -(-count // _WIDTH)
+    rows = max(1, -(-count // _WIDTH))
     maps = np.zeros((2, rows * _WIDTH), dtype=np.float32)
     maps[0, :count], maps[1, :count] = x, y
     border = cv2.BORDER_WRAP if wrap else cv2.BORDER_REPLICATE
@@ -51,14 +51,24 @@ def visible(size: float, pixel: Float32Array) -> Float32Array:
 
 def noise(u: Float32Array, v: Float32Array, size: float, pixel: Float32Array) -> Float32Array:
     """Smooth noise in about −0.5…0.5 with blobs of `size` metres: (N,)."""
+    strength = visible(size, pixel)
+    shown = np.nonzero(strength)[0]
+    if len(shown) < len(strength):  # what is too fine to be seen need not be looked up
+        value = np.zeros_like(strength)
+        if len(shown):
+            value[shown] = _look_up(u[shown], v[shown], size) * strength[shown]
+        return value
+    return _look_up(u, v, size) * strength
+
+
+def _look_up(u: Float32Array, v: Float32Array, size: float) -> Float32Array:
     scale = np.float32(_UPSAMPLE / size)
     period = np.float32(_LATTICE * _UPSAMPLE)
     # Reduced by hand: np.mod takes longer than the look-up, and cv2.remap knows 16-bit coordinates only.
     x, y = u * scale, v * scale
     x -= period * np.floor(x / period)
     y -= period * np.floor(y / period)
-    value = sample(_NOISE, x, y, wrap=True)
-    return (value - np.float32(0.5)) * visible(size, pixel)
+    return sample(_NOISE, x, y, wrap=True) - np.float32(0.5)
 
 
 def fbm(

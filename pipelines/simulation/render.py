@@ -19,6 +19,8 @@ _CHUNK = 1 << 17
 _RAYS_KEPT = 1 << 24
 _SUN = np.array([3.0, 2.78, 2.45], dtype=np.float32)
 _SKY = np.array([0.52, 0.62, 0.80], dtype=np.float32)
+_HORIZON = np.array([0.72, 0.79, 0.86], dtype=np.float32)
+_ZENITH = np.array([0.24, 0.42, 0.75], dtype=np.float32)
 _BOUNCE = np.array([0.22, 0.20, 0.17], dtype=np.float32)
 _HAZE_M = 1300.0
 _SHADOW_LIFT_M = 0.02
@@ -87,7 +89,8 @@ class Renderer:
             light = self._shade(pose, rays @ rotation.T, rotation)
             # Clipped first: a highlight inside a pixel must not outshine the rest of it.
             light = np.minimum(light, np.float32(1.5)).reshape(-1, self._lens.width, self._samples, 3)
-            parts.append(light.mean(axis=2))
+            # Slice by slice: numpy's mean over so short an axis takes four times as long.
+            parts.append(sum(light[:, :, k] for k in range(self._samples)) / np.float32(self._samples))
         return np.concatenate(parts)
 
     def depth(self, pose: Pose) -> Float32Array:
@@ -108,14 +111,15 @@ class Renderer:
     def _shade(self, pose: Pose, rays: Float32Array, rotation: Float32Array) -> Float32Array:
         """Linear light (N, 3) that comes along rays (N, 3) whose depth is 1."""
         hits = self.raycaster.first_hits(pose.center, rays)
-        unit = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-        light = _sky(unit, self._scene.sun.astype(np.float32))
-        seen = np.nonzero(hits.triangle != MISS)[0]
+        hit = hits.triangle != MISS
+        light = np.empty_like(rays)
+        free, seen = np.nonzero(~hit)[0], np.nonzero(hit)[0]
+        light[free] = _sky(rays[free], self._scene.sun.astype(np.float32))
         if len(seen):
             found = Hits(hits.triangle[seen], hits.distance[seen], hits.barycentric[seen])
             color = self._surface_light(pose, rays[seen], found, rotation)
             haze = 1 - np.exp(-np.square(found.distance / np.float32(_HAZE_M)))
-            light[seen] = mix(color, light[seen], haze)
+            light[seen] = mix(color, _HORIZON, haze)
         return light
 
     def _surface_light(self, pose: Pose, rays: Float32Array, hits: Hits, rotation: Float32Array) -> Float32Array:
@@ -186,11 +190,11 @@ def _normals(corners: Float32Array, weights: Float32Array, rays: Float32Array) -
     return np.asarray(normal)
 
 
-def _sky(unit: Float32Array, sun: Float32Array) -> Float32Array:
+def _sky(rays: Float32Array, sun: Float32Array) -> Float32Array:
+    unit = rays / np.linalg.norm(rays, axis=1, keepdims=True)
     height = np.clip(unit[:, 2], 0, 1)[:, None] ** np.float32(0.6)
-    horizon, zenith = np.array([[0.72, 0.79, 0.86], [0.24, 0.42, 0.75]], dtype=np.float32)
     glow = np.clip(unit @ sun, 0, 1)[:, None] ** 8
-    return np.asarray(horizon + (zenith - horizon) * height + np.float32(0.2) * glow)
+    return np.asarray(_HORIZON + (_ZENITH - _HORIZON) * height + np.float32(0.2) * glow)
 
 
 def _encode(linear: Float32Array) -> Float32Array:

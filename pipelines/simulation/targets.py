@@ -17,7 +17,7 @@ from pipelines.simulation.render import Pose
 WANTED_RAYS = 6
 LEAST_RAYS = 2
 _SHARES: dict[SpotKind, float] = {"ground": 0.45, "roof": 0.3, "wall": 0.25}
-_APART_M: dict[SpotKind, float] = {"ground": 5.0, "roof": 4.0, "wall": 3.0}
+_APART_M: dict[SpotKind, float] = {"ground": 5.0, "roof": 4.0, "wall": 2.2}
 _MARGIN_PX = 4.0
 _LEAST_PX = 3.0
 _LEAST_COSINE = 0.2
@@ -90,8 +90,9 @@ def choose_control(spots: Sequence[Spot], rays: NDArray[np.int64], count: int) -
     """Indices of `count` control points, a third of all at the most: on the ground first, spread far."""
     usable = [i for i in range(len(spots)) if rays[i] >= LEAST_RAYS]
     count = min(count, len(usable) // 3)
-    good = [i for i in usable if spots[i].kind == "ground" and rays[i] >= WANTED_RAYS]
-    pool = good if len(good) >= count else usable
+    good = [i for i in usable if rays[i] >= WANTED_RAYS]
+    low = [i for i in good if spots[i].kind == "ground"]
+    pool = next(pool for pool in (low, good, usable) if len(pool) >= count)
     if not pool or count == 0:
         return []
     positions = np.array([spots[i].position for i in pool])

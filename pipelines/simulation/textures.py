@@ -62,9 +62,10 @@ def _grime(s: Surface) -> Float32Array:
 
 
 def _masonry(
-    s: Surface, length: float, height: float, joint: float, salt: int
+    s: Surface, stone_m: tuple[float, float], joint: float, salt: int
 ) -> tuple[Float32Array, Float32Array]:
     """Tone of each stone, and the share of joints."""
+    length, height = stone_m
     row = np.floor(s.v / np.float32(height))
     along = s.u + np.float32(0.5 * length) * np.mod(row, 2)
     tone = cell_random(np.floor(along / np.float32(length)), row, salt) - np.float32(0.5)
@@ -75,14 +76,11 @@ def _masonry(
 def wall(s: Surface) -> Float32Array:
     """A facade: plaster, masonry or panels, with plinth, windows, frames, sills, curtains and shops."""
     color = _tinted(s.finish[:, BASE], _grime(s))
-    stones = s.finish[:, STYLE] == 1
-    if stones.any():
-        tone, joints = _masonry(s, 0.8, 0.4, 0.035, 1)
-        color = np.where(stones[:, None], mix(_tinted(color, 0.75 * tone), color * np.float32(0.55), joints), color)
-    panels = s.finish[:, STYLE] == 2
-    if panels.any():
-        tone, joints = _masonry(s, 3.0, 1.5, 0.05, 2)
-        color = np.where(panels[:, None], mix(_tinted(color, 0.3 * tone), color * np.float32(0.4), joints), color)
+    for style, stone_m, joint, contrast in ((1, (0.8, 0.4), 0.035, 0.75), (2, (3.0, 1.5), 0.05, 0.3)):
+        own = np.nonzero(s.finish[:, STYLE] == style)[0]
+        if len(own):
+            tone, joints = _masonry(s.select(own), stone_m, joint, style)
+            color[own] = mix(_tinted(color[own], contrast * tone), color[own] * np.float32(0.5), joints)
     plinth = band(s.v, -50.0, 0.7, s.dv)
     color = mix(color, s.finish[:, BASE] * np.float32(0.35) + np.float32(0.05), plinth * np.float32(0.8))
     cornice = band(s.v, s.finish[:, TOP] + 0.05, s.finish[:, TOP] + 0.3, s.dv)
@@ -190,17 +188,37 @@ def ground(s: Surface, plan: GroundPlan) -> Float32Array:
     kind = plan.kind.sample(s.u, s.v, fine)
     away = np.maximum(np.abs(s.u), np.abs(s.v))
     outside = np.clip((away - np.float32(plan.reach_m - 12)) / np.float32(10), 0, 1)
-    color, grass = mix(color, _fields(s), outside), np.maximum(kind[:, 0], outside)
-    paving, asphalt = kind[:, 1] * (1 - outside), kind[:, 2] * (1 - outside)
-    meadow = fbm(s.u, s.v, (7.0, 3.0, 1.3, 0.6, 0.28, 0.13), s.pixel, 0.85)
-    grit = fbm(s.u + 50, s.v, (2.6, 1.1, 0.45, 0.2, 0.09), s.pixel, 0.9)
-    slab, joints = _masonry(s, 1.6, 0.8, 0.05, 8)
-    amount = grass * np.float32(0.85) * meadow + (paving * np.float32(0.4) + asphalt * np.float32(0.75)) * grit
-    color = _tinted(color, amount + paving * np.float32(0.55) * slab)
-    dry = grass * np.clip(np.float32(1.6) * meadow, 0, 0.5)
-    color = mix(color, np.array([0.26, 0.23, 0.1], dtype=np.float32), dry)
-    crack = np.abs(fbm(s.u, s.v + 90, (4.0, 1.7, 0.7), s.pixel)) < 0.012
-    color = mix(color, color * np.float32(0.45), asphalt * crack * visible(0.25, s.pixel))
+    beyond = np.nonzero(outside > 0)[0]
+    color[beyond] = mix(color[beyond], _fields(s.select(beyond)), outside[beyond])
+    kind *= (1 - outside)[:, None]
+    kind[:, 0] += outside
+    green = np.nonzero(kind[:, 0] > 0.02)[0]
+    color[green] = _meadow(s.select(green), color[green], kind[green, 0])
+    hard = np.nonzero(kind[:, 1] + kind[:, 2] > 0.02)[0]
+    color[hard] = _pavement(s.select(hard), color[hard], kind[hard])
+    return color
+
+
+def _meadow(s: Surface, color: Float32Array, grass: Float32Array) -> Float32Array:
+    """Blades and dry patches, as far as there is grass."""
+    grain = fbm(s.u, s.v, (7.0, 3.0, 1.3, 0.6, 0.28, 0.13), s.pixel, 0.85)
+    color = _tinted(color, grass * np.float32(0.85) * grain)
+    dry = grass * np.clip(np.float32(1.6) * grain, 0, 0.5)
+    return mix(color, np.array([0.26, 0.23, 0.1], dtype=np.float32), dry)
+
+
+def _pavement(s: Surface, color: Float32Array, kind: Float32Array) -> Float32Array:
+    """Slabs and joints of paving; grit and cracks of asphalt."""
+    paving, asphalt = kind[:, 1], kind[:, 2]
+    grit = fbm(s.u + np.float32(50), s.v, (2.6, 1.1, 0.45, 0.2, 0.09), s.pixel, 0.9)
+    slab, joints = _masonry(s, (1.6, 0.8), 0.05, 8)
+    rough = (paving * np.float32(0.4) + asphalt * np.float32(0.75)) * grit
+    color = _tinted(color, rough + paving * np.float32(0.55) * slab)
+    tarred = np.nonzero(asphalt > 0.3)[0]
+    t = s.select(tarred)
+    crack = np.abs(fbm(t.u, t.v + np.float32(90), (4.0, 1.7, 0.7), t.pixel)) < 0.012
+    share = asphalt[tarred] * crack * visible(0.25, t.pixel)
+    color[tarred] = mix(color[tarred], color[tarred] * np.float32(0.45), share)
     return mix(color, color * np.float32(0.5), paving * joints)
 
 
