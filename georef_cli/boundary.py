@@ -45,10 +45,10 @@ class Manners:
 
 def guarded(group: click.Group, arguments: Sequence[str] | None) -> int:
     """Run the command line and turn how it ended into an exit code."""
-    _interrupt_on_sigterm()
     try:
-        code = group.main(args=arguments, prog_name=group.name, standalone_mode=False)
-        sys.stdout.flush()
+        with _sigterm_interrupts():
+            code = group.main(args=arguments, prog_name=group.name, standalone_mode=False)
+            sys.stdout.flush()
     except click.ClickException as error:
         error.show()
         return error.exit_code
@@ -70,16 +70,18 @@ def guarded(group: click.Group, arguments: Sequence[str] | None) -> int:
     return code if isinstance(code, int) else 0
 
 
-def _interrupt_on_sigterm() -> None:
-    """Let SIGTERM end the program as Ctrl-C does, so that a stage can write what it has."""
+@contextmanager
+def _sigterm_interrupts() -> Iterator[None]:
+    """Let SIGTERM end the work as Ctrl-C does, so that a stage can save what it has."""
 
     def interrupt(_signal: int, _frame: FrameType | None) -> None:
         raise KeyboardInterrupt
 
+    before = signal.signal(signal.SIGTERM, interrupt)
     try:
-        signal.signal(signal.SIGTERM, interrupt)
-    except ValueError:  # not in the main thread, which alone receives signals
-        log.debug("SIGTERM keeps its handler")
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 @contextmanager
@@ -127,21 +129,19 @@ def _attached(handler: logging.Handler, level: int) -> Iterator[None]:
 
 
 def _terminal_handler() -> logging.Handler:
-    from rich.logging import RichHandler
+    from georef_cli.display import ConsoleHandler, stderr_console
 
-    from georef_cli.display import stderr_console
-
-    return RichHandler(console=stderr_console(), show_path=False, show_level=True, log_time_format="%H:%M:%S")
+    return ConsoleHandler(stderr_console())
 
 
 def _line_handler() -> logging.Handler:
     handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(_LineFormatter())
+    handler.setFormatter(LineFormatter())
     return handler
 
 
-class _LineFormatter(logging.Formatter):
-    """`message`, or `warning: message`: plain lines for files and pipes."""
+class LineFormatter(logging.Formatter):
+    """`message`, or `warning: message`."""
 
     def format(self, record: logging.LogRecord) -> str:
         text = super().format(record)

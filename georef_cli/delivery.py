@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
 from pathlib import Path
 
 from pipelines.errors import InputError
@@ -21,20 +20,22 @@ def check_target(target: Path, *, overwrite: bool) -> None:
         raise InputError("exists already: --force replaces it", path=target)
 
 
-def deliver(sources: Sequence[Path], targets: Sequence[Path]) -> None:
-    """Copy files; a target appears, or is replaced, only when all copies are complete.
+def deliver(source: Path, target: Path) -> None:
+    """Copy a file and its sidecars (`source.*`); they appear, or are replaced, when all copies are complete.
 
     Raises:
-        InputError: a target cannot be written.
+        InputError: the target cannot be written.
     """
-    drafts = [target.with_name(f".{target.name}.partial") for target in targets]
+    family = sorted(source.parent.glob(f"{source.name}*"))
+    targets = [target.with_name(target.name + member.name.removeprefix(source.name)) for member in family]
+    drafts = [path.with_name(f".{path.name}.partial") for path in targets]
     try:
-        for source, draft in zip(sources, drafts, strict=True):
-            shutil.copyfile(source, draft)
-        for draft, target in zip(drafts, targets, strict=True):
-            draft.replace(target)
+        for member, draft in zip(family, drafts, strict=True):
+            shutil.copyfile(member, draft)
+        for draft, path in zip(drafts, targets, strict=True):
+            draft.replace(path)
     except PermissionError as error:
-        raise InputError("cannot be written", path=targets[0].parent) from error
+        raise InputError("cannot be written", path=target.parent) from error
     finally:
         for draft in drafts:
             draft.unlink(missing_ok=True)

@@ -23,10 +23,11 @@ from rich.progress import Progress as Bars
 from rich.progress import ProgressColumn as Column
 from rich.text import Text
 
-from georef_cli.boundary import Manners
+from georef_cli.boundary import LineFormatter, Manners
 from pipelines.progress import SILENT, Progress, ProgressTask
 
 LINE_EVERY_S = 30.0
+LEVEL_STYLES = {logging.ERROR: "red", logging.WARNING: "yellow", logging.INFO: ""}
 
 log = logging.getLogger(__name__)
 
@@ -35,6 +36,20 @@ log = logging.getLogger(__name__)
 def stderr_console() -> Console:
     """The one console on stderr: bars and log lines must share it so as not to overwrite each other."""
     return Console(stderr=True)
+
+
+class ConsoleHandler(logging.Handler):
+    """Log records as coloured lines above the bars."""
+
+    def __init__(self, console: Console) -> None:
+        super().__init__()
+        self.setFormatter(LineFormatter())
+        self._console = console
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Print a record."""
+        style = next((style for level, style in LEVEL_STYLES.items() if record.levelno >= level), "dim")
+        self._console.print(Text(self.format(record), style=style))
 
 
 def progress_for(manners: Manners) -> Progress:

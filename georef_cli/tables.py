@@ -7,9 +7,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
 from typing import Any
 
+from rich.console import Group
 from rich.markup import escape
 from rich.table import Table
 
+from pipelines.errors import InputError
 from pipelines.runner import Outcome
 from pipelines.stages import REPORT
 from pipelines.states import StageState
@@ -34,7 +36,7 @@ POINT_COLUMNS = {
     "max_3d_m": "max 3D",
 }
 IMAGE_COLUMNS = {"views": "views", "psnr": "PSNR dB", "ssim": "SSIM", "lpips": "LPIPS"}
-Renderable = Table | str
+Renderable = Group | Table | str
 
 
 def states(rows: Iterable[StageState]) -> Table:
@@ -82,8 +84,16 @@ def outcomes(results: Sequence[Outcome]) -> Table:
 
 
 def report_of(workspace: Workspace) -> list[Renderable]:
-    """The tables of a workspace's evaluation."""
-    return report(json.loads(workspace.path(REPORT).read_text(encoding="utf-8")))
+    """The tables of a workspace's evaluation.
+
+    Raises:
+        InputError: the report was replaced by something that is not JSON.
+    """
+    path = workspace.path(REPORT)
+    try:
+        return report(json.loads(path.read_text(encoding="utf-8")))
+    except ValueError as error:
+        raise InputError(f"not valid JSON: {error}", path=path) from error
 
 
 def report(document: Mapping[str, Any]) -> list[Renderable]:
@@ -109,18 +119,18 @@ def duration(seconds: float | None) -> str:
     return f"{minutes // 60} h {minutes % 60:02d} min"
 
 
-def _rows(title: str, section: Mapping[str, Any], columns: Mapping[str, str]) -> Table | None:
-    """One table, a row a member of `section`, with those columns that any row has."""
+def _rows(title: str, section: Mapping[str, Any], columns: Mapping[str, str]) -> Group | None:
+    """One table under its title, a row a member of `section`, with those columns that any row has."""
     rows = {name: row for name, row in section.items() if isinstance(row, Mapping)}
     shown = {key: head for key, head in columns.items() if any(key in row for row in rows.values())}
     if not shown:
         return None
-    table = _table("", *shown.values(), title=title)
+    table = _table("", *shown.values())
     for column in table.columns[1:]:
         column.justify = "right"
     for name, row in rows.items():
         table.add_row(name, *(_number(row.get(key)) for key in shown))
-    return table
+    return Group(f"\n[bold]{title}[/]", table)
 
 
 def _figures(values: Mapping[str, Any]) -> Table:
@@ -133,10 +143,8 @@ def _figures(values: Mapping[str, Any]) -> Table:
     return table
 
 
-def _table(*columns: str, title: str | None = None, header: bool = True) -> Table:
-    table = Table(*columns, title=title, title_justify="left", show_header=header, box=None, pad_edge=False)
-    table.title_style = "bold"
-    return table
+def _table(*columns: str, header: bool = True) -> Table:
+    return Table(*columns, show_header=header, box=None, pad_edge=False)
 
 
 def _number(value: Any) -> str:

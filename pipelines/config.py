@@ -135,7 +135,7 @@ class EvaluateConfig(StageConfig):
     backend: Literal["auto", "cpu", "cuda"] = Field("auto", description="Rasteriser.")
     renders: int = Field(8, ge=0, description="Side-by-side renders to write at the most.")
     lpips_weights: InputPath | None = Field(
-        None, description="TorchScript file of LPIPS weights (without it LPIPS is null)."
+        None, description="NPZ file of LPIPS (VGG) weights; without it LPIPS is null."
     )
 
 

@@ -13,11 +13,6 @@ from georef_cli.stage import StageCommand
 from pipelines.stages import SPLAT
 
 
-def sidecar_of(path: Path) -> Path:
-    """The file beside a splat that tells where it lies."""
-    return path.with_name(f"{path.name}.georef.json")
-
-
 class ExportCommand(StageCommand):
     """The stage with `-o FILE`."""
 
@@ -29,8 +24,7 @@ class ExportCommand(StageCommand):
         outcome = self.run(ctx, values)
         if output is not None:
             with workspace.lock("export-ply"):
-                splat = workspace.path(SPLAT)
-                deliver((splat, sidecar_of(splat)), (output, sidecar_of(output)))
+                deliver(workspace.path(SPLAT), output)
         print_outcome(workspace, outcome, as_json=values["as_json"])
 
 

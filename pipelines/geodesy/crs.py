@@ -27,7 +27,7 @@ from pyproj.transformer import AreaOfInterest, TransformerGroup
 
 from pipelines.errors import InputError
 from pipelines.geodesy.enu import lla_from_ecef
-from pipelines.geodesy.vertical import ELLIPSOIDAL, VerticalChoice, assumed_ellipsoidal, missing_grid_error
+from pipelines.geodesy.vertical import ELLIPSOIDAL, VerticalChoice, assumed_ellipsoidal, missing_grid_error, name_of
 from pipelines.products import FloatArray, VerticalDatum
 
 ECEF = "EPSG:4978"
@@ -199,7 +199,8 @@ class PointCrs:
             accuracy = best.accuracy if best.accuracy >= 0 else None
             return best, Operation(best.description, accuracy, () if group.best_available else missing)
         if missing:
-            raise missing_grid_error(self.vertical.name, missing, get_user_data_dir(), path)
+            datum = self._crs.sub_crs_list[1].name if self._crs.is_compound else self.name
+            raise missing_grid_error(datum, missing, get_user_data_dir(), path)
         raise InputError(
             f"no transformation from {self.name} to WGS84 is known here: name its datum (+datum=… or +towgs84=… in "
             "a PROJ string), or give another CRS",
@@ -264,8 +265,7 @@ def parse_crs(
         )
     axes = (crs.source_crs or crs if crs.is_bound else crs).axis_info
     if len(axes) == 3:
-        datum = crs.sub_crs_list[1].name if crs.is_compound else ELLIPSOIDAL
-        stated = VerticalDatum(name=datum, stated=True, note=f"part of {_short(name)}")
+        stated = _own_vertical(crs, _short(name))
         return PointCrs(_short(name), stated, True, axes[2].unit_name, crs, 1.0, True)
     if vertical is not None and vertical.epsg is not None:
         upright = _vertical_crs(vertical)
@@ -299,6 +299,15 @@ def _parse(name: str, path: Path | str | None, line: int | None, field: str | No
             line=line,
             field=field,
         ) from error
+
+
+def _own_vertical(crs: CRS, name: str) -> VerticalDatum:
+    if not crs.is_compound:
+        return VerticalDatum(name=ELLIPSOIDAL, stated=True, note=f"part of {name}")
+    upright = crs.sub_crs_list[1]
+    epsg = upright.to_epsg()
+    short = upright.name if epsg is None else name_of(epsg)
+    return VerticalDatum(name=short, stated=True, note=f"{upright.name}, part of {name}")
 
 
 def _vertical_crs(choice: VerticalChoice) -> CRS:

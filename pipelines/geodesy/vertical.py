@@ -46,7 +46,12 @@ def parse_vertical(text: str) -> VerticalChoice:
     if match is None:
         known = ", ".join([ELLIPSOIDAL, *_EPSG_OF, "EPSG:n"])
         raise InputError(f"{text!r} is no vertical datum: give one of {known}", field="--vertical")
-    return VerticalChoice(f"EPSG:{match[1]}", int(match[1]))
+    return VerticalChoice(name_of(int(match[1])), int(match[1]))
+
+
+def name_of(epsg: int) -> str:
+    """The short name of a vertical CRS, so that `EPSG:5773` and `EGM96` are the same datum."""
+    return next((name for name, code in _EPSG_OF.items() if code == epsg), f"EPSG:{epsg}")
 
 
 def assumed_ellipsoidal(note: str) -> VerticalDatum:

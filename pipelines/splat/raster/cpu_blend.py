@@ -1,0 +1,291 @@
+"""Blending the splats of each tile, and its derivative, as numba kernels.
+
+One row of a tile is one vector (see `cpu_lanes`). A pixel's transmittance T is kept as −T once the pixel is
+done, so that nothing adds to it any more and yet its final value is known. Forward and backward walk the same
+lists in the same direction with the same arithmetic, so that they take the same decisions at every cut-off.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import prange
+
+from pipelines.splat.raster.api import ALPHA_MAX, TRANSMITTANCE_MIN
+from pipelines.splat.raster.cpu_lanes import (
+    LANES,
+    any_positive,
+    exp,
+    load,
+    splat,
+    store,
+    total,
+    where_greater,
+)
+from pipelines.splat.raster.cpu_project import (
+    BLUE,
+    DEPTH,
+    FACTOR_XX,
+    FACTOR_XY,
+    FACTOR_YY,
+    GREEN,
+    LOG_ALPHA_MIN,
+    LOG_OPACITY,
+    RED,
+    X,
+    Y,
+    jit,
+    parallel_jit,
+)
+from pipelines.splat.raster.cpu_tiles import TILE_HEIGHT, TILE_WIDTH, unpack_hit
+
+TILE_PIXELS = TILE_WIDTH * TILE_HEIGHT
+# Splats between two looks at whether the whole tile is done.
+HITS_PER_LOOK = 16
+
+# Planes of a tile's scratch memory.
+T, R, G, B, D, MEDIAN = range(6)
+FORWARD_PLANES = 6
+G_RED, G_GREEN, G_BLUE, G_DEPTH, G_REST, REMAINING = 1, 2, 3, 4, 5, 6
+BACKWARD_PLANES = 7
+
+# Columns of the gradient of one hit: Σq, Σq·dx, Σq·dy, Σq·dx², Σq·dx·dy, Σq·dy² with q = ∂L/∂(exponent) at
+# each pixel, then ∂L/∂(red, green, blue, depth).
+Q, Q_X, Q_Y, Q_XX, Q_XY, Q_YY, D_RED, D_GREEN, D_BLUE, D_DEPTH = range(10)
+HIT_GRADIENT_WIDTH = 10
+
+
+@jit
+def _row_exponent(table: Any, index: int, dx: Any, dy: Any) -> Any:
+    """ln α of one splat along a row of pixels, before the cut-offs."""
+    slanted = splat(table[index, FACTOR_XX]) * dx + splat(table[index, FACTOR_XY] * dy)
+    vertical = table[index, FACTOR_YY] * dy
+    return splat(table[index, LOG_OPACITY] - vertical * vertical) - slanted * slanted
+
+
+@jit
+def _start_tile(scratch: Any, tile_x: int, tile_y: int, width: int, height: int) -> None:
+    """T = 1 inside the image; what sticks out of it is done before it starts."""
+    number = scratch.dtype.type
+    for row in range(TILE_HEIGHT):
+        for column in range(TILE_WIDTH):
+            inside = tile_y + row < height and tile_x + column < width
+            scratch[T * TILE_PIXELS + row * TILE_WIDTH + column] = number(1.0) if inside else number(-1.0)
+
+
+@jit
+def _any_alive(scratch: Any) -> bool:
+    for row in range(TILE_HEIGHT):  # noqa: SIM110 (numba has no any)
+        if any_positive(load(scratch, T * TILE_PIXELS + row * TILE_WIDTH)):
+            return True
+    return False
+
+
+@jit
+def _blend_tile(table: Any, hits: Any, first: int, last: int, tile_x: int, tile_y: int, depth: bool, scratch: Any,
+                lane_x: Any) -> int:  # fmt: skip
+    """Blend hits first … last − 1 into the tile's scratch planes; returns the hit after the last one looked at."""
+    number = table.dtype.type
+    zero, one, half = splat(number(0.0)), splat(number(1.0)), splat(number(0.5))
+    cutoff, alpha_max = splat(number(LOG_ALPHA_MIN)), splat(number(ALPHA_MAX))
+    t_min = splat(number(TRANSMITTANCE_MIN))
+    pixel_x = load(lane_x, 0) + splat(number(tile_x))
+    for place in range(first, last):
+        if (place - first) % HITS_PER_LOOK == HITS_PER_LOOK - 1 and not _any_alive(scratch):
+            return place
+        index, first_row, last_row = unpack_hit(hits[place])
+        red, green, blue = splat(table[index, RED]), splat(table[index, GREEN]), splat(table[index, BLUE])
+        z = splat(table[index, DEPTH])
+        dx = pixel_x - splat(table[index, X])
+        for row in range(first_row, last_row + 1):
+            at = row * TILE_WIDTH
+            dy = number(tile_y + row) + number(0.5) - table[index, Y]
+            exponent = _row_exponent(table, index, dx, dy)
+            alpha = exp(exponent)
+            alpha = where_greater(alpha, alpha_max, alpha_max, alpha)
+            alpha = where_greater(cutoff, exponent, zero, alpha)
+            t = load(scratch, T * TILE_PIXELS + at)
+            t_next = t * (one - alpha)
+            weight = where_greater(t_next, t_min, alpha * t, zero)
+            done = where_greater(t, zero, zero - t, t)
+            store(scratch, T * TILE_PIXELS + at, where_greater(t_next, t_min, t_next, done))
+            store(scratch, R * TILE_PIXELS + at, load(scratch, R * TILE_PIXELS + at) + weight * red)
+            store(scratch, G * TILE_PIXELS + at, load(scratch, G * TILE_PIXELS + at) + weight * green)
+            store(scratch, B * TILE_PIXELS + at, load(scratch, B * TILE_PIXELS + at) + weight * blue)
+            if depth:
+                store(scratch, D * TILE_PIXELS + at, load(scratch, D * TILE_PIXELS + at) + weight * z)
+                median = load(scratch, MEDIAN * TILE_PIXELS + at)
+                crossed = where_greater(t, half, where_greater(t_next, half, median, z), median)
+                store(scratch, MEDIAN * TILE_PIXELS + at, crossed)
+    return last
+
+
+@jit
+def _finish_tile(scratch: Any, tile_x: int, tile_y: int, background: Any, images: Any) -> None:
+    """Write a blended tile into the images."""
+    colour, alpha, depth, median = images
+    for row in range(min(TILE_HEIGHT, colour.shape[0] - tile_y)):
+        for column in range(min(TILE_WIDTH, colour.shape[1] - tile_x)):
+            at = row * TILE_WIDTH + column
+            y, x = tile_y + row, tile_x + column
+            final = abs(scratch[T * TILE_PIXELS + at])
+            colour[y, x, 0] = scratch[R * TILE_PIXELS + at] + final * background[0]
+            colour[y, x, 1] = scratch[G * TILE_PIXELS + at] + final * background[1]
+            colour[y, x, 2] = scratch[B * TILE_PIXELS + at] + final * background[2]
+            alpha[y, x] = 1 - final
+            if depth.shape[0] > 0:
+                depth[y, x] = scratch[D * TILE_PIXELS + at]
+                median[y, x] = scratch[MEDIAN * TILE_PIXELS + at]
+
+
+@parallel_jit
+def blend(
+    table: Any, hits: Any, tile_start: Any, background: Any, images: Any, tile_end: Any, workers: int
+) -> None:
+    """Render.
+
+    Args:
+        table: (M, SPLAT_WIDTH) splats, nearest first.
+        hits: (H,) packed hits by tile, nearest first.
+        tile_start: (tiles + 1,) into `hits`.
+        background: (3,) float64.
+        images: colour (H, W, 3), alpha (H, W), Σ w z (H, W), median depth (H, W), written; the depths may be
+            of size (0, 0).
+        tile_end: (tiles,) hit after the last one that was looked at, written.
+        workers: number of threads.
+    """
+    height, width = images[1].shape
+    columns = (width + TILE_WIDTH - 1) // TILE_WIDTH
+    tiles = tile_end.shape[0]
+    for worker in prange(workers):
+        scratch = np.empty(FORWARD_PLANES * TILE_PIXELS, table.dtype)
+        lane_x = np.arange(LANES).astype(table.dtype) + table.dtype.type(0.5)
+        for tile in range(worker, tiles, workers):
+            tile_x, tile_y = tile % columns * TILE_WIDTH, tile // columns * TILE_HEIGHT
+            scratch[:] = 0
+            _start_tile(scratch, tile_x, tile_y, width, height)
+            tile_end[tile] = _blend_tile(
+                table, hits, tile_start[tile], tile_start[tile + 1], tile_x, tile_y, images[2].shape[0] > 0,
+                scratch, lane_x,
+            )  # fmt: skip
+            _finish_tile(scratch, tile_x, tile_y, background, images)
+
+
+@jit
+def _start_tile_gradient(scratch: Any, tile_x: int, tile_y: int, background: Any, images: Any, grads: Any) -> None:
+    """Gather what each pixel's loss depends on.
+
+    With v_i = g·c_i + g_z z_i − (g·background − g_alpha) the loss is Σ w_i v_i plus a constant, so that
+    background and alpha need no term of their own further on. `REMAINING` starts as the whole sum.
+    """
+    colour, alpha, depth, _ = images
+    g_colour, g_alpha, g_depth = grads
+    for row in range(min(TILE_HEIGHT, colour.shape[0] - tile_y)):
+        for column in range(min(TILE_WIDTH, colour.shape[1] - tile_x)):
+            at = row * TILE_WIDTH + column
+            y, x = tile_y + row, tile_x + column
+            red, green, blue = g_colour[y, x, 0], g_colour[y, x, 1], g_colour[y, x, 2]
+            behind = red * background[0] + green * background[1] + blue * background[2]
+            scratch[G_RED * TILE_PIXELS + at] = red
+            scratch[G_GREEN * TILE_PIXELS + at] = green
+            scratch[G_BLUE * TILE_PIXELS + at] = blue
+            scratch[G_REST * TILE_PIXELS + at] = behind - g_alpha[y, x]
+            whole = red * colour[y, x, 0] + green * colour[y, x, 1] + blue * colour[y, x, 2] - behind
+            whole += g_alpha[y, x] * alpha[y, x]
+            if depth.shape[0] > 0:
+                scratch[G_DEPTH * TILE_PIXELS + at] = g_depth[y, x]
+                whole += g_depth[y, x] * depth[y, x]
+            scratch[REMAINING * TILE_PIXELS + at] = whole
+
+
+@jit
+def _blend_tile_gradient(table: Any, hits: Any, first: int, last: int, tile_x: int, tile_y: int, depth: bool,
+                         scratch: Any, lane_x: Any, gradient: Any) -> None:  # fmt: skip
+    """Write the gradient of hits first … last − 1; `scratch` as `_start_tile` and `_start_tile_gradient` left it.
+
+    ∂L/∂α_i = T_i v_i − (Σ_{j>i} w_j v_j) / (1 − α_i), and q_i = ∂L/∂ln α_i = α_i ∂L/∂α_i.
+    """
+    number = table.dtype.type
+    zero, one = splat(number(0.0)), splat(number(1.0))
+    cutoff, alpha_max = splat(number(LOG_ALPHA_MIN)), splat(number(ALPHA_MAX))
+    t_min = splat(number(TRANSMITTANCE_MIN))
+    pixel_x = load(lane_x, 0) + splat(number(tile_x))
+    for place in range(first, last):
+        index, first_row, last_row = unpack_hit(hits[place])
+        red, green, blue = splat(table[index, RED]), splat(table[index, GREEN]), splat(table[index, BLUE])
+        z = splat(table[index, DEPTH])
+        dx = pixel_x - splat(table[index, X])
+        q_sum, qy_sum, qyy_sum = zero, zero, zero
+        red_sum, green_sum, blue_sum, depth_sum = zero, zero, zero, zero
+        for row in range(first_row, last_row + 1):
+            at = row * TILE_WIDTH
+            dy = number(tile_y + row) + number(0.5) - table[index, Y]
+            exponent = _row_exponent(table, index, dx, dy)
+            free_alpha = exp(exponent)
+            alpha = where_greater(free_alpha, alpha_max, alpha_max, free_alpha)
+            alpha = where_greater(cutoff, exponent, zero, alpha)
+            t = load(scratch, T * TILE_PIXELS + at)
+            kept = one - alpha
+            t_next = t * kept
+            alpha = where_greater(t_next, t_min, alpha, zero)
+            weight = alpha * t
+            done = where_greater(t, zero, zero - t, t)
+            store(scratch, T * TILE_PIXELS + at, where_greater(t_next, t_min, t_next, done))
+
+            g_red = load(scratch, G_RED * TILE_PIXELS + at)
+            g_green = load(scratch, G_GREEN * TILE_PIXELS + at)
+            g_blue = load(scratch, G_BLUE * TILE_PIXELS + at)
+            value = g_red * red + g_green * green + g_blue * blue - load(scratch, G_REST * TILE_PIXELS + at)
+            if depth:
+                g_depth = load(scratch, G_DEPTH * TILE_PIXELS + at)
+                value = value + g_depth * z
+                depth_sum = depth_sum + weight * g_depth
+            part = weight * value
+            remaining = load(scratch, REMAINING * TILE_PIXELS + at) - part
+            store(scratch, REMAINING * TILE_PIXELS + at, remaining)
+            q = where_greater(free_alpha, alpha_max, zero, part - remaining * (alpha / kept))
+            qy = q * splat(dy)
+            q_sum = q_sum + q
+            qy_sum = qy_sum + qy
+            qyy_sum = qyy_sum + qy * splat(dy)
+            red_sum = red_sum + weight * g_red
+            green_sum = green_sum + weight * g_green
+            blue_sum = blue_sum + weight * g_blue
+        qx_sum = q_sum * dx
+        out = gradient[place]
+        out[Q], out[Q_X], out[Q_XX] = total(q_sum), total(qx_sum), total(qx_sum * dx)
+        out[Q_Y], out[Q_XY], out[Q_YY] = total(qy_sum), total(qy_sum * dx), total(qyy_sum)
+        out[D_RED], out[D_GREEN], out[D_BLUE] = total(red_sum), total(green_sum), total(blue_sum)
+        out[D_DEPTH] = total(depth_sum)
+
+
+@parallel_jit
+def blend_gradient(
+    table: Any, hits: Any, tile_start: Any, tile_end: Any, background: Any, images: Any, grads: Any, gradient: Any,
+    workers: int,
+) -> None:  # fmt: skip
+    """The derivative of `blend`.
+
+    Args:
+        table, hits, tile_start, tile_end, background, images: as `blend` had and left them.
+        grads: ∂L/∂ colour (H, W, 3), alpha (H, W), Σ w z (H, W or 0, 0).
+        gradient: (H, HIT_GRADIENT_WIDTH) for each hit, written.
+        workers: number of threads.
+    """
+    height, width = images[1].shape
+    columns = (width + TILE_WIDTH - 1) // TILE_WIDTH
+    tiles = tile_end.shape[0]
+    for worker in prange(workers):
+        scratch = np.empty(BACKWARD_PLANES * TILE_PIXELS, table.dtype)
+        lane_x = np.arange(LANES).astype(table.dtype) + table.dtype.type(0.5)
+        for tile in range(worker, tiles, workers):
+            tile_x, tile_y = tile % columns * TILE_WIDTH, tile // columns * TILE_HEIGHT
+            scratch[:] = 0
+            _start_tile(scratch, tile_x, tile_y, width, height)
+            _start_tile_gradient(scratch, tile_x, tile_y, background, images, grads)
+            _blend_tile_gradient(
+                table, hits, tile_start[tile], tile_end[tile], tile_x, tile_y, images[2].shape[0] > 0,
+                scratch, lane_x, gradient,
+            )  # fmt: skip
+            gradient[tile_end[tile] : tile_start[tile + 1]] = 0

@@ -1,0 +1,257 @@
+"""From the gradients of hits to those of Gaussians and camera, as numba kernels.
+
+Sums run in a fixed order whatever the number of threads, and nothing is added atomically: the result is the
+same bit for bit on every run.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import prange
+
+from pipelines.splat.raster.cpu_blend import (
+    D_BLUE,
+    D_DEPTH,
+    D_GREEN,
+    D_RED,
+    HIT_GRADIENT_WIDTH,
+    Q_X,
+    Q_XX,
+    Q_XY,
+    Q_Y,
+    Q_YY,
+    Q,
+)
+from pipelines.splat.raster.cpu_project import (
+    BLOCK,
+    View,
+    jacobian,
+    jit,
+    log_sigmoid,
+    parallel_jit,
+    point_in_cam,
+    rotation,
+    row3,
+    screen_covariance,
+    screen_from_model,
+    sh_colour,
+    times_rotation,
+    unit_direction,
+    unit_quat,
+    variances,
+)
+from pipelines.splat.raster.cpu_sh import MAX_COEFFICIENTS, sh_basis, sh_direction_gradient
+
+# Entries of a block's share of the camera's gradient: 12 of the pose, row by row, then 3 of the centre.
+CAMERA_WIDTH = 15
+
+
+@jit
+def _sum_hits(gradient: Any, places: Any, first: int, last: int, sums: Any) -> None:
+    sums[:] = 0.0
+    for slot in range(first, last):
+        hit = gradient[places[slot]]
+        for k in range(HIT_GRADIENT_WIDTH):
+            sums[k] += hit[k]
+
+
+@jit
+def _conic_gradients(cov: Any, sums: Any) -> Any:
+    """∂L/∂ screen mean (u, v) and the symmetric ∂L/∂C (xx, xy, yy) of the screen covariance C.
+
+    The exponent is −½ dᵀ C⁻¹ d, so that they are C⁻¹ Σ q d and ½ C⁻¹ (Σ q d dᵀ) C⁻¹.
+    """
+    xx, xy, yy = cov
+    scale = 1.0 / (xx * yy - xy * xy)
+    a, b, c = yy * scale, -xy * scale, xx * scale
+    # Rows of C⁻¹ Σ q d dᵀ.
+    m00, m01 = a * sums[Q_XX] + b * sums[Q_XY], a * sums[Q_XY] + b * sums[Q_YY]
+    m10, m11 = b * sums[Q_XX] + c * sums[Q_XY], b * sums[Q_XY] + c * sums[Q_YY]
+    mean = (a * sums[Q_X] + b * sums[Q_Y], b * sums[Q_X] + c * sums[Q_Y])
+    return mean, (0.5 * (m00 * a + m01 * b), 0.5 * (m00 * b + m01 * c), 0.5 * (m10 * b + m11 * c))
+
+
+@jit
+def _axes_gradient(axes: Any, variance: Any, g_cov: Any) -> Any:
+    """∂L/∂V (6) of Σ = V diag(σ²) Vᵀ, given the symmetric ∂L/∂Σ."""
+    xx, xy, yy = g_cov
+    a, b, c = variance
+    return (
+        2 * a * (xx * axes[0] + xy * axes[3]),
+        2 * b * (xx * axes[1] + xy * axes[4]),
+        2 * c * (xx * axes[2] + xy * axes[5]),
+        2 * a * (xy * axes[0] + yy * axes[3]),
+        2 * b * (xy * axes[1] + yy * axes[4]),
+        2 * c * (xy * axes[2] + yy * axes[5]),
+    )
+
+
+@jit
+def _times_transposed(v: Any, r: Any) -> Any:
+    """V Rᵀ (6) of a 2×3 and a 3×3 matrix."""
+    return (
+        v[0] * r[0] + v[1] * r[1] + v[2] * r[2],
+        v[0] * r[3] + v[1] * r[4] + v[2] * r[5],
+        v[0] * r[6] + v[1] * r[7] + v[2] * r[8],
+        v[3] * r[0] + v[4] * r[1] + v[5] * r[2],
+        v[3] * r[3] + v[4] * r[4] + v[5] * r[5],
+        v[3] * r[6] + v[4] * r[7] + v[5] * r[8],
+    )
+
+
+@jit
+def _quat_gradient(quat: Any, scale: float, w: Any, v: Any) -> Any:
+    """∂L/∂ quaternion (4) before normalisation, where ∂L/∂R = Wᵀ ∂L/∂V."""
+    r00, r01, r02 = w[0] * v[0] + w[3] * v[3], w[0] * v[1] + w[3] * v[4], w[0] * v[2] + w[3] * v[5]
+    r10, r11, r12 = w[1] * v[0] + w[4] * v[3], w[1] * v[1] + w[4] * v[4], w[1] * v[2] + w[4] * v[5]
+    r20, r21, r22 = w[2] * v[0] + w[5] * v[3], w[2] * v[1] + w[5] * v[4], w[2] * v[2] + w[5] * v[5]
+    qw, qx, qy, qz = quat
+    gw = 2 * (qx * (r21 - r12) + qy * (r02 - r20) + qz * (r10 - r01))
+    gx = 2 * (qw * (r21 - r12) + qy * (r01 + r10) + qz * (r02 + r20) - 2 * qx * (r11 + r22))
+    gy = 2 * (qw * (r02 - r20) + qx * (r01 + r10) + qz * (r12 + r21) - 2 * qy * (r00 + r22))
+    gz = 2 * (qw * (r10 - r01) + qx * (r02 + r20) + qy * (r12 + r21) - 2 * qz * (r00 + r11))
+    along = qw * gw + qx * gx + qy * gy + qz * gz
+    return (
+        scale * (gw - along * qw),
+        scale * (gx - along * qx),
+        scale * (gy - along * qy),
+        scale * (gz - along * qz),
+    )
+
+
+@jit
+def _point_gradient(view: View, point: Any, g_mean: Any, g_depth: float, pose: Any, g_w: Any) -> Any:
+    """∂L/∂ point in the camera's frame (3): through the screen mean, the depth and the Jacobian."""
+    x, y, z = point
+    gu, gv = g_mean
+    j00 = g_w[0] * pose[0, 0] + g_w[1] * pose[0, 1] + g_w[2] * pose[0, 2]
+    j02 = g_w[0] * pose[2, 0] + g_w[1] * pose[2, 1] + g_w[2] * pose[2, 2]
+    j11 = g_w[3] * pose[1, 0] + g_w[4] * pose[1, 1] + g_w[5] * pose[1, 2]
+    j12 = g_w[3] * pose[2, 0] + g_w[4] * pose[2, 1] + g_w[5] * pose[2, 2]
+    fx_z, fy_z = view.fx / z, view.fy / z
+    gx, gy = fx_z * gu, fy_z * gv
+    gz = g_depth - (x * gx + y * gy + fx_z * j00 + fy_z * j11) / z
+    slope_x, slope_y = x / z, y / z
+    if view.slope_x_min <= slope_x <= view.slope_x_max:
+        gx -= fx_z * j02 / z
+        gz += 2 * fx_z * slope_x * j02 / z
+    else:
+        gz += fx_z * min(max(slope_x, view.slope_x_min), view.slope_x_max) * j02 / z
+    if view.slope_y_min <= slope_y <= view.slope_y_max:
+        gy -= fy_z * j12 / z
+        gz += 2 * fy_z * slope_y * j12 / z
+    else:
+        gz += fy_z * min(max(slope_y, view.slope_y_min), view.slope_y_max) * j12 / z
+    return gx, gy, gz
+
+
+@jit
+def _add_pose_gradient(camera: Any, mean: Any, g_point: Any, jac: Any, g_w: Any) -> None:
+    """Add ∂L/∂[A | t] (12) of p = A m + t and W = J A."""
+    j00, j02, j11, j12 = jac
+    for k in range(3):
+        camera[k] += g_point[0] * mean[k] + j00 * g_w[k]
+        camera[4 + k] += g_point[1] * mean[k] + j11 * g_w[3 + k]
+        camera[8 + k] += g_point[2] * mean[k] + j02 * g_w[k] + j12 * g_w[3 + k]
+    camera[3] += g_point[0]
+    camera[7] += g_point[1]
+    camera[11] += g_point[2]
+
+
+@jit
+def _colour_gradient(sh: Any, i: int, mean: Any, center: Any, degree: int, sums: Any, work: Any, g_sh: Any) -> Any:
+    """Write ∂L/∂ SH of Gaussian i into `g_sh` (K, 3); returns ∂L/∂(mean − centre)."""
+    basis, weight = work
+    terms = (degree + 1) ** 2
+    direction, scale = unit_direction(mean, center)
+    sh_basis(direction, degree, basis)
+    red, green, blue = sh_colour(sh, i, basis, terms)
+    g_red = sums[D_RED] if red >= 0.0 else 0.0
+    g_green = sums[D_GREEN] if green >= 0.0 else 0.0
+    g_blue = sums[D_BLUE] if blue >= 0.0 else 0.0
+    for k in range(terms):
+        g_sh[k, 0], g_sh[k, 1], g_sh[k, 2] = basis[k] * g_red, basis[k] * g_green, basis[k] * g_blue
+        weight[k] = sh[i, k, 0] * g_red + sh[i, k, 1] * g_green + sh[i, k, 2] * g_blue
+    g_sh[terms:] = 0
+    gx, gy, gz = sh_direction_gradient(direction, degree, weight)
+    along = direction[0] * gx + direction[1] * gy + direction[2] * gz
+    return (
+        scale * (gx - along * direction[0]),
+        scale * (gy - along * direction[1]),
+        scale * (gz - along * direction[2]),
+    )
+
+
+@jit
+def _gaussian_gradient(parameters: Any, pose: Any, center: Any, view: View, degree: int, i: int, sums: Any,
+                       work: Any, outputs: Any, camera: Any) -> Any:  # fmt: skip
+    """Write the gradient of Gaussian i, add to the camera's; returns that of its screen mean."""
+    means, quats, log_scales, logit_opacities, sh = parameters
+    g_means, g_quats, g_log_scales, g_logits, g_sh = outputs
+    mean = row3(means, i)
+    point = point_in_cam(pose, mean)
+    quat, scale = unit_quat(quats, i)
+    turn = rotation(quat)
+    jac = jacobian(view, point)
+    w = screen_from_model(jac, pose)
+    axes, variance = times_rotation(w, turn), variances(log_scales, i)
+    g_mean, g_cov = _conic_gradients(screen_covariance(axes, variance, view.dilation), sums)
+    g_axes = _axes_gradient(axes, variance, g_cov)
+    g_w = _times_transposed(g_axes, turn)
+    for k in range(3):
+        g_log_scales[i, k] = axes[k] * g_axes[k] + axes[3 + k] * g_axes[3 + k]
+    g_quats[i, 0], g_quats[i, 1], g_quats[i, 2], g_quats[i, 3] = _quat_gradient(quat, scale, w, g_axes)
+    g_point = _point_gradient(view, point, g_mean, sums[D_DEPTH], pose, g_w)
+    # ln α = ln σ(logit) + exponent, and ∂ ln σ/∂logit = 1 − σ(logit) = σ(−logit).
+    logit = float(logit_opacities[i])
+    g_logits[i] = sums[Q] * np.exp(log_sigmoid(logit) - logit)
+    g_direction = _colour_gradient(sh, i, mean, center, degree, sums, work, g_sh[i])
+    for k in range(3):
+        g_means[i, k] = pose[0, k] * g_point[0] + pose[1, k] * g_point[1] + pose[2, k] * g_point[2] + g_direction[k]
+        camera[12 + k] -= g_direction[k]
+    _add_pose_gradient(camera, mean, g_point, jac, g_w)
+    return g_mean
+
+
+@jit
+def _clear_rows(outputs: Any, first: int, last: int) -> None:
+    means, quats, log_scales, logit_opacities, sh = outputs
+    means[first:last] = 0
+    quats[first:last] = 0
+    log_scales[first:last] = 0
+    logit_opacities[first:last] = 0
+    sh[first:last] = 0
+
+
+@parallel_jit
+def gaussian_gradients(
+    parameters: Any, pose: Any, center: Any, view: View, degree: int, visible: Any, rank: Any, gradient: Any,
+    splat_start: Any, places: Any, block_start: Any, outputs: Any, camera: Any, g_screen: Any, workers: int,
+) -> None:  # fmt: skip
+    """Reduce hits to Gaussians and go back through the projection and the colours.
+
+    Args:
+        parameters, pose, center, view, degree, visible, rank: as in `project_visible`.
+        gradient: (H, HIT_GRADIENT_WIDTH) of the hits by tile.
+        splat_start, places: where the hits of each splat are, see `list_hits`.
+        block_start: (blocks + 1,) into `visible`: the blocks of BLOCK Gaussians each.
+        outputs: gradients of the N Gaussians in the form of `parameters`, written, zero for the invisible.
+        camera: (blocks, CAMERA_WIDTH) each block's share of ∂L/∂ pose and centre, written.
+        g_screen: (M, 2) ∂L/∂ screen mean, written.
+        workers: number of threads.
+    """
+    count = parameters[0].shape[0]
+    blocks = block_start.shape[0] - 1
+    for worker in prange(workers):
+        sums = np.empty(HIT_GRADIENT_WIDTH)
+        work = (np.empty(MAX_COEFFICIENTS), np.empty(MAX_COEFFICIENTS))
+        for block in range(worker, blocks, workers):
+            camera[block] = 0.0
+            _clear_rows(outputs, block * BLOCK, min((block + 1) * BLOCK, count))
+            for m in range(block_start[block], block_start[block + 1]):
+                _sum_hits(gradient, places, splat_start[rank[m]], splat_start[rank[m] + 1], sums)
+                g_screen[m, 0], g_screen[m, 1] = _gaussian_gradient(
+                    parameters, pose, center, view, degree, visible[m], sums, work, outputs, camera[block]
+                )

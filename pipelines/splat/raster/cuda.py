@@ -1,0 +1,156 @@
+"""The rasteriser on a GPU: gsplat behind the common interface.
+
+gsplat (doi 10.48550/arXiv.2409.06765) blends by the rules of `api`; what it lacks, the median depth, is
+gathered here from its pixel–Gaussian intersections.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import sys
+from types import ModuleType
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pipelines.errors import BackendUnavailableError
+from pipelines.splat.gaussians import Gaussians
+from pipelines.splat.raster.api import (
+    ALPHA_MAX,
+    BackendName,
+    Pinhole,
+    RasterSettings,
+    Render,
+    ScreenStats,
+)
+
+_EVERY_BATCH = 2**31 - 1
+
+
+def cuda_available() -> bool:
+    """Whether a CUDA device and gsplat are both present."""
+    return torch.cuda.is_available() and importlib.util.find_spec("gsplat") is not None
+
+
+class CudaRasterizer:
+    """gsplat ≥ 1.5.3. The tensors must be on the CUDA device.
+
+    Raises:
+        BackendUnavailableError: no CUDA device, no gsplat, or no kernels for it.
+    """
+
+    name: BackendName = "cuda"
+
+    def __init__(self) -> None:
+        self._gsplat = _import_gsplat()
+
+    def render(
+        self, gaussians: Gaussians, cam_from_model: Tensor, camera: Pinhole, settings: RasterSettings
+    ) -> Render:
+        """See `Rasterizer.render`; the view and its statistics stay on the device."""
+        device = gaussians.means.device
+        image, alpha, meta = self._gsplat.rasterization(
+            gaussians.means,
+            gaussians.quats_wxyz,
+            torch.exp(gaussians.log_scales),
+            torch.sigmoid(gaussians.logit_opacities),
+            gaussians.sh,
+            cam_from_model.float()[None],
+            _intrinsics(camera, device)[None],
+            camera.width,
+            camera.height,
+            near_plane=settings.near_m,
+            eps2d=settings.dilation_px2,
+            sh_degree=settings.sh_degree,
+            packed=True,
+            backgrounds=torch.tensor([settings.background], device=device),
+            render_mode="RGB+ED" if settings.depth else "RGB",
+        )
+        return Render(
+            colour=image[0, ..., :3],
+            alpha=alpha[0, ..., 0],
+            expected_depth=image[0, ..., 3] if settings.depth else None,
+            median_depth=self._median_depth(meta, camera) if settings.depth else None,
+            stats=_screen_stats(meta),
+        )
+
+    @torch.no_grad()
+    def _median_depth(self, meta: dict[str, Any], camera: Pinhole) -> Tensor:
+        """(H, W) z of the Gaussian at which the transmittance falls to one half, 0 where it never does."""
+        means_px, conics, opacities = meta["means2d"], meta["conics"], meta["opacities"]
+        median = torch.zeros(camera.height * camera.width, device=means_px.device)
+        # The intersections come grouped by pixel, nearest first.
+        gaussian, pixel, _ = self._gsplat.rasterize_to_indices_in_range(
+            0,
+            _EVERY_BATCH,
+            torch.ones((1, camera.height, camera.width), device=means_px.device),
+            means_px[None],
+            conics[None],
+            opacities[None],
+            camera.width,
+            camera.height,
+            meta["tile_size"],
+            meta["isect_offsets"],
+            meta["flatten_ids"],
+        )
+        dx = means_px[gaussian, 0] - (pixel % camera.width + 0.5)
+        dy = means_px[gaussian, 1] - (pixel // camera.width + 0.5)
+        xx, xy, yy = conics[gaussian].unbind(-1)
+        sigma = 0.5 * (xx * dx * dx + yy * dy * dy) + xy * dx * dy
+        alpha = (opacities[gaussian] * torch.exp(-sigma)).clamp(max=ALPHA_MAX)
+        log_kept = torch.cumsum(torch.log1p(-alpha.double()), dim=0)
+        count = torch.bincount(pixel, minlength=len(median))
+        start = torch.cumsum(count, dim=0) - count
+        before_pixel = torch.cat([log_kept.new_zeros(1), log_kept])[start[pixel]]
+        half = torch.log(log_kept.new_tensor(0.5))
+        reached = log_kept - before_pixel <= half
+        first = reached.clone()
+        first[1:] &= ~(reached[:-1] & (pixel[1:] == pixel[:-1]))
+        median[pixel[first]] = meta["depths"][gaussian[first]]
+        return median.view(camera.height, camera.width)
+
+
+def _import_gsplat() -> ModuleType:
+    if not torch.cuda.is_available():
+        raise BackendUnavailableError(
+            "no CUDA device found: install a driver and a CUDA build of torch, or use the cpu backend"
+        )
+    try:
+        # Its first import may compile for minutes, and says so on stdout, which belongs to results.
+        with contextlib.redirect_stdout(sys.stderr):
+            import gsplat
+            from gsplat.cuda import _backend
+    except ImportError as error:
+        raise BackendUnavailableError(
+            f"gsplat cannot be imported ({error}): pip install 'georefgs[cuda]', or use the cpu backend"
+        ) from error
+    if _backend._C is None:
+        raise BackendUnavailableError(
+            "gsplat found no CUDA toolkit (nvcc) to compile its kernels with: install one, install a prebuilt"
+            " gsplat wheel after pip install 'georefgs[cuda]', or use the cpu backend"
+        )
+    module: ModuleType = gsplat
+    return module
+
+
+def _intrinsics(camera: Pinhole, device: torch.device) -> Tensor:
+    return torch.tensor([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]], device=device)
+
+
+def _screen_stats(meta: dict[str, Any]) -> ScreenStats:
+    means_px = meta["means2d"]
+    with torch.no_grad():
+        xx, xy, yy = meta["conics"].unbind(-1)
+        smallest = 0.5 * (xx + yy) - torch.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
+        # The conic is the inverse covariance: its smaller eigenvalue belongs to the longer axis.
+        radius = 3.0 / torch.sqrt(smallest.clamp(min=1e-12))
+    stats = ScreenStats(visible=meta["gaussian_ids"].long(), radius_px=radius)
+    if means_px.requires_grad:
+
+        def keep_gradient(gradient: Tensor) -> None:
+            stats.mean_gradient = gradient
+
+        means_px.register_hook(keep_gradient)
+    return stats
