@@ -48,7 +48,7 @@ from pipelines.splat.initialise import (
 )
 from pipelines.splat.optimizer import GaussianAdam
 from pipelines.splat.raster.api import rasterizer
-from pipelines.splat.storage import write_splat
+from pipelines.splat.storage import write_gaussians
 from pipelines.stages import SIM3, SPARSE, SURVEY
 from pipelines.workspace import StageRun, Summary
 
@@ -243,7 +243,7 @@ def _save(trainer: JointTrainer, scene: Scene, out: Path, seconds: float) -> Sum
         backend=trainer.rasterizer.name,
         gnss_outliers=outliers,
     )
-    write_splat(out / "gaussians.ply", gaussians)
+    write_gaussians(out / "gaussians.ply", gaussians)
     save_json(model, out / "model.json")
     rows = [json.loads(row) for row in (out / _METRICS).read_text(encoding="utf-8").splitlines()]
     psnr = float(np.mean([row["psnr"] for row in rows[-20:]]))
