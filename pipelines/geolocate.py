@@ -164,7 +164,7 @@ def _warnings(measured: _Measured, source: str) -> list[str]:
     if rejected:
         warnings.append(
             f"{len(rejected)} of {len(fixes)} fixes contradict the SfM model and give no rays: "
-            + ", ".join(rejected[:8])
+            + ", ".join(sorted(rejected)[:8])
             + (" …" if len(rejected) > 8 else "")
         )
     prior = measured.prior
