@@ -166,7 +166,12 @@ class SimulateConfig(StageConfig):
         gt=0,
         description="Radius of the circle, half side of the grid, or distance from facades in metres.",
     )
-    interval: float = Field(2.0, ge=0.2, le=60, description="Seconds from one photograph to the next.")
+    interval: float | None = Field(
+        None,
+        ge=0.2,
+        le=600,
+        description="Seconds between photographs (default: 2, more above 8 m/s).",
+    )
     gnss: Literal["rtk", "ppk", "consumer", "outliers"] = Field(
         "rtk", description="Receiver: sets σ, slow bias and outliers, each of which can be set by itself."
     )

@@ -13,6 +13,7 @@ from pipelines.products import FloatArray
 
 LEAD_S = 1.0  # the sensors run this long before the first and after the last photograph
 _LOOK_AT_M = 6.0
+_SPEED_M_S = 8.0
 DEFAULT_HEIGHTS_M = {"orbit": (60.0,), "grid": (70.0,), "facade": (7.0, 15.0)}
 DEFAULT_RADIUS_M = {"orbit": 85.0, "grid": 60.0, "facade": 19.0}
 
@@ -24,14 +25,14 @@ class FlightPlan:
     Attributes:
         kind: "orbit", "grid" or "facade".
         images: photographs.
-        interval_s: time between them.
+        interval_s: time between them; None for 2 s, or more where the aircraft would be faster than 8 m/s.
         heights_m: above the origin, one round each.
         radius_m: radius, half side, or distance from the facade.
     """
 
     kind: str
     images: int
-    interval_s: float
+    interval_s: float | None
     heights_m: tuple[float, ...]
     radius_m: float
 
@@ -86,7 +87,7 @@ def fly(plan: FlightPlan, complex_m: tuple[float, float], axes: FloatArray, rng:
     pitch = float(np.round(angles[:, 1].mean()))
     angles = angles + wobble
     angles[:, 0] = np.degrees(np.unwrap(np.radians(angles[:, 0])))
-    times = index * plan.interval_s
+    times = index * (plan.interval_s or _unhurried_s(positions))
     return Track(
         times[1:-1].astype(np.float64),
         # The mount tilts the camera as the flight needs, so that the body itself flies level.
@@ -94,6 +95,12 @@ def fly(plan: FlightPlan, complex_m: tuple[float, float], axes: FloatArray, rng:
         CubicSpline(times, positions),
         PchipInterpolator(times, angles),
     )
+
+
+def _unhurried_s(positions: FloatArray) -> float:
+    """Interval in half seconds, so that photographs and fixes coincide: 2 s, or what the distances need."""
+    step_m = float(np.median(np.linalg.norm(np.diff(positions, axis=0), axis=1)))
+    return max(2.0, float(np.ceil(2 * step_m / _SPEED_M_S)) / 2)
 
 
 def _rounds(plan: FlightPlan, index: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
