@@ -16,6 +16,8 @@ from torch import Tensor
 
 from pipelines.splat.gaussians import Gaussians
 
+_REFERENCE_ITERATIONS = 30_000
+_MOST_RAISED = 4.0
 _CORRECTED_STEPS = 20_000  # 0.999^20000 = 2e-9: below float32's resolution of 1
 
 
@@ -47,6 +49,18 @@ class LearningRates:
     beta2: float = 0.999
     eps: float = 1e-15
 
+    @classmethod
+    def for_iterations(cls, iterations: int) -> LearningRates:
+        """The rates of 3DGS, made for 30 000 iterations, raised for shorter trainings.
+
+        A Gaussian can only change so much in so many steps: at the rates of 3DGS, 600 iterations of a 48-image
+        orbit (240 px, 20 000 Gaussians) leave holes between Gaussians that had no time to grow, and 18.1 dB on
+        the test views. Raised 2, 4 and 8 times they give 22.3, 26.8 and 23.7 dB.
+        """
+        factor = min(max((_REFERENCE_ITERATIONS / iterations) ** (1 / 3), 1.0), _MOST_RAISED)
+        rates = ("means", "means_final", "quats_wxyz", "log_scales", "logit_opacities", "sh_dc", "sh_rest")
+        return cls(**{name: factor * getattr(cls(), name) for name in rates})
+
     def means_at(self, progress: float) -> float:
         """Rate of the centres, in scene extents, after the fraction `progress` (0 to 1) of the training."""
         return float(self.means ** (1 - progress) * self.means_final**progress)
@@ -68,9 +82,9 @@ class GaussianAdam:
             gaussians: N Gaussians, float32; copied.
             extent_m: size of the scene, the unit of the centres' rate.
             iterations: length of the training, over which that rate falls.
-            rates: learning rates (default: those of 3DGS).
+            rates: learning rates (default: those of 3DGS, raised for trainings shorter than its own).
         """
-        self.rates = rates or LearningRates()
+        self.rates = rates or LearningRates.for_iterations(iterations)
         self.extent_m = extent_m
         self.iterations = iterations
         self.gaussians = _leaves(gaussians)

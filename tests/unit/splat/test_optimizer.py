@@ -32,7 +32,7 @@ def fill_gradients(gaussians: Gaussians, seed: int) -> None:
 def test_all_rows_is_plain_adam() -> None:
     start = random_gaussians(40)
     rates = LearningRates()
-    ours = GaussianAdam(start, extent_m=5.0, iterations=ITERATIONS)
+    ours = GaussianAdam(start, extent_m=5.0, iterations=ITERATIONS, rates=rates)
     theirs = {name: tensor.clone().requires_grad_() for name, tensor in start.tensors().items()}
     rest = theirs.pop("sh")
     dc, rest = rest[:, :1].detach().clone().requires_grad_(), rest[:, 1:].detach().clone().requires_grad_()
@@ -69,7 +69,7 @@ def test_only_the_given_rows_move() -> None:
 
 
 def test_first_update_of_a_row_is_one_rate_whenever_it_comes() -> None:
-    adam = GaussianAdam(random_gaussians(2), 1.0, ITERATIONS)
+    adam = GaussianAdam(random_gaussians(2), 1.0, ITERATIONS, LearningRates())
     for iteration in range(30):
         fill_gradients(adam.gaussians, iteration)
         adam.step(iteration, torch.tensor([0]))
@@ -154,3 +154,13 @@ def test_rate_of_the_centres_falls_a_hundredfold() -> None:
     assert rates.means_at(0.0) == pytest.approx(1.6e-4)
     assert rates.means_at(0.5) == pytest.approx(1.6e-5)
     assert rates.means_at(1.0) == pytest.approx(1.6e-6)
+
+
+def test_short_trainings_have_higher_rates() -> None:
+    assert LearningRates.for_iterations(30_000) == LearningRates()
+    assert LearningRates.for_iterations(100_000) == LearningRates()
+    short = LearningRates.for_iterations(3_750)
+    assert short.log_scales == pytest.approx(2 * 5e-3)
+    assert short.means_final / short.means == pytest.approx(0.01)
+    assert short.eps == LearningRates().eps
+    assert LearningRates.for_iterations(1).sh_dc == pytest.approx(4 * 2.5e-3)
