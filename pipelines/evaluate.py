@@ -49,8 +49,7 @@ class Eye:
     def __init__(self, trained: Trained, images: ImageCache, backend: Rasterizer) -> None:
         self.trained, self.images, self._backend = trained, images, backend
         device = torch.device("cuda" if backend.name == "cuda" else "cpu")
-        tensors = trained.gaussians.tensors().items()
-        self._gaussians = type(trained.gaussians)(**{name: tensor.to(device) for name, tensor in tensors})
+        self._gaussians = trained.gaussians.to(device)
 
     def look(self, index: int, *, depth: bool = False) -> Render:
         """The model from camera `index`, at training size."""

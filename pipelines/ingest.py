@@ -92,7 +92,7 @@ def build_survey(config: IngestConfig, progress: Progress = SILENT) -> Survey:
     )
     control, check = split_checks(control_file, check_file, config.check)
     if measured.located.any():
-        middle = np.median(enu.ecef_from_lla(measured.lla[measured.located]), axis=0)
+        middle = enu.median_lla(measured.lla[measured.located])
         require_near(control_file, middle)
         require_near(check_file, middle)
     origin = _origin(measured, control)
@@ -167,8 +167,8 @@ def _without_far_fixes(measured: Measured, photos: Sequence[Photo], notes: Notes
     known = measured.located
     if not known.any():
         return measured
-    ecef = enu.ecef_from_lla(measured.lla)
-    distance_m = np.linalg.norm(ecef - np.median(ecef[known], axis=0), axis=1)
+    middle = enu.ecef_from_lla(enu.median_lla(measured.lla[known]))
+    distance_m = np.linalg.norm(enu.ecef_from_lla(measured.lla) - middle, axis=1)
     far = known & (distance_m > _FIX_RANGE_M)
     notes.warn_counted(
         [f"{photos[row].name} ({distance_m[row] / 1000:.0f} km)" for row in np.flatnonzero(far).tolist()],
@@ -186,7 +186,7 @@ def _origin(measured: Measured, control: Sequence[GroundPoint]) -> Origin:
         raise InputError(
             "no image has a position, and there are no ground control points: give --trajectory, --geo or --gcp"
         )
-    lat, lon, alt = enu.lla_from_ecef(np.median(enu.ecef_from_lla(places), axis=0))
+    lat, lon, alt = enu.median_lla(places)
     return Origin(lat_deg=round(float(lat), 5), lon_deg=round(float(lon), 5), alt_m=round(float(alt)))
 
 

@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from pipelines.blocks.background import background
 from pipelines.blocks.checkpoint import load_checkpoint, save_checkpoint
 from pipelines.blocks.scene import Scene, geo_problem, initial_scene, photographs
 from pipelines.blocks.trainer import JointOptions, JointTrainer, StepReport, Views
@@ -38,10 +39,16 @@ from pipelines.products import (
 )
 from pipelines.progress import Progress
 from pipelines.splat.densify import DefaultSettings, DefaultStrategy
-from pipelines.splat.initialise import InitialisationOptions, gaussians_from_points, scene_extent
+from pipelines.splat.gaussians import Gaussians
+from pipelines.splat.initialise import (
+    InitialisationOptions,
+    gaussians_from_points,
+    gaussians_of_size,
+    scene_extent,
+)
 from pipelines.splat.optimizer import GaussianAdam
 from pipelines.splat.raster.api import rasterizer
-from pipelines.splat.storage import write_splat
+from pipelines.splat.storage import write_gaussians
 from pipelines.stages import SIM3, SPARSE, SURVEY
 from pipelines.workspace import StageRun, Summary
 
@@ -101,9 +108,7 @@ def make_trainer(scene: Scene, images: ImageCache, problem: GeoProblem, config: 
     """
     preset, backend = effort(config), rasterizer(config.backend)
     device = torch.device("cuda" if backend.name == "cuda" else "cpu")
-    options = InitialisationOptions(sh_degree=config.sh_degree, max_gaussians=preset.max_gaussians)
-    gaussians = gaussians_from_points(scene.point_in_model, scene.sparse.point_rgb, options)
-    gaussians = type(gaussians)(**{name: tensor.to(device) for name, tensor in gaussians.tensors().items()})
+    gaussians = initial_gaussians(scene, images, config).to(device)
     extent_m = scene_extent(scene.poses.cam_center_in_model)
     settings = DefaultSettings.for_iterations(preset.iterations, preset.max_gaussians)
     return JointTrainer(
@@ -114,6 +119,22 @@ def make_trainer(scene: Scene, images: ImageCache, problem: GeoProblem, config: 
         rasterizer=backend,
         options=JointOptions(preset.iterations, config.sh_degree, geo_weight=config.geo_weight, seed=config.seed),
     )
+
+
+def initial_gaussians(scene: Scene, images: ImageCache, config: TrainConfig) -> Gaussians:
+    """One at each SfM point, and those of the background.
+
+    Raises:
+        DegenerateGeometryError: too few SfM points.
+    """
+    most = effort(config).max_gaussians
+    options = InitialisationOptions(sh_degree=config.sh_degree, max_gaussians=most)
+    behind = background(scene, images)
+    near = gaussians_from_points(scene.point_in_model, scene.sparse.point_rgb, options)
+    far = gaussians_of_size(behind.point_in_model, behind.rgb, behind.sigma_m, options)
+    room = max(most - len(near), 0)
+    keep = torch.linspace(0, max(len(far) - 1, 0), min(room, len(far))).long()
+    return Gaussians.concatenate([near, far.select(keep)])
 
 
 def _optimise(trainer: JointTrainer, stage: StageRun, config: TrainConfig) -> float:
@@ -222,7 +243,7 @@ def _save(trainer: JointTrainer, scene: Scene, out: Path, seconds: float) -> Sum
         backend=trainer.rasterizer.name,
         gnss_outliers=outliers,
     )
-    write_splat(out / "gaussians.ply", gaussians)
+    write_gaussians(out / "gaussians.ply", gaussians)
     save_json(model, out / "model.json")
     rows = [json.loads(row) for row in (out / _METRICS).read_text(encoding="utf-8").splitlines()]
     psnr = float(np.mean([row["psnr"] for row in rows[-20:]]))

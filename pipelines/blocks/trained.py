@@ -13,7 +13,7 @@ from pipelines.geometry.similarity import Similarity
 from pipelines.georef.cameras import CameraPoses
 from pipelines.products import Survey, TrainedModel, load_json
 from pipelines.splat.gaussians import Gaussians
-from pipelines.splat.storage import read_splat
+from pipelines.splat.storage import read_gaussians
 from pipelines.stages import GAUSSIANS, MODEL, SPARSE, SURVEY
 from pipelines.workspace import Workspace
 
@@ -66,5 +66,5 @@ def load_trained(workspace: Workspace) -> Trained:
         sparse=sparse,
         model=model,
         poses=CameraPoses(rotation, -np.einsum("nji,nj->ni", rotation, translation)),
-        gaussians=read_splat(workspace.path(GAUSSIANS)),
+        gaussians=read_gaussians(workspace.path(GAUSSIANS)),
     )

@@ -109,14 +109,14 @@ def split_checks(
     return kept, (*listed, *(point for point in points if point.name in names))
 
 
-def require_near(file: GroundFile | None, center_in_ecef: FloatArray) -> None:
-    """Refuse points that are nowhere near the cameras, whose middle is `center_in_ecef` (3,).
+def require_near(file: GroundFile | None, middle_lla: FloatArray) -> None:
+    """Refuse points that are nowhere near the cameras, whose middle is `middle_lla` (3,).
 
     Raises:
         InputError: a point more than 50 km away.
     """
     for point in () if file is None else file.points:
-        distance_m = float(np.linalg.norm(ecef_from_lla(point.lla) - center_in_ecef))
+        distance_m = float(np.linalg.norm(ecef_from_lla(point.lla) - ecef_from_lla(middle_lla)))
         if file is not None and distance_m > _RANGE_M:
             message = f"{point.name} is {distance_m / 1000:.0f} km from the images: wrong CRS, or x and y swapped?"
             raise InputError(message, path=file.path, line=point.line)

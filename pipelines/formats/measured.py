@@ -18,7 +18,7 @@ from pipelines.formats.photo_folder import Photo
 from pipelines.formats.poses import PoseTable, complete, interpolate, match_by_name
 from pipelines.formats.xmp import RTK_FIXED, RTK_FLOAT
 from pipelines.geodesy.crs import WGS84, PointCrs, parse_crs
-from pipelines.geodesy.enu import ecef_from_lla, lla_from_ecef
+from pipelines.geodesy.enu import ecef_from_lla, lla_from_ecef, median_lla
 from pipelines.geodesy.vertical import VerticalChoice, assumed_ellipsoidal
 from pipelines.geometry.rotations import geo_from_cam, quat_xyzw_from_matrix
 from pipelines.products import FloatArray, VerticalDatum
@@ -34,6 +34,7 @@ SIGMA_M = {
 }
 # Vertical over horizontal σ of a fix that states only the horizontal one.
 _VERTICAL_RATIO = 2.0
+_DISAGREEMENT_M = 2_000.0
 _EXIF_NOTE = "EXIF altitude, which is often above a geoid or barometric, taken as ellipsoidal: see --vertical"
 
 
@@ -130,6 +131,7 @@ def from_table(table: PoseTable, photos: Sequence[Photo], options: PoseOptions, 
     rows = _with_heights(rows, photos, crs, notes) if rows.names is not None else rows
     lla = crs.lla_from_xyz(rows.xyz, path=table.path, lines=rows.lines.tolist())
     note_operation(crs, lla, notes)
+    _compare_with_exif(median_lla(lla), photos, table.path, notes)
     cartesian = replace(rows, xyz=ecef_from_lla(lla))
     if rows.names is not None:
         at = np.array([images.index(name) for name in rows.names])
@@ -209,6 +211,19 @@ def _crs_of(table: PoseTable, options: PoseOptions, notes: Notes) -> PointCrs:
     return crs
 
 
+def _compare_with_exif(middle: FloatArray, photos: Sequence[Photo], path: Path, notes: Notes) -> None:
+    """Tell when a table and EXIF disagree by kilometres: a wrong zone passes all other checks."""
+    found = [(tags.gps.lat_deg, tags.gps.lon_deg, 0.0) for tags in (photo.tags for photo in photos) if tags.gps]
+    if not found:
+        return
+    exif, table = ecef_from_lla(np.stack([median_lla(found), middle * [1.0, 1.0, 0.0]]))
+    distance_m = float(np.linalg.norm(exif - table))
+    if distance_m > _DISAGREEMENT_M:
+        notes.warn(
+            f"positions in {path.name} are {distance_m / 1000:.0f} km from those in EXIF: wrong CRS or zone?"
+        )
+
+
 def _with_heights(rows: PoseTable, photos: Sequence[Photo], crs: PointCrs, notes: Notes) -> PoseTable:
     """Fill heights that the table lacks from EXIF, and leave out the rows where that has none either."""
     lacking = np.flatnonzero(np.isnan(rows.xyz[:, 2]))
@@ -220,7 +235,7 @@ def _with_heights(rows: PoseTable, photos: Sequence[Photo], crs: PointCrs, notes
         xyz[lacking, 2] = [_or_nan(altitude.get(rows.names[row])) for row in lacking]
     filled = complete(xyz)
     if filled[lacking].any():
-        notes.assume(f"{int(filled[lacking].sum())} heights that {rows.path.name} lacks are from EXIF")
+        notes.assume(f"heights that {rows.path.name} lacks are from EXIF ({int(filled[lacking].sum())})")
     places = [f"{rows.path.name}:{line}" for line in rows.lines[~filled]]
     notes.warn_counted(places, "row has no height and was left out", "rows have no height and were left out")
     if not filled.any():
@@ -279,15 +294,14 @@ def _with_defaults(
         result[:, :2] = options.sigma_h_m
     if options.sigma_v_m is not None:
         result[:, 2] = options.sigma_v_m
-    overridden = options.sigma_h_m is not None or options.sigma_v_m is not None
-    complete_override = options.sigma_h_m is not None and options.sigma_v_m is not None
     for kind in sorted(set(kinds)):
         rows = known & ~from_file & np.array([one == kind for one in kinds])
-        if rows.any() and not complete_override:
-            h, v = SIGMA_M[kind]
-            notes.assume(
-                f"σ of {int(rows.sum())} positions without one: {h:g} m horizontal, {v:g} m vertical ({kind})"
-            )
+        h, v = SIGMA_M[kind]
+        parts = [f"{h:g} m horizontal"] if options.sigma_h_m is None else []
+        parts += [f"{v:g} m vertical"] if options.sigma_v_m is None else []
+        if rows.any() and parts:
+            notes.assume(f"σ of positions without one ({int(rows.sum())}): {', '.join(parts)} ({kind})")
+    overridden = options.sigma_h_m is not None or options.sigma_v_m is not None
     sources: list[SigmaSource] = ["option" if overridden else "file" if one else "default" for one in from_file]
     return result, tuple(sources)
 

@@ -50,6 +50,15 @@ def lla_from_ecef(ecef: ArrayLike) -> FloatArray:
     return np.stack([np.degrees(lat), np.degrees(np.arctan2(y, x)), alt], axis=-1)
 
 
+def median_lla(lla: ArrayLike) -> FloatArray:
+    """Median latitude, longitude and height (3,) of points (N, 3), N ≥ 1; also across the date line."""
+    points = _checked(lla)
+    lon = points[:, 1] - 360.0 * np.round((points[:, 1] - points[0, 1]) / 360.0)
+    middle = np.median(np.stack([points[:, 0], lon, points[:, 2]], axis=-1), axis=0)
+    middle[1] -= 360.0 * np.round(middle[1] / 360.0)
+    return np.asarray(middle)
+
+
 def lla_of(origin: Origin) -> FloatArray:
     """The origin as an array (3,) of latitude, longitude, height."""
     return np.array([origin.lat_deg, origin.lon_deg, origin.alt_m])

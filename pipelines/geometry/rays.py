@@ -28,7 +28,7 @@ BoolArray = NDArray[np.bool_]
 
 _CHUNK_RAYS = 60_000  # working arrays of a chunk stay in the processor's cache
 _CONVEX_SCALE = 0.5  # near enough to a sum of distances that the fit is a median
-_CONVEX_STEPS, _REDESCENDING_STEPS = 9, 5
+_CONVEX_STEPS, _REDESCENDING_STEPS = 6, 4
 _RAY_GATE = float(chi2_quantile(0.999, 2))
 _RAY_ALARM = float(chi2_quantile(0.99, 2))
 _WORST_CONDITION = 1e10

@@ -58,6 +58,17 @@ class Correspondences:
             cov_in_geo=self.cov_in_geo[chosen],
         )
 
+    def joined(self, other: Correspondences) -> Correspondences:
+        """These, then the others."""
+        return Correspondences(
+            name=self.name + other.name,
+            control=np.concatenate([self.control, other.control]),
+            in_local=np.concatenate([self.in_local, other.in_local]),
+            cov_in_local=np.concatenate([self.cov_in_local, other.cov_in_local]),
+            in_geo=np.concatenate([self.in_geo, other.in_geo]),
+            cov_in_geo=np.concatenate([self.cov_in_geo, other.cov_in_geo]),
+        )
+
 
 @dataclass(frozen=True)
 class RotationPrior:
@@ -249,13 +260,15 @@ def _excess(
     if count < _LEAST_FOR_EXCESS:
         return 0.0
     missed, cov = residuals(data, state)[members], covariances(data, state)[members]
+    variances, axes = np.linalg.eigh(cov)
+    along = (np.swapaxes(axes, 1, 2) @ missed[..., None])[..., 0] ** 2
     # The share of the scatter that the parameters have taken up.
     free = (
         1 - 7 / (3 * max(int(state.inlier.sum()), 3)) if leverage is None else _redundancy(data, leverage, members)
     )
 
     def surplus(sigma: float) -> float:
-        squared = squared_mahalanobis(missed, cov + sigma**2 * np.eye(3))
+        squared = (along / (variances + sigma**2)).sum(axis=1)
         return float(np.median(squared) / _MEDIAN_CHI2 if robust else squared.mean() / 3) - free
 
     if surplus(0.0) <= 0:

@@ -31,7 +31,6 @@ from pipelines.geometry.similarity import Similarity, umeyama
 from pipelines.georef.adjustment import (
     OUTLIER_GATE,
     Adjusted,
-    BoolArray,
     Correspondences,
     RotationPrior,
     State,
@@ -102,13 +101,19 @@ def align(
     firm = [found for found in candidates if found.rotation_sigma_rad <= _WORST_ROTATION_RAD]
     if firm:
         best = _choose(firm, data)
-        return Alignment(best, _layout(data, best.state.inlier), False)
+        return Alignment(best, layout_of(data.in_local[best.state.inlier]), False)
     worst = min((np.degrees(found.rotation_sigma_rad) for found in candidates), default=np.inf)
     if attitude is None:
         size = f"is known to {worst:.0f}° only" if worst < 90 else "is not determined"
         raise DegenerateGeometryError(f"the positions lie on one line: the rotation about it {size}; {ADVICE}")
     candidates = _candidates(data, [_start_with_rotation(data, attitude.rotation, rng)], attitude)
     return Alignment(_choose(candidates, data), "line", True)
+
+
+def layout_of(positions: FloatArray) -> Literal["volume", "plane"]:
+    """Whether positions (n, 3) fill a volume or lie in one plane."""
+    extent = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False)
+    return "plane" if len(extent) < 3 or extent[2] < _FLAT * extent[0] else "volume"
 
 
 def mean_rotation(rotations: FloatArray, sigma_rad: FloatArray) -> RotationPrior:
@@ -163,7 +168,7 @@ def _ransac_start(data: Correspondences, rng: np.random.Generator) -> list[Simil
         found = [result.model]
         if result.inlier.mean() > 0.5:
             with suppress(DegenerateGeometryError):
-                found = [umeyama(data.in_local[result.inlier], data.in_geo[result.inlier]), result.model]
+                found = [umeyama(data.in_local[result.inlier], data.in_geo[result.inlier])]
             break
     return found
 
@@ -219,9 +224,3 @@ def _choose(candidates: list[Adjusted], data: Correspondences) -> Adjusted:
         return found.cost + _BIAS_COST
 
     return min(candidates, key=cost)
-
-
-def _layout(data: Correspondences, inlier: BoolArray) -> Literal["volume", "plane"]:
-    positions = data.in_local[inlier]
-    extent = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False)
-    return "plane" if len(extent) < 3 or extent[2] < _FLAT * extent[0] else "volume"

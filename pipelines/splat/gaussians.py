@@ -58,6 +58,10 @@ class Gaussians:
         """The rows that `index` (bool mask or integer) picks."""
         return Gaussians(**{name: tensor[index] for name, tensor in self.tensors().items()})
 
+    def to(self, device: torch.device) -> Gaussians:
+        """The same Gaussians on a device."""
+        return Gaussians(**{name: tensor.to(device) for name, tensor in self.tensors().items()})
+
     @staticmethod
     def concatenate(parts: list[Gaussians]) -> Gaussians:
         """All rows of `parts`, in order."""
@@ -67,8 +71,8 @@ class Gaussians:
 
 
 def rotation_matrices(quats_wxyz: Tensor) -> Tensor:
-    """Rotation matrices (N, 3, 3) of quaternions (N, 4) of any length."""
-    w, x, y, z = (quats_wxyz / quats_wxyz.norm(dim=1, keepdim=True)).unbind(1)
+    """Rotation matrices (N, 3, 3) of quaternions (N, 4) of any length but zero."""
+    w, x, y, z = torch.nn.functional.normalize(quats_wxyz, dim=1).unbind(1)
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
         2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),

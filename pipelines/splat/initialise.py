@@ -73,7 +73,7 @@ def gaussians_from_points(
     if options.max_gaussians is not None and len(order) > options.max_gaussians:
         order = order[np.linspace(0, len(order) - 1, max(options.max_gaussians, 2)).astype(np.int64)]
         log.info("thinned %d SfM points to %d", len(keep), len(order))
-    return _isotropic(points[order], rgb[order], options)
+    return gaussians_of_size(points[order], rgb[order], _gap(points[order]), options)
 
 
 def scene_extent(camera_centers: ArrayLike) -> float:
@@ -92,14 +92,19 @@ def scene_extent(camera_centers: ArrayLike) -> float:
     return 1.1 * radius
 
 
-def _isotropic(points: FloatArray, rgb: FloatArray, options: InitialisationOptions) -> Gaussians:
+def gaussians_of_size(
+    points_in_model: ArrayLike, colours: ArrayLike, sigma_m: ArrayLike, options: InitialisationOptions | None = None
+) -> Gaussians:
+    """Isotropic Gaussians of given standard deviations (N,) in metres; otherwise as `gaussians_from_points`."""
+    options = options or InitialisationOptions()
+    points, rgb = _checked(points_in_model, colours)
     count = len(points)
     sh = torch.zeros(count, coefficient_count(options.sh_degree), 3)
     sh[:, 0] = sh_from_rgb(torch.as_tensor(rgb)).float()
     return Gaussians(
         means=torch.as_tensor(points, dtype=torch.float32),
         quats_wxyz=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
-        log_scales=torch.as_tensor(_gap(points)).log().float()[:, None].repeat(1, 3),
+        log_scales=torch.as_tensor(np.asarray(sigma_m)).log().float()[:, None].repeat(1, 3),
         logit_opacities=torch.logit(torch.full((count,), options.opacity)),
         sh=sh,
     )

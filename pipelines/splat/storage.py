@@ -8,7 +8,7 @@ from pipelines.formats.splat_ply import SplatArrays, read_splat_ply, write_splat
 from pipelines.splat.gaussians import Gaussians
 
 
-def write_splat(path: Path, gaussians: Gaussians) -> None:
+def write_gaussians(path: Path, gaussians: Gaussians) -> None:
     """Write Gaussians as a 3DGS PLY; the file appears whole or not at all.
 
     Raises:
@@ -17,7 +17,7 @@ def write_splat(path: Path, gaussians: Gaussians) -> None:
     write_splat_ply(path, SplatArrays(**gaussians.arrays()))
 
 
-def read_splat(path: Path) -> Gaussians:
+def read_gaussians(path: Path) -> Gaussians:
     """Read Gaussians from a 3DGS PLY.
 
     Raises:

@@ -68,3 +68,8 @@ def test_north_turns_by_the_convergence_of_the_meridians() -> None:
 def test_wrong_shape_is_refused() -> None:
     with pytest.raises(ValueError, match=r"\(…, 3\)"):
         enu.ecef_from_lla(np.zeros((4, 2)))
+
+
+def test_median_across_the_date_line() -> None:
+    lla = [[10.0, 179.9, 1.0], [11.0, -179.8, 2.0], [12.0, -179.9, 3.0]]
+    np.testing.assert_allclose(enu.median_lla(lla), [11.0, -179.9, 2.0])

@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 
 from pipelines.splat.gaussians import Gaussians
-from pipelines.splat.storage import read_splat, write_splat
+from pipelines.splat.storage import read_gaussians, write_gaussians
 
 
 def test_round_trip(tmp_path: Path) -> None:
@@ -19,8 +19,8 @@ def test_round_trip(tmp_path: Path) -> None:
         torch.randn(9),
         torch.randn(9, 9, 3),
     )
-    write_splat(tmp_path / "splat.ply", before)
-    after = read_splat(tmp_path / "splat.ply")
+    write_gaussians(tmp_path / "splat.ply", before)
+    after = read_gaussians(tmp_path / "splat.ply")
     assert after.sh_degree == 2
     for name, tensor in before.tensors().items():
         assert torch.equal(after.tensors()[name], tensor)
