@@ -53,7 +53,6 @@ HOMES: dict[str, tuple[str, ...]] = {
     "exifread": ("pipelines.formats",),
     "defusedxml": ("pipelines.formats",),
     "rosbags": ("pipelines.formats",),
-    "trimesh": ("pipelines.simulation",),
     "embreex": ("pipelines.simulation",),
 }
 FOUNDATION_LIBRARIES = {"numpy", "pydantic"}
