@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from pipelines.config import SfmConfig
 from pipelines.errors import DegenerateGeometryError, InputError
+from pipelines.formats.colmap import pycolmap_module
 from pipelines.geometry.pairs import Views, all_pairs, select_pairs
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.products import CameraPrior, Survey, load_json
@@ -59,8 +60,7 @@ def run(stage: StageRun, config: SfmConfig) -> Summary:
 @contextmanager
 def quiet_colmap() -> Iterator[Any]:
     """pycolmap, with its log reduced to errors while in use."""
-    import pycolmap
-
+    pycolmap = pycolmap_module()
     level = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = _COLMAP_ERRORS_ONLY
     try:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import signal
+import threading
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -124,7 +126,7 @@ def write_sparse(model: SparseModel, path: Path) -> None:
     Raises:
         BackendUnavailableError: pycolmap is not installed.
     """
-    pycolmap = _pycolmap()
+    pycolmap = pycolmap_module()
     reconstruction = pycolmap.Reconstruction()
     for camera_id, camera in model.cameras.items():
         reconstruction.add_camera_with_trivial_rig(
@@ -144,7 +146,7 @@ def write_sparse(model: SparseModel, path: Path) -> None:
 
 def _add_images(reconstruction: Any, model: SparseModel) -> IntArray:
     """Add the images with their pixels; returns the place of each observation in its image's list."""
-    pycolmap = _pycolmap()
+    pycolmap = pycolmap_module()
     by_image = np.argsort(model.obs_image, kind="stable")
     bounds = np.searchsorted(model.obs_image[by_image], np.arange(len(model.image_name) + 1))
     rank = np.empty(len(by_image), dtype=np.int64)
@@ -160,7 +162,7 @@ def _add_images(reconstruction: Any, model: SparseModel) -> IntArray:
 
 
 def _add_points(reconstruction: Any, model: SparseModel, rank: IntArray) -> None:
-    pycolmap = _pycolmap()
+    pycolmap = pycolmap_module()
     starts = np.searchsorted(model.obs_point, np.arange(len(model.point_id) + 1))
     observer = model.image_id[model.obs_image]
     for index, point_id in enumerate(model.point_id):
@@ -175,16 +177,26 @@ def _add_points(reconstruction: Any, model: SparseModel, rank: IntArray) -> None
         reconstruction.add_point3D_with_id(int(point_id), point)
 
 
-def _pycolmap() -> Any:
+def pycolmap_module() -> Any:
+    """pycolmap, imported so that it leaves the process's signals alone.
+
+    On import it takes SIGTERM to print a stack trace and die, which would cost an interrupted stage its clean end.
+
+    Raises:
+        BackendUnavailableError: pycolmap is not installed.
+    """
     try:
         import pycolmap
     except ImportError as error:
         raise BackendUnavailableError("pycolmap is not installed: `pip install pycolmap`") from error
+    if threading.current_thread() is threading.main_thread():
+        handler = signal.getsignal(signal.SIGTERM)  # Python's own record, which the import has not changed
+        signal.signal(signal.SIGTERM, signal.SIG_DFL if handler is None else handler)
     return pycolmap
 
 
 def _load(path: Path) -> Any:
-    pycolmap = _pycolmap()
+    pycolmap = pycolmap_module()
     if not path.is_dir():
         raise InputError("no such folder; expected a COLMAP model (cameras, images, points3D)", path=path)
     for name, least in _LEAST_RECORD_BYTES.items():
@@ -207,7 +219,7 @@ def _check_count(file: Path, least_record_bytes: int) -> None:
 
 def _observations(images: list[Any], point_ids: IntArray) -> tuple[IntArray, IntArray, FloatArray]:
     """Flat arrays over all observations that belong to a point, sorted by point."""
-    pycolmap = _pycolmap()
+    pycolmap = pycolmap_module()
     # A pinhole of unit focal length at the origin turns a list of pixels into an array in one call.
     unit = pycolmap.Camera(model="SIMPLE_PINHOLE", width=1, height=1, params=[1.0, 0.0, 0.0])
     xy: list[FloatArray] = [np.empty((0, 2))]
