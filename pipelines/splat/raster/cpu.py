@@ -6,7 +6,7 @@ same lists. The kernels are in `cpu_project`, `cpu_tiles`, `cpu_blend` and `cpu_
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numba
@@ -33,7 +33,8 @@ _Array = NDArray[Any]
 class CpuRasterizer:
     """The CPU backend. Exact gradients; the same result on every run, whatever the number of threads.
 
-    Works in the dtype of the Gaussians: float32 to train, float64 to check.
+    Works in the dtype of the Gaussians: float32 to train, float64 to check. The number of threads is numba's
+    (`numba.set_num_threads`, `NUMBA_NUM_THREADS`).
     """
 
     name: BackendName = "cpu"
@@ -49,43 +50,83 @@ class CpuRasterizer:
         _validate(gaussians, cam_from_model, camera, settings)
         pose = cam_from_model[:3].to(torch.float64)
         center_in_model = -torch.linalg.solve(pose[:, :3], pose[:, 3])
-        frame = _Frame(camera, settings, numba.get_num_threads())
+        frame = _Frame(camera, settings)
         colour, alpha, depth_sum, median = _Rasterize.apply(
             *gaussians.tensors().values(), pose, center_in_model, frame
         )
-        expected = None
-        if settings.depth:
-            opaque = alpha > 0
-            expected = torch.where(opaque, depth_sum / torch.where(opaque, alpha, 1.0), 0.0)
-        assert frame.stats is not None
-        return Render(colour, alpha, expected, median if settings.depth else None, frame.stats)
+        if not settings.depth:
+            return Render(colour, alpha, None, None, frame.stats)
+        opaque = alpha > 0
+        expected = torch.where(opaque, depth_sum / torch.where(opaque, alpha, 1.0), 0.0)
+        return Render(colour, alpha, expected, median, frame.stats)
+
+
+def predicted_bytes(
+    count: int, camera: Pinhole, sh_degree: int, *, visible: int | None = None, hits_per_visible: float = 6.0
+) -> int:
+    """Peak memory in bytes of one render and its backward pass, gradients included, parameters excluded.
+
+    Args:
+        count: number of Gaussians.
+        camera: the image.
+        sh_degree: degree of the stored spherical harmonics.
+        visible: how many of them are in the image; all, if None.
+        hits_per_visible: tiles (16 × 32 px) that one of them touches on average: 3 to 6 in trained models, and as
+            many as there are tiles if all are huge.
+    """
+    gradients = count * (11 + 3 * (sh_degree + 1) ** 2) * 4 + count * 5
+    splats = cpu_project.SPLAT_WIDTH + cpu_project.ELLIPSE_WIDTH
+    in_view = count if visible is None else visible
+    hits = in_view * hits_per_visible * (16 + 4 * cpu_blend.HIT_GRADIENT_WIDTH)
+    # Colour, alpha, two depths, and the gradients of the first three.
+    images = camera.width * camera.height * 11 * 4
+    return int(gradients + in_view * (4 * splats + 48) + hits + images)
 
 
 @dataclass
 class _Frame:
-    """One render: what was asked, and what the forward pass leaves for the backward pass."""
+    """One render: what was asked, and what the forward pass leaves for the backward pass.
+
+    Attributes:
+        camera, settings: what was asked.
+        workers: number of threads.
+        stats: handed out with the render.
+        visible: (M,) rows of the visible Gaussians, ascending.
+        rank: (M,) their places in the order of depth.
+        table: (M, SPLAT_WIDTH) splats in the order of depth.
+        lists: their hits on tiles.
+    """
 
     camera: Pinhole
     settings: RasterSettings
-    workers: int
-    stats: ScreenStats | None = None
-    visible: _Array | None = None
-    rank: _Array | None = None
-    table: _Array | None = None
-    lists: _TileLists | None = None
+    workers: int = field(default_factory=numba.get_num_threads)
+    stats: ScreenStats = field(init=False)
+    visible: _Array = field(init=False)
+    rank: _Array = field(init=False)
+    table: _Array = field(init=False)
+    lists: _TileLists = field(init=False)
 
-    def constants(self) -> tuple[cpu_project.View, int, _Array]:
-        """What kernels take: the view, the degree of the harmonics, the background."""
-        return (
-            cpu_project.make_view(self.camera, self.settings),
-            self.settings.sh_degree,
-            np.array(self.settings.background, dtype=np.float64),
-        )
+    @property
+    def background(self) -> _Array:
+        """(3,) float64."""
+        return np.array(self.settings.background, dtype=np.float64)
+
+    def view(self, pose: _Array) -> cpu_project.View:
+        """The camera as kernels want it."""
+        return cpu_project.make_view(self.camera, self.settings, pose)
 
 
 @dataclass
 class _TileLists:
-    """H hits of M splats in the tiles; see `cpu_tiles.list_hits`."""
+    """H hits of M splats in the tiles.
+
+    Attributes:
+        hits: (H,) packed, by tile, nearest first.
+        tile_start: (tiles + 1,) into `hits`.
+        tile_end: (tiles,) where blending stopped because all pixels were done.
+        splat_start: (M + 1,) into `places`.
+        places: (H,) into `hits`, by splat.
+    """
 
     hits: _Array
     tile_start: _Array
@@ -100,18 +141,13 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, ...]:
         *tensors, frame = inputs
-        *parameters, pose, center = (tensor.detach().contiguous().numpy() for tensor in tensors)
-        background = frame.constants()[2]
-        _project(frame, tuple(parameters), pose, center)
-        images = _empty_images(frame, parameters[0].dtype)
+        *parameters, pose, center = (_array(tensor) for tensor in tensors)
+        _project(frame, parameters, pose, center)
+        images = _empty_images(frame)
+        lists = frame.lists
         cpu_blend.blend(
-            frame.table,
-            frame.lists.hits,
-            frame.lists.tile_start,
-            background,
-            images,
-            frame.lists.tile_end,
-            frame.workers,
+            *(frame.table, lists.hits, lists.tile_start),
+            *(frame.background, images, lists.tile_end, frame.workers),
         )
         outputs = tuple(torch.from_numpy(image) for image in images)
         ctx.frame = frame
@@ -123,37 +159,37 @@ class _Rasterize(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
         frame: _Frame = ctx.frame
-        saved = [tensor.detach().contiguous().numpy() for tensor in ctx.saved_tensors]
+        saved = [_array(tensor) for tensor in ctx.saved_tensors]
         *parameters, pose, center = saved[:7]
-        grads = tuple(grad.contiguous().numpy() for grad in grad_outputs[:3])
-        hit_gradient = _hit_gradient(frame, tuple(saved[7:]), grads)
-        outputs = tuple(np.empty_like(parameter) for parameter in parameters)
-        camera = _gaussian_gradients(frame, (tuple(parameters), pose, center), hit_gradient, outputs)
-        return (
-            *(torch.from_numpy(output) for output in outputs),
-            torch.from_numpy(camera[:12].reshape(3, 4)),
-            torch.from_numpy(camera[12:]),
-            None,
-        )
+        hit_gradient = _hit_gradient(frame, tuple(saved[7:]), tuple(_array(grad) for grad in grad_outputs[:3]))
+        outputs = [np.empty_like(parameter) for parameter in parameters]
+        camera = _gaussian_gradients(frame, [*parameters, pose, center], hit_gradient, outputs)
+        gradients = [*outputs, camera[:12].reshape(3, 4), camera[12:]]
+        return (*(torch.from_numpy(gradient) for gradient in gradients), None)
 
 
-def _project(frame: _Frame, parameters: tuple[_Array, ...], pose: _Array, center: _Array) -> None:
+def _array(tensor: Tensor) -> _Array:
+    array: _Array = tensor.detach().contiguous().numpy()
+    return array
+
+
+def _project(frame: _Frame, parameters: list[_Array], pose: _Array, center: _Array) -> None:
     """Project what is visible, order it by depth and list it by tile."""
-    view, degree, _ = frame.constants()
-    count, dtype = len(parameters[0]), parameters[0].dtype
-    is_visible, depth = np.empty(count, dtype=np.bool_), np.empty(count, dtype=dtype)
+    view, dtype = frame.view(pose), parameters[0].dtype
+    is_visible, depth = np.empty(len(parameters[0]), dtype=np.bool_), np.empty(len(parameters[0]), dtype=dtype)
     cpu_project.find_visible(*parameters[:4], pose, view, is_visible, depth, frame.workers)
-    visible = np.flatnonzero(is_visible)
-    rank = _depth_rank(depth[visible])
-    table = np.empty((len(visible), cpu_project.SPLAT_WIDTH), dtype=dtype)
-    ellipses = np.empty((len(visible), cpu_project.ELLIPSE_WIDTH), dtype=dtype)
-    radius = np.empty(len(visible), dtype=np.float32)
+    frame.visible = np.flatnonzero(is_visible)
+    frame.rank = _depth_rank(depth[frame.visible])
+    count = len(frame.visible)
+    frame.table = np.empty((count, cpu_project.SPLAT_WIDTH), dtype=dtype)
+    ellipses = np.empty((count, cpu_project.ELLIPSE_WIDTH), dtype=dtype)
+    radius = np.empty(count, dtype=np.float32)
     cpu_project.project_visible(
-        parameters, pose, center, view, degree, visible, rank, table, ellipses, radius, frame.workers
+        *(*parameters, pose, center, view, frame.settings.sh_degree),
+        *(frame.visible, frame.rank, frame.table, ellipses, radius, frame.workers),
     )
-    frame.visible, frame.rank, frame.table = visible, rank, table
     frame.lists = _list_tiles(ellipses, frame.camera)
-    frame.stats = ScreenStats(visible=torch.from_numpy(visible), radius_px=torch.from_numpy(radius))
+    frame.stats = ScreenStats(visible=torch.from_numpy(frame.visible), radius_px=torch.from_numpy(radius))
 
 
 def _depth_rank(depth: _Array) -> _Array:
@@ -174,56 +210,46 @@ def _list_tiles(ellipses: _Array, camera: Pinhole) -> _TileLists:
     columns, rows = cpu_tiles.tile_grid(camera.width, camera.height)
     tiles = columns * rows
     per_tile = np.empty((cpu_tiles.RUNS, tiles), dtype=np.int64)
-    per_splat = np.empty(len(ellipses), dtype=np.int64)
-    cpu_tiles.count_hits(ellipses, camera.width, camera.height, per_tile, per_splat)
-    splat_start = np.concatenate([[0], np.cumsum(per_splat)])
+    splat_start = np.zeros(len(ellipses) + 1, dtype=np.int64)
+    cpu_tiles.count_hits(ellipses, camera.width, camera.height, per_tile, splat_start[1:])
+    np.cumsum(splat_start, out=splat_start)
     tile_start = np.empty(tiles + 1, dtype=np.int64)
     cpu_tiles.starts_from_counts(per_tile, tile_start)
-    hits = np.empty(tile_start[-1], dtype=np.int64)
-    places = np.empty(tile_start[-1], dtype=np.int64)
+    hits = np.empty(splat_start[-1], dtype=np.int64)
+    places = np.empty(splat_start[-1], dtype=np.int64)
     cpu_tiles.list_hits(ellipses, camera.width, camera.height, per_tile, splat_start, hits, places)
     return _TileLists(hits, tile_start, np.empty(tiles, dtype=np.int64), splat_start, places)
 
 
-def _empty_images(frame: _Frame, dtype: Any) -> tuple[_Array, ...]:
+def _empty_images(frame: _Frame) -> tuple[_Array, ...]:
     """Colour, alpha, Σ w z and median depth, the last two of size (0, 0) if they are not wanted."""
     size = (frame.camera.height, frame.camera.width)
     depth_size = size if frame.settings.depth else (0, 0)
     shapes: tuple[tuple[int, ...], ...] = ((*size, 3), size, depth_size, depth_size)
-    return tuple(np.empty(shape, dtype=dtype) for shape in shapes)
+    return tuple(np.empty(shape, dtype=frame.table.dtype) for shape in shapes)
 
 
 def _hit_gradient(frame: _Frame, images: tuple[_Array, ...], grads: tuple[_Array, ...]) -> _Array:
     lists = frame.lists
-    assert lists is not None and frame.table is not None
-    gradient = np.empty((len(lists.hits), cpu_blend.HIT_GRADIENT_WIDTH), dtype=frame.table.dtype)
+    gradient = np.empty(len(lists.hits) * cpu_blend.HIT_GRADIENT_WIDTH, dtype=frame.table.dtype)
     cpu_blend.blend_gradient(
-        frame.table,
-        lists.hits,
-        lists.tile_start,
-        lists.tile_end,
-        frame.constants()[2],
-        images,
-        grads,
-        gradient,
-        frame.workers,
+        *(frame.table, lists.hits, lists.tile_start, lists.tile_end),
+        *(frame.background, images, grads, gradient, frame.workers),
     )
     return gradient
 
 
-def _gaussian_gradients(frame: _Frame, inputs: tuple[Any, ...], hit_gradient: _Array, outputs: Any) -> _Array:
+def _gaussian_gradients(frame: _Frame, inputs: list[_Array], hit_gradient: _Array, outputs: list[_Array]) -> _Array:
     """Fill `outputs`; returns the gradient (15,) of pose and centre."""
-    parameters, pose, center = inputs
-    lists = frame.lists
-    assert lists is not None and frame.visible is not None and frame.stats is not None
-    view, degree, _ = frame.constants()
+    *parameters, pose, center = inputs
     blocks = -(-len(parameters[0]) // cpu_project.BLOCK)
     block_start = np.searchsorted(frame.visible, np.arange(blocks + 1) * cpu_project.BLOCK)
     camera = np.empty((blocks, cpu_gradients.CAMERA_WIDTH), dtype=np.float64)
     g_screen = np.empty((len(frame.visible), 2), dtype=np.float32)
     cpu_gradients.gaussian_gradients(
-        *(parameters, pose, center, view, degree, frame.visible, frame.rank, hit_gradient),
-        *(lists.splat_start, lists.places, block_start, outputs, camera, g_screen, frame.workers),
+        *(*parameters, pose, center, frame.view(pose), frame.settings.sh_degree, frame.visible, frame.rank),
+        *(hit_gradient, frame.lists.splat_start, frame.lists.places, block_start),
+        *(*outputs, camera, g_screen, frame.workers),
     )
     frame.stats.mean_gradient = torch.from_numpy(g_screen)
     total: _Array = camera.sum(axis=0)
@@ -231,9 +257,8 @@ def _gaussian_gradients(frame: _Frame, inputs: tuple[Any, ...], hit_gradient: _A
 
 
 def _validate(gaussians: Gaussians, cam_from_model: Tensor, camera: Pinhole, settings: RasterSettings) -> None:
-    count = len(gaussians)
+    count, dtype = len(gaussians), gaussians.means.dtype
     shapes = {"means": (count, 3), "quats_wxyz": (count, 4), "log_scales": (count, 3), "logit_opacities": (count,)}
-    dtype = gaussians.means.dtype
     for name, tensor in gaussians.tensors().items():
         expected = shapes.get(name, (count, (gaussians.sh_degree + 1) ** 2, 3))
         if tuple(tensor.shape) != expected:
@@ -244,8 +269,9 @@ def _validate(gaussians: Gaussians, cam_from_model: Tensor, camera: Pinhole, set
             raise InputError(f"is on {tensor.device}: the cpu backend needs it on the cpu", field=name)
     if tuple(cam_from_model.shape) != (4, 4):
         raise InputError(f"has shape {tuple(cam_from_model.shape)}, must be (4, 4)", field="cam_from_model")
-    if not 0 <= settings.sh_degree <= min(gaussians.sh_degree, 3):
-        raise InputError(f"must be 0 to {min(gaussians.sh_degree, 3)}, is {settings.sh_degree}", field="sh_degree")
+    highest = min(gaussians.sh_degree, 3)
+    if not 0 <= settings.sh_degree <= highest:
+        raise InputError(f"must be 0 to {highest}, is {settings.sh_degree}", field="sh_degree")
     if settings.near_m <= 0:
         raise InputError(f"must be positive, is {settings.near_m}", field="near_m")
     if camera.width < 1 or camera.height < 1:

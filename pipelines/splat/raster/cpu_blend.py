@@ -13,6 +13,7 @@ import numpy as np
 from numba import prange
 
 from pipelines.splat.raster.api import ALPHA_MAX, TRANSMITTANCE_MIN
+from pipelines.splat.raster.cpu_jit import jit, parallel_jit, worker_jit
 from pipelines.splat.raster.cpu_lanes import (
     LANES,
     any_positive,
@@ -20,7 +21,7 @@ from pipelines.splat.raster.cpu_lanes import (
     load,
     splat,
     store,
-    total,
+    store_totals,
     where_greater,
 )
 from pipelines.splat.raster.cpu_project import (
@@ -35,13 +36,11 @@ from pipelines.splat.raster.cpu_project import (
     RED,
     X,
     Y,
-    jit,
-    parallel_jit,
 )
 from pipelines.splat.raster.cpu_tiles import TILE_HEIGHT, TILE_WIDTH, unpack_hit
 
 TILE_PIXELS = TILE_WIDTH * TILE_HEIGHT
-# Splats between two looks at whether the whole tile is done.
+# Hits between two looks at which rows of the tile are not done yet.
 HITS_PER_LOOK = 16
 
 # Planes of a tile's scratch memory.
@@ -50,10 +49,20 @@ FORWARD_PLANES = 6
 G_RED, G_GREEN, G_BLUE, G_DEPTH, G_REST, REMAINING = 1, 2, 3, 4, 5, 6
 BACKWARD_PLANES = 7
 
-# Columns of the gradient of one hit: Σq, Σq·dx, Σq·dy, Σq·dx², Σq·dx·dy, Σq·dy² with q = ∂L/∂(exponent) at
-# each pixel, then ∂L/∂(red, green, blue, depth).
-Q, Q_X, Q_Y, Q_XX, Q_XY, Q_YY, D_RED, D_GREEN, D_BLUE, D_DEPTH = range(10)
-HIT_GRADIENT_WIDTH = 10
+# Places in the gradient of one hit: Σ q and its moments in dx and dy, where q = ∂L/∂(exponent) at each pixel, and
+# ∂L/∂ depth and colour; in fours, because they are summed in fours.
+Q, Q_X, Q_Y, Q_YY, Q_XX, Q_XY, D_DEPTH = range(7)
+D_RED, D_GREEN, D_BLUE = 8, 9, 10
+HIT_GRADIENT_WIDTH = 12
+
+
+@jit
+def pixel_centers(dtype: Any) -> Any:
+    """(LANES,) centres of a row's pixels, from its left end."""
+    centers = np.empty(LANES, dtype)
+    for lane in range(LANES):
+        centers[lane] = lane + 0.5
+    return centers
 
 
 @jit
@@ -66,8 +75,10 @@ def _row_exponent(table: Any, index: int, dx: Any, dy: Any) -> Any:
 
 @jit
 def _start_tile(scratch: Any, tile_x: int, tile_y: int, width: int, height: int) -> None:
-    """T = 1 inside the image; what sticks out of it is done before it starts."""
+    """T = 1 inside the image; what sticks out of it is done before it starts. The other planes start at 0."""
     number = scratch.dtype.type
+    for k in range(scratch.shape[0]):
+        scratch[k] = 0
     for row in range(TILE_HEIGHT):
         for column in range(TILE_WIDTH):
             inside = tile_y + row < height and tile_x + column < width
@@ -75,11 +86,13 @@ def _start_tile(scratch: Any, tile_x: int, tile_y: int, width: int, height: int)
 
 
 @jit
-def _any_alive(scratch: Any) -> bool:
-    for row in range(TILE_HEIGHT):  # noqa: SIM110 (numba has no any)
-        if any_positive(load(scratch, T * TILE_PIXELS + row * TILE_WIDTH)):
-            return True
-    return False
+def _alive_rows(scratch: Any, top: int, bottom: int) -> Any:
+    """First and last row of top … bottom with a pixel that is not done; top > bottom if there is none."""
+    while top <= bottom and not any_positive(load(scratch, T * TILE_PIXELS + top * TILE_WIDTH)):
+        top += 1
+    while bottom > top and not any_positive(load(scratch, T * TILE_PIXELS + bottom * TILE_WIDTH)):
+        bottom -= 1
+    return top, bottom
 
 
 @jit
@@ -91,14 +104,17 @@ def _blend_tile(table: Any, hits: Any, first: int, last: int, tile_x: int, tile_
     cutoff, alpha_max = splat(number(LOG_ALPHA_MIN)), splat(number(ALPHA_MAX))
     t_min = splat(number(TRANSMITTANCE_MIN))
     pixel_x = load(lane_x, 0) + splat(number(tile_x))
+    top, bottom = 0, TILE_HEIGHT - 1
     for place in range(first, last):
-        if (place - first) % HITS_PER_LOOK == HITS_PER_LOOK - 1 and not _any_alive(scratch):
-            return place
+        if (place - first) % HITS_PER_LOOK == 0:
+            top, bottom = _alive_rows(scratch, top, bottom)
+            if top > bottom:
+                return place
         index, first_row, last_row = unpack_hit(hits[place])
         red, green, blue = splat(table[index, RED]), splat(table[index, GREEN]), splat(table[index, BLUE])
         z = splat(table[index, DEPTH])
         dx = pixel_x - splat(table[index, X])
-        for row in range(first_row, last_row + 1):
+        for row in range(max(first_row, top), min(last_row, bottom) + 1):
             at = row * TILE_WIDTH
             dy = number(tile_y + row) + number(0.5) - table[index, Y]
             exponent = _row_exponent(table, index, dx, dy)
@@ -139,6 +155,24 @@ def _finish_tile(scratch: Any, tile_x: int, tile_y: int, background: Any, images
                 median[y, x] = scratch[MEDIAN * TILE_PIXELS + at]
 
 
+@worker_jit
+def _blend(
+    table: Any, hits: Any, tile_start: Any, background: Any, images: Any, tile_end: Any, worker: int, workers: int
+) -> None:
+    height, width = images[1].shape
+    columns = (width + TILE_WIDTH - 1) // TILE_WIDTH
+    depth = images[2].shape[0] > 0
+    scratch = np.empty(FORWARD_PLANES * TILE_PIXELS, table.dtype)
+    lane_x = pixel_centers(table.dtype)
+    for tile in range(worker, tile_end.shape[0], workers):
+        x, y = tile % columns * TILE_WIDTH, tile // columns * TILE_HEIGHT
+        _start_tile(scratch, x, y, width, height)
+        tile_end[tile] = _blend_tile(
+            table, hits, tile_start[tile], tile_start[tile + 1], x, y, depth, scratch, lane_x
+        )
+        _finish_tile(scratch, x, y, background, images)
+
+
 @parallel_jit
 def blend(
     table: Any, hits: Any, tile_start: Any, background: Any, images: Any, tile_end: Any, workers: int
@@ -155,21 +189,8 @@ def blend(
         tile_end: (tiles,) hit after the last one that was looked at, written.
         workers: number of threads.
     """
-    height, width = images[1].shape
-    columns = (width + TILE_WIDTH - 1) // TILE_WIDTH
-    tiles = tile_end.shape[0]
     for worker in prange(workers):
-        scratch = np.empty(FORWARD_PLANES * TILE_PIXELS, table.dtype)
-        lane_x = np.arange(LANES).astype(table.dtype) + table.dtype.type(0.5)
-        for tile in range(worker, tiles, workers):
-            tile_x, tile_y = tile % columns * TILE_WIDTH, tile // columns * TILE_HEIGHT
-            scratch[:] = 0
-            _start_tile(scratch, tile_x, tile_y, width, height)
-            tile_end[tile] = _blend_tile(
-                table, hits, tile_start[tile], tile_start[tile + 1], tile_x, tile_y, images[2].shape[0] > 0,
-                scratch, lane_x,
-            )  # fmt: skip
-            _finish_tile(scratch, tile_x, tile_y, background, images)
+        _blend(table, hits, tile_start, background, images, tile_end, np.int64(worker), workers)
 
 
 @jit
@@ -200,6 +221,18 @@ def _start_tile_gradient(scratch: Any, tile_x: int, tile_y: int, background: Any
 
 
 @jit
+def _store_hit_gradient(gradient: Any, place: int, dx: Any, moments: Any, colour_and_depth: Any) -> None:
+    """Sum over the columns, in each of which dx is constant."""
+    q, qy, qyy = moments
+    red, green, blue, depth = colour_and_depth
+    start, qx = place * HIT_GRADIENT_WIDTH, q * dx
+    nothing = splat(gradient.dtype.type(0.0))
+    store_totals(gradient, start + Q, q, qx, qy, qyy)
+    store_totals(gradient, start + Q_XX, qx * dx, qy * dx, depth, nothing)
+    store_totals(gradient, start + D_RED, red, green, blue, nothing)
+
+
+@jit
 def _blend_tile_gradient(table: Any, hits: Any, first: int, last: int, tile_x: int, tile_y: int, depth: bool,
                          scratch: Any, lane_x: Any, gradient: Any) -> None:  # fmt: skip
     """Write the gradient of hits first … last − 1; `scratch` as `_start_tile` and `_start_tile_gradient` left it.
@@ -211,14 +244,17 @@ def _blend_tile_gradient(table: Any, hits: Any, first: int, last: int, tile_x: i
     cutoff, alpha_max = splat(number(LOG_ALPHA_MIN)), splat(number(ALPHA_MAX))
     t_min = splat(number(TRANSMITTANCE_MIN))
     pixel_x = load(lane_x, 0) + splat(number(tile_x))
+    top, bottom = 0, TILE_HEIGHT - 1
     for place in range(first, last):
+        if (place - first) % HITS_PER_LOOK == 0:
+            top, bottom = _alive_rows(scratch, top, bottom)
         index, first_row, last_row = unpack_hit(hits[place])
         red, green, blue = splat(table[index, RED]), splat(table[index, GREEN]), splat(table[index, BLUE])
         z = splat(table[index, DEPTH])
         dx = pixel_x - splat(table[index, X])
         q_sum, qy_sum, qyy_sum = zero, zero, zero
         red_sum, green_sum, blue_sum, depth_sum = zero, zero, zero, zero
-        for row in range(first_row, last_row + 1):
+        for row in range(max(first_row, top), min(last_row, bottom) + 1):
             at = row * TILE_WIDTH
             dy = number(tile_y + row) + number(0.5) - table[index, Y]
             exponent = _row_exponent(table, index, dx, dy)
@@ -252,12 +288,28 @@ def _blend_tile_gradient(table: Any, hits: Any, first: int, last: int, tile_x: i
             red_sum = red_sum + weight * g_red
             green_sum = green_sum + weight * g_green
             blue_sum = blue_sum + weight * g_blue
-        qx_sum = q_sum * dx
-        out = gradient[place]
-        out[Q], out[Q_X], out[Q_XX] = total(q_sum), total(qx_sum), total(qx_sum * dx)
-        out[Q_Y], out[Q_XY], out[Q_YY] = total(qy_sum), total(qy_sum * dx), total(qyy_sum)
-        out[D_RED], out[D_GREEN], out[D_BLUE] = total(red_sum), total(green_sum), total(blue_sum)
-        out[D_DEPTH] = total(depth_sum)
+        _store_hit_gradient(
+            gradient, place, dx, (q_sum, qy_sum, qyy_sum), (red_sum, green_sum, blue_sum, depth_sum)
+        )
+
+
+@worker_jit
+def _blend_gradient(
+    table: Any, hits: Any, tile_start: Any, tile_end: Any, background: Any, images: Any, grads: Any, gradient: Any,
+    worker: int, workers: int,
+) -> None:  # fmt: skip
+    height, width = images[1].shape
+    columns = (width + TILE_WIDTH - 1) // TILE_WIDTH
+    depth = images[2].shape[0] > 0
+    scratch = np.empty(BACKWARD_PLANES * TILE_PIXELS, table.dtype)
+    lane_x = pixel_centers(table.dtype)
+    for tile in range(worker, tile_end.shape[0], workers):
+        x, y = tile % columns * TILE_WIDTH, tile // columns * TILE_HEIGHT
+        _start_tile(scratch, x, y, width, height)
+        _start_tile_gradient(scratch, x, y, background, images, grads)
+        _blend_tile_gradient(table, hits, tile_start[tile], tile_end[tile], x, y, depth, scratch, lane_x, gradient)
+        for k in range(tile_end[tile] * HIT_GRADIENT_WIDTH, tile_start[tile + 1] * HIT_GRADIENT_WIDTH):
+            gradient[k] = 0
 
 
 @parallel_jit
@@ -270,22 +322,10 @@ def blend_gradient(
     Args:
         table, hits, tile_start, tile_end, background, images: as `blend` had and left them.
         grads: ∂L/∂ colour (H, W, 3), alpha (H, W), Σ w z (H, W or 0, 0).
-        gradient: (H, HIT_GRADIENT_WIDTH) for each hit, written.
+        gradient: (H · HIT_GRADIENT_WIDTH,) of the hits, one after the other, written.
         workers: number of threads.
     """
-    height, width = images[1].shape
-    columns = (width + TILE_WIDTH - 1) // TILE_WIDTH
-    tiles = tile_end.shape[0]
     for worker in prange(workers):
-        scratch = np.empty(BACKWARD_PLANES * TILE_PIXELS, table.dtype)
-        lane_x = np.arange(LANES).astype(table.dtype) + table.dtype.type(0.5)
-        for tile in range(worker, tiles, workers):
-            tile_x, tile_y = tile % columns * TILE_WIDTH, tile // columns * TILE_HEIGHT
-            scratch[:] = 0
-            _start_tile(scratch, tile_x, tile_y, width, height)
-            _start_tile_gradient(scratch, tile_x, tile_y, background, images, grads)
-            _blend_tile_gradient(
-                table, hits, tile_start[tile], tile_end[tile], tile_x, tile_y, images[2].shape[0] > 0,
-                scratch, lane_x, gradient,
-            )  # fmt: skip
-            gradient[tile_end[tile] : tile_start[tile + 1]] = 0
+        _blend_gradient(
+            table, hits, tile_start, tile_end, background, images, grads, gradient, np.int64(worker), workers
+        )

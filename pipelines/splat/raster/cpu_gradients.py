@@ -6,6 +6,7 @@ same bit for bit on every run.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -24,13 +25,12 @@ from pipelines.splat.raster.cpu_blend import (
     Q_YY,
     Q,
 )
+from pipelines.splat.raster.cpu_jit import jit, parallel_jit, worker_jit
 from pipelines.splat.raster.cpu_project import (
     BLOCK,
     View,
     jacobian,
-    jit,
     log_sigmoid,
-    parallel_jit,
     point_in_cam,
     rotation,
     row3,
@@ -50,11 +50,12 @@ CAMERA_WIDTH = 15
 
 @jit
 def _sum_hits(gradient: Any, places: Any, first: int, last: int, sums: Any) -> None:
-    sums[:] = 0.0
+    for k in range(HIT_GRADIENT_WIDTH):
+        sums[k] = 0.0
     for slot in range(first, last):
-        hit = gradient[places[slot]]
+        start = places[slot] * HIT_GRADIENT_WIDTH
         for k in range(HIT_GRADIENT_WIDTH):
-            sums[k] += hit[k]
+            sums[k] += gradient[start + k]
 
 
 @jit
@@ -151,46 +152,52 @@ def _point_gradient(view: View, point: Any, g_mean: Any, g_depth: float, pose: A
 def _add_pose_gradient(camera: Any, mean: Any, g_point: Any, jac: Any, g_w: Any) -> None:
     """Add ∂L/∂[A | t] (12) of p = A m + t and W = J A."""
     j00, j02, j11, j12 = jac
-    for k in range(3):
-        camera[k] += g_point[0] * mean[k] + j00 * g_w[k]
-        camera[4 + k] += g_point[1] * mean[k] + j11 * g_w[3 + k]
-        camera[8 + k] += g_point[2] * mean[k] + j02 * g_w[k] + j12 * g_w[3 + k]
-    camera[3] += g_point[0]
-    camera[7] += g_point[1]
-    camera[11] += g_point[2]
+    x, y, z = mean
+    gx, gy, gz = g_point
+    camera[0] += gx * x + j00 * g_w[0]
+    camera[1] += gx * y + j00 * g_w[1]
+    camera[2] += gx * z + j00 * g_w[2]
+    camera[3] += gx
+    camera[4] += gy * x + j11 * g_w[3]
+    camera[5] += gy * y + j11 * g_w[4]
+    camera[6] += gy * z + j11 * g_w[5]
+    camera[7] += gy
+    camera[8] += gz * x + j02 * g_w[0] + j12 * g_w[3]
+    camera[9] += gz * y + j02 * g_w[1] + j12 * g_w[4]
+    camera[10] += gz * z + j02 * g_w[2] + j12 * g_w[5]
+    camera[11] += gz
 
 
 @jit
-def _colour_gradient(sh: Any, i: int, mean: Any, center: Any, degree: int, sums: Any, work: Any, g_sh: Any) -> Any:
-    """Write ∂L/∂ SH of Gaussian i into `g_sh` (K, 3); returns ∂L/∂(mean − centre)."""
-    basis, weight = work
+def _colour_gradient(
+    sh: Any, i: int, direction: Any, degree: int, sums: Any, basis: Any, weight: Any, g_sh: Any
+) -> Any:
+    """Write row i of ∂L/∂ SH; returns ∂L/∂ direction, the basis taken as functions of all space."""
     terms = (degree + 1) ** 2
-    direction, scale = unit_direction(mean, center)
     sh_basis(direction, degree, basis)
     red, green, blue = sh_colour(sh, i, basis, terms)
     g_red = sums[D_RED] if red >= 0.0 else 0.0
     g_green = sums[D_GREEN] if green >= 0.0 else 0.0
     g_blue = sums[D_BLUE] if blue >= 0.0 else 0.0
     for k in range(terms):
-        g_sh[k, 0], g_sh[k, 1], g_sh[k, 2] = basis[k] * g_red, basis[k] * g_green, basis[k] * g_blue
+        g_sh[i, k, 0], g_sh[i, k, 1], g_sh[i, k, 2] = basis[k] * g_red, basis[k] * g_green, basis[k] * g_blue
         weight[k] = sh[i, k, 0] * g_red + sh[i, k, 1] * g_green + sh[i, k, 2] * g_blue
-    g_sh[terms:] = 0
-    gx, gy, gz = sh_direction_gradient(direction, degree, weight)
-    along = direction[0] * gx + direction[1] * gy + direction[2] * gz
-    return (
-        scale * (gx - along * direction[0]),
-        scale * (gy - along * direction[1]),
-        scale * (gz - along * direction[2]),
-    )
+    return sh_direction_gradient(direction, degree, weight)
 
 
 @jit
-def _gaussian_gradient(parameters: Any, pose: Any, center: Any, view: View, degree: int, i: int, sums: Any,
-                       work: Any, outputs: Any, camera: Any) -> Any:  # fmt: skip
-    """Write the gradient of Gaussian i, add to the camera's; returns that of its screen mean."""
-    means, quats, log_scales, logit_opacities, sh = parameters
-    g_means, g_quats, g_log_scales, g_logits, g_sh = outputs
-    mean = row3(means, i)
+def _unnormalised(direction: Any, scale: float, gradient: Any) -> Any:
+    """∂L/∂v of a vector v, given ∂L/∂ direction of direction = scale · v of unit length."""
+    x, y, z = direction
+    gx, gy, gz = gradient
+    along = x * gx + y * gy + z * gz
+    return scale * (gx - along * x), scale * (gy - along * y), scale * (gz - along * z)
+
+
+@jit
+def _geometry_gradient(quats: Any, log_scales: Any, i: int, mean: Any, pose: Any, view: View, sums: Any,
+                       camera: Any, g_quats: Any, g_log_scales: Any) -> Any:  # fmt: skip
+    """Write row i of ∂L/∂ quaternion and log scales, add to the pose's; returns ∂L/∂ point and screen mean."""
     point = point_in_cam(pose, mean)
     quat, scale = unit_quat(quats, i)
     turn = rotation(quat)
@@ -200,58 +207,92 @@ def _gaussian_gradient(parameters: Any, pose: Any, center: Any, view: View, degr
     g_mean, g_cov = _conic_gradients(screen_covariance(axes, variance, view.dilation), sums)
     g_axes = _axes_gradient(axes, variance, g_cov)
     g_w = _times_transposed(g_axes, turn)
-    for k in range(3):
-        g_log_scales[i, k] = axes[k] * g_axes[k] + axes[3 + k] * g_axes[3 + k]
     g_quats[i, 0], g_quats[i, 1], g_quats[i, 2], g_quats[i, 3] = _quat_gradient(quat, scale, w, g_axes)
+    g_log_scales[i, 0] = axes[0] * g_axes[0] + axes[3] * g_axes[3]
+    g_log_scales[i, 1] = axes[1] * g_axes[1] + axes[4] * g_axes[4]
+    g_log_scales[i, 2] = axes[2] * g_axes[2] + axes[5] * g_axes[5]
     g_point = _point_gradient(view, point, g_mean, sums[D_DEPTH], pose, g_w)
-    # ln α = ln σ(logit) + exponent, and ∂ ln σ/∂logit = 1 − σ(logit) = σ(−logit).
-    logit = float(logit_opacities[i])
-    g_logits[i] = sums[Q] * np.exp(log_sigmoid(logit) - logit)
-    g_direction = _colour_gradient(sh, i, mean, center, degree, sums, work, g_sh[i])
-    for k in range(3):
-        g_means[i, k] = pose[0, k] * g_point[0] + pose[1, k] * g_point[1] + pose[2, k] * g_point[2] + g_direction[k]
-        camera[12 + k] -= g_direction[k]
     _add_pose_gradient(camera, mean, g_point, jac, g_w)
-    return g_mean
+    return g_point, g_mean
 
 
 @jit
-def _clear_rows(outputs: Any, first: int, last: int) -> None:
-    means, quats, log_scales, logit_opacities, sh = outputs
-    means[first:last] = 0
-    quats[first:last] = 0
-    log_scales[first:last] = 0
-    logit_opacities[first:last] = 0
-    sh[first:last] = 0
+def _clear_rows(
+    first: int, last: int, g_means: Any, g_quats: Any, g_log_scales: Any, g_logits: Any, g_sh: Any
+) -> None:
+    for i in range(first, last):
+        g_logits[i] = 0
+        for k in range(3):
+            g_means[i, k] = 0
+            g_log_scales[i, k] = 0
+        for k in range(4):
+            g_quats[i, k] = 0
+        for k in range(g_sh.shape[1]):
+            g_sh[i, k, 0], g_sh[i, k, 1], g_sh[i, k, 2] = 0, 0, 0
+
+
+@worker_jit
+def _gaussian_gradients(
+    means: Any, quats: Any, log_scales: Any, logit_opacities: Any, sh: Any, pose: Any, center: Any, view: View,
+    degree: int, visible: Any, rank: Any, gradient: Any, splat_start: Any, places: Any, block_start: Any,
+    g_means: Any, g_quats: Any, g_log_scales: Any, g_logits: Any, g_sh: Any, camera: Any, g_screen: Any,
+    worker: int, workers: int,
+) -> None:  # fmt: skip
+    sums, share = np.empty(HIT_GRADIENT_WIDTH), np.empty(CAMERA_WIDTH)
+    basis, weight = np.empty(MAX_COEFFICIENTS), np.empty(MAX_COEFFICIENTS)
+    for block in range(worker, block_start.shape[0] - 1, workers):
+        for k in range(CAMERA_WIDTH):
+            share[k] = 0.0
+        _clear_rows(
+            block * BLOCK, min((block + 1) * BLOCK, means.shape[0]), g_means, g_quats, g_log_scales, g_logits, g_sh
+        )
+        for m in range(block_start[block], block_start[block + 1]):
+            i, row = visible[m], rank[m]
+            _sum_hits(gradient, places, splat_start[row], splat_start[row + 1], sums)
+            mean = row3(means, i)
+            (px, py, pz), (g_screen[m, 0], g_screen[m, 1]) = _geometry_gradient(
+                quats, log_scales, i, mean, pose, view, sums, share, g_quats, g_log_scales
+            )
+            # ln α = ln σ(logit) + exponent, and ∂ ln σ/∂logit = 1 − σ(logit) = σ(−logit).
+            logit = float(logit_opacities[i])
+            g_logits[i] = sums[Q] * math.exp(log_sigmoid(logit) - logit)
+            direction, scale = unit_direction(mean, center)
+            g_direction = _colour_gradient(sh, i, direction, degree, sums, basis, weight, g_sh)
+            dx, dy, dz = _unnormalised(direction, scale, g_direction)
+            g_means[i, 0] = pose[0, 0] * px + pose[1, 0] * py + pose[2, 0] * pz + dx
+            g_means[i, 1] = pose[0, 1] * px + pose[1, 1] * py + pose[2, 1] * pz + dy
+            g_means[i, 2] = pose[0, 2] * px + pose[1, 2] * py + pose[2, 2] * pz + dz
+            share[12] -= dx
+            share[13] -= dy
+            share[14] -= dz
+        for k in range(CAMERA_WIDTH):
+            camera[block, k] = share[k]
 
 
 @parallel_jit
 def gaussian_gradients(
-    parameters: Any, pose: Any, center: Any, view: View, degree: int, visible: Any, rank: Any, gradient: Any,
-    splat_start: Any, places: Any, block_start: Any, outputs: Any, camera: Any, g_screen: Any, workers: int,
+    means: Any, quats: Any, log_scales: Any, logit_opacities: Any, sh: Any, pose: Any, center: Any, view: View,
+    degree: int, visible: Any, rank: Any, gradient: Any, splat_start: Any, places: Any, block_start: Any,
+    g_means: Any, g_quats: Any, g_log_scales: Any, g_logits: Any, g_sh: Any, camera: Any, g_screen: Any,
+    workers: int,
 ) -> None:  # fmt: skip
     """Reduce hits to Gaussians and go back through the projection and the colours.
 
     Args:
-        parameters, pose, center, view, degree, visible, rank: as in `project_visible`.
-        gradient: (H, HIT_GRADIENT_WIDTH) of the hits by tile.
+        means, quats, log_scales, logit_opacities, sh, pose, center, view, degree, visible, rank: as in
+            `project_visible`.
+        gradient: (H · HIT_GRADIENT_WIDTH,) of the hits by tile.
         splat_start, places: where the hits of each splat are, see `list_hits`.
         block_start: (blocks + 1,) into `visible`: the blocks of BLOCK Gaussians each.
-        outputs: gradients of the N Gaussians in the form of `parameters`, written, zero for the invisible.
+        g_means, g_quats, g_log_scales, g_logits, g_sh: gradients of the N Gaussians, written; zero for the
+            invisible.
         camera: (blocks, CAMERA_WIDTH) each block's share of ∂L/∂ pose and centre, written.
         g_screen: (M, 2) ∂L/∂ screen mean, written.
         workers: number of threads.
     """
-    count = parameters[0].shape[0]
-    blocks = block_start.shape[0] - 1
     for worker in prange(workers):
-        sums = np.empty(HIT_GRADIENT_WIDTH)
-        work = (np.empty(MAX_COEFFICIENTS), np.empty(MAX_COEFFICIENTS))
-        for block in range(worker, blocks, workers):
-            camera[block] = 0.0
-            _clear_rows(outputs, block * BLOCK, min((block + 1) * BLOCK, count))
-            for m in range(block_start[block], block_start[block + 1]):
-                _sum_hits(gradient, places, splat_start[rank[m]], splat_start[rank[m] + 1], sums)
-                g_screen[m, 0], g_screen[m, 1] = _gaussian_gradient(
-                    parameters, pose, center, view, degree, visible[m], sums, work, outputs, camera[block]
-                )
+        _gaussian_gradients(
+            means, quats, log_scales, logit_opacities, sh, pose, center, view, degree, visible, rank, gradient,
+            splat_start, places, block_start, g_means, g_quats, g_log_scales, g_logits, g_sh, camera, g_screen,
+            np.int64(worker), workers,
+        )  # fmt: skip

@@ -104,23 +104,38 @@ def any_positive(typing_context: Any, lanes: Any) -> Any:
     return types.boolean(lanes), generate
 
 
+def _fold(builder: Any, a: Any, b: Any, low: list[int], high: list[int]) -> Any:
+    """The sum of two shuffles of the vectors a and b."""
+    halves = (
+        builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(_INDEX, len(mask)), mask)) for mask in (low, high)
+    )
+    return builder.fadd(*halves)
+
+
 @intrinsic
-def total(typing_context: Any, lanes: Any) -> Any:
-    """Sum over the lanes, always in the same order."""
+def store_totals(typing_context: Any, array: Any, index: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
+    """`array[index : index + 4] = a.sum(), b.sum(), c.sum(), d.sum()`, always added in the same order.
+
+    The four sums share their shuffles: within each group of four lanes first, then across the groups.
+    """
+    fours = range(0, LANES, 4)
+    pairs = [[k + step for k in fours for step in (s, LANES + s, 1 + s, LANES + 1 + s)] for s in (0, 2)]
+    quads = [[k + step for k in fours for step in (s, 1 + s, LANES + s, LANES + 1 + s)] for s in (0, 2)]
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        (vector,) = args
+        first = _fold(builder, args[2], args[3], *pairs)
+        second = _fold(builder, args[4], args[5], *pairs)
+        totals = _fold(builder, first, second, *quads)
         width = LANES
-        while width > 1:
+        while width > 4:
             width //= 2
-            low = ir.Constant(ir.VectorType(_INDEX, width), list(range(width)))
-            high = ir.Constant(ir.VectorType(_INDEX, width), list(range(width, 2 * width)))
-            vector = builder.fadd(
-                builder.shuffle_vector(vector, vector, low), builder.shuffle_vector(vector, vector, high)
-            )
-        return builder.extract_element(vector, _INDEX(0))
+            totals = _fold(builder, totals, totals, list(range(width)), list(range(width, 2 * width)))
+        start = builder.gep(context.make_array(array)(context, builder, args[0]).data, [args[1]])
+        pointer = builder.bitcast(start, totals.type.as_pointer())
+        builder.store(totals, pointer, align=array.dtype.bitwidth // 8)
+        return context.get_dummy_value()
 
-    return lanes.element(lanes), generate
+    return types.void(array, types.intp, a, a, a, a), generate
 
 
 def _define_operator(function: Callable[..., Any], instruction: str) -> None:

@@ -10,14 +10,18 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
+from numpy.typing import NDArray
 
 from pipelines.splat.raster.api import ALPHA_MIN, Pinhole, RasterSettings
+from pipelines.splat.raster.cpu_jit import jit, parallel_jit, worker_jit
 from pipelines.splat.raster.cpu_sh import MAX_COEFFICIENTS, sh_basis
 from pipelines.splat.raster.reference import FRUSTUM_MARGIN
 
 LOG_ALPHA_MIN = math.log(ALPHA_MIN)
 LOGIT_ALPHA_MIN = math.log(ALPHA_MIN / (1 - ALPHA_MIN))
+# Mahalanobis radius at which an opaque Gaussian falls to ALPHA_MIN.
+WIDEST = math.sqrt(-2 * LOG_ALPHA_MIN)
 # Gaussians that one worker takes at a time: dealt out in turn, because the visible ones come in clusters.
 BLOCK = 256
 
@@ -29,12 +33,12 @@ SPLAT_WIDTH = 10
 E_X, E_Y, E_XX, E_XY, E_YY, E_LEVEL = range(6)
 ELLIPSE_WIDTH = 6
 
-jit: Any = njit(cache=True, error_model="numpy", fastmath={"contract"})
-parallel_jit: Any = njit(cache=True, error_model="numpy", fastmath={"contract"}, parallel=True)
-
 
 class View(NamedTuple):
-    """The camera as kernels want it: lengths in pixels, slopes x/z and y/z, near plane in metres."""
+    """The camera as kernels want it: lengths in pixels, slopes x/z and y/z, near plane in metres.
+
+    A standard deviation of 1 m at a depth of 1 m is at most `stretch_x` px wide and `stretch_y` px high.
+    """
 
     width: float
     height: float
@@ -48,12 +52,18 @@ class View(NamedTuple):
     slope_y_max: float
     near: float
     dilation: float
+    stretch_x: float
+    stretch_y: float
 
 
-def make_view(camera: Pinhole, settings: RasterSettings) -> View:
+def make_view(camera: Pinhole, settings: RasterSettings, pose: NDArray[np.float64]) -> View:
     """The kernels' view of `camera`; the Jacobian is taken no further out than these slopes, as in gsplat."""
     margin_x = FRUSTUM_MARGIN * 0.5 * camera.width / camera.fx
     margin_y = FRUSTUM_MARGIN * 0.5 * camera.height / camera.fy
+    slope_x_min, slope_x_max = -camera.cx / camera.fx - margin_x, (camera.width - camera.cx) / camera.fx + margin_x
+    slope_y_min, slope_y_max = -camera.cy / camera.fy - margin_y, (camera.height - camera.cy) / camera.fy + margin_y
+    # 1 for a rotation, which is what it should be; but the derivative is taken in all of its entries.
+    norm = float(np.linalg.norm(pose[:, :3], 2))
     return View(
         width=float(camera.width),
         height=float(camera.height),
@@ -61,12 +71,14 @@ def make_view(camera: Pinhole, settings: RasterSettings) -> View:
         fy=float(camera.fy),
         cx=float(camera.cx),
         cy=float(camera.cy),
-        slope_x_min=-camera.cx / camera.fx - margin_x,
-        slope_x_max=(camera.width - camera.cx) / camera.fx + margin_x,
-        slope_y_min=-camera.cy / camera.fy - margin_y,
-        slope_y_max=(camera.height - camera.cy) / camera.fy + margin_y,
+        slope_x_min=slope_x_min,
+        slope_x_max=slope_x_max,
+        slope_y_min=slope_y_min,
+        slope_y_max=slope_y_max,
         near=float(settings.near_m),
         dilation=float(settings.dilation_px2),
+        stretch_x=camera.fx * norm * math.hypot(1.0, max(-slope_x_min, slope_x_max)),
+        stretch_y=camera.fy * norm * math.hypot(1.0, max(-slope_y_min, slope_y_max)),
     )
 
 
@@ -184,6 +196,17 @@ def _holds_pixel(center: float, extent: float, size: float) -> bool:
 
 
 @jit
+def _may_reach_image(point: Any, largest_log_scale: float, view: View) -> bool:
+    """False only if a sphere around the Gaussian is sure to project outside the image: cheap, for most of them."""
+    x, y, z = point
+    sigma = math.exp(largest_log_scale) / z
+    reach_x = WIDEST * math.sqrt(view.stretch_x * view.stretch_x * sigma * sigma + view.dilation)
+    reach_y = WIDEST * math.sqrt(view.stretch_y * view.stretch_y * sigma * sigma + view.dilation)
+    u, v = view.fx * x / z + view.cx, view.fy * y / z + view.cy
+    return -reach_x <= u <= view.width + reach_x and -reach_y <= v <= view.height + reach_y
+
+
+@jit
 def _is_visible(means: Any, quats: Any, log_scales: Any, logit: float, pose: Any, view: View, i: int) -> bool:
     """Whether the ellipse in which Gaussian i reaches ALPHA_MIN has a pixel in its bounding box.
 
@@ -200,28 +223,39 @@ def _is_visible(means: Any, quats: Any, log_scales: Any, logit: float, pose: Any
     )
 
 
+@worker_jit
+def _find_visible(
+    means: Any, quats: Any, log_scales: Any, logit_opacities: Any, pose: Any, view: View, visible: Any, depth: Any,
+    worker: int, workers: int,
+) -> None:  # fmt: skip
+    for block in range(worker, (means.shape[0] + BLOCK - 1) // BLOCK, workers):
+        for i in range(block * BLOCK, min((block + 1) * BLOCK, means.shape[0])):
+            visible[i] = False
+            point = point_in_cam(pose, row3(means, i))
+            logit = float(logit_opacities[i])
+            if not (point[2] >= view.near and logit >= LOGIT_ALPHA_MIN):
+                continue
+            a, b, c = row3(log_scales, i)
+            if _may_reach_image(point, max(a, b, c), view):
+                visible[i] = _is_visible(means, quats, log_scales, logit, pose, view, i)
+                depth[i] = point[2]
+
+
 @parallel_jit
 def find_visible(
     means: Any, quats: Any, log_scales: Any, logit_opacities: Any, pose: Any, view: View, visible: Any, depth: Any,
     workers: int,
 ) -> None:  # fmt: skip
     """Write, for N Gaussians, whether each is visible (N,) and its depth (N,) if it is; on `workers` threads."""
-    count = means.shape[0]
-    blocks = (count + BLOCK - 1) // BLOCK
     for worker in prange(workers):
-        for block in range(worker, blocks, workers):
-            for i in range(block * BLOCK, min((block + 1) * BLOCK, count)):
-                visible[i] = False
-                z = point_in_cam(pose, row3(means, i))[2]
-                logit = float(logit_opacities[i])
-                if z >= view.near and logit >= LOGIT_ALPHA_MIN:
-                    visible[i] = _is_visible(means, quats, log_scales, logit, pose, view, i)
-                    depth[i] = z
+        _find_visible(
+            means, quats, log_scales, logit_opacities, pose, view, visible, depth, np.int64(worker), workers
+        )
 
 
 @jit
-def _write_splat(splat: Any, ellipse: Any, u: float, v: float, cov: Any, log_opacity: float) -> None:
-    """Fill the rows that blending and binning read.
+def _write_splat(splats: Any, ellipses: Any, row: int, center: Any, cov: Any, log_opacity: float) -> None:
+    """Fill the row that blending and the one that binning reads, but for colour and depth.
 
     The conic is kept as the factor of ½ Σ⁻¹: the exponent is −(f_xx dx + f_xy dy)² − (f_yy dy)², which does not
     cancel catastrophically for long thin Gaussians as the polynomial does.
@@ -229,14 +263,22 @@ def _write_splat(splat: Any, ellipse: Any, u: float, v: float, cov: Any, log_opa
     xx, xy, yy = cov
     determinant = xx * yy - xy * xy
     factor_xx = math.sqrt(0.5 * yy / determinant)
-    splat[X], splat[Y] = u, v
-    splat[FACTOR_XX] = factor_xx
-    splat[FACTOR_XY] = -0.5 * xy / (determinant * factor_xx)
-    splat[FACTOR_YY] = math.sqrt(0.5 / yy)
-    splat[LOG_OPACITY] = log_opacity
-    ellipse[E_X], ellipse[E_Y] = u, v
-    ellipse[E_XX], ellipse[E_XY], ellipse[E_YY] = xx, xy, yy
-    ellipse[E_LEVEL] = 2.0 * (log_opacity - LOG_ALPHA_MIN)
+    splats[row, X], splats[row, Y] = center
+    splats[row, FACTOR_XX] = factor_xx
+    splats[row, FACTOR_XY] = -0.5 * xy / (determinant * factor_xx)
+    splats[row, FACTOR_YY] = math.sqrt(0.5 / yy)
+    splats[row, LOG_OPACITY] = log_opacity
+    ellipses[row, E_X], ellipses[row, E_Y] = center
+    ellipses[row, E_XX], ellipses[row, E_XY], ellipses[row, E_YY] = xx, xy, yy
+    ellipses[row, E_LEVEL] = 2.0 * (log_opacity - LOG_ALPHA_MIN)
+
+
+@jit
+def _longer_radius(cov: Any) -> float:
+    """Three standard deviations along the longer axis of a covariance xx, xy, yy."""
+    xx, xy, yy = cov
+    half_difference = 0.5 * (xx - yy)
+    return 3.0 * math.sqrt(0.5 * (xx + yy) + math.sqrt(half_difference * half_difference + xy * xy))
 
 
 @jit
@@ -258,15 +300,38 @@ def sh_colour(sh: Any, i: int, basis: Any, terms: int) -> Any:
     return red, green, blue
 
 
+@worker_jit
+def _project_visible(
+    means: Any, quats: Any, log_scales: Any, logit_opacities: Any, sh: Any, pose: Any, center: Any, view: View,
+    degree: int, visible: Any, rank: Any, splats: Any, ellipses: Any, radius: Any, worker: int, workers: int,
+) -> None:  # fmt: skip
+    basis = np.empty(MAX_COEFFICIENTS)
+    count = visible.shape[0]
+    for block in range(worker, (count + BLOCK - 1) // BLOCK, workers):
+        for m in range(block * BLOCK, min((block + 1) * BLOCK, count)):
+            i, row = visible[m], rank[m]
+            (x, y, z), cov = _ellipse(means, quats, log_scales, pose, view, i)
+            on_screen = (view.fx * x / z + view.cx, view.fy * y / z + view.cy)
+            _write_splat(splats, ellipses, row, on_screen, cov, log_sigmoid(float(logit_opacities[i])))
+            direction, _ = unit_direction(row3(means, i), center)
+            sh_basis(direction, degree, basis)
+            red, green, blue = sh_colour(sh, i, basis, (degree + 1) ** 2)
+            splats[row, RED] = max(red, 0.0)
+            splats[row, GREEN] = max(green, 0.0)
+            splats[row, BLUE] = max(blue, 0.0)
+            splats[row, DEPTH] = z
+            radius[m] = _longer_radius(cov)
+
+
 @parallel_jit
 def project_visible(
-    parameters: Any, pose: Any, center: Any, view: View, degree: int, visible: Any, rank: Any, splats: Any,
-    ellipses: Any, radius: Any, workers: int,
+    means: Any, quats: Any, log_scales: Any, logit_opacities: Any, sh: Any, pose: Any, center: Any, view: View,
+    degree: int, visible: Any, rank: Any, splats: Any, ellipses: Any, radius: Any, workers: int,
 ) -> None:  # fmt: skip
     """Fill the tables of the M visible Gaussians.
 
     Args:
-        parameters: means, quats, log_scales, logit_opacities, sh.
+        means, quats, log_scales, logit_opacities, sh: of the N Gaussians.
         pose: (3, 4).
         center: (3,) the camera's centre in the model's frame.
         view: camera.
@@ -278,26 +343,8 @@ def project_visible(
         radius: (M,) three standard deviations along the longer axis in px, in the order of `visible`, written.
         workers: number of threads.
     """
-    means, quats, log_scales, logit_opacities, sh = parameters
-    count = visible.shape[0]
-    blocks = (count + BLOCK - 1) // BLOCK
     for worker in prange(workers):
-        basis = np.empty(MAX_COEFFICIENTS)
-        for block in range(worker, blocks, workers):
-            for m in range(block * BLOCK, min((block + 1) * BLOCK, count)):
-                i, row = visible[m], rank[m]
-                (x, y, z), cov = _ellipse(means, quats, log_scales, pose, view, i)
-                u, v = view.fx * x / z + view.cx, view.fy * y / z + view.cy
-                _write_splat(splats[row], ellipses[row], u, v, cov, log_sigmoid(float(logit_opacities[i])))
-                direction, _ = unit_direction(row3(means, i), center)
-                sh_basis(direction, degree, basis)
-                red, green, blue = sh_colour(sh, i, basis, (degree + 1) ** 2)
-                splats[row, RED], splats[row, GREEN], splats[row, BLUE] = (
-                    max(red, 0.0),
-                    max(green, 0.0),
-                    max(blue, 0.0),
-                )
-                splats[row, DEPTH] = z
-                half_difference = 0.5 * (cov[0] - cov[2])
-                spread = math.sqrt(half_difference * half_difference + cov[1] * cov[1])
-                radius[m] = 3.0 * math.sqrt(0.5 * (cov[0] + cov[2]) + spread)
+        _project_visible(
+            means, quats, log_scales, logit_opacities, sh, pose, center, view, degree, visible, rank, splats,
+            ellipses, radius, np.int64(worker), workers,
+        )  # fmt: skip

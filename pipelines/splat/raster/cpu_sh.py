@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from numba import njit
+from pipelines.splat.raster.cpu_jit import jit
 
 # N_lm of the real spherical harmonics; the rest of each is a polynomial of the direction.
 _C0 = math.sqrt(1 / (4 * math.pi))
@@ -23,7 +23,7 @@ _C3_0 = math.sqrt(7 / (16 * math.pi))
 MAX_COEFFICIENTS = 16
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@jit
 def sh_basis(direction: Any, degree: int, basis: Any) -> None:
     """Write the (degree + 1)² functions of a unit vector (x, y, z) into `basis` (16,)."""
     x, y, z = direction
@@ -50,7 +50,7 @@ def sh_basis(direction: Any, degree: int, basis: Any) -> None:
     basis[15] = -_C3_3 * x * (xx - 3 * yy)
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@jit
 def sh_direction_gradient(direction: Any, degree: int, weight: Any) -> Any:
     """Σ_k weight[k] · ∂basis[k]/∂(x, y, z), the polynomials taken as functions of all space."""
     x, y, z = direction

@@ -10,13 +10,15 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 from numba import prange
 
+from pipelines.splat.raster.cpu_jit import jit, kernel_jit, parallel_jit, worker_jit
 from pipelines.splat.raster.cpu_lanes import LANES
-from pipelines.splat.raster.cpu_project import E_LEVEL, E_X, E_XX, E_XY, E_Y, E_YY, jit, parallel_jit
+from pipelines.splat.raster.cpu_project import E_LEVEL, E_X, E_XX, E_XY, E_Y, E_YY
 
 TILE_WIDTH = LANES
-TILE_HEIGHT = 16
+TILE_HEIGHT = 32
 # The splats are counted and written in this many runs of the depth order, whatever the number of threads.
 RUNS = 32
 
@@ -44,36 +46,58 @@ def _clamp_to_int(value: float, low: int, high: int) -> int:
 
 
 @jit
-def _column_span(ellipse: Any, width: int) -> Any:
+def _column_span(ellipses: Any, splat: int, width: int) -> Any:
     """First and last column of tiles; first > last if there is none."""
-    extent = math.sqrt(ellipse[E_LEVEL] * ellipse[E_XX])
-    first = _clamp_to_int(math.ceil(ellipse[E_X] - extent - 0.5), 0, width)
-    last = _clamp_to_int(math.floor(ellipse[E_X] + extent - 0.5), -1, width - 1)
+    x = float(ellipses[splat, E_X])
+    extent = math.sqrt(float(ellipses[splat, E_LEVEL]) * float(ellipses[splat, E_XX]))
+    first = _clamp_to_int(math.ceil(x - extent - 0.5), 0, width)
+    last = _clamp_to_int(math.floor(x + extent - 0.5), -1, width - 1)
     if first > last:
         return 0, -1
     return first // TILE_WIDTH, last // TILE_WIDTH
 
 
 @jit
-def _row_span(ellipse: Any, column: int, height: int) -> Any:
+def _row_span(ellipses: Any, splat: int, column: int, height: int) -> Any:
     """First and last row of pixels that the ellipse touches within a column of tiles.
 
     At a distance dx from the centre the ellipse spans dx · xy/xx ± sqrt((level − dx²/xx) · det/xx); the upper
     branch is concave, so its maximum over an interval is at its own, clamped to the interval.
     """
-    xx, xy, yy, level = float(ellipse[E_XX]), float(ellipse[E_XY]), float(ellipse[E_YY]), float(ellipse[E_LEVEL])
+    x, y = float(ellipses[splat, E_X]), float(ellipses[splat, E_Y])
+    xx, xy, yy = float(ellipses[splat, E_XX]), float(ellipses[splat, E_XY]), float(ellipses[splat, E_YY])
+    level = float(ellipses[splat, E_LEVEL])
     extent = math.sqrt(level * xx)
-    left = max(column * TILE_WIDTH + 0.5 - ellipse[E_X], -extent)
-    right = min(column * TILE_WIDTH + TILE_WIDTH - 0.5 - ellipse[E_X], extent)
+    left = max(column * TILE_WIDTH + 0.5 - x, -extent)
+    right = min(column * TILE_WIDTH + TILE_WIDTH - 0.5 - x, extent)
     slope = xy / xx
     spread = (xx * yy - xy * xy) / xx
     top = xy * math.sqrt(level / yy)
     dx_high, dx_low = min(max(top, left), right), min(max(-top, left), right)
     high = slope * dx_high + math.sqrt(spread * max(level - dx_high * dx_high / xx, 0.0))
     low = slope * dx_low - math.sqrt(spread * max(level - dx_low * dx_low / xx, 0.0))
-    first = _clamp_to_int(math.ceil(ellipse[E_Y] + low - 0.5), 0, height)
-    last = _clamp_to_int(math.floor(ellipse[E_Y] + high - 0.5), -1, height - 1)
+    first = _clamp_to_int(math.ceil(y + low - 0.5), 0, height)
+    last = _clamp_to_int(math.floor(y + high - 0.5), -1, height - 1)
     return first, last
+
+
+@worker_jit
+def _count_hits(ellipses: Any, width: int, height: int, per_tile: Any, per_splat: Any, run: int) -> None:
+    splats = ellipses.shape[0]
+    columns = (width + TILE_WIDTH - 1) // TILE_WIDTH
+    for tile in range(per_tile.shape[1]):
+        per_tile[run, tile] = 0
+    for splat in range(splats * run // RUNS, splats * (run + 1) // RUNS):
+        hits = 0
+        first_column, last_column = _column_span(ellipses, splat, width)
+        for column in range(first_column, last_column + 1):
+            first, last = _row_span(ellipses, splat, column, height)
+            if first > last:
+                continue
+            for tile_row in range(first // TILE_HEIGHT, last // TILE_HEIGHT + 1):
+                per_tile[run, tile_row * columns + column] += 1
+                hits += 1
+        per_splat[splat] = hits
 
 
 @parallel_jit
@@ -86,25 +110,11 @@ def count_hits(ellipses: Any, width: int, height: int, per_tile: Any, per_splat:
         per_tile: (RUNS, tiles) hits of each run in each tile, written.
         per_splat: (M,) hits of each splat, written.
     """
-    splats = ellipses.shape[0]
-    columns = (width + TILE_WIDTH - 1) // TILE_WIDTH
     for run in prange(RUNS):
-        counts = per_tile[run]
-        counts[:] = 0
-        for splat in range(splats * run // RUNS, splats * (run + 1) // RUNS):
-            hits = 0
-            first_column, last_column = _column_span(ellipses[splat], width)
-            for column in range(first_column, last_column + 1):
-                first, last = _row_span(ellipses[splat], column, height)
-                if first > last:
-                    continue
-                for tile_row in range(first // TILE_HEIGHT, last // TILE_HEIGHT + 1):
-                    counts[tile_row * columns + column] += 1
-                    hits += 1
-            per_splat[splat] = hits
+        _count_hits(ellipses, width, height, per_tile, per_splat, np.int64(run))
 
 
-@jit
+@kernel_jit
 def starts_from_counts(per_tile: Any, tile_start: Any) -> None:
     """Turn `per_tile` (RUNS, tiles) into the place of each run's first hit, and fill `tile_start` (tiles + 1,)."""
     place = 0
@@ -115,6 +125,28 @@ def starts_from_counts(per_tile: Any, tile_start: Any) -> None:
             per_tile[run, tile] = place
             place += count
     tile_start[per_tile.shape[1]] = place
+
+
+@worker_jit
+def _list_hits(
+    ellipses: Any, width: int, height: int, next_place: Any, splat_start: Any, hits: Any, places: Any, run: int
+) -> None:
+    splats = ellipses.shape[0]
+    columns = (width + TILE_WIDTH - 1) // TILE_WIDTH
+    for splat in range(splats * run // RUNS, splats * (run + 1) // RUNS):
+        slot = splat_start[splat]
+        first_column, last_column = _column_span(ellipses, splat, width)
+        for column in range(first_column, last_column + 1):
+            first, last = _row_span(ellipses, splat, column, height)
+            if first > last:
+                continue
+            for tile_row in range(first // TILE_HEIGHT, last // TILE_HEIGHT + 1):
+                tile, top = tile_row * columns + column, tile_row * TILE_HEIGHT
+                place = next_place[run, tile]
+                hits[place] = pack_hit(splat, max(first - top, 0), min(last - top, TILE_HEIGHT - 1))
+                places[slot] = place
+                next_place[run, tile] += 1
+                slot += 1
 
 
 @parallel_jit
@@ -131,21 +163,5 @@ def list_hits(
         hits: (H,) packed hits by tile, written.
         places: (H,) places in `hits` by splat, written.
     """
-    splats = ellipses.shape[0]
-    columns = (width + TILE_WIDTH - 1) // TILE_WIDTH
     for run in prange(RUNS):
-        place = next_place[run]
-        for splat in range(splats * run // RUNS, splats * (run + 1) // RUNS):
-            slot = splat_start[splat]
-            first_column, last_column = _column_span(ellipses[splat], width)
-            for column in range(first_column, last_column + 1):
-                first, last = _row_span(ellipses[splat], column, height)
-                if first > last:
-                    continue
-                for tile_row in range(first // TILE_HEIGHT, last // TILE_HEIGHT + 1):
-                    tile, top = tile_row * columns + column, tile_row * TILE_HEIGHT
-                    bottom_row = min(last - top, TILE_HEIGHT - 1)
-                    hits[place[tile]] = pack_hit(splat, max(first - top, 0), bottom_row)
-                    places[slot] = place[tile]
-                    place[tile] += 1
-                    slot += 1
+        _list_hits(ellipses, width, height, next_place, splat_start, hits, places, np.int64(run))
