@@ -8,6 +8,8 @@ origin, `local` the SfM model's frame, `model` the metric, origin-shifted frame 
 from __future__ import annotations
 
 import json
+import zipfile
+import zlib
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -179,24 +181,12 @@ class InitialSimilarity(Product):
 
 
 class TrainedCamera(Product):
-    """A camera after training: `cam_from_model` as quaternion and translation; corrected or as SfM left it."""
+    """A camera after training, as `cam_from_model`. A test camera has moved only with its neighbours."""
 
     name: str
     split: Literal["train", "test"]
     quat_xyzw: Quaternion
     translation: Vector3
-    corrected: bool
-
-
-class TrainedIntrinsics(Product):
-    """The undistorted pinhole camera of the training images, in pixels."""
-
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
 
 
 class TrainedModel(Product):
@@ -205,8 +195,7 @@ class TrainedModel(Product):
     format_version: Literal[1] = 1
     geo_from_model: SimilarityRecord
     model_from_local: SimilarityRecord
-    intrinsics: dict[str, TrainedIntrinsics]
-    camera_of: dict[str, str]
+    max_image_size: int = Field(gt=0)
     cameras: tuple[TrainedCamera, ...]
     background: Vector3
     sh_degree: int
@@ -229,7 +218,7 @@ def load_json(product_type: type[ProductT], path: Path) -> ProductT:
     """Read and validate a JSON product.
 
     Raises:
-        InputError: not JSON, or not of that form; names file and field.
+        InputError: unreadable, not JSON, or not of that form; names file and field.
     """
     try:
         return product_type.model_validate_json(path.read_text(encoding="utf-8"))
@@ -239,6 +228,8 @@ def load_json(product_type: type[ProductT], path: Path) -> ProductT:
         raise InputError(first["msg"], path=path, field=where or None) from error
     except UnicodeDecodeError as error:
         raise InputError("not a UTF-8 text file", path=path) from error
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror}", path=path) from error
 
 
 def dump_json(document: Any) -> str:
@@ -300,5 +291,5 @@ def load_npz(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
             if missing:
                 raise InputError(f"array {missing[0]!r} is missing", path=path)
             return {name: archive[name] for name in names}
-    except (OSError, ValueError, EOFError) as error:
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise InputError(f"not a readable NPZ file: {error}", path=path) from error

@@ -97,6 +97,12 @@ def producer_of(path: str) -> StageSpec:
     return next(spec for spec in PIPELINE if spec.folder == folder)
 
 
+def products_of(spec: StageSpec) -> tuple[str, ...]:
+    """Everything in a stage's folder that people or later stages look for."""
+    read = (path for other in PIPELINE for path in other.reads if producer_of(path) is spec)
+    return tuple(dict.fromkeys((spec.product, *read)))
+
+
 def stage_slice(first: str | None, last: str | None) -> tuple[StageSpec, ...]:
     """The stages from `first` to `last`, both included.
 

@@ -1,36 +1,40 @@
 """The workspace directory: the contract between the stages.
 
 Every stage owns one folder with a `manifest.json`. A stage writes into `<folder>.partial` and the folder is
-renamed when complete, so that a killed stage leaves the previous product whole; `recover` finishes or undoes a
-rename that was cut off. One writer at a time holds an advisory lock, which the system drops when it dies.
+renamed when complete, so that a killed stage leaves the previous product whole; the next writer finishes or undoes
+a rename that was cut off. One writer at a time holds an advisory lock, which the system drops when it dies.
 """
 
 from __future__ import annotations
 
 import fcntl
-import hashlib
 import json
 import os
 import shutil
-from collections.abc import Iterator
+import time
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TextIO
 
 from pydantic import BaseModel, ConfigDict
 
-from pipelines.config import CONFIG_FILE, InputMarker, StageConfig
+from pipelines.config import CONFIG_FILE
 from pipelines.errors import InputError, MissingProductError, WorkspaceBusyError
 from pipelines.products import load_json, save_json
 from pipelines.progress import SILENT, Progress
-from pipelines.stages import PIPELINE, StageSpec, producer_of
+from pipelines.stages import PIPELINE, StageSpec, producer_of, products_of
 
 MANIFEST = "manifest.json"
 TOKEN = "token.txt"
+FAILURE = "failure.txt"
 REQUESTS = "requests.json"
 LOCK = ".lock"
+LOCK_ATTEMPTS, LOCK_PAUSE_S = 3, 0.1
+
+Resume = Literal["never", "if-same", "always"]
 
 
 class Manifest(BaseModel):
@@ -109,10 +113,28 @@ class Workspace:
         """The workspace's `georef.toml`."""
         return self.root / CONFIG_FILE
 
+    def log_file(self, spec: StageSpec) -> Path:
+        """Where the log of a stage is kept."""
+        return self.root / "logs" / f"{spec.name}.log"
+
     def manifest(self, spec: StageSpec) -> Manifest | None:
-        """The manifest of a finished stage, or None."""
+        """The manifest of a finished stage, or None.
+
+        Raises:
+            InputError: it is damaged.
+        """
         path = self.root / spec.folder / MANIFEST
         return load_json(Manifest, path) if path.exists() else None
+
+    def placed_by_hand(self, spec: StageSpec) -> bool:
+        """Whether all products of a stage are there, but no stage has made them."""
+        folder = self.root / spec.folder
+        return not (folder / MANIFEST).exists() and all((self.root / p).exists() for p in products_of(spec))
+
+    def failure(self, spec: StageSpec) -> str | None:
+        """The message with which the latest run of a stage failed, or None."""
+        path = self.partial(spec) / FAILURE
+        return path.read_text(encoding="utf-8") if path.exists() else None
 
     def partial(self, spec: StageSpec) -> Path:
         """Where a stage writes before it is complete."""
@@ -122,8 +144,11 @@ class Workspace:
         return self.root / f".{spec.folder}.old"
 
     @contextmanager
-    def lock(self) -> Iterator[None]:
+    def lock(self, activity: str) -> Iterator[None]:
         """Hold the workspace for writing, and repair what a killed writer left.
+
+        Args:
+            activity: the command that writes, for those who find the workspace busy.
 
         Raises:
             WorkspaceBusyError: another process holds it.
@@ -135,24 +160,42 @@ class Workspace:
         except OSError as error:
             raise InputError(f"cannot be used as a workspace: {error.strerror}", path=self.root) from error
         with handle:
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                handle.seek(0)
-                holder = handle.read().strip() or "another process"
-                raise WorkspaceBusyError(
-                    f"{self.root} is being written by {holder}: wait for it, or stop it"
-                ) from None
+            self._acquire(handle)
             handle.truncate(0)
-            handle.write(f"process {os.getpid()}")
+            handle.write(f"{activity} in process {os.getpid()}")
             handle.flush()
             for spec in PIPELINE:
                 self._recover(spec)
             yield
 
+    def _acquire(self, handle: TextIO) -> None:
+        # `writer` holds the lock for an instant, which must not turn a writer away: hence more than one attempt.
+        for _ in range(LOCK_ATTEMPTS):
+            try:
+                return fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                time.sleep(LOCK_PAUSE_S)
+            except OSError as error:
+                raise InputError(f"cannot be locked: {error.strerror}", path=self.root) from error
+        handle.seek(0)
+        holder = handle.read().strip() or "another process"
+        raise WorkspaceBusyError(f"{self.root} is being written by {holder}: wait for it, or stop it")
+
+    def writer(self) -> str | None:
+        """The activity of the process that is writing now (`train`), or None."""
+        try:
+            with (self.root / LOCK).open(encoding="utf-8") as handle:
+                try:
+                    fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
+                except BlockingIOError:
+                    return handle.read().partition(" in process ")[0]
+        except OSError:
+            pass  # no lock file, or none that can be opened: nobody writes
+        return None
+
     def _recover(self, spec: StageSpec) -> None:
-        final, partial, old = self.root / spec.folder, self.partial(spec), self._old(spec)
-        if (partial / MANIFEST).exists():  # complete: only the renames are missing
+        final, old = self.root / spec.folder, self._old(spec)
+        if (self.partial(spec) / MANIFEST).exists():  # complete: only the renames are missing
             self._swap(spec)
         elif old.exists() and not final.exists():
             old.rename(final)
@@ -160,54 +203,80 @@ class Workspace:
             shutil.rmtree(old)
 
     def _swap(self, spec: StageSpec) -> None:
-        final, old = self.root / spec.folder, self._old(spec)
+        final, old, partial = self.root / spec.folder, self._old(spec), self.partial(spec)
+        (partial / TOKEN).unlink(missing_ok=True)
         if final.exists():
             if old.exists():
                 shutil.rmtree(old)
             final.rename(old)
-        self.partial(spec).rename(final)
+        partial.rename(final)
         if old.exists():
             shutil.rmtree(old)
 
-    def begin(self, spec: StageSpec, token: str, *, resume: bool) -> tuple[Path, bool]:
-        """Open the partial folder of a stage: continued if `resume` and `token` fits, else empty.
+    def begin(self, spec: StageSpec, token: str, resume: Resume) -> tuple[Path, bool]:
+        """Open the partial folder of a stage: as an interrupted run left it, or empty.
+
+        Args:
+            token: stands for the inputs and options of the run.
+            resume: continue an interrupted run never; if it had the same token, or else begin afresh; always, and
+                refuse to begin afresh where one with another token is.
 
         Returns:
             The folder, and whether it is continued.
+
+        Raises:
+            InputError: there is an interrupted run that must be, and cannot be, continued.
         """
         partial = self.partial(spec)
         held = partial / TOKEN
-        if resume and spec.resumable and held.exists() and held.read_text(encoding="utf-8") == token:
-            return partial, True
+        if spec.resumable and held.exists() and resume != "never":
+            if held.read_text(encoding="utf-8") == token:
+                (partial / FAILURE).unlink(missing_ok=True)
+                return partial, True
+            if resume == "always":
+                raise InputError(
+                    "the interrupted run had other inputs or options: give those, or start afresh without --resume",
+                    path=partial,
+                )
+        held.unlink(missing_ok=True)  # first: a half deleted run must not be taken for one to continue
         if partial.exists():
             shutil.rmtree(partial)
         partial.mkdir(parents=True)
         held.write_text(token, encoding="utf-8")
         return partial, False
 
+    def fail(self, spec: StageSpec, message: str) -> None:
+        """Record why a stage could not be completed."""
+        (self.partial(spec) / FAILURE).write_text(message, encoding="utf-8")
+
     def commit(self, spec: StageSpec, manifest: Manifest) -> None:
         """Make the partial folder the stage's product."""
         partial = self.partial(spec)
-        (partial / TOKEN).unlink(missing_ok=True)
         draft = partial / f"{MANIFEST}.tmp"
         save_json(manifest, draft)
-        draft.rename(partial / MANIFEST)
+        draft.rename(partial / MANIFEST)  # from here on it counts as complete, whatever happens
         self._swap(spec)
 
     def requests(self) -> dict[str, dict[str, Any]]:
-        """The flags that each stage was last asked for with, so that `georef run` can complete them."""
+        """The flags that each stage was last asked for with, so that `georef run` can complete them.
+
+        Raises:
+            InputError: the file is damaged.
+        """
         path = self.root / REQUESTS
         if not path.exists():
             return {}
         try:
-            document: dict[str, dict[str, Any]] = json.loads(path.read_text(encoding="utf-8"))
-        except json.JSONDecodeError as error:
+            document = json.loads(path.read_text(encoding="utf-8"))
+        except ValueError as error:
             raise InputError("not valid JSON: delete it and give the options again", path=path) from error
+        if not isinstance(document, dict) or not all(isinstance(flags, dict) for flags in document.values()):
+            raise InputError("not a table of options by stage: delete it and give them again", path=path)
         return document
 
-    def remember(self, stage: str, flags: dict[str, Any]) -> None:
+    def remember(self, stage: str, flags: Mapping[str, Any]) -> None:
         """Record the flags that a stage was asked for with."""
-        document = {**self.requests(), stage: flags}
+        document = {**self.requests(), stage: dict(flags)}
         path = self.root / REQUESTS
         draft = path.with_suffix(".tmp")
         draft.write_text(json.dumps(document, indent=1, default=str) + "\n", encoding="utf-8")
@@ -217,53 +286,3 @@ class Workspace:
 def now() -> datetime:
     """The time for manifests: UTC, seconds."""
     return datetime.now(UTC).replace(microsecond=0)
-
-
-def fingerprints(workspace: Workspace, spec: StageSpec, config: StageConfig) -> dict[str, str]:
-    """Hashes of everything that decides a stage's result.
-
-    Workspace products by content; files that the options name by content, folders that they name by the name,
-    size and modification time of each file (reading gigabytes of photographs at each look would be too slow).
-
-    Raises:
-        MissingProductError: a product is not there.
-        InputError: a path that an option names does not exist.
-    """
-    found = {product: _hash_product(workspace.path(product)) for product in spec.reads}
-    for name, info in type(config).model_fields.items():
-        value = getattr(config, name)
-        if value is None or not any(isinstance(mark, InputMarker) for mark in _metadata(info)):
-            continue
-        path = Path(value)
-        if not path.exists():
-            raise InputError("no such file or folder", path=path, field="--" + name.replace("_", "-"))
-        found[f"--{name}"] = _hash_file(path) if path.is_file() else _hash_listing(path)
-    return found
-
-
-def _metadata(info: Any) -> list[Any]:
-    """Markers of a field, also where `InputPath | None` hides them in the union's members."""
-    members = getattr(info.annotation, "__args__", ())
-    return [*info.metadata, *(mark for member in members for mark in getattr(member, "__metadata__", ()))]
-
-
-def _hash_file(path: Path) -> str:
-    with path.open("rb") as handle:
-        return hashlib.file_digest(handle, "sha256").hexdigest()
-
-
-def _hash_product(path: Path) -> str:
-    if path.is_file():
-        return _hash_file(path)
-    digest = hashlib.sha256()
-    for file in sorted(file for file in path.rglob("*") if file.is_file()):
-        digest.update(f"{file.relative_to(path)}={_hash_file(file)}\n".encode())
-    return digest.hexdigest()
-
-
-def _hash_listing(path: Path) -> str:
-    digest = hashlib.sha256()
-    for file in sorted(file for file in path.rglob("*") if file.is_file()):
-        stat = file.stat()
-        digest.update(f"{file.relative_to(path)} {stat.st_size} {stat.st_mtime_ns}\n".encode())
-    return digest.hexdigest()

@@ -5,6 +5,8 @@ All functions are batched over leading dimensions and work in float64. Quaternio
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
@@ -13,7 +15,8 @@ from pipelines.products import FloatArray
 
 # Columns: the gimbal's forward, right and down axes seen from a camera (x right, y down, z forward).
 _CAM_FROM_GIMBAL = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
-_ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+# Also the attitude in East-North-Up of a body (forward, right, down) that is level and heads north.
+ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 
 def matrix_from_quat_xyzw(quat_xyzw: ArrayLike) -> FloatArray:
@@ -59,5 +62,18 @@ def geo_from_cam(yaw_pitch_roll_deg: ArrayLike) -> FloatArray:
     """
     angles = np.asarray(yaw_pitch_roll_deg, dtype=np.float64)
     ned_from_gimbal = Rotation.from_euler("ZYX", angles.reshape(-1, 3), degrees=True).as_matrix()
-    rotation = _ENU_FROM_NED @ np.asarray(ned_from_gimbal) @ _CAM_FROM_GIMBAL.T
+    rotation = ENU_FROM_NED @ np.asarray(ned_from_gimbal) @ _CAM_FROM_GIMBAL.T
     return rotation.reshape(*angles.shape[:-1], 3, 3)
+
+
+def yaw_pitch_roll_deg(geo_from_cam_rotation: ArrayLike) -> FloatArray:
+    """Gimbal angles (…, 3) in degrees of rotations camera → East-North-Up (…, 3, 3): undoes `geo_from_cam`.
+
+    Straight down or up, yaw and roll turn about the same axis: roll is then zero.
+    """
+    matrix = np.asarray(geo_from_cam_rotation, dtype=np.float64)
+    ned_from_gimbal = ENU_FROM_NED.T @ matrix @ _CAM_FROM_GIMBAL
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Gimbal lock", category=UserWarning)
+        angles = Rotation.from_matrix(ned_from_gimbal.reshape(-1, 3, 3)).as_euler("ZYX", degrees=True)
+    return np.asarray(angles).reshape(*matrix.shape[:-2], 3)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 
@@ -42,9 +45,22 @@ class Gaussians:
         """The same values without gradient history."""
         return Gaussians(**{name: tensor.detach() for name, tensor in self.tensors().items()})
 
+    def arrays(self) -> dict[str, NDArray[np.float32]]:
+        """The values as numpy arrays by name, for files."""
+        return {name: tensor.detach().cpu().numpy() for name, tensor in self.tensors().items()}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[np.float32]]) -> Gaussians:
+        """From arrays by the names of the attributes; copied."""
+        return cls(**{field.name: torch.tensor(arrays[field.name]) for field in fields(cls)})
+
     def select(self, index: Tensor) -> Gaussians:
         """The rows that `index` (bool mask or integer) picks."""
         return Gaussians(**{name: tensor[index] for name, tensor in self.tensors().items()})
+
+    def to(self, device: torch.device) -> Gaussians:
+        """The same Gaussians on a device."""
+        return Gaussians(**{name: tensor.to(device) for name, tensor in self.tensors().items()})
 
     @staticmethod
     def concatenate(parts: list[Gaussians]) -> Gaussians:
@@ -52,3 +68,14 @@ class Gaussians:
         return Gaussians(
             **{name: torch.cat([part.tensors()[name] for part in parts]) for name in parts[0].tensors()}
         )
+
+
+def rotation_matrices(quats_wxyz: Tensor) -> Tensor:
+    """Rotation matrices (N, 3, 3) of quaternions (N, 4) of any length but zero."""
+    w, x, y, z = torch.nn.functional.normalize(quats_wxyz, dim=1).unbind(1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, dim=1).reshape(-1, 3, 3)

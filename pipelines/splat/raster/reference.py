@@ -11,7 +11,8 @@ import math
 import torch
 from torch import Tensor
 
-from pipelines.splat.gaussians import Gaussians
+from pipelines.splat import sh
+from pipelines.splat.gaussians import Gaussians, rotation_matrices
 from pipelines.splat.raster.api import (
     ALPHA_MAX,
     ALPHA_MIN,
@@ -93,47 +94,10 @@ def project(
     return mean_px, cov_px2
 
 
-def rotation_matrices(quats_wxyz: Tensor) -> Tensor:
-    """(N, 3, 3) of quaternions (N, 4) of any length but zero."""
-    w, x, y, z = torch.nn.functional.normalize(quats_wxyz, dim=-1).unbind(-1)
-    return torch.stack(
-        [
-            *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-            *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-            *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-        ],
-        dim=-1,
-    ).view(-1, 3, 3)
-
-
 def view_colours(gaussians: Gaussians, cam_from_model: Tensor, sh_degree: int) -> Tensor:
     """(N, 3) colours of the Gaussians seen from the camera's centre, not negative."""
     center_in_model = -torch.linalg.solve(cam_from_model[:3, :3], cam_from_model[:3, 3])
-    direction = torch.nn.functional.normalize(gaussians.means - center_in_model, dim=-1)
-    basis = sh_basis(direction, sh_degree)
-    return torch.einsum("nk,nkc->nc", basis, gaussians.sh[:, : basis.shape[1]]).add(0.5).clamp_min(0.0)
-
-
-def sh_basis(direction: Tensor, degree: int) -> Tensor:
-    """(N, (degree + 1)²) real spherical harmonics of unit vectors (N, 3), in the order and signs of 3DGS."""
-    x, y, z = direction.unbind(-1)
-    xx, yy, zz = x * x, y * y, z * z
-    pi = math.pi
-    terms = [torch.full_like(x, math.sqrt(1 / (4 * pi)))]
-    if degree >= 1:
-        c = math.sqrt(3 / (4 * pi))
-        terms += [-c * y, c * z, -c * x]
-    if degree >= 2:
-        c = math.sqrt(15 / (4 * pi))
-        zonal = math.sqrt(5 / (16 * pi))
-        terms += [c * x * y, -c * y * z, zonal * (2 * zz - xx - yy), -c * x * z, c / 2 * (xx - yy)]
-    if degree >= 3:
-        a, b = math.sqrt(35 / (32 * pi)), math.sqrt(105 / (4 * pi))
-        c, zonal = math.sqrt(21 / (32 * pi)), math.sqrt(7 / (16 * pi))
-        terms += [-a * y * (3 * xx - yy), b * x * y * z, -c * y * (4 * zz - xx - yy)]
-        terms += [zonal * z * (2 * zz - 3 * xx - 3 * yy), -c * x * (4 * zz - xx - yy)]
-        terms += [b / 2 * z * (xx - yy), -a * x * (xx - 3 * yy)]
-    return torch.stack(terms, dim=-1)
+    return (sh.evaluate(gaussians.sh, gaussians.means - center_in_model, sh_degree) + 0.5).clamp_min(0.0)
 
 
 def _alpha(mean_px: Tensor, cov_px2: Tensor, opacity: Tensor, camera: Pinhole) -> Tensor:

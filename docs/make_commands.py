@@ -1,0 +1,75 @@
+"""Write docs/commands.md from the commands themselves: `python docs/make_commands.py [--print]`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import click
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from georef_cli.main import COMMANDS, cli  # noqa: E402
+
+INTRODUCTION = """# Commands
+
+Made by `python docs/make_commands.py` from the help of the commands; a test compares the two.
+
+`georef -v` tells more, `georef -q` warnings and errors only, `georef --traceback` where an error was raised.
+Results go to stdout, everything else to stderr and to `logs/<stage>.log` in the workspace. Exit codes: 0 done,
+1 known failure, 2 usage, 130 interrupted. With `--json`, stdout is one JSON document; it stays empty when the
+command fails.
+"""
+
+
+def describe(name: str) -> str:
+    """The section of one command: text, options, examples."""
+    command = cli.get_command(click.Context(cli), name)
+    assert command is not None
+    text, _, examples = (command.help or "").partition("\b\nExamples:\n")
+    arguments = " ".join(param.make_metavar(click.Context(command)) for param in _of(command, click.Argument))
+    rows = [f"| `{_spelling(option)}` | {_escape(option.help or '')} |" for option in _of(command, click.Option)]
+    calls = "\n".join(line.strip() for line in examples.strip().splitlines())
+    return "\n".join(
+        [
+            f"## georef {name}\n",
+            f"`georef {name} {arguments} [OPTIONS]`\n",
+            _escape(text.strip()) + "\n",
+            "| option | meaning |\n|---|---|",
+            *rows,
+            f"\n```sh\n{calls}\n```\n",
+        ]
+    )
+
+
+def _of(command: click.Command, kind: type) -> list:
+    return [param for param in command.params if isinstance(param, kind)]
+
+
+def _spelling(option: click.Option) -> str:
+    names = ", ".join(option.opts)
+    if option.secondary_opts:
+        return f"{names} / {', '.join(option.secondary_opts)}"
+    if option.is_flag:
+        return names
+    choices = getattr(option.type, "choices", None)
+    value = "\\|".join(choices) if choices else option.metavar or option.type.name.upper()
+    return f"{names} {value}"
+
+
+def _escape(text: str) -> str:
+    return text.replace("<", "\\<").replace("*", "\\*")
+
+
+def main() -> None:
+    """Write the document, or print it."""
+    document = "\n".join([INTRODUCTION, *(describe(name) for name in COMMANDS)]).rstrip() + "\n"
+    if "--print" in sys.argv:
+        sys.stdout.write(document)
+    else:
+        (ROOT / "docs/commands.md").write_text(document, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,175 @@
+"""The edge of the program: errors become messages and exit codes, log records become lines.
+
+Exit codes: 0 done, 1 known failure, 2 usage, 130 interrupted. An exception that nobody foresaw keeps its
+traceback. Everything said here goes to stderr; stdout is the result's.
+"""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+import signal
+import sys
+import traceback as tracebacks
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+
+import click
+
+from pipelines.errors import GeorefError
+
+FAILED, INTERRUPTED = 1, 130
+OURS = ("pipelines", "georef_cli")
+FILE_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Manners:
+    """How the program talks: the options of the group."""
+
+    verbose: bool = False
+    quiet: bool = False
+    traceback: bool = False
+
+    @property
+    def level(self) -> int:
+        """The least severe level that is told on stderr."""
+        return logging.DEBUG if self.verbose else logging.WARNING if self.quiet else logging.INFO
+
+
+def guarded(group: click.Group, arguments: Sequence[str] | None) -> int:
+    """Run the command line and turn how it ended into an exit code."""
+    try:
+        with _sigterm_interrupts():
+            code = group.main(args=arguments, prog_name=group.name, standalone_mode=False)
+            sys.stdout.flush()
+    except click.ClickException as error:
+        error.show()
+        return error.exit_code
+    except (click.Abort, KeyboardInterrupt):
+        click.echo("interrupted", err=True)
+        return INTERRUPTED
+    except GeorefError as error:
+        click.echo(f"error: {error}", err=True)
+        return FAILED
+    except BrokenPipeError:
+        # Whoever read the result has enough; what is left in the buffer must not raise again at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return FAILED
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        click.echo(f"error: {error.filename or 'workspace'}: the disk is full", err=True)
+        return FAILED
+    return code if isinstance(code, int) else 0
+
+
+@contextmanager
+def _sigterm_interrupts() -> Iterator[None]:
+    """Let SIGTERM end the work as Ctrl-C does, so that a stage can save what it has."""
+
+    def interrupt(_signal: int, _frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+@contextmanager
+def told(manners: Manners) -> Iterator[None]:
+    """Tell log records on stderr while the context lasts, and the traceback of its error if asked."""
+    handler = _terminal_handler() if sys.stderr.isatty() else _line_handler()
+    handler.setLevel(manners.level)
+    with _attached(handler, logging.DEBUG if manners.verbose else logging.INFO):
+        try:
+            yield
+        except GeorefError:
+            if manners.traceback:
+                tracebacks.print_exc()
+            raise
+
+
+@contextmanager
+def written(path: Path) -> Iterator[None]:
+    """Append log records to the file `path` while the context lasts, and the error that ends it."""
+    handler = _LateFileHandler(path)
+    handler.setFormatter(logging.Formatter(FILE_FORMAT))
+    with _attached(handler, logging.INFO):
+        try:
+            yield
+        except BaseException as error:
+            handler.tell_end(error)
+            raise
+
+
+@contextmanager
+def _attached(handler: logging.Handler, level: int) -> Iterator[None]:
+    root = logging.getLogger()
+    levels = {name: logging.getLogger(name).level for name in OURS}
+    root.addHandler(handler)
+    for name in OURS:
+        logger = logging.getLogger(name)
+        logger.setLevel(min(level, logger.level or level))
+    try:
+        yield
+    finally:
+        root.removeHandler(handler)
+        handler.close()
+        for name, before in levels.items():
+            logging.getLogger(name).setLevel(before)
+
+
+def _terminal_handler() -> logging.Handler:
+    from georef_cli.display import ConsoleHandler, stderr_console
+
+    return ConsoleHandler(stderr_console())
+
+
+def _line_handler() -> logging.Handler:
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(LineFormatter())
+    return handler
+
+
+class LineFormatter(logging.Formatter):
+    """`message`, or `warning: message`."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        text = super().format(record)
+        return text if record.levelno == logging.INFO else f"{record.levelname.lower()}: {text}"
+
+
+class _LateFileHandler(logging.FileHandler):
+    """Opens its file at the first record, in a workspace that is there by then.
+
+    A command that is refused before it began leaves nothing behind, not even a folder.
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, mode="a", encoding="utf-8", delay=True)
+        self.path = path
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if self.path.parent.parent.is_dir():
+            self.path.parent.mkdir(exist_ok=True)
+            super().emit(record)
+
+    def tell_end(self, error: BaseException) -> None:
+        """Record how a stage was ended."""
+        known = isinstance(error, GeorefError | KeyboardInterrupt)
+        text = str(error) or type(error).__name__
+        self.emit(
+            logging.LogRecord(
+                __name__, logging.ERROR, __file__, 0, text, None,
+                None if known else (type(error), error, error.__traceback__),
+            )
+        )  # fmt: skip

@@ -1,0 +1,51 @@
+"""`georef export-ply`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from georef_cli.delivery import check_target, deliver
+from georef_cli.output import print_outcome
+from georef_cli.stage import StageCommand
+from pipelines.stages import SPLAT
+
+
+class ExportCommand(StageCommand):
+    """The stage with `-o FILE`."""
+
+    def act(self, ctx: click.Context, **values: Any) -> None:
+        """Export, copy the result where the user wants it, and print it."""
+        workspace, output = values["workspace"], values["output"]
+        if output is not None:
+            check_target(output, overwrite=values["force"])
+        outcome = self.run(ctx, values)
+        if output is not None:
+            with workspace.lock("export-ply"):
+                deliver(workspace.path(SPLAT), output)
+        print_outcome(workspace, outcome, as_json=values["as_json"])
+
+
+command = ExportCommand(
+    "export-ply",
+    """Write the splat as a PLY that knows where it is.
+
+    The PLY is in an East-North-Up frame in metres; FILE.georef.json beside it tells where that frame lies on
+    Earth, and how well.
+
+    \b
+    Examples:
+      georef export-ply flight
+      georef export-ply flight -o splat.ply --min-opacity 0.02
+    """,
+    extra=[
+        click.Option(
+            ["-o", "--output"],
+            type=click.Path(dir_okay=False, resolve_path=True, path_type=Path),
+            metavar="FILE",
+            help="Copy the PLY and its sidecar here; an existing file is replaced only with --force.",
+        )
+    ],
+)

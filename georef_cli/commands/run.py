@@ -1,0 +1,106 @@
+"""`georef run`."""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any
+
+import click
+
+from georef_cli import boundary, options
+from georef_cli.display import progress_for
+from georef_cli.output import print_outcomes
+from pipelines import runner
+from pipelines.config import IngestConfig
+from pipelines.errors import GeorefError
+from pipelines.stages import BY_NAME, PIPELINE, StageSpec, stage_slice
+
+# Options of later stages that `run` offers too, and the stages that each is for. The others are set in
+# georef.toml, or with the stage's own command.
+LATER: dict[str, tuple[str, ...]] = {
+    "mapper": ("sfm",),
+    "import_model": ("sfm",),
+    "max_residual": ("init-sim3",),
+    "preset": ("train",),
+    "iterations": ("train",),
+    "max_image_size": ("train",),
+    "max_gaussians": ("train",),
+    "backend": ("train", "evaluate"),
+    "seed": ("sfm", "init-sim3", "train"),
+}
+OWNERS: dict[str, tuple[str, ...]] = {**dict.fromkeys(IngestConfig.model_fields, ("ingest",)), **LATER}
+
+
+def _run(ctx: click.Context, **values: Any) -> None:
+    stages = _stages(values["first"], values["last"])
+    flags = _flags(ctx, stages)
+    workspace = values["workspace"]
+    outcomes = runner.run_pipeline(
+        workspace,
+        stages,
+        flags,
+        force=values["force"],
+        progress=progress_for(ctx.obj),
+        around=lambda spec: boundary.written(workspace.log_file(spec)),
+    )
+    print_outcomes(workspace, outcomes, as_json=values["as_json"])
+
+
+def _stages(first: str | None, last: str | None) -> tuple[StageSpec, ...]:
+    try:
+        return stage_slice(first, last)
+    except GeorefError as error:
+        raise click.UsageError(str(error)) from error
+
+
+def _flags(ctx: click.Context, stages: tuple[StageSpec, ...]) -> dict[str, dict[str, Any]]:
+    """The given options by stage.
+
+    Raises:
+        click.UsageError: an option is for stages that are not to run.
+    """
+    running = {spec.name for spec in stages}
+    flags: dict[str, dict[str, Any]] = {}
+    for name, value in options.given(ctx, OWNERS).items():
+        owners = [owner for owner in OWNERS[name] if owner in running]
+        if not owners:
+            raise click.UsageError(
+                f"{options.config_option(BY_NAME[OWNERS[name][0]].config, name).opts[0]} is for "
+                f"{' and '.join(OWNERS[name])}, which is not among the stages to run."
+            )
+        for owner in owners:
+            flags.setdefault(owner, {})[name] = value
+    return flags
+
+
+def _stage_option(flag: str, dest: str, help_text: str) -> click.Option:
+    return click.Option([flag, dest], type=click.Choice([spec.name for spec in PIPELINE]), help=help_text)
+
+
+command = click.Command(
+    "run",
+    params=[
+        options.workspace_argument(),
+        _stage_option("--from", "first", "First stage to run."),
+        _stage_option("--to", "last", "Last stage to run."),
+        *(options.config_option(BY_NAME[owners[0]].config, name) for name, owners in OWNERS.items()),
+        options.force_option("Run the stages even if their products are current."),
+        options.json_option(),
+    ],
+    callback=click.pass_context(_run),
+    help=inspect.cleandoc(
+        """Run all stages, or some, skipping what is current.
+
+        What was interrupted is resumed. Options that a stage was given before are remembered, so that a later
+        run needs only what changes. Options that are not listed here are set in WS/georef.toml or with the
+        stage's own command.
+
+        \b
+        Examples:
+          georef run flight --images photos --preset fast
+          georef run flight --images photos --gcp gcp_list.txt --to init-sim3
+          georef run flight --from train --iterations 2000
+          georef run flight
+        """
+    ),
+)

@@ -1,0 +1,57 @@
+"""`georef simulate`."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import time
+from pathlib import Path
+from typing import Any
+
+import click
+
+from georef_cli import options, tables
+from georef_cli.display import progress_for
+from georef_cli.output import print_json, print_rich
+from pipelines.config import CONFIG_FILE, SimulateConfig, resolve
+
+
+def _simulate(ctx: click.Context, **values: Any) -> None:
+    from pipelines.simulate import simulate
+
+    config = resolve(SimulateConfig, {}, options.given(ctx, SimulateConfig.model_fields), Path(CONFIG_FILE))
+    started = time.monotonic()
+    summary = simulate(config, values["directory"], progress_for(ctx.obj), overwrite=values["force"])
+    if values["as_json"]:
+        print_json({**dataclasses.asdict(summary), "directory": str(summary.directory)})
+        return
+    took = tables.duration(time.monotonic() - started)
+    print_rich(f"[bold]simulate[/]: {summary.key_figure} in {summary.directory} ({took})")
+
+
+command = click.Command(
+    "simulate",
+    params=[
+        click.Argument(
+            ["directory"], type=click.Path(file_okay=False, resolve_path=True, path_type=Path), metavar="DIR"
+        ),
+        *options.stage_options(SimulateConfig),
+        options.force_option("Replace an earlier simulation in DIR."),
+        options.json_option(),
+    ],
+    callback=click.pass_context(_simulate),
+    help=inspect.cleandoc(
+        """Simulate a survey whose truth is known exactly.
+
+        DIR gets photographs, a trajectory, raw navigation, control and check points as a surveyor would hand them
+        over, and truth.json with everything that they hide. The same options give the same bytes.
+
+        \b
+        Examples:
+          georef simulate survey
+          georef simulate survey --scene village --flight grid --images 60 --size 1200x900 --gnss consumer
+          georef simulate survey --height 50 --height 75 --lever-arm 0.1,0,-0.3 --boresight 0.5,0.3,-1
+          georef simulate survey --clock-offset 0.2 --bag mcap --depth --origin=-33.86,151.21,40
+        """
+    ),
+)

@@ -1,0 +1,35 @@
+"""`georef train`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import click
+
+from georef_cli.output import print_outcome
+from georef_cli.stage import StageCommand
+
+
+class TrainCommand(StageCommand):
+    """The stage with `--resume`."""
+
+    def act(self, ctx: click.Context, **values: Any) -> None:
+        """Train, or continue to train, and print the result."""
+        outcome = self.run(ctx, values, resume=values["resume"])
+        print_outcome(values["workspace"], outcome, as_json=values["as_json"])
+
+
+command = TrainCommand(
+    "train",
+    """Train the Gaussians together with the similarity and the cameras.
+
+    Interrupted with Ctrl-C it writes a checkpoint, and --resume goes on from there with the same options.
+
+    \b
+    Examples:
+      georef train flight --preset fast
+      georef train flight --preset fast --resume
+      georef train flight --iterations 5000 --max-image-size 800 --backend cpu
+    """,
+    extra=[click.Option(["--resume"], is_flag=True, help="Continue the interrupted run.")],
+)

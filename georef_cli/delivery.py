@@ -1,0 +1,41 @@
+"""Copies of products outside the workspace: never half written, never over a file by accident."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+from pipelines.errors import InputError
+
+
+def check_target(target: Path, *, overwrite: bool) -> None:
+    """See before the work begins that its result can be put at `target`.
+
+    Raises:
+        InputError: the folder is missing, or the file exists and may not be replaced.
+    """
+    if not target.parent.is_dir():
+        raise InputError("no such folder: make it first", path=target.parent)
+    if target.exists() and not overwrite:
+        raise InputError("exists already: --force replaces it", path=target)
+
+
+def deliver(source: Path, target: Path) -> None:
+    """Copy a file and its sidecars (`source.*`); they appear, or are replaced, when all copies are complete.
+
+    Raises:
+        InputError: the target cannot be written.
+    """
+    family = sorted(source.parent.glob(f"{source.name}*"))
+    targets = [target.with_name(target.name + member.name.removeprefix(source.name)) for member in family]
+    drafts = [path.with_name(f".{path.name}.partial") for path in targets]
+    try:
+        for member, draft in zip(family, drafts, strict=True):
+            shutil.copyfile(member, draft)
+        for draft, path in zip(drafts, targets, strict=True):
+            draft.replace(path)
+    except PermissionError as error:
+        raise InputError("cannot be written", path=target.parent) from error
+    finally:
+        for draft in drafts:
+            draft.unlink(missing_ok=True)

@@ -1,0 +1,111 @@
+"""The group `georef`: a table of commands, each imported when it is called.
+
+`georef --help` reads the table alone, so that it answers at once: no command module, and with it neither the
+validation library nor anything heavier, is imported for it.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import click
+
+from georef_cli import boundary
+
+PROGRAM = "georef"
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One line of `georef --help`: the module that holds `command`, the section and one line of help."""
+
+    module: str
+    section: str
+    help: str
+
+
+COMMANDS: dict[str, Entry] = {
+    "simulate": Entry("simulate", "Surveys", "Simulate a survey whose truth is known exactly."),
+    "run": Entry("run", "Pipeline", "Run all stages, or some, skipping what is current."),
+    "status": Entry("status", "Pipeline", "Show the state of every stage."),
+    "ingest": Entry("ingest", "Stages", "Read photographs, positions and control points into one survey."),
+    "sfm": Entry("sfm", "Stages", "Reconstruct cameras and points with COLMAP."),
+    "geolocate": Entry("geolocate", "Stages", "Intersect every SfM point on Earth."),
+    "init-sim3": Entry("init_sim3", "Stages", "Estimate the similarity from the SfM model to the Earth."),
+    "train": Entry("train", "Stages", "Train the Gaussians with the similarity and the cameras."),
+    "evaluate": Entry("evaluate", "Stages", "Measure test views and check points."),
+    "export-ply": Entry("export_ply", "Stages", "Write the splat as a PLY that knows where it is."),
+}
+
+
+class LazyGroup(click.Group):
+    """A group whose subcommands live in `georef_cli.commands`, imported one at a time."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Names in the order of the table, which is that of the work."""
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Import the command of that name; None if there is none."""
+        entry = COMMANDS.get(cmd_name)
+        if entry is None:
+            return None
+        command = importlib.import_module(f"georef_cli.commands.{entry.module}").command
+        assert isinstance(command, click.Command)
+        return command
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run a subcommand with the manners that the group's options ask for."""
+        if ctx.params["verbose"] and ctx.params["quiet"]:
+            raise click.UsageError("--verbose and --quiet exclude each other.", ctx)
+        ctx.obj = boundary.Manners(**ctx.params)
+        with boundary.told(ctx.obj):
+            return super().invoke(ctx)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the commands from the table, without importing one."""
+        for section in dict.fromkeys(entry.section for entry in COMMANDS.values()):
+            with formatter.section(section):
+                formatter.write_dl([(name, e.help) for name, e in COMMANDS.items() if e.section == section])
+
+
+def _print_version(ctx: click.Context, _param: click.Parameter, value: bool) -> None:
+    if not value or ctx.resilient_parsing:
+        return
+    from importlib.metadata import version
+
+    click.echo(f"{PROGRAM} {version('georefgs')}")
+    ctx.exit()
+
+
+@click.group(name=PROGRAM, cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.option("-v", "--verbose", is_flag=True, help="Tell more.")
+@click.option("-q", "--quiet", is_flag=True, help="Tell warnings and errors only.")
+@click.option("--traceback", is_flag=True, help="Show where in the program an error was raised.")
+@click.option(
+    "--version",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_print_version,
+    help="Show the version.",
+)
+def cli(**_manners: bool) -> None:
+    """From drone flights to georeferenced 3D Gaussian splats.
+
+    Every command works on a workspace, a folder that holds the products of the stages.
+
+    \b
+    Examples:
+      georef run flight --images photos
+      georef status flight
+    """
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point of `georef`: run the command line and exit with its code."""
+    sys.exit(boundary.guarded(cli, arguments))

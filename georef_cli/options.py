@@ -1,0 +1,105 @@
+"""Options of the commands: what all share, and what follows from a stage's config.
+
+A stage's options are read off its config class (names, types, meaning, defaults), so that each exists once.
+"""
+
+from __future__ import annotations
+
+import types
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
+
+import click
+from pydantic.fields import FieldInfo
+
+from pipelines.config import StageConfig, flag_name
+from pipelines.workspace import Workspace
+
+FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
+
+_BOUNDS = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
+
+
+class WorkspaceType(click.Path):
+    """A workspace directory as an argument."""
+
+    def __init__(self) -> None:
+        super().__init__(file_okay=False, resolve_path=True, path_type=Path)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The workspace at that path."""
+        return value if isinstance(value, Workspace) else Workspace(Path(str(super().convert(value, param, ctx))))
+
+
+def workspace_argument() -> click.Argument:
+    """The workspace, shown as WS."""
+    return click.Argument(["workspace"], type=WorkspaceType(), metavar="WS")
+
+
+def json_option() -> click.Option:
+    """`--json`."""
+    return click.Option(["--json", "as_json"], is_flag=True, help="Print the result as one JSON document.")
+
+
+def force_option(help_text: str = "Run even if the product is current.") -> click.Option:
+    """`--force`."""
+    return click.Option(["--force"], is_flag=True, help=help_text)
+
+
+def stage_options(config_type: type[StageConfig], only: Iterable[str] | None = None) -> list[click.Option]:
+    """One click option for each field of a config, or for those named in `only`."""
+    wanted = list(config_type.model_fields) if only is None else list(only)
+    return [config_option(config_type, name) for name in wanted]
+
+
+def config_option(config_type: type[StageConfig], name: str) -> click.Option:
+    """The click option of one field: it has no default of its own, only a text that tells the config's."""
+    info = config_type.model_fields[name]
+    flag, kind = flag_name(config_type, name), _bare_type(info.annotation)
+    help_text = " ".join(filter(None, [info.description, _told_default(info)]))
+    if kind is bool:
+        return click.Option(
+            [f"{flag}/--no-{flag.removeprefix('--')}", name], is_flag=True, default=None, help=help_text
+        )
+    if get_origin(kind) is tuple:
+        return click.Option(
+            [flag, name], multiple=True, type=_click_type(get_args(kind)[0]), help=help_text + "  [repeatable]"
+        )
+    return click.Option([flag, name], type=_click_type(kind), default=None, help=help_text)
+
+
+def given(ctx: click.Context, names: Iterable[str]) -> dict[str, Any]:
+    """Values of those options that the user gave; the others are the config's and `georef.toml`'s to decide."""
+    return {
+        name: ctx.params[name]
+        for name in names
+        if ctx.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE
+    }
+
+
+def _bare_type(annotation: Any) -> Any:
+    """The type without `| None` and `Annotated`."""
+    if get_origin(annotation) in (Union, types.UnionType):
+        (annotation,) = [member for member in get_args(annotation) if member is not type(None)]
+    return get_args(annotation)[0] if get_origin(annotation) is Annotated else annotation
+
+
+def _click_type(kind: Any) -> click.ParamType:
+    if get_origin(kind) is Literal:
+        return click.Choice(get_args(kind))
+    if kind is Path:
+        return click.Path(resolve_path=True, path_type=Path)
+    known: dict[type, click.ParamType] = {int: click.INT, float: click.FLOAT, str: click.STRING}
+    return known[kind]
+
+
+def _told_default(info: FieldInfo) -> str:
+    """`[default: 1200; ≥ 128]`: default and range, as far as there are any."""
+    parts = []
+    if info.default not in (None, ()):
+        value = {True: "on", False: "off"}[info.default] if isinstance(info.default, bool) else info.default
+        parts.append(f"default: {value}")
+    for bound, sign in _BOUNDS.items():
+        parts += [f"{sign} {getattr(mark, bound)}" for mark in info.metadata if hasattr(mark, bound)]
+    return f" [{'; '.join(parts)}]" if parts else ""

@@ -1,0 +1,61 @@
+"""What the commands of single stages have in common: build the command, run the stage, print its result."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import click
+
+from georef_cli import boundary, options
+from georef_cli.display import progress_for
+from georef_cli.output import print_outcome
+from pipelines import runner
+from pipelines.stages import BY_NAME
+
+
+class StageCommand(click.Command):
+    """`georef STAGE WS …`: the options of the stage's config, `--force` and `--json`.
+
+    Args:
+        name: of the stage.
+        doc: help, with examples.
+        extra: further options, handed to `act`.
+    """
+
+    def __init__(self, name: str, doc: str, extra: Sequence[click.Option] = ()) -> None:
+        self.spec = BY_NAME[name]
+        super().__init__(
+            name,
+            params=[
+                options.workspace_argument(),
+                *options.stage_options(self.spec.config),
+                *extra,
+                options.force_option(),
+                options.json_option(),
+            ],
+            help=inspect.cleandoc(doc),
+            callback=click.pass_context(self.act),
+        )
+
+    def act(self, ctx: click.Context, **values: Any) -> None:
+        """Run the stage and print its result."""
+        outcome = self.run(ctx, values)
+        print_outcome(values["workspace"], outcome, as_json=values["as_json"])
+
+    def run(self, ctx: click.Context, values: Mapping[str, Any], *, resume: bool = False) -> runner.Outcome:
+        """Run the stage with the options that the user gave; to resume, on top of those given before."""
+        flags = options.given(ctx, self.spec.config.model_fields)
+        workspace = values["workspace"]
+        if resume:
+            flags = runner.remembered(workspace, self.spec, flags)
+        with boundary.written(workspace.log_file(self.spec)):
+            return runner.run_stage(
+                workspace,
+                self.spec,
+                flags,
+                force=values["force"],
+                resume="always" if resume else "never",
+                progress=progress_for(ctx.obj),
+            )

@@ -1,0 +1,1 @@
+"""Pieces that several stages share: they join formats, splat and georef."""

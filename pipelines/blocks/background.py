@@ -1,0 +1,110 @@
+"""Gaussians for what the cameras see but SfM has no points on: sky, horizon, bare ground around the scene.
+
+Left empty, these parts of the photographs are filled by floaters: Gaussians of the scene that grow in mid-air until
+they cover the gap, in front of everything else. So rays through such parts start with a Gaussian of the pixel's
+colour on the ground, or far away where they do not meet the ground.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.blocks.scene import Scene
+from pipelines.formats.image_cache import ImageCache, PinholeImage
+from pipelines.products import FloatArray
+
+_COLUMNS = 24  # cells across an image
+_MOST_VIEWS = 120
+_GROUND_PERCENTILE = 5.0
+_GROUND_REACH = 6.0  # in scene radii: beyond, the ground is as good as infinitely far
+_SKY_RADIUS = 12.0  # in scene radii
+
+
+@dataclass(frozen=True)
+class Background:
+    """B points beyond the SfM points.
+
+    Attributes:
+        point_in_model: (B, 3) metres.
+        rgb: (B, 3) uint8.
+        sigma_m: (B,) half the width of the image cell that each stands for.
+    """
+
+    point_in_model: FloatArray
+    rgb: NDArray[np.uint8]
+    sigma_m: FloatArray
+
+
+def background(scene: Scene, images: ImageCache) -> Background:
+    """Points on the rays of those image cells of the training views in which no SfM point is seen.
+
+    The frame `model` has its z axis up; the ground is taken to be level, at a low percentile of the SfM points.
+    """
+    points = scene.point_in_model
+    middle = np.median(points, axis=0)
+    radius = float(np.percentile(np.linalg.norm(points - middle, axis=1), 90))
+    ground = float(np.percentile(points[:, 2], _GROUND_PERCENTILE))
+    found, colours, sigmas = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)], [np.zeros(0)]
+    step = max(1, len(scene.train) // _MOST_VIEWS)
+    for index in map(int, scene.train[::step]):
+        camera, center = images.pinhole(index), scene.poses.cam_center_in_model[index]
+        cells = _empty_cells(scene, index, camera)
+        pixel = (cells + 0.5) * (camera.width / _COLUMNS)
+        ray = _rays(pixel, camera) @ scene.poses.cam_from_model[index]
+        distance = _distance(ray, center, ground, radius)
+        found.append(center + distance[:, None] * ray)
+        colours.append(_colours(images.image(index), pixel))
+        sigmas.append(0.5 * distance * camera.width / (_COLUMNS * camera.fx))
+    return _thinned(Background(np.concatenate(found), np.concatenate(colours), np.concatenate(sigmas)))
+
+
+def _empty_cells(scene: Scene, index: int, camera: PinholeImage) -> FloatArray:
+    """Cells (E, 2) as column and row, without an SfM point in them or beside them."""
+    rows = max(1, round(_COLUMNS * camera.height / camera.width))
+    in_cam = (scene.point_in_model - scene.poses.cam_center_in_model[index]) @ scene.poses.cam_from_model[index].T
+    in_cam = in_cam[in_cam[:, 2] > 0]
+    x = (camera.fx * in_cam[:, 0] / in_cam[:, 2] + camera.cx) * _COLUMNS / camera.width
+    y = (camera.fy * in_cam[:, 1] / in_cam[:, 2] + camera.cy) * rows / camera.height
+    inside = (x >= 0) & (x < _COLUMNS) & (y >= 0) & (y < rows)
+    taken = np.zeros((rows + 2, _COLUMNS + 2), dtype=bool)
+    column, row = x[inside].astype(int), y[inside].astype(int)
+    for shift_row in (0, 1, 2):
+        for shift_column in (0, 1, 2):
+            taken[row + shift_row, column + shift_column] = True
+    empty_row, empty_column = np.nonzero(~taken[1:-1, 1:-1])
+    return np.stack([empty_column, empty_row], axis=1).astype(np.float64)
+
+
+def _rays(pixel: FloatArray, camera: PinholeImage) -> FloatArray:
+    ray = np.stack(
+        [(pixel[:, 0] - camera.cx) / camera.fx, (pixel[:, 1] - camera.cy) / camera.fy, np.ones(len(pixel))], axis=1
+    )
+    return np.asarray(ray / np.linalg.norm(ray, axis=1, keepdims=True))
+
+
+def _distance(ray: FloatArray, center: FloatArray, ground: float, radius: float) -> FloatArray:
+    """Along the rays (E, 3): to the ground where it is met within reach, else to the sky."""
+    down = np.minimum(ray[:, 2], -1e-6)
+    to_ground = (ground - center[2]) / down
+    meets = (ray[:, 2] < 0) & (to_ground > 0) & (to_ground < _GROUND_REACH * radius)
+    return np.where(meets, to_ground, _SKY_RADIUS * radius)
+
+
+def _colours(image: NDArray[np.uint8], pixel: FloatArray) -> NDArray[np.uint8]:
+    row = np.clip(pixel[:, 1].astype(int), 0, image.shape[0] - 1)
+    column = np.clip(pixel[:, 0].astype(int), 0, image.shape[1] - 1)
+    return np.asarray(image[row, column])
+
+
+def _thinned(all_points: Background) -> Background:
+    """One point a cube of its own size: neighbouring views see the same places."""
+    if not len(all_points.sigma_m):
+        return all_points
+    level = np.round(np.log2(np.maximum(all_points.sigma_m, 1e-6)))
+    cube = np.floor(all_points.point_in_model / (2.0 ** (level + 1))[:, None])
+    _, first = np.unique(np.column_stack([level, cube]), axis=0, return_index=True)
+    first.sort()
+    return Background(all_points.point_in_model[first], all_points.rgb[first], all_points.sigma_m[first])

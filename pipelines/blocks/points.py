@@ -1,0 +1,102 @@
+"""Surveyed points found again in the model: by its cameras, and by its surface."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.blocks.trained import Trained
+from pipelines.formats.image_cache import PinholeImage
+from pipelines.geometry.cameras import undistort
+from pipelines.geometry.rays import Rays, Views, intersect
+from pipelines.products import FloatArray, SurveyedPoint
+
+# Rays of a mark are held to agree within their mark's σ and this much of the cameras' own error.
+_SIGMA_CENTER_M = 0.02
+_SIGMA_ATTITUDE_RAD = 2e-4
+
+
+@dataclass(frozen=True)
+class Sights:
+    """K image marks of J surveyed points, in registered images.
+
+    Attributes:
+        point: (K,) index into the points, ascending.
+        camera: (K,) index into the cameras.
+        xy: (K, 2) undistorted x/z and y/z.
+        sigma: (K,) σ of xy.
+    """
+
+    point: NDArray[np.int64]
+    camera: NDArray[np.int64]
+    xy: FloatArray
+    sigma: FloatArray
+
+
+def sights(trained: Trained, points: tuple[SurveyedPoint, ...]) -> Sights:
+    """The marks of `points` in images that SfM has registered."""
+    index = trained.sparse.image_index()
+    rows = []
+    for j, point in enumerate(points):
+        for mark in point.marks:
+            if (i := index.get(mark.image)) is not None:
+                camera = trained.sparse.camera_of(i)
+                xy = undistort(camera, np.array([mark.x_px, mark.y_px]))
+                rows.append((j, i, xy, mark.sigma_px / float(camera.params[0])))
+    return Sights(
+        np.array([row[0] for row in rows], dtype=np.int64),
+        np.array([row[1] for row in rows], dtype=np.int64),
+        np.array([row[2] for row in rows], dtype=np.float64).reshape(-1, 2),
+        np.array([row[3] for row in rows], dtype=np.float64),
+    )
+
+
+def points_by_camera(trained: Trained, seen: Sights, count: int) -> FloatArray:
+    """Points (J, 3) in `geo` where the rays of their marks meet; NaN with fewer than two rays."""
+    n = len(trained.poses.cam_center_in_model)
+    sigma = np.full(n, 1e-3)
+    sigma[seen.camera] = seen.sigma
+    views = Views(
+        trained.poses.cam_center_in_model,
+        np.swapaxes(trained.poses.cam_from_model, 1, 2),
+        np.tile(_SIGMA_CENTER_M**2 * np.eye(3), (n, 1, 1)),
+        np.full(n, _SIGMA_ATTITUDE_RAD),
+        sigma,
+    )
+    found = intersect(Rays(seen.point, seen.camera, seen.xy), views, count)
+    return trained.geo_from_model.apply(found.position_in_geo)
+
+
+def points_by_model(
+    trained: Trained, seen: Sights, depth_m: dict[int, FloatArray], pinholes: dict[int, PinholeImage], count: int
+) -> FloatArray:
+    """Points (J, 3) in `geo` where the model's surface lies behind their marks: median over the views.
+
+    Args:
+        depth_m: median depth (H, W) along z by camera, 0 where there is no surface.
+        pinholes: cameras of these depth maps.
+        count: J.
+    """
+    hits: list[list[FloatArray]] = [[] for _ in range(count)]
+    for j, i, xy in zip(seen.point, seen.camera, seen.xy, strict=True):
+        depth = _depth_at(depth_m[int(i)], pinholes[int(i)], xy)
+        if depth > 0:
+            ray = depth * np.append(xy, 1.0)
+            hits[j].append(trained.poses.cam_from_model[i].T @ ray + trained.poses.cam_center_in_model[i])
+    middle = np.array([np.median(np.array(hit), axis=0) if len(hit) >= 2 else np.full(3, np.nan) for hit in hits])
+    return trained.geo_from_model.apply(middle.reshape(-1, 3))
+
+
+def _depth_at(depth_m: FloatArray, camera: PinholeImage, xy: FloatArray) -> float:
+    """Depth at a ray: bilinear where the four pixels around it have a surface, else the nearest, 0 outside."""
+    x, y = camera.fx * xy[0] + camera.cx - 0.5, camera.fy * xy[1] + camera.cy - 0.5
+    if not (0 <= x <= camera.width - 1 and 0 <= y <= camera.height - 1):
+        return 0.0
+    x0, y0 = min(int(x), camera.width - 2), min(int(y), camera.height - 2)
+    patch = np.asarray(depth_m[y0 : y0 + 2, x0 : x0 + 2], dtype=np.float64)
+    if (patch <= 0).any():
+        return float(depth_m[round(y), round(x)])
+    weight = np.outer([1 - (y - y0), y - y0], [1 - (x - x0), x - x0])
+    return float(1.0 / (weight / patch).sum())  # inverse depth is linear across a plane

@@ -1,0 +1,70 @@
+"""A trained model, read back for evaluation: cameras in `model`, the similarity, and the Gaussians."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipelines.errors import InputError
+from pipelines.formats.colmap import SparseModel, read_sparse
+from pipelines.geometry.rotations import matrix_from_quat_xyzw
+from pipelines.geometry.similarity import Similarity
+from pipelines.georef.cameras import CameraPoses
+from pipelines.products import Survey, TrainedModel, load_json
+from pipelines.splat.gaussians import Gaussians
+from pipelines.splat.storage import read_gaussians
+from pipelines.stages import GAUSSIANS, MODEL, SPARSE, SURVEY
+from pipelines.workspace import Workspace
+
+
+@dataclass(frozen=True)
+class Trained:
+    """What training left.
+
+    Attributes:
+        survey: what was measured.
+        sparse: the SfM model; its images have the order of `poses`.
+        model: similarity, cameras, settings.
+        poses: refined cameras in `model`.
+        gaussians: in `model`.
+    """
+
+    survey: Survey
+    sparse: SparseModel
+    model: TrainedModel
+    poses: CameraPoses
+    gaussians: Gaussians
+
+    @property
+    def geo_from_model(self) -> Similarity:
+        """The refined similarity."""
+        return Similarity.from_record(self.model.geo_from_model)
+
+    def indices(self, split: str) -> list[int]:
+        """Indices of the cameras of a split."""
+        return [index for index, camera in enumerate(self.model.cameras) if camera.split == split]
+
+
+def load_trained(workspace: Workspace) -> Trained:
+    """Read the products of ingest, sfm and train.
+
+    Raises:
+        MissingProductError: one of them is not there.
+        InputError: they do not belong together.
+    """
+    model_path = workspace.path(MODEL)
+    model = load_json(TrainedModel, model_path)
+    sparse = read_sparse(workspace.path(SPARSE))
+    names = tuple(camera.name for camera in model.cameras)
+    if names != sparse.image_name:
+        raise InputError("its cameras are not those of sfm/sparse: train again", path=model_path, field="cameras")
+    rotation = matrix_from_quat_xyzw([camera.quat_xyzw for camera in model.cameras])
+    translation = np.array([camera.translation for camera in model.cameras])
+    return Trained(
+        survey=load_json(Survey, workspace.path(SURVEY)),
+        sparse=sparse,
+        model=model,
+        poses=CameraPoses(rotation, -np.einsum("nji,nj->ni", rotation, translation)),
+        gaussians=read_gaussians(workspace.path(GAUSSIANS)),
+    )

@@ -1,0 +1,248 @@
+"""COLMAP sparse models, binary or text, as flat numpy arrays."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.errors import BackendUnavailableError, InputError
+from pipelines.geometry.cameras import Camera
+from pipelines.products import FloatArray
+
+log = logging.getLogger(__name__)
+
+IntArray = NDArray[np.int64]
+
+_INVALID_POINT = np.uint64(2**64 - 1)
+
+# Least bytes of one record of each binary file. COLMAP believes the record count at the head of the file, and
+# reads on for ever past the end of a truncated or forged one.
+_LEAST_RECORD_BYTES = {"cameras.bin": 48, "images.bin": 73, "points3D.bin": 51, "frames.bin": 8, "rigs.bin": 8}
+
+
+@dataclass(frozen=True)
+class SparseModel:
+    """An SfM model in its own frame `local`: n registered images, N points, M observations.
+
+    Observations are sorted by point, then by image, so that the track of a point is one contiguous run.
+
+    Attributes:
+        cameras: intrinsics by COLMAP's camera id.
+        image_id: (n,) COLMAP's ids, ascending.
+        image_name: n names, relative to the image folder.
+        image_camera_id: (n,) keys of `cameras`.
+        rotation_cam_from_local: (n, 3, 3).
+        translation_cam_from_local: (n, 3), in units of `local`.
+        point_id: (N,) COLMAP's ids, ascending.
+        point_in_local: (N, 3).
+        point_rgb: (N, 3) uint8.
+        point_error_px: (N,) mean reprojection error; NaN where the model does not state it.
+        obs_point: (M,) index into the points, ascending.
+        obs_image: (M,) index into the images.
+        obs_xy_px: (M, 2) pixels, the centre of the top-left pixel being (0.5, 0.5).
+    """
+
+    cameras: dict[int, Camera]
+    image_id: IntArray
+    image_name: tuple[str, ...]
+    image_camera_id: IntArray
+    rotation_cam_from_local: FloatArray
+    translation_cam_from_local: FloatArray
+    point_id: IntArray
+    point_in_local: FloatArray
+    point_rgb: NDArray[np.uint8]
+    point_error_px: FloatArray
+    obs_point: IntArray
+    obs_image: IntArray
+    obs_xy_px: FloatArray
+
+    @property
+    def cam_center_in_local(self) -> FloatArray:
+        """Projection centres (n, 3): −Rᵀ t."""
+        return -np.einsum("nji,nj->ni", self.rotation_cam_from_local, self.translation_cam_from_local)
+
+    def image_index(self) -> dict[str, int]:
+        """Index of each image by its name."""
+        return {name: index for index, name in enumerate(self.image_name)}
+
+    def camera_of(self, image: int) -> Camera:
+        """Intrinsics of the image with that index."""
+        return self.cameras[int(self.image_camera_id[image])]
+
+
+def read_sparse(path: Path) -> SparseModel:
+    """Read the COLMAP model (cameras, images, points3D as .bin or .txt) in a folder.
+
+    Images without a pose are left out, and so are observations that belong to no point.
+
+    Raises:
+        InputError: unreadable, inconsistent, or with values that are not finite.
+        BackendUnavailableError: pycolmap is not installed.
+    """
+    reconstruction = _load(path)
+    cameras = {
+        int(camera_id): Camera(
+            camera.model_name, int(camera.width), int(camera.height), np.array(camera.params, dtype=np.float64)
+        )
+        for camera_id, camera in reconstruction.cameras.items()
+    }
+    images = [reconstruction.images[image_id] for image_id in sorted(reconstruction.reg_image_ids())]
+    poses = [image.cam_from_world().matrix() for image in images]
+    pose = np.array(poses, dtype=np.float64).reshape(-1, 3, 4)
+    ids = np.array(sorted(reconstruction.point3D_ids()), dtype=np.int64)
+    points = [reconstruction.points3D[int(point_id)] for point_id in ids]
+    obs_point, obs_image, obs_xy = _observations(images, ids)
+    model = SparseModel(
+        cameras=cameras,
+        image_id=np.array([image.image_id for image in images], dtype=np.int64),
+        image_name=tuple(image.name for image in images),
+        image_camera_id=np.array([image.camera_id for image in images], dtype=np.int64),
+        rotation_cam_from_local=np.ascontiguousarray(pose[:, :, :3]),
+        translation_cam_from_local=np.ascontiguousarray(pose[:, :, 3]),
+        point_id=ids,
+        point_in_local=np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3),
+        point_rgb=np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3),
+        point_error_px=np.array([point.error if point.has_error() else np.nan for point in points]),
+        obs_point=obs_point,
+        obs_image=obs_image,
+        obs_xy_px=obs_xy,
+    )
+    _check(model, path)
+    return model
+
+
+def write_sparse(model: SparseModel, path: Path) -> None:
+    """Write a model in COLMAP's binary form, so that `read_sparse` returns it again and COLMAP opens it.
+
+    Every image gets its own frame and every camera a trivial rig. The folder is made if needed.
+
+    Raises:
+        BackendUnavailableError: pycolmap is not installed.
+    """
+    pycolmap = pycolmap_module()
+    reconstruction = pycolmap.Reconstruction()
+    for camera_id, camera in model.cameras.items():
+        reconstruction.add_camera_with_trivial_rig(
+            pycolmap.Camera(
+                camera_id=camera_id,
+                model=camera.model,
+                width=camera.width,
+                height=camera.height,
+                params=camera.params,
+            )
+        )
+    rank = _add_images(reconstruction, model)
+    _add_points(reconstruction, model, rank)
+    path.mkdir(parents=True, exist_ok=True)
+    reconstruction.write_binary(path)
+
+
+def _add_images(reconstruction: Any, model: SparseModel) -> IntArray:
+    """Add the images with their pixels; returns the place of each observation in its image's list."""
+    pycolmap = pycolmap_module()
+    by_image = np.argsort(model.obs_image, kind="stable")
+    bounds = np.searchsorted(model.obs_image[by_image], np.arange(len(model.image_name) + 1))
+    rank = np.empty(len(by_image), dtype=np.int64)
+    rank[by_image] = np.arange(len(by_image)) - bounds[model.obs_image[by_image]]
+    for index, name in enumerate(model.image_name):
+        pixels = model.obs_xy_px[by_image[bounds[index] : bounds[index + 1]]]
+        image = pycolmap.Image(name, pixels, camera_id=int(model.image_camera_id[index]))
+        image.image_id = int(model.image_id[index])
+        rotation = pycolmap.Rotation3d(model.rotation_cam_from_local[index])
+        pose = pycolmap.Rigid3d(rotation, model.translation_cam_from_local[index])
+        reconstruction.add_image_with_trivial_frame(image, pose)
+    return rank
+
+
+def _add_points(reconstruction: Any, model: SparseModel, rank: IntArray) -> None:
+    pycolmap = pycolmap_module()
+    starts = np.searchsorted(model.obs_point, np.arange(len(model.point_id) + 1))
+    observer = model.image_id[model.obs_image]
+    for index, point_id in enumerate(model.point_id):
+        run = slice(starts[index], starts[index + 1])
+        point = pycolmap.Point3D(xyz=model.point_in_local[index], color=model.point_rgb[index])
+        if np.isfinite(model.point_error_px[index]):
+            point.error = model.point_error_px[index]
+        point.track.elements = [
+            pycolmap.TrackElement(int(image_id), int(place))
+            for image_id, place in zip(observer[run], rank[run], strict=True)
+        ]
+        reconstruction.add_point3D_with_id(int(point_id), point)
+
+
+def pycolmap_module() -> Any:
+    """pycolmap, imported so that it leaves the process's signals alone.
+
+    On import it takes SIGTERM to print a stack trace and die, which would cost an interrupted stage its clean end.
+
+    Raises:
+        BackendUnavailableError: pycolmap is not installed.
+    """
+    try:
+        import pycolmap
+    except ImportError as error:
+        raise BackendUnavailableError("pycolmap is not installed: `pip install pycolmap`") from error
+    if threading.current_thread() is threading.main_thread():
+        handler = signal.getsignal(signal.SIGTERM)  # Python's own record, which the import has not changed
+        signal.signal(signal.SIGTERM, signal.SIG_DFL if handler is None else handler)
+    return pycolmap
+
+
+def _load(path: Path) -> Any:
+    pycolmap = pycolmap_module()
+    if not path.is_dir():
+        raise InputError("no such folder; expected a COLMAP model (cameras, images, points3D)", path=path)
+    for name, least in _LEAST_RECORD_BYTES.items():
+        _check_count(path / name, least)
+    try:
+        return pycolmap.Reconstruction(str(path))
+    except (ValueError, RuntimeError, IndexError, MemoryError) as error:
+        raise InputError(f"not a readable COLMAP model: {error}", path=path) from error
+
+
+def _check_count(file: Path, least_record_bytes: int) -> None:
+    if not file.is_file():
+        return
+    with file.open("rb") as handle:
+        head = handle.read(8)
+    count = int.from_bytes(head, "little")
+    if len(head) < 8 or count * least_record_bytes > file.stat().st_size - 8:
+        raise InputError("shorter than the number of its records says: it is truncated, copy it again", path=file)
+
+
+def _observations(images: list[Any], point_ids: IntArray) -> tuple[IntArray, IntArray, FloatArray]:
+    """Flat arrays over all observations that belong to a point, sorted by point."""
+    pycolmap = pycolmap_module()
+    # A pinhole of unit focal length at the origin turns a list of pixels into an array in one call.
+    unit = pycolmap.Camera(model="SIMPLE_PINHOLE", width=1, height=1, params=[1.0, 0.0, 0.0])
+    xy: list[FloatArray] = [np.empty((0, 2))]
+    owner: list[NDArray[np.uint64]] = [np.empty(0, dtype=np.uint64)]
+    source: list[IntArray] = [np.empty(0, dtype=np.int64)]
+    for index, image in enumerate(images):
+        points = image.points2D
+        ids = np.fromiter((point.point3D_id for point in points), dtype=np.uint64, count=len(points))
+        seen = ids != _INVALID_POINT
+        xy.append(np.asarray(unit.cam_from_img(points)).reshape(-1, 2)[seen])
+        owner.append(ids[seen])
+        source.append(np.full(int(seen.sum()), index, dtype=np.int64))
+    obs_image, obs_owner = np.concatenate(source), np.concatenate(owner).astype(np.int64)
+    obs_point = np.searchsorted(point_ids, obs_owner).astype(np.int64)
+    order = np.lexsort((obs_image, obs_point))
+    return obs_point[order], obs_image[order], np.concatenate(xy)[order]
+
+
+def _check(model: SparseModel, path: Path) -> None:
+    for name in ("rotation_cam_from_local", "translation_cam_from_local", "point_in_local", "obs_xy_px"):
+        if not np.isfinite(getattr(model, name)).all():
+            raise InputError("contains values that are not finite: reconstruct again", path=path, field=name)
+    if any(not np.isfinite(camera.params).all() for camera in model.cameras.values()):
+        raise InputError("contains values that are not finite: reconstruct again", path=path, field="camera params")
+    if len(set(model.image_name)) != len(model.image_name):
+        raise InputError("two images have the same name", path=path, field="images")

@@ -1,0 +1,252 @@
+"""EXIF of a photograph: where, when, with which lens. DJI's XMP comes along.
+
+EXIF is written by thousands of programs. A tag that cannot be trusted (a zero denominator, a latitude without its
+hemisphere, 0° 0°) is as good as absent, and the reason is kept for the log.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta, timezone
+from typing import Any, Literal
+
+from pipelines.formats.xmp import DjiTags, XmpError, read_dji
+
+_JPEG = b"\xff\xd8"
+_TIFF = (b"II*\x00", b"MM\x00*")
+# A JPEG's EXIF lies in its first 64 KiB segment; the rest is none of the parser's business.
+_JPEG_HEAD = 1024 * 1024
+_MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+_BELOW_ZERO = frozenset({1, 3})  # EXIF 3.0 added 2 and 3: above and below the sea, said outright
+_WGS84_NAMES = frozenset({"", "WGS84"})
+_GPS_H_ERROR = ("GPS GPSHPositioningError", "GPS Tag 0x001F")
+TimeSource = Literal["offset", "gps", "assumed UTC"]
+
+
+@dataclass(frozen=True)
+class GpsTag:
+    """A position: WGS84 degrees, metres (None where only the altitude is missing), σ horizontal if given."""
+
+    lat_deg: float
+    lon_deg: float
+    alt_m: float | None
+    sigma_h_m: float | None
+    datum: str
+
+
+@dataclass(frozen=True)
+class LensTags:
+    """What EXIF says of the lens; None where absent.
+
+    Attributes:
+        focal_mm: real focal length.
+        focal_35mm_mm: of the same angle of view on 35 mm film.
+        px_per_mm: of the image as it was taken.
+        taken_width_px: longer side of the image as it was taken, which may have been scaled since.
+        zoom: digital zoom, 1 if none.
+    """
+
+    focal_mm: float | None = None
+    focal_35mm_mm: float | None = None
+    px_per_mm: float | None = None
+    taken_width_px: float | None = None
+    zoom: float = 1.0
+
+
+@dataclass(frozen=True)
+class PhotoTags:
+    """What a photograph says of itself.
+
+    Attributes:
+        make: manufacturer.
+        model: camera.
+        orientation: EXIF orientation, 1 for upright.
+        lens: focal length and what scales it.
+        timestamp_s: seconds since 1970 UTC.
+        time_source: how the time zone was known.
+        gps: position.
+        dji: DJI's XMP.
+        problems: why tags were not used, one phrase each.
+    """
+
+    make: str = ""
+    model: str = ""
+    orientation: int = 1
+    lens: LensTags = LensTags()
+    timestamp_s: float | None = None
+    time_source: TimeSource | None = None
+    gps: GpsTag | None = None
+    dji: DjiTags | None = None
+    problems: tuple[str, ...] = ()
+
+    @property
+    def make_model(self) -> str:
+        """Make and model, the make once."""
+        return self.model if self.model.startswith(self.make) else f"{self.make} {self.model}"
+
+
+def read_tags(data: bytes) -> PhotoTags:
+    """EXIF and DJI XMP of a photograph. Never fails: what cannot be read is in `problems`.
+
+    Args:
+        data: the file.
+    """
+    problems: list[str] = []
+    tags = _exif(data, problems)
+    try:
+        dji = read_dji(data)
+    except XmpError as error:
+        dji = None
+        problems.append(str(error))
+    timestamp_s, time_source = _time(tags)
+    return PhotoTags(
+        make=_text(tags, "Image Make"),
+        model=_text(tags, "Image Model"),
+        orientation=int(_number(tags, "Image Orientation") or 1),
+        lens=_lens(tags),
+        timestamp_s=timestamp_s,
+        time_source=time_source,
+        gps=_gps(tags, dji, problems),
+        dji=dji,
+        problems=tuple(problems),
+    )
+
+
+def _exif(data: bytes, problems: list[str]) -> Mapping[str, Any]:
+    import exifread
+
+    if data[:2] == _JPEG:
+        data = data[:_JPEG_HEAD]
+    elif data[:4] not in _TIFF:
+        return {}
+    try:
+        found: Mapping[str, Any] = exifread.process_file(io.BytesIO(data), details=False)
+    except Exception as error:  # the parser raises whatever its arithmetic on broken bytes raises
+        problems.append(f"the EXIF data cannot be read ({type(error).__name__})")
+        return {}
+    return found
+
+
+def _gps(tags: Mapping[str, Any], dji: DjiTags | None, problems: list[str]) -> GpsTag | None:
+    lat = _degrees(tags, "GPS GPSLatitude")
+    lon = _degrees(tags, "GPS GPSLongitude")
+    if lat is None or lon is None:
+        if "GPS GPSLatitude" in tags or "GPS GPSLongitude" in tags:
+            problems.append("the GPS latitude or longitude is not a number")
+        return None
+    south = _text(tags, "GPS GPSLatitudeRef")[:1].upper()
+    west = _text(tags, "GPS GPSLongitudeRef")[:1].upper()
+    if south not in ("N", "S") or west not in ("E", "W"):
+        problems.append("the GPS position does not say its hemisphere")
+        return None
+    lat, lon = (-lat if south == "S" else lat), (-lon if west == "W" else lon)
+    if abs(lat) > 90.0 or abs(lon) > 180.0:
+        problems.append(f"the GPS position {lat:.6g}, {lon:.6g} is out of range")
+        return None
+    if lat == 0.0 and lon == 0.0:
+        problems.append("the GPS position is 0, 0, which means none")
+        return None
+    datum = _text(tags, "GPS GPSMapDatum")
+    plain = datum.upper().replace("-", "").replace(" ", "")
+    return GpsTag(
+        lat, lon, _altitude(tags, dji), _first(tags, _GPS_H_ERROR), "" if plain in _WGS84_NAMES else datum
+    )
+
+
+def _altitude(tags: Mapping[str, Any], dji: DjiTags | None) -> float | None:
+    altitude = _number(tags, "GPS GPSAltitude")
+    if altitude is None:
+        return dji.absolute_altitude_m if dji is not None else None
+    return -altitude if _number(tags, "GPS GPSAltitudeRef") in _BELOW_ZERO else altitude
+
+
+def _lens(tags: Mapping[str, Any]) -> LensTags:
+    resolution = _number(tags, "EXIF FocalPlaneXResolution")
+    unit = _MM_PER_UNIT.get(int(_number(tags, "EXIF FocalPlaneResolutionUnit") or 2))
+    sides = [_number(tags, f"EXIF ExifImage{side}") for side in ("Width", "Length")]
+    zoom = _number(tags, "EXIF DigitalZoomRatio")
+    return LensTags(
+        focal_mm=_positive(_number(tags, "EXIF FocalLength")),
+        focal_35mm_mm=_positive(_number(tags, "EXIF FocalLengthIn35mmFilm")),
+        px_per_mm=resolution / unit if resolution and resolution > 0 and unit else None,
+        taken_width_px=_positive(max((side for side in sides if side is not None), default=None)),
+        zoom=zoom if zoom is not None and zoom > 1.0 else 1.0,
+    )
+
+
+def _time(tags: Mapping[str, Any]) -> tuple[float | None, TimeSource | None]:
+    """Seconds since 1970 UTC: by the clock's own zone, else from GPS, else the clock taken for UTC."""
+    local = _datetime(_text(tags, "EXIF DateTimeOriginal") or _text(tags, "Image DateTime"))
+    fraction = _text(tags, "EXIF SubSecTimeOriginal") or _text(tags, "EXIF SubSecTime")
+    seconds = float(f"0.{fraction}") if fraction.isascii() and fraction.isdigit() else 0.0
+    zone = _zone(_text(tags, "EXIF OffsetTimeOriginal") or _text(tags, "EXIF OffsetTime"))
+    if local is not None and zone is not None:
+        return local.replace(tzinfo=zone).timestamp() + seconds, "offset"
+    stamp = _numbers(tags, "GPS GPSTimeStamp")
+    day = _datetime(_text(tags, "GPS GPSDate") + " 00:00:00")
+    if len(stamp) == 3 and day is not None:
+        return day.replace(tzinfo=UTC).timestamp() + 3600 * stamp[0] + 60 * stamp[1] + stamp[2], "gps"
+    if local is not None:
+        return local.replace(tzinfo=UTC).timestamp() + seconds, "assumed UTC"
+    return None, None
+
+
+def _datetime(text: str) -> datetime | None:
+    try:
+        return datetime.strptime(text.strip("\x00 ")[:19].replace("-", ":"), "%Y:%m:%d %H:%M:%S")
+    except ValueError:
+        return None
+
+
+def _zone(text: str) -> timezone | None:
+    try:
+        sign = {"+": 1, "-": -1}[text[0]]
+        return timezone(sign * timedelta(hours=int(text[1:3]), minutes=int(text[4:6])))
+    except (IndexError, KeyError, ValueError):
+        return None
+
+
+def _text(tags: Mapping[str, Any], key: str) -> str:
+    tag = tags.get(key)
+    values = getattr(tag, "values", "")
+    return values.strip("\x00 ") if isinstance(values, str) else ""
+
+
+def _numbers(tags: Mapping[str, Any], key: str) -> list[float]:
+    """All values of a tag, or none if one of them is no number."""
+    values = getattr(tags.get(key), "values", None)
+    if values is None or isinstance(values, str):
+        return []
+    found = []
+    for value in values if isinstance(values, (list, tuple)) else [values]:
+        if hasattr(value, "den") and value.den == 0:
+            return []
+        try:
+            found.append(float(value))
+        except (TypeError, ValueError, OverflowError):
+            return []
+    return found if all(math.isfinite(value) for value in found) else []
+
+
+def _number(tags: Mapping[str, Any], key: str) -> float | None:
+    values = _numbers(tags, key)
+    return values[0] if values else None
+
+
+def _first(tags: Mapping[str, Any], keys: tuple[str, ...]) -> float | None:
+    return next((value for key in keys if (value := _positive(_number(tags, key))) is not None), None)
+
+
+def _positive(value: float | None) -> float | None:
+    return value if value is not None and value > 0.0 else None
+
+
+def _degrees(tags: Mapping[str, Any], key: str) -> float | None:
+    """Degrees, minutes, seconds; some writers give degrees alone, or degrees and minutes."""
+    values = _numbers(tags, key)
+    if not 1 <= len(values) <= 3 or min(values) < 0.0:
+        return None
+    return sum(value / 60.0**power for power, value in enumerate(values))

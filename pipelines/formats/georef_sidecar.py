@@ -1,0 +1,94 @@
+"""The sidecar of an exported artefact: where on Earth it lies, and how well that is known.
+
+JSON beside the file (`splat.ply.georef.json`), because PLY comments are lost by popular tools. It mirrors
+SPZ_NIANTIC_georeference: p_ecef = scale · R(rotation) · p_file + origin, in float64. docs/formats.md has every
+field and a worked example.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import ConfigDict, Field, field_validator
+from pydantic.alias_generators import to_camel
+
+from pipelines.geometry.rotations import matrix_from_quat_xyzw
+from pipelines.geometry.similarity import Similarity
+from pipelines.products import Product, Quaternion, Vector3, VerticalDatum, load_json
+
+SUFFIX = ".georef.json"
+
+Row7 = tuple[float, float, float, float, float, float, float]
+Covariance7 = Annotated[tuple[Row7, ...], Field(min_length=7, max_length=7)]
+
+
+class _CamelCase(Product):
+    model_config = ConfigDict(alias_generator=to_camel, populate_by_name=True)
+
+
+class PredictedAccuracy(Product):
+    """Standard deviations in metres that the covariance predicts at `at`, a point of the file's frame.
+
+    It is the uncertainty of the georeference alone, not of the model's shape, and not measured on check points.
+    """
+
+    kind: Literal["predicted"] = "predicted"
+    at: Vector3
+    sigma_e_m: float
+    sigma_n_m: float
+    sigma_u_m: float
+    sigma_h_m: float
+    sigma_v_m: float
+    sigma_3d_m: float
+
+
+class GeorefSidecar(_CamelCase):
+    """Content of the sidecar; names in the file are in camelCase."""
+
+    format: Literal["georefgs"] = "georefgs"
+    version: Literal[1] = 1
+    crs_id: Literal["EPSG:4978"] = "EPSG:4978"
+    origin: Vector3
+    rotation: Quaternion
+    scale: float = Field(gt=0)
+    epoch: float | None = None
+    origin_lla: Vector3
+    vertical_datum: VerticalDatum
+    crs_wkt: str
+    covariance: Covariance7 | None
+    accuracy: PredictedAccuracy | None
+
+    @field_validator("rotation")
+    @classmethod
+    def _unit(cls, rotation: Quaternion) -> Quaternion:
+        if abs(float(np.linalg.norm(rotation)) - 1) > 1e-6:
+            raise ValueError("not a unit quaternion")
+        return rotation
+
+    def ecef_from_file(self) -> Similarity:
+        """p_ecef = s R p_file + origin."""
+        return Similarity(self.scale, matrix_from_quat_xyzw(self.rotation), np.array(self.origin))
+
+
+def sidecar_path(artefact: Path) -> Path:
+    """Where the sidecar of a file lies: its name with `.georef.json` added."""
+    return artefact.with_name(artefact.name + SUFFIX)
+
+
+def write_sidecar(sidecar: GeorefSidecar, artefact: Path) -> None:
+    """Write the sidecar beside its file; it appears whole or not at all."""
+    path = sidecar_path(artefact)
+    draft = path.with_name(path.name + ".tmp")
+    draft.write_text(sidecar.model_dump_json(by_alias=True, indent=1) + "\n", encoding="utf-8")
+    draft.replace(path)
+
+
+def read_sidecar(artefact: Path) -> GeorefSidecar:
+    """Read the sidecar of a file.
+
+    Raises:
+        InputError: there is none, or it is not of this form; names the field.
+    """
+    return load_json(GeorefSidecar, sidecar_path(artefact))

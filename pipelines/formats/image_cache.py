@@ -1,0 +1,158 @@
+"""Undistorted photographs at training size, cached as plain arrays on disk and mapped into memory on use."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.errors import InputError
+from pipelines.geometry.cameras import Camera, project
+from pipelines.progress import SILENT, Progress
+
+log = logging.getLogger(__name__)
+
+# A pixel that needs light from beyond the photograph's edge is not compared.
+_EDGE_PX = 0.5
+
+
+@dataclass(frozen=True)
+class PinholeImage:
+    """Size and intrinsics of an undistorted image, in pixels; centre of the top-left pixel is (0.5, 0.5)."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """A photograph to undistort: its name, file, and camera at full size."""
+
+    name: str
+    file: Path
+    camera: Camera
+
+
+def pinhole_of(camera: Camera, max_size_px: int) -> PinholeImage:
+    """The pinhole camera of the same view at a size of at most `max_size_px` along the longer side.
+
+    The focal length is kept; distortion parameters are dropped.
+    """
+    scale = min(1.0, max_size_px / max(camera.width, camera.height))
+    width, height = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
+    fx, fy, cx, cy = _focal_and_centre(camera)
+    sx, sy = width / camera.width, height / camera.height
+    return PinholeImage(width, height, fx * sx, fy * sy, cx * sx, cy * sy)
+
+
+def _focal_and_centre(camera: Camera) -> tuple[float, float, float, float]:
+    p = camera.params
+    one_focal = camera.model.startswith("SIMPLE") or camera.model.startswith("RADIAL")
+    return (p[0], p[0], p[1], p[2]) if one_focal else (p[0], p[1], p[2], p[3])
+
+
+class ImageCache:
+    """Undistorted images on disk: uint8 RGB arrays, made once, mapped when asked for.
+
+    Args:
+        folder: where the arrays are kept.
+        photographs: what to undistort.
+        max_size_px: longest side.
+    """
+
+    def __init__(self, folder: Path, photographs: list[Photograph], max_size_px: int) -> None:
+        self._folder = folder
+        self._photographs = photographs
+        self.max_size_px = max_size_px
+        self._maps: dict[bytes, tuple[NDArray[np.float32], NDArray[np.bool_]]] = {}
+
+    def __len__(self) -> int:
+        return len(self._photographs)
+
+    def pinhole(self, index: int) -> PinholeImage:
+        """Camera of an undistorted image."""
+        return pinhole_of(self._photographs[index].camera, self.max_size_px)
+
+    def build(self, progress: Progress = SILENT) -> None:
+        """Make what is not there yet.
+
+        Raises:
+            InputError: a photograph cannot be read, or has another size than its camera.
+        """
+        self._folder.mkdir(parents=True, exist_ok=True)
+        with progress.task("undistorting", len(self)) as task:
+            for index in range(len(self)):
+                if not self._path(index).exists():
+                    self._write(index)
+                task.advance()
+
+    def image(self, index: int) -> NDArray[np.uint8]:
+        """RGB of an image: (H, W, 3), mapped from disk."""
+        path = self._path(index)
+        if not path.exists():
+            self._write(index)
+        array: NDArray[np.uint8] = np.load(path, mmap_mode="r", allow_pickle=False)
+        return array
+
+    def mask(self, index: int) -> NDArray[np.bool_]:
+        """Pixels that the photograph covers: (H, W)."""
+        return self._map(index)[1]
+
+    def _path(self, index: int) -> Path:
+        photograph = self._photographs[index]
+        stat = photograph.file.stat()
+        camera = photograph.camera
+        key = (
+            f"{photograph.name}|{stat.st_size}|{stat.st_mtime_ns}|{camera.model}|{camera.width}x{camera.height}|"
+            f"{camera.params.tobytes().hex()}|{self.max_size_px}"
+        )
+        return self._folder / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.npy"
+
+    def _write(self, index: int) -> None:
+        photograph, pinhole = self._photographs[index], self.pinhole(index)
+        # COLMAP does not turn images by their EXIF orientation, so neither do we.
+        full = cv2.imread(str(photograph.file), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        if full is None:
+            raise InputError("the photograph cannot be read", path=photograph.file)
+        if (full.shape[1], full.shape[0]) != (photograph.camera.width, photograph.camera.height):
+            raise InputError(
+                f"the photograph is {full.shape[1]}×{full.shape[0]}, its camera "
+                f"{photograph.camera.width}×{photograph.camera.height}",
+                path=photograph.file,
+            )
+        small = cv2.resize(full, (pinhole.width, pinhole.height), interpolation=cv2.INTER_AREA)
+        source, _ = self._map(index)
+        flat = cv2.remap(small, source[..., 0], source[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+        path = self._path(index)
+        draft = path.with_suffix(".tmp")
+        with draft.open("wb") as handle:
+            np.save(handle, np.ascontiguousarray(flat[..., ::-1]), allow_pickle=False)
+        draft.rename(path)
+
+    def _map(self, index: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Where each undistorted pixel lies in the shrunken photograph, and whether it lies inside."""
+        camera = self._photographs[index].camera
+        key = camera.params.tobytes() + f"{camera.model}{camera.width}x{camera.height}".encode()
+        if key not in self._maps:
+            self._maps[key] = _distortion_map(camera, self.pinhole(index))
+        return self._maps[key]
+
+
+def _distortion_map(camera: Camera, pinhole: PinholeImage) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    u, v = np.meshgrid(np.arange(pinhole.width) + 0.5, np.arange(pinhole.height) + 0.5)
+    rays = np.stack([(u - pinhole.cx) / pinhole.fx, (v - pinhole.cy) / pinhole.fy, np.ones_like(u)], axis=-1)
+    full = project(camera, rays.reshape(-1, 3)).reshape(pinhole.height, pinhole.width, 2)
+    size = np.array([pinhole.width / camera.width, pinhole.height / camera.height])
+    small = full * size
+    limit = np.array([pinhole.width, pinhole.height]) - _EDGE_PX
+    inside = ((small >= _EDGE_PX) & (small <= limit)).all(axis=-1)
+    return (small - 0.5).astype(np.float32), inside  # cv2 counts from the centre of the first pixel

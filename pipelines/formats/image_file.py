@@ -1,0 +1,131 @@
+"""Photographs as files: their size from the header, whether they decode, and their hash.
+
+The header is read before anything is allocated, so that a file that claims a billion pixels is refused.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.errors import InputError
+
+SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff"})
+MAX_BYTES = 512 * 1024 * 1024
+MAX_PIXELS = 400_000_000
+_FRAME_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+_TIFF_WIDTH, _TIFF_HEIGHT = 256, 257
+
+
+@dataclass(frozen=True)
+class ImageFile:
+    """A photograph that decodes.
+
+    Attributes:
+        width: pixels as stored, before any EXIF orientation.
+        height: the same.
+        sha256: of the whole file, hexadecimal.
+    """
+
+    width: int
+    height: int
+    sha256: str
+
+
+def read_bytes(path: Path) -> bytes:
+    """The whole file.
+
+    Raises:
+        InputError: unreadable, empty, or larger than 512 MiB.
+    """
+    try:
+        size = path.stat().st_size
+        if size == 0:
+            raise InputError("is empty", path=path)
+        if size > MAX_BYTES:
+            raise InputError(f"{size / 2**20:.0f} MiB is too large for a photograph (limit 512 MiB)", path=path)
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror}", path=path) from error
+
+
+def inspect_image(data: bytes, path: Path) -> ImageFile:
+    """Size and hash of a JPEG, PNG or TIFF file, after decoding it to its end.
+
+    Args:
+        data: the file.
+        path: its name, for errors.
+
+    Raises:
+        InputError: no such image, more than 400 million pixels, or it does not decode.
+    """
+    size = header_size(data)
+    if size is None:
+        raise InputError("is no JPEG, PNG or TIFF image", path=path)
+    width, height = size
+    if not (0 < width * height <= MAX_PIXELS):
+        raise InputError(f"claims {width}×{height} pixels (limit {MAX_PIXELS // 10**6} million)", path=path)
+    if not _decodes(data):
+        raise InputError("is damaged: it does not decode to its end", path=path)
+    return ImageFile(width, height, hashlib.sha256(data).hexdigest())
+
+
+def header_size(data: bytes) -> tuple[int, int] | None:
+    """Width and height that a JPEG, PNG or TIFF header states, or None."""
+    try:
+        if data[:2] == b"\xff\xd8":
+            return _jpeg_size(data)
+        if data[:8] == b"\x89PNG\r\n\x1a\n" and data[12:16] == b"IHDR":
+            return struct.unpack(">II", data[16:24])
+        if data[:4] in (b"II*\x00", b"MM\x00*"):
+            return _tiff_size(data)
+    except (struct.error, IndexError):
+        return None
+    return None
+
+
+def _jpeg_size(data: bytes) -> tuple[int, int] | None:
+    position = 2
+    while position + 4 <= len(data):
+        if data[position] != 0xFF:
+            return None
+        marker = data[position + 1]
+        if marker == 0xFF:  # padding
+            position += 1
+            continue
+        if marker in _FRAME_MARKERS:
+            height, width = struct.unpack(">HH", data[position + 5 : position + 9])
+            return width, height
+        (length,) = struct.unpack(">H", data[position + 2 : position + 4])
+        position += 2 + length
+    return None
+
+
+def _tiff_size(data: bytes) -> tuple[int, int] | None:
+    order = "<" if data[:2] == b"II" else ">"
+    (directory,) = struct.unpack_from(order + "I", data, 4)
+    (count,) = struct.unpack_from(order + "H", data, directory)
+    found: dict[int, int] = {}
+    for entry in range(count):
+        at = directory + 2 + 12 * entry
+        tag, kind = struct.unpack_from(order + "HH", data, at)
+        if tag in (_TIFF_WIDTH, _TIFF_HEIGHT):
+            (found[tag],) = struct.unpack_from(order + ("H" if kind == 3 else "I"), data, at + 8)
+    if len(found) < 2:
+        return None
+    return found[_TIFF_WIDTH], found[_TIFF_HEIGHT]
+
+
+def _decodes(data: bytes) -> bool:
+    import cv2
+
+    # An eighth of the size still reads the entropy-coded stream to its end, which is where truncation shows.
+    flags = cv2.IMREAD_REDUCED_GRAYSCALE_8 | cv2.IMREAD_IGNORE_ORIENTATION
+    try:
+        return cv2.imdecode(np.frombuffer(data, np.uint8), flags) is not None
+    except cv2.error:
+        return False

@@ -1,0 +1,43 @@
+"""What a reader has to tell besides its result: assumptions it made, and what it left out and why."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+_SHOWN = 4
+
+
+@dataclass
+class Notes:
+    """Assumptions and warnings, gathered while a survey is read, in order and without repeats."""
+
+    assumptions: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+
+    def assume(self, text: str) -> None:
+        """Record an assumption."""
+        if text not in self.assumptions:
+            self.assumptions.append(text)
+
+    def warn(self, text: str) -> None:
+        """Record a warning."""
+        if text not in self.warnings:
+            self.warnings.append(text)
+
+    def warn_counted(self, items: Sequence[str], singular: str, plural: str) -> None:
+        """Record one warning for all `items`, with their count and the first few; none if there are none.
+
+        Args:
+            items: file names or `file:line` places.
+            singular: what is wrong with one, e.g. "image is empty and was left out".
+            plural: the same for many, e.g. "images are empty and were left out".
+        """
+        if items:
+            self.warn(f"{len(items)} {singular if len(items) == 1 else plural}: {shortened(items)}")
+
+
+def shortened(items: Sequence[str]) -> str:
+    """The first few of a list, and how many more there are."""
+    more = f" and {len(items) - _SHOWN} more" if len(items) > _SHOWN else ""
+    return ", ".join(items[:_SHOWN]) + more

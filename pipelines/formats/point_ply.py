@@ -1,0 +1,35 @@
+"""A PLY of points with their uncertainty, for viewers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from plyfile import PlyData, PlyElement
+
+from pipelines.products import FloatArray
+
+_VERTEX = [
+    ("x", "<f8"), ("y", "<f8"), ("z", "<f8"),
+    ("red", "u1"), ("green", "u1"), ("blue", "u1"),
+    ("sigma", "<f4"), ("inlier", "u1"),
+]  # fmt: skip
+
+
+def write_point_ply(
+    path: Path, position: FloatArray, rgb: NDArray[np.uint8], sigma_m: FloatArray, inlier: NDArray[np.bool_]
+) -> None:
+    """Write points (N, 3) with colour (N, 3), σ along their worst axis (N,) and an inlier flag (N,), in binary.
+
+    Points without a position (NaN) are left out, since viewers stumble over them.
+    """
+    finite = np.isfinite(position).all(axis=1)
+    vertex = np.empty(int(finite.sum()), dtype=_VERTEX)
+    for column, axis in enumerate("xyz"):
+        vertex[axis] = position[finite, column]
+    for column, colour in enumerate(("red", "green", "blue")):
+        vertex[colour] = rgb[finite, column]
+    vertex["sigma"], vertex["inlier"] = sigma_m[finite], inlier[finite]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(str(path))

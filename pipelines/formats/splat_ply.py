@@ -1,0 +1,179 @@
+"""The PLY of 3D Gaussian Splatting: binary little-endian float32, as viewers and trainers exchange it.
+
+Properties: `x y z nx ny nz f_dc_0..2 f_rest_0.. opacity scale_0..2 rot_0..3`. Opacity is a logit, scales are
+natural logarithms, the rotation is wxyz, `f_rest` goes channel by channel, the normals are zero.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.lib import recfunctions
+from numpy.typing import NDArray
+from plyfile import PlyData, PlyElement, PlyParseError
+
+from pipelines.errors import InputError
+
+FloatRows = NDArray[np.float32]
+
+_HEADER_LIMIT = 64 * 1024
+_POSITION = ("x", "y", "z")
+_NORMAL = ("nx", "ny", "nz")
+_DC = ("f_dc_0", "f_dc_1", "f_dc_2")
+_SCALE = ("scale_0", "scale_1", "scale_2")
+_ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
+_REST_COUNTS = (0, 9, 24, 45)  # degree 0 to 3: three channels of (degree + 1)² − 1
+
+
+@dataclass(frozen=True)
+class SplatArrays:
+    """N Gaussians as float32 arrays; names and shapes are those of `pipelines.splat.gaussians.Gaussians`.
+
+    Attributes:
+        means: (N, 3).
+        quats_wxyz: (N, 4).
+        log_scales: (N, 3).
+        logit_opacities: (N,).
+        sh: (N, K, 3), K = (degree + 1)².
+    """
+
+    means: FloatRows
+    quats_wxyz: FloatRows
+    log_scales: FloatRows
+    logit_opacities: FloatRows
+    sh: FloatRows
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+
+def write_splat_ply(path: Path, splat: SplatArrays) -> None:
+    """Write Gaussians; the file appears whole or not at all.
+
+    Raises:
+        ValueError: shapes do not belong together.
+        OSError: the file cannot be written.
+    """
+    count, coefficients = len(splat), splat.sh.shape[1]
+    rest = 3 * (coefficients - 1)
+    if rest not in _REST_COUNTS or splat.sh.shape != (count, coefficients, 3):
+        raise ValueError(f"expected spherical harmonics (N, 1 | 4 | 9 | 16, 3), got {splat.sh.shape}")
+    names = _property_names(rest)
+    rows = np.empty((count, len(names)), dtype="<f4")
+    rows[:, :3], rows[:, 3:6], rows[:, 6:9] = splat.means, 0.0, splat.sh[:, 0]
+    rows[:, 9 : 9 + rest] = splat.sh[:, 1:].transpose(0, 2, 1).reshape(count, rest)
+    rows[:, 9 + rest] = splat.logit_opacities
+    rows[:, 10 + rest : 13 + rest], rows[:, 13 + rest :] = splat.log_scales, splat.quats_wxyz
+    vertices = rows.view([(name, "<f4") for name in names]).reshape(count)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draft = path.with_name(path.name + ".tmp")
+    PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(draft))
+    draft.replace(path)
+
+
+def read_splat_ply(path: Path) -> SplatArrays:
+    """Read Gaussians of any SH degree from 0 to 3; other properties are ignored.
+
+    Raises:
+        InputError: no such file, not a PLY of that form, cut off, or with values that are not finite.
+    """
+    _check_header(path)
+    try:
+        vertices = PlyData.read(str(path), mmap="r")["vertex"].data
+    except (PlyParseError, ValueError, OverflowError, KeyError) as error:
+        raise InputError(f"damaged PLY file: {error}", path=path) from error
+    table = _Table(path, tuple(vertices.dtype.names), vertices)
+    rest = sum(name.startswith("f_rest_") for name in table.names)
+    if rest not in _REST_COUNTS:
+        raise InputError(
+            f"{rest} coefficients; degree 0 to 3 has {', '.join(map(str, _REST_COUNTS))}",
+            path=path,
+            field="f_rest",
+        )
+    higher = table.columns(tuple(f"f_rest_{i}" for i in range(rest))).reshape(len(vertices), 3, rest // 3)
+    dc = table.columns(_DC)[:, None, :]
+    return SplatArrays(
+        means=table.columns(_POSITION),
+        quats_wxyz=table.columns(_ROTATION),
+        log_scales=table.columns(_SCALE),
+        logit_opacities=table.columns(("opacity",))[:, 0],
+        sh=np.concatenate([dc, higher.transpose(0, 2, 1)], axis=1),
+    )
+
+
+def _property_names(rest: int) -> list[str]:
+    return [*_POSITION, *_NORMAL, *_DC, *(f"f_rest_{i}" for i in range(rest)), "opacity", *_SCALE, *_ROTATION]
+
+
+class _Table:
+    """The rows of the file and what their columns are called."""
+
+    def __init__(self, path: Path, names: tuple[str, ...], vertices: NDArray[np.void]) -> None:
+        self.path = path
+        self.names = names
+        # One type for all columns, as the format has it, makes this a view; a file of mixed types is converted.
+        self._rows = recfunctions.structured_to_unstructured(vertices, dtype=np.float32)
+
+    def columns(self, names: tuple[str, ...]) -> FloatRows:
+        missing = [name for name in names if name not in self.names]
+        if missing:
+            raise InputError(
+                "the property is missing: this PLY does not hold Gaussians", path=self.path, field=missing[0]
+            )
+        index = [self.names.index(name) for name in names]
+        first = index[0] if index else 0
+        span = slice(first, first + len(index))
+        block = (
+            self._rows[:, span] if index == list(range(*span.indices(len(self.names)))) else self._rows[:, index]
+        )
+        values = np.array(block, dtype=np.float32)
+        finite = np.isfinite(values).all(axis=1)
+        if not finite.all():
+            raise InputError(
+                f"{int((~finite).sum())} of {len(values)} Gaussians have values that are not finite, "
+                f"the first is number {int(np.argmin(finite))}",
+                path=self.path,
+                field=" ".join(names[:4]),
+            )
+        return values
+
+
+def _check_header(path: Path) -> None:
+    """Refuse, before anything is allocated, a file whose size is not what its header promises."""
+    try:
+        with path.open("rb") as stream:
+            start = stream.read(_HEADER_LIMIT)
+        size = path.stat().st_size
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror}", path=path) from error
+    head, found, _ = start.partition(b"end_header")
+    lines = [line.split() for line in head.decode("ascii", errors="replace").splitlines()]
+    if not found or lines[:1] != [["ply"]]:
+        raise InputError("not a PLY file", path=path)
+    if ["format", "binary_little_endian", "1.0"] not in lines:
+        raise InputError("expected a PLY of format binary_little_endian 1.0", path=path)
+    elements = [line for line in lines if line[:1] == ["element"]]
+    if len(elements) != 1 or elements[0][1:2] != ["vertex"] or len(elements[0]) != 3:
+        raise InputError("expected one element, vertex", path=path)
+    properties = [line for line in lines if line[:1] == ["property"]]
+    widths = [_WIDTHS.get(line[1], 0) if len(line) == 3 else 0 for line in properties]
+    if not widths or 0 in widths:
+        raise InputError("expected properties of fixed size only", path=path)
+    promised = int(elements[0][2]) if elements[0][2].isdecimal() and len(elements[0][2]) < 16 else -1
+    body = size - len(head) - len(found) - (2 if start[len(head) + len(found) :][:1] == b"\r" else 1)
+    if promised < 1 or promised * sum(widths) != body:
+        raise InputError(
+            f"the header promises {elements[0][2][:20]} Gaussians of {sum(widths)} bytes, the file holds "
+            f"{max(body, 0)} bytes: it is empty, cut off or damaged",
+            path=path,
+        )
+
+
+_WIDTHS = {
+    **dict.fromkeys(("char", "uchar", "int8", "uint8"), 1),
+    **dict.fromkeys(("short", "ushort", "int16", "uint16"), 2),
+    **dict.fromkeys(("int", "uint", "float", "int32", "uint32", "float32"), 4),
+    **dict.fromkeys(("double", "float64"), 8),
+}

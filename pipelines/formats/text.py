@@ -1,0 +1,63 @@
+"""Reading text that people and spreadsheets wrote: marks of byte order, line ends, decimal commas, limits."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+from pipelines.errors import InputError
+
+MAX_BYTES = 128 * 1024 * 1024
+
+
+def read_lines(path: Path) -> list[str]:
+    """Lines of a UTF-8 text file without their ends; a byte order mark and CRLF or CR are taken off.
+
+    Raises:
+        InputError: missing, a folder, larger than 128 MiB, empty, or not UTF-8.
+    """
+    try:
+        size = path.stat().st_size
+        if size > MAX_BYTES:
+            raise InputError(f"{size / 2**20:.0f} MiB is too large for a text table (limit 128 MiB)", path=path)
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror}", path=path) from error
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        raise InputError("not UTF-8 text: save the file as UTF-8", path=path, line=line) from error
+    if "\x00" in text:
+        raise InputError("contains zero bytes: not a text file, or UTF-16; save it as UTF-8", path=path)
+    if not text.strip():
+        raise InputError("is empty", path=path)
+    return text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+
+
+def number(text: str, *, path: Path, line: int, field: str, decimal_comma: bool = False) -> float:
+    """A number as a person writes it; `nan`, `inf` and an empty cell are NaN.
+
+    Args:
+        text: the cell.
+        path: for errors.
+        line: for errors.
+        field: for errors.
+        decimal_comma: whether `46,02` is a number here (where commas do not separate).
+
+    Raises:
+        InputError: not a number.
+    """
+    cell = text.strip()
+    if not cell:
+        return math.nan
+    if decimal_comma and "." not in cell:
+        cell = cell.replace(",", ".", 1)
+    try:
+        if "_" in cell:  # Python's own digit grouping, which no table means
+            raise ValueError(cell)
+        value = float(cell)
+    except ValueError:
+        hint = ": write decimals with a point" if "," in cell else ""
+        raise InputError(f"{text.strip()[:40]!r} is no number{hint}", path=path, line=line, field=field) from None
+    return value if math.isfinite(value) else math.nan

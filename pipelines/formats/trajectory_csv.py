@@ -1,0 +1,270 @@
+"""A trajectory as CSV with a header. docs/inputs.md tells the columns to users.
+
+Attitude is either the gimbal's `yaw, pitch, roll` in degrees (docs/conventions.md) or a quaternion
+`qx, qy, qz, qw` that rotates camera axes (x right, y down, z forward) into East-North-Up at the camera.
+"""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.errors import InputError
+from pipelines.formats.notes import Notes
+from pipelines.formats.poses import PoseTable, complete
+from pipelines.formats.text import number, read_lines
+from pipelines.geometry.rotations import geo_from_cam, quat_xyzw_from_matrix
+from pipelines.products import FloatArray
+
+_ALIASES = {
+    "image": ("image_name", "filename", "file_name", "file", "name"),
+    "timestamp": ("timestamp_s", "time", "time_s", "t"),
+    "latitude": ("lat", "latitude_deg"),
+    "longitude": ("lon", "lng", "long", "longitude_deg"),
+    "altitude": ("alt", "height", "altitude_m", "ellipsoidal_height"),
+    "x": ("easting", "east"),
+    "y": ("northing", "north"),
+    "z": ("elevation",),
+    "yaw": ("yaw_deg", "heading"),
+    "pitch": ("pitch_deg",),
+    "roll": ("roll_deg",),
+    **dict.fromkeys(("qx", "qy", "qz", "qw"), ()),
+    **{f"sigma_{axis}": (f"sigma_{axis}_m", f"std_{axis}") for axis in ("e", "n", "u")},
+}
+_CANONICAL = {alias: key for key, aliases in _ALIASES.items() for alias in (key, *aliases)}
+_GEOGRAPHIC = ("longitude", "latitude", "altitude")
+_PROJECTED = ("x", "y", "z")
+_ANGLES = ("yaw", "pitch", "roll")
+_QUATERNION = ("qx", "qy", "qz", "qw")
+_SIGMAS = ("sigma_e", "sigma_n", "sigma_u")
+_LATEST_S = 1e11  # the year 5138; larger numbers are milliseconds or finer
+
+
+def read_trajectory(path: Path, notes: Notes) -> PoseTable:
+    """Read a trajectory.
+
+    Separators are `,`, `;` or tab; with the latter two, decimals may be written with commas. Rows without a
+    position are left out and noted; so are unknown columns, which are ignored.
+
+    Raises:
+        InputError: no usable header, a cell that is no number, a latitude out of range, half a group of columns,
+            a row longer than the header, or no row with a position. Names file, line and column.
+    """
+    cells = _Cells.read(path, notes)
+    position = _position_columns(cells)
+    xyz = cells.group(position)
+    geographic = position == _GEOGRAPHIC
+    if geographic:
+        cells.check_range(xyz[:, 1], 90.0, "latitude")
+        cells.check_range(xyz[:, 0], 360.0, "longitude")
+    table = PoseTable(
+        path=path,
+        source="csv",
+        lines=np.array(cells.lines, dtype=np.int64),
+        names=tuple(cells.texts("image")) if "image" in cells.columns else None,
+        time_s=_times(cells, notes) if "timestamp" in cells.columns else None,
+        xyz=xyz,
+        geographic=geographic,
+        quat_xyzw=_attitudes(cells),
+        sigma_enu_m=_sigmas(cells),
+    )
+    return _with_positions(table, notes)
+
+
+@dataclass(frozen=True)
+class _Cells:
+    """The rows as text, with the column that each canonical name has."""
+
+    path: Path
+    header_line: int
+    columns: dict[str, int]
+    rows: list[list[str]]
+    lines: list[int]
+    decimal_comma: bool
+
+    @classmethod
+    def read(cls, path: Path, notes: Notes) -> _Cells:
+        lines = read_lines(path)
+        first = next(index for index, line in enumerate(lines) if line.strip())
+        header = lines[first].lstrip("# ")
+        separator = max(";\t,", key=header.count)
+        if separator not in header:
+            raise InputError(
+                "the header has one column only: separate columns by , ; or tab", path=path, line=first + 1
+            )
+        columns = _columns(next(csv.reader([header], delimiter=separator)), path, first + 1, notes)
+        width = header.count(separator) + 1
+        rows, numbers = [], []
+        reader = csv.reader(lines[first + 1 :], delimiter=separator)
+        try:
+            for row in reader:
+                line = first + 1 + reader.line_num
+                if not any(cell.strip() for cell in row) or row[0].lstrip().startswith("#"):
+                    continue
+                if len(row) > width and any(cell.strip() for cell in row[width:]):
+                    hint = "; decimal commas need ; as separator" if separator == "," else ""
+                    raise InputError(f"has {len(row)} cells, the header has {width}{hint}", path=path, line=line)
+                rows.append(row + [""] * (width - len(row)))
+                numbers.append(line)
+        except csv.Error as error:
+            raise InputError(f"is no CSV: {error}", path=path, line=first + 1 + reader.line_num) from error
+        if not rows:
+            raise InputError("has a header but no rows", path=path)
+        return cls(path, first + 1, columns, rows, numbers, separator != ",")
+
+    def texts(self, column: str) -> list[str]:
+        at = self.columns[column]
+        return [row[at].strip() for row in self.rows]
+
+    def numbers(self, column: str) -> FloatArray:
+        """(N,) numbers of a column; NaN where empty."""
+        return np.array(
+            [
+                number(text, path=self.path, line=line, field=column, decimal_comma=self.decimal_comma)
+                for text, line in zip(self.texts(column), self.lines, strict=True)
+            ]
+        )
+
+    def has(self, columns: tuple[str, ...]) -> bool:
+        """Whether a group of columns is there: all of them, or none."""
+        present = [name for name in columns if name in self.columns]
+        if present and len(present) < len(columns):
+            missing = ", ".join(name for name in columns if name not in self.columns)
+            raise InputError(f"has {', '.join(present)} but not {missing}", path=self.path, line=self.header_line)
+        return bool(present)
+
+    def group(self, columns: tuple[str, ...]) -> FloatArray:
+        """(N, len(columns)) numbers."""
+        return np.stack([self.numbers(column) for column in columns], axis=-1)
+
+    def check_range(self, values: FloatArray, limit: float, column: str, least: float | None = None) -> None:
+        """Raise for the first value outside −limit … limit (or least … limit)."""
+        lowest = -limit if least is None else least
+        bad = np.flatnonzero((values < lowest) | (values > limit))
+        if len(bad):
+            message = f"{values[bad[0]]:g} is out of range {lowest:g} … {limit:g}"
+            raise InputError(message, path=self.path, line=self.lines[bad[0]], field=column)
+
+
+def _columns(names: list[str], path: Path, line: int, notes: Notes) -> dict[str, int]:
+    found: dict[str, int] = {}
+    unknown = []
+    for at, name in enumerate(names):
+        key = _CANONICAL.get(name.strip().lower().replace(" ", "_"))
+        if key is None:
+            unknown.append(name.strip())
+        elif key in found:
+            raise InputError(
+                f"two columns for {key}: {names[found[key]].strip()}, {name.strip()}", path=path, line=line
+            )
+        else:
+            found[key] = at
+    if not found:
+        raise InputError(
+            "the first line must be a header: image and/or timestamp, then latitude,longitude,altitude or x,y,z",
+            path=path,
+            line=line,
+        )
+    if "image" not in found and "timestamp" not in found:
+        raise InputError("needs a column image or timestamp", path=path, line=line)
+    notes.warn_counted(
+        [f"{path.name}:{line} ({name or 'unnamed'})" for name in unknown],
+        "column is unknown and was ignored",
+        "columns are unknown and were ignored",
+    )
+    return found
+
+
+def _position_columns(cells: _Cells) -> tuple[str, ...]:
+    geographic, projected = cells.has(_GEOGRAPHIC), cells.has(_PROJECTED)
+    if geographic == projected:
+        which = "both" if geographic else "neither of"
+        raise InputError(
+            f"has {which} latitude,longitude,altitude and x,y,z", path=cells.path, line=cells.header_line
+        )
+    return _GEOGRAPHIC if geographic else _PROJECTED
+
+
+def _attitudes(cells: _Cells) -> FloatArray | None:
+    """(N, 4) rotations camera → East-North-Up, NaN where a row has none."""
+    angles, quaternion = cells.has(_ANGLES), cells.has(_QUATERNION)
+    if angles and quaternion:
+        raise InputError("has both yaw,pitch,roll and qx,qy,qz,qw", path=cells.path, line=cells.header_line)
+    if not (angles or quaternion):
+        return None
+    values = cells.group(_ANGLES if angles else _QUATERNION)
+    known = complete(values)
+    result = np.full((len(values), 4), np.nan)
+    if angles:
+        cells.check_range(values[:, 0], 360.0, "yaw")
+        cells.check_range(values[:, 1], 180.0, "pitch")
+        cells.check_range(values[:, 2], 360.0, "roll")
+        result[known] = quat_xyzw_from_matrix(geo_from_cam(values[known]))
+        return result
+    length = np.linalg.norm(values, axis=1)
+    bad = np.flatnonzero(known & (np.abs(length - 1.0) > 0.01))
+    if len(bad):
+        message = f"the quaternion has length {length[bad[0]]:g}, not 1"
+        raise InputError(message, path=cells.path, line=cells.lines[bad[0]], field="qx,qy,qz,qw")
+    result[known] = values[known] / length[known, None]
+    return result
+
+
+def _sigmas(cells: _Cells) -> FloatArray | None:
+    if not cells.has(_SIGMAS):
+        return None
+    values = cells.group(_SIGMAS)
+    for axis, column in enumerate(_SIGMAS):
+        cells.check_range(values[:, axis], 1e6, column, least=1e-6)
+    return values
+
+
+def _times(cells: _Cells, notes: Notes) -> FloatArray:
+    """(N,) seconds since 1970 UTC: numbers, or ISO 8601 (without a zone: UTC)."""
+    times = np.array(
+        [
+            _time(text, cells.path, line, cells.decimal_comma, notes)
+            for text, line in zip(cells.texts("timestamp"), cells.lines, strict=True)
+        ]
+    )
+    late = np.flatnonzero(np.abs(times) > _LATEST_S)
+    if len(late):
+        message = f"{times[late[0]]:.0f} looks like milliseconds or finer: give seconds since 1970"
+        raise InputError(message, path=cells.path, line=cells.lines[late[0]], field="timestamp")
+    return times
+
+
+def _time(text: str, path: Path, line: int, decimal_comma: bool, notes: Notes) -> float:
+    if text[4:5] == "-" and len(text) >= 10:
+        try:
+            moment = datetime.fromisoformat(text)
+        except ValueError:
+            raise InputError(f"{text!r} is no ISO 8601 time", path=path, line=line, field="timestamp") from None
+        if moment.tzinfo is None:
+            notes.assume(f"times without a zone in {path.name} are UTC")
+            moment = moment.replace(tzinfo=UTC)
+        return moment.timestamp()
+    return number(text, path=path, line=line, field="timestamp", decimal_comma=decimal_comma)
+
+
+def _with_positions(table: PoseTable, notes: Notes) -> PoseTable:
+    """Without the rows that have no position, and without repeats of a moment where there are no names."""
+    known = complete(table.xyz)
+    places = [f"{table.path.name}:{line}" for line in table.lines[~known]]
+    notes.warn_counted(places, "row has no position (empty or NaN)", "rows have no position (empty or NaN)")
+    if not known.any():
+        raise InputError("no row has a position", path=table.path)
+    table = table.take(known)
+    if table.names is not None or table.time_s is None:
+        return table
+    _, first = np.unique(table.time_s, return_index=True)
+    repeated = np.setdiff1d(np.arange(len(table)), first)
+    places = [f"{table.path.name}:{line}" for line in table.lines[repeated]]
+    notes.warn_counted(
+        places, "row repeats an earlier time and was left out", "rows repeat earlier times and were left out"
+    )
+    return table.take(np.sort(first))

@@ -1,0 +1,71 @@
+"""Vertical datums by name: what a height counts from, who said so, and what to do when its grid is missing.
+
+An ellipsoidal height and one above a geoid differ by up to 100 m, so every survey says which it has, and
+whether that was stated or assumed.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipelines.errors import InputError
+from pipelines.products import VerticalDatum
+
+ELLIPSOIDAL = "ellipsoidal"
+_EPSG_OF = {"EGM84": 5798, "EGM96": 5773, "EGM2008": 3855}
+
+
+@dataclass(frozen=True)
+class VerticalChoice:
+    """A vertical datum as an option names it.
+
+    Attributes:
+        name: `ellipsoidal`, `EGM96` … or `EPSG:n`.
+        epsg: code of the vertical CRS; None for ellipsoidal heights.
+    """
+
+    name: str
+    epsg: int | None
+
+
+def parse_vertical(text: str) -> VerticalChoice:
+    """Read `ellipsoidal`, `EGM84`, `EGM96`, `EGM2008` or `EPSG:n` (any case).
+
+    Raises:
+        InputError: none of these.
+    """
+    name = text.strip()
+    if name.lower() == ELLIPSOIDAL:
+        return VerticalChoice(ELLIPSOIDAL, None)
+    if name.upper() in _EPSG_OF:
+        return VerticalChoice(name.upper(), _EPSG_OF[name.upper()])
+    match = re.fullmatch(r"EPSG:(\d{1,6})", name, re.IGNORECASE)
+    if match is None:
+        known = ", ".join([ELLIPSOIDAL, *_EPSG_OF, "EPSG:n"])
+        raise InputError(f"{text!r} is no vertical datum: give one of {known}", field="--vertical")
+    return VerticalChoice(name_of(int(match[1])), int(match[1]))
+
+
+def name_of(epsg: int) -> str:
+    """The short name of a vertical CRS, so that `EPSG:5773` and `EGM96` are the same datum."""
+    return next((name for name, code in _EPSG_OF.items() if code == epsg), f"EPSG:{epsg}")
+
+
+def assumed_ellipsoidal(note: str) -> VerticalDatum:
+    """The datum of heights of which nothing is said; `note` tells what was read and what may be wrong with it."""
+    return VerticalDatum(name=ELLIPSOIDAL, stated=False, note=note)
+
+
+def missing_grid_error(datum: str, grids: Sequence[str], folder: str, path: Path | str | None) -> InputError:
+    """The error for heights whose conversion needs `grids` that are not in PROJ's data `folder`s."""
+    files = ", ".join(grids)
+    command = " ".join(["pyproj sync", *(f"--file {grid}" for grid in grids)])
+    return InputError(
+        f"heights above {datum} cannot be made ellipsoidal: the PROJ grid {files} is not installed. "
+        f"Run `{command}`, or copy it from https://cdn.proj.org into {folder}. "
+        "If the heights are ellipsoidal after all, give the horizontal CRS alone and `--vertical ellipsoidal`",
+        path=path,
+    )

@@ -1,0 +1,213 @@
+"""What bundle adjustment knows of its cameras: the information that the image observations leave in the poses.
+
+The reduced normal matrix of the bundle (points and intrinsics eliminated) says which corrections of the cameras
+the observations would resist, and how much. Its square root gives coordinates in which every correction that
+costs the observations χ² = 1 has length one, and in which the seven movements that no observation can see, those
+of a similarity of the whole, do not exist.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+from scipy.sparse import csr_matrix
+
+from pipelines.errors import DegenerateGeometryError
+from pipelines.geometry.cameras import Camera, project
+from pipelines.geometry.rotations import skew
+from pipelines.products import FloatArray
+
+IntArray = NDArray[np.int64]
+
+# A camera that hangs on few observations is held to a tenth of its distance from the scene.
+_LOOSEST_RELATIVE_SIGMA = 0.1
+_STEP = 1e-6
+_CAUCHY_SCALE = 2.385  # 95 % efficiency on Gaussian noise
+
+
+@dataclass(frozen=True)
+class Network:
+    """A bundle of n cameras, N points, M observations, in any metric frame `world`.
+
+    Attributes:
+        cameras: intrinsics by camera id.
+        camera_id: (n,) keys of `cameras`.
+        cam_from_world: (n, 3, 3) rotations.
+        cam_center_in_world: (n, 3) metres.
+        point_in_world: (N, 3) metres.
+        obs_point, obs_image: (M,) indices.
+        obs_xy_px: (M, 2) pixels.
+    """
+
+    cameras: dict[int, Camera]
+    camera_id: IntArray
+    cam_from_world: FloatArray
+    cam_center_in_world: FloatArray
+    point_in_world: FloatArray
+    obs_point: IntArray
+    obs_image: IntArray
+    obs_xy_px: FloatArray
+
+
+@dataclass(frozen=True)
+class CorrectionBasis:
+    """Whitened corrections: (δω, δc) of all cameras = matrix @ z, with z ~ N(0, I) a posteriori.
+
+    `δω` [rad] turns a camera about its centre, axes of the world: `R' = R Exp(−δω)`; `δc` [m] moves the centre.
+
+    Attributes:
+        matrix: (n, 6, k), rows (δω, δc), k = 6 n − 7.
+        sigma_px: σ of an image coordinate, estimated from the residuals.
+    """
+
+    matrix: FloatArray
+    sigma_px: float
+
+
+@dataclass(frozen=True)
+class _Linearised:
+    residual: FloatArray  # (M, 2)
+    by_pose: FloatArray  # (M, 2, 6)
+    by_point: FloatArray  # (M, 2, 3)
+    by_intrinsics: FloatArray  # (M, 2, P), P the longest parameter list
+
+
+def correction_basis(network: Network) -> CorrectionBasis:
+    """Whitened, gauge-free coordinates of the camera corrections.
+
+    Robust: observations are weighted by Cauchy's kernel. The corrections obey the inner constraints (zero mean
+    similarity), as in free-network adjustment. Cost O((6 n)³).
+
+    Raises:
+        DegenerateGeometryError: fewer observations than unknowns.
+    """
+    lin = _linearise(network)
+    n, points = len(network.camera_id), len(network.point_in_world)
+    redundancy = 2 * len(lin.residual) - 6 * n - 3 * points
+    if redundancy <= 0:
+        raise DegenerateGeometryError(
+            f"{len(lin.residual)} observations do not determine {n} cameras and {points} points"
+        )
+    weight = _robust_weights(lin.residual)
+    sigma_px = float(np.sqrt((weight[:, None] * lin.residual**2).sum() / redundancy))
+    information = _reduced_information(network, lin, np.sqrt(weight) / sigma_px)
+    return CorrectionBasis(_whitened(network, information), sigma_px)
+
+
+def _linearise(network: Network) -> _Linearised:
+    ray = network.point_in_world[network.obs_point] - network.cam_center_in_world[network.obs_image]
+    rotation = network.cam_from_world[network.obs_image]
+    in_cam = np.einsum("mij,mj->mi", rotation, ray)
+    count = len(ray)
+    longest = max(len(camera.params) for camera in network.cameras.values())
+    residual, by_cam = np.zeros((count, 2)), np.zeros((count, 2, 3))
+    by_intrinsics = np.zeros((count, 2, longest))
+    camera_of = network.camera_id[network.obs_image]
+    for key, camera in network.cameras.items():
+        rows = np.flatnonzero(camera_of == key)
+        local = in_cam[rows]
+        residual[rows] = project(camera, local) - network.obs_xy_px[rows]
+        by_cam[rows] = _differences(partial(project, camera), local)
+        for index in range(len(camera.params)):
+            by_intrinsics[rows, :, index] = _by_parameter(camera, index, local)
+    by_point = by_cam @ rotation
+    by_pose = np.concatenate([by_point @ skew(ray), -by_point], axis=2)
+    return _Linearised(residual, by_pose, by_point, by_intrinsics)
+
+
+def _differences(function: Callable[[FloatArray], FloatArray], points: FloatArray) -> FloatArray:
+    """Central differences of (M, 2) by (M, 3), with steps relative to each point's depth."""
+    step = _STEP * points[:, 2:3]
+    columns = []
+    for axis in range(3):
+        shift = np.zeros((1, 3))
+        shift[0, axis] = 1.0
+        columns.append((function(points + step * shift) - function(points - step * shift)) / (2 * step))
+    return np.stack(columns, axis=2)
+
+
+def _by_parameter(camera: Camera, index: int, points: FloatArray) -> FloatArray:
+    step = _STEP * max(1.0, abs(float(camera.params[index])))
+    shifted = []
+    for sign in (1.0, -1.0):
+        params = camera.params.copy()
+        params[index] += sign * step
+        shifted.append(project(Camera(camera.model, camera.width, camera.height, params), points))
+    return (shifted[0] - shifted[1]) / (2 * step)
+
+
+def _robust_weights(residual: FloatArray) -> FloatArray:
+    length = np.linalg.norm(residual, axis=1)
+    scale = max(float(np.median(length)) / 1.1774, 1e-9)  # median of a Rayleigh distribution
+    return 1.0 / (1.0 + (length / (_CAUCHY_SCALE * scale)) ** 2)
+
+
+def _reduced_information(network: Network, lin: _Linearised, root_weight: FloatArray) -> FloatArray:
+    """Schur complement of points and intrinsics: information (6 n, 6 n) of the poses."""
+    n, points = len(network.camera_id), len(network.point_in_world)
+    scaled = root_weight[:, None, None]
+    keys = list(network.cameras)
+    slot = np.array([keys.index(int(key)) for key in network.camera_id])[network.obs_image]
+    pose = _scatter(lin.by_pose * scaled, network.obs_image, n)
+    intrinsics = _scatter(lin.by_intrinsics * scaled, slot, len(keys))
+    by_point = lin.by_point * scaled
+    normal = np.zeros((points, 3, 3))
+    np.add.at(normal, network.obs_point, np.swapaxes(by_point, 1, 2) @ by_point)
+    normal += 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3) + 1e-12 * np.eye(3)
+    inverse_root = np.swapaxes(np.linalg.inv(np.linalg.cholesky(normal)), 1, 2)
+    point = _scatter(by_point @ inverse_root[network.obs_point], network.obs_point, points)
+    pose_point, intrinsics_point = pose.T @ point, intrinsics.T @ point
+    cc = (pose.T @ pose - pose_point @ pose_point.T).toarray()
+    ci = (pose.T @ intrinsics - pose_point @ intrinsics_point.T).toarray()
+    ii = (intrinsics.T @ intrinsics - intrinsics_point @ intrinsics_point.T).toarray()
+    used = np.flatnonzero(np.diag(ii) > 0)  # shorter parameter lists leave empty columns
+    if len(used):
+        scale = 1.0 / np.sqrt(np.diag(ii)[used])
+        block = ii[np.ix_(used, used)] * scale[:, None] * scale + 1e-9 * np.eye(len(used))
+        cross = ci[:, used] * scale
+        cc -= cross @ np.linalg.solve(block, cross.T)
+    return (cc + cc.T) / 2
+
+
+def _scatter(blocks: FloatArray, column_block: IntArray, count: int) -> csr_matrix:
+    """Sparse matrix with one (2, w) block a row pair, in the block column that is given: (2 M, w · count)."""
+    rows, height, width = blocks.shape
+    columns = column_block[:, None, None] * width + np.arange(width)[None, None, :]
+    columns = np.broadcast_to(columns, blocks.shape)
+    pointer = np.arange(0, rows * height * width + 1, width)
+    return csr_matrix((blocks.ravel(), columns.ravel(), pointer), shape=(rows * height, width * count))
+
+
+def _whitened(network: Network, information: FloatArray) -> FloatArray:
+    center = network.cam_center_in_world
+    n = len(center)
+    distance = np.linalg.norm(network.point_in_world[network.obs_point] - center[network.obs_image], axis=1)
+    typical = float(np.median(distance))
+    unit = np.tile([1 / typical] * 3 + [1.0] * 3, n)  # rotations in metres at the scene, so that units agree
+    scaled = information * unit[:, None] * unit
+    gauge = similarity_modes(center).reshape(6 * n, 7) / unit[:, None]
+    complement = np.linalg.qr(gauge, mode="complete")[0][:, 7:]
+    reduced = complement.T @ scaled @ complement
+    reduced += np.eye(len(reduced)) / (_LOOSEST_RELATIVE_SIGMA * typical) ** 2
+    root = np.linalg.cholesky(reduced)
+    basis = solve_triangular(root, complement.T, lower=True).T
+    return (basis * unit[:, None]).reshape(n, 6, -1)
+
+
+def similarity_modes(cam_center_in_world: FloatArray) -> FloatArray:
+    """How an infinitesimal similarity about the mean centre moves each camera: (n, 6, 7).
+
+    Rows (δω, δc) as in `CorrectionBasis`, columns (ln s, rotation, translation).
+    """
+    arm = cam_center_in_world - cam_center_in_world.mean(axis=0)
+    modes = np.zeros((len(arm), 6, 7))
+    modes[:, :3, 1:4] = np.eye(3)
+    modes[:, 3:, 0] = arm
+    modes[:, 3:, 1:4] = -skew(arm)
+    modes[:, 3:, 4:] = np.eye(3)
+    return modes

@@ -1,0 +1,177 @@
+"""Cameras with lens distortion: pixels ↔ rays, for COLMAP's camera models.
+
+Pixels have the centre of the top-left pixel at (0.5, 0.5). Rays are normalised coordinates (x/z, y/z) in the
+camera frame: x right, y down, z forward. Every model is brought into one of two forms, OpenCV's rational lens
+(FULL_OPENCV, of which the simpler models are special cases) or the equidistant fisheye.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from pipelines.errors import InputError
+from pipelines.products import FloatArray
+
+# Where each of COLMAP's parameters goes: fx fy cx cy | k1 k2 p1 p2 k3 k4 k5 k6 (fisheye: k1 k2 k3 k4).
+_LAYOUT: dict[str, tuple[tuple[int, ...], ...]] = {
+    "SIMPLE_PINHOLE": ((0, 1), (2,), (3,)),
+    "PINHOLE": ((0,), (1,), (2,), (3,)),
+    "SIMPLE_RADIAL": ((0, 1), (2,), (3,), (4,)),
+    "RADIAL": ((0, 1), (2,), (3,), (4,), (5,)),
+    "OPENCV": tuple((slot,) for slot in range(8)),
+    "FULL_OPENCV": tuple((slot,) for slot in range(12)),
+    "OPENCV_FISHEYE": tuple((slot,) for slot in range(8)),
+}
+MODELS = tuple(_LAYOUT)
+
+_MAX_NEWTON_STEPS = 30
+_TOLERANCE = 1e-11  # of normalised coordinates: 1e-8 px at f = 1000 px
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Intrinsics of a COLMAP camera model.
+
+    Attributes:
+        model: COLMAP's name of the model, e.g. "OPENCV".
+        width, height: image size in pixels.
+        params: (P,) float64, COLMAP's parameters of that model, in pixels where they are lengths.
+    """
+
+    model: str
+    width: int
+    height: int
+    params: FloatArray
+
+    @property
+    def mean_focal_px(self) -> float:
+        """Mean of the two focal lengths in pixels."""
+        focal, _, _ = _lens(self)
+        return float(focal.mean())
+
+
+def undistort(camera: Camera, xy_px: ArrayLike) -> FloatArray:
+    """Rays (…, 2) as (x/z, y/z) of pixels (…, 2); NaN where the lens model maps no ray to the pixel.
+
+    Newton's method on the distortion, with its analytic derivative; a solution beyond the fold of the radial
+    polynomial (where it stops being one to one) is refused.
+
+    Raises:
+        InputError: unknown camera model, or a wrong number of parameters.
+    """
+    focal, center, distortion = _lens(camera)
+    target = (np.asarray(xy_px, dtype=np.float64) - center) / focal
+    if not distortion.any() and camera.model != "OPENCV_FISHEYE":
+        return target
+    flat = target.reshape(-1, 2)
+    rays = _undistort_fisheye(flat, distortion) if _is_fisheye(camera) else _undistort_rational(flat, distortion)
+    return rays.reshape(target.shape)
+
+
+def project(camera: Camera, point_in_cam: ArrayLike) -> FloatArray:
+    """Pixels (…, 2) of points (…, 3) in the camera frame; NaN behind the camera.
+
+    Raises:
+        InputError: as `undistort`.
+    """
+    point = np.asarray(point_in_cam, dtype=np.float64)
+    depth = np.where(point[..., 2:] > 0, point[..., 2:], np.nan)
+    return distort(camera, point[..., :2] / depth)
+
+
+def distort(camera: Camera, ray: ArrayLike) -> FloatArray:
+    """Pixels (…, 2) of rays (…, 2) given as (x/z, y/z).
+
+    Raises:
+        InputError: as `undistort`.
+    """
+    focal, center, distortion = _lens(camera)
+    normalised = np.asarray(ray, dtype=np.float64)
+    flat = normalised.reshape(-1, 2)
+    bent = _distort_fisheye(flat, distortion) if _is_fisheye(camera) else _distort_rational(flat, distortion)[0]
+    return bent.reshape(normalised.shape) * focal + center
+
+
+def _is_fisheye(camera: Camera) -> bool:
+    return camera.model == "OPENCV_FISHEYE"
+
+
+def _lens(camera: Camera) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Focal lengths (2,), principal point (2,) and distortion (8,), zero where the model has no such term."""
+    layout = _LAYOUT.get(camera.model)
+    if layout is None:
+        raise InputError(f"camera model {camera.model} is not supported; use one of {', '.join(MODELS)}")
+    if len(camera.params) != len(layout):
+        raise InputError(f"camera model {camera.model} has {len(layout)} parameters, not {len(camera.params)}")
+    full = np.zeros(12)
+    for value, slots in zip(camera.params, layout, strict=True):
+        full[list(slots)] = value
+    if not (full[:2] > 0).all():
+        raise InputError(f"focal length {full[0]:g} px is not positive")
+    return full[:2], full[2:4], full[4:]
+
+
+def _distort_rational(ray: FloatArray, lens: FloatArray) -> tuple[FloatArray, tuple[FloatArray, ...]]:
+    """Distorted rays (N, 2) and the derivative's entries (du/dx, du/dy = dv/dx, dv/dy), each (N,)."""
+    k1, k2, p1, p2, k3, k4, k5, k6 = lens
+    x, y = ray[:, 0], ray[:, 1]
+    r2 = x * x + y * y
+    above = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    below = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+    gain = above / below
+    slope = (k1 + r2 * (2 * k2 + r2 * 3 * k3) - gain * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / below
+    u = x * gain + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    v = y * gain + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
+    du_dx = gain + 2 * slope * x * x + 2 * p1 * y + 6 * p2 * x
+    dv_dy = gain + 2 * slope * y * y + 2 * p2 * x + 6 * p1 * y
+    mixed = 2 * slope * x * y + 2 * p1 * x + 2 * p2 * y
+    return np.stack([u, v], axis=-1), (du_dx, mixed, dv_dy)
+
+
+def _undistort_rational(target: FloatArray, lens: FloatArray) -> FloatArray:
+    ray = target.copy()
+    with np.errstate(all="ignore"):
+        for _ in range(_MAX_NEWTON_STEPS):
+            bent, (a, b, c) = _distort_rational(ray, lens)
+            miss = target - bent
+            if not (np.abs(miss) > _TOLERANCE).any():
+                break
+            determinant = a * c - b * b
+            ray[:, 0] += (c * miss[:, 0] - b * miss[:, 1]) / determinant
+            ray[:, 1] += (a * miss[:, 1] - b * miss[:, 0]) / determinant
+        bent, (a, b, c) = _distort_rational(ray, lens)
+        solved = (np.abs(target - bent) <= 10 * _TOLERANCE).all(axis=1) & (a * c - b * b > 0) & (a + c > 0)
+    return np.where(solved[:, None], ray, np.nan)
+
+
+def _fisheye_angle(theta: FloatArray, lens: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Distorted angle and its derivative; `lens` holds k1 … k4."""
+    t2 = theta * theta
+    k1, k2, k3, k4 = lens[:4]
+    bent = theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+    return bent, 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
+
+
+def _distort_fisheye(ray: FloatArray, lens: FloatArray) -> FloatArray:
+    radius = np.hypot(ray[:, 0], ray[:, 1])
+    bent, _ = _fisheye_angle(np.arctan(radius), lens)
+    return ray * np.where(radius > 1e-12, bent / np.maximum(radius, 1e-12), 1.0)[:, None]
+
+
+def _undistort_fisheye(target: FloatArray, lens: FloatArray) -> FloatArray:
+    bent = np.hypot(target[:, 0], target[:, 1])
+    theta = np.minimum(bent, 1.5)
+    with np.errstate(all="ignore"):
+        for _ in range(_MAX_NEWTON_STEPS):
+            value, slope = _fisheye_angle(theta, lens)
+            if not (np.abs(value - bent) > _TOLERANCE).any():
+                break
+            theta = theta + (bent - value) / slope
+        value, slope = _fisheye_angle(theta, lens)
+        # A ray at or beyond 90° has no (x/z, y/z).
+        solved = (np.abs(value - bent) <= 10 * _TOLERANCE) & (slope > 0) & (theta >= 0) & (theta < np.pi / 2)
+        stretch = np.where(bent > 1e-12, np.tan(theta) / np.maximum(bent, 1e-12), 1.0)
+    return np.where(solved[:, None], target * stretch[:, None], np.nan)

@@ -1,0 +1,69 @@
+"""Cameras that may move while training: corrections in the coordinates that bundle adjustment left."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pipelines.georef.similarity import exp_so3
+from pipelines.products import FloatArray
+
+
+@dataclass(frozen=True)
+class CameraPoses:
+    """n cameras in the frame `model`.
+
+    Attributes:
+        cam_from_model: (n, 3, 3) rotations.
+        cam_center_in_model: (n, 3) metres.
+    """
+
+    cam_from_model: FloatArray
+    cam_center_in_model: FloatArray
+
+
+class CameraCorrections(torch.nn.Module):
+    """Poses = base corrected by (δω, δc) = basis · z, in float64.
+
+    With the basis of `geometry.bundle.correction_basis`, |z|² is what the correction costs the image
+    observations, and no z moves all cameras by a similarity: the gauge is held by construction. A test camera
+    gives no gradient; it is carried along by its ties to the others, as it would be in the bundle.
+
+    Args:
+        base: poses before training.
+        basis: (n, 6, k); k = 0 holds the cameras fixed.
+    """
+
+    def __init__(self, base: CameraPoses, basis: FloatArray) -> None:
+        super().__init__()
+        self.z = torch.nn.Parameter(torch.zeros(basis.shape[2], dtype=torch.float64))
+        self.basis: Tensor
+        self.rotation: Tensor
+        self.center: Tensor
+        self.register_buffer("basis", torch.from_numpy(np.ascontiguousarray(basis)))
+        self.register_buffer("rotation", torch.from_numpy(np.ascontiguousarray(base.cam_from_model)))
+        self.register_buffer("center", torch.from_numpy(np.ascontiguousarray(base.cam_center_in_model)))
+
+    def centers(self) -> Tensor:
+        """Corrected projection centres (n, 3) in `model`."""
+        return self.center + self.basis[:, 3:] @ self.z
+
+    def rotations(self) -> Tensor:
+        """Corrected rotations cam ← model (n, 3, 3)."""
+        return self.rotation @ exp_so3(-(self.basis[:, :3] @ self.z))
+
+    def cam_from_model(self, index: int) -> Tensor:
+        """Corrected pose of one camera, (4, 4) float32, differentiable in z."""
+        correction = self.basis[index] @ self.z
+        rotation = self.rotation[index] @ exp_so3(-correction[:3])
+        translation = -rotation @ (self.center[index] + correction[3:])
+        bottom = torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=torch.float64, device=rotation.device)
+        return torch.cat([torch.cat([rotation, translation[:, None]], dim=1), bottom]).float()
+
+    def current(self) -> CameraPoses:
+        """The present poses."""
+        with torch.no_grad():
+            return CameraPoses(self.rotations().cpu().numpy(), self.centers().cpu().numpy())

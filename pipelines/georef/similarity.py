@@ -1,0 +1,73 @@
+"""The similarity that is learned: seven whitened coordinates about the initial estimate, in float64."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pipelines.geometry.similarity import Similarity
+from pipelines.products import FloatArray
+
+
+def cross_matrix(vector: Tensor) -> Tensor:
+    """Cross-product matrices (…, 3, 3) of vectors (…, 3)."""
+    x, y, z = vector.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).reshape(*vector.shape[:-1], 3, 3)
+
+
+def exp_so3(rotation_vector: Tensor) -> Tensor:
+    """Rotation matrices (…, 3, 3) of rotation vectors (…, 3), differentiable also at zero."""
+    return torch.linalg.matrix_exp(cross_matrix(rotation_vector))
+
+
+class LearnableSimilarity(torch.nn.Module):
+    """`geo_from_model` = perturbation(root · y) ∘ base, with y ~ N(0, I) a priori.
+
+    The perturbation is that of `products.SimilarityRecord`: (δ ln s, δω, δt) about `pivot` in the target frame.
+    In the coordinates y all seven unknowns are of one size, whatever the extent of the scene, so that one
+    learning rate fits.
+
+    Args:
+        base: initial estimate.
+        covariance: (7, 7) of the initial estimate; its root is the unit of y.
+        pivot: (3,) in the target frame.
+    """
+
+    def __init__(self, base: Similarity, covariance: FloatArray, pivot: FloatArray) -> None:
+        super().__init__()
+        self.base = base
+        self.pivot_in_geo = np.asarray(pivot, dtype=np.float64)
+        self.y = torch.nn.Parameter(torch.zeros(7, dtype=torch.float64))
+        self.root: Tensor
+        self.register_buffer("root", torch.from_numpy(_root(covariance)))
+
+    def forward(self, points: Tensor) -> Tensor:
+        """Map points (N, 3) float64 of `model` to `geo`."""
+        rotation = torch.as_tensor(self.base.rotation, dtype=torch.float64, device=points.device)
+        pivot = torch.as_tensor(self.pivot_in_geo, dtype=torch.float64, device=points.device)
+        shift = torch.as_tensor(self.base.translation, dtype=torch.float64, device=points.device)
+        delta = self.root @ self.y
+        arm = self.base.scale * points @ rotation.T + (shift - pivot)
+        turned = arm @ exp_so3(delta[1:4]).T
+        return torch.exp(delta[0]) * turned + (pivot + delta[4:])
+
+    def current(self) -> Similarity:
+        """The present estimate."""
+        delta = (self.root @ self.y).detach().cpu()
+        turn = exp_so3(delta[1:4]).numpy()
+        grow = float(torch.exp(delta[0]))
+        move = Similarity(grow, turn, self.pivot_in_geo + delta[4:].numpy() - grow * turn @ self.pivot_in_geo)
+        return move @ self.base
+
+    def prior_covariance(self) -> FloatArray:
+        """Covariance (7, 7) of the initial estimate."""
+        root = self.root.cpu().numpy()
+        return np.asarray(root @ root.T)
+
+
+def _root(covariance: FloatArray) -> FloatArray:
+    """A square root of a positive semi-definite matrix; a direction without uncertainty keeps a tiny one."""
+    value, vector = np.linalg.eigh((covariance + covariance.T) / 2)
+    return np.asarray(vector * np.sqrt(np.maximum(value, 1e-12 * max(value.max(), 1e-12))))

@@ -1,0 +1,331 @@
+"""Stage `ingest`: photographs, positions, attitudes and ground points into one survey in one frame.
+
+Reads: a folder of photographs; optionally a CSV trajectory or `geo.txt`, `gcp_list.txt`, check points.
+Writes: `ingest/survey.json`, and `ingest/images/` with --copy. See docs/inputs.md for every format and default.
+"""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from pipelines.config import IngestConfig
+from pipelines.errors import InputError
+from pipelines.formats.camera_priors import camera_priors
+from pipelines.formats.ground_points import GroundFile, GroundPoint, read_ground_file, require_near, split_checks
+from pipelines.formats.measured import Measured, PoseOptions, from_table, from_tags
+from pipelines.formats.notes import Notes
+from pipelines.formats.odm import read_geo
+from pipelines.formats.photo_folder import Photo, scan_folder
+from pipelines.formats.poses import complete
+from pipelines.formats.trajectory_csv import read_trajectory
+from pipelines.geodesy import enu
+from pipelines.geodesy.vertical import parse_vertical
+from pipelines.geometry.rotations import matrix_from_quat_xyzw, quat_xyzw_from_matrix
+from pipelines.products import (
+    Attitude,
+    Fix,
+    FloatArray,
+    Matrix3,
+    Origin,
+    Survey,
+    SurveyedPoint,
+    SurveyImage,
+    Vector3,
+    VerticalDatum,
+    save_json,
+)
+from pipelines.progress import SILENT, Progress
+from pipelines.workspace import StageRun, Summary
+
+log = logging.getLogger(__name__)
+
+LEAST_IMAGES = 3
+SIGMA_GIMBAL_DEG = 2.0
+SIGMA_TABLE_ATTITUDE_DEG = 1.0
+# A fix further than this from the middle of all is a blunder.
+_FIX_RANGE_M = 100_000.0
+
+
+def run(stage: StageRun, config: IngestConfig) -> Summary:
+    """Build the survey and save it.
+
+    Raises:
+        InputError: anything wrong with the inputs; names file, line and field.
+    """
+    if config.images is not None and stage.workspace.root.resolve().is_relative_to(config.images.resolve()):
+        message = "the workspace lies inside the folder of photographs: put it elsewhere"
+        raise InputError(message, path=stage.workspace.root)
+    survey = build_survey(config, stage.progress)
+    if config.copy_images:
+        survey = _copied(survey, stage)
+    save_json(survey, stage.out / "survey.json")
+    for assumption in survey.assumptions:
+        log.info("assumed: %s", assumption)
+    return _summary(survey)
+
+
+def build_survey(config: IngestConfig, progress: Progress = SILENT) -> Survey:
+    """Everything that was measured, in one East-North-Up frame; reads files, writes none.
+
+    The origin is the median of the image positions (of the control points if there are none), rounded to 10⁻⁵
+    degrees and a metre. Every `test_every`-th image by name is held out, beginning with the first.
+
+    Raises:
+        InputError: as `run`.
+    """
+    _check_options(config)
+    notes = Notes()
+    photos = _usable(Path(str(config.images)), notes, progress)
+    options = _pose_options(config)
+    measured = _without_far_fixes(_measured(config, photos, options, notes), photos, notes)
+    sizes = {photo.name: (photo.file.width, photo.file.height) for photo in photos}
+    control_file, check_file = (
+        read_ground_file(path, sizes, config.sigma_mark, options, notes) if path is not None else None
+        for path in (config.gcp, config.checkpoints)
+    )
+    control, check = split_checks(control_file, check_file, config.check)
+    if measured.located.any():
+        middle = enu.median_lla(measured.lla[measured.located])
+        require_near(control_file, middle)
+        require_near(check_file, middle)
+    origin = _origin(measured, control)
+    cameras, camera_of = camera_priors(photos, config.focal_px, notes)
+    _note_coverage(measured, photos, len(control), notes)
+    if config.test_every and not _held_out(len(photos), config.test_every):
+        notes.warn(f"{len(photos)} images are too few to hold any out for testing")
+    return Survey(
+        origin=origin,
+        source_crs=measured.crs_name if control_file is None or measured.located.any() else control_file.crs_name,
+        vertical=_vertical(measured, control_file, check_file, notes),
+        image_dir=str(Path(str(config.images)).resolve()),
+        cameras=cameras,
+        images=_images(photos, camera_of, measured, origin, config),
+        control_points=_surveyed(control, origin, config),
+        check_points=_surveyed(check, origin, config),
+        assumptions=tuple(notes.assumptions),
+        warnings=tuple(notes.warnings),
+    )
+
+
+def _check_options(config: IngestConfig) -> None:
+    if config.images is None:
+        raise InputError("give the folder of photographs", field="--images")
+    if config.trajectory is not None and config.geo is not None:
+        raise InputError("give a trajectory or a geo.txt, not both", field="--geo")
+    if config.crs is not None and config.trajectory is None:
+        raise InputError("is for the columns of --trajectory; other files state their CRS", field="--crs")
+    if config.check and config.gcp is None:
+        raise InputError("names points of --gcp, which is not given", field="--check")
+    if config.test_every == 1:
+        raise InputError("1 would leave nothing to train on: give 0, or 2 and more", field="--test-every")
+
+
+def _pose_options(config: IngestConfig) -> PoseOptions:
+    return PoseOptions(
+        crs=config.crs,
+        vertical=parse_vertical(config.vertical) if config.vertical is not None else None,
+        max_gap_s=config.max_gap,
+        sigma_h_m=config.sigma_h,
+        sigma_v_m=config.sigma_v,
+    )
+
+
+def _usable(root: Path, notes: Notes, progress: Progress) -> list[Photo]:
+    photos = scan_folder(root, notes, progress)
+    if len(photos) < LEAST_IMAGES:
+        why = "".join(f"; {warning}" for warning in notes.warnings)
+        raise InputError(
+            f"{len(photos)} usable images, a survey needs {LEAST_IMAGES}{why}", path=root, field="--images"
+        )
+    for problem in sorted({problem for photo in photos for problem in photo.tags.problems}):
+        names = [photo.name for photo in photos if problem in photo.tags.problems]
+        notes.warn_counted(names, f"image where {problem}", f"images where {problem}")
+    notes.warn_counted(
+        [photo.name for photo in photos if photo.tags.orientation != 1],
+        "image has an EXIF orientation, which is ignored: pixels count as stored",
+        "images have an EXIF orientation, which is ignored: pixels count as stored",
+    )
+    return photos
+
+
+def _measured(config: IngestConfig, photos: Sequence[Photo], options: PoseOptions, notes: Notes) -> Measured:
+    if config.trajectory is not None:
+        return from_table(read_trajectory(config.trajectory, notes), photos, options, notes)
+    if config.geo is not None:
+        return from_table(read_geo(config.geo, notes), photos, options, notes)
+    return from_tags(photos, options, notes)
+
+
+def _without_far_fixes(measured: Measured, photos: Sequence[Photo], notes: Notes) -> Measured:
+    known = measured.located
+    if not known.any():
+        return measured
+    middle = enu.ecef_from_lla(enu.median_lla(measured.lla[known]))
+    distance_m = np.linalg.norm(enu.ecef_from_lla(measured.lla) - middle, axis=1)
+    far = known & (distance_m > _FIX_RANGE_M)
+    notes.warn_counted(
+        [f"{photos[row].name} ({distance_m[row] / 1000:.0f} km)" for row in np.flatnonzero(far).tolist()],
+        "position is far from the others and was left out",
+        "positions are far from the others and were left out",
+    )
+    return replace(measured, lla=np.where(far[:, None], np.nan, measured.lla))
+
+
+def _origin(measured: Measured, control: Sequence[GroundPoint]) -> Origin:
+    places = measured.lla[measured.located]
+    if not len(places):
+        places = np.array([point.lla for point in control]).reshape(-1, 3)
+    if not len(places):
+        raise InputError(
+            "no image has a position, and there are no ground control points: give --trajectory, --geo or --gcp"
+        )
+    lat, lon, alt = enu.median_lla(places)
+    return Origin(lat_deg=round(float(lat), 5), lon_deg=round(float(lon), 5), alt_m=round(float(alt)))
+
+
+def _note_coverage(measured: Measured, photos: Sequence[Photo], points: int, notes: Notes) -> None:
+    known = measured.located
+    if measured.source == "exif":
+        names = [photo.name for photo, one in zip(photos, known, strict=True) if not one]
+        notes.warn_counted(names, "image has no position in EXIF", "images have no position in EXIF")
+    if not known.any():
+        notes.warn(f"no image has a position: {points} ground control points alone place the model")
+    elif known.sum() < LEAST_IMAGES and points < LEAST_IMAGES:
+        notes.warn(f"only {int(known.sum())} positions and {points} control points: three of a kind place a model")
+
+
+def _vertical(
+    measured: Measured, control: GroundFile | None, check: GroundFile | None, notes: Notes
+) -> VerticalDatum:
+    """The datum of the image positions, or of the control points if there are none; all assumptions noted."""
+    places = {"the images": measured.vertical} if measured.located.any() else {}
+    places |= {file.path.name: file.vertical for file in (control, check) if file is not None}
+    for place, datum in places.items():
+        if not datum.stated:
+            notes.assume(f"heights of {place} are {datum.name}: {datum.note}")
+    stated = [place for place, datum in places.items() if datum.stated]
+    assumed = [place for place, datum in places.items() if not datum.stated]
+    if stated and assumed:
+        notes.warn(
+            f"the vertical datum of {', '.join(stated)} is stated, that of {', '.join(assumed)} only assumed: they "
+            "may differ by a geoid's height, up to 100 m; see --vertical"
+        )
+    return next(iter(places.values()))
+
+
+def _images(
+    photos: Sequence[Photo], camera_of: dict[str, int], measured: Measured, origin: Origin, config: IngestConfig
+) -> tuple[SurveyImage, ...]:
+    fixes, attitudes = _fixes(measured, origin), _attitudes(measured, origin, config)
+    held_out = _held_out(len(photos), config.test_every)
+    return tuple(
+        SurveyImage(
+            name=photo.name,
+            camera_id=camera_of[photo.name],
+            sha256=photo.file.sha256,
+            timestamp_s=float(measured.time_s[row]) if np.isfinite(measured.time_s[row]) else None,
+            fix=fixes[row],
+            attitude=attitudes[row],
+            split="test" if row in held_out else "train",
+        )
+        for row, photo in enumerate(photos)
+    )
+
+
+def _fixes(measured: Measured, origin: Origin) -> list[Fix | None]:
+    position = enu.enu_from_lla(measured.lla, origin)
+    geo_from_enu = enu.geo_from_enu_at(measured.lla, origin)
+    covariance = geo_from_enu @ (measured.sigma_enu_m[:, :, None] ** 2 * np.swapaxes(geo_from_enu, -1, -2))
+    return [
+        Fix(
+            position_in_geo=_vector(position[row]),
+            cov_in_geo=_matrix(covariance[row]),
+            source=measured.source,
+            sigma_source=measured.sigma_source[row],
+        )
+        if located
+        else None
+        for row, located in enumerate(measured.located)
+    ]
+
+
+def _attitudes(measured: Measured, origin: Origin, config: IngestConfig) -> list[Attitude | None]:
+    found: list[Attitude | None] = [None] * len(measured.lla)
+    rows = np.flatnonzero(complete(measured.quat_xyzw))
+    # Without a position, north is the origin's: within a survey it turns by minutes of arc.
+    place = np.where(measured.located[rows, None], measured.lla[rows], enu.lla_of(origin))
+    rotation = enu.geo_from_enu_at(place, origin) @ matrix_from_quat_xyzw(measured.quat_xyzw[rows])
+    for row, quat in zip(rows, quat_xyzw_from_matrix(rotation), strict=True):
+        source = measured.attitude_source[row]
+        default_deg = SIGMA_GIMBAL_DEG if source == "gimbal" else SIGMA_TABLE_ATTITUDE_DEG
+        x, y, z, w = (float(value) for value in quat)
+        sigma_deg = default_deg if config.sigma_attitude is None else config.sigma_attitude
+        found[row] = Attitude(quat_xyzw=(x, y, z, w), sigma_deg=sigma_deg, source=source)
+    return found
+
+
+def _held_out(count: int, every: int) -> range:
+    """Rows of the test images: every N-th, none where that would leave too few to train on."""
+    held_out = range(0, count, every) if every else range(0)
+    return held_out if count - len(held_out) >= LEAST_IMAGES else range(0)
+
+
+def _surveyed(points: Sequence[GroundPoint], origin: Origin, config: IngestConfig) -> tuple[SurveyedPoint, ...]:
+    sigma_m = np.array([config.sigma_gcp_h, config.sigma_gcp_h, config.sigma_gcp_v])
+    found = []
+    for point in points:
+        geo_from_enu = enu.geo_from_enu_at(point.lla, origin)
+        found.append(
+            SurveyedPoint(
+                name=point.name,
+                position_in_geo=_vector(enu.enu_from_lla(point.lla, origin)),
+                cov_in_geo=_matrix(geo_from_enu * sigma_m**2 @ geo_from_enu.T),
+                marks=point.marks,
+            )
+        )
+    return tuple(found)
+
+
+def _copied(survey: Survey, stage: StageRun) -> Survey:
+    """Copy the images into the stage's folder, and the survey that refers to them there."""
+    with stage.progress.task("copy", len(survey.images)) as task:
+        for image in survey.images:
+            target = stage.out / "images" / image.name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(Path(survey.image_dir) / image.name, target)
+            task.advance()
+    return survey.model_copy(update={"image_dir": "ingest/images"})
+
+
+def _summary(survey: Survey) -> Summary:
+    counts = {
+        "images": len(survey.images),
+        "test": len(survey.names("test")),
+        "fixes": sum(image.fix is not None for image in survey.images),
+        "attitudes": sum(image.attitude is not None for image in survey.images),
+        "cameras": len(survey.cameras),
+        "control_points": len(survey.control_points),
+        "check_points": len(survey.check_points),
+    }
+    key_figure = (
+        f"{counts['images']} images, {counts['fixes']} positions, {counts['control_points']} control and "
+        f"{counts['check_points']} check points"
+    )
+    values = {**counts, "origin": survey.origin.model_dump(), "vertical": survey.vertical.model_dump()}
+    return Summary(key_figure, values, survey.warnings)
+
+
+def _vector(values: ArrayLike) -> Vector3:
+    x, y, z = (float(value) for value in np.asarray(values))
+    return (x, y, z)
+
+
+def _matrix(values: FloatArray) -> Matrix3:
+    return (_vector(values[0]), _vector(values[1]), _vector(values[2]))

@@ -1,0 +1,45 @@
+"""Interrupts at a time of one's own choosing: a loop ends its step and saves before it stops."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from types import FrameType
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+@dataclass
+class StopRequest:
+    """Whether the user has asked to stop."""
+
+    requested: bool = False
+
+
+@contextmanager
+def deferred_interrupts() -> Iterator[StopRequest]:
+    """Hold back SIGINT and SIGTERM while the context lasts: the first sets `requested`, a second one interrupts.
+
+    The loop inside looks at `requested` after each step, saves, and raises `KeyboardInterrupt` itself. Only the
+    main thread receives signals; in any other the request stays unset.
+    """
+    stop = StopRequest()
+    if threading.current_thread() is not threading.main_thread():
+        yield stop
+        return
+
+    def note(_signal: int, _frame: FrameType | None) -> None:
+        if stop.requested:
+            raise KeyboardInterrupt
+        stop.requested = True
+
+    previous = {number: signal.signal(number, note) for number in SIGNALS}
+    try:
+        yield stop
+    finally:
+        for number, handler in previous.items():
+            # None stands for a handler that was not set from Python and cannot be set again from here.
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)

@@ -1,0 +1,57 @@
+"""Statistics of residuals: robust scale, consistency, and the figures that reports print."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.stats import chi2
+
+from pipelines.products import FloatArray, ResidualStats
+
+_NORMAL_MAD = 1.4826  # σ / MAD of a normal distribution
+
+
+def chi2_quantile(probability: float, degrees: ArrayLike) -> FloatArray:
+    """Quantile of χ² with `degrees` (…) of freedom; 0 where there are none."""
+    dof = np.asarray(degrees)
+    distinct, place = np.unique(dof, return_inverse=True)
+    values = np.where(distinct > 0, chi2.ppf(probability, np.maximum(distinct, 1)), 0.0)
+    return np.asarray(values[place].reshape(dof.shape), dtype=np.float64)
+
+
+def weighted_mean(values: ArrayLike, weights: ArrayLike) -> FloatArray:
+    """Mean (…) over the first axis of values (N, …), weighted by weights (N,)."""
+    return np.asarray(np.average(np.asarray(values, dtype=np.float64), axis=0, weights=np.asarray(weights)))
+
+
+def mad_sigma(values: ArrayLike) -> float:
+    """σ of values (N,) from the median absolute deviation: half of them may be outliers."""
+    array = np.asarray(values, dtype=np.float64)
+    return float(_NORMAL_MAD * np.median(np.abs(array - np.median(array))))
+
+
+def squared_mahalanobis(residuals: ArrayLike, covariances: ArrayLike) -> FloatArray:
+    """rᵀ Σ⁻¹ r (N,) of residuals (N, d) with covariances (N, d, d) or (d, d)."""
+    r = np.asarray(residuals, dtype=np.float64)
+    solved = np.linalg.solve(np.asarray(covariances, dtype=np.float64), r[..., None])[..., 0]
+    return np.asarray((r * solved).sum(axis=-1))
+
+
+def residual_stats(residuals_in_geo: ArrayLike) -> ResidualStats:
+    """Figures of residuals (N, 3), East-North-Up in metres; null where N is 0."""
+    r = np.asarray(residuals_in_geo, dtype=np.float64).reshape(-1, 3)
+    if len(r) == 0:
+        empty = dict.fromkeys(name for name in ResidualStats.model_fields if name != "count")
+        return ResidualStats(count=0, **empty)
+    mean_square = (r**2).mean(axis=0)
+    horizontal = np.hypot(r[:, 0], r[:, 1])
+    return ResidualStats(
+        count=len(r),
+        mean_h_m=float(horizontal.mean()),
+        rmse_e_m=float(np.sqrt(mean_square[0])),
+        rmse_n_m=float(np.sqrt(mean_square[1])),
+        rmse_h_m=float(np.sqrt(mean_square[0] + mean_square[1])),
+        rmse_v_m=float(np.sqrt(mean_square[2])),
+        rmse_3d_m=float(np.sqrt(mean_square.sum())),
+        max_3d_m=float(np.sqrt((r**2).sum(axis=1).max())),
+    )

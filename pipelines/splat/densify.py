@@ -1,0 +1,206 @@
+"""Where Gaussians are added and removed while training: strategies behind one small interface.
+
+A strategy is told of every render after its backward pass, and may then edit the Gaussians through the optimiser,
+which keeps the moments of those that stay. Settings are apart from running state; the state can be saved, and
+everything random comes from the strategy's own generator.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from pipelines.splat.gaussians import Gaussians, rotation_matrices
+from pipelines.splat.morton import morton_order
+from pipelines.splat.optimizer import GaussianAdam
+from pipelines.splat.raster.api import Pinhole, ScreenStats
+
+_CHILDREN = 2
+_SHRINK = 0.8 * _CHILDREN  # 3DGS: a child of a split has 1/1.6 of its parent's standard deviations
+
+
+@dataclass(frozen=True)
+class Change:
+    """What a strategy did to the Gaussians in one iteration."""
+
+    cloned: int = 0
+    split: int = 0
+    pruned: int = 0
+    opacity_reset: bool = False
+
+
+class Strategy(Protocol):
+    """A way to add and remove Gaussians."""
+
+    def observe(self, stats: ScreenStats, camera: Pinhole) -> None:
+        """Take note of a render, after its backward pass."""
+
+    def update(self, iteration: int, optimizer: GaussianAdam) -> Change:
+        """Edit the Gaussians, if it is time; called after the optimiser's step of every iteration (from 1)."""
+
+    def state(self) -> dict[str, Tensor]:
+        """Copies of the running state, for a checkpoint."""
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Take over a state."""
+
+
+@dataclass(frozen=True)
+class DefaultSettings:
+    """Settings of `DefaultStrategy`; iterations count from 1.
+
+    Attributes:
+        start: add Gaussians after this iteration,
+        stop: and up to this one,
+        every: after each so many iterations.
+        reset_every: iterations between opacity resets, before `stop` (0: none).
+        gradient_threshold: mean length of ∂L/∂(centre in normalised device coordinates) from which a Gaussian
+            is cloned or split.
+        split_scale: clone up to this standard deviation, split above; in scene extents.
+        prune_opacity: remove what is less opaque.
+        prune_scale: remove what has a larger standard deviation, in scene extents,
+        prune_scale_from: after this iteration.
+        reset_opacity: opacity that a reset leaves at the most.
+        max_gaussians: never more than so many.
+    """
+
+    start: int = 500
+    stop: int = 15_000
+    every: int = 100
+    reset_every: int = 3_000
+    gradient_threshold: float = 2e-4
+    split_scale: float = 0.01
+    prune_opacity: float = 0.005
+    prune_scale: float = 0.1
+    prune_scale_from: int = 3_000
+    reset_opacity: float = 0.01
+    max_gaussians: int = 1_000_000
+
+    @classmethod
+    def for_iterations(cls, iterations: int, max_gaussians: int) -> DefaultSettings:
+        """The schedule of 3DGS, made for 30 000 iterations, fitted to a training of another length.
+
+        Fewer iterations mean more frequent, not only fewer, additions, as long as every Gaussian is seen some
+        times in between. A reset of the opacities costs several hundred iterations to recover from: short runs
+        have none.
+        """
+        stop, reset_every = iterations // 2, max(iterations // 10, 1_500)
+        return cls(
+            start=_between(50, iterations // 20, 500),
+            stop=stop,
+            every=_between(50, iterations // 40, 100),
+            reset_every=reset_every if reset_every < stop else 0,
+            prune_scale_from=iterations // 10,
+            max_gaussians=max_gaussians,
+        )
+
+
+class DefaultStrategy:
+    """Adaptive density control of 3D Gaussian Splatting (doi 10.1145/3592433, section 5.2).
+
+    Gaussians whose projected centre is pulled hard are cloned where small and split where large; transparent and
+    oversized ones are removed; opacities are reset now and then. Where the limit leaves no room for all, those
+    with the largest gradients come first. Edited Gaussians are put back into spatial order.
+    """
+
+    def __init__(self, settings: DefaultSettings, extent_m: float, count: int, seed: int = 0) -> None:
+        """Start with nothing observed of `count` Gaussians in a scene of size `extent_m`."""
+        self.settings = settings
+        self.extent_m = extent_m
+        self._generator = torch.Generator().manual_seed(seed)
+        self._gradient_sum = torch.zeros(count)
+        self._observations = torch.zeros(count)
+
+    def observe(self, stats: ScreenStats, camera: Pinhole) -> None:
+        """Add a render's screen gradients to those since the last edit.
+
+        Raises:
+            ValueError: the render has had no backward pass.
+        """
+        if stats.mean_gradient is None:
+            raise ValueError("the render has no screen gradients yet: call backward() first")
+        # Threshold and 3DGS are in normalised device coordinates: 2 units across the image.
+        x, y = stats.mean_gradient.unbind(dim=1)
+        length = torch.hypot(x * (camera.width / 2), y * (camera.height / 2)).float()
+        self._gradient_sum = self._gradient_sum.to(length.device)
+        self._observations = self._observations.to(length.device)
+        self._gradient_sum.index_add_(0, stats.visible, length)
+        self._observations.index_add_(0, stats.visible, torch.ones_like(length))
+
+    def update(self, iteration: int, optimizer: GaussianAdam) -> Change:
+        """See `Strategy.update`."""
+        settings, change = self.settings, Change()
+        if settings.start < iteration <= settings.stop and iteration % settings.every == 0:
+            change = self._edit(iteration, optimizer)
+        if settings.reset_every and iteration < settings.stop and iteration % settings.reset_every == 0:
+            ceiling = math.log(settings.reset_opacity / (1 - settings.reset_opacity))
+            capped = optimizer.gaussians.logit_opacities.detach().clamp_max(ceiling)
+            optimizer.overwrite("logit_opacities", capped)
+            change = Change(change.cloned, change.split, change.pruned, opacity_reset=True)
+        return change
+
+    def state(self) -> dict[str, Tensor]:
+        """See `Strategy.state`."""
+        return {
+            "gradient_sum": self._gradient_sum.clone(),
+            "observations": self._observations.clone(),
+            "generator": self._generator.get_state(),
+        }
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """See `Strategy.restore`."""
+        self._gradient_sum = state["gradient_sum"].clone()
+        self._observations = state["observations"].clone()
+        self._generator.set_state(state["generator"])
+
+    def _edit(self, iteration: int, optimizer: GaussianAdam) -> Change:
+        gaussians = optimizer.gaussians.detached()
+        alive = self._alive(gaussians, iteration)
+        chosen = self._chosen(alive)
+        large = gaussians.log_scales.amax(dim=1).exp() > self.settings.split_scale * self.extent_m
+        cloned, parents = chosen & ~large, chosen & large
+        stay = (alive & ~parents).nonzero()[:, 0]
+        parts = [gaussians.select(stay), gaussians.select(cloned), self._children(gaussians.select(parents))]
+        edited = Gaussians.concatenate(parts)
+        source = torch.full((len(edited),), -1, dtype=torch.int64, device=stay.device)
+        source[: len(stay)] = stay
+        order = morton_order(edited.means)
+        optimizer.rearrange(edited.select(order), source[order])
+        self._gradient_sum = torch.zeros(len(edited))
+        self._observations = torch.zeros(len(edited))
+        return Change(int(cloned.sum()), int(parents.sum()), int((~alive).sum()))
+
+    def _alive(self, gaussians: Gaussians, iteration: int) -> Tensor:
+        alive = torch.sigmoid(gaussians.logit_opacities) >= self.settings.prune_opacity
+        if iteration > self.settings.prune_scale_from:
+            scale = gaussians.log_scales.amax(dim=1).exp()
+            alive &= scale <= self.settings.prune_scale * self.extent_m
+        return alive
+
+    def _chosen(self, alive: Tensor) -> Tensor:
+        """Mask of the Gaussians to clone or split: each adds one, and there is room for so many."""
+        gradient = (self._gradient_sum / self._observations.clamp_min(1)).to(alive.device)
+        chosen = alive & (gradient >= self.settings.gradient_threshold)
+        room = max(self.settings.max_gaussians - int(alive.sum()), 0)
+        if int(chosen.sum()) > room:
+            strongest = torch.argsort(gradient * chosen, descending=True, stable=True)[:room]
+            chosen = torch.zeros_like(chosen)
+            chosen[strongest] = True
+        return chosen
+
+    def _children(self, parents: Gaussians) -> Gaussians:
+        """Two smaller Gaussians a parent, at random places within it."""
+        children = Gaussians.concatenate([parents] * _CHILDREN)
+        noise = torch.randn(len(children), 3, generator=self._generator).to(children.means)
+        offset = rotation_matrices(children.quats_wxyz) @ (children.log_scales.exp() * noise)[..., None]
+        children.means = children.means + offset[..., 0]
+        children.log_scales = children.log_scales - math.log(_SHRINK)
+        return children
+
+
+def _between(low: int, value: int, high: int) -> int:
+    return min(max(value, low), high)

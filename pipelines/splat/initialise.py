@@ -1,0 +1,137 @@
+"""Gaussians to start from: one at each SfM point, as large as the gaps between the points."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
+
+from pipelines.errors import DegenerateGeometryError
+from pipelines.products import FloatArray
+from pipelines.splat.gaussians import Gaussians
+from pipelines.splat.morton import morton_order
+from pipelines.splat.sh import coefficient_count, sh_from_rgb
+
+log = logging.getLogger(__name__)
+
+_NEIGHBOURS = 3
+# A lone pair of points has no gap to measure, and a lone point in the sky no size: both take their scale from
+# the cloud. Its spread of scales is some two orders of magnitude.
+_SCALE_SPREAD = 10.0
+
+
+@dataclass(frozen=True)
+class InitialisationOptions:
+    """How to start.
+
+    Attributes:
+        sh_degree: degree of the spherical harmonics; all but the constant start at zero.
+        opacity: opacity of every Gaussian.
+        far: points farther from the cloud's median centre than this many median distances are left out: they
+            are mismatches, or the sky.
+        max_gaussians: thin a larger cloud evenly down to this number.
+    """
+
+    sh_degree: int = 3
+    opacity: float = 0.1
+    far: float = 50.0
+    max_gaussians: int | None = None
+
+
+def gaussians_from_points(
+    points_in_model: ArrayLike, colours: ArrayLike, options: InitialisationOptions | None = None
+) -> Gaussians:
+    """Isotropic Gaussians at SfM points, as 3D Gaussian Splatting starts (doi 10.1145/3592433, section 5.1).
+
+    A Gaussian's standard deviation is the mean distance to the three nearest other points. Points that are not
+    finite, repeated or far out are left out.
+
+    Args:
+        points_in_model: (N, 3) metres in the model frame.
+        colours: (N, 3) uint8, or floats from 0 to 1.
+        options: how to start.
+
+    Returns:
+        At most N Gaussians, float32, in spatial order.
+
+    Raises:
+        DegenerateGeometryError: fewer than two different points.
+        ValueError: shapes do not agree.
+    """
+    options = options or InitialisationOptions()
+    points, rgb = _checked(points_in_model, colours)
+    keep = _usable(points, options.far)
+    if len(keep) < len(points):
+        log.info("left out %d of %d points: repeated, far out or not finite", len(points) - len(keep), len(points))
+    if len(keep) < 2:
+        raise DegenerateGeometryError(f"{len(keep)} usable SfM points are too few to start Gaussians from")
+    order = keep[morton_order(torch.as_tensor(points[keep])).numpy()]
+    if options.max_gaussians is not None and len(order) > options.max_gaussians:
+        order = order[np.linspace(0, len(order) - 1, max(options.max_gaussians, 2)).astype(np.int64)]
+        log.info("thinned %d SfM points to %d", len(keep), len(order))
+    return gaussians_of_size(points[order], rgb[order], _gap(points[order]), options)
+
+
+def scene_extent(camera_centers: ArrayLike) -> float:
+    """Size of a scene in metres: 1.1 times the largest distance of a camera from their mean (as 3DGS has it).
+
+    Args:
+        camera_centers: (N, 3) metres.
+
+    Raises:
+        DegenerateGeometryError: all cameras are at one place.
+    """
+    centers = np.asarray(camera_centers, dtype=np.float64).reshape(-1, 3)
+    radius = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max(initial=0.0)) if len(centers) else 0.0
+    if not radius > 0:
+        raise DegenerateGeometryError("all cameras are at one place: the scene has no size")
+    return 1.1 * radius
+
+
+def gaussians_of_size(
+    points_in_model: ArrayLike, colours: ArrayLike, sigma_m: ArrayLike, options: InitialisationOptions | None = None
+) -> Gaussians:
+    """Isotropic Gaussians of given standard deviations (N,) in metres; otherwise as `gaussians_from_points`."""
+    options = options or InitialisationOptions()
+    points, rgb = _checked(points_in_model, colours)
+    count = len(points)
+    sh = torch.zeros(count, coefficient_count(options.sh_degree), 3)
+    sh[:, 0] = sh_from_rgb(torch.as_tensor(rgb)).float()
+    return Gaussians(
+        means=torch.as_tensor(points, dtype=torch.float32),
+        quats_wxyz=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
+        log_scales=torch.as_tensor(np.asarray(sigma_m)).log().float()[:, None].repeat(1, 3),
+        logit_opacities=torch.logit(torch.full((count,), options.opacity)),
+        sh=sh,
+    )
+
+
+def _gap(points: FloatArray) -> FloatArray:
+    """Mean distance to the nearest other points (N,), held near the cloud's median."""
+    neighbours = min(_NEIGHBOURS, len(points) - 1)
+    distance, _ = cKDTree(points).query(points, k=neighbours + 1)
+    gap = np.asarray(distance)[:, 1:].mean(axis=1)
+    median = float(np.median(gap))
+    return np.clip(gap, median / _SCALE_SPREAD, median * _SCALE_SPREAD)
+
+
+def _usable(points: FloatArray, far: float) -> NDArray[np.int64]:
+    """Rows of points that are finite, the first of their kind (in float32, as they will be kept), and not far."""
+    rows = np.flatnonzero(np.isfinite(points).all(axis=1))
+    if len(rows) == 0:
+        return rows
+    _, first = np.unique(points[rows].astype(np.float32), axis=0, return_index=True)
+    rows = rows[np.sort(first)]
+    distance = np.linalg.norm(points[rows] - np.median(points[rows], axis=0), axis=1)
+    return rows[distance <= far * np.median(distance)]
+
+
+def _checked(points_in_model: ArrayLike, colours: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    points, rgb = np.asarray(points_in_model, dtype=np.float64), np.asarray(colours)
+    if points.ndim != 2 or points.shape[1] != 3 or rgb.shape != points.shape:
+        raise ValueError(f"expected points and colours (N, 3), got {points.shape} and {rgb.shape}")
+    return points, rgb / 255.0 if rgb.dtype == np.uint8 else rgb.astype(np.float64)

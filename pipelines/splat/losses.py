@@ -1,0 +1,161 @@
+"""The photometric loss of 3D Gaussian Splatting (doi 10.1145/3592433, eq. 7): 0.8 · L1 + 0.2 · (1 − SSIM).
+
+SSIM (doi 10.1109/TIP.2003.819861) has the 11×11 Gaussian window, σ = 1.5 px, zeros around the image. On a CPU
+value and gradient come from one pass of fused kernels: torch's convolutions cost more than the rasteriser.
+
+A mask says which pixels count. The others are zero in both images, like everything outside: they add neither to
+L1 nor to SSIM's mean, and a window that reaches over them sees what it sees at the image's edge.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from pipelines.splat import ssim_kernels as kernels
+
+SSIM_WEIGHT = 0.2
+
+
+@dataclass(frozen=True)
+class ImageSimilarity:
+    """Mean absolute difference and mean SSIM of two images over the pixels that count (channels averaged)."""
+
+    l1: float
+    ssim: float
+
+
+def photometric_loss(
+    rendered: Tensor, target: Tensor, mask: Tensor | None = None, *, ssim_weight: float = SSIM_WEIGHT
+) -> Tensor:
+    """(1 − w) · mean|rendered − target| + w · (1 − mean SSIM), differentiable in `rendered`.
+
+    Args:
+        rendered: (H, W, 3) float32 or float64.
+        target: (H, W, 3), same type and device.
+        mask: (H, W) bool, True where a pixel counts; None: all do.
+        ssim_weight: w.
+
+    Returns:
+        A scalar of the images' type; 0 if no pixel counts.
+
+    Raises:
+        ValueError: shapes, types or devices do not agree.
+    """
+    _check(rendered, target, mask)
+    if rendered.device.type == "cpu":
+        loss: Tensor = _Photometric.apply(rendered, target, mask, ssim_weight)
+        return loss
+    l1, ssim = _terms_by_convolution(rendered, target, mask)
+    return (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim)
+
+
+def image_similarity(image: Tensor, target: Tensor, mask: Tensor | None = None) -> ImageSimilarity:
+    """L1 and SSIM of two images (H, W, 3), without gradient; see `photometric_loss`.
+
+    Raises:
+        ValueError: shapes, types or devices do not agree.
+    """
+    _check(image, target, mask)
+    with torch.no_grad():
+        if image.device.type == "cpu":
+            sums, count, _ = _forward(image, target, mask)
+            return ImageSimilarity(sums[0] / count, sums[1] / count)
+        l1, ssim = _terms_by_convolution(image, target, mask)
+        return ImageSimilarity(float(l1), float(ssim))
+
+
+class _Photometric(torch.autograd.Function):
+    """Value and gradient in one go: the gradient is only scaled afterwards."""
+
+    @staticmethod
+    def forward(ctx: Any, rendered: Tensor, target: Tensor, mask: Tensor | None, ssim_weight: float) -> Tensor:
+        sums, count, partials = _forward(rendered, target, mask)
+        if ctx.needs_input_grad[0]:
+            scales = ((1 - ssim_weight) / count, ssim_weight / count)
+            ctx.save_for_backward(_gradient(rendered, target, mask, partials, scales))
+        loss = (1 - ssim_weight) * sums[0] / count + ssim_weight * (1 - sums[1] / count)
+        return rendered.new_tensor(loss)
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, None, None, None]:
+        (gradient,) = ctx.saved_tensors
+        return gradient * grad_outputs[0], None, None, None
+
+
+def _forward(
+    rendered: Tensor, target: Tensor, mask: Tensor | None
+) -> tuple[tuple[float, float], int, np.ndarray[Any, Any]]:
+    """Σ|x − y| and Σ SSIM, how many values they are sums of, and SSIM's derivatives for `_gradient`."""
+    x, y, valid = _rows(rendered), _rows(target), _valid(mask)
+    partials = np.empty((3, *x.shape), dtype=x.dtype)
+    sums = np.empty((len(x), 2))
+    taps, c1, c2 = kernels.gaussian_taps(x.dtype), x.dtype.type(kernels.C1), x.dtype.type(kernels.C2)
+    kernels.ssim_forward(x, y, valid, taps, c1, c2, _bands(len(x)), partials, sums)
+    count = x.size if mask is None else 3 * int(valid.sum())
+    l1, ssim = sums.sum(axis=0)
+    # Nothing to compare is no difference: SSIM counts as 1.
+    return ((float(l1), float(ssim)), count, partials) if count else ((0.0, 1.0), 1, partials)
+
+
+def _gradient(
+    rendered: Tensor,
+    target: Tensor,
+    mask: Tensor | None,
+    partials: np.ndarray[Any, Any],
+    scales: tuple[float, float],
+) -> Tensor:
+    """∂(scales[0] · Σ|x − y| − scales[1] · Σ SSIM)/∂rendered."""
+    x, y = _rows(rendered), _rows(target)
+    gradient = torch.empty_like(rendered, memory_format=torch.contiguous_format)
+    kind = x.dtype.type
+    kernels.ssim_backward(
+        x, y, _valid(mask), partials, kernels.gaussian_taps(x.dtype), kind(scales[0]), kind(scales[1]),
+        _bands(len(x)), gradient.numpy().reshape(x.shape),
+    )  # fmt: skip
+    return gradient
+
+
+def _rows(image: Tensor) -> np.ndarray[Any, Any]:
+    return image.detach().contiguous().numpy().reshape(image.shape[0], -1)
+
+
+def _valid(mask: Tensor | None) -> np.ndarray[Any, Any]:
+    return np.empty((0, 0), dtype=np.bool_) if mask is None else mask.contiguous().numpy()
+
+
+def _bands(height: int) -> int:
+    # A band blurs ten rows that its neighbours blur too: no more bands than threads, and none of a few rows.
+    return max(1, min(numba.get_num_threads(), height // kernels.WINDOW))
+
+
+def _terms_by_convolution(image: Tensor, target: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
+    """L1 and SSIM in torch operations, for devices that the kernels do not run on."""
+    weight = torch.ones_like(image[..., 0]) if mask is None else mask.to(image.dtype)
+    x, y = (value * weight[..., None] for value in (image, target))
+    half = torch.as_tensor(kernels.gaussian_taps(np.float64), dtype=image.dtype, device=image.device)
+    taps = torch.cat([half.flip(0), half[1:]])
+    planes = torch.cat([x, y, x * x, y * y, x * y], dim=-1).permute(2, 0, 1)[:, None]
+    blurred = functional.conv2d(planes, taps.view(1, 1, -1, 1), padding=(kernels.RADIUS, 0))
+    blurred = functional.conv2d(blurred, taps.view(1, 1, 1, -1), padding=(0, kernels.RADIUS))
+    mx, my, xx, yy, xy = blurred[:, 0].unflatten(0, (5, 3))
+    numerator = (2 * mx * my + kernels.C1) * (2 * (xy - mx * my) + kernels.C2)
+    denominator = (mx * mx + my * my + kernels.C1) * (xx - mx * mx + yy - my * my + kernels.C2)
+    count = (3 * weight.sum()).clamp_min(1)
+    ssim = 1 - ((1 - numerator / denominator) * weight).sum() / count
+    return (x - y).abs().sum() / count, ssim
+
+
+def _check(rendered: Tensor, target: Tensor, mask: Tensor | None) -> None:
+    if rendered.ndim != 3 or rendered.shape[2] != 3 or rendered.shape != target.shape:
+        raise ValueError(f"expected two images (H, W, 3), got {tuple(rendered.shape)} and {tuple(target.shape)}")
+    if rendered.dtype != target.dtype or rendered.dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"expected two float images of one type, got {rendered.dtype} and {target.dtype}")
+    if mask is not None and (mask.shape != rendered.shape[:2] or mask.dtype != torch.bool):
+        raise ValueError(f"expected a bool mask {tuple(rendered.shape[:2])}, got {mask.dtype} {tuple(mask.shape)}")

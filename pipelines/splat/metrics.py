@@ -1,0 +1,63 @@
+"""Image quality as the splatting literature reports it: PSNR, SSIM and LPIPS of images as they are shown."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+from torch import Tensor
+
+from pipelines.splat.losses import image_similarity
+from pipelines.splat.lpips import Lpips
+
+
+def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
+    """Peak signal-to-noise ratio in dB, of values from 0 to 1 over all channels; infinite for equal images.
+
+    Args:
+        image: (H, W, 3); clamped to 0 … 1, as it would be shown.
+        target: (H, W, 3).
+        mask: (H, W) bool, True where a pixel counts; None: all do.
+
+    Raises:
+        ValueError: shapes do not agree, or no pixel counts.
+    """
+    _check(image, target, mask)
+    difference = image.detach().clamp(0, 1).double() - target.double()
+    if mask is not None:
+        difference = difference[mask]
+    error = float(difference.square().mean())
+    return -10 * math.log10(error) if error > 0 else math.inf
+
+
+def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
+    """Mean SSIM with the 11×11 Gaussian window of the loss (`pipelines.splat.losses`), 1 for equal images.
+
+    Args:
+        image: (H, W, 3); clamped to 0 … 1, as it would be shown.
+        target: (H, W, 3).
+        mask: (H, W) bool, True where a pixel counts; None: all do.
+
+    Raises:
+        ValueError: shapes do not agree, or no pixel counts.
+    """
+    _check(image, target, mask)
+    return image_similarity(image.detach().clamp(0, 1), target, mask).ssim
+
+
+def lpips(weights: Path | None) -> Lpips | str:
+    """The perceptual distance, or the reason why there is none.
+
+    Raises:
+        InputError: `weights` is not an NPZ file of LPIPS weights.
+    """
+    if weights is None:
+        return "no weights were given: they are not part of the package (--lpips-weights FILE.npz)"
+    return Lpips(weights)
+
+
+def _check(image: Tensor, target: Tensor, mask: Tensor | None) -> None:
+    if image.shape != target.shape:
+        raise ValueError(f"expected two images of one shape, got {tuple(image.shape)} and {tuple(target.shape)}")
+    if mask is not None and not bool(mask.any()):
+        raise ValueError("the mask leaves no pixel to compare")

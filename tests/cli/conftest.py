@@ -1,0 +1,21 @@
+"""Fixtures for the command line."""
+
+from __future__ import annotations
+
+import pytest
+
+from georef_cli import boundary
+from georef_cli.main import cli
+from tests.cli_runs import Georef, Result
+
+
+@pytest.fixture
+def georef(capsys: pytest.CaptureFixture[str], fake_stages: None) -> Georef:
+    """`georef` in this process, with fake stages."""
+
+    def call(*arguments: object) -> Result:
+        code = boundary.guarded(cli, [str(argument) for argument in arguments])
+        captured = capsys.readouterr()
+        return Result(code, captured.out, captured.err)
+
+    return call

@@ -1,0 +1,241 @@
+"""Every command over a workspace with fake stages: what it does, prints and returns."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from pipelines.errors import ConvergenceError
+from pipelines.stages import BY_NAME, PIPELINE
+from pipelines.workspace import StageRun, Summary, Workspace
+from tests import fakes
+from tests.cli_runs import Georef
+
+STAGES = [spec.name for spec in PIPELINE]
+
+
+@pytest.fixture
+def done(georef: Georef, workspace: Workspace, photos: Path) -> Path:
+    """A workspace in which all stages are current."""
+    assert georef("run", workspace.root, "--images", photos).code == 0
+    return workspace.root
+
+
+def test_run_runs_everything_once(georef: Georef, workspace: Workspace, photos: Path) -> None:
+    first = georef("run", workspace.root, "--images", photos, "--json")
+    assert first.code == 0
+    assert [(row["stage"], row["ran"]) for row in first.document["stages"]] == [(name, True) for name in STAGES]
+    second = georef("run", workspace.root, "--json")
+    assert [row["ran"] for row in second.document["stages"]] == [False] * len(STAGES)
+
+
+def test_stage_by_stage(georef: Georef, workspace: Workspace, photos: Path) -> None:
+    for name in STAGES:
+        options = ["--images", photos] if name == "ingest" else []
+        result = georef(name, workspace.root, *options, "--json")
+        assert result.code == 0
+        assert set(result.document) == {"stage", "ran", "key_figure", "values", "warnings", "duration_s"}
+        assert (result.document["stage"], result.document["ran"]) == (name, True)
+        assert not georef(name, workspace.root, *options, "--json").document["ran"]
+        assert georef(name, workspace.root, *options, "--force", "--json").document["ran"]
+
+
+def test_status(georef: Georef, done: Path, photos: Path) -> None:
+    (photos / "c.jpg").write_bytes(b"c")
+    table = georef("status", done)
+    assert table.code == 0
+    assert table.err == ""
+    lines = table.out.splitlines()
+    assert [line.split()[0] for line in lines] == ["stage", *STAGES]
+    assert "stale" in lines[1]
+    assert "--images changed" in lines[1]
+    rows = georef("status", done, "--json").document["stages"]
+    assert [row["stage"] for row in rows] == STAGES
+    assert set(rows[0]) == {"stage", "state", "reason", "finished", "duration_s", "key_figure"}
+    assert [row["state"] for row in rows] == ["stale"] * len(STAGES)
+
+
+def test_status_of_nothing(georef: Georef, tmp_path: Path) -> None:
+    result = georef("status", tmp_path / "nowhere", "--json")
+    assert (result.code, result.out) == (1, "")
+    assert result.err == f"error: {tmp_path}/nowhere: no such workspace: `georef ingest` makes one\n"
+
+
+class TestRunOptions:
+    def test_each_option_reaches_its_stages(self, georef: Georef, done: Path) -> None:
+        result = georef("run", done, "--seed", 3, "--backend", "cpu", "--preset", "smoke", "--max-image-size", 400)
+        assert result.code == 0
+        requests = Workspace(done).requests()
+        assert requests["sfm"] == {"seed": 3}
+        assert requests["init-sim3"] == {"seed": 3}
+        assert requests["train"] == {"seed": 3, "backend": "cpu", "preset": "smoke", "max_image_size": 400}
+        assert requests["evaluate"] == {"backend": "cpu"}
+
+    def test_slice(self, georef: Georef, done: Path) -> None:
+        result = georef("run", done, "--from", "sfm", "--to", "init-sim3", "--force", "--json")
+        assert [row["stage"] for row in result.document["stages"]] == ["sfm", "geolocate", "init-sim3"]
+        assert all(row["ran"] for row in result.document["stages"])
+
+    @pytest.mark.parametrize(
+        ("arguments", "message"),
+        [
+            (
+                ["--to", "sfm", "--iterations", "5"],
+                "--iterations is for train, which is not among",
+            ),
+            (["--from", "train", "--copy"], "--copy is for ingest"),
+            (["--from", "train", "--to", "sfm"], "--from train comes after --to sfm"),
+            (["--from", "training"], "'training' is not one of 'ingest'"),
+        ],
+    )
+    def test_options_that_make_no_sense(
+        self, georef: Georef, done: Path, arguments: list[str], message: str
+    ) -> None:
+        result = georef("run", done, *arguments)
+        assert (result.code, result.out) == (2, "")
+        assert message in result.err
+
+    def test_relative_paths_are_remembered_absolute(
+        self, georef: Georef, workspace: Workspace, photos: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.chdir(photos.parent)
+        assert georef("run", "flight", "--images", "photos").code == 0
+        monkeypatch.chdir("/")
+        rows = georef("run", workspace.root, "--json").document["stages"]
+        assert [row["ran"] for row in rows] == [False] * len(STAGES)
+
+
+class TestFlags:
+    def test_file_decides_where_no_flag_is_given(self, georef: Georef, done: Path) -> None:
+        (done / "georef.toml").write_text("[train]\nseed = 4\ngeo_loss = false\n")
+        georef("train", done)
+        georef("train", done, "--geo-loss", "--checkpoint-every", 9)
+        manifest = Workspace(done).manifest(BY_NAME["train"])
+        assert manifest is not None
+        assert (manifest.config["seed"], manifest.config["geo_loss"]) == (4, True)
+        assert manifest.config["checkpoint_every"] == 9
+
+    def test_repeated_option(self, georef: Georef, done: Path, photos: Path) -> None:
+        georef("ingest", done, "--images", photos, "--check", "P1", "--check", "P2", "--no-copy")
+        assert Workspace(done).requests()["ingest"] == {
+            "images": str(photos),
+            "check": ["P1", "P2"],
+            "copy_images": False,
+        }
+
+    def test_out_of_range(self, georef: Georef, done: Path) -> None:
+        result = georef("sfm", done, "--max-features", 1, "--json")
+        assert (result.code, result.out) == (1, "")
+        assert result.err == "error: [--max-features]: Input should be greater than or equal to 200\n"
+
+    @pytest.mark.parametrize("arguments", [["--mapper", "best"], ["--max-features", "many"], ["--frobnicate"]])
+    def test_usage(self, georef: Georef, done: Path, arguments: list[str]) -> None:
+        result = georef("sfm", done, *arguments)
+        assert (result.code, result.out) == (2, "")
+        assert arguments[0] in result.err
+
+    def test_unknown_key_in_file(self, georef: Georef, done: Path) -> None:
+        (done / "georef.toml").write_text("[train]\nsteps = 4\n")
+        result = georef("train", done)
+        assert result.code == 1
+        assert result.err.startswith(f"error: {done}/georef.toml [steps]: unknown key")
+
+
+class TestTrainResume:
+    def stop(self, stage: StageRun, config: object) -> Summary:
+        (stage.out / "checkpoint").write_text("1000")
+        raise KeyboardInterrupt
+
+    def test_resume_keeps_the_options(self, georef: Georef, done: Path) -> None:
+        fakes.install(train=self.stop)
+        assert georef("train", done, "--preset", "fast").code == 130
+        fakes.install()
+        other = georef("train", done, "--preset", "high", "--resume")
+        assert other.code == 1
+        assert "other inputs or options" in other.err
+        values = georef("train", done, "--resume", "--json").document["values"]
+        assert values["resumed"]
+        assert '"preset":"fast"' in values["text"]
+
+
+class TestExport:
+    @pytest.fixture(autouse=True)
+    def splat_with_sidecar(self, georef: Georef) -> None:
+        def export(stage: StageRun, config: object) -> Summary:
+            (stage.out / "splat.ply").write_text("ply")
+            (stage.out / "splat.ply.georef.json").write_text("{}")
+            return Summary("1 Gaussian")
+
+        fakes.install(export_ply=export)
+
+    def test_output(self, georef: Georef, done: Path, tmp_path: Path) -> None:
+        target = tmp_path / "site.ply"
+        assert georef("export-ply", done, "-o", target).code == 0
+        assert target.read_text() == "ply"
+        assert (tmp_path / "site.ply.georef.json").read_text() == "{}"
+
+    def test_existing_file_is_kept_unless_forced(self, georef: Georef, done: Path, tmp_path: Path) -> None:
+        target = tmp_path / "site.ply"
+        target.write_text("mine")
+        result = georef("export-ply", done, "-o", target)
+        assert (result.code, result.err) == (1, f"error: {target}: exists already: --force replaces it\n")
+        assert target.read_text() == "mine"
+        assert georef("export-ply", done, "-o", target, "--force").code == 0
+        assert target.read_text() == "ply"
+
+    def test_missing_folder(self, georef: Georef, done: Path, tmp_path: Path) -> None:
+        result = georef("export-ply", done, "-o", tmp_path / "out" / "site.ply")
+        assert (result.code, result.err) == (1, f"error: {tmp_path}/out: no such folder: make it first\n")
+
+
+class TestTalk:
+    """stdout is the result's; everything else goes to stderr and to the stage's log."""
+
+    def test_stderr_tells_stages_and_warnings(self, georef: Georef, done: Path, photos: Path) -> None:
+        (photos / "c.jpg").write_bytes(b"c")
+        result = georef("sfm", done, "--force")
+        assert result.out.startswith("sfm: sfm done (")
+        lines = result.err.splitlines()
+        assert lines[0] == "warning: sfm builds on ingest, which is stale (--images changed)"
+        assert lines[1:3] == ["sfm: started", "sfm: 2/2 after 0 s, half"]
+        quiet = georef("-q", "sfm", done, "--force")
+        assert quiet.err.splitlines() == lines[:1]
+
+    def test_log_keeps_the_story(self, georef: Georef, done: Path) -> None:
+        def fail(stage: StageRun, config: object) -> Summary:
+            raise ConvergenceError("diverged at iteration 7")
+
+        fakes.install(train=fail)
+        assert georef("-q", "train", done, "--force").code == 1
+        text = (done / "logs/train.log").read_text()
+        assert "INFO pipelines.runner: train: train done" in text
+        assert text.rstrip().endswith("ERROR georef_cli.boundary: diverged at iteration 7")
+
+    def test_refused_command_leaves_nothing(self, georef: Georef, tmp_path: Path) -> None:
+        assert georef("train", tmp_path / "typo").code == 1
+        assert not (tmp_path / "typo").exists()
+
+    def test_traceback_on_demand(self, georef: Georef, done: Path) -> None:
+        plain = georef("sfm", done, "--max-features", 1).err
+        long = georef("--traceback", "sfm", done, "--max-features", 1).err
+        assert "Traceback" not in plain
+        assert "Traceback" in long
+        assert long.endswith(plain)
+
+    def test_verbose_and_quiet(self, georef: Georef, done: Path) -> None:
+        result = georef("-v", "-q", "status", done)
+        assert result.code == 2
+        assert "exclude each other" in result.err
+
+    def test_markup_in_results_is_text(self, georef: Georef, done: Path) -> None:
+        def run(stage: StageRun, config: object) -> Summary:
+            fakes.write_products(stage, BY_NAME["sfm"], "")
+            return Summary("[red]48[/red] of 48", {"[bold]a": "[b]"}, ("[i]w[/i]",))
+
+        fakes.install(sfm=run)
+        assert "[red]48[/red] of 48" in georef("sfm", done, "--force").out
+        again = georef("sfm", done).out
+        assert "warning: [i]w[/i]" in again
+        assert "[bold]a" in again
+        assert "[red]48[/red]" in georef("status", done).out

@@ -1,0 +1,131 @@
+"""Progress and tables."""
+
+from __future__ import annotations
+
+import io
+import logging
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from georef_cli import display, tables
+from georef_cli.boundary import Manners
+from pipelines.progress import SILENT
+
+REPORT: dict[str, Any] = {
+    "photometric": {"test": {"views": 6, "psnr": 24.31, "ssim": 0.812, "lpips": None}},
+    "checkpoints": {
+        "camera": {"count": 30, "mean_h_m": 0.014, "rmse_h_m": 0.016, "rmse_v_m": 0.021, "rmse_3d_m": 0.0264},
+        "model": {"count": 28, "mean_h_m": 0.035, "rmse_h_m": 0.041, "rmse_v_m": 0.05, "rmse_3d_m": 0.065},
+    },
+    "fit": {"gnss": {"count": 42, "rmse_h_m": 1.5, "rmse_v_m": 3.1}, "gcp": None},
+}
+
+
+def text_of(*parts: Any) -> str:
+    console = Console(file=io.StringIO(), width=120)
+    for part in parts:
+        console.print(part)
+    assert isinstance(console.file, io.StringIO)
+    return console.file.getvalue()
+
+
+class TestReport:
+    def test_numbers_stand_under_their_names(self) -> None:
+        lines = text_of(*tables.report(REPORT)).splitlines()
+        head = next(line for line in lines if "RMSE H" in line)
+        camera = next(line for line in lines if line.startswith("camera"))
+        for name, value in [("points", "30"), ("mean H", "0.014"), ("RMSE V", "0.021"), ("RMSE 3D", "0.026")]:
+            end = head.index(name) + len(name)  # figures are right-aligned under the heads
+            assert camera[:end].endswith(value)
+
+    def test_fit_is_not_called_an_accuracy(self) -> None:
+        checks, fit = [text_of(part) for part in tables.report(REPORT)[1:]]
+        assert "gnss" not in checks
+        assert "camera" not in fit
+        assert "not an accuracy" in fit
+
+    def test_unknown_is_a_dash(self) -> None:
+        assert "–" in text_of(*tables.report(REPORT)[:1])
+
+    @pytest.mark.parametrize("document", [{}, {"checkpoints": {"camera": None, "model": None}}, {"fit": {}}])
+    def test_what_is_not_there_has_no_table(self, document: dict[str, Any]) -> None:
+        assert tables.report(document) == []
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(None, ""), (0.44, "0.4 s"), (12.2, "12 s"), (59.7, "1 min 00 s"), (200, "3 min 20 s"), (3900, "1 h 05 min")],
+)
+def test_duration(seconds: float | None, text: str) -> None:
+    assert tables.duration(seconds) == text
+
+
+class TestLines:
+    def test_short_task_is_one_line(self, caplog: pytest.LogCaptureFixture) -> None:
+        with caplog.at_level(logging.INFO), display.LineProgress().task("features", 48) as task:
+            for _ in range(48):
+                task.advance(note="9 000 a image")
+        assert caplog.messages == ["features: 48/48 after 0 s, 9 000 a image"]
+
+    def test_long_task_is_told_twice_a_minute(
+        self, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        clock = 0.0
+        monkeypatch.setattr(display.time, "monotonic", lambda: clock)
+        with caplog.at_level(logging.INFO), display.LineProgress().task("train") as task:
+            for _ in range(100):
+                clock += 1.0
+                task.advance()
+        assert len(caplog.messages) == 4
+        assert caplog.messages[0] == "train: 30 after 30 s"
+
+
+class TestBars:
+    def test_bar_tells_count_speed_and_note(self) -> None:
+        console = Console(file=io.StringIO(), force_terminal=True, width=140)
+        with display.BarProgress(console).task("train", 200) as task:
+            for _ in range(200):
+                task.advance(note="psnr 23.1 dB")
+        assert isinstance(console.file, io.StringIO)
+        last = console.file.getvalue()
+        assert "200/200" in last
+        assert "it/s" in last
+        assert "psnr 23.1 dB" in last
+
+    def test_nested_and_consecutive_tasks(self) -> None:
+        console = Console(file=io.StringIO(), force_terminal=True, width=140)
+        progress = display.BarProgress(console)
+        with progress.task("mapping", 2) as outer:
+            with progress.task("adjustment") as inner:
+                inner.advance()
+            outer.advance(2)
+        with progress.task("undistortion", 1) as later:
+            later.advance()
+        assert isinstance(console.file, io.StringIO)
+        for name in ("mapping", "adjustment", "undistortion"):
+            assert name in console.file.getvalue()
+
+    def test_bar_is_closed_by_an_error(self) -> None:
+        progress = display.BarProgress(Console(file=io.StringIO(), force_terminal=True))
+        with pytest.raises(ValueError, match="diverged"), progress.task("train", 2):
+            raise ValueError("diverged")
+        with progress.task("train", 1) as task:  # a live display left open would refuse another
+            task.advance()
+
+
+def test_log_lines_on_a_terminal_are_marked_and_verbatim() -> None:
+    console = Console(file=io.StringIO(), force_terminal=True, width=140, color_system="standard")
+    handler = display.ConsoleHandler(console)
+    for level, text in [(logging.INFO, "sfm: started"), (logging.WARNING, "only [red]30[/red] of 48")]:
+        handler.handle(logging.LogRecord("pipelines.sfm", level, "", 0, text, None, None))
+    assert isinstance(console.file, io.StringIO)
+    plain, marked = console.file.getvalue().splitlines()
+    assert plain == "sfm: started"
+    assert "warning: only [red]30[/red] of 48" in marked
+    assert marked.startswith("\x1b[33m")
+
+
+def test_quiet_is_silent() -> None:
+    assert display.progress_for(Manners(quiet=True)) is SILENT

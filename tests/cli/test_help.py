@@ -1,0 +1,75 @@
+"""Help and documents: every command explains itself, and every example that is printed parses."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import click
+import pytest
+
+from georef_cli.main import COMMANDS, cli
+
+REPOSITORY = Path(__file__).parents[2]
+DOCUMENTS = [*REPOSITORY.glob("README.md"), *sorted(REPOSITORY.glob("docs/*.md"))]
+
+
+def command_of(name: str) -> click.Command:
+    command = cli.get_command(click.Context(cli), name)
+    assert command is not None
+    return command
+
+
+def examples_in(text: str) -> list[str]:
+    """Lines that call georef, with continuation lines joined."""
+    joined = re.sub(r"\\\n\s*", " ", text)
+    return [line.strip().removeprefix("$ ") for line in joined.splitlines() if re.match(r"\s*(\$ )?georef ", line)]
+
+
+def parse(line: str) -> None:
+    """Parse a command line as click would, without running it."""
+    words = shlex.split(line.partition(" | ")[0].partition(" > ")[0], comments=True)[1:]
+    position = next((index for index, word in enumerate(words) if word in COMMANDS), len(words))
+    context = cli.make_context("georef", words[: position + 1])
+    name = words[position]
+    command_of(name).make_context(name, words[position + 1 :], parent=context)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_command_explains_itself(name: str) -> None:
+    command = command_of(name)
+    assert command.name == name
+    examples = examples_in(command.help or "")
+    assert examples
+    assert all(f" {name} " in line for line in examples)
+    for parameter in command.params:
+        assert isinstance(parameter, click.Argument) or getattr(parameter, "help", None)
+    assert "--json" in [option for parameter in command.params for option in parameter.opts]
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_examples_of_the_help_parse(name: str) -> None:
+    for line in examples_in(command_of(name).help or ""):
+        parse(line)
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_examples_of_the_documents_parse(document: Path) -> None:
+    text = document.read_text(encoding="utf-8")
+    blocks = re.findall(r"^```(?:sh|console|bash|text)?\n(.*?)^```", text, re.M | re.S)
+    for line in [example for block in blocks for example in examples_in(block)]:
+        with contextlib.suppress(click.exceptions.Exit):  # --help and --version end here
+            parse(line)
+
+
+def test_commands_document_is_current() -> None:
+    made = subprocess.run(
+        [sys.executable, REPOSITORY / "docs/make_commands.py", "--print"],
+        capture_output=True, text=True, check=True, cwd=REPOSITORY,
+    )  # fmt: skip
+    written = (REPOSITORY / "docs/commands.md").read_text(encoding="utf-8")
+    assert made.stdout == written, "run `python docs/make_commands.py` and commit docs/commands.md"

@@ -1,0 +1,49 @@
+"""The command line as users meet it: arguments in; exit code, stdout and stderr out."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+REPOSITORY = Path(__file__).parents[1]
+WITH_FAKES = "from tests import fakes; fakes.install(); from georef_cli.main import main; main()"
+
+
+@dataclass(frozen=True)
+class Result:
+    """How a command ended."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def document(self) -> Any:
+        """stdout as the one JSON document that it must be."""
+        return json.loads(self.out)
+
+
+Georef = Callable[..., Result]
+
+
+def start(*arguments: object, code: str = WITH_FAKES) -> subprocess.Popen[str]:
+    """`georef` in a process of its own, with fake stages."""
+    return subprocess.Popen(
+        [sys.executable, "-c", code, *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(REPOSITORY)},
+    )
+
+
+def finish(process: subprocess.Popen[str]) -> Result:
+    """Wait for a process."""
+    out, err = process.communicate(timeout=60)
+    return Result(process.returncode, out, err)

@@ -1,0 +1,32 @@
+"""Fixtures for all tests."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from pipelines.stages import PIPELINE
+from pipelines.workspace import Workspace
+from tests import fakes
+
+
+@pytest.fixture
+def fake_stages(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fake stages in place of the real ones, for one test."""
+    for spec in PIPELINE:
+        monkeypatch.setitem(sys.modules, spec.module, None)  # so that what was there is put back
+    fakes.install()
+
+
+@pytest.fixture
+def workspace(tmp_path: Path) -> Workspace:
+    """A workspace that is not there yet."""
+    return Workspace(tmp_path / "flight")
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> Path:
+    """A folder that stands for one of photographs."""
+    return fakes.photographs(tmp_path / "photos")

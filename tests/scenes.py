@@ -1,0 +1,226 @@
+"""Synthetic surveys with known truth, as arrays, as a COLMAP model and as a `Survey` product."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from pipelines.formats.colmap import SparseModel, write_sparse
+from pipelines.geometry.cameras import Camera, project
+from pipelines.geometry.rotations import exp_so3, quat_xyzw_from_matrix
+from pipelines.geometry.similarity import Similarity
+from pipelines.products import (
+    Attitude,
+    CameraPrior,
+    Fix,
+    Mark,
+    Origin,
+    Survey,
+    SurveyedPoint,
+    SurveyImage,
+    VerticalDatum,
+    save_json,
+)
+from pipelines.stages import SPARSE, SURVEY
+from pipelines.workspace import Workspace
+
+CAMERA = Camera("OPENCV", 1200, 900, np.array([1020.0, 1018.0, 603.0, 447.0, -0.045, 0.012, 3e-4, -2e-4]))
+GEO_FROM_LOCAL = Similarity(12.5, exp_so3([0.4, -1.1, 2.0]), np.array([30.0, -45.0, 70.0]))
+Layout = Literal["orbit", "grid", "line"]
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviations of what is measured."""
+
+    fix_m: tuple[float, float, float] = (0.02, 0.02, 0.03)
+    attitude_deg: float = 0.5
+    pixel_px: float = 0.5
+    gcp_m: float = 0.02
+    mark_px: float = 0.3
+    outliers: tuple[int, ...] = ()
+    outlier_m: float = 15.0
+    bias_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """True cameras and points in geo, and which camera sees which point."""
+
+    center_in_geo: np.ndarray  # (n, 3)
+    geo_from_cam: np.ndarray  # (n, 3, 3)
+    point_in_geo: np.ndarray  # (N, 3)
+    gcp_in_geo: np.ndarray  # (g, 3)
+    camera: Camera = CAMERA
+    geo_from_local: Similarity = field(default_factory=lambda: GEO_FROM_LOCAL)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the images."""
+        return tuple(f"image_{index:03d}.jpg" for index in range(len(self.center_in_geo)))
+
+    def pixels(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Where points (N, 3) in geo appear: point and image of each observation, exact pixels; by point."""
+        found = []
+        for image, (center, rotation) in enumerate(zip(self.center_in_geo, self.geo_from_cam, strict=True)):
+            in_cam = (points - center) @ rotation
+            ahead = np.flatnonzero(in_cam[:, 2] > 0.5)
+            # The lens polynomial holds in the picture only; far outside it folds back in.
+            ahead = ahead[(np.abs(in_cam[ahead, :2]) < 0.8 * in_cam[ahead, 2:]).all(axis=1)]
+            xy = project(self.camera, in_cam[ahead])
+            inside = ((xy > 0) & (xy < [self.camera.width, self.camera.height])).all(axis=1)
+            found.append(np.column_stack([ahead[inside], np.full(inside.sum(), image), xy[inside]]))
+        rows = np.concatenate(found)
+        rows = rows[np.lexsort((rows[:, 1], rows[:, 0]))]
+        return rows[:, 0].astype(np.int64), rows[:, 1].astype(np.int64), rows[:, 2:]
+
+
+def looking_at(center: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Rotations geo ← camera (n, 3, 3) of level cameras at centres (n, 3) that look at targets (n, 3)."""
+    forward = target - center
+    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
+    right = np.cross(forward, [1e-9, 0.0, 1.0])
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    return np.stack([right, np.cross(forward, right), forward], axis=-1)
+
+
+def make_scene(
+    layout: Layout = "orbit", images: int = 24, points: int = 300, gcps: int = 6, seed: int = 0
+) -> Scene:
+    """A built-up area 100 m wide, seen from an orbit at two heights, a nadir grid, or one straight line."""
+    rng = np.random.default_rng(seed)
+    cloud = np.column_stack([rng.uniform(-50, 50, (points, 2)), rng.uniform(0, 20, points)])
+    control = np.column_stack([rng.uniform(-45, 45, (gcps, 2)), rng.uniform(0, 5, gcps)])
+    if layout == "orbit":
+        angle = np.linspace(0, 4 * np.pi, images, endpoint=False)
+        height = np.where(angle < 2 * np.pi, 60.0, 80.0) + rng.normal(0, 0.5, images)
+        center = np.column_stack([88 * np.cos(angle), 88 * np.sin(angle), height])
+        target = np.zeros_like(center) + rng.normal(0, 3, center.shape)
+    else:
+        side = int(np.ceil(np.sqrt(images))) if layout == "grid" else images
+        rows = 1 if layout == "line" else side
+        east, north = np.meshgrid(np.linspace(-60, 60, side), np.linspace(-60, 60, rows) if rows > 1 else [0.0])
+        center = np.column_stack([east.ravel(), north.ravel(), np.full(east.size, 80.0)])[:images]
+        target = center - np.array([0.0, 1e-3, 80.0])
+    return Scene(center, looking_at(center, target), cloud, control)
+
+
+def sparse_model(scene: Scene, noise: Noise, rng: np.random.Generator) -> SparseModel:
+    """What an SfM with perfect cameras would give: the scene in `local`, with noisy pixels."""
+    local_from_geo = scene.geo_from_local.inverse()
+    owner, image, xy = scene.pixels(scene.point_in_geo)
+    rotation = np.swapaxes(scene.geo_from_cam, 1, 2) @ scene.geo_from_local.rotation
+    center = local_from_geo.apply(scene.center_in_geo)
+    count = len(scene.point_in_geo)
+    return SparseModel(
+        cameras={1: scene.camera},
+        image_id=np.arange(1, len(center) + 1),
+        image_name=scene.names,
+        image_camera_id=np.ones(len(center), dtype=np.int64),
+        rotation_cam_from_local=rotation,
+        translation_cam_from_local=-np.einsum("nij,nj->ni", rotation, center),
+        point_id=np.arange(1, count + 1),
+        point_in_local=local_from_geo.apply(scene.point_in_geo),
+        point_rgb=np.full((count, 3), 128, dtype=np.uint8),
+        point_error_px=np.full(count, noise.pixel_px),
+        obs_point=owner,
+        obs_image=image,
+        obs_xy_px=xy + rng.normal(0, noise.pixel_px, xy.shape),
+    )
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Which measurements a survey carries."""
+
+    fixes: bool = True
+    attitudes: bool = True
+    gcps: bool = False
+
+
+def survey_of(scene: Scene, noise: Noise, measured: Measured, rng: np.random.Generator) -> Survey:
+    """The measurements, with noise of exactly the σ that they state (but for outliers and bias)."""
+    fixes = scene.center_in_geo + rng.normal(size=scene.center_in_geo.shape) * noise.fix_m + noise.bias_m
+    for index in noise.outliers:
+        direction = rng.normal(size=3)
+        fixes[index] += noise.outlier_m * direction / np.linalg.norm(direction)
+    turned = exp_so3(np.radians(noise.attitude_deg) * rng.normal(size=fixes.shape)) @ scene.geo_from_cam
+    cov = _matrix(np.diag(np.square(noise.fix_m)))
+    images = []
+    for index, name in enumerate(scene.names):
+        fix = Fix(position_in_geo=_vector(fixes[index]), cov_in_geo=cov, source="csv", sigma_source="file")
+        quat = tuple(quat_xyzw_from_matrix(turned[index]).tolist())
+        attitude = Attitude(quat_xyzw=quat, sigma_deg=noise.attitude_deg, source="csv")
+        image = SurveyImage(name=name, camera_id=1, sha256="0" * 64)
+        if measured.fixes:
+            image = image.model_copy(update={"fix": fix})
+        if measured.attitudes:
+            image = image.model_copy(update={"attitude": attitude})
+        images.append(image)
+    prior = CameraPrior(
+        camera_id=1,
+        model=scene.camera.model,
+        width=scene.camera.width,
+        height=scene.camera.height,
+        params=tuple(scene.camera.params.tolist()),
+        focal_source="calibrated",
+    )
+    return Survey(
+        origin=Origin(lat_deg=46.0, lon_deg=7.75, alt_m=1600.0),
+        source_crs="EPSG:4979",
+        vertical=VerticalDatum(name="ellipsoidal", stated=True),
+        image_dir=".",
+        cameras=(prior,),
+        images=tuple(images),
+        control_points=_control(scene, noise, rng) if measured.gcps else (),
+    )
+
+
+def _control(scene: Scene, noise: Noise, rng: np.random.Generator) -> tuple[SurveyedPoint, ...]:
+    owner, image, xy = scene.pixels(scene.gcp_in_geo)
+    xy = xy + rng.normal(0, noise.mark_px, xy.shape)
+    surveyed = scene.gcp_in_geo + rng.normal(0, noise.gcp_m, scene.gcp_in_geo.shape)
+    return tuple(
+        SurveyedPoint(
+            name=f"gcp{index}",
+            position_in_geo=_vector(position),
+            cov_in_geo=_matrix(np.eye(3) * noise.gcp_m**2),
+            marks=tuple(
+                Mark(image=scene.names[image[row]], x_px=xy[row, 0], y_px=xy[row, 1], sigma_px=noise.mark_px)
+                for row in np.flatnonzero(owner == index)
+            ),
+        )
+        for index, position in enumerate(surveyed)
+    )
+
+
+def write_workspace(root: Path, survey: Survey, model: SparseModel) -> Workspace:
+    """A workspace as `ingest` and `sfm` leave it."""
+    save_json(survey, root / SURVEY)
+    write_sparse(model, root / SPARSE)
+    return Workspace(root)
+
+
+def without_fixes(survey: Survey, names: tuple[str, ...]) -> Survey:
+    """The survey with the fixes of some images taken away."""
+    images = tuple(
+        image.model_copy(update={"fix": None}) if image.name in names else image for image in survey.images
+    )
+    return survey.model_copy(update={"images": images})
+
+
+def moved(scene: Scene, geo_from_local: Similarity) -> Scene:
+    """The scene with another SfM frame."""
+    return replace(scene, geo_from_local=geo_from_local)
+
+
+def _vector(values: np.ndarray) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in values)
+    return x, y, z
+
+
+def _matrix(values: np.ndarray) -> tuple[tuple[float, float, float], ...]:
+    return tuple(_vector(row) for row in values)

@@ -1,0 +1,57 @@
+"""Statistics against values worked out by hand or by scipy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from pipelines.robust.statistics import (
+    chi2_quantile,
+    mad_sigma,
+    residual_stats,
+    squared_mahalanobis,
+    weighted_mean,
+)
+
+
+def test_residual_stats_of_known_residuals() -> None:
+    stats = residual_stats([[3.0, 4.0, 0.0], [0.0, 0.0, 2.0]])
+    assert stats.count == 2
+    assert stats.mean_h_m == pytest.approx(2.5)
+    assert stats.rmse_e_m == pytest.approx(np.sqrt(4.5))
+    assert stats.rmse_n_m == pytest.approx(np.sqrt(8.0))
+    assert stats.rmse_h_m == pytest.approx(np.sqrt(12.5))
+    assert stats.rmse_v_m == pytest.approx(np.sqrt(2.0))
+    assert stats.rmse_3d_m == pytest.approx(np.sqrt(14.5))
+    assert stats.max_3d_m == pytest.approx(5.0)
+
+
+def test_residual_stats_of_nothing_are_null() -> None:
+    stats = residual_stats(np.empty((0, 3)))
+    assert stats.count == 0
+    assert stats.rmse_3d_m is None
+
+
+def test_mad_sigma_ignores_forty_percent_outliers() -> None:
+    values = np.random.default_rng(0).normal(5.0, 2.0, 5000)
+    assert mad_sigma(values) == pytest.approx(2.0, rel=0.05)
+    values[:2000] += 1000.0
+    assert mad_sigma(values) < 8.0
+
+
+def test_weighted_mean_of_vectors() -> None:
+    assert weighted_mean([[0.0, 2.0], [4.0, 6.0]], [3.0, 1.0]) == pytest.approx([1.0, 3.0])
+
+
+def test_squared_mahalanobis_of_correlated_errors() -> None:
+    cov = np.array([[4.0, 1.0], [1.0, 2.0]])
+    r = np.array([[1.0, -1.0], [0.5, 2.0]])
+    expected = [row @ np.linalg.inv(cov) @ row for row in r]
+    assert squared_mahalanobis(r, cov) == pytest.approx(expected)
+
+
+def test_chi2_quantile_of_many_degrees() -> None:
+    degrees = np.array([[1, 3], [0, 3]])
+    expected = np.where(degrees > 0, chi2.ppf(0.99, np.maximum(degrees, 1)), 0.0)
+    np.testing.assert_allclose(chi2_quantile(0.99, degrees), expected)
