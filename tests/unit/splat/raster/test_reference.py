@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 import pytest
 import torch
 
+from pipelines.splat import sh
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.raster.api import ALPHA_MIN, Pinhole, RasterSettings
-from pipelines.splat.raster.reference import project, render_reference, sh_basis
+from pipelines.splat.raster.reference import project, render_reference
 
 
 def test_single_round_gaussian_has_its_closed_form(camera):
@@ -54,20 +54,6 @@ def test_gradcheck(make_scene):
     assert torch.autograd.gradcheck(images, inputs, check_undefined_grad=False)
 
 
-def test_sh_basis_is_orthonormal():
-    # Gauss–Legendre in z and even spacing in longitude integrate polynomials of degree 6 on the sphere exactly.
-    z, weight = (torch.tensor(values) for values in np.polynomial.legendre.leggauss(8))
-    longitude = torch.arange(16, dtype=torch.float64) * (2 * math.pi / 16)
-    radius = torch.sqrt(1 - z * z)[:, None]
-    directions = torch.stack(
-        [radius * torch.cos(longitude), radius * torch.sin(longitude), z[:, None].expand(-1, 16)], dim=-1
-    )
-    basis = sh_basis(directions.reshape(-1, 3), 3)
-    weights = (weight[:, None] * (2 * math.pi / 16)).expand(-1, 16).reshape(-1)
-    product = torch.einsum("n,ni,nj->ij", weights, basis, basis)
-    torch.testing.assert_close(product, torch.eye(16, dtype=torch.float64), rtol=0, atol=1e-12)
-
-
 def test_projection_and_harmonics_agree_with_gsplat(make_scene, camera):
     theirs = pytest.importorskip("gsplat.cuda._torch_impl", reason="gsplat is an extra")
     gaussians, pose = make_scene(200, seed=5, log_scale=-1.0)
@@ -80,7 +66,7 @@ def test_projection_and_harmonics_agree_with_gsplat(make_scene, camera):
     torch.testing.assert_close(ours_cov, cov_px2[0], rtol=1e-10, atol=1e-10)
     direction = torch.nn.functional.normalize(gaussians.means, dim=-1)
     torch.testing.assert_close(
-        torch.einsum("nk,nkc->nc", sh_basis(direction, 3), gaussians.sh),
+        sh.evaluate(gaussians.sh, direction, 3),
         theirs._spherical_harmonics(3, direction, gaussians.sh),
         rtol=1e-6,  # their constants have seven digits or more
         atol=1e-9,
