@@ -82,9 +82,8 @@ def free_covariance(network: Network) -> np.ndarray:
     scale = 1.0 / np.linalg.norm(design, axis=0)
     scaled = design * scale
     constraint = np.zeros((unknowns, 7))
-    constraint[: 6 * n] = units(network)[:, None] ** -2 * similarity_modes(network.cam_center_in_world).reshape(
-        -1, 7
-    )
+    modes = similarity_modes(network.cam_center_in_world).reshape(-1, 7)
+    constraint[: 6 * n] = modes / units(network)[:, None] ** 2
     constraint = constraint * scale[:, None]
     constraint /= np.linalg.norm(constraint, axis=0)
     bordered = np.block([[scaled.T @ scaled, constraint], [constraint.T, np.zeros((7, 7))]])
