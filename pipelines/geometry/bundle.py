@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.sparse import csr_matrix
+from scipy.special import exp1
 
 from pipelines.errors import DegenerateGeometryError
 from pipelines.geometry.cameras import Camera, project
@@ -28,6 +29,11 @@ IntArray = NDArray[np.int64]
 _LOOSEST_RELATIVE_SIGMA = 0.1
 _STEP = 1e-6
 _CAUCHY_SCALE = 2.385  # 95 % efficiency on Gaussian noise
+# Means of the weight w and of w r²/2 under Gaussian noise of σ = 1, where r²/2 is exponentially distributed:
+# without them the weights would take noise for outliers, and state a σ that is a fifth too small.
+_HALF_SCALE2 = _CAUCHY_SCALE**2 / 2
+_MEAN_WEIGHT = float(_HALF_SCALE2 * np.exp(_HALF_SCALE2) * exp1(_HALF_SCALE2))
+_MEAN_WEIGHTED_SQUARE = _HALF_SCALE2 * (1 - _MEAN_WEIGHT)
 
 
 @dataclass(frozen=True)
@@ -94,9 +100,9 @@ def correction_basis(network: Network) -> CorrectionBasis:
             f"{len(lin.residual)} observations do not determine {n} cameras and {points} points"
         )
     weight = _robust_weights(lin.residual)
-    sigma_px = float(np.sqrt((weight[:, None] * lin.residual**2).sum() / redundancy))
-    information = _reduced_information(network, lin, np.sqrt(weight) / sigma_px)
-    return CorrectionBasis(_whitened(network, information), sigma_px)
+    variance = (weight[:, None] * lin.residual**2).sum() / (_MEAN_WEIGHTED_SQUARE * redundancy)
+    information = _reduced_information(network, lin, np.sqrt(weight / (_MEAN_WEIGHT * variance)))
+    return CorrectionBasis(_whitened(network, information), float(np.sqrt(variance)))
 
 
 def _linearise(network: Network) -> _Linearised:
