@@ -100,7 +100,7 @@ def intersect(cameras: CameraCorrections, marks: ControlMarks) -> Tensor:
         normal = _sum_by_point(weight[:, None, None] * projector, marks)
         right = _sum_by_point(weight[:, None, None] * (projector @ center[:, :, None]), marks)
         point = torch.linalg.solve(normal, right)[:, :, 0]
-        distance = (point.detach()[marks.point] - center.detach()).norm(dim=1)
+        distance = (point[marks.point] - center).norm(dim=1)
         weight = 1.0 / (marks.sigma_rad * distance) ** 2
     return point
 
