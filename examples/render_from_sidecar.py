@@ -2,9 +2,9 @@
 
     python examples/render_from_sidecar.py WORKSPACE SPLAT.ply OUTPUT_FOLDER [--images 6]
 
-Each camera stands where GNSS measured it, on the Earth (EPSG:4978); only the sidecar brings it into the frame of the
-PLY. It looks where the trained camera looks, or with `--attitude recorded` where the gimbal says. Writes photograph
-and render side by side; what lies between them is the error of GNSS (and gimbal).
+Each camera stands where GNSS measured it, on the Earth (EPSG:4978); only the sidecar takes it into the PLY's frame.
+It looks where the trained camera looks, or with `--attitude recorded` where the gimbal says. Writes photograph and
+render side by side; what lies between them is the error of GNSS (and gimbal).
 """
 
 from __future__ import annotations
