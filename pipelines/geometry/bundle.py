@@ -86,8 +86,10 @@ class _Linearised:
 def correction_basis(network: Network) -> CorrectionBasis:
     """Whitened, gauge-free coordinates of the camera corrections.
 
-    Robust: observations are weighted by Cauchy's kernel. The corrections obey the inner constraints (zero mean
-    similarity), as in free-network adjustment. Cost O((6 n)³).
+    Robust: observations are weighted by Cauchy's kernel. The gauge is held at the points: each correction, with the
+    points following the cameras, leaves them in place on the average (mean similarity zero, weighted by how well
+    each is seen). So what is uncertain about the whole is in the similarity, and what is uncertain about the
+    cameras against the scene, such as focal length against height, is not. Cost O((6 n)³).
 
     Raises:
         DegenerateGeometryError: fewer observations than unknowns.
@@ -101,8 +103,12 @@ def correction_basis(network: Network) -> CorrectionBasis:
         )
     weight = _robust_weights(lin.residual)
     variance = (weight[:, None] * lin.residual**2).sum() / (_MEAN_WEIGHTED_SQUARE * redundancy)
-    information = _reduced_information(network, lin, np.sqrt(weight / (_MEAN_WEIGHT * variance)))
-    return CorrectionBasis(_whitened(network, information), float(np.sqrt(variance)))
+    reduced = _reduced(network, lin, np.sqrt(weight / (_MEAN_WEIGHT * variance)))
+    basis = _whitened(network, reduced.information)
+    flat = basis.reshape(-1, basis.shape[2])
+    modes = similarity_modes(network.cam_center_in_world).reshape(-1, 7)
+    held = flat - modes @ (reduced.points_follow @ flat)
+    return CorrectionBasis(held.reshape(basis.shape), float(np.sqrt(variance)))
 
 
 def _linearise(network: Network) -> _Linearised:
@@ -153,8 +159,14 @@ def _robust_weights(residual: FloatArray) -> FloatArray:
     return 1.0 / (1.0 + (length / (_CAUCHY_SCALE * scale)) ** 2)
 
 
-def _reduced_information(network: Network, lin: _Linearised, root_weight: FloatArray) -> FloatArray:
-    """Schur complement of points and intrinsics: information (6 n, 6 n) of the poses."""
+@dataclass(frozen=True)
+class _Reduced:
+    information: FloatArray  # (6 n, 6 n) of the poses, points and intrinsics eliminated
+    points_follow: FloatArray  # (7, 6 n) mean similarity of the points when the cameras move
+
+
+def _reduced(network: Network, lin: _Linearised, root_weight: FloatArray) -> _Reduced:
+    """Schur complement of points and intrinsics, and how these follow the poses."""
     n, points = len(network.camera_id), len(network.point_in_world)
     scaled = root_weight[:, None, None]
     keys = list(network.cameras)
@@ -165,19 +177,27 @@ def _reduced_information(network: Network, lin: _Linearised, root_weight: FloatA
     normal = np.zeros((points, 3, 3))
     np.add.at(normal, network.obs_point, np.swapaxes(by_point, 1, 2) @ by_point)
     normal += 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3) + 1e-12 * np.eye(3)
-    inverse_root = np.swapaxes(np.linalg.inv(np.linalg.cholesky(normal)), 1, 2)
+    root = np.linalg.cholesky(normal)
+    inverse_root = np.swapaxes(np.linalg.inv(root), 1, 2)
     point = _scatter(by_point @ inverse_root[network.obs_point], network.obs_point, points)
     pose_point, intrinsics_point = pose.T @ point, intrinsics.T @ point
     cc = (pose.T @ pose - pose_point @ pose_point.T).toarray()
     ci = (pose.T @ intrinsics - pose_point @ intrinsics_point.T).toarray()
     ii = (intrinsics.T @ intrinsics - intrinsics_point @ intrinsics_point.T).toarray()
     used = np.flatnonzero(np.diag(ii) > 0)  # shorter parameter lists leave empty columns
-    if len(used):
-        scale = 1.0 / np.sqrt(np.diag(ii)[used])
-        block = ii[np.ix_(used, used)] * scale[:, None] * scale + 1e-9 * np.eye(len(used))
-        cross = ci[:, used] * scale
-        cc -= cross @ np.linalg.solve(block, cross.T)
-    return (cc + cc.T) / 2
+    scale = 1.0 / np.sqrt(np.diag(ii)[used])
+    block = ii[np.ix_(used, used)] * scale[:, None] * scale + 1e-9 * np.eye(len(used))
+    intrinsics_follow = -scale[:, None] * np.linalg.solve(block, (ci[:, used] * scale).T)
+    cc += ci[:, used] @ intrinsics_follow
+    moved = (np.swapaxes(root, 1, 2) @ _displacements(network)).reshape(3 * points, 7)
+    pull = (pose_point @ moved).T + (intrinsics_point[used] @ moved).T @ intrinsics_follow
+    return _Reduced((cc + cc.T) / 2, -np.linalg.solve(moved.T @ moved, pull))
+
+
+def _displacements(network: Network) -> FloatArray:
+    """How an infinitesimal similarity about the mean camera centre moves each point: (N, 3, 7)."""
+    arm = network.point_in_world - network.cam_center_in_world.mean(axis=0)
+    return np.concatenate([arm[:, :, None], -skew(arm), np.tile(np.eye(3), (len(arm), 1, 1))], axis=2)
 
 
 def _scatter(blocks: FloatArray, column_block: IntArray, count: int) -> csr_matrix:

@@ -73,9 +73,9 @@ def jacobian(network: Network) -> np.ndarray:
 
 
 def free_covariance(network: Network) -> np.ndarray:
-    """Covariance (6 n, 6 n) of the poses for unit pixel noise, by inner constraints on them, all at once.
+    """Covariance (6 n, 6 n) of the poses for unit pixel noise, with the points held on the average.
 
-    The normal matrix of everything is bordered by the gauge (Meissl's constraints on the cameras alone).
+    The normal matrix of everything is bordered by Meissl's constraints on the cameras; then the gauge is moved.
     """
     n, unknowns = len(network.camera_id), size(network)
     design = jacobian(network)
@@ -88,7 +88,27 @@ def free_covariance(network: Network) -> np.ndarray:
     constraint /= np.linalg.norm(constraint, axis=0)
     bordered = np.block([[scaled.T @ scaled, constraint], [constraint.T, np.zeros((7, 7))]])
     inverse = np.linalg.inv(bordered)[:unknowns, :unknowns] * scale[:, None] * scale
-    return inverse[: 6 * n, : 6 * n]
+    hold = np.eye(6 * n) - modes @ points_follow(network, np.eye(6 * n))
+    return hold @ inverse[: 6 * n, : 6 * n] @ hold.T
+
+
+def points_follow(network: Network, corrections: np.ndarray) -> np.ndarray:
+    """Mean similarity (7, c) of the points when they and the lens follow corrections (6 n, c) by least squares."""
+    n, points = len(network.camera_id), len(network.point_in_world)
+    design, modes = jacobian(network), point_modes(network)
+    rest = design[:, 6 * n :]
+    follow = np.linalg.lstsq(rest, -design[:, : 6 * n] @ corrections, rcond=None)[0][: 3 * points]
+    own = [design[:, 6 * n + 3 * j : 6 * n + 3 * j + 3] for j in range(points)]
+    pull = sum(m.T @ d.T @ d @ follow[3 * j : 3 * j + 3] for j, (m, d) in enumerate(zip(modes, own, strict=True)))
+    return np.linalg.solve(sum(m.T @ d.T @ d @ m for m, d in zip(modes, own, strict=True)), pull)
+
+
+def point_modes(network: Network) -> np.ndarray:
+    """∂(point)/∂(ln s, rotation, translation) of a similarity about the mean camera centre: (N, 3, 7)."""
+    arm = network.point_in_world - network.cam_center_in_world.mean(axis=0)
+    turns = [np.cross(axis, arm) for axis in np.eye(3)]
+    shifts = [np.tile(axis, (len(arm), 1)) for axis in np.eye(3)]
+    return np.stack([arm, *turns, *shifts], axis=2)
 
 
 def units(network: Network) -> np.ndarray:
@@ -114,16 +134,17 @@ def test_basis_is_the_root_of_the_full_bundles_covariance() -> None:
     np.testing.assert_allclose(shape, expected, atol=0.01 * np.abs(expected).max())
 
 
-def test_no_correction_moves_the_cameras_by_a_similarity() -> None:
-    network = noisy(exact_network(), np.random.default_rng(1))
-    basis = correction_basis(network).matrix
+def test_no_correction_moves_the_points_by_a_similarity() -> None:
+    network = exact_network()
+    # Equal residuals everywhere: the robust weights are all the same, as they are in the design below.
+    basis = correction_basis(replace(network, obs_xy_px=network.obs_xy_px + SIGMA_PX)).matrix
     assert basis.shape == (6, 6, 6 * 6 - 7)
-    unit = units(network)[:, None]
-    modes = similarity_modes(network.cam_center_in_world).reshape(-1, 7) / unit
-    modes /= np.linalg.norm(modes, axis=0)
-    flat = basis.reshape(36, -1) / unit
-    assert np.abs(modes.T @ flat).max() < 1e-10 * np.linalg.norm(flat, axis=0).max()
-    assert np.linalg.matrix_rank(flat) == 29
+    assert np.linalg.matrix_rank(basis.reshape(36, -1) / units(network)[:, None]) == 29
+    flat = basis.reshape(36, -1)
+    # Both derivatives are numerical, with steps of 1e-6.
+    mean = points_follow(network, flat)
+    assert np.abs(mean[4:]).max() < 1e-3 * np.abs(flat.reshape(6, 6, -1)[:, 3:]).max()
+    assert np.abs(mean[:4]).max() < 1e-3 * np.abs(flat.reshape(6, 6, -1)[:, :3]).max()
 
 
 def test_modes_are_what_a_similarity_does_to_the_pixels() -> None:
