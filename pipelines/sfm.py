@@ -13,7 +13,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -207,10 +206,7 @@ def _match(colmap: Any, job: SfmJob, pairs: list[tuple[str, str]], progress: Pro
 
 
 def _map(colmap: Any, job: SfmJob, progress: Progress) -> list[Any]:
-    with (
-        progress.task("mapping", len(job.survey.images)) as task,
-        TemporaryDirectory(dir=job.database.parent) as out,
-    ):
+    with progress.task("mapping", len(job.survey.images)) as task, _scratch(job.database.parent) as out:
         if job.config.mapper == "global":
             options = colmap.GlobalPipelineOptions()
             options.num_threads, options.random_seed = job.config.threads, job.config.seed
@@ -224,6 +220,18 @@ def _map(colmap: Any, job: SfmJob, progress: Progress) -> list[Any]:
             job.database, job.images, out, options, next_image_callback=lambda: task.advance(1)
         )
         return list(models.values())
+
+
+@contextmanager
+def _scratch(folder: Path) -> Iterator[Path]:
+    """An empty folder for COLMAP's own output; its fixed name lets the next run clear what a killed one left."""
+    scratch = folder / "mapping"
+    shutil.rmtree(scratch, ignore_errors=True)
+    scratch.mkdir()
+    try:
+        yield scratch
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
 
 
 def import_model(colmap: Any, path: Path, survey: Survey) -> Any:
