@@ -109,7 +109,7 @@ def _photometric(eye: Eye, config: EvaluateConfig, renders: Path, progress: Prog
                 }
             )
             if place < config.renders:
-                _write_side_by_side(renders / f"{Path(name).stem}.png", photo, colour)
+                _write_side_by_side(renders / Path(name).with_suffix(".png"), photo, colour)
             task.advance()
     summary: dict[str, Any] = {"views": len(rows)}
     for metric in ("psnr", "ssim", "lpips"):
@@ -124,6 +124,7 @@ def _write_side_by_side(path: Path, photo: torch.Tensor, colour: torch.Tensor) -
     """Photograph, render, and their difference (× 3)."""
     difference = (3 * (photo - colour).abs()).clamp(0, 1)
     strip = torch.cat([photo, colour, difference], dim=1).mul(255).round().byte().numpy()
+    path.parent.mkdir(parents=True, exist_ok=True)  # photographs of one name lie in folders of their own
     cv2.imwrite(str(path), np.ascontiguousarray(strip[..., ::-1]))
 
 

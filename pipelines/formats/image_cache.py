@@ -109,7 +109,11 @@ class ImageCache:
 
     def _path(self, index: int) -> Path:
         photograph = self._photographs[index]
-        stat = photograph.file.stat()
+        try:
+            stat = photograph.file.stat()
+        except OSError as error:
+            message = f"the photograph cannot be read ({error.strerror}): put it back, or run `georef ingest` again"
+            raise InputError(message, path=photograph.file) from error
         camera = photograph.camera
         key = (
             f"{photograph.name}|{stat.st_size}|{stat.st_mtime_ns}|{camera.model}|{camera.width}x{camera.height}|"

@@ -22,7 +22,8 @@ PACKAGES = ("georef_cli", "pipelines")
 FOUNDATION = {
     f"pipelines.{name}"
     for name in (
-        "config", "errors", "fingerprints", "interrupts", "products", "progress", "stages", "states", "workspace",
+        "config", "errors", "fingerprints", "interrupts", "products", "progress", "stages", "states", "validators",
+        "workspace",
     )
 }  # fmt: skip
 # `simulate` makes a survey and not a product of the workspace, but is called and built as a stage is.
