@@ -13,7 +13,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,7 @@ from numpy.typing import NDArray
 
 from pipelines.config import SfmConfig
 from pipelines.errors import DegenerateGeometryError, InputError
-from pipelines.formats.colmap import pycolmap_module
+from pipelines.formats.colmap import load_reconstruction, pycolmap_module
 from pipelines.geometry.pairs import Views, all_pairs, select_pairs
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.products import CameraPrior, Survey, load_json
@@ -48,7 +47,7 @@ def run(stage: StageRun, config: SfmConfig) -> Summary:
         shutil.rmtree(sparse)
     with quiet_colmap() as colmap:
         if config.import_model is not None:
-            model = import_model(colmap, config.import_model, survey)
+            model = import_model(config.import_model, survey)
         else:
             job = SfmJob(survey, images, stage.out / "database.db", config)
             model = reconstruct(colmap, job, stage.progress)
@@ -207,35 +206,33 @@ def _match(colmap: Any, job: SfmJob, pairs: list[tuple[str, str]], progress: Pro
 
 
 def _map(colmap: Any, job: SfmJob, progress: Progress) -> list[Any]:
-    with (
-        progress.task("mapping", len(job.survey.images)) as task,
-        TemporaryDirectory(dir=job.database.parent) as out,
-    ):
+    drafts = job.database.with_name("mapping")
+    shutil.rmtree(drafts, ignore_errors=True)  # of a run that was killed
+    drafts.mkdir()
+    with progress.task("mapping", len(job.survey.images)) as task:
         if job.config.mapper == "global":
             options = colmap.GlobalPipelineOptions()
             options.num_threads, options.random_seed = job.config.threads, job.config.seed
-            models = colmap.global_mapping(job.database, job.images, out, options)
+            models = colmap.global_mapping(job.database, job.images, drafts, options)
             task.advance(len(job.survey.images))
-            return list(models.values())
-        options = colmap.IncrementalPipelineOptions()
-        options.num_threads, options.random_seed = job.config.threads, job.config.seed
-        options.min_model_size = 3
-        models = colmap.incremental_mapping(
-            job.database, job.images, out, options, next_image_callback=lambda: task.advance(1)
-        )
-        return list(models.values())
+        else:
+            options = colmap.IncrementalPipelineOptions()
+            options.num_threads, options.random_seed = job.config.threads, job.config.seed
+            options.min_model_size = 3
+            models = colmap.incremental_mapping(
+                job.database, job.images, drafts, options, next_image_callback=lambda: task.advance(1)
+            )
+    shutil.rmtree(drafts)
+    return list(models.values())
 
 
-def import_model(colmap: Any, path: Path, survey: Survey) -> Any:
+def import_model(path: Path, survey: Survey) -> Any:
     """Someone else's COLMAP model, reduced to the survey's images.
 
     Raises:
         InputError: not a COLMAP model, or fewer than 3 of its images are the survey's.
     """
-    try:
-        model = colmap.Reconstruction(str(path))
-    except (ValueError, RuntimeError) as error:
-        raise InputError("not a COLMAP model (cameras, images, points3D as .bin or .txt)", path=path) from error
+    model = load_reconstruction(path)
     names = {image.name for image in survey.images}
     foreign = [image.image_id for image in model.images.values() if image.name not in names]
     for image_id in foreign:

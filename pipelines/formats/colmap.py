@@ -86,7 +86,7 @@ def read_sparse(path: Path) -> SparseModel:
         InputError: unreadable, inconsistent, or with values that are not finite.
         BackendUnavailableError: pycolmap is not installed.
     """
-    reconstruction = _load(path)
+    reconstruction = load_reconstruction(path)
     cameras = {
         int(camera_id): Camera(
             camera.model_name, int(camera.width), int(camera.height), np.array(camera.params, dtype=np.float64)
@@ -195,7 +195,13 @@ def pycolmap_module() -> Any:
     return pycolmap
 
 
-def _load(path: Path) -> Any:
+def load_reconstruction(path: Path) -> Any:
+    """The `pycolmap.Reconstruction` in a folder, whose files are first checked for their length.
+
+    Raises:
+        InputError: not a readable COLMAP model.
+        BackendUnavailableError: pycolmap is not installed.
+    """
     pycolmap = pycolmap_module()
     if not path.is_dir():
         raise InputError("no such folder; expected a COLMAP model (cameras, images, points3D)", path=path)
