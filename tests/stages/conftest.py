@@ -1,0 +1,34 @@
+"""Trained surveys of a rendered scene, made once for the tests of training and evaluation."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+import torch
+from splat_scenes import Flight, make_rendered, write_photographs
+
+SEEDS = 3
+
+
+@pytest.fixture(scope="session")
+def one_thread() -> Iterator[None]:
+    """Images this small only lose time to threads; results do not depend on them."""
+    numba = pytest.importorskip("numba")
+    before = numba.get_num_threads(), torch.get_num_threads()
+    numba.set_num_threads(1)
+    torch.set_num_threads(1)
+    yield
+    numba.set_num_threads(before[0])
+    torch.set_num_threads(before[1])
+
+
+@pytest.fixture(scope="session")
+def flights(one_thread: None, tmp_path_factory: pytest.TempPathFactory) -> list[Flight]:
+    """Rendered surveys that differ in everything random."""
+    made = []
+    for seed in range(SEEDS):
+        rendered, root = make_rendered(seed), tmp_path_factory.mktemp(f"rendered{seed}")
+        write_photographs(rendered, root / "photos")
+        made.append(Flight(rendered, root, seed))
+    return made
