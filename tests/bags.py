@@ -338,7 +338,7 @@ def as_ros1(message: Any, store: Any) -> Any:
     return store.types[kind](**values)
 
 
-def write_with_unknown(flight: Flight) -> list[Message]:
+def with_unknown(flight: Flight) -> list[Message]:
     """A usual bag with a topic of a type that nobody knows, in nobody's encoding."""
     TYPES.register(get_types_from_msg("uint32 number", "nobody_msgs/msg/Thing"))
     thing = make("nobody_msgs/msg/Thing", 7)

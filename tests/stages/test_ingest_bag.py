@@ -390,7 +390,7 @@ class TestWhatIsMissing:
 
     def test_unknown_type_is_no_harm(self, ingest: Ingest) -> None:
         flight = Flight()
-        survey = ingest(bags.write_with_unknown(flight))
+        survey = ingest(bags.with_unknown(flight))
         check(survey, flight)
 
     def test_choice_is_by_rule_and_told(self, ingest: Ingest) -> None:
