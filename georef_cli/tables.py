@@ -84,6 +84,32 @@ def outcomes(results: Sequence[Outcome]) -> Table:
     return table
 
 
+def topics(rows: Iterable[Mapping[str, Any]]) -> Table:
+    """`georef inspect`: a line a topic."""
+    table = _table("topic", "type", "messages", "Hz", "span", "longest gap", "frame", "use", "")
+    for column in table.columns[2:6]:
+        column.justify = "right"
+    for row in rows:
+        span = None if row["first_s"] is None else row["last_s"] - row["first_s"]
+        remarks = [
+            f"{row['gaps']} gaps" if row["gaps"] else "",
+            f"{row['backwards']} backwards" if row["backwards"] else "",
+        ]
+        remarks += ["no stamps" if row["clock"] == "recording" else "", row["problem"]]
+        table.add_row(
+            escape(row["name"]),
+            escape(row["type"].replace("/msg/", "/")),
+            str(row["messages"]),
+            _number(row["rate_hz"]),
+            duration(span),
+            duration(row["longest_gap_s"]),
+            escape(row["frame"]),
+            f"[green]{row['use']}[/]",
+            escape(", ".join(filter(None, remarks))),
+        )
+    return table
+
+
 def report_of(workspace: Workspace) -> list[Renderable]:
     """The tables of a workspace's evaluation.
 

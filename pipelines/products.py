@@ -305,6 +305,57 @@ class GeolocatedPoints:
         return cls(**arrays, rotation_source=source)
 
 
+@dataclass(frozen=True)
+class NavigationTrack:
+    """Product of `ingest` beside the survey: the navigation as recorded, and how n cameras sit in it.
+
+    What `calibrate` fits the SfM cameras to. Positions are the antenna's, attitudes the body's
+    (forward-right-down), both on the navigation's clock; nothing of the rig is applied to them.
+
+    Attributes:
+        position_time_s: (K,) float64, seconds.
+        antenna_in_geo: (K, 3) float64, metres.
+        sigma_m: (K, 3) float64, σ east, north, up; NaN where the receiver states none.
+        attitude_time_s: (M,) float64, seconds.
+        geo_from_body: (M, 3, 3) float64.
+        image: (n,) names of images.
+        image_time_s: (n,) float64, camera clock.
+        cam_from_body: (n, 3, 3) float64, mount; NaN where unknown.
+        antenna_in_body: (n, 3) float64, lever arm that the survey has applied; NaN where unknown.
+        nominal_from_cam: (3, 3) float64, boresight that the survey has applied.
+        time_offset_s: () float64, navigation clock minus camera clock that the survey has applied.
+        max_gap_s: () float64, longest gap to interpolate over.
+    """
+
+    position_time_s: FloatArray
+    antenna_in_geo: FloatArray
+    sigma_m: FloatArray
+    attitude_time_s: FloatArray
+    geo_from_body: FloatArray
+    image: NDArray[np.str_]
+    image_time_s: FloatArray
+    cam_from_body: FloatArray
+    antenna_in_body: FloatArray
+    nominal_from_cam: FloatArray
+    time_offset_s: FloatArray
+    max_gap_s: FloatArray
+
+    def save(self, path: Path) -> None:
+        """Write as NPZ."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        arrays: dict[str, Any] = {field.name: np.asarray(getattr(self, field.name)) for field in fields(self)}
+        np.savez(path, **arrays)
+
+    @classmethod
+    def load(cls, path: Path) -> NavigationTrack:
+        """Read from NPZ.
+
+        Raises:
+            InputError: not an NPZ file of that form.
+        """
+        return cls(**load_npz(path, tuple(field.name for field in fields(cls))))
+
+
 # Kind of number, and shape of one point's entry.
 _POINT_ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
     "point_id": ("i", ()),

@@ -165,8 +165,10 @@ def _add_camera(colmap: Any, job: SfmJob, prior: CameraPrior) -> None:
     with colmap.Database.open(job.database) as database:
         if database.exists_camera(prior.camera_id):
             return
+        # A fisheye has no likeness among the perspective models to start from.
+        model = prior.model if prior.model == "OPENCV_FISHEYE" else job.config.camera_model
         camera = colmap.Camera.create_from_model_name(
-            prior.camera_id, job.config.camera_model, prior.params[0], prior.width, prior.height
+            prior.camera_id, model, prior.params[0], prior.width, prior.height
         )
         _copy_shared_params(colmap, prior, camera)
         camera.has_prior_focal_length = prior.focal_source != "assumed"
