@@ -114,15 +114,21 @@ def geo_problem(scene: Scene, survey: Survey, initial: InitialSimilarity, config
     covariance = moved_pivot(np.array(record.covariance), record.pivot, pivot)
     basis = _correction_basis(scene) if config.optimize_cameras else None
     matrix = np.zeros((len(scene.sparse.image_name), 6, 0)) if basis is None else basis.matrix
-    use = config.geo_loss
+    fixes = _fixes(scene, survey) if config.geo_loss else None
+    marks = _control_marks(scene, survey) if config.geo_loss else None
     return GeoProblem(
         LearnableSimilarity(scene.geo_from_model, covariance, pivot),
         CameraCorrections(scene.poses, matrix),
-        _fixes(scene, survey) if use else None,
-        _control_marks(scene, survey) if use else None,
+        fixes,
+        marks,
         weighting=config.weighting,
-        hold_prior=initial.layout == "line",
+        hold_prior=initial.layout == "line" or (fixes is None and not _determined_by(marks)),
     )
+
+
+def _determined_by(marks: ControlMarks | None) -> bool:
+    """Whether control points alone fix all seven unknowns of the similarity."""
+    return marks is not None and len(marks.position_in_geo) >= 3
 
 
 def _correction_basis(scene: Scene) -> CorrectionBasis | None:
@@ -158,11 +164,12 @@ def _fixes(scene: Scene, survey: Survey) -> Fixes | None:
 
 
 def _control_marks(scene: Scene, survey: Survey) -> ControlMarks | None:
-    """Marks of the control points in training images, where a point has two or more of them."""
-    kept = [(point, found) for point in survey.control_points if len(found := _rays(scene, point)) >= 2]
+    """Marks of the control points in training images, where a point is seen in two or more of them."""
+    rays = [(point, _rays(scene, point)) for point in survey.control_points]
+    kept = [(point, found) for point, found in rays if len({camera for camera, _, _ in found}) >= 2]
     if not kept:
         return None
-    flat = [(j, *ray) for j, (_, rays) in enumerate(kept) for ray in rays]
+    flat = [(j, *ray) for j, (_, found) in enumerate(kept) for ray in found]
     marks = ControlMarks(
         point=torch.tensor([row[0] for row in flat]),
         camera=torch.tensor([row[1] for row in flat]),
@@ -185,6 +192,8 @@ def _rays(scene: Scene, point: SurveyedPoint) -> list[tuple[int, FloatArray, flo
             continue
         camera = scene.sparse.camera_of(camera_index)
         ray = np.append(undistort(camera, np.array([mark.x_px, mark.y_px])), 1.0)
+        if not np.isfinite(ray).all():  # a mark where the lens model maps no ray
+            continue
         rays.append((camera_index, ray / np.linalg.norm(ray), mark.sigma_px / float(camera.params[0])))
     return rays
 

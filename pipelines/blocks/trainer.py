@@ -204,5 +204,9 @@ class JointTrainer:
         for name, parameter in (("y", self.problem.similarity.y), ("z", self.problem.cameras.z)):
             with torch.no_grad():
                 parameter.copy_(geo[name])
-            moments = {key.removeprefix(f"{name}_"): geo[key] for key in geo if key.startswith(f"{name}_")}
-            self._geo_adam.state[parameter] = dict(moments)
+            # Adam counts its steps on the CPU, whatever the device.
+            self._geo_adam.state[parameter] = {
+                key: geo[f"{name}_{key}"].to("cpu" if key == "step" else self.device)
+                for key in ("step", "exp_avg", "exp_avg_sq")
+                if f"{name}_{key}" in geo
+            }

@@ -12,13 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.errors import InputError
-from pipelines.geometry.cameras import Camera, project
+from pipelines.geometry.cameras import Camera, distort, undistort
 from pipelines.progress import SILENT, Progress
 
 log = logging.getLogger(__name__)
 
 # A pixel that needs light from beyond the photograph's edge is not compared.
 _EDGE_PX = 0.5
+_SAME_RAY = 1e-6  # of normalised coordinates
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,6 @@ class ImageCache:
         Raises:
             InputError: a photograph cannot be read, or has another size than its camera.
         """
-        self._folder.mkdir(parents=True, exist_ok=True)
         with progress.task("undistorting", len(self)) as task:
             for index in range(len(self)):
                 if not self._path(index).exists():
@@ -96,16 +96,29 @@ class ImageCache:
                 task.advance()
 
     def image(self, index: int) -> NDArray[np.uint8]:
-        """RGB of an image: (H, W, 3), mapped from disk."""
+        """RGB of an image: (H, W, 3), mapped from disk; made if it is not there or not whole.
+
+        Raises:
+            InputError: as `build`.
+        """
         path = self._path(index)
         if not path.exists():
             self._write(index)
-        array: NDArray[np.uint8] = np.load(path, mmap_mode="r", allow_pickle=False)
-        return array
+        try:
+            return self._open(path)
+        except (ValueError, EOFError):  # cut off, by a full disk or a power failure
+            log.warning("%s is damaged and made again", path)
+            self._write(index)
+            return self._open(path)
 
     def mask(self, index: int) -> NDArray[np.bool_]:
         """Pixels that the photograph covers: (H, W)."""
         return self._map(index)[1]
+
+    @staticmethod
+    def _open(path: Path) -> NDArray[np.uint8]:
+        array: NDArray[np.uint8] = np.load(path, mmap_mode="r", allow_pickle=False)
+        return array
 
     def _path(self, index: int) -> Path:
         photograph = self._photographs[index]
@@ -138,6 +151,7 @@ class ImageCache:
         flat = cv2.remap(small, source[..., 0], source[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
         path = self._path(index)
         draft = path.with_suffix(".tmp")
+        self._folder.mkdir(parents=True, exist_ok=True)
         with draft.open("wb") as handle:
             np.save(handle, np.ascontiguousarray(flat[..., ::-1]), allow_pickle=False)
         draft.rename(path)
@@ -153,10 +167,15 @@ class ImageCache:
 
 def _distortion_map(camera: Camera, pinhole: PinholeImage) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     u, v = np.meshgrid(np.arange(pinhole.width) + 0.5, np.arange(pinhole.height) + 0.5)
-    rays = np.stack([(u - pinhole.cx) / pinhole.fx, (v - pinhole.cy) / pinhole.fy, np.ones_like(u)], axis=-1)
-    full = project(camera, rays.reshape(-1, 3)).reshape(pinhole.height, pinhole.width, 2)
+    ray = np.stack([(u - pinhole.cx) / pinhole.fx, (v - pinhole.cy) / pinhole.fy], axis=-1)
+    full = distort(camera, ray)
+    # Beyond its fold a lens polynomial leads back into the picture, to a place that another ray shows.
+    with np.errstate(invalid="ignore"):
+        own = (np.abs(undistort(camera, full) - ray) < _SAME_RAY).all(axis=-1)
     size = np.array([pinhole.width / camera.width, pinhole.height / camera.height])
     small = full * size
     limit = np.array([pinhole.width, pinhole.height]) - _EDGE_PX
-    inside = ((small >= _EDGE_PX) & (small <= limit)).all(axis=-1)
-    return (small - 0.5).astype(np.float32), inside  # cv2 counts from the centre of the first pixel
+    inside = own & ((small >= _EDGE_PX) & (small <= limit)).all(axis=-1)
+    # cv2 counts from the centre of the first pixel, and takes long to reflect what lies far outside.
+    source = np.clip(np.nan_to_num(small - 0.5), -limit, 2 * limit)
+    return source.astype(np.float32), inside

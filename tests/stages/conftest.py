@@ -6,7 +6,11 @@ from collections.abc import Iterator
 
 import pytest
 import torch
-from splat_scenes import Flight, make_rendered, write_photographs
+from splat_scenes import TRAINING, Flight, make_rendered, write_photographs
+
+from pipelines.runner import run_stage
+from pipelines.stages import BY_NAME
+from pipelines.workspace import Workspace
 
 SEEDS = 3
 
@@ -32,3 +36,15 @@ def flights(one_thread: None, tmp_path_factory: pytest.TempPathFactory) -> list[
         write_photographs(rendered, root / "photos")
         made.append(Flight(rendered, root, seed))
     return made
+
+
+@pytest.fixture(scope="session")
+def trained(flights: list[Flight]) -> list[tuple[Workspace, Workspace]]:
+    """Each survey trained with the geographic losses and without."""
+    pairs = []
+    for flight in flights:
+        pair = flight.workspace("with"), flight.workspace("without")
+        run_stage(pair[0], BY_NAME["train"], TRAINING)
+        run_stage(pair[1], BY_NAME["train"], {**TRAINING, "geo_loss": False})
+        pairs.append(pair)
+    return pairs

@@ -244,9 +244,8 @@ def test_global_mapper(mapped: Workspace, tmp_path: Path) -> None:
     survey = load_json(Survey, mapped.path(SURVEY))
     config = CONFIG.model_copy(update={"mapper": "global"})
     with quiet_colmap() as colmap:
-        model = reconstruct(
-            colmap, SfmJob(survey, mapped.root / "photos", tmp_path / "database.db", config), SILENT
-        )
+        job = SfmJob(survey, mapped.root / "photos", tmp_path / "database.db", config)
+        model = reconstruct(colmap, job, SILENT)
     assert model.num_reg_images() == IMAGES
 
 

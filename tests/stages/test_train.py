@@ -15,7 +15,7 @@ import torch
 from georef_scenes import squared_error
 from scenes import GEO_FROM_LOCAL, without_fixes
 from scipy.stats import chi2
-from splat_scenes import Flight
+from splat_scenes import TRAINING, Flight
 
 from pipelines.config import TrainConfig
 from pipelines.errors import BackendUnavailableError, DegenerateGeometryError, InputError
@@ -33,23 +33,9 @@ from pipelines.train import PRESETS, Preset, effort
 from pipelines.workspace import Workspace
 
 TRAIN = BY_NAME["train"]
-# Too few for density control, which would turn differences of rounding into differences of tenths of a dB.
-FLAGS = {"iterations": 150, "sh_degree": 0, "log_every": 5}
 SHORT = {"iterations": 30, "sh_degree": 1, "log_every": 2, "checkpoint_every": 8}
-Pairs = list[tuple[Workspace, Workspace]]  # with the geographic losses, and without
+Pairs = list[tuple[Workspace, Workspace]]
 FAR = float(chi2.ppf(0.999, 7))
-
-
-@pytest.fixture(scope="module")
-def trained(flights: list[Flight]) -> Pairs:
-    """Each survey trained with the geographic losses and without."""
-    pairs = []
-    for flight in flights:
-        pair = flight.workspace("with"), flight.workspace("without")
-        run_stage(pair[0], TRAIN, FLAGS)
-        run_stage(pair[1], TRAIN, {**FLAGS, "geo_loss": False})
-        pairs.append(pair)
-    return pairs
 
 
 def metrics(workspace: Workspace, folder: str = "train") -> list[dict]:
@@ -221,7 +207,7 @@ def test_wrong_fix_is_named_and_moves_nothing(flights: list[Flight]) -> None:
     wrong = fix.model_copy(update={"position_in_geo": (east + 9.0, north - 12.0, up)})
     images[5] = images[5].model_copy(update={"fix": wrong})
     save_json(survey.model_copy(update={"images": tuple(images)}), workspace.root / SURVEY)
-    outcome = run_stage(workspace, TRAIN, {**FLAGS, "iterations": 100})
+    outcome = run_stage(workspace, TRAIN, {**TRAINING, "iterations": 100})
     assert outcome.manifest.values["gnss_outliers"] == [images[5].name]
     assert any(images[5].name in text for text in outcome.manifest.warnings)
     assert error_of(workspace) < FAR
