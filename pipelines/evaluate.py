@@ -98,7 +98,7 @@ def _photometric(eye: Eye, config: EvaluateConfig, renders: Path, progress: Prog
         for place, index in enumerate(indices):
             colour = eye.look(index).colour.clamp(0, 1).cpu()
             photo = torch.from_numpy(np.array(eye.images.image(index))).float() / 255.0
-            mask = torch.from_numpy(eye.images.mask(index))
+            mask = torch.from_numpy(np.array(eye.images.mask(index)))
             name = eye.trained.sparse.image_name[index]
             rows.append(
                 {
