@@ -98,7 +98,7 @@ def _photometric(eye: Eye, config: EvaluateConfig, renders: Path, progress: Prog
         for place, index in enumerate(indices):
             colour = eye.look(index).colour.clamp(0, 1).cpu()
             photo = torch.from_numpy(np.array(eye.images.image(index))).float() / 255.0
-            mask = torch.from_numpy(eye.images.mask(index))
+            mask = torch.from_numpy(np.array(eye.images.mask(index)))
             name = eye.trained.sparse.image_name[index]
             rows.append(
                 {
@@ -129,7 +129,6 @@ def _write_side_by_side(path: Path, photo: torch.Tensor, colour: torch.Tensor) -
     """Photograph, render, and their difference (× 3)."""
     difference = (3 * (photo - colour).abs()).clamp(0, 1)
     strip = torch.cat([photo, colour, difference], dim=1).mul(255).round().byte().numpy()
-    path.parent.mkdir(parents=True, exist_ok=True)  # photographs of one name lie in folders of their own
     cv2.imwrite(str(path), np.ascontiguousarray(strip[..., ::-1]))
 
 

@@ -27,6 +27,9 @@ FloatArray = NDArray[np.float64]
 Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 Matrix3 = tuple[Vector3, Vector3, Vector3]
+Matrix34 = tuple[
+    tuple[float, float, float, float], tuple[float, float, float, float], tuple[float, float, float, float]
+]
 
 # Products may be written by hand: larger than any survey's, and they are not even read.
 _MAX_JSON_BYTES = 1 << 30
@@ -201,12 +204,16 @@ class InitialSimilarity(Product):
 
 
 class TrainedCamera(Product):
-    """A camera after training, as `cam_from_model`. A test camera has moved only with its neighbours."""
+    """A camera after training, as `cam_from_model`. A test camera has moved only with its neighbours.
+
+    `exposure` is the gain matrix and offset (A | b) with which the photograph shows a colour c: A c + b.
+    """
 
     name: ImageName
     split: Literal["train", "test"]
     quat_xyzw: Rotation
     translation: Vector3
+    exposure: Matrix34 | None = None
 
 
 class TrainedModel(Product):

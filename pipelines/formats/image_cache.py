@@ -6,6 +6,7 @@ import hashlib
 import logging
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -64,6 +65,9 @@ def _focal_and_centre(camera: Camera) -> tuple[float, float, float, float]:
 class ImageCache:
     """Undistorted images on disk: uint8 RGB arrays, made once, mapped when asked for.
 
+    Memory does not grow with their number: of the distortion maps only the last is kept, and masks, one a camera,
+    lie on disk beside the images.
+
     Args:
         folder: where the arrays are kept.
         photographs: what to undistort.
@@ -74,7 +78,7 @@ class ImageCache:
         self._folder = folder
         self._photographs = photographs
         self.max_size_px = max_size_px
-        self._maps: dict[bytes, tuple[NDArray[np.float32], NDArray[np.bool_]]] = {}
+        self._last_map: tuple[str, NDArray[np.float32], NDArray[np.bool_]] | None = None
 
     def __len__(self) -> int:
         return len(self._photographs)
@@ -112,8 +116,18 @@ class ImageCache:
             return self._open(path)
 
     def mask(self, index: int) -> NDArray[np.bool_]:
-        """Pixels that the photograph covers: (H, W)."""
-        return self._map(index)[1]
+        """Pixels that the photograph covers: (H, W), mapped from disk."""
+        path = self._folder / f"{self.mask_key(index)}.mask.npy"
+        if not path.exists():
+            _save(path, self._map(index)[1])
+        array: NDArray[np.bool_] = np.load(path, mmap_mode="r", allow_pickle=False)
+        return array
+
+    def mask_key(self, index: int) -> str:
+        """The same for photographs of the same camera, whose masks are the same."""
+        camera = self._photographs[index].camera
+        key = f"{camera.model}|{camera.width}x{camera.height}|{camera.params.tobytes().hex()}|{self.max_size_px}"
+        return hashlib.sha256(key.encode()).hexdigest()[:32]
 
     @staticmethod
     def _open(path: Path) -> NDArray[np.uint8]:
@@ -149,20 +163,22 @@ class ImageCache:
         small = cv2.resize(full, (pinhole.width, pinhole.height), interpolation=cv2.INTER_AREA)
         source, _ = self._map(index)
         flat = cv2.remap(small, source[..., 0], source[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
-        path = self._path(index)
-        draft = path.with_suffix(".tmp")
-        self._folder.mkdir(parents=True, exist_ok=True)
-        with draft.open("wb") as handle:
-            np.save(handle, np.ascontiguousarray(flat[..., ::-1]), allow_pickle=False)
-        draft.rename(path)
+        _save(self._path(index), np.ascontiguousarray(flat[..., ::-1]))
 
     def _map(self, index: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Where each undistorted pixel lies in the shrunken photograph, and whether it lies inside."""
-        camera = self._photographs[index].camera
-        key = camera.params.tobytes() + f"{camera.model}{camera.width}x{camera.height}".encode()
-        if key not in self._maps:
-            self._maps[key] = _distortion_map(camera, self.pinhole(index))
-        return self._maps[key]
+        key = self.mask_key(index)
+        if self._last_map is None or self._last_map[0] != key:
+            self._last_map = (key, *_distortion_map(self._photographs[index].camera, self.pinhole(index)))
+        return self._last_map[1:]
+
+
+def _save(path: Path, array: NDArray[Any]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draft = path.with_suffix(".tmp")
+    with draft.open("wb") as handle:
+        np.save(handle, array, allow_pickle=False)
+    draft.rename(path)
 
 
 def _distortion_map(camera: Camera, pinhole: PinholeImage) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
