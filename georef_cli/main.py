@@ -30,6 +30,7 @@ class Entry:
 
 COMMANDS: dict[str, Entry] = {
     "simulate": Entry("simulate", "Surveys", "Simulate a survey whose truth is known exactly."),
+    "inspect": Entry("inspect", "Surveys", "Show what a ROS bag holds, what ingest would choose, what is missing."),
     "run": Entry("run", "Pipeline", "Run all stages, or some, skipping what is current."),
     "status": Entry("status", "Pipeline", "Show the state of every stage."),
     "ingest": Entry("ingest", "Stages", "Read photographs, positions and control points into one survey."),

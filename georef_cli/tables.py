@@ -36,6 +36,7 @@ POINT_COLUMNS = {
     "max_3d_m": "max 3D",
 }
 IMAGE_COLUMNS = {"views": "views", "psnr": "PSNR dB", "ssim": "SSIM", "lpips": "LPIPS"}
+SECTIONS = ("photometric", "checkpoints", "fit")
 Renderable = Group | Table | str
 
 
@@ -83,17 +84,46 @@ def outcomes(results: Sequence[Outcome]) -> Table:
     return table
 
 
+def topics(rows: Iterable[Mapping[str, Any]]) -> Table:
+    """`georef inspect`: a line a topic."""
+    table = _table("topic", "type", "messages", "Hz", "span", "longest gap", "frame", "use", "")
+    for column in table.columns[2:6]:
+        column.justify = "right"
+    for row in rows:
+        span = None if row["first_s"] is None else row["last_s"] - row["first_s"]
+        remarks = [
+            f"{row['gaps']} gaps" if row["gaps"] else "",
+            f"{row['backwards']} backwards" if row["backwards"] else "",
+        ]
+        remarks += ["no stamps" if row["clock"] == "recording" else "", row["problem"]]
+        table.add_row(
+            escape(row["name"]),
+            escape(row["type"].replace("/msg/", "/")),
+            str(row["messages"]),
+            _number(row["rate_hz"]),
+            duration(span),
+            duration(row["longest_gap_s"]),
+            escape(row["frame"]),
+            f"[green]{row['use']}[/]",
+            escape(", ".join(filter(None, remarks))),
+        )
+    return table
+
+
 def report_of(workspace: Workspace) -> list[Renderable]:
     """The tables of a workspace's evaluation.
 
     Raises:
-        InputError: the report was replaced by something that is not JSON.
+        InputError: the report was replaced by something else.
     """
     path = workspace.path(REPORT)
     try:
-        return report(json.loads(path.read_text(encoding="utf-8")))
-    except ValueError as error:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
         raise InputError(f"not valid JSON: {error}", path=path) from error
+    if not isinstance(document, dict) or not all(isinstance(document.get(name, {}), dict) for name in SECTIONS):
+        raise InputError("not a report: make it again with `georef evaluate --force`", path=path)
+    return report(document)
 
 
 def report(document: Mapping[str, Any]) -> list[Renderable]:

@@ -18,6 +18,7 @@ from pydantic.fields import FieldInfo
 from pipelines.errors import InputError
 
 CONFIG_FILE = "georef.toml"
+AUTO = "auto"
 
 
 class InputMarker:
@@ -37,6 +38,35 @@ class IngestConfig(StageConfig):
     """What `georef ingest` reads, and what it assumes where the files are silent."""
 
     images: InputPath | None = Field(None, description="Folder of photographs.")
+    bag: InputPath | None = Field(
+        None, description="ROS bag with photographs and navigation: rosbag2 folder, .mcap, .db3 or ROS 1 .bag."
+    )
+    image_topic: str | None = Field(None, description="Topic of the photographs in the bag (default: by rule).")
+    fix_topic: str | None = Field(None, description="Topic of the positions in the bag (default: by rule).")
+    attitude_topic: str | None = Field(None, description="Topic of the attitudes in the bag (default: by rule).")
+    every: str | None = Field(
+        None, description="Take a frame of the bag every 2s, or every 5m flown (default: all)."
+    )
+    skip_blurred: bool = Field(False, description="Pass over blurred frames of the bag.")
+    origin: str | None = Field(
+        None,
+        description="Zero of a bag's local frame (odometry, poses): latitude,longitude,ellipsoidal height.",
+    )
+    time_offset: str = Field(
+        "0", description="Navigation clock minus camera clock in seconds; auto: by `georef calibrate` after sfm."
+    )
+    lever_arm: str | None = Field(
+        None,
+        description="Antenna seen from the camera in the body's axes, forward,right,down in metres (default: /tf).",
+    )
+    camera_mount: str | None = Field(
+        None,
+        description="How the camera is turned in the body, yaw,pitch,roll in degrees; 0,-90,0 looks down "
+        "(default: /tf).",
+    )
+    boresight: str = Field(
+        "0,0,0", description="Rotation vector from the true to the nominal camera axes, x,y,z in degrees."
+    )
     trajectory: InputPath | None = Field(None, description="CSV with a header: image and/or timestamp, position …")
     geo: InputPath | None = Field(None, description="ODM geo.txt with the image positions.")
     gcp: InputPath | None = Field(None, description="ODM gcp_list.txt: ground control points and their marks.")
@@ -58,6 +88,30 @@ class IngestConfig(StageConfig):
     copy_images: bool = Field(
         False, description="Copy the photographs into the workspace.", json_schema_extra={"flag": "--copy"}
     )
+
+    @property
+    def time_offset_s(self) -> float:
+        """Seconds; zero while it is still to be estimated."""
+        return 0.0 if self.time_offset == AUTO else float(self.time_offset)
+
+    @field_validator("time_offset")
+    @classmethod
+    def _is_offset(cls, text: str) -> str:
+        if text != AUTO and not abs(float(text)) < 1e6:
+            raise ValueError("a number of seconds, or auto")
+        return text
+
+    @field_validator("lever_arm", "camera_mount", "boresight")
+    @classmethod
+    def _is_triple(cls, text: str | None) -> str | None:
+        if text is not None:
+            triple(text)
+        return text
+
+    @field_validator("origin")
+    @classmethod
+    def _is_on_earth(cls, text: str | None) -> str | None:
+        return text if text is None else on_earth(text)
 
 
 class SfmConfig(StageConfig):
@@ -230,16 +284,25 @@ class SimulateConfig(StageConfig):
     @field_validator("origin")
     @classmethod
     def _on_earth(cls, text: str) -> str:
-        lat, lon, alt = triple(text)
-        if abs(lat) > 90 or abs(lon) > 180 or not -1000 <= alt <= 10000:
-            raise ValueError("latitude −90 … 90, longitude −180 … 180, height −1000 … 10000")
-        return text
+        return on_earth(text)
 
     @field_validator("lever_arm", "boresight")
     @classmethod
     def _is_triple(cls, text: str) -> str:
         triple(text)
         return text
+
+
+def on_earth(text: str) -> str:
+    """The text, if it is latitude,longitude,height of a place on Earth.
+
+    Raises:
+        ValueError: it is not.
+    """
+    lat, lon, alt = triple(text)
+    if abs(lat) > 90 or abs(lon) > 180 or not -1000 <= alt <= 10000:
+        raise ValueError("latitude −90 … 90, longitude −180 … 180, height −1000 … 10000")
+    return text
 
 
 def triple(text: str) -> tuple[float, float, float]:

@@ -129,6 +129,7 @@ def _write_side_by_side(path: Path, photo: torch.Tensor, colour: torch.Tensor) -
     """Photograph, render, and their difference (× 3)."""
     difference = (3 * (photo - colour).abs()).clamp(0, 1)
     strip = torch.cat([photo, colour, difference], dim=1).mul(255).round().byte().numpy()
+    path.parent.mkdir(parents=True, exist_ok=True)  # photographs of one name lie in folders of their own
     cv2.imwrite(str(path), np.ascontiguousarray(strip[..., ::-1]))
 
 

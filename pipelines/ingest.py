@@ -1,7 +1,8 @@
 """Stage `ingest`: photographs, positions, attitudes and ground points into one survey in one frame.
 
-Reads: a folder of photographs; optionally a CSV trajectory or `geo.txt`, `gcp_list.txt`, check points.
-Writes: `ingest/survey.json`, and `ingest/images/` with --copy. See docs/inputs.md for every format and default.
+Reads: a folder of photographs or a ROS bag; optionally a CSV trajectory or `geo.txt`, `gcp_list.txt`, check points.
+Writes: `ingest/survey.json`; `ingest/images/` with --bag or --copy; `ingest/track.npz` where the navigation was
+recorded by time. See docs/inputs.md and docs/bags.md for every format and default.
 """
 
 from __future__ import annotations
@@ -15,24 +16,22 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
+from pipelines.blocks.intake import LEAST_IMAGES, pose_options, take_in
 from pipelines.config import IngestConfig
 from pipelines.errors import InputError
-from pipelines.formats.camera_priors import camera_priors
 from pipelines.formats.ground_points import GroundFile, GroundPoint, read_ground_file, require_near, split_checks
-from pipelines.formats.measured import Measured, PoseOptions, from_table, from_tags
+from pipelines.formats.measured import Measured
 from pipelines.formats.notes import Notes
-from pipelines.formats.odm import read_geo
-from pipelines.formats.photo_folder import Photo, scan_folder
+from pipelines.formats.photo_folder import Photo
 from pipelines.formats.poses import complete
-from pipelines.formats.trajectory_csv import read_trajectory
 from pipelines.geodesy import enu
-from pipelines.geodesy.vertical import parse_vertical
 from pipelines.geometry.rotations import matrix_from_quat_xyzw, quat_xyzw_from_matrix
 from pipelines.products import (
     Attitude,
     Fix,
     FloatArray,
     Matrix3,
+    NavigationTrack,
     Origin,
     Survey,
     SurveyedPoint,
@@ -46,7 +45,6 @@ from pipelines.workspace import StageRun, Summary
 
 log = logging.getLogger(__name__)
 
-LEAST_IMAGES = 3
 SIGMA_GIMBAL_DEG = 2.0
 SIGMA_TABLE_ATTITUDE_DEG = 1.0
 # A fix further than this from the middle of all is a blunder.
@@ -62,17 +60,21 @@ def run(stage: StageRun, config: IngestConfig) -> Summary:
     if config.images is not None and stage.workspace.root.resolve().is_relative_to(config.images.resolve()):
         message = "the workspace lies inside the folder of photographs: put it elsewhere"
         raise InputError(message, path=stage.workspace.root)
-    survey = build_survey(config, stage.progress)
-    if config.copy_images:
+    survey, track = survey_and_track(config, stage.out / "images", stage.progress)
+    if config.bag is not None:
+        survey = survey.model_copy(update={"image_dir": "ingest/images"})
+    elif config.copy_images:
         survey = _copied(survey, stage)
     save_json(survey, stage.out / "survey.json")
+    if track is not None:
+        track.save(stage.out / "track.npz")
     for assumption in survey.assumptions:
         log.info("assumed: %s", assumption)
     return _summary(survey)
 
 
 def build_survey(config: IngestConfig, progress: Progress = SILENT) -> Survey:
-    """Everything that was measured, in one East-North-Up frame; reads files, writes none.
+    """Everything that was measured, in one East-North-Up frame; reads files, writes none: not for bags.
 
     The origin is the median of the image positions (of the control points if there are none), rounded to 10⁻⁵
     degrees and a metre. Every `test_every`-th image by name is held out, beginning with the first.
@@ -80,14 +82,29 @@ def build_survey(config: IngestConfig, progress: Progress = SILENT) -> Survey:
     Raises:
         InputError: as `run`.
     """
-    _check_options(config)
+    return survey_and_track(config, None, progress)[0]
+
+
+def survey_and_track(
+    config: IngestConfig, frames: Path | None, progress: Progress = SILENT
+) -> tuple[Survey, NavigationTrack | None]:
+    """As `build_survey`, and the navigation in the same frame where it has been recorded by time.
+
+    Args:
+        config: options.
+        frames: where the photographs of a bag are written.
+        progress: whom to tell.
+
+    Raises:
+        InputError: as `run`.
+    """
     notes = Notes()
-    photos = _usable(Path(str(config.images)), notes, progress)
-    options = _pose_options(config)
-    measured = _without_far_fixes(_measured(config, photos, options, notes), photos, notes)
+    taken = take_in(config, frames, notes, progress)
+    photos = taken.photos
+    measured = _without_far_fixes(taken.measured, photos, notes)
     sizes = {photo.name: (photo.file.width, photo.file.height) for photo in photos}
     control_file, check_file = (
-        read_ground_file(path, sizes, config.sigma_mark, options, notes) if path is not None else None
+        read_ground_file(path, sizes, config.sigma_mark, pose_options(config), notes) if path is not None else None
         for path in (config.gcp, config.checkpoints)
     )
     control, check = split_checks(control_file, check_file, config.check)
@@ -96,71 +113,22 @@ def build_survey(config: IngestConfig, progress: Progress = SILENT) -> Survey:
         require_near(control_file, middle)
         require_near(check_file, middle)
     origin = _origin(measured, control)
-    cameras, camera_of = camera_priors(photos, config.focal_px, notes)
     _note_coverage(measured, photos, len(control), notes)
     if config.test_every and not _held_out(len(photos), config.test_every):
         notes.warn(f"{len(photos)} images are too few to hold any out for testing")
-    return Survey(
+    survey = Survey(
         origin=origin,
         source_crs=measured.crs_name if control_file is None or measured.located.any() else control_file.crs_name,
         vertical=_vertical(measured, control_file, check_file, notes),
-        image_dir=str(Path(str(config.images)).resolve()),
-        cameras=cameras,
-        images=_images(photos, camera_of, measured, origin, config),
+        image_dir=str(taken.folder),
+        cameras=taken.cameras,
+        images=_images(photos, taken.camera_of, measured, origin, config),
         control_points=_surveyed(control, origin, config),
         check_points=_surveyed(check, origin, config),
         assumptions=tuple(notes.assumptions),
         warnings=tuple(notes.warnings),
     )
-
-
-def _check_options(config: IngestConfig) -> None:
-    if config.images is None:
-        raise InputError("give the folder of photographs", field="--images")
-    if config.trajectory is not None and config.geo is not None:
-        raise InputError("give a trajectory or a geo.txt, not both", field="--geo")
-    if config.crs is not None and config.trajectory is None:
-        raise InputError("is for the columns of --trajectory; other files state their CRS", field="--crs")
-    if config.check and config.gcp is None:
-        raise InputError("names points of --gcp, which is not given", field="--check")
-    if config.test_every == 1:
-        raise InputError("1 would leave nothing to train on: give 0, or 2 and more", field="--test-every")
-
-
-def _pose_options(config: IngestConfig) -> PoseOptions:
-    return PoseOptions(
-        crs=config.crs,
-        vertical=parse_vertical(config.vertical) if config.vertical is not None else None,
-        max_gap_s=config.max_gap,
-        sigma_h_m=config.sigma_h,
-        sigma_v_m=config.sigma_v,
-    )
-
-
-def _usable(root: Path, notes: Notes, progress: Progress) -> list[Photo]:
-    photos = scan_folder(root, notes, progress)
-    if len(photos) < LEAST_IMAGES:
-        why = "".join(f"; {warning}" for warning in notes.warnings)
-        raise InputError(
-            f"{len(photos)} usable images, a survey needs {LEAST_IMAGES}{why}", path=root, field="--images"
-        )
-    for problem in sorted({problem for photo in photos for problem in photo.tags.problems}):
-        names = [photo.name for photo in photos if problem in photo.tags.problems]
-        notes.warn_counted(names, f"image where {problem}", f"images where {problem}")
-    notes.warn_counted(
-        [photo.name for photo in photos if photo.tags.orientation != 1],
-        "image has an EXIF orientation, which is ignored: pixels count as stored",
-        "images have an EXIF orientation, which is ignored: pixels count as stored",
-    )
-    return photos
-
-
-def _measured(config: IngestConfig, photos: Sequence[Photo], options: PoseOptions, notes: Notes) -> Measured:
-    if config.trajectory is not None:
-        return from_table(read_trajectory(config.trajectory, notes), photos, options, notes)
-    if config.geo is not None:
-        return from_table(read_geo(config.geo, notes), photos, options, notes)
-    return from_tags(photos, options, notes)
+    return survey, taken.track(origin)
 
 
 def _without_far_fixes(measured: Measured, photos: Sequence[Photo], notes: Notes) -> Measured:
@@ -266,7 +234,9 @@ def _attitudes(measured: Measured, origin: Origin, config: IngestConfig) -> list
         source = measured.attitude_source[row]
         default_deg = SIGMA_GIMBAL_DEG if source == "gimbal" else SIGMA_TABLE_ATTITUDE_DEG
         x, y, z, w = (float(value) for value in quat)
-        sigma_deg = default_deg if config.sigma_attitude is None else config.sigma_attitude
+        stated = np.nan if measured.sigma_attitude_deg is None else measured.sigma_attitude_deg[row]
+        sigma_deg = float(stated) if np.isfinite(stated) else default_deg
+        sigma_deg = sigma_deg if config.sigma_attitude is None else config.sigma_attitude
         found[row] = Attitude(quat_xyzw=(x, y, z, w), sigma_deg=sigma_deg, source=source)
     return found
 

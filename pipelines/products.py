@@ -16,9 +16,10 @@ from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from pipelines.errors import InputError
+from pipelines.validators import covariance, image_dir, image_name, unit_quaternion
 
 FORMAT_VERSION = 1
 
@@ -26,6 +27,14 @@ FloatArray = NDArray[np.float64]
 Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 Matrix3 = tuple[Vector3, Vector3, Vector3]
+
+# Products may be written by hand: larger than any survey's, and they are not even read.
+_MAX_JSON_BYTES = 1 << 30
+
+ImageName = Annotated[str, AfterValidator(image_name)]
+Rotation = Annotated[Quaternion, AfterValidator(unit_quaternion)]
+Covariance3 = Annotated[Matrix3, AfterValidator(covariance)]
+Row7 = tuple[float, float, float, float, float, float, float]
 
 
 class Product(BaseModel):
@@ -69,7 +78,7 @@ class Fix(Product):
     """
 
     position_in_geo: Vector3
-    cov_in_geo: Matrix3
+    cov_in_geo: Covariance3
     source: Literal["exif", "csv", "geo.txt", "bag"]
     sigma_source: Literal["file", "option", "default"]
 
@@ -77,7 +86,7 @@ class Fix(Product):
 class Attitude(Product):
     """Measured rotation of a camera: `p_geo = R(quat_xyzw) p_cam + centre`, σ per axis in degrees."""
 
-    quat_xyzw: Quaternion
+    quat_xyzw: Rotation
     sigma_deg: float = Field(gt=0)
     source: Literal["gimbal", "csv", "geo.txt", "bag"]
 
@@ -85,7 +94,7 @@ class Attitude(Product):
 class SurveyImage(Product):
     """One photograph. `name` is relative to the survey's `image_dir`; `sha256` is of the file."""
 
-    name: str
+    name: ImageName
     camera_id: int
     sha256: str
     timestamp_s: float | None = None
@@ -97,7 +106,7 @@ class SurveyImage(Product):
 class Mark(Product):
     """Where a surveyed point is seen: full-image pixels, centre of the top-left pixel (0.5, 0.5)."""
 
-    image: str
+    image: ImageName
     x_px: float
     y_px: float
     sigma_px: float = Field(gt=0)
@@ -108,7 +117,7 @@ class SurveyedPoint(Product):
 
     name: str
     position_in_geo: Vector3
-    cov_in_geo: Matrix3
+    cov_in_geo: Covariance3
     marks: tuple[Mark, ...]
 
 
@@ -119,13 +128,24 @@ class Survey(Product):
     origin: Origin
     source_crs: str
     vertical: VerticalDatum
-    image_dir: str
+    image_dir: Annotated[str, AfterValidator(image_dir)]
     cameras: tuple[CameraPrior, ...]
     images: tuple[SurveyImage, ...]
     control_points: tuple[SurveyedPoint, ...] = ()
     check_points: tuple[SurveyedPoint, ...] = ()
     assumptions: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
+
+    @model_validator(mode="after")
+    def _belongs_together(self) -> Survey:
+        names = [image.name for image in self.images]
+        if len(set(names)) != len(names):
+            raise ValueError("images: two have the same name")
+        cameras = {camera.camera_id for camera in self.cameras}
+        lost = next((image for image in self.images if image.camera_id not in cameras), None)
+        if lost is not None:
+            raise ValueError(f"images: {lost.name} has camera {lost.camera_id}, which is not among the cameras")
+        return self
 
     def image(self, name: str) -> SurveyImage | None:
         """The image of that name, or None."""
@@ -146,10 +166,10 @@ class SimilarityRecord(Product):
     from_frame: str
     to_frame: str
     scale: float = Field(gt=0)
-    quat_xyzw: Quaternion
+    quat_xyzw: Rotation
     translation: Vector3
     pivot: Vector3 = (0.0, 0.0, 0.0)
-    covariance: Annotated[tuple[tuple[float, ...], ...], Field(min_length=7, max_length=7)]
+    covariance: Annotated[tuple[Row7, ...], Field(min_length=7, max_length=7)]
 
 
 class ResidualStats(Product):
@@ -183,9 +203,9 @@ class InitialSimilarity(Product):
 class TrainedCamera(Product):
     """A camera after training, as `cam_from_model`. A test camera has moved only with its neighbours."""
 
-    name: str
+    name: ImageName
     split: Literal["train", "test"]
-    quat_xyzw: Quaternion
+    quat_xyzw: Rotation
     translation: Vector3
 
 
@@ -221,6 +241,8 @@ def load_json(product_type: type[ProductT], path: Path) -> ProductT:
         InputError: unreadable, not JSON, or not of that form; names file and field.
     """
     try:
+        if path.stat().st_size > _MAX_JSON_BYTES:
+            raise InputError("is too large for a product", path=path)
         return product_type.model_validate_json(path.read_text(encoding="utf-8"))
     except ValidationError as error:
         first = error.errors()[0]
@@ -275,8 +297,75 @@ class GeolocatedPoints:
             InputError: not an NPZ file of that form.
         """
         arrays = load_npz(path, tuple(field.name for field in fields(cls)))
+        for name, (kind, shape) in _POINT_ARRAYS.items():
+            array = arrays[name]
+            if array.dtype.kind not in kind or array.shape != (len(arrays["point_id"].ravel()), *shape):
+                raise InputError(f"has the form {array.shape} {array.dtype}", path=path, field=name)
         source = str(arrays.pop("rotation_source"))
         return cls(**arrays, rotation_source=source)
+
+
+@dataclass(frozen=True)
+class NavigationTrack:
+    """Product of `ingest` beside the survey: the navigation as recorded, and how n cameras sit in it.
+
+    What `calibrate` fits the SfM cameras to. Positions are the antenna's, attitudes the body's
+    (forward-right-down), both on the navigation's clock; nothing of the rig is applied to them.
+
+    Attributes:
+        position_time_s: (K,) float64, seconds.
+        antenna_in_geo: (K, 3) float64, metres.
+        sigma_m: (K, 3) float64, σ east, north, up; NaN where the receiver states none.
+        attitude_time_s: (M,) float64, seconds.
+        geo_from_body: (M, 3, 3) float64.
+        image: (n,) names of images.
+        image_time_s: (n,) float64, camera clock.
+        cam_from_body: (n, 3, 3) float64, mount; NaN where unknown.
+        antenna_in_body: (n, 3) float64, lever arm that the survey has applied; NaN where unknown.
+        nominal_from_cam: (3, 3) float64, boresight that the survey has applied.
+        time_offset_s: () float64, navigation clock minus camera clock that the survey has applied.
+        max_gap_s: () float64, longest gap to interpolate over.
+    """
+
+    position_time_s: FloatArray
+    antenna_in_geo: FloatArray
+    sigma_m: FloatArray
+    attitude_time_s: FloatArray
+    geo_from_body: FloatArray
+    image: NDArray[np.str_]
+    image_time_s: FloatArray
+    cam_from_body: FloatArray
+    antenna_in_body: FloatArray
+    nominal_from_cam: FloatArray
+    time_offset_s: FloatArray
+    max_gap_s: FloatArray
+
+    def save(self, path: Path) -> None:
+        """Write as NPZ."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        arrays: dict[str, Any] = {field.name: np.asarray(getattr(self, field.name)) for field in fields(self)}
+        np.savez(path, **arrays)
+
+    @classmethod
+    def load(cls, path: Path) -> NavigationTrack:
+        """Read from NPZ.
+
+        Raises:
+            InputError: not an NPZ file of that form.
+        """
+        return cls(**load_npz(path, tuple(field.name for field in fields(cls))))
+
+
+# Kind of number, and shape of one point's entry.
+_POINT_ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
+    "point_id": ("i", ()),
+    "position_in_geo": ("f", (3,)),
+    "cov_in_geo": ("f", (3, 3)),
+    "ray_count": ("i", ()),
+    "max_angle_deg": ("f", ()),
+    "condition": ("f", ()),
+    "inlier": ("b", ()),
+}
 
 
 def load_npz(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
@@ -291,5 +380,5 @@ def load_npz(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
             if missing:
                 raise InputError(f"array {missing[0]!r} is missing", path=path)
             return {name: archive[name] for name in names}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+    except (OSError, ValueError, EOFError, MemoryError, zipfile.BadZipFile, zlib.error) as error:
         raise InputError(f"not a readable NPZ file: {error}", path=path) from error

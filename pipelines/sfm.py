@@ -165,8 +165,10 @@ def _add_camera(colmap: Any, job: SfmJob, prior: CameraPrior) -> None:
     with colmap.Database.open(job.database) as database:
         if database.exists_camera(prior.camera_id):
             return
+        # A fisheye has no likeness among the perspective models to start from.
+        model = prior.model if prior.model == "OPENCV_FISHEYE" else job.config.camera_model
         camera = colmap.Camera.create_from_model_name(
-            prior.camera_id, job.config.camera_model, prior.params[0], prior.width, prior.height
+            prior.camera_id, model, prior.params[0], prior.width, prior.height
         )
         _copy_shared_params(colmap, prior, camera)
         camera.has_prior_focal_length = prior.focal_source != "assumed"
@@ -175,9 +177,14 @@ def _add_camera(colmap: Any, job: SfmJob, prior: CameraPrior) -> None:
 
 def _copy_shared_params(colmap: Any, prior: CameraPrior, camera: Any) -> None:
     """Take over the prior's focal length, centre and distortion as far as both models know them."""
-    given = colmap.Camera(model=prior.model, width=prior.width, height=prior.height, params=list(prior.params))
-    names = [name.strip() for name in given.params_info.split(",")]
-    known = dict(zip(names, prior.params, strict=True))
+    try:
+        given = colmap.Camera(model=prior.model, width=prior.width, height=prior.height, params=list(prior.params))
+        names = [name.strip() for name in given.params_info.split(",")]
+        known = dict(zip(names, prior.params, strict=True))
+    except ValueError as error:
+        raise InputError(
+            f"{prior.model} is no camera of COLMAP with {len(prior.params)} parameters", field=SURVEY
+        ) from error
     f = known.get("f", known.get("fx", 0.0))
     known = {"f": f, "fx": f, "fy": f, "k": known.get("k1", 0.0), "k1": known.get("k", 0.0), **known}
     params = camera.params
@@ -191,8 +198,8 @@ def _match(colmap: Any, job: SfmJob, pairs: list[tuple[str, str]], progress: Pro
     matching.num_threads = job.config.threads
     verification = colmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = job.config.seed
-    if any(" " in name for pair in pairs for name in pair):
-        log.warning("file names with blanks cannot be listed for COLMAP: all pairs are matched")
+    if any(" " in name or name.startswith("#") for pair in pairs for name in pair):
+        log.warning("file names with blanks or # cannot be listed for COLMAP: all pairs are matched")
         colmap.match_exhaustive(job.database, matching, verification_options=verification)
         return
     listing = job.database.with_name("pairs.txt")
@@ -206,24 +213,32 @@ def _match(colmap: Any, job: SfmJob, pairs: list[tuple[str, str]], progress: Pro
 
 
 def _map(colmap: Any, job: SfmJob, progress: Progress) -> list[Any]:
-    drafts = job.database.with_name("mapping")
-    shutil.rmtree(drafts, ignore_errors=True)  # of a run that was killed
-    drafts.mkdir()
-    with progress.task("mapping", len(job.survey.images)) as task:
+    with progress.task("mapping", len(job.survey.images)) as task, _scratch(job.database.parent) as out:
         if job.config.mapper == "global":
             options = colmap.GlobalPipelineOptions()
             options.num_threads, options.random_seed = job.config.threads, job.config.seed
-            models = colmap.global_mapping(job.database, job.images, drafts, options)
+            models = colmap.global_mapping(job.database, job.images, out, options)
             task.advance(len(job.survey.images))
-        else:
-            options = colmap.IncrementalPipelineOptions()
-            options.num_threads, options.random_seed = job.config.threads, job.config.seed
-            options.min_model_size = 3
-            models = colmap.incremental_mapping(
-                job.database, job.images, drafts, options, next_image_callback=lambda: task.advance(1)
-            )
-    shutil.rmtree(drafts)
-    return list(models.values())
+            return list(models.values())
+        options = colmap.IncrementalPipelineOptions()
+        options.num_threads, options.random_seed = job.config.threads, job.config.seed
+        options.min_model_size = 3
+        models = colmap.incremental_mapping(
+            job.database, job.images, out, options, next_image_callback=lambda: task.advance(1)
+        )
+        return list(models.values())
+
+
+@contextmanager
+def _scratch(folder: Path) -> Iterator[Path]:
+    """An empty folder for COLMAP's own output; its fixed name lets the next run clear what a killed one left."""
+    scratch = folder / "mapping"
+    shutil.rmtree(scratch, ignore_errors=True)
+    scratch.mkdir()
+    try:
+        yield scratch
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
 
 
 def import_model(path: Path, survey: Survey) -> Any:

@@ -20,6 +20,7 @@ from pipelines.config import (
 from pipelines.errors import GeorefError
 
 SURVEY = "ingest/survey.json"
+TRACK = "ingest/track.npz"  # not always there
 SPARSE = "sfm/sparse"
 POINTS = "geolocate/points.npz"
 SIM3 = "sim3/geo_from_local.json"

@@ -47,7 +47,7 @@ from pipelines.splat.initialise import (
     scene_extent,
 )
 from pipelines.splat.optimizer import GaussianAdam
-from pipelines.splat.raster.api import rasterizer
+from pipelines.splat.raster.api import Rasterizer, rasterizer
 from pipelines.splat.storage import write_gaussians
 from pipelines.stages import SIM3, SPARSE, SURVEY
 from pipelines.workspace import StageRun, Summary
@@ -87,6 +87,7 @@ def effort(config: TrainConfig) -> Preset:
 
 def run(stage: StageRun, config: TrainConfig) -> Summary:
     """Train, with checkpoints, and write the result."""
+    backend = rasterizer(config.backend)  # first: without a GPU, `--backend cuda` need not wait for its refusal
     workspace = stage.workspace
     survey = load_json(Survey, workspace.path(SURVEY))
     initial = load_json(InitialSimilarity, workspace.path(SIM3))
@@ -94,19 +95,20 @@ def run(stage: StageRun, config: TrainConfig) -> Summary:
     images = photographs(scene.sparse, survey, workspace, effort(config).max_image_size)
     images.build(stage.progress)
     problem = geo_problem(scene, survey, initial, config)
-    trainer = make_trainer(scene, images, problem, config)
+    trainer = make_trainer(scene, images, problem, backend, config)
     seconds = _optimise(trainer, stage, config)
     return _save(trainer, scene, stage.out, seconds)
 
 
-def make_trainer(scene: Scene, images: ImageCache, problem: GeoProblem, config: TrainConfig) -> JointTrainer:
+def make_trainer(
+    scene: Scene, images: ImageCache, problem: GeoProblem, backend: Rasterizer, config: TrainConfig
+) -> JointTrainer:
     """Gaussians from the SfM points, and everything that moves them.
 
     Raises:
-        BackendUnavailableError: `--backend cuda` without a GPU or without gsplat.
         DegenerateGeometryError: too few SfM points.
     """
-    preset, backend = effort(config), rasterizer(config.backend)
+    preset = effort(config)
     device = torch.device("cuda" if backend.name == "cuda" else "cpu")
     gaussians = initial_gaussians(scene, images, config).to(device)
     extent_m = scene_extent(scene.poses.cam_center_in_model)

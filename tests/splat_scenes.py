@@ -25,7 +25,7 @@ from pipelines.workspace import Workspace
 CAMERA = Camera("PINHOLE", 96, 72, np.array([90.0, 90.0, 48.0, 36.0]))
 # Of the surface's Gaussians: metres between them, and their standard deviation along the ground.
 SPACING_M, SIGMA_M = 1.6, 0.9
-NOISE = Noise(fix_m=(0.05, 0.05, 0.08), pixel_px=0.1, mark_px=0.1, gcp_m=0.0)
+NOISE = Noise(fix_m=(0.05, 0.05, 0.08), pixel_px=0.1, mark_px=0.1, gcp_m=1e-4)
 TEST_VIEWS = (3, 9)
 # Too few for density control, which would turn differences of rounding into differences of tenths of a dB.
 TRAINING = {"iterations": 150, "sh_degree": 0, "log_every": 5}

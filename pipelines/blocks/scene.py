@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from pipelines.config import TrainConfig
-from pipelines.errors import DegenerateGeometryError
+from pipelines.errors import DegenerateGeometryError, InputError
 from pipelines.formats.colmap import SparseModel
 from pipelines.formats.image_cache import ImageCache, Photograph
 from pipelines.geometry.bundle import CorrectionBasis, Network, correction_basis
@@ -25,6 +25,7 @@ from pipelines.georef.losses import ControlMarks, Fixes
 from pipelines.georef.problem import GeoProblem
 from pipelines.georef.similarity import LearnableSimilarity
 from pipelines.products import FloatArray, InitialSimilarity, Survey, SurveyedPoint
+from pipelines.stages import SPARSE
 from pipelines.workspace import Workspace
 
 # Beyond this the dense normal matrix of the cameras no longer fits a laptop.
@@ -86,7 +87,19 @@ def initial_scene(sparse: SparseModel, survey: Survey, initial: InitialSimilarit
 
 
 def photographs(sparse: SparseModel, survey: Survey, workspace: Workspace, max_size_px: int) -> ImageCache:
-    """The registered photographs, undistorted to a longest side of `max_size_px`, cached in the workspace."""
+    """The registered photographs, undistorted to a longest side of `max_size_px`, cached in the workspace.
+
+    Raises:
+        InputError: an image of the model is not in the survey.
+    """
+    known = {image.name for image in survey.images}
+    foreign = [name for name in sparse.image_name if name not in known]
+    if foreign:
+        raise InputError(
+            f"{len(foreign)} images are not in the survey, the first is {foreign[0]!r}: take the model over with "
+            "`georef sfm --import`, which leaves them out",
+            path=workspace.root / SPARSE,
+        )
     folder = workspace.root / survey.image_dir
     shots = [
         Photograph(name, folder / name, sparse.camera_of(index)) for index, name in enumerate(sparse.image_name)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pipelines.errors import BackendUnavailableError, InputError
 from pipelines.geometry.cameras import Camera
 from pipelines.products import FloatArray
+from pipelines.validators import stays_inside
 
 log = logging.getLogger(__name__)
 
@@ -196,10 +197,10 @@ def pycolmap_module() -> Any:
 
 
 def load_reconstruction(path: Path) -> Any:
-    """The `pycolmap.Reconstruction` in a folder, whose files are first checked for their length.
+    """The COLMAP model in a folder as a `pycolmap.Reconstruction`.
 
     Raises:
-        InputError: not a readable COLMAP model.
+        InputError: no such folder, or not a readable model.
         BackendUnavailableError: pycolmap is not installed.
     """
     pycolmap = pycolmap_module()
@@ -252,3 +253,7 @@ def _check(model: SparseModel, path: Path) -> None:
         raise InputError("contains values that are not finite: reconstruct again", path=path, field="camera params")
     if len(set(model.image_name)) != len(model.image_name):
         raise InputError("two images have the same name", path=path, field="images")
+    astray = next((name for name in model.image_name if not stays_inside(name)), None)
+    if astray is not None:
+        message = f"{astray!r} leaves the folder of photographs: names are relative to it"
+        raise InputError(message, path=path, field="images")

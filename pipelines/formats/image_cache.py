@@ -125,7 +125,8 @@ class ImageCache:
         try:
             stat = photograph.file.stat()
         except OSError as error:
-            raise InputError(f"the photograph cannot be read: {error.strerror}", path=photograph.file) from error
+            message = f"the photograph cannot be read ({error.strerror}): put it back, or run `georef ingest` again"
+            raise InputError(message, path=photograph.file) from error
         camera = photograph.camera
         key = (
             f"{photograph.name}|{stat.st_size}|{stat.st_mtime_ns}|{camera.model}|{camera.width}x{camera.height}|"

@@ -24,7 +24,7 @@ from pipelines.geometry.rotations import geo_from_cam, quat_xyzw_from_matrix
 from pipelines.products import FloatArray, VerticalDatum
 
 SigmaSource = Literal["file", "option", "default"]
-AttitudeSource = Literal["gimbal", "csv", "geo.txt"]
+AttitudeSource = Literal["gimbal", "csv", "geo.txt", "bag"]
 # σ horizontal and vertical in metres where the file is silent, by kind of receiver.
 SIGMA_M = {
     "RTK fixed": (0.02, 0.03),
@@ -32,6 +32,7 @@ SIGMA_M = {
     "single-frequency": (2.5, 5.0),
     "unknown receiver": (5.0, 10.0),
 }
+KINDS = tuple(SIGMA_M)  # from the best to the worst
 # Vertical over horizontal σ of a fix that states only the horizontal one.
 _VERTICAL_RATIO = 2.0
 _DISAGREEMENT_M = 2_000.0
@@ -45,6 +46,7 @@ class PoseOptions:
     crs: str | None = None
     vertical: VerticalChoice | None = None
     max_gap_s: float = 1.0
+    time_offset_s: float = 0.0
     sigma_h_m: float | None = None
     sigma_v_m: float | None = None
 
@@ -63,6 +65,7 @@ class Measured:
         source: where positions are from.
         crs_name: their CRS.
         vertical: what their heights counted from.
+        sigma_attitude_deg: (N,) σ that the attitudes state, NaN where none; None for none at all.
     """
 
     lla: FloatArray
@@ -71,9 +74,10 @@ class Measured:
     quat_xyzw: FloatArray
     attitude_source: tuple[AttitudeSource, ...]
     time_s: FloatArray
-    source: Literal["exif", "csv", "geo.txt"]
+    source: Literal["exif", "csv", "geo.txt", "bag"]
     crs_name: str
     vertical: VerticalDatum
+    sigma_attitude_deg: FloatArray | None = None
 
     @property
     def located(self) -> NDArray[np.bool_]:
@@ -101,7 +105,7 @@ def from_tags(photos: Sequence[Photo], options: PoseOptions, notes: Notes) -> Me
     lla[known] = crs.lla_from_xyz(xyz[known])
     gimbal: list[AttitudeSource] = ["gimbal" for _ in photos]
     rows = [_tag_sigma(photo.tags) for photo in photos]
-    sigma, source = _with_defaults([row[0] for row in rows], [row[1] for row in rows], known, options, notes)
+    sigma, source = with_defaults([row[0] for row in rows], [row[1] for row in rows], known, options, notes)
     vertical = crs.vertical if crs.vertical.stated else assumed_ellipsoidal(_EXIF_NOTE)
     return Measured(
         lla=lla,
@@ -136,7 +140,7 @@ def from_table(table: PoseTable, photos: Sequence[Photo], options: PoseOptions, 
     if rows.names is not None:
         at = np.array([images.index(name) for name in rows.names])
     else:
-        cartesian, at = _match_by_time(cartesian, photos, options.max_gap_s, notes)
+        cartesian, at = _match_by_time(cartesian, photos, options, notes)
     count = len(photos)
     absent = np.setdiff1d(np.arange(count), at)
     notes.warn_counted(
@@ -144,7 +148,7 @@ def from_table(table: PoseTable, photos: Sequence[Photo], options: PoseOptions, 
         f"image has no position in {table.path.name}",
         f"images have no position in {table.path.name}",
     )
-    sigma, sigma_source = _with_defaults(
+    sigma, sigma_source = with_defaults(
         list(_spread(cartesian.sigma_enu_m, at, count, 3)),
         ["unknown receiver"] * count,
         np.isin(np.arange(count), at),
@@ -244,7 +248,7 @@ def _with_heights(rows: PoseTable, photos: Sequence[Photo], crs: PointCrs, notes
 
 
 def _match_by_time(
-    table: PoseTable, photos: Sequence[Photo], max_gap_s: float, notes: Notes
+    table: PoseTable, photos: Sequence[Photo], options: PoseOptions, notes: Notes
 ) -> tuple[PoseTable, NDArray[np.int64]]:
     times = np.array([_or_nan(photo.tags.timestamp_s) for photo in photos])
     timeless = [photo.name for photo in photos if photo.tags.timestamp_s is None]
@@ -253,7 +257,8 @@ def _match_by_time(
         raise InputError("has no column image, and no image has a time in EXIF", path=table.path, field="timestamp")
     if any(photo.tags.time_source == "assumed UTC" for photo in photos):
         notes.assume("EXIF times without a zone are UTC")
-    rows, found = interpolate(table, times, max_gap_s)
+    max_gap_s, offset_s = options.max_gap_s, options.time_offset_s
+    rows, found = interpolate(table, times + offset_s, max_gap_s)
     if not found.any():
         raise InputError(
             f"covers {_span(np.asarray(table.time_s))}, the images {_span(times)}: none fits, with gaps of "
@@ -261,7 +266,7 @@ def _match_by_time(
             path=table.path,
             field="timestamp",
         )
-    return rows, np.flatnonzero(found)
+    return replace(rows, time_s=times[found]), np.flatnonzero(found)
 
 
 def _span(times: FloatArray) -> str:
@@ -282,7 +287,7 @@ def _tag_sigma(tags: PhotoTags) -> tuple[FloatArray, str]:
     return np.full(3, np.nan), kind
 
 
-def _with_defaults(
+def with_defaults(
     stated: Sequence[FloatArray], kinds: Sequence[str], known: NDArray[np.bool_], options: PoseOptions, notes: Notes
 ) -> tuple[FloatArray, tuple[SigmaSource, ...]]:
     """σ (N, 3) by precedence: option, then file, then the receiver's default; and which it was."""

@@ -37,7 +37,7 @@ class PoseTable:
     """
 
     path: Path
-    source: Literal["csv", "geo.txt"]
+    source: Literal["csv", "geo.txt", "bag"]
     lines: NDArray[np.int64]
     names: tuple[str, ...] | None
     time_s: FloatArray | None
@@ -111,8 +111,9 @@ def match_by_name(table: PoseTable, images: list[str], notes: Notes) -> PoseTabl
 def interpolate(table: PoseTable, time_s: FloatArray, max_gap_s: float) -> tuple[PoseTable, NDArray[np.bool_]]:
     """Rows of `table` at the times `time_s` (M,): positions and σ linearly, attitudes along the shortest arc.
 
-    Nothing is extrapolated, and nothing interpolated between rows more than `max_gap_s` apart; an image within a
-    millisecond of a row gets that row. Positions should be Cartesian: degrees jump at the date line.
+    Nothing is extrapolated, and nothing interpolated between rows more than `max_gap_s` apart; an image that
+    is outside, but within a millisecond of a row, gets that row. Positions should be
+    Cartesian: degrees jump at the date line.
 
     Args:
         table: with times; rows without position or time do not count.
@@ -137,6 +138,7 @@ def interpolate(table: PoseTable, time_s: FloatArray, max_gap_s: float) -> tuple
     exact = np.abs(clock[nearest] - time_s) <= _SAME_TIME_S
     inside = (time_s >= clock[before]) & (time_s <= clock[after]) & (gap <= max_gap_s)
     found = np.asarray(exact | inside)
+    exact &= ~inside
     before = np.where(exact, nearest, before)[found]
     after = np.where(exact, nearest, after)[found]
     part = np.where(exact, 0.0, part)[found]

@@ -22,11 +22,12 @@ PACKAGES = ("georef_cli", "pipelines")
 FOUNDATION = {
     f"pipelines.{name}"
     for name in (
-        "config", "errors", "fingerprints", "interrupts", "products", "progress", "stages", "states", "workspace",
+        "config", "errors", "fingerprints", "interrupts", "products", "progress", "stages", "states", "validators",
+        "workspace",
     )
 }  # fmt: skip
-# `simulate` makes a survey and not a product of the workspace, but is called and built as a stage is.
-STAGES = {"pipelines.simulate", *(spec.module for spec in PIPELINE)}
+# Those that make no product of the workspace are called and built as stages are.
+STAGES = {"pipelines.calibrate", "pipelines.inspect_bag", "pipelines.simulate", *(spec.module for spec in PIPELINE)}
 # From the ground up. A file may import what lies on a lower floor.
 FLOORS: tuple[set[str], ...] = (
     FOUNDATION,

@@ -81,6 +81,8 @@ class CudaRasterizer:
         """(H, W) z of the Gaussian at which the transmittance falls to one half, 0 where it never does."""
         means_px, conics, opacities = meta["means2d"], meta["conics"], meta["opacities"]
         median = torch.zeros(camera.height * camera.width, device=means_px.device)
+        if len(means_px) == 0:
+            return median.view(camera.height, camera.width)
         # The intersections come grouped by pixel, nearest first.
         gaussian, pixel, _ = self._gsplat.rasterize_to_indices_in_range(
             0,

@@ -1,0 +1,51 @@
+"""`georef inspect`."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+from pathlib import Path
+
+import click
+from rich.markup import escape
+
+from georef_cli import options, tables
+from georef_cli.display import progress_for
+from georef_cli.output import print_json, print_rich
+
+
+def _inspect(ctx: click.Context, bag: Path, as_json: bool) -> None:
+    from pipelines.inspect_bag import inspect_bag
+
+    report = inspect_bag(bag, progress_for(ctx.obj))
+    document = dataclasses.asdict(report)
+    if as_json:
+        print_json(document)
+        return
+    print_rich(tables.topics(document["topics"]))
+    for text in report.remarks:
+        print_rich(f"[dim]chosen:[/] {escape(text)}")
+    for text in report.missing:
+        print_rich(f"[yellow]missing:[/] {escape(text)}")
+
+
+command = click.Command(
+    "inspect",
+    params=[
+        click.Argument(["bag"], type=click.Path(resolve_path=True, path_type=Path), metavar="BAG"),
+        options.json_option(),
+    ],
+    callback=click.pass_context(_inspect),
+    help=inspect.cleandoc(
+        """Show what a ROS bag holds.
+
+        Topics with type, rate, gaps, time span and frames; what `georef ingest` would choose, and what is missing.
+        BAG is a rosbag2 folder, a .mcap or .db3 file, or a ROS 1 .bag. Nothing is written.
+
+        \b
+        Examples:
+          georef inspect flight_bag
+          georef inspect flight_0.mcap --json
+        """
+    ),
+)

@@ -1,0 +1,195 @@
+"""What comes in: photographs with position and attitude, out of a folder and its tables or out of a ROS bag."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.config import AUTO, IngestConfig, triple
+from pipelines.errors import InputError
+from pipelines.formats.bag_photos import FrameOptions, parse_every
+from pipelines.formats.bag_survey import BagFlight, BagOptions, RawTrack, read_flight
+from pipelines.formats.bag_topics import AskedTopics
+from pipelines.formats.camera_priors import camera_priors
+from pipelines.formats.measured import Measured, PoseOptions, from_table, from_tags
+from pipelines.formats.notes import Notes
+from pipelines.formats.odm import read_geo
+from pipelines.formats.photo_folder import Photo, scan_folder
+from pipelines.formats.poses import PoseTable
+from pipelines.formats.rigged import with_rig
+from pipelines.formats.trajectory_csv import read_trajectory
+from pipelines.geodesy import enu
+from pipelines.geodesy.vertical import parse_vertical
+from pipelines.geometry.rig import Rig, boresight, mount
+from pipelines.products import CameraPrior, FloatArray, NavigationTrack, Origin
+from pipelines.progress import SILENT, Progress
+
+LEAST_IMAGES = 3
+_BAG_ONLY = ("image_topic", "fix_topic", "attitude_topic", "every", "origin")
+
+
+@dataclass(frozen=True)
+class Intake:
+    """Photographs, what was measured of them, their cameras; `track` gives the navigation in a frame."""
+
+    folder: Path
+    photos: list[Photo]
+    measured: Measured
+    cameras: tuple[CameraPrior, ...]
+    camera_of: dict[str, int]
+    track: Callable[[Origin], NavigationTrack | None]
+
+
+def pose_options(config: IngestConfig) -> PoseOptions:
+    """How to read positions."""
+    return PoseOptions(
+        crs=config.crs,
+        vertical=parse_vertical(config.vertical) if config.vertical is not None else None,
+        max_gap_s=config.max_gap,
+        time_offset_s=config.time_offset_s,
+        sigma_h_m=config.sigma_h,
+        sigma_v_m=config.sigma_v,
+    )
+
+
+def take_in(config: IngestConfig, frames: Path | None, notes: Notes, progress: Progress = SILENT) -> Intake:
+    """Read what the options name.
+
+    Args:
+        config: options of `ingest`.
+        frames: where the photographs of a bag are written.
+        notes: assumptions and warnings.
+        progress: whom to tell.
+
+    Raises:
+        InputError: options that contradict each other, anything wrong with the inputs, too few photographs.
+    """
+    _check_options(config, frames)
+    if config.time_offset == AUTO:
+        notes.warn("the time offset is zero until `georef calibrate` has estimated it from the SfM cameras")
+    if config.bag is not None and frames is not None:
+        return _from_bag(config, config.bag, frames, notes, progress)
+    return _from_folder(config, notes, progress)
+
+
+def _from_bag(config: IngestConfig, bag: Path, frames: Path, notes: Notes, progress: Progress) -> Intake:
+    origin = None
+    if config.origin is not None:
+        lat, lon, alt = triple(config.origin)
+        origin = Origin(lat_deg=lat, lon_deg=lon, alt_m=alt)
+    options = BagOptions(
+        topics=AskedTopics(config.image_topic, config.fix_topic, config.attitude_topic),
+        frames=FrameOptions(parse_every(config.every) if config.every else None, config.skip_blurred),
+        local_origin=origin,
+        time_offset_s=config.time_offset_s,
+        rig=_rig(config),
+        pose=pose_options(config),
+        focal_px=config.focal_px,
+    )
+    flight = read_flight(bag, options, frames, notes, progress)
+    _require_enough(flight.photos, bag, "--bag", notes)
+
+    def track(origin: Origin) -> NavigationTrack | None:
+        return _track(flight, options, origin)
+
+    return Intake(frames.resolve(), flight.photos, flight.measured, flight.cameras, flight.camera_of, track)
+
+
+def _from_folder(config: IngestConfig, notes: Notes, progress: Progress) -> Intake:
+    folder = Path(str(config.images))
+    photos = _usable(folder, notes, progress)
+    options = pose_options(config)
+    table: PoseTable | None = None
+    if config.trajectory is not None:
+        table = read_trajectory(config.trajectory, notes)
+    elif config.geo is not None:
+        table = read_geo(config.geo, notes)
+    measured = from_tags(photos, options, notes) if table is None else from_table(table, photos, options, notes)
+    measured = with_rig(measured, _rig(config), [photo.name for photo in photos], notes)
+    cameras, camera_of = camera_priors(photos, config.focal_px, notes)
+    return Intake(folder.resolve(), photos, measured, cameras, camera_of, lambda _: None)
+
+
+def _check_options(config: IngestConfig, frames: Path | None) -> None:
+    if config.images is None and config.bag is None:
+        raise InputError("give the folder of photographs, or a --bag", field="--images")
+    if config.bag is not None:
+        if frames is None:
+            raise InputError("a bag needs a workspace to put its photographs in", field="--bag")
+        beside = [name for name in ("images", "trajectory", "geo", "crs") if getattr(config, name) is not None]
+        if beside:
+            raise InputError(f"has photographs and positions itself: give it without --{beside[0]}", field="--bag")
+    elif given := [name for name in _BAG_ONLY if getattr(config, name) is not None]:
+        raise InputError("is for a --bag, which is not given", field="--" + given[0].replace("_", "-"))
+    if config.trajectory is not None and config.geo is not None:
+        raise InputError("give a trajectory or a geo.txt, not both", field="--geo")
+    if config.crs is not None and config.trajectory is None:
+        raise InputError("is for the columns of --trajectory; other files state their CRS", field="--crs")
+    if config.check and config.gcp is None:
+        raise InputError("names points of --gcp, which is not given", field="--check")
+    if config.test_every == 1:
+        raise InputError("1 would leave nothing to train on: give 0, or 2 and more", field="--test-every")
+
+
+def _rig(config: IngestConfig) -> Rig:
+    return Rig(
+        cam_from_body=mount(triple(config.camera_mount)) if config.camera_mount is not None else None,
+        antenna_in_body=np.array(triple(config.lever_arm)) if config.lever_arm is not None else None,
+        nominal_from_cam=boresight(triple(config.boresight)),
+    )
+
+
+def _usable(root: Path, notes: Notes, progress: Progress) -> list[Photo]:
+    photos = scan_folder(root, notes, progress)
+    _require_enough(photos, root, "--images", notes)
+    for problem in sorted({problem for photo in photos for problem in photo.tags.problems}):
+        names = [photo.name for photo in photos if problem in photo.tags.problems]
+        notes.warn_counted(names, f"image where {problem}", f"images where {problem}")
+    notes.warn_counted(
+        [photo.name for photo in photos if photo.tags.orientation != 1],
+        "image has an EXIF orientation, which is ignored: pixels count as stored",
+        "images have an EXIF orientation, which is ignored: pixels count as stored",
+    )
+    return photos
+
+
+def _require_enough(photos: Sequence[Photo], source: Path, field: str, notes: Notes) -> None:
+    if len(photos) < LEAST_IMAGES:
+        why = "".join(f"; {warning}" for warning in notes.warnings)
+        raise InputError(
+            f"{len(photos)} usable images, a survey needs {LEAST_IMAGES}{why}", path=source, field=field
+        )
+
+
+def _track(flight: BagFlight, options: BagOptions, origin: Origin) -> NavigationTrack | None:
+    raw = flight.track
+    if not len(raw.position_time_s):
+        return None
+    return NavigationTrack(
+        position_time_s=raw.position_time_s,
+        antenna_in_geo=enu.enu_from_ecef(raw.position_in_ecef, origin),
+        sigma_m=raw.sigma_enu_m,
+        attitude_time_s=raw.attitude_time_s,
+        geo_from_body=_turned_to_geo(raw, origin),
+        image=np.array([photo.name for photo in flight.photos]),
+        image_time_s=flight.measured.time_s,
+        cam_from_body=raw.cam_from_body,
+        antenna_in_body=raw.antenna_in_body,
+        nominal_from_cam=options.rig.nominal_from_cam,
+        time_offset_s=np.array(options.time_offset_s),
+        max_gap_s=np.array(options.pose.max_gap_s),
+    )
+
+
+def _turned_to_geo(raw: RawTrack, origin: Origin) -> FloatArray:
+    """Attitudes against north and up where each was taken, turned into the frame at the origin."""
+    if not len(raw.attitude_time_s):
+        return raw.enu_from_body
+    clock = raw.position_time_s
+    place = np.stack(
+        [np.interp(raw.attitude_time_s, clock, raw.position_in_ecef[:, axis]) for axis in range(3)], axis=1
+    )
+    return enu.geo_from_enu_at(enu.lla_from_ecef(place), origin) @ raw.enu_from_body

@@ -1,0 +1,52 @@
+"""How camera, antenna and body are put together: mount, boresight, lever arm.
+
+The body is Forward-Right-Down. The mount is the planned rotation between body and camera; the boresight is the
+small rotation from the true camera axes to those that the mount says.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from pipelines.geometry.rotations import ENU_FROM_NED, exp_so3, geo_from_cam
+from pipelines.products import FloatArray
+
+FLU_FROM_FRD = np.diag([1.0, -1.0, -1.0])
+
+
+@dataclass(frozen=True)
+class Rig:
+    """What is known of an aircraft's rig.
+
+    Attributes:
+        cam_from_body: (3, 3) mount, or None where nobody said.
+        antenna_in_body: (3,) metres from the camera's centre, forward-right-down, or None.
+        nominal_from_cam: (3, 3) boresight.
+    """
+
+    cam_from_body: FloatArray | None = None
+    antenna_in_body: FloatArray | None = None
+    nominal_from_cam: FloatArray = field(default_factory=lambda: np.eye(3))
+
+
+def mount(yaw_pitch_roll_deg: ArrayLike) -> FloatArray:
+    """Rotation (3, 3) body → camera of a camera turned by yaw, pitch, roll (Z-Y-X) from the body's forward axis.
+
+    (0, 0, 0) looks ahead, (0, −90, 0) straight down with the top of the image ahead.
+    """
+    return np.asarray(geo_from_cam(yaw_pitch_roll_deg).T @ ENU_FROM_NED)
+
+
+def boresight(rotation_vector_deg: ArrayLike) -> FloatArray:
+    """Rotation (3, 3) true camera axes → nominal camera axes of a rotation vector (3,) in degrees."""
+    return exp_so3(np.radians(np.asarray(rotation_vector_deg, dtype=np.float64)))
+
+
+def frame_from_frd(axes: str) -> FloatArray:
+    """Rotation (3, 3) from forward-right-down into a frame's own axes: "frd", "flu" or "optical"."""
+    if axes == "optical":
+        return mount([0.0, 0.0, 0.0])
+    return FLU_FROM_FRD.copy() if axes == "flu" else np.eye(3)
