@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import pytest
-import torch
 from splat_scenes import TRAINING, Flight, make_rendered, write_photographs
+from threads import single_thread
 
 from pipelines.runner import run_stage
 from pipelines.stages import BY_NAME
@@ -16,24 +14,13 @@ SEEDS = 3
 
 
 @pytest.fixture(scope="session")
-def one_thread() -> Iterator[None]:
-    """Images this small only lose time to threads; results do not depend on them."""
-    numba = pytest.importorskip("numba")
-    before = numba.get_num_threads(), torch.get_num_threads()
-    numba.set_num_threads(1)
-    torch.set_num_threads(1)
-    yield
-    numba.set_num_threads(before[0])
-    torch.set_num_threads(before[1])
-
-
-@pytest.fixture(scope="session")
-def flights(one_thread: None, tmp_path_factory: pytest.TempPathFactory) -> list[Flight]:
+def flights(tmp_path_factory: pytest.TempPathFactory) -> list[Flight]:
     """Rendered surveys that differ in everything random."""
     made = []
     for seed in range(SEEDS):
         rendered, root = make_rendered(seed), tmp_path_factory.mktemp(f"rendered{seed}")
-        write_photographs(rendered, root / "photos")
+        with single_thread():
+            write_photographs(rendered, root / "photos")
         made.append(Flight(rendered, root, seed))
     return made
 
@@ -44,7 +31,8 @@ def trained(flights: list[Flight]) -> list[tuple[Workspace, Workspace]]:
     pairs = []
     for flight in flights:
         pair = flight.workspace("with"), flight.workspace("without")
-        run_stage(pair[0], BY_NAME["train"], TRAINING)
-        run_stage(pair[1], BY_NAME["train"], {**TRAINING, "geo_loss": False})
+        with single_thread():
+            run_stage(pair[0], BY_NAME["train"], TRAINING)
+            run_stage(pair[1], BY_NAME["train"], {**TRAINING, "geo_loss": False})
         pairs.append(pair)
     return pairs

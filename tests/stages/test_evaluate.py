@@ -19,6 +19,7 @@ from pipelines.runner import Outcome, run_stage
 from pipelines.stages import BY_NAME, MODEL, REPORT, SURVEY
 from pipelines.workspace import Workspace
 
+pytestmark = pytest.mark.usefixtures("one_thread")
 EVALUATE = BY_NAME["evaluate"]
 STATS = {"count", "mean_h_m", "rmse_h_m", "rmse_e_m", "rmse_n_m", "rmse_v_m", "rmse_3d_m", "max_3d_m"}
 

@@ -32,6 +32,7 @@ from pipelines.stages import BY_NAME, GAUSSIANS, MODEL, SIM3, SURVEY
 from pipelines.train import PRESETS, Preset, effort
 from pipelines.workspace import Workspace
 
+pytestmark = pytest.mark.usefixtures("one_thread")
 TRAIN = BY_NAME["train"]
 SHORT = {"iterations": 30, "sh_degree": 1, "log_every": 2, "checkpoint_every": 8}
 Pairs = list[tuple[Workspace, Workspace]]

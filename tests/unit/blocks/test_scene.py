@@ -15,6 +15,7 @@ from pipelines.formats.colmap import SparseModel
 from pipelines.geometry.cameras import Camera
 from pipelines.products import InitialSimilarity, Mark, Survey
 
+pytestmark = pytest.mark.usefixtures("one_thread")
 NOISELESS = Noise(pixel_px=0.2, mark_px=1e-9, gcp_m=1e-9, fix_m=(1e-9, 1e-9, 1e-9), attitude_deg=0.5)
 STATED = Noise()
 CONFIG = TrainConfig()

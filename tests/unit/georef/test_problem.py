@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -27,20 +26,12 @@ from pipelines.georef import problem as module
 from pipelines.georef.cameras import CameraPoses
 from pipelines.georef.losses import CAUCHY_SCALE2
 
+pytestmark = pytest.mark.usefixtures("one_thread")
 BLOCK = make_block()
 RTK = np.array([0.02, 0.02, 0.03])
 CONSUMER = np.array([1.5, 1.5, 3.0])
 CONTROL = np.array([[-15.0, -15, 0], [15, -12, 1], [12, 15, 2], [-14, 13, 0.5], [0, 0, 3]])
 FAR = float(chi2.ppf(0.999, 7))
-
-
-@pytest.fixture(autouse=True)
-def _one_thread() -> Iterator[None]:
-    """Matrices this small only lose time to threads."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 @pytest.mark.parametrize(
