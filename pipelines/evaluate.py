@@ -23,6 +23,7 @@ from pipelines.formats.image_cache import ImageCache
 from pipelines.products import FloatArray, SurveyedPoint, dump_json
 from pipelines.progress import Progress
 from pipelines.robust.statistics import residual_stats
+from pipelines.splat.exposure import fitted_affine, with_affine
 from pipelines.splat.metrics import lpips, psnr, ssim
 from pipelines.splat.raster.api import Rasterizer, RasterSettings, Render, rasterizer
 from pipelines.workspace import StageRun, Summary
@@ -90,7 +91,11 @@ def evaluate(eye: Eye, config: EvaluateConfig, renders: Path, progress: Progress
 
 
 def _photometric(eye: Eye, config: EvaluateConfig, renders: Path, progress: Progress) -> dict[str, Any]:
-    """PSNR, SSIM and LPIPS of the test views; cameras of test views were never fitted to them."""
+    """PSNR, SSIM and LPIPS of the test views; cameras of test views were never fitted to them.
+
+    `psnr` compares the render as it is. `psnr_compensated` first gives it the photograph's own exposure, an affine
+    change of colour fitted to that very photograph: what is left then is not a matter of exposure.
+    """
     indices, rows = eye.trained.indices("test"), []
     renders.mkdir(parents=True, exist_ok=True)
     distance = lpips(config.lpips_weights)
@@ -104,6 +109,7 @@ def _photometric(eye: Eye, config: EvaluateConfig, renders: Path, progress: Prog
                 {
                     "image": name,
                     "psnr": psnr(colour, photo, mask),
+                    "psnr_compensated": psnr(with_affine(colour, fitted_affine(colour, photo, mask)), photo, mask),
                     "ssim": ssim(colour, photo, mask),
                     "lpips": distance(colour, photo) if callable(distance) else None,
                 }
@@ -112,7 +118,7 @@ def _photometric(eye: Eye, config: EvaluateConfig, renders: Path, progress: Prog
                 _write_side_by_side(renders / render_name(name), photo, colour)
             task.advance()
     summary: dict[str, Any] = {"views": len(rows)}
-    for metric in ("psnr", "ssim", "lpips"):
+    for metric in ("psnr", "psnr_compensated", "ssim", "lpips"):
         values = [row[metric] for row in rows if row[metric] is not None]
         summary[metric] = float(np.mean(np.array(values, dtype=np.float64))) if values else None
     if not callable(distance):
@@ -202,6 +208,7 @@ def _summarise(report: dict[str, Any]) -> Summary:
     values = {
         "views": test["views"],
         "psnr": test["psnr"],
+        "psnr_compensated": test["psnr_compensated"],
         "ssim": test["ssim"],
         **{
             f"{way}_{key}": checks[way][key]

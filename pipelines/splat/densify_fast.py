@@ -31,8 +31,8 @@ class FastSettings:
     """
 
     views: int = 10
-    high_error_px: float = 1.0
-    least_px: float = 0.5
+    high_error_px: float = 0.2
+    least_px: float = 0.2
     least_views: int = 2
     prune_stop: int = 25_000
 
