@@ -36,6 +36,7 @@ POINT_COLUMNS = {
     "max_3d_m": "max 3D",
 }
 IMAGE_COLUMNS = {"views": "views", "psnr": "PSNR dB", "ssim": "SSIM", "lpips": "LPIPS"}
+SECTIONS = ("photometric", "checkpoints", "fit")
 Renderable = Group | Table | str
 
 
@@ -133,13 +134,16 @@ def report_of(workspace: Workspace) -> list[Renderable]:
     """The tables of a workspace's evaluation.
 
     Raises:
-        InputError: the report was replaced by something that is not JSON.
+        InputError: the report was replaced by something else.
     """
     path = workspace.path(REPORT)
     try:
-        return report(json.loads(path.read_text(encoding="utf-8")))
-    except ValueError as error:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
         raise InputError(f"not valid JSON: {error}", path=path) from error
+    if not isinstance(document, dict) or not all(isinstance(document.get(name, {}), dict) for name in SECTIONS):
+        raise InputError("not a report: make it again with `georef evaluate --force`", path=path)
+    return report(document)
 
 
 def report(document: Mapping[str, Any]) -> list[Renderable]:

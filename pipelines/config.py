@@ -173,6 +173,12 @@ class TrainConfig(StageConfig):
     max_gaussians: int | None = Field(None, ge=100, description="Limit of Gaussians (default: the preset's).")
     backend: Literal["auto", "cpu", "cuda"] = Field("auto", description="Rasteriser.")
     sh_degree: int = Field(3, ge=0, le=3, description="Degree of the spherical harmonics.")
+    strategy: Literal["default", "mcmc", "fast"] = Field(
+        "default", description="Where Gaussians are added and removed: as 3DGS, by MCMC, or as several views agree."
+    )
+    coarse_to_fine: bool = Field(True, description="Start with shrunken photographs.")
+    exposure: bool = Field(True, description="Fit the exposure of each training photograph.")
+    faithful_surface: bool = Field(False, description="Hold the Gaussians to surfaces, for depths to measure in.")
     geo_loss: bool = Field(True, description="Use the geographic losses.")
     weighting: Literal["whitened", "paper"] = Field(
         "whitened", description="Residuals divided by their σ, or plain mean squares as in the paper."

@@ -66,5 +66,9 @@ class ConvergenceError(GeorefError):
     """An optimisation diverged, or ended outside the bound that the user set."""
 
 
+class ResourceError(GeorefError):
+    """The machine is too small for what was asked; the message says what to ask for instead."""
+
+
 class BackendUnavailableError(GeorefError):
     """An optional library or device is missing; the message names the extra to install."""

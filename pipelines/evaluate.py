@@ -98,7 +98,7 @@ def _photometric(eye: Eye, config: EvaluateConfig, renders: Path, progress: Prog
         for place, index in enumerate(indices):
             colour = eye.look(index).colour.clamp(0, 1).cpu()
             photo = torch.from_numpy(np.array(eye.images.image(index))).float() / 255.0
-            mask = torch.from_numpy(eye.images.mask(index))
+            mask = torch.from_numpy(np.array(eye.images.mask(index)))
             name = eye.trained.sparse.image_name[index]
             rows.append(
                 {
@@ -109,7 +109,7 @@ def _photometric(eye: Eye, config: EvaluateConfig, renders: Path, progress: Prog
                 }
             )
             if place < config.renders:
-                _write_side_by_side(renders / f"{Path(name).stem}.png", photo, colour)
+                _write_side_by_side(renders / render_name(name), photo, colour)
             task.advance()
     summary: dict[str, Any] = {"views": len(rows)}
     for metric in ("psnr", "ssim", "lpips"):
@@ -118,6 +118,11 @@ def _photometric(eye: Eye, config: EvaluateConfig, renders: Path, progress: Prog
     if not callable(distance):
         summary["lpips_reason"] = distance
     return {**summary, "per_view": rows}
+
+
+def render_name(image: str) -> str:
+    """File name of an image's render: folders have become part of it, since images in two may share their names."""
+    return Path(image).with_suffix(".png").as_posix().replace("/", "_")
 
 
 def _write_side_by_side(path: Path, photo: torch.Tensor, colour: torch.Tensor) -> None:

@@ -155,6 +155,12 @@ def _rotation_source(measured: _Measured, config: GeolocateConfig) -> Literal["r
 
 def _warnings(measured: _Measured, source: str) -> list[str]:
     warnings = []
+    turned = measured.recorded.contradicting
+    if turned:
+        warnings.append(
+            f"{len(turned)} attitudes contradict the SfM model and are not used: {', '.join(sorted(turned)[:8])}"
+            f"{' …' if len(turned) > 8 else ''}. Were these photographs turned in an image viewer?"
+        )
     total, fixes, alignment = len(measured.model.image_name), measured.fixes, measured.alignment
     if len(fixes) < total:
         warnings.append(f"{total - len(fixes)} of {total} registered images have no fix and give no rays")

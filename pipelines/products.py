@@ -16,9 +16,10 @@ from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from pipelines.errors import InputError
+from pipelines.validators import covariance, image_dir, image_name, unit_quaternion
 
 FORMAT_VERSION = 1
 
@@ -26,6 +27,17 @@ FloatArray = NDArray[np.float64]
 Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 Matrix3 = tuple[Vector3, Vector3, Vector3]
+Matrix34 = tuple[
+    tuple[float, float, float, float], tuple[float, float, float, float], tuple[float, float, float, float]
+]
+
+# Products may be written by hand: larger than any survey's, and they are not even read.
+_MAX_JSON_BYTES = 1 << 30
+
+ImageName = Annotated[str, AfterValidator(image_name)]
+Rotation = Annotated[Quaternion, AfterValidator(unit_quaternion)]
+Covariance3 = Annotated[Matrix3, AfterValidator(covariance)]
+Row7 = tuple[float, float, float, float, float, float, float]
 
 
 class Product(BaseModel):
@@ -69,7 +81,7 @@ class Fix(Product):
     """
 
     position_in_geo: Vector3
-    cov_in_geo: Matrix3
+    cov_in_geo: Covariance3
     source: Literal["exif", "csv", "geo.txt", "bag"]
     sigma_source: Literal["file", "option", "default"]
 
@@ -77,7 +89,7 @@ class Fix(Product):
 class Attitude(Product):
     """Measured rotation of a camera: `p_geo = R(quat_xyzw) p_cam + centre`, σ per axis in degrees."""
 
-    quat_xyzw: Quaternion
+    quat_xyzw: Rotation
     sigma_deg: float = Field(gt=0)
     source: Literal["gimbal", "csv", "geo.txt", "bag"]
 
@@ -85,7 +97,7 @@ class Attitude(Product):
 class SurveyImage(Product):
     """One photograph. `name` is relative to the survey's `image_dir`; `sha256` is of the file."""
 
-    name: str
+    name: ImageName
     camera_id: int
     sha256: str
     timestamp_s: float | None = None
@@ -97,7 +109,7 @@ class SurveyImage(Product):
 class Mark(Product):
     """Where a surveyed point is seen: full-image pixels, centre of the top-left pixel (0.5, 0.5)."""
 
-    image: str
+    image: ImageName
     x_px: float
     y_px: float
     sigma_px: float = Field(gt=0)
@@ -108,7 +120,7 @@ class SurveyedPoint(Product):
 
     name: str
     position_in_geo: Vector3
-    cov_in_geo: Matrix3
+    cov_in_geo: Covariance3
     marks: tuple[Mark, ...]
 
 
@@ -119,13 +131,24 @@ class Survey(Product):
     origin: Origin
     source_crs: str
     vertical: VerticalDatum
-    image_dir: str
+    image_dir: Annotated[str, AfterValidator(image_dir)]
     cameras: tuple[CameraPrior, ...]
     images: tuple[SurveyImage, ...]
     control_points: tuple[SurveyedPoint, ...] = ()
     check_points: tuple[SurveyedPoint, ...] = ()
     assumptions: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
+
+    @model_validator(mode="after")
+    def _belongs_together(self) -> Survey:
+        names = [image.name for image in self.images]
+        if len(set(names)) != len(names):
+            raise ValueError("images: two have the same name")
+        cameras = {camera.camera_id for camera in self.cameras}
+        lost = next((image for image in self.images if image.camera_id not in cameras), None)
+        if lost is not None:
+            raise ValueError(f"images: {lost.name} has camera {lost.camera_id}, which is not among the cameras")
+        return self
 
     def image(self, name: str) -> SurveyImage | None:
         """The image of that name, or None."""
@@ -146,10 +169,10 @@ class SimilarityRecord(Product):
     from_frame: str
     to_frame: str
     scale: float = Field(gt=0)
-    quat_xyzw: Quaternion
+    quat_xyzw: Rotation
     translation: Vector3
     pivot: Vector3 = (0.0, 0.0, 0.0)
-    covariance: Annotated[tuple[tuple[float, ...], ...], Field(min_length=7, max_length=7)]
+    covariance: Annotated[tuple[Row7, ...], Field(min_length=7, max_length=7)]
 
 
 class ResidualStats(Product):
@@ -181,12 +204,16 @@ class InitialSimilarity(Product):
 
 
 class TrainedCamera(Product):
-    """A camera after training, as `cam_from_model`. A test camera has moved only with its neighbours."""
+    """A camera after training, as `cam_from_model`. A test camera has moved only with its neighbours.
 
-    name: str
+    `exposure` is the gain matrix and offset (A | b) with which the photograph shows a colour c: A c + b.
+    """
+
+    name: ImageName
     split: Literal["train", "test"]
-    quat_xyzw: Quaternion
+    quat_xyzw: Rotation
     translation: Vector3
+    exposure: Matrix34 | None = None
 
 
 class TrainedModel(Product):
@@ -221,6 +248,8 @@ def load_json(product_type: type[ProductT], path: Path) -> ProductT:
         InputError: unreadable, not JSON, or not of that form; names file and field.
     """
     try:
+        if path.stat().st_size > _MAX_JSON_BYTES:
+            raise InputError("is too large for a product", path=path)
         return product_type.model_validate_json(path.read_text(encoding="utf-8"))
     except ValidationError as error:
         first = error.errors()[0]
@@ -275,6 +304,10 @@ class GeolocatedPoints:
             InputError: not an NPZ file of that form.
         """
         arrays = load_npz(path, tuple(field.name for field in fields(cls)))
+        for name, (kind, shape) in _POINT_ARRAYS.items():
+            array = arrays[name]
+            if array.dtype.kind not in kind or array.shape != (len(arrays["point_id"].ravel()), *shape):
+                raise InputError(f"has the form {array.shape} {array.dtype}", path=path, field=name)
         source = str(arrays.pop("rotation_source"))
         return cls(**arrays, rotation_source=source)
 
@@ -330,6 +363,18 @@ class NavigationTrack:
         return cls(**load_npz(path, tuple(field.name for field in fields(cls))))
 
 
+# Kind of number, and shape of one point's entry.
+_POINT_ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
+    "point_id": ("i", ()),
+    "position_in_geo": ("f", (3,)),
+    "cov_in_geo": ("f", (3, 3)),
+    "ray_count": ("i", ()),
+    "max_angle_deg": ("f", ()),
+    "condition": ("f", ()),
+    "inlier": ("b", ()),
+}
+
+
 def load_npz(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
     """Read the named arrays of an NPZ file, without pickle.
 
@@ -342,5 +387,5 @@ def load_npz(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
             if missing:
                 raise InputError(f"array {missing[0]!r} is missing", path=path)
             return {name: archive[name] for name in names}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+    except (OSError, ValueError, EOFError, MemoryError, zipfile.BadZipFile, zlib.error) as error:
         raise InputError(f"not a readable NPZ file: {error}", path=path) from error

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 from importlib import metadata
 from typing import Any
 
-from pipelines.errors import GeorefError, InputError
+from pipelines.errors import GeorefError, InputError, MissingProductError
 from pipelines.fingerprints import Memo
 from pipelines.progress import SILENT, Progress
 from pipelines.stages import StageSpec, producer_of, products_of
-from pipelines.states import BY_HAND, Flags, Request, must_exist, request, status, why_stale
+from pipelines.states import BY_HAND, Flags, Request, must_exist, request, stage_config, status, why_stale
 from pipelines.workspace import Manifest, Resume, StageRun, Summary, Workspace, now
 
 log = logging.getLogger(__name__)
@@ -62,14 +62,14 @@ def run_stage(
         asked = request(workspace, spec, flags, memo)
         _warn_of_stale_inputs(workspace, spec, memo)
         before = workspace.requests().get(spec.name, {})
-        workspace.remember(spec.name, flags)
+        workspace.remember({spec.name: flags})
         previous = None if force else _current(workspace, asked)
         if previous is not None:
             return Outcome(spec.name, False, previous)
         try:
             manifest = _execute(workspace, asked, "never" if force else resume, progress)
         except InputError:
-            workspace.remember(spec.name, before)
+            workspace.remember({spec.name: before})
             raise
         return Outcome(spec.name, True, manifest)
 
@@ -85,6 +85,9 @@ def run_pipeline(
 ) -> list[Outcome]:
     """Run stages in order, skipping what is current and resuming what was interrupted.
 
+    All options are checked and remembered before the first stage begins: a bad option of a late stage costs no
+    hours, and a run that is killed early is completed as it was asked for.
+
     Args:
         flags: options by stage; they come on top of those that the stage was last asked for with.
         around: a context to run each stage in.
@@ -92,12 +95,27 @@ def run_pipeline(
     Raises:
         GeorefError: the first failure.
     """
-    outcomes = []
+    if stages[0].reads:
+        must_exist(workspace)
+    before = workspace.requests()
+    asked = {spec.name: remembered(workspace, spec, flags.get(spec.name, {})) for spec in stages}
     for spec in stages:
-        with around(spec):
-            asked = remembered(workspace, spec, flags.get(spec.name, {}))
-            outcome = run_stage(workspace, spec, asked, force=force, resume="if-same", progress=progress)
-        outcomes.append(outcome)
+        stage_config(workspace, spec, asked[spec.name])
+    with workspace.lock("run"):
+        workspace.remember(asked)
+    outcomes: list[Outcome] = []
+    try:
+        for spec in stages:
+            with around(spec):
+                outcome = run_stage(
+                    workspace, spec, asked[spec.name], force=force, resume="if-same", progress=progress
+                )
+            outcomes.append(outcome)
+    except (InputError, MissingProductError):
+        refused = [spec.name for spec in stages[len(outcomes) :]]
+        with workspace.lock("run"):
+            workspace.remember({name: before.get(name, {}) for name in refused})
+        raise
     return outcomes
 
 

@@ -13,7 +13,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,7 @@ from numpy.typing import NDArray
 
 from pipelines.config import SfmConfig
 from pipelines.errors import DegenerateGeometryError, InputError
-from pipelines.formats.colmap import pycolmap_module
+from pipelines.formats.colmap import load_reconstruction, pycolmap_module
 from pipelines.geometry.pairs import Views, all_pairs, select_pairs
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.products import CameraPrior, Survey, load_json
@@ -48,7 +47,7 @@ def run(stage: StageRun, config: SfmConfig) -> Summary:
         shutil.rmtree(sparse)
     with quiet_colmap() as colmap:
         if config.import_model is not None:
-            model = import_model(colmap, config.import_model, survey)
+            model = import_model(config.import_model, survey)
         else:
             job = SfmJob(survey, images, stage.out / "database.db", config)
             model = reconstruct(colmap, job, stage.progress)
@@ -178,9 +177,14 @@ def _add_camera(colmap: Any, job: SfmJob, prior: CameraPrior) -> None:
 
 def _copy_shared_params(colmap: Any, prior: CameraPrior, camera: Any) -> None:
     """Take over the prior's focal length, centre and distortion as far as both models know them."""
-    given = colmap.Camera(model=prior.model, width=prior.width, height=prior.height, params=list(prior.params))
-    names = [name.strip() for name in given.params_info.split(",")]
-    known = dict(zip(names, prior.params, strict=True))
+    try:
+        given = colmap.Camera(model=prior.model, width=prior.width, height=prior.height, params=list(prior.params))
+        names = [name.strip() for name in given.params_info.split(",")]
+        known = dict(zip(names, prior.params, strict=True))
+    except ValueError as error:
+        raise InputError(
+            f"{prior.model} is no camera of COLMAP with {len(prior.params)} parameters", field=SURVEY
+        ) from error
     f = known.get("f", known.get("fx", 0.0))
     known = {"f": f, "fx": f, "fy": f, "k": known.get("k1", 0.0), "k1": known.get("k", 0.0), **known}
     params = camera.params
@@ -194,8 +198,8 @@ def _match(colmap: Any, job: SfmJob, pairs: list[tuple[str, str]], progress: Pro
     matching.num_threads = job.config.threads
     verification = colmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = job.config.seed
-    if any(" " in name for pair in pairs for name in pair):
-        log.warning("file names with blanks cannot be listed for COLMAP: all pairs are matched")
+    if any(" " in name or name.startswith("#") for pair in pairs for name in pair):
+        log.warning("file names with blanks or # cannot be listed for COLMAP: all pairs are matched")
         colmap.match_exhaustive(job.database, matching, verification_options=verification)
         return
     listing = job.database.with_name("pairs.txt")
@@ -209,10 +213,7 @@ def _match(colmap: Any, job: SfmJob, pairs: list[tuple[str, str]], progress: Pro
 
 
 def _map(colmap: Any, job: SfmJob, progress: Progress) -> list[Any]:
-    with (
-        progress.task("mapping", len(job.survey.images)) as task,
-        TemporaryDirectory(dir=job.database.parent) as out,
-    ):
+    with progress.task("mapping", len(job.survey.images)) as task, _scratch(job.database.parent) as out:
         if job.config.mapper == "global":
             options = colmap.GlobalPipelineOptions()
             options.num_threads, options.random_seed = job.config.threads, job.config.seed
@@ -228,16 +229,25 @@ def _map(colmap: Any, job: SfmJob, progress: Progress) -> list[Any]:
         return list(models.values())
 
 
-def import_model(colmap: Any, path: Path, survey: Survey) -> Any:
+@contextmanager
+def _scratch(folder: Path) -> Iterator[Path]:
+    """An empty folder for COLMAP's own output; its fixed name lets the next run clear what a killed one left."""
+    scratch = folder / "mapping"
+    shutil.rmtree(scratch, ignore_errors=True)
+    scratch.mkdir()
+    try:
+        yield scratch
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
+def import_model(path: Path, survey: Survey) -> Any:
     """Someone else's COLMAP model, reduced to the survey's images.
 
     Raises:
         InputError: not a COLMAP model, or fewer than 3 of its images are the survey's.
     """
-    try:
-        model = colmap.Reconstruction(str(path))
-    except (ValueError, RuntimeError) as error:
-        raise InputError("not a COLMAP model (cameras, images, points3D as .bin or .txt)", path=path) from error
+    model = load_reconstruction(path)
     names = {image.name for image in survey.images}
     foreign = [image.image_id for image in model.images.values() if image.name not in names]
     for image_id in foreign:

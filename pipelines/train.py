@@ -9,10 +9,6 @@ from __future__ import annotations
 
 import json
 import logging
-import math
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,15 +16,14 @@ import numpy as np
 import torch
 
 from pipelines.blocks.background import background
-from pipelines.blocks.checkpoint import load_checkpoint, save_checkpoint
+from pipelines.blocks.loop import LoopOptions, Outcome, optimise
 from pipelines.blocks.scene import Scene, geo_problem, initial_scene, photographs
-from pipelines.blocks.trainer import JointOptions, JointTrainer, StepReport, Views
+from pipelines.blocks.trainer import JointOptions, JointTrainer, Views, pinhole
 from pipelines.config import TrainConfig
 from pipelines.formats.colmap import read_sparse
 from pipelines.formats.image_cache import ImageCache
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
 from pipelines.georef.problem import GeoProblem
-from pipelines.interrupts import deferred_interrupts
 from pipelines.products import (
     InitialSimilarity,
     Survey,
@@ -37,8 +32,10 @@ from pipelines.products import (
     load_json,
     save_json,
 )
-from pipelines.progress import Progress
-from pipelines.splat.densify import DefaultSettings, DefaultStrategy
+from pipelines.splat.densify import DefaultSettings, DefaultStrategy, Strategy
+from pipelines.splat.densify_fast import FastSettings, FastStrategy
+from pipelines.splat.densify_mcmc import McmcSettings, McmcStrategy
+from pipelines.splat.exposure import Exposures
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.initialise import (
     InitialisationOptions,
@@ -46,9 +43,11 @@ from pipelines.splat.initialise import (
     gaussians_of_size,
     scene_extent,
 )
+from pipelines.splat.memory import TrainingSize, free_memory_bytes, require_memory
 from pipelines.splat.optimizer import GaussianAdam
-from pipelines.splat.raster.api import rasterizer
+from pipelines.splat.raster.api import Rasterizer, rasterizer
 from pipelines.splat.storage import write_gaussians
+from pipelines.splat.surface import SurfaceSettings
 from pipelines.stages import SIM3, SPARSE, SURVEY
 from pipelines.workspace import StageRun, Summary
 
@@ -56,6 +55,7 @@ log = logging.getLogger(__name__)
 
 _CHECKPOINT = "checkpoint.npz"
 _METRICS = "metrics.jsonl"
+_COARSE = ((4, 0.1), (2, 0.3))  # shrunken so much, up to this fraction of the training
 
 
 @dataclass(frozen=True)
@@ -86,39 +86,81 @@ def effort(config: TrainConfig) -> Preset:
 
 
 def run(stage: StageRun, config: TrainConfig) -> Summary:
-    """Train, with checkpoints, and write the result."""
+    """Train, with checkpoints, and write the result.
+
+    Raises:
+        BackendUnavailableError: `--backend cuda` without a GPU or without gsplat.
+        ResourceError: the training would not fit into memory.
+        ConvergenceError: it diverged twice.
+    """
+    backend = rasterizer(config.backend)  # first: without a GPU, `--backend cuda` need not wait for its refusal
     workspace = stage.workspace
     survey = load_json(Survey, workspace.path(SURVEY))
     initial = load_json(InitialSimilarity, workspace.path(SIM3))
     scene = initial_scene(read_sparse(workspace.path(SPARSE)), survey, initial)
     images = photographs(scene.sparse, survey, workspace, effort(config).max_image_size)
+    require_memory(training_size(scene, images, config), free_memory_bytes(device_of(backend)))
     images.build(stage.progress)
     problem = geo_problem(scene, survey, initial, config)
-    trainer = make_trainer(scene, images, problem, config)
-    seconds = _optimise(trainer, stage, config)
-    return _save(trainer, scene, stage.out, seconds)
+    trainer = make_trainer(scene, images, problem, backend, config)
+    options = LoopOptions(
+        stage.out / _CHECKPOINT, stage.out / _METRICS, config.checkpoint_every, config.log_every, stage.resumed
+    )
+    return _save(trainer, scene, stage.out, optimise(trainer, options, stage.progress))
 
 
-def make_trainer(scene: Scene, images: ImageCache, problem: GeoProblem, config: TrainConfig) -> JointTrainer:
+def device_of(backend: Rasterizer) -> torch.device:
+    """Where the tensors of a backend live."""
+    return torch.device("cuda" if backend.name == "cuda" else "cpu")
+
+
+def training_size(scene: Scene, images: ImageCache, config: TrainConfig) -> TrainingSize:
+    """What the memory of a training depends on."""
+    cameras = [pinhole(images, index) for index in map(int, scene.train)]
+    largest = max(cameras, key=lambda camera: camera.width * camera.height)
+    corrected = len(images) if config.optimize_cameras else 0
+    return TrainingSize(effort(config).max_gaussians, largest, config.sh_degree, corrected)
+
+
+def make_trainer(
+    scene: Scene, images: ImageCache, problem: GeoProblem, backend: Rasterizer, config: TrainConfig
+) -> JointTrainer:
     """Gaussians from the SfM points, and everything that moves them.
 
     Raises:
-        BackendUnavailableError: `--backend cuda` without a GPU or without gsplat.
         DegenerateGeometryError: too few SfM points.
     """
-    preset, backend = effort(config), rasterizer(config.backend)
-    device = torch.device("cuda" if backend.name == "cuda" else "cpu")
+    preset, device = effort(config), device_of(backend)
     gaussians = initial_gaussians(scene, images, config).to(device)
     extent_m = scene_extent(scene.poses.cam_center_in_model)
-    settings = DefaultSettings.for_iterations(preset.iterations, preset.max_gaussians)
+    train = torch.from_numpy(scene.train)
     return JointTrainer(
         GaussianAdam(gaussians, extent_m, preset.iterations),
-        DefaultStrategy(settings, extent_m, len(gaussians), config.seed),
+        _strategy(config, extent_m, len(gaussians)),
         problem.to(device),
         Views(scene.train, images),
         rasterizer=backend,
-        options=JointOptions(preset.iterations, config.sh_degree, geo_weight=config.geo_weight, seed=config.seed),
+        options=JointOptions(
+            preset.iterations,
+            config.sh_degree,
+            geo_weight=config.geo_weight,
+            seed=config.seed,
+            coarse=_COARSE if config.coarse_to_fine else (),
+            surface=SurfaceSettings() if config.faithful_surface else None,
+        ),
+        exposures=Exposures(len(images), train, preset.iterations, device) if config.exposure else None,
     )
+
+
+def _strategy(config: TrainConfig, extent_m: float, count: int) -> Strategy:
+    iterations, most = effort(config).iterations, effort(config).max_gaussians
+    if config.strategy == "mcmc":
+        return McmcStrategy(McmcSettings.for_iterations(iterations, count, most), extent_m, config.seed)
+    settings = DefaultSettings.for_iterations(iterations, most)
+    if config.strategy == "fast":
+        fast = FastSettings.for_iterations(iterations)
+        return FastStrategy(settings, fast, extent_m, count, config.seed)
+    return DefaultStrategy(settings, extent_m, count, config.seed)
 
 
 def initial_gaussians(scene: Scene, images: ImageCache, config: TrainConfig) -> Gaussians:
@@ -137,92 +179,7 @@ def initial_gaussians(scene: Scene, images: ImageCache, config: TrainConfig) -> 
     return Gaussians.concatenate([near, far.select(keep)])
 
 
-def _optimise(trainer: JointTrainer, stage: StageRun, config: TrainConfig) -> float:
-    """Iterate to the end; returns the seconds spent, those before a resume included.
-
-    Raises:
-        KeyboardInterrupt: the user asked to stop; a checkpoint was written.
-        ConvergenceError: a loss is not finite.
-    """
-    checkpoint, metrics = stage.out / _CHECKPOINT, stage.out / _METRICS
-    spent = _restore(trainer, checkpoint, metrics) if stage.resumed else 0.0
-    total, clock = trainer.options.iterations, time.monotonic()
-
-    def save() -> None:
-        seconds = torch.tensor(spent + time.monotonic() - clock, dtype=torch.float64)
-        save_checkpoint(checkpoint, {**trainer.state(), "seconds": seconds})
-
-    with _bar(stage.progress, trainer) as advance, deferred_interrupts() as stop:
-        with metrics.open("a", encoding="utf-8") as lines:
-            while trainer.iteration < total:
-                report = trainer.step()
-                due = trainer.iteration % config.log_every == 0 or trainer.iteration == total
-                if due:
-                    trainer.check_finite(report)
-                    row = _metrics_row(trainer, report, spent + time.monotonic() - clock)
-                    lines.write(json.dumps(row) + "\n")
-                    lines.flush()
-                    advance(row)
-                if stop.requested:
-                    save()
-                    log.warning("stopped at iteration %d of %d: --resume continues", trainer.iteration, total)
-                    raise KeyboardInterrupt
-                if trainer.iteration % config.checkpoint_every == 0:
-                    save()
-        save()
-    return spent + time.monotonic() - clock
-
-
-def _restore(trainer: JointTrainer, checkpoint: Path, metrics: Path) -> float:
-    """Take over a checkpoint and drop the metrics that came after it; returns the seconds spent before."""
-    if not checkpoint.exists():
-        metrics.unlink(missing_ok=True)
-        return 0.0
-    state = load_checkpoint(checkpoint)
-    trainer.restore(state)
-    rows = metrics.read_text(encoding="utf-8").splitlines() if metrics.exists() else []
-    kept = [row for row in rows if row.endswith("}") and json.loads(row)["iteration"] <= trainer.iteration]
-    metrics.write_text("".join(row + "\n" for row in kept), encoding="utf-8")
-    log.info("resumed at iteration %d", trainer.iteration)
-    return float(state["seconds"])
-
-
-@contextmanager
-def _bar(progress: Progress, trainer: JointTrainer) -> Iterator[Callable[[dict[str, float]], None]]:
-    """A progress bar that is advanced by a line of metrics."""
-    with progress.task("training", trainer.options.iterations) as task:
-        shown = 0
-
-        def advance(row: dict[str, float]) -> None:
-            nonlocal shown
-            note = f"psnr {row['psnr']:.1f} dB, {row['gaussians']} gaussians"
-            task.advance(trainer.iteration - shown, note)
-            shown = trainer.iteration
-
-        if trainer.iteration:
-            task.advance(trainer.iteration)
-            shown = trainer.iteration
-        yield advance
-
-
-def _metrics_row(trainer: JointTrainer, report: StepReport, seconds: float) -> dict[str, float]:
-    problem = trainer.problem
-    with torch.no_grad():
-        terms = problem.terms()
-    row = {
-        "iteration": trainer.iteration,
-        "seconds": round(seconds, 2),
-        "photometric": float(report.photometric),
-        "psnr": -10.0 * math.log10(max(float(report.mean_square_error), 1e-10)),
-        "gaussians": len(trainer.optimizer.gaussians),
-        "geo_weight": report.weight,
-        "cameras": float(terms.cameras),
-    }
-    named = {"absolute": terms.absolute, "control": terms.control}
-    return row | {name: float(value) for name, value in named.items() if value is not None}
-
-
-def _save(trainer: JointTrainer, scene: Scene, out: Path, seconds: float) -> Summary:
+def _save(trainer: JointTrainer, scene: Scene, out: Path, outcome: Outcome) -> Summary:
     problem, gaussians = trainer.problem, trainer.optimizer.gaussians.detached()
     covariance = problem.covariance() if problem.fixes is not None or problem.marks is not None else None
     outliers = tuple(sorted(scene.sparse.image_name[index] for index in problem.outliers()))
@@ -252,18 +209,21 @@ def _save(trainer: JointTrainer, scene: Scene, out: Path, seconds: float) -> Sum
         "iterations": trainer.iteration,
         "gaussians": len(gaussians),
         "train_psnr": round(psnr, 3),
-        "seconds": round(seconds, 1),
-        "seconds_per_iteration": round(seconds / trainer.iteration, 4),
+        "seconds": round(outcome.seconds, 1),
+        "seconds_per_iteration": round(outcome.seconds / trainer.iteration, 4),
         "similarity_sigma_m": [round(float(value), 5) for value in sigma[4:]],
         "gnss_outliers": list(outliers),
     }
     figure = f"{len(gaussians)} gaussians, train PSNR {psnr:.2f} dB"
-    warnings = (f"{len(outliers)} fixes contradict the cameras: {', '.join(outliers[:5])}",) if outliers else ()
-    return Summary(figure, values, warnings)
+    warnings = [f"{len(outliers)} fixes contradict the cameras: {', '.join(outliers[:5])}"] if outliers else []
+    if outcome.recovery is not None:
+        warnings.append(outcome.recovery)
+    return Summary(figure, values, tuple(warnings))
 
 
 def _cameras(trainer: JointTrainer, scene: Scene) -> tuple[TrainedCamera, ...]:
     poses, train = trainer.problem.cameras.current(), set(map(int, scene.train))
+    exposure = None if trainer.exposures is None else trainer.exposures.affine.cpu().numpy().astype(float)
     quats = quat_xyzw_from_matrix(poses.cam_from_model)
     translations = -np.einsum("nij,nj->ni", poses.cam_from_model, poses.cam_center_in_model)
     return tuple(
@@ -272,6 +232,7 @@ def _cameras(trainer: JointTrainer, scene: Scene) -> tuple[TrainedCamera, ...]:
             split="train" if index in train else "test",
             quat_xyzw=tuple(quats[index]),
             translation=tuple(translations[index]),
+            exposure=None if exposure is None or index not in train else tuple(map(tuple, exposure[index])),
         )
         for index, name in enumerate(scene.sparse.image_name)
     )

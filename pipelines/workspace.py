@@ -274,9 +274,9 @@ class Workspace:
             raise InputError("not a table of options by stage: delete it and give them again", path=path)
         return document
 
-    def remember(self, stage: str, flags: Mapping[str, Any]) -> None:
-        """Record the flags that a stage was asked for with."""
-        document = {**self.requests(), stage: dict(flags)}
+    def remember(self, flags: Mapping[str, Mapping[str, Any]]) -> None:
+        """Record the flags that stages were asked for with, by stage."""
+        document = {**self.requests(), **{stage: dict(given) for stage, given in flags.items()}}
         path = self.root / REQUESTS
         draft = path.with_suffix(".tmp")
         draft.write_text(json.dumps(document, indent=1, default=str) + "\n", encoding="utf-8")

@@ -47,3 +47,16 @@ def finish(process: subprocess.Popen[str]) -> Result:
     """Wait for a process."""
     out, err = process.communicate(timeout=60)
     return Result(process.returncode, out, err)
+
+
+def products_in(workspace: Path) -> dict[str, bytes]:
+    """Every product in a workspace."""
+    kept = (path for path in sorted(workspace.rglob("*")) if path.is_file() and path.name != ".lock")
+    found = {path.relative_to(workspace).as_posix(): path.read_bytes() for path in kept}
+    return {name: data for name, data in found.items() if not name.startswith(("logs/", "ingest.partial/"))}
+
+
+def write_files(folder: Path, files: dict[str, bytes]) -> None:
+    for name, data in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(data)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -30,3 +31,12 @@ def workspace(tmp_path: Path) -> Workspace:
 def photos(tmp_path: Path) -> Path:
     """A folder that stands for one of photographs."""
     return fakes.photographs(tmp_path / "photos")
+
+
+@pytest.fixture
+def one_thread() -> Iterator[None]:
+    """Compute with one thread: see `threads.single_thread`."""
+    from tests.threads import single_thread
+
+    with single_thread():
+        yield

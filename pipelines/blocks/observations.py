@@ -9,11 +9,13 @@ import numpy as np
 from pipelines.formats.colmap import IntArray, SparseModel
 from pipelines.geometry.cameras import undistort
 from pipelines.geometry.rays import Rays, Views, intersect
-from pipelines.geometry.rotations import matrix_from_quat_xyzw
+from pipelines.geometry.rotations import log_so3, matrix_from_quat_xyzw
 from pipelines.georef.adjustment import Correspondences, RotationPrior
 from pipelines.georef.alignment import mean_rotation
 from pipelines.products import FloatArray, Mark, Survey, SurveyedPoint
 
+_CONTRADICTION_SIGMAS = 6.0
+_CONTRADICTION_RAD = np.radians(15.0)  # never less: σ of an attitude are often optimistic
 _TINY = 1e-9  # stands for "exact" where a covariance must be regular
 
 
@@ -25,11 +27,13 @@ class RecordedRotations:
         image: (k,) index into the model's images.
         geo_from_cam: (k, 3, 3).
         sigma_rad: (k,) per axis.
+        contradicting: names of further images, whose attitudes the SfM model contradicts.
     """
 
     image: IntArray
     geo_from_cam: FloatArray
     sigma_rad: FloatArray
+    contradicting: tuple[str, ...] = ()
 
 
 def fix_correspondences(survey: Survey, model: SparseModel) -> Correspondences:
@@ -114,14 +118,27 @@ def _intersect_marks(model: SparseModel, marks: list[list[Mark]]) -> tuple[Float
 
 
 def recorded_rotations(survey: Survey, model: SparseModel) -> RecordedRotations:
-    """Attitudes of the registered images that have one."""
+    """Attitudes of the registered images that have one, as far as the SfM model bears them out.
+
+    A photograph that was turned in an image viewer keeps the attitude that the drone wrote: it contradicts the
+    others by far more than its σ.
+    """
     attitudes = {image.name: image.attitude for image in survey.images if image.attitude is not None}
     image = np.array([index for index, name in enumerate(model.image_name) if name in attitudes], dtype=np.int64)
     found = [attitudes[model.image_name[index]] for index in image]
+    rotation = matrix_from_quat_xyzw(np.array([each.quat_xyzw for each in found]).reshape(-1, 4))
+    sigma_rad = np.radians([each.sigma_deg for each in found])
+    agrees = np.ones(len(image), dtype=bool)
+    if len(image) > 2:
+        geo_from_local = rotation @ model.rotation_cam_from_local[image]
+        mean = mean_rotation(geo_from_local, sigma_rad).rotation
+        turn = np.linalg.norm(log_so3(geo_from_local @ mean.T), axis=1)
+        agrees = turn < np.maximum(_CONTRADICTION_SIGMAS * sigma_rad, _CONTRADICTION_RAD)
     return RecordedRotations(
-        image=image,
-        geo_from_cam=matrix_from_quat_xyzw(np.array([each.quat_xyzw for each in found]).reshape(-1, 4)),
-        sigma_rad=np.radians([each.sigma_deg for each in found]),
+        image=image[agrees],
+        geo_from_cam=rotation[agrees],
+        sigma_rad=sigma_rad[agrees],
+        contradicting=tuple(model.image_name[index] for index in image[~agrees]),
     )
 
 

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from pipelines.config import TrainConfig
-from pipelines.errors import DegenerateGeometryError
+from pipelines.errors import DegenerateGeometryError, InputError
 from pipelines.formats.colmap import SparseModel
 from pipelines.formats.image_cache import ImageCache, Photograph
 from pipelines.geometry.bundle import CorrectionBasis, Network, correction_basis
@@ -25,6 +25,7 @@ from pipelines.georef.losses import ControlMarks, Fixes
 from pipelines.georef.problem import GeoProblem
 from pipelines.georef.similarity import LearnableSimilarity
 from pipelines.products import FloatArray, InitialSimilarity, Survey, SurveyedPoint
+from pipelines.stages import SPARSE
 from pipelines.workspace import Workspace
 
 # Beyond this the dense normal matrix of the cameras no longer fits a laptop.
@@ -86,7 +87,19 @@ def initial_scene(sparse: SparseModel, survey: Survey, initial: InitialSimilarit
 
 
 def photographs(sparse: SparseModel, survey: Survey, workspace: Workspace, max_size_px: int) -> ImageCache:
-    """The registered photographs, undistorted to a longest side of `max_size_px`, cached in the workspace."""
+    """The registered photographs, undistorted to a longest side of `max_size_px`, cached in the workspace.
+
+    Raises:
+        InputError: an image of the model is not in the survey.
+    """
+    known = {image.name for image in survey.images}
+    foreign = [name for name in sparse.image_name if name not in known]
+    if foreign:
+        raise InputError(
+            f"{len(foreign)} images are not in the survey, the first is {foreign[0]!r}: take the model over with "
+            "`georef sfm --import`, which leaves them out",
+            path=workspace.root / SPARSE,
+        )
     folder = workspace.root / survey.image_dir
     shots = [
         Photograph(name, folder / name, sparse.camera_of(index)) for index, name in enumerate(sparse.image_name)
@@ -101,15 +114,21 @@ def geo_problem(scene: Scene, survey: Survey, initial: InitialSimilarity, config
     covariance = moved_pivot(np.array(record.covariance), record.pivot, pivot)
     basis = _correction_basis(scene) if config.optimize_cameras else None
     matrix = np.zeros((len(scene.sparse.image_name), 6, 0)) if basis is None else basis.matrix
-    use = config.geo_loss
+    fixes = _fixes(scene, survey) if config.geo_loss else None
+    marks = _control_marks(scene, survey) if config.geo_loss else None
     return GeoProblem(
         LearnableSimilarity(scene.geo_from_model, covariance, pivot),
         CameraCorrections(scene.poses, matrix),
-        _fixes(scene, survey) if use else None,
-        _control_marks(scene, survey) if use else None,
+        fixes,
+        marks,
         weighting=config.weighting,
-        hold_prior=initial.layout == "line",
+        hold_prior=initial.layout == "line" or (fixes is None and not _determined_by(marks)),
     )
+
+
+def _determined_by(marks: ControlMarks | None) -> bool:
+    """Whether control points alone fix all seven unknowns of the similarity."""
+    return marks is not None and len(marks.position_in_geo) >= 3
 
 
 def _correction_basis(scene: Scene) -> CorrectionBasis | None:
@@ -145,11 +164,12 @@ def _fixes(scene: Scene, survey: Survey) -> Fixes | None:
 
 
 def _control_marks(scene: Scene, survey: Survey) -> ControlMarks | None:
-    """Marks of the control points in training images, where a point has two or more of them."""
-    kept = [(point, found) for point in survey.control_points if len(found := _rays(scene, point)) >= 2]
+    """Marks of the control points in training images, where a point is seen in two or more of them."""
+    rays = [(point, _rays(scene, point)) for point in survey.control_points]
+    kept = [(point, found) for point, found in rays if len({camera for camera, _, _ in found}) >= 2]
     if not kept:
         return None
-    flat = [(j, *ray) for j, (_, rays) in enumerate(kept) for ray in rays]
+    flat = [(j, *ray) for j, (_, found) in enumerate(kept) for ray in found]
     marks = ControlMarks(
         point=torch.tensor([row[0] for row in flat]),
         camera=torch.tensor([row[1] for row in flat]),
@@ -172,6 +192,8 @@ def _rays(scene: Scene, point: SurveyedPoint) -> list[tuple[int, FloatArray, flo
             continue
         camera = scene.sparse.camera_of(camera_index)
         ray = np.append(undistort(camera, np.array([mark.x_px, mark.y_px])), 1.0)
+        if not np.isfinite(ray).all():  # a mark where the lens model maps no ray
+            continue
         rays.append((camera_index, ray / np.linalg.norm(ray), mark.sigma_px / float(camera.params[0])))
     return rays
 

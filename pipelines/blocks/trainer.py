@@ -10,17 +10,23 @@ import torch
 from torch import Tensor
 
 from pipelines.blocks.checkpoint import prefixed, unprefixed
-from pipelines.errors import ConvergenceError
+from pipelines.blocks.targets import Target, Targets
 from pipelines.formats.image_cache import ImageCache
 from pipelines.georef.losses import rising_weight
 from pipelines.georef.problem import GeoProblem
 from pipelines.splat.densify import Strategy
+from pipelines.splat.evidence import Evidence, evidence
+from pipelines.splat.exposure import Exposures
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.losses import photometric_loss
 from pipelines.splat.optimizer import GaussianAdam
-from pipelines.splat.raster.api import Pinhole, Rasterizer, RasterSettings
+from pipelines.splat.raster.api import Pinhole, Rasterizer, RasterSettings, Render
+from pipelines.splat.surface import SurfaceSettings, flatness_loss, normal_loss
+from pipelines.splat.watch import FiniteWatch
 
 _FINAL_RATE = 0.05  # of the geographic learning rates, relative to the first
+# A gradient that is not finite shows in one of these: colours pass theirs on to the opacities.
+_WATCHED = ("means", "quats_wxyz", "log_scales", "logit_opacities")
 
 
 @dataclass(frozen=True)
@@ -36,6 +42,9 @@ class JointOptions:
         camera_rate: first learning rate of the camera corrections, likewise.
         background: colour behind the scene.
         seed: of the order of views.
+        coarse: (shrink, fraction) pairs: photographs are shrunken so much up to this fraction of the training.
+        coarse_least_px: but never to a longest side of less than this.
+        surface: weights of the surface losses; None: the photographs alone decide.
     """
 
     iterations: int
@@ -46,6 +55,9 @@ class JointOptions:
     camera_rate: float = 0.01
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     seed: int = 0
+    coarse: tuple[tuple[int, float], ...] = ()
+    coarse_least_px: int = 160
+    surface: SurfaceSettings | None = None
 
 
 @dataclass(frozen=True)
@@ -80,6 +92,8 @@ def pinhole(images: ImageCache, index: int) -> Pinhole:
 class JointTrainer:
     """State of a joint optimisation; every iteration is a pure function of it.
 
+    Nothing in an iteration waits for the device.
+
     Args:
         optimizer: the Gaussians and their moments.
         strategy: density control.
@@ -87,6 +101,7 @@ class JointTrainer:
         views: what to compare with.
         rasterizer: backend.
         options: schedule.
+        exposures: of the photographs; None: all alike.
     """
 
     def __init__(
@@ -98,11 +113,16 @@ class JointTrainer:
         *,
         rasterizer: Rasterizer,
         options: JointOptions,
+        exposures: Exposures | None = None,
     ) -> None:
         self.optimizer, self.strategy, self.problem = optimizer, strategy, problem
         self.views, self.rasterizer, self.options = views, rasterizer, options
+        self.exposures = exposures
         self.iteration = 0
         self.device = optimizer.gaussians.means.device
+        self._targets = Targets(views.images, self.device)
+        names = ("photometric loss", "geographic loss", *(f"gradient of {name}" for name in self._watched()))
+        self._watch = FiniteWatch(names, self.device)
         self._geo_adam = torch.optim.Adam(
             [
                 {"params": [problem.similarity.y], "rate": options.similarity_rate},
@@ -114,40 +134,99 @@ class JointTrainer:
         """Render one view, compare, and move everything a little."""
         self.iteration += 1
         index = self._view_of(self.iteration)
-        settings = RasterSettings(sh_degree=self._sh_degree(), background=self.options.background)
-        camera = pinhole(self.views.images, index)
+        target = self._targets.get(index, self._shrink(index), self._view_of(self.iteration + 1))
         pose = self.problem.cameras.cam_from_model(index)
-        render = self.rasterizer.render(self.optimizer.gaussians, pose, camera, settings)
-        target, mask = self.target(index)
-        photometric = photometric_loss(render.colour, target, mask)
+        render = self._render(pose, target.camera)
+        colour = render.colour if self.exposures is None else self.exposures.apply(index, render.colour)
+        photometric = photometric_loss(colour, target.colour, target.mask)
         weight = rising_weight(
             self.iteration, self.options.geo_weight, self.options.geo_rise * self.options.iterations
         )
         geographic = self.problem.loss()
         self.optimizer.zero_grad()
         self._geo_adam.zero_grad()
-        (photometric + weight * geographic).backward()
+        total = photometric + weight * geographic
+        penalty = self.strategy.penalty(self.optimizer.gaussians, render.stats)
+        for term in (penalty, self._surface(render, pose, target)):
+            total = total if term is None else total + term
+        total.backward()
+        self._note(photometric, geographic)
         self._apply(render.stats.visible)
-        self.strategy.observe(render.stats, camera)
-        self.strategy.update(self.iteration, self.optimizer)
-        with torch.no_grad():
-            error = (render.colour - target).square()
-            mean_square = error.mean() if mask is None else error[mask].mean()
-        return StepReport(photometric.detach(), mean_square, geographic.detach(), weight)
+        self.strategy.observe(render.stats, target.camera)
+        self.strategy.update(self.iteration, self.optimizer, self.evidence)
+        return StepReport(photometric.detach(), _mean_square(colour, target), geographic.detach(), weight)
 
-    def target(self, index: int) -> tuple[Tensor, Tensor | None]:
-        """Photograph (H, W, 3) from 0 to 1, and the pixels that count (None: all)."""
-        pixels = torch.from_numpy(np.array(self.views.images.image(index)))
-        covered = self.views.images.mask(index)
-        mask = None if covered.all() else torch.from_numpy(covered).to(self.device)
-        return pixels.to(self.device).float() / 255.0, mask
+    @torch.no_grad()
+    def evidence(self, count: int, generator: torch.Generator) -> list[Evidence]:
+        """What `count` different training views say of the Gaussians; see `splat.evidence.Probe`."""
+        found = []
+        for place in torch.randperm(len(self.views.camera), generator=generator)[:count].tolist():
+            index = int(self.views.camera[place])
+            target, pose = self._targets.get(index, self._shrink(index)), self.problem.cameras.cam_from_model(index)
+            colour = self._render(pose, target.camera).colour
+            if self.exposures is not None:
+                colour = self.exposures.apply(index, colour)
+            error = (colour - target.colour).abs().mean(dim=-1)
+            error = error if target.mask is None else error * target.mask
+            found.append(evidence(self.optimizer.gaussians, pose, target.camera, error, self.rasterizer))
+        return found
+
+    def check_finite(self) -> None:
+        """Wait for the device and stop before a divergence spoils everything.
+
+        Raises:
+            NonFiniteError: a loss or gradient was not finite; names the first and its iteration.
+        """
+        self._watch.check()
+
+    def slow_down(self, factor: float) -> None:
+        """Lower all learning rates from here on; forget what was not finite."""
+        self.optimizer.rate_factor *= factor
+        self._watch.reset()
+
+    def _render(self, pose: Tensor, camera: Pinhole) -> Render:
+        settings = RasterSettings(sh_degree=self._sh_degree(), background=self.options.background)
+        return self.rasterizer.render(self.optimizer.gaussians, pose, camera, settings)
+
+    def _surface(self, render: Render, pose: Tensor, target: Target) -> Tensor | None:
+        """The surface losses, where they are wanted."""
+        wanted, gaussians = self.options.surface, self.optimizer.gaussians
+        if wanted is None:
+            return None
+        loss = wanted.flatness * flatness_loss(gaussians, render.stats.visible, self.optimizer.extent_m)
+        if self.iteration > wanted.normals_from * self.options.iterations:
+            normals = normal_loss(gaussians, pose, target.camera, self.rasterizer, wanted.edge)
+            loss = loss + wanted.normals * normals
+        return loss
+
+    def _watched(self) -> dict[str, Tensor]:
+        tensors = self.optimizer.gaussians.tensors()
+        geo = {"the similarity": self.problem.similarity.y, "the cameras": self.problem.cameras.z}
+        return {name: tensors[name] for name in _WATCHED} | geo
+
+    def _note(self, photometric: Tensor, geographic: Tensor) -> None:
+        losses = {"photometric loss": photometric, "geographic loss": geographic}
+        gradients = {
+            f"gradient of {name}": geographic.new_zeros(()) if tensor.grad is None else tensor.grad.sum()
+            for name, tensor in self._watched().items()
+        }
+        self._watch.note(self.iteration, losses | gradients)
 
     def _apply(self, visible: Tensor) -> None:
         progress = self.iteration / self.options.iterations
         for group in self._geo_adam.param_groups:
-            group["lr"] = group["rate"] * _FINAL_RATE**progress
+            group["lr"] = self.optimizer.rate_factor * group["rate"] * _FINAL_RATE**progress
         self._geo_adam.step()
         self.optimizer.step(self.iteration, visible)
+        if self.exposures is not None:
+            self.exposures.step(self.iteration)
+
+    def _shrink(self, index: int) -> int:
+        """How much the photographs are shrunken at this iteration."""
+        camera = pinhole(self.views.images, index)
+        most = max(max(camera.width, camera.height) // self.options.coarse_least_px, 1)
+        progress = self.iteration / self.options.iterations
+        return min(next((shrink for shrink, until in self.options.coarse if progress <= until), 1), most)
 
     def _view_of(self, iteration: int) -> int:
         """Every view once an epoch, in an order that only depends on the seed and the epoch."""
@@ -161,20 +240,6 @@ class JointTrainer:
         every = max(self.options.iterations // 6, 1)
         return min(self.options.sh_degree, self.iteration // every)
 
-    def check_finite(self, report: StepReport) -> None:
-        """Stop before a divergence spoils everything.
-
-        Raises:
-            ConvergenceError: a loss is not finite; names the term and the iteration.
-        """
-        terms = {"photometric": report.photometric, "geographic": report.geographic}
-        for name, value in terms.items():
-            if not bool(torch.isfinite(value)):
-                raise ConvergenceError(
-                    f"the {name} loss is not finite at iteration {self.iteration}: train again with another --seed "
-                    "or a smaller --geo-weight"
-                )
-
     def state(self) -> dict[str, Tensor]:
         """Everything that the next iteration depends on."""
         parameters = {"y": self.problem.similarity.y, "z": self.problem.cameras.z}
@@ -182,17 +247,22 @@ class JointTrainer:
         for name, parameter in parameters.items():
             moments = self._geo_adam.state[parameter]
             geo |= {f"{name}_{key}": torch.as_tensor(value) for key, value in moments.items()}
+        exposures = {} if self.exposures is None else self.exposures.state()
         return {
             "iteration": torch.tensor(self.iteration),
+            "rate_factor": torch.tensor(self.optimizer.rate_factor, dtype=torch.float64),
             **prefixed("gaussians", self.optimizer.gaussians.tensors()),
             **prefixed("optimizer", self.optimizer.state()),
             **prefixed("strategy", self.strategy.state()),
             **prefixed("geo", geo),
+            **prefixed("exposures", exposures),
         }
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
         """Go on from `state`."""
         self.iteration = int(state["iteration"])
+        self.optimizer.rate_factor = float(state["rate_factor"])
+        self._watch.reset()
         tensors = {name: tensor.to(self.device) for name, tensor in unprefixed("gaussians", state).items()}
         gaussians = Gaussians(**tensors)
         fresh = torch.full((len(gaussians),), -1, dtype=torch.int64, device=self.device)
@@ -200,9 +270,24 @@ class JointTrainer:
         self.optimizer.rearrange(gaussians, fresh)
         self.optimizer.restore(unprefixed("optimizer", state))
         self.strategy.restore(unprefixed("strategy", state))
+        if self.exposures is not None:
+            self.exposures.restore(unprefixed("exposures", state))
         geo = unprefixed("geo", state)
         for name, parameter in (("y", self.problem.similarity.y), ("z", self.problem.cameras.z)):
             with torch.no_grad():
                 parameter.copy_(geo[name])
-            moments = {key.removeprefix(f"{name}_"): geo[key] for key in geo if key.startswith(f"{name}_")}
-            self._geo_adam.state[parameter] = dict(moments)
+            # Adam counts its steps on the CPU, whatever the device.
+            self._geo_adam.state[parameter] = {
+                key: geo[f"{name}_{key}"].to("cpu" if key == "step" else self.device)
+                for key in ("step", "exp_avg", "exp_avg_sq")
+                if f"{name}_{key}" in geo
+            }
+
+
+@torch.no_grad()
+def _mean_square(colour: Tensor, target: Target) -> Tensor:
+    """Mean square error over the pixels that count, without waiting for the device to count them."""
+    error = (colour - target.colour).square()
+    if target.mask is None:
+        return error.mean()
+    return (error * target.mask[..., None]).sum() / (3 * target.mask.sum()).clamp_min(1)

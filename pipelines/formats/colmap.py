@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pipelines.errors import BackendUnavailableError, InputError
 from pipelines.geometry.cameras import Camera
 from pipelines.products import FloatArray
+from pipelines.validators import stays_inside
 
 log = logging.getLogger(__name__)
 
@@ -86,7 +87,7 @@ def read_sparse(path: Path) -> SparseModel:
         InputError: unreadable, inconsistent, or with values that are not finite.
         BackendUnavailableError: pycolmap is not installed.
     """
-    reconstruction = _load(path)
+    reconstruction = load_reconstruction(path)
     cameras = {
         int(camera_id): Camera(
             camera.model_name, int(camera.width), int(camera.height), np.array(camera.params, dtype=np.float64)
@@ -195,7 +196,13 @@ def pycolmap_module() -> Any:
     return pycolmap
 
 
-def _load(path: Path) -> Any:
+def load_reconstruction(path: Path) -> Any:
+    """The COLMAP model in a folder as a `pycolmap.Reconstruction`.
+
+    Raises:
+        InputError: no such folder, or not a readable model.
+        BackendUnavailableError: pycolmap is not installed.
+    """
     pycolmap = pycolmap_module()
     if not path.is_dir():
         raise InputError("no such folder; expected a COLMAP model (cameras, images, points3D)", path=path)
@@ -246,3 +253,7 @@ def _check(model: SparseModel, path: Path) -> None:
         raise InputError("contains values that are not finite: reconstruct again", path=path, field="camera params")
     if len(set(model.image_name)) != len(model.image_name):
         raise InputError("two images have the same name", path=path, field="images")
+    astray = next((name for name in model.image_name if not stays_inside(name)), None)
+    if astray is not None:
+        message = f"{astray!r} leaves the folder of photographs: names are relative to it"
+        raise InputError(message, path=path, field="images")

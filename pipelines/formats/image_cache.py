@@ -6,19 +6,21 @@ import hashlib
 import logging
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.errors import InputError
-from pipelines.geometry.cameras import Camera, project
+from pipelines.geometry.cameras import Camera, distort, undistort
 from pipelines.progress import SILENT, Progress
 
 log = logging.getLogger(__name__)
 
 # A pixel that needs light from beyond the photograph's edge is not compared.
 _EDGE_PX = 0.5
+_SAME_RAY = 1e-6  # of normalised coordinates
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,9 @@ def _focal_and_centre(camera: Camera) -> tuple[float, float, float, float]:
 class ImageCache:
     """Undistorted images on disk: uint8 RGB arrays, made once, mapped when asked for.
 
+    Memory does not grow with their number: of the distortion maps only the last is kept, and masks, one a camera,
+    lie on disk beside the images.
+
     Args:
         folder: where the arrays are kept.
         photographs: what to undistort.
@@ -73,7 +78,7 @@ class ImageCache:
         self._folder = folder
         self._photographs = photographs
         self.max_size_px = max_size_px
-        self._maps: dict[bytes, tuple[NDArray[np.float32], NDArray[np.bool_]]] = {}
+        self._last_map: tuple[str, NDArray[np.float32], NDArray[np.bool_]] | None = None
 
     def __len__(self) -> int:
         return len(self._photographs)
@@ -88,7 +93,6 @@ class ImageCache:
         Raises:
             InputError: a photograph cannot be read, or has another size than its camera.
         """
-        self._folder.mkdir(parents=True, exist_ok=True)
         with progress.task("undistorting", len(self)) as task:
             for index in range(len(self)):
                 if not self._path(index).exists():
@@ -96,20 +100,47 @@ class ImageCache:
                 task.advance()
 
     def image(self, index: int) -> NDArray[np.uint8]:
-        """RGB of an image: (H, W, 3), mapped from disk."""
+        """RGB of an image: (H, W, 3), mapped from disk; made if it is not there or not whole.
+
+        Raises:
+            InputError: as `build`.
+        """
         path = self._path(index)
         if not path.exists():
             self._write(index)
+        try:
+            return self._open(path)
+        except (ValueError, EOFError):  # cut off, by a full disk or a power failure
+            log.warning("%s is damaged and made again", path)
+            self._write(index)
+            return self._open(path)
+
+    def mask(self, index: int) -> NDArray[np.bool_]:
+        """Pixels that the photograph covers: (H, W), mapped from disk."""
+        path = self._folder / f"{self.mask_key(index)}.mask.npy"
+        if not path.exists():
+            _save(path, self._map(index)[1])
+        array: NDArray[np.bool_] = np.load(path, mmap_mode="r", allow_pickle=False)
+        return array
+
+    def mask_key(self, index: int) -> str:
+        """The same for photographs of the same camera, whose masks are the same."""
+        camera = self._photographs[index].camera
+        key = f"{camera.model}|{camera.width}x{camera.height}|{camera.params.tobytes().hex()}|{self.max_size_px}"
+        return hashlib.sha256(key.encode()).hexdigest()[:32]
+
+    @staticmethod
+    def _open(path: Path) -> NDArray[np.uint8]:
         array: NDArray[np.uint8] = np.load(path, mmap_mode="r", allow_pickle=False)
         return array
 
-    def mask(self, index: int) -> NDArray[np.bool_]:
-        """Pixels that the photograph covers: (H, W)."""
-        return self._map(index)[1]
-
     def _path(self, index: int) -> Path:
         photograph = self._photographs[index]
-        stat = photograph.file.stat()
+        try:
+            stat = photograph.file.stat()
+        except OSError as error:
+            message = f"the photograph cannot be read ({error.strerror}): put it back, or run `georef ingest` again"
+            raise InputError(message, path=photograph.file) from error
         camera = photograph.camera
         key = (
             f"{photograph.name}|{stat.st_size}|{stat.st_mtime_ns}|{camera.model}|{camera.width}x{camera.height}|"
@@ -132,27 +163,35 @@ class ImageCache:
         small = cv2.resize(full, (pinhole.width, pinhole.height), interpolation=cv2.INTER_AREA)
         source, _ = self._map(index)
         flat = cv2.remap(small, source[..., 0], source[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
-        path = self._path(index)
-        draft = path.with_suffix(".tmp")
-        with draft.open("wb") as handle:
-            np.save(handle, np.ascontiguousarray(flat[..., ::-1]), allow_pickle=False)
-        draft.rename(path)
+        _save(self._path(index), np.ascontiguousarray(flat[..., ::-1]))
 
     def _map(self, index: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Where each undistorted pixel lies in the shrunken photograph, and whether it lies inside."""
-        camera = self._photographs[index].camera
-        key = camera.params.tobytes() + f"{camera.model}{camera.width}x{camera.height}".encode()
-        if key not in self._maps:
-            self._maps[key] = _distortion_map(camera, self.pinhole(index))
-        return self._maps[key]
+        key = self.mask_key(index)
+        if self._last_map is None or self._last_map[0] != key:
+            self._last_map = (key, *_distortion_map(self._photographs[index].camera, self.pinhole(index)))
+        return self._last_map[1:]
+
+
+def _save(path: Path, array: NDArray[Any]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draft = path.with_suffix(".tmp")
+    with draft.open("wb") as handle:
+        np.save(handle, array, allow_pickle=False)
+    draft.rename(path)
 
 
 def _distortion_map(camera: Camera, pinhole: PinholeImage) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     u, v = np.meshgrid(np.arange(pinhole.width) + 0.5, np.arange(pinhole.height) + 0.5)
-    rays = np.stack([(u - pinhole.cx) / pinhole.fx, (v - pinhole.cy) / pinhole.fy, np.ones_like(u)], axis=-1)
-    full = project(camera, rays.reshape(-1, 3)).reshape(pinhole.height, pinhole.width, 2)
+    ray = np.stack([(u - pinhole.cx) / pinhole.fx, (v - pinhole.cy) / pinhole.fy], axis=-1)
+    full = distort(camera, ray)
+    # Beyond its fold a lens polynomial leads back into the picture, to a place that another ray shows.
+    with np.errstate(invalid="ignore"):
+        own = (np.abs(undistort(camera, full) - ray) < _SAME_RAY).all(axis=-1)
     size = np.array([pinhole.width / camera.width, pinhole.height / camera.height])
     small = full * size
     limit = np.array([pinhole.width, pinhole.height]) - _EDGE_PX
-    inside = ((small >= _EDGE_PX) & (small <= limit)).all(axis=-1)
-    return (small - 0.5).astype(np.float32), inside  # cv2 counts from the centre of the first pixel
+    inside = own & ((small >= _EDGE_PX) & (small <= limit)).all(axis=-1)
+    # cv2 counts from the centre of the first pixel, and takes long to reflect what lies far outside.
+    source = np.clip(np.nan_to_num(small - 0.5), -limit, 2 * limit)
+    return source.astype(np.float32), inside

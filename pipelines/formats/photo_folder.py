@@ -13,6 +13,7 @@ from pipelines.formats.exif import PhotoTags, read_tags
 from pipelines.formats.image_file import SUFFIXES, ImageFile, inspect_image, read_bytes
 from pipelines.formats.notes import Notes
 from pipelines.progress import SILENT, Progress
+from pipelines.validators import stays_inside
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,13 @@ def scan_folder(root: Path, notes: Notes, progress: Progress = SILENT) -> list[P
         "image is a link that leaves the folder and was left out",
         "images are links that leave the folder and were left out",
     )
+    named = [path for path in inside if stays_inside(_name(path, root))]
+    notes.warn_counted(
+        [ascii(_name(path, root)) for path in inside if path not in set(named)],
+        "image has a name that is no text and was left out",
+        "images have names that are no text and were left out",
+    )
+    inside = named
     if not inside:
         raise InputError("holds no JPEG, PNG or TIFF image", path=root, field="--images")
     photos: list[Photo] = []

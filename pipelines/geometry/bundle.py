@@ -1,9 +1,9 @@
 """What bundle adjustment knows of its cameras: the information that the image observations leave in the poses.
 
-The reduced normal matrix of the bundle (points and intrinsics eliminated) says which corrections of the cameras
-the observations would resist, and how much. Its square root gives coordinates in which every correction that
-costs the observations χ² = 1 has length one, and in which the seven movements that no observation can see, those
-of a similarity of the whole, do not exist.
+The reduced normal matrix of the bundle (points eliminated) says which corrections of the cameras the observations
+would resist, and how much. The lens is taken as given, for training renders through a fixed one. The square root of
+that matrix gives coordinates in which every correction that costs the observations χ² = 1 has length one, and in
+which the seven movements that no observation can see, those of a similarity of the whole, do not exist.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.sparse import csr_matrix
+from scipy.special import exp1
 
 from pipelines.errors import DegenerateGeometryError
 from pipelines.geometry.cameras import Camera, project
@@ -28,6 +29,11 @@ IntArray = NDArray[np.int64]
 _LOOSEST_RELATIVE_SIGMA = 0.1
 _STEP = 1e-6
 _CAUCHY_SCALE = 2.385  # 95 % efficiency on Gaussian noise
+# Means of the weight w and of w r²/2 under Gaussian noise of σ = 1, where r²/2 is exponentially distributed:
+# without them the weights would take noise for outliers, and state a σ that is a fifth too small.
+_HALF_SCALE2 = _CAUCHY_SCALE**2 / 2
+_MEAN_WEIGHT = float(_HALF_SCALE2 * np.exp(_HALF_SCALE2) * exp1(_HALF_SCALE2))
+_MEAN_WEIGHTED_SQUARE = _HALF_SCALE2 * (1 - _MEAN_WEIGHT)
 
 
 @dataclass(frozen=True)
@@ -74,14 +80,15 @@ class _Linearised:
     residual: FloatArray  # (M, 2)
     by_pose: FloatArray  # (M, 2, 6)
     by_point: FloatArray  # (M, 2, 3)
-    by_intrinsics: FloatArray  # (M, 2, P), P the longest parameter list
 
 
 def correction_basis(network: Network) -> CorrectionBasis:
     """Whitened, gauge-free coordinates of the camera corrections.
 
-    Robust: observations are weighted by Cauchy's kernel. The corrections obey the inner constraints (zero mean
-    similarity), as in free-network adjustment. Cost O((6 n)³).
+    Robust: observations are weighted by Cauchy's kernel. The gauge is held at the points: each correction, with the
+    points following the cameras, leaves them in place on the average (mean similarity zero, weighted by how well
+    each is seen). So the uncertainty of the similarity is that of the scene, not that of the cameras' mean.
+    Cost O((6 n)³).
 
     Raises:
         DegenerateGeometryError: fewer observations than unknowns.
@@ -94,9 +101,13 @@ def correction_basis(network: Network) -> CorrectionBasis:
             f"{len(lin.residual)} observations do not determine {n} cameras and {points} points"
         )
     weight = _robust_weights(lin.residual)
-    sigma_px = float(np.sqrt((weight[:, None] * lin.residual**2).sum() / redundancy))
-    information = _reduced_information(network, lin, np.sqrt(weight) / sigma_px)
-    return CorrectionBasis(_whitened(network, information), sigma_px)
+    variance = (weight[:, None] * lin.residual**2).sum() / (_MEAN_WEIGHTED_SQUARE * redundancy)
+    reduced = _reduced(network, lin, np.sqrt(weight / (_MEAN_WEIGHT * variance)))
+    basis = _whitened(network, reduced.information)
+    flat = basis.reshape(-1, basis.shape[2])
+    modes = similarity_modes(network.cam_center_in_world).reshape(-1, 7)
+    held = flat - modes @ (reduced.points_follow @ flat)
+    return CorrectionBasis(held.reshape(basis.shape), float(np.sqrt(variance)))
 
 
 def _linearise(network: Network) -> _Linearised:
@@ -104,20 +115,16 @@ def _linearise(network: Network) -> _Linearised:
     rotation = network.cam_from_world[network.obs_image]
     in_cam = np.einsum("mij,mj->mi", rotation, ray)
     count = len(ray)
-    longest = max(len(camera.params) for camera in network.cameras.values())
     residual, by_cam = np.zeros((count, 2)), np.zeros((count, 2, 3))
-    by_intrinsics = np.zeros((count, 2, longest))
     camera_of = network.camera_id[network.obs_image]
     for key, camera in network.cameras.items():
         rows = np.flatnonzero(camera_of == key)
         local = in_cam[rows]
         residual[rows] = project(camera, local) - network.obs_xy_px[rows]
         by_cam[rows] = _differences(partial(project, camera), local)
-        for index in range(len(camera.params)):
-            by_intrinsics[rows, :, index] = _by_parameter(camera, index, local)
     by_point = by_cam @ rotation
     by_pose = np.concatenate([by_point @ skew(ray), -by_point], axis=2)
-    return _Linearised(residual, by_pose, by_point, by_intrinsics)
+    return _Linearised(residual, by_pose, by_point)
 
 
 def _differences(function: Callable[[FloatArray], FloatArray], points: FloatArray) -> FloatArray:
@@ -131,47 +138,41 @@ def _differences(function: Callable[[FloatArray], FloatArray], points: FloatArra
     return np.stack(columns, axis=2)
 
 
-def _by_parameter(camera: Camera, index: int, points: FloatArray) -> FloatArray:
-    step = _STEP * max(1.0, abs(float(camera.params[index])))
-    shifted = []
-    for sign in (1.0, -1.0):
-        params = camera.params.copy()
-        params[index] += sign * step
-        shifted.append(project(Camera(camera.model, camera.width, camera.height, params), points))
-    return (shifted[0] - shifted[1]) / (2 * step)
-
-
 def _robust_weights(residual: FloatArray) -> FloatArray:
     length = np.linalg.norm(residual, axis=1)
     scale = max(float(np.median(length)) / 1.1774, 1e-9)  # median of a Rayleigh distribution
     return 1.0 / (1.0 + (length / (_CAUCHY_SCALE * scale)) ** 2)
 
 
-def _reduced_information(network: Network, lin: _Linearised, root_weight: FloatArray) -> FloatArray:
-    """Schur complement of points and intrinsics: information (6 n, 6 n) of the poses."""
+@dataclass(frozen=True)
+class _Reduced:
+    information: FloatArray  # (6 n, 6 n) of the poses, points eliminated
+    points_follow: FloatArray  # (7, 6 n) mean similarity of the points when the cameras move
+
+
+def _reduced(network: Network, lin: _Linearised, root_weight: FloatArray) -> _Reduced:
+    """Schur complement of the points, and how these follow the poses."""
     n, points = len(network.camera_id), len(network.point_in_world)
     scaled = root_weight[:, None, None]
-    keys = list(network.cameras)
-    slot = np.array([keys.index(int(key)) for key in network.camera_id])[network.obs_image]
     pose = _scatter(lin.by_pose * scaled, network.obs_image, n)
-    intrinsics = _scatter(lin.by_intrinsics * scaled, slot, len(keys))
     by_point = lin.by_point * scaled
     normal = np.zeros((points, 3, 3))
     np.add.at(normal, network.obs_point, np.swapaxes(by_point, 1, 2) @ by_point)
     normal += 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3) + 1e-12 * np.eye(3)
-    inverse_root = np.swapaxes(np.linalg.inv(np.linalg.cholesky(normal)), 1, 2)
+    root = np.linalg.cholesky(normal)
+    inverse_root = np.swapaxes(np.linalg.inv(root), 1, 2)
     point = _scatter(by_point @ inverse_root[network.obs_point], network.obs_point, points)
-    pose_point, intrinsics_point = pose.T @ point, intrinsics.T @ point
-    cc = (pose.T @ pose - pose_point @ pose_point.T).toarray()
-    ci = (pose.T @ intrinsics - pose_point @ intrinsics_point.T).toarray()
-    ii = (intrinsics.T @ intrinsics - intrinsics_point @ intrinsics_point.T).toarray()
-    used = np.flatnonzero(np.diag(ii) > 0)  # shorter parameter lists leave empty columns
-    if len(used):
-        scale = 1.0 / np.sqrt(np.diag(ii)[used])
-        block = ii[np.ix_(used, used)] * scale[:, None] * scale + 1e-9 * np.eye(len(used))
-        cross = ci[:, used] * scale
-        cc -= cross @ np.linalg.solve(block, cross.T)
-    return (cc + cc.T) / 2
+    pose_point = pose.T @ point
+    information = (pose.T @ pose - pose_point @ pose_point.T).toarray()
+    moved = (np.swapaxes(root, 1, 2) @ _displacements(network)).reshape(3 * points, 7)
+    follow = -np.linalg.solve(moved.T @ moved, (pose_point @ moved).T)
+    return _Reduced((information + information.T) / 2, follow)
+
+
+def _displacements(network: Network) -> FloatArray:
+    """How an infinitesimal similarity about the mean camera centre moves each point: (N, 3, 7)."""
+    arm = network.point_in_world - network.cam_center_in_world.mean(axis=0)
+    return np.concatenate([arm[:, :, None], -skew(arm), np.tile(np.eye(3), (len(arm), 1, 1))], axis=2)
 
 
 def _scatter(blocks: FloatArray, column_block: IntArray, count: int) -> csr_matrix:

@@ -60,7 +60,7 @@ class CameraCorrections(torch.nn.Module):
         correction = self.basis[index] @ self.z
         rotation = self.rotation[index] @ exp_so3(-correction[:3])
         translation = -rotation @ (self.center[index] + correction[3:])
-        bottom = torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=torch.float64, device=rotation.device)
+        bottom = torch.eye(4, dtype=torch.float64, device=rotation.device)[3:]
         return torch.cat([torch.cat([rotation, translation[:, None]], dim=1), bottom]).float()
 
     def current(self) -> CameraPoses:

@@ -23,6 +23,9 @@ from pipelines.products import FloatArray
 
 # A fix further out than this (99.9 % of χ² with 3 degrees of freedom) is called an outlier.
 _OUTLIER_CHI2 = 16.27
+# Cauchy's weight also falls on what is only noise. Under Gaussian noise of the stated σ, weights divided by this
+# give the covariance that the estimator has: E[w] E[w² χ²/3] / E[∂(w r)/∂r]² for χ² with 3 degrees of freedom.
+_WEIGHT_OF_NOISE = 0.7886
 
 
 @dataclass(frozen=True)
@@ -120,9 +123,10 @@ class GeoProblem(torch.nn.Module):
 
         by_y, by_z = torch.func.jacrev(residuals, argnums=(0, 1), chunk_size=64)(y, z)
         with torch.no_grad():
-            root = (1.0 / (1.0 + self().square().sum(dim=1) / CAUCHY_SCALE2)).sqrt()
-        by_y = (root[:, None, None] * by_y).reshape(-1, len(y)).cpu().numpy()
-        by_z = (root[:, None, None] * by_z).reshape(-1, len(z)).cpu().numpy()
+            weight = 1.0 / (1.0 + self().square().sum(dim=1) / CAUCHY_SCALE2)
+            root = (weight / _WEIGHT_OF_NOISE).sqrt()[:, None, None]
+        by_y = (root * by_y).flatten(0, 1).cpu().numpy()
+        by_z = (root * by_z).flatten(0, 1).cpu().numpy()
         information = by_y.T @ by_y + (np.eye(len(y)) if self.hold_prior else 0.0)
         cross = by_y.T @ by_z
         information -= cross @ np.linalg.solve(by_z.T @ by_z + np.eye(len(z)), cross.T)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -18,8 +20,16 @@ def cross_matrix(vector: Tensor) -> Tensor:
 
 
 def exp_so3(rotation_vector: Tensor) -> Tensor:
-    """Rotation matrices (…, 3, 3) of rotation vectors (…, 3), differentiable also at zero."""
-    return torch.linalg.matrix_exp(cross_matrix(rotation_vector))
+    """Rotation matrices (…, 3, 3) of rotation vectors (…, 3), differentiable also at zero.
+
+    Rodrigues' formula: `torch.linalg.matrix_exp` would wait for the device.
+    """
+    squared = rotation_vector.square().sum(dim=-1, keepdim=True)[..., None]
+    angle = (squared + torch.finfo(squared.dtype).tiny).sqrt()  # the root has no derivative at zero
+    cross = cross_matrix(rotation_vector)
+    identity = torch.eye(3, dtype=cross.dtype, device=cross.device)
+    linear, quadratic = torch.sinc(angle / math.pi), 0.5 * torch.sinc(0.5 * angle / math.pi).square()
+    return identity + linear * cross + quadratic * (cross @ cross)
 
 
 class LearnableSimilarity(torch.nn.Module):
@@ -42,16 +52,19 @@ class LearnableSimilarity(torch.nn.Module):
         self.y = torch.nn.Parameter(torch.zeros(7, dtype=torch.float64))
         self.root: Tensor
         self.register_buffer("root", torch.from_numpy(_root(covariance)))
+        self.base_rotation: Tensor
+        self.base_shift: Tensor
+        self.pivot: Tensor
+        self.register_buffer("base_rotation", torch.tensor(base.rotation, dtype=torch.float64))
+        self.register_buffer("base_shift", torch.tensor(base.translation, dtype=torch.float64))
+        self.register_buffer("pivot", torch.tensor(self.pivot_in_geo))
 
     def forward(self, points: Tensor) -> Tensor:
         """Map points (N, 3) float64 of `model` to `geo`."""
-        rotation = torch.as_tensor(self.base.rotation, dtype=torch.float64, device=points.device)
-        pivot = torch.as_tensor(self.pivot_in_geo, dtype=torch.float64, device=points.device)
-        shift = torch.as_tensor(self.base.translation, dtype=torch.float64, device=points.device)
         delta = self.root @ self.y
-        arm = self.base.scale * points @ rotation.T + (shift - pivot)
+        arm = self.base.scale * points @ self.base_rotation.T + (self.base_shift - self.pivot)
         turned = arm @ exp_so3(delta[1:4]).T
-        return torch.exp(delta[0]) * turned + (pivot + delta[4:])
+        return torch.exp(delta[0]) * turned + (self.pivot + delta[4:])
 
     def current(self) -> Similarity:
         """The present estimate."""

@@ -8,12 +8,13 @@ everything random comes from the strategy's own generator.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import torch
 from torch import Tensor
 
+from pipelines.splat.evidence import Probe
 from pipelines.splat.gaussians import Gaussians, rotation_matrices
 from pipelines.splat.morton import morton_order
 from pipelines.splat.optimizer import GaussianAdam
@@ -30,17 +31,27 @@ class Change:
     cloned: int = 0
     split: int = 0
     pruned: int = 0
+    relocated: int = 0
     opacity_reset: bool = False
 
 
 class Strategy(Protocol):
     """A way to add and remove Gaussians."""
 
+    def penalty(self, gaussians: Gaussians, stats: ScreenStats) -> Tensor | None:
+        """A term to add to the loss of a render, if the strategy has one; scalar."""
+
     def observe(self, stats: ScreenStats, camera: Pinhole) -> None:
         """Take note of a render, after its backward pass."""
 
-    def update(self, iteration: int, optimizer: GaussianAdam) -> Change:
-        """Edit the Gaussians, if it is time; called after the optimiser's step of every iteration (from 1)."""
+    def update(self, iteration: int, optimizer: GaussianAdam, probe: Probe | None = None) -> Change:
+        """Edit the Gaussians, if it is time; called after the optimiser's step of every iteration (from 1).
+
+        Args:
+            iteration: from 1.
+            optimizer: holds the Gaussians and their moments.
+            probe: shows what training views say of the Gaussians, to strategies that ask.
+        """
 
     def state(self) -> dict[str, Tensor]:
         """Copies of the running state, for a checkpoint."""
@@ -115,6 +126,10 @@ class DefaultStrategy:
         self._gradient_sum = torch.zeros(count)
         self._observations = torch.zeros(count)
 
+    def penalty(self, gaussians: Gaussians, stats: ScreenStats) -> Tensor | None:
+        """None: the photographs alone decide."""
+        return None
+
     def observe(self, stats: ScreenStats, camera: Pinhole) -> None:
         """Add a render's screen gradients to those since the last edit.
 
@@ -131,16 +146,18 @@ class DefaultStrategy:
         self._gradient_sum.index_add_(0, stats.visible, length)
         self._observations.index_add_(0, stats.visible, torch.ones_like(length))
 
-    def update(self, iteration: int, optimizer: GaussianAdam) -> Change:
+    def update(self, iteration: int, optimizer: GaussianAdam, probe: Probe | None = None) -> Change:
         """See `Strategy.update`."""
         settings, change = self.settings, Change()
         if settings.start < iteration <= settings.stop and iteration % settings.every == 0:
-            change = self._edit(iteration, optimizer)
+            gaussians = optimizer.gaussians.detached()
+            alive = self._alive(gaussians, iteration)
+            change = self._edit(optimizer, alive, self._chosen(alive))
         if settings.reset_every and iteration < settings.stop and iteration % settings.reset_every == 0:
             ceiling = math.log(settings.reset_opacity / (1 - settings.reset_opacity))
             capped = optimizer.gaussians.logit_opacities.detach().clamp_max(ceiling)
             optimizer.overwrite("logit_opacities", capped)
-            change = Change(change.cloned, change.split, change.pruned, opacity_reset=True)
+            change = replace(change, opacity_reset=True)
         return change
 
     def state(self) -> dict[str, Tensor]:
@@ -157,10 +174,9 @@ class DefaultStrategy:
         self._observations = state["observations"].clone()
         self._generator.set_state(state["generator"])
 
-    def _edit(self, iteration: int, optimizer: GaussianAdam) -> Change:
+    def _edit(self, optimizer: GaussianAdam, alive: Tensor, chosen: Tensor) -> Change:
+        """Keep those of the mask `alive`, and add one for each of the mask `chosen`."""
         gaussians = optimizer.gaussians.detached()
-        alive = self._alive(gaussians, iteration)
-        chosen = self._chosen(alive)
         large = gaussians.log_scales.amax(dim=1).exp() > self.settings.split_scale * self.extent_m
         cloned, parents = chosen & ~large, chosen & large
         stay = (alive & ~parents).nonzero()[:, 0]
@@ -183,11 +199,18 @@ class DefaultStrategy:
 
     def _chosen(self, alive: Tensor) -> Tensor:
         """Mask of the Gaussians to clone or split: each adds one, and there is room for so many."""
-        gradient = (self._gradient_sum / self._observations.clamp_min(1)).to(alive.device)
+        gradient = self._mean_gradient(alive.device)
         chosen = alive & (gradient >= self.settings.gradient_threshold)
+        return self._within_room(alive, chosen, gradient)
+
+    def _mean_gradient(self, device: torch.device) -> Tensor:
+        return (self._gradient_sum / self._observations.clamp_min(1)).to(device)
+
+    def _within_room(self, alive: Tensor, chosen: Tensor, score: Tensor) -> Tensor:
+        """Of the mask `chosen`, as many as the limit leaves room for, those with the highest scores."""
         room = max(self.settings.max_gaussians - int(alive.sum()), 0)
         if int(chosen.sum()) > room:
-            strongest = torch.argsort(gradient * chosen, descending=True, stable=True)[:room]
+            strongest = torch.argsort(score * chosen, descending=True, stable=True)[:room]
             chosen = torch.zeros_like(chosen)
             chosen[strongest] = True
         return chosen

@@ -71,6 +71,7 @@ class GaussianAdam:
 
     Attributes:
         gaussians: leaf tensors that require gradients; replaced by `rearrange`.
+        rate_factor: of all learning rates; lowered after a divergence.
     """
 
     def __init__(
@@ -87,6 +88,7 @@ class GaussianAdam:
         self.rates = rates or LearningRates.for_iterations(iterations)
         self.extent_m = extent_m
         self.iterations = iterations
+        self.rate_factor = 1.0
         self.gaussians = _leaves(gaussians)
         count, width = len(gaussians), sum(_width(tensor) for tensor in gaussians.tensors().values())
         self._exp_avg = gaussians.means.new_zeros(count, width)
@@ -120,6 +122,11 @@ class GaussianAdam:
                 self._step_by_kernel(iteration, rows)
             else:
                 self._step_by_tensors(iteration, rows)
+
+    def means_rate(self, iteration: int) -> float:
+        """Learning rate of the centres, in metres."""
+        progress = min(max(iteration / max(self.iterations, 1), 0.0), 1.0)
+        return self.rate_factor * self.rates.means_at(progress) * self.extent_m
 
     def rearrange(self, gaussians: Gaussians, source: Tensor) -> None:
         """Replace all rows: survivors keep their moments, new ones start without.
@@ -169,15 +176,15 @@ class GaussianAdam:
         return columns
 
     def _column_rates(self, iteration: int) -> Tensor:
-        rates, columns = torch.empty(self._exp_avg.shape[1]), self._columns()
-        progress = min(max(iteration / max(self.iterations, 1), 0.0), 1.0)
-        rates[columns["means"]] = self.rates.means_at(progress) * self.extent_m
+        rates, columns = self._exp_avg.new_empty(self._exp_avg.shape[1]), self._columns()
         rates[columns["quats_wxyz"]] = self.rates.quats_wxyz
         rates[columns["log_scales"]] = self.rates.log_scales
         rates[columns["logit_opacities"]] = self.rates.logit_opacities
         rates[columns["sh"]] = self.rates.sh_rest
         rates[columns["sh"]][:3] = self.rates.sh_dc
-        return rates.to(self._exp_avg)
+        rates *= self.rate_factor
+        rates[columns["means"]] = self.means_rate(iteration)
+        return rates
 
     def _step_by_kernel(self, iteration: int, rows: Tensor) -> None:
         from pipelines.splat.adam_kernel import adam_rows

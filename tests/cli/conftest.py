@@ -12,7 +12,16 @@ from tests.cli_runs import Georef, Result
 @pytest.fixture
 def georef(capsys: pytest.CaptureFixture[str], fake_stages: None) -> Georef:
     """`georef` in this process, with fake stages."""
+    return _in_this_process(capsys)
 
+
+@pytest.fixture
+def real_georef(capsys: pytest.CaptureFixture[str]) -> Georef:
+    """`georef` in this process, as it is."""
+    return _in_this_process(capsys)
+
+
+def _in_this_process(capsys: pytest.CaptureFixture[str]) -> Georef:
     def call(*arguments: object) -> Result:
         code = boundary.guarded(cli, [str(argument) for argument in arguments])
         captured = capsys.readouterr()

@@ -148,3 +148,24 @@ def test_limits_of_angle_and_sigma_thin_the_inliers() -> None:
     assert 0 < strict.inlier.sum() < all_points.inlier.sum()
     wide, _, _ = located(Noise(), Measured(), GeolocateConfig(min_angle=80))
     assert (wide.max_angle_deg[wide.inlier] >= 80).all()
+
+
+def test_a_photograph_turned_in_a_viewer_loses_its_attitude_not_the_survey() -> None:
+    # The drone's attitude stays in the file when a person turns the picture: it is wrong by 180° about the axis.
+    scene, rng = make_scene(points=100), np.random.default_rng(0)
+    whole = survey_of(scene, Noise(), Measured(), rng)
+    images = list(whole.images)
+    turned = [2, 5]
+    for index in turned:
+        attitude = images[index].attitude
+        assert attitude is not None
+        upside_down = matrix_from_quat_xyzw(attitude.quat_xyzw) @ np.diag([-1.0, -1.0, 1.0])
+        quat = tuple(float(value) for value in quat_xyzw_from_matrix(upside_down))
+        images[index] = images[index].model_copy(
+            update={"attitude": attitude.model_copy(update={"quat_xyzw": quat})}
+        )
+    survey = whole.model_copy(update={"images": tuple(images)})
+    found = geolocate(survey, sparse_model(scene, Noise(), rng), CONFIG)
+    for index in turned:
+        assert any(images[index].name in warning and "turned" in warning for warning in found.warnings)
+    assert found.points.inlier.mean() > 0.9

@@ -199,6 +199,35 @@ class TestRequests:
             runner.run_stage(done, BY_NAME["ingest"], {"images": photos, "test_every": -1})
         assert done.requests()["ingest"] == {"images": str(photos)}
 
+    def test_options_of_all_stages_are_remembered_before_the_first_begins(
+        self, workspace: Workspace, photos: Path
+    ) -> None:
+        """A run that is killed early must be completed with the effort that was asked for."""
+
+        def killed(stage: StageRun, config: object) -> Summary:
+            raise KeyboardInterrupt
+
+        fakes.install(sfm=killed)
+        with pytest.raises(KeyboardInterrupt):
+            complete(workspace, ingest={"images": photos}, train={"preset": "smoke"})
+        fakes.install()
+        complete(workspace)
+        manifest = workspace.manifest(BY_NAME["train"])
+        assert manifest is not None and manifest.config["preset"] == "smoke"
+
+    def test_bad_option_of_a_late_stage_is_told_before_the_first_begins(
+        self, workspace: Workspace, photos: Path
+    ) -> None:
+        with pytest.raises(InputError, match="--iterations"):
+            complete(workspace, ingest={"images": photos}, train={"iterations": 0})
+        assert not workspace.root.exists()
+
+    def test_refused_run_is_not_remembered(self, done: Workspace, photos: Path, tmp_path: Path) -> None:
+        before = done.requests()
+        with pytest.raises(InputError, match="no such file or folder"):
+            complete(done, ingest={"images": tmp_path / "phots"}, train={"preset": "smoke"})
+        assert done.requests() == before
+
     def test_failed_demand_is_remembered(self, done: Workspace) -> None:
         """A bound that did not hold must not be dropped by the next `georef run`."""
 

@@ -222,8 +222,8 @@ def test_damaged_requests_are_named(workspace: Workspace, text: str) -> None:
 
 def test_requests_are_kept_by_stage(workspace: Workspace) -> None:
     workspace.root.mkdir()
-    workspace.remember("ingest", {"images": Path("/photos"), "check": ("P1", "P2")})
-    workspace.remember("train", {"preset": "fast"})
-    workspace.remember("train", {"seed": 3})
+    workspace.remember({"ingest": {"images": Path("/photos"), "check": ("P1", "P2")}})
+    workspace.remember({"train": {"preset": "fast"}})
+    workspace.remember({"train": {"seed": 3}})
     assert workspace.requests() == {"ingest": {"images": "/photos", "check": ["P1", "P2"]}, "train": {"seed": 3}}
     assert json.loads((workspace.root / "requests.json").read_text())

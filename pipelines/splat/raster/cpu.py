@@ -6,6 +6,7 @@ same lists. The kernels are in `cpu_project`, `cpu_tiles`, `cpu_blend` and `cpu_
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -28,6 +29,9 @@ from pipelines.splat.raster.api import (
 )
 
 _Array = NDArray[Any]
+
+# Kernels use all cores; and numba's fallback threading layer crashes when two threads launch at once.
+_ONE_AT_A_TIME = threading.Lock()
 
 
 class CpuRasterizer:
@@ -142,13 +146,9 @@ class _Rasterize(torch.autograd.Function):
     def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, ...]:
         *tensors, frame = inputs
         *parameters, pose, center = (_array(tensor) for tensor in tensors)
-        _project(frame, parameters, pose, center)
-        images = _empty_images(frame)
-        lists = frame.lists
-        cpu_blend.blend(
-            *(frame.table, lists.hits, lists.tile_start),
-            *(frame.background, images, lists.tile_end, frame.workers),
-        )
+        with _ONE_AT_A_TIME:
+            _project(frame, parameters, pose, center)
+            images = _blend(frame)
         outputs = tuple(torch.from_numpy(image) for image in images)
         ctx.frame = frame
         ctx.save_for_backward(*tensors, *outputs)
@@ -161,9 +161,11 @@ class _Rasterize(torch.autograd.Function):
         frame: _Frame = ctx.frame
         saved = [_array(tensor) for tensor in ctx.saved_tensors]
         *parameters, pose, center = saved[:7]
-        hit_gradient = _hit_gradient(frame, tuple(saved[7:]), tuple(_array(grad) for grad in grad_outputs[:3]))
+        grads = tuple(_array(grad) for grad in grad_outputs[:3])
         outputs = [np.empty_like(parameter) for parameter in parameters]
-        camera = _gaussian_gradients(frame, [*parameters, pose, center], hit_gradient, outputs)
+        with _ONE_AT_A_TIME:
+            hit_gradient = _hit_gradient(frame, tuple(saved[7:]), grads)
+            camera = _gaussian_gradients(frame, [*parameters, pose, center], hit_gradient, outputs)
         gradients = [*outputs, camera[:12].reshape(3, 4), camera[12:]]
         return (*(torch.from_numpy(gradient) for gradient in gradients), None)
 
@@ -221,12 +223,18 @@ def _list_tiles(ellipses: _Array, camera: Pinhole) -> _TileLists:
     return _TileLists(hits, tile_start, np.empty(tiles, dtype=np.int64), splat_start, places)
 
 
-def _empty_images(frame: _Frame) -> tuple[_Array, ...]:
+def _blend(frame: _Frame) -> tuple[_Array, ...]:
     """Colour, alpha, Σ w z and median depth, the last two of size (0, 0) if they are not wanted."""
     size = (frame.camera.height, frame.camera.width)
     depth_size = size if frame.settings.depth else (0, 0)
     shapes: tuple[tuple[int, ...], ...] = ((*size, 3), size, depth_size, depth_size)
-    return tuple(np.empty(shape, dtype=frame.table.dtype) for shape in shapes)
+    images = tuple(np.empty(shape, dtype=frame.table.dtype) for shape in shapes)
+    lists = frame.lists
+    cpu_blend.blend(
+        *(frame.table, lists.hits, lists.tile_start),
+        *(frame.background, images, lists.tile_end, frame.workers),
+    )
+    return images
 
 
 def _hit_gradient(frame: _Frame, images: tuple[_Array, ...], grads: tuple[_Array, ...]) -> _Array:

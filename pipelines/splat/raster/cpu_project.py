@@ -332,8 +332,7 @@ def project_visible(
 
     Args:
         means, quats, log_scales, logit_opacities, sh: of the N Gaussians.
-        pose: (3, 4).
-        center: (3,) the camera's centre in the model's frame.
+        pose, center: (3, 4) and, in the model's frame, (3,).
         view: camera.
         degree: of the spherical harmonics in use.
         visible: (M,) rows of the Gaussians, ascending.

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import sys
+from functools import lru_cache
 from types import ModuleType
 from typing import Any
 
@@ -65,7 +66,7 @@ class CudaRasterizer:
             eps2d=settings.dilation_px2,
             sh_degree=settings.sh_degree,
             packed=True,
-            backgrounds=torch.tensor([settings.background], device=device),
+            backgrounds=_row(settings.background, device),
             render_mode="RGB+ED" if settings.depth else "RGB",
         )
         return Render(
@@ -81,6 +82,8 @@ class CudaRasterizer:
         """(H, W) z of the Gaussian at which the transmittance falls to one half, 0 where it never does."""
         means_px, conics, opacities = meta["means2d"], meta["conics"], meta["opacities"]
         median = torch.zeros(camera.height * camera.width, device=means_px.device)
+        if len(means_px) == 0:
+            return median.view(camera.height, camera.width)
         # The intersections come grouped by pixel, nearest first.
         gaussian, pixel, _ = self._gsplat.rasterize_to_indices_in_range(
             0,
@@ -135,6 +138,13 @@ def _import_gsplat() -> ModuleType:
     return module
 
 
+# Small constants are made once: every copy to the device waits for all that was asked of it before.
+@lru_cache(maxsize=64)
+def _row(values: tuple[float, ...], device: torch.device) -> Tensor:
+    return torch.tensor([values], device=device)
+
+
+@lru_cache(maxsize=4096)
 def _intrinsics(camera: Pinhole, device: torch.device) -> Tensor:
     return torch.tensor([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]], device=device)
 

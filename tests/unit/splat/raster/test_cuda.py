@@ -135,3 +135,14 @@ def test_without_depth_there_is_none(make_scene, camera, backend):
     assert render.colour.shape == (45, 70, 3)
     assert render.expected_depth is None
     assert render.median_depth is None
+
+
+def test_nothing_visible(make_scene, camera, backend):
+    rasteriser, stand_in = backend
+    stand_in.camera = camera
+    gaussians, pose = make_scene(3)
+    gaussians = Gaussians(*(tensor.float() for tensor in gaussians.tensors().values()))
+    gaussians.means -= 100 * pose[2, :3].float()
+    render = rasteriser.render(gaussians, pose, camera, RasterSettings(0, BACKGROUND, depth=True))
+    assert len(render.stats.visible) == 0
+    assert render.median_depth.abs().max() == 0

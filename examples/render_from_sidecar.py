@@ -1,0 +1,85 @@
+"""Look at an exported splat from where the photographs were taken: PLY, sidecar and survey are all it knows.
+
+    python examples/render_from_sidecar.py WORKSPACE SPLAT.ply OUTPUT_FOLDER [--images 6]
+
+Each camera stands where GNSS measured it, on the Earth (EPSG:4978); only the sidecar takes it into the PLY's frame.
+It looks where the trained camera looks, or with `--attitude recorded` where the gimbal says. Writes photograph and
+render side by side; what lies between them is the error of GNSS (and gimbal).
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+
+from pipelines.blocks.scene import photographs
+from pipelines.blocks.trained import Trained, load_trained
+from pipelines.blocks.trainer import pinhole
+from pipelines.formats.georef_sidecar import read_sidecar
+from pipelines.geodesy.enu import ecef_from_enu, ecef_from_enu_rotation, lla_of
+from pipelines.geometry.rotations import matrix_from_quat_xyzw
+from pipelines.products import Fix, FloatArray, Origin, SurveyImage
+from pipelines.splat.raster.api import RasterSettings, rasterizer
+from pipelines.splat.storage import read_gaussians
+from pipelines.workspace import Workspace
+
+
+def geo_from_cam(image: SurveyImage, trained: Trained, recorded: bool) -> FloatArray:
+    """Rotation (3, 3) of a photograph's camera, measured or trained."""
+    if recorded:
+        if image.attitude is None:
+            raise SystemExit(f"{image.name} has no recorded attitude")
+        return matrix_from_quat_xyzw(image.attitude.quat_xyzw)
+    index = trained.sparse.image_index()[image.name]
+    return np.asarray(trained.geo_from_model.rotation @ trained.poses.cam_from_model[index].T)
+
+
+def cam_from_ply(fix: Fix, rotation_geo_from_cam: FloatArray, origin: Origin, splat: Path) -> torch.Tensor:
+    """Pose (4, 4) in the PLY's frame of a camera that stands at a fix."""
+    ply_from_ecef = read_sidecar(splat).ecef_from_file().inverse()
+    center = ply_from_ecef.apply(ecef_from_enu(np.array(fix.position_in_geo), origin))
+    ecef_from_cam = ecef_from_enu_rotation(lla_of(origin)) @ rotation_geo_from_cam
+    rotation = (ply_from_ecef.rotation @ ecef_from_cam).T
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ center
+    return torch.from_numpy(pose).float()
+
+
+def main() -> None:
+    """Render and write."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("workspace", type=Path)
+    parser.add_argument("splat", type=Path)
+    parser.add_argument("output", type=Path)
+    parser.add_argument("--images", type=int, default=6)
+    parser.add_argument("--size", type=int, default=640)
+    parser.add_argument("--attitude", choices=("trained", "recorded"), default="trained")
+    options = parser.parse_args()
+    workspace = Workspace(options.workspace)
+    trained = load_trained(workspace)
+    registered = [
+        image for image in trained.survey.images if image.name in trained.sparse.image_index() and image.fix
+    ]
+    chosen = registered[:: max(1, len(registered) // options.images)][: options.images]
+    images = photographs(trained.sparse, trained.survey, workspace, options.size)
+    gaussians, backend = read_gaussians(options.splat), rasterizer("auto")
+    options.output.mkdir(parents=True, exist_ok=True)
+    for image in chosen:
+        index = trained.sparse.image_index()[image.name]
+        rotation = geo_from_cam(image, trained, options.attitude == "recorded")
+        pose = cam_from_ply(image.fix, rotation, trained.survey.origin, options.splat)
+        with torch.no_grad():
+            render = backend.render(gaussians, pose, pinhole(images, index), RasterSettings())
+        colour = render.colour.clamp(0, 1).mul(255).byte().numpy()
+        strip = np.concatenate([images.image(index), colour], axis=1)
+        path = options.output / f"{Path(image.name).stem}.png"
+        cv2.imwrite(str(path), np.ascontiguousarray(strip[..., ::-1]))
+        print(path)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,86 @@
+"""Fewer Gaussians for the same image: density control by what several views agree on.
+
+After FastGS (doi 10.48550/arXiv.2511.04283, section 3) and Taming 3DGS (doi 10.1145/3680528.3687694): a Gaussian is
+cloned or split only if it makes up pixels with a high error in several sampled views, not merely because one view
+pulls at it; and one that hardly makes up any pixel of any view goes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from pipelines.splat.densify import Change, DefaultSettings, DefaultStrategy
+from pipelines.splat.evidence import Evidence, Probe
+from pipelines.splat.optimizer import GaussianAdam
+
+
+@dataclass(frozen=True)
+class FastSettings:
+    """Settings of `FastStrategy` beside those of the default one.
+
+    Attributes:
+        views: views to sample for an edit.
+        high_error_px: pixels of high error, mean over the views that see a Gaussian, from which it is cloned or
+            split.
+        least_px: a Gaussian that makes up fewer pixels in each of the views is removed,
+        least_views: if at least so many of them see it.
+        prune_stop: remove up to this iteration, also after the last one that adds.
+    """
+
+    views: int = 10
+    high_error_px: float = 1.0
+    least_px: float = 0.5
+    least_views: int = 2
+    prune_stop: int = 25_000
+
+    @classmethod
+    def for_iterations(cls, iterations: int) -> FastSettings:
+        """Removal ends at five sixths of the training, so that what stays can settle."""
+        return cls(prune_stop=iterations * 5 // 6)
+
+
+class FastStrategy(DefaultStrategy):
+    """Default density control with candidates and removals that several views agree on."""
+
+    def __init__(
+        self, settings: DefaultSettings, fast: FastSettings, extent_m: float, count: int, seed: int = 0
+    ) -> None:
+        """Start with nothing observed; see `DefaultStrategy`."""
+        super().__init__(settings, extent_m, count, seed)
+        self.fast = fast
+
+    def update(self, iteration: int, optimizer: GaussianAdam, probe: Probe | None = None) -> Change:
+        """See `Strategy.update`.
+
+        Raises:
+            ValueError: no probe.
+        """
+        settings = self.settings
+        adds = settings.start < iteration <= settings.stop and iteration % settings.every == 0
+        # Views are not asked twice as often for what changes half as fast.
+        removes = settings.stop < iteration <= self.fast.prune_stop and iteration % (4 * settings.every) == 0
+        if not adds and not removes:
+            return Change()
+        if probe is None:
+            raise ValueError("this strategy asks training views: it needs a probe")
+        seen = probe(self.fast.views, self._generator)
+        alive = self._alive(optimizer.gaussians.detached(), iteration) & ~self._redundant(seen)
+        chosen = self._agreed(alive, seen) if adds else torch.zeros_like(alive)
+        return self._edit(optimizer, alive, chosen)
+
+    def _redundant(self, seen: list[Evidence]) -> Tensor:
+        """Mask of the Gaussians that views see, but that no view would miss."""
+        weight = torch.stack([view.weight_px for view in seen])
+        views = (weight > 0).sum(dim=0)
+        return (views >= self.fast.least_views) & (weight.amax(dim=0) < self.fast.least_px)
+
+    def _agreed(self, alive: Tensor, seen: list[Evidence]) -> Tensor:
+        """Mask of the Gaussians to clone or split; where room is short, those with the most pixels in error."""
+        error = torch.stack([view.high_error_px for view in seen])
+        views = torch.stack([view.weight_px > 0 for view in seen]).sum(dim=0)
+        score = error.sum(dim=0) / views.clamp_min(1)
+        pulled = self._mean_gradient(alive.device) >= self.settings.gradient_threshold
+        return self._within_room(alive, alive & pulled & (score >= self.fast.high_error_px), score)

@@ -1,0 +1,125 @@
+"""Peak memory of a training, predicted before it starts, against what the machine has left."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from pipelines.errors import ResourceError
+from pipelines.splat.raster.api import Pinhole
+from pipelines.splat.sh import coefficient_count
+
+_FLOAT = 4
+# Copies of all parameters that exist at once while density control rearranges them: the old ones, their gradients,
+# two moments and their successors (two more), and the new ones in parts, joined, in spatial order, and as leaves.
+_COPIES = 10
+# Photograph, mask, render, loss, their gradients and the exposure's: floats a pixel.
+_IMAGE_FLOATS = 45
+_ROW_BYTES = 40  # counters, keys of the spatial order
+_FIXED_BYTES = 150 * 2**20  # compiled kernels and what the allocators keep
+_USABLE = 0.9  # of what is free: other programs live too
+
+
+@dataclass(frozen=True)
+class TrainingSize:
+    """What memory depends on.
+
+    Attributes:
+        gaussians: most Gaussians.
+        camera: the largest image.
+        sh_degree: of the stored spherical harmonics.
+        cameras: those whose poses are corrected together (0: none).
+    """
+
+    gaussians: int
+    camera: Pinhole
+    sh_degree: int
+    cameras: int
+
+
+def predicted_peak_bytes(size: TrainingSize) -> int:
+    """Bytes that training adds to the process at its peak; all Gaussians are taken to be in view."""
+    width = 11 + 3 * coefficient_count(size.sh_degree)
+    # The dense normal matrix of the cameras, its factor, the basis, and a Jacobian of the same size.
+    poses = 4 * 8 * (6 * size.cameras) ** 2
+    images = size.camera.width * size.camera.height * _IMAGE_FLOATS * _FLOAT
+    per_gaussian = max(_COPIES * width * _FLOAT, 4 * width * _FLOAT + _raster_bytes()) + _ROW_BYTES
+    return size.gaussians * per_gaussian + images + poses + _FIXED_BYTES
+
+
+def require_memory(size: TrainingSize, free_bytes: int | None) -> None:
+    """Refuse a training that will not fit.
+
+    Args:
+        size: of the training.
+        free_bytes: from `free_memory_bytes`; None: unknown, nothing is refused.
+
+    Raises:
+        ResourceError: says how much is missing, and with how many Gaussians it would fit.
+    """
+    needed = predicted_peak_bytes(size)
+    if free_bytes is None or needed <= _USABLE * free_bytes:
+        return
+    none = predicted_peak_bytes(TrainingSize(0, size.camera, size.sh_degree, size.cameras))
+    each = (needed - none) / max(size.gaussians, 1)
+    fitting = int((_USABLE * free_bytes - none) / each) // 1000 * 1000
+    advice = (
+        f"--max-gaussians {fitting}"
+        if fitting >= 1000
+        else "a smaller --max-image-size and a smaller --max-gaussians"
+    )
+    raise ResourceError(
+        f"training needs about {_gib(needed)} at its peak ({size.gaussians} Gaussians, images of "
+        f"{size.camera.width}×{size.camera.height} pixels) and {_gib(free_bytes)} are free: use {advice}"
+        f"{', or a smaller --max-image-size' if fitting >= 1000 else ''}, or close other programs"
+    )
+
+
+def free_memory_bytes(device: torch.device) -> int | None:
+    """Memory that a training on `device` may still take; None where the system does not tell."""
+    if device.type == "cuda":
+        return int(torch.cuda.mem_get_info(device)[0])
+    known = [free for free in (_free_in_system(), _free_in_group(Path("/sys/fs/cgroup"))) if free is not None]
+    return min(known) if known else None
+
+
+def _raster_bytes() -> int:
+    """Of the CPU rasteriser, for one visible Gaussian on six tiles; the GPU's needs less."""
+    from pipelines.splat.raster.cpu import predicted_bytes
+
+    nothing = Pinhole(1, 1, 1.0, 1.0, 0.5, 0.5)
+    return predicted_bytes(1000, nothing, 0) // 1000
+
+
+def _free_in_system() -> int | None:
+    try:
+        for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
+            if line.startswith("MemAvailable:"):
+                return int(line.split()[1]) * 1024
+    except (OSError, ValueError):
+        pass
+    try:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, ValueError, OSError):
+        return None
+
+
+def _free_in_group(root: Path) -> int | None:
+    """What the control group (version 2) of a container leaves; file cache that can be dropped counts as free."""
+    try:
+        limit = (root / "memory.max").read_text(encoding="ascii").strip()
+        if limit == "max":
+            return None
+        used = int((root / "memory.current").read_text(encoding="ascii"))
+        rows = (line.split() for line in (root / "memory.stat").read_text(encoding="ascii").splitlines())
+        cache = next((int(value) for name, value in rows if name == "inactive_file"), 0)
+        return max(int(limit) - used + cache, 0)
+    except (OSError, ValueError):
+        return None
+
+
+def _gib(size: float) -> str:
+    return f"{size / 2**30:.1f} GiB"

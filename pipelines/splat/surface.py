@@ -1,0 +1,97 @@
+"""Losses that make the Gaussians lie on surfaces, so that the depth of a render can be measured in.
+
+Each Gaussian is flattened towards a disc (as in PGSR, doi 10.1109/TVCG.2024.3494046, eq. 1), and the normals of the
+discs are held to those of the rendered depth (2D Gaussian Splatting, doi 10.1145/3641519.3657428, eq. 14).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from pipelines.splat.gaussians import Gaussians, rotation_matrices
+from pipelines.splat.raster.api import Pinhole, Rasterizer, RasterSettings
+from pipelines.splat.sh import sh_from_rgb
+
+
+@dataclass(frozen=True)
+class SurfaceSettings:
+    """Weights of the losses.
+
+    Attributes:
+        flatness: of the mean smallest standard deviation, in scene extents.
+        normals: of the depth–normal consistency,
+        normals_from: from this fraction of the training.
+        edge: depth steps larger than this fraction of the depth between neighbouring pixels are edges, where
+            the depth has no normal.
+    """
+
+    flatness: float = 20.0
+    normals: float = 0.05
+    normals_from: float = 0.3
+    edge: float = 0.05
+
+
+def flatness_loss(gaussians: Gaussians, visible: Tensor, extent_m: float) -> Tensor:
+    """Mean smallest standard deviation of the visible Gaussians, in scene extents; scalar."""
+    return gaussians.log_scales[visible].amin(dim=1).exp().mean() / extent_m
+
+
+def disc_normals(gaussians: Gaussians, center_in_model: Tensor) -> Tensor:
+    """Normals (N, 3) in `model`: the shortest principal axes, on the side of a camera centre (3,)."""
+    axis = gaussians.log_scales.argmin(dim=1)
+    rotation = rotation_matrices(gaussians.quats_wxyz)
+    normal = rotation.gather(2, axis[:, None, None].expand(-1, 3, 1))[:, :, 0]
+    away = (normal * (gaussians.means - center_in_model)).sum(dim=1, keepdim=True) > 0
+    return torch.where(away, -normal, normal)
+
+
+def depth_normals(depth_m: Tensor, camera: Pinhole) -> Tensor:
+    """Normals (H − 1, W − 1, 3) in `cam`, towards the camera, of a depth map (H, W) along z."""
+    v, u = torch.meshgrid(
+        torch.arange(camera.height, device=depth_m.device) + 0.5,
+        torch.arange(camera.width, device=depth_m.device) + 0.5,
+        indexing="ij",
+    )
+    point = torch.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, torch.ones_like(u)], dim=-1)
+    point = point * depth_m[..., None]
+    right, down = point[:-1, 1:] - point[:-1, :-1], point[1:, :-1] - point[:-1, :-1]
+    return functional.normalize(torch.linalg.cross(down, right), dim=-1)
+
+
+def normal_loss(
+    gaussians: Gaussians, cam_from_model: Tensor, camera: Pinhole, rasterizer: Rasterizer, edge: float
+) -> Tensor:
+    """Mean of α · (1 − n · n_depth) over the pixels that are not at a depth edge; scalar.
+
+    One further render, whose colours are the normals of the discs, with expected depth.
+    """
+    rotation = cam_from_model[:3, :3]
+    center = (-rotation.T @ cam_from_model[:3, 3]).detach()
+    normal = disc_normals(gaussians, center) @ rotation.detach().T
+    # Colours are clamped at zero: a normal's components are moved to 0 … 1, and back after blending.
+    painted = Gaussians(
+        gaussians.means,
+        gaussians.quats_wxyz,
+        gaussians.log_scales,
+        gaussians.logit_opacities,
+        sh_from_rgb(0.5 + 0.5 * normal)[:, None],
+    )
+    render = rasterizer.render(painted, cam_from_model.detach(), camera, RasterSettings(sh_degree=0, depth=True))
+    assert render.expected_depth is not None
+    depth, alpha = render.expected_depth, render.alpha
+    blended = (2 * render.colour - alpha[..., None])[:-1, :-1]
+    smooth = _smooth(depth.detach(), alpha.detach(), edge)
+    agreement = (blended * depth_normals(depth, camera)).sum(dim=-1)
+    return ((alpha[:-1, :-1] - agreement) * smooth).sum() / smooth.sum().clamp_min(1)
+
+
+def _smooth(depth: Tensor, alpha: Tensor, edge: float) -> Tensor:
+    """1 where a pixel and its neighbours to the right and below lie on one surface, else 0."""
+    here = depth[:-1, :-1]
+    step = torch.maximum((depth[:-1, 1:] - here).abs(), (depth[1:, :-1] - here).abs())
+    solid = (alpha[:-1, :-1] > 0.5) & (alpha[:-1, 1:] > 0.5) & (alpha[1:, :-1] > 0.5)
+    return ((step < edge * here) & solid).to(depth.dtype)

@@ -1,0 +1,300 @@
+"""Bad input to `georef ingest`, as a user meets it: exit code, what is said, and that nothing is lost."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from pipelines.products import Survey, load_json
+from pipelines.stages import SURVEY
+from tests.cli_runs import Georef, finish, products_in, start, write_files
+from tests.photos import Exif, gps_entries, jpeg, write_flight
+
+LAT, LON = 46.02, 7.75
+
+
+@pytest.fixture
+def flight(tmp_path: Path) -> Path:
+    """A folder with `photos` of a flight: IMG_0000.JPG … IMG_0004.JPG."""
+    write_flight(tmp_path / "photos", 5, lat=LAT, lon=LON)
+    return tmp_path
+
+
+def table(header: str, *rows: str, ends: str = "\n") -> bytes:
+    return ends.join([header, *rows, ""]).encode()
+
+
+def positions(*last: str, header: str = "image,latitude,longitude,altitude") -> bytes:
+    """A trajectory of three good rows and those given, from line 5 on."""
+    good = [f"IMG_{index:04d}.JPG,46.02,{7.75 + 1e-4 * index:.4f},500" for index in range(3)]
+    return table(header, *good, *last)
+
+
+def marks(*last: str, crs: str = "EPSG:4979") -> bytes:
+    """A gcp_list.txt of two good rows and those given, from line 4 on."""
+    return table(crs, "7.75 46.02 500 10 10 IMG_0000.JPG P1", "7.75 46.02 500 12 10 IMG_0001.JPG P1", *last)
+
+
+class Case(NamedTuple):
+    """Files that a user adds to the flight, options of `georef ingest`, and what they are told."""
+
+    name: str
+    files: dict[str, bytes]
+    options: str
+    told: str
+
+
+CSV = "--trajectory {here}/t.csv"
+GEO = "--geo {here}/geo.txt"
+GCP = "--gcp {here}/gcp.txt"
+
+REFUSED = (
+    # positions
+    Case("missing file", {}, CSV, "t.csv [--trajectory]: no such file or folder"),
+    Case("empty table", {"t.csv": b" \n"}, CSV, "t.csv: is empty"),
+    Case("header only", {"t.csv": b"image,lat,lon,alt\n"}, CSV, "t.csv: has a header but no rows"),
+    Case("no header", {"t.csv": b"IMG_0000.JPG,46,7,500\n"}, CSV, "t.csv:1: the first line must be a header"),
+    Case("not text", {"t.csv": b"\xff\xfe\x00"}, CSV, "t.csv:1: not UTF-8 text: save the file as UTF-8"),
+    Case(
+        "no number", {"t.csv": positions("IMG_0003.JPG,46.02,east,500")}, CSV, "t.csv:5 [longitude]: 'east' is no"
+    ),
+    Case(
+        "decimal commas between commas",
+        {"t.csv": positions("IMG_0003.JPG,46,02,7,7503,500")},
+        CSV,
+        "t.csv:5: has 6 cells, the header has 4; decimal commas need ; as separator",
+    ),
+    Case(
+        "latitude out of range",
+        {"t.csv": positions("IMG_0003.JPG,96.02,7.75,500")},
+        CSV,
+        "t.csv:5 [latitude]: 96.02 is out of range -90 … 90",
+    ),
+    Case(
+        "path that leaves the folder",
+        {"t.csv": positions("../IMG_0003.JPG,46.02,7.75,500")},
+        CSV,
+        "t.csv:5 [image]: '../IMG_0003.JPG' leaves the image folder: name images relative to it",
+    ),
+    Case(
+        "two rows of an image",
+        {"t.csv": positions("IMG_0000.JPG,46.02,7.75,500")},
+        CSV,
+        "t.csv:5 [image]: IMG_0000.JPG has a row already, in line 2",
+    ),
+    Case(
+        "none of the names",
+        {"t.csv": table("image,lat,lon,alt", "DJI_1.JPG,46,7,500")},
+        CSV,
+        "t.csv [image]: names none of the images: it has 'DJI_1.JPG' …, the folder 'IMG_0000.JPG'",
+    ),
+    Case(
+        "x,y,z without CRS",
+        {"t.csv": table("image,x,y,z", "IMG_0000.JPG,400000,5097000,500")},
+        CSV,
+        "--crs",
+    ),
+    Case(
+        "degrees in a projected CRS",
+        {"t.csv": table("image,x,y,z", "IMG_0000.JPG,7.75,46.02,500")},
+        CSV + " --crs EPSG:32632",
+        "t.csv:2: (7.75, 46.02, 500): degrees? EPSG:32632 has eastings and northings: wrong CRS",
+    ),
+    Case("unknown CRS", {"t.csv": positions()}, CSV + " --crs EPSG:999999", "[--crs]: 'EPSG:999999' is no CRS"),
+    Case("CRS without table", {}, "--crs EPSG:32632", "[--crs]: is for the columns of --trajectory"),
+    Case("two tables", {"t.csv": positions(), "geo.txt": b"x"}, CSV + " " + GEO, "[--geo]: give a trajectory or"),
+    Case("geo.txt without CRS", {"geo.txt": b"a.jpg 7.75 46.02 500\n"}, GEO, "geo.txt:1: the first line must be"),
+    Case(
+        "geo.txt cut off",
+        {"geo.txt": b"EPSG:4326\nIMG_0000.JPG 7.75\n"},
+        GEO,
+        "geo.txt:2: has 2 columns, expected 3, 4, 7 or 9: image x y [z] [yaw pitch roll] [h_acc v_acc]",
+    ),
+    # ground points
+    Case(
+        "cut off mark", {"gcp.txt": marks("7.75 46.02 500 10")}, GCP, "gcp.txt:4: has 4 columns, expected at least"
+    ),
+    Case(
+        "mark that is no number", {"gcp.txt": marks("7.75 46.02 500 nan 1 IMG_0002.JPG P1")}, GCP, "gcp.txt:4 [px]"
+    ),
+    Case("mark outside", {"gcp.txt": marks("7.75 46.02 500 99 1 IMG_0002.JPG P1")}, GCP, "gcp.txt:4"),
+    Case("mark that escapes", {"gcp.txt": marks("7.75 46.02 500 9 1 /etc/x.jpg P1")}, GCP, "gcp.txt:4 [image]"),
+    Case(
+        "far away", {"gcp.txt": marks().replace(b"7.75 46.02", b"46.02 7.75")}, GCP, "wrong CRS, or x and y swapped"
+    ),
+    Case("unknown check point", {"gcp.txt": marks()}, GCP + " --check P9", "[--check]"),
+    Case("check without points", {}, "--check P1", "[--check]: names points of --gcp, which is not given"),
+    # heights and numbers
+    Case(
+        "unknown datum", {}, "--vertical sea", "[--vertical]: 'sea' is no vertical datum: give one of ellipsoidal"
+    ),
+    Case("missing grid", {}, "--vertical EGM2008", "us_nga_egm08_25.tif is not installed"),
+    Case("sigma of nothing", {}, "--sigma-h 0", "[--sigma-h]: Input should be greater than 0"),
+    Case("sigma that is no number", {}, "--sigma-h nan", "[--sigma-h]: Input should be"),
+    Case("every image held out", {}, "--test-every 1", "[--test-every]: 1 would leave nothing to train on"),
+    # options in the file
+    Case(
+        "unknown table", {"ws/georef.toml": b"[traim]\n"}, "", "georef.toml [traim]: unknown table; the stages are"
+    ),
+    Case(
+        "unknown key", {"ws/georef.toml": b"[ingest]\nsigma = 1\n"}, "", "georef.toml [sigma]: unknown key; known"
+    ),
+    Case(
+        "bad value", {"ws/georef.toml": b"[ingest]\nsigma_v = -1\n"}, "", "georef.toml [sigma_v]: Input should be"
+    ),
+    Case("no TOML", {"ws/georef.toml": b"sigma_v -1"}, "", "georef.toml: not valid TOML"),
+)
+
+
+@pytest.mark.parametrize("case", REFUSED, ids=lambda case: case.name)
+def test_refused(real_georef: Georef, flight: Path, case: Case) -> None:
+    workspace = flight / "ws"
+    assert real_georef("ingest", workspace, "--images", flight / "photos").code == 0
+    write_files(flight, case.files)
+    before = products_in(workspace)
+    options = case.options.format(here=flight).split()
+    result = real_georef("ingest", workspace, "--images", flight / "photos", *options, "--json")
+    assert (result.code, result.out) == (1, ""), result.err
+    last = result.err.splitlines()[-1]
+    assert last.startswith("error: ")
+    assert case.told in last
+    assert "Traceback" not in result.err
+    assert products_in(workspace) == before
+
+
+COUNTED = (
+    Case("empty image", {"photos/E.JPG": b""}, "", "1 image was left out: E.JPG ("),
+    Case("damaged image", {"photos/D.JPG": jpeg(8)[:700]}, "", "1 image was left out: D.JPG ("),
+    Case("no image", {"photos/N.JPG": b"GIF89a"}, "", "1 image was left out: N.JPG ("),
+    Case(
+        "duplicate image",
+        {"photos/A.JPG": jpeg(7), "photos/B.JPG": jpeg(7)},
+        "",
+        "1 image is a copy of another and was left out: B.JPG (as A.JPG)",
+    ),
+    Case("mixed sizes", {"photos/L.JPG": jpeg(8, (96, 64))}, "", "images have 2 sizes (64×48, 96×64)"),
+    Case("no GPS on some", {"photos/Z.JPG": jpeg(8)}, "", "1 image has no position in EXIF: Z.JPG"),
+    Case(
+        "position out of range",
+        {"photos/Z.JPG": jpeg(8, exif=Exif(gps=gps_entries(91.5, 7.75)))},
+        "",
+        "1 image has no position in EXIF: Z.JPG",
+    ),
+    Case(
+        "position far away",
+        {"photos/Z.JPG": jpeg(8, exif=Exif(gps=gps_entries(-33.0, 151.0)))},
+        "",
+        "1 position is far from the others and was left out: Z.JPG (",
+    ),
+    Case(
+        "name that is not here",
+        {"t.csv": positions("DJI_9.JPG,46.02,7.75,500")},
+        CSV,
+        "1 row names no image here: t.csv:5 (DJI_9.JPG)",
+    ),
+    Case("NaN", {"t.csv": positions("IMG_0003.JPG,nan,7.75,500")}, CSV, "t.csv:5"),
+    Case("unknown column", {"t.csv": positions(header="image,lat,lon,alt,mood")}, CSV, "t.csv:1 (mood)"),
+    Case("mark elsewhere", {"gcp.txt": marks("7.75 46.02 500 9 9 DJI_9.JPG P1")}, GCP, "gcp.txt:4"),
+    Case("point with one mark", {"gcp.txt": marks("7.7501 46.02 500 9 9 IMG_0000.JPG P2")}, GCP, "P2"),
+)
+
+
+@pytest.mark.parametrize("case", COUNTED, ids=lambda case: case.name)
+def test_counted(real_georef: Georef, flight: Path, case: Case) -> None:
+    write_files(flight, case.files)
+    result = real_georef(
+        "ingest", flight / "ws", "--images", flight / "photos", *case.options.format(here=flight).split()
+    )
+    assert result.code == 0, result.err
+    told = [line for line in result.err.splitlines() if line.startswith("warning: ingest: ") and case.told in line]
+    assert len(told) == 1, result.err
+    again = real_georef(
+        "ingest", flight / "ws", "--images", flight / "photos", *case.options.format(here=flight).split()
+    )
+    assert case.told in again.out
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"\xef\xbb\xbf" + positions(),
+        positions().replace(b"\n", b"\r\n"),
+        positions().replace(b",", b";").replace(b".02", b",02").replace(b"7.75", b"7,75"),
+    ],
+    ids=["byte order mark", "CRLF", "decimal commas"],
+)
+def test_read_as_meant(real_georef: Georef, flight: Path, data: bytes) -> None:
+    """What spreadsheets do to a table changes nothing."""
+    fixes = []
+    for name, content in {"plain": positions(), "odd": data}.items():
+        (flight / "t.csv").write_bytes(content)
+        done = real_georef("ingest", flight / name, "--images", flight / "photos", "--trajectory", flight / "t.csv")
+        assert done.code == 0, done.err
+        fixes.append([image.fix for image in load_json(Survey, flight / name / SURVEY).images])
+    assert fixes[0] == fixes[1]
+    assert sum(fix is not None for fix in fixes[0]) == 3
+
+
+@pytest.mark.parametrize(
+    ("spoil", "told"),
+    [
+        (
+            lambda photos: [path.unlink() for path in sorted(photos.iterdir())[2:]],
+            "2 usable images, a survey needs 3",
+        ),
+        (shutil.rmtree, "photos [--images]: no such file or folder"),
+        (
+            lambda photos: [path.rename(path.with_suffix(".raw")) for path in photos.iterdir()],
+            "holds no JPEG, PNG or",
+        ),
+        (
+            lambda photos: [path.write_bytes(jpeg(i)) for i, path in enumerate(sorted(photos.iterdir()))],
+            "no image has a position, and there are no ground control points: give --trajectory, --geo or --gcp",
+        ),
+    ],
+    ids=["two images", "no folder", "no images", "no positions at all"],
+)
+def test_photographs_that_make_no_survey(
+    real_georef: Georef, flight: Path, spoil: Callable[[Path], object], told: str
+) -> None:
+    spoil(flight / "photos")
+    result = real_georef("ingest", flight / "ws", "--images", flight / "photos")
+    assert (result.code, result.out) == (1, "")
+    assert told in result.err.splitlines()[-1]
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("ingest",),
+        ("ingest", "ws", "--test-every", "often"),
+        ("train", "ws", "--preset", "best"),
+        ("train", "ws", "--backend", "gpu"),
+        ("sfm", "ws", "--mapper", "best"),
+        ("run", "ws", "--to", "trian"),
+        ("splat", "ws"),
+    ],
+)
+def test_usage(
+    real_georef: Georef, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    result = real_georef(*arguments)
+    assert (result.code, result.out) == (2, "")
+    assert "Usage:" in result.err
+    assert not (tmp_path / "ws").exists()
+
+
+def test_as_a_process(flight: Path) -> None:
+    """The same through a shell: one line on stderr, nothing on stdout, nothing left behind."""
+    (flight / "t.csv").write_bytes(positions("IMG_0003.JPG,96.02,7.75,500"))
+    code = "from georef_cli.main import main; main()"
+    arguments = ("--images", flight / "photos", "--trajectory", flight / "t.csv")
+    result = finish(start("-q", "ingest", flight / "ws", *arguments, code=code))
+    assert (result.code, result.out) == (1, "")
+    assert result.err == f"error: {flight}/t.csv:5 [latitude]: 96.02 is out of range -90 … 90\n"
+    assert not (flight / "ws/ingest").exists()

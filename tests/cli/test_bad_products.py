@@ -1,0 +1,170 @@
+"""Products that are missing, damaged or of something else, as a user of the later stages meets them."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from pipelines.products import GeolocatedPoints, SimilarityRecord, Survey, TrainedModel, load_json, save_json
+from pipelines.stages import BY_NAME, GAUSSIANS, MODEL, POINTS, SIM3, SPARSE, SURVEY
+from tests.cli_runs import Georef, products_in, write_files
+from tests.photos import jpeg
+from tests.scenes import Measured, Noise, make_scene, sparse_model, survey_of, write_workspace
+
+
+@pytest.fixture
+def made(tmp_path: Path) -> Path:
+    """A workspace with a survey and an SfM model, as put there by hand."""
+    rng = np.random.default_rng(4)
+    scene = make_scene()
+    survey = survey_of(scene, Noise(), Measured(), rng)
+    return write_workspace(tmp_path / "ws", survey, sparse_model(scene, Noise(), rng)).root
+
+
+@pytest.mark.parametrize(
+    ("stage", "gone", "told"),
+    [
+        ("sfm", "ingest", f"error: {SURVEY} is missing: run `georef ingest {{ws}}` first"),
+        ("geolocate", "sfm", f"error: {SPARSE} is missing: run `georef sfm {{ws}}` first"),
+        ("init-sim3", "geolocate", f"error: {POINTS} is missing: run `georef geolocate {{ws}}` first"),
+        ("train", "sim3", f"error: {SIM3} is missing: run `georef init-sim3 {{ws}}` first"),
+        ("evaluate", "train", f"error: {MODEL} is missing: run `georef train {{ws}}` first"),
+        ("export-ply", "train", f"error: {MODEL} is missing: run `georef train {{ws}}` first"),
+    ],
+)
+def test_upstream_missing(real_georef: Georef, made: Path, stage: str, gone: str, told: str) -> None:
+    shutil.rmtree(made / gone, ignore_errors=True)
+    result = real_georef(stage, made)
+    assert (result.code, result.out) == (1, "")
+    assert result.err.splitlines()[-1] == told.format(ws=made)
+
+
+DAMAGED = (
+    ("geolocate", SURVEY, b"{", f"{SURVEY}: Invalid JSON"),
+    ("geolocate", SURVEY, b"\xff", f"{SURVEY}: not a UTF-8 text file"),
+    ("geolocate", SURVEY, b"{}", f"{SURVEY} [origin]: Field required"),
+    ("geolocate", f"{SPARSE}/images.bin", b"\xff" * 40, "images.bin: shorter than the number of its records says"),
+    ("geolocate", f"{SPARSE}/cameras.bin", b"", "cameras.bin: shorter than the number of its records says"),
+    ("init-sim3", POINTS, b"PK\x03\x04", f"{POINTS}: not a readable NPZ file"),
+    ("train", SIM3, b"[]", f"{SIM3}: Input should be an object"),
+    ("evaluate", MODEL, b'{"format_version": 1}', f"{MODEL} [geo_from_model]: Field required"),
+    ("export-ply", MODEL, b"nonsense", f"{MODEL}: Invalid JSON"),
+)
+
+
+@pytest.mark.parametrize("case", DAMAGED, ids=lambda case: f"{case[0]}-{case[1]}-{case[2][:4]!r}")
+def test_damaged_product(real_georef: Georef, made: Path, case: tuple[str, str, bytes, str]) -> None:
+    stage, product, data, told = case
+    absent = [read for read in BY_NAME[stage].reads if not (made / read).exists()]
+    write_files(made, dict.fromkeys(absent, b"") | {product: data})
+    result = real_georef(stage, made)
+    assert (result.code, result.out) == (1, "")
+    assert told in result.err.splitlines()[-1]
+    assert "Traceback" not in result.err
+
+
+@pytest.mark.parametrize(
+    ("data", "told"),
+    [
+        (b"ply\n", "gaussians.ply: not a PLY file"),
+        (b"ply\nformat ascii 1.0\nelement vertex 1\nend_header\n", "expected a PLY of format binary_little_endian"),
+        (
+            b"ply\nformat binary_little_endian 1.0\nelement vertex 9999999999\nproperty float x\nend_header\n",
+            "gaussians.ply: the header promises 9999999999 Gaussians of 4 bytes, the file holds 0 bytes",
+        ),
+    ],
+    ids=["no PLY", "text", "forged"],
+)
+def test_damaged_gaussians(real_georef: Georef, made: Path, data: bytes, told: str) -> None:
+    same = SimilarityRecord(
+        from_frame="model", to_frame="geo", scale=1.0, quat_xyzw=(0, 0, 0, 1), translation=(0, 0, 0),
+        covariance=((0.0,) * 7,) * 7,
+    )  # fmt: skip
+    model = TrainedModel(
+        geo_from_model=same, model_from_local=same, max_image_size=64, cameras=(), background=(0, 0, 0),
+        sh_degree=0, iterations=1, gaussians=1, backend="cpu",
+    )  # fmt: skip
+    save_json(model, made / MODEL)
+    write_files(made, {GAUSSIANS: data})
+    result = real_georef("export-ply", made)
+    assert (result.code, result.out) == (1, "")
+    assert told in result.err.splitlines()[-1]
+    assert not (made / "export").exists()
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_cuda_without_gpu(real_georef: Georef, made: Path) -> None:
+    """Asked for in so many words, the GPU is not replaced by something slower."""
+    survey = load_json(Survey, made / SURVEY)
+    save_json(survey.model_copy(update={"image_dir": str(made.parent)}), made / SURVEY)
+    size = (survey.cameras[0].width, survey.cameras[0].height)
+    write_files(made.parent, {image.name: jpeg(index, size) for index, image in enumerate(survey.images)})
+    assert real_georef("run", made, "--to", "init-sim3").code == 0
+    result = real_georef("train", made, "--backend", "cuda", "--preset", "smoke")
+    assert (result.code, result.out) == (1, "")
+    assert "error: no CUDA device found: install a driver" in result.err.splitlines()[-1]
+    assert not (made / "train").exists()
+
+
+def test_points_of_another_model(real_georef: Georef, made: Path) -> None:
+    assert real_georef("geolocate", made).code == 0
+    points = GeolocatedPoints.load(made / POINTS)
+    fewer = {name: value if isinstance(value, str) else value[:-1] for name, value in vars(points).items()}
+    GeolocatedPoints(**fewer).save(made / POINTS)
+    result = real_georef("init-sim3", made)
+    assert (result.code, result.out) == (1, "")
+    assert "the geolocated points are of another model: run `georef geolocate` again" in result.err
+
+
+@pytest.mark.parametrize(
+    ("files", "told"),
+    [
+        ({"notes.txt": b"hello"}, "not a readable COLMAP model"),
+        (
+            dict.fromkeys(("cameras.bin", "images.bin", "points3D.bin"), b"\xff" * 64),
+            "shorter than the number of",
+        ),
+        ({"cameras.txt": b"1 PINHOLE x\n", "images.txt": b"", "points3D.txt": b""}, "not a readable COLMAP model"),
+    ],
+    ids=["no model", "forged", "text without numbers"],
+)
+def test_import_of_something_else(real_georef: Georef, made: Path, files: dict[str, bytes], told: str) -> None:
+    write_files(made.parent / "model", files)
+    before = products_in(made)
+    result = real_georef("sfm", made, "--import", made.parent / "model", "--force")
+    assert (result.code, result.out) == (1, "")
+    assert told in result.err.splitlines()[-1]
+    assert str(made.parent / "model") in result.err
+    kept = {name: data for name, data in products_in(made).items() if not name.startswith("sfm.partial/")}
+    assert {name: data for name, data in kept.items() if name != "requests.json"} == before
+
+
+def test_import_of_another_flight(real_georef: Georef, made: Path) -> None:
+    survey = load_json(Survey, made / SURVEY)
+    others = [image.model_copy(update={"name": f"other/{image.name}"}) for image in survey.images]
+    save_json(survey.model_copy(update={"images": tuple(others)}), made / SURVEY)
+    shutil.copytree(made / SPARSE, made.parent / "model")
+    result = real_georef("sfm", made, "--import", made.parent / "model", "--force")
+    assert (result.code, result.out) == (1, "")
+    assert "only 0 of its images are in the survey: names must be equal" in result.err
+
+
+def test_residual_larger_than_allowed(real_georef: Georef, made: Path) -> None:
+    assert real_georef("geolocate", made).code == 0
+    assert real_georef("init-sim3", made).code == 0
+    before = (made / SIM3).read_bytes()
+    result = real_georef("init-sim3", made, "--max-residual", "0.000001")
+    assert (result.code, result.out) == (1, "")
+    assert "--max-residual" in result.err.splitlines()[-1]
+    assert (made / SIM3).read_bytes() == before
+
+
+def test_photographs_that_are_gone(real_georef: Georef, made: Path) -> None:
+    result = real_georef("sfm", made, "--force")
+    assert (result.code, result.out) == (1, "")
+    assert "photographs of the survey are gone" in result.err.splitlines()[-1]
+    assert real_georef("geolocate", made).code == 0  # the model that was there is kept

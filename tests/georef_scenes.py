@@ -1,0 +1,139 @@
+"""Geographic problems with known truth, without images: a block of cameras, fixes, and control points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scenes import looking_at
+
+from pipelines.geometry.bundle import similarity_modes
+from pipelines.geometry.rotations import log_so3
+from pipelines.geometry.similarity import Similarity
+from pipelines.georef.cameras import CameraCorrections, CameraPoses
+from pipelines.georef.losses import CAUCHY_SCALE2, ControlMarks, Fixes, Weighting
+from pipelines.georef.problem import GeoProblem
+from pipelines.georef.similarity import LearnableSimilarity
+
+SHIFT = np.array([100.0, 50.0, 20.0])
+# Of an initial similarity that is far from the truth: 1 % of scale, 1°, 2 m.
+LOOSE = np.diag([0.01, 0.02, 0.02, 0.02, 2.0, 2.0, 2.0]) ** 2
+CENTER_M, TURN_RAD = 0.02, 3e-4
+
+
+@dataclass(frozen=True)
+class Block:
+    """Two rings of cameras above a place, as SfM left them in `model`; corrections are N(0, I) in the basis."""
+
+    poses: CameraPoses
+    basis: np.ndarray
+
+
+def make_block(images: int = 12) -> Block:
+    """Cameras whose corrections have σ of `CENTER_M` and `TURN_RAD`, free of any similarity of the whole."""
+    angle = np.linspace(0, 2 * np.pi, images, endpoint=False)
+    center = np.column_stack([40 * np.cos(angle), 40 * np.sin(angle), 30.0 + 10 * (np.arange(images) % 2)])
+    rotation = np.swapaxes(looking_at(center, np.zeros_like(center)), 1, 2)
+    unit = np.tile([TURN_RAD] * 3 + [CENTER_M] * 3, images)
+    modes = similarity_modes(center).reshape(-1, 7) / unit[:, None]
+    free = np.linalg.qr(modes, mode="complete")[0][:, 7:]
+    return Block(CameraPoses(rotation, center), (unit[:, None] * free).reshape(images, 6, -1))
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What the measurements were made of."""
+
+    geo_from_model: Similarity
+    poses: CameraPoses
+
+
+def draw_truth(block: Block, rng: np.random.Generator, covariance: np.ndarray = LOOSE) -> Truth:
+    """A similarity and corrections, drawn from what is known of them beforehand."""
+    similarity = LearnableSimilarity(Similarity(translation=SHIFT), covariance, pivot(block))
+    corrections = CameraCorrections(block.poses, block.basis)
+    with torch.no_grad():
+        similarity.y.copy_(torch.from_numpy(rng.normal(size=7)))
+        corrections.z.copy_(torch.from_numpy(rng.normal(size=len(corrections.z))))
+    return Truth(similarity.current(), corrections.current())
+
+
+def pivot(block: Block) -> np.ndarray:
+    """Of the similarity: the middle of the cameras in `geo`."""
+    return block.poses.cam_center_in_model.mean(axis=0) + SHIFT
+
+
+def fixes_of(truth: Truth, sigma_m: np.ndarray, rng: np.random.Generator) -> Fixes:
+    """All cameras' fixes, with noise of the σ (3,) that they state."""
+    position = truth.geo_from_model.apply(truth.poses.cam_center_in_model)
+    return Fixes(
+        torch.arange(len(position)),
+        torch.from_numpy(position + sigma_m * rng.normal(size=position.shape)),
+        torch.from_numpy(np.tile(np.diag(1 / sigma_m), (len(position), 1, 1))),
+    )
+
+
+def marks_of(truth: Truth, points_in_model: np.ndarray, sigma_m: float, rng: np.random.Generator) -> ControlMarks:
+    """Control points (J, 3) seen by all cameras with exact bearings, surveyed with σ `sigma_m`."""
+    count, images = len(points_in_model), len(truth.poses.cam_center_in_model)
+    point, camera = np.repeat(np.arange(count), images), np.tile(np.arange(images), count)
+    ray = points_in_model[point] - truth.poses.cam_center_in_model[camera]
+    bearing = np.einsum("kij,kj->ki", truth.poses.cam_from_model[camera], ray)
+    surveyed = truth.geo_from_model.apply(points_in_model) + sigma_m * rng.normal(size=(count, 3))
+    return ControlMarks(
+        torch.from_numpy(point),
+        torch.from_numpy(camera),
+        torch.from_numpy(bearing / np.linalg.norm(bearing, axis=1, keepdims=True)),
+        torch.full((len(point),), 1e-4, dtype=torch.float64),
+        torch.from_numpy(surveyed),
+        torch.eye(3, dtype=torch.float64).repeat(count, 1, 1) / sigma_m,
+    )
+
+
+def problem_of(
+    block: Block, fixes: Fixes | None, marks: ControlMarks | None = None, weighting: Weighting = "whitened"
+) -> GeoProblem:
+    """From the block as SfM left it and an initial similarity that is a guess."""
+    start = Similarity(translation=SHIFT)
+    return GeoProblem(
+        LearnableSimilarity(start, LOOSE, pivot(block)),
+        CameraCorrections(block.poses, block.basis),
+        fixes,
+        marks,
+        weighting=weighting,
+    )
+
+
+def minimise(problem: GeoProblem, steps: int = 20) -> None:
+    """Bring the loss to its minimum: Gauss–Newton with Cauchy's weights, on the residuals of `problem.forward`."""
+    y, z = problem.similarity.y, problem.cameras.z
+    for _ in range(steps):
+        by_y, by_z = torch.func.jacrev(lambda y, z: _residuals(problem, y, z), argnums=(0, 1))(
+            y.detach(), z.detach()
+        )
+        with torch.no_grad():
+            white = problem()
+            root = (1 + white.square().sum(dim=1, keepdim=True) / CAUCHY_SCALE2).rsqrt()
+            jacobian = torch.cat(
+                [(root[..., None] * by_y).flatten(0, 1), (root[..., None] * by_z).flatten(0, 1)], 1
+            )
+            known = torch.cat([torch.full((len(y),), float(problem.hold_prior)), torch.ones(len(z))]).double()
+            state = torch.cat([y, z])
+            normal = jacobian.T @ jacobian + known.diag()
+            step = torch.linalg.solve(normal, jacobian.T @ (root * white).flatten() + known * state)
+            y -= step[: len(y)]
+            z -= step[len(y) :]
+        if float(step.norm()) < 1e-4:  # of a σ
+            return
+
+
+def _residuals(problem: GeoProblem, y: torch.Tensor, z: torch.Tensor) -> torch.Tensor:
+    return torch.func.functional_call(problem, {"similarity.y": y, "cameras.z": z}, ())
+
+
+def squared_error(truth: Similarity, found: Similarity, covariance: np.ndarray, about: np.ndarray) -> float:
+    """Squared Mahalanobis distance of a similarity from the truth; the covariance (7, 7) is about the pivot."""
+    away = truth @ found.inverse()
+    error = np.array([np.log(away.scale), *log_so3(away.rotation), *(away.apply(about) - about)])
+    return float(error @ np.linalg.solve(covariance, error))

@@ -1,0 +1,162 @@
+"""A survey whose photographs are renders of known Gaussians: what training should find again."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from scenes import GEO_FROM_LOCAL, Measured, Noise, Scene, looking_at, sparse_model, survey_of, write_workspace
+
+from pipelines.formats.colmap import SparseModel
+from pipelines.geometry.cameras import Camera
+from pipelines.geometry.rotations import exp_so3
+from pipelines.geometry.similarity import Similarity
+from pipelines.products import InitialSimilarity, Survey, save_json
+from pipelines.splat.gaussians import Gaussians
+from pipelines.splat.raster.api import Pinhole, RasterSettings
+from pipelines.splat.raster.cpu import CpuRasterizer
+from pipelines.splat.sh import sh_from_rgb
+from pipelines.stages import SIM3
+from pipelines.workspace import Workspace
+
+CAMERA = Camera("PINHOLE", 96, 72, np.array([90.0, 90.0, 48.0, 36.0]))
+# Of the surface's Gaussians: metres between them, and their standard deviation along the ground.
+SPACING_M, SIGMA_M = 1.6, 0.9
+NOISE = Noise(fix_m=(0.05, 0.05, 0.08), pixel_px=0.1, mark_px=0.1, gcp_m=1e-4)
+TEST_VIEWS = (3, 9)
+# Too few for density control, which would turn differences of rounding into differences of tenths of a dB.
+TRAINING = {"iterations": 150, "sh_degree": 0, "log_every": 5}
+# How far off the similarity starts: half a per cent, 0.3°, 0.3 m, ten and more times what training will state.
+START_COVARIANCE = np.diag([5e-3, 5e-3, 5e-3, 5e-3, 0.3, 0.3, 0.3]) ** 2
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """True scene, its Gaussians in `geo`, and what was measured of it."""
+
+    scene: Scene
+    gaussians: Gaussians
+    survey: Survey
+    sparse: SparseModel
+
+
+def ground_height(east: np.ndarray, north: np.ndarray) -> np.ndarray:
+    """A smooth hill, in metres."""
+    return 6.0 * np.exp(-(east**2 + north**2) / 300.0)
+
+
+def true_gaussians(rng: np.random.Generator) -> Gaussians:
+    """Opaque, flat, randomly coloured Gaussians on the hill, out to 36 m."""
+    grid = np.arange(-36.0, 36.1, SPACING_M)
+    east, north = (axis.ravel() for axis in np.meshgrid(grid, grid))
+    count = len(east)
+    patch = rng.uniform(0.1, 0.9, (12, 12, 3))
+    cell = np.clip(((np.column_stack([east, north]) + 36) // 6).astype(int), 0, 11)
+    colour = np.clip(patch[cell[:, 0], cell[:, 1]] + rng.normal(0, 0.08, (count, 3)), 0, 1)
+    return Gaussians(
+        means=torch.from_numpy(np.column_stack([east, north, ground_height(east, north)])).float(),
+        quats_wxyz=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
+        log_scales=torch.tensor([SIGMA_M, SIGMA_M, 0.1]).log().repeat(count, 1),
+        logit_opacities=torch.full((count,), 4.0),
+        sh=sh_from_rgb(torch.from_numpy(colour)).float()[:, None],
+    )
+
+
+def true_scene(rng: np.random.Generator, images: int = 14, points: int = 500) -> Scene:
+    """Two rings of cameras around the hill that look down on it; points, control and check places on it."""
+    angle = np.linspace(0, 2 * np.pi, images, endpoint=False)
+    height = np.where(np.arange(images) % 2, 30.0, 38.0)
+    center = np.column_stack([32 * np.cos(angle), 32 * np.sin(angle), height])
+    place = rng.uniform(-26, 26, (points, 2))
+    marked = np.array([[-10.0, -8], [9, -11], [12, 8], [-7, 11], [1, 2], [-14, 2]])
+    return Scene(
+        center,
+        looking_at(center, rng.normal(0, 2, center.shape) * [1, 1, 0]),
+        np.column_stack([place, ground_height(*place.T)]),
+        np.column_stack([marked, ground_height(*marked.T)]),
+        camera=CAMERA,
+    )
+
+
+def make_rendered(seed: int = 0) -> Rendered:
+    """The survey with the scene's six surveyed places as check points, two views held out, and its SfM model."""
+    rng = np.random.default_rng(seed)
+    scene, gaussians = true_scene(rng), true_gaussians(rng)
+    survey = survey_of(scene, NOISE, Measured(gcps=True), rng)
+    images = tuple(
+        image.model_copy(update={"split": "test"}) if index in TEST_VIEWS else image
+        for index, image in enumerate(survey.images)
+    )
+    update = {"images": images, "check_points": survey.control_points, "control_points": (), "image_dir": "photos"}
+    sparse = sparse_model(scene, NOISE, rng)
+    east, north = scene.point_in_geo[:, 0], scene.point_in_geo[:, 1]
+    nearest = (
+        np.abs(gaussians.means[:, None, :2].numpy() - np.column_stack([east, north])).max(axis=2).argmin(axis=0)
+    )
+    rgb = (0.5 + 0.28209479 * gaussians.sh[nearest, 0].numpy()).clip(0, 1)
+    sparse = replace(sparse, point_rgb=(255 * rgb).astype(np.uint8))
+    return Rendered(scene, gaussians, survey.model_copy(update=update), sparse)
+
+
+def write_photographs(rendered: Rendered, folder: Path) -> None:
+    """Render every view into a PNG of its name."""
+    folder.mkdir(parents=True, exist_ok=True)
+    camera = Pinhole(CAMERA.width, CAMERA.height, *CAMERA.params)
+    scene = rendered.scene
+    for name, center, rotation in zip(scene.names, scene.center_in_geo, scene.geo_from_cam, strict=True):
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = rotation.T, -rotation.T @ center
+        with torch.no_grad():
+            view = CpuRasterizer().render(
+                rendered.gaussians, torch.from_numpy(pose).float(), camera, RasterSettings(sh_degree=0)
+            )
+        rgb = (255 * view.colour.clamp(0, 1)).round().byte().numpy()
+        # The names end in .jpg, whose losses would be noise: the content is PNG, which OpenCV goes by.
+        (folder / name).write_bytes(cv2.imencode(".png", rgb[..., ::-1])[1].tobytes())
+
+
+def initial_similarity(
+    rng: np.random.Generator, covariance: np.ndarray, pivot: np.ndarray, truth: Similarity = GEO_FROM_LOCAL
+) -> InitialSimilarity:
+    """The truth, off by one draw from `covariance` (7, 7) about `pivot`."""
+    delta = np.linalg.cholesky(covariance) @ rng.normal(size=7)
+    turn, grow = exp_so3(delta[1:4]), float(np.exp(delta[0]))
+    off = Similarity(grow, turn, pivot + delta[4:] - grow * turn @ pivot)
+    return InitialSimilarity(
+        geo_from_local=(off @ truth).to_record("local", "geo", covariance=covariance, pivot=pivot),
+        method="robust",
+        correspondences={"gnss": 14, "gcp": 0, "points": 0},
+        inliers={"gnss": 14, "gcp": 0, "points": 0},
+        residuals={},
+        condition_number=1.0,
+        layout="volume",
+        attitude_used=False,
+    )
+
+
+def write_rendered(root: Path, rendered: Rendered, initial: InitialSimilarity) -> Workspace:
+    """A workspace as the stages before training leave it; the photographs must be in `root/photos`."""
+    workspace = write_workspace(root, rendered.survey, rendered.sparse)
+    save_json(initial, root / SIM3)
+    return workspace
+
+
+@dataclass(frozen=True)
+class Flight:
+    """A rendered survey and the folder of its photographs."""
+
+    rendered: Rendered
+    root: Path
+    seed: int
+
+    def workspace(self, name: str) -> Workspace:
+        """A new workspace of that name, ready to train."""
+        root = self.root / name
+        root.mkdir()
+        (root / "photos").symlink_to(self.root / "photos")
+        pivot = self.rendered.scene.center_in_geo.mean(axis=0)
+        initial = initial_similarity(np.random.default_rng(self.seed), START_COVARIANCE, pivot)
+        return write_rendered(root, self.rendered, initial)

@@ -1,0 +1,168 @@
+"""Stage `evaluate` on a trained survey of known truth: the report's form, and its figures."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from splat_scenes import SIGMA_M, TEST_VIEWS, Flight
+
+from pipelines.errors import InputError
+from pipelines.evaluate import render_name
+from pipelines.products import Mark, Survey, TrainedModel, load_json, save_json
+from pipelines.runner import Outcome, run_stage
+from pipelines.stages import BY_NAME, MODEL, REPORT, SURVEY
+from pipelines.workspace import Workspace
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+EVALUATE = BY_NAME["evaluate"]
+STATS = {"count", "mean_h_m", "rmse_h_m", "rmse_e_m", "rmse_n_m", "rmse_v_m", "rmse_3d_m", "max_3d_m"}
+
+
+@pytest.fixture(scope="module")
+def evaluated(trained: list[tuple[Workspace, Workspace]]) -> tuple[Workspace, Outcome]:
+    """The first survey, trained with the geographic losses and evaluated."""
+    workspace = trained[0][0]
+    return workspace, run_stage(workspace, EVALUATE, {"renders": 1})
+
+
+@pytest.fixture
+def altered(evaluated: tuple[Workspace, Outcome], tmp_path: Path) -> Workspace:
+    """A copy whose survey or model a test may change."""
+    root = tmp_path / "copy"
+    shutil.copytree(evaluated[0].root, root, symlinks=True, ignore=shutil.ignore_patterns("evaluate"))
+    return Workspace(root)
+
+
+def report_of(workspace: Workspace) -> dict[str, Any]:
+    document: dict[str, Any] = json.loads(workspace.path(REPORT).read_text(encoding="utf-8"))
+    return document
+
+
+def change_survey(workspace: Workspace, **update: object) -> None:
+    survey = load_json(Survey, workspace.path(SURVEY))
+    save_json(survey.model_copy(update=update), workspace.root / SURVEY)
+
+
+def test_report_has_the_form_that_scripts_read(evaluated: tuple[Workspace, Outcome]) -> None:
+    report = report_of(evaluated[0])
+    test = report["photometric"]["test"]
+    assert {"views", "psnr", "ssim", "lpips"} <= set(test)
+    assert set(report["checkpoints"]) == {"camera", "model"}
+    for way in ("camera", "model"):
+        assert set(report["checkpoints"][way]) >= STATS
+    assert set(report["fit"]) == {"gnss", "gcp"}
+    assert set(report["fit"]["gnss"]) >= STATS
+    assert report["fit"]["gcp"]["count"] == 0
+    assert report["fit"]["gcp"]["rmse_3d_m"] is None
+
+
+def test_test_views_are_those_held_out(evaluated: tuple[Workspace, Outcome]) -> None:
+    workspace, outcome = evaluated
+    test = report_of(workspace)["photometric"]["test"]
+    assert test["views"] == 2
+    assert [row["image"] for row in test["per_view"]] == [f"image_{index:03d}.jpg" for index in TEST_VIEWS]
+    assert test["psnr"] == pytest.approx(np.mean([row["psnr"] for row in test["per_view"]]))
+    assert 22.0 < test["psnr"] < 40.0
+    assert 0.5 < test["ssim"] < 1.0
+    assert test["lpips"] is None
+    assert "weights" in test["lpips_reason"]
+    assert outcome.manifest.values["psnr"] == test["psnr"]
+    assert f"test PSNR {test['psnr']:.2f} dB" in outcome.manifest.key_figure
+
+
+def test_renders_stand_beside_the_photographs(evaluated: tuple[Workspace, Outcome]) -> None:
+    workspace, _ = evaluated
+    renders = sorted((workspace.root / "evaluate" / "renders").iterdir())
+    assert [path.name for path in renders] == ["image_003.png"]
+    strip = cv2.imread(str(renders[0]))
+    assert strip.shape == (72, 3 * 96, 3)
+    photo = cv2.imread(str(workspace.root / "photos" / "image_003.jpg"))
+    np.testing.assert_array_equal(strip[:, :96], photo)
+    shown = np.abs(photo.astype(float) - strip[:, 96:192])
+    np.testing.assert_allclose(strip[:, 192:], np.minimum(3 * shown, 255), atol=4)
+
+
+def test_check_points_by_camera_are_as_good_as_the_measurements(evaluated: tuple[Workspace, Outcome]) -> None:
+    found = report_of(evaluated[0])["checkpoints"]["camera"]
+    assert found["count"] == 6
+    # Marks of 0.1 px are 5 cm from 45 m, over √12 rays 2 cm; the similarity's own 1.5 and 2.4 cm, and its turn.
+    assert found["rmse_h_m"] < 0.08
+    assert found["rmse_v_m"] < 0.12
+    assert [row["rays"] for row in found["points"]] == [14] * 6
+    errors = np.array([[row[key] for key in ("de_m", "dn_m", "du_m")] for row in found["points"]])
+    assert found["rmse_3d_m"] == pytest.approx(np.sqrt((errors**2).sum(axis=1).mean()))
+    assert found["mean_h_m"] == pytest.approx(np.hypot(errors[:, 0], errors[:, 1]).mean())
+
+
+def test_check_points_by_model_lie_on_the_surface(evaluated: tuple[Workspace, Outcome]) -> None:
+    found = report_of(evaluated[0])["checkpoints"]["model"]
+    assert found["count"] == 6
+    # The surface is known to a Gaussian: its size, not the cameras, decides.
+    assert found["rmse_3d_m"] < 1.5 * SIGMA_M
+    assert found["rmse_h_m"] < SIGMA_M
+
+
+def test_fit_is_that_of_the_fixes(evaluated: tuple[Workspace, Outcome]) -> None:
+    fit = report_of(evaluated[0])["fit"]["gnss"]
+    assert fit["count"] == 12  # of the training views
+    assert fit["outliers"] == 0
+    # 5 cm in east and north and 8 cm up, less seven of 36 degrees of freedom.
+    assert fit["rmse_h_m"] == pytest.approx(0.07 * np.sqrt(29 / 36), rel=0.4)
+    assert fit["rmse_v_m"] == pytest.approx(0.08 * np.sqrt(29 / 36), rel=0.5)
+
+
+def test_few_check_points_are_remarked_on(evaluated: tuple[Workspace, Outcome]) -> None:
+    assert evaluated[1].manifest.warnings == ["6 check points: the ASPRS standard asks for 30 or more"]
+
+
+def test_control_points_are_a_fit_and_not_an_accuracy(altered: Workspace, flights: list[Flight]) -> None:
+    survey = flights[0].rendered.survey
+    change_survey(altered, control_points=survey.check_points, check_points=())
+    run_stage(altered, EVALUATE, {"renders": 0})
+    report = report_of(altered)
+    assert report["checkpoints"]["camera"]["count"] == 0
+    assert report["checkpoints"]["model"]["rmse_3d_m"] is None
+    assert report["fit"]["gcp"]["count"] == 6
+
+
+def test_without_test_views_there_are_no_figures(altered: Workspace) -> None:
+    model = load_json(TrainedModel, altered.path(MODEL))
+    cameras = tuple(camera.model_copy(update={"split": "train"}) for camera in model.cameras)
+    save_json(model.model_copy(update={"cameras": cameras}), altered.root / MODEL)
+    outcome = run_stage(altered, EVALUATE, {})
+    test = report_of(altered)["photometric"]["test"]
+    assert (test["views"], test["psnr"], test["ssim"], test["lpips"]) == (0, None, None, None)
+    assert "no test views" in outcome.manifest.key_figure
+
+
+def test_unusable_marks_leave_a_point_unmeasured(altered: Workspace) -> None:
+    survey = load_json(Survey, altered.path(SURVEY))
+    first, second, *rest = survey.check_points
+    alone = first.model_copy(update={"marks": first.marks[:1]})
+    elsewhere = second.model_copy(
+        update={"marks": tuple(Mark(image="other.jpg", x_px=1, y_px=1, sigma_px=1) for _ in range(3))}
+    )
+    change_survey(altered, check_points=(alone, elsewhere, *rest))
+    run_stage(altered, EVALUATE, {"renders": 0})
+    found = report_of(altered)["checkpoints"]["camera"]
+    assert found["count"] == 4
+    assert [row["rays"] for row in found["points"][:2]] == [1, 0]
+    assert [row["de_m"] for row in found["points"][:2]] == [None, None]
+
+
+def test_images_of_one_name_in_two_folders_have_renders_of_their_own() -> None:
+    assert render_name("day 1/DJI_0001.JPG") == "day 1_DJI_0001.png"
+    assert len({render_name(f"{folder}/DJI_0001.JPG") for folder in ("a", "b", "a/b")}) == 3
+
+
+def test_cameras_of_another_reconstruction_are_refused(altered: Workspace) -> None:
+    model = load_json(TrainedModel, altered.path(MODEL))
+    save_json(model.model_copy(update={"cameras": model.cameras[1:]}), altered.root / MODEL)
+    with pytest.raises(InputError, match="train again"):
+        run_stage(altered, EVALUATE, {})

@@ -1,0 +1,87 @@
+"""A training of a few hundred Gaussians on six small photographs, which are renders of known ones."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+
+from pipelines.blocks.trainer import JointOptions, JointTrainer, Views
+from pipelines.formats.image_cache import ImageCache, Photograph
+from pipelines.geometry.cameras import Camera
+from pipelines.geometry.similarity import Similarity
+from pipelines.georef.cameras import CameraCorrections, CameraPoses
+from pipelines.georef.problem import GeoProblem
+from pipelines.georef.similarity import LearnableSimilarity
+from pipelines.splat.densify import DefaultSettings, DefaultStrategy, Strategy
+from pipelines.splat.exposure import Exposures
+from pipelines.splat.gaussians import Gaussians
+from pipelines.splat.optimizer import GaussianAdam
+from pipelines.splat.raster.api import Pinhole, RasterSettings
+from pipelines.splat.raster.cpu import CpuRasterizer
+
+CAMERA = Camera("PINHOLE", 64, 48, np.array([60.0, 60.0, 32.0, 24.0]))
+PINHOLE = Pinhole(64, 48, 60.0, 60.0, 32.0, 24.0)
+EXTENT_M = 2.0
+SETTINGS = DefaultSettings(start=4, stop=60, every=8, reset_every=0, max_gaussians=400)
+
+
+def true_gaussians(count: int = 200, seed: int = 0) -> Gaussians:
+    """Coloured blobs on a wall 4 m away."""
+    random = torch.Generator().manual_seed(seed)
+    place = torch.rand(count, 2, generator=random) * torch.tensor([5.0, 4.0]) - torch.tensor([2.5, 2.0])
+    return Gaussians(
+        torch.cat([place, torch.full((count, 1), 4.0)], dim=1),
+        torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
+        torch.full((count, 3), -1.8),
+        torch.full((count,), 2.0),
+        torch.randn(count, 4, 3, generator=random) * torch.tensor([1.0, 0.0, 0.0, 0.0])[:, None],
+    )
+
+
+def poses(count: int = 6) -> CameraPoses:
+    """Cameras beside each other that look along z."""
+    center = np.column_stack([np.linspace(-1, 1, count), np.zeros(count), np.zeros(count)])
+    return CameraPoses(np.tile(np.eye(3), (count, 1, 1)), center)
+
+
+def photographs(folder: Path, scene: Gaussians, gains: tuple[float, ...] = (1.0,) * 6) -> ImageCache:
+    """Renders of the scene as PNG files, each times its gain, and the cache over them."""
+    shots = []
+    for index, gain in enumerate(gains):
+        pose = torch.eye(4)
+        pose[0, 3] = -float(poses(len(gains)).cam_center_in_model[index, 0])
+        colour = CpuRasterizer().render(scene, pose, PINHOLE, RasterSettings(sh_degree=0)).colour
+        file = folder / f"{index}.png"
+        cv2.imwrite(str(file), (gain * colour).clamp(0, 1).mul(255).round().byte().numpy()[..., ::-1])
+        shots.append(Photograph(file.name, file, CAMERA))
+    return ImageCache(folder / "cache", shots, 64)
+
+
+def trainer(
+    images: ImageCache,
+    options: JointOptions,
+    *,
+    strategy: Strategy | None = None,
+    with_exposures: bool = False,
+    count: int = 200,
+) -> JointTrainer:
+    """A trainer that starts from the true places, grey and small."""
+    start = true_gaussians(count)
+    start = replace(start, log_scales=start.log_scales - 0.5, sh=torch.zeros_like(start.sh))
+    train = np.arange(len(images))
+    similarity = LearnableSimilarity(Similarity(), np.eye(7) * 1e-4, np.zeros(3))
+    cameras = CameraCorrections(poses(len(images)), np.zeros((len(images), 6, 0)))
+    exposures = Exposures(len(images), torch.from_numpy(train), options.iterations, torch.device("cpu"))
+    return JointTrainer(
+        GaussianAdam(start, EXTENT_M, options.iterations),
+        strategy or DefaultStrategy(SETTINGS, EXTENT_M, len(start)),
+        GeoProblem(similarity, cameras, None, None),
+        Views(train, images),
+        rasterizer=CpuRasterizer(),
+        options=options,
+        exposures=exposures if with_exposures else None,
+    )

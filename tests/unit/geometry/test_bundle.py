@@ -1,0 +1,216 @@
+"""What bundle adjustment knows of its cameras, against the full normal matrix and against real readjustments."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import looking_at
+
+from pipelines.errors import DegenerateGeometryError
+from pipelines.geometry.bundle import Network, correction_basis, similarity_modes
+from pipelines.geometry.cameras import Camera, project
+from pipelines.geometry.rotations import exp_so3
+
+LENS = Camera("SIMPLE_RADIAL", 600, 450, np.array([500.0, 300.0, 225.0, -0.05]))
+SIGMA_PX = 0.5
+
+
+def exact_network(images: int = 6, points: int = 60, seed: int = 0) -> Network:
+    """Two rings of cameras about points that all of them see, with exact pixels.
+
+    Every other camera stands on its side.
+    """
+    rng = np.random.default_rng(seed)
+    angle = np.linspace(0, 2 * np.pi, images, endpoint=False)
+    height = np.where(np.arange(images) % 2, 18.0, 36.0)
+    center = np.column_stack([30 * np.cos(angle), 30 * np.sin(angle), height])
+    rotation = np.swapaxes(looking_at(center, rng.normal(0, 1, center.shape)), 1, 2)
+    rotation = exp_so3(np.arange(images)[:, None] * [0.0, 0.0, np.pi / 2]) @ rotation
+    cloud = rng.uniform([-9, -9, -6], [9, 9, 9], (points, 3))
+    network = Network(
+        cameras={1: LENS},
+        camera_id=np.ones(images, dtype=np.int64),
+        cam_from_world=rotation,
+        cam_center_in_world=center,
+        point_in_world=cloud,
+        obs_point=np.repeat(np.arange(points), images),
+        obs_image=np.tile(np.arange(images), points),
+        obs_xy_px=np.zeros((points * images, 2)),
+    )
+    return replace(network, obs_xy_px=pixels(network, np.zeros(size(network))))
+
+
+def size(network: Network) -> int:
+    """Unknowns: six for a camera, three for a point."""
+    return 6 * len(network.camera_id) + 3 * len(network.point_in_world)
+
+
+def pixels(network: Network, change: np.ndarray) -> np.ndarray:
+    """Pixels (M, 2) after a change of all unknowns: poses as documented, then points."""
+    n = len(network.camera_id)
+    pose = change[: 6 * n].reshape(n, 6)
+    cloud = network.point_in_world + change[6 * n :].reshape(-1, 3)
+    rotation = network.cam_from_world @ exp_so3(-pose[:, :3])
+    center = network.cam_center_in_world + pose[:, 3:]
+    ray = cloud[network.obs_point] - center[network.obs_image]
+    return project(network.cameras[1], np.einsum("mij,mj->mi", rotation[network.obs_image], ray))
+
+
+def jacobian(network: Network) -> np.ndarray:
+    """∂pixels/∂unknowns (2 M, U) by central differences, one unknown at a time."""
+    steps = np.full(size(network), 1e-5)
+    columns = []
+    for index, step in enumerate(steps):
+        change = np.zeros(len(steps))
+        change[index] = step
+        columns.append((pixels(network, change) - pixels(network, -change)).ravel() / (2 * step))
+    return np.array(columns).T
+
+
+def free_covariance(network: Network) -> np.ndarray:
+    """Covariance (6 n, 6 n) of the poses for unit pixel noise, with the points held on the average.
+
+    The normal matrix of everything is bordered by Meissl's constraints on the cameras; then the gauge is moved.
+    """
+    n, unknowns = len(network.camera_id), size(network)
+    design = jacobian(network)
+    scale = 1.0 / np.linalg.norm(design, axis=0)
+    scaled = design * scale
+    constraint = np.zeros((unknowns, 7))
+    modes = similarity_modes(network.cam_center_in_world).reshape(-1, 7)
+    constraint[: 6 * n] = modes / units(network)[:, None] ** 2
+    constraint = constraint * scale[:, None]
+    constraint /= np.linalg.norm(constraint, axis=0)
+    bordered = np.block([[scaled.T @ scaled, constraint], [constraint.T, np.zeros((7, 7))]])
+    inverse = np.linalg.inv(bordered)[:unknowns, :unknowns] * scale[:, None] * scale
+    hold = np.eye(6 * n) - modes @ points_follow(network, np.eye(6 * n))
+    return hold @ inverse[: 6 * n, : 6 * n] @ hold.T
+
+
+def points_follow(network: Network, corrections: np.ndarray) -> np.ndarray:
+    """Mean similarity (7, c) of the points when they follow corrections (6 n, c) by least squares."""
+    n, points = len(network.camera_id), len(network.point_in_world)
+    design, modes = jacobian(network), point_modes(network)
+    rest = design[:, 6 * n :]
+    follow = np.linalg.lstsq(rest, -design[:, : 6 * n] @ corrections, rcond=None)[0][: 3 * points]
+    own = [design[:, 6 * n + 3 * j : 6 * n + 3 * j + 3] for j in range(points)]
+    pull = sum(m.T @ d.T @ d @ follow[3 * j : 3 * j + 3] for j, (m, d) in enumerate(zip(modes, own, strict=True)))
+    return np.linalg.solve(sum(m.T @ d.T @ d @ m for m, d in zip(modes, own, strict=True)), pull)
+
+
+def point_modes(network: Network) -> np.ndarray:
+    """∂(point)/∂(ln s, rotation, translation) of a similarity about the mean camera centre: (N, 3, 7)."""
+    arm = network.point_in_world - network.cam_center_in_world.mean(axis=0)
+    turns = [np.cross(axis, arm) for axis in np.eye(3)]
+    shifts = [np.tile(axis, (len(arm), 1)) for axis in np.eye(3)]
+    return np.stack([arm, *turns, *shifts], axis=2)
+
+
+def units(network: Network) -> np.ndarray:
+    """Units (6 n,) in which rotations count as metres at the scene: 1 / median distance, and 1."""
+    ray = network.point_in_world[network.obs_point] - network.cam_center_in_world[network.obs_image]
+    return np.tile([1 / np.median(np.linalg.norm(ray, axis=1))] * 3 + [1.0] * 3, len(network.camera_id))
+
+
+def noisy(network: Network, rng: np.random.Generator) -> Network:
+    return replace(network, obs_xy_px=network.obs_xy_px + rng.normal(0, SIGMA_PX, network.obs_xy_px.shape))
+
+
+def test_basis_is_the_root_of_the_full_bundles_covariance() -> None:
+    network = exact_network(images=5, points=40)
+    # Equal residuals everywhere: the robust weights are all the same, and the two agree but for the hold.
+    shifted = replace(network, obs_xy_px=network.obs_xy_px + SIGMA_PX)
+    found = correction_basis(shifted)
+    basis = found.matrix.reshape(30, -1) / units(network)[:, None]
+    expected = free_covariance(network) / units(network)[:, None] / units(network)
+    shape = basis @ basis.T
+    shape *= np.trace(expected) / np.trace(shape)
+    # The hold of 0.1 distances takes (σ / hold)² from what is worst known: at 1 px (0.4 m / 3.8 m)² = 1 %.
+    np.testing.assert_allclose(shape, expected, atol=0.01 * np.abs(expected).max())
+
+
+def test_no_correction_moves_the_points_by_a_similarity() -> None:
+    network = exact_network()
+    # Equal residuals everywhere: the robust weights are all the same, as they are in the design below.
+    basis = correction_basis(replace(network, obs_xy_px=network.obs_xy_px + SIGMA_PX)).matrix
+    assert basis.shape == (6, 6, 6 * 6 - 7)
+    assert np.linalg.matrix_rank(basis.reshape(36, -1) / units(network)[:, None]) == 29
+    flat = basis.reshape(36, -1)
+    # Both derivatives are numerical, with steps of 1e-6.
+    mean = points_follow(network, flat)
+    assert np.abs(mean[4:]).max() < 1e-3 * np.abs(flat.reshape(6, 6, -1)[:, 3:]).max()
+    assert np.abs(mean[:4]).max() < 1e-3 * np.abs(flat.reshape(6, 6, -1)[:, :3]).max()
+
+
+def test_modes_are_what_a_similarity_does_to_the_pixels() -> None:
+    # Moving cameras and points by one similarity leaves all pixels: this fixes signs and axes of the modes.
+    network = exact_network()
+    pivot = network.cam_center_in_world.mean(axis=0)
+    modes = similarity_modes(network.cam_center_in_world)
+    for column in range(7):
+        step = np.zeros(7)
+        step[column] = 1e-4
+        arm = network.point_in_world - pivot
+        moved = np.exp(step[0]) * arm @ exp_so3(step[1:4]).T + step[4:] - arm
+        change = np.concatenate([(modes @ step).ravel(), moved.ravel()])
+        # Second order: 1e-8 of 40 m at 500 px over 40 m.
+        np.testing.assert_allclose(pixels(network, change), network.obs_xy_px, atol=1e-4)
+
+
+def test_readjusted_cameras_differ_by_unit_variance() -> None:
+    exact = exact_network()
+    design = jacobian(exact)
+    scale = 1.0 / np.linalg.norm(design, axis=0)
+    value, vector = np.linalg.eigh((design * scale).T @ (design * scale))
+    seen = vector[:, 7:] / np.sqrt(value[7:])  # all but the gauge
+    solve = scale[:, None] * (seen @ seen.T) @ (design * scale).T
+    squared, sigmas = [], []
+    for seed in range(30):
+        network = noisy(exact, np.random.default_rng(seed))
+        change = solve @ (network.obs_xy_px - exact.obs_xy_px).ravel()
+        found = correction_basis(readjusted(network, change))
+        white = np.linalg.lstsq(complete(found.matrix, exact), change[:36] / units(exact), rcond=None)[0][:29]
+        squared.append(white @ white)
+        sigmas.append(found.sigma_px)
+    # 720 coordinates and 216 unknowns: σ̂ is good to 3 % a run, the mean of 30 χ²₂₉ / 29 to 5 %.
+    assert np.mean(sigmas) == pytest.approx(SIGMA_PX, rel=0.03)
+    assert np.mean(squared) / 29 == pytest.approx(1.0, rel=0.12)
+
+
+def readjusted(network: Network, change: np.ndarray) -> Network:
+    """The network after adjustment: everything moved, pixels as observed."""
+    n = len(network.camera_id)
+    pose = change[: 6 * n].reshape(n, 6)
+    return replace(
+        network,
+        cam_from_world=network.cam_from_world @ exp_so3(-pose[:, :3]),
+        cam_center_in_world=network.cam_center_in_world + pose[:, 3:],
+        point_in_world=network.point_in_world + change[6 * n :].reshape(-1, 3),
+    )
+
+
+def complete(matrix: np.ndarray, network: Network) -> np.ndarray:
+    """Basis and gauge together (6 n, 6 n), in metres: any change of the cameras is one combination of them."""
+    unit = units(network)[:, None]
+    modes = similarity_modes(network.cam_center_in_world).reshape(-1, 7)
+    return np.hstack([matrix.reshape(len(modes), -1) / unit, modes / unit])
+
+
+def test_outlying_observations_cost_little() -> None:
+    rng = np.random.default_rng(3)
+    network = noisy(exact_network(), rng)
+    wrong = rng.choice(len(network.obs_xy_px), len(network.obs_xy_px) // 20, replace=False)
+    spoilt = network.obs_xy_px.copy()
+    spoilt[wrong] += rng.normal(0, 30.0, (len(wrong), 2))
+    clean, hit = correction_basis(network), correction_basis(replace(network, obs_xy_px=spoilt))
+    # 5 % of the observations at 60 σ: least squares would find 13 times the σ.
+    assert hit.sigma_px < 1.4 * clean.sigma_px
+    assert np.linalg.norm(hit.matrix) < 1.5 * np.linalg.norm(clean.matrix)
+
+
+def test_too_few_observations_are_refused() -> None:
+    network = exact_network(images=3, points=5)
+    with pytest.raises(DegenerateGeometryError, match="15 observations do not determine 3 cameras and 5 points"):
+        correction_basis(network)

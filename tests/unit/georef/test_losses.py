@@ -1,0 +1,129 @@
+"""Geographic losses: their values by hand, their gradients by differences, their robustness."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from georef_scenes import draw_truth, fixes_of, make_block, marks_of, problem_of
+
+from pipelines.georef.losses import (
+    CAUCHY_SCALE2,
+    absolute_loss,
+    cauchy,
+    control_point_loss,
+    intersect,
+    rising_weight,
+)
+from pipelines.georef.problem import GeoProblem
+
+BLOCK = make_block(images=4)
+SIGMA_M = np.array([0.5, 0.4, 0.8])
+CONTROL = np.array([[5.0, -4.0, 1.0], [-8.0, 6.0, 0.0], [2.0, 9.0, 3.0]])
+
+
+@pytest.fixture
+def problem() -> GeoProblem:
+    rng = np.random.default_rng(5)
+    truth = draw_truth(BLOCK, rng)
+    return problem_of(BLOCK, fixes_of(truth, SIGMA_M, rng), marks_of(truth, CONTROL, 0.05, rng))
+
+
+def test_weight_rises_as_equation_27() -> None:
+    assert rising_weight(0, 0.05, 100.0) == 0.0
+    assert rising_weight(100, 0.05, 100.0) == pytest.approx(0.05 * (1 - math.exp(-1)))
+    assert rising_weight(100_000, 0.05, 100.0) == pytest.approx(0.05)
+    values = [rising_weight(t, 0.05, 100.0) for t in range(300)]
+    assert all(a < b for a, b in pairwise(values))
+
+
+def test_cauchy_is_chi2_when_small_and_flat_when_large() -> None:
+    chi2 = torch.tensor([1e-4, 1e6], dtype=torch.float64, requires_grad=True)
+    value = cauchy(chi2)
+    assert float(value[0].detach()) == pytest.approx(1e-4, rel=1e-4)
+    value.sum().backward()
+    assert chi2.grad is not None
+    assert float(chi2.grad[1]) == pytest.approx(CAUCHY_SCALE2 / 1e6, rel=1e-4)
+
+
+def test_absolute_loss_is_the_mean_of_rho(problem: GeoProblem) -> None:
+    fixes = problem.fixes
+    assert fixes is not None
+    center = problem.similarity.current().apply(problem.cameras.current().cam_center_in_model)
+    residual = center - fixes.position_in_geo.numpy()
+    chi2 = ((residual / SIGMA_M) ** 2).sum(axis=1)
+    found = absolute_loss(problem.similarity, problem.cameras, fixes, "whitened")
+    assert found.item() == pytest.approx(np.mean(CAUCHY_SCALE2 * np.log1p(chi2 / CAUCHY_SCALE2)))
+    plain = absolute_loss(problem.similarity, problem.cameras, fixes, "paper")
+    assert plain.item() == pytest.approx((residual**2).sum(axis=1).mean())
+
+
+def test_full_covariance_whitens(problem: GeoProblem) -> None:
+    fixes = problem.fixes
+    assert fixes is not None
+    half = np.random.default_rng(1).normal(size=(3, 3))
+    covariance = half @ half.T + 0.1 * np.eye(3)
+    root = torch.from_numpy(np.linalg.inv(np.linalg.cholesky(covariance))).repeat(4, 1, 1)
+    center = problem.similarity.current().apply(problem.cameras.current().cam_center_in_model)
+    residual = center - fixes.position_in_geo.numpy()
+    chi2 = np.einsum("ni,ij,nj->n", residual, np.linalg.inv(covariance), residual)
+    found = absolute_loss(problem.similarity, problem.cameras, replace(fixes, root_information=root), "whitened")
+    assert found.item() == pytest.approx(np.mean(CAUCHY_SCALE2 * np.log1p(chi2 / CAUCHY_SCALE2)))
+
+
+def test_marks_meet_in_the_point_they_were_made_of() -> None:
+    truth = draw_truth(BLOCK, np.random.default_rng(0))
+    marks = marks_of(truth, CONTROL, 0.05, np.random.default_rng(0))
+    problem = problem_of(replace(BLOCK, poses=truth.poses), None, marks)
+    np.testing.assert_allclose(intersect(problem.cameras, marks).detach(), CONTROL, atol=1e-10)
+
+
+def test_intersection_weighs_rays_by_angle_and_distance() -> None:
+    # Two pairs of parallel-plane rays that disagree: the point lies nearer to the better pair.
+    truth = draw_truth(BLOCK, np.random.default_rng(0))
+    marks = marks_of(truth, CONTROL[:1], 0.05, np.random.default_rng(0))
+    turned = marks.bearing_in_cam.clone()
+    turned[0] += torch.tensor([1e-3, 0.0, 0.0], dtype=torch.float64)
+    turned[0] /= turned[0].norm()
+    shift = []
+    for sigma in (1e-3, 1e-5):
+        sigmas = torch.full((4,), 1e-4, dtype=torch.float64)
+        sigmas[0] = sigma
+        spoilt = replace(marks, bearing_in_cam=turned, sigma_rad=sigmas)
+        problem = problem_of(replace(BLOCK, poses=truth.poses), None, spoilt)
+        found = intersect(problem.cameras, spoilt).detach().numpy()
+        shift.append(np.linalg.norm(found - CONTROL[:1]))
+    # 1e-3 rad over 55 m are 5.5 cm across the ray, which a good ray imposes and a bad one does not.
+    assert shift[0] < 0.002
+    assert shift[1] > 0.03
+
+
+@pytest.mark.parametrize("weighting", ["whitened", "paper"])
+def test_gradients_are_exact(problem: GeoProblem, weighting: str) -> None:
+    problem.weighting = weighting  # type: ignore[assignment]
+
+    def losses(y: torch.Tensor, z: torch.Tensor) -> torch.Tensor:
+        return torch.func.functional_call(_Losses(problem), {"problem.similarity.y": y, "problem.cameras.z": z}, ())
+
+    rng = np.random.default_rng(7)
+    y = torch.from_numpy(0.1 * rng.normal(size=7)).requires_grad_()
+    z = torch.from_numpy(rng.normal(size=len(problem.cameras.z))).requires_grad_()
+    assert torch.autograd.gradcheck(losses, (y, z), eps=1e-6, atol=1e-5, rtol=1e-4)
+
+
+class _Losses(torch.nn.Module):
+    def __init__(self, problem: GeoProblem) -> None:
+        super().__init__()
+        self.problem = problem
+
+    def forward(self) -> torch.Tensor:
+        problem = self.problem
+        assert problem.fixes is not None
+        assert problem.marks is not None
+        absolute = absolute_loss(problem.similarity, problem.cameras, problem.fixes, problem.weighting)
+        control = control_point_loss(problem.similarity, problem.cameras, problem.marks, problem.weighting)
+        return torch.stack([absolute, control, problem.loss(), *intersect(problem.cameras, problem.marks)[0]])

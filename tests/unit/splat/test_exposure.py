@@ -1,0 +1,68 @@
+"""Exposures of photographs: found again where they differ, and never by changing all of them together."""
+
+from __future__ import annotations
+
+import torch
+
+from pipelines.splat.exposure import Exposures, fitted_affine, with_affine
+
+CPU = torch.device("cpu")
+TRAIN = torch.tensor([0, 1, 3])
+
+
+def picture(seed: int = 0) -> torch.Tensor:
+    return torch.rand(12, 16, 3, generator=torch.Generator().manual_seed(seed))
+
+
+def test_gains_that_differ_are_found_and_their_mean_is_held() -> None:
+    # Photograph 0 is 10 % brighter and 1 is 10 % darker than the scene; 3 is as the scene is.
+    gain = {0: 1.1, 1: 0.9, 3: 1.0}
+    exposures, colour = Exposures(4, TRAIN, 600, CPU), picture()
+    for iteration in range(1, 601):
+        index = int(TRAIN[iteration % 3])
+        shown = exposures.apply(index, colour)
+        (shown - gain[index] * colour).square().mean().backward()
+        exposures.step(iteration)
+    for index, factor in gain.items():
+        shown = with_affine(colour, exposures.affine[index])
+        assert float((shown - factor * colour).abs().max()) < 0.01
+    torch.testing.assert_close(exposures.affine[TRAIN].mean(dim=0), torch.eye(3, 4), atol=1e-6, rtol=0)
+    assert torch.equal(exposures.affine[2], torch.eye(3, 4))
+
+
+def test_a_common_gain_is_left_to_the_gaussians() -> None:
+    exposures, colour = Exposures(4, TRAIN, 300, CPU), picture()
+    for iteration in range(1, 301):
+        shown = exposures.apply(int(TRAIN[iteration % 3]), colour)
+        (shown - 1.2 * colour).square().mean().backward()
+        exposures.step(iteration)
+    # The last step pulls one of three further than the others: a rate of 5e-4 at the end.
+    assert float((exposures.affine - torch.eye(3, 4)).abs().max()) < 0.01
+
+
+def test_a_state_continues_exactly() -> None:
+    def run(exposures: Exposures, first: int, last: int) -> None:
+        for iteration in range(first, last):
+            shown = exposures.apply(int(TRAIN[iteration % 3]), picture())
+            (shown - picture(iteration % 3 + 1)).abs().mean().backward()
+            exposures.step(iteration)
+
+    whole, part, resumed = (Exposures(4, TRAIN, 40, CPU) for _ in range(3))
+    run(whole, 1, 30)
+    run(part, 1, 13)
+    resumed.restore(part.state())
+    run(resumed, 13, 30)
+    assert torch.equal(whole.affine, resumed.affine)
+
+
+def test_least_squares_finds_an_affine_change_exactly_and_ignores_what_is_masked() -> None:
+    true = torch.tensor([[0.9, 0.1, 0.0, 0.05], [0.0, 1.1, 0.0, -0.02], [0.02, 0.0, 0.8, 0.1]])
+    rendered = picture()
+    photograph, mask = with_affine(rendered, true), torch.ones(12, 16, dtype=torch.bool)
+    photograph[:3], mask[:3] = 7.0, False
+    torch.testing.assert_close(fitted_affine(rendered, photograph, mask), true, atol=1e-5, rtol=0)
+
+
+def test_a_render_of_one_colour_still_has_a_fit() -> None:
+    fit = fitted_affine(torch.full((4, 4, 3), 0.5), torch.full((4, 4, 3), 0.25))
+    torch.testing.assert_close(with_affine(torch.full((3,), 0.5), fit), torch.full((3,), 0.25), atol=1e-6, rtol=0)

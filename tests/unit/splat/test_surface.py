@@ -1,0 +1,82 @@
+"""Surface losses: zero on a surface, and downhill towards one."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from pipelines.splat.gaussians import Gaussians
+from pipelines.splat.raster.api import Pinhole
+from pipelines.splat.raster.cpu import CpuRasterizer
+from pipelines.splat.surface import depth_normals, disc_normals, flatness_loss, normal_loss
+
+CAMERA = Pinhole(48, 36, 40.0, 40.0, 24.0, 18.0)
+POSE = torch.eye(4)
+
+
+def wall(tilt_rad: float, thickness_m: float = 0.01, disc_tilt_rad: float | None = None) -> Gaussians:
+    """Opaque discs on a plane 5 m ahead that is turned about the vertical; the discs may be turned otherwise."""
+    grid = torch.linspace(-4, 4, 33)
+    u, v = (axis.reshape(-1) for axis in torch.meshgrid(grid, grid, indexing="ij"))
+    turned = tilt_rad if disc_tilt_rad is None else disc_tilt_rad
+    return Gaussians(
+        torch.stack([u * math.cos(tilt_rad), v, 5 - u * math.sin(tilt_rad)], dim=1),
+        torch.tensor([math.cos(turned / 2), 0.0, math.sin(turned / 2), 0.0]).repeat(len(u), 1),
+        torch.tensor([0.25, 0.25, thickness_m]).log().repeat(len(u), 1),
+        torch.full((len(u),), 3.0),
+        torch.zeros(len(u), 1, 3),
+    )
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.5, -0.8])
+def test_normals_of_a_plane_are_those_of_its_depth_and_of_its_discs(tilt: float) -> None:
+    true = torch.tensor([-math.sin(tilt), 0.0, -math.cos(tilt)])
+    assert float((disc_normals(wall(tilt), torch.zeros(3)) - true).abs().max()) < 1e-5
+    v, u = torch.meshgrid(torch.arange(36) + 0.5, torch.arange(48) + 0.5, indexing="ij")
+    ray = torch.stack([(u - 24) / 40, (v - 18) / 40, torch.ones_like(u)], dim=-1)
+    depth = 5 * math.cos(tilt) / (ray @ -true)
+    assert float((depth_normals(depth, CAMERA) - true).abs().max()) < 1e-3
+
+
+def test_discs_in_their_plane_cost_nothing_and_turned_ones_do() -> None:
+    backend = CpuRasterizer()
+    true = float(normal_loss(wall(0.4), POSE, CAMERA, backend, 0.1))
+    turned = float(normal_loss(wall(0.4, disc_tilt_rad=0.0), POSE, CAMERA, backend, 0.1))
+    # 1 − cos 0.4 = 0.079 for normals that are off by 0.4 rad; blending over thick edges leaves some thousandths.
+    assert true < 0.01
+    assert turned > 0.04
+
+
+def test_the_gradient_turns_the_discs_into_the_plane() -> None:
+    gaussians = wall(0.4, disc_tilt_rad=0.2)
+    gaussians.quats_wxyz.requires_grad_()
+    optimizer = torch.optim.Adam([gaussians.quats_wxyz], lr=0.01)
+    first = float(normal_loss(gaussians, POSE, CAMERA, CpuRasterizer(), 0.1).detach())
+    for _ in range(15):
+        optimizer.zero_grad()
+        loss = normal_loss(gaussians, POSE, CAMERA, CpuRasterizer(), 0.1)
+        loss.backward()
+        optimizer.step()
+    assert float(loss.detach()) < 0.5 * first
+
+
+def test_depth_edges_do_not_count() -> None:
+    near, far = wall(0.0), wall(0.0)
+    near = near.select(near.means[:, 0] < 0)
+    near.means[:, 2] -= 2.0
+    both = Gaussians.concatenate([near, far])
+    # Two parallel walls behind each other have one normal; the step between them has none.
+    assert float(normal_loss(both, POSE, CAMERA, CpuRasterizer(), 0.02)) < 0.02
+
+
+def test_flatness_is_the_smallest_standard_deviation_of_what_is_visible() -> None:
+    gaussians = wall(0.0, thickness_m=0.05)
+    gaussians.log_scales.requires_grad_()
+    loss = flatness_loss(gaussians, torch.tensor([0, 2]), extent_m=10.0)
+    assert float(loss.detach()) == pytest.approx(0.005)
+    loss.backward()
+    assert gaussians.log_scales.grad is not None
+    assert gaussians.log_scales.grad.abs().sum(dim=0)[:2].tolist() == [0, 0]
+    assert gaussians.log_scales.grad[:, 2].nonzero()[:, 0].tolist() == [0, 2]
