@@ -110,10 +110,13 @@ def estimate_rig(
     found = fit_rig(data, before_s, track.nominal_from_cam, options)
     arm = np.nan_to_num(track.antenna_in_body).mean(axis=0)
     state, sigma = found.state, found.sigma
+    # Along its view a camera's centre trades against lens and terrain: SfM is wrong there by a pixel's footprint,
+    # alike in all images, which no scatter shows.
+    arm_sigma = np.hypot(sigma[11:14], state.geo_from_local.scale * _footprint(model))
     rows = {
         "time-offset": (np.array([state.offset_s]), sigma[7:8], np.array([before_s])),
         "boresight": (_degrees(state.boresight), np.degrees(sigma[8:11]), _degrees(track.nominal_from_cam)),
-        "lever-arm": (arm + state.arm, sigma[11:14], arm),
+        "lever-arm": (arm + state.arm, arm_sigma, arm),
     }
     estimates = []
     for name in wanted:
@@ -144,8 +147,16 @@ def _data(survey: Survey, model: SparseModel, track: NavigationTrack) -> RigData
         antenna_in_body=np.nan_to_num(track.antenna_in_body[rows]),
         control_in_local=control.in_local,
         control_in_geo=control.in_geo,
-        control_cov=control.cov_in_geo,
+        control_cov_in_local=control.cov_in_local,
+        control_cov_in_geo=control.cov_in_geo,
     )
+
+
+def _footprint(model: SparseModel) -> float:
+    """Width of a pixel at the distance of the points, in units of local."""
+    arm = model.point_in_local[model.obs_point] - model.cam_center_in_local[model.obs_image]
+    focal = np.array([model.camera_of(image).mean_focal_px for image in range(len(model.image_name))])
+    return float(np.median(np.linalg.norm(arm, axis=1) / focal[model.obs_image]))
 
 
 def _degrees(rotation: FloatArray) -> FloatArray:

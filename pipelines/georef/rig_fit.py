@@ -38,6 +38,7 @@ _SCAN_STEP_S = 0.1
 _DIFFERENCE_S = 0.5
 _SMOOTHING_S = 0.1
 _LEAST_IMAGES = 6
+_MEDIAN_CHI2_3 = 2.366
 _LEAST_SIGMA_M, _LEAST_SIGMA_RAD = 1e-3, 1e-5
 
 
@@ -59,7 +60,8 @@ class RigData:
         center_in_local: (n, 3) and cam_from_local: (n, 3, 3), of SfM.
         cam_from_body: (n, 3, 3) mount, NaN where unknown.
         antenna_in_body: (n, 3) lever arm to start from.
-        control_in_local, control_in_geo: (c, 3); control_cov: (c, 3, 3) in geo.
+        control_in_local, control_in_geo: (c, 3).
+        control_cov_in_local, control_cov_in_geo: (c, 3, 3), of their marks and of their survey.
     """
 
     track: NavigationTrack
@@ -70,7 +72,8 @@ class RigData:
     antenna_in_body: FloatArray
     control_in_local: FloatArray
     control_in_geo: FloatArray
-    control_cov: FloatArray
+    control_cov_in_local: FloatArray
+    control_cov_in_geo: FloatArray
 
 
 @dataclass(frozen=True)
@@ -261,13 +264,25 @@ def _normal(
         normal += np.einsum("n,nia,nib->ab", weight, jacobian, jacobian)
         gradient -= np.einsum("n,nia,ni->a", weight, jacobian, residual)
     if len(data.control_in_local):
-        missed = data.control_in_geo - state.geo_from_local.apply(data.control_in_local)
         jacobian = -_similarity_jacobian(state, data.control_in_local)
-        inverse = np.linalg.solve(data.control_cov, np.tile(np.eye(3), (len(missed), 1, 1)))
+        missed, inverse = _control(data, state)
         weight = cauchy_weight(np.einsum("ni,nij,nj->n", missed, inverse, missed))
         normal[:7, :7] += np.einsum("n,nia,nij,njb->ab", weight, jacobian, inverse, jacobian)
         gradient[:7] -= np.einsum("n,nia,nij,nj->a", weight, jacobian, inverse, missed)
     return normal, gradient
+
+
+def _control(data: RigData, state: RigState) -> tuple[FloatArray, FloatArray]:
+    """Misses of the control points (c, 3) and their weights (c, 3, 3).
+
+    The SfM model bends: where the control points scatter more than marks and survey allow, all count for less.
+    """
+    model = state.geo_from_local
+    missed = data.control_in_geo - model.apply(data.control_in_local)
+    cov = data.control_cov_in_geo + model.scale**2 * model.rotation @ data.control_cov_in_local @ model.rotation.T
+    inverse = np.linalg.solve(cov, np.tile(np.eye(3), (len(missed), 1, 1)))
+    usual = float(np.median(np.einsum("ni,nij,nj->n", missed, inverse, missed)))
+    return missed, inverse / max(1.0, usual / _MEDIAN_CHI2_3)
 
 
 def _similarity_jacobian(state: RigState, points: FloatArray) -> FloatArray:

@@ -60,7 +60,8 @@ def _data(track: Track, seed: int = 1, control: int = 0) -> RigData:
         antenna_in_body=np.tile(ARM_M, (count, 1)),
         control_in_local=local_from_geo.apply(points),
         control_in_geo=points,
-        control_cov=np.tile(1e-4 * np.eye(3), (control, 1, 1)),
+        control_cov_in_local=np.zeros((control, 3, 3)),
+        control_cov_in_geo=np.tile(1e-4 * np.eye(3), (control, 1, 1)),
     )
 
 
