@@ -84,9 +84,29 @@ def outcomes(results: Sequence[Outcome]) -> Table:
     return table
 
 
+def calibration(document: Mapping[str, Any]) -> list[Renderable]:
+    """`georef calibrate`: a line a component, and what is left."""
+    table = _table("", "estimated", "± σ", "before", "unit", "")
+    for column in table.columns[1:4]:
+        column.justify = "right"
+    for row in document["estimates"]:
+        axes = {"boresight": "xyz", "lever-arm": ("forward", "right", "down")}.get(row["name"], ("",))
+        for axis, value, sigma, before, seen in zip(
+            axes, row["value"], row["sigma"], row["before"], row["observable"], strict=True
+        ):
+            told = "" if seen else "[yellow]not observable in this flight[/]"
+            name = f"{row['name']} {axis}".strip()
+            table.add_row(name, f"{value:.4f}", f"{sigma:.4f}", f"{before:.4f}", row["unit"], told)
+    left = f"left over: {document['rms_position_m']:.3f} m an axis"
+    if document["rms_attitude_deg"] is not None:
+        left += f", {document['rms_attitude_deg']:.2f}°"
+    return [table, f"{left} ({document['images']} images, {document['control_points']} control points)"]
+
+
 def topics(rows: Iterable[Mapping[str, Any]]) -> Table:
     """`georef inspect`: a line a topic."""
     table = _table("topic", "type", "messages", "Hz", "span", "longest gap", "frame", "use", "")
+    table.columns[0].overflow = table.columns[1].overflow = "fold"
     for column in table.columns[2:6]:
         column.justify = "right"
     for row in rows:

@@ -19,6 +19,7 @@ from pipelines.errors import InputError
 
 CONFIG_FILE = "georef.toml"
 AUTO = "auto"
+RIG_PARAMETERS = ("time-offset", "boresight", "lever-arm")
 
 
 class InputMarker:
@@ -203,6 +204,30 @@ class ExportPlyConfig(StageConfig):
     """The splat as a 3DGS PLY with its sidecar."""
 
     min_opacity: float = Field(0.005, ge=0, lt=1, description="Leave out Gaussians that are less opaque.")
+
+
+class CalibrateConfig(StageConfig):
+    """What `georef calibrate` estimates from the SfM cameras and the recorded navigation."""
+
+    estimate: str = Field(
+        "time-offset,boresight", description="Any of time-offset, boresight and lever-arm, with commas."
+    )
+    max_offset: float = Field(
+        2.0, gt=0, le=60, description="Search the time offset so many seconds on either side of the present one."
+    )
+
+    @property
+    def wanted(self) -> tuple[str, ...]:
+        """The parameters, in their usual order."""
+        return tuple(name for name in RIG_PARAMETERS if name in self.estimate.split(","))
+
+    @field_validator("estimate")
+    @classmethod
+    def _are_parameters(cls, text: str) -> str:
+        unknown = [name for name in text.split(",") if name not in RIG_PARAMETERS]
+        if unknown:
+            raise ValueError(f"{unknown[0]!r} is none of {', '.join(RIG_PARAMETERS)}")
+        return text
 
 
 class SimulateConfig(StageConfig):

@@ -11,13 +11,14 @@ from pipelines.stages import StageSpec
 from pipelines.workspace import Workspace
 
 Memo = dict[Path, str]
+_WHOLE_BYTES = 256 * 1024 * 1024
 
 
 def fingerprints(workspace: Workspace, spec: StageSpec, config: StageConfig, memo: Memo) -> dict[str, str]:
     """Hashes of everything that decides a stage's result, by product or flag.
 
-    Workspace products by content; files that the options name by content, folders that they name by the name,
-    size and modification time of each file (reading gigabytes of photographs at each look would be too slow).
+    Workspace products by content; files that the options name by content, those beyond 256 MiB (bags) and folders
+    by the name, size and modification time of each file (reading gigabytes at each look would be too slow).
 
     Args:
         memo: hashes found so far; a product that several stages read is hashed once.
@@ -32,10 +33,19 @@ def fingerprints(workspace: Workspace, spec: StageSpec, config: StageConfig, mem
             flag = flag_name(type(config), name)
             if not path.exists():
                 raise InputError("no such file or folder", path=path, field=flag)
-            found[flag] = _hash_file(path) if path.is_file() else _hash_listing(path, workspace.root)
+            found[flag] = _hash_input(path, workspace.root)
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}", path=error.filename) from error
     return found
+
+
+def _hash_input(path: Path, workspace_root: Path) -> str:
+    if path.is_dir():
+        return _hash_listing(path, workspace_root)
+    stat = path.stat()
+    if stat.st_size > _WHOLE_BYTES:
+        return hashlib.sha256(f"{path.name} {stat.st_size} {stat.st_mtime_ns}".encode()).hexdigest()
+    return _hash_file(path)
 
 
 def _hash_file(path: Path) -> str:

@@ -9,7 +9,7 @@ which the seven movements that no observation can see, those of a similarity of 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -93,6 +93,7 @@ def correction_basis(network: Network) -> CorrectionBasis:
     Raises:
         DegenerateGeometryError: fewer observations than unknowns.
     """
+    network = _in_front(network)
     lin = _linearise(network)
     n, points = len(network.camera_id), len(network.point_in_world)
     redundancy = 2 * len(lin.residual) - 6 * n - 3 * points
@@ -108,6 +109,20 @@ def correction_basis(network: Network) -> CorrectionBasis:
     modes = similarity_modes(network.cam_center_in_world).reshape(-1, 7)
     held = flat - modes @ (reduced.points_follow @ flat)
     return CorrectionBasis(held.reshape(basis.shape), float(np.sqrt(variance)))
+
+
+def _in_front(network: Network) -> Network:
+    """Without the observations of points behind their camera, which an imported model may hold."""
+    ray = network.point_in_world[network.obs_point] - network.cam_center_in_world[network.obs_image]
+    ahead = np.einsum("mj,mj->m", network.cam_from_world[network.obs_image, 2], ray) > 0
+    if ahead.all():
+        return network
+    return replace(
+        network,
+        obs_point=network.obs_point[ahead],
+        obs_image=network.obs_image[ahead],
+        obs_xy_px=network.obs_xy_px[ahead],
+    )
 
 
 def _linearise(network: Network) -> _Linearised:

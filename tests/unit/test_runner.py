@@ -10,7 +10,9 @@ from pathlib import Path
 import pytest
 
 from pipelines import runner, states
+from pipelines.config import IngestConfig
 from pipelines.errors import ConvergenceError, GeorefError, InputError, MissingProductError
+from pipelines.fingerprints import fingerprints
 from pipelines.stages import BY_NAME, PIPELINE, SPARSE, stage_slice
 from pipelines.workspace import StageRun, Summary, Workspace
 from tests import fakes
@@ -332,3 +334,21 @@ def test_workspace_inside_the_photographs(photos: Path) -> None:
 def test_slice_in_wrong_order() -> None:
     with pytest.raises(GeorefError, match="--from train comes after --to sfm"):
         stage_slice("train", "sfm")
+
+
+def test_large_input_file_counts_by_size_and_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A bag of many gigabytes is not read at each look: its size and time stand for its content."""
+    bag = tmp_path / "flight.mcap"
+    bag.write_bytes(b"x" * 100)
+    workspace, spec = Workspace(tmp_path / "ws"), BY_NAME["ingest"]
+    config = IngestConfig(bag=bag)
+
+    def seen() -> str:
+        return fingerprints(workspace, spec, config, {})["--bag"]
+
+    whole = seen()
+    monkeypatch.setattr("pipelines.fingerprints._WHOLE_BYTES", 99)
+    large = seen()
+    assert large != whole and seen() == large
+    os.utime(bag, (1, 1))
+    assert seen() != large

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,9 +19,9 @@ from splat_scenes import (
 
 from pipelines.blocks.checkpoint import load_checkpoint, save_checkpoint
 from pipelines.blocks.scene import geo_problem, initial_scene, photographs
-from pipelines.blocks.trainer import JointTrainer, StepReport
+from pipelines.blocks.trainer import JointTrainer
 from pipelines.config import TrainConfig
-from pipelines.errors import ConvergenceError
+from pipelines.splat.raster.api import rasterizer
 from pipelines.train import make_trainer
 from pipelines.workspace import Workspace
 
@@ -52,7 +51,7 @@ def trainer_of(rendered: Rendered, workspace: Workspace, config: TrainConfig = C
     scene = initial_scene(rendered.sparse, rendered.survey, initial)  # type: ignore[arg-type]
     images = photographs(scene.sparse, rendered.survey, workspace, 640)
     problem = geo_problem(scene, rendered.survey, initial, config)  # type: ignore[arg-type]
-    return make_trainer(scene, images, problem, config)
+    return make_trainer(scene, images, problem, rasterizer("cpu"), config)
 
 
 def test_every_view_is_seen_once_an_epoch_and_no_test_view_ever(rendered: Rendered, workspace: Workspace) -> None:
@@ -109,22 +108,3 @@ def test_state_of_a_run_that_has_not_begun(rendered: Rendered, workspace: Worksp
     save_checkpoint(tmp_path / "c.npz", one.state())
     two.restore(load_checkpoint(tmp_path / "c.npz"))
     assert float(one.step().photometric) == float(two.step().photometric)
-
-
-def test_divergence_is_told_by_term_and_iteration(rendered: Rendered, workspace: Workspace) -> None:
-    trainer = trainer_of(rendered, workspace)
-    fine = StepReport(torch.tensor(0.1), torch.tensor(0.01), torch.tensor(2.0), 0.05)
-    trainer.check_finite(fine)
-    trainer.iteration = 40
-    with pytest.raises(ConvergenceError, match=r"photometric loss is not finite at iteration 40.*--seed"):
-        trainer.check_finite(replace(fine, photometric=torch.tensor(float("nan"))))
-    with pytest.raises(ConvergenceError, match=r"geographic loss .*--geo-weight"):
-        trainer.check_finite(replace(fine, geographic=torch.tensor(float("inf"))))
-
-
-def test_target_is_the_photograph(rendered: Rendered, workspace: Workspace) -> None:
-    trainer = trainer_of(rendered, workspace)
-    target, mask = trainer.target(0)
-    assert target.shape == (72, 96, 3)
-    assert 0 <= float(target.min()) < float(target.max()) <= 1
-    assert mask is None  # a pinhole photograph covers all of its pinhole image

@@ -214,3 +214,19 @@ def test_too_few_observations_are_refused() -> None:
     network = exact_network(images=3, points=5)
     with pytest.raises(DegenerateGeometryError, match="15 observations do not determine 3 cameras and 5 points"):
         correction_basis(network)
+
+
+def test_points_behind_a_camera_are_left_out() -> None:
+    network = noisy(exact_network(), np.random.default_rng(4))
+    behind = 2 * network.cam_center_in_world[0] - network.point_in_world.mean(axis=0)
+    spoilt = replace(
+        network,
+        point_in_world=np.vstack([network.point_in_world, behind]),
+        obs_point=np.append(network.obs_point, 60),
+        obs_image=np.append(network.obs_image, 0),
+        obs_xy_px=np.vstack([network.obs_xy_px, [[300.0, 225.0]]]),
+    )
+    # The lone point has no observation left: it adds three unknowns to the count, and nothing else.
+    np.testing.assert_allclose(
+        correction_basis(spoilt).matrix, correction_basis(network).matrix, rtol=0.02, atol=1e-4
+    )
