@@ -138,7 +138,7 @@ def make_trainer(
         GaussianAdam(gaussians, extent_m, preset.iterations),
         _strategy(config, extent_m, len(gaussians)),
         problem.to(device),
-        Views(scene.train, images),
+        Views(scene.train, images, _observed(scene, device) if config.faithful_surface else ()),
         rasterizer=backend,
         options=JointOptions(
             preset.iterations,
@@ -150,6 +150,13 @@ def make_trainer(
         ),
         exposures=Exposures(len(images), train, preset.iterations, device) if config.exposure else None,
     )
+
+
+def _observed(scene: Scene, device: torch.device) -> tuple[torch.Tensor, ...]:
+    """By image, the SfM points (K, 3) in `model` that it observes."""
+    points, sparse = scene.point_in_model, scene.sparse
+    rows = (np.unique(sparse.obs_point[sparse.obs_image == index]) for index in range(len(sparse.image_name)))
+    return tuple(torch.from_numpy(points[found]).float().to(device) for found in rows)
 
 
 def _strategy(config: TrainConfig, extent_m: float, count: int) -> Strategy:

@@ -21,7 +21,7 @@ from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.losses import photometric_loss
 from pipelines.splat.optimizer import GaussianAdam
 from pipelines.splat.raster.api import Pinhole, Rasterizer, RasterSettings, Render
-from pipelines.splat.surface import SurfaceSettings, flatness_loss, normal_loss
+from pipelines.splat.surface import SurfaceSettings, depth_loss, flatness_loss, normal_loss
 from pipelines.splat.watch import FiniteWatch
 
 _FINAL_RATE = 0.05  # of the geographic learning rates, relative to the first
@@ -67,10 +67,12 @@ class Views:
     Attributes:
         camera: (V,) indices into the cameras (and the images) of those to train on.
         images: all undistorted images.
+        observed: by image, the SfM points (K, 3) in `model` that it observes; only the surface losses need them.
     """
 
     camera: np.ndarray
     images: ImageCache
+    observed: tuple[Tensor, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -147,7 +149,7 @@ class JointTrainer:
         self._geo_adam.zero_grad()
         total = photometric + weight * geographic
         penalty = self.strategy.penalty(self.optimizer.gaussians, render.stats)
-        for term in (penalty, self._surface(render, pose, target)):
+        for term in (penalty, self._surface(render, pose, target, index)):
             total = total if term is None else total + term
         total.backward()
         self._note(photometric, geographic)
@@ -185,15 +187,21 @@ class JointTrainer:
         self._watch.reset()
 
     def _render(self, pose: Tensor, camera: Pinhole) -> Render:
-        settings = RasterSettings(sh_degree=self._sh_degree(), background=self.options.background)
+        depth = self.options.surface is not None
+        settings = RasterSettings(sh_degree=self._sh_degree(), background=self.options.background, depth=depth)
         return self.rasterizer.render(self.optimizer.gaussians, pose, camera, settings)
 
-    def _surface(self, render: Render, pose: Tensor, target: Target) -> Tensor | None:
+    def _surface(self, render: Render, pose: Tensor, target: Target, index: int) -> Tensor | None:
         """The surface losses, where they are wanted."""
         wanted, gaussians = self.options.surface, self.optimizer.gaussians
         if wanted is None:
             return None
         loss = wanted.flatness * flatness_loss(gaussians, render.stats.visible, self.optimizer.extent_m)
+        if self.views.observed and len(self.views.observed[index]) and render.expected_depth is not None:
+            points = self.views.observed[index]
+            loss = loss + wanted.depth * depth_loss(
+                render.expected_depth, render.alpha, points, pose, target.camera
+            )
         if self.iteration > wanted.normals_from * self.options.iterations:
             normals = normal_loss(gaussians, pose, target.camera, self.rasterizer, wanted.edge)
             loss = loss + wanted.normals * normals

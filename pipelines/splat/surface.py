@@ -1,7 +1,9 @@
 """Losses that make the Gaussians lie on surfaces, so that the depth of a render can be measured in.
 
-Each Gaussian is flattened towards a disc (as in PGSR, doi 10.1109/TVCG.2024.3494046, eq. 1), and the normals of the
-discs are held to those of the rendered depth (2D Gaussian Splatting, doi 10.1145/3641519.3657428, eq. 14).
+The rendered depth is held to that of the SfM points that a view observes (as in DS-NeRF,
+doi 10.1109/CVPR52688.2022.01254), each Gaussian is flattened towards a disc (as in PGSR,
+doi 10.1109/TVCG.2024.3494046, eq. 1), and the normals of the discs are held to those of the rendered depth (2D
+Gaussian Splatting, doi 10.1145/3641519.3657428, eq. 14).
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ class SurfaceSettings:
     """Weights of the losses.
 
     Attributes:
+        depth: of the mean relative difference of depth at the SfM points.
         flatness: of the mean smallest standard deviation, in scene extents.
         normals: of the depth–normal consistency,
         normals_from: from this fraction of the training.
@@ -29,10 +32,37 @@ class SurfaceSettings:
             the depth has no normal.
     """
 
-    flatness: float = 20.0
-    normals: float = 0.05
-    normals_from: float = 0.3
+    depth: float = 1.0
+    flatness: float = 1.0
+    normals: float = 0.01
+    normals_from: float = 0.5
     edge: float = 0.05
+
+
+def depth_loss(
+    depth_m: Tensor, alpha: Tensor, point_in_model: Tensor, cam_from_model: Tensor, camera: Pinhole
+) -> Tensor:
+    """Mean |z_rendered / z − 1| of points (K, 3) that the view observes; scalar.
+
+    Points that fall outside, or where the render is nearly transparent, do not count: there is no surface yet.
+
+    Args:
+        depth_m: (H, W) expected depth.
+        alpha: (H, W).
+        point_in_model: (K, 3) metres.
+        cam_from_model: (4, 4) pose; no gradient reaches it, for cameras shall not follow the surface.
+        camera: of H × W pixels.
+    """
+    pose = cam_from_model.detach()
+    in_cam = point_in_model @ pose[:3, :3].T + pose[:3, 3]
+    z = in_cam[:, 2].clamp_min(1e-3)
+    x = (camera.fx * in_cam[:, 0] / z + camera.cx) / camera.width
+    y = (camera.fy * in_cam[:, 1] / z + camera.cy) / camera.height
+    place = 2 * torch.stack([x, y], dim=1) - 1
+    maps = torch.stack([depth_m, alpha.detach()])[None]
+    found = functional.grid_sample(maps, place[None, None], align_corners=False, padding_mode="border")[0, :, 0]
+    counts = ((place.abs() < 1).all(dim=1) & (in_cam[:, 2] > 1e-3) & (found[1] > 0.5)).to(depth_m.dtype)
+    return ((found[0] / z - 1).abs() * counts).sum() / counts.sum().clamp_min(1)
 
 
 def flatness_loss(gaussians: Gaussians, visible: Tensor, extent_m: float) -> Tensor:

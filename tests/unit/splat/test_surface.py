@@ -10,7 +10,7 @@ import torch
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.raster.api import Pinhole
 from pipelines.splat.raster.cpu import CpuRasterizer
-from pipelines.splat.surface import depth_normals, disc_normals, flatness_loss, normal_loss
+from pipelines.splat.surface import depth_loss, depth_normals, disc_normals, flatness_loss, normal_loss
 
 CAMERA = Pinhole(48, 36, 40.0, 40.0, 24.0, 18.0)
 POSE = torch.eye(4)
@@ -80,3 +80,26 @@ def test_flatness_is_the_smallest_standard_deviation_of_what_is_visible() -> Non
     assert gaussians.log_scales.grad is not None
     assert gaussians.log_scales.grad.abs().sum(dim=0)[:2].tolist() == [0, 0]
     assert gaussians.log_scales.grad[:, 2].nonzero()[:, 0].tolist() == [0, 2]
+
+
+def test_depth_is_held_to_the_points_that_are_seen_in_it() -> None:
+    depth = torch.full((36, 48), 5.0, requires_grad=True)
+    alpha = torch.ones(36, 48)
+    alpha[:, :8] = 0.1
+    points = torch.tensor([
+        [0.0, 0.0, 4.0],  # 25 % too far
+        [0.5, -0.5, 5.0],  # right
+        [-2.4, 0.0, 4.0],  # at column 0, where nothing is opaque
+        [9.0, 0.0, 4.0],  # outside
+        [0.0, 0.0, -4.0],  # behind
+    ])  # fmt: skip
+    loss = depth_loss(depth, alpha, points, POSE, CAMERA)
+    assert float(loss.detach()) == pytest.approx(0.125, rel=1e-5)
+    loss.backward()
+    assert depth.grad is not None
+    # Only the four pixels around the middle are pulled, and nearer.
+    assert (depth.grad[17:19, 23:25] > 0).all() and int((depth.grad.abs() > 1e-6).sum()) <= 8
+    elsewhere = torch.eye(4)
+    elsewhere[2, 3] = 1.0
+    far = depth_loss(depth.detach(), alpha, points[:1], elsewhere, CAMERA)
+    assert float(far) == pytest.approx(0.0, abs=1e-6)
