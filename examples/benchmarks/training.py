@@ -2,8 +2,8 @@
 
 `scaling` prints time and memory of an iteration (projection, harmonics, binning, blending, loss with SSIM,
 backward, optimiser, density statistics) against Gaussians and pixels, over the made-up scene of raster.py.
-`curve` trains on a workspace with each strategy and prints PSNR on its test views against wall-clock time, without the time
-that measuring it takes.
+`curve` trains on a workspace with each strategy and prints PSNR on its test views against wall-clock time, without
+the time that measuring it takes.
 """
 
 from __future__ import annotations
