@@ -1,9 +1,9 @@
 """What bundle adjustment knows of its cameras: the information that the image observations leave in the poses.
 
-The reduced normal matrix of the bundle (points eliminated) says which corrections of the cameras the observations
-would resist, and how much. The lens is taken as given, for training renders through a fixed one. The square root of
-that matrix gives coordinates in which every correction that costs the observations χ² = 1 has length one, and in
-which the seven movements that no observation can see, those of a similarity of the whole, do not exist.
+The reduced normal matrix of the bundle (points and intrinsics eliminated) says which corrections of the cameras
+the observations would resist, and how much. Its square root gives coordinates in which every correction that
+costs the observations χ² = 1 has length one, and in which the seven movements that no observation can see, those
+of a similarity of the whole, do not exist.
 """
 
 from __future__ import annotations
@@ -80,6 +80,7 @@ class _Linearised:
     residual: FloatArray  # (M, 2)
     by_pose: FloatArray  # (M, 2, 6)
     by_point: FloatArray  # (M, 2, 3)
+    by_intrinsics: FloatArray  # (M, 2, P), P the longest parameter list
 
 
 def correction_basis(network: Network) -> CorrectionBasis:
@@ -88,7 +89,10 @@ def correction_basis(network: Network) -> CorrectionBasis:
     Robust: observations are weighted by Cauchy's kernel. The gauge is held at the points: each correction, with the
     points following the cameras, leaves them in place on the average (mean similarity zero, weighted by how well
     each is seen). So the uncertainty of the similarity is that of the scene, not that of the cameras' mean.
-    Cost O((6 n)³).
+
+    The lens is uncertain, hence eliminated from the information; but training renders through a fixed one, hence
+    the points follow the cameras through that. A wrong focal length or principal point then shows as a common shift
+    of the cameras against the scene, which costs little, as it should. Cost O((6 n)³).
 
     Raises:
         DegenerateGeometryError: fewer observations than unknowns.
@@ -130,16 +134,20 @@ def _linearise(network: Network) -> _Linearised:
     rotation = network.cam_from_world[network.obs_image]
     in_cam = np.einsum("mij,mj->mi", rotation, ray)
     count = len(ray)
+    longest = max(len(camera.params) for camera in network.cameras.values())
     residual, by_cam = np.zeros((count, 2)), np.zeros((count, 2, 3))
+    by_intrinsics = np.zeros((count, 2, longest))
     camera_of = network.camera_id[network.obs_image]
     for key, camera in network.cameras.items():
         rows = np.flatnonzero(camera_of == key)
         local = in_cam[rows]
         residual[rows] = project(camera, local) - network.obs_xy_px[rows]
         by_cam[rows] = _differences(partial(project, camera), local)
+        for index in range(len(camera.params)):
+            by_intrinsics[rows, :, index] = _by_parameter(camera, index, local)
     by_point = by_cam @ rotation
     by_pose = np.concatenate([by_point @ skew(ray), -by_point], axis=2)
-    return _Linearised(residual, by_pose, by_point)
+    return _Linearised(residual, by_pose, by_point, by_intrinsics)
 
 
 def _differences(function: Callable[[FloatArray], FloatArray], points: FloatArray) -> FloatArray:
@@ -153,6 +161,16 @@ def _differences(function: Callable[[FloatArray], FloatArray], points: FloatArra
     return np.stack(columns, axis=2)
 
 
+def _by_parameter(camera: Camera, index: int, points: FloatArray) -> FloatArray:
+    step = _STEP * max(1.0, abs(float(camera.params[index])))
+    shifted = []
+    for sign in (1.0, -1.0):
+        params = camera.params.copy()
+        params[index] += sign * step
+        shifted.append(project(Camera(camera.model, camera.width, camera.height, params), points))
+    return (shifted[0] - shifted[1]) / (2 * step)
+
+
 def _robust_weights(residual: FloatArray) -> FloatArray:
     length = np.linalg.norm(residual, axis=1)
     scale = max(float(np.median(length)) / 1.1774, 1e-9)  # median of a Rayleigh distribution
@@ -161,15 +179,18 @@ def _robust_weights(residual: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class _Reduced:
-    information: FloatArray  # (6 n, 6 n) of the poses, points eliminated
+    information: FloatArray  # (6 n, 6 n) of the poses, points and intrinsics eliminated
     points_follow: FloatArray  # (7, 6 n) mean similarity of the points when the cameras move
 
 
 def _reduced(network: Network, lin: _Linearised, root_weight: FloatArray) -> _Reduced:
-    """Schur complement of the points, and how these follow the poses."""
+    """Schur complement of points and intrinsics, and how the points follow the poses through a fixed lens."""
     n, points = len(network.camera_id), len(network.point_in_world)
     scaled = root_weight[:, None, None]
+    keys = list(network.cameras)
+    slot = np.array([keys.index(int(key)) for key in network.camera_id])[network.obs_image]
     pose = _scatter(lin.by_pose * scaled, network.obs_image, n)
+    intrinsics = _scatter(lin.by_intrinsics * scaled, slot, len(keys))
     by_point = lin.by_point * scaled
     normal = np.zeros((points, 3, 3))
     np.add.at(normal, network.obs_point, np.swapaxes(by_point, 1, 2) @ by_point)
@@ -177,11 +198,17 @@ def _reduced(network: Network, lin: _Linearised, root_weight: FloatArray) -> _Re
     root = np.linalg.cholesky(normal)
     inverse_root = np.swapaxes(np.linalg.inv(root), 1, 2)
     point = _scatter(by_point @ inverse_root[network.obs_point], network.obs_point, points)
-    pose_point = pose.T @ point
-    information = (pose.T @ pose - pose_point @ pose_point.T).toarray()
+    pose_point, intrinsics_point = pose.T @ point, intrinsics.T @ point
+    cc = (pose.T @ pose - pose_point @ pose_point.T).toarray()
+    ci = (pose.T @ intrinsics - pose_point @ intrinsics_point.T).toarray()
+    ii = (intrinsics.T @ intrinsics - intrinsics_point @ intrinsics_point.T).toarray()
+    used = np.flatnonzero(np.diag(ii) > 0)  # shorter parameter lists leave empty columns
+    scale = 1.0 / np.sqrt(np.diag(ii)[used])
+    block = ii[np.ix_(used, used)] * scale[:, None] * scale + 1e-9 * np.eye(len(used))
+    cross = ci[:, used] * scale
+    cc -= cross @ np.linalg.solve(block, cross.T)
     moved = (np.swapaxes(root, 1, 2) @ _displacements(network)).reshape(3 * points, 7)
-    follow = -np.linalg.solve(moved.T @ moved, (pose_point @ moved).T)
-    return _Reduced((information + information.T) / 2, follow)
+    return _Reduced((cc + cc.T) / 2, -np.linalg.solve(moved.T @ moved, (pose_point @ moved).T))
 
 
 def _displacements(network: Network) -> FloatArray:
