@@ -282,7 +282,7 @@ def _control(data: RigData, state: RigState) -> tuple[FloatArray, FloatArray]:
     cov = data.control_cov_in_geo + model.scale**2 * model.rotation @ data.control_cov_in_local @ model.rotation.T
     inverse = np.linalg.solve(cov, np.tile(np.eye(3), (len(missed), 1, 1)))
     usual = float(np.median(np.einsum("ni,nij,nj->n", missed, inverse, missed)))
-    return missed, inverse / max(1.0, usual / _MEDIAN_CHI2_3)
+    return missed, np.asarray(inverse / max(1.0, usual / _MEDIAN_CHI2_3), dtype=np.float64)
 
 
 def _similarity_jacobian(state: RigState, points: FloatArray) -> FloatArray:
