@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scenes import Measured, Noise, make_scene, sparse_model, survey_of
 
-from pipelines.blocks.background import background
+from pipelines.blocks.background import background, ground_plane
 from pipelines.blocks.scene import Scene
 from pipelines.blocks.scene import make_scene as in_model
 from pipelines.formats.image_cache import ImageCache, Photograph
@@ -61,7 +61,9 @@ def test_points_lie_on_the_ground_or_in_the_sky(scene: Scene, images: ImageCache
     found = background(scene, images)
     middle = np.median(scene.point_in_model, axis=0)
     distance = np.linalg.norm(found.point_in_model - middle, axis=1)
-    ground = np.abs(found.point_in_model[:, 2] - np.percentile(scene.point_in_model[:, 2], 5)) < 1e-6
+    a, b, c = ground_plane(scene.point_in_model)
+    x, y, z = found.point_in_model.T
+    ground = np.abs(z - (a * x + b * y + c)) < 1e-6
     radius = np.percentile(np.linalg.norm(scene.point_in_model - middle, axis=1), 90)
     assert ground.sum() > 20
     assert (~ground).sum() > 20
