@@ -7,6 +7,7 @@ validation library nor anything heavier, is imported for it.
 from __future__ import annotations
 
 import importlib
+import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,6 +18,11 @@ import click
 from georef_cli import boundary
 
 PROGRAM = "georef"
+
+# Threads that are done wait asleep. By default OpenMP's spin, and where another program has one of two cores, each
+# spins away the time that the other one needs: training was six times slower beside one busy program. The library
+# reads this when it is loaded, which no import above does.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,6 +12,9 @@ import pytest
 from pipelines.stages import PIPELINE
 from pipelines.workspace import Workspace
 from tests import fakes
+
+# As the command line does, and for the same reason: see georef_cli/main.py.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 
 @pytest.fixture

@@ -9,11 +9,15 @@ measuring takes does not count.
 from __future__ import annotations
 
 import argparse
+import os
 import statistics
 import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+
+# As the command line does, and for the same reason: see georef_cli/main.py.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import numpy as np
 import torch

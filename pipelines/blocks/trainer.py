@@ -164,13 +164,16 @@ class JointTrainer:
         found = []
         for place in torch.randperm(len(self.views.camera), generator=generator)[:count].tolist():
             index = int(self.views.camera[place])
-            target, pose = self._targets.get(index, self._shrink(index)), self.problem.cameras.cam_from_model(index)
+            shrink, pose = self._shrink(index), self.problem.cameras.cam_from_model(index)
+            target = self._targets.get(index, shrink)
             colour = self._render(pose, target.camera).colour
             if self.exposures is not None:
                 colour = self.exposures.apply(index, colour)
             error = (colour - target.colour).abs().mean(dim=-1)
             error = error if target.mask is None else error * target.mask
-            found.append(evidence(self.optimizer.gaussians, pose, target.camera, error, self.rasterizer))
+            seen = evidence(self.optimizer.gaussians, pose, target.camera, error, self.rasterizer)
+            # Strategies count pixels of the photographs, whatever the schedule makes of them.
+            found.append(Evidence(shrink**2 * seen.weight_px, shrink**2 * seen.high_error_px))
         return found
 
     def check_finite(self) -> None:
