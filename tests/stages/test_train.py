@@ -107,7 +107,7 @@ def test_similarity_comes_within_its_covariance(trained: Pairs) -> None:
         sigma = np.sqrt(np.diag(np.array(model.geo_from_model.covariance)))
         # 5 cm over √12, and 6 cm over the ring of 32 m.
         np.testing.assert_allclose(sigma[4:6], [0.0145, 0.0145], rtol=0.15)
-        # Heights: 8 cm over √12 at the least. How far below steep cameras the scene lies, and how large it is, hangs
+        # Heights: 8 cm over √12 at the least. How far below steep cameras the scene lies, and how large it is, hang
         # on the focal length too, which images of 96 pixels tell to some tenths of a per cent.
         assert 0.02 < sigma[6] < 0.2
         assert sigma[0] < 0.004
