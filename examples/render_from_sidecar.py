@@ -18,7 +18,6 @@ import torch
 
 from pipelines.blocks.scene import photographs
 from pipelines.blocks.trained import Trained, load_trained
-from pipelines.blocks.trainer import pinhole
 from pipelines.formats.georef_sidecar import read_sidecar
 from pipelines.geodesy.enu import ecef_from_enu, ecef_from_enu_rotation, lla_of
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
@@ -73,7 +72,7 @@ def main() -> None:
         rotation = geo_from_cam(image, trained, options.attitude == "recorded")
         pose = cam_from_ply(image.fix, rotation, trained.survey.origin, options.splat)
         with torch.no_grad():
-            render = backend.render(gaussians, pose, pinhole(images, index), RasterSettings())
+            render = backend.render(gaussians, pose, images.pinhole(index), RasterSettings())
         colour = render.colour.clamp(0, 1).mul(255).byte().numpy()
         strip = np.concatenate([images.image(index), colour], axis=1)
         path = options.output / f"{Path(image.name).stem}.png"

@@ -17,7 +17,6 @@ import torch
 from pipelines.blocks.points import Sights, points_by_camera, points_by_model, sights
 from pipelines.blocks.scene import photographs
 from pipelines.blocks.trained import Trained, load_trained
-from pipelines.blocks.trainer import pinhole
 from pipelines.config import EvaluateConfig
 from pipelines.formats.image_cache import ImageCache
 from pipelines.products import FloatArray, SurveyedPoint, dump_json
@@ -61,7 +60,7 @@ class Eye:
         settings = RasterSettings(sh_degree=model.sh_degree, background=model.background, depth=depth)
         pose = torch.as_tensor(matrix, dtype=torch.float32, device=self._gaussians.means.device)
         with torch.no_grad():
-            return self._backend.render(self._gaussians, pose, pinhole(self.images, index), settings)
+            return self._backend.render(self._gaussians, pose, self.images.pinhole(index), settings)
 
 
 def evaluate(eye: Eye, config: EvaluateConfig, renders: Path, progress: Progress) -> dict[str, Any]:

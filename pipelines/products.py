@@ -292,9 +292,7 @@ class GeolocatedPoints:
 
     def save(self, path: Path) -> None:
         """Write as NPZ."""
-        path.parent.mkdir(parents=True, exist_ok=True)
-        arrays: dict[str, Any] = {field.name: np.asarray(getattr(self, field.name)) for field in fields(self)}
-        np.savez(path, **arrays)
+        _save_npz(path, {field.name: getattr(self, field.name) for field in fields(self)})
 
     @classmethod
     def load(cls, path: Path) -> GeolocatedPoints:
@@ -349,9 +347,7 @@ class NavigationTrack:
 
     def save(self, path: Path) -> None:
         """Write as NPZ."""
-        path.parent.mkdir(parents=True, exist_ok=True)
-        arrays: dict[str, Any] = {field.name: np.asarray(getattr(self, field.name)) for field in fields(self)}
-        np.savez(path, **arrays)
+        _save_npz(path, {field.name: getattr(self, field.name) for field in fields(self)})
 
     @classmethod
     def load(cls, path: Path) -> NavigationTrack:
@@ -373,6 +369,11 @@ _POINT_ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
     "condition": ("f", ()),
     "inlier": ("b", ()),
 }
+
+
+def _save_npz(path: Path, arrays: dict[str, Any]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.savez(path, **{name: np.asarray(array) for name, array in arrays.items()})  # type: ignore[arg-type]
 
 
 def load_npz(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:

@@ -18,7 +18,7 @@ import torch
 from pipelines.blocks.background import background
 from pipelines.blocks.loop import LoopOptions, Outcome, optimise
 from pipelines.blocks.scene import Scene, geo_problem, initial_scene, photographs
-from pipelines.blocks.trainer import JointOptions, JointTrainer, Views, pinhole
+from pipelines.blocks.trainer import JointOptions, JointTrainer, Views
 from pipelines.config import TrainConfig
 from pipelines.formats.colmap import read_sparse
 from pipelines.formats.image_cache import ImageCache
@@ -116,7 +116,7 @@ def device_of(backend: Rasterizer) -> torch.device:
 
 def training_size(scene: Scene, images: ImageCache, config: TrainConfig) -> TrainingSize:
     """What the memory of a training depends on."""
-    cameras = [pinhole(images, index) for index in map(int, scene.train)]
+    cameras = [images.pinhole(index) for index in map(int, scene.train)]
     largest = max(cameras, key=lambda camera: camera.width * camera.height)
     corrected = len(images) if config.optimize_cameras else 0
     return TrainingSize(effort(config).max_gaussians, largest, config.sh_degree, corrected)

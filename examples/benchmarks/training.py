@@ -24,7 +24,7 @@ import torch
 from raster import make_scene
 
 from pipelines.blocks.scene import Scene, geo_problem, initial_scene, photographs
-from pipelines.blocks.trainer import JointTrainer, pinhole
+from pipelines.blocks.trainer import JointTrainer
 from pipelines.config import TrainConfig
 from pipelines.formats.colmap import read_sparse
 from pipelines.formats.image_cache import ImageCache
@@ -121,7 +121,7 @@ def _test_psnr(trainer: JointTrainer, scene: Scene, images: ImageCache) -> float
     for index in map(int, scene.test):
         pose = trainer.problem.cameras.cam_from_model(index)
         colour = trainer.rasterizer.render(
-            trainer.optimizer.gaussians, pose, pinhole(images, index), settings
+            trainer.optimizer.gaussians, pose, images.pinhole(index), settings
         ).colour
         photo = torch.from_numpy(np.array(images.image(index))).float() / 255.0
         values.append(psnr(colour.cpu(), photo, torch.from_numpy(np.array(images.mask(index)))))

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.blocks.scene import Scene
-from pipelines.formats.image_cache import ImageCache, PinholeImage
+from pipelines.formats.image_cache import ImageCache
+from pipelines.geometry.cameras import Pinhole
 from pipelines.products import FloatArray
 
 _COLUMNS = 24  # cells across an image
@@ -62,7 +63,7 @@ def background(scene: Scene, images: ImageCache) -> Background:
     return _thinned(Background(np.concatenate(found), np.concatenate(colours), np.concatenate(sigmas)))
 
 
-def _empty_cells(scene: Scene, index: int, camera: PinholeImage) -> FloatArray:
+def _empty_cells(scene: Scene, index: int, camera: Pinhole) -> FloatArray:
     """Cells (E, 2) as column and row, without an SfM point in them or beside them."""
     rows = max(1, round(_COLUMNS * camera.height / camera.width))
     in_cam = (scene.point_in_model - scene.poses.cam_center_in_model[index]) @ scene.poses.cam_from_model[index].T
@@ -79,7 +80,7 @@ def _empty_cells(scene: Scene, index: int, camera: PinholeImage) -> FloatArray:
     return np.stack([empty_column, empty_row], axis=1).astype(np.float64)
 
 
-def _rays(pixel: FloatArray, camera: PinholeImage) -> FloatArray:
+def _rays(pixel: FloatArray, camera: Pinhole) -> FloatArray:
     ray = np.stack(
         [(pixel[:, 0] - camera.cx) / camera.fx, (pixel[:, 1] - camera.cy) / camera.fy, np.ones(len(pixel))], axis=1
     )

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.blocks.trained import Trained
-from pipelines.formats.image_cache import PinholeImage
-from pipelines.geometry.cameras import undistort
+from pipelines.geometry.cameras import Pinhole, undistort
 from pipelines.geometry.rays import Rays, Views, intersect
 from pipelines.products import FloatArray, SurveyedPoint
 
@@ -70,7 +69,7 @@ def points_by_camera(trained: Trained, seen: Sights, count: int) -> FloatArray:
 
 
 def points_by_model(
-    trained: Trained, seen: Sights, depth_m: dict[int, FloatArray], pinholes: dict[int, PinholeImage], count: int
+    trained: Trained, seen: Sights, depth_m: dict[int, FloatArray], pinholes: dict[int, Pinhole], count: int
 ) -> FloatArray:
     """Points (J, 3) in `geo` where the model's surface lies behind their marks: median over the views.
 
@@ -89,7 +88,7 @@ def points_by_model(
     return trained.geo_from_model.apply(middle.reshape(-1, 3))
 
 
-def _depth_at(depth_m: FloatArray, camera: PinholeImage, xy: FloatArray) -> float:
+def _depth_at(depth_m: FloatArray, camera: Pinhole, xy: FloatArray) -> float:
     """Depth at a ray: bilinear where the four pixels around it have a surface, else the nearest, 0 outside."""
     x, y = camera.fx * xy[0] + camera.cx - 0.5, camera.fy * xy[1] + camera.cy - 0.5
     if not (0 <= x <= camera.width - 1 and 0 <= y <= camera.height - 1):

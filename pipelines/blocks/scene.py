@@ -8,6 +8,7 @@ Earth, `geo_from_model`, is what training refines.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -49,7 +50,7 @@ class Scene:
     train: NDArray[np.int64]
     test: NDArray[np.int64]
 
-    @property
+    @cached_property
     def poses(self) -> CameraPoses:
         """The cameras as SfM left them."""
         turn = self.model_from_local.rotation
@@ -58,7 +59,7 @@ class Scene:
             self.model_from_local.apply(self.sparse.cam_center_in_local),
         )
 
-    @property
+    @cached_property
     def point_in_model(self) -> FloatArray:
         """SfM points (N, 3) in metres."""
         return self.model_from_local.apply(self.sparse.point_in_local)

@@ -57,7 +57,7 @@ class Targets:
         if self._reader is not None and upcoming is not None:
             self._next = (upcoming, self._reader.submit(self._read, upcoming))
         colour = pixels.to(self._device, non_blocking=True).float() / 255.0
-        camera = _pinhole(self._images, index)
+        camera = self._images.pinhole(index)
         if shrink > 1:
             colour = functional.avg_pool2d(colour.permute(2, 0, 1), shrink).permute(1, 2, 0).contiguous()
             camera = shrunken(camera, shrink)
@@ -96,8 +96,3 @@ def shrunken(camera: Pinhole, shrink: int) -> Pinhole:
         camera.height // shrink,
         *(value / shrink for value in (camera.fx, camera.fy, camera.cx, camera.cy)),
     )
-
-
-def _pinhole(images: ImageCache, index: int) -> Pinhole:
-    camera = images.pinhole(index)
-    return Pinhole(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)

@@ -85,12 +85,6 @@ class StepReport:
     weight: float
 
 
-def pinhole(images: ImageCache, index: int) -> Pinhole:
-    """Camera of an undistorted image, for the rasteriser."""
-    camera = images.pinhole(index)
-    return Pinhole(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-
-
 class JointTrainer:
     """State of a joint optimisation; every iteration is a pure function of it.
 
@@ -234,7 +228,7 @@ class JointTrainer:
 
     def _shrink(self, index: int) -> int:
         """How much the photographs are shrunken at this iteration."""
-        camera = pinhole(self.views.images, index)
+        camera = self.views.images.pinhole(index)
         most = max(max(camera.width, camera.height) // self.options.coarse_least_px, 1)
         progress = self.iteration / self.options.iterations
         return min(next((shrink for shrink, until in self.options.coarse if progress <= until), 1), most)

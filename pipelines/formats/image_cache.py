@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.errors import InputError
-from pipelines.geometry.cameras import Camera, distort, undistort
+from pipelines.geometry.cameras import Camera, Pinhole, distort, undistort
 from pipelines.progress import SILENT, Progress
 
 log = logging.getLogger(__name__)
@@ -21,18 +21,6 @@ log = logging.getLogger(__name__)
 # A pixel that needs light from beyond the photograph's edge is not compared.
 _EDGE_PX = 0.5
 _SAME_RAY = 1e-6  # of normalised coordinates
-
-
-@dataclass(frozen=True)
-class PinholeImage:
-    """Size and intrinsics of an undistorted image, in pixels; centre of the top-left pixel is (0.5, 0.5)."""
-
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
 
 
 @dataclass(frozen=True)
@@ -44,7 +32,7 @@ class Photograph:
     camera: Camera
 
 
-def pinhole_of(camera: Camera, max_size_px: int) -> PinholeImage:
+def pinhole_of(camera: Camera, max_size_px: int) -> Pinhole:
     """The pinhole camera of the same view at a size of at most `max_size_px` along the longer side.
 
     The focal length is kept; distortion parameters are dropped.
@@ -53,7 +41,7 @@ def pinhole_of(camera: Camera, max_size_px: int) -> PinholeImage:
     width, height = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
     fx, fy, cx, cy = _focal_and_centre(camera)
     sx, sy = width / camera.width, height / camera.height
-    return PinholeImage(width, height, fx * sx, fy * sy, cx * sx, cy * sy)
+    return Pinhole(width, height, fx * sx, fy * sy, cx * sx, cy * sy)
 
 
 def _focal_and_centre(camera: Camera) -> tuple[float, float, float, float]:
@@ -83,7 +71,7 @@ class ImageCache:
     def __len__(self) -> int:
         return len(self._photographs)
 
-    def pinhole(self, index: int) -> PinholeImage:
+    def pinhole(self, index: int) -> Pinhole:
         """Camera of an undistorted image."""
         return pinhole_of(self._photographs[index].camera, self.max_size_px)
 
@@ -181,7 +169,7 @@ def _save(path: Path, array: NDArray[Any]) -> None:
     draft.rename(path)
 
 
-def _distortion_map(camera: Camera, pinhole: PinholeImage) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+def _distortion_map(camera: Camera, pinhole: Pinhole) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     u, v = np.meshgrid(np.arange(pinhole.width) + 0.5, np.arange(pinhole.height) + 0.5)
     ray = np.stack([(u - pinhole.cx) / pinhole.fx, (v - pinhole.cy) / pinhole.fy], axis=-1)
     full = distort(camera, ray)

@@ -32,6 +32,18 @@ _TOLERANCE = 1e-11  # of normalised coordinates: 1e-8 px at f = 1000 px
 
 
 @dataclass(frozen=True)
+class Pinhole:
+    """Undistorted camera: size and intrinsics in pixels; the centre of the top-left pixel is (0.5, 0.5)."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+
+@dataclass(frozen=True)
 class Camera:
     """Intrinsics of a COLMAP camera model.
 

@@ -13,6 +13,7 @@ from typing import Literal, Protocol
 from torch import Tensor
 
 from pipelines.errors import BackendUnavailableError
+from pipelines.geometry.cameras import Pinhole
 from pipelines.splat.gaussians import Gaussians
 
 ALPHA_MIN = 1.0 / 255.0
@@ -20,18 +21,6 @@ ALPHA_MAX = 0.999
 TRANSMITTANCE_MIN = 1e-4
 
 BackendName = Literal["cpu", "cuda"]
-
-
-@dataclass(frozen=True)
-class Pinhole:
-    """Undistorted camera: size and intrinsics in pixels."""
-
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
 
 
 @dataclass(frozen=True)

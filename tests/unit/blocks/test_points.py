@@ -8,7 +8,7 @@ from scenes import GEO_FROM_LOCAL, Measured, Noise, make_scene, sparse_model, su
 
 from pipelines.blocks.points import points_by_camera, points_by_model, sights
 from pipelines.blocks.trained import Trained
-from pipelines.formats.image_cache import PinholeImage
+from pipelines.geometry.cameras import Pinhole
 from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.similarity import Similarity
 from pipelines.georef.cameras import CameraPoses
@@ -17,7 +17,7 @@ from pipelines.splat.initialise import gaussians_of_size
 
 EXACT = Noise(mark_px=1e-7, gcp_m=1e-9)
 MODEL_FROM_GEO = Similarity(1.0, exp_so3([0.01, 0.02, -0.03]), np.array([-10.0, 20.0, -5.0]))
-PINHOLE = PinholeImage(320, 240, 270.0, 270.0, 160.0, 120.0)
+PINHOLE = Pinhole(320, 240, 270.0, 270.0, 160.0, 120.0)
 
 
 @pytest.fixture
