@@ -137,6 +137,12 @@ class SfmConfig(StageConfig):
     seed: int = Field(0, ge=0, description="Seed of every random choice.")
 
 
+class AdjustConfig(StageConfig):
+    """Bundle adjustment with the fixes as priors, the baseline of `georef compare`."""
+
+    seed: int = Field(0, ge=0, description="Seed of every random choice.")
+
+
 class GeolocateConfig(StageConfig):
     """Multi-view intersection of every SfM point in the geo frame."""
 
@@ -159,6 +165,7 @@ class InitSim3Config(StageConfig):
     max_residual: float | None = Field(
         None, gt=0, description="Fail if the RMS residual of the camera centres is larger, in metres."
     )
+    control_points: bool = Field(True, description="Use the control points.")
     seed: int = Field(0, ge=0, description="Seed of the RANSAC.")
 
 
@@ -195,6 +202,9 @@ class EvaluateConfig(StageConfig):
 
     backend: Literal["auto", "cpu", "cuda"] = Field("auto", description="Rasteriser.")
     renders: int = Field(8, ge=0, description="Side-by-side renders to write at the most.")
+    similarity: Literal["trained", "initial"] = Field(
+        "trained", description="Place the model on Earth as training found, or as init-sim3 did."
+    )
     lpips_weights: InputPath | None = Field(
         None, description="NPZ file of LPIPS (VGG) weights; without it LPIPS is null."
     )

@@ -1,7 +1,7 @@
 """Evaluation: images against held-out photographs, positions against check points (method, section 4).
 
-Reads the trained model and the survey. Writes `evaluate/report.json` and side-by-side renders. Check points enter
-no solve; what was used in one is reported as a fit, not as an accuracy.
+Reads the trained model, the survey and the initial similarity. Writes `evaluate/report.json` and side-by-side
+renders. Check points enter no solve; what was used in one is reported as a fit, not as an accuracy.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _ASPRS_LEAST_POINTS = 30
 
 def run(stage: StageRun, config: EvaluateConfig) -> Summary:
     """Measure, write the report and the renders."""
-    trained = load_trained(stage.workspace)
+    trained = load_trained(stage.workspace, config.similarity)
     images = photographs(trained.sparse, trained.survey, stage.workspace, trained.model.max_image_size)
     images.build(stage.progress)
     eye = Eye(trained, images, rasterizer(config.backend))

@@ -64,6 +64,8 @@ def estimate_similarity(
     if not np.array_equal(points.point_id, model.point_id):
         raise InputError("the geolocated points are of another model: run `georef geolocate` again")
     fixes = fix_correspondences(survey, model)
+    if not config.control_points:
+        survey = survey.model_copy(update={"control_points": ()})
     control, warnings = control_correspondences(survey, model)
     data = fixes.joined(control)
     if config.method == "paper":

@@ -193,7 +193,7 @@ class InitialSimilarity(Product):
 
     format_version: Literal[1] = 1
     geo_from_local: SimilarityRecord
-    method: Literal["robust", "paper"]
+    method: Literal["robust", "paper", "adjusted"]
     correspondences: dict[str, int]
     inliers: dict[str, int]
     gnss_outliers: tuple[str, ...] = ()

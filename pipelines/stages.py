@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from pipelines.config import (
+    AdjustConfig,
     EvaluateConfig,
     ExportPlyConfig,
     GeolocateConfig,
@@ -28,6 +29,7 @@ MODEL = "train/model.json"
 GAUSSIANS = "train/gaussians.ply"
 REPORT = "evaluate/report.json"
 SPLAT = "export/splat.ply"
+ADJUSTED = "adjust/sparse"  # of variants only, see `ADJUST`
 
 
 @dataclass(frozen=True)
@@ -78,7 +80,7 @@ PIPELINE: tuple[StageSpec, ...] = (
     ),
     StageSpec(
         "evaluate", "pipelines.evaluate", EvaluateConfig, "evaluate",
-        (SURVEY, SPARSE, MODEL, GAUSSIANS), REPORT,
+        (SURVEY, SPARSE, SIM3, MODEL, GAUSSIANS), REPORT,
         "Measure test views and check points.",
     ),
     StageSpec(
@@ -88,6 +90,13 @@ PIPELINE: tuple[StageSpec, ...] = (
     ),
 )  # fmt: skip
 
+# Not part of the line: `georef compare` runs it for the baseline, whose later stages read its product as `sfm`'s.
+ADJUST = StageSpec(
+    "adjust", "pipelines.adjust", AdjustConfig, "adjust", (SURVEY, SPARSE), ADJUSTED,
+    "Adjust the bundle with the fixes as priors of the camera positions.",
+)  # fmt: skip
+
+STAGES = (*PIPELINE, ADJUST)
 BY_NAME = {spec.name: spec for spec in PIPELINE}
 CONFIGS = {spec.name: spec.config for spec in PIPELINE}
 
@@ -95,7 +104,7 @@ CONFIGS = {spec.name: spec.config for spec in PIPELINE}
 def producer_of(path: str) -> StageSpec:
     """The stage that writes a workspace path."""
     folder = path.split("/", maxsplit=1)[0]
-    return next(spec for spec in PIPELINE if spec.folder == folder)
+    return next(spec for spec in STAGES if spec.folder == folder)
 
 
 def products_of(spec: StageSpec) -> tuple[str, ...]:

@@ -88,7 +88,7 @@ def status(workspace: Workspace, memo: Memo | None = None, before: StageSpec | N
     look = _Look(workspace, {} if memo is None else memo, workspace.requests())
     writer = workspace.writer()
     rows = []
-    for spec in PIPELINE[: len(PIPELINE) if before is None else PIPELINE.index(before)]:
+    for spec in PIPELINE[: PIPELINE.index(before) if before in PIPELINE else len(PIPELINE)]:
         row = look.at(spec)
         rows.append(replace(row, state="running", reason="") if spec.name == writer else row)
     return rows

@@ -101,7 +101,7 @@ def photographs(sparse: SparseModel, survey: Survey, workspace: Workspace, max_s
             "`georef sfm --import`, which leaves them out",
             path=workspace.root / SPARSE,
         )
-    folder = workspace.root / survey.image_dir
+    folder = workspace.photographs(survey.image_dir)
     shots = [
         Photograph(name, folder / name, sparse.camera_of(index)) for index, name in enumerate(sparse.image_name)
     ]
