@@ -11,6 +11,7 @@ from rich.console import Group
 from rich.markup import escape
 from rich.table import Table
 
+from pipelines.comparison import Comparison, cells, remarks_on
 from pipelines.errors import InputError
 from pipelines.runner import Outcome
 from pipelines.stages import REPORT
@@ -101,6 +102,20 @@ def calibration(document: Mapping[str, Any]) -> list[Renderable]:
     if document["rms_attitude_deg"] is not None:
         left += f", {document['rms_attitude_deg']:.2f}°"
     return [table, f"{left} ({document['images']} images, {document['control_points']} control points)"]
+
+
+def comparison(table: Comparison) -> list[Renderable]:
+    """`georef compare`: a line a configuration, and what sets it apart below."""
+    heads = [f"{way}\n{name}" for way in ("camera", "model") for name in ("mean H", "median H", "RMSE H", "RMSE V")]
+    del heads[1]  # by camera, mean and median hardly differ
+    shown = _table("", "test\nPSNR", "\nSSIM", *heads, "check\npoints", "\ntraining")
+    for column in shown.columns[1:]:
+        column.justify, column.no_wrap = "right", True
+    for row in table.rows:
+        shown.add_row(row.configuration, *cells(row))
+    notes = [f"[bold]{row.configuration}[/] {escape(f'{row.title}: {row.note}')}" for row in table.rows]
+    remarks = [f"[yellow]{row.configuration}:[/] {escape(text)}" for row in table.rows for text in remarks_on(row)]
+    return ["[bold]Test views in dB, check points in metres[/]", shown, "", *notes, *remarks]
 
 
 def topics(rows: Iterable[Mapping[str, Any]]) -> Table:
