@@ -29,7 +29,6 @@ MODEL = "train/model.json"
 GAUSSIANS = "train/gaussians.ply"
 REPORT = "evaluate/report.json"
 SPLAT = "export/splat.ply"
-ADJUSTED = "adjust/sparse"  # of variants only, see `ADJUST`
 
 
 @dataclass(frozen=True)
@@ -43,8 +42,9 @@ class StageSpec:
         folder: its folder in the workspace.
         reads: workspace paths (files or folders) that decide its result.
         product: the path that later stages and people look for.
-        resumable: whether a partial product can be continued.
         title: one line of help.
+        resumable: whether a partial product can be continued.
+        also: further paths in its folder that others look for, besides what the stages of the pipeline read.
     """
 
     name: str
@@ -55,6 +55,7 @@ class StageSpec:
     product: str
     title: str
     resumable: bool = False
+    also: tuple[str, ...] = ()
 
 
 PIPELINE: tuple[StageSpec, ...] = (
@@ -80,7 +81,7 @@ PIPELINE: tuple[StageSpec, ...] = (
     ),
     StageSpec(
         "evaluate", "pipelines.evaluate", EvaluateConfig, "evaluate",
-        (SURVEY, SPARSE, SIM3, MODEL, GAUSSIANS), REPORT,
+        (SURVEY, SPARSE, MODEL, GAUSSIANS, SIM3), REPORT,
         "Measure test views and check points.",
     ),
     StageSpec(
@@ -90,10 +91,11 @@ PIPELINE: tuple[StageSpec, ...] = (
     ),
 )  # fmt: skip
 
-# Not part of the line: `georef compare` runs it for the baseline, whose later stages read its product as `sfm`'s.
+# Not part of the line: `georef compare` runs it for the baseline, whose later stages find in its folder what they
+# otherwise read from those of sfm and init-sim3.
 ADJUST = StageSpec(
-    "adjust", "pipelines.adjust", AdjustConfig, "adjust", (SURVEY, SPARSE), ADJUSTED,
-    "Adjust the bundle with the fixes as priors of the camera positions.",
+    "adjust", "pipelines.adjust", AdjustConfig, "adjust", (SURVEY, SPARSE), "adjust/sparse",
+    "Adjust the bundle with the fixes as priors of the camera positions.", also=("adjust/geo_from_local.json",),
 )  # fmt: skip
 
 STAGES = (*PIPELINE, ADJUST)
@@ -110,7 +112,7 @@ def producer_of(path: str) -> StageSpec:
 def products_of(spec: StageSpec) -> tuple[str, ...]:
     """Everything in a stage's folder that people or later stages look for."""
     read = (path for other in PIPELINE for path in other.reads if producer_of(path) is spec)
-    return tuple(dict.fromkeys((spec.product, *read)))
+    return tuple(dict.fromkeys((spec.product, *spec.also, *read)))
 
 
 def stage_slice(first: str | None, last: str | None) -> tuple[StageSpec, ...]:

@@ -57,6 +57,7 @@ def _draw(axes: Axes, panel: Panel) -> None:
     heights = [value for values in panel.series.values() for value in values if value is not None]
     if heights and min(heights) > 0 and max(heights) > _WIDE_RANGE * min(heights):
         axes.set_yscale("log")
+        axes.yaxis.set_major_formatter("{x:g}")
         axes.set_ylim(min(heights) / 2, max(heights) * 3)
     elif heights:
         axes.set_ylim(panel.least, panel.least + 1.18 * max(max(heights) - panel.least, 1e-9))
@@ -72,4 +73,5 @@ def _draw(axes: Axes, panel: Panel) -> None:
     axes.set_ylabel(panel.axis)
     axes.spines[["top", "right"]].set_visible(False)
     if len(panel.series) > 1:
-        axes.legend(frameon=False, fontsize=8)
+        below = (0.5, -0.08)
+        axes.legend(frameon=False, fontsize=8, loc="upper center", bbox_to_anchor=below, ncols=len(panel.series))
