@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from scenes import GEO_FROM_LOCAL, Measured, Noise, Scene, make_scene, sparse_model, survey_of, without_fixes
 
-from pipelines.blocks.scene import geo_problem, initial_scene, root_information
+from pipelines.blocks.geographic import geo_problem
+from pipelines.blocks.measurements import root_information
+from pipelines.blocks.scene import initial_scene
 from pipelines.config import TrainConfig
 from pipelines.errors import DegenerateGeometryError
 from pipelines.formats.colmap import SparseModel

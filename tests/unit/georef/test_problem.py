@@ -22,8 +22,8 @@ from scipy.integrate import quad
 from scipy.stats import chi2
 
 from pipelines.geometry.similarity import Similarity, umeyama
-from pipelines.georef import problem as module
 from pipelines.georef.cameras import CameraPoses
+from pipelines.georef.linear import WEIGHT_OF_NOISE
 from pipelines.georef.losses import CAUCHY_SCALE2
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -63,7 +63,7 @@ def test_weight_of_noise_is_that_of_gaussian_residuals() -> None:
 
     slope = mean(lambda x: weight(x) - 2 / 3 * x * weight(x) ** 2 / CAUCHY_SCALE2)
     expected = mean(weight) * mean(lambda x: weight(x) ** 2 * x / 3) / slope**2
-    assert expected == pytest.approx(module._WEIGHT_OF_NOISE, abs=1e-4)
+    assert expected == pytest.approx(WEIGHT_OF_NOISE, abs=1e-4)
 
 
 @pytest.mark.parametrize("control", [False, True])
