@@ -116,11 +116,14 @@ class Workspace:
             MissingProductError: it is not there; names the command that makes it.
         """
         folder, _, inside = product.partition("/")
-        path = self.lent.get(folder, self.root / folder) / inside
+        path = self._folder(folder) / inside
         if not path.exists():
             name, home = producer_of(product).name, self.base or self
             raise MissingProductError(product, f"georef {'compare' if self.base else name} {home.root}")
         return path
+
+    def _folder(self, name: str) -> Path:
+        return self.lent.get(name, self.root / name)
 
     def photographs(self, image_dir: str) -> Path:
         """The folder of photographs that a survey names."""
@@ -146,7 +149,7 @@ class Workspace:
         Raises:
             InputError: it is damaged.
         """
-        path = self.root / spec.folder / MANIFEST
+        path = self._folder(spec.folder) / MANIFEST
         return load_json(Manifest, path) if path.exists() else None
 
     def placed_by_hand(self, spec: StageSpec) -> bool:

@@ -239,6 +239,7 @@ def test_variant_reads_what_is_lent_and_writes_its_own(tmp_path: Path) -> None:
     assert variant.path(SIM3) == variant.root / SIM3
     assert variant.partial(TRAIN).parent == variant.root == workspace.root / "compare/A"
     assert variant.cache == workspace.cache
+    assert {row.stage: row.state for row in states.status(variant)}["sfm"] == "current"
     assert variant.config_file == workspace.config_file
     assert variant.photographs("ingest/images") == workspace.root / "ingest/images"
     assert variant.photographs("/photos") == Path("/photos")
