@@ -72,7 +72,7 @@ def linearise(
     by_x = torch.cat([by_y, by_v], dim=2).flatten(0, 1)
     white, x = residuals(y, correction, v).detach().flatten(), torch.cat([y, v])
     base = white - by_x @ x - by_z @ z
-    return Linearised(*(each.cpu() for each in (base, by_x, by_z @ by_z.T, precision, x, white)))
+    return Linearised(*(each.detach().cpu() for each in (base, by_x, by_z @ by_z.T, precision, x, white)))
 
 
 def solve(model: Linearised, start: Tensor, free: Tensor) -> Solution:

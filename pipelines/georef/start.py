@@ -28,7 +28,8 @@ def begin(problem: GeoProblem) -> float:
     y, errors = problem.similarity.y, problem.errors
     before = y.detach().clone()
     for _ in range(_ROUNDS):
-        best, model = _best(problem, with_errors=True)
+        model = problem.linearised()
+        best = _best(problem, model, with_errors=True)
         covariance = posterior(model, best.white)
         moved = best.x - model.x
         errors.begin(best.x[7:].numpy(), torch.linalg.cholesky(covariance[7:, 7:]).numpy())
@@ -36,10 +37,10 @@ def begin(problem: GeoProblem) -> float:
             y.copy_(best.x[:7])
         if float((moved @ torch.linalg.solve(covariance, moved)).sqrt()) < _NEAR:
             break
-    saved = _best(problem, with_errors=False)[0].cost - _best(problem, with_errors=True)[0].cost
+    without = _best(problem, model, with_errors=False)
     with torch.no_grad():
         y.copy_(before)
-    return saved
+    return without.cost - best.cost
 
 
 def bias_pays(problem: GeoProblem, saved: float) -> bool:
@@ -51,12 +52,11 @@ def bias_pays(problem: GeoProblem, saved: float) -> bool:
     return saved > _BIAS_COST * problem.errors.flights
 
 
-def _best(problem: GeoProblem, with_errors: bool) -> tuple[Solution, Linearised]:
-    model = problem.linearised()
+def _best(problem: GeoProblem, model: Linearised, with_errors: bool) -> Solution:
     free = torch.ones(len(model.x), dtype=torch.bool)
     free[7:] = with_errors
-    found = [solve(model, start, free) for start in (model.x, _from_control(problem, model.x, with_errors))]
-    return min(found, key=lambda solution: solution.cost), model
+    starts = (model.x, _from_control(problem, model.x, with_errors))
+    return min((solve(model, start, free) for start in starts), key=lambda solution: solution.cost)
 
 
 @torch.no_grad()
