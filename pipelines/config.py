@@ -195,6 +195,9 @@ class EvaluateConfig(StageConfig):
 
     backend: Literal["auto", "cpu", "cuda"] = Field("auto", description="Rasteriser.")
     renders: int = Field(8, ge=0, description="Side-by-side renders to write at the most.")
+    crs: str | None = Field(
+        None, description="List the check points in this CRS too, e.g. EPSG:32632, or EPSG:32632+5773 for heights."
+    )
     lpips_weights: InputPath | None = Field(
         None, description="NPZ file of LPIPS (VGG) weights; without it LPIPS is null."
     )

@@ -78,6 +78,12 @@ def lambert_two_parallels(
     return np.stack([false_easting_m + radius * np.sin(angle), radius_0 - radius * np.cos(angle)], axis=-1)
 
 
+def long_island(lla: np.ndarray) -> np.ndarray:
+    """New York's Long Island zone on NAD83 (N, 2), in metres."""
+    parallels = (41 + 2 / 60, 40 + 40 / 60)
+    return lambert_two_parallels(lla, parallels, lat_0=40 + 10 / 60, lon_0=-74.0, false_easting_m=300_000.0)
+
+
 def polar_stereographic_north(lla: np.ndarray) -> np.ndarray:
     """UPS North on WGS84 (N, 2), easting first: Snyder (1987), equations 21-30 … 21-33."""
     e = np.sqrt(WGS84_FLATTENING * (2 - WGS84_FLATTENING))

@@ -24,7 +24,7 @@ from tests.map_projections import (
     GRS80_FLATTENING,
     US_FOOT_M,
     TransverseMercator,
-    lambert_two_parallels,
+    long_island,
     polar_stereographic_north,
     utm,
 )
@@ -109,11 +109,6 @@ def test_the_ground_falls_away_from_the_tangent_plane() -> None:
 ARIZONA_EAST = TransverseMercator(
     -(110 + 10 / 60), 31.0, scale=0.9999, false_easting_m=700_000 * FOOT_M, flattening=GRS80_FLATTENING
 )
-
-
-def long_island(lla: np.ndarray) -> np.ndarray:
-    parallels = (41 + 2 / 60, 40 + 40 / 60)
-    return lambert_two_parallels(lla, parallels, lat_0=40 + 10 / 60, lon_0=-74.0, false_easting_m=300_000.0)
 
 
 @pytest.mark.parametrize(
