@@ -114,7 +114,7 @@ def _photometric(eye: Eye, config: EvaluateConfig, renders: Path, progress: Prog
                     "psnr": psnr(colour, photo, mask),
                     "psnr_compensated": psnr(with_affine(colour, fitted_affine(colour, photo, mask)), photo, mask),
                     "ssim": ssim(colour, photo, mask),
-                    "lpips": distance(colour, photo) if callable(distance) else None,
+                    "lpips": distance(colour, photo, mask) if callable(distance) else None,
                 }
             )
             if place < config.renders:
