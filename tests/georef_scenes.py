@@ -118,7 +118,7 @@ def minimise(problem: GeoProblem, steps: int = 20) -> None:
             jacobian = torch.cat(
                 [(root[..., None] * by_y).flatten(0, 1), (root[..., None] * by_z).flatten(0, 1)], 1
             )
-            known = torch.cat([torch.full((len(y),), float(problem.hold_prior)), torch.ones(len(z))]).double()
+            known = torch.cat([float(problem.hold_prior) * problem.similarity.held, torch.ones(len(z))]).double()
             state = torch.cat([y, z])
             normal = jacobian.T @ jacobian + known.diag()
             step = torch.linalg.solve(normal, jacobian.T @ (root * white).flatten() + known * state)

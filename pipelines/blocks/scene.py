@@ -20,7 +20,9 @@ from pipelines.formats.colmap import SparseModel
 from pipelines.formats.image_cache import ImageCache, Photograph
 from pipelines.geometry.bundle import CorrectionBasis, Network, correction_basis
 from pipelines.geometry.cameras import undistort
+from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.similarity import Similarity, moved_pivot
+from pipelines.georef.adjustment import RotationPrior
 from pipelines.georef.cameras import CameraCorrections, CameraPoses
 from pipelines.georef.losses import ControlMarks, Fixes
 from pipelines.georef.problem import GeoProblem
@@ -118,13 +120,21 @@ def geo_problem(scene: Scene, survey: Survey, initial: InitialSimilarity, config
     fixes = _fixes(scene, survey) if config.geo_loss else None
     marks = _control_marks(scene, survey) if config.geo_loss else None
     return GeoProblem(
-        LearnableSimilarity(scene.geo_from_model, covariance, pivot),
+        LearnableSimilarity(scene.geo_from_model, covariance, pivot, _attitude(scene, initial)),
         CameraCorrections(scene.poses, matrix),
         fixes,
         marks,
         weighting=config.weighting,
         hold_prior=initial.layout == "line" or (fixes is None and not _determined_by(marks)),
     )
+
+
+def _attitude(scene: Scene, initial: InitialSimilarity) -> RotationPrior | None:
+    """What attitudes said of the rotation geo ← model, where the initial similarity needed them."""
+    if initial.attitude is None:
+        return None
+    geo_from_local = matrix_from_quat_xyzw(initial.attitude.quat_xyzw)
+    return RotationPrior(geo_from_local @ scene.model_from_local.rotation.T, np.array(initial.attitude.cov_rad2))
 
 
 def _determined_by(marks: ControlMarks | None) -> bool:

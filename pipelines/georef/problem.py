@@ -46,8 +46,8 @@ class GeoProblem(torch.nn.Module):
         fixes: of the training cameras, or None.
         marks: of the control points, or None.
         weighting: "whitened" (maximum a posteriori) or "paper" (plain mean squares).
-        hold_prior: keep the initial similarity as an observation. Only for layouts that the fixes do not
-            determine (a line), since it was estimated from the same fixes.
+        hold_prior: keep what was known of the similarity beforehand as an observation. Only for layouts that the
+            fixes do not determine; for a line only the attitude, since the rest came from the same fixes.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class GeoProblem(torch.nn.Module):
 
     def _prior(self) -> Tensor:
         prior = self.cameras.z.square().sum()
-        return prior + self.similarity.y.square().sum() if self.hold_prior else prior
+        return prior + self.similarity.prior() if self.hold_prior else prior
 
     def _normaliser(self) -> int:
         """N of the means: the fixes, or the cameras where there is none."""
@@ -127,7 +127,7 @@ class GeoProblem(torch.nn.Module):
             root = (weight / _WEIGHT_OF_NOISE).sqrt()[:, None, None]
         by_y = (root * by_y).flatten(0, 1).cpu().numpy()
         by_z = (root * by_z).flatten(0, 1).cpu().numpy()
-        information = by_y.T @ by_y + (np.eye(len(y)) if self.hold_prior else 0.0)
+        information = by_y.T @ by_y + float(self.hold_prior) * np.diag(self.similarity.held.cpu().numpy())
         cross = by_y.T @ by_z
         information -= cross @ np.linalg.solve(by_z.T @ by_z + np.eye(len(z)), cross.T)
         basis = self.similarity.root.cpu().numpy()
