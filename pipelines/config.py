@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 from pydantic.fields import FieldInfo
 
 from pipelines.errors import InputError
@@ -20,6 +20,7 @@ from pipelines.errors import InputError
 CONFIG_FILE = "georef.toml"
 AUTO = "auto"
 RIG_PARAMETERS = ("time-offset", "boresight", "lever-arm")
+ERROR_PARAMETERS = ("bias", "lever-arm", "boresight")
 
 
 class InputMarker:
@@ -183,11 +184,47 @@ class TrainConfig(StageConfig):
     weighting: Literal["whitened", "paper"] = Field(
         "whitened", description="Residuals divided by their σ, or plain mean squares as in the paper."
     )
+    gcp_loss: bool = Field(True, description="Use the control points, L_gcp.")
+    gcp_mode: Literal["camera", "depth"] = Field(
+        "camera", description="Find control points by intersecting their marks, or through the rendered depth."
+    )
+    rel_loss: bool = Field(True, description="Use distances between located points, L_rel.")
     geo_weight: float = Field(0.05, gt=0, description="Final weight w_max of the geographic losses (eq. 27).")
+    geo_schedule: Literal["rising", "constant"] = Field(
+        "rising", description="Let that weight rise as in eq. 27, or be final from the first iteration."
+    )
+    loss_weights: Literal["fixed", "learned"] = Field(
+        "fixed", description="Weigh the geographic losses by the stated σ, or learn a variance factor for each."
+    )
+    estimate: str = Field(
+        "auto",
+        description="Constant errors to estimate: any of bias (of the positions of a flight), lever-arm and "
+        "boresight, with commas; auto: a bias that 3 or more control points show; or none.",
+    )
     optimize_cameras: bool = Field(True, description="Correct the training cameras while training.")
     checkpoint_every: int = Field(500, ge=1, description="Iterations between checkpoints.")
     log_every: int = Field(10, ge=1, description="Iterations between lines of metrics.jsonl.")
     seed: int = Field(0, ge=0, description="Seed of every random choice.")
+
+    @property
+    def estimated(self) -> tuple[str, ...]:
+        """The constant errors that are asked for by name."""
+        return tuple(name for name in ERROR_PARAMETERS if name in self.estimate.split(","))
+
+    @field_validator("estimate")
+    @classmethod
+    def _are_errors(cls, text: str) -> str:
+        unknown = [name for name in text.split(",") if name not in ERROR_PARAMETERS]
+        if unknown and text not in (AUTO, "none"):
+            raise ValueError(f"{unknown[0]!r} is none of {', '.join(ERROR_PARAMETERS)}; or auto, or none")
+        return text
+
+    @field_validator("estimate")
+    @classmethod
+    def _has_sigma(cls, text: str, info: ValidationInfo) -> str:
+        if info.data.get("weighting") == "paper" and text not in (AUTO, "none"):
+            raise ValueError("constant errors are estimated with --weighting whitened only")
+        return text
 
 
 class EvaluateConfig(StageConfig):

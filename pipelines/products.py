@@ -224,6 +224,22 @@ class TrainedCamera(Product):
     exposure: Matrix34 | None = None
 
 
+class EstimatedError(Product):
+    """A constant error of the measurements that training estimated, with its σ, by axis.
+
+    `bias`: fix minus truth, east, north, up, in m; `flight` counts from 0 in the order of time. `lever-arm`:
+    antenna seen from the camera beyond what the survey has applied, camera axes, in m. `boresight`: rotation vector
+    from the true to the nominal camera axes, in degrees. `observed`: σ is at most half of that of the prior.
+    """
+
+    name: Literal["bias", "lever-arm", "boresight"]
+    flight: int | None = None
+    unit: Literal["m", "deg"]
+    value: Vector3
+    sigma: Vector3
+    observed: tuple[bool, bool, bool]
+
+
 class TrainedModel(Product):
     """Product of `train` beside the Gaussians: frames, cameras and what was optimised."""
 
@@ -238,6 +254,8 @@ class TrainedModel(Product):
     gaussians: int
     backend: Literal["cpu", "cuda"]
     gnss_outliers: tuple[str, ...] = ()
+    control_outliers: tuple[str, ...] = ()
+    estimated_errors: tuple[EstimatedError, ...] = ()
 
 
 ProductT = TypeVar("ProductT", bound=BaseModel)

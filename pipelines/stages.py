@@ -73,7 +73,7 @@ PIPELINE: tuple[StageSpec, ...] = (
         "Estimate the similarity from the SfM model to the Earth.",
     ),
     StageSpec(
-        "train", "pipelines.train", TrainConfig, "train", (SURVEY, SPARSE, SIM3), MODEL,
+        "train", "pipelines.train", TrainConfig, "train", (SURVEY, SPARSE, SIM3, POINTS), MODEL,
         "Train the Gaussians together with the similarity and the cameras.", resumable=True,
     ),
     StageSpec(

@@ -1,8 +1,8 @@
 """Training: Gaussians, similarity and cameras optimised together (GeoRefGS section 2.4).
 
-Reads the survey, the SfM model and the initial similarity. Writes `train/gaussians.ply` (frame `model`),
-`train/model.json` (similarity with covariance, cameras), `train/metrics.jsonl` and the latest checkpoint. An
-interrupted run leaves a checkpoint in `train.partial/` from which `--resume` continues.
+Reads the survey, the SfM model, the geolocated points and the initial similarity. Writes `train/gaussians.ply`
+(frame `model`), `train/model.json` (similarity with covariance, cameras, constant errors), `train/metrics.jsonl`
+and the latest checkpoint. An interrupted run leaves a checkpoint in `train.partial/` for `--resume` to go on from.
 """
 
 from __future__ import annotations
@@ -16,8 +16,9 @@ import numpy as np
 import torch
 
 from pipelines.blocks.background import background
+from pipelines.blocks.geographic import geo_problem
 from pipelines.blocks.loop import LoopOptions, Outcome, optimise
-from pipelines.blocks.scene import Scene, geo_problem, initial_scene, photographs
+from pipelines.blocks.scene import Scene, initial_scene, photographs
 from pipelines.blocks.trainer import JointOptions, JointTrainer, Views
 from pipelines.config import TrainConfig
 from pipelines.formats.colmap import read_sparse
@@ -25,6 +26,8 @@ from pipelines.formats.image_cache import ImageCache
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
 from pipelines.georef.problem import GeoProblem
 from pipelines.products import (
+    EstimatedError,
+    GeolocatedPoints,
     InitialSimilarity,
     Survey,
     TrainedCamera,
@@ -48,13 +51,19 @@ from pipelines.splat.optimizer import GaussianAdam
 from pipelines.splat.raster.api import Rasterizer, rasterizer
 from pipelines.splat.storage import write_gaussians
 from pipelines.splat.surface import SurfaceSettings
-from pipelines.stages import SIM3, SPARSE, SURVEY
+from pipelines.stages import POINTS, SIM3, SPARSE, SURVEY
 from pipelines.workspace import StageRun, Summary
 
 log = logging.getLogger(__name__)
 
 _CHECKPOINT = "checkpoint.npz"
 _METRICS = "metrics.jsonl"
+_EVIDENT_SIGMAS = 3.0
+_CAUSES = {
+    "bias": "Check the base station, the vertical datum and the antenna offset",
+    "lever-arm": "`georef ingest --lever-arm` can apply it, in the axes of the body",
+    "boresight": "`georef ingest --boresight` can apply it",
+}
 _COARSE = ((4, 0.1), (2, 0.3))  # shrunken so much, up to this fraction of the training
 
 
@@ -101,7 +110,7 @@ def run(stage: StageRun, config: TrainConfig) -> Summary:
     images = photographs(scene.sparse, survey, workspace, effort(config).max_image_size)
     require_memory(training_size(scene, images, config), free_memory_bytes(device_of(backend)))
     images.build(stage.progress)
-    problem = geo_problem(scene, survey, initial, config)
+    problem = geo_problem(scene, survey, initial, config, GeolocatedPoints.load(workspace.path(POINTS)))
     trainer = make_trainer(scene, images, problem, backend, config)
     options = LoopOptions(
         stage.out / _CHECKPOINT, stage.out / _METRICS, config.checkpoint_every, config.log_every, stage.resumed
@@ -144,6 +153,7 @@ def make_trainer(
             preset.iterations,
             config.sh_degree,
             geo_weight=config.geo_weight,
+            geo_schedule=config.geo_schedule,
             seed=config.seed,
             coarse=_COARSE if config.coarse_to_fine else (),
             surface=SurfaceSettings() if config.faithful_surface else None,
@@ -188,13 +198,16 @@ def initial_gaussians(scene: Scene, images: ImageCache, config: TrainConfig) -> 
 
 def _save(trainer: JointTrainer, scene: Scene, out: Path, outcome: Outcome) -> Summary:
     problem, gaussians = trainer.problem, trainer.optimizer.gaussians.detached()
-    covariance = problem.covariance() if problem.fixes is not None or problem.marks is not None else None
+    measured = problem.fixes is not None or problem.marks is not None
+    covariance, of_errors = problem.covariances() if measured else (problem.similarity.prior_covariance(), None)
     outliers = tuple(sorted(scene.sparse.image_name[index] for index in problem.outliers()))
+    blunders = () if problem.marks is None else tuple(problem.marks.name[j] for j in problem.control_outliers())
+    errors = () if of_errors is None else problem.errors.found(of_errors)
     model = TrainedModel(
         geo_from_model=problem.similarity.current().to_record(
             "model",
             "geo",
-            covariance=problem.similarity.prior_covariance() if covariance is None else covariance,
+            covariance=covariance,
             pivot=problem.similarity.pivot_in_geo,
         ),
         model_from_local=scene.model_from_local.to_record("local", "model"),
@@ -206,6 +219,8 @@ def _save(trainer: JointTrainer, scene: Scene, out: Path, outcome: Outcome) -> S
         gaussians=len(gaussians),
         backend=trainer.rasterizer.name,
         gnss_outliers=outliers,
+        control_outliers=blunders,
+        estimated_errors=errors,
     )
     write_gaussians(out / "gaussians.ply", gaussians)
     save_json(model, out / "model.json")
@@ -220,12 +235,34 @@ def _save(trainer: JointTrainer, scene: Scene, out: Path, outcome: Outcome) -> S
         "seconds_per_iteration": round(outcome.seconds / trainer.iteration, 4),
         "similarity_sigma_m": [round(float(value), 5) for value in sigma[4:]],
         "gnss_outliers": list(outliers),
+        "control_outliers": list(blunders),
+        "estimated_errors": [error.model_dump() for error in errors],
     }
     figure = f"{len(gaussians)} gaussians, train PSNR {psnr:.2f} dB"
     warnings = [f"{len(outliers)} fixes contradict the cameras: {', '.join(outliers[:5])}"] if outliers else []
+    if blunders:
+        warnings.append(f"{len(blunders)} control points contradict the cameras: {', '.join(blunders[:5])}")
+    warnings += [told for error in errors if (told := _told(error)) is not None]
     if outcome.recovery is not None:
         warnings.append(outcome.recovery)
     return Summary(figure, values, tuple(warnings))
+
+
+def _told(error: EstimatedError) -> str | None:
+    """What to warn of: an error beyond 3 σ, or one that could not be observed."""
+    axes = "east, north, up" if error.name == "bias" else "right, down, forward"
+    flight = "" if error.flight is None else f" of flight {error.flight + 1}"
+    what = f"{error.name}{flight}"
+    values = ", ".join(f"{value:+.3f} ± {sigma:.3f}" for value, sigma in zip(error.value, error.sigma, strict=True))
+    far = [
+        abs(value) > _EVIDENT_SIGMAS * sigma and seen
+        for value, sigma, seen in zip(error.value, error.sigma, error.observed, strict=True)
+    ]
+    if any(far):
+        return f"{what} of ({values}) {error.unit} {axes}, beyond 3 σ: it is taken out here. {_CAUSES[error.name]}"
+    if not all(error.observed):
+        return f"{what} is not observable along every axis: ({values}) {error.unit} {axes}"
+    return None
 
 
 def _cameras(trainer: JointTrainer, scene: Scene) -> tuple[TrainedCamera, ...]:

@@ -9,12 +9,14 @@ import torch
 from scenes import looking_at
 
 from pipelines.geometry.bundle import similarity_modes
-from pipelines.geometry.rotations import log_so3
+from pipelines.geometry.rotations import exp_so3, log_so3
 from pipelines.geometry.similarity import Similarity
 from pipelines.georef.cameras import CameraCorrections, CameraPoses
-from pipelines.georef.losses import CAUCHY_SCALE2, ControlMarks, Fixes, Weighting
+from pipelines.georef.losses import CAUCHY_SCALE2, Weighting
+from pipelines.georef.measured import Attitudes, ControlMarks, Fixes, Measured, Pairs
 from pipelines.georef.problem import GeoProblem
 from pipelines.georef.similarity import LearnableSimilarity
+from pipelines.georef.systematic import SystematicErrors
 
 SHIFT = np.array([100.0, 50.0, 20.0])
 # Of an initial similarity that is far from the truth: 1 % of scale, 1°, 2 m.
@@ -91,45 +93,86 @@ def marks_of(truth: Truth, points_in_model: np.ndarray, sigma_m: float, rng: np.
     )
 
 
+def attitudes_of(
+    truth: Truth, sigma_rad: float, rng: np.random.Generator, nominal_from_true: np.ndarray | None = None
+) -> Attitudes:
+    """Recorded rotations of all cameras, with white noise, in axes from which the cameras' are turned."""
+    true = truth.geo_from_model.rotation @ np.swapaxes(truth.poses.cam_from_model, 1, 2)
+    recorded = true if nominal_from_true is None else true @ nominal_from_true.T
+    noise = exp_so3(sigma_rad * rng.normal(size=(len(recorded), 3)))
+    return Attitudes(
+        torch.arange(len(recorded)),
+        torch.from_numpy(recorded @ noise),
+        torch.full((len(recorded),), 1 / sigma_rad, dtype=torch.float64),
+    )
+
+
+def pairs_of(truth: Truth, points_in_model: np.ndarray, sigma_m: float, rng: np.random.Generator) -> Pairs:
+    """All distances between points (J, 3), each point located on Earth with σ `sigma_m`."""
+    located = truth.geo_from_model.apply(points_in_model) + sigma_m * rng.normal(size=points_in_model.shape)
+    i, j = np.triu_indices(len(located), 1)
+    return Pairs(
+        torch.from_numpy(np.linalg.norm(points_in_model[i] - points_in_model[j], axis=1)),
+        None,
+        torch.from_numpy(np.linalg.norm(located[i] - located[j], axis=1)),
+        torch.full((len(i),), 1 / (np.sqrt(2) * sigma_m), dtype=torch.float64),
+        1.0,
+    )
+
+
 def problem_of(
     block: Block, fixes: Fixes | None, marks: ControlMarks | None = None, weighting: Weighting = "whitened"
 ) -> GeoProblem:
     """From the block as SfM left it and an initial similarity that is a guess."""
-    start = Similarity(translation=SHIFT)
+    return problem_with(block, Measured(fixes, marks), weighting=weighting)
+
+
+def problem_with(
+    block: Block,
+    measured: Measured,
+    errors: SystematicErrors | None = None,
+    *,
+    weighting: Weighting = "whitened",
+    learned_weights: bool = False,
+) -> GeoProblem:
+    """The same with any measurements, and constant errors to be estimated."""
     return GeoProblem(
-        LearnableSimilarity(start, LOOSE, pivot(block)),
+        LearnableSimilarity(Similarity(translation=SHIFT), LOOSE, pivot(block)),
         CameraCorrections(block.poses, block.basis),
-        fixes,
-        marks,
+        measured,
         weighting=weighting,
+        errors=errors,
+        learned_weights=learned_weights,
     )
 
 
 def minimise(problem: GeoProblem, steps: int = 20) -> None:
     """Bring the loss to its minimum: Gauss–Newton with Cauchy's weights, on the residuals of `problem.forward`."""
-    y, z = problem.similarity.y, problem.cameras.z
+    names = ("similarity.y", "cameras.z", "errors.x")
+    parameters = {name: problem.get_parameter(name) for name in names}
+    sizes = [len(each) for each in parameters.values()]
+
+    def residuals(*values: torch.Tensor) -> torch.Tensor:
+        return torch.func.functional_call(problem, dict(zip(parameters, values, strict=True)), ())
+
     for _ in range(steps):
-        by_y, by_z = torch.func.jacrev(lambda y, z: _residuals(problem, y, z), argnums=(0, 1))(
-            y.detach(), z.detach()
-        )
+        values = tuple(each.detach() for each in parameters.values())
+        by_each = torch.func.jacrev(residuals, argnums=(0, 1, 2))(*values)
         with torch.no_grad():
-            white = problem()
+            white, errors = problem(), problem.errors
             root = (1 + white.square().sum(dim=1, keepdim=True) / CAUCHY_SCALE2).rsqrt()
-            jacobian = torch.cat(
-                [(root[..., None] * by_y).flatten(0, 1), (root[..., None] * by_z).flatten(0, 1)], 1
-            )
-            known = torch.cat([float(problem.hold_prior) * problem.similarity.held, torch.ones(len(z))]).double()
-            state = torch.cat([y, z])
-            normal = jacobian.T @ jacobian + known.diag()
-            step = torch.linalg.solve(normal, jacobian.T @ (root * white).flatten() + known * state)
-            y -= step[: len(y)]
-            z -= step[len(y) :]
+            jacobian = torch.cat([(root[..., None] * each).flatten(0, 1) for each in by_each], 1)
+            held = float(problem.hold_prior) * problem.similarity.held
+            # What the cameras and the errors cost: |z|² and |v/σ|², v = start + unit · x.
+            known = torch.cat([held, torch.ones(sizes[1], dtype=torch.float64)]).diag()
+            by_prior = torch.block_diag(known, errors.unit / errors.sigma[:, None])
+            prior = torch.cat([held * values[0], values[1], errors.vector() / errors.sigma])
+            normal = jacobian.T @ jacobian + by_prior.T @ by_prior
+            step = torch.linalg.solve(normal, jacobian.T @ (root * white).flatten() + by_prior.T @ prior)
+            for name, change in zip(names, step.split(sizes), strict=True):
+                parameters[name] -= change
         if float(step.norm()) < 1e-4:  # of a σ
             return
-
-
-def _residuals(problem: GeoProblem, y: torch.Tensor, z: torch.Tensor) -> torch.Tensor:
-    return torch.func.functional_call(problem, {"similarity.y": y, "cameras.z": z}, ())
 
 
 def squared_error(truth: Similarity, found: Similarity, covariance: np.ndarray, about: np.ndarray) -> float:

@@ -23,7 +23,8 @@ import numpy as np
 import torch
 from raster import make_scene
 
-from pipelines.blocks.scene import Scene, geo_problem, initial_scene, photographs
+from pipelines.blocks.geographic import geo_problem
+from pipelines.blocks.scene import Scene, initial_scene, photographs
 from pipelines.blocks.trainer import JointTrainer
 from pipelines.config import TrainConfig
 from pipelines.formats.colmap import read_sparse

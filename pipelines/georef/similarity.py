@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -32,6 +33,29 @@ def exp_so3(rotation_vector: Tensor) -> Tensor:
     identity = torch.eye(3, dtype=cross.dtype, device=cross.device)
     linear, quadratic = torch.sinc(angle / math.pi), 0.5 * torch.sinc(0.5 * angle / math.pi).square()
     return identity + linear * cross + quadratic * (cross @ cross)
+
+
+def log_so3(rotation: Tensor) -> Tensor:
+    """Rotation vectors (…, 3) of rotations (…, 3, 3) by less than π, differentiable also at zero."""
+    skewed = rotation - rotation.transpose(-1, -2)
+    sine_axis = 0.5 * torch.stack([skewed[..., 2, 1], skewed[..., 0, 2], skewed[..., 1, 0]], dim=-1)
+    # The root has no derivative at zero: 1e-12 rad stand for none.
+    sine = (sine_axis.square().sum(dim=-1, keepdim=True) + 1e-24).sqrt()
+    cosine = 0.5 * (rotation.diagonal(dim1=-2, dim2=-1).sum(dim=-1, keepdim=True) - 1.0)
+    return sine_axis * (torch.atan2(sine, cosine) / sine)
+
+
+@dataclass(frozen=True)
+class Mapping:
+    """geo ← model: p_geo = scale · rotation p_model + shift; scale (), rotation (3, 3), shift (3,), float64."""
+
+    scale: Tensor
+    rotation: Tensor
+    shift: Tensor
+
+    def apply(self, points: Tensor) -> Tensor:
+        """Map points (N, 3)."""
+        return self.scale * points @ self.rotation.T + self.shift
 
 
 class LearnableSimilarity(torch.nn.Module):
@@ -75,10 +99,17 @@ class LearnableSimilarity(torch.nn.Module):
 
     def forward(self, points: Tensor) -> Tensor:
         """Map points (N, 3) float64 of `model` to `geo`."""
-        delta = self.root @ self.y
-        arm = self.base.scale * points @ self.base_rotation.T + (self.base_shift - self.pivot)
-        turned = arm @ exp_so3(delta[1:4]).T
-        return torch.exp(delta[0]) * turned + (self.pivot + delta[4:])
+        return self.at(self.y).apply(points)
+
+    def at(self, y: Tensor) -> Mapping:
+        """The similarity of coordinates (7,), differentiable in them."""
+        delta = self.root @ y
+        turn, grow = exp_so3(delta[1:4]), torch.exp(delta[0])
+        return Mapping(
+            grow * self.base.scale,
+            turn @ self.base_rotation,
+            self.pivot + delta[4:] + grow * (turn @ (self.base_shift - self.pivot)),
+        )
 
     def current(self) -> Similarity:
         """The present estimate."""

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from scenes import GEO_FROM_LOCAL, Measured, Noise, Scene, make_scene, sparse_model, survey_of, without_fixes
 
-from pipelines.blocks.scene import geo_problem, initial_scene, root_information
+from pipelines.blocks.geographic import geo_problem
+from pipelines.blocks.measurements import root_information
+from pipelines.blocks.scene import initial_scene
 from pipelines.config import TrainConfig
 from pipelines.errors import DegenerateGeometryError
 from pipelines.formats.colmap import SparseModel
@@ -130,6 +132,9 @@ def test_line_holds_its_start() -> None:
     _, sparse, survey = material()
     assert geo_problem(initial_scene(sparse, survey, initial()), survey, initial("line"), CONFIG).hold_prior
     assert not geo_problem(initial_scene(sparse, survey, initial()), survey, initial(), CONFIG).hold_prior
+    # With a boresight to estimate, the attitudes are observations themselves, and must not count twice.
+    observed = TrainConfig(estimate="boresight")
+    assert not geo_problem(initial_scene(sparse, survey, initial()), survey, initial("line"), observed).hold_prior
 
 
 def test_line_holds_only_what_attitude_said() -> None:

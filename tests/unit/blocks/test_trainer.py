@@ -18,7 +18,8 @@ from splat_scenes import (
 )
 
 from pipelines.blocks.checkpoint import load_checkpoint, save_checkpoint
-from pipelines.blocks.scene import geo_problem, initial_scene, photographs
+from pipelines.blocks.geographic import geo_problem
+from pipelines.blocks.scene import initial_scene, photographs
 from pipelines.blocks.trainer import JointTrainer
 from pipelines.config import TrainConfig
 from pipelines.splat.raster.api import rasterizer

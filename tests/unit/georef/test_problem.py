@@ -24,11 +24,12 @@ from scipy.stats import chi2
 
 from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.similarity import Similarity, umeyama
-from pipelines.georef import problem as module
 from pipelines.georef.adjustment import Correspondences, RotationPrior
 from pipelines.georef.alignment import align
 from pipelines.georef.cameras import CameraCorrections, CameraPoses
-from pipelines.georef.losses import CAUCHY_SCALE2, Fixes
+from pipelines.georef.linear import WEIGHT_OF_NOISE
+from pipelines.georef.losses import CAUCHY_SCALE2
+from pipelines.georef.measured import Fixes, Measured
 from pipelines.georef.problem import GeoProblem
 from pipelines.georef.similarity import LearnableSimilarity
 
@@ -69,7 +70,7 @@ def test_weight_of_noise_is_that_of_gaussian_residuals() -> None:
 
     slope = mean(lambda x: weight(x) - 2 / 3 * x * weight(x) ** 2 / CAUCHY_SCALE2)
     expected = mean(weight) * mean(lambda x: weight(x) ** 2 * x / 3) / slope**2
-    assert expected == pytest.approx(module._WEIGHT_OF_NOISE, abs=1e-4)
+    assert expected == pytest.approx(WEIGHT_OF_NOISE, abs=1e-4)
 
 
 @pytest.mark.parametrize("control", [False, True])
@@ -188,7 +189,7 @@ def test_covariance_of_a_line_counts_its_fixes_once(sigma_m: np.ndarray, sigma_r
             similarity = LearnableSimilarity(start.geo_from_local, start.solution.covariance, about, prior)
             assert similarity.current().apply(about) == pytest.approx(start.geo_from_local.apply(about), abs=1e-9)
             problem = GeoProblem(
-                similarity, CameraCorrections(block.poses, block.basis), fixes, None, hold_prior=True
+                similarity, CameraCorrections(block.poses, block.basis), Measured(fixes, None), hold_prior=True
             )
             minimise(problem)
             found.append(squared_error(truth.geo_from_model, similarity.current(), problem.covariance(), about))
