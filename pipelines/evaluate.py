@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import torch
 
+from pipelines.blocks.coordinates import in_crs, target_crs
 from pipelines.blocks.points import Sights, points_by_camera, points_by_model, sights
 from pipelines.blocks.scene import photographs
 from pipelines.blocks.trained import Trained, load_trained
@@ -35,10 +36,13 @@ _ASPRS_LEAST_POINTS = 30
 def run(stage: StageRun, config: EvaluateConfig) -> Summary:
     """Measure, write the report and the renders."""
     trained = load_trained(stage.workspace, config.similarity)
+    crs = None if config.crs is None else target_crs(config.crs, trained.survey)
     images = photographs(trained.sparse, trained.survey, stage.workspace, trained.model.max_image_size)
     images.build(stage.progress)
     eye = Eye(trained, images, rasterizer(config.backend))
     report = evaluate(eye, config, stage.out / "renders", stage.progress)
+    if crs is not None:
+        report["coordinates"] = in_crs(report["checkpoints"], trained.survey, crs)
     (stage.out / "report.json").write_text(dump_json(report) + "\n", encoding="utf-8")
     return _summarise(report)
 
@@ -110,7 +114,7 @@ def _photometric(eye: Eye, config: EvaluateConfig, renders: Path, progress: Prog
                     "psnr": psnr(colour, photo, mask),
                     "psnr_compensated": psnr(with_affine(colour, fitted_affine(colour, photo, mask)), photo, mask),
                     "ssim": ssim(colour, photo, mask),
-                    "lpips": distance(colour, photo) if callable(distance) else None,
+                    "lpips": distance(colour, photo, mask) if callable(distance) else None,
                 }
             )
             if place < config.renders:

@@ -188,6 +188,13 @@ class ResidualStats(Product):
     max_3d_m: float | None
 
 
+class AttitudeRecord(Product):
+    """Rotation `to ← from` of a similarity as recorded attitudes have it: covariance in rad² along target axes."""
+
+    quat_xyzw: Rotation
+    cov_rad2: Covariance3
+
+
 class InitialSimilarity(Product):
     """Product of `init-sim3`: `geo_from_local`, how it was found and how well it is determined."""
 
@@ -201,6 +208,7 @@ class InitialSimilarity(Product):
     condition_number: float
     layout: Literal["volume", "plane", "line"]
     attitude_used: bool
+    attitude: AttitudeRecord | None = None
 
 
 class TrainedCamera(Product):

@@ -162,7 +162,7 @@ def minimise(problem: GeoProblem, steps: int = 20) -> None:
             white, errors = problem(), problem.errors
             root = (1 + white.square().sum(dim=1, keepdim=True) / CAUCHY_SCALE2).rsqrt()
             jacobian = torch.cat([(root[..., None] * each).flatten(0, 1) for each in by_each], 1)
-            held = torch.full((sizes[0],), float(problem.hold_prior), dtype=torch.float64)
+            held = float(problem.hold_prior) * problem.similarity.held
             # What the cameras and the errors cost: |z|² and |v/σ|², v = start + unit · x.
             known = torch.cat([held, torch.ones(sizes[1], dtype=torch.float64)]).diag()
             by_prior = torch.block_diag(known, errors.unit / errors.sigma[:, None])

@@ -15,5 +15,6 @@ command = StageCommand(
     Examples:
       georef evaluate flight
       georef evaluate flight --renders 2 --json
+      georef evaluate flight --crs EPSG:32632
     """,
 )

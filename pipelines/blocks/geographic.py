@@ -11,7 +11,9 @@ from pipelines.blocks.scene import Scene
 from pipelines.config import AUTO, TrainConfig
 from pipelines.errors import InputError
 from pipelines.geometry.bundle import CorrectionBasis, Network, correction_basis
+from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.similarity import moved_pivot
+from pipelines.georef.adjustment import RotationPrior
 from pipelines.georef.cameras import CameraCorrections
 from pipelines.georef.measured import ControlMarks, Measured
 from pipelines.georef.problem import GeoProblem
@@ -48,11 +50,11 @@ def geo_problem(
     matrix = np.zeros((len(scene.sparse.image_name), 6, 0)) if basis is None else basis.matrix
     measured = _measured(scene, survey, config, points) if config.geo_loss else Measured()
     problem = GeoProblem(
-        LearnableSimilarity(scene.geo_from_model, covariance, pivot),
+        LearnableSimilarity(scene.geo_from_model, covariance, pivot, _attitude(scene, initial)),
         CameraCorrections(scene.poses, matrix),
         measured,
         weighting=config.weighting,
-        hold_prior=initial.layout == "line" or (measured.fixes is None and not _determined_by(measured.marks)),
+        hold_prior=_leaves_open(measured, initial),
         errors=_errors(measured, config) if config.geo_loss else None,
         learned_weights=config.loss_weights == "learned",
     )
@@ -61,6 +63,21 @@ def geo_problem(
         if config.estimate == AUTO and not bias_pays(problem, saved):
             problem.errors = SystematicErrors()
     return problem
+
+
+def _attitude(scene: Scene, initial: InitialSimilarity) -> RotationPrior | None:
+    """What attitudes said of the rotation geo ← model, where the initial similarity needed them."""
+    if initial.attitude is None:
+        return None
+    geo_from_local = matrix_from_quat_xyzw(initial.attitude.quat_xyzw)
+    return RotationPrior(geo_from_local @ scene.model_from_local.rotation.T, np.array(initial.attitude.cov_rad2))
+
+
+def _leaves_open(measured: Measured, initial: InitialSimilarity) -> bool:
+    """Whether the observations leave some of the similarity to what was known of it beforehand."""
+    if initial.layout == "line":
+        return measured.attitudes is None
+    return measured.fixes is None and not _determined_by(measured.marks)
 
 
 def _determined_by(marks: ControlMarks | None) -> bool:

@@ -67,8 +67,8 @@ class GeoProblem(torch.nn.Module):
         cameras: poses in `model`.
         measured: the observations.
         weighting: "whitened" (maximum a posteriori) or "paper" (plain mean squares).
-        hold_prior: keep the initial similarity as an observation. Only for layouts that the fixes do not
-            determine (a line), since it was estimated from the same fixes.
+        hold_prior: keep what was known of the similarity beforehand as an observation. Only for layouts that the
+            fixes do not determine; for a line only the attitude, since the rest came from the same fixes.
         errors: constant errors to estimate; None: none.
         learned_weights: learn a variance factor of each term.
     """
@@ -211,7 +211,7 @@ class GeoProblem(torch.nn.Module):
         def residuals(y: Tensor, correction: Tensor, vector: Tensor) -> Tensor:
             return self.whitened(self._estimate(y, correction, vector))
 
-        held = torch.full_like(self.similarity.y.detach(), float(self.hold_prior))
+        held = float(self.hold_prior) * self.similarity.held
         precision = torch.cat([held, self.errors.sigma**-2])
         with torch.no_grad():
             at = (self.similarity.y, self.cameras.corrections(), self.errors.vector(), self.cameras.z)
@@ -251,7 +251,7 @@ class GeoProblem(torch.nn.Module):
 
     def _prior(self) -> Tensor:
         prior = self.cameras.z.square().sum()
-        return prior + self.similarity.y.square().sum() if self.hold_prior else prior
+        return prior + self.similarity.prior() if self.hold_prior else prior
 
     def _normaliser(self) -> int:
         """N of the means: the fixes, or the cameras where there is none."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,8 @@ from pipelines.errors import InputError
 from pipelines.evaluate import render_name
 from pipelines.products import Mark, Survey, TrainedModel, load_json, save_json
 from pipelines.runner import Outcome, run_stage
-from pipelines.stages import BY_NAME, MODEL, REPORT, SURVEY
+from pipelines.splat.storage import read_gaussians, write_gaussians
+from pipelines.stages import BY_NAME, GAUSSIANS, MODEL, REPORT, SURVEY
 from pipelines.workspace import Workspace
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -129,6 +131,24 @@ def test_control_points_are_a_fit_and_not_an_accuracy(altered: Workspace, flight
     assert report["checkpoints"]["camera"]["count"] == 0
     assert report["checkpoints"]["model"]["rmse_3d_m"] is None
     assert report["fit"]["gcp"]["count"] == 6
+
+
+def test_equal_images_are_reported_at_the_cap(altered: Workspace) -> None:
+    """An empty model against black photographs: PSNR has no limit, JSON no infinity."""
+    model = load_json(TrainedModel, altered.path(MODEL))
+    save_json(model.model_copy(update={"background": (0.0, 0.0, 0.0)}), altered.root / MODEL)
+    gaussians = read_gaussians(altered.path(GAUSSIANS))
+    write_gaussians(
+        altered.root / GAUSSIANS, replace(gaussians, logit_opacities=0 * gaussians.logit_opacities - 20)
+    )
+    (altered.root / "photos").unlink()
+    (altered.root / "photos").mkdir()
+    for camera in model.cameras:
+        black = cv2.imencode(".png", np.zeros((72, 96, 3), dtype=np.uint8))[1]
+        (altered.root / "photos" / camera.name).write_bytes(black.tobytes())
+    run_stage(altered, EVALUATE, {"renders": 0})
+    test = report_of(altered)["photometric"]["test"]
+    assert (test["psnr"], test["psnr_compensated"], test["ssim"]) == (100.0, 100.0, 1.0)
 
 
 def test_without_test_views_there_are_no_figures(altered: Workspace) -> None:

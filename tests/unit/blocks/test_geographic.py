@@ -18,7 +18,7 @@ from pipelines.formats.colmap import SparseModel
 from pipelines.geometry.cameras import Camera
 from pipelines.georef.losses import depth_residuals
 from pipelines.georef.problem import GeoProblem
-from pipelines.products import InitialSimilarity, Mark, Survey
+from pipelines.products import AttitudeRecord, InitialSimilarity, Mark, Survey
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 NOISELESS = Noise(pixel_px=0.2, mark_px=1e-9, gcp_m=1e-9, fix_m=(1e-9, 1e-9, 1e-9), attitude_deg=0.5)
@@ -109,6 +109,21 @@ def test_line_holds_its_start() -> None:
     _, sparse, survey = material()
     assert geo_problem(initial_scene(sparse, survey, initial()), survey, initial("line"), CONFIG).hold_prior
     assert not geo_problem(initial_scene(sparse, survey, initial()), survey, initial(), CONFIG).hold_prior
+    # With a boresight to estimate, the attitudes are observations themselves, and must not count twice.
+    observed = TrainConfig(estimate="boresight")
+    assert not geo_problem(initial_scene(sparse, survey, initial()), survey, initial("line"), observed).hold_prior
+
+
+def test_line_holds_only_what_attitude_said() -> None:
+    _, sparse, survey = material()
+    start = initial("line")
+    x, y, z, w = start.geo_from_local.quat_xyzw
+    attitude = AttitudeRecord(quat_xyzw=(x, y, z, w), cov_rad2=((4e-4, 0, 0), (0, 4e-4, 0), (0, 0, 4e-4)))
+    known = start.model_copy(update={"attitude": attitude})
+    similarity = geo_problem(initial_scene(sparse, survey, known), survey, known, CONFIG).similarity
+    # The start states σ 0.01 rad about every axis, the attitude 0.02: a quarter of what is known of the rotation.
+    np.testing.assert_allclose(similarity.held, [0, 0, 0, 0, 0.25, 0.25, 0.25], atol=0.01)
+    np.testing.assert_allclose(similarity.y.detach(), 0.0, atol=1e-9)
 
 
 def test_covariance_of_the_start_is_about_the_cameras() -> None:

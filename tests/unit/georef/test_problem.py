@@ -9,6 +9,7 @@ import pytest
 import torch
 from georef_scenes import (
     SHIFT,
+    Block,
     draw_truth,
     fixes_of,
     make_block,
@@ -22,11 +23,16 @@ from georef_scenes import (
 from scipy.integrate import quad
 from scipy.stats import chi2
 
+from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.similarity import Similarity, jacobian_at, umeyama
-from pipelines.georef.cameras import CameraPoses
+from pipelines.georef.adjustment import Correspondences, RotationPrior
+from pipelines.georef.alignment import align
+from pipelines.georef.cameras import CameraCorrections, CameraPoses
 from pipelines.georef.linear import WEIGHT_OF_NOISE
 from pipelines.georef.losses import CAUCHY_SCALE2
-from pipelines.georef.measured import Measured
+from pipelines.georef.measured import Fixes, Measured
+from pipelines.georef.problem import GeoProblem
+from pipelines.georef.similarity import LearnableSimilarity
 from pipelines.georef.start import begin, bias_pays
 from pipelines.georef.systematic import SystematicErrors
 
@@ -199,14 +205,60 @@ def test_gauge_holds_while_the_measurements_pull() -> None:
     assert abs((arm * (moved - center)).sum() / (arm * arm).sum()) < 1e-12
 
 
+def line_of(images: int) -> Block:
+    """Cameras that look straight down from a line of 100 m, and are held."""
+    center = np.column_stack([np.linspace(-50, 50, images), np.zeros((images, 2))])
+    poses = CameraPoses(np.tile(np.diag([1.0, -1.0, -1.0]), (images, 1, 1)), center)
+    return Block(poses, np.zeros((images, 6, 0)))
+
+
+@pytest.mark.parametrize(
+    ("sigma_m", "sigma_rad"),
+    [(RTK, 0.02), (CONSUMER, 0.02), (CONSUMER, 0.1)],
+    ids=["rtk", "consumer", "poor compass"],
+)
+def test_covariance_of_a_line_counts_its_fixes_once(sigma_m: np.ndarray, sigma_rad: float) -> None:
+    """Only the attitude is held: the start was estimated from the fixes, which are observed in training again."""
+    block, squared, twice = line_of(12), [], []
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        truth = replace(draw_truth(block, rng), poses=block.poses)
+        fixes = fixes_of(truth, sigma_m, rng)
+        seen = exp_so3(sigma_rad * rng.normal(size=3)) @ truth.geo_from_model.rotation
+        attitude = RotationPrior(seen, sigma_rad**2 * np.eye(3))
+        start = align(_correspondences(block, fixes, sigma_m), rng, attitude=attitude)
+        about = start.solution.pivot
+        for prior, found in ((attitude, squared), (None, twice)):
+            similarity = LearnableSimilarity(start.geo_from_local, start.solution.covariance, about, prior)
+            assert similarity.current().apply(about) == pytest.approx(start.geo_from_local.apply(about), abs=1e-9)
+            problem = GeoProblem(
+                similarity, CameraCorrections(block.poses, block.basis), Measured(fixes, None), hold_prior=True
+            )
+            minimise(problem)
+            found.append(squared_error(truth.geo_from_model, similarity.current(), problem.covariance(), about))
+    # The mean of 30 χ²₇ has σ 0.68, 10 % of 7.
+    assert np.mean(squared) == pytest.approx(7.0, rel=0.25)
+    # All of the start held: six of the seven unknowns, those that the fixes know, look twice as certain.
+    assert np.mean(twice) > 9.0
+
+
+def _correspondences(block: Block, fixes: Fixes, sigma_m: np.ndarray) -> Correspondences:
+    count = len(block.poses.cam_center_in_model)
+    return Correspondences(
+        name=tuple(map(str, range(count))),
+        control=np.zeros(count, dtype=bool),
+        in_local=block.poses.cam_center_in_model,
+        cov_in_local=np.zeros((count, 3, 3)),
+        in_geo=fixes.position_in_geo.numpy(),
+        cov_in_geo=np.tile(np.diag(sigma_m**2), (count, 1, 1)),
+    )
+
+
 def test_prior_is_held_where_asked() -> None:
     # On a line the turn about it is open: only the initial estimate knows it.
-    line = CameraPoses(
-        np.tile(np.diag([1.0, -1.0, -1.0]), (6, 1, 1)), np.column_stack([np.linspace(-50, 50, 6), np.zeros((6, 2))])
-    )
-    block = replace(BLOCK, poses=line, basis=np.zeros((6, 6, 0)))
+    block = line_of(6)
     rng = np.random.default_rng(0)
-    truth = replace(draw_truth(block, rng), poses=line)
+    truth = replace(draw_truth(block, rng), poses=block.poses)
     problem = problem_of(block, fixes_of(truth, RTK, rng))
     problem.hold_prior = True
     minimise(problem)
