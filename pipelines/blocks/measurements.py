@@ -117,7 +117,7 @@ def attitudes_of(scene: Scene, survey: Survey) -> Attitudes | None:
 def pairs_of(scene: Scene, fixes: Fixes, points: GeolocatedPoints | None, seed: int) -> Pairs | None:
     """Some hundred long distances across the scene: between located points, else between cameras with fixes.
 
-    What they are worth is limited to what the fixes themselves say of the scale (`measured.scale_share`).
+    What they are worth is limited to a tenth of what the fixes say of the scale (`georef.measured.scale_share`).
 
     Raises:
         InputError: `points` does not belong to the scene.

@@ -9,6 +9,7 @@ from typing import TypeVar
 from torch import Tensor
 
 RecordT = TypeVar("RecordT")
+_WORTH = 0.1  # of the fixes' information on the scale, that distances between points repeat
 
 
 @dataclass(frozen=True)
@@ -140,13 +141,15 @@ def _moved(record: RecordT, move: Callable[[Tensor], Tensor]) -> RecordT:
 
 
 def scale_share(information_of_fixes: float, information_of_pairs: float) -> float:
-    """What each pair may count for, so that all together say no more of the scale than the fixes do.
+    """What each pair may count for, so that all together say at most a tenth of what the fixes do of the scale.
 
-    Located points are functions of the same few fixes (`georef.alignment`): counted as independent, some hundred of
-    them would claim to know the scale many times better than the fixes from which they were made.
+    Located points are functions of the same few fixes (`georef.alignment`), and carry the lens's errors besides:
+    counted as independent, some hundred of them would claim to know the scale many times better than the fixes from
+    which they were made. Being nothing new, they shall steady the scale and not decide it.
 
     Args:
         information_of_fixes: Σ |W (C_i − C̄)|², of ln s.
         information_of_pairs: Σ (distance/σ)², of ln s.
     """
-    return min(1.0, information_of_fixes / information_of_pairs) if information_of_pairs > 0 else 0.0
+    most = _WORTH * information_of_fixes
+    return min(1.0, most / information_of_pairs) if information_of_pairs > 0 else 0.0

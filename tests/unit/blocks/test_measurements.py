@@ -74,7 +74,7 @@ def test_distances_agree_with_the_truth_within_their_sigma() -> None:
     assert float(pairs.distance_in_geo.min()) > 50.0
 
 
-def test_distances_say_no_more_of_the_scale_than_the_fixes() -> None:
+def test_distances_say_of_the_scale_a_tenth_of_what_the_fixes_say() -> None:
     for noise in (Noise(), Noise(fix_m=(1.5, 1.5, 3.0), attitude_deg=0.01)):
         _, scene, survey, points = material(noise)
         fixes = fixes_of(scene, survey)
@@ -84,7 +84,7 @@ def test_distances_say_no_more_of_the_scale_than_the_fixes() -> None:
         of_pairs = pairs.share * float((pairs.distance_in_geo * pairs.root_information).square().sum())
         arm = fixes.position_in_geo - fixes.position_in_geo.mean(dim=0)
         of_fixes = float((fixes.root_information @ arm[..., None]).square().sum())
-        assert 0 < of_pairs <= of_fixes * (1 + 1e-3)
+        assert 0 < of_pairs <= 0.1 * of_fixes * (1 + 1e-3)
 
 
 def test_without_located_points_the_cameras_serve() -> None:
@@ -114,7 +114,7 @@ def test_points_of_another_model_are_refused() -> None:
 
 
 def test_distances_do_not_overrule_the_fixes() -> None:
-    """A geolocation that is a per cent too large, of many precise points, moves the scale half way at the most."""
+    """A geolocation that is a per cent too large, of many precise points, moves the scale by a tenth of that."""
     truth, scene, survey, points = material(Noise(attitude_deg=0.01))
     middle = truth.point_in_geo.mean(axis=0)
     blown = replace(points, position_in_geo=middle + 1.01 * (points.position_in_geo - middle))
@@ -124,7 +124,7 @@ def test_distances_do_not_overrule_the_fixes() -> None:
         adam.zero_grad()
         problem.loss().backward()
         adam.step()
-    assert problem.similarity.current().scale == pytest.approx(1.0, abs=5.5e-3)
+    assert problem.similarity.current().scale == pytest.approx(1.0, abs=1.2e-3)
 
 
 def test_root_information() -> None:
