@@ -76,11 +76,20 @@ class CorrectionBasis:
 
 
 @dataclass(frozen=True)
-class _Linearised:
-    residual: FloatArray  # (M, 2)
-    by_pose: FloatArray  # (M, 2, 6)
-    by_point: FloatArray  # (M, 2, 3)
-    by_intrinsics: FloatArray  # (M, 2, P), P the longest parameter list
+class Linearised:
+    """Residuals of M observations in pixels (projected minus observed), and their derivatives.
+
+    Attributes:
+        residual: (M, 2).
+        by_pose: (M, 2, 6), by (δω, δc) of the camera, as in `CorrectionBasis`.
+        by_point: (M, 2, 3).
+        by_intrinsics: (M, 2, P), P the longest parameter list; zero beyond a shorter one.
+    """
+
+    residual: FloatArray
+    by_pose: FloatArray
+    by_point: FloatArray
+    by_intrinsics: FloatArray
 
 
 def correction_basis(network: Network) -> CorrectionBasis:
@@ -97,8 +106,8 @@ def correction_basis(network: Network) -> CorrectionBasis:
     Raises:
         DegenerateGeometryError: fewer observations than unknowns.
     """
-    network = _in_front(network)
-    lin = _linearise(network)
+    network = in_front(network)
+    lin = linearise(network)
     n, points = len(network.camera_id), len(network.point_in_world)
     redundancy = 2 * len(lin.residual) - 6 * n - 3 * points
     if redundancy <= 0:
@@ -115,7 +124,7 @@ def correction_basis(network: Network) -> CorrectionBasis:
     return CorrectionBasis(held.reshape(basis.shape), float(np.sqrt(variance)))
 
 
-def _in_front(network: Network) -> Network:
+def in_front(network: Network) -> Network:
     """Without the observations of points behind their camera, which an imported model may hold."""
     ray = network.point_in_world[network.obs_point] - network.cam_center_in_world[network.obs_image]
     ahead = np.einsum("mj,mj->m", network.cam_from_world[network.obs_image, 2], ray) > 0
@@ -129,7 +138,8 @@ def _in_front(network: Network) -> Network:
     )
 
 
-def _linearise(network: Network) -> _Linearised:
+def linearise(network: Network) -> Linearised:
+    """The observations of a network, all points in front of their cameras, as linear functions of its unknowns."""
     ray = network.point_in_world[network.obs_point] - network.cam_center_in_world[network.obs_image]
     rotation = network.cam_from_world[network.obs_image]
     in_cam = np.einsum("mij,mj->mi", rotation, ray)
@@ -147,7 +157,7 @@ def _linearise(network: Network) -> _Linearised:
             by_intrinsics[rows, :, index] = _by_parameter(camera, index, local)
     by_point = by_cam @ rotation
     by_pose = np.concatenate([by_point @ skew(ray), -by_point], axis=2)
-    return _Linearised(residual, by_pose, by_point, by_intrinsics)
+    return Linearised(residual, by_pose, by_point, by_intrinsics)
 
 
 def _differences(function: Callable[[FloatArray], FloatArray], points: FloatArray) -> FloatArray:
@@ -183,21 +193,21 @@ class _Reduced:
     points_follow: FloatArray  # (7, 6 n) mean similarity of the points when the cameras move
 
 
-def _reduced(network: Network, lin: _Linearised, root_weight: FloatArray) -> _Reduced:
+def _reduced(network: Network, lin: Linearised, root_weight: FloatArray) -> _Reduced:
     """Schur complement of points and intrinsics, and how the points follow the poses through a fixed lens."""
     n, points = len(network.camera_id), len(network.point_in_world)
     scaled = root_weight[:, None, None]
     keys = list(network.cameras)
     slot = np.array([keys.index(int(key)) for key in network.camera_id])[network.obs_image]
-    pose = _scatter(lin.by_pose * scaled, network.obs_image, n)
-    intrinsics = _scatter(lin.by_intrinsics * scaled, slot, len(keys))
+    pose = scatter(lin.by_pose * scaled, network.obs_image, n)
+    intrinsics = scatter(lin.by_intrinsics * scaled, slot, len(keys))
     by_point = lin.by_point * scaled
     normal = np.zeros((points, 3, 3))
     np.add.at(normal, network.obs_point, np.swapaxes(by_point, 1, 2) @ by_point)
     normal += 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3) + 1e-12 * np.eye(3)
     root = np.linalg.cholesky(normal)
     inverse_root = np.swapaxes(np.linalg.inv(root), 1, 2)
-    point = _scatter(by_point @ inverse_root[network.obs_point], network.obs_point, points)
+    point = scatter(by_point @ inverse_root[network.obs_point], network.obs_point, points)
     pose_point, intrinsics_point = pose.T @ point, intrinsics.T @ point
     cc = (pose.T @ pose - pose_point @ pose_point.T).toarray()
     ci = (pose.T @ intrinsics - pose_point @ intrinsics_point.T).toarray()
@@ -217,7 +227,7 @@ def _displacements(network: Network) -> FloatArray:
     return np.concatenate([arm[:, :, None], -skew(arm), np.tile(np.eye(3), (len(arm), 1, 1))], axis=2)
 
 
-def _scatter(blocks: FloatArray, column_block: IntArray, count: int) -> csr_matrix:
+def scatter(blocks: FloatArray, column_block: IntArray, count: int) -> csr_matrix:
     """Sparse matrix with one (2, w) block a row pair, in the block column that is given: (2 M, w · count)."""
     rows, height, width = blocks.shape
     columns = column_block[:, None, None] * width + np.arange(width)[None, None, :]
