@@ -12,7 +12,7 @@ from pipelines.geometry.bundle import similarity_modes
 from pipelines.geometry.rotations import log_so3
 from pipelines.geometry.similarity import Similarity
 from pipelines.georef.cameras import CameraCorrections, CameraPoses
-from pipelines.georef.losses import CAUCHY_SCALE2, ControlMarks, Fixes, Weighting
+from pipelines.georef.losses import ControlMarks, Fixes, Weighting
 from pipelines.georef.problem import GeoProblem
 from pipelines.georef.similarity import LearnableSimilarity
 
@@ -103,33 +103,6 @@ def problem_of(
         marks,
         weighting=weighting,
     )
-
-
-def minimise(problem: GeoProblem, steps: int = 20) -> None:
-    """Bring the loss to its minimum: Gauss–Newton with Cauchy's weights, on the residuals of `problem.forward`."""
-    y, z = problem.similarity.y, problem.cameras.z
-    for _ in range(steps):
-        by_y, by_z = torch.func.jacrev(lambda y, z: _residuals(problem, y, z), argnums=(0, 1))(
-            y.detach(), z.detach()
-        )
-        with torch.no_grad():
-            white = problem()
-            root = (1 + white.square().sum(dim=1, keepdim=True) / CAUCHY_SCALE2).rsqrt()
-            jacobian = torch.cat(
-                [(root[..., None] * by_y).flatten(0, 1), (root[..., None] * by_z).flatten(0, 1)], 1
-            )
-            known = torch.cat([torch.full((len(y),), float(problem.hold_prior)), torch.ones(len(z))]).double()
-            state = torch.cat([y, z])
-            normal = jacobian.T @ jacobian + known.diag()
-            step = torch.linalg.solve(normal, jacobian.T @ (root * white).flatten() + known * state)
-            y -= step[: len(y)]
-            z -= step[len(y) :]
-        if float(step.norm()) < 1e-4:  # of a σ
-            return
-
-
-def _residuals(problem: GeoProblem, y: torch.Tensor, z: torch.Tensor) -> torch.Tensor:
-    return torch.func.functional_call(problem, {"similarity.y": y, "cameras.z": z}, ())
 
 
 def squared_error(truth: Similarity, found: Similarity, covariance: np.ndarray, about: np.ndarray) -> float:

@@ -25,7 +25,7 @@ from pipelines.products import FloatArray
 _OUTLIER_CHI2 = 16.27
 # Cauchy's weight also falls on what is only noise. Under Gaussian noise of the stated σ, weights divided by this
 # give the covariance that the estimator has: E[w] E[w² χ²/3] / E[∂(w r)/∂r]² for χ² with 3 degrees of freedom.
-_WEIGHT_OF_NOISE = 0.7886
+WEIGHT_OF_NOISE = 0.7886
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class GeoProblem(torch.nn.Module):
             absolute = absolute_loss(self.similarity, self.cameras, self.fixes, self.weighting)
         if self.marks is not None:
             control = control_point_loss(self.similarity, self.cameras, self.marks, self.weighting)
-        return GeoTerms(absolute, control, self._prior() / self._normaliser())
+        return GeoTerms(absolute, control, self.prior() / self._normaliser())
 
     def loss(self) -> Tensor:
         """L_abs + λ_gcp L_gcp + the cameras' own term; scalar.
@@ -90,7 +90,8 @@ class GeoProblem(torch.nn.Module):
             total = total + weight * terms.control
         return total
 
-    def _prior(self) -> Tensor:
+    def prior(self) -> Tensor:
+        """What is known beforehand: a sum of squares of single parameters; scalar."""
         prior = self.cameras.z.square().sum()
         return prior + self.similarity.y.square().sum() if self.hold_prior else prior
 
@@ -124,7 +125,7 @@ class GeoProblem(torch.nn.Module):
         by_y, by_z = torch.func.jacrev(residuals, argnums=(0, 1), chunk_size=64)(y, z)
         with torch.no_grad():
             weight = 1.0 / (1.0 + self().square().sum(dim=1) / CAUCHY_SCALE2)
-            root = (weight / _WEIGHT_OF_NOISE).sqrt()[:, None, None]
+            root = (weight / WEIGHT_OF_NOISE).sqrt()[:, None, None]
         by_y = (root * by_y).flatten(0, 1).cpu().numpy()
         by_z = (root * by_z).flatten(0, 1).cpu().numpy()
         information = by_y.T @ by_y + (np.eye(len(y)) if self.hold_prior else 0.0)

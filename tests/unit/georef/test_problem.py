@@ -13,7 +13,6 @@ from georef_scenes import (
     fixes_of,
     make_block,
     marks_of,
-    minimise,
     pivot,
     problem_of,
     squared_error,
@@ -25,6 +24,7 @@ from pipelines.geometry.similarity import Similarity, umeyama
 from pipelines.georef import problem as module
 from pipelines.georef.cameras import CameraPoses
 from pipelines.georef.losses import CAUCHY_SCALE2
+from pipelines.georef.posterior import minimise
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 BLOCK = make_block()
@@ -63,7 +63,7 @@ def test_weight_of_noise_is_that_of_gaussian_residuals() -> None:
 
     slope = mean(lambda x: weight(x) - 2 / 3 * x * weight(x) ** 2 / CAUCHY_SCALE2)
     expected = mean(weight) * mean(lambda x: weight(x) ** 2 * x / 3) / slope**2
-    assert expected == pytest.approx(module._WEIGHT_OF_NOISE, abs=1e-4)
+    assert expected == pytest.approx(module.WEIGHT_OF_NOISE, abs=1e-4)
 
 
 @pytest.mark.parametrize("control", [False, True])
