@@ -66,13 +66,20 @@ class CorrectionBasis:
 
     `δω` [rad] turns a camera about its centre, axes of the world: `R' = R Exp(−δω)`; `δc` [m] moves the centre.
 
+    The lens is not corrected. How far it is from the true one, (L,) for the parameters of all cameras in the order
+    of `Network.cameras`, each list as long as the longest, is lens_matrix @ z + a rest with covariance `lens_cov`.
+
     Attributes:
         matrix: (n, 6, k), rows (δω, δc), k = 6 n − 7.
         sigma_px: σ of an image coordinate, estimated from the residuals.
+        lens_matrix: (L, k).
+        lens_cov: (L, L).
     """
 
     matrix: FloatArray
     sigma_px: float
+    lens_matrix: FloatArray
+    lens_cov: FloatArray
 
 
 @dataclass(frozen=True)
@@ -121,7 +128,9 @@ def correction_basis(network: Network) -> CorrectionBasis:
     flat = basis.reshape(-1, basis.shape[2])
     modes = similarity_modes(network.cam_center_in_world).reshape(-1, 7)
     held = flat - modes @ (reduced.points_follow @ flat)
-    return CorrectionBasis(held.reshape(basis.shape), float(np.sqrt(variance)))
+    return CorrectionBasis(
+        held.reshape(basis.shape), float(np.sqrt(variance)), reduced.lens_follows @ flat, reduced.lens_cov
+    )
 
 
 def in_front(network: Network) -> Network:
@@ -191,16 +200,17 @@ def _robust_weights(residual: FloatArray) -> FloatArray:
 class _Reduced:
     information: FloatArray  # (6 n, 6 n) of the poses, points and intrinsics eliminated
     points_follow: FloatArray  # (7, 6 n) mean similarity of the points when the cameras move
+    lens_follows: FloatArray  # (L, 6 n) expected lens parameters when the cameras move
+    lens_cov: FloatArray  # (L, L) about that
 
 
 def _reduced(network: Network, lin: Linearised, root_weight: FloatArray) -> _Reduced:
     """Schur complement of points and intrinsics, and how the points follow the poses through a fixed lens."""
     n, points = len(network.camera_id), len(network.point_in_world)
     scaled = root_weight[:, None, None]
-    keys = list(network.cameras)
-    slot = np.array([keys.index(int(key)) for key in network.camera_id])[network.obs_image]
+    slot = lens_slots(network)
     pose = scatter(lin.by_pose * scaled, network.obs_image, n)
-    intrinsics = scatter(lin.by_intrinsics * scaled, slot, len(keys))
+    intrinsics = scatter(lin.by_intrinsics * scaled, slot, len(network.cameras))
     by_point = lin.by_point * scaled
     normal = np.zeros((points, 3, 3))
     np.add.at(normal, network.obs_point, np.swapaxes(by_point, 1, 2) @ by_point)
@@ -216,9 +226,19 @@ def _reduced(network: Network, lin: Linearised, root_weight: FloatArray) -> _Red
     scale = 1.0 / np.sqrt(np.diag(ii)[used])
     block = ii[np.ix_(used, used)] * scale[:, None] * scale + 1e-9 * np.eye(len(used))
     cross = ci[:, used] * scale
-    cc -= cross @ np.linalg.solve(block, cross.T)
+    follows, cov = np.zeros((len(ii), 6 * n)), np.zeros_like(ii)
+    follows[used] = -scale[:, None] * np.linalg.solve(block, cross.T)
+    cov[np.ix_(used, used)] = scale[:, None] * np.linalg.solve(block, np.eye(len(used))) * scale
+    cc += ci @ follows
     moved = (np.swapaxes(root, 1, 2) @ _displacements(network)).reshape(3 * points, 7)
-    return _Reduced((cc + cc.T) / 2, -np.linalg.solve(moved.T @ moved, (pose_point @ moved).T))
+    points_follow = -np.linalg.solve(moved.T @ moved, (pose_point @ moved).T)
+    return _Reduced((cc + cc.T) / 2, points_follow, follows, cov)
+
+
+def lens_slots(network: Network) -> IntArray:
+    """Place of each observation's camera (M,) among `network.cameras`."""
+    keys = list(network.cameras)
+    return np.array([keys.index(int(key)) for key in network.camera_id], dtype=np.int64)[network.obs_image]
 
 
 def _displacements(network: Network) -> FloatArray:

@@ -1,74 +1,63 @@
-"""How points follow the cameras that see them: the derivative of an intersection of rays (GeoRefGS eqs 4–8)."""
+"""How intersected points follow the cameras that see them and their lens: the derivative of an intersection."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
-from pipelines.geometry.rotations import skew
+from pipelines.geometry.bundle import IntArray, Network, lens_slots, linearise
 from pipelines.products import FloatArray
-
-IntArray = NDArray[np.int64]
-
-
-@dataclass(frozen=True)
-class SightLines:
-    """K rays from cameras to points.
-
-    Attributes:
-        point: (K,) index into the points.
-        camera: (K,) index into the cameras.
-        sigma_rad: (K,) angular σ of the image mark.
-    """
-
-    point: IntArray
-    camera: IntArray
-    sigma_rad: FloatArray
 
 
 @dataclass(frozen=True)
 class Following:
-    """What moves J intersected points.
+    """What moves N intersected points, to first order.
 
     Attributes:
-        by_cameras: (J, 3, k) metres per unit of each of the k corrections.
-        cov_of_marks: (J, 3, 3) m², what the marks' own σ leaves.
+        by_poses: (3 N, 6 n) sparse, metres by (δω, δc) of each camera as in `geometry.bundle.CorrectionBasis`.
+        by_lens: (N, 3, L) metres by the lens parameters, in the order of `CorrectionBasis`.
+        cov_of_marks: (N, 3, 3) m², what the marks' own σ leaves; NaN for a point that its rays do not determine.
     """
 
-    by_cameras: FloatArray
+    by_poses: csr_matrix
+    by_lens: FloatArray
     cov_of_marks: FloatArray
 
+    def by(self, basis: FloatArray) -> FloatArray:
+        """Metres (N, 3, k) per unit of each of the k corrections of a basis (n, 6, k)."""
+        moved = self.by_poses @ basis.reshape(-1, basis.shape[2])
+        return np.asarray(moved).reshape(-1, 3, basis.shape[2])
 
-def follow(point: FloatArray, lines: SightLines, center: FloatArray, basis: FloatArray) -> Following:
-    """How points that are intersected from rays follow corrections of the cameras, to first order.
 
-    A camera that turns by δω about its centre c and moves by δc carries its ray at the point p along, by
-    δc + δω × (p − c). The part of it across the ray counts, weighted by the inverse variance of the mark there.
+def follow(marks: Network, sigma_px: FloatArray) -> Following:
+    """How the points of a network follow, each intersected from its own marks, the lens and the poses held.
+
+    Where the marks are does not enter, but the places where the points appear do.
 
     Args:
-        point: (J, 3), where the rays meet; each by two rays that are not parallel, else NaN results.
-        lines: the rays.
-        center: (n, 3) of the cameras, in the frame of the points.
-        basis: (n, 6, k), see `geometry.bundle.CorrectionBasis`.
+        marks: N points, M marks.
+        sigma_px: (M,) of the marks.
     """
-    count, n = len(point), len(center)
-    arm = point[lines.point] - center[lines.camera]
-    distance = np.linalg.norm(arm, axis=1)
-    direction = arm / distance[:, None]
-    weight = 1.0 / (lines.sigma_rad * distance) ** 2
-    across = weight[:, None, None] * (np.eye(3) - direction[:, :, None] * direction[:, None, :])
+    lin, count = linearise(marks), len(marks.point_in_world)
+    pull = np.swapaxes(lin.by_point, 1, 2) / (sigma_px**2)[:, None, None]
     normal = np.zeros((count, 3, 3))
-    np.add.at(normal, lines.point, across)
+    np.add.at(normal, marks.obs_point, pull @ lin.by_point)
     value, vector = np.linalg.eigh(normal)
     value[value[:, 0] <= 1e-9 * value[:, 2]] = np.nan
     cov = (vector / value[:, None, :]) @ np.swapaxes(vector, 1, 2)
-    share = cov[lines.point] @ across
-    blocks = np.concatenate([share @ -skew(arm), share], axis=2)
-    columns = np.broadcast_to((6 * lines.camera)[:, None, None] + np.arange(6), blocks.shape)
-    rows = np.broadcast_to((3 * lines.point)[:, None, None] + np.arange(3)[:, None], blocks.shape)
-    response = csr_matrix((blocks.ravel(), (rows.ravel(), columns.ravel())), shape=(3 * count, 6 * n))
-    by_cameras = response @ basis.reshape(6 * n, -1)
-    return Following(np.asarray(by_cameras).reshape(count, 3, -1), cov)
+    response = -cov[marks.obs_point] @ pull  # (M, 3, 2) metres per pixel
+    longest = lin.by_intrinsics.shape[2]
+    lens = _blocks(marks, response @ lin.by_intrinsics, lens_slots(marks), longest * len(marks.cameras))
+    poses = _blocks(marks, response @ lin.by_pose, marks.obs_image, 6 * len(marks.camera_id))
+    return Following(poses, lens.toarray().reshape(count, 3, -1), cov)
+
+
+def _blocks(marks: Network, blocks: FloatArray, column_block: IntArray, width: int) -> csr_matrix:
+    """Sparse (3 N, width) of blocks (M, 3, w) of each mark, those of one place added up."""
+    rows = (3 * marks.obs_point)[:, None, None] + np.arange(3)[:, None]
+    columns = (blocks.shape[2] * column_block)[:, None, None] + np.arange(blocks.shape[2])
+    rows, columns = np.broadcast_to(rows, blocks.shape), np.broadcast_to(columns, blocks.shape)
+    shape = (3 * len(marks.point_in_world), width)
+    return csr_matrix((blocks.ravel(), (rows.ravel(), columns.ravel())), shape=shape)

@@ -47,21 +47,42 @@ class _Linear:
 
 
 @dataclass(frozen=True)
-class Posterior:
-    """Joint covariance of the similarity and k camera corrections.
+class LensDoubt:
+    """What is not known of the lens, whose L parameters stay as SfM found them.
 
     Attributes:
-        covariance: (7 + k, 7 + k) of (δ ln s, δω, δt) about `pivot`, as in `SimilarityRecord`, then of
-            `CameraCorrections.z`; whatever else was estimated is marginalised out.
+        follows: (L, k) how far it is off for each unit of a camera correction: `CorrectionBasis.lens_matrix`.
+        cov: (L, L) beyond that.
+        by_control: (J, 3, L) metres by which each control point in geo is found elsewhere with another lens.
+    """
+
+    follows: FloatArray
+    cov: FloatArray
+    by_control: FloatArray
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Joint covariance of the errors of the similarity, of k camera corrections, and of the lens.
+
+    Attributes:
+        covariance: (7 + k + L, 7 + k + L) of (δ ln s, δω, δt) about `pivot`, as in `SimilarityRecord`, of
+            `CameraCorrections.z`, and of the lens parameters; whatever else was estimated is marginalised out.
         pivot: (3,) in geo.
     """
 
     covariance: FloatArray
     pivot: FloatArray
 
-    def at(self, point_in_geo: FloatArray, by_cameras: FloatArray) -> FloatArray:
-        """Covariance (J, 3, 3) in m² of points (J, 3) that follow the corrections by (J, 3, k) metres each."""
-        jacobian = np.concatenate([jacobian_at(point_in_geo, self.pivot), by_cameras], axis=2)
+    def at(self, point_in_geo: FloatArray, by_cameras: FloatArray, by_lens: FloatArray) -> FloatArray:
+        """Covariance (J, 3, 3) in m² of points (J, 3).
+
+        Args:
+            point_in_geo: (J, 3).
+            by_cameras: (J, 3, k) metres in geo by which they follow the corrections.
+            by_lens: (J, 3, L) likewise the lens.
+        """
+        jacobian = np.concatenate([jacobian_at(point_in_geo, self.pivot), by_cameras, by_lens], axis=2)
         return np.asarray(jacobian @ self.covariance @ np.swapaxes(jacobian, 1, 2))
 
 
@@ -102,19 +123,41 @@ def minimise(problem: GeoProblem) -> None:
             return
 
 
-def posterior(problem: GeoProblem) -> Posterior:
+def posterior(problem: GeoProblem, lens: LensDoubt | None = None) -> Posterior:
     """The joint covariance at the present state.
+
+    The lens is not estimated here, and control points are intersected through the one that SfM found: its error d
+    pulls the estimate by −G d, with G the response to the control points, and is itself what the camera corrections
+    (with error e₁ before) let expect, and a rest. So e = e₁ − G d, and d is correlated with e₁ as z is.
+
+    Args:
+        lens: None where it is known.
 
     Raises:
         DegenerateGeometryError: the measurements leave the similarity open.
     """
-    linear = _linearised(problem)
-    covariance = cho_solve(linear.factor(_weights(_white(problem)) / WEIGHT_OF_NOISE), np.eye(len(linear.prior)))
+    linear, white = _linearised(problem), _white(problem)
+    weight = _weights(white) / WEIGHT_OF_NOISE
+    factor = linear.factor(weight)
+    covariance = cho_solve(factor, np.eye(len(linear.prior)))
     similarity, cameras = linear.place[_SIMILARITY], linear.place[_CAMERAS]
     kept = np.r_[similarity, cameras]
-    unit = np.eye(len(kept))
+    doubt = LensDoubt(np.zeros((0, len(kept) - 7)), np.zeros((0, 0)), np.zeros((0, 3, 0))) if lens is None else lens
+    of_lens = doubt.follows @ doubt.follows.T + doubt.cov
+    shared = covariance[:, cameras] @ doubt.follows.T
+    if lens is not None and problem.marks is not None:
+        rows = _control_rows(problem)
+        root = problem.marks.root_information.cpu().numpy()
+        moved = (weight[rows, None, None] * (root @ lens.by_control)).reshape(-1, len(of_lens))
+        pulled = cho_solve(
+            factor, linear.jacobian.reshape(len(white), 3, -1)[rows].reshape(len(moved), -1).T @ moved
+        )
+        covariance = covariance - shared @ pulled.T - pulled @ shared.T + pulled @ of_lens @ pulled.T
+        shared = shared - pulled @ of_lens
+    joint = np.block([[covariance[np.ix_(kept, kept)], shared[kept]], [shared[kept].T, of_lens]])
+    unit = np.eye(len(joint))
     unit[:7, :7] = problem.similarity.root.cpu().numpy()
-    return Posterior(unit @ covariance[np.ix_(kept, kept)] @ unit.T, problem.similarity.pivot_in_geo)
+    return Posterior(unit @ joint @ unit.T, problem.similarity.pivot_in_geo)
 
 
 def leave_one_out(problem: GeoProblem) -> LeftOut:

@@ -10,8 +10,6 @@ import torch
 from georef_scenes import Block, Truth, draw_truth, fixes_of, make_block, marks_of, pivot, problem_of
 
 from pipelines.errors import DegenerateGeometryError
-from pipelines.geometry.following import SightLines, follow
-from pipelines.georef.cameras import CameraCorrections
 from pipelines.georef.losses import ControlMarks, Fixes, intersect
 from pipelines.georef.posterior import leave_one_out, minimise, posterior
 from pipelines.georef.problem import GeoProblem
@@ -66,40 +64,6 @@ def test_measurements_on_earth_that_leave_the_similarity_open_are_refused() -> N
         posterior(problem)
     problem.hold_prior = True
     np.testing.assert_allclose(posterior(problem).covariance[:7, :7], problem.similarity.prior_covariance())
-
-
-def test_points_follow_as_the_intersection_does() -> None:
-    rng = np.random.default_rng(5)
-    truth = replace(draw_truth(BLOCK, rng), poses=BLOCK.poses)
-    marks = marks_of(truth, CONTROL, 0.02, rng)
-    marks = replace(marks, sigma_rad=marks.sigma_rad * torch.from_numpy(rng.uniform(0.5, 2, len(marks.point))))
-    cameras = CameraCorrections(BLOCK.poses, BLOCK.basis)
-
-    def intersected(z: torch.Tensor) -> torch.Tensor:
-        moved = torch.func.functional_call(_Intersection(cameras, marks), {"cameras.z": z}, ())
-        assert isinstance(moved, torch.Tensor)
-        return moved
-
-    expected = torch.func.jacrev(intersected)(cameras.z.detach()).numpy()
-    lines = SightLines(marks.point.numpy(), marks.camera.numpy(), marks.sigma_rad.numpy())
-    found = follow(CONTROL, lines, BLOCK.poses.cam_center_in_model, BLOCK.basis)
-    np.testing.assert_allclose(found.by_cameras, expected, atol=1e-6 * np.abs(expected).max())
-
-
-class _Intersection(torch.nn.Module):
-    def __init__(self, cameras: CameraCorrections, marks: ControlMarks) -> None:
-        super().__init__()
-        self.cameras, self.marks = cameras, marks
-
-    def forward(self) -> torch.Tensor:
-        return intersect(self.cameras, self.marks)
-
-
-def test_parallel_rays_determine_no_point() -> None:
-    lines = SightLines(np.array([0, 0]), np.array([0, 1]), np.full(2, 1e-4))
-    center = np.array([[0.0, 0, 10], [0, 0, 20]])
-    found = follow(np.zeros((1, 3)), lines, center, np.zeros((2, 6, 4)))
-    assert np.isnan(found.cov_of_marks).all()
 
 
 @pytest.mark.parametrize(
