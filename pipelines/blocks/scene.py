@@ -64,6 +64,28 @@ class Scene:
         """SfM points (N, 3) in metres."""
         return self.model_from_local.apply(self.sparse.point_in_local)
 
+    @cached_property
+    def network(self) -> Network:
+        """Cameras, points and image observations as SfM left them, in `model`."""
+        sparse, poses = self.sparse, self.poses
+        return Network(
+            sparse.cameras,
+            sparse.image_camera_id,
+            poses.cam_from_model,
+            poses.cam_center_in_model,
+            self.point_in_model,
+            sparse.obs_point,
+            sparse.obs_image,
+            sparse.obs_xy_px,
+        )
+
+    @cached_property
+    def correction_basis(self) -> CorrectionBasis | None:
+        """What the image observations know of the cameras; None where there are too many of them."""
+        if len(self.sparse.image_name) > _MOST_CORRECTED_CAMERAS:
+            return None
+        return correction_basis(self.network)
+
 
 def make_scene(sparse: SparseModel, survey: Survey, model_from_local: Similarity, shift: FloatArray) -> Scene:
     """Put a sparse model into the frame `model`, whose origin lies at `shift` (3,) in `geo`.
@@ -113,7 +135,7 @@ def geo_problem(scene: Scene, survey: Survey, initial: InitialSimilarity, config
     record = initial.geo_from_local
     pivot = scene.geo_from_model.apply(scene.poses.cam_center_in_model[scene.train]).mean(axis=0)
     covariance = moved_pivot(np.array(record.covariance), record.pivot, pivot)
-    basis = _correction_basis(scene) if config.optimize_cameras else None
+    basis = scene.correction_basis if config.optimize_cameras else None
     matrix = np.zeros((len(scene.sparse.image_name), 6, 0)) if basis is None else basis.matrix
     fixes = _fixes(scene, survey) if config.geo_loss else None
     marks = _control_marks(scene, survey) if config.geo_loss else None
@@ -130,24 +152,6 @@ def geo_problem(scene: Scene, survey: Survey, initial: InitialSimilarity, config
 def _determined_by(marks: ControlMarks | None) -> bool:
     """Whether control points alone fix all seven unknowns of the similarity."""
     return marks is not None and len(marks.position_in_geo) >= 3
-
-
-def _correction_basis(scene: Scene) -> CorrectionBasis | None:
-    sparse, poses = scene.sparse, scene.poses
-    if len(sparse.image_name) > _MOST_CORRECTED_CAMERAS:
-        return None
-    return correction_basis(
-        Network(
-            sparse.cameras,
-            sparse.image_camera_id,
-            poses.cam_from_model,
-            poses.cam_center_in_model,
-            scene.point_in_model,
-            sparse.obs_point,
-            sparse.obs_image,
-            sparse.obs_xy_px,
-        )
-    )
 
 
 def _fixes(scene: Scene, survey: Survey) -> Fixes | None:

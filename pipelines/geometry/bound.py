@@ -17,7 +17,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import csr_matrix, hstack
 
 from pipelines.errors import DegenerateGeometryError
-from pipelines.geometry.bundle import IntArray, Network, in_front, lens_slots, linearise, scatter
+from pipelines.geometry.bundle import IntArray, Network, in_front, is_ahead, lens_slots, linearise, scatter
 from pipelines.products import FloatArray
 
 _WORST_SCALED = 1e-10  # pivot of the scaled normal matrix below which a direction is open
@@ -64,7 +64,6 @@ class CameraInformation:
     """
 
     def __init__(self, ties: Network, sigma_px: float, anchors: Anchors) -> None:
-        ties = in_front(ties)
         information = _eliminated(ties, np.full(len(ties.obs_point), sigma_px), None)
         inverse = np.linalg.inv(anchors.cov_fix)
         place = (6 * anchors.camera)[:, None] + np.arange(3, 6)
@@ -92,6 +91,7 @@ class CameraInformation:
             wanted: the points and their K marks; its cameras are those of the bundle.
             sigma_px: (K,) of the marks.
         """
+        sigma_px, wanted = sigma_px[is_ahead(wanted)], in_front(wanted)
         found = np.full((len(wanted.point_in_world), 3, 3), np.nan)
         for j in np.unique(wanted.obs_point):
             mine = wanted.obs_point == j
@@ -137,12 +137,13 @@ def _rows(network: Network, sigma_px: FloatArray) -> _Rows:
 
 def _eliminated(network: Network, sigma_px: FloatArray, cov_known: FloatArray | None) -> FloatArray:
     """Information of cameras and lens (6 n + L, 6 n + L), the points eliminated, which may be known beforehand."""
+    sigma_px, network = sigma_px[is_ahead(network)], in_front(network)
     rows, count = _rows(network, sigma_px), len(network.point_in_world)
     normal = np.zeros((count, 3, 3))
     np.add.at(normal, network.obs_point, np.swapaxes(rows.by_point, 1, 2) @ rows.by_point)
     if cov_known is not None:
         normal += np.linalg.inv(cov_known)
-    normal += _RIDGE * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    normal += (_RIDGE * np.trace(normal, axis1=1, axis2=2) + _RIDGE)[:, None, None] * np.eye(3)
     root = np.swapaxes(np.linalg.inv(np.linalg.cholesky(normal)), 1, 2)
     point = scatter(rows.by_point @ root[network.obs_point], network.obs_point, count)
     cross = rows.by_cameras.T @ point

@@ -135,8 +135,7 @@ def correction_basis(network: Network) -> CorrectionBasis:
 
 def in_front(network: Network) -> Network:
     """Without the observations of points behind their camera, which an imported model may hold."""
-    ray = network.point_in_world[network.obs_point] - network.cam_center_in_world[network.obs_image]
-    ahead = np.einsum("mj,mj->m", network.cam_from_world[network.obs_image, 2], ray) > 0
+    ahead = is_ahead(network)
     if ahead.all():
         return network
     return replace(
@@ -145,6 +144,12 @@ def in_front(network: Network) -> Network:
         obs_image=network.obs_image[ahead],
         obs_xy_px=network.obs_xy_px[ahead],
     )
+
+
+def is_ahead(network: Network) -> NDArray[np.bool_]:
+    """Which observations (M,) are of points in front of their camera."""
+    ray = network.point_in_world[network.obs_point] - network.cam_center_in_world[network.obs_image]
+    return np.asarray(np.einsum("mj,mj->m", network.cam_from_world[network.obs_image, 2], ray) > 0)
 
 
 def linearise(network: Network) -> Linearised:

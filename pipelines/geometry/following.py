@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import csr_matrix
 
-from pipelines.geometry.bundle import IntArray, Network, lens_slots, linearise
+from pipelines.geometry.bundle import IntArray, Network, in_front, is_ahead, lens_slots, linearise
 from pipelines.products import FloatArray
 
 
@@ -38,8 +38,9 @@ def follow(marks: Network, sigma_px: FloatArray) -> Following:
 
     Args:
         marks: N points, M marks.
-        sigma_px: (M,) of the marks.
+        sigma_px: (M,) of the marks. Those of points behind their camera do not count.
     """
+    sigma_px, marks = sigma_px[is_ahead(marks)], in_front(marks)
     lin, count = linearise(marks), len(marks.point_in_world)
     pull = np.swapaxes(lin.by_point, 1, 2) / (sigma_px**2)[:, None, None]
     normal = np.zeros((count, 3, 3))
