@@ -1,8 +1,8 @@
 """Evaluation: images against held-out photographs, positions against check points (method, section 4).
 
-Reads the trained model, the survey and the initial similarity. Writes `evaluate/report.json`, side-by-side renders,
-and the predicted accuracy over the scene as `accuracy.csv` and `accuracy.png`. Check points enter no solve; what was
-used in one is reported as a fit, not as an accuracy (docs/accuracy.md).
+Reads the trained model, the survey and the initial similarity. Writes `evaluate/report.json`, side-by-side
+renders, and the predicted accuracy over the scene as `accuracy.csv` and `accuracy.png`. Check points enter no
+solve; what was used in one is reported as a fit, not as an accuracy (docs/accuracy.md).
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import cv2
 import numpy as np
 import torch
 
-from pipelines.blocks.accuracy_map import AccuracyMap, Signs, accuracy_map, write_csv, write_png
-from pipelines.blocks.point_report import point_report, ray_counts
+from pipelines.blocks.accuracy_map import AccuracyMap, accuracy_map, write_area
+from pipelines.blocks.point_report import point_report, point_rows, ray_counts
 from pipelines.blocks.points import Sights, points_by_camera, points_by_model, sights
 from pipelines.blocks.prediction import Prediction, cramer_rao, left_out
 from pipelines.blocks.restored import Restored, restore, training_config
@@ -70,7 +70,7 @@ def run(stage: StageRun, config: EvaluateConfig) -> Summary:
         known = str(error)
     report = evaluate(eye, known, config, stage.out / "renders", stage.progress)
     if isinstance(known, Known) and known.area is not None:
-        _write_area(known.area, trained, stage.out)
+        write_area(known.area, trained, stage.out)
     (stage.out / "report.json").write_text(dump_json(report) + "\n", encoding="utf-8")
     return _summarise(report, config)
 
@@ -219,6 +219,8 @@ def _cross_validation(trained: Trained, known: Known | str, config: EvaluateConf
     found = left_out(known.restored)
     rays = ray_counts(sights(trained, points), len(points))
     report = point_report(found.error_in_geo, points, rays=rays, predicted=found.cov_in_geo)
+    for of_check_points_only in ("asprs", "cramer_rao"):
+        del report[of_check_points_only]
     reason = None if report["count"] else "no control point can be spared, or none entered the training"
     return {**report, "reason": reason}
 
@@ -227,23 +229,9 @@ def _accuracy(known: Known | str) -> dict[str, Any]:
     """The predicted accuracy over the scene in short; the grid is in `accuracy.csv`."""
     if isinstance(known, str):
         return {"cells": 0, "reason": known}
-    area = known.area
-    if area is None:
+    if known.area is None:
         return {"cells": 0, "reason": "the scene has too few points"}
-    figures = {
-        f"{name}_sigma_{way}_m": float(figure(values))
-        for way, values in (("h", area.sigma_h_m), ("v", area.sigma_v_m))
-        for name, figure in (("least", np.min), ("median", np.median), ("largest", np.max))
-    }
-    return {"cells": len(area.cell), "cell_m": area.size_m, **figures, "reason": None}
-
-
-def _write_area(area: AccuracyMap, trained: Trained, out: Path) -> None:
-    survey = trained.survey
-    write_csv(area, survey.origin, out / "accuracy.csv")
-    cameras = trained.geo_from_model.apply(trained.poses.cam_center_in_model)
-    signs = Signs(cameras, _surveyed(survey.control_points), _surveyed(survey.check_points))
-    write_png(area, signs, out / "accuracy.png")
+    return {**known.area.figures(), "reason": None}
 
 
 def _control_fit(trained: Trained) -> dict[str, Any]:
@@ -251,13 +239,8 @@ def _control_fit(trained: Trained) -> dict[str, Any]:
     points = trained.survey.control_points
     seen = sights(trained, points)
     error = points_by_camera(trained, seen, len(points)) - _surveyed(points)
-    measured, rays = np.isfinite(error).all(axis=1), ray_counts(seen, len(points))
-    rows = [
-        {"name": point.name, "rays": int(rays[j])}
-        | dict(zip(("de_m", "dn_m", "du_m"), error[j].tolist() if measured[j] else [None] * 3, strict=True))
-        for j, point in enumerate(points)
-    ]
-    return {**residual_stats(error[measured]).model_dump(), "points": rows}
+    rows = point_rows(error, points, ray_counts(seen, len(points)))
+    return {**residual_stats(error[~np.isnan(error[:, 0])]).model_dump(), "points": rows}
 
 
 def _gnss_fit(trained: Trained) -> dict[str, Any]:

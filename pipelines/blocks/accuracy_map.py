@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,6 +15,7 @@ from scipy.spatial import cKDTree
 
 from pipelines.blocks.prediction import Prediction
 from pipelines.blocks.restored import Restored
+from pipelines.blocks.trained import Trained
 from pipelines.geodesy.enu import ecef_from_enu, lla_from_ecef
 from pipelines.products import FloatArray, Origin
 
@@ -62,6 +65,17 @@ class AccuracyMap:
         """Vertical (C,)."""
         return self.sigma_m[:, 2]
 
+    def figures(self) -> dict[str, Any]:
+        """The map in short, as plain values."""
+        values = {"h": self.sigma_h_m, "v": self.sigma_v_m}
+        kinds: tuple[tuple[str, Callable[[FloatArray], Any]], ...] = (
+            ("least", np.min),
+            ("median", np.median),
+            ("largest", np.max),
+        )
+        found = {f"{kind}_sigma_{way}_m": float(of(values[way])) for way in values for kind, of in kinds}
+        return {"cells": len(self.cell), "cell_m": self.size_m, **found}
+
 
 def accuracy_map(restored: Restored, prediction: Prediction) -> AccuracyMap | None:
     """Predict at the middle of each cell, seen by the cameras that see the SfM points there.
@@ -110,6 +124,18 @@ def _sigma(prediction: Prediction, position: FloatArray, owner: IntArray, camera
         cov = prediction.of_scene(position[first : first + _CHUNK], owner[mine] - first, camera[mine])
         parts.append(np.sqrt(np.diagonal(cov, axis1=1, axis2=2)))
     return np.concatenate(parts)
+
+
+def write_area(found: AccuracyMap, trained: Trained, out: Path) -> None:
+    """Write the grid as `accuracy.csv` and `accuracy.png` into a folder."""
+    survey = trained.survey
+    write_csv(found, survey.origin, out / "accuracy.csv")
+    signs = Signs(
+        trained.geo_from_model.apply(trained.poses.cam_center_in_model),
+        np.array([point.position_in_geo for point in survey.control_points]).reshape(-1, 3),
+        np.array([point.position_in_geo for point in survey.check_points]).reshape(-1, 3),
+    )
+    write_png(found, signs, out / "accuracy.png")
 
 
 def write_csv(found: AccuracyMap, origin: Origin, path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipelines.blocks.points import Sights
 from pipelines.products import FloatArray, SurveyedPoint
@@ -15,7 +16,7 @@ def point_report(
     error_in_geo: FloatArray,
     points: tuple[SurveyedPoint, ...],
     *,
-    rays: FloatArray,
+    rays: NDArray[np.int64],
     predicted: FloatArray | None = None,
     bound: FloatArray | None = None,
 ) -> dict[str, Any]:
@@ -33,13 +34,13 @@ def point_report(
     found = assess(error[measured], survey[measured])
     blunder = np.zeros(len(points), dtype=bool)
     blunder[measured] = found.blunder
-    sigma = None if predicted is None else np.sqrt(np.diagonal(predicted, axis1=1, axis2=2))
-    rows = []
-    for j, point in enumerate(points):
-        row = {"name": point.name, "rays": int(rays[j]), **_axes(("de_m", "dn_m", "du_m"), error[j])}
-        if sigma is not None:
-            row |= _axes(("sigma_e_m", "sigma_n_m", "sigma_u_m"), sigma[j])
-        rows.append({**row, "blunder": bool(blunder[j])})
+    rows = point_rows(error, points, rays)
+    for row, bad in zip(rows, blunder.tolist(), strict=True):
+        row["blunder"] = bad
+    if predicted is not None:
+        sigma = np.sqrt(np.diagonal(predicted, axis1=1, axis2=2))
+        for row, axes in zip(rows, sigma, strict=True):
+            row.update(_axes(("sigma_e_m", "sigma_n_m", "sigma_u_m"), axes))
     return {
         **found.document(),
         "blunders": [point.name for point, bad in zip(points, blunder, strict=True) if bad],
@@ -49,9 +50,19 @@ def point_report(
     }
 
 
-def ray_counts(seen: Sights, count: int) -> FloatArray:
+def point_rows(
+    error_in_geo: FloatArray, points: tuple[SurveyedPoint, ...], rays: NDArray[np.int64]
+) -> list[dict[str, Any]]:
+    """A row for each point: name, marks, error (3,) in metres or null."""
+    return [
+        {"name": point.name, "rays": int(count), **_axes(("de_m", "dn_m", "du_m"), error)}
+        for point, count, error in zip(points, rays, error_in_geo, strict=True)
+    ]
+
+
+def ray_counts(seen: Sights, count: int) -> NDArray[np.int64]:
     """Marks (J,) of each of `count` points."""
-    return np.bincount(seen.point, minlength=count)
+    return np.bincount(seen.point, minlength=count).astype(np.int64)
 
 
 def _axes(names: tuple[str, str, str], values: FloatArray) -> dict[str, float | None]:
@@ -72,7 +83,7 @@ def _predicted(error: FloatArray, predicted: FloatArray, survey: FloatArray) -> 
     """What was predicted, and errors squared over their variances (survey included): 1 on the average if true."""
     variance = np.diagonal(predicted + survey, axis1=1, axis2=2)
     known = np.isfinite(error).all(axis=1) & np.isfinite(variance).all(axis=1)
-    normalised = dict.fromkeys("enu")
+    normalised: dict[str, float | None] = dict.fromkeys("enu")
     if known.any():
         normalised = dict(zip("enu", (error[known] ** 2 / variance[known]).mean(axis=0).tolist(), strict=True))
     return {**_rms(predicted[known]), "normalised_error_squared": normalised}

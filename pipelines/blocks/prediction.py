@@ -113,7 +113,10 @@ def cramer_rao(restored: Restored, seen: Sights) -> FloatArray:
 
 
 def left_out(restored: Restored) -> LeftOut:
-    """Each control point of the survey (J) measured without it; NaN for one that entered no solution."""
+    """Each control point of the survey (J) measured without it; NaN for one that entered no solution.
+
+    The covariance is that of the solution and the marks: the survey's own is taken off again.
+    """
     points, marks = restored.trained.survey.control_points, restored.problem.marks
     error, cov = np.full((len(points), 3), np.nan), np.full((len(points), 3, 3), np.nan)
     if marks is None:
@@ -122,7 +125,7 @@ def left_out(restored: Restored) -> LeftOut:
     used, row = [tuple(position) for position in marks.position_in_geo.tolist()], 0
     for j, point in enumerate(points):  # the used ones are in the survey's order
         if row < len(used) and used[row] == point.position_in_geo:
-            error[j], cov[j] = found.error_in_geo[row], found.cov_in_geo[row]
+            error[j], cov[j] = found.error_in_geo[row], found.cov_in_geo[row] - np.array(point.cov_in_geo)
             row += 1
     return LeftOut(error, cov)
 

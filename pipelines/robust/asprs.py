@@ -89,9 +89,9 @@ class Assessment:
         if tested is None:
             return None
         count, (horizontal, vertical) = self.stats.count, tested.classes_cm
-        enough = f"tested on {count} check points"
+        on = f"tested on {count} check points: " if count >= LEAST_POINTS else f"{few_points(count)}. "
         return (
-            f"{enough if count >= LEAST_POINTS else few_points(count)}: RMSE_H {100 * tested.rmse_h_m:.1f} cm, "
+            f"{on}RMSE_H {100 * tested.rmse_h_m:.1f} cm, "
             f"RMSE_V {100 * tested.rmse_v_m:.1f} cm, the check points' survey included: horizontal accuracy class "
             f"{horizontal} cm, vertical accuracy class {vertical} cm (ASPRS, 2nd ed.)"
         )
