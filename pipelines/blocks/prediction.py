@@ -25,19 +25,10 @@ class Prediction:
     """
 
     def __init__(self, restored: Restored) -> None:
-        trained, problem = restored.trained, restored.problem
-        self._trained, self._network = trained, restored.scene.network
-        self._basis = problem.cameras.basis.cpu().numpy()
-        found = restored.scene.correction_basis if self._basis.shape[2] else None
-        doubt = None
-        if found is not None:
-            by_control = np.zeros((0, 3, len(found.lens_cov)))
-            if problem.marks is not None:
-                position = trained.geo_from_model.inverse().apply(problem.marks.position_in_geo.cpu().numpy())
-                seen = (problem.marks.point.cpu().numpy(), problem.marks.camera.cpu().numpy())
-                by_control = self._turn() @ self._follow(position, *seen).by_lens
-            doubt = LensDoubt(found.lens_matrix, found.lens_cov, by_control)
-        self.posterior, self._lens = posterior(problem, doubt), doubt
+        self._restored = restored
+        self._basis = restored.problem.cameras.basis.cpu().numpy()
+        self._lens = _lens_doubt(restored) if self._basis.shape[2] else None
+        self._posterior = posterior(restored.problem, self._lens)
 
     def of_sights(self, point_in_geo: FloatArray, seen: Sights) -> FloatArray:
         """Covariance (J, 3, 3) in m² of points (J, 3) that are intersected from their marks, these included.
@@ -45,39 +36,70 @@ class Prediction:
         NaN for a point that is NaN or that its marks do not determine.
         """
         good = np.isfinite(point_in_geo[seen.point]).all(axis=1)
-        focal = np.array([self._trained.sparse.camera_of(int(i)).params[0] for i in seen.camera])
-        sigma_px = (seen.sigma * focal)[good]
-        position = self._trained.geo_from_model.inverse().apply(np.nan_to_num(point_in_geo))
-        following = self._follow(position, seen.point[good], seen.camera[good], sigma_px)
-        turn = self._turn()
-        cov = self._of(np.nan_to_num(point_in_geo), following) + turn @ following.cov_of_marks @ turn.T
-        cov[np.bincount(seen.point[good], minlength=len(cov)) < 2] = np.nan
+        position, seen = np.nan_to_num(point_in_geo), seen.part(np.flatnonzero(good))
+        moved = following(self._restored, position, seen)
+        turn = _turn(self._restored)
+        cov = self._of(position, moved) + turn @ moved.cov_of_marks @ turn.T
+        cov[np.bincount(seen.point, minlength=len(cov)) < 2] = np.nan
         return cov
 
     def of_scene(self, point_in_geo: FloatArray, point: IntArray, camera: IntArray) -> FloatArray:
         """Covariance (J, 3, 3) in m² of points (J, 3) of the scene that cameras see (pairs of point and camera)."""
-        position = self._trained.geo_from_model.inverse().apply(point_in_geo)
-        return self._of(point_in_geo, self._follow(position, point, camera))
+        seen = Sights(point, camera, np.zeros((len(point), 2)), np.ones(len(point)))
+        return self._of(point_in_geo, following(self._restored, point_in_geo, seen))
 
-    def _of(self, point_in_geo: FloatArray, following: Following) -> FloatArray:
-        turn = self._turn()
-        by_lens = turn @ following.by_lens if self._lens is not None else np.zeros((len(point_in_geo), 3, 0))
-        return self.posterior.at(point_in_geo, turn @ following.by(self._basis), by_lens)
+    def _of(self, point_in_geo: FloatArray, moved: Following) -> FloatArray:
+        turn = _turn(self._restored)
+        by_lens = turn @ moved.by_lens if self._lens is not None else np.zeros((len(point_in_geo), 3, 0))
+        return self._posterior.at(point_in_geo, turn @ moved.by(self._basis), by_lens)
 
-    def _follow(
-        self, position: FloatArray, point: IntArray, camera: IntArray, sigma_px: FloatArray | None = None
-    ) -> Following:
-        poses = self._trained.poses
-        marks = replace(
-            _marked(self._network, position, point, camera),
-            cam_from_world=poses.cam_from_model,
-            cam_center_in_world=poses.cam_center_in_model,
-        )
-        return follow(marks, np.ones(len(point)) if sigma_px is None else sigma_px)
 
-    def _turn(self) -> FloatArray:
-        geo_from_model = self._trained.geo_from_model
-        return geo_from_model.scale * geo_from_model.rotation
+def following(restored: Restored, point_in_geo: FloatArray, seen: Sights) -> Following:
+    """How points (J, 3), intersected from their marks, follow the trained cameras; in metres of `model`."""
+    poses = restored.trained.poses
+    position = restored.trained.geo_from_model.inverse().apply(point_in_geo)
+    marks = replace(
+        _marked(restored.scene.network, position, seen),
+        cam_from_world=poses.cam_from_model,
+        cam_center_in_world=poses.cam_center_in_model,
+    )
+    return follow(marks, _sigma_px(restored, seen))
+
+
+def control_sights(restored: Restored) -> Sights:
+    """The marks of the control points that entered the training; none without these."""
+    marks = restored.problem.marks
+    if marks is None:
+        return Sights(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty((0, 2)), np.empty(0))
+    bearing = marks.bearing_in_cam.cpu().numpy()
+    return Sights(
+        marks.point.cpu().numpy(),
+        marks.camera.cpu().numpy(),
+        bearing[:, :2] / bearing[:, 2:],
+        marks.sigma_rad.cpu().numpy(),
+    )
+
+
+def _lens_doubt(restored: Restored) -> LensDoubt | None:
+    found, marks = restored.scene.correction_basis, restored.problem.marks
+    if found is None:
+        return None
+    by_control = np.zeros((0, 3, len(found.lens_cov)))
+    if marks is not None:
+        moved = following(restored, marks.position_in_geo.cpu().numpy(), control_sights(restored))
+        by_control = _turn(restored) @ moved.by_lens
+    return LensDoubt(found.lens_matrix, found.lens_cov, by_control)
+
+
+def _turn(restored: Restored) -> FloatArray:
+    """Metres of `geo` by metres of `model` (3, 3)."""
+    geo_from_model = restored.trained.geo_from_model
+    return geo_from_model.scale * geo_from_model.rotation
+
+
+def _sigma_px(restored: Restored, seen: Sights) -> FloatArray:
+    focal = [restored.scene.sparse.camera_of(int(index)).params[0] for index in seen.camera]
+    return np.asarray(seen.sigma * np.array(focal).reshape(-1))
 
 
 def cramer_rao(restored: Restored, seen: Sights) -> FloatArray:
@@ -98,18 +120,16 @@ def cramer_rao(restored: Restored, seen: Sights) -> FloatArray:
     if problem.marks is not None:
         position = problem.marks.position_in_geo.cpu().numpy()
         surveyed = {point.position_in_geo: point.cov_in_geo for point in trained.survey.control_points}
-        point, camera = problem.marks.point.cpu().numpy(), problem.marks.camera.cpu().numpy()
-        focal = np.array([scene.sparse.camera_of(int(i)).params[0] for i in camera])
+        control = control_sights(restored)
         anchors = replace(
             anchors,
-            control=_marked(network, position, point, camera),
-            control_sigma_px=problem.marks.sigma_rad.cpu().numpy() * focal,
+            control=_marked(network, position, control),
+            control_sigma_px=_sigma_px(restored, control),
             cov_control=np.array([surveyed[tuple(row)] for row in position.tolist()]),
         )
     information = CameraInformation(network, scene.correction_basis.sigma_px, anchors)
     position = np.array([point.position_in_geo for point in trained.survey.check_points]).reshape(-1, 3)
-    focal = np.array([scene.sparse.camera_of(int(i)).params[0] for i in seen.camera])
-    return information.bound(_marked(network, position, seen.point, seen.camera), seen.sigma * focal)
+    return information.bound(_marked(network, position, seen), _sigma_px(restored, seen))
 
 
 def left_out(restored: Restored) -> LeftOut:
@@ -140,8 +160,12 @@ def in_geo(network: Network, geo_from_model: Similarity) -> Network:
     )
 
 
-def _marked(network: Network, position: FloatArray, point: IntArray, camera: IntArray) -> Network:
+def _marked(network: Network, position: FloatArray, seen: Sights) -> Network:
     """The cameras of a network with other points (J, 3), seen where the cameras show them."""
     return replace(
-        network, point_in_world=position, obs_point=point, obs_image=camera, obs_xy_px=np.zeros((len(point), 2))
+        network,
+        point_in_world=position,
+        obs_point=seen.point,
+        obs_image=seen.camera,
+        obs_xy_px=np.zeros((len(seen.point), 2)),
     )
