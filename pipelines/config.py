@@ -248,6 +248,9 @@ class EvaluateConfig(StageConfig):
     lpips_weights: InputPath | None = Field(
         None, description="NPZ file of LPIPS (VGG) weights; without it LPIPS is null."
     )
+    cross_validate: bool = Field(
+        False, description="Leave out each control point in turn and measure it by a solution without it."
+    )
 
 
 class ExportPlyConfig(StageConfig):

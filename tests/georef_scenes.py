@@ -12,7 +12,7 @@ from pipelines.geometry.bundle import similarity_modes
 from pipelines.geometry.rotations import exp_so3, log_so3
 from pipelines.geometry.similarity import Similarity
 from pipelines.georef.cameras import CameraCorrections, CameraPoses
-from pipelines.georef.losses import CAUCHY_SCALE2, Weighting
+from pipelines.georef.losses import Weighting
 from pipelines.georef.measured import Attitudes, ControlMarks, Fixes, Measured, Pairs
 from pipelines.georef.problem import GeoProblem
 from pipelines.georef.similarity import LearnableSimilarity
@@ -144,35 +144,6 @@ def problem_with(
         errors=errors,
         learned_weights=learned_weights,
     )
-
-
-def minimise(problem: GeoProblem, steps: int = 20) -> None:
-    """Bring the loss to its minimum: Gauss–Newton with Cauchy's weights, on the residuals of `problem.forward`."""
-    names = ("similarity.y", "cameras.z", "errors.x")
-    parameters = {name: problem.get_parameter(name) for name in names}
-    sizes = [len(each) for each in parameters.values()]
-
-    def residuals(*values: torch.Tensor) -> torch.Tensor:
-        return torch.func.functional_call(problem, dict(zip(parameters, values, strict=True)), ())
-
-    for _ in range(steps):
-        values = tuple(each.detach() for each in parameters.values())
-        by_each = torch.func.jacrev(residuals, argnums=(0, 1, 2))(*values)
-        with torch.no_grad():
-            white, errors = problem(), problem.errors
-            root = (1 + white.square().sum(dim=1, keepdim=True) / CAUCHY_SCALE2).rsqrt()
-            jacobian = torch.cat([(root[..., None] * each).flatten(0, 1) for each in by_each], 1)
-            held = float(problem.hold_prior) * problem.similarity.held
-            # What the cameras and the errors cost: |z|² and |v/σ|², v = start + unit · x.
-            known = torch.cat([held, torch.ones(sizes[1], dtype=torch.float64)]).diag()
-            by_prior = torch.block_diag(known, errors.unit / errors.sigma[:, None])
-            prior = torch.cat([held * values[0], values[1], errors.vector() / errors.sigma])
-            normal = jacobian.T @ jacobian + by_prior.T @ by_prior
-            step = torch.linalg.solve(normal, jacobian.T @ (root * white).flatten() + by_prior.T @ prior)
-            for name, change in zip(names, step.split(sizes), strict=True):
-                parameters[name] -= change
-        if float(step.norm()) < 1e-4:  # of a σ
-            return
 
 
 def descend(problem: GeoProblem, steps: int = 500, variance_rate: float = 0.01) -> None:

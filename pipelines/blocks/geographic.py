@@ -10,7 +10,6 @@ from pipelines.blocks.measurements import attitudes_of, control_marks, depth_mar
 from pipelines.blocks.scene import Scene
 from pipelines.config import AUTO, TrainConfig
 from pipelines.errors import InputError
-from pipelines.geometry.bundle import CorrectionBasis, Network, correction_basis
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.similarity import moved_pivot
 from pipelines.georef.adjustment import RotationPrior
@@ -22,8 +21,6 @@ from pipelines.georef.start import begin, bias_pays
 from pipelines.georef.systematic import SystematicErrors
 from pipelines.products import GeolocatedPoints, InitialSimilarity, Survey
 
-# Beyond this the dense normal matrix of the cameras no longer fits a laptop.
-_MOST_CORRECTED_CAMERAS = 1200
 # Fewer control points cannot tell a bias of the fixes from a blunder of their own.
 _LEAST_CONTROL = 3
 
@@ -46,7 +43,7 @@ def geo_problem(
     record = initial.geo_from_local
     pivot = scene.geo_from_model.apply(scene.poses.cam_center_in_model[scene.train]).mean(axis=0)
     covariance = moved_pivot(np.array(record.covariance), record.pivot, pivot)
-    basis = _correction_basis(scene) if config.optimize_cameras else None
+    basis = scene.correction_basis if config.optimize_cameras else None
     matrix = np.zeros((len(scene.sparse.image_name), 6, 0)) if basis is None else basis.matrix
     measured = _measured(scene, survey, config, points) if config.geo_loss else Measured()
     problem = GeoProblem(
@@ -116,22 +113,4 @@ def _errors(measured: Measured, config: TrainConfig) -> SystematicErrors:
         flights if "bias" in wanted else 0,
         arm="lever-arm" in wanted,
         attitude_sigma_rad=None if attitudes is None else float((1.0 / attitudes.root_information).median()),
-    )
-
-
-def _correction_basis(scene: Scene) -> CorrectionBasis | None:
-    sparse, poses = scene.sparse, scene.poses
-    if len(sparse.image_name) > _MOST_CORRECTED_CAMERAS:
-        return None
-    return correction_basis(
-        Network(
-            sparse.cameras,
-            sparse.image_camera_id,
-            poses.cam_from_model,
-            poses.cam_center_in_model,
-            scene.point_in_model,
-            sparse.obs_point,
-            sparse.obs_image,
-            sparse.obs_xy_px,
-        )
     )

@@ -33,6 +33,10 @@ class Sights:
     xy: FloatArray
     sigma: FloatArray
 
+    def part(self, chosen: NDArray[np.int64]) -> Sights:
+        """Some of them."""
+        return Sights(self.point[chosen], self.camera[chosen], self.xy[chosen], self.sigma[chosen])
+
 
 def sights(trained: Trained, points: tuple[SurveyedPoint, ...]) -> Sights:
     """The marks of `points` in images that SfM has registered."""

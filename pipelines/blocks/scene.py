@@ -16,11 +16,15 @@ from numpy.typing import NDArray
 from pipelines.errors import DegenerateGeometryError, InputError
 from pipelines.formats.colmap import SparseModel
 from pipelines.formats.image_cache import ImageCache, Photograph
+from pipelines.geometry.bundle import CorrectionBasis, Network, correction_basis
 from pipelines.geometry.similarity import Similarity
 from pipelines.georef.cameras import CameraPoses
 from pipelines.products import FloatArray, InitialSimilarity, Survey
 from pipelines.stages import SPARSE
 from pipelines.workspace import Workspace
+
+# Beyond this the dense normal matrix of the cameras no longer fits a laptop.
+_MOST_CORRECTED_CAMERAS = 1200
 
 
 @dataclass(frozen=True)
@@ -53,6 +57,28 @@ class Scene:
     def point_in_model(self) -> FloatArray:
         """SfM points (N, 3) in metres."""
         return self.model_from_local.apply(self.sparse.point_in_local)
+
+    @cached_property
+    def network(self) -> Network:
+        """Cameras, points and image observations as SfM left them, in `model`."""
+        sparse, poses = self.sparse, self.poses
+        return Network(
+            sparse.cameras,
+            sparse.image_camera_id,
+            poses.cam_from_model,
+            poses.cam_center_in_model,
+            self.point_in_model,
+            sparse.obs_point,
+            sparse.obs_image,
+            sparse.obs_xy_px,
+        )
+
+    @cached_property
+    def correction_basis(self) -> CorrectionBasis | None:
+        """What the image observations know of the cameras; None where there are too many of them."""
+        if len(self.sparse.image_name) > _MOST_CORRECTED_CAMERAS:
+            return None
+        return correction_basis(self.network)
 
 
 def make_scene(sparse: SparseModel, survey: Survey, model_from_local: Similarity, shift: FloatArray) -> Scene:

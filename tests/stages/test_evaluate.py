@@ -16,6 +16,7 @@ from splat_scenes import SIGMA_M, TEST_VIEWS, Flight
 from pipelines.errors import InputError
 from pipelines.evaluate import render_name
 from pipelines.products import Mark, Survey, TrainedModel, load_json, save_json
+from pipelines.robust.asprs import few_points
 from pipelines.runner import Outcome, run_stage
 from pipelines.splat.storage import read_gaussians, write_gaussians
 from pipelines.stages import BY_NAME, GAUSSIANS, MODEL, REPORT, SURVEY
@@ -120,7 +121,7 @@ def test_fit_is_that_of_the_fixes(evaluated: tuple[Workspace, Outcome]) -> None:
 
 
 def test_few_check_points_are_remarked_on(evaluated: tuple[Workspace, Outcome]) -> None:
-    assert evaluated[1].manifest.warnings == ["6 check points: the ASPRS standard asks for 30 or more"]
+    assert evaluated[1].manifest.warnings == [few_points(6)]
 
 
 def test_control_points_are_a_fit_and_not_an_accuracy(altered: Workspace, flights: list[Flight]) -> None:

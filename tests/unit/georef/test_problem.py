@@ -14,7 +14,6 @@ from georef_scenes import (
     fixes_of,
     make_block,
     marks_of,
-    minimise,
     pivot,
     problem_of,
     problem_with,
@@ -31,6 +30,7 @@ from pipelines.georef.cameras import CameraCorrections, CameraPoses
 from pipelines.georef.linear import WEIGHT_OF_NOISE
 from pipelines.georef.losses import CAUCHY_SCALE2
 from pipelines.georef.measured import Fixes, Measured
+from pipelines.georef.posterior import minimise
 from pipelines.georef.problem import GeoProblem
 from pipelines.georef.similarity import LearnableSimilarity
 from pipelines.georef.start import begin, bias_pays

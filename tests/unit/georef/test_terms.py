@@ -17,7 +17,6 @@ from georef_scenes import (
     fixes_of,
     make_block,
     marks_of,
-    minimise,
     pairs_of,
     problem_with,
 )
@@ -27,6 +26,7 @@ from pipelines.geometry.similarity import Similarity
 from pipelines.georef.cameras import CameraPoses
 from pipelines.georef.losses import control_residuals
 from pipelines.georef.measured import ControlMarks, Fixes, Measured
+from pipelines.georef.posterior import minimise
 from pipelines.georef.problem import GeoProblem
 from pipelines.georef.similarity import log_so3 as torch_log
 from pipelines.georef.start import begin
