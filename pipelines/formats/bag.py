@@ -175,7 +175,7 @@ class Bag:
             store = get_typestore(Stores.EMPTY)
             store.register(get_types_from_msg(text, message.type))
             try:
-                decoded = store.deserialize_cdr(message.data, message.type)
+                decoded: Any = store.deserialize_cdr(message.data, message.type)
             except Exception:  # another length, or damaged
                 continue
             sample = getattr(decoded, "timestamp_sample", 0)
