@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from pipelines.config import (
+    CalibrateConfig,
     EvaluateConfig,
     ExportPlyConfig,
     GeolocateConfig,
@@ -42,6 +43,8 @@ class StageSpec:
         reads: workspace paths (files or folders) that decide its result.
         product: the path that later stages and people look for.
         resumable: whether a partial product can be continued.
+        photographs_only: whether it reads nothing of the survey but photographs, cameras, and the positions and
+            attitudes as recorded: control points, σ and what `calibrate` applies do not make it stale.
         title: one line of help.
     """
 
@@ -53,6 +56,7 @@ class StageSpec:
     product: str
     title: str
     resumable: bool = False
+    photographs_only: bool = False
 
 
 PIPELINE: tuple[StageSpec, ...] = (
@@ -62,7 +66,7 @@ PIPELINE: tuple[StageSpec, ...] = (
     ),
     StageSpec(
         "sfm", "pipelines.sfm", SfmConfig, "sfm", (SURVEY,), SPARSE,
-        "Reconstruct cameras and points with COLMAP.", resumable=True,
+        "Reconstruct cameras and points with COLMAP.", resumable=True, photographs_only=True,
     ),
     StageSpec(
         "geolocate", "pipelines.geolocate", GeolocateConfig, "geolocate", (SURVEY, SPARSE), POINTS,
@@ -87,6 +91,13 @@ PIPELINE: tuple[StageSpec, ...] = (
         "Write the splat as a PLY that knows where it is.",
     ),
 )  # fmt: skip
+
+# Between sfm and what builds on the survey's positions: makes the survey anew where it asks for that.
+CALIBRATE = StageSpec(
+    "calibrate", "pipelines.calibrate", CalibrateConfig, "ingest", (SURVEY, SPARSE), SURVEY,
+    "Estimate time offset, boresight and lever arm after sfm.",
+)  # fmt: skip
+CALIBRATED_BEFORE = "geolocate"
 
 BY_NAME = {spec.name: spec for spec in PIPELINE}
 CONFIGS = {spec.name: spec.config for spec in PIPELINE}

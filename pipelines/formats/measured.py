@@ -66,6 +66,7 @@ class Measured:
         crs_name: their CRS.
         vertical: what their heights counted from.
         sigma_attitude_deg: (N,) σ that the attitudes state, NaN where none; None for none at all.
+        recorded: the table that images were matched with by time, Earth-centred; None where it was by name.
     """
 
     lla: FloatArray
@@ -78,6 +79,7 @@ class Measured:
     crs_name: str
     vertical: VerticalDatum
     sigma_attitude_deg: FloatArray | None = None
+    recorded: PoseTable | None = None
 
     @property
     def located(self) -> NDArray[np.bool_]:
@@ -136,10 +138,11 @@ def from_table(table: PoseTable, photos: Sequence[Photo], options: PoseOptions, 
     lla = crs.lla_from_xyz(rows.xyz, path=table.path, lines=rows.lines.tolist())
     note_operation(crs, lla, notes)
     _compare_with_exif(median_lla(lla), photos, table.path, notes)
-    cartesian = replace(rows, xyz=ecef_from_lla(lla))
+    cartesian, by_time = replace(rows, xyz=ecef_from_lla(lla)), None
     if rows.names is not None:
         at = np.array([images.index(name) for name in rows.names])
     else:
+        by_time = cartesian
         cartesian, at = _match_by_time(cartesian, photos, options, notes)
     count = len(photos)
     absent = np.setdiff1d(np.arange(count), at)
@@ -171,6 +174,7 @@ def from_table(table: PoseTable, photos: Sequence[Photo], options: PoseOptions, 
         source=table.source,
         crs_name=crs.name,
         vertical=crs.vertical,
+        recorded=by_time,
     )
 
 

@@ -50,6 +50,7 @@ def _data(track: Track, seed: int = 1, control: int = 0) -> RigData:
         nominal_from_cam=np.eye(3),
         time_offset_s=np.array(0.0),
         max_gap_s=np.array(1.0),
+        body_known=np.array(True),
     )
     return RigData(
         track=navigation,
