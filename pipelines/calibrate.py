@@ -122,17 +122,12 @@ def estimate_rig(
     found = fit_rig(data, start_s, track.nominal_from_cam, options)
     arm = np.nan_to_num(track.antenna_in_body).mean(axis=0)
     state, sigma = found.state, found.sigma
-    # Lens against tilt, and lens and terrain against the centre along the view: SfM is wrong there by up to a
-    # pixel, alike in all images, which no scatter shows.
-    pixel_rad, footprint = _pixel(model)
-    arm_sigma = np.hypot(sigma[11:14], state.geo_from_local.scale * footprint)
-    boresight_sigma = np.degrees(np.hypot(sigma[8:11], pixel_rad))
     rows: dict[RigParameter, RigEstimate] = {
         "time-offset": _estimate("time-offset", [state.offset_s], sigma[7:8], [start_s]),
         "boresight": _estimate(
-            "boresight", _degrees(state.boresight), boresight_sigma, _degrees(track.nominal_from_cam)
+            "boresight", _degrees(state.boresight), np.degrees(sigma[8:11]), _degrees(track.nominal_from_cam)
         ),
-        "lever-arm": _estimate("lever-arm", arm + state.arm, arm_sigma, arm),
+        "lever-arm": _estimate("lever-arm", arm + state.arm, sigma[11:14], arm),
     }
     attitude = found.rms_attitude_deg
     return RigCalibration(
@@ -150,6 +145,7 @@ def _data(survey: Survey, model: SparseModel, track: NavigationTrack) -> RigData
     registered = [index for index, name in enumerate(model.image_name) if name in row_of]
     rows = [row_of[model.image_name[index]] for index in registered]
     control, _ = control_correspondences(survey, model)
+    pixel_rad, footprint = _pixel(model)
     return RigData(
         track=track,
         time_s=track.image_time_s[rows],
@@ -161,6 +157,8 @@ def _data(survey: Survey, model: SparseModel, track: NavigationTrack) -> RigData
         control_in_geo=control.in_geo,
         control_cov_in_local=control.cov_in_local,
         control_cov_in_geo=control.cov_in_geo,
+        pixel_rad=pixel_rad,
+        footprint_in_local=footprint,
     )
 
 

@@ -63,6 +63,7 @@ class RigData:
         antenna_in_body: (n, 3) lever arm to start from.
         control_in_local, control_in_geo: (c, 3).
         control_cov_in_local, control_cov_in_geo: (c, 3, 3), of their marks and of their survey.
+        pixel_rad: angle of a pixel; footprint_in_local: its width at the distance of the scene.
     """
 
     track: NavigationTrack
@@ -75,6 +76,8 @@ class RigData:
     control_in_geo: FloatArray
     control_cov_in_local: FloatArray
     control_cov_in_geo: FloatArray
+    pixel_rad: float
+    footprint_in_local: float
 
 
 @dataclass(frozen=True)
@@ -93,7 +96,9 @@ class RigFit:
 
     Attributes:
         state: the values.
-        sigma: (14,) σ: of the similarity (7), offset in s, boresight in rad (3), lever arm in m (3).
+        sigma: (14,) σ: of the similarity (7), offset in s, boresight in rad (3), lever arm in m (3). A lens that
+            SfM has not quite found tilts all cameras alike, or moves them along their view, with the scene's
+            consent: no scatter shows it, and σ of boresight and lever arm count a pixel of it.
         images: that took part.
         rms_position_m, rms_attitude_deg: robust scatter per axis of what is left; attitude NaN without any.
     """
@@ -149,6 +154,8 @@ def fit_rig(data: RigData, start_offset_s: float, start_boresight: FloatArray, o
         # Noise of the fixes passes for motion, and motion for information: what noise would give is taken off.
         known = sigma[_OFFSET] ** -2 - 3 * (len(position) + len(attitude)) / (2 * _DIFFERENCE_S**2)
         sigma[_OFFSET] = np.maximum(known, options.max_offset_s**-2) ** -0.5
+    sigma[_BORESIGHT] = np.hypot(sigma[_BORESIGHT], data.pixel_rad)
+    sigma[_ARM] = np.hypot(sigma[_ARM], state.geo_from_local.scale * data.footprint_in_local)
     left = float(np.degrees(sigma_rad)) if len(attitude) else np.nan
     return RigFit(state, sigma, len(position), sigma_m, left)
 
