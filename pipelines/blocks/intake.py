@@ -114,6 +114,11 @@ def _from_folder(config: IngestConfig, notes: Notes, progress: Progress) -> Inta
         table = read_geo(config.geo, notes)
     measured = from_tags(photos, options, notes) if table is None else from_table(table, photos, options, notes)
     names, recorded = [photo.name for photo in photos], measured.recorded
+    if config.time_offset_s and recorded is None:
+        raise InputError(
+            "is for navigation by time: a --bag, or a --trajectory without a column of images",
+            field="--time-offset",
+        )
     measured = with_rig(measured, _rig(config), names, notes)
     cameras, camera_of = camera_priors(photos, config.focal_px, notes)
 
@@ -134,7 +139,13 @@ def _check_options(config: IngestConfig, frames: Path | None) -> None:
     if config.bag is not None:
         if frames is None:
             raise InputError("a bag needs a workspace to put its photographs in", field="--bag")
-        beside = [name for name in ("images", "trajectory", "geo", "crs") if getattr(config, name) is not None]
+        if config.crs is not None:
+            raise InputError(
+                "has no meaning for a --bag: its positions are latitude, longitude and ellipsoidal height, or "
+                "metres in a frame whose zero --origin names",
+                field="--crs",
+            )
+        beside = [name for name in ("images", "trajectory", "geo") if getattr(config, name) is not None]
         if beside:
             raise InputError(f"has photographs and positions itself: give it without --{beside[0]}", field="--bag")
     elif given := [name for name in _BAG_ONLY if getattr(config, name) is not None]:

@@ -223,6 +223,25 @@ class TestBadMessages:
         assert warned(survey, "is neither JPEG nor PNG (format 'h264')")
         assert warned(survey, "1 messages of /gnss/fix do not decode")
 
+    @pytest.mark.parametrize("storage", list(StoragePlugin))
+    def test_damage_in_the_middle(self, ingest: Ingest, tmp_path: Path, storage: StoragePlugin) -> None:
+        """What lies before the damage is used, and told to be not all."""
+        flight = Flight(count=40)
+        messages = sorted(bags.usual(flight), key=lambda one: one[2])
+        for _, kind, _, message in messages:
+            if kind.endswith("CompressedImage"):  # padded behind its end, for a bag of several chunks
+                message.data = np.concatenate([message.data, np.zeros(200_000, np.uint8)])
+        bags.write(tmp_path / "bag", messages, Form(storage))
+        (file,) = [path for path in (tmp_path / "bag").iterdir() if path.suffix in (".mcap", ".db3")]
+        data = bytearray(file.read_bytes())
+        # In sqlite3 one page, of a photograph: with damaged branches a base cannot even be opened.
+        start, length = int(0.3 * len(data)) // 4096 * 4096, 4096 if storage is StoragePlugin.SQLITE3 else 250_000
+        data[start : start + length] = b"\xff" * length
+        file.write_bytes(data)
+        survey = ingest(tmp_path / "bag")
+        assert 5 < len(survey.images) < 20
+        assert warned(survey, "is damaged: it could be read for")
+
     def test_truncated_bag(self, refused: Refused, tmp_path: Path) -> None:
         for storage in StoragePlugin:
             bags.write(tmp_path / storage.name, bags.usual(Flight()), Form(storage))
@@ -254,6 +273,10 @@ class TestWhatIsMissing:
     def test_named_topic(self, refused: Refused) -> None:
         told = refused(bags.usual(Flight()), "--fix-topic", "/imu/data")
         assert "/imu/data is a sensor_msgs/msg/Imu; those with positions: /gnss/fix" in told
+
+    def test_crs_has_no_meaning(self, refused: Refused) -> None:
+        told = refused(bags.usual(Flight()), "--crs", "EPSG:32632")
+        assert "[--crs]: has no meaning for a --bag" in told and "--origin" in told
 
     def test_no_mount(self, ingest: Ingest) -> None:
         flight = Flight()
