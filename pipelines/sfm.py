@@ -103,8 +103,16 @@ def reconstruct(colmap: Any, job: SfmJob, progress: Progress) -> Any:
     if missing:
         raise InputError(f"{len(missing)} photographs of the survey are gone", path=job.images / missing[0])
     colmap.set_random_seed(job.config.seed)
+    plain = {name: f"{number:06d}" for number, name in enumerate(names)}
+    _rename(colmap, job.database, {short: name for name, short in plain.items()})  # as a killed run may leave it
     _extract(colmap, job, progress)
-    _match(colmap, job, [(names[i], names[j]) for i, j in candidate_pairs(job.survey, job.config)], progress)
+    # COLMAP takes pairs from a text in which a blank ends a name: meanwhile, photographs go by numbers.
+    _rename(colmap, job.database, plain)
+    pairs = [(plain[names[i]], plain[names[j]]) for i, j in candidate_pairs(job.survey, job.config)]
+    try:
+        _match(colmap, job, pairs, progress)
+    finally:
+        _rename(colmap, job.database, {short: name for name, short in plain.items()})
     models = _map(colmap, job, progress)
     if not models:
         raise DegenerateGeometryError(
@@ -198,10 +206,6 @@ def _match(colmap: Any, job: SfmJob, pairs: list[tuple[str, str]], progress: Pro
     matching.num_threads = job.config.threads
     verification = colmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = job.config.seed
-    if any(" " in name or name.startswith("#") for pair in pairs for name in pair):
-        log.warning("file names with blanks or # cannot be listed for COLMAP: all pairs are matched")
-        colmap.match_exhaustive(job.database, matching, verification_options=verification)
-        return
     listing = job.database.with_name("pairs.txt")
     with progress.task("matching", len(pairs)) as task:
         for chunk in _chunks(pairs, _PAIRS_A_CHUNK):
@@ -210,6 +214,15 @@ def _match(colmap: Any, job: SfmJob, pairs: list[tuple[str, str]], progress: Pro
             colmap.match_image_pairs(job.database, matching, pairing, verification)
             task.advance(len(chunk))
     listing.unlink(missing_ok=True)
+
+
+def _rename(colmap: Any, path: Path, names: dict[str, str]) -> None:
+    """Rename the images of a database, as far as they have one of these names."""
+    with colmap.Database.open(path) as database:
+        for image in database.read_all_images():
+            if image.name in names:
+                image.name = names[image.name]
+                database.update_image(image)
 
 
 def _map(colmap: Any, job: SfmJob, progress: Progress) -> list[Any]:
