@@ -23,6 +23,7 @@ from pipelines.errors import DegenerateGeometryError, InputError
 from pipelines.formats.colmap import load_reconstruction, pycolmap_module
 from pipelines.geometry.pairs import Views, all_pairs, select_pairs
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
+from pipelines.interrupts import interruptible
 from pipelines.products import CameraPrior, Survey, load_json
 from pipelines.progress import Progress
 from pipelines.stages import SURVEY
@@ -230,7 +231,7 @@ def _map(colmap: Any, job: SfmJob, progress: Progress) -> list[Any]:
         if job.config.mapper == "global":
             options = colmap.GlobalPipelineOptions()
             options.num_threads, options.random_seed = job.config.threads, job.config.seed
-            models = colmap.global_mapping(job.database, job.images, out, options)
+            models = interruptible(lambda: colmap.global_mapping(job.database, job.images, out, options))
             task.advance(len(job.survey.images))
             return list(models.values())
         options = colmap.IncrementalPipelineOptions()
