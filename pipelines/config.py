@@ -10,7 +10,7 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 from pydantic.fields import FieldInfo
@@ -19,7 +19,8 @@ from pipelines.errors import InputError
 
 CONFIG_FILE = "georef.toml"
 AUTO = "auto"
-RIG_PARAMETERS = ("time-offset", "boresight", "lever-arm")
+RigParameter = Literal["time-offset", "boresight", "lever-arm"]
+RIG_PARAMETERS: tuple[RigParameter, ...] = get_args(RigParameter)
 ERROR_PARAMETERS = ("bias", "lever-arm", "boresight")
 
 
@@ -55,7 +56,12 @@ class IngestConfig(StageConfig):
         description="Zero of a bag's local frame (odometry, poses): latitude,longitude,ellipsoidal height.",
     )
     time_offset: str = Field(
-        "0", description="Navigation clock minus camera clock in seconds; auto: by `georef calibrate` after sfm."
+        "0", description="Navigation clock minus camera clock in seconds; auto: estimate it after sfm."
+    )
+    estimate: str | None = Field(
+        None,
+        description="Estimate any of time-offset, boresight and lever-arm (with commas) after sfm, from the SfM "
+        "cameras against the recorded navigation.",
     )
     lever_arm: str | None = Field(
         None,
@@ -95,6 +101,17 @@ class IngestConfig(StageConfig):
     def time_offset_s(self) -> float:
         """Seconds; zero while it is still to be estimated."""
         return 0.0 if self.time_offset == AUTO else float(self.time_offset)
+
+    @property
+    def wanted(self) -> tuple[RigParameter, ...]:
+        """What of the rig is to be estimated, in the usual order."""
+        asked = {*(self.estimate or "").split(","), *(["time-offset"] if self.time_offset == AUTO else [])}
+        return tuple(name for name in RIG_PARAMETERS if name in asked)
+
+    @field_validator("estimate")
+    @classmethod
+    def _are_parameters(cls, text: str | None) -> str | None:
+        return text if text is None else rig_parameters(text)
 
     @field_validator("time_offset")
     @classmethod
@@ -270,17 +287,26 @@ class CalibrateConfig(StageConfig):
     )
 
     @property
-    def wanted(self) -> tuple[str, ...]:
+    def wanted(self) -> tuple[RigParameter, ...]:
         """The parameters, in their usual order."""
         return tuple(name for name in RIG_PARAMETERS if name in self.estimate.split(","))
 
     @field_validator("estimate")
     @classmethod
     def _are_parameters(cls, text: str) -> str:
-        unknown = [name for name in text.split(",") if name not in RIG_PARAMETERS]
-        if unknown:
-            raise ValueError(f"{unknown[0]!r} is none of {', '.join(RIG_PARAMETERS)}")
-        return text
+        return rig_parameters(text)
+
+
+def rig_parameters(text: str) -> str:
+    """The text, if it is parameters of the rig with commas between.
+
+    Raises:
+        ValueError: it is not.
+    """
+    unknown = [name for name in text.split(",") if name not in RIG_PARAMETERS]
+    if unknown:
+        raise ValueError(f"{unknown[0]!r} is none of {', '.join(RIG_PARAMETERS)}")
+    return text
 
 
 def on_earth(text: str) -> str:

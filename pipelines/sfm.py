@@ -23,6 +23,7 @@ from pipelines.errors import DegenerateGeometryError, InputError
 from pipelines.formats.colmap import load_reconstruction, quiet_colmap
 from pipelines.geometry.pairs import Views, all_pairs, select_pairs
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
+from pipelines.interrupts import interruptible
 from pipelines.products import CameraPrior, Survey, load_json
 from pipelines.progress import Progress
 from pipelines.stages import SURVEY
@@ -89,8 +90,16 @@ def reconstruct(colmap: Any, job: SfmJob, progress: Progress) -> Any:
     if missing:
         raise InputError(f"{len(missing)} photographs of the survey are gone", path=job.images / missing[0])
     colmap.set_random_seed(job.config.seed)
+    plain = {name: f"{number:06d}" for number, name in enumerate(names)}
+    _rename(colmap, job.database, {short: name for name, short in plain.items()})  # as a killed run may leave it
     _extract(colmap, job, progress)
-    _match(colmap, job, [(names[i], names[j]) for i, j in candidate_pairs(job.survey, job.config)], progress)
+    # COLMAP takes pairs from a text in which a blank ends a name: meanwhile, photographs go by numbers.
+    _rename(colmap, job.database, plain)
+    pairs = [(plain[names[i]], plain[names[j]]) for i, j in candidate_pairs(job.survey, job.config)]
+    try:
+        _match(colmap, job, pairs, progress)
+    finally:
+        _rename(colmap, job.database, {short: name for name, short in plain.items()})
     models = _map(colmap, job, progress)
     if not models:
         raise DegenerateGeometryError(
@@ -184,10 +193,6 @@ def _match(colmap: Any, job: SfmJob, pairs: list[tuple[str, str]], progress: Pro
     matching.num_threads = job.config.threads
     verification = colmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = job.config.seed
-    if any(" " in name or name.startswith("#") for pair in pairs for name in pair):
-        log.warning("file names with blanks or # cannot be listed for COLMAP: all pairs are matched")
-        colmap.match_exhaustive(job.database, matching, verification_options=verification)
-        return
     listing = job.database.with_name("pairs.txt")
     with progress.task("matching", len(pairs)) as task:
         for chunk in _chunks(pairs, _PAIRS_A_CHUNK):
@@ -198,12 +203,21 @@ def _match(colmap: Any, job: SfmJob, pairs: list[tuple[str, str]], progress: Pro
     listing.unlink(missing_ok=True)
 
 
+def _rename(colmap: Any, path: Path, names: dict[str, str]) -> None:
+    """Rename the images of a database, as far as they have one of these names."""
+    with colmap.Database.open(path) as database:
+        for image in database.read_all_images():
+            if image.name in names:
+                image.name = names[image.name]
+                database.update_image(image)
+
+
 def _map(colmap: Any, job: SfmJob, progress: Progress) -> list[Any]:
     with progress.task("mapping", len(job.survey.images)) as task, _scratch(job.database.parent) as out:
         if job.config.mapper == "global":
             options = colmap.GlobalPipelineOptions()
             options.num_threads, options.random_seed = job.config.threads, job.config.seed
-            models = colmap.global_mapping(job.database, job.images, out, options)
+            models = interruptible(lambda: colmap.global_mapping(job.database, job.images, out, options))
             task.advance(len(job.survey.images))
             return list(models.values())
         options = colmap.IncrementalPipelineOptions()

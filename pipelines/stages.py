@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 from pipelines.config import (
     AdjustConfig,
+    CalibrateConfig,
     EvaluateConfig,
     ExportPlyConfig,
     GeolocateConfig,
@@ -42,6 +43,8 @@ class StageSpec:
         folder: its folder in the workspace.
         reads: workspace paths (files or folders) that decide its result.
         product: the path that later stages and people look for.
+        photographs_only: whether it reads nothing of the survey but photographs, cameras, and the positions and
+            attitudes as recorded: control points, σ and what `calibrate` applies do not make it stale.
         title: one line of help.
         resumable: whether a partial product can be continued.
         also: further paths in its folder that others look for, besides what the stages of the pipeline read.
@@ -56,6 +59,7 @@ class StageSpec:
     title: str
     resumable: bool = False
     also: tuple[str, ...] = ()
+    photographs_only: bool = False
 
 
 PIPELINE: tuple[StageSpec, ...] = (
@@ -65,7 +69,7 @@ PIPELINE: tuple[StageSpec, ...] = (
     ),
     StageSpec(
         "sfm", "pipelines.sfm", SfmConfig, "sfm", (SURVEY,), SPARSE,
-        "Reconstruct cameras and points with COLMAP.", resumable=True,
+        "Reconstruct cameras and points with COLMAP.", resumable=True, photographs_only=True,
     ),
     StageSpec(
         "geolocate", "pipelines.geolocate", GeolocateConfig, "geolocate", (SURVEY, SPARSE), POINTS,
@@ -99,6 +103,13 @@ ADJUST = StageSpec(
 )  # fmt: skip
 
 STAGES = (*PIPELINE, ADJUST)
+# Between sfm and what builds on the survey's positions: makes the survey anew where it asks for that.
+CALIBRATE = StageSpec(
+    "calibrate", "pipelines.calibrate", CalibrateConfig, "ingest", (SURVEY, SPARSE), SURVEY,
+    "Estimate time offset, boresight and lever arm after sfm.",
+)  # fmt: skip
+CALIBRATED_BEFORE = "geolocate"
+
 BY_NAME = {spec.name: spec for spec in PIPELINE}
 CONFIGS = {spec.name: spec.config for spec in PIPELINE}
 

@@ -67,6 +67,7 @@ class Measured:
         crs_name: their CRS.
         vertical: what their heights counted from.
         sigma_attitude_deg: (N,) σ that the attitudes state, NaN where none; None for none at all.
+        recorded: the table that images were matched with by time, Earth-centred; None where it was by name.
     """
 
     lla: FloatArray
@@ -79,6 +80,7 @@ class Measured:
     crs_name: str
     vertical: VerticalDatum
     sigma_attitude_deg: FloatArray | None = None
+    recorded: PoseTable | None = None
 
     @property
     def located(self) -> NDArray[np.bool_]:
@@ -139,10 +141,11 @@ def from_table(table: PoseTable, photos: Sequence[Photo], options: PoseOptions, 
     if table.sigma_enu_m is not None and "foot" in crs.units[0]:
         notes.assume(f"σ in {table.path.name} are in metres, although {crs.name} counts in feet")
     _compare_with_exif(median_lla(lla), photos, table.path, notes)
-    cartesian = replace(rows, xyz=ecef_from_lla(lla))
+    cartesian, by_time = replace(rows, xyz=ecef_from_lla(lla)), None
     if rows.names is not None:
         at = np.array([images.index(name) for name in rows.names])
     else:
+        by_time = cartesian
         cartesian, at = _match_by_time(cartesian, photos, options, notes)
     count = len(photos)
     absent = np.setdiff1d(np.arange(count), at)
@@ -174,6 +177,7 @@ def from_table(table: PoseTable, photos: Sequence[Photo], options: PoseOptions, 
         source=table.source,
         crs_name=crs.name,
         vertical=crs.vertical,
+        recorded=by_time,
     )
 
 

@@ -15,7 +15,8 @@ import pytest
 
 from pipelines import runner, states
 from pipelines.errors import InputError, MissingProductError, WorkspaceBusyError
-from pipelines.stages import BY_NAME, MODEL, PIPELINE, POINTS, SIM3, SPARSE
+from pipelines.products import VerticalDatum, load_json, save_json
+from pipelines.stages import BY_NAME, MODEL, PIPELINE, POINTS, SIM3, SPARSE, SURVEY
 from pipelines.workspace import Workspace
 from tests import fakes
 
@@ -135,6 +136,19 @@ class TestKilledAtAnyMoment:
         for workspace in kill_points(make, drop, tmp_path):
             out, continued = workspace.begin(TRAIN, "same", "if-same")
             assert all((out / name / "part").exists() == continued for name in folders)
+
+
+def test_replaced_product_is_the_old_one_or_the_new(tmp_path: Path) -> None:
+    """As `calibrate` makes a survey anew, killed ahead of each change."""
+    old, new = (VerticalDatum(name=name, stated=True) for name in ("old", "new"))
+    path = tmp_path / SURVEY
+    for step in range(1, 10):
+        save_json(old, path)
+        killed = killed_at(step, partial(Workspace(tmp_path).replace, SURVEY, new))
+        assert load_json(VerticalDatum, path) == (old if killed else new)
+        if not killed:
+            break
+    assert step > 2
 
 
 class TestLock:
