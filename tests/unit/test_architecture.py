@@ -32,7 +32,7 @@ STAGES = {"pipelines.calibrate", "pipelines.inspect_bag", "pipelines.simulate", 
 FLOORS: tuple[set[str], ...] = (
     FOUNDATION,
     {"pipelines.geodesy", "pipelines.geometry", "pipelines.robust"},
-    {"pipelines.formats", "pipelines.georef", "pipelines.splat"},
+    {"pipelines.formats", "pipelines.georef", "pipelines.splat", "pipelines.stereo"},
     {"pipelines.blocks", "pipelines.simulation"},
     STAGES,
     {"pipelines.runner"},
