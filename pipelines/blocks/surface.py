@@ -41,7 +41,7 @@ class SurfaceOptions:
     """
 
     max_size_px: int = 400
-    neighbours: int = 6
+    neighbours: int = 10
     sweep: SweepSettings = field(default_factory=SweepSettings)
     agreement: AgreementSettings = field(default_factory=AgreementSettings)
 
@@ -76,7 +76,7 @@ class SceneSurface:
             scene.point_in_model, scene.poses.cam_center_in_model, sparse.obs_point, sparse.obs_image
         )
         self._neighbours: dict[int, list[int]] = {}
-        self._folder = folder / self._key()
+        self.folder = folder / self._key()
 
     def build(self, progress: Progress = SILENT) -> None:
         """Make the maps that are not there yet: first each view's own, then what they agree on."""
@@ -195,7 +195,7 @@ class SceneSurface:
         return np.asarray(cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA), np.uint8)
 
     def _path(self, index: int, kind: str) -> Path:
-        return self._folder / f"{index:06d}.{kind}.npy"
+        return self.folder / f"{index:06d}.{kind}.npy"
 
     def _key(self) -> str:
         """Changes with all that the maps depend on."""

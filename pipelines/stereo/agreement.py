@@ -30,7 +30,7 @@ class AgreementSettings:
         least_views: other views that must agree.
     """
 
-    least_score: float = 0.5
+    least_score: float = 0.4
     steps: float = 1.5
     least_views: int = 2
 

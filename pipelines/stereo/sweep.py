@@ -10,6 +10,7 @@ texture needs a wide window, and beside a roof's edge a wide window sees the roo
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import cv2
@@ -126,11 +127,23 @@ def plane_sweep(
     sign, own = reference.rays() @ planes.normal_in_world, planes.normal_in_world @ reference.cam_center_in_world
     peak = _Peak(reference.grey.shape)
     for offset in planes.offset_m:
-        scores = np.stack([correlation(_seen_on_plane(reference, view, planes, offset)) for view in neighbours])
-        best = smooth.filter(np.partition(scores, -used, axis=0)[-used:].mean(axis=0))
+        scores = (correlation(_seen_on_plane(reference, view, planes, offset)) for view in neighbours)
+        best = np.asarray(smooth.filter(_mean_of_best(scores, used)), dtype=np.float32)
         best[~(sign * (offset - own) > 0)] = _UNSEEN
         peak.add(best)
     return peak.result(planes.offset_m)
+
+
+def _mean_of_best(scores: Iterable[FloatImage], count: int) -> FloatImage:
+    """Mean (H, W) of the `count` largest scores at each pixel."""
+    largest: list[FloatImage] = []
+    for score in scores:
+        rest = score
+        for place, kept in enumerate(largest):
+            largest[place], rest = np.maximum(kept, rest), np.minimum(kept, rest)
+        if len(largest) < count:
+            largest.append(rest)
+    return np.asarray(sum(largest[1:], start=largest[0]) / np.float32(count))
 
 
 def _seen_on_plane(reference: StereoView, other: StereoView, planes: Planes, offset_m: float) -> FloatImage:
