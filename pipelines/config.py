@@ -203,7 +203,8 @@ class TrainConfig(StageConfig):
     )
     coarse_to_fine: bool = Field(True, description="Start with shrunken photographs.")
     exposure: bool = Field(True, description="Fit the exposure of each training photograph.")
-    faithful_surface: bool = Field(False, description="Hold the Gaussians to surfaces, for depths to measure in.")
+    dense: bool = Field(True, description="Find the scene's surface by multi-view stereo first, to start from.")
+    faithful_surface: bool = Field(True, description="Hold the Gaussians to the surface, for depths to measure in.")
     geo_loss: bool = Field(True, description="Use the geographic losses.")
     weighting: Literal["whitened", "paper"] = Field(
         "whitened", description="Residuals divided by their σ, or plain mean squares as in the paper."

@@ -15,10 +15,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from pipelines.blocks.background import background
 from pipelines.blocks.geographic import geo_problem
 from pipelines.blocks.loop import LoopOptions, Outcome, optimise
+from pipelines.blocks.material import Material, initial_gaussians, points_to_hold
 from pipelines.blocks.scene import Scene, initial_scene, photographs
+from pipelines.blocks.surface import SceneSurface
 from pipelines.blocks.trainer import JointOptions, JointTrainer, Views
 from pipelines.config import TrainConfig
 from pipelines.formats.colmap import read_sparse
@@ -39,13 +40,7 @@ from pipelines.splat.densify import DefaultSettings, DefaultStrategy, Strategy
 from pipelines.splat.densify_fast import FastSettings, FastStrategy
 from pipelines.splat.densify_mcmc import McmcSettings, McmcStrategy
 from pipelines.splat.exposure import Exposures
-from pipelines.splat.gaussians import Gaussians
-from pipelines.splat.initialise import (
-    InitialisationOptions,
-    gaussians_from_points,
-    gaussians_of_size,
-    scene_extent,
-)
+from pipelines.splat.initialise import InitialisationOptions, scene_extent
 from pipelines.splat.memory import TrainingSize, free_memory_bytes, require_memory
 from pipelines.splat.optimizer import GaussianAdam
 from pipelines.splat.raster.api import Rasterizer, rasterizer
@@ -110,8 +105,11 @@ def run(stage: StageRun, config: TrainConfig) -> Summary:
     images = photographs(scene.sparse, survey, workspace, effort(config).max_image_size)
     require_memory(training_size(scene, images, config), free_memory_bytes(device_of(backend)))
     images.build(stage.progress)
+    surface = SceneSurface(workspace.cache / "surface", scene, images) if config.dense else None
+    if surface is not None:
+        surface.build(stage.progress)
     problem = geo_problem(scene, survey, initial, config, GeolocatedPoints.load(workspace.path(POINTS)))
-    trainer = make_trainer(scene, images, problem, backend, config)
+    trainer = make_trainer(Material(scene, images, surface), problem, backend, config)
     options = LoopOptions(
         stage.out / _CHECKPOINT, stage.out / _METRICS, config.checkpoint_every, config.log_every, stage.resumed
     )
@@ -131,23 +129,23 @@ def training_size(scene: Scene, images: ImageCache, config: TrainConfig) -> Trai
     return TrainingSize(effort(config).max_gaussians, largest, config.sh_degree, corrected)
 
 
-def make_trainer(
-    scene: Scene, images: ImageCache, problem: GeoProblem, backend: Rasterizer, config: TrainConfig
-) -> JointTrainer:
-    """Gaussians from the SfM points, and everything that moves them.
+def make_trainer(material: Material, problem: GeoProblem, backend: Rasterizer, config: TrainConfig) -> JointTrainer:
+    """Gaussians on the surface, and everything that moves them.
 
     Raises:
         DegenerateGeometryError: too few SfM points.
     """
     preset, device = effort(config), device_of(backend)
-    gaussians = initial_gaussians(scene, images, config).to(device)
+    scene, images = material.scene, material.images
+    options = InitialisationOptions(sh_degree=config.sh_degree, max_gaussians=preset.max_gaussians)
+    gaussians = initial_gaussians(material, options, preset.max_gaussians, config.seed).to(device)
     extent_m = scene_extent(scene.poses.cam_center_in_model)
     train = torch.from_numpy(scene.train)
     return JointTrainer(
         GaussianAdam(gaussians, extent_m, preset.iterations),
         _strategy(config, extent_m, len(gaussians)),
         problem.to(device),
-        Views(scene.train, images, _observed(scene, device) if config.faithful_surface else ()),
+        Views(scene.train, images, points_to_hold(material, device) if config.faithful_surface else None),
         rasterizer=backend,
         options=JointOptions(
             preset.iterations,
@@ -162,13 +160,6 @@ def make_trainer(
     )
 
 
-def _observed(scene: Scene, device: torch.device) -> tuple[torch.Tensor, ...]:
-    """By image, the SfM points (K, 3) in `model` that it observes."""
-    points, sparse = scene.point_in_model, scene.sparse
-    rows = (np.unique(sparse.obs_point[sparse.obs_image == index]) for index in range(len(sparse.image_name)))
-    return tuple(torch.from_numpy(points[found]).float().to(device) for found in rows)
-
-
 def _strategy(config: TrainConfig, extent_m: float, count: int) -> Strategy:
     iterations, most = effort(config).iterations, effort(config).max_gaussians
     if config.strategy == "mcmc":
@@ -178,22 +169,6 @@ def _strategy(config: TrainConfig, extent_m: float, count: int) -> Strategy:
         fast = FastSettings.for_iterations(iterations)
         return FastStrategy(settings, fast, extent_m, count, config.seed)
     return DefaultStrategy(settings, extent_m, count, config.seed)
-
-
-def initial_gaussians(scene: Scene, images: ImageCache, config: TrainConfig) -> Gaussians:
-    """One at each SfM point, and those of the background.
-
-    Raises:
-        DegenerateGeometryError: too few SfM points.
-    """
-    most = effort(config).max_gaussians
-    options = InitialisationOptions(sh_degree=config.sh_degree, max_gaussians=most)
-    behind = background(scene, images)
-    near = gaussians_from_points(scene.point_in_model, scene.sparse.point_rgb, options)
-    far = gaussians_of_size(behind.point_in_model, behind.rgb, behind.sigma_m, options)
-    room = max(most - len(near), 0)
-    keep = torch.linspace(0, max(len(far) - 1, 0), min(room, len(far))).long()
-    return Gaussians.concatenate([near, far.select(keep)])
 
 
 def _save(trainer: JointTrainer, scene: Scene, out: Path, outcome: Outcome) -> Summary:

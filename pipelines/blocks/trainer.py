@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -73,12 +73,12 @@ class Views:
     Attributes:
         camera: (V,) indices into the cameras (and the images) of those to train on.
         images: all undistorted images.
-        observed: by image, the SfM points (K, 3) in `model` that it observes; only the surface losses need them.
+        surface: gives the points (K, 3) in `model` that an image shows; only the surface losses need them.
     """
 
     camera: np.ndarray
     images: ImageCache
-    observed: tuple[Tensor, ...] = ()
+    surface: Callable[[int], Tensor] | None = None
 
 
 @dataclass(frozen=True)
@@ -220,11 +220,10 @@ class JointTrainer:
         if wanted is None:
             return None
         loss = wanted.flatness * flatness_loss(gaussians, render.stats.visible, self.optimizer.extent_m)
-        if self.views.observed and len(self.views.observed[index]) and render.expected_depth is not None:
-            points = self.views.observed[index]
-            loss = loss + wanted.depth * depth_loss(
-                render.expected_depth, render.alpha, points, pose, target.camera
-            )
+        if self.views.surface is not None and render.expected_depth is not None:
+            points = self.views.surface(index)
+            depth = depth_loss(render.expected_depth, render.alpha, points, pose, target.camera)
+            loss = loss + wanted.depth * depth
         if self.iteration > wanted.normals_from * self.options.iterations:
             normals = normal_loss(gaussians, pose, target.camera, self.rasterizer, wanted.edge)
             loss = loss + wanted.normals * normals

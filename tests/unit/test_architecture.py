@@ -37,7 +37,7 @@ RUNNERS = {"pipelines.runner", "pipelines.compare", "pipelines.comparison"}
 FLOORS: tuple[set[str], ...] = (
     FOUNDATION,
     {"pipelines.geodesy", "pipelines.geometry", "pipelines.robust"},
-    {"pipelines.formats", "pipelines.georef", "pipelines.splat"},
+    {"pipelines.formats", "pipelines.georef", "pipelines.splat", "pipelines.stereo"},
     {"pipelines.blocks", "pipelines.simulation"},
     STAGES,
     RUNNERS,
