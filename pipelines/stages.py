@@ -78,7 +78,7 @@ PIPELINE: tuple[StageSpec, ...] = (
     ),
     StageSpec(
         "evaluate", "pipelines.evaluate", EvaluateConfig, "evaluate",
-        (SURVEY, SPARSE, SIM3, MODEL, GAUSSIANS), REPORT,
+        (SURVEY, SPARSE, MODEL, GAUSSIANS, SIM3), REPORT,
         "Measure test views and check points.",
     ),
     StageSpec(
