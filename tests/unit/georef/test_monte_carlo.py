@@ -137,7 +137,7 @@ PROFILES = {
 def test_predicted_accuracy_is_true(profile: str) -> None:
     sigma_m, control, most = PROFILES[profile]
     squared, variance = runs(30, sigma_m, control)
-    # Points of a run share most of their error: 30 values and a few more for each of three axes: σ of 0.13.
+    # Points of a run share most of their error: 30 values and a few more for each axis, σ of the mean 0.13.
     assert (squared / variance).mean() == pytest.approx(1.0, abs=0.25)
     assert np.sqrt(squared.mean() / bound(sigma_m, control).mean()) < most
 
