@@ -34,6 +34,7 @@ from pipelines.robust.statistics import residual_stats
 from pipelines.splat.exposure import fitted_affine, with_affine
 from pipelines.splat.metrics import lpips, psnr, ssim
 from pipelines.splat.raster.api import Rasterizer, RasterSettings, Render, rasterizer
+from pipelines.splat.surface import measured_depth
 from pipelines.stages import SIM3
 from pipelines.workspace import StageRun, Summary
 
@@ -182,9 +183,9 @@ def _depth_maps(eye: Eye, seen: Sights, progress: Progress) -> dict[int, FloatAr
     cameras = sorted({int(i) for i in seen.camera})
     with progress.task("depth maps", len(cameras)) as task:
         for index in cameras:
-            median = eye.look(index, depth=True).median_depth
-            if median is not None:
-                depth[index] = median.cpu().numpy()
+            view = eye.look(index, depth=True)
+            if view.median_depth is not None and view.expected_depth is not None:
+                depth[index] = measured_depth(view.median_depth, view.expected_depth).cpu().numpy()
             task.advance()
     return depth
 

@@ -83,7 +83,7 @@ def points_by_model(
     views do not count for a point that two or more others show on unbroken surface.
 
     Args:
-        depth_m: median depth (H, W) along z by camera, 0 where there is no surface.
+        depth_m: depth (H, W) of the surface along z by camera, 0 where there is none.
         pinholes: cameras of these depth maps.
         count: J.
     """
