@@ -3,8 +3,8 @@
     accuracy.py OUT --orbit DATA            a survey folder with trajectory_rtk.csv, _consumer.csv, _outlier.csv
     accuracy.py OUT --seeds 0,1,2,3,4       surveys of `georef simulate`, one a seed
 
-Of each survey the photographs are reconstructed once; each profile then gets a workspace of its own in OUT, on which
-`georef compare` runs. What stands in OUT already is not made again. Prints a line a survey, profile and
+Of each survey the photographs are reconstructed once; each profile then gets a workspace of its own in OUT, on
+which `georef compare` runs. What stands in OUT already is not made again. Prints a line a survey, profile and
 configuration, and the medians over the surveys; `--json` FILE keeps them.
 """
 
