@@ -140,6 +140,7 @@ class SfmConfig(StageConfig):
     camera_model: Literal["SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"] = Field(
         "OPENCV", description="COLMAP camera model to estimate."
     )
+    principal_point: bool = Field(True, description="Estimate the principal point, from 10 images on.")
     pairs: Literal["auto", "exhaustive"] = Field(
         "auto", description="Image pairs to match: from positions and view directions, or all."
     )

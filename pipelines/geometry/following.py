@@ -27,8 +27,8 @@ class Following:
 
     def by(self, basis: FloatArray) -> FloatArray:
         """Metres (N, 3, k) per unit of each of the k corrections of a basis (n, 6, k)."""
-        moved = self.by_poses @ basis.reshape(-1, basis.shape[2])
-        return np.asarray(moved).reshape(-1, 3, basis.shape[2])
+        moved = self.by_poses @ basis.reshape(self.by_poses.shape[1], basis.shape[2])
+        return np.asarray(moved).reshape(len(self.by_lens), 3, basis.shape[2])
 
 
 def follow(marks: Network, sigma_px: FloatArray) -> Following:
