@@ -11,6 +11,7 @@ from rich.console import Group
 from rich.markup import escape
 from rich.table import Table
 
+from pipelines.comparison import Comparison, cells, remarks_on
 from pipelines.errors import InputError
 from pipelines.runner import Outcome
 from pipelines.stages import REPORT
@@ -27,13 +28,28 @@ STATE_STYLE = {
 }
 POINT_COLUMNS = {
     "count": "points",
+    "mean_e_m": "mean E",
+    "mean_n_m": "mean N",
+    "mean_u_m": "mean U",
     "mean_h_m": "mean H",
+    "median_h_m": "median H",
     "rmse_e_m": "RMSE E",
     "rmse_n_m": "RMSE N",
     "rmse_h_m": "RMSE H",
     "rmse_v_m": "RMSE V",
     "rmse_3d_m": "RMSE 3D",
     "max_3d_m": "max 3D",
+}
+# Column: where its figure is in a row of `checkpoints`.
+ACCURACY_COLUMNS = {
+    "RMSE H": ("with_survey", "rmse_h_m"),
+    "RMSE V": ("with_survey", "rmse_v_m"),
+    "class H": ("asprs", "horizontal_class"),
+    "class V": ("asprs", "vertical_class"),
+    "predicted H": ("predicted", "rms_h_m"),
+    "predicted V": ("predicted", "rms_v_m"),
+    "bound H": ("cramer_rao", "rms_h_m"),
+    "bound V": ("cramer_rao", "rms_v_m"),
 }
 IMAGE_COLUMNS = {"views": "views", "psnr": "PSNR dB", "ssim": "SSIM", "lpips": "LPIPS"}
 SECTIONS = ("photometric", "checkpoints", "fit")
@@ -103,6 +119,20 @@ def calibration(document: Mapping[str, Any]) -> list[Renderable]:
     return [table, f"{left} ({document['images']} images, {document['control_points']} control points)"]
 
 
+def comparison(table: Comparison) -> list[Renderable]:
+    """`georef compare`: a line a configuration, and what sets it apart below."""
+    heads = [f"{way}\n{name}" for way in ("camera", "model") for name in ("mean H", "median H", "RMSE H", "RMSE V")]
+    del heads[1]  # by camera, mean and median hardly differ
+    shown = _table("", "test\nPSNR", "\nSSIM", *heads, "check\npoints", "\ntraining")
+    for column in shown.columns[1:]:
+        column.justify, column.no_wrap = "right", True
+    for row in table.rows:
+        shown.add_row(row.configuration, *cells(row))
+    notes = [f"[bold]{row.configuration}[/] {escape(f'{row.title}: {row.note}')}" for row in table.rows]
+    remarks = [f"[yellow]{row.configuration}:[/] {escape(text)}" for row in table.rows for text in remarks_on(row)]
+    return ["[bold]Test views in dB, check points in metres[/]", shown, "", *notes, *remarks]
+
+
 def topics(rows: Iterable[Mapping[str, Any]]) -> Table:
     """`georef inspect`: a line a topic."""
     table = _table("topic", "type", "messages", "Hz", "span", "longest gap", "frame", "use", "")
@@ -147,14 +177,17 @@ def report_of(workspace: Workspace) -> list[Renderable]:
 
 
 def report(document: Mapping[str, Any]) -> list[Renderable]:
-    """The tables of `evaluate/report.json`: test views, check points, residuals of the fit.
+    """The tables of `evaluate/report.json`: test views, check points, cross-validation, residuals of the fit.
 
-    A fit residual is not an accuracy: the two never share a table.
+    A fit residual is not an accuracy, and a control point no check point: they never share a table.
     """
     views = _rows("Test views", document.get("photometric", {}), IMAGE_COLUMNS)
     check = _rows("Check points, metres", document.get("checkpoints", {}), POINT_COLUMNS)
+    crossed = {"left out": document.get("cross_validation")}
+    cross = _rows("Control points, each left out in turn (cross-validation), metres", crossed, POINT_COLUMNS)
     fit = _rows("Residuals of the fit (not an accuracy), metres", document.get("fit", {}), POINT_COLUMNS)
-    return [table for table in (views, check, fit) if table is not None]
+    tables = (views, check, _accuracy(document.get("checkpoints", {})), cross, fit)
+    return [table for table in tables if table is not None]
 
 
 def duration(seconds: float | None) -> str:
@@ -181,6 +214,18 @@ def _rows(title: str, section: Mapping[str, Any], columns: Mapping[str, str]) ->
     for name, row in rows.items():
         table.add_row(name, *(_number(row.get(key)) for key in shown))
     return Group(f"\n[bold]{title}[/]", table)
+
+
+def _accuracy(checkpoints: Mapping[str, Any]) -> Group | None:
+    """What the check points say after the standard, beside what was predicted and what is possible."""
+    rows = {
+        way: {head: (found.get(part) or {}).get(key) for head, (part, key) in ACCURACY_COLUMNS.items()}
+        for way, found in checkpoints.items()
+        if isinstance(found, Mapping) and found.get("with_survey")
+    }
+    columns = {head: head for head in ACCURACY_COLUMNS}
+    title = "Accuracy with the check points' own survey (ASPRS, 2nd ed.), prediction and Cramér–Rao bound, metres"
+    return _rows(title, rows, columns)
 
 
 def _figures(values: Mapping[str, Any]) -> Table:

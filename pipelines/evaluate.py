@@ -1,12 +1,14 @@
 """Evaluation: images against held-out photographs, positions against check points (method, section 4).
 
-Reads the trained model and the survey. Writes `evaluate/report.json` and side-by-side renders. Check points enter
-no solve; what was used in one is reported as a fit, not as an accuracy.
+Reads the trained model, the survey and the initial similarity. Writes `evaluate/report.json`, side-by-side
+renders, and the predicted accuracy over the scene as `accuracy.csv` and `accuracy.png`. Check points enter no
+solve; what was used in one is reported as a fit, not as an accuracy (docs/accuracy.md).
 """
 
 from __future__ import annotations
 
 import logging
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,33 +16,67 @@ import cv2
 import numpy as np
 import torch
 
+from pipelines.blocks.accuracy_map import AccuracyMap, accuracy_map, write_area
+from pipelines.blocks.coordinates import in_crs, target_crs
+from pipelines.blocks.point_report import point_report, point_rows, ray_counts
 from pipelines.blocks.points import Sights, points_by_camera, points_by_model, sights
+from pipelines.blocks.prediction import Prediction, cramer_rao, left_out
+from pipelines.blocks.restored import Restored, restore, training_config
 from pipelines.blocks.scene import photographs
 from pipelines.blocks.trained import Trained, load_trained
 from pipelines.config import EvaluateConfig
+from pipelines.errors import DegenerateGeometryError
 from pipelines.formats.image_cache import ImageCache
-from pipelines.products import FloatArray, SurveyedPoint, dump_json
+from pipelines.products import FloatArray, InitialSimilarity, SurveyedPoint, dump_json, load_json
 from pipelines.progress import Progress
+from pipelines.robust.asprs import LEAST_POINTS, few_points
 from pipelines.robust.statistics import residual_stats
 from pipelines.splat.exposure import fitted_affine, with_affine
 from pipelines.splat.metrics import lpips, psnr, ssim
 from pipelines.splat.raster.api import Rasterizer, RasterSettings, Render, rasterizer
+from pipelines.stages import SIM3
 from pipelines.workspace import StageRun, Summary
 
 log = logging.getLogger(__name__)
 
-_ASPRS_LEAST_POINTS = 30
+
+@dataclass(frozen=True)
+class Known:
+    """What the measurements say of the trained survey's own accuracy.
+
+    Attributes:
+        restored: the geographic half, solved.
+        prediction: covariances that follow from it.
+        area: the prediction over the scene; None for a scene of too few points.
+    """
+
+    restored: Restored
+    prediction: Prediction
+    area: AccuracyMap | None
 
 
 def run(stage: StageRun, config: EvaluateConfig) -> Summary:
-    """Measure, write the report and the renders."""
-    trained = load_trained(stage.workspace)
+    """Measure, write the report, the renders and the map of the predicted accuracy."""
+    trained = load_trained(stage.workspace, config.similarity)
+    crs = None if config.crs is None else target_crs(config.crs, trained.survey)
+    initial = load_json(InitialSimilarity, stage.workspace.path(SIM3))
     images = photographs(trained.sparse, trained.survey, stage.workspace, trained.model.max_image_size)
     images.build(stage.progress)
     eye = Eye(trained, images, rasterizer(config.backend))
-    report = evaluate(eye, config, stage.out / "renders", stage.progress)
+    known: Known | str
+    try:
+        restored = restore(trained, initial, training_config(stage.workspace))
+        prediction = Prediction(restored)
+        known = Known(restored, prediction, accuracy_map(restored, prediction))
+    except DegenerateGeometryError as error:
+        known = str(error)
+    report = evaluate(eye, known, config, stage.out / "renders", stage.progress)
+    if crs is not None:
+        report["coordinates"] = in_crs(report["checkpoints"], trained.survey, crs)
+    if isinstance(known, Known) and known.area is not None:
+        write_area(known.area, trained, stage.out)
     (stage.out / "report.json").write_text(dump_json(report) + "\n", encoding="utf-8")
-    return _summarise(report)
+    return _summarise(report, config)
 
 
 class Eye:
@@ -63,23 +99,27 @@ class Eye:
             return self._backend.render(self._gaussians, pose, self.images.pinhole(index), settings)
 
 
-def evaluate(eye: Eye, config: EvaluateConfig, renders: Path, progress: Progress) -> dict[str, Any]:
-    """The report as a plain document; side-by-side renders go to the folder `renders`."""
+def evaluate(
+    eye: Eye, known: Known | str, config: EvaluateConfig, renders: Path, progress: Progress
+) -> dict[str, Any]:
+    """The report as a plain document; side-by-side renders go to the folder `renders`.
+
+    Args:
+        known: what is known of the accuracy, or why nothing is.
+    """
     trained = eye.trained
     checks = sights(trained, trained.survey.check_points)
-    controls = sights(trained, trained.survey.control_points)
     depth = _depth_maps(eye, checks, progress)
     return {
         "format_version": 1,
         "photometric": {"test": _photometric(eye, config, renders, progress)},
         "checkpoints": {
-            "camera": _by_camera(trained, checks, trained.survey.check_points),
-            "model": _by_model(eye, checks, depth),
+            "camera": _checks_by_camera(trained, checks, known),
+            "model": _checks_by_model(eye, checks, depth),
         },
-        "fit": {
-            "gnss": _gnss_fit(trained),
-            "gcp": _by_camera(trained, controls, trained.survey.control_points),
-        },
+        "cross_validation": _cross_validation(trained, known, config),
+        "accuracy": _accuracy(known),
+        "fit": {"gnss": _gnss_fit(trained), "gcp": _control_fit(trained)},
         "similarity": {
             "sigma_ln_scale": float(np.sqrt(trained.model.geo_from_model.covariance[0][0])),
             "sigma_translation_m": [
@@ -110,7 +150,7 @@ def _photometric(eye: Eye, config: EvaluateConfig, renders: Path, progress: Prog
                     "psnr": psnr(colour, photo, mask),
                     "psnr_compensated": psnr(with_affine(colour, fitted_affine(colour, photo, mask)), photo, mask),
                     "ssim": ssim(colour, photo, mask),
-                    "lpips": distance(colour, photo) if callable(distance) else None,
+                    "lpips": distance(colour, photo, mask) if callable(distance) else None,
                 }
             )
             if place < config.renders:
@@ -149,32 +189,62 @@ def _depth_maps(eye: Eye, seen: Sights, progress: Progress) -> dict[int, FloatAr
     return depth
 
 
-def _by_camera(trained: Trained, seen: Sights, points: tuple[SurveyedPoint, ...]) -> dict[str, Any]:
-    return _point_report(points_by_camera(trained, seen, len(points)), seen, points)
+def _surveyed(points: tuple[SurveyedPoint, ...]) -> FloatArray:
+    return np.array([point.position_in_geo for point in points]).reshape(-1, 3)
 
 
-def _by_model(eye: Eye, seen: Sights, depth: dict[int, FloatArray]) -> dict[str, Any]:
+def _checks_by_camera(trained: Trained, seen: Sights, known: Known | str) -> dict[str, Any]:
+    points = trained.survey.check_points
+    found, predicted, bound = points_by_camera(trained, seen, len(points)), None, None
+    if isinstance(known, Known) and points:
+        predicted = known.prediction.of_sights(found, seen)
+        try:
+            bound = cramer_rao(known.restored, seen)
+        except DegenerateGeometryError as error:
+            log.info("no Cramér–Rao bound: %s", error)
+    rays = ray_counts(seen, len(points))
+    return point_report(found - _surveyed(points), points, rays=rays, predicted=predicted, bound=bound)
+
+
+def _checks_by_model(eye: Eye, seen: Sights, depth: dict[int, FloatArray]) -> dict[str, Any]:
     points = eye.trained.survey.check_points
     pinholes = {index: eye.images.pinhole(index) for index in depth}
-    return _point_report(points_by_model(eye.trained, seen, depth, pinholes, len(points)), seen, points)
+    found = points_by_model(eye.trained, seen, depth, pinholes, len(points))
+    return point_report(found - _surveyed(points), points, rays=ray_counts(seen, len(points)))
 
 
-def _point_report(found: FloatArray, seen: Sights, points: tuple[SurveyedPoint, ...]) -> dict[str, Any]:
-    """Statistics and rows of found (J, 3) against surveyed positions, in metres."""
-    surveyed = np.array([point.position_in_geo for point in points]).reshape(-1, 3)
-    error = found.reshape(-1, 3) - surveyed
-    measured = np.isfinite(error).all(axis=1)
-    rows = [
-        {
-            "name": point.name,
-            "rays": int((seen.point == j).sum()),
-            "de_m": float(error[j, 0]) if measured[j] else None,
-            "dn_m": float(error[j, 1]) if measured[j] else None,
-            "du_m": float(error[j, 2]) if measured[j] else None,
-        }
-        for j, point in enumerate(points)
-    ]
-    return {**residual_stats(error[measured]).model_dump(), "points": rows}
+def _cross_validation(trained: Trained, known: Known | str, config: EvaluateConfig) -> dict[str, Any] | None:
+    """Control points, each measured by a solution without it; None where that was not asked for."""
+    if not config.cross_validate:
+        return None
+    if isinstance(known, str):
+        return {"count": 0, "reason": known}
+    points = trained.survey.control_points
+    found = left_out(known.restored)
+    rays = ray_counts(sights(trained, points), len(points))
+    report = point_report(found.error_in_geo, points, rays=rays, predicted=found.cov_in_geo)
+    for of_check_points_only in ("asprs", "cramer_rao"):
+        del report[of_check_points_only]
+    reason = None if report["count"] else "no control point can be spared, or none entered the training"
+    return {**report, "reason": reason}
+
+
+def _accuracy(known: Known | str) -> dict[str, Any]:
+    """The predicted accuracy over the scene in short; the grid is in `accuracy.csv`."""
+    if isinstance(known, str):
+        return {"cells": 0, "reason": known}
+    if known.area is None:
+        return {"cells": 0, "reason": "the scene has too few points"}
+    return {**known.area.figures(), "reason": None}
+
+
+def _control_fit(trained: Trained) -> dict[str, Any]:
+    """Residuals of the control points: how the solution fits, not how accurate it is."""
+    points = trained.survey.control_points
+    seen = sights(trained, points)
+    error = points_by_camera(trained, seen, len(points)) - _surveyed(points)
+    rows = point_rows(error, points, ray_counts(seen, len(points)))
+    return {**residual_stats(error[~np.isnan(error[:, 0])]).model_dump(), "points": rows}
 
 
 def _gnss_fit(trained: Trained) -> dict[str, Any]:
@@ -194,16 +264,12 @@ def _gnss_fit(trained: Trained) -> dict[str, Any]:
     return {**stats.model_dump(), "outliers": left_out}
 
 
-def _summarise(report: dict[str, Any]) -> Summary:
+def _summarise(report: dict[str, Any], config: EvaluateConfig) -> Summary:
     test, checks = report["photometric"]["test"], report["checkpoints"]
     parts = [f"test PSNR {test['psnr']:.2f} dB" if test["psnr"] is not None else "no test views"]
-    warnings = []
     for way in ("camera", "model"):
         if checks[way]["count"]:
             parts.append(f"check points by {way} {checks[way]['mean_h_m']:.3f} m H")
-    count = checks["camera"]["count"]
-    if 0 < count < _ASPRS_LEAST_POINTS:
-        warnings.append(f"{count} check points: the ASPRS standard asks for {_ASPRS_LEAST_POINTS} or more")
     values = {
         "views": test["views"],
         "psnr": test["psnr"],
@@ -215,4 +281,23 @@ def _summarise(report: dict[str, Any]) -> Summary:
             for key in ("count", "mean_h_m", "rmse_h_m", "rmse_v_m", "rmse_3d_m")
         },
     }
-    return Summary(", ".join(parts), values, tuple(warnings))
+    return Summary(", ".join(parts), values, _warnings(report, config))
+
+
+def _warnings(report: dict[str, Any], config: EvaluateConfig) -> tuple[str, ...]:
+    warnings, checks = [], report["checkpoints"]
+    count = checks["camera"]["count"]
+    if 0 < count < LEAST_POINTS:
+        warnings.append(few_points(count))
+    for way in ("camera", "model"):
+        names = checks[way]["blunders"]
+        if names:
+            more = " …" if len(names) > 8 else ""
+            warnings.append(
+                f"by {way}, {len(names)} of {checks[way]['count']} check points are off by more than three times "
+                f"the class that the others meet: {', '.join(names[:8])}{more}"
+            )
+    crossed = report["cross_validation"]
+    if config.cross_validate and crossed["reason"] is not None:
+        warnings.append(f"no cross-validation: {crossed['reason']}")
+    return tuple(warnings)

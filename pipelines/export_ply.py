@@ -16,11 +16,11 @@ import torch
 
 from pipelines.config import ExportPlyConfig
 from pipelines.errors import DegenerateGeometryError
-from pipelines.formats.georef_sidecar import GeorefSidecar, PredictedAccuracy, Row7, write_sidecar
+from pipelines.formats.georef_sidecar import GeorefSidecar, Row7, predicted_accuracy, write_sidecar
 from pipelines.geodesy.crs import ECEF, parse_crs
 from pipelines.geodesy.enu import ecef_from_enu, ecef_from_enu_rotation, ecef_from_lla, lla_from_ecef, lla_of
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
-from pipelines.geometry.similarity import Similarity, covariance_at, moved_pivot
+from pipelines.geometry.similarity import Similarity, moved_pivot
 from pipelines.products import (
     FloatArray,
     Origin,
@@ -137,21 +137,7 @@ def _sidecar(origin_lla: FloatArray, covariance: FloatArray | None, survey: Surv
         vertical_datum=survey.vertical,
         crs_wkt=parse_crs(ECEF).wkt,
         covariance=None if covariance is None else tuple(map(_row, covariance)),
-        accuracy=None if covariance is None else _predicted(covariance, np.zeros(3)),
-    )
-
-
-def _predicted(covariance: FloatArray, point_in_ply: FloatArray) -> PredictedAccuracy:
-    """Standard deviations at a point of the PLY's frame."""
-    east, north, up = np.diagonal(covariance_at(point_in_ply[None], covariance, np.zeros(3))[0])
-    return PredictedAccuracy(
-        at=_vector(point_in_ply),
-        sigma_e_m=float(np.sqrt(east)),
-        sigma_n_m=float(np.sqrt(north)),
-        sigma_u_m=float(np.sqrt(up)),
-        sigma_h_m=float(np.sqrt(east + north)),
-        sigma_v_m=float(np.sqrt(up)),
-        sigma_3d_m=float(np.sqrt(east + north + up)),
+        accuracy=None if covariance is None else predicted_accuracy(covariance, np.zeros(3)),
     )
 
 

@@ -232,12 +232,19 @@ class ResidualStats(Product):
     max_3d_m: float | None
 
 
+class AttitudeRecord(Product):
+    """Rotation `to ← from` of a similarity as recorded attitudes have it: covariance in rad² along target axes."""
+
+    quat_xyzw: Rotation
+    cov_rad2: Covariance3
+
+
 class InitialSimilarity(Product):
     """Product of `init-sim3`: `geo_from_local`, how it was found and how well it is determined."""
 
     format_version: Literal[1] = 1
     geo_from_local: SimilarityRecord
-    method: Literal["robust", "paper"]
+    method: Literal["robust", "paper", "adjusted"]
     correspondences: dict[str, int]
     inliers: dict[str, int]
     gnss_outliers: tuple[str, ...] = ()
@@ -245,6 +252,7 @@ class InitialSimilarity(Product):
     condition_number: float
     layout: Literal["volume", "plane", "line"]
     attitude_used: bool
+    attitude: AttitudeRecord | None = None
 
 
 class TrainedCamera(Product):
@@ -258,6 +266,22 @@ class TrainedCamera(Product):
     quat_xyzw: Rotation
     translation: Vector3
     exposure: Matrix34 | None = None
+
+
+class EstimatedError(Product):
+    """A constant error of the measurements that training estimated, with its σ, by axis.
+
+    `bias`: fix minus truth, east, north, up, in m; `flight` counts from 0 in the order of time. `lever-arm`:
+    antenna seen from the camera beyond what the survey has applied, camera axes, in m. `boresight`: rotation vector
+    from the true to the nominal camera axes, in degrees. `observed`: σ is at most half of that of the prior.
+    """
+
+    name: Literal["bias", "lever-arm", "boresight"]
+    flight: int | None = None
+    unit: Literal["m", "deg"]
+    value: Vector3
+    sigma: Vector3
+    observed: tuple[bool, bool, bool]
 
 
 class TrainedModel(Product):
@@ -274,6 +298,8 @@ class TrainedModel(Product):
     gaussians: int
     backend: Literal["cpu", "cuda"]
     gnss_outliers: tuple[str, ...] = ()
+    control_outliers: tuple[str, ...] = ()
+    estimated_errors: tuple[EstimatedError, ...] = ()
 
 
 ProductT = TypeVar("ProductT", bound=BaseModel)

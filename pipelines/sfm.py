@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from pipelines.config import SfmConfig
 from pipelines.errors import DegenerateGeometryError, InputError
-from pipelines.formats.colmap import load_reconstruction, pycolmap_module
+from pipelines.formats.colmap import load_reconstruction, quiet_colmap
 from pipelines.geometry.pairs import Views, all_pairs, select_pairs
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.interrupts import interruptible
@@ -35,14 +35,12 @@ _EXHAUSTIVE_UP_TO = 20
 _IMAGES_A_CHUNK = 4
 _PAIRS_A_CHUNK = 48
 _FEW_REGISTERED = 0.8
-# COLMAP writes one line a step; only its errors are of use here.
-_COLMAP_ERRORS_ONLY = 2
 
 
 def run(stage: StageRun, config: SfmConfig) -> Summary:
     """Reconstruct, or take over someone else's model, and say how complete it is."""
     survey = load_json(Survey, stage.workspace.path(SURVEY))
-    images = stage.workspace.root / survey.image_dir
+    images = stage.workspace.photographs(survey.image_dir)
     sparse = stage.out / "sparse"
     if sparse.exists():
         shutil.rmtree(sparse)
@@ -55,18 +53,6 @@ def run(stage: StageRun, config: SfmConfig) -> Summary:
         sparse.mkdir()
         model.write_binary(str(sparse))
     return _summarise(model, survey)
-
-
-@contextmanager
-def quiet_colmap() -> Iterator[Any]:
-    """pycolmap, with its log reduced to errors while in use."""
-    pycolmap = pycolmap_module()
-    level = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = _COLMAP_ERRORS_ONLY
-    try:
-        yield pycolmap
-    finally:
-        pycolmap.logging.minloglevel = level
 
 
 @dataclass(frozen=True)

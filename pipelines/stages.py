@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from pipelines.config import (
+    AdjustConfig,
     CalibrateConfig,
     EvaluateConfig,
     ExportPlyConfig,
@@ -42,10 +43,11 @@ class StageSpec:
         folder: its folder in the workspace.
         reads: workspace paths (files or folders) that decide its result.
         product: the path that later stages and people look for.
-        resumable: whether a partial product can be continued.
         photographs_only: whether it reads nothing of the survey but photographs, cameras, and the positions and
             attitudes as recorded: control points, σ and what `calibrate` applies do not make it stale.
         title: one line of help.
+        resumable: whether a partial product can be continued.
+        also: further paths in its folder that others look for, besides what the stages of the pipeline read.
     """
 
     name: str
@@ -56,6 +58,7 @@ class StageSpec:
     product: str
     title: str
     resumable: bool = False
+    also: tuple[str, ...] = ()
     photographs_only: bool = False
 
 
@@ -77,12 +80,12 @@ PIPELINE: tuple[StageSpec, ...] = (
         "Estimate the similarity from the SfM model to the Earth.",
     ),
     StageSpec(
-        "train", "pipelines.train", TrainConfig, "train", (SURVEY, SPARSE, SIM3), MODEL,
+        "train", "pipelines.train", TrainConfig, "train", (SURVEY, SPARSE, SIM3, POINTS), MODEL,
         "Train the Gaussians together with the similarity and the cameras.", resumable=True,
     ),
     StageSpec(
         "evaluate", "pipelines.evaluate", EvaluateConfig, "evaluate",
-        (SURVEY, SPARSE, MODEL, GAUSSIANS), REPORT,
+        (SURVEY, SPARSE, MODEL, GAUSSIANS, SIM3), REPORT,
         "Measure test views and check points.",
     ),
     StageSpec(
@@ -92,6 +95,14 @@ PIPELINE: tuple[StageSpec, ...] = (
     ),
 )  # fmt: skip
 
+# Not part of the line: `georef compare` runs it for the baseline, whose later stages find in its folder what they
+# otherwise read from those of sfm and init-sim3.
+ADJUST = StageSpec(
+    "adjust", "pipelines.adjust", AdjustConfig, "adjust", (SURVEY, SPARSE), "adjust/sparse",
+    "Adjust the bundle with the fixes as priors of the camera positions.", also=("adjust/geo_from_local.json",),
+)  # fmt: skip
+
+STAGES = (*PIPELINE, ADJUST)
 # Between sfm and what builds on the survey's positions: makes the survey anew where it asks for that.
 CALIBRATE = StageSpec(
     "calibrate", "pipelines.calibrate", CalibrateConfig, "ingest", (SURVEY, SPARSE), SURVEY,
@@ -106,13 +117,13 @@ CONFIGS = {spec.name: spec.config for spec in PIPELINE}
 def producer_of(path: str) -> StageSpec:
     """The stage that writes a workspace path."""
     folder = path.split("/", maxsplit=1)[0]
-    return next(spec for spec in PIPELINE if spec.folder == folder)
+    return next(spec for spec in STAGES if spec.folder == folder)
 
 
 def products_of(spec: StageSpec) -> tuple[str, ...]:
     """Everything in a stage's folder that people or later stages look for."""
     read = (path for other in PIPELINE for path in other.reads if producer_of(path) is spec)
-    return tuple(dict.fromkeys((spec.product, *read)))
+    return tuple(dict.fromkeys((spec.product, *spec.also, *read)))
 
 
 def stage_slice(first: str | None, last: str | None) -> tuple[StageSpec, ...]:

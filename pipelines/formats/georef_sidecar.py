@@ -7,16 +7,18 @@ field and a worked example.
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 from pydantic import ConfigDict, Field, field_validator
 from pydantic.alias_generators import to_camel
 
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
-from pipelines.geometry.similarity import Similarity
-from pipelines.products import Product, Quaternion, Vector3, VerticalDatum, load_json
+from pipelines.geometry.similarity import Similarity, covariance_at
+from pipelines.products import FloatArray, Product, Quaternion, Vector3, VerticalDatum, load_json
 
 SUFFIX = ".georef.json"
 
@@ -70,6 +72,31 @@ class GeorefSidecar(_CamelCase):
     def ecef_from_file(self) -> Similarity:
         """p_ecef = s R p_file + origin."""
         return Similarity(self.scale, matrix_from_quat_xyzw(self.rotation), np.array(self.origin))
+
+    def covariance_at(self, point_in_file: ArrayLike) -> FloatArray | None:
+        """Covariance (N, 3, 3) in m² along the file's axes at points (N, 3) of it; None where none was estimated.
+
+        J C Jᵀ with J = [p, −[p]×, I]: what the georeference leaves open, not the splat's own shape.
+        """
+        if self.covariance is None:
+            return None
+        return covariance_at(point_in_file, self.covariance, np.zeros(3))
+
+
+def predicted_accuracy(covariance: ArrayLike, point_in_file: ArrayLike) -> PredictedAccuracy:
+    """What the sidecar's covariance (7, 7) predicts at a point (3,) of the file's frame."""
+    at = np.asarray(point_in_file, dtype=np.float64)
+    east, north, up = np.diagonal(covariance_at(at[None], covariance, np.zeros(3))[0]).tolist()
+    x, y, z = at.tolist()
+    return PredictedAccuracy(
+        at=(x, y, z),
+        sigma_e_m=math.sqrt(east),
+        sigma_n_m=math.sqrt(north),
+        sigma_u_m=math.sqrt(up),
+        sigma_h_m=math.sqrt(east + north),
+        sigma_v_m=math.sqrt(up),
+        sigma_3d_m=math.sqrt(east + north + up),
+    )
 
 
 def sidecar_path(artefact: Path) -> Path:

@@ -66,21 +66,37 @@ class CorrectionBasis:
 
     `δω` [rad] turns a camera about its centre, axes of the world: `R' = R Exp(−δω)`; `δc` [m] moves the centre.
 
+    The lens is not corrected. How far it is from the true one, (L,) for the parameters of all cameras in the order
+    of `Network.cameras`, each list as long as the longest, is lens_matrix @ z + a rest with covariance `lens_cov`.
+
     Attributes:
         matrix: (n, 6, k), rows (δω, δc), k = 6 n − 7.
         sigma_px: σ of an image coordinate, estimated from the residuals.
+        lens_matrix: (L, k).
+        lens_cov: (L, L).
     """
 
     matrix: FloatArray
     sigma_px: float
+    lens_matrix: FloatArray
+    lens_cov: FloatArray
 
 
 @dataclass(frozen=True)
-class _Linearised:
-    residual: FloatArray  # (M, 2)
-    by_pose: FloatArray  # (M, 2, 6)
-    by_point: FloatArray  # (M, 2, 3)
-    by_intrinsics: FloatArray  # (M, 2, P), P the longest parameter list
+class Linearised:
+    """Residuals of M observations in pixels (projected minus observed), and their derivatives.
+
+    Attributes:
+        residual: (M, 2).
+        by_pose: (M, 2, 6), by (δω, δc) of the camera, as in `CorrectionBasis`.
+        by_point: (M, 2, 3).
+        by_intrinsics: (M, 2, P), P the longest parameter list; zero beyond a shorter one.
+    """
+
+    residual: FloatArray
+    by_pose: FloatArray
+    by_point: FloatArray
+    by_intrinsics: FloatArray
 
 
 def correction_basis(network: Network) -> CorrectionBasis:
@@ -97,8 +113,8 @@ def correction_basis(network: Network) -> CorrectionBasis:
     Raises:
         DegenerateGeometryError: fewer observations than unknowns.
     """
-    network = _in_front(network)
-    lin = _linearise(network)
+    network = in_front(network)
+    lin = linearise(network)
     n, points = len(network.camera_id), len(network.point_in_world)
     redundancy = 2 * len(lin.residual) - 6 * n - 3 * points
     if redundancy <= 0:
@@ -112,13 +128,14 @@ def correction_basis(network: Network) -> CorrectionBasis:
     flat = basis.reshape(-1, basis.shape[2])
     modes = similarity_modes(network.cam_center_in_world).reshape(-1, 7)
     held = flat - modes @ (reduced.points_follow @ flat)
-    return CorrectionBasis(held.reshape(basis.shape), float(np.sqrt(variance)))
+    return CorrectionBasis(
+        held.reshape(basis.shape), float(np.sqrt(variance)), reduced.lens_follows @ flat, reduced.lens_cov
+    )
 
 
-def _in_front(network: Network) -> Network:
+def in_front(network: Network) -> Network:
     """Without the observations of points behind their camera, which an imported model may hold."""
-    ray = network.point_in_world[network.obs_point] - network.cam_center_in_world[network.obs_image]
-    ahead = np.einsum("mj,mj->m", network.cam_from_world[network.obs_image, 2], ray) > 0
+    ahead = is_ahead(network)
     if ahead.all():
         return network
     return replace(
@@ -129,7 +146,14 @@ def _in_front(network: Network) -> Network:
     )
 
 
-def _linearise(network: Network) -> _Linearised:
+def is_ahead(network: Network) -> NDArray[np.bool_]:
+    """Which observations (M,) are of points in front of their camera."""
+    ray = network.point_in_world[network.obs_point] - network.cam_center_in_world[network.obs_image]
+    return np.asarray(np.einsum("mj,mj->m", network.cam_from_world[network.obs_image, 2], ray) > 0)
+
+
+def linearise(network: Network) -> Linearised:
+    """The observations of a network, all points in front of their cameras, as linear functions of its unknowns."""
     ray = network.point_in_world[network.obs_point] - network.cam_center_in_world[network.obs_image]
     rotation = network.cam_from_world[network.obs_image]
     in_cam = np.einsum("mij,mj->mi", rotation, ray)
@@ -147,7 +171,7 @@ def _linearise(network: Network) -> _Linearised:
             by_intrinsics[rows, :, index] = _by_parameter(camera, index, local)
     by_point = by_cam @ rotation
     by_pose = np.concatenate([by_point @ skew(ray), -by_point], axis=2)
-    return _Linearised(residual, by_pose, by_point, by_intrinsics)
+    return Linearised(residual, by_pose, by_point, by_intrinsics)
 
 
 def _differences(function: Callable[[FloatArray], FloatArray], points: FloatArray) -> FloatArray:
@@ -181,23 +205,24 @@ def _robust_weights(residual: FloatArray) -> FloatArray:
 class _Reduced:
     information: FloatArray  # (6 n, 6 n) of the poses, points and intrinsics eliminated
     points_follow: FloatArray  # (7, 6 n) mean similarity of the points when the cameras move
+    lens_follows: FloatArray  # (L, 6 n) expected lens parameters when the cameras move
+    lens_cov: FloatArray  # (L, L) about that
 
 
-def _reduced(network: Network, lin: _Linearised, root_weight: FloatArray) -> _Reduced:
+def _reduced(network: Network, lin: Linearised, root_weight: FloatArray) -> _Reduced:
     """Schur complement of points and intrinsics, and how the points follow the poses through a fixed lens."""
     n, points = len(network.camera_id), len(network.point_in_world)
     scaled = root_weight[:, None, None]
-    keys = list(network.cameras)
-    slot = np.array([keys.index(int(key)) for key in network.camera_id])[network.obs_image]
-    pose = _scatter(lin.by_pose * scaled, network.obs_image, n)
-    intrinsics = _scatter(lin.by_intrinsics * scaled, slot, len(keys))
+    slot = lens_slots(network)
+    pose = scatter(lin.by_pose * scaled, network.obs_image, n)
+    intrinsics = scatter(lin.by_intrinsics * scaled, slot, len(network.cameras))
     by_point = lin.by_point * scaled
     normal = np.zeros((points, 3, 3))
     np.add.at(normal, network.obs_point, np.swapaxes(by_point, 1, 2) @ by_point)
     normal += 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3) + 1e-12 * np.eye(3)
     root = np.linalg.cholesky(normal)
     inverse_root = np.swapaxes(np.linalg.inv(root), 1, 2)
-    point = _scatter(by_point @ inverse_root[network.obs_point], network.obs_point, points)
+    point = scatter(by_point @ inverse_root[network.obs_point], network.obs_point, points)
     pose_point, intrinsics_point = pose.T @ point, intrinsics.T @ point
     cc = (pose.T @ pose - pose_point @ pose_point.T).toarray()
     ci = (pose.T @ intrinsics - pose_point @ intrinsics_point.T).toarray()
@@ -206,9 +231,19 @@ def _reduced(network: Network, lin: _Linearised, root_weight: FloatArray) -> _Re
     scale = 1.0 / np.sqrt(np.diag(ii)[used])
     block = ii[np.ix_(used, used)] * scale[:, None] * scale + 1e-9 * np.eye(len(used))
     cross = ci[:, used] * scale
-    cc -= cross @ np.linalg.solve(block, cross.T)
+    follows, cov = np.zeros((len(ii), 6 * n)), np.zeros_like(ii)
+    follows[used] = -scale[:, None] * np.linalg.solve(block, cross.T)
+    cov[np.ix_(used, used)] = scale[:, None] * np.linalg.solve(block, np.eye(len(used))) * scale
+    cc += ci @ follows
     moved = (np.swapaxes(root, 1, 2) @ _displacements(network)).reshape(3 * points, 7)
-    return _Reduced((cc + cc.T) / 2, -np.linalg.solve(moved.T @ moved, (pose_point @ moved).T))
+    points_follow = -np.linalg.solve(moved.T @ moved, (pose_point @ moved).T)
+    return _Reduced((cc + cc.T) / 2, points_follow, follows, cov)
+
+
+def lens_slots(network: Network) -> IntArray:
+    """Place of each observation's camera (M,) among `network.cameras`."""
+    keys = list(network.cameras)
+    return np.array([keys.index(int(key)) for key in network.camera_id], dtype=np.int64)[network.obs_image]
 
 
 def _displacements(network: Network) -> FloatArray:
@@ -217,7 +252,7 @@ def _displacements(network: Network) -> FloatArray:
     return np.concatenate([arm[:, :, None], -skew(arm), np.tile(np.eye(3), (len(arm), 1, 1))], axis=2)
 
 
-def _scatter(blocks: FloatArray, column_block: IntArray, count: int) -> csr_matrix:
+def scatter(blocks: FloatArray, column_block: IntArray, count: int) -> csr_matrix:
     """Sparse matrix with one (2, w) block a row pair, in the block column that is given: (2 M, w · count)."""
     rows, height, width = blocks.shape
     columns = column_block[:, None, None] * width + np.arange(width)[None, None, :]

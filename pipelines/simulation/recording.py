@@ -7,10 +7,10 @@ from typing import Literal
 
 import numpy as np
 
-from pipelines.config import SimulateConfig
 from pipelines.geodesy.enu import lla_from_enu
 from pipelines.geometry.rotations import ENU_FROM_NED, geo_from_cam, yaw_pitch_roll_deg
 from pipelines.products import FloatArray, Matrix3, Vector3
+from pipelines.simulate_config import SimulateConfig
 from pipelines.simulation.raycast import Raycaster
 from pipelines.simulation.sensors import (
     RECEIVERS,

@@ -46,6 +46,21 @@ class TestReport:
         assert "camera" not in fit
         assert "not an accuracy" in fit
 
+    def test_accuracy_has_class_prediction_and_bound(self) -> None:
+        camera = {
+            **REPORT["checkpoints"]["camera"],
+            "with_survey": {"rmse_h_m": 0.018, "rmse_v_m": 0.023},
+            "asprs": {"horizontal_class": "2 cm", "vertical_class": "3 cm"},
+            "predicted": {"rms_h_m": 0.017, "rms_v_m": 0.022},
+            "cramer_rao": None,
+        }
+        document = {"checkpoints": {"camera": camera}, "cross_validation": {"count": 8, "rmse_h_m": 0.044}}
+        check, accuracy, cross = [text_of(part) for part in tables.report(document)]
+        line = next(line for line in accuracy.splitlines() if line.startswith("camera"))
+        assert line.split() == ["camera", "0.018", "0.023", "2", "cm", "3", "cm", "0.017", "0.022", "–", "–"]
+        assert "0.044" in cross
+        assert "0.044" not in check
+
     def test_unknown_is_a_dash(self) -> None:
         assert "–" in text_of(*tables.report(REPORT)[:1])
 

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pipelines.config import SfmConfig, SimulateConfig
+from pipelines.config import SfmConfig
 from pipelines.errors import DegenerateGeometryError, InputError
 from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.similarity import umeyama
@@ -33,6 +33,7 @@ from pipelines.progress import SILENT
 from pipelines.runner import run_stage
 from pipelines.sfm import SfmJob, _summarise, candidate_pairs, import_model, quiet_colmap, reconstruct, run
 from pipelines.simulate import simulate
+from pipelines.simulate_config import SimulateConfig
 from pipelines.stages import BY_NAME, SPARSE, SURVEY
 from pipelines.states import status
 from pipelines.workspace import StageRun, Workspace

@@ -1,0 +1,184 @@
+"""How near the estimates come to the Cramér–Rao bound: `python examples/benchmarks/cramer_rao.py WORKSPACE`.
+
+The trained cameras, and control and check points where their marks show them there, are taken for the truth. Each
+run draws anew what was measured of it, with the σ that the survey states: the fixes, survey and marks of the
+control points, marks of the check points, and what the noise of the image observations does to cameras and lens.
+Then it estimates as the tool does: the similarity of `init-sim3`, and from there similarity and cameras as in
+training, but without the photographs, solved to the end. The RMS errors at the check points are divided by the
+bound.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from pipelines.blocks.points import Sights, points_by_camera, sights
+from pipelines.blocks.prediction import control_sights, cramer_rao, following
+from pipelines.blocks.restored import Restored, restore, training_config
+from pipelines.blocks.trained import load_trained
+from pipelines.geometry.following import Following
+from pipelines.georef.adjustment import Correspondences
+from pipelines.georef.alignment import align
+from pipelines.georef.cameras import CameraCorrections
+from pipelines.georef.losses import ControlMarks, Fixes
+from pipelines.georef.posterior import minimise
+from pipelines.georef.problem import GeoProblem
+from pipelines.georef.similarity import LearnableSimilarity
+from pipelines.products import FloatArray, InitialSimilarity, load_json
+from pipelines.stages import SIM3
+from pipelines.workspace import Workspace
+
+
+@dataclass(frozen=True)
+class Marked:
+    """Points (J, 3) in `model` where their marks show them, and how they follow the cameras."""
+
+    position: FloatArray
+    follow: Following
+
+    @classmethod
+    def of(cls, restored: Restored, seen: Sights, count: int) -> Marked:
+        """J points from their marks."""
+        in_geo = points_by_camera(restored.trained, seen, count)
+        in_model = restored.trained.geo_from_model.inverse().apply(in_geo)
+        return cls(in_model, following(restored, in_geo, seen))
+
+
+@dataclass(frozen=True)
+class Truth:
+    """A trained survey that is taken for the truth."""
+
+    restored: Restored
+    control: Marked | None
+    check: Marked
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """One run's measurements, and where the check points (J, 3) truly are in `geo`."""
+
+    fixes: Fixes | None
+    marks: ControlMarks | None
+    check_in_geo: FloatArray
+
+
+def draw(truth: Truth, rng: np.random.Generator, *, images: bool) -> Drawn:
+    """Draw the measurements; without `images`, image observations and the check points' marks are exact."""
+    problem, found = truth.restored.problem, truth.restored.scene.correction_basis
+    geo_from_model, basis = truth.restored.trained.geo_from_model, problem.cameras.basis.numpy()
+    z = rng.normal(size=basis.shape[2]) * images
+    lens = np.zeros(truth.check.follow.by_lens.shape[2])
+    if images and found is not None:
+        lens = found.lens_matrix @ z + _noise(found.lens_cov[None], rng)[0]
+
+    def true(marked: Marked) -> FloatArray:
+        return marked.position + marked.follow.by(basis) @ z + marked.follow.by_lens @ lens
+
+    fixes, marks = problem.fixes, problem.marks
+    if fixes is not None:
+        moved = truth.restored.trained.poses.cam_center_in_model + basis[:, 3:] @ z
+        position = geo_from_model.apply(moved[fixes.camera.numpy()])
+        position = position + _noise(_covariance(fixes.root_information), rng)
+        fixes = replace(fixes, position_in_geo=torch.from_numpy(position))
+    if marks is not None and truth.control is not None:
+        position = geo_from_model.apply(true(truth.control)) + _noise(_covariance(marks.root_information), rng)
+        marks = replace(marks, position_in_geo=torch.from_numpy(position))
+    check = true(truth.check) + images * _noise(truth.check.follow.cov_of_marks, rng)
+    return Drawn(fixes, marks, geo_from_model.apply(check))
+
+
+def _covariance(root_information: torch.Tensor) -> FloatArray:
+    root = root_information.numpy()
+    return np.linalg.inv(np.swapaxes(root, 1, 2) @ root)
+
+
+def _noise(cov: FloatArray, rng: np.random.Generator) -> FloatArray:
+    value, vector = np.linalg.eigh(cov)
+    white = rng.normal(size=value.shape) * np.sqrt(np.maximum(value, 0.0))
+    return (vector @ white[..., None])[..., 0]
+
+
+def estimate(truth: Truth, drawn: Drawn, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    """The check points (J, 3) in `geo`: by the similarity of `init-sim3`, and by similarity and cameras."""
+    poses, basis = truth.restored.trained.poses, truth.restored.problem.cameras.basis.numpy()
+    solution = align(_correspondences(truth, drawn), rng).solution
+    start = solution.state.geo_from_local
+    problem = GeoProblem(
+        LearnableSimilarity(start, solution.covariance, solution.pivot),
+        CameraCorrections(poses, basis),
+        drawn.fixes,
+        drawn.marks,
+    )
+    minimise(problem)
+    followed = truth.check.position + truth.check.follow.by(basis) @ problem.cameras.z.detach().numpy()
+    return start.apply(truth.check.position), problem.similarity.current().apply(followed)
+
+
+def _correspondences(truth: Truth, drawn: Drawn) -> Correspondences:
+    """What `init-sim3` would be given, the frame `model` standing for `local`."""
+    local, cov_local, geo, cov, control = [np.empty((0, 3))], [], [np.empty((0, 3))], [], []
+    if drawn.fixes is not None:
+        local.append(truth.restored.trained.poses.cam_center_in_model[drawn.fixes.camera.numpy()])
+        geo.append(drawn.fixes.position_in_geo.numpy())
+        cov.append(_covariance(drawn.fixes.root_information))
+        control += [False] * len(geo[-1])
+    if drawn.marks is not None and truth.control is not None:
+        local.append(truth.control.position)
+        geo.append(drawn.marks.position_in_geo.numpy())
+        cov.append(_covariance(drawn.marks.root_information))
+        control += [True] * len(geo[-1])
+    count = len(control)
+    cov_local = np.zeros((count, 3, 3))
+    names = tuple(str(index) for index in range(count))
+    return Correspondences(
+        names, np.array(control), np.concatenate(local), cov_local, np.concatenate(geo), np.concatenate(cov)
+    )
+
+
+def rms(errors: FloatArray) -> tuple[float, float]:
+    """Horizontal and vertical root mean square of errors (…, 3)."""
+    east, north, up = (errors**2).reshape(-1, 3).mean(axis=0)
+    return float(np.sqrt(east + north)), float(np.sqrt(up))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("workspace", type=Path, help="trained, with check points")
+    parser.add_argument("--runs", type=int, default=200)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--exact-images", action="store_true", help="draw fixes and control points only")
+    options = parser.parse_args()
+    workspace = Workspace(options.workspace)
+    trained = load_trained(workspace)
+    initial = load_json(InitialSimilarity, workspace.path(SIM3))
+    restored = restore(trained, initial, training_config(workspace))
+    seen, points = sights(trained, trained.survey.check_points), trained.survey.check_points
+    control, marks = control_sights(restored), restored.problem.marks
+    truth = Truth(
+        restored,
+        None if marks is None else Marked.of(restored, control, len(marks.position_in_geo)),
+        Marked.of(restored, seen, len(points)),
+    )
+    bound = np.sqrt(np.diagonal(cramer_rao(restored, seen), axis1=1, axis2=2))
+    clock, errors = time.perf_counter(), []
+    for run in range(options.runs):
+        rng = np.random.default_rng([options.seed, run])
+        drawn = draw(truth, rng, images=not options.exact_images)
+        errors.append([found - drawn.check_in_geo for found in estimate(truth, drawn, rng)])
+    seconds = time.perf_counter() - clock
+    least = rms(bound)
+    print(f"{options.runs} runs, {len(points)} check points, {seconds:.0f} s")
+    print(f"Cramér–Rao bound:        {least[0]:.4f} m H, {least[1]:.4f} m V")
+    for name, found in zip(("init-sim3", "similarity and cameras"), np.array(errors).swapaxes(0, 1), strict=True):
+        h, v = rms(found)
+        print(f"{name + ':':24s} {h:.4f} m H, {v:.4f} m V; × bound: {h / least[0]:.3f} H, {v / least[1]:.3f} V")
+
+
+if __name__ == "__main__":
+    main()
