@@ -94,8 +94,8 @@ def told(rig: RigCalibration) -> str:
     for one in rig.estimates:
         value = ", ".join(f"{number:.3f}" for number in one.value)
         sigma = ", ".join(f"{number:.3f}" for number in one.sigma)
-        unit = one.unit.replace("deg", "°")
-        parts.append(f"{one.name} {value} ± {sigma} {unit}{'' if one.usable else ' (not observable, not applied)'}")
+        unit = {"s": " s", "deg": "°", "m": " m"}[one.unit]
+        parts.append(f"{one.name} {value} ± {sigma}{unit}{'' if one.usable else ' (not observable, not applied)'}")
     return "; ".join(parts) or "nothing of the rig is observable"
 
 

@@ -13,13 +13,14 @@ import pytest
 
 from georef_cli import boundary
 from georef_cli.main import cli
-from pipelines.config import CalibrateConfig, SimulateConfig
+from pipelines.config import CalibrateConfig
 from pipelines.formats.colmap import write_sparse
 from pipelines.geodesy.enu import enu_from_lla, lla_from_enu
 from pipelines.geometry.rig import boresight
 from pipelines.geometry.rotations import log_so3, matrix_from_quat_xyzw
 from pipelines.products import Survey, load_json
 from pipelines.simulate import simulate
+from pipelines.simulate_config import SimulateConfig
 from pipelines.simulation.truth import Truth
 from pipelines.stages import SURVEY
 from tests import bags
