@@ -228,10 +228,11 @@ def _cross_validation(trained: Trained, known: Known | str, config: EvaluateConf
 def _accuracy(known: Known | str) -> dict[str, Any]:
     """The predicted accuracy over the scene in short; the grid is in `accuracy.csv`."""
     if isinstance(known, str):
-        return {"cells": 0, "reason": known}
+        return {"cells": 0, "reason": known, "cautions": []}
+    cautions = list(known.prediction.cautions)
     if known.area is None:
-        return {"cells": 0, "reason": "the scene has too few points"}
-    return {**known.area.figures(), "reason": None}
+        return {"cells": 0, "reason": "the scene has too few points", "cautions": cautions}
+    return {**known.area.figures(), "reason": None, "cautions": cautions}
 
 
 def _control_fit(trained: Trained) -> dict[str, Any]:
@@ -281,7 +282,7 @@ def _summarise(report: dict[str, Any], config: EvaluateConfig) -> Summary:
 
 
 def _warnings(report: dict[str, Any], config: EvaluateConfig) -> tuple[str, ...]:
-    warnings, checks = [], report["checkpoints"]
+    warnings, checks = list(report["accuracy"]["cautions"]), report["checkpoints"]
     count = checks["camera"]["count"]
     if 0 < count < LEAST_POINTS:
         warnings.append(few_points(count))
