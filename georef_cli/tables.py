@@ -11,6 +11,7 @@ from rich.console import Group
 from rich.markup import escape
 from rich.table import Table
 
+from pipelines.comparison import Comparison, cells, remarks_on
 from pipelines.errors import InputError
 from pipelines.runner import Outcome
 from pipelines.stages import REPORT
@@ -101,21 +102,35 @@ def outcomes(results: Sequence[Outcome]) -> Table:
 
 def calibration(document: Mapping[str, Any]) -> list[Renderable]:
     """`georef calibrate`: a line a component, and what is left."""
-    table = _table("", "estimated", "± σ", "before", "unit", "")
+    table = _table("", "estimated", "± σ", "ingest", "unit", "")
     for column in table.columns[1:4]:
         column.justify = "right"
     for row in document["estimates"]:
         axes = {"boresight": "xyz", "lever-arm": ("forward", "right", "down")}.get(row["name"], ("",))
-        for axis, value, sigma, before, seen in zip(
-            axes, row["value"], row["sigma"], row["before"], row["observable"], strict=True
+        for axis, value, sigma, start, seen in zip(
+            axes, row["value"], row["sigma"], row["start"], row["observable"], strict=True
         ):
             told = "" if seen else "[yellow]not observable in this flight[/]"
             name = f"{row['name']} {axis}".strip()
-            table.add_row(name, f"{value:.4f}", f"{sigma:.4f}", f"{before:.4f}", row["unit"], told)
+            table.add_row(name, f"{value:.4f}", f"{sigma:.4f}", f"{start:.4f}", row["unit"], told)
     left = f"left over: {document['rms_position_m']:.3f} m an axis"
     if document["rms_attitude_deg"] is not None:
         left += f", {document['rms_attitude_deg']:.2f}°"
     return [table, f"{left} ({document['images']} images, {document['control_points']} control points)"]
+
+
+def comparison(table: Comparison) -> list[Renderable]:
+    """`georef compare`: a line a configuration, and what sets it apart below."""
+    heads = [f"{way}\n{name}" for way in ("camera", "model") for name in ("mean H", "median H", "RMSE H", "RMSE V")]
+    del heads[1]  # by camera, mean and median hardly differ
+    shown = _table("", "test\nPSNR", "\nSSIM", *heads, "check\npoints", "\ntraining")
+    for column in shown.columns[1:]:
+        column.justify, column.no_wrap = "right", True
+    for row in table.rows:
+        shown.add_row(row.configuration, *cells(row))
+    notes = [f"[bold]{row.configuration}[/] {escape(f'{row.title}: {row.note}')}" for row in table.rows]
+    remarks = [f"[yellow]{row.configuration}:[/] {escape(text)}" for row in table.rows for text in remarks_on(row)]
+    return ["[bold]Test views in dB, check points in metres[/]", shown, "", *notes, *remarks]
 
 
 def topics(rows: Iterable[Mapping[str, Any]]) -> Table:

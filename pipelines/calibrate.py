@@ -1,18 +1,22 @@
 """`georef calibrate`: time offset, boresight and lever arm, from the SfM cameras against the recorded navigation.
 
-Reads `ingest/survey.json`, `ingest/track.npz` and `sfm/sparse`; writes nothing. What it finds is applied by running
-`ingest` again with the values as its options: the survey then has them in every position and attitude.
+Reads `ingest/survey.json`, `ingest/track.npz` and `sfm/sparse`. What it finds is applied to the survey: positions
+and attitudes anew from the navigation, the estimates beside them. What SfM made of the photographs stays as it is.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import logging
+from typing import Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from pipelines.blocks.observations import control_correspondences
-from pipelines.config import CalibrateConfig
-from pipelines.errors import InputError
+from pipelines.blocks.rig import require_estimable, with_rig
+from pipelines.config import CalibrateConfig, RigParameter
+from pipelines.errors import DegenerateGeometryError, InputError
+from pipelines.fingerprints import layout_of, product_hash
 from pipelines.formats.colmap import SparseModel, read_sparse
 from pipelines.geometry.rotations import log_so3
 from pipelines.georef.rig_fit import (
@@ -23,59 +27,22 @@ from pipelines.georef.rig_fit import (
     RigData,
     fit_rig,
 )
-from pipelines.products import FloatArray, NavigationTrack, Survey, load_json
+from pipelines.products import FloatArray, NavigationTrack, RigCalibration, RigEstimate, Survey, load_json
 from pipelines.stages import SPARSE, SURVEY, TRACK
 from pipelines.workspace import Workspace
 
-_LIMITS = {"time-offset": LIMIT_OFFSET_S, "boresight": LIMIT_BORESIGHT_DEG, "lever-arm": LIMIT_ARM_M}
-_UNITS = {"time-offset": "s", "boresight": "deg", "lever-arm": "m"}
+log = logging.getLogger(__name__)
+
+_LIMITS: dict[RigParameter, tuple[float, Literal["s", "deg", "m"]]] = {
+    "time-offset": (LIMIT_OFFSET_S, "s"),
+    "boresight": (LIMIT_BORESIGHT_DEG, "deg"),
+    "lever-arm": (LIMIT_ARM_M, "m"),
+}
+_ENDLESS = 1e6
 
 
-@dataclass(frozen=True)
-class Estimate:
-    """One parameter of the rig, in the sense and unit of the option of `ingest` of the same name.
-
-    Attributes:
-        value: estimated; `before`: that the survey was made with; `sigma`: of each component.
-        observable: by component: whether σ is small enough to use it.
-    """
-
-    name: str
-    unit: str
-    value: tuple[float, ...]
-    sigma: tuple[float, ...]
-    before: tuple[float, ...]
-    observable: tuple[bool, ...]
-
-    @property
-    def usable(self) -> bool:
-        """Whether every component is observable."""
-        return all(self.observable)
-
-    @property
-    def option(self) -> str:
-        """The value as `ingest` takes it."""
-        return ",".join(f"{number:.6g}" for number in self.value)
-
-
-@dataclass(frozen=True)
-class Calibration:
-    """The estimates, images used, and what is left: robust σ per axis of positions (m) and attitudes (degrees)."""
-
-    estimates: tuple[Estimate, ...]
-    images: int
-    control_points: int
-    rms_position_m: float
-    rms_attitude_deg: float | None
-
-    @property
-    def options(self) -> dict[str, str]:
-        """Options of `ingest` that apply what is usable."""
-        return {one.name.replace("-", "_"): one.option for one in self.estimates if one.usable}
-
-
-def calibrate(workspace: Workspace, config: CalibrateConfig) -> Calibration:
-    """Estimate the rig of a workspace's flight.
+def calibrate(workspace: Workspace, config: CalibrateConfig) -> RigCalibration:
+    """Estimate the rig of a workspace's flight; changes nothing.
 
     Raises:
         MissingProductError: there is no survey or no SfM model.
@@ -84,48 +51,88 @@ def calibrate(workspace: Workspace, config: CalibrateConfig) -> Calibration:
     """
     survey = load_json(Survey, workspace.path(SURVEY))
     model = read_sparse(workspace.path(SPARSE))
-    if not (workspace.root / TRACK).exists():
-        raise InputError(
-            "the survey has no navigation recorded by time, only a position for each image: ingest a --bag",
-            path=workspace.root / TRACK,
+    found = estimate_rig(survey, model, _track(workspace), config)
+    return found.model_copy(update={"model": product_hash(workspace, SPARSE), "layout": layout_of(survey)})
+
+
+def apply_calibration(workspace: Workspace, rig: RigCalibration) -> None:
+    """Make the survey of a workspace anew with what is usable of `rig`; the lock is the caller's to hold."""
+    survey = load_json(Survey, workspace.path(SURVEY))
+    workspace.replace(SURVEY, with_rig(survey, _track(workspace), rig))
+
+
+def calibrate_as_asked(workspace: Workspace) -> tuple[RigCalibration | None, bool]:
+    """Estimate and apply what the survey asks for, unless that is done and the SfM model still the same.
+
+    A flight that shows nothing of the rig is no failure here: the survey then says so.
+
+    Returns:
+        The estimates, None if nothing is asked for; and whether they were made now.
+    """
+    survey = load_json(Survey, workspace.path(SURVEY))
+    wanted = survey.rig.wanted if survey.rig is not None else survey.estimate
+    if not wanted:
+        return None, False
+    if survey.rig is not None and survey.rig.model == product_hash(workspace, SPARSE):
+        return survey.rig, False
+    try:
+        found = calibrate(workspace, CalibrateConfig(estimate=",".join(wanted)))
+    except DegenerateGeometryError as error:
+        found = RigCalibration(
+            wanted=wanted, problem=str(error), model=product_hash(workspace, SPARSE), layout=layout_of(survey)
         )
-    return estimate_rig(survey, model, NavigationTrack.load(workspace.root / TRACK), config)
+    for warning in warnings_of(found):
+        log.warning("calibrate: %s", warning)
+    log.info("calibrate: %s", told(found))
+    apply_calibration(workspace, found)
+    return found, True
+
+
+def told(rig: RigCalibration) -> str:
+    """The estimates in a line."""
+    parts = []
+    for one in rig.estimates:
+        value = ", ".join(f"{number:.3f}" for number in one.value)
+        sigma = ", ".join(f"{number:.3f}" for number in one.sigma)
+        unit = one.unit.replace("deg", "°")
+        parts.append(f"{one.name} {value} ± {sigma} {unit}{'' if one.usable else ' (not observable, not applied)'}")
+    return "; ".join(parts) or "nothing of the rig is observable"
+
+
+def warnings_of(rig: RigCalibration) -> list[str]:
+    """What could not be estimated, and what counts instead."""
+    if rig.problem:
+        return [f"{rig.problem}; {', '.join(rig.wanted)} stay as told"]
+    return [
+        f"{one.name} is not observable in this flight (σ {max(one.sigma):.2g} {one.unit}): it stays as told"
+        for one in rig.estimates
+        if not one.usable
+    ]
 
 
 def estimate_rig(
     survey: Survey, model: SparseModel, track: NavigationTrack, config: CalibrateConfig
-) -> Calibration:
+) -> RigCalibration:
     """As `calibrate`, of products."""
-    data = _data(survey, model, track)
-    mounted = bool(np.isfinite(data.cam_from_body).all(axis=(1, 2)).any())
-    if "lever-arm" in config.wanted and not len(track.attitude_time_s):
-        raise InputError("lever-arm needs attitudes, which were not recorded", field="--estimate")
-    if "boresight" in config.wanted and not (mounted and len(track.attitude_time_s)):
-        raise InputError(
-            "boresight needs recorded attitudes and the camera's mount (/tf or --camera-mount)", field="--estimate"
-        )
     wanted = config.wanted
-    before_s = float(track.time_offset_s)
+    require_estimable(track, wanted, "--estimate")
+    data = _data(survey, model, track)
+    start_s = float(track.time_offset_s)
     options = FitOptions("time-offset" in wanted, "lever-arm" in wanted, config.max_offset)
-    found = fit_rig(data, before_s, track.nominal_from_cam, options)
+    found = fit_rig(data, start_s, track.nominal_from_cam, options)
     arm = np.nan_to_num(track.antenna_in_body).mean(axis=0)
     state, sigma = found.state, found.sigma
-    # Along its view a camera's centre trades against lens and terrain: SfM is wrong there by a pixel's footprint,
-    # alike in all images, which no scatter shows.
-    arm_sigma = np.hypot(sigma[11:14], state.geo_from_local.scale * _footprint(model))
-    rows = {
-        "time-offset": (np.array([state.offset_s]), sigma[7:8], np.array([before_s])),
-        "boresight": (_degrees(state.boresight), np.degrees(sigma[8:11]), _degrees(track.nominal_from_cam)),
-        "lever-arm": (arm + state.arm, arm_sigma, arm),
+    rows: dict[RigParameter, RigEstimate] = {
+        "time-offset": _estimate("time-offset", [state.offset_s], sigma[7:8], [start_s]),
+        "boresight": _estimate(
+            "boresight", _degrees(state.boresight), np.degrees(sigma[8:11]), _degrees(track.nominal_from_cam)
+        ),
+        "lever-arm": _estimate("lever-arm", arm + state.arm, sigma[11:14], arm),
     }
-    estimates = []
-    for name in wanted:
-        value, spread, before = (tuple(float(number) for number in row) for row in rows[name])
-        seen = tuple(one <= _LIMITS[name] for one in spread)
-        estimates.append(Estimate(name, _UNITS[name], value, spread, before, seen))
     attitude = found.rms_attitude_deg
-    return Calibration(
-        estimates=tuple(estimates),
+    return RigCalibration(
+        wanted=wanted,
+        estimates=tuple(rows[name] for name in wanted),
         images=found.images,
         control_points=len(data.control_in_local),
         rms_position_m=found.rms_position_m,
@@ -138,6 +145,7 @@ def _data(survey: Survey, model: SparseModel, track: NavigationTrack) -> RigData
     registered = [index for index, name in enumerate(model.image_name) if name in row_of]
     rows = [row_of[model.image_name[index]] for index in registered]
     control, _ = control_correspondences(survey, model)
+    pixel_rad, footprint = _pixel(model)
     return RigData(
         track=track,
         time_s=track.image_time_s[rows],
@@ -149,14 +157,43 @@ def _data(survey: Survey, model: SparseModel, track: NavigationTrack) -> RigData
         control_in_geo=control.in_geo,
         control_cov_in_local=control.cov_in_local,
         control_cov_in_geo=control.cov_in_geo,
+        pixel_rad=pixel_rad,
+        footprint_in_local=footprint,
     )
 
 
-def _footprint(model: SparseModel) -> float:
-    """Width of a pixel at the distance of the points, in units of local."""
+def _pixel(model: SparseModel) -> tuple[float, float]:
+    """A pixel's angle in radians, and its width at the distance of the points in units of local."""
     arm = model.point_in_local[model.obs_point] - model.cam_center_in_local[model.obs_image]
     focal = np.array([model.camera_of(image).mean_focal_px for image in range(len(model.image_name))])
-    return float(np.median(np.linalg.norm(arm, axis=1) / focal[model.obs_image]))
+    footprint = np.median(np.linalg.norm(arm, axis=1) / focal[model.obs_image])
+    return float(1.0 / np.median(focal)), float(footprint)
+
+
+def _estimate(name: RigParameter, value: ArrayLike, sigma: ArrayLike, start: ArrayLike) -> RigEstimate:
+    values, sigmas, starts = (tuple(float(number) for number in np.ravel(row)) for row in (value, sigma, start))
+    limit, unit = _LIMITS[name]
+    # What nothing was said of has an endless σ, which JSON does not have.
+    sigmas = tuple(min(number, _ENDLESS) for number in sigmas)
+    return RigEstimate(
+        name=name,
+        unit=unit,
+        value=values,
+        sigma=sigmas,
+        start=starts,
+        observable=tuple(number <= limit for number in sigmas),
+    )
+
+
+def _track(workspace: Workspace) -> NavigationTrack:
+    path = workspace.root / TRACK
+    if not path.exists():
+        raise InputError(
+            "the survey has no navigation recorded by time, only a position for each image: ingest a --bag, or a "
+            "--trajectory by time",
+            path=path,
+        )
+    return NavigationTrack.load(path)
 
 
 def _degrees(rotation: FloatArray) -> FloatArray:

@@ -10,16 +10,18 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 from pydantic.fields import FieldInfo
 
 from pipelines.errors import InputError
 
 CONFIG_FILE = "georef.toml"
 AUTO = "auto"
-RIG_PARAMETERS = ("time-offset", "boresight", "lever-arm")
+RigParameter = Literal["time-offset", "boresight", "lever-arm"]
+RIG_PARAMETERS: tuple[RigParameter, ...] = get_args(RigParameter)
+ERROR_PARAMETERS = ("bias", "lever-arm", "boresight")
 
 
 class InputMarker:
@@ -54,7 +56,12 @@ class IngestConfig(StageConfig):
         description="Zero of a bag's local frame (odometry, poses): latitude,longitude,ellipsoidal height.",
     )
     time_offset: str = Field(
-        "0", description="Navigation clock minus camera clock in seconds; auto: by `georef calibrate` after sfm."
+        "0", description="Navigation clock minus camera clock in seconds; auto: estimate it after sfm."
+    )
+    estimate: str | None = Field(
+        None,
+        description="Estimate any of time-offset, boresight and lever-arm (with commas) after sfm, from the SfM "
+        "cameras against the recorded navigation.",
     )
     lever_arm: str | None = Field(
         None,
@@ -94,6 +101,17 @@ class IngestConfig(StageConfig):
     def time_offset_s(self) -> float:
         """Seconds; zero while it is still to be estimated."""
         return 0.0 if self.time_offset == AUTO else float(self.time_offset)
+
+    @property
+    def wanted(self) -> tuple[RigParameter, ...]:
+        """What of the rig is to be estimated, in the usual order."""
+        asked = {*(self.estimate or "").split(","), *(["time-offset"] if self.time_offset == AUTO else [])}
+        return tuple(name for name in RIG_PARAMETERS if name in asked)
+
+    @field_validator("estimate")
+    @classmethod
+    def _are_parameters(cls, text: str | None) -> str | None:
+        return text if text is None else rig_parameters(text)
 
     @field_validator("time_offset")
     @classmethod
@@ -137,6 +155,12 @@ class SfmConfig(StageConfig):
     seed: int = Field(0, ge=0, description="Seed of every random choice.")
 
 
+class AdjustConfig(StageConfig):
+    """Bundle adjustment with the fixes as priors, the baseline of `georef compare`."""
+
+    seed: int = Field(0, ge=0, description="Seed of every random choice.")
+
+
 class GeolocateConfig(StageConfig):
     """Multi-view intersection of every SfM point in the geo frame."""
 
@@ -159,6 +183,7 @@ class InitSim3Config(StageConfig):
     max_residual: float | None = Field(
         None, gt=0, description="Fail if the RMS residual of the camera centres is larger, in metres."
     )
+    control_points: bool = Field(True, description="Use the control points.")
     seed: int = Field(0, ge=0, description="Seed of the RANSAC.")
 
 
@@ -178,16 +203,53 @@ class TrainConfig(StageConfig):
     )
     coarse_to_fine: bool = Field(True, description="Start with shrunken photographs.")
     exposure: bool = Field(True, description="Fit the exposure of each training photograph.")
-    faithful_surface: bool = Field(False, description="Hold the Gaussians to surfaces, for depths to measure in.")
+    dense: bool = Field(True, description="Find the scene's surface by multi-view stereo first, to start from.")
+    faithful_surface: bool = Field(True, description="Hold the Gaussians to the surface, for depths to measure in.")
     geo_loss: bool = Field(True, description="Use the geographic losses.")
     weighting: Literal["whitened", "paper"] = Field(
         "whitened", description="Residuals divided by their σ, or plain mean squares as in the paper."
     )
+    gcp_loss: bool = Field(True, description="Use the control points, L_gcp.")
+    gcp_mode: Literal["camera", "depth"] = Field(
+        "camera", description="Find control points by intersecting their marks, or through the rendered depth."
+    )
+    rel_loss: bool = Field(True, description="Use distances between located points, L_rel.")
     geo_weight: float = Field(0.05, gt=0, description="Final weight w_max of the geographic losses (eq. 27).")
+    geo_schedule: Literal["rising", "constant"] = Field(
+        "rising", description="Let that weight rise as in eq. 27, or be final from the first iteration."
+    )
+    loss_weights: Literal["fixed", "learned"] = Field(
+        "fixed", description="Weigh the geographic losses by the stated σ, or learn a variance factor for each."
+    )
+    estimate: str = Field(
+        "auto",
+        description="Constant errors to estimate: any of bias (of the positions of a flight), lever-arm and "
+        "boresight, with commas; auto: a bias that 3 or more control points show; or none.",
+    )
     optimize_cameras: bool = Field(True, description="Correct the training cameras while training.")
     checkpoint_every: int = Field(500, ge=1, description="Iterations between checkpoints.")
     log_every: int = Field(10, ge=1, description="Iterations between lines of metrics.jsonl.")
     seed: int = Field(0, ge=0, description="Seed of every random choice.")
+
+    @property
+    def estimated(self) -> tuple[str, ...]:
+        """The constant errors that are asked for by name."""
+        return tuple(name for name in ERROR_PARAMETERS if name in self.estimate.split(","))
+
+    @field_validator("estimate")
+    @classmethod
+    def _are_errors(cls, text: str) -> str:
+        unknown = [name for name in text.split(",") if name not in ERROR_PARAMETERS]
+        if unknown and text not in (AUTO, "none"):
+            raise ValueError(f"{unknown[0]!r} is none of {', '.join(ERROR_PARAMETERS)}; or auto, or none")
+        return text
+
+    @field_validator("estimate")
+    @classmethod
+    def _has_sigma(cls, text: str, info: ValidationInfo) -> str:
+        if info.data.get("weighting") == "paper" and text not in (AUTO, "none"):
+            raise ValueError("constant errors are estimated with --weighting whitened only")
+        return text
 
 
 class EvaluateConfig(StageConfig):
@@ -195,6 +257,12 @@ class EvaluateConfig(StageConfig):
 
     backend: Literal["auto", "cpu", "cuda"] = Field("auto", description="Rasteriser.")
     renders: int = Field(8, ge=0, description="Side-by-side renders to write at the most.")
+    similarity: Literal["trained", "initial"] = Field(
+        "trained", description="Place the model on Earth as training found, or as init-sim3 did."
+    )
+    crs: str | None = Field(
+        None, description="List the check points in this CRS too, e.g. EPSG:32632, or EPSG:32632+5773 for heights."
+    )
     lpips_weights: InputPath | None = Field(
         None, description="NPZ file of LPIPS (VGG) weights; without it LPIPS is null."
     )
@@ -220,111 +288,26 @@ class CalibrateConfig(StageConfig):
     )
 
     @property
-    def wanted(self) -> tuple[str, ...]:
+    def wanted(self) -> tuple[RigParameter, ...]:
         """The parameters, in their usual order."""
         return tuple(name for name in RIG_PARAMETERS if name in self.estimate.split(","))
 
     @field_validator("estimate")
     @classmethod
     def _are_parameters(cls, text: str) -> str:
-        unknown = [name for name in text.split(",") if name not in RIG_PARAMETERS]
-        if unknown:
-            raise ValueError(f"{unknown[0]!r} is none of {', '.join(RIG_PARAMETERS)}")
-        return text
+        return rig_parameters(text)
 
 
-class SimulateConfig(StageConfig):
-    """A survey to simulate. Triples are written with commas: `46.02,7.75,1620`."""
+def rig_parameters(text: str) -> str:
+    """The text, if it is parameters of the rig with commas between.
 
-    scene: Literal["city", "village"] = Field("city", description="What stands there.")
-    flight: Literal["orbit", "grid", "facade"] = Field(
-        "orbit", description="Circles around the complex, nadir lines, or along its facades."
-    )
-    images: int = Field(48, ge=3, le=5000, description="Photographs.")
-    size: str = Field("640x480", pattern=r"^\d{2,5}x\d{2,5}$", description="Their size in pixels, WxH.")
-    seed: int = Field(0, ge=0, description="Seed of everything: scene, flight and noise.")
-    origin: str = Field("46.02,7.75,1620", description="Where on Earth: latitude,longitude,ellipsoidal height.")
-    heights: tuple[float, ...] = Field(
-        (),
-        description="Height of a circle, grid or round above the origin in metres (default: by flight).",
-        json_schema_extra={"flag": "--height"},
-    )
-    radius: float | None = Field(
-        None,
-        gt=0,
-        description="Radius of the circle, half side of the grid, or distance from facades in metres.",
-    )
-    interval: float | None = Field(
-        None,
-        ge=0.2,
-        le=600,
-        description="Seconds between photographs (default: 2, more above 8 m/s).",
-    )
-    gnss: Literal["rtk", "ppk", "consumer", "outliers"] = Field(
-        "rtk", description="Receiver: sets σ, slow bias and outliers, each of which can be set by itself."
-    )
-    sigma_h: float | None = Field(None, ge=0, description="White noise of the fixes, horizontal σ in metres.")
-    sigma_v: float | None = Field(None, ge=0, description="White noise of the fixes, vertical σ in metres.")
-    bias: float | None = Field(None, ge=0, description="RMS of the slow bias of the fixes per axis in metres.")
-    bias_period: float = Field(60.0, gt=0, description="Period of the slow bias in seconds.")
-    outlier_share: float | None = Field(None, ge=0, le=1, description="Share of photographs whose fixes are wrong.")
-    outlier_size: float = Field(15.0, gt=0, description="How far a wrong fix is off, in metres.")
-    sigma_attitude: float = Field(0.5, ge=0, description="White noise of the attitude per axis in degrees.")
-    lever_arm: str = Field(
-        "0,0,0", description="Antenna seen from the camera in the body's axes, forward,right,down in metres."
-    )
-    boresight: str = Field(
-        "0,0,0", description="Rotation vector from the true to the nominal camera axes, x,y,z in degrees."
-    )
-    clock_offset: float = Field(0.0, ge=-10, le=10, description="Navigation clock minus camera clock in seconds.")
-    lens: Literal["pinhole", "radial", "opencv"] = Field("opencv", description="Lens model.")
-    focal: float = Field(0.85, ge=0.3, le=10, description="Focal length as a multiple of the image's width.")
-    k1: float = Field(-0.045, ge=-0.5, le=0.5, description="Radial distortion.")
-    k2: float = Field(0.012, ge=-0.5, le=0.5, description="Radial distortion of the next order.")
-    p1: float = Field(0.0004, ge=-0.02, le=0.02, description="Tangential distortion (opencv).")
-    p2: float = Field(-0.0003, ge=-0.02, le=0.02, description="Tangential distortion (opencv).")
-    exposure: float = Field(0.08, ge=0, le=0.5, description="Variation of the exposure (σ of its logarithm).")
-    noise: float = Field(1.0, ge=0, le=20, description="Sensor noise; 1 is a small sensor at base sensitivity.")
-    samples: Literal["1", "4", "9", "16"] = Field("4", description="Rays for a pixel (anti-aliasing).")
-    quality: int = Field(95, ge=50, le=100, description="JPEG quality.")
-    targets: int = Field(60, ge=0, le=500, description="Survey targets to lay out.")
-    target_size: float | None = Field(
-        None, gt=0.05, le=20, description="Width of a target in metres (default: five pixels)."
-    )
-    control: int = Field(
-        8, ge=0, description="Targets to use as control points, a third at the most; the others are check points."
-    )
-    sigma_survey: float = Field(0.0, ge=0, description="σ of the targets' surveyed coordinates in metres.")
-    sigma_mark: float = Field(0.2, ge=0, description="σ of the image marks in pixels.")
-    bag: Literal["none", "mcap", "sqlite3"] = Field("none", description="Write the flight as a rosbag2 too.")
-    depth: bool = Field(False, description="Write true depth maps (float32, metres).")
-    exif: bool = Field(True, description="Write position, attitude and lens into the photographs.")
-    threads: int = Field(-1, ge=-1, le=256, description="Threads that render (-1: all cores).")
-
-    @property
-    def size_px(self) -> tuple[int, int]:
-        """Width and height."""
-        width, height = self.size.split("x")
-        return int(width), int(height)
-
-    @field_validator("size")
-    @classmethod
-    def _sensible_size(cls, text: str) -> str:
-        sides = [int(side) for side in text.split("x")]
-        if min(sides) < 32 or max(sides) > 8192:
-            raise ValueError("sides from 32 to 8192 pixels")
-        return text
-
-    @field_validator("origin")
-    @classmethod
-    def _on_earth(cls, text: str) -> str:
-        return on_earth(text)
-
-    @field_validator("lever_arm", "boresight")
-    @classmethod
-    def _is_triple(cls, text: str) -> str:
-        triple(text)
-        return text
+    Raises:
+        ValueError: it is not.
+    """
+    unknown = [name for name in text.split(",") if name not in RIG_PARAMETERS]
+    if unknown:
+        raise ValueError(f"{unknown[0]!r} is none of {', '.join(RIG_PARAMETERS)}")
+    return text
 
 
 def on_earth(text: str) -> str:

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from pipelines.blocks.accuracy_map import AccuracyMap, accuracy_map, write_area
+from pipelines.blocks.coordinates import in_crs, target_crs
 from pipelines.blocks.point_report import point_report, point_rows, ray_counts
 from pipelines.blocks.points import Sights, points_by_camera, points_by_model, sights
 from pipelines.blocks.prediction import Prediction, cramer_rao, left_out
@@ -33,6 +34,7 @@ from pipelines.robust.statistics import residual_stats
 from pipelines.splat.exposure import fitted_affine, with_affine
 from pipelines.splat.metrics import lpips, psnr, ssim
 from pipelines.splat.raster.api import Rasterizer, RasterSettings, Render, rasterizer
+from pipelines.splat.surface import measured_depth
 from pipelines.stages import SIM3
 from pipelines.workspace import StageRun, Summary
 
@@ -56,7 +58,8 @@ class Known:
 
 def run(stage: StageRun, config: EvaluateConfig) -> Summary:
     """Measure, write the report, the renders and the map of the predicted accuracy."""
-    trained = load_trained(stage.workspace)
+    trained = load_trained(stage.workspace, config.similarity)
+    crs = None if config.crs is None else target_crs(config.crs, trained.survey)
     initial = load_json(InitialSimilarity, stage.workspace.path(SIM3))
     images = photographs(trained.sparse, trained.survey, stage.workspace, trained.model.max_image_size)
     images.build(stage.progress)
@@ -69,6 +72,8 @@ def run(stage: StageRun, config: EvaluateConfig) -> Summary:
     except DegenerateGeometryError as error:
         known = str(error)
     report = evaluate(eye, known, config, stage.out / "renders", stage.progress)
+    if crs is not None:
+        report["coordinates"] = in_crs(report["checkpoints"], trained.survey, crs)
     if isinstance(known, Known) and known.area is not None:
         write_area(known.area, trained, stage.out)
     (stage.out / "report.json").write_text(dump_json(report) + "\n", encoding="utf-8")
@@ -146,7 +151,7 @@ def _photometric(eye: Eye, config: EvaluateConfig, renders: Path, progress: Prog
                     "psnr": psnr(colour, photo, mask),
                     "psnr_compensated": psnr(with_affine(colour, fitted_affine(colour, photo, mask)), photo, mask),
                     "ssim": ssim(colour, photo, mask),
-                    "lpips": distance(colour, photo) if callable(distance) else None,
+                    "lpips": distance(colour, photo, mask) if callable(distance) else None,
                 }
             )
             if place < config.renders:
@@ -178,9 +183,9 @@ def _depth_maps(eye: Eye, seen: Sights, progress: Progress) -> dict[int, FloatAr
     cameras = sorted({int(i) for i in seen.camera})
     with progress.task("depth maps", len(cameras)) as task:
         for index in cameras:
-            median = eye.look(index, depth=True).median_depth
-            if median is not None:
-                depth[index] = median.cpu().numpy()
+            view = eye.look(index, depth=True)
+            if view.median_depth is not None and view.expected_depth is not None:
+                depth[index] = measured_depth(view.median_depth, view.expected_depth).cpu().numpy()
             task.advance()
     return depth
 

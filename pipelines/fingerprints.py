@@ -7,7 +7,8 @@ from pathlib import Path
 
 from pipelines.config import StageConfig, flag_name, input_paths
 from pipelines.errors import InputError
-from pipelines.stages import StageSpec
+from pipelines.products import Survey, load_json
+from pipelines.stages import SURVEY, StageSpec
 from pipelines.workspace import Workspace
 
 Memo = dict[Path, str]
@@ -18,7 +19,8 @@ def fingerprints(workspace: Workspace, spec: StageSpec, config: StageConfig, mem
     """Hashes of everything that decides a stage's result, by product or flag.
 
     Workspace products by content; files that the options name by content, those beyond 256 MiB (bags) and folders
-    by the name, size and modification time of each file (reading gigabytes at each look would be too slow).
+    by the name, size and modification time of each file (reading gigabytes at each look would be too slow). Of the
+    survey, sfm reads the photographs, their cameras, and the positions and attitudes as recorded.
 
     Args:
         memo: hashes found so far; a product that several stages read is hashed once.
@@ -28,7 +30,7 @@ def fingerprints(workspace: Workspace, spec: StageSpec, config: StageConfig, mem
         InputError: a path that an option names does not exist, or something cannot be read.
     """
     try:
-        found = {product: _hash_product(workspace.path(product), memo) for product in spec.reads}
+        found = {product: _hash_read(workspace, spec, product, memo) for product in spec.reads}
         for name, path in input_paths(config).items():
             flag = flag_name(type(config), name)
             if not path.exists():
@@ -37,6 +39,39 @@ def fingerprints(workspace: Workspace, spec: StageSpec, config: StageConfig, mem
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}", path=error.filename) from error
     return found
+
+
+def product_hash(workspace: Workspace, product: str) -> str:
+    """The hash of a product by content.
+
+    Raises:
+        MissingProductError: it is not there.
+    """
+    return _hash_product(workspace.path(product), {})
+
+
+def layout_of(survey: Survey) -> str:
+    """Hash of a survey's positions and attitudes as they were recorded, whatever was applied to them after sfm."""
+    if survey.rig is not None and survey.rig.layout:
+        return survey.rig.layout
+    layout = [
+        (image.fix and image.fix.position_in_geo, image.attitude and image.attitude.quat_xyzw)
+        for image in survey.images
+    ]
+    return hashlib.sha256(repr(layout).encode()).hexdigest()
+
+
+def _hash_read(workspace: Workspace, spec: StageSpec, product: str, memo: Memo) -> str:
+    path = workspace.path(product)
+    if not (spec.photographs_only and product == SURVEY):
+        return _hash_product(path, memo)
+    try:
+        survey = load_json(Survey, path)
+    except InputError:  # the stage will tell
+        return _hash_product(path, memo)
+    cameras = [camera.model_dump() for camera in survey.cameras]
+    images = [(image.name, image.camera_id, image.sha256) for image in survey.images]
+    return hashlib.sha256(repr((survey.image_dir, cameras, images, layout_of(survey))).encode()).hexdigest()
 
 
 def _hash_input(path: Path, workspace_root: Path) -> str:

@@ -70,6 +70,11 @@ def run(stage: StageRun, config: GeolocateConfig) -> Summary:
         GeorefError: unreadable products, or attitudes asked for that are not there.
     """
     survey = load_json(Survey, stage.workspace.path(SURVEY))
+    if survey.estimate and survey.rig is None:
+        log.warning(
+            "%s were to be estimated after sfm: `georef calibrate --apply`, or `georef run`, does",
+            ", ".join(survey.estimate),
+        )
     model = read_sparse(stage.workspace.path(SPARSE))
     found = geolocate(survey, model, config)
     points = found.points

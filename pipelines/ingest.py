@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pipelines.blocks.intake import LEAST_IMAGES, pose_options, take_in
+from pipelines.blocks.rig import require_estimable
 from pipelines.config import IngestConfig
 from pipelines.errors import InputError
 from pipelines.formats.ground_points import GroundFile, GroundPoint, read_ground_file, require_near, split_checks
@@ -116,6 +117,9 @@ def survey_and_track(
     _note_coverage(measured, photos, len(control), notes)
     if config.test_every and not _held_out(len(photos), config.test_every):
         notes.warn(f"{len(photos)} images are too few to hold any out for testing")
+    track = taken.track(origin)
+    if config.wanted:
+        require_estimable(track, config.wanted, "--estimate" if config.estimate else "--time-offset")
     survey = Survey(
         origin=origin,
         source_crs=measured.crs_name if control_file is None or measured.located.any() else control_file.crs_name,
@@ -127,8 +131,9 @@ def survey_and_track(
         check_points=_surveyed(check, origin, config),
         assumptions=tuple(notes.assumptions),
         warnings=tuple(notes.warnings),
+        estimate=config.wanted,
     )
-    return survey, taken.track(origin)
+    return survey, track
 
 
 def _without_far_fixes(measured: Measured, photos: Sequence[Photo], notes: Notes) -> Measured:

@@ -16,10 +16,12 @@ from pipelines.blocks.observations import attitude_prior, control_correspondence
 from pipelines.config import InitSim3Config
 from pipelines.errors import ConvergenceError, DegenerateGeometryError, InputError
 from pipelines.formats.colmap import SparseModel, read_sparse
+from pipelines.geometry.rotations import quat_xyzw_from_matrix
 from pipelines.geometry.similarity import Similarity, jacobian_at, spread_ratio_similarity, umeyama
-from pipelines.georef.adjustment import OUTLIER_GATE, Adjusted, Correspondences
+from pipelines.georef.adjustment import OUTLIER_GATE, Adjusted, Correspondences, RotationPrior
 from pipelines.georef.alignment import Alignment, align, layout_of
 from pipelines.products import (
+    AttitudeRecord,
     FloatArray,
     GeolocatedPoints,
     InitialSimilarity,
@@ -64,6 +66,8 @@ def estimate_similarity(
     if not np.array_equal(points.point_id, model.point_id):
         raise InputError("the geolocated points are of another model: run `georef geolocate` again")
     fixes = fix_correspondences(survey, model)
+    if not config.control_points:
+        survey = survey.model_copy(update={"control_points": ()})
     control, warnings = control_correspondences(survey, model)
     data = fixes.joined(control)
     if config.method == "paper":
@@ -119,7 +123,16 @@ def _robust_product(
         condition_number=solution.condition_number,
         layout=alignment.layout,
         attitude_used=alignment.attitude_used,
+        attitude=_attitude(alignment.attitude),
     )
+
+
+def _attitude(prior: RotationPrior | None) -> AttitudeRecord | None:
+    if prior is None:
+        return None
+    x, y, z, w = quat_xyzw_from_matrix(prior.rotation).tolist()
+    first, second, third = (tuple(row) for row in prior.cov_rad2.tolist())
+    return AttitudeRecord(quat_xyzw=(x, y, z, w), cov_rad2=(first, second, third))
 
 
 def _by_paper(model: SparseModel, points: GeolocatedPoints, data: Correspondences) -> InitialSimilarity:

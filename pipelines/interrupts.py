@@ -1,15 +1,19 @@
-"""Interrupts at a time of one's own choosing: a loop ends its step and saves before it stops."""
+"""Interrupts at a time of one's own choosing: a loop ends its step and saves before it stops; a library that never
+looks up is left to itself."""
 
 from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from types import FrameType
+from typing import TypeVar
 
+ResultT = TypeVar("ResultT")
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_LOOK_UP_S = 0.2
 
 
 @dataclass
@@ -43,3 +47,27 @@ def deferred_interrupts() -> Iterator[StopRequest]:
         for number, handler in previous.items():
             # None stands for a handler that was not set from Python and cannot be set again from here.
             signal.signal(number, signal.SIG_DFL if handler is None else handler)
+
+
+def interruptible(work: Callable[[], ResultT]) -> ResultT:
+    """The result of long work in a library that lets go of Python but hears no signals.
+
+    It runs in a thread of its own, so that SIGINT and SIGTERM interrupt the wait for it; the thread then goes on
+    until the process ends, which it does not hold up.
+    """
+    results: list[ResultT] = []
+    errors: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            results.append(work())
+        except BaseException as error:  # raised again where it is awaited
+            errors.append(error)
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    while thread.is_alive():
+        thread.join(_LOOK_UP_S)
+    if errors:
+        raise errors[0]
+    return results[0]

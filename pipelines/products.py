@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from pipelines.config import RigParameter
 from pipelines.errors import InputError
 from pipelines.validators import covariance, image_dir, image_name, unit_quaternion
 
@@ -124,8 +125,49 @@ class SurveyedPoint(Product):
     marks: tuple[Mark, ...]
 
 
+class RigEstimate(Product):
+    """A parameter of the rig, estimated from the SfM cameras, in sense and unit of `ingest`'s option of that name.
+
+    `start` is what `ingest` was told, `sigma` of each component; `observable` by component: whether σ is small
+    enough to use it.
+    """
+
+    name: RigParameter
+    unit: Literal["s", "deg", "m"]
+    value: tuple[float, ...]
+    sigma: tuple[float, ...]
+    start: tuple[float, ...]
+    observable: tuple[bool, ...]
+
+    @property
+    def usable(self) -> bool:
+        """Whether every component is observable."""
+        return all(self.observable)
+
+
+class RigCalibration(Product):
+    """Estimates of the rig, and what is left over: robust σ per axis of positions (m) and attitudes (degrees).
+
+    `problem` tells why there are none. `model` is the fingerprint of the SfM model that they are from, `layout`
+    that of the survey's positions and attitudes before what is usable was applied to them.
+    """
+
+    wanted: tuple[RigParameter, ...]
+    estimates: tuple[RigEstimate, ...] = ()
+    images: int = 0
+    control_points: int = 0
+    rms_position_m: float | None = None
+    rms_attitude_deg: float | None = None
+    problem: str = ""
+    model: str = ""
+    layout: str = ""
+
+
 class Survey(Product):
-    """Product of `ingest`: everything that was measured, in one frame."""
+    """Product of `ingest`: everything that was measured, in one frame.
+
+    `estimate` names what of the rig is to be estimated after sfm, `rig` is what came out.
+    """
 
     format_version: Literal[1] = 1
     origin: Origin
@@ -138,6 +180,8 @@ class Survey(Product):
     check_points: tuple[SurveyedPoint, ...] = ()
     assumptions: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
+    estimate: tuple[RigParameter, ...] = ()
+    rig: RigCalibration | None = None
 
     @model_validator(mode="after")
     def _belongs_together(self) -> Survey:
@@ -188,12 +232,19 @@ class ResidualStats(Product):
     max_3d_m: float | None
 
 
+class AttitudeRecord(Product):
+    """Rotation `to ← from` of a similarity as recorded attitudes have it: covariance in rad² along target axes."""
+
+    quat_xyzw: Rotation
+    cov_rad2: Covariance3
+
+
 class InitialSimilarity(Product):
     """Product of `init-sim3`: `geo_from_local`, how it was found and how well it is determined."""
 
     format_version: Literal[1] = 1
     geo_from_local: SimilarityRecord
-    method: Literal["robust", "paper"]
+    method: Literal["robust", "paper", "adjusted"]
     correspondences: dict[str, int]
     inliers: dict[str, int]
     gnss_outliers: tuple[str, ...] = ()
@@ -201,6 +252,7 @@ class InitialSimilarity(Product):
     condition_number: float
     layout: Literal["volume", "plane", "line"]
     attitude_used: bool
+    attitude: AttitudeRecord | None = None
 
 
 class TrainedCamera(Product):
@@ -214,6 +266,22 @@ class TrainedCamera(Product):
     quat_xyzw: Rotation
     translation: Vector3
     exposure: Matrix34 | None = None
+
+
+class EstimatedError(Product):
+    """A constant error of the measurements that training estimated, with its σ, by axis.
+
+    `bias`: fix minus truth, east, north, up, in m; `flight` counts from 0 in the order of time. `lever-arm`:
+    antenna seen from the camera beyond what the survey has applied, camera axes, in m. `boresight`: rotation vector
+    from the true to the nominal camera axes, in degrees. `observed`: σ is at most half of that of the prior.
+    """
+
+    name: Literal["bias", "lever-arm", "boresight"]
+    flight: int | None = None
+    unit: Literal["m", "deg"]
+    value: Vector3
+    sigma: Vector3
+    observed: tuple[bool, bool, bool]
 
 
 class TrainedModel(Product):
@@ -230,6 +298,8 @@ class TrainedModel(Product):
     gaussians: int
     backend: Literal["cpu", "cuda"]
     gnss_outliers: tuple[str, ...] = ()
+    control_outliers: tuple[str, ...] = ()
+    estimated_errors: tuple[EstimatedError, ...] = ()
 
 
 ProductT = TypeVar("ProductT", bound=BaseModel)
@@ -315,7 +385,8 @@ class NavigationTrack:
     """Product of `ingest` beside the survey: the navigation as recorded, and how n cameras sit in it.
 
     What `calibrate` fits the SfM cameras to. Positions are the antenna's, attitudes the body's
-    (forward-right-down), both on the navigation's clock; nothing of the rig is applied to them.
+    (forward-right-down), both on the navigation's clock; nothing of the rig is applied to them. What is said of the
+    rig is what `ingest` was told.
 
     Attributes:
         position_time_s: (K,) float64, seconds.
@@ -326,10 +397,11 @@ class NavigationTrack:
         image: (n,) names of images.
         image_time_s: (n,) float64, camera clock.
         cam_from_body: (n, 3, 3) float64, mount; NaN where unknown.
-        antenna_in_body: (n, 3) float64, lever arm that the survey has applied; NaN where unknown.
-        nominal_from_cam: (3, 3) float64, boresight that the survey has applied.
-        time_offset_s: () float64, navigation clock minus camera clock that the survey has applied.
+        antenna_in_body: (n, 3) float64, lever arm; NaN where unknown.
+        nominal_from_cam: (3, 3) float64, boresight.
+        time_offset_s: () float64, navigation clock minus camera clock.
         max_gap_s: () float64, longest gap to interpolate over.
+        body_known: () bool; where not, the camera's nominal axes stand for the body's.
     """
 
     position_time_s: FloatArray
@@ -344,6 +416,7 @@ class NavigationTrack:
     nominal_from_cam: FloatArray
     time_offset_s: FloatArray
     max_gap_s: FloatArray
+    body_known: NDArray[np.bool_]
 
     def save(self, path: Path) -> None:
         """Write as NPZ."""

@@ -15,8 +15,17 @@ from typing import Any
 
 from pipelines.errors import GeorefError, InputError, MissingProductError
 from pipelines.fingerprints import Memo
+from pipelines.products import Survey, load_json
 from pipelines.progress import SILENT, Progress
-from pipelines.stages import StageSpec, producer_of, products_of
+from pipelines.stages import (
+    CALIBRATE,
+    CALIBRATED_BEFORE,
+    SPARSE,
+    SURVEY,
+    StageSpec,
+    producer_of,
+    products_of,
+)
 from pipelines.states import BY_HAND, Flags, Request, must_exist, request, stage_config, status, why_stale
 from pipelines.workspace import Manifest, Resume, StageRun, Summary, Workspace, now
 
@@ -85,6 +94,9 @@ def run_pipeline(
 ) -> list[Outcome]:
     """Run stages in order, skipping what is current and resuming what was interrupted.
 
+    What the survey wants to have estimated of the rig is estimated and applied ahead of the first stage that builds
+    on its positions.
+
     All options are checked and remembered before the first stage begins: a bad option of a late stage costs no
     hours, and a run that is killed early is completed as it was asked for.
 
@@ -106,17 +118,47 @@ def run_pipeline(
     outcomes: list[Outcome] = []
     try:
         for spec in stages:
+            if spec.name == CALIBRATED_BEFORE:
+                with around(CALIBRATE):
+                    outcomes += _calibrated(workspace)
             with around(spec):
                 outcome = run_stage(
                     workspace, spec, asked[spec.name], force=force, resume="if-same", progress=progress
                 )
             outcomes.append(outcome)
     except (InputError, MissingProductError):
-        refused = [spec.name for spec in stages[len(outcomes) :]]
+        done = {outcome.stage for outcome in outcomes}
+        refused = [spec.name for spec in stages if spec.name not in done]
         with workspace.lock("run"):
             workspace.remember({name: before.get(name, {}) for name in refused})
         raise
     return outcomes
+
+
+def _calibrated(workspace: Workspace) -> list[Outcome]:
+    """What `calibrate` did where the survey asks for it: one outcome, or none."""
+    try:
+        survey = load_json(Survey, workspace.path(SURVEY))
+    except GeorefError:  # the stage that reads it will tell
+        return []
+    if not survey.estimate and survey.rig is None:
+        return []
+    started, clock = now(), time.monotonic()
+    calibration = importlib.import_module(CALIBRATE.module)
+    with workspace.lock(CALIBRATE.name):
+        found, ran = calibration.calibrate_as_asked(workspace)
+    manifest = Manifest(
+        stage=CALIBRATE.name,
+        config={"estimate": list(found.wanted)},
+        inputs={SPARSE: found.model},
+        versions=_versions(),
+        started=started,
+        duration_s=round(time.monotonic() - clock, 3),
+        key_figure=calibration.told(found),
+        values=found.model_dump(mode="json"),
+        warnings=calibration.warnings_of(found),
+    )
+    return [Outcome(CALIBRATE.name, ran, manifest)]
 
 
 def remembered(workspace: Workspace, spec: StageSpec, flags: Flags) -> dict[str, Any]:

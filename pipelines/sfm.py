@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 
 from pipelines.config import SfmConfig
 from pipelines.errors import DegenerateGeometryError, InputError
-from pipelines.formats.colmap import load_reconstruction, pycolmap_module
+from pipelines.formats.colmap import load_reconstruction, quiet_colmap
 from pipelines.geometry.pairs import Views, all_pairs, select_pairs
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
+from pipelines.interrupts import interruptible
 from pipelines.products import CameraPrior, Survey, load_json
 from pipelines.progress import Progress
 from pipelines.stages import SURVEY
@@ -34,14 +35,12 @@ _EXHAUSTIVE_UP_TO = 20
 _IMAGES_A_CHUNK = 4
 _PAIRS_A_CHUNK = 48
 _FEW_REGISTERED = 0.8
-# COLMAP writes one line a step; only its errors are of use here.
-_COLMAP_ERRORS_ONLY = 2
 
 
 def run(stage: StageRun, config: SfmConfig) -> Summary:
     """Reconstruct, or take over someone else's model, and say how complete it is."""
     survey = load_json(Survey, stage.workspace.path(SURVEY))
-    images = stage.workspace.root / survey.image_dir
+    images = stage.workspace.photographs(survey.image_dir)
     sparse = stage.out / "sparse"
     if sparse.exists():
         shutil.rmtree(sparse)
@@ -54,18 +53,6 @@ def run(stage: StageRun, config: SfmConfig) -> Summary:
         sparse.mkdir()
         model.write_binary(str(sparse))
     return _summarise(model, survey)
-
-
-@contextmanager
-def quiet_colmap() -> Iterator[Any]:
-    """pycolmap, with its log reduced to errors while in use."""
-    pycolmap = pycolmap_module()
-    level = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = _COLMAP_ERRORS_ONLY
-    try:
-        yield pycolmap
-    finally:
-        pycolmap.logging.minloglevel = level
 
 
 @dataclass(frozen=True)
@@ -103,8 +90,16 @@ def reconstruct(colmap: Any, job: SfmJob, progress: Progress) -> Any:
     if missing:
         raise InputError(f"{len(missing)} photographs of the survey are gone", path=job.images / missing[0])
     colmap.set_random_seed(job.config.seed)
+    plain = {name: f"{number:06d}" for number, name in enumerate(names)}
+    _rename(colmap, job.database, {short: name for name, short in plain.items()})  # as a killed run may leave it
     _extract(colmap, job, progress)
-    _match(colmap, job, [(names[i], names[j]) for i, j in candidate_pairs(job.survey, job.config)], progress)
+    # COLMAP takes pairs from a text in which a blank ends a name: meanwhile, photographs go by numbers.
+    _rename(colmap, job.database, plain)
+    pairs = [(plain[names[i]], plain[names[j]]) for i, j in candidate_pairs(job.survey, job.config)]
+    try:
+        _match(colmap, job, pairs, progress)
+    finally:
+        _rename(colmap, job.database, {short: name for name, short in plain.items()})
     models = _map(colmap, job, progress)
     if not models:
         raise DegenerateGeometryError(
@@ -198,10 +193,6 @@ def _match(colmap: Any, job: SfmJob, pairs: list[tuple[str, str]], progress: Pro
     matching.num_threads = job.config.threads
     verification = colmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = job.config.seed
-    if any(" " in name or name.startswith("#") for pair in pairs for name in pair):
-        log.warning("file names with blanks or # cannot be listed for COLMAP: all pairs are matched")
-        colmap.match_exhaustive(job.database, matching, verification_options=verification)
-        return
     listing = job.database.with_name("pairs.txt")
     with progress.task("matching", len(pairs)) as task:
         for chunk in _chunks(pairs, _PAIRS_A_CHUNK):
@@ -212,12 +203,21 @@ def _match(colmap: Any, job: SfmJob, pairs: list[tuple[str, str]], progress: Pro
     listing.unlink(missing_ok=True)
 
 
+def _rename(colmap: Any, path: Path, names: dict[str, str]) -> None:
+    """Rename the images of a database, as far as they have one of these names."""
+    with colmap.Database.open(path) as database:
+        for image in database.read_all_images():
+            if image.name in names:
+                image.name = names[image.name]
+                database.update_image(image)
+
+
 def _map(colmap: Any, job: SfmJob, progress: Progress) -> list[Any]:
     with progress.task("mapping", len(job.survey.images)) as task, _scratch(job.database.parent) as out:
         if job.config.mapper == "global":
             options = colmap.GlobalPipelineOptions()
             options.num_threads, options.random_seed = job.config.threads, job.config.seed
-            models = colmap.global_mapping(job.database, job.images, out, options)
+            models = interruptible(lambda: colmap.global_mapping(job.database, job.images, out, options))
             task.advance(len(job.survey.images))
             return list(models.values())
         options = colmap.IncrementalPipelineOptions()

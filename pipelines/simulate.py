@@ -18,12 +18,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from pipelines.config import SimulateConfig
 from pipelines.errors import InputError
 from pipelines.formats.bag_writer import BagCamera, BagFlight, write_bag
 from pipelines.formats.exif_writer import PhotoTags, with_tags
 from pipelines.products import save_json
 from pipelines.progress import SILENT, Progress
+from pipelines.simulate_config import SimulateConfig
 from pipelines.simulation.recording import Recording, record
 from pipelines.simulation.render import Renderer, Sensor
 from pipelines.simulation.sensors import against_local_north

@@ -8,6 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from pipelines.config import (
+    AdjustConfig,
+    CalibrateConfig,
     EvaluateConfig,
     ExportPlyConfig,
     GeolocateConfig,
@@ -41,8 +43,11 @@ class StageSpec:
         folder: its folder in the workspace.
         reads: workspace paths (files or folders) that decide its result.
         product: the path that later stages and people look for.
-        resumable: whether a partial product can be continued.
+        photographs_only: whether it reads nothing of the survey but photographs, cameras, and the positions and
+            attitudes as recorded: control points, σ and what `calibrate` applies do not make it stale.
         title: one line of help.
+        resumable: whether a partial product can be continued.
+        also: further paths in its folder that others look for, besides what the stages of the pipeline read.
     """
 
     name: str
@@ -53,6 +58,8 @@ class StageSpec:
     product: str
     title: str
     resumable: bool = False
+    also: tuple[str, ...] = ()
+    photographs_only: bool = False
 
 
 PIPELINE: tuple[StageSpec, ...] = (
@@ -62,7 +69,7 @@ PIPELINE: tuple[StageSpec, ...] = (
     ),
     StageSpec(
         "sfm", "pipelines.sfm", SfmConfig, "sfm", (SURVEY,), SPARSE,
-        "Reconstruct cameras and points with COLMAP.", resumable=True,
+        "Reconstruct cameras and points with COLMAP.", resumable=True, photographs_only=True,
     ),
     StageSpec(
         "geolocate", "pipelines.geolocate", GeolocateConfig, "geolocate", (SURVEY, SPARSE), POINTS,
@@ -73,7 +80,7 @@ PIPELINE: tuple[StageSpec, ...] = (
         "Estimate the similarity from the SfM model to the Earth.",
     ),
     StageSpec(
-        "train", "pipelines.train", TrainConfig, "train", (SURVEY, SPARSE, SIM3), MODEL,
+        "train", "pipelines.train", TrainConfig, "train", (SURVEY, SPARSE, SIM3, POINTS), MODEL,
         "Train the Gaussians together with the similarity and the cameras.", resumable=True,
     ),
     StageSpec(
@@ -88,6 +95,21 @@ PIPELINE: tuple[StageSpec, ...] = (
     ),
 )  # fmt: skip
 
+# Not part of the line: `georef compare` runs it for the baseline, whose later stages find in its folder what they
+# otherwise read from those of sfm and init-sim3.
+ADJUST = StageSpec(
+    "adjust", "pipelines.adjust", AdjustConfig, "adjust", (SURVEY, SPARSE), "adjust/sparse",
+    "Adjust the bundle with the fixes as priors of the camera positions.", also=("adjust/geo_from_local.json",),
+)  # fmt: skip
+
+STAGES = (*PIPELINE, ADJUST)
+# Between sfm and what builds on the survey's positions: makes the survey anew where it asks for that.
+CALIBRATE = StageSpec(
+    "calibrate", "pipelines.calibrate", CalibrateConfig, "ingest", (SURVEY, SPARSE), SURVEY,
+    "Estimate time offset, boresight and lever arm after sfm.",
+)  # fmt: skip
+CALIBRATED_BEFORE = "geolocate"
+
 BY_NAME = {spec.name: spec for spec in PIPELINE}
 CONFIGS = {spec.name: spec.config for spec in PIPELINE}
 
@@ -95,13 +117,13 @@ CONFIGS = {spec.name: spec.config for spec in PIPELINE}
 def producer_of(path: str) -> StageSpec:
     """The stage that writes a workspace path."""
     folder = path.split("/", maxsplit=1)[0]
-    return next(spec for spec in PIPELINE if spec.folder == folder)
+    return next(spec for spec in STAGES if spec.folder == folder)
 
 
 def products_of(spec: StageSpec) -> tuple[str, ...]:
     """Everything in a stage's folder that people or later stages look for."""
     read = (path for other in PIPELINE for path in other.reads if producer_of(path) is spec)
-    return tuple(dict.fromkeys((spec.product, *read)))
+    return tuple(dict.fromkeys((spec.product, *spec.also, *read)))
 
 
 def stage_slice(first: str | None, last: str | None) -> tuple[StageSpec, ...]:

@@ -88,7 +88,7 @@ def status(workspace: Workspace, memo: Memo | None = None, before: StageSpec | N
     look = _Look(workspace, {} if memo is None else memo, workspace.requests())
     writer = workspace.writer()
     rows = []
-    for spec in PIPELINE[: len(PIPELINE) if before is None else PIPELINE.index(before)]:
+    for spec in PIPELINE[: PIPELINE.index(before) if before in PIPELINE else len(PIPELINE)]:
         row = look.at(spec)
         rows.append(replace(row, state="running", reason="") if spec.name == writer else row)
     return rows
@@ -117,6 +117,8 @@ class _Look:
         return row
 
     def _state(self, spec: StageSpec) -> StageState:
+        if spec.folder in self.workspace.lent:  # who lends it has seen to it
+            return StageState(spec.name, "current", "")
         if self.workspace.placed_by_hand(spec):
             return StageState(spec.name, "current", BY_HAND)
         failure = self.workspace.failure(spec)

@@ -1,8 +1,8 @@
 """Training: Gaussians, similarity and cameras optimised together (GeoRefGS section 2.4).
 
-Reads the survey, the SfM model and the initial similarity. Writes `train/gaussians.ply` (frame `model`),
-`train/model.json` (similarity with covariance, cameras), `train/metrics.jsonl` and the latest checkpoint. An
-interrupted run leaves a checkpoint in `train.partial/` from which `--resume` continues.
+Reads the survey, the SfM model, the geolocated points and the initial similarity. Writes `train/gaussians.ply`
+(frame `model`), `train/model.json` (similarity with covariance, cameras, constant errors), `train/metrics.jsonl`
+and the latest checkpoint. An interrupted run leaves a checkpoint in `train.partial/` for `--resume` to go on from.
 """
 
 from __future__ import annotations
@@ -15,9 +15,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from pipelines.blocks.background import background
+from pipelines.blocks.geographic import geo_problem
 from pipelines.blocks.loop import LoopOptions, Outcome, optimise
-from pipelines.blocks.scene import Scene, geo_problem, initial_scene, photographs
+from pipelines.blocks.material import Material, initial_gaussians, points_to_hold
+from pipelines.blocks.scene import Scene, initial_scene, photographs
+from pipelines.blocks.surface import SceneSurface
 from pipelines.blocks.trainer import JointOptions, JointTrainer, Views
 from pipelines.config import TrainConfig
 from pipelines.formats.colmap import read_sparse
@@ -25,6 +27,8 @@ from pipelines.formats.image_cache import ImageCache
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
 from pipelines.georef.problem import GeoProblem
 from pipelines.products import (
+    EstimatedError,
+    GeolocatedPoints,
     InitialSimilarity,
     Survey,
     TrainedCamera,
@@ -36,25 +40,25 @@ from pipelines.splat.densify import DefaultSettings, DefaultStrategy, Strategy
 from pipelines.splat.densify_fast import FastSettings, FastStrategy
 from pipelines.splat.densify_mcmc import McmcSettings, McmcStrategy
 from pipelines.splat.exposure import Exposures
-from pipelines.splat.gaussians import Gaussians
-from pipelines.splat.initialise import (
-    InitialisationOptions,
-    gaussians_from_points,
-    gaussians_of_size,
-    scene_extent,
-)
+from pipelines.splat.initialise import InitialisationOptions, scene_extent
 from pipelines.splat.memory import TrainingSize, free_memory_bytes, require_memory
 from pipelines.splat.optimizer import GaussianAdam
 from pipelines.splat.raster.api import Rasterizer, rasterizer
 from pipelines.splat.storage import write_gaussians
 from pipelines.splat.surface import SurfaceSettings
-from pipelines.stages import SIM3, SPARSE, SURVEY
+from pipelines.stages import POINTS, SIM3, SPARSE, SURVEY
 from pipelines.workspace import StageRun, Summary
 
 log = logging.getLogger(__name__)
 
 _CHECKPOINT = "checkpoint.npz"
 _METRICS = "metrics.jsonl"
+_EVIDENT_SIGMAS = 3.0
+_CAUSES = {
+    "bias": "Check the base station, the vertical datum and the antenna offset",
+    "lever-arm": "`georef ingest --lever-arm` can apply it, in the axes of the body",
+    "boresight": "`georef ingest --boresight` can apply it",
+}
 _COARSE = ((4, 0.1), (2, 0.3))  # shrunken so much, up to this fraction of the training
 
 
@@ -101,8 +105,11 @@ def run(stage: StageRun, config: TrainConfig) -> Summary:
     images = photographs(scene.sparse, survey, workspace, effort(config).max_image_size)
     require_memory(training_size(scene, images, config), free_memory_bytes(device_of(backend)))
     images.build(stage.progress)
-    problem = geo_problem(scene, survey, initial, config)
-    trainer = make_trainer(scene, images, problem, backend, config)
+    surface = SceneSurface(workspace.cache / "surface", scene, images) if config.dense else None
+    if surface is not None:
+        surface.build(stage.progress)
+    problem = geo_problem(scene, survey, initial, config, GeolocatedPoints.load(workspace.path(POINTS)))
+    trainer = make_trainer(Material(scene, images, surface), problem, backend, config)
     options = LoopOptions(
         stage.out / _CHECKPOINT, stage.out / _METRICS, config.checkpoint_every, config.log_every, stage.resumed
     )
@@ -122,41 +129,35 @@ def training_size(scene: Scene, images: ImageCache, config: TrainConfig) -> Trai
     return TrainingSize(effort(config).max_gaussians, largest, config.sh_degree, corrected)
 
 
-def make_trainer(
-    scene: Scene, images: ImageCache, problem: GeoProblem, backend: Rasterizer, config: TrainConfig
-) -> JointTrainer:
-    """Gaussians from the SfM points, and everything that moves them.
+def make_trainer(material: Material, problem: GeoProblem, backend: Rasterizer, config: TrainConfig) -> JointTrainer:
+    """Gaussians on the surface, and everything that moves them.
 
     Raises:
         DegenerateGeometryError: too few SfM points.
     """
     preset, device = effort(config), device_of(backend)
-    gaussians = initial_gaussians(scene, images, config).to(device)
+    scene, images = material.scene, material.images
+    options = InitialisationOptions(sh_degree=config.sh_degree, max_gaussians=preset.max_gaussians)
+    gaussians = initial_gaussians(material, options, preset.max_gaussians, config.seed).to(device)
     extent_m = scene_extent(scene.poses.cam_center_in_model)
     train = torch.from_numpy(scene.train)
     return JointTrainer(
         GaussianAdam(gaussians, extent_m, preset.iterations),
         _strategy(config, extent_m, len(gaussians)),
         problem.to(device),
-        Views(scene.train, images, _observed(scene, device) if config.faithful_surface else ()),
+        Views(scene.train, images, points_to_hold(material, device) if config.faithful_surface else None),
         rasterizer=backend,
         options=JointOptions(
             preset.iterations,
             config.sh_degree,
             geo_weight=config.geo_weight,
+            geo_schedule=config.geo_schedule,
             seed=config.seed,
             coarse=_COARSE if config.coarse_to_fine else (),
             surface=SurfaceSettings() if config.faithful_surface else None,
         ),
         exposures=Exposures(len(images), train, preset.iterations, device) if config.exposure else None,
     )
-
-
-def _observed(scene: Scene, device: torch.device) -> tuple[torch.Tensor, ...]:
-    """By image, the SfM points (K, 3) in `model` that it observes."""
-    points, sparse = scene.point_in_model, scene.sparse
-    rows = (np.unique(sparse.obs_point[sparse.obs_image == index]) for index in range(len(sparse.image_name)))
-    return tuple(torch.from_numpy(points[found]).float().to(device) for found in rows)
 
 
 def _strategy(config: TrainConfig, extent_m: float, count: int) -> Strategy:
@@ -170,31 +171,18 @@ def _strategy(config: TrainConfig, extent_m: float, count: int) -> Strategy:
     return DefaultStrategy(settings, extent_m, count, config.seed)
 
 
-def initial_gaussians(scene: Scene, images: ImageCache, config: TrainConfig) -> Gaussians:
-    """One at each SfM point, and those of the background.
-
-    Raises:
-        DegenerateGeometryError: too few SfM points.
-    """
-    most = effort(config).max_gaussians
-    options = InitialisationOptions(sh_degree=config.sh_degree, max_gaussians=most)
-    behind = background(scene, images)
-    near = gaussians_from_points(scene.point_in_model, scene.sparse.point_rgb, options)
-    far = gaussians_of_size(behind.point_in_model, behind.rgb, behind.sigma_m, options)
-    room = max(most - len(near), 0)
-    keep = torch.linspace(0, max(len(far) - 1, 0), min(room, len(far))).long()
-    return Gaussians.concatenate([near, far.select(keep)])
-
-
 def _save(trainer: JointTrainer, scene: Scene, out: Path, outcome: Outcome) -> Summary:
     problem, gaussians = trainer.problem, trainer.optimizer.gaussians.detached()
-    covariance = problem.covariance() if problem.fixes is not None or problem.marks is not None else None
+    measured = problem.fixes is not None or problem.marks is not None
+    covariance, of_errors = problem.covariances() if measured else (problem.similarity.prior_covariance(), None)
     outliers = tuple(sorted(scene.sparse.image_name[index] for index in problem.outliers()))
+    blunders = () if problem.marks is None else tuple(problem.marks.name[j] for j in problem.control_outliers())
+    errors = () if of_errors is None else problem.errors.found(of_errors)
     model = TrainedModel(
         geo_from_model=problem.similarity.current().to_record(
             "model",
             "geo",
-            covariance=problem.similarity.prior_covariance() if covariance is None else covariance,
+            covariance=covariance,
             pivot=problem.similarity.pivot_in_geo,
         ),
         model_from_local=scene.model_from_local.to_record("local", "model"),
@@ -206,6 +194,8 @@ def _save(trainer: JointTrainer, scene: Scene, out: Path, outcome: Outcome) -> S
         gaussians=len(gaussians),
         backend=trainer.rasterizer.name,
         gnss_outliers=outliers,
+        control_outliers=blunders,
+        estimated_errors=errors,
     )
     write_gaussians(out / "gaussians.ply", gaussians)
     save_json(model, out / "model.json")
@@ -220,12 +210,34 @@ def _save(trainer: JointTrainer, scene: Scene, out: Path, outcome: Outcome) -> S
         "seconds_per_iteration": round(outcome.seconds / trainer.iteration, 4),
         "similarity_sigma_m": [round(float(value), 5) for value in sigma[4:]],
         "gnss_outliers": list(outliers),
+        "control_outliers": list(blunders),
+        "estimated_errors": [error.model_dump() for error in errors],
     }
     figure = f"{len(gaussians)} gaussians, train PSNR {psnr:.2f} dB"
     warnings = [f"{len(outliers)} fixes contradict the cameras: {', '.join(outliers[:5])}"] if outliers else []
+    if blunders:
+        warnings.append(f"{len(blunders)} control points contradict the cameras: {', '.join(blunders[:5])}")
+    warnings += [told for error in errors if (told := _told(error)) is not None]
     if outcome.recovery is not None:
         warnings.append(outcome.recovery)
     return Summary(figure, values, tuple(warnings))
+
+
+def _told(error: EstimatedError) -> str | None:
+    """What to warn of: an error beyond 3 σ, or one that could not be observed."""
+    axes = "east, north, up" if error.name == "bias" else "right, down, forward"
+    flight = "" if error.flight is None else f" of flight {error.flight + 1}"
+    what = f"{error.name}{flight}"
+    values = ", ".join(f"{value:+.3f} ± {sigma:.3f}" for value, sigma in zip(error.value, error.sigma, strict=True))
+    far = [
+        abs(value) > _EVIDENT_SIGMAS * sigma and seen
+        for value, sigma, seen in zip(error.value, error.sigma, error.observed, strict=True)
+    ]
+    if any(far):
+        return f"{what} of ({values}) {error.unit} {axes}, beyond 3 σ: it is taken out here. {_CAUSES[error.name]}"
+    if not all(error.observed):
+        return f"{what} is not observable along every axis: ({values}) {error.unit} {axes}"
+    return None
 
 
 def _cameras(trainer: JointTrainer, scene: Scene) -> tuple[TrainedCamera, ...]:

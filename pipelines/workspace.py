@@ -25,7 +25,7 @@ from pipelines.config import CONFIG_FILE
 from pipelines.errors import InputError, MissingProductError, WorkspaceBusyError
 from pipelines.products import load_json, save_json
 from pipelines.progress import SILENT, Progress
-from pipelines.stages import PIPELINE, StageSpec, producer_of, products_of
+from pipelines.stages import STAGES, StageSpec, producer_of, products_of
 
 MANIFEST = "manifest.json"
 TOKEN = "token.txt"
@@ -88,9 +88,26 @@ class StageRun:
 
 @dataclass(frozen=True)
 class Workspace:
-    """A workspace directory."""
+    """A workspace directory.
+
+    Attributes:
+        root: the directory.
+        base: of a variant, the workspace that it is a variant of: it has the photographs, the cache and
+            `georef.toml`.
+        lent: stage folders that a variant reads elsewhere, by name. It writes none of them.
+    """
 
     root: Path
+    base: Workspace | None = None
+    lent: Mapping[str, Path] = field(default_factory=dict, hash=False)
+
+    def variant(self, place: str, lent: Mapping[str, Path]) -> Workspace:
+        """A workspace at `place` inside this one, in which some stages are run otherwise.
+
+        Args:
+            lent: the folders of all stages that are not run in it but read by it.
+        """
+        return Workspace(self.root / place, self, lent)
 
     def path(self, product: str) -> Path:
         """Absolute path of a finished product.
@@ -98,20 +115,29 @@ class Workspace:
         Raises:
             MissingProductError: it is not there; names the command that makes it.
         """
-        path = self.root / product
+        folder, _, inside = product.partition("/")
+        path = self._folder(folder) / inside
         if not path.exists():
-            raise MissingProductError(product, f"georef {producer_of(product).name} {self.root}")
+            name, home = producer_of(product).name, self.base or self
+            raise MissingProductError(product, f"georef {'compare' if self.base else name} {home.root}")
         return path
+
+    def _folder(self, name: str) -> Path:
+        return self.lent.get(name, self.root / name)
+
+    def photographs(self, image_dir: str) -> Path:
+        """The folder of photographs that a survey names."""
+        return (self.base or self).root / image_dir
 
     @property
     def cache(self) -> Path:
         """Folder of things that can be made again (undistorted images)."""
-        return self.root / "cache"
+        return (self.base or self).root / "cache"
 
     @property
     def config_file(self) -> Path:
         """The workspace's `georef.toml`."""
-        return self.root / CONFIG_FILE
+        return (self.base or self).root / CONFIG_FILE
 
     def log_file(self, spec: StageSpec) -> Path:
         """Where the log of a stage is kept."""
@@ -123,7 +149,7 @@ class Workspace:
         Raises:
             InputError: it is damaged.
         """
-        path = self.root / spec.folder / MANIFEST
+        path = self._folder(spec.folder) / MANIFEST
         return load_json(Manifest, path) if path.exists() else None
 
     def placed_by_hand(self, spec: StageSpec) -> bool:
@@ -164,7 +190,7 @@ class Workspace:
             handle.truncate(0)
             handle.write(f"{activity} in process {os.getpid()}")
             handle.flush()
-            for spec in PIPELINE:
+            for spec in STAGES:
                 self._recover(spec)
             yield
 
@@ -257,6 +283,13 @@ class Workspace:
         draft.rename(partial / MANIFEST)  # from here on it counts as complete, whatever happens
         self._swap(spec)
 
+    def replace(self, product: str, document: BaseModel) -> None:
+        """Put another JSON product in the place of a finished one; what builds on it becomes stale."""
+        path = self.path(product)
+        draft = path.with_suffix(".tmp")
+        save_json(document, draft)
+        draft.rename(path)
+
     def requests(self) -> dict[str, dict[str, Any]]:
         """The flags that each stage was last asked for with, so that `georef run` can complete them.
 
@@ -277,10 +310,14 @@ class Workspace:
     def remember(self, flags: Mapping[str, Mapping[str, Any]]) -> None:
         """Record the flags that stages were asked for with, by stage."""
         document = {**self.requests(), **{stage: dict(given) for stage, given in flags.items()}}
-        path = self.root / REQUESTS
-        draft = path.with_suffix(".tmp")
-        draft.write_text(json.dumps(document, indent=1, default=str) + "\n", encoding="utf-8")
-        draft.rename(path)
+        replace_text(self.root / REQUESTS, json.dumps(document, indent=1, default=str) + "\n")
+
+
+def replace_text(path: Path, text: str) -> None:
+    """Write a file; one that is there is replaced when the new one is complete."""
+    draft = path.with_suffix(".tmp")
+    draft.write_text(text, encoding="utf-8")
+    draft.rename(path)
 
 
 def now() -> datetime:

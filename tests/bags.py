@@ -14,7 +14,6 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from ruamel.yaml import YAML
 from scipy.spatial.transform import Rotation
 
-from pipelines.formats.bag_definitions import DEFINITIONS
 from pipelines.geodesy.enu import enu_from_lla, geo_from_enu_at, lla_from_enu
 from pipelines.geometry.rig import mount
 from pipelines.geometry.rotations import ENU_FROM_NED, quat_xyzw_from_matrix
@@ -25,8 +24,6 @@ ORIGIN = Origin(lat_deg=46.02, lon_deg=7.75, alt_m=1620.0)
 FLU = np.diag([1.0, -1.0, -1.0])
 OPTICAL_FROM_FRD = mount([0.0, 0.0, 0.0])
 TYPES = get_typestore(Stores.ROS2_JAZZY)
-for _name, _text in DEFINITIONS.items():
-    TYPES.register(get_types_from_msg(_text, _name))
 
 Message = tuple[str, str, int, Any]  # topic, type, time of recording, message
 
@@ -200,38 +197,6 @@ def poses(flight: Flight, kind: str, world: str = "map", body: str = "base_link"
     return found
 
 
-def px4(flight: Flight, kind: str, boot_ns: int = 0) -> list[Message]:
-    """PX4's messages; their microseconds count from `boot_ns`."""
-    kind = f"px4_msgs/msg/{kind}"
-    times = flight.imu_ns if kind.endswith("Attitude") else flight.fix_ns
-    turns = ENU_FROM_NED.T @ (flight.enu_from_body(times) if kind.endswith("Odometry") else at_place(flight, times))
-    quats = quat_xyzw_from_matrix(turns)[:, [3, 0, 1, 2]].astype(np.float32, order="C")
-    zero = np.zeros(3, np.float32)
-    found = []
-    for i, ns in enumerate(times):
-        stamp = int(ns - boot_ns) // 1000
-        camera, antenna = flight.camera(times[i : i + 1])[0], flight.antenna(times[i : i + 1])[0]
-        (lat, lon, alt), gps = lla_from_enu(camera, ORIGIN), lla_from_enu(antenna, ORIGIN)
-        if kind.endswith("VehicleAttitude"):
-            message = make(kind, stamp, stamp, quats[i], np.zeros(4, np.float32), 0)
-        elif kind.endswith("VehicleGlobalPosition"):
-            message = make(kind, stamp, stamp, lat, lon, alt - 50, alt, 0.0, 0, 0, 0.3, 0.5, 0.0, False, False)
-        elif kind.endswith("VehicleOdometry"):
-            ned = (ENU_FROM_NED.T @ camera).astype(np.float32)
-            variance = np.full(3, 0.01, np.float32)
-            message = make(
-                kind, stamp, stamp, 1, ned, quats[i], 1, zero, zero, variance, variance, variance, 0, 100
-            )
-        else:
-            message = make(
-                kind, stamp, stamp, 1, *(float(v) for v in gps[:2]), float(gps[2]) - 50, float(gps[2]), 0.0, 0.0, 6,
-                0.02, 0.03, 0.7, 1.0, 0, 0, 0, 0, 0, 0.0, 0.0, 0.0, 0.0, 0.0, True, 0, 0, 20, 0.0, 0.0, 0.0, 1.0, 0,
-                False, 0,
-            )  # fmt: skip
-        found.append((f"/fmu/out/{kind.rpartition('/')[2]}", kind, int(ns), message))
-    return found
-
-
 def usual(flight: Flight) -> list[Message]:
     """NavSatFix, Imu, CameraInfo and /tf_static beside the photographs."""
     return [transforms(flight), info(flight), *fixes(flight), *imu(flight), *images(flight)]
@@ -243,10 +208,11 @@ class Form:
 
     storage: StoragePlugin = StoragePlugin.MCAP
     compression: CompressionMode | None = None
+    definitions: dict[str, str] = field(default_factory=dict)  # instead of the usual ones; "" for none
 
 
 def write(path: Path, messages: list[Message], form: Form = Form()) -> Path:
-    """Write messages by time of recording.."""
+    """Write messages by time of recording."""
     writer = Writer(path, version=9, storage_plugin=form.storage)
     if form.compression is not None:
         writer.set_compression(form.compression, CompressionFormat.ZSTD)
@@ -254,7 +220,8 @@ def write(path: Path, messages: list[Message], form: Form = Form()) -> Path:
         links: dict[str, Any] = {}
         for topic, kind, ns, message in sorted(messages, key=lambda one: one[2]):
             if topic not in links:
-                links[topic] = writer.add_connection(topic, kind, typestore=TYPES)
+                stated = {"msgdef": form.definitions[kind], "rihs01": "-"} if kind in form.definitions else {}
+                links[topic] = writer.add_connection(topic, kind, typestore=TYPES, **stated)
             data = message if isinstance(message, bytes) else bytes(TYPES.serialize_cdr(message, kind))
             writer.write(links[topic], int(ns), data)
     return path

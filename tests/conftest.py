@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.stages import PIPELINE
+from pipelines.stages import STAGES
 from pipelines.workspace import Workspace
 from tests import fakes
 
@@ -20,7 +20,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 @pytest.fixture
 def fake_stages(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fake stages in place of the real ones, for one test."""
-    for spec in PIPELINE:
+    for spec in STAGES:
         monkeypatch.setitem(sys.modules, spec.module, None)  # so that what was there is put back
     fakes.install()
 

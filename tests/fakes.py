@@ -14,7 +14,7 @@ from pathlib import Path
 from types import ModuleType
 
 from pipelines.config import StageConfig
-from pipelines.stages import PIPELINE, StageSpec, products_of
+from pipelines.stages import PIPELINE, STAGES, StageSpec, products_of
 from pipelines.workspace import StageRun, Summary, Workspace
 
 Run = Callable[[StageRun, StageConfig], Summary]
@@ -56,7 +56,7 @@ def fake_run(spec: StageSpec) -> Run:
 
 def install(**replaced: Run) -> None:
     """Put fake stages where the runner looks for stages; `replaced` by name, with `_` for `-`."""
-    for spec in PIPELINE:
+    for spec in STAGES:
         module = ModuleType(spec.module)
         module.run = replaced.get(spec.name.replace("-", "_"), fake_run(spec))  # type: ignore[attr-defined]
         sys.modules[spec.module] = module

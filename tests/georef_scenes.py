@@ -9,12 +9,14 @@ import torch
 from scenes import looking_at
 
 from pipelines.geometry.bundle import similarity_modes
-from pipelines.geometry.rotations import log_so3
+from pipelines.geometry.rotations import exp_so3, log_so3
 from pipelines.geometry.similarity import Similarity
 from pipelines.georef.cameras import CameraCorrections, CameraPoses
-from pipelines.georef.losses import ControlMarks, Fixes, Weighting
+from pipelines.georef.losses import Weighting
+from pipelines.georef.measured import Attitudes, ControlMarks, Fixes, Measured, Pairs
 from pipelines.georef.problem import GeoProblem
 from pipelines.georef.similarity import LearnableSimilarity
+from pipelines.georef.systematic import SystematicErrors
 
 SHIFT = np.array([100.0, 50.0, 20.0])
 # Of an initial similarity that is far from the truth: 1 % of scale, 1°, 2 m.
@@ -91,18 +93,69 @@ def marks_of(truth: Truth, points_in_model: np.ndarray, sigma_m: float, rng: np.
     )
 
 
+def attitudes_of(
+    truth: Truth, sigma_rad: float, rng: np.random.Generator, nominal_from_true: np.ndarray | None = None
+) -> Attitudes:
+    """Recorded rotations of all cameras, with white noise, in axes from which the cameras' are turned."""
+    true = truth.geo_from_model.rotation @ np.swapaxes(truth.poses.cam_from_model, 1, 2)
+    recorded = true if nominal_from_true is None else true @ nominal_from_true.T
+    noise = exp_so3(sigma_rad * rng.normal(size=(len(recorded), 3)))
+    return Attitudes(
+        torch.arange(len(recorded)),
+        torch.from_numpy(recorded @ noise),
+        torch.full((len(recorded),), 1 / sigma_rad, dtype=torch.float64),
+    )
+
+
+def pairs_of(truth: Truth, points_in_model: np.ndarray, sigma_m: float, rng: np.random.Generator) -> Pairs:
+    """All distances between points (J, 3), each point located on Earth with σ `sigma_m`."""
+    located = truth.geo_from_model.apply(points_in_model) + sigma_m * rng.normal(size=points_in_model.shape)
+    i, j = np.triu_indices(len(located), 1)
+    return Pairs(
+        torch.from_numpy(np.linalg.norm(points_in_model[i] - points_in_model[j], axis=1)),
+        None,
+        torch.from_numpy(np.linalg.norm(located[i] - located[j], axis=1)),
+        torch.full((len(i),), 1 / (np.sqrt(2) * sigma_m), dtype=torch.float64),
+        1.0,
+    )
+
+
 def problem_of(
     block: Block, fixes: Fixes | None, marks: ControlMarks | None = None, weighting: Weighting = "whitened"
 ) -> GeoProblem:
     """From the block as SfM left it and an initial similarity that is a guess."""
-    start = Similarity(translation=SHIFT)
+    return problem_with(block, Measured(fixes, marks), weighting=weighting)
+
+
+def problem_with(
+    block: Block,
+    measured: Measured,
+    errors: SystematicErrors | None = None,
+    *,
+    weighting: Weighting = "whitened",
+    learned_weights: bool = False,
+) -> GeoProblem:
+    """The same with any measurements, and constant errors to be estimated."""
     return GeoProblem(
-        LearnableSimilarity(start, LOOSE, pivot(block)),
+        LearnableSimilarity(Similarity(translation=SHIFT), LOOSE, pivot(block)),
         CameraCorrections(block.poses, block.basis),
-        fixes,
-        marks,
+        measured,
         weighting=weighting,
+        errors=errors,
+        learned_weights=learned_weights,
     )
+
+
+def descend(problem: GeoProblem, steps: int = 500, variance_rate: float = 0.01) -> None:
+    """The training's own way down: Adam at its rates, which fall to a twentieth."""
+    rates = {"y": 0.1, "z": 0.01, "x": 0.1, "u": variance_rate}
+    adam = torch.optim.Adam([{"params": [each], "rate": rates[name]} for name, each in problem.learned().items()])
+    for step in range(steps):
+        for group in adam.param_groups:
+            group["lr"] = group["rate"] * 0.05 ** (step / steps)
+        adam.zero_grad()
+        problem.loss().backward()
+        adam.step()
 
 
 def squared_error(truth: Similarity, found: Similarity, covariance: np.ndarray, about: np.ndarray) -> float:

@@ -10,7 +10,9 @@ import numpy as np
 import torch
 from scenes import GEO_FROM_LOCAL, Measured, Noise, Scene, looking_at, sparse_model, survey_of, write_workspace
 
+from pipelines.config import GeolocateConfig
 from pipelines.formats.colmap import SparseModel
+from pipelines.geolocate import geolocate
 from pipelines.geometry.cameras import Camera
 from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.similarity import Similarity
@@ -19,7 +21,7 @@ from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.raster.api import Pinhole, RasterSettings
 from pipelines.splat.raster.cpu import CpuRasterizer
 from pipelines.splat.sh import sh_from_rgb
-from pipelines.stages import SIM3
+from pipelines.stages import POINTS, SIM3
 from pipelines.workspace import Workspace
 
 CAMERA = Camera("PINHOLE", 96, 72, np.array([90.0, 90.0, 48.0, 36.0]))
@@ -141,6 +143,7 @@ def write_rendered(root: Path, rendered: Rendered, initial: InitialSimilarity) -
     """A workspace as the stages before training leave it; the photographs must be in `root/photos`."""
     workspace = write_workspace(root, rendered.survey, rendered.sparse)
     save_json(initial, root / SIM3)
+    geolocate(rendered.survey, rendered.sparse, GeolocateConfig()).points.save(root / POINTS)
     return workspace
 
 

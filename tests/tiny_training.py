@@ -14,6 +14,7 @@ from pipelines.formats.image_cache import ImageCache, Photograph
 from pipelines.geometry.cameras import Camera
 from pipelines.geometry.similarity import Similarity
 from pipelines.georef.cameras import CameraCorrections, CameraPoses
+from pipelines.georef.measured import Measured
 from pipelines.georef.problem import GeoProblem
 from pipelines.georef.similarity import LearnableSimilarity
 from pipelines.splat.densify import DefaultSettings, DefaultStrategy, Strategy
@@ -79,7 +80,7 @@ def trainer(
     return JointTrainer(
         GaussianAdam(start, EXTENT_M, options.iterations),
         strategy or DefaultStrategy(SETTINGS, EXTENT_M, len(start)),
-        GeoProblem(similarity, cameras, None, None),
+        GeoProblem(similarity, cameras, Measured()),
         Views(train, images),
         rasterizer=CpuRasterizer(),
         options=options,

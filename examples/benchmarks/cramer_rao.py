@@ -26,7 +26,7 @@ from pipelines.geometry.following import Following
 from pipelines.georef.adjustment import Correspondences
 from pipelines.georef.alignment import align
 from pipelines.georef.cameras import CameraCorrections
-from pipelines.georef.losses import ControlMarks, Fixes
+from pipelines.georef.measured import ControlMarks, Fixes, Measured
 from pipelines.georef.posterior import minimise
 from pipelines.georef.problem import GeoProblem
 from pipelines.georef.similarity import LearnableSimilarity
@@ -112,8 +112,7 @@ def estimate(truth: Truth, drawn: Drawn, rng: np.random.Generator) -> tuple[Floa
     problem = GeoProblem(
         LearnableSimilarity(start, solution.covariance, solution.pivot),
         CameraCorrections(poses, basis),
-        drawn.fixes,
-        drawn.marks,
+        Measured(drawn.fixes, drawn.marks),
     )
     minimise(problem)
     followed = truth.check.position + truth.check.follow.by(basis) @ problem.cameras.z.detach().numpy()

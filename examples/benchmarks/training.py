@@ -23,7 +23,10 @@ import numpy as np
 import torch
 from raster import make_scene
 
-from pipelines.blocks.scene import Scene, geo_problem, initial_scene, photographs
+from pipelines.blocks.geographic import geo_problem
+from pipelines.blocks.material import Material
+from pipelines.blocks.scene import Scene, initial_scene, photographs
+from pipelines.blocks.surface import SceneSurface
 from pipelines.blocks.trainer import JointTrainer
 from pipelines.config import TrainConfig
 from pipelines.formats.colmap import read_sparse
@@ -99,8 +102,13 @@ def curve(arguments: argparse.Namespace) -> None:
         )
         images = photographs(scene.sparse, survey, workspace, arguments.max_image_size)
         images.build()
+        surface = SceneSurface(workspace.cache / "surface", scene, images)
+        surface.build()
         trainer = make_trainer(
-            scene, images, geo_problem(scene, survey, initial, config), rasterizer(config.backend), config
+            Material(scene, images, surface),
+            geo_problem(scene, survey, initial, config),
+            rasterizer(config.backend),
+            config,
         )
         seconds, device = 0.0, arguments.backend
         while trainer.iteration < arguments.iterations and seconds < arguments.seconds:

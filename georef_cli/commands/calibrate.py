@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import inspect
 from pathlib import Path
 from typing import Any
@@ -10,31 +9,28 @@ from typing import Any
 import click
 
 from georef_cli import boundary, options, tables
-from georef_cli.display import progress_for
-from georef_cli.output import document_of, print_json, print_outcome, print_rich
-from pipelines import runner
+from georef_cli.output import print_json, print_rich
 from pipelines.config import CONFIG_FILE, CalibrateConfig, resolve
-from pipelines.stages import BY_NAME
+from pipelines.stages import CALIBRATE
 
 
 def _calibrate(ctx: click.Context, **values: Any) -> None:
-    from pipelines.calibrate import calibrate
+    from pipelines.calibrate import apply_calibration, calibrate
 
-    workspace, spec = values["workspace"], BY_NAME["ingest"]
+    workspace = values["workspace"]
     config = resolve(CalibrateConfig, {}, options.given(ctx, CalibrateConfig.model_fields), Path(CONFIG_FILE))
     found = calibrate(workspace, config)
-    document = dataclasses.asdict(found)
-    if not values["as_json"]:
-        print_rich(*tables.calibration(document))
-    outcome = None
-    if values["apply"] and found.options:
-        flags = runner.remembered(workspace, spec, found.options)
-        with boundary.written(workspace.log_file(spec)):
-            outcome = runner.run_stage(workspace, spec, flags, progress=progress_for(ctx.obj))
+    applied: list[str] = []
+    if values["apply"]:
+        applied = [one.name for one in found.estimates if one.usable]
+        with workspace.lock(CALIBRATE.name), boundary.written(workspace.log_file(CALIBRATE)):
+            apply_calibration(workspace, found)
     if values["as_json"]:
-        print_json({**document, "applied": outcome and document_of(outcome)})
-    elif outcome is not None:
-        print_outcome(workspace, outcome, as_json=False)
+        print_json({**found.model_dump(mode="json"), "applied": applied})
+        return
+    print_rich(*tables.calibration(found.model_dump(mode="json")))
+    if values["apply"]:
+        print_rich(f"applied to the survey: {', '.join(applied) or 'nothing'}")
 
 
 command = click.Command(
@@ -42,15 +38,16 @@ command = click.Command(
     params=[
         options.workspace_argument(),
         *options.stage_options(CalibrateConfig),
-        click.Option(["--apply"], is_flag=True, help="Run ingest again with what is observable."),
+        click.Option(["--apply"], is_flag=True, help="Put what is observable into the survey."),
         options.json_option(),
     ],
     callback=click.pass_context(_calibrate),
     help=inspect.cleandoc(
         """Estimate time offset, boresight and lever arm from the SfM cameras.
 
-        After sfm, the track of the cameras is laid on the navigation that ingest kept from a bag. Each parameter
-        comes with its σ; one that the flight does not show is said to be not observable, and is not applied.
+        After sfm, the track of the cameras is laid on the navigation that ingest kept from a bag or a trajectory by
+        time. Each parameter comes with its σ; one that the flight does not show is said to be not observable, and
+        is not applied. `georef run` does this itself where ingest was asked to (--time-offset auto, --estimate).
 
         \b
         Examples:

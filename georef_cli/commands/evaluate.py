@@ -17,6 +17,7 @@ command = StageCommand(
     Examples:
       georef evaluate flight
       georef evaluate flight --renders 2 --json
+      georef evaluate flight --crs EPSG:32632
       georef evaluate flight --cross-validate
     """,
 )

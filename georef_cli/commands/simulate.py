@@ -13,7 +13,8 @@ import click
 from georef_cli import options, tables
 from georef_cli.display import progress_for
 from georef_cli.output import print_json, print_rich
-from pipelines.config import CONFIG_FILE, SimulateConfig, resolve
+from pipelines.config import CONFIG_FILE, resolve
+from pipelines.simulate_config import SimulateConfig
 
 
 def _simulate(ctx: click.Context, **values: Any) -> None:

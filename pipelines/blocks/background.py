@@ -1,4 +1,4 @@
-"""Gaussians for what the cameras see but SfM has no points on: sky, horizon, bare ground around the scene.
+"""Gaussians for what cameras see but no point is known on: sky, horizon, bare ground around the scene.
 
 Left empty, these parts of the photographs are filled by floaters: Gaussians of the scene that grow in mid-air until
 they cover the gap, in front of everything else. So rays through such parts start with a Gaussian of the pixel's
@@ -40,12 +40,11 @@ class Background:
     sigma_m: FloatArray
 
 
-def background(scene: Scene, images: ImageCache) -> Background:
-    """Points on the rays of those image cells of the training views in which no SfM point is seen.
+def background(scene: Scene, images: ImageCache, points: FloatArray) -> Background:
+    """Points on the rays of those image cells of the training views in which none of `points` (N, 3) is seen.
 
-    The frame `model` has its z axis up; the ground is taken to be a plane below most of the SfM points.
+    The frame `model` has its z axis up; the ground is taken to be a plane below most of the points.
     """
-    points = scene.point_in_model
     middle = np.median(points, axis=0)
     radius = float(np.percentile(np.linalg.norm(points - middle, axis=1), 90))
     ground = ground_plane(points)
@@ -53,7 +52,7 @@ def background(scene: Scene, images: ImageCache) -> Background:
     step = max(1, len(scene.train) // _MOST_VIEWS)
     for index in map(int, scene.train[::step]):
         camera, center = images.pinhole(index), scene.poses.cam_center_in_model[index]
-        cells = _empty_cells(scene, index, camera)
+        cells = _empty_cells(scene, index, camera, points)
         pixel = (cells + 0.5) * (camera.width / _COLUMNS)
         ray = _rays(pixel, camera) @ scene.poses.cam_from_model[index]
         distance = _distance(ray, center, ground, radius)
@@ -63,10 +62,10 @@ def background(scene: Scene, images: ImageCache) -> Background:
     return _thinned(Background(np.concatenate(found), np.concatenate(colours), np.concatenate(sigmas)))
 
 
-def _empty_cells(scene: Scene, index: int, camera: Pinhole) -> FloatArray:
-    """Cells (E, 2) as column and row, without an SfM point in them or beside them."""
+def _empty_cells(scene: Scene, index: int, camera: Pinhole, points: FloatArray) -> FloatArray:
+    """Cells (E, 2) as column and row, without a point in them or beside them."""
     rows = max(1, round(_COLUMNS * camera.height / camera.width))
-    in_cam = (scene.point_in_model - scene.poses.cam_center_in_model[index]) @ scene.poses.cam_from_model[index].T
+    in_cam = (points - scene.poses.cam_center_in_model[index]) @ scene.poses.cam_from_model[index].T
     in_cam = in_cam[in_cam[:, 2] > 0]
     x = (camera.fx * in_cam[:, 0] / in_cam[:, 2] + camera.cx) * _COLUMNS / camera.width
     y = (camera.fy * in_cam[:, 1] / in_cam[:, 2] + camera.cy) * rows / camera.height

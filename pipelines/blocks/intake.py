@@ -8,22 +8,23 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.config import AUTO, IngestConfig, triple
+from pipelines.config import IngestConfig, triple
 from pipelines.errors import InputError
 from pipelines.formats.bag_photos import FrameOptions, parse_every
-from pipelines.formats.bag_survey import BagFlight, BagOptions, RawTrack, read_flight
+from pipelines.formats.bag_survey import BagOptions, RawTrack, read_flight
 from pipelines.formats.bag_topics import AskedTopics
 from pipelines.formats.camera_priors import camera_priors
 from pipelines.formats.measured import Measured, PoseOptions, from_table, from_tags
 from pipelines.formats.notes import Notes
 from pipelines.formats.odm import read_geo
 from pipelines.formats.photo_folder import Photo, scan_folder
-from pipelines.formats.poses import PoseTable
+from pipelines.formats.poses import PoseTable, complete
 from pipelines.formats.rigged import with_rig
 from pipelines.formats.trajectory_csv import read_trajectory
 from pipelines.geodesy import enu
 from pipelines.geodesy.vertical import parse_vertical
 from pipelines.geometry.rig import Rig, boresight, mount
+from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.products import CameraPrior, FloatArray, NavigationTrack, Origin
 from pipelines.progress import SILENT, Progress
 
@@ -68,8 +69,11 @@ def take_in(config: IngestConfig, frames: Path | None, notes: Notes, progress: P
         InputError: options that contradict each other, anything wrong with the inputs, too few photographs.
     """
     _check_options(config, frames)
-    if config.time_offset == AUTO:
-        notes.warn("the time offset is zero until `georef calibrate` has estimated it from the SfM cameras")
+    if config.wanted:
+        notes.assume(
+            f"{', '.join(config.wanted)}: as given, until `georef run` or `georef calibrate --apply` has estimated "
+            "it after sfm"
+        )
     if config.bag is not None and frames is not None:
         return _from_bag(config, config.bag, frames, notes, progress)
     return _from_folder(config, notes, progress)
@@ -93,7 +97,8 @@ def _from_bag(config: IngestConfig, bag: Path, frames: Path, notes: Notes, progr
     _require_enough(flight.photos, bag, "--bag", notes)
 
     def track(origin: Origin) -> NavigationTrack | None:
-        return _track(flight, options, origin)
+        names, time_s = [photo.name for photo in flight.photos], flight.measured.time_s
+        return _track(flight.track, names, time_s, config, origin)
 
     return Intake(frames.resolve(), flight.photos, flight.measured, flight.cameras, flight.camera_of, track)
 
@@ -108,9 +113,24 @@ def _from_folder(config: IngestConfig, notes: Notes, progress: Progress) -> Inta
     elif config.geo is not None:
         table = read_geo(config.geo, notes)
     measured = from_tags(photos, options, notes) if table is None else from_table(table, photos, options, notes)
-    measured = with_rig(measured, _rig(config), [photo.name for photo in photos], notes)
+    names, recorded = [photo.name for photo in photos], measured.recorded
+    if config.time_offset_s and recorded is None:
+        raise InputError(
+            "is for navigation by time: a --bag, or a --trajectory without a column of images",
+            field="--time-offset",
+        )
+    measured = with_rig(measured, _rig(config), names, notes)
     cameras, camera_of = camera_priors(photos, config.focal_px, notes)
-    return Intake(folder.resolve(), photos, measured, cameras, camera_of, lambda _: None)
+
+    def track(origin: Origin) -> NavigationTrack | None:
+        if recorded is None:
+            return None
+        timed = np.isfinite(measured.time_s)
+        raw = _raw_track(recorded, _rig(config), int(timed.sum()))
+        timed_names = [name for name, one in zip(names, timed, strict=True) if one]
+        return _track(raw, timed_names, measured.time_s[timed], config, origin)
+
+    return Intake(folder.resolve(), photos, measured, cameras, camera_of, track)
 
 
 def _check_options(config: IngestConfig, frames: Path | None) -> None:
@@ -119,7 +139,13 @@ def _check_options(config: IngestConfig, frames: Path | None) -> None:
     if config.bag is not None:
         if frames is None:
             raise InputError("a bag needs a workspace to put its photographs in", field="--bag")
-        beside = [name for name in ("images", "trajectory", "geo", "crs") if getattr(config, name) is not None]
+        if config.crs is not None:
+            raise InputError(
+                "has no meaning for a --bag: its positions are latitude, longitude and ellipsoidal height, or "
+                "metres in a frame whose zero --origin names",
+                field="--crs",
+            )
+        beside = [name for name in ("images", "trajectory", "geo") if getattr(config, name) is not None]
         if beside:
             raise InputError(f"has photographs and positions itself: give it without --{beside[0]}", field="--bag")
     elif given := [name for name in _BAG_ONLY if getattr(config, name) is not None]:
@@ -164,8 +190,30 @@ def _require_enough(photos: Sequence[Photo], source: Path, field: str, notes: No
         )
 
 
-def _track(flight: BagFlight, options: BagOptions, origin: Origin) -> NavigationTrack | None:
-    raw = flight.track
+def _raw_track(table: PoseTable, rig: Rig, images: int) -> RawTrack:
+    """A table by time as navigation; without a mount, the cameras' nominal axes stand for the body's."""
+    usable = np.flatnonzero(np.isfinite(np.asarray(table.time_s)) & complete(table.xyz))
+    table = table.take(usable[np.argsort(np.asarray(table.time_s)[usable], kind="stable")])
+    quat = np.full((len(table), 4), np.nan) if table.quat_xyzw is None else table.quat_xyzw
+    turned = complete(quat)
+    cam_from_body = np.eye(3) if rig.cam_from_body is None else rig.cam_from_body
+    arm = np.full(3, np.nan) if rig.antenna_in_body is None else rig.antenna_in_body
+    time_s = np.asarray(table.time_s)
+    return RawTrack(
+        position_time_s=time_s,
+        position_in_ecef=table.xyz,
+        sigma_enu_m=np.full((len(table), 3), np.nan) if table.sigma_enu_m is None else table.sigma_enu_m,
+        attitude_time_s=time_s[turned],
+        enu_from_body=matrix_from_quat_xyzw(quat[turned]) @ cam_from_body,
+        cam_from_body=np.tile(cam_from_body, (images, 1, 1)),
+        antenna_in_body=np.tile(arm, (images, 1)),
+    )
+
+
+def _track(
+    raw: RawTrack, names: Sequence[str], time_s: FloatArray, config: IngestConfig, origin: Origin
+) -> NavigationTrack | None:
+    """The navigation in the frame at the origin, with images of those names at times (n,) of the camera's clock."""
     if not len(raw.position_time_s):
         return None
     return NavigationTrack(
@@ -174,13 +222,14 @@ def _track(flight: BagFlight, options: BagOptions, origin: Origin) -> Navigation
         sigma_m=raw.sigma_enu_m,
         attitude_time_s=raw.attitude_time_s,
         geo_from_body=_turned_to_geo(raw, origin),
-        image=np.array([photo.name for photo in flight.photos]),
-        image_time_s=flight.measured.time_s,
+        image=np.array(names, dtype=np.str_),
+        image_time_s=time_s,
         cam_from_body=raw.cam_from_body,
         antenna_in_body=raw.antenna_in_body,
-        nominal_from_cam=options.rig.nominal_from_cam,
-        time_offset_s=np.array(options.time_offset_s),
-        max_gap_s=np.array(options.pose.max_gap_s),
+        nominal_from_cam=_rig(config).nominal_from_cam,
+        time_offset_s=np.array(config.time_offset_s),
+        max_gap_s=np.array(config.max_gap),
+        body_known=np.array(config.bag is not None or config.camera_mount is not None),
     )
 
 

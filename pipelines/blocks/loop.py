@@ -166,7 +166,7 @@ class _Loop:
 def _metrics_row(trainer: JointTrainer, report: StepReport, seconds: float) -> dict[str, float]:
     problem = trainer.problem
     with torch.no_grad():
-        terms = problem.terms()
+        terms, factors = problem.terms().present(), problem.weights.variance_factors()
     row = {
         "iteration": trainer.iteration,
         "seconds": round(seconds, 2),
@@ -174,7 +174,8 @@ def _metrics_row(trainer: JointTrainer, report: StepReport, seconds: float) -> d
         "psnr": -10.0 * math.log10(max(float(report.mean_square_error), 1e-10)),
         "gaussians": len(trainer.optimizer.gaussians),
         "geo_weight": report.weight,
-        "cameras": float(terms.cameras),
     }
-    named = {"absolute": terms.absolute, "control": terms.control}
-    return row | {name: float(value) for name, value in named.items() if value is not None}
+    row |= {name: float(value) for name, value in terms.items()}
+    if report.by_depth is not None:
+        row["control_by_depth"] = float(report.by_depth)
+    return row | {f"variance_{name}": factors[name] for name in factors if name in terms}

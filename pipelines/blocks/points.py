@@ -15,6 +15,8 @@ from pipelines.products import FloatArray, SurveyedPoint
 # Rays of a mark are held to agree within their mark's σ and this much of the cameras' own error.
 _SIGMA_CENTER_M = 0.02
 _SIGMA_ATTITUDE_RAD = 2e-4
+_EDGE_REACH_PX = 2
+_EDGE_STEP = 0.04  # of the depth; ground seen under 30° changes by 1 % within the reach
 
 
 @dataclass(frozen=True)
@@ -77,19 +79,33 @@ def points_by_model(
 ) -> FloatArray:
     """Points (J, 3) in `geo` where the model's surface lies behind their marks: median over the views.
 
+    Where a mark lies beside an edge of the surface, a fraction of a pixel decides between roof and ground: such
+    views do not count for a point that two or more others show on unbroken surface.
+
     Args:
-        depth_m: median depth (H, W) along z by camera, 0 where there is no surface.
+        depth_m: depth (H, W) of the surface along z by camera, 0 where there is none.
         pinholes: cameras of these depth maps.
         count: J.
     """
-    hits: list[list[FloatArray]] = [[] for _ in range(count)]
+    clear: list[list[FloatArray]] = [[] for _ in range(count)]
+    beside: list[list[FloatArray]] = [[] for _ in range(count)]
     for j, i, xy in zip(seen.point, seen.camera, seen.xy, strict=True):
         depth = _depth_at(depth_m[int(i)], pinholes[int(i)], xy)
         if depth > 0:
             ray = depth * np.append(xy, 1.0)
-            hits[j].append(trained.poses.cam_from_model[i].T @ ray + trained.poses.cam_center_in_model[i])
+            kind = beside if _at_edge(depth_m[int(i)], pinholes[int(i)], xy) else clear
+            kind[j].append(trained.poses.cam_from_model[i].T @ ray + trained.poses.cam_center_in_model[i])
+    hits = [good if len(good) >= 2 else good + poor for good, poor in zip(clear, beside, strict=True)]
     middle = np.array([np.median(np.array(hit), axis=0) if len(hit) >= 2 else np.full(3, np.nan) for hit in hits])
     return trained.geo_from_model.apply(middle.reshape(-1, 3))
+
+
+def _at_edge(depth_m: FloatArray, camera: Pinhole, xy: FloatArray) -> bool:
+    """Whether the depth changes by more than a slope does within two pixels of a ray."""
+    x, y = int(camera.fx * xy[0] + camera.cx), int(camera.fy * xy[1] + camera.cy)
+    around = depth_m[max(y - _EDGE_REACH_PX, 0) : y + _EDGE_REACH_PX + 1]
+    around = around[:, max(x - _EDGE_REACH_PX, 0) : x + _EDGE_REACH_PX + 1]
+    return bool(around.size == 0 or around.max() > (1 + _EDGE_STEP) * around.min())
 
 
 def _depth_at(depth_m: FloatArray, camera: Pinhole, xy: FloatArray) -> float:

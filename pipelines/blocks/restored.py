@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from pipelines.blocks.scene import Scene, geo_problem, make_scene
+from pipelines.blocks.geographic import geo_problem
+from pipelines.blocks.scene import Scene, make_scene
 from pipelines.blocks.trained import Trained
 from pipelines.config import TrainConfig
 from pipelines.geometry.rotations import log_so3
@@ -53,7 +54,8 @@ def restore(trained: Trained, initial: InitialSimilarity, config: TrainConfig) -
     model_from_local = Similarity.from_record(trained.model.model_from_local)
     start = Similarity.from_record(initial.geo_from_local) @ model_from_local.inverse()
     scene = make_scene(trained.sparse, trained.survey, model_from_local, start.translation)
-    problem = geo_problem(scene, trained.survey, initial, config)
+    # Distances repeat what the fixes say, and have no part in the whitened residuals.
+    problem = geo_problem(scene, trained.survey, initial, config.model_copy(update={"rel_loss": False}))
     _place(problem.similarity, trained.geo_from_model)
     minimise(problem)
     return Restored(trained, scene, problem, config)

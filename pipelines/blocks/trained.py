@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -11,10 +12,10 @@ from pipelines.formats.colmap import SparseModel, read_sparse
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.similarity import Similarity
 from pipelines.georef.cameras import CameraPoses
-from pipelines.products import Survey, TrainedModel, load_json
+from pipelines.products import InitialSimilarity, SimilarityRecord, Survey, TrainedModel, load_json
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.storage import read_gaussians
-from pipelines.stages import GAUSSIANS, MODEL, SPARSE, SURVEY
+from pipelines.stages import GAUSSIANS, MODEL, SIM3, SPARSE, SURVEY
 from pipelines.workspace import Workspace
 
 
@@ -46,8 +47,12 @@ class Trained:
         return [index for index, camera in enumerate(self.model.cameras) if camera.split == split]
 
 
-def load_trained(workspace: Workspace) -> Trained:
+def load_trained(workspace: Workspace, similarity: Literal["trained", "initial"] = "trained") -> Trained:
     """Read the products of ingest, sfm and train.
+
+    Args:
+        similarity: what places the model on Earth: `geo_from_model` as training left it, or that which follows
+            from the similarity of init-sim3, whatever training made of its own.
 
     Raises:
         MissingProductError: one of them is not there.
@@ -59,6 +64,9 @@ def load_trained(workspace: Workspace) -> Trained:
     names = tuple(camera.name for camera in model.cameras)
     if names != sparse.image_name:
         raise InputError("its cameras are not those of sfm/sparse: train again", path=model_path, field="cameras")
+    if similarity == "initial":
+        record = _placed(model, load_json(InitialSimilarity, workspace.path(SIM3)))
+        model = model.model_copy(update={"geo_from_model": record})
     rotation = matrix_from_quat_xyzw([camera.quat_xyzw for camera in model.cameras])
     translation = np.array([camera.translation for camera in model.cameras])
     return Trained(
@@ -68,3 +76,11 @@ def load_trained(workspace: Workspace) -> Trained:
         poses=CameraPoses(rotation, -np.einsum("nji,nj->ni", rotation, translation)),
         gaussians=read_gaussians(workspace.path(GAUSSIANS)),
     )
+
+
+def _placed(model: TrainedModel, initial: InitialSimilarity) -> SimilarityRecord:
+    """`geo_from_model` of a similarity geo ← local; its covariance, of a movement on Earth, stays as it is."""
+    geo_from_local = Similarity.from_record(initial.geo_from_local)
+    geo_from_model = geo_from_local @ Similarity.from_record(model.model_from_local).inverse()
+    covariance = np.array(initial.geo_from_local.covariance)
+    return geo_from_model.to_record("model", "geo", covariance=covariance, pivot=initial.geo_from_local.pivot)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +12,7 @@ from torch import Tensor
 from pipelines.blocks.checkpoint import prefixed, unprefixed
 from pipelines.blocks.targets import Target, Targets
 from pipelines.formats.image_cache import ImageCache
-from pipelines.georef.losses import rising_weight
+from pipelines.georef.losses import Schedule, rising_weight
 from pipelines.georef.problem import GeoProblem
 from pipelines.splat.densify import Strategy
 from pipelines.splat.evidence import Evidence, evidence
@@ -25,6 +25,7 @@ from pipelines.splat.surface import SurfaceSettings, depth_loss, flatness_loss, 
 from pipelines.splat.watch import FiniteWatch
 
 _FINAL_RATE = 0.05  # of the geographic learning rates, relative to the first
+_TOLD = {"y": "the similarity", "z": "the cameras", "x": "the constant errors", "u": "the weights of the losses"}
 # A gradient that is not finite shows in one of these: colours pass theirs on to the opacities.
 _WATCHED = ("means", "quats_wxyz", "log_scales", "logit_opacities")
 
@@ -38,8 +39,11 @@ class JointOptions:
         sh_degree: degree that the spherical harmonics reach.
         geo_weight: w_max of eq. 27.
         geo_rise: τ of eq. 27, as a fraction of the iterations.
-        similarity_rate: first learning rate of the similarity, in standard deviations an iteration.
+        geo_schedule: "rising" as in eq. 27, or "constant": w_max from the first iteration.
+        similarity_rate: first learning rate of the similarity and of constant errors of the measurements, in
+            standard deviations an iteration.
         camera_rate: first learning rate of the camera corrections, likewise.
+        variance_rate: first learning rate of the log-variances of the geographic terms.
         background: colour behind the scene.
         seed: of the order of views.
         coarse: (shrink, fraction) pairs: photographs are shrunken so much up to this fraction of the training.
@@ -51,8 +55,10 @@ class JointOptions:
     sh_degree: int = 3
     geo_weight: float = 0.05
     geo_rise: float = 0.1
+    geo_schedule: Schedule = "rising"
     similarity_rate: float = 0.1
     camera_rate: float = 0.01
+    variance_rate: float = 0.01
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     seed: int = 0
     coarse: tuple[tuple[int, float], ...] = ()
@@ -67,22 +73,23 @@ class Views:
     Attributes:
         camera: (V,) indices into the cameras (and the images) of those to train on.
         images: all undistorted images.
-        observed: by image, the SfM points (K, 3) in `model` that it observes; only the surface losses need them.
+        surface: gives the points (K, 3) in `model` that an image shows; only the surface losses need them.
     """
 
     camera: np.ndarray
     images: ImageCache
-    observed: tuple[Tensor, ...] = ()
+    surface: Callable[[int], Tensor] | None = None
 
 
 @dataclass(frozen=True)
 class StepReport:
-    """What one iteration saw: scalars, not yet fetched from the device."""
+    """What one iteration saw: scalars, not yet fetched from the device; `by_depth` only of a view with marks."""
 
     photometric: Tensor
     mean_square_error: Tensor
     geographic: Tensor
     weight: float
+    by_depth: Tensor | None = None
 
 
 class JointTrainer:
@@ -119,11 +126,14 @@ class JointTrainer:
         self._targets = Targets(views.images, self.device)
         names = ("photometric loss", "geographic loss", *(f"gradient of {name}" for name in self._watched()))
         self._watch = FiniteWatch(names, self.device)
+        rates = {
+            "y": options.similarity_rate,
+            "z": options.camera_rate,
+            "x": options.similarity_rate,
+            "u": options.variance_rate,
+        }
         self._geo_adam = torch.optim.Adam(
-            [
-                {"params": [problem.similarity.y], "rate": options.similarity_rate},
-                {"params": [problem.cameras.z], "rate": options.camera_rate},
-            ]
+            [{"params": [parameter], "rate": rates[name]} for name, parameter in problem.learned().items()]
         )
 
     def step(self) -> StepReport:
@@ -132,13 +142,11 @@ class JointTrainer:
         index = self._view_of(self.iteration)
         target = self._targets.get(index, self._shrink(index), self._view_of(self.iteration + 1))
         pose = self.problem.cameras.cam_from_model(index)
-        render = self._render(pose, target.camera)
+        render = self._render(pose, target.camera, depth=self.problem.sees_by_depth(index))
         colour = render.colour if self.exposures is None else self.exposures.apply(index, render.colour)
         photometric = photometric_loss(colour, target.colour, target.mask)
-        weight = rising_weight(
-            self.iteration, self.options.geo_weight, self.options.geo_rise * self.options.iterations
-        )
-        geographic = self.problem.loss()
+        weight, by_depth = self._geo_weight(), self._by_depth(index, render, target)
+        geographic = self.problem.loss() if by_depth is None else self.problem.loss() + by_depth
         self.optimizer.zero_grad()
         self._geo_adam.zero_grad()
         total = photometric + weight * geographic
@@ -150,7 +158,13 @@ class JointTrainer:
         self._apply(render.stats.visible)
         self.strategy.observe(render.stats, target.camera)
         self.strategy.update(self.iteration, self.optimizer, self.evidence)
-        return StepReport(photometric.detach(), _mean_square(colour, target), geographic.detach(), weight)
+        return StepReport(
+            photometric.detach(),
+            _mean_square(colour, target),
+            geographic.detach(),
+            weight,
+            None if by_depth is None else by_depth.detach(),
+        )
 
     @torch.no_grad()
     def evidence(self, count: int, generator: torch.Generator) -> list[Evidence]:
@@ -183,8 +197,20 @@ class JointTrainer:
         self.optimizer.rate_factor *= factor
         self._watch.reset()
 
-    def _render(self, pose: Tensor, camera: Pinhole) -> Render:
-        depth = self.options.surface is not None
+    def _geo_weight(self) -> float:
+        options = self.options
+        if options.geo_schedule == "constant":
+            return options.geo_weight
+        return rising_weight(self.iteration, options.geo_weight, options.geo_rise * options.iterations)
+
+    def _by_depth(self, index: int, render: Render, target: Target) -> Tensor | None:
+        """The control points of this view, where they are found through the rendered depth."""
+        if render.expected_depth is None:
+            return None
+        return self.problem.depth_loss(index, render.expected_depth, render.alpha, target.camera)
+
+    def _render(self, pose: Tensor, camera: Pinhole, *, depth: bool = False) -> Render:
+        depth = depth or self.options.surface is not None
         settings = RasterSettings(sh_degree=self._sh_degree(), background=self.options.background, depth=depth)
         return self.rasterizer.render(self.optimizer.gaussians, pose, camera, settings)
 
@@ -194,11 +220,10 @@ class JointTrainer:
         if wanted is None:
             return None
         loss = wanted.flatness * flatness_loss(gaussians, render.stats.visible, self.optimizer.extent_m)
-        if self.views.observed and len(self.views.observed[index]) and render.expected_depth is not None:
-            points = self.views.observed[index]
-            loss = loss + wanted.depth * depth_loss(
-                render.expected_depth, render.alpha, points, pose, target.camera
-            )
+        if self.views.surface is not None and render.expected_depth is not None:
+            points = self.views.surface(index)
+            depth = depth_loss(render.expected_depth, render.alpha, points, pose, target.camera)
+            loss = loss + wanted.depth * depth
         if self.iteration > wanted.normals_from * self.options.iterations:
             normals = normal_loss(gaussians, pose, target.camera, self.rasterizer, wanted.edge)
             loss = loss + wanted.normals * normals
@@ -206,7 +231,7 @@ class JointTrainer:
 
     def _watched(self) -> dict[str, Tensor]:
         tensors = self.optimizer.gaussians.tensors()
-        geo = {"the similarity": self.problem.similarity.y, "the cameras": self.problem.cameras.z}
+        geo = {_TOLD[name]: parameter for name, parameter in self.problem.learned().items()}
         return {name: tensors[name] for name in _WATCHED} | geo
 
     def _note(self, photometric: Tensor, geographic: Tensor) -> None:
@@ -247,7 +272,7 @@ class JointTrainer:
 
     def state(self) -> dict[str, Tensor]:
         """Everything that the next iteration depends on."""
-        parameters = {"y": self.problem.similarity.y, "z": self.problem.cameras.z}
+        parameters = self.problem.learned()
         geo: dict[str, Tensor] = {**parameters}
         for name, parameter in parameters.items():
             moments = self._geo_adam.state[parameter]
@@ -278,7 +303,7 @@ class JointTrainer:
         if self.exposures is not None:
             self.exposures.restore(unprefixed("exposures", state))
         geo = unprefixed("geo", state)
-        for name, parameter in (("y", self.problem.similarity.y), ("z", self.problem.cameras.z)):
+        for name, parameter in self.problem.learned().items():
             with torch.no_grad():
                 parameter.copy_(geo[name])
             # Adam counts its steps on the CPU, whatever the device.

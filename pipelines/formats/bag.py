@@ -1,11 +1,13 @@
 """ROS bags, read one message at a time: rosbag2 folders and bare files (mcap, sqlite3), and ROS 1 bags.
 
-Every message type is decoded by its own definition: the bag's, else the distribution's, else (PX4, whose
-messages no distribution has) those of `bag_definitions`. A damaged definition harms its own topic only.
+Every message type is decoded by its own definition: the bag's, else the distribution's, or (PX4, whose messages no
+distribution has) that of `bag_definitions` which fits the message. A damaged definition harms its own
+topic only.
 """
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
@@ -18,6 +20,10 @@ from pipelines.formats.bag_definitions import DEFINITIONS
 
 # A chunk is unpacked in one piece, and held up to three times; ROS writes 0.8 to 4 MiB.
 _MAX_CHUNK_BYTES = 200 * 1024 * 1024
+# Schemas of mcap that have no place in a ROS bag, and with which the reader cannot open it.
+_FOREIGN_SCHEMAS = ("jsonschema", "protobuf", "flatbuffer", "ros1msg")
+# PX4 sends a message within milliseconds of the sample that it is made from.
+_SAMPLE_LAG_US = 60_000_000
 _REPAIR = "repair it with `mcap recover` (mcap) or `ros2 bag reindex` (sqlite3, or metadata.yaml missing)"
 
 
@@ -57,6 +63,9 @@ class Bag:
     def __init__(self, path: Path, reader: Any, ros2: bool) -> None:
         self.path, self._reader, self._ros2 = path, reader, ros2
         self._connections = list(reader.connections)
+        # Of a split bag, any file may be the one that has a definition.
+        links = [link for part in _parts(reader) for link in part.connections] + self._connections
+        self._definitions = {link.msgtype: link.msgdef for link in links if link.msgdef.data}
         self._stores: dict[str, Any] = {}
         self.damage: str | None = None
         self.fallback_types: set[str] = set()
@@ -99,7 +108,7 @@ class Bag:
         Raises:
             UndecodableError: it does not fit, or no definition is known.
         """
-        store = self._store(message.type)
+        store = self._store(message)
         try:
             if self._ros2:
                 return store.deserialize_cdr(message.data, message.type)
@@ -129,34 +138,55 @@ class Bag:
             return None
         return sec * 1_000_000_000 + nanosec or None
 
-    def _store(self, kind: str) -> Any:
+    def _store(self, message: RawMessage) -> Any:
+        """A typestore that knows the type of `message`."""
+        kind = message.type
         if kind not in self._stores:
-            self._stores[kind] = self._make_store(kind)
+            stated = self._definitions.get(kind)
+            if stated is None and kind in DEFINITIONS:
+                self._stores[kind] = self._store_that_fits(message)
+            else:
+                self._stores[kind] = self._make_store(kind, stated)
         store = self._stores[kind]
         if isinstance(store, str):
             raise UndecodableError(store)
         return store
 
-    def _make_store(self, kind: str) -> Any:
-        """A typestore that knows `kind`, or why there is none."""
-        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+    def _make_store(self, kind: str, stated: Any | None) -> Any:
+        """A typestore that knows `kind` as the bag defines it, or by default, or why there is none."""
+        from rosbags.typesys import Stores, get_typestore
 
-        stated = next(
-            (link.msgdef for link in self._connections if link.msgtype == kind and link.msgdef.data), None
-        )
-        store = get_typestore(Stores.EMPTY)
         if stated is not None:
+            store = get_typestore(Stores.EMPTY)
             try:
                 store.register(_parsed(stated, kind))
                 return store
             except Exception as error:  # a grammar error, an unknown word, a name twice …
                 return f"its definition of {kind} cannot be read: {type(error).__name__}: {error}"
         self.fallback_types.add(kind)
-        if kind in DEFINITIONS:
-            store.register(get_types_from_msg(DEFINITIONS[kind], kind))
-            return store
         common = get_typestore(Stores.ROS2_JAZZY if self._ros2 else Stores.ROS1_NOETIC)
         return common if kind in common.types else f"it has no definition of {kind}"
+
+    def _store_that_fits(self, message: RawMessage) -> Any:
+        """A typestore with that layout of `DEFINITIONS` which fits `message`."""
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+        for release, text in DEFINITIONS[message.type].items():
+            store = get_typestore(Stores.EMPTY)
+            store.register(get_types_from_msg(text, message.type))
+            try:
+                decoded: Any = store.deserialize_cdr(message.data, message.type)
+            except Exception:  # another length, or damaged
+                continue
+            sample = getattr(decoded, "timestamp_sample", 0)
+            if sample and abs(sample - decoded.timestamp) > _SAMPLE_LAG_US:
+                continue
+            self.fallback_types.add(f"{message.type} (as of PX4 {release})")
+            return store
+        # Not remembered: the next message may be whole.
+        raise UndecodableError(
+            f"{len(message.data)} bytes are none of the layouts of {message.type} that are known here"
+        )
 
 
 @contextmanager
@@ -172,6 +202,12 @@ def open_bag(path: Path) -> Iterator[Bag]:
         reader.open()
     except InputError:
         raise
+    except KeyError as error:
+        if error.args[0] not in _FOREIGN_SCHEMAS:
+            raise InputError(f"is no bag, or is damaged ({_told(error)}): {_REPAIR}", path=path) from error
+        raise InputError(
+            f"has a topic in {error.args[0]!r}, which is not ROS 2's: leave it out with `mcap filter`", path=path
+        ) from error
     except Exception as error:  # truncated and forged files raise whatever the parser trips over
         raise InputError(f"is no bag, or is damaged ({_told(error)}): {_REPAIR}", path=path) from error
     try:
@@ -203,8 +239,7 @@ def _reader(path: Path, ros2: bool) -> Any:
 
 
 def _check_chunks(reader: Any, path: Path) -> None:
-    outer = getattr(reader, "storage", None)
-    for storage in getattr(outer, "storages", [outer]):
+    for storage in _parts(reader):
         largest = max((chunk.uncompressed_size for chunk in getattr(storage, "chunks", ())), default=0)
         if largest > _MAX_CHUNK_BYTES:
             raise InputError(
@@ -212,6 +247,12 @@ def _check_chunks(reader: Any, path: Path) -> None:
                 "smaller ones, e.g. `mcap compress --chunk-size 4194304`",
                 path=path,
             )
+
+
+def _parts(reader: Any) -> list[Any]:
+    """The files of a rosbag2."""
+    outer = getattr(reader, "storage", None)
+    return list(getattr(outer, "storages", [] if outer is None else [outer]))
 
 
 def _parsed(definition: Any, kind: str) -> Any:
@@ -222,10 +263,12 @@ def _parsed(definition: Any, kind: str) -> Any:
     if definition.format == MessageDefinitionFormat.MSG:
         return get_types_from_msg(definition.data, kind)
     rule = "=" * 80 + "\n"
-    if not definition.data.startswith(f"{rule}IDL: "):
-        return get_types_from_idl(definition.data)
+    # rosbags' parser takes no directives; what they include stands below.
+    text = re.sub(r"^[ \t]*#.*$", "", definition.data, flags=re.MULTILINE)
+    if not text.startswith(f"{rule}IDL: "):
+        return get_types_from_idl(text)
     types: dict[str, Any] = {}
-    for part in definition.data.split(rule)[1:]:
+    for part in text.split(rule)[1:]:
         types.update(get_types_from_idl(part.partition("\n")[2]))
     return types
 

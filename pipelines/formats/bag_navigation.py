@@ -20,7 +20,7 @@ Axes = Literal["flu", "frd", "optical"]
 BASE = "base_link"
 _NAN3 = (math.nan, math.nan, math.nan)
 _LARGEST_SIGMA_M = 1e4
-_FRD_FIX = 3  # PX4: a 3D fix
+_PX4_FIXES = range(3, 7)  # 3D, differential, RTK float, RTK fixed; 8 is extrapolated
 _PX4_KIND = {5: "RTK float", 6: "RTK fixed"}
 _STATUS_NO_FIX = -1
 _COVARIANCE_UNKNOWN = 0
@@ -96,18 +96,21 @@ def _fix(message: Any) -> Position:
 
 def _global_position(message: Any) -> Position:
     place = (float(message.lat), float(message.lon), float(message.alt_ellipsoid))
-    valid = getattr(message, "lat_lon_valid", True) and getattr(message, "alt_valid", True)
+    flags = ("lat_lon_valid", "alt_valid", "alt_ellipsoid_valid")  # since px4_msgs 1.16
+    valid = all(getattr(message, flag, True) for flag in flags)
     problem = _geodetic_problem(place) if valid else "no fix (status)"
+    if message.dead_reckoning:
+        problem = "dead reckoning, without a receiver"
     return Position(place, _eph_epv(message), BASE, problem=problem)
 
 
 def _sensor_gps(message: Any) -> Position:
     if hasattr(message, "latitude_deg"):
         place = (message.latitude_deg, message.longitude_deg, message.altitude_ellipsoid_m)
-    else:  # px4_msgs up to release 1.13: 1e-7 degrees and millimetres
+    else:  # px4_msgs up to release 1.14: 1e-7 degrees and millimetres
         place = (message.lat * 1e-7, message.lon * 1e-7, message.alt_ellipsoid * 1e-3)
     place = (float(place[0]), float(place[1]), float(place[2]))
-    problem = "no fix (status)" if message.fix_type < _FRD_FIX else _geodetic_problem(place)
+    problem = "no fix (status)" if message.fix_type not in _PX4_FIXES else _geodetic_problem(place)
     kind = _PX4_KIND.get(int(message.fix_type), "single-frequency")
     return Position(place, _eph_epv(message), "gps", kind=kind, problem=problem)
 

@@ -21,8 +21,9 @@ from pipelines.formats.notes import Notes
 from pipelines.formats.photo_folder import Photo
 from pipelines.formats.poses import PoseTable, complete, interpolate
 from pipelines.formats.rigged import camera_places
-from pipelines.geodesy.crs import WGS84, parse_crs
+from pipelines.geodesy.crs import parse_crs
 from pipelines.geodesy.enu import ecef_from_lla, lla_from_ecef, lla_from_enu
+from pipelines.geodesy.operations import WGS84
 from pipelines.geodesy.vertical import assumed_ellipsoidal
 from pipelines.geometry.rig import Rig, frame_from_frd
 from pipelines.geometry.rotations import matrix_from_quat_xyzw, quat_xyzw_from_matrix

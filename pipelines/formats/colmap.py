@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 import signal
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +22,9 @@ from pipelines.validators import stays_inside
 log = logging.getLogger(__name__)
 
 IntArray = NDArray[np.int64]
+
+# COLMAP writes one line a step; only its errors are of use here.
+_COLMAP_ERRORS_ONLY = 2
 
 _INVALID_POINT = np.uint64(2**64 - 1)
 
@@ -194,6 +199,18 @@ def pycolmap_module() -> Any:
         handler = signal.getsignal(signal.SIGTERM)  # Python's own record, which the import has not changed
         signal.signal(signal.SIGTERM, signal.SIG_DFL if handler is None else handler)
     return pycolmap
+
+
+@contextmanager
+def quiet_colmap() -> Iterator[Any]:
+    """pycolmap, with its log reduced to errors while in use."""
+    pycolmap = pycolmap_module()
+    level = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = _COLMAP_ERRORS_ONLY
+    try:
+        yield pycolmap
+    finally:
+        pycolmap.logging.minloglevel = level
 
 
 def load_reconstruction(path: Path) -> Any:

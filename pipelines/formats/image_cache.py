@@ -107,7 +107,7 @@ class ImageCache:
         """Pixels that the photograph covers: (H, W), mapped from disk."""
         path = self._folder / f"{self.mask_key(index)}.mask.npy"
         if not path.exists():
-            _save(path, self._map(index)[1])
+            save_array(path, self._map(index)[1])
         array: NDArray[np.bool_] = np.load(path, mmap_mode="r", allow_pickle=False)
         return array
 
@@ -123,6 +123,14 @@ class ImageCache:
         return array
 
     def _path(self, index: int) -> Path:
+        return self._folder / f"{self.key(index)}.npy"
+
+    def key(self, index: int) -> str:
+        """Changes with all that an undistorted image depends on.
+
+        Raises:
+            InputError: the photograph is gone.
+        """
         photograph = self._photographs[index]
         try:
             stat = photograph.file.stat()
@@ -134,7 +142,7 @@ class ImageCache:
             f"{photograph.name}|{stat.st_size}|{stat.st_mtime_ns}|{camera.model}|{camera.width}x{camera.height}|"
             f"{camera.params.tobytes().hex()}|{self.max_size_px}"
         )
-        return self._folder / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.npy"
+        return hashlib.sha256(key.encode()).hexdigest()[:32]
 
     def _write(self, index: int) -> None:
         photograph, pinhole = self._photographs[index], self.pinhole(index)
@@ -151,7 +159,7 @@ class ImageCache:
         small = cv2.resize(full, (pinhole.width, pinhole.height), interpolation=cv2.INTER_AREA)
         source, _ = self._map(index)
         flat = cv2.remap(small, source[..., 0], source[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
-        _save(self._path(index), np.ascontiguousarray(flat[..., ::-1]))
+        save_array(self._path(index), np.ascontiguousarray(flat[..., ::-1]))
 
     def _map(self, index: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Where each undistorted pixel lies in the shrunken photograph, and whether it lies inside."""
@@ -161,7 +169,8 @@ class ImageCache:
         return self._last_map[1:]
 
 
-def _save(path: Path, array: NDArray[Any]) -> None:
+def save_array(path: Path, array: NDArray[Any]) -> None:
+    """Write an array; it appears whole or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_suffix(".tmp")
     with draft.open("wb") as handle:

@@ -17,8 +17,9 @@ from pipelines.formats.notes import Notes
 from pipelines.formats.photo_folder import Photo
 from pipelines.formats.poses import PoseTable, complete, interpolate, match_by_name
 from pipelines.formats.xmp import RTK_FIXED, RTK_FLOAT
-from pipelines.geodesy.crs import WGS84, PointCrs, parse_crs
+from pipelines.geodesy.crs import PointCrs, parse_crs
 from pipelines.geodesy.enu import ecef_from_lla, lla_from_ecef, median_lla
+from pipelines.geodesy.operations import WGS84
 from pipelines.geodesy.vertical import VerticalChoice, assumed_ellipsoidal
 from pipelines.geometry.rotations import geo_from_cam, quat_xyzw_from_matrix
 from pipelines.products import FloatArray, VerticalDatum
@@ -66,6 +67,7 @@ class Measured:
         crs_name: their CRS.
         vertical: what their heights counted from.
         sigma_attitude_deg: (N,) σ that the attitudes state, NaN where none; None for none at all.
+        recorded: the table that images were matched with by time, Earth-centred; None where it was by name.
     """
 
     lla: FloatArray
@@ -78,6 +80,7 @@ class Measured:
     crs_name: str
     vertical: VerticalDatum
     sigma_attitude_deg: FloatArray | None = None
+    recorded: PoseTable | None = None
 
     @property
     def located(self) -> NDArray[np.bool_]:
@@ -135,11 +138,14 @@ def from_table(table: PoseTable, photos: Sequence[Photo], options: PoseOptions, 
     rows = _with_heights(rows, photos, crs, notes) if rows.names is not None else rows
     lla = crs.lla_from_xyz(rows.xyz, path=table.path, lines=rows.lines.tolist())
     note_operation(crs, lla, notes)
+    if table.sigma_enu_m is not None and "foot" in crs.units[0]:
+        notes.assume(f"σ in {table.path.name} are in metres, although {crs.name} counts in feet")
     _compare_with_exif(median_lla(lla), photos, table.path, notes)
-    cartesian = replace(rows, xyz=ecef_from_lla(lla))
+    cartesian, by_time = replace(rows, xyz=ecef_from_lla(lla)), None
     if rows.names is not None:
         at = np.array([images.index(name) for name in rows.names])
     else:
+        by_time = cartesian
         cartesian, at = _match_by_time(cartesian, photos, options, notes)
     count = len(photos)
     absent = np.setdiff1d(np.arange(count), at)
@@ -171,6 +177,7 @@ def from_table(table: PoseTable, photos: Sequence[Photo], options: PoseOptions, 
         source=table.source,
         crs_name=crs.name,
         vertical=crs.vertical,
+        recorded=by_time,
     )
 
 

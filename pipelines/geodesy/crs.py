@@ -3,15 +3,13 @@
 The only module that uses pyproj, and the only one that thinks about axis order: `xyz` here is always easting or
 longitude first, as in ODM's files and PROJ's visualisation order; `lla` is latitude first, as everywhere else.
 
-PROJ would rather answer than fail: without a geoid's grid it applies a *ballpark* transformation, that is none.
-Here such transformations are forbidden, and a missing grid is an error that names it. One operation serves
-all points of a call, or neighbours on two sides of an operation's border would be torn apart by metres.
+One operation serves all points of a call, or neighbours on two sides of an operation's border would be torn apart
+by metres; which one, and what happens where a grid is missing, is told in `pipelines.geodesy.operations`.
 """
 
 from __future__ import annotations
 
 import re
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,38 +18,18 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pyproj import CRS, Transformer
 from pyproj.crs import CompoundCRS
-from pyproj.datadir import get_user_data_dir
 from pyproj.enums import TransformDirection
 from pyproj.exceptions import CRSError
-from pyproj.transformer import AreaOfInterest, TransformerGroup
 
 from pipelines.errors import InputError
-from pipelines.geodesy.enu import lla_from_ecef
-from pipelines.geodesy.vertical import ELLIPSOIDAL, VerticalChoice, assumed_ellipsoidal, missing_grid_error, name_of
+from pipelines.geodesy.operations import Operation, Way, best_operation
+from pipelines.geodesy.plausible import Rows, check_area, horizontal_of, rough_lon_lat
+from pipelines.geodesy.vertical import ELLIPSOIDAL, VerticalChoice, assumed_ellipsoidal, name_of
 from pipelines.products import FloatArray, VerticalDatum
 
 ECEF = "EPSG:4978"
-WGS84 = "EPSG:4326"
-_WGS84_3D = "EPSG:4979"
 _MAX_TEXT = 20_000
-# Surveys lawfully run over the border of their zone; further than this from it the CRS is a mistake.
-_AREA_MARGIN_DEG = 3.0
 _UTM = re.compile(r"WGS\s?84\s*/?\s*UTM(?:\s+zone)?\s+(\d{1,2})\s*([NS])", re.IGNORECASE)
-
-
-@dataclass(frozen=True)
-class Operation:
-    """How PROJ gets from a CRS to WGS84.
-
-    Attributes:
-        name: PROJ's description.
-        accuracy_m: as published; None if unknown.
-        missing_grids: grids with which there would be a better one.
-    """
-
-    name: str
-    accuracy_m: float | None
-    missing_grids: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -76,7 +54,14 @@ class PointCrs:
     @property
     def is_geographic(self) -> bool:
         """Whether the horizontal coordinates are angles."""
-        return _horizontal(self._crs).is_geographic
+        return horizontal_of(self._crs).is_geographic
+
+    @property
+    def units(self) -> tuple[str, str, str]:
+        """Names of the three coordinates' units."""
+        source = self._crs.source_crs if self._crs.is_bound else None
+        first, second = (axis.unit_name for axis in horizontal_of(source or self._crs).axis_info[:2])
+        return first, second, self.height_unit
 
     @property
     def wkt(self) -> str:
@@ -99,9 +84,9 @@ class PointCrs:
         points = np.asarray(xyz, dtype=np.float64).reshape(-1, 3)
         if not len(points):
             return points
-        rows = _Rows(points, path, lines)
-        lon, lat = self._rough_lon_lat(rows)
-        transformer, _ = self._transformer(lon, lat, path)
+        rows = Rows(points, self.name, path, lines)
+        lon, lat = rough_lon_lat(self._crs, rows)
+        transformer, _ = best_operation(self._way(path), lon, lat)
         height = points[:, 2] * (1.0 if self._three_dimensional else self._height_unit_m)
         x, y, z = transformer.transform(points[:, 0], points[:, 1], height)
         lla = np.stack([y, x, z if self._three_dimensional else height], axis=-1)
@@ -113,18 +98,26 @@ class PointCrs:
         """Points (N, 3) in this CRS of WGS84 latitude, longitude, ellipsoidal height (N, 3).
 
         Raises:
-            InputError: a missing grid, no transformation, or a point outside the CRS's domain.
+            InputError: a point far outside the CRS's area or domain, a missing grid, or no transformation.
         """
         points = np.asarray(lla, dtype=np.float64).reshape(-1, 3)
         if not len(points):
             return points
-        transformer, _ = self._transformer(points[:, 1], points[:, 0], None)
-        x, y, z = transformer.transform(
-            points[:, 1], points[:, 0], points[:, 2], direction=TransformDirection.INVERSE
-        )
-        height = z if self._three_dimensional else points[:, 2] / self._height_unit_m
-        xyz = np.stack([x, y, height], axis=-1)
-        _Rows(points).require(np.isfinite(xyz).all(axis=1), f"outside the domain of {self.name}")
+        rows = Rows(points, self.name)
+        rows.require(np.isfinite(points).all(axis=1), "not a number")
+        check_area(self._crs, points[:, 1], points[:, 0], rows)
+        transformer, _ = best_operation(self._way(), points[:, 1], points[:, 0])
+        x, y, z = _inverse(transformer, points[:, 1], points[:, 0], points[:, 2])
+        if not self._three_dimensional:
+            # PROJ's flat datum shifts take a height for one above their own ellipsoid, on the way there and on the
+            # way back: millimetres between the two. What a file's points mean is the way there.
+            lon, lat, _ = transformer.transform(x, y, points[:, 2])
+            off = points[:, 1] - lon
+            off -= 360.0 * np.round(off / 360.0)
+            x, y, _ = _inverse(transformer, points[:, 1] + off, 2 * points[:, 0] - lat, points[:, 2])
+            z = points[:, 2] / self._height_unit_m
+        xyz = np.stack([x, y, z], axis=-1)
+        rows.require(np.isfinite(xyz).all(axis=1), f"outside the domain of {self.name}")
         return xyz
 
     def operation(self, lla: ArrayLike) -> Operation:
@@ -134,99 +127,17 @@ class PointCrs:
             InputError: as `lla_from_xyz`.
         """
         points = np.asarray(lla, dtype=np.float64).reshape(-1, 3)
-        return self._transformer(points[:, 1], points[:, 0], None)[1]
+        return best_operation(self._way(), points[:, 1], points[:, 0])[1]
 
-    def _rough_lon_lat(self, rows: _Rows) -> tuple[FloatArray, FloatArray]:
-        """Longitude and latitude in the CRS's own datum (within a kilometre of WGS84), checked for sanity."""
-        points = rows.points
-        rows.require(np.isfinite(points).all(axis=1), "not a number")
-        if self._crs.is_geocentric:
-            lla = lla_from_ecef(points)
-            rows.require(np.abs(lla[:, 2]) < 1e5, f"not near the Earth's surface in {self.name}")
-            return lla[:, 1], lla[:, 0]
-        horizontal = _horizontal(self._crs)
-        x, y = points[:, 0], points[:, 1]
-        if horizontal.is_geographic:
-            degrees = np.degrees(horizontal.axis_info[0].unit_conversion_factor)
-            lon, lat = x * degrees, y * degrees
-            order = f"(in {self.name} x is the longitude, y the latitude)"
-            rows.require(np.abs(lat) <= 90.0, f"latitude out of range −90 … 90 {order}", "latitude")
-            rows.require(np.abs(lon) <= 360.0, "longitude out of range −180 … 180", "longitude")
-        else:
-            metric = (np.abs(x) > 180.0) | (np.abs(y) > 90.0)
-            rows.require(metric, f"degrees? {self.name} has eastings and northings: wrong CRS")
-            to_degrees = Transformer.from_crs(horizontal, horizontal.geodetic_crs, always_xy=True)
-            lon, lat = to_degrees.transform(x, y)
-        rows.require(np.isfinite(lon + lat), f"outside the domain of {self.name}")
-        self._check_area(lon, lat, rows)
-        return lon, lat
-
-    def _check_area(self, lon: FloatArray, lat: FloatArray, rows: _Rows) -> None:
-        area = _horizontal(self._crs).area_of_use
-        if area is None:
-            return
-        width = (area.east - area.west) % 360.0 or 360.0
-        inside = (
-            ((lon - area.west + _AREA_MARGIN_DEG) % 360.0 <= width + 2 * _AREA_MARGIN_DEG)
-            & (lat >= area.south - _AREA_MARGIN_DEG)
-            & (lat <= area.north + _AREA_MARGIN_DEG)
-        )
-        bounds = f"{area.south:g} … {area.north:g}° N, {area.west:g} … {area.east:g}° E"
-        rows.require(inside, f"far outside the area of {self.name} ({bounds}): wrong CRS, or x and y swapped?")
-
-    def _transformer(
-        self, lon: FloatArray, lat: FloatArray, path: Path | str | None
-    ) -> tuple[Transformer, Operation]:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # "best transformation is not available": told below
-            group = TransformerGroup(
-                self._crs,
-                _WGS84_3D if self._three_dimensional else WGS84,
-                always_xy=True,
-                allow_ballpark=False,
-                area_of_interest=_area(lon, lat),
-            )
-        missing = tuple(
-            dict.fromkeys(
-                grid.short_name
-                for operation in group.unavailable_operations[:1]
-                for grid in operation.grids
-                if not grid.available
-            )
-        )
-        if group.transformers:
-            best = group.transformers[0]
-            accuracy = best.accuracy if best.accuracy >= 0 else None
-            return best, Operation(best.description, accuracy, () if group.best_available else missing)
-        if missing:
-            datum = self._crs.sub_crs_list[1].name if self._crs.is_compound else self.name
-            raise missing_grid_error(datum, missing, get_user_data_dir(), path)
-        raise InputError(
-            f"no transformation from {self.name} to WGS84 is known here: name its datum (+datum=… or +towgs84=… in "
-            "a PROJ string), or give another CRS",
-            path=path,
-        )
+    def _way(self, path: Path | str | None = None) -> Way:
+        return Way(self._crs, self.name, self._three_dimensional, path)
 
 
-@dataclass(frozen=True)
-class _Rows:
-    """Points (N, 3) and where they stand, to blame the right one."""
-
-    points: FloatArray
-    path: Path | str | None = None
-    lines: Sequence[int] | None = None
-
-    def require(self, accepted: ArrayLike, message: str, field: str | None = None) -> None:
-        """Raise an InputError for the first point that is not accepted (N,)."""
-        good = np.asarray(accepted)
-        if good.all():
-            return
-        worst = int(np.argmin(good))
-        text = ", ".join(f"{value:.10g}" for value in self.points[worst])
-        count = int((~good).sum())
-        more = f" ({count} such points)" if count > 1 else ""
-        line = self.lines[worst] if self.lines is not None else None
-        raise InputError(f"({text}): {message}{more}", path=self.path, line=line, field=field)
+def _inverse(
+    transformer: Transformer, lon: FloatArray, lat: FloatArray, height: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    x, y, z = transformer.transform(lon, lat, height, direction=TransformDirection.INVERSE)
+    return x, y, z
 
 
 def parse_crs(
@@ -255,7 +166,7 @@ def parse_crs(
     """
     name = " ".join(text.split())
     crs = _parse(name, path, line, field)
-    horizontal = _horizontal(crs)
+    horizontal = horizontal_of(crs)
     if not (crs.is_geographic or crs.is_projected or crs.is_geocentric):
         raise InputError(
             f"{_short(name)} is a {crs.type_name}, which places no points on Earth",
@@ -318,19 +229,6 @@ def _vertical_crs(choice: VerticalChoice) -> CRS:
     if not crs.is_vertical or crs.is_compound:
         raise InputError(f"{choice.name} ({crs.name}) is no vertical CRS", field="--vertical")
     return crs
-
-
-def _horizontal(crs: CRS) -> CRS:
-    return crs.sub_crs_list[0] if crs.is_compound else crs
-
-
-def _area(lon: FloatArray, lat: FloatArray) -> AreaOfInterest | None:
-    """Box around points, widened by a metre or so; None where it would straddle the date line."""
-    margin = 1e-5
-    west, east = float(lon.min()) - margin, float(lon.max()) + margin
-    if west < -180.0 or east > 180.0 or east - west > 180.0:
-        return None
-    return AreaOfInterest(west, max(float(lat.min()) - margin, -90.0), east, min(float(lat.max()) + margin, 90.0))
 
 
 def _short(name: str) -> str:

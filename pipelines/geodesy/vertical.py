@@ -59,13 +59,29 @@ def assumed_ellipsoidal(note: str) -> VerticalDatum:
     return VerticalDatum(name=ELLIPSOIDAL, stated=False, note=note)
 
 
-def missing_grid_error(datum: str, grids: Sequence[str], folder: str, path: Path | str | None) -> InputError:
-    """The error for heights whose conversion needs `grids` that are not in PROJ's data `folder`s."""
-    files = ", ".join(grids)
+def missing_grid_error(
+    datum: str | None, crs_name: str, grids: Sequence[str], folder: str, path: Path | str | None
+) -> InputError:
+    """The error for points of a CRS that need `grids`, of which none is in PROJ's data `folder`s.
+
+    Args:
+        datum: what the heights count from, if they do not count from the ellipsoid.
+        crs_name: the CRS.
+        grids: file names.
+        folder: where PROJ looks.
+        path: file of the points.
+    """
+    what = f"points of {crs_name} cannot be brought to WGS84"
+    instead = "Or give coordinates in another CRS"
+    if datum is not None:
+        what = f"heights above {datum} cannot be made ellipsoidal"
+        instead = (
+            "If the heights are ellipsoidal after all, give the horizontal CRS alone and `--vertical ellipsoidal`"
+        )
+    files = f"the PROJ grid {grids[0]} is" if len(grids) == 1 else f"the PROJ grids {', '.join(grids)} are"
     command = " ".join(["pyproj sync", *(f"--file {grid}" for grid in grids)])
     return InputError(
-        f"heights above {datum} cannot be made ellipsoidal: the PROJ grid {files} is not installed. "
-        f"Run `{command}`, or copy it from https://cdn.proj.org into {folder}. "
-        "If the heights are ellipsoidal after all, give the horizontal CRS alone and `--vertical ellipsoidal`",
+        f"{what}: {files} not installed. Run `{command}`, or copy from https://cdn.proj.org into {folder}. "
+        f"{instead}",
         path=path,
     )

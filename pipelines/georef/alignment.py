@@ -62,12 +62,17 @@ class Alignment:
     Attributes:
         solution: parameters, covariance and residuals.
         layout: extent of the correspondences used: "volume", "plane", or "line" if attitude was needed.
-        attitude_used: whether recorded attitudes resolved the rotation.
+        attitude: the recorded attitudes, where they resolved the rotation.
     """
 
     solution: Adjusted
     layout: Literal["volume", "plane", "line"]
-    attitude_used: bool
+    attitude: RotationPrior | None
+
+    @property
+    def attitude_used(self) -> bool:
+        """Whether recorded attitudes resolved the rotation."""
+        return self.attitude is not None
 
     @property
     def geo_from_local(self) -> Similarity:
@@ -101,13 +106,13 @@ def align(
     firm = [found for found in candidates if found.rotation_sigma_rad <= _WORST_ROTATION_RAD]
     if firm:
         best = _choose(firm, data)
-        return Alignment(best, layout_of(data.in_local[best.state.inlier]), False)
+        return Alignment(best, layout_of(data.in_local[best.state.inlier]), None)
     worst = min((np.degrees(found.rotation_sigma_rad) for found in candidates), default=np.inf)
     if attitude is None:
         size = f"is known to {worst:.0f}° only" if worst < 90 else "is not determined"
         raise DegenerateGeometryError(f"the positions lie on one line: the rotation about it {size}; {ADVICE}")
     candidates = _candidates(data, [_start_with_rotation(data, attitude.rotation, rng)], attitude)
-    return Alignment(_choose(candidates, data), "line", True)
+    return Alignment(_choose(candidates, data), "line", attitude)
 
 
 def layout_of(positions: FloatArray) -> Literal["volume", "plane"]:

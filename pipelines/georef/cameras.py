@@ -47,19 +47,31 @@ class CameraCorrections(torch.nn.Module):
         self.register_buffer("rotation", torch.from_numpy(np.ascontiguousarray(base.cam_from_model)))
         self.register_buffer("center", torch.from_numpy(np.ascontiguousarray(base.cam_center_in_model)))
 
+    def corrections(self) -> Tensor:
+        """(δω, δc) of all cameras (n, 6)."""
+        return (self.basis.flatten(0, 1) @ self.z).view(-1, 6)
+
     def centers(self) -> Tensor:
         """Corrected projection centres (n, 3) in `model`."""
-        return self.center + self.basis[:, 3:] @ self.z
+        return self.moved(self.corrections())[1]
 
     def rotations(self) -> Tensor:
         """Corrected rotations cam ← model (n, 3, 3)."""
-        return self.rotation @ exp_so3(-(self.basis[:, :3] @ self.z))
+        return self.moved(self.corrections())[0]
+
+    def moved(self, correction: Tensor) -> tuple[Tensor, Tensor]:
+        """Rotations cam ← model (n, 3, 3) and centres (n, 3) under corrections (n, 6), differentiable in them."""
+        return self.rotation @ exp_so3(-correction[:, :3]), self.center + correction[:, 3:]
+
+    def pose(self, index: int) -> tuple[Tensor, Tensor]:
+        """Corrected rotation cam ← model (3, 3) and centre (3,) of one camera."""
+        correction = self.basis[index] @ self.z
+        return self.rotation[index] @ exp_so3(-correction[:3]), self.center[index] + correction[3:]
 
     def cam_from_model(self, index: int) -> Tensor:
         """Corrected pose of one camera, (4, 4) float32, differentiable in z."""
-        correction = self.basis[index] @ self.z
-        rotation = self.rotation[index] @ exp_so3(-correction[:3])
-        translation = -rotation @ (self.center[index] + correction[3:])
+        rotation, center = self.pose(index)
+        translation = -rotation @ center
         bottom = torch.eye(4, dtype=torch.float64, device=rotation.device)[3:]
         return torch.cat([torch.cat([rotation, translation[:, None]], dim=1), bottom]).float()
 

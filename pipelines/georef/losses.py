@@ -1,4 +1,4 @@
-"""Geographic losses (GeoRefGS section 2.4, doi 10.3390/drones10030195), in float64.
+"""Residuals and losses of the measurements (GeoRefGS section 2.4, doi 10.3390/drones10030195), in float64.
 
 Residuals are whitened by their covariance, so that each term is half of a χ² and the whole a maximum a posteriori
 estimate; `paper` takes plain mean squares in metres instead. A Cauchy kernel bounds what one bad fix can do.
@@ -13,54 +13,21 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from pipelines.georef.cameras import CameraCorrections
-from pipelines.georef.similarity import LearnableSimilarity
+from pipelines.georef.measured import Attitudes, ControlMarks, DepthMarks, Fixes, Pairs
+from pipelines.georef.similarity import Mapping, exp_so3, log_so3
+from pipelines.georef.systematic import Errors
 
 Weighting = Literal["whitened", "paper"]
+Schedule = Literal["rising", "constant"]
 
-# Cauchy's scale² for residuals of three degrees of freedom: χ²₃ at 95 %.
+# Cauchy's scale² for residuals of one and of three degrees of freedom: χ² at 95 %.
 CAUCHY_SCALE2 = 7.815
+CAUCHY_SCALE2_OF_ONE = 3.841
 
 
-def cauchy(chi2: Tensor) -> Tensor:
+def cauchy(chi2: Tensor, scale2: float = CAUCHY_SCALE2) -> Tensor:
     """Cauchy's ρ of squared whitened residuals (N,): c² ln(1 + χ²/c²)."""
-    return CAUCHY_SCALE2 * torch.log1p(chi2 / CAUCHY_SCALE2)
-
-
-@dataclass(frozen=True)
-class Fixes:
-    """Measured centres of F training cameras.
-
-    Attributes:
-        camera: (F,) int64 index into the cameras.
-        position_in_geo: (F, 3) float64 metres.
-        root_information: (F, 3, 3) float64, W with WᵀW = Σ⁻¹.
-    """
-
-    camera: Tensor
-    position_in_geo: Tensor
-    root_information: Tensor
-
-
-@dataclass(frozen=True)
-class ControlMarks:
-    """Image marks of J control points, K in all.
-
-    Attributes:
-        point: (K,) int64 index into the points.
-        camera: (K,) int64 index into the cameras.
-        bearing_in_cam: (K, 3) float64 unit vectors.
-        sigma_rad: (K,) float64 angular σ of a mark.
-        position_in_geo: (J, 3) float64 metres, surveyed.
-        root_information: (J, 3, 3) float64 of survey and intersection together.
-    """
-
-    point: Tensor
-    camera: Tensor
-    bearing_in_cam: Tensor
-    sigma_rad: Tensor
-    position_in_geo: Tensor
-    root_information: Tensor
+    return scale2 * torch.log1p(chi2 / scale2)
 
 
 def rising_weight(iteration: int, w_max: float, tau: float) -> float:
@@ -68,28 +35,92 @@ def rising_weight(iteration: int, w_max: float, tau: float) -> float:
     return w_max * (1.0 - math.exp(-iteration / tau))
 
 
-def absolute_loss(
-    similarity: LearnableSimilarity, cameras: CameraCorrections, fixes: Fixes, weighting: Weighting
+@dataclass(frozen=True)
+class Estimate:
+    """Everything that the measurements are compared with.
+
+    Attributes:
+        rotation: (n, 3, 3) cam ← model.
+        center: (n, 3) projection centres in `model`.
+        geo_from_model: the similarity.
+        errors: constant errors of the measurements.
+    """
+
+    rotation: Tensor
+    center: Tensor
+    geo_from_model: Mapping
+    errors: Errors
+
+    def geo_from_cam(self, camera: Tensor) -> Tensor:
+        """Rotations (K, 3, 3) of cameras (K,)."""
+        return self.geo_from_model.rotation @ self.rotation[camera].transpose(1, 2)
+
+
+def fix_residuals(at: Estimate, fixes: Fixes) -> Tensor:
+    """T(c_i) + lever arm + bias − C_i (F, 3) in metres: the residuals of L_abs."""
+    predicted = at.geo_from_model.apply(at.center[fixes.camera])
+    if at.errors.arm_m is not None:
+        predicted = predicted + at.geo_from_cam(fixes.camera) @ at.errors.arm_m
+    if at.errors.bias_m is not None:
+        predicted = predicted + (at.errors.bias_m[0] if fixes.flight is None else at.errors.bias_m[fixes.flight])
+    return predicted - fixes.position_in_geo
+
+
+def control_residuals(at: Estimate, marks: ControlMarks) -> Tensor:
+    """T(x_j) − X_j (J, 3) in metres, x_j intersected from its marks and the cameras: the residuals of L_gcp."""
+    return at.geo_from_model.apply(intersect(at, marks)) - marks.position_in_geo
+
+
+def depth_residuals(
+    pose: tuple[Tensor, Tensor], geo_from_model: Mapping, marks: DepthMarks, rows: slice, depth_m: Tensor
 ) -> Tensor:
-    """L_abs = 1/N Σ ρ(|T(c_i) − C_i|²) over the fixes; scalar."""
-    residual = similarity(cameras.centers()[fixes.camera]) - fixes.position_in_geo
-    return _mean_rho(residual, fixes.root_information, weighting)
+    """T(c_i + R_iᵀ z (x, y, 1)) − X_j (K, 3) in metres of the marks `rows` of one camera: L_gcp by depth.
+
+    Args:
+        pose: rotation cam ← model (3, 3) and centre (3,) of that camera.
+        geo_from_model: the similarity.
+        marks: of all cameras.
+        rows: those of this one.
+        depth_m: (K,) rendered depth along the camera's z axis at the marks.
+    """
+    rotation, center = pose
+    ray = torch.nn.functional.pad(marks.xy[rows], (0, 1), value=1.0)
+    point = center + (depth_m[:, None] * ray) @ rotation
+    return geo_from_model.apply(point) - marks.position_in_geo[rows]
 
 
-def control_point_loss(
-    similarity: LearnableSimilarity, cameras: CameraCorrections, marks: ControlMarks, weighting: Weighting
-) -> Tensor:
-    """L_gcp = 1/M Σ ρ(|T(x_j) − X_j|²), x_j intersected from its marks and the current cameras; scalar."""
-    residual = similarity(intersect(cameras, marks)) - marks.position_in_geo
-    return _mean_rho(residual, marks.root_information, weighting)
+def attitude_residuals(at: Estimate, attitudes: Attitudes) -> Tensor:
+    """Log(R_iᵀ G_i B) (A, 3) in radians: what turns a camera into its recorded axes, less the boresight; L_att."""
+    found = at.geo_from_cam(attitudes.camera)
+    recorded = attitudes.geo_from_cam
+    if at.errors.common_rad is not None:
+        found = exp_so3(at.errors.common_rad) @ found
+    if at.errors.boresight_rad is not None:
+        recorded = recorded @ exp_so3(at.errors.boresight_rad)
+    return log_so3(found.transpose(1, 2) @ recorded)
 
 
-def intersect(cameras: CameraCorrections, marks: ControlMarks) -> Tensor:
+def pair_residuals(at: Estimate, pairs: Pairs) -> Tensor:
+    """s |x_i − x_j| − |X_i − X_j| (P,) in metres: the residuals of L_rel.
+
+    Points stay where SfM put them. They would follow the cameras' corrections; but these are such that the points
+    keep their mean place, turn and size (`geometry.bundle.correction_basis`), so that fixed ones are right to first
+    order for what the pairs can say: the scale.
+    """
+    if pairs.camera is None:
+        assert pairs.distance_in_model is not None
+        distance = pairs.distance_in_model
+    else:
+        distance = (at.center[pairs.camera[:, 0]] - at.center[pairs.camera[:, 1]]).norm(dim=1)
+    return at.geo_from_model.scale * distance - pairs.distance_in_geo
+
+
+def intersect(at: Estimate, marks: ControlMarks) -> Tensor:
     """Points (J, 3) in `model` nearest to the rays of their marks, differentiable in the cameras.
 
     Rays are weighted by the inverse of their lateral σ at the point (angular σ × distance); GeoRefGS eqs 4–8.
     """
-    rotation, center = cameras.rotations()[marks.camera], cameras.centers()[marks.camera]
+    rotation, center = at.rotation[marks.camera], at.center[marks.camera]
     direction = (rotation.transpose(1, 2) @ marks.bearing_in_cam[:, :, None])[:, :, 0]
     projector = torch.eye(3, dtype=direction.dtype, device=direction.device) - (
         direction[:, :, None] * direction[:, None, :]
@@ -108,10 +139,3 @@ def intersect(cameras: CameraCorrections, marks: ControlMarks) -> Tensor:
 def _sum_by_point(terms: Tensor, marks: ControlMarks) -> Tensor:
     total = torch.zeros((len(marks.position_in_geo), *terms.shape[1:]), dtype=terms.dtype, device=terms.device)
     return total.index_add(0, marks.point, terms)
-
-
-def _mean_rho(residual: Tensor, root_information: Tensor, weighting: Weighting) -> Tensor:
-    if weighting == "paper":
-        return residual.square().sum(dim=1).mean()
-    white = (root_information @ residual[:, :, None])[:, :, 0]
-    return cauchy(white.square().sum(dim=1)).mean()

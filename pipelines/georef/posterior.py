@@ -1,7 +1,7 @@
 """What the measurements say of similarity and cameras together: their minimum, joint covariance, and leave-one-out.
 
 All from the Gauss–Newton normal matrix of the whitened residuals of `GeoProblem.forward`, over all its parameters,
-whichever there are, with the weights that the Cauchy kernel gives at the state at hand.
+constant errors among them, with the weights that the Cauchy kernel gives at the state at hand.
 """
 
 from __future__ import annotations
@@ -10,16 +10,17 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import block_diag, cho_factor, cho_solve
 from torch import Tensor
 
 from pipelines.errors import DegenerateGeometryError
 from pipelines.geometry.similarity import jacobian_at
+from pipelines.georef.linear import WEIGHT_OF_NOISE
 from pipelines.georef.losses import CAUCHY_SCALE2
-from pipelines.georef.problem import WEIGHT_OF_NOISE, GeoProblem
+from pipelines.georef.problem import GeoProblem
 from pipelines.products import FloatArray
 
-_SIMILARITY, _CAMERAS = "similarity.y", "cameras.z"
+_SIMILARITY, _CAMERAS, _ERRORS = "similarity.y", "cameras.z", "errors.x"
 _STEPS = 10  # new derivatives
 _ROUNDS = 20  # new weights with the same derivatives
 _TOLERANCE = 1e-4  # of a σ
@@ -31,14 +32,14 @@ class _Linear:
     """The problem near its present state, in P parameters, R residuals of three components."""
 
     jacobian: FloatArray  # (3 R, P), whitened
-    prior: FloatArray  # (P,) information
+    prior: FloatArray  # (P, P) information
     place: dict[str, slice]
 
     def factor(self, weight: FloatArray) -> tuple[FloatArray, bool]:
         """Cholesky factor of the normal matrix with weights (R,)."""
         weighted = self.jacobian * np.repeat(weight, 3)[:, None]
         try:
-            factor: tuple[FloatArray, bool] = cho_factor(weighted.T @ self.jacobian + np.diag(self.prior))
+            factor: tuple[FloatArray, bool] = cho_factor(weighted.T @ self.jacobian + self.prior)
         except np.linalg.LinAlgError as error:
             raise DegenerateGeometryError(
                 "fixes and control points leave the similarity open: add control points, at least 3"
@@ -113,7 +114,7 @@ def minimise(problem: GeoProblem) -> None:
         for _ in range(_ROUNDS):
             white = _white(problem)
             factor = linear.factor(_weights(white))
-            pull = linear.jacobian.T @ (white * _weights(white)[:, None]).ravel() + linear.prior * _state(problem)
+            pull = linear.jacobian.T @ (white * _weights(white)[:, None]).ravel() + _prior_pull(problem)
             step = -cho_solve(factor, pull)
             _move(problem, linear, step)
             moved = max(moved, float(np.linalg.norm(step)))
@@ -202,8 +203,13 @@ def _control_rows(problem: GeoProblem) -> slice:
     return slice(first, first + len(problem.marks.position_in_geo))
 
 
+def _parameters(problem: GeoProblem) -> dict[str, torch.nn.Parameter]:
+    """What is estimated: the learned weights of the terms stay as they are."""
+    return {name: problem.get_parameter(name) for name in (_SIMILARITY, _CAMERAS, _ERRORS)}
+
+
 def _linearised(problem: GeoProblem) -> _Linear:
-    state = {name: parameter.detach() for name, parameter in problem.named_parameters()}
+    state = {name: parameter.detach() for name, parameter in _parameters(problem).items()}
     sizes = [len(value) for value in state.values()]
     ends = np.cumsum(sizes)
     place = {name: slice(end - size, end) for name, end, size in zip(state, ends, sizes, strict=True)}
@@ -220,16 +226,20 @@ def _linearised(problem: GeoProblem) -> _Linear:
 
 
 def _prior_information(problem: GeoProblem) -> FloatArray:
-    """Half the second derivative (P,) of the prior, which is a sum of squares of single parameters."""
-    parameters = list(problem.parameters())
-    first = torch.autograd.grad(
-        problem.prior(), parameters, create_graph=True, allow_unused=True, materialize_grads=True
-    )
-    total = torch.cat([gradient.flatten() for gradient in first]).sum()
-    if not total.requires_grad:
-        return np.zeros(sum(parameter.numel() for parameter in parameters))
-    second = torch.autograd.grad(total, parameters, allow_unused=True, materialize_grads=True)
-    return np.asarray(torch.cat([row.flatten() for row in second]).cpu().numpy() / 2)
+    """Half the second derivative (P, P) of what is known beforehand."""
+    errors = problem.errors
+    root = (errors.unit / errors.sigma[:, None]).cpu().numpy()
+    held = float(problem.hold_prior) * problem.similarity.held.cpu().numpy()
+    return np.asarray(block_diag(np.diag(held), np.eye(len(problem.cameras.z)), root.T @ root))
+
+
+def _prior_pull(problem: GeoProblem) -> FloatArray:
+    """Half its first derivative (P,) at the present state."""
+    errors, similarity = problem.errors, problem.similarity
+    with torch.no_grad():
+        held = float(problem.hold_prior) * similarity.held * similarity.y
+        known = errors.unit.T @ (errors.vector() / errors.sigma**2)
+        return np.asarray(torch.cat([held, problem.cameras.z, known]).cpu().numpy())
 
 
 def _white(problem: GeoProblem) -> FloatArray:
@@ -244,11 +254,7 @@ def _weights(white: FloatArray) -> FloatArray:
     return np.asarray(1.0 / (1.0 + (white**2).sum(axis=1) / CAUCHY_SCALE2))
 
 
-def _state(problem: GeoProblem) -> FloatArray:
-    return np.concatenate([parameter.detach().cpu().numpy() for parameter in problem.parameters()])
-
-
 def _move(problem: GeoProblem, linear: _Linear, step: FloatArray) -> None:
     with torch.no_grad():
-        for name, parameter in problem.named_parameters():
+        for name, parameter in _parameters(problem).items():
             parameter.add_(torch.from_numpy(step[linear.place[name]]).to(parameter.device))

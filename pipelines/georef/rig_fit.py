@@ -24,6 +24,7 @@ from scipy.spatial.transform import Rotation
 from pipelines.errors import DegenerateGeometryError
 from pipelines.geometry.rotations import exp_so3, log_so3
 from pipelines.geometry.similarity import Similarity, umeyama
+from pipelines.geometry.track import covered, places_at, turns_at
 from pipelines.products import FloatArray, NavigationTrack
 from pipelines.robust.kernels import cauchy_weight
 from pipelines.robust.statistics import mad_sigma
@@ -62,6 +63,7 @@ class RigData:
         antenna_in_body: (n, 3) lever arm to start from.
         control_in_local, control_in_geo: (c, 3).
         control_cov_in_local, control_cov_in_geo: (c, 3, 3), of their marks and of their survey.
+        pixel_rad: angle of a pixel; footprint_in_local: its width at the distance of the scene.
     """
 
     track: NavigationTrack
@@ -74,6 +76,8 @@ class RigData:
     control_in_geo: FloatArray
     control_cov_in_local: FloatArray
     control_cov_in_geo: FloatArray
+    pixel_rad: float
+    footprint_in_local: float
 
 
 @dataclass(frozen=True)
@@ -92,7 +96,9 @@ class RigFit:
 
     Attributes:
         state: the values.
-        sigma: (14,) σ: of the similarity (7), offset in s, boresight in rad (3), lever arm in m (3).
+        sigma: (14,) σ: of the similarity (7), offset in s, boresight in rad (3), lever arm in m (3). A lens that
+            SfM has not quite found tilts all cameras alike, or moves them along their view, with the scene's
+            consent: no scatter shows it, and σ of boresight and lever arm count a pixel of it.
         images: that took part.
         rms_position_m, rms_attitude_deg: robust scatter per axis of what is left; attitude NaN without any.
     """
@@ -148,6 +154,8 @@ def fit_rig(data: RigData, start_offset_s: float, start_boresight: FloatArray, o
         # Noise of the fixes passes for motion, and motion for information: what noise would give is taken off.
         known = sigma[_OFFSET] ** -2 - 3 * (len(position) + len(attitude)) / (2 * _DIFFERENCE_S**2)
         sigma[_OFFSET] = np.maximum(known, options.max_offset_s**-2) ** -0.5
+    sigma[_BORESIGHT] = np.hypot(sigma[_BORESIGHT], data.pixel_rad)
+    sigma[_ARM] = np.hypot(sigma[_ARM], state.geo_from_local.scale * data.footprint_in_local)
     left = float(np.degrees(sigma_rad)) if len(attitude) else np.nan
     return RigFit(state, sigma, len(position), sigma_m, left)
 
@@ -197,7 +205,7 @@ def _usable(data: RigData, offset_s: float) -> Mask:
     clocks = [track.position_time_s, track.attitude_time_s] if _has_attitudes(track) else [track.position_time_s]
     for clock in clocks:
         for shift in (-_DIFFERENCE_S, 0.0, _DIFFERENCE_S):
-            usable &= _covered(clock, data.time_s + offset_s + shift, float(track.max_gap_s))
+            usable &= covered(clock, data.time_s + offset_s + shift, float(track.max_gap_s))
     return usable
 
 
@@ -208,27 +216,11 @@ def _has_attitudes(track: NavigationTrack) -> bool:
 def _navigation(data: RigData, offset_s: float, arm: FloatArray, used: Mask) -> tuple[FloatArray, FloatArray]:
     """Camera places (k, 3) and bodies geo ← body (k, 3, 3), or none, that the navigation says of images (n,)."""
     track, at = data.track, data.time_s[used] + offset_s
-    place = np.stack([np.interp(at, track.position_time_s, track.antenna_in_geo[:, i]) for i in range(3)], axis=1)
+    place = places_at(track.position_time_s, track.antenna_in_geo, at)
     if not _has_attitudes(track):
         return place, np.empty((0, 3, 3))
-    bodies = _turned(track.attitude_time_s, track.geo_from_body, at)
+    bodies = turns_at(track.attitude_time_s, track.geo_from_body, at)
     return place - np.einsum("nij,nj->ni", bodies, data.antenna_in_body[used] + arm), bodies
-
-
-def _turned(clock: FloatArray, rotations: FloatArray, at: FloatArray) -> FloatArray:
-    """Rotations (k, 3, 3) at times (k,) on the shortest arc between the neighbours of each."""
-    after = np.clip(np.searchsorted(clock, at), 1, len(clock) - 1)
-    before = after - 1
-    part = (at - clock[before]) / (clock[after] - clock[before])
-    arc = log_so3(np.swapaxes(rotations[before], 1, 2) @ rotations[after])
-    return rotations[before] @ exp_so3(part[:, None] * arc)
-
-
-def _covered(clock: FloatArray, at: FloatArray, max_gap_s: float) -> Mask:
-    if len(clock) < 2:
-        return np.zeros(len(at), dtype=bool)
-    after = np.clip(np.searchsorted(clock, at), 1, len(clock) - 1)
-    return (at >= clock[0]) & (at <= clock[-1]) & (clock[after] - clock[after - 1] <= max_gap_s)
 
 
 def _residuals(data: RigData, state: RigState, used: Mask) -> tuple[FloatArray, FloatArray]:

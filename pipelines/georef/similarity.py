@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from pipelines.geometry import rotations
 from pipelines.geometry.similarity import Similarity
+from pipelines.georef.adjustment import RotationPrior
 from pipelines.products import FloatArray
 
 
@@ -32,26 +35,61 @@ def exp_so3(rotation_vector: Tensor) -> Tensor:
     return identity + linear * cross + quadratic * (cross @ cross)
 
 
+def log_so3(rotation: Tensor) -> Tensor:
+    """Rotation vectors (…, 3) of rotations (…, 3, 3) by less than π, differentiable also at zero."""
+    skewed = rotation - rotation.transpose(-1, -2)
+    sine_axis = 0.5 * torch.stack([skewed[..., 2, 1], skewed[..., 0, 2], skewed[..., 1, 0]], dim=-1)
+    # The root has no derivative at zero: 1e-12 rad stand for none.
+    sine = (sine_axis.square().sum(dim=-1, keepdim=True) + 1e-24).sqrt()
+    cosine = 0.5 * (rotation.diagonal(dim1=-2, dim2=-1).sum(dim=-1, keepdim=True) - 1.0)
+    return sine_axis * (torch.atan2(sine, cosine) / sine)
+
+
+@dataclass(frozen=True)
+class Mapping:
+    """geo ← model: p_geo = scale · rotation p_model + shift; scale (), rotation (3, 3), shift (3,), float64."""
+
+    scale: Tensor
+    rotation: Tensor
+    shift: Tensor
+
+    def apply(self, points: Tensor) -> Tensor:
+        """Map points (N, 3)."""
+        return self.scale * points @ self.rotation.T + self.shift
+
+
 class LearnableSimilarity(torch.nn.Module):
-    """`geo_from_model` = perturbation(root · y) ∘ base, with y ~ N(0, I) a priori.
+    """`geo_from_model` = perturbation(root · y) ∘ base, with y ~ N(0, diag(1 / held)) a priori.
 
     The perturbation is that of `products.SimilarityRecord`: (δ ln s, δω, δt) about `pivot` in the target frame.
     In the coordinates y all seven unknowns are of one size, whatever the extent of the scene, so that one
     learning rate fits.
 
+    What was known before the fixes is all of the initial estimate, or only the `attitude` that it took in beside
+    them. Then the axes of y are turned so that this prior is diagonal too: `held` is what part of the information
+    in the initial estimate came from the attitude, and y = 0 is where the attitude would have the rotation.
+
     Args:
-        base: initial estimate.
+        initial: initial estimate.
         covariance: (7, 7) of the initial estimate; its root is the unit of y.
         pivot: (3,) in the target frame.
+        attitude: measured rotation geo ← model that the initial estimate has made use of.
     """
 
-    def __init__(self, base: Similarity, covariance: FloatArray, pivot: FloatArray) -> None:
+    def __init__(
+        self, initial: Similarity, covariance: FloatArray, pivot: FloatArray, attitude: RotationPrior | None = None
+    ) -> None:
         super().__init__()
-        self.base = base
         self.pivot_in_geo = np.asarray(pivot, dtype=np.float64)
-        self.y = torch.nn.Parameter(torch.zeros(7, dtype=torch.float64))
+        root, held, start = _root(covariance), np.ones(7), np.zeros(7)
+        if attitude is not None:
+            root, held, start = _about_attitude(root, initial.rotation, attitude)
+        self.base = base = _perturbation(root @ start, self.pivot_in_geo).inverse() @ initial
+        self.y = torch.nn.Parameter(torch.from_numpy(start))
         self.root: Tensor
-        self.register_buffer("root", torch.from_numpy(_root(covariance)))
+        self.held: Tensor
+        self.register_buffer("root", torch.from_numpy(root))
+        self.register_buffer("held", torch.from_numpy(held))
         self.base_rotation: Tensor
         self.base_shift: Tensor
         self.pivot: Tensor
@@ -61,23 +99,54 @@ class LearnableSimilarity(torch.nn.Module):
 
     def forward(self, points: Tensor) -> Tensor:
         """Map points (N, 3) float64 of `model` to `geo`."""
-        delta = self.root @ self.y
-        arm = self.base.scale * points @ self.base_rotation.T + (self.base_shift - self.pivot)
-        turned = arm @ exp_so3(delta[1:4]).T
-        return torch.exp(delta[0]) * turned + (self.pivot + delta[4:])
+        return self.at(self.y).apply(points)
+
+    def at(self, y: Tensor) -> Mapping:
+        """The similarity of coordinates (7,), differentiable in them."""
+        delta = self.root @ y
+        turn, grow = exp_so3(delta[1:4]), torch.exp(delta[0])
+        return Mapping(
+            grow * self.base.scale,
+            turn @ self.base_rotation,
+            self.pivot + delta[4:] + grow * (turn @ (self.base_shift - self.pivot)),
+        )
 
     def current(self) -> Similarity:
         """The present estimate."""
-        delta = (self.root @ self.y).detach().cpu()
-        turn = exp_so3(delta[1:4]).numpy()
-        grow = float(torch.exp(delta[0]))
-        move = Similarity(grow, turn, self.pivot_in_geo + delta[4:].numpy() - grow * turn @ self.pivot_in_geo)
-        return move @ self.base
+        delta = (self.root @ self.y).detach().cpu().numpy()
+        return _perturbation(delta, self.pivot_in_geo) @ self.base
+
+    def prior(self) -> Tensor:
+        """Twice the negative logarithm of the density of y a priori, but for a constant; scalar."""
+        return self.held @ self.y.square()
 
     def prior_covariance(self) -> FloatArray:
         """Covariance (7, 7) of the initial estimate."""
         root = self.root.cpu().numpy()
         return np.asarray(root @ root.T)
+
+
+def _perturbation(delta: FloatArray, pivot: FloatArray) -> Similarity:
+    """p' = pivot + δt + e^{δ ln s} Exp(δω) (p − pivot)."""
+    grow, turn = float(np.exp(delta[0])), rotations.exp_so3(delta[1:4])
+    return Similarity(grow, turn, pivot + delta[4:] - grow * turn @ pivot)
+
+
+def _about_attitude(
+    root: FloatArray, rotation: FloatArray, attitude: RotationPrior
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Root with axes in which the attitude's information is diagonal; that information; y of the initial estimate.
+
+    The attitude says nothing of scale and shift: four of the seven axes are free of it.
+    """
+    information = np.zeros((7, 7))
+    information[1:4, 1:4] = np.linalg.solve(attitude.cov_rad2, np.eye(3))
+    part, turn = np.linalg.eigh(root.T @ information @ root)
+    root = root @ turn
+    held = np.where(np.arange(7) < 4, 0.0, np.clip(part, 0.0, 1.0))
+    away = np.concatenate([[0.0], rotations.log_so3(rotation @ attitude.rotation.T), np.zeros(3)])
+    start = np.where(np.arange(7) < 4, 0.0, np.linalg.solve(root, away))
+    return root, held, start
 
 
 def _root(covariance: FloatArray) -> FloatArray:

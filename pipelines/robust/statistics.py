@@ -19,11 +19,6 @@ def chi2_quantile(probability: float, degrees: ArrayLike) -> FloatArray:
     return np.asarray(values[place].reshape(dof.shape), dtype=np.float64)
 
 
-def weighted_mean(values: ArrayLike, weights: ArrayLike) -> FloatArray:
-    """Mean (…) over the first axis of values (N, …), weighted by weights (N,)."""
-    return np.asarray(np.average(np.asarray(values, dtype=np.float64), axis=0, weights=np.asarray(weights)))
-
-
 def mad_sigma(values: ArrayLike) -> float:
     """σ of values (N,) from the median absolute deviation: half of them may be outliers."""
     array = np.asarray(values, dtype=np.float64)

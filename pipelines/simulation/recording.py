@@ -7,10 +7,10 @@ from typing import Literal
 
 import numpy as np
 
-from pipelines.config import SimulateConfig
 from pipelines.geodesy.enu import lla_from_enu
 from pipelines.geometry.rotations import ENU_FROM_NED, geo_from_cam, yaw_pitch_roll_deg
 from pipelines.products import FloatArray, Matrix3, Vector3
+from pipelines.simulate_config import SimulateConfig
 from pipelines.simulation.raycast import Raycaster
 from pipelines.simulation.sensors import (
     RECEIVERS,
@@ -101,8 +101,8 @@ def _photo_records(world: World, receiver: Receiver, gnss: GnssLog, imu: ImuLog)
     # The aircraft's angles are those of a camera that looks along its nose.
     level_cam_from_body = geo_from_cam([0.0, 0.0, 0.0]).T @ ENU_FROM_NED
     body_angles = yaw_pitch_roll_deg(enu_from_body @ level_cam_from_body.T)
-    width = max(4, len(str(len(stamps) - 1)))
-    names = tuple(f"IMG_{i:0{width}d}.jpg" for i in range(len(stamps)))
+    # As the frames of a bag are named, so that the marks in one gcp_list.txt fit the photographs and the bag.
+    names = tuple(f"frame_{i:06d}.jpg" for i in range(len(stamps)))
     stated = np.maximum([receiver.sigma_h_m, receiver.sigma_h_m, receiver.sigma_v_m], _LEAST_SIGMA_M)
     return PhotoRecords(names, stamps, lla_from_enu(fixes, world.origin), angles, stated), body_angles
 

@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.config import SimulateConfig, triple
+from pipelines.config import triple
 from pipelines.errors import InputError
 from pipelines.geometry.rotations import exp_so3
 from pipelines.products import Origin
+from pipelines.simulate_config import SimulateConfig
 from pipelines.simulation.buildings import Spot
 from pipelines.simulation.flight import DEFAULT_HEIGHTS_M, DEFAULT_RADIUS_M, FlightPlan, Track, fly
 from pipelines.simulation.lens import Lens

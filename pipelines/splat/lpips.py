@@ -43,14 +43,19 @@ class Lpips:
                 raise InputError(f"expected finite numbers of shape {shape}", path=weights, field=name)
         self._weights = {name: torch.as_tensor(array, dtype=torch.float32) for name, array in arrays.items()}
 
-    def __call__(self, image: Tensor, target: Tensor) -> float:
+    def __call__(self, image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
         """Distance of two images (H, W, 3) with values from 0 to 1.
+
+        The features see neighbourhoods, so pixels cannot be left out: where the `mask` (H, W) is False, the image
+        is given the target's pixels, and the two are equal there.
 
         Raises:
             ValueError: other shapes, or smaller than 16 px.
         """
         if image.shape != target.shape or image.ndim != 3 or min(image.shape[:2]) < _SMALLEST_PX:
             raise ValueError(f"expected two images (H, W, 3) of 16 px or more, got {tuple(image.shape)}")
+        if mask is not None:
+            image = torch.where(mask[:, :, None], image, target)
         with torch.no_grad():
             layers = zip(self._features(image), self._features(target), strict=True)
             distances = [

@@ -10,9 +10,12 @@ from torch import Tensor
 from pipelines.splat.losses import image_similarity
 from pipelines.splat.lpips import Lpips
 
+# What equal images get: a report has no infinity. Rounding to 8 bits alone is 59 dB.
+MAX_PSNR_DB = 100.0
+
 
 def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
-    """Peak signal-to-noise ratio in dB, of values from 0 to 1 over all channels; infinite for equal images.
+    """Peak signal-to-noise ratio in dB, of values from 0 to 1 over all channels; at most 100 dB.
 
     Args:
         image: (H, W, 3); clamped to 0 … 1, as it would be shown.
@@ -27,7 +30,7 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
     if mask is not None:
         difference = difference[mask]
     error = float(difference.square().mean())
-    return -10 * math.log10(error) if error > 0 else math.inf
+    return min(-10 * math.log10(error), MAX_PSNR_DB) if error > 0 else MAX_PSNR_DB
 
 
 def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:

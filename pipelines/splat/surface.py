@@ -18,6 +18,8 @@ from pipelines.splat.gaussians import Gaussians, rotation_matrices
 from pipelines.splat.raster.api import Pinhole, Rasterizer, RasterSettings
 from pipelines.splat.sh import sh_from_rgb
 
+_SAME_SURFACE = 0.01  # of the depth
+
 
 @dataclass(frozen=True)
 class SurfaceSettings:
@@ -63,6 +65,16 @@ def depth_loss(
     found = functional.grid_sample(maps, place[None, None], align_corners=False, padding_mode="border")[0, :, 0]
     counts = ((place.abs() < 1).all(dim=1) & (in_cam[:, 2] > 1e-3) & (found[1] > 0.5)).to(depth_m.dtype)
     return ((found[0] / z - 1).abs() * counts).sum() / counts.sum().clamp_min(1)
+
+
+def measured_depth(median_m: Tensor, expected_m: Tensor) -> Tensor:
+    """Depth (H, W) to measure in, 0 where there is no surface.
+
+    The median says which surface a pixel shows, through whatever haze there is before and behind it; where the mean
+    lies on the same surface, it is the less noisy of the two.
+    """
+    same = (expected_m - median_m).abs() < _SAME_SURFACE * median_m
+    return torch.where(same, expected_m, median_m)
 
 
 def flatness_loss(gaussians: Gaussians, visible: Tensor, extent_m: float) -> Tensor:

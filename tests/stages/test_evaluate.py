@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,8 @@ from pipelines.evaluate import render_name
 from pipelines.products import InitialSimilarity, Mark, Survey, TrainedModel, load_json, save_json
 from pipelines.robust.asprs import few_points
 from pipelines.runner import Outcome, run_stage
-from pipelines.stages import BY_NAME, MODEL, REPORT, SIM3, SURVEY
+from pipelines.splat.storage import read_gaussians, write_gaussians
+from pipelines.stages import BY_NAME, GAUSSIANS, MODEL, REPORT, SIM3, SURVEY
 from pipelines.workspace import Workspace
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -261,6 +263,24 @@ def names_in(document: Any) -> set[str]:
     if not isinstance(document, dict):
         return set()
     return set(document).union(*map(names_in, document.values()))
+
+
+def test_equal_images_are_reported_at_the_cap(altered: Workspace) -> None:
+    """An empty model against black photographs: PSNR has no limit, JSON no infinity."""
+    model = load_json(TrainedModel, altered.path(MODEL))
+    save_json(model.model_copy(update={"background": (0.0, 0.0, 0.0)}), altered.root / MODEL)
+    gaussians = read_gaussians(altered.path(GAUSSIANS))
+    write_gaussians(
+        altered.root / GAUSSIANS, replace(gaussians, logit_opacities=0 * gaussians.logit_opacities - 20)
+    )
+    (altered.root / "photos").unlink()
+    (altered.root / "photos").mkdir()
+    for camera in model.cameras:
+        black = cv2.imencode(".png", np.zeros((72, 96, 3), dtype=np.uint8))[1]
+        (altered.root / "photos" / camera.name).write_bytes(black.tobytes())
+    run_stage(altered, EVALUATE, {"renders": 0})
+    test = report_of(altered)["photometric"]["test"]
+    assert (test["psnr"], test["psnr_compensated"], test["ssim"]) == (100.0, 100.0, 1.0)
 
 
 def test_without_test_views_there_are_no_figures(altered: Workspace) -> None:

@@ -1,71 +1,23 @@
-"""`georef ingest --bag` on tiny bags of one flight, whose truth is known: every type, convention and storage."""
+"""`georef ingest --bag` on tiny bags of one flight, whose truth is known: every type and convention."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import CompressionMode, StoragePlugin
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.rosbag2 import StoragePlugin
 
-from georef_cli import boundary
-from georef_cli.main import cli
 from pipelines.geometry.rig import mount
 from pipelines.geometry.rotations import log_so3, matrix_from_quat_xyzw
-from pipelines.products import NavigationTrack, Survey, load_json
+from pipelines.products import NavigationTrack
 from tests import bags
 from tests.bags import Flight, Form, Message
+from tests.ingested_bags import Ingest, Refused, check, warned
+from tests.px4_bags import px4
 
 WHERE = "46.02,7.75,1620"
-Ingest = Callable[..., Survey]
-
-
-@pytest.fixture
-def ingest(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Ingest:
-    def call(bag: Path | list[Message], *arguments: str) -> Survey:
-        path = bag if isinstance(bag, Path) else bags.write(tmp_path / f"bag{len(list(tmp_path.iterdir()))}", bag)
-        workspace = tmp_path / f"ws{len(list(tmp_path.iterdir()))}"
-        code = boundary.guarded(cli, ["ingest", str(workspace), "--bag", str(path), *arguments])
-        told = capsys.readouterr()
-        assert code == 0, told.err
-        survey = load_json(Survey, workspace / "ingest/survey.json")
-        assert all((workspace / survey.image_dir / image.name).is_file() for image in survey.images)
-        return survey
-
-    return call
-
-
-@pytest.fixture
-def refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
-    def call(bag: Path | list[Message], *arguments: str) -> str:
-        path = bag if isinstance(bag, Path) else bags.write(tmp_path / "refused", bag)
-        code = boundary.guarded(cli, ["ingest", str(tmp_path / "never"), "--bag", str(path), *arguments])
-        told = capsys.readouterr()
-        assert (code, told.out) == (1, "")
-        return told.err
-
-    return call
-
-
-def check(survey: Survey, flight: Flight, *, tolerance_m: float = 1e-3, attitude: bool = True) -> None:
-    """The survey has the flight's cameras, to a millimetre and a hundredth of a degree."""
-    centers, rotations = bags.expected(flight, survey.origin)
-    assert len(survey.images) == flight.count
-    found = np.array([image.fix.position_in_geo for image in survey.images if image.fix])
-    np.testing.assert_allclose(found, centers, rtol=0, atol=tolerance_m)
-    if attitude:
-        quats = [image.attitude.quat_xyzw for image in survey.images if image.attitude]
-        turned = log_so3(matrix_from_quat_xyzw(quats) @ np.swapaxes(rotations, 1, 2))
-        assert np.degrees(np.linalg.norm(turned, axis=1)).max() < 0.01
-
-
-def warned(survey: Survey, text: str) -> bool:
-    return any(text in warning for warning in survey.warnings)
 
 
 def test_usual_bag(ingest: Ingest, tmp_path: Path) -> None:
@@ -96,7 +48,7 @@ LOCAL = {
     "pose": lambda f: bags.poses(f, "geometry_msgs/msg/PoseStamped"),
     "pose with covariance": lambda f: bags.poses(f, "geometry_msgs/msg/PoseWithCovarianceStamped"),
     "odometry of the optical frame": lambda f: bags.poses(f, "nav_msgs/msg/Odometry", body="camera_optical"),
-    "px4 odometry": lambda f: bags.px4(f, "VehicleOdometry"),
+    "px4 odometry": lambda f: px4(f, "VehicleOdometry"),
 }
 
 
@@ -119,34 +71,6 @@ def test_ned_frames(ingest: Ingest) -> None:
     check(ingest(mounted, "--camera-mount", "0,-35,0", "--lever-arm", "0.1,-0.2,-0.3"), flight)
 
 
-@pytest.mark.parametrize("position", ["SensorGps", "VehicleGlobalPosition"])
-def test_px4(ingest: Ingest, position: str) -> None:
-    flight = Flight()
-    messages = [
-        bags.transforms(flight), *bags.px4(flight, position), *bags.px4(flight, "VehicleAttitude"),
-        *bags.images(flight),
-    ]  # fmt: skip
-    options = ["--lever-arm", "0.1,-0.2,-0.3"] if position == "SensorGps" else []
-    survey = ingest(messages, *options)
-    check(survey, flight)  # its altitude has 32 bits: 0.1 mm at 1700 m
-    fix = survey.images[0].fix
-    assert fix is not None
-    sigma = 0.02 if position == "SensorGps" else 0.3
-    assert fix.cov_in_geo[0][0] == pytest.approx(sigma**2 / 2, rel=1e-3)  # eph is that of the plane
-
-
-def test_px4_counts_from_boot(ingest: Ingest) -> None:
-    flight = Flight()
-    boot = bags.START - 7_000_000_000
-    messages = [
-        bags.transforms(flight), *bags.px4(flight, "VehicleGlobalPosition", boot),
-        *bags.px4(flight, "VehicleAttitude", boot), *bags.images(flight),
-    ]  # fmt: skip
-    survey = ingest(messages)
-    check(survey, flight)
-    assert any("count from another epoch" in text for text in survey.assumptions)
-
-
 def test_position_at_interpolated_times_and_offset(ingest: Ingest) -> None:
     """Stamps of the camera's clock between the samples, and 0.2 s behind the navigation's."""
     flight = Flight()
@@ -157,54 +81,6 @@ def test_position_at_interpolated_times_and_offset(ingest: Ingest) -> None:
     survey = ingest(messages, "--time-offset", "0.2")
     check(survey, flight)
     assert survey.images[0].timestamp_s == pytest.approx(bags.START / 1e9 - 0.2)
-
-
-FORMS = {
-    "mcap": Form(),
-    "sqlite3": Form(StoragePlugin.SQLITE3),
-    "mcap, zstd by message": Form(compression=CompressionMode.MESSAGE),
-    "sqlite3, zstd by message": Form(StoragePlugin.SQLITE3, CompressionMode.MESSAGE),
-    "sqlite3, zstd by file": Form(StoragePlugin.SQLITE3, CompressionMode.FILE),
-    "mcap, storage compression": Form(compression=CompressionMode.STORAGE),
-}
-
-
-@pytest.mark.parametrize("form", FORMS)
-def test_storage(ingest: Ingest, tmp_path: Path, form: str) -> None:
-    flight = Flight(count=4)
-    check(ingest(bags.write(tmp_path / "bag", bags.usual(flight), FORMS[form])), flight)
-
-
-@pytest.mark.parametrize("storage", list(StoragePlugin))
-def test_bare_file(ingest: Ingest, tmp_path: Path, storage: StoragePlugin) -> None:
-    flight = Flight(count=4)
-    bags.write(tmp_path / "bag", bags.usual(flight), Form(storage))
-    (file,) = [path for path in (tmp_path / "bag").iterdir() if path.suffix in (".mcap", ".db3")]
-    check(ingest(file), flight)
-
-
-def test_split_bag(ingest: Ingest, tmp_path: Path) -> None:
-    flight = Flight()
-    messages = sorted(bags.usual(flight), key=lambda one: one[2])
-    half = len(messages) // 2
-    bags.join(
-        tmp_path / "bag",
-        [bags.write(tmp_path / "a", messages[:half]), bags.write(tmp_path / "b", messages[half:])],
-    )
-    check(ingest(tmp_path / "bag"), flight)
-
-
-def test_ros1_bag(ingest: Ingest, tmp_path: Path) -> None:
-    flight = Flight(count=4)
-    store = get_typestore(Stores.ROS1_NOETIC)
-    store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
-    with Writer1(tmp_path / "flight.bag") as writer:
-        links: dict[str, Any] = {}
-        for topic, kind, ns, message in sorted(bags.usual(flight), key=lambda one: one[2]):
-            if topic not in links:
-                links[topic] = writer.add_connection(topic, kind, typestore=store)
-            writer.write(links[topic], int(ns), store.serialize_ros1(bags.as_ros1(message, store), kind))
-    check(ingest(tmp_path / "flight.bag"), flight)
 
 
 RAW = {
@@ -347,7 +223,26 @@ class TestBadMessages:
         assert warned(survey, "is neither JPEG nor PNG (format 'h264')")
         assert warned(survey, "1 messages of /gnss/fix do not decode")
 
-    def test_truncated_bag(self, refused: Callable[..., str], tmp_path: Path) -> None:
+    @pytest.mark.parametrize("storage", list(StoragePlugin))
+    def test_damage_in_the_middle(self, ingest: Ingest, tmp_path: Path, storage: StoragePlugin) -> None:
+        """What lies before the damage is used, and told to be not all."""
+        flight = Flight(count=40)
+        messages = sorted(bags.usual(flight), key=lambda one: one[2])
+        for _, kind, _, message in messages:
+            if kind.endswith("CompressedImage"):  # padded behind its end, for a bag of several chunks
+                message.data = np.concatenate([message.data, np.zeros(200_000, np.uint8)])
+        bags.write(tmp_path / "bag", messages, Form(storage))
+        (file,) = [path for path in (tmp_path / "bag").iterdir() if path.suffix in (".mcap", ".db3")]
+        data = bytearray(file.read_bytes())
+        # In sqlite3 one page, of a photograph: with damaged branches a base cannot even be opened.
+        start, length = int(0.3 * len(data)) // 4096 * 4096, 4096 if storage is StoragePlugin.SQLITE3 else 250_000
+        data[start : start + length] = b"\xff" * length
+        file.write_bytes(data)
+        survey = ingest(tmp_path / "bag")
+        assert 5 < len(survey.images) < 20
+        assert warned(survey, "is damaged: it could be read for")
+
+    def test_truncated_bag(self, refused: Refused, tmp_path: Path) -> None:
         for storage in StoragePlugin:
             bags.write(tmp_path / storage.name, bags.usual(Flight()), Form(storage))
             for path in (tmp_path / storage.name).iterdir():
@@ -357,7 +252,7 @@ class TestBadMessages:
         # SQLite reads on as far as its pages go: what is there is too little, or the file is refused.
         assert "damaged" in refused(tmp_path / "SQLITE3")
 
-    def test_no_bag(self, refused: Callable[..., str], tmp_path: Path) -> None:
+    def test_no_bag(self, refused: Refused, tmp_path: Path) -> None:
         (tmp_path / "x.mcap").write_bytes(b"")
         assert "is no bag, or is damaged" in refused(tmp_path / "x.mcap")
         (tmp_path / "empty").mkdir()
@@ -367,17 +262,21 @@ class TestBadMessages:
 
 
 class TestWhatIsMissing:
-    def test_local_frame_needs_an_origin(self, refused: Callable[..., str]) -> None:
+    def test_local_frame_needs_an_origin(self, refused: Refused) -> None:
         flight = Flight()
         told = refused([*bags.poses(flight, "nav_msgs/msg/Odometry"), *bags.images(flight)])
         assert "give --origin LAT,LON,HEIGHT" in told
 
-    def test_no_photographs(self, refused: Callable[..., str]) -> None:
+    def test_no_photographs(self, refused: Refused) -> None:
         assert "has no topic of sensor_msgs/Image" in refused(bags.fixes(Flight()))
 
-    def test_named_topic(self, refused: Callable[..., str]) -> None:
+    def test_named_topic(self, refused: Refused) -> None:
         told = refused(bags.usual(Flight()), "--fix-topic", "/imu/data")
         assert "/imu/data is a sensor_msgs/msg/Imu; those with positions: /gnss/fix" in told
+
+    def test_crs_has_no_meaning(self, refused: Refused) -> None:
+        told = refused(bags.usual(Flight()), "--crs", "EPSG:32632")
+        assert "[--crs]: has no meaning for a --bag" in told and "--origin" in told
 
     def test_no_mount(self, ingest: Ingest) -> None:
         flight = Flight()

@@ -9,10 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from georef_cli import boundary
+from georef_cli.main import cli
 from pipelines.config import IngestConfig
 from pipelines.geodesy import enu
 from pipelines.geometry.rotations import log_so3, matrix_from_quat_xyzw
-from pipelines.ingest import build_survey
+from pipelines.ingest import build_survey, survey_and_track
 from pipelines.products import FloatArray, Origin, Survey
 
 DATA = Path(os.environ.get("GEOREF_DATA", Path(__file__).parents[2].parent / "shared" / "data"))
@@ -64,6 +66,28 @@ def test_orbit_attitudes_err_by_half_a_degree() -> None:
     error_deg = np.degrees(log_so3(measured @ cam_from_enu))
     # 0.5° of noise on each angle; yaw counts less about a camera that looks 35° down.
     assert 0.25 < np.sqrt(np.mean(error_deg**2)) < 0.75
+
+
+@needs_orbit
+def test_orbit_bag_says_what_it_lacks_and_takes_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """It was recorded without /tf: nobody but the user knows how the camera sits in the body."""
+    assert boundary.guarded(cli, ["inspect", str(ORBIT / "bag")]) == 0
+    told = " ".join(capsys.readouterr().out.split())
+    assert "/tf does not link camera 'camera_optical' and body 'base_link': give --camera-mount" in told
+    bare, _ = survey_and_track(IngestConfig(bag=ORBIT / "bag"), tmp_path / "bare")
+    assert not any(image.attitude for image in bare.images)
+    assert any("give --camera-mount YAW,PITCH,ROLL" in warning for warning in bare.warnings)
+    mounted = IngestConfig(bag=ORBIT / "bag", camera_mount="0,0,0", lever_arm="0,0,0")  # its body is the gimbal
+    survey, _ = survey_and_track(mounted, tmp_path / "mounted")
+    assert survey.warnings == ()
+    document = json.loads((ORBIT / "truth.json").read_text())
+    measured = matrix_from_quat_xyzw([image.attitude.quat_xyzw for image in survey.images if image.attitude])
+    error_deg = np.degrees(log_so3(measured @ np.array(document["cam_from_enu"], dtype=np.float64)))
+    assert 0.25 < np.sqrt(np.mean(error_deg**2)) < 0.75  # 0.5° of noise on each axis
+    origin = Origin(lat_deg=document["lat"], lon_deg=document["lon"], alt_m=document["alt"])
+    in_geo = np.array([image.fix.position_in_geo for image in survey.images if image.fix is not None])
+    positions = enu.enu_from_ecef(enu.ecef_from_enu(in_geo, survey.origin), origin)
+    assert np.abs(positions - document["centers"]).max() < 5 * 0.03
 
 
 @needs_beach

@@ -134,7 +134,7 @@ def test_line_needs_attitude() -> None:
     survey, model, points = material(Noise(), Measured(), layout="line")
     found, _ = estimate_similarity(survey, model, points, CONFIG)
     assert found.layout == "line"
-    assert found.attitude_used
+    assert found.attitude_used and found.attitude is not None
     assert squared_error(found) < 24.3
     bare = survey.model_copy(
         update={"images": tuple(image.model_copy(update={"attitude": None}) for image in survey.images)}
@@ -168,3 +168,13 @@ def test_points_of_another_model_are_refused() -> None:
     survey, model, points = material(Noise(), Measured())
     with pytest.raises(InputError, match="another model"):
         estimate_similarity(survey, model, replace(points, point_id=points.point_id + 1), CONFIG)
+
+
+def test_control_points_can_be_left_out() -> None:
+    survey, model, points = material(CONSUMER, Measured(gcps=True))
+    with_control, _ = estimate_similarity(survey, model, points, CONFIG)
+    without, _ = estimate_similarity(survey, model, points, InitSim3Config(control_points=False))
+    assert with_control.correspondences["gcp"] == 6
+    assert without.correspondences["gcp"] == without.residuals["gcp"].count == 0
+    alone, _ = estimate_similarity(survey.model_copy(update={"control_points": ()}), model, points, CONFIG)
+    assert without == alone

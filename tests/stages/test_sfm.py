@@ -14,16 +14,28 @@ import cv2
 import numpy as np
 import pytest
 
-from pipelines.config import SfmConfig, SimulateConfig
+from pipelines.config import SfmConfig
 from pipelines.errors import DegenerateGeometryError, InputError
 from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.similarity import umeyama
-from pipelines.products import CameraPrior, Origin, Survey, SurveyImage, VerticalDatum, load_json, save_json
+from pipelines.products import (
+    CameraPrior,
+    Fix,
+    Origin,
+    Survey,
+    SurveyedPoint,
+    SurveyImage,
+    VerticalDatum,
+    load_json,
+    save_json,
+)
 from pipelines.progress import SILENT
 from pipelines.runner import run_stage
 from pipelines.sfm import SfmJob, _summarise, candidate_pairs, import_model, quiet_colmap, reconstruct, run
 from pipelines.simulate import simulate
+from pipelines.simulate_config import SimulateConfig
 from pipelines.stages import BY_NAME, SPARSE, SURVEY
+from pipelines.states import status
 from pipelines.workspace import StageRun, Workspace
 
 pycolmap = pytest.importorskip("pycolmap")
@@ -150,6 +162,29 @@ def test_continues_the_database_of_an_interrupted_run(
     assert {path.name for path in out.iterdir()} == {"sparse", "database.db"}
 
 
+def test_current_while_photographs_and_places_are_the_same(mapped: Workspace, tmp_path: Path) -> None:
+    """Control points, the split and σ are none of its business; a photograph, a lens or a place is."""
+    root = tmp_path / "flight"
+    shutil.copytree(mapped.root, root, symlinks=True)
+    workspace, survey = Workspace(root), load_json(Survey, mapped.path(SURVEY))
+    fix = Fix(position_in_geo=(1, 2, 3), cov_in_geo=np.eye(3).tolist(), source="csv", sigma_source="file")
+
+    def state_with(**update: object) -> str:
+        save_json(survey.model_copy(update=update), root / SURVEY)
+        return status(workspace)[1].state
+
+    point = SurveyedPoint(name="P", position_in_geo=(0, 0, 0), cov_in_geo=np.eye(3).tolist(), marks=())
+    first, *others = survey.images
+    assert state_with() == state_with(control_points=(point,), warnings=("careful",)) == "current"
+    assert state_with(images=(first.model_copy(update={"split": "test"}), *others)) == "current"
+    assert state_with(images=(first.model_copy(update={"fix": fix}), *others)) == "stale"
+    assert state_with(images=tuple(others)) == "stale"
+    prior = survey.cameras[0].model_copy(update={"params": (210.0, 120.0, 90.0, 0.0)})
+    assert state_with(cameras=(prior,)) == "stale"
+    (root / SURVEY).write_text("{", encoding="utf-8")
+    assert status(workspace)[1].state == "stale"
+
+
 def test_import_takes_over_a_model(mapped: Workspace, tmp_path: Path) -> None:
     out = tmp_path / "sfm.partial"
     out.mkdir()
@@ -191,17 +226,40 @@ def test_import_of_a_truncated_model_is_refused(tmp_path: Path, mapped: Workspac
         import_model(broken, survey_of(["a.jpg"]))
 
 
-def test_file_names_with_blanks(photographs: Photographs, tmp_path: Path) -> None:
-    names = photographs.names[:4]
+def test_file_names_with_blanks(photographs: Photographs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """COLMAP's lists of pairs cannot hold them; the pairs asked for are matched all the same, and no others."""
     photos = tmp_path / "photos"
     photos.mkdir()
-    for name in names:
-        shutil.copy(photographs.folder / name, photos / f"flight 1 {name}")
+    for name in photographs.names[:5]:
+        shutil.copy(photographs.folder / name, photos / f"# flight 1 {name}")
     survey = survey_of(sorted(path.name for path in photos.iterdir()))
+    asked = np.array([(0, 1), (1, 2), (2, 3), (3, 4), (0, 2), (1, 3), (2, 4)])
+    monkeypatch.setattr("pipelines.sfm.candidate_pairs", lambda *_: asked)
+    job = SfmJob(survey, photos, tmp_path / "database.db", CONFIG)
     with quiet_colmap() as colmap:
-        model = reconstruct(colmap, SfmJob(survey, photos, tmp_path / "database.db", CONFIG), SILENT)
-    assert {image.name for image in model.images.values()} <= {image.name for image in survey.images}
+        model = reconstruct(colmap, job, SILENT)
+    names = {image.name for image in survey.images}
+    assert {image.name for image in model.images.values()} <= names
     assert model.num_reg_images() >= 3
+    with pycolmap.Database.open(job.database) as database:
+        assert {image.name for image in database.read_all_images()} == names
+        assert database.num_matched_image_pairs() == len(asked)
+
+
+def test_run_that_was_killed_while_matching_is_continued(mapped: Workspace, tmp_path: Path) -> None:
+    """Photographs then go by numbers, for COLMAP's lists of pairs."""
+    shutil.copy(mapped.path("sfm/database.db"), tmp_path / "database.db")
+    with pycolmap.Database.open(tmp_path / "database.db") as database:
+        for number, image in enumerate(sorted(database.read_all_images(), key=lambda image: image.name)):
+            image.name = f"{number:06d}"
+            database.update_image(image)
+    survey = load_json(Survey, mapped.path(SURVEY))
+    with quiet_colmap() as colmap:
+        job = SfmJob(survey, mapped.root / "photos", tmp_path / "database.db", CONFIG)
+        model = reconstruct(colmap, job, SILENT)
+    assert {image.name for image in model.images.values()} == {image.name for image in survey.images}
+    with pycolmap.Database.open(job.database) as database:
+        assert database.num_images() == IMAGES
 
 
 def test_missing_photographs_are_named(mapped: Workspace, tmp_path: Path) -> None:

@@ -16,12 +16,14 @@ import pycolmap
 import pytest
 from rosbags.highlevel import AnyReader
 
-from pipelines.config import SimulateConfig, resolve
+from pipelines.config import IngestConfig, resolve
 from pipelines.errors import InputError
 from pipelines.geodesy.enu import enu_from_lla, lla_from_enu
 from pipelines.geometry.rotations import geo_from_cam, log_so3
+from pipelines.ingest import build_survey, survey_and_track
 from pipelines.products import Origin, load_json
 from pipelines.simulate import SimulationSummary, simulate
+from pipelines.simulate_config import SimulateConfig
 from pipelines.simulation.render import Renderer, Sensor
 from pipelines.simulation.scene import make_scene
 from pipelines.simulation.truth import Truth
@@ -189,6 +191,20 @@ def test_bag_says_the_same_as_the_tables(made: Made) -> None:
     rows = made.table("gnss.csv")
     assert len(rows) == len(fixes)
     assert [round(float(row["timestamp"]) * 10) for row in rows] == [stamp // 100_000_000 for stamp in fixes]
+
+
+def test_marks_fit_the_photographs_and_the_bag(made: Made, tmp_path: Path) -> None:
+    """One gcp_list.txt serves both: the photographs are named as a bag's frames."""
+    points = {"gcp": made.folder / "gcp_list.txt", "checkpoints": made.folder / "checkpoints.txt"}
+    from_bag, _ = survey_and_track(IngestConfig(bag=made.folder / "bag", **points), tmp_path / "frames")
+    from_folder = build_survey(IngestConfig(images=made.folder / "images", **points))
+    assert [image.name for image in from_bag.images] == [image.name for image in from_folder.images]
+    marks = [
+        {point.name: point.marks for point in (*one.control_points, *one.check_points)}
+        for one in (from_bag, from_folder)
+    ]
+    assert marks[0] == marks[1]
+    assert len(marks[0]) == sum(len(target.marks) > 1 for target in made.truth.targets) > 5
 
 
 def test_depth_lies_on_the_surface(made: Made) -> None:

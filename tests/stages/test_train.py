@@ -16,6 +16,7 @@ from georef_scenes import squared_error
 from scenes import GEO_FROM_LOCAL, without_fixes
 from scipy.stats import chi2
 from splat_scenes import TRAINING, Flight
+from threads import single_thread
 
 from pipelines.config import TrainConfig
 from pipelines.errors import BackendUnavailableError, DegenerateGeometryError, InputError
@@ -155,7 +156,8 @@ def interrupt() -> None:
 @pytest.fixture(scope="module")
 def uninterrupted(flights: list[Flight]) -> Workspace:
     workspace = flights[0].workspace("uninterrupted")
-    run_stage(workspace, TRAIN, SHORT)
+    with single_thread():  # as the runs that it is compared with: sums of many threads differ in the last bit
+        run_stage(workspace, TRAIN, SHORT)
     return workspace
 
 
@@ -250,6 +252,60 @@ def test_two_cameras_are_needed(flights: list[Flight]) -> None:
     save_json(survey.model_copy(update={"images": images}), workspace.root / SURVEY)
     with pytest.raises(DegenerateGeometryError, match="0 registered training images"):
         run_stage(workspace, TRAIN, SHORT)
+
+
+BIAS_M = (1.5, -1.0, 3.0)
+EVERYTHING = {**SHORT, "gcp_mode": "depth", "loss_weights": "learned", "estimate": "bias,lever-arm,boresight"}
+
+
+def with_control(workspace: Workspace, offset_m: tuple[float, float, float] = BIAS_M) -> Workspace:
+    """The workspace with the surveyed places as control points, and all positions off by as much."""
+    survey, images = load_json(Survey, workspace.path(SURVEY)), []
+    for image in survey.images:
+        assert image.fix is not None
+        place = tuple(a + b for a, b in zip(image.fix.position_in_geo, offset_m, strict=True))
+        images.append(image.model_copy(update={"fix": image.fix.model_copy(update={"position_in_geo": place})}))
+    update = {"images": tuple(images), "control_points": survey.check_points, "check_points": ()}
+    save_json(survey.model_copy(update=update), workspace.root / SURVEY)
+    return workspace
+
+
+def test_evident_bias_is_estimated_and_told(flights: list[Flight]) -> None:
+    workspace = with_control(flights[0].workspace("biased"))
+    outcome = run_stage(workspace, TRAIN, {**TRAINING, "iterations": 120})
+    model = load_json(TrainedModel, workspace.path(MODEL))
+    (bias,) = model.estimated_errors
+    assert (bias.name, bias.flight, bias.unit, bias.observed) == ("bias", 0, "m", (True, True, True))
+    assert (np.abs(np.array(bias.value) - BIAS_M) < 4 * np.array(bias.sigma) + 0.02).all()
+    assert max(bias.sigma) < 0.2
+    assert error_of(workspace) < FAR
+    assert any("bias of flight 1 of (+1." in told for told in outcome.manifest.warnings)
+    assert outcome.manifest.values["estimated_errors"][0]["name"] == "bias"
+    assert outcome.manifest.values["control_outliers"] == []
+
+
+def test_every_option_together_trains_and_resumes(flights: list[Flight]) -> None:
+    whole, broken = (with_control(flights[0].workspace(name)) for name in ("whole", "broken"))
+    outcome = run_stage(whole, TRAIN, EVERYTHING)
+    with pytest.raises(KilledError):
+        run_stage(broken, TRAIN, EVERYTHING, progress=Signalling(20, kill))
+    run_stage(broken, TRAIN, EVERYTHING, resume="always")
+    assert broken.path(MODEL).read_bytes() == whole.path(MODEL).read_bytes()
+    errors = {error.name: error for error in load_json(TrainedModel, whole.path(MODEL)).estimated_errors}
+    assert set(errors) == {"bias", "lever-arm", "boresight"}
+    assert errors["boresight"].unit == "deg"
+    assert any("bias" in told for told in outcome.manifest.warnings)
+    for row in metrics(whole):
+        told = {"absolute", "control", "relative", "attitude", "cameras", "errors"}
+        assert told <= set(row)
+        assert 0.01 <= row["variance_control"] <= 100
+    assert any("control_by_depth" in row for row in metrics(whole))
+
+
+def test_constant_schedule_starts_at_the_full_weight(flights: list[Flight]) -> None:
+    workspace = flights[0].workspace("constant")
+    run_stage(workspace, TRAIN, {**SHORT, "iterations": 4, "geo_schedule": "constant"})
+    assert [row["geo_weight"] for row in metrics(workspace)] == [0.05, 0.05]
 
 
 def test_presets_can_be_changed_in_part() -> None:

@@ -15,6 +15,7 @@ import pytest
 
 from georef_cli.main import COMMANDS
 from pipelines.stages import PIPELINE
+from pipelines.stages import STAGES as ALL_STAGES
 
 REPOSITORY = Path(__file__).parents[2]
 PACKAGES = ("georef_cli", "pipelines")
@@ -22,23 +23,27 @@ PACKAGES = ("georef_cli", "pipelines")
 FOUNDATION = {
     f"pipelines.{name}"
     for name in (
-        "config", "errors", "fingerprints", "interrupts", "products", "progress", "stages", "states", "validators",
-        "workspace",
+        "config", "errors", "fingerprints", "interrupts", "products", "progress", "simulate_config", "stages",
+        "states", "validators", "workspace",
     )
 }  # fmt: skip
 # Those that make no product of the workspace are called and built as stages are.
-STAGES = {"pipelines.calibrate", "pipelines.inspect_bag", "pipelines.simulate", *(spec.module for spec in PIPELINE)}
+STAGES = {
+    "pipelines.calibrate", "pipelines.inspect_bag", "pipelines.simulate", *(spec.module for spec in ALL_STAGES),
+}  # fmt: skip
+# What runs stages, by their names: compare, on top of the runner, in several configurations.
+RUNNERS = {"pipelines.runner", "pipelines.compare", "pipelines.comparison"}
 # From the ground up. A file may import what lies on a lower floor.
 FLOORS: tuple[set[str], ...] = (
     FOUNDATION,
     {"pipelines.geodesy", "pipelines.geometry", "pipelines.robust"},
-    {"pipelines.formats", "pipelines.georef", "pipelines.splat"},
+    {"pipelines.formats", "pipelines.georef", "pipelines.splat", "pipelines.stereo"},
     {"pipelines.blocks", "pipelines.simulation"},
     STAGES,
-    {"pipelines.runner"},
+    RUNNERS,
     {"georef_cli"},
 )
-GROUND, STAGE_FLOOR, RUNNER_FLOOR = 0, FLOORS.index(STAGES), FLOORS.index({"pipelines.runner"})
+GROUND, STAGE_FLOOR, RUNNER_FLOOR = 0, FLOORS.index(STAGES), FLOORS.index(RUNNERS)
 # The command line starts stages through the runner; the floors in between are none of its business.
 SEEN_BY_CLI = {GROUND, STAGE_FLOOR, RUNNER_FLOOR, len(FLOORS) - 1}
 
@@ -46,7 +51,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     "click": ("georef_cli",),
     "rich": ("georef_cli",),
     "pyproj": ("pipelines.geodesy",),
-    "pycolmap": ("pipelines.sfm", "pipelines.formats"),
+    "pycolmap": ("pipelines.sfm", "pipelines.adjust", "pipelines.formats"),
     "numba": ("pipelines.splat", "pipelines.geometry", "pipelines.robust"),
     "gsplat": ("pipelines.splat.raster.cuda",),
     "torch": ("pipelines.splat", "pipelines.georef", "pipelines.blocks", *sorted(STAGES)),
@@ -55,6 +60,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     "defusedxml": ("pipelines.formats",),
     "rosbags": ("pipelines.formats",),
     "embreex": ("pipelines.simulation",),
+    "matplotlib": ("pipelines.formats.bar_plot",),
 }
 FOUNDATION_LIBRARIES = {"numpy", "pydantic"}
 
@@ -118,6 +124,7 @@ def test_arrows_point_down() -> None:
         between_stages = above[0] == below[0] == STAGE_FLOOR and not same_room
         past_the_runner = above[1] == "georef_cli" and below[0] not in SEEN_BY_CLI
         runner_knows_stage = above[1] == "pipelines.runner" and below[0] not in (GROUND, RUNNER_FLOOR)
+        runner_knows_stage |= above[0] == RUNNER_FLOOR and below[0] == STAGE_FLOOR
         if upwards or between_stages or past_the_runner or runner_knows_stage:
             wrong.append(f"{importer} → {imported}")
     assert wrong == []

@@ -119,3 +119,31 @@ def test_every_option_explains_itself(config: type[StageConfig], name: str, info
 def test_presets_leave_room_for_explicit_sizes() -> None:
     config = TrainConfig()
     assert (config.iterations, config.max_image_size, config.max_gaussians) == (None, None, None)
+
+
+@pytest.mark.parametrize(
+    ("text", "names"),
+    [
+        ("auto", ()),
+        ("none", ()),
+        ("bias", ("bias",)),
+        ("boresight,bias", ("bias", "boresight")),
+        ("lever-arm,boresight,bias", ("bias", "lever-arm", "boresight")),
+    ],
+)
+def test_constant_errors_are_named(text: str, names: tuple[str, ...]) -> None:
+    assert TrainConfig(estimate=text).estimated == names
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        ({"estimate": "drift"}, r"--estimate.*'drift' is none of bias, lever-arm, boresight"),
+        ({"estimate": "bias,auto"}, r"--estimate.*'auto' is none of"),
+        ({"estimate": ""}, r"--estimate.*'' is none of"),
+        ({"estimate": "bias", "weighting": "paper"}, r"--estimate.*--weighting whitened only"),
+    ],
+)
+def test_constant_errors_that_cannot_be(flags: dict[str, str], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        resolve(TrainConfig, {}, flags, Path("georef.toml"))

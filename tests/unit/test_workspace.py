@@ -15,7 +15,8 @@ import pytest
 
 from pipelines import runner, states
 from pipelines.errors import InputError, MissingProductError, WorkspaceBusyError
-from pipelines.stages import BY_NAME, PIPELINE, POINTS, SPARSE
+from pipelines.products import VerticalDatum, load_json, save_json
+from pipelines.stages import BY_NAME, MODEL, PIPELINE, POINTS, SIM3, SPARSE, SURVEY
 from pipelines.workspace import Workspace
 from tests import fakes
 
@@ -137,6 +138,19 @@ class TestKilledAtAnyMoment:
             assert all((out / name / "part").exists() == continued for name in folders)
 
 
+def test_replaced_product_is_the_old_one_or_the_new(tmp_path: Path) -> None:
+    """As `calibrate` makes a survey anew, killed ahead of each change."""
+    old, new = (VerticalDatum(name=name, stated=True) for name in ("old", "new"))
+    path = tmp_path / SURVEY
+    for step in range(1, 10):
+        save_json(old, path)
+        killed = killed_at(step, partial(Workspace(tmp_path).replace, SURVEY, new))
+        assert load_json(VerticalDatum, path) == (old if killed else new)
+        if not killed:
+            break
+    assert step > 2
+
+
 class TestLock:
     def test_second_writer_is_told_who_writes(self, workspace: Workspace) -> None:
         with (
@@ -227,3 +241,21 @@ def test_requests_are_kept_by_stage(workspace: Workspace) -> None:
     workspace.remember({"train": {"seed": 3}})
     assert workspace.requests() == {"ingest": {"images": "/photos", "check": ["P1", "P2"]}, "train": {"seed": 3}}
     assert json.loads((workspace.root / "requests.json").read_text())
+
+
+def test_variant_reads_what_is_lent_and_writes_its_own(tmp_path: Path) -> None:
+    workspace, elsewhere = Workspace(tmp_path / "flight"), tmp_path / "elsewhere"
+    variant = workspace.variant("compare/A", {"sfm": workspace.root / "sfm", "geolocate": elsewhere})
+    for path in (workspace.root / SPARSE, elsewhere / "points.npz", variant.root / SIM3):
+        path.mkdir(parents=True)
+    assert variant.path(SPARSE) == workspace.root / SPARSE
+    assert variant.path(POINTS) == elsewhere / "points.npz"
+    assert variant.path(SIM3) == variant.root / SIM3
+    assert variant.partial(TRAIN).parent == variant.root == workspace.root / "compare/A"
+    assert variant.cache == workspace.cache
+    assert {row.stage: row.state for row in states.status(variant)}["sfm"] == "current"
+    assert variant.config_file == workspace.config_file
+    assert variant.photographs("ingest/images") == workspace.root / "ingest/images"
+    assert variant.photographs("/photos") == Path("/photos")
+    with pytest.raises(MissingProductError, match=f"georef compare {workspace.root}"):
+        variant.path(MODEL)  # not the workspace's own, even if it were there

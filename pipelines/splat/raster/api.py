@@ -3,6 +3,13 @@
 The blending is that of 3D Gaussian Splatting (doi 10.1145/3592433), with gsplat's conventions: pixel centres at
 (0.5, 0.5), screen covariance dilated by `dilation_px2`, contributions below alpha 1/255 left out, alpha at most
 0.999, a pixel is done when its transmittance would fall to 1e-4.
+
+The depth of a Gaussian is that of its plane at the pixel, not of its centre: the conditional mean of z given the
+pixel, z + q · (p − µ) with q = C⁻¹ c, where C is the screen covariance and c the covariance of the screen position
+with z (RaDe-GS, doi 10.48550/arXiv.2406.01467, in the local affine approximation of the perspective). Where α
+reaches 1/255 this departs from the centre by at most 3.33 standard deviations along z; q is shortened where even
+that were more than `DEPTH_REACH` of the centre's depth, so that z stays positive. Gaussians are ordered by their
+centres.
 """
 
 from __future__ import annotations
@@ -19,6 +26,7 @@ from pipelines.splat.gaussians import Gaussians
 ALPHA_MIN = 1.0 / 255.0
 ALPHA_MAX = 0.999
 TRANSMITTANCE_MIN = 1e-4
+DEPTH_REACH = 0.75
 
 BackendName = Literal["cpu", "cuda"]
 
@@ -64,9 +72,10 @@ class Render:
     Attributes:
         colour: (H, W, 3), linear in the Gaussians' colours, background blended in.
         alpha: (H, W), 1 − final transmittance.
-        expected_depth: (H, W), Σ w z / Σ w along the camera's z axis in metres, 0 where alpha is 0; or None.
-        median_depth: (H, W), z of the Gaussian at which the transmittance falls to one half, 0 where it never
-            does; not differentiable; or None.
+        expected_depth: (H, W), Σ w z / Σ w along the camera's z axis in metres, each Gaussian's z at the pixel,
+            0 where alpha is 0; or None.
+        median_depth: (H, W), z at the pixel of the Gaussian at which the transmittance falls to one half, 0
+            where it never does; not differentiable; or None.
         stats: for densification.
     """
 

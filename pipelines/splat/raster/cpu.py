@@ -19,7 +19,7 @@ from torch.autograd.function import once_differentiable
 
 from pipelines.errors import InputError
 from pipelines.splat.gaussians import Gaussians
-from pipelines.splat.raster import cpu_blend, cpu_gradients, cpu_project, cpu_tiles
+from pipelines.splat.raster import cpu_blend, cpu_gradients, cpu_project, cpu_tiles, cpu_view
 from pipelines.splat.raster.api import (
     BackendName,
     Pinhole,
@@ -115,9 +115,9 @@ class _Frame:
         """(3,) float64."""
         return np.array(self.settings.background, dtype=np.float64)
 
-    def view(self, pose: _Array) -> cpu_project.View:
+    def view(self, pose: _Array) -> cpu_view.View:
         """The camera as kernels want it."""
-        return cpu_project.make_view(self.camera, self.settings, pose)
+        return cpu_view.make_view(self.camera, self.settings, pose)
 
 
 @dataclass

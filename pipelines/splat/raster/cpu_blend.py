@@ -34,6 +34,8 @@ from pipelines.splat.raster.cpu_project import (
     LOG_ALPHA_MIN,
     LOG_OPACITY,
     RED,
+    SLOPE_X,
+    SLOPE_Y,
     X,
     Y,
 )
@@ -50,9 +52,8 @@ G_RED, G_GREEN, G_BLUE, G_DEPTH, G_REST, REMAINING = 1, 2, 3, 4, 5, 6
 BACKWARD_PLANES = 7
 
 # Places in the gradient of one hit: Σ q and its moments in dx and dy, where q = ∂L/∂(exponent) at each pixel, and
-# ∂L/∂ depth and colour; in fours, because they are summed in fours.
-Q, Q_X, Q_Y, Q_YY, Q_XX, Q_XY, D_DEPTH = range(7)
-D_RED, D_GREEN, D_BLUE = 8, 9, 10
+# ∂L/∂ depth, its slopes and colour; in fours, because they are summed in fours.
+Q, Q_X, Q_Y, Q_YY, Q_XX, Q_XY, D_DEPTH, D_SLOPE_X, D_RED, D_GREEN, D_BLUE, D_SLOPE_Y = range(12)
 HIT_GRADIENT_WIDTH = 12
 
 
@@ -71,6 +72,12 @@ def _row_exponent(table: Any, index: int, dx: Any, dy: Any) -> Any:
     slanted = splat(table[index, FACTOR_XX]) * dx + splat(table[index, FACTOR_XY] * dy)
     vertical = table[index, FACTOR_YY] * dy
     return splat(table[index, LOG_OPACITY] - vertical * vertical) - slanted * slanted
+
+
+@jit
+def _row_depth(table: Any, index: int, dx: Any, dy: Any) -> Any:
+    """z of one splat along a row of pixels."""
+    return splat(table[index, SLOPE_X]) * dx + splat(table[index, DEPTH] + table[index, SLOPE_Y] * dy)
 
 
 @jit
@@ -112,7 +119,6 @@ def _blend_tile(table: Any, hits: Any, first: int, last: int, tile_x: int, tile_
                 return place
         index, first_row, last_row = unpack_hit(hits[place])
         red, green, blue = splat(table[index, RED]), splat(table[index, GREEN]), splat(table[index, BLUE])
-        z = splat(table[index, DEPTH])
         dx = pixel_x - splat(table[index, X])
         for row in range(max(first_row, top), min(last_row, bottom) + 1):
             at = row * TILE_WIDTH
@@ -130,6 +136,7 @@ def _blend_tile(table: Any, hits: Any, first: int, last: int, tile_x: int, tile_
             store(scratch, G * TILE_PIXELS + at, load(scratch, G * TILE_PIXELS + at) + weight * green)
             store(scratch, B * TILE_PIXELS + at, load(scratch, B * TILE_PIXELS + at) + weight * blue)
             if depth:
+                z = _row_depth(table, index, dx, dy)
                 store(scratch, D * TILE_PIXELS + at, load(scratch, D * TILE_PIXELS + at) + weight * z)
                 median = load(scratch, MEDIAN * TILE_PIXELS + at)
                 crossed = where_greater(t, half, where_greater(t_next, half, median, z), median)
@@ -224,12 +231,11 @@ def _start_tile_gradient(scratch: Any, tile_x: int, tile_y: int, background: Any
 def _store_hit_gradient(gradient: Any, place: int, dx: Any, moments: Any, colour_and_depth: Any) -> None:
     """Sum over the columns, in each of which dx is constant."""
     q, qy, qyy = moments
-    red, green, blue, depth = colour_and_depth
+    red, green, blue, depth, slope_y = colour_and_depth
     start, qx = place * HIT_GRADIENT_WIDTH, q * dx
-    nothing = splat(gradient.dtype.type(0.0))
     store_totals(gradient, start + Q, q, qx, qy, qyy)
-    store_totals(gradient, start + Q_XX, qx * dx, qy * dx, depth, nothing)
-    store_totals(gradient, start + D_RED, red, green, blue, nothing)
+    store_totals(gradient, start + Q_XX, qx * dx, qy * dx, depth, depth * dx)
+    store_totals(gradient, start + D_RED, red, green, blue, slope_y)
 
 
 @jit
@@ -250,10 +256,9 @@ def _blend_tile_gradient(table: Any, hits: Any, first: int, last: int, tile_x: i
             top, bottom = _alive_rows(scratch, top, bottom)
         index, first_row, last_row = unpack_hit(hits[place])
         red, green, blue = splat(table[index, RED]), splat(table[index, GREEN]), splat(table[index, BLUE])
-        z = splat(table[index, DEPTH])
         dx = pixel_x - splat(table[index, X])
         q_sum, qy_sum, qyy_sum = zero, zero, zero
-        red_sum, green_sum, blue_sum, depth_sum = zero, zero, zero, zero
+        red_sum, green_sum, blue_sum, depth_sum, slope_y_sum = zero, zero, zero, zero, zero
         for row in range(max(first_row, top), min(last_row, bottom) + 1):
             at = row * TILE_WIDTH
             dy = number(tile_y + row) + number(0.5) - table[index, Y]
@@ -275,8 +280,10 @@ def _blend_tile_gradient(table: Any, hits: Any, first: int, last: int, tile_x: i
             value = g_red * red + g_green * green + g_blue * blue - load(scratch, G_REST * TILE_PIXELS + at)
             if depth:
                 g_depth = load(scratch, G_DEPTH * TILE_PIXELS + at)
-                value = value + g_depth * z
-                depth_sum = depth_sum + weight * g_depth
+                value = value + g_depth * _row_depth(table, index, dx, dy)
+                g_depth = weight * g_depth
+                depth_sum = depth_sum + g_depth
+                slope_y_sum = slope_y_sum + g_depth * splat(dy)
             part = weight * value
             remaining = load(scratch, REMAINING * TILE_PIXELS + at) - part
             store(scratch, REMAINING * TILE_PIXELS + at, remaining)
@@ -288,9 +295,8 @@ def _blend_tile_gradient(table: Any, hits: Any, first: int, last: int, tile_x: i
             red_sum = red_sum + weight * g_red
             green_sum = green_sum + weight * g_green
             blue_sum = blue_sum + weight * g_blue
-        _store_hit_gradient(
-            gradient, place, dx, (q_sum, qy_sum, qyy_sum), (red_sum, green_sum, blue_sum, depth_sum)
-        )
+        colour_and_depth = (red_sum, green_sum, blue_sum, depth_sum, slope_y_sum)
+        _store_hit_gradient(gradient, place, dx, (q_sum, qy_sum, qyy_sum), colour_and_depth)
 
 
 @worker_jit

@@ -17,6 +17,8 @@ from pipelines.splat.raster.cpu_blend import (
     D_DEPTH,
     D_GREEN,
     D_RED,
+    D_SLOPE_X,
+    D_SLOPE_Y,
     HIT_GRADIENT_WIDTH,
     Q_X,
     Q_XX,
@@ -28,7 +30,6 @@ from pipelines.splat.raster.cpu_blend import (
 from pipelines.splat.raster.cpu_jit import jit, parallel_jit, worker_jit
 from pipelines.splat.raster.cpu_project import (
     BLOCK,
-    View,
     jacobian,
     log_sigmoid,
     point_in_cam,
@@ -43,6 +44,8 @@ from pipelines.splat.raster.cpu_project import (
     variances,
 )
 from pipelines.splat.raster.cpu_sh import MAX_COEFFICIENTS, sh_basis, sh_direction_gradient
+from pipelines.splat.raster.cpu_slope import depth_slope_gradient
+from pipelines.splat.raster.cpu_view import View
 
 # Entries of a block's share of the camera's gradient: 12 of the pose, row by row, then 3 of the centre.
 CAMERA_WIDTH = 15
@@ -75,23 +78,41 @@ def _conic_gradients(cov: Any, sums: Any) -> Any:
 
 
 @jit
-def _axes_gradient(axes: Any, variance: Any, g_cov: Any) -> Any:
-    """∂L/∂V (6) of Σ = V diag(σ²) Vᵀ, given the symmetric ∂L/∂Σ."""
+def _covariance_gradients(axes: Any, variance: Any, view: View, depth: float, sums: Any) -> Any:
+    """∂L/∂ screen mean (2), depth of the centre, screen covariance (3) and covariance of screen and depth (2)."""
+    cov = screen_covariance(axes, variance, view.dilation)
+    (gu, gv), (xx, xy, yy) = _conic_gradients(cov, sums)
+    g_depth, g_slope = sums[D_DEPTH], (sums[D_SLOPE_X], sums[D_SLOPE_Y])
+    if g_depth == 0.0 and g_slope[0] == 0.0 and g_slope[1] == 0.0:
+        # As in every render without depth.
+        return (gu, gv), 0.0, (xx, xy, yy), (0.0, 0.0)
+    slope, g_c, (s_xx, s_xy, s_yy), g_reach = depth_slope_gradient(axes, variance, cov, depth, g_slope)
+    g_mean = (gu - slope[0] * g_depth, gv - slope[1] * g_depth)
+    return g_mean, g_depth + g_reach, (xx + s_xx, xy + s_xy, yy + s_yy), g_c
+
+
+@jit
+def _axes_gradient(axes: Any, variance: Any, g_cov: Any, g_c: Any) -> Any:
+    """∂L/∂V (9), given the symmetric ∂L/∂ screen covariance and ∂L/∂ its covariance with depth."""
     xx, xy, yy = g_cov
+    xz, yz = g_c
     a, b, c = variance
     return (
-        2 * a * (xx * axes[0] + xy * axes[3]),
-        2 * b * (xx * axes[1] + xy * axes[4]),
-        2 * c * (xx * axes[2] + xy * axes[5]),
-        2 * a * (xy * axes[0] + yy * axes[3]),
-        2 * b * (xy * axes[1] + yy * axes[4]),
-        2 * c * (xy * axes[2] + yy * axes[5]),
+        a * (2 * xx * axes[0] + 2 * xy * axes[3] + xz * axes[6]),
+        b * (2 * xx * axes[1] + 2 * xy * axes[4] + xz * axes[7]),
+        c * (2 * xx * axes[2] + 2 * xy * axes[5] + xz * axes[8]),
+        a * (2 * xy * axes[0] + 2 * yy * axes[3] + yz * axes[6]),
+        b * (2 * xy * axes[1] + 2 * yy * axes[4] + yz * axes[7]),
+        c * (2 * xy * axes[2] + 2 * yy * axes[5] + yz * axes[8]),
+        a * (xz * axes[0] + yz * axes[3]),
+        b * (xz * axes[1] + yz * axes[4]),
+        c * (xz * axes[2] + yz * axes[5]),
     )
 
 
 @jit
 def _times_transposed(v: Any, r: Any) -> Any:
-    """V Rᵀ (6) of a 2×3 and a 3×3 matrix."""
+    """V Rᵀ (9)."""
     return (
         v[0] * r[0] + v[1] * r[1] + v[2] * r[2],
         v[0] * r[3] + v[1] * r[4] + v[2] * r[5],
@@ -99,15 +120,24 @@ def _times_transposed(v: Any, r: Any) -> Any:
         v[3] * r[0] + v[4] * r[1] + v[5] * r[2],
         v[3] * r[3] + v[4] * r[4] + v[5] * r[5],
         v[3] * r[6] + v[4] * r[7] + v[5] * r[8],
+        v[6] * r[0] + v[7] * r[1] + v[8] * r[2],
+        v[6] * r[3] + v[7] * r[4] + v[8] * r[5],
+        v[6] * r[6] + v[7] * r[7] + v[8] * r[8],
     )
+
+
+@jit
+def _transposed_times(w: Any, v: Any, i: int, k: int) -> float:
+    """Entry (i, k) of Wᵀ V."""
+    return float(w[i] * v[k] + w[3 + i] * v[3 + k] + w[6 + i] * v[6 + k])
 
 
 @jit
 def _quat_gradient(quat: Any, scale: float, w: Any, v: Any) -> Any:
     """∂L/∂ quaternion (4) before normalisation, where ∂L/∂R = Wᵀ ∂L/∂V."""
-    r00, r01, r02 = w[0] * v[0] + w[3] * v[3], w[0] * v[1] + w[3] * v[4], w[0] * v[2] + w[3] * v[5]
-    r10, r11, r12 = w[1] * v[0] + w[4] * v[3], w[1] * v[1] + w[4] * v[4], w[1] * v[2] + w[4] * v[5]
-    r20, r21, r22 = w[2] * v[0] + w[5] * v[3], w[2] * v[1] + w[5] * v[4], w[2] * v[2] + w[5] * v[5]
+    r00, r01, r02 = _transposed_times(w, v, 0, 0), _transposed_times(w, v, 0, 1), _transposed_times(w, v, 0, 2)
+    r10, r11, r12 = _transposed_times(w, v, 1, 0), _transposed_times(w, v, 1, 1), _transposed_times(w, v, 1, 2)
+    r20, r21, r22 = _transposed_times(w, v, 2, 0), _transposed_times(w, v, 2, 1), _transposed_times(w, v, 2, 2)
     qw, qx, qy, qz = quat
     gw = 2 * (qx * (r21 - r12) + qy * (r02 - r20) + qz * (r10 - r01))
     gx = 2 * (qw * (r21 - r12) + qy * (r01 + r10) + qz * (r02 + r20) - 2 * qx * (r11 + r22))
@@ -150,7 +180,7 @@ def _point_gradient(view: View, point: Any, g_mean: Any, g_depth: float, pose: A
 
 @jit
 def _add_pose_gradient(camera: Any, mean: Any, g_point: Any, jac: Any, g_w: Any) -> None:
-    """Add ∂L/∂[A | t] (12) of p = A m + t and W = J A."""
+    """Add ∂L/∂[A | t] (12) of p = A m + t and W."""
     j00, j02, j11, j12 = jac
     x, y, z = mean
     gx, gy, gz = g_point
@@ -162,9 +192,9 @@ def _add_pose_gradient(camera: Any, mean: Any, g_point: Any, jac: Any, g_w: Any)
     camera[5] += gy * y + j11 * g_w[4]
     camera[6] += gy * z + j11 * g_w[5]
     camera[7] += gy
-    camera[8] += gz * x + j02 * g_w[0] + j12 * g_w[3]
-    camera[9] += gz * y + j02 * g_w[1] + j12 * g_w[4]
-    camera[10] += gz * z + j02 * g_w[2] + j12 * g_w[5]
+    camera[8] += gz * x + j02 * g_w[0] + j12 * g_w[3] + g_w[6]
+    camera[9] += gz * y + j02 * g_w[1] + j12 * g_w[4] + g_w[7]
+    camera[10] += gz * z + j02 * g_w[2] + j12 * g_w[5] + g_w[8]
     camera[11] += gz
 
 
@@ -204,14 +234,15 @@ def _geometry_gradient(quats: Any, log_scales: Any, i: int, mean: Any, pose: Any
     jac = jacobian(view, point)
     w = screen_from_model(jac, pose)
     axes, variance = times_rotation(w, turn), variances(log_scales, i)
-    g_mean, g_cov = _conic_gradients(screen_covariance(axes, variance, view.dilation), sums)
-    g_axes = _axes_gradient(axes, variance, g_cov)
+    g_mean, g_depth, g_cov, g_c = _covariance_gradients(axes, variance, view, point[2], sums)
+    g_axes = _axes_gradient(axes, variance, g_cov, g_c)
     g_w = _times_transposed(g_axes, turn)
     g_quats[i, 0], g_quats[i, 1], g_quats[i, 2], g_quats[i, 3] = _quat_gradient(quat, scale, w, g_axes)
-    g_log_scales[i, 0] = axes[0] * g_axes[0] + axes[3] * g_axes[3]
-    g_log_scales[i, 1] = axes[1] * g_axes[1] + axes[4] * g_axes[4]
-    g_log_scales[i, 2] = axes[2] * g_axes[2] + axes[5] * g_axes[5]
-    g_point = _point_gradient(view, point, g_mean, sums[D_DEPTH], pose, g_w)
+    # Scaling a principal axis is as good as scaling its column of V.
+    g_log_scales[i, 0] = _transposed_times(axes, g_axes, 0, 0)
+    g_log_scales[i, 1] = _transposed_times(axes, g_axes, 1, 1)
+    g_log_scales[i, 2] = _transposed_times(axes, g_axes, 2, 2)
+    g_point = _point_gradient(view, point, g_mean, g_depth, pose, g_w)
     _add_pose_gradient(camera, mean, g_point, jac, g_w)
     return g_point, g_mean
 

@@ -7,79 +7,29 @@ are flat tuples, row by row, so that they stay in registers.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numba import prange
-from numpy.typing import NDArray
 
-from pipelines.splat.raster.api import ALPHA_MIN, Pinhole, RasterSettings
+from pipelines.splat.raster.api import ALPHA_MIN
 from pipelines.splat.raster.cpu_jit import jit, parallel_jit, worker_jit
 from pipelines.splat.raster.cpu_sh import MAX_COEFFICIENTS, sh_basis
-from pipelines.splat.raster.reference import FRUSTUM_MARGIN
+from pipelines.splat.raster.cpu_slope import WIDEST, depth_slope
+from pipelines.splat.raster.cpu_view import View
 
 LOG_ALPHA_MIN = math.log(ALPHA_MIN)
 LOGIT_ALPHA_MIN = math.log(ALPHA_MIN / (1 - ALPHA_MIN))
-# Mahalanobis radius at which an opaque Gaussian falls to ALPHA_MIN.
-WIDEST = math.sqrt(-2 * LOG_ALPHA_MIN)
 # Gaussians that one worker takes at a time: dealt out in turn, because the visible ones come in clusters.
 BLOCK = 256
 
 # Columns of the table of splats that blending reads: centre, factor of the conic (see `write_splat`),
-# logarithm of the opacity, colour, depth.
-X, Y, FACTOR_XX, FACTOR_XY, FACTOR_YY, LOG_OPACITY, RED, GREEN, BLUE, DEPTH = range(10)
-SPLAT_WIDTH = 10
+# logarithm of the opacity, colour, depth of the centre, slope of the depth in metres per pixel.
+X, Y, FACTOR_XX, FACTOR_XY, FACTOR_YY, LOG_OPACITY, RED, GREEN, BLUE, DEPTH, SLOPE_X, SLOPE_Y = range(12)
+SPLAT_WIDTH = 12
 # Columns of the table of ellipses that binning reads: centre, covariance, squared Mahalanobis radius.
 E_X, E_Y, E_XX, E_XY, E_YY, E_LEVEL = range(6)
 ELLIPSE_WIDTH = 6
-
-
-class View(NamedTuple):
-    """The camera as kernels want it: lengths in pixels, slopes x/z and y/z, near plane in metres.
-
-    A standard deviation of 1 m at a depth of 1 m is at most `stretch_x` px wide and `stretch_y` px high.
-    """
-
-    width: float
-    height: float
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    slope_x_min: float
-    slope_x_max: float
-    slope_y_min: float
-    slope_y_max: float
-    near: float
-    dilation: float
-    stretch_x: float
-    stretch_y: float
-
-
-def make_view(camera: Pinhole, settings: RasterSettings, pose: NDArray[np.float64]) -> View:
-    """The kernels' view of `camera`; the Jacobian is taken no further out than these slopes, as in gsplat."""
-    margin_x = FRUSTUM_MARGIN * 0.5 * camera.width / camera.fx
-    margin_y = FRUSTUM_MARGIN * 0.5 * camera.height / camera.fy
-    slope_x_min, slope_x_max = -camera.cx / camera.fx - margin_x, (camera.width - camera.cx) / camera.fx + margin_x
-    slope_y_min, slope_y_max = -camera.cy / camera.fy - margin_y, (camera.height - camera.cy) / camera.fy + margin_y
-    # 1 for a rotation, which is what it should be; but the derivative is taken in all of its entries.
-    norm = float(np.linalg.norm(pose[:, :3], 2))
-    return View(
-        width=float(camera.width),
-        height=float(camera.height),
-        fx=float(camera.fx),
-        fy=float(camera.fy),
-        cx=float(camera.cx),
-        cy=float(camera.cy),
-        slope_x_min=slope_x_min,
-        slope_x_max=slope_x_max,
-        slope_y_min=slope_y_min,
-        slope_y_max=slope_y_max,
-        near=float(settings.near_m),
-        dilation=float(settings.dilation_px2),
-        stretch_x=camera.fx * norm * math.hypot(1.0, max(-slope_x_min, slope_x_max)),
-        stretch_y=camera.fy * norm * math.hypot(1.0, max(-slope_y_min, slope_y_max)),
-    )
 
 
 @jit
@@ -136,7 +86,7 @@ def jacobian(view: View, point: Any) -> Any:
 
 @jit
 def screen_from_model(jac: Any, pose: Any) -> Any:
-    """J A (6): the linearised map from the model's frame to the screen."""
+    """W (9): the linearised map from the model's frame to (u, v, z)."""
     j00, j02, j11, j12 = jac
     return (
         j00 * pose[0, 0] + j02 * pose[2, 0],
@@ -145,12 +95,13 @@ def screen_from_model(jac: Any, pose: Any) -> Any:
         j11 * pose[1, 0] + j12 * pose[2, 0],
         j11 * pose[1, 1] + j12 * pose[2, 1],
         j11 * pose[1, 2] + j12 * pose[2, 2],
+        *(pose[2, 0], pose[2, 1], pose[2, 2]),
     )
 
 
 @jit
 def times_rotation(w: Any, r: Any) -> Any:
-    """W R (6) of a 2×3 and a 3×3 matrix: the principal axes on the screen."""
+    """V = W R (9): the principal axes along (u, v, z)."""
     return (
         w[0] * r[0] + w[1] * r[3] + w[2] * r[6],
         w[0] * r[1] + w[1] * r[4] + w[2] * r[7],
@@ -158,12 +109,15 @@ def times_rotation(w: Any, r: Any) -> Any:
         w[3] * r[0] + w[4] * r[3] + w[5] * r[6],
         w[3] * r[1] + w[4] * r[4] + w[5] * r[7],
         w[3] * r[2] + w[4] * r[5] + w[5] * r[8],
+        w[6] * r[0] + w[7] * r[3] + w[8] * r[6],
+        w[6] * r[1] + w[7] * r[4] + w[8] * r[7],
+        w[6] * r[2] + w[7] * r[5] + w[8] * r[8],
     )
 
 
 @jit
 def screen_covariance(axes: Any, variance: Any, dilation: float) -> Any:
-    """xx, xy, yy of V diag(σ²) Vᵀ + dilation · I."""
+    """xx, xy, yy of V diag(σ²) Vᵀ, of the rows u and v of V, + dilation · I."""
     a, b, c = variance
     return (
         axes[0] * axes[0] * a + axes[1] * axes[1] * b + axes[2] * axes[2] * c + dilation,
@@ -180,11 +134,13 @@ def log_sigmoid(logit: float) -> float:
 
 @jit
 def _ellipse(means: Any, quats: Any, log_scales: Any, pose: Any, view: View, i: int) -> Any:
-    """Point in the camera's frame and screen covariance of Gaussian i."""
+    """Point in the camera's frame, screen covariance and slope of the depth of Gaussian i."""
     point = point_in_cam(pose, row3(means, i))
     quat, _ = unit_quat(quats, i)
     axes = times_rotation(screen_from_model(jacobian(view, point), pose), rotation(quat))
-    return point, screen_covariance(axes, variances(log_scales, i), view.dilation)
+    variance = variances(log_scales, i)
+    cov = screen_covariance(axes, variance, view.dilation)
+    return point, cov, depth_slope(axes, variance, cov, point[2])
 
 
 @jit
@@ -212,7 +168,7 @@ def _is_visible(means: Any, quats: Any, log_scales: Any, logit: float, pose: Any
 
     Written so that NaN anywhere makes it invisible.
     """
-    point, (xx, xy, yy) = _ellipse(means, quats, log_scales, pose, view, i)
+    point, (xx, xy, yy), _ = _ellipse(means, quats, log_scales, pose, view, i)
     if not (xx * yy - xy * xy > 0.0 and xx < math.inf and yy < math.inf):
         return False
     level = 2.0 * (log_sigmoid(logit) - LOG_ALPHA_MIN)
@@ -255,7 +211,7 @@ def find_visible(
 
 @jit
 def _write_splat(splats: Any, ellipses: Any, row: int, center: Any, cov: Any, log_opacity: float) -> None:
-    """Fill the row that blending and the one that binning reads, but for colour and depth.
+    """Fill the row that blending and the one that binning reads, but for colour, depth and slope.
 
     The conic is kept as the factor of ½ Σ⁻¹: the exponent is −(f_xx dx + f_xy dy)² − (f_yy dy)², which does not
     cancel catastrophically for long thin Gaussians as the polynomial does.
@@ -310,7 +266,7 @@ def _project_visible(
     for block in range(worker, (count + BLOCK - 1) // BLOCK, workers):
         for m in range(block * BLOCK, min((block + 1) * BLOCK, count)):
             i, row = visible[m], rank[m]
-            (x, y, z), cov = _ellipse(means, quats, log_scales, pose, view, i)
+            (x, y, z), cov, slope = _ellipse(means, quats, log_scales, pose, view, i)
             on_screen = (view.fx * x / z + view.cx, view.fy * y / z + view.cy)
             _write_splat(splats, ellipses, row, on_screen, cov, log_sigmoid(float(logit_opacities[i])))
             direction, _ = unit_direction(row3(means, i), center)
@@ -320,6 +276,7 @@ def _project_visible(
             splats[row, GREEN] = max(green, 0.0)
             splats[row, BLUE] = max(blue, 0.0)
             splats[row, DEPTH] = z
+            splats[row, SLOPE_X], splats[row, SLOPE_Y] = slope
             radius[m] = _longer_radius(cov)
 
 

@@ -1,7 +1,7 @@
 """The rasteriser on a GPU: gsplat behind the common interface.
 
-gsplat (doi 10.48550/arXiv.2409.06765) blends by the rules of `api`; what it lacks, the median depth, is
-gathered here from its pixel–Gaussian intersections.
+gsplat (doi 10.48550/arXiv.2409.06765) blends by the rules of `api`; what it lacks, depth at the pixel, is made
+here: the expected one by blending the Gaussians' planes, the median one from its pixel–Gaussian intersections.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from pipelines.splat.raster.api import (
     Render,
     ScreenStats,
 )
+from pipelines.splat.raster.reference import bounded_slope, screen_depth_covariance
 
 _EVERY_BATCH = 2**31 - 1
 
@@ -67,18 +68,40 @@ class CudaRasterizer:
             sh_degree=settings.sh_degree,
             packed=True,
             backgrounds=_row(settings.background, device),
-            render_mode="RGB+ED" if settings.depth else "RGB",
         )
-        return Render(
-            colour=image[0, ..., :3],
-            alpha=alpha[0, ..., 0],
-            expected_depth=image[0, ..., 3] if settings.depth else None,
-            median_depth=self._median_depth(meta, camera) if settings.depth else None,
-            stats=_screen_stats(meta),
+        expected, median = None, None
+        if settings.depth:
+            slope = _depth_slope(gaussians, cam_from_model, camera, meta)
+            expected = self._expected_depth(meta, slope, camera, alpha)
+            median = self._median_depth(meta, slope, camera)
+        return Render(image[0], alpha[0, ..., 0], expected, median, _screen_stats(meta))
+
+    def _expected_depth(self, meta: dict[str, Any], slope: Tensor, camera: Pinhole, alpha: Tensor) -> Tensor:
+        """(H, W) Σ w z / Σ w: the blend of z = z₀ + q · (p − middle of the image), whose three numbers are blended.
+
+        About the middle, because a plane's depth at (0, 0) can be far from those that it is seen at.
+        """
+        middle = 0.5 * _row((float(camera.width), float(camera.height)), slope.device)
+        at_middle = meta["depths"] + (slope * (middle - meta["means2d"])).sum(dim=-1)
+        planes, _ = self._gsplat.rasterize_to_pixels(
+            meta["means2d"],
+            meta["conics"],
+            torch.cat([at_middle[:, None], slope], dim=-1),
+            meta["opacities"],
+            camera.width,
+            camera.height,
+            meta["tile_size"],
+            meta["isect_offsets"],
+            meta["flatten_ids"],
+            packed=True,
         )
+        constant, per_column, per_row = planes[0].unbind(-1)
+        u = torch.arange(camera.width, device=slope.device) + 0.5 * (1 - camera.width)
+        v = torch.arange(camera.height, device=slope.device) + 0.5 * (1 - camera.height)
+        return (constant + per_column * u + per_row * v[:, None]) / alpha[0, ..., 0].clamp(min=1e-10)
 
     @torch.no_grad()
-    def _median_depth(self, meta: dict[str, Any], camera: Pinhole) -> Tensor:
+    def _median_depth(self, meta: dict[str, Any], slope: Tensor, camera: Pinhole) -> Tensor:
         """(H, W) z of the Gaussian at which the transmittance falls to one half, 0 where it never does."""
         means_px, conics, opacities = meta["means2d"], meta["conics"], meta["opacities"]
         median = torch.zeros(camera.height * camera.width, device=means_px.device)
@@ -111,7 +134,9 @@ class CudaRasterizer:
         reached = log_kept - before_pixel <= half
         first = reached.clone()
         first[1:] &= ~(reached[:-1] & (pixel[1:] == pixel[:-1]))
-        median[pixel[first]] = meta["depths"][gaussian[first]]
+        at = torch.nonzero(first)[:, 0]
+        front, to_mean_px = gaussian[at], torch.stack([dx[at], dy[at]], dim=-1)
+        median[pixel[at]] = meta["depths"][front] - (slope[front] * to_mean_px).sum(dim=-1)
         return median.view(camera.height, camera.width)
 
 
@@ -147,6 +172,21 @@ def _row(values: tuple[float, ...], device: torch.device) -> Tensor:
 @lru_cache(maxsize=4096)
 def _intrinsics(camera: Pinhole, device: torch.device) -> Tensor:
     return torch.tensor([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]], device=device)
+
+
+def _depth_slope(gaussians: Gaussians, cam_from_model: Tensor, camera: Pinhole, meta: dict[str, Any]) -> Tensor:
+    """∂z/∂(u, v) of the M visible Gaussians (M, 2), in m/px.
+
+    By gsplat's own conics: they decide how far from its centre a Gaussian is seen, hence how far its plane reaches.
+    """
+    rows, pose = meta["gaussian_ids"].long(), cam_from_model.to(gaussians.means.dtype)
+    mean_in_cam = gaussians.means[rows] @ pose[:3, :3].T + pose[:3, 3]
+    quats_wxyz, log_scales = gaussians.quats_wxyz[rows], gaussians.log_scales[rows]
+    cov_px_m = screen_depth_covariance(quats_wxyz, log_scales, mean_in_cam, pose, camera)
+    xx, xy, yy = meta["conics"].unbind(-1)
+    x, y = cov_px_m.unbind(-1)
+    slope = torch.stack([xx * x + xy * y, xy * x + yy * y], dim=-1)
+    return bounded_slope(slope, cov_px_m, meta["depths"])
 
 
 def _screen_stats(meta: dict[str, Any]) -> ScreenStats:

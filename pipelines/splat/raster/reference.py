@@ -16,6 +16,7 @@ from pipelines.splat.gaussians import Gaussians, rotation_matrices
 from pipelines.splat.raster.api import (
     ALPHA_MAX,
     ALPHA_MIN,
+    DEPTH_REACH,
     TRANSMITTANCE_MIN,
     Pinhole,
     RasterSettings,
@@ -50,7 +51,8 @@ def render_reference(
 
     mean_px, cov_px2 = project(sorted_gaussians, mean_in_cam, pose, camera, settings.dilation_px2)
     colours = view_colours(sorted_gaussians, pose, settings.sh_degree)
-    alpha = _alpha(mean_px, cov_px2, torch.sigmoid(sorted_gaussians.logit_opacities), camera)
+    offset_px = _offsets(mean_px, camera)
+    alpha = _alpha(offset_px, cov_px2, torch.sigmoid(sorted_gaussians.logit_opacities))
 
     after = torch.cumprod(1 - alpha, dim=0)
     counted = after > TRANSMITTANCE_MIN
@@ -62,9 +64,13 @@ def render_reference(
     size = (camera.height, camera.width)
     expected, median = None, None
     if settings.depth:
-        depth = mean_in_cam[:, 2]
+        quats_wxyz, log_scales = sorted_gaussians.quats_wxyz, sorted_gaussians.log_scales
+        cov_px_m = screen_depth_covariance(quats_wxyz, log_scales, mean_in_cam, pose, camera)
+        slope = bounded_slope(torch.linalg.solve(cov_px2, cov_px_m), cov_px_m, mean_in_cam[:, 2])
+        depth = mean_in_cam[:, 2:] + (slope[:, None] * offset_px).sum(dim=-1)
         opaque = final < 1
-        expected = torch.where(opaque, (depth @ weight) / torch.where(opaque, 1 - final, 1.0), 0.0).view(size)
+        depth_sum = (depth * weight).sum(dim=0)
+        expected = torch.where(opaque, depth_sum / torch.where(opaque, 1 - final, 1.0), 0.0).view(size)
         median = _median_depth(depth, before, after, counted).view(size)
     stats = _screen_stats(front, mean_px, cov_px2, sorted_gaussians.logit_opacities, camera)
     return Render(colour.view(*size, 3), (1 - final).view(size), expected, median, stats)
@@ -73,7 +79,41 @@ def render_reference(
 def project(
     gaussians: Gaussians, mean_in_cam: Tensor, cam_from_model: Tensor, camera: Pinhole, dilation_px2: float
 ) -> tuple[Tensor, Tensor]:
-    """Screen means (N, 2) in px and dilated screen covariances (N, 2, 2) in px².
+    """Screen means (N, 2) in px and dilated screen covariances (N, 2, 2) in px²."""
+    x, y, z = mean_in_cam.unbind(-1)
+    screen_axes = _projected_axes(gaussians.quats_wxyz, gaussians.log_scales, mean_in_cam, cam_from_model, camera)[
+        :, :2
+    ]
+    cov_px2 = screen_axes @ screen_axes.mT + dilation_px2 * torch.eye(2, dtype=z.dtype)
+    mean_px = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], dim=-1)
+    return mean_px, cov_px2
+
+
+def screen_depth_covariance(
+    quats_wxyz: Tensor, log_scales: Tensor, mean_in_cam: Tensor, cam_from_model: Tensor, camera: Pinhole
+) -> Tensor:
+    """Covariances (N, 2) of the screen position (u, v) with z, in px · m, of Gaussians at (N, 3)."""
+    axes = _projected_axes(quats_wxyz, log_scales, mean_in_cam, cam_from_model, camera)
+    return (axes[:, :2] @ axes[:, 2, :, None])[..., 0]
+
+
+def bounded_slope(slope: Tensor, cov_px_m: Tensor, depth: Tensor) -> Tensor:
+    """∂z/∂(u, v) of the Gaussians (N, 2) in m/px, shortened where z would leave `DEPTH_REACH` of the centre's.
+
+    Args:
+        slope: (N, 2) q = C⁻¹ c.
+        cov_px_m: (N, 2) c. By Cauchy and Schwarz |q · d| ≤ √(c · q) √(dᵀ C⁻¹ d).
+        depth: (N,) z of the centres.
+    """
+    spread_m = torch.sqrt((cov_px_m * slope).sum(dim=-1).clamp_min(torch.finfo(slope.dtype).tiny))
+    most_m = DEPTH_REACH / math.sqrt(-2 * math.log(ALPHA_MIN)) * depth
+    return slope * (most_m / torch.maximum(spread_m, most_m))[:, None]
+
+
+def _projected_axes(
+    quats_wxyz: Tensor, log_scales: Tensor, mean_in_cam: Tensor, cam_from_model: Tensor, camera: Pinhole
+) -> Tensor:
+    """The principal axes, a standard deviation long, along (u, v, z): (N, 3, 3), one axis a column, px, px and m.
 
     The perspective is linearised at the centre (EWA, doi 10.1109/TVCG.2002.1021576), but no further out than
     `FRUSTUM_MARGIN` beyond the image, as in gsplat.
@@ -83,15 +123,15 @@ def project(
     margin_y = FRUSTUM_MARGIN * 0.5 * camera.height / camera.fy
     slope_x = (x / z).clamp(-camera.cx / camera.fx - margin_x, (camera.width - camera.cx) / camera.fx + margin_x)
     slope_y = (y / z).clamp(-camera.cy / camera.fy - margin_y, (camera.height - camera.cy) / camera.fy + margin_y)
-    zero = torch.zeros_like(z)
-    jacobian = torch.stack(
-        [camera.fx / z, zero, -camera.fx * slope_x / z, zero, camera.fy / z, -camera.fy * slope_y / z], dim=-1
-    ).view(-1, 2, 3)
-    axes = rotation_matrices(gaussians.quats_wxyz) * torch.exp(gaussians.log_scales)[:, None, :]
-    screen_axes = jacobian @ cam_from_model[:3, :3] @ axes
-    cov_px2 = screen_axes @ screen_axes.mT + dilation_px2 * torch.eye(2, dtype=z.dtype)
-    mean_px = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], dim=-1)
-    return mean_px, cov_px2
+    zero, one = torch.zeros_like(z), torch.ones_like(z)
+    rows = [
+        camera.fx / z, zero, -camera.fx * slope_x / z,
+        zero, camera.fy / z, -camera.fy * slope_y / z,
+        zero, zero, one,
+    ]  # fmt: skip
+    jacobian = torch.stack(rows, dim=-1).view(-1, 3, 3)
+    axes = rotation_matrices(quats_wxyz) * torch.exp(log_scales)[:, None, :]
+    return jacobian @ cam_from_model[:3, :3] @ axes
 
 
 def view_colours(gaussians: Gaussians, cam_from_model: Tensor, sh_degree: int) -> Tensor:
@@ -100,14 +140,19 @@ def view_colours(gaussians: Gaussians, cam_from_model: Tensor, sh_degree: int) -
     return (sh.evaluate(gaussians.sh, gaussians.means - center_in_model, sh_degree) + 0.5).clamp_min(0.0)
 
 
-def _alpha(mean_px: Tensor, cov_px2: Tensor, opacity: Tensor, camera: Pinhole) -> Tensor:
-    """(N, H·W) opacity of each Gaussian at each pixel centre, cut off below ALPHA_MIN and above ALPHA_MAX."""
+def _offsets(mean_px: Tensor, camera: Pinhole) -> Tensor:
+    """(N, H·W, 2) from the screen means to the pixel centres."""
     v, u = torch.meshgrid(
         torch.arange(camera.height, dtype=mean_px.dtype) + 0.5,
         torch.arange(camera.width, dtype=mean_px.dtype) + 0.5,
         indexing="ij",
     )
-    dx, dy = u.reshape(1, -1) - mean_px[:, :1], v.reshape(1, -1) - mean_px[:, 1:]
+    return torch.stack([u.reshape(-1), v.reshape(-1)], dim=-1) - mean_px[:, None]
+
+
+def _alpha(offset_px: Tensor, cov_px2: Tensor, opacity: Tensor) -> Tensor:
+    """(N, H·W) opacity of each Gaussian at each pixel centre, cut off below ALPHA_MIN and above ALPHA_MAX."""
+    dx, dy = offset_px.unbind(-1)
     xx, xy, yy = cov_px2[:, 0, 0, None], cov_px2[:, 0, 1, None], cov_px2[:, 1, 1, None]
     sigma = 0.5 * (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / (xx * yy - xy * xy)
     alpha = opacity[:, None] * torch.exp(-sigma)
@@ -115,9 +160,9 @@ def _alpha(mean_px: Tensor, cov_px2: Tensor, opacity: Tensor, camera: Pinhole) -
 
 
 def _median_depth(depth: Tensor, before: Tensor, after: Tensor, counted: Tensor) -> Tensor:
-    """(P,) z of the Gaussian at which the transmittance of each of P pixels falls to one half, else 0."""
+    """(P,) z, of (N, P), of the Gaussian at which the transmittance of each pixel falls to one half, else 0."""
     crossing = counted & (before > 0.5) & (after <= 0.5)
-    return torch.where(crossing, depth.detach()[:, None], 0.0).sum(dim=0)
+    return torch.where(crossing, depth.detach(), 0.0).sum(dim=0)
 
 
 def _screen_stats(

@@ -58,7 +58,7 @@ def images(scene: Scene, tmp_path: Path) -> ImageCache:
 
 
 def test_points_lie_on_the_ground_or_in_the_sky(scene: Scene, images: ImageCache) -> None:
-    found = background(scene, images)
+    found = background(scene, images, scene.point_in_model)
     middle = np.median(scene.point_in_model, axis=0)
     distance = np.linalg.norm(found.point_in_model - middle, axis=1)
     a, b, c = ground_plane(scene.point_in_model)
@@ -73,7 +73,7 @@ def test_points_lie_on_the_ground_or_in_the_sky(scene: Scene, images: ImageCache
 
 
 def test_colours_are_those_of_the_rays(scene: Scene, images: ImageCache) -> None:
-    found = background(scene, images)
+    found = background(scene, images, scene.point_in_model)
     high = found.point_in_model[:, 2] > 40.0  # above every camera
     assert (found.rgb[high] == (60, 120, BLUE)).all()
     low = np.abs(found.point_in_model[:, 2] - np.percentile(scene.point_in_model[:, 2], 5)) < 1e-6
@@ -81,14 +81,14 @@ def test_colours_are_those_of_the_rays(scene: Scene, images: ImageCache) -> None
 
 
 def test_places_with_sfm_points_are_left_to_them(scene: Scene, images: ImageCache) -> None:
-    found = background(scene, images)
+    found = background(scene, images, scene.point_in_model)
     ground = found.point_in_model[:, 2] < 5.0
     in_the_cloud = (np.abs(found.point_in_model[ground, :2]) < 15.0).all(axis=1)
     assert in_the_cloud.sum() <= 0.02 * len(found.sigma_m)
 
 
 def test_size_is_that_of_the_cell_seen_from_its_camera(scene: Scene, images: ImageCache) -> None:
-    found = background(scene, images)
+    found = background(scene, images, scene.point_in_model)
     middle, radius = np.median(scene.point_in_model, axis=0), 0.0
     radius = float(np.percentile(np.linalg.norm(scene.point_in_model - middle, axis=1), 90))
     sky = found.point_in_model[:, 2] > 60.0
@@ -97,7 +97,7 @@ def test_size_is_that_of_the_cell_seen_from_its_camera(scene: Scene, images: Ima
 
 
 def test_neighbouring_views_do_not_repeat_a_place(scene: Scene, images: ImageCache) -> None:
-    found = background(scene, images)
+    found = background(scene, images, scene.point_in_model)
     level = np.round(np.log2(found.sigma_m))
     cube = np.floor(found.point_in_model / (2.0 ** (level + 1))[:, None])
     assert len(np.unique(np.column_stack([level, cube]), axis=0)) == len(cube)
@@ -107,4 +107,4 @@ def test_cloud_that_fills_the_view_needs_none(scene: Scene, images: ImageCache) 
     rng = np.random.default_rng(1)
     everywhere = rng.normal(0, 200, (60_000, 3))
     full = replace(scene, sparse=replace(scene.sparse, point_in_local=everywhere))
-    assert len(background(full, images).sigma_m) == 0
+    assert len(background(full, images, full.point_in_model).sigma_m) == 0

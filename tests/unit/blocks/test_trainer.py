@@ -18,7 +18,9 @@ from splat_scenes import (
 )
 
 from pipelines.blocks.checkpoint import load_checkpoint, save_checkpoint
-from pipelines.blocks.scene import geo_problem, initial_scene, photographs
+from pipelines.blocks.geographic import geo_problem
+from pipelines.blocks.material import Material
+from pipelines.blocks.scene import initial_scene, photographs
 from pipelines.blocks.trainer import JointTrainer
 from pipelines.config import TrainConfig
 from pipelines.splat.raster.api import rasterizer
@@ -51,7 +53,7 @@ def trainer_of(rendered: Rendered, workspace: Workspace, config: TrainConfig = C
     scene = initial_scene(rendered.sparse, rendered.survey, initial)  # type: ignore[arg-type]
     images = photographs(scene.sparse, rendered.survey, workspace, 640)
     problem = geo_problem(scene, rendered.survey, initial, config)  # type: ignore[arg-type]
-    return make_trainer(scene, images, problem, rasterizer("cpu"), config)
+    return make_trainer(Material(scene, images), problem, rasterizer("cpu"), config)
 
 
 def test_every_view_is_seen_once_an_epoch_and_no_test_view_ever(rendered: Rendered, workspace: Workspace) -> None:

@@ -9,17 +9,22 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
-from georef_scenes import draw_truth, fixes_of, make_block, marks_of, problem_of
-
-from pipelines.georef.losses import (
-    CAUCHY_SCALE2,
-    absolute_loss,
-    cauchy,
-    control_point_loss,
-    intersect,
-    rising_weight,
+from georef_scenes import (
+    attitudes_of,
+    draw_truth,
+    fixes_of,
+    make_block,
+    marks_of,
+    pairs_of,
+    problem_of,
+    problem_with,
 )
+
+from pipelines.georef.losses import CAUCHY_SCALE2, Weighting, cauchy, intersect, pair_residuals, rising_weight
+from pipelines.georef.measured import Measured, Pairs
 from pipelines.georef.problem import GeoProblem
+from pipelines.georef.similarity import LearnableSimilarity
+from pipelines.georef.systematic import SystematicErrors
 
 BLOCK = make_block(images=4)
 SIGMA_M = np.array([0.5, 0.4, 0.8])
@@ -56,9 +61,12 @@ def test_absolute_loss_is_the_mean_of_rho(problem: GeoProblem) -> None:
     center = problem.similarity.current().apply(problem.cameras.current().cam_center_in_model)
     residual = center - fixes.position_in_geo.numpy()
     chi2 = ((residual / SIGMA_M) ** 2).sum(axis=1)
-    found = absolute_loss(problem.similarity, problem.cameras, fixes, "whitened")
+    found = problem.terms().absolute
+    assert found is not None
     assert found.item() == pytest.approx(np.mean(CAUCHY_SCALE2 * np.log1p(chi2 / CAUCHY_SCALE2)))
-    plain = absolute_loss(problem.similarity, problem.cameras, fixes, "paper")
+    problem.weighting = "paper"
+    plain = problem.terms().absolute
+    assert plain is not None
     assert plain.item() == pytest.approx((residual**2).sum(axis=1).mean())
 
 
@@ -71,7 +79,9 @@ def test_full_covariance_whitens(problem: GeoProblem) -> None:
     center = problem.similarity.current().apply(problem.cameras.current().cam_center_in_model)
     residual = center - fixes.position_in_geo.numpy()
     chi2 = np.einsum("ni,ij,nj->n", residual, np.linalg.inv(covariance), residual)
-    found = absolute_loss(problem.similarity, problem.cameras, replace(fixes, root_information=root), "whitened")
+    problem.measured = Measured(replace(fixes, root_information=root))
+    found = problem.terms().absolute
+    assert found is not None
     assert found.item() == pytest.approx(np.mean(CAUCHY_SCALE2 * np.log1p(chi2 / CAUCHY_SCALE2)))
 
 
@@ -79,7 +89,7 @@ def test_marks_meet_in_the_point_they_were_made_of() -> None:
     truth = draw_truth(BLOCK, np.random.default_rng(0))
     marks = marks_of(truth, CONTROL, 0.05, np.random.default_rng(0))
     problem = problem_of(replace(BLOCK, poses=truth.poses), None, marks)
-    np.testing.assert_allclose(intersect(problem.cameras, marks).detach(), CONTROL, atol=1e-10)
+    np.testing.assert_allclose(intersect(problem.estimate(), marks).detach(), CONTROL, atol=1e-10)
 
 
 def test_intersection_weighs_rays_by_angle_and_distance() -> None:
@@ -95,7 +105,7 @@ def test_intersection_weighs_rays_by_angle_and_distance() -> None:
         sigmas[0] = sigma
         spoilt = replace(marks, bearing_in_cam=turned, sigma_rad=sigmas)
         problem = problem_of(replace(BLOCK, poses=truth.poses), None, spoilt)
-        found = intersect(problem.cameras, spoilt).detach().numpy()
+        found = intersect(problem.estimate(), spoilt).detach().numpy()
         shift.append(np.linalg.norm(found - CONTROL[:1]))
     # 1e-3 rad over 55 m are 5.5 cm across the ray, which a good ray imposes and a bad one does not.
     assert shift[0] < 0.002
@@ -103,27 +113,56 @@ def test_intersection_weighs_rays_by_angle_and_distance() -> None:
 
 
 @pytest.mark.parametrize("weighting", ["whitened", "paper"])
-def test_gradients_are_exact(problem: GeoProblem, weighting: str) -> None:
-    problem.weighting = weighting  # type: ignore[assignment]
+@pytest.mark.parametrize("learned", [False, True])
+def test_gradients_are_exact(weighting: Weighting, learned: bool) -> None:
+    rng = np.random.default_rng(5)
+    truth = draw_truth(BLOCK, rng)
+    fixes = replace(fixes_of(truth, SIGMA_M, rng), flight=torch.tensor([0, 1, 1, 0]))
+    measured = Measured(
+        fixes,
+        marks_of(truth, CONTROL, 0.05, rng),
+        attitudes=attitudes_of(truth, 0.01, rng),
+        pairs=pairs_of(truth, CONTROL, 0.1, rng),
+    )
+    errors = SystematicErrors(2, arm=True, attitude_sigma_rad=0.01)
+    problem = problem_with(BLOCK, measured, errors, weighting=weighting, learned_weights=learned)
+    names = ("similarity.y", "cameras.z", "errors.x", "weights.u")
+    start = problem.state_dict()
+    values = tuple((start[name] + 0.1 * torch.from_numpy(rng.normal(size=start[name].shape))) for name in names)
 
-    def losses(y: torch.Tensor, z: torch.Tensor) -> torch.Tensor:
-        return torch.func.functional_call(_Losses(problem), {"problem.similarity.y": y, "problem.cameras.z": z}, ())
+    def losses(*values: torch.Tensor) -> torch.Tensor:
+        told = {f"problem.{name}": value for name, value in zip(names, values, strict=True)}
+        return torch.func.functional_call(_Losses(problem), told, ())
 
-    rng = np.random.default_rng(7)
-    y = torch.from_numpy(0.1 * rng.normal(size=7)).requires_grad_()
-    z = torch.from_numpy(rng.normal(size=len(problem.cameras.z))).requires_grad_()
-    assert torch.autograd.gradcheck(losses, (y, z), eps=1e-6, atol=1e-5, rtol=1e-4)
+    assert torch.autograd.gradcheck(
+        losses, tuple(each.requires_grad_() for each in values), eps=1e-6, atol=1e-5, rtol=1e-4
+    )
+
+
+def test_pairs_of_cameras_move_with_them() -> None:
+    # The distance between two cameras is that of where they are now.
+    truth = draw_truth(BLOCK, np.random.default_rng(0))
+    center = truth.geo_from_model.apply(truth.poses.cam_center_in_model)
+    camera = torch.tensor([[0, 1], [1, 3]])
+    distance = torch.from_numpy(np.linalg.norm(center[[0, 1]] - center[[1, 3]], axis=1))
+    pairs = Pairs(None, camera, distance, torch.ones(2, dtype=torch.float64), 1.0)
+    problem = problem_with(replace(BLOCK, poses=truth.poses), Measured(pairs=pairs))
+    problem.similarity = LearnableSimilarity(truth.geo_from_model, np.eye(7), np.zeros(3))
+    np.testing.assert_allclose(pair_residuals(problem.estimate(), pairs).detach(), 0.0, atol=1e-12)
+    with torch.no_grad():
+        problem.cameras.z += 1.0
+    assert float(pair_residuals(problem.estimate(), pairs).detach().abs().max()) > 1e-3
 
 
 class _Losses(torch.nn.Module):
+    """Every term, and the sum."""
+
     def __init__(self, problem: GeoProblem) -> None:
         super().__init__()
         self.problem = problem
 
     def forward(self) -> torch.Tensor:
         problem = self.problem
-        assert problem.fixes is not None
         assert problem.marks is not None
-        absolute = absolute_loss(problem.similarity, problem.cameras, problem.fixes, problem.weighting)
-        control = control_point_loss(problem.similarity, problem.cameras, problem.marks, problem.weighting)
-        return torch.stack([absolute, control, problem.loss(), *intersect(problem.cameras, problem.marks)[0]])
+        point = intersect(problem.estimate(), problem.marks)[0]
+        return torch.stack([*problem.terms().present().values(), problem.loss(), *point])

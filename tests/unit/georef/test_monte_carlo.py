@@ -22,6 +22,7 @@ from pipelines.geometry.following import follow
 from pipelines.geometry.similarity import Similarity
 from pipelines.georef.cameras import CameraCorrections, CameraPoses
 from pipelines.georef.losses import ControlMarks, Fixes, intersect
+from pipelines.georef.measured import Measured
 from pipelines.georef.posterior import LensDoubt, minimise, posterior
 from pipelines.georef.problem import GeoProblem
 from pipelines.georef.similarity import LearnableSimilarity
@@ -89,8 +90,7 @@ def one_run(seed: int, sigma_m: np.ndarray, control: bool, solve: np.ndarray) ->
     problem = GeoProblem(
         LearnableSimilarity(Similarity(), START, center.mean(axis=0)),
         CameraCorrections(CameraPoses(network.cam_from_world, network.cam_center_in_world), found.matrix),
-        fixes,
-        marks_of(at_control, SURVEY_M**2 * np.eye(3), rng) if control else None,
+        Measured(fixes, marks_of(at_control, SURVEY_M**2 * np.eye(3), rng) if control else None),
     )
     minimise(problem)
     by_control = follow(at_control, np.full(len(at_control.obs_point), MARK_PX)).by_lens

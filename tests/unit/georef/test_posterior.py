@@ -7,12 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from georef_scenes import Block, Truth, draw_truth, fixes_of, make_block, marks_of, pivot, problem_of
+from georef_scenes import Block, Truth, draw_truth, fixes_of, make_block, marks_of, pivot, problem_of, problem_with
 
 from pipelines.errors import DegenerateGeometryError
-from pipelines.georef.losses import ControlMarks, Fixes, intersect
+from pipelines.georef.losses import ControlMarks, intersect
+from pipelines.georef.measured import Measured
 from pipelines.georef.posterior import leave_one_out, minimise, posterior
 from pipelines.georef.problem import GeoProblem
+from pipelines.georef.systematic import SystematicErrors
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 BLOCK = make_block()
@@ -81,9 +83,9 @@ def test_leaving_out_is_what_solving_again_would_give(sigma_m: np.ndarray | None
         with torch.no_grad():
             measured = again.similarity(intersect(again.cameras, problem.marks))[j]
         error = (measured - problem.marks.position_in_geo[j]).numpy()
-        # The weights of the others change a little when it is gone: a tenth of what is expected of the error.
+        # The weights of the others change a little when it is gone: a fifth of what is expected of the error.
         sigma = np.sqrt(np.diag(found.cov_in_geo[j]))
-        np.testing.assert_allclose(found.error_in_geo[j], error, atol=0.15 * sigma.max())
+        np.testing.assert_allclose(found.error_in_geo[j], error, atol=0.2 * sigma.max())
 
 
 def test_a_blundered_control_point_shows_when_it_is_left_out() -> None:
@@ -135,30 +137,15 @@ def test_without_control_points_there_is_nothing_to_leave_out() -> None:
     assert leave_one_out(problem).error_in_geo.shape == (0, 3)
 
 
-def test_a_parameter_that_was_added_is_marginalised_out() -> None:
-    class WithBias(GeoProblem):
-        """All fixes off by a common vector, known beforehand to 10 m."""
-
-        def __init__(self, problem: GeoProblem) -> None:
-            super().__init__(problem.similarity, problem.cameras, problem.fixes, problem.marks)
-            self.bias = torch.nn.Parameter(torch.zeros(3, dtype=torch.float64))
-
-        def prior(self) -> torch.Tensor:
-            return super().prior() + (self.bias / 10).square().sum()
-
-        def forward(self) -> torch.Tensor:
-            assert self.fixes is not None
-            white = (self.fixes.root_information @ self.bias[:, None])[:, :, 0]
-            rest = super().forward()
-            return torch.cat([rest[: len(white)] + white, rest[len(white) :]])
-
+def test_a_bias_that_is_estimated_is_marginalised_out() -> None:
     rng = np.random.default_rng(4)
     truth = draw_truth(BLOCK, rng)
     fixes = fixes_of(truth, RTK, rng)
-    shifted = Fixes(fixes.camera, fixes.position_in_geo + torch.tensor([2.0, -1.0, 3.0]), fixes.root_information)
-    problem = WithBias(problem_of(BLOCK, shifted, marks_of(truth, CONTROL, 0.02, rng)))
+    shifted = replace(fixes, position_in_geo=fixes.position_in_geo + torch.tensor([2.0, -1.0, 3.0]))
+    measured = Measured(shifted, marks_of(truth, CONTROL, 0.02, rng))
+    problem = problem_with(BLOCK, measured, SystematicErrors(1))
     minimise(problem)
-    np.testing.assert_allclose(problem.bias.detach(), [2.0, -1.0, 3.0], atol=0.05)
+    np.testing.assert_allclose(problem.errors.vector().detach(), [2.0, -1.0, 3.0], atol=0.05)
     # The position then is the control points' alone: worse than with fixes that are believed.
     believed = problem_of(BLOCK, fixes, problem.marks)
     minimise(believed)

@@ -11,7 +11,6 @@ from pipelines.robust.statistics import (
     mad_sigma,
     residual_stats,
     squared_mahalanobis,
-    weighted_mean,
 )
 
 
@@ -38,10 +37,6 @@ def test_mad_sigma_ignores_forty_percent_outliers() -> None:
     assert mad_sigma(values) == pytest.approx(2.0, rel=0.05)
     values[:2000] += 1000.0
     assert mad_sigma(values) < 8.0
-
-
-def test_weighted_mean_of_vectors() -> None:
-    assert weighted_mean([[0.0, 2.0], [4.0, 6.0]], [3.0, 1.0]) == pytest.approx([1.0, 3.0])
 
 
 def test_squared_mahalanobis_of_correlated_errors() -> None:

@@ -73,6 +73,18 @@ def test_distance_is_that_of_the_definition(network: tuple[nn.Sequential, list[T
         lpips(image[:8], target[:8])
 
 
+def test_pixels_outside_the_mask_are_equal(network: tuple[nn.Sequential, list[Tensor], Path]) -> None:
+    lpips = Lpips(network[2])
+    image, target = torch.rand(2, 37, 33, 3, generator=torch.Generator().manual_seed(1))
+    mask = torch.ones(37, 33, dtype=torch.bool)
+    mask[:, :8] = False
+    spoilt = image.clone()
+    spoilt[:, :8] = 1.0
+    assert lpips(spoilt, target, mask) == lpips(image, target, mask)
+    assert 0 < lpips(image, target, mask) < lpips(image, target)
+    assert lpips(image, target, ~torch.ones_like(mask)) == 0
+
+
 def test_without_weights_there_is_a_reason() -> None:
     reason = lpips_or_reason(None)
     assert isinstance(reason, str)

@@ -10,7 +10,14 @@ import torch
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.raster.api import Pinhole
 from pipelines.splat.raster.cpu import CpuRasterizer
-from pipelines.splat.surface import depth_loss, depth_normals, disc_normals, flatness_loss, normal_loss
+from pipelines.splat.surface import (
+    depth_loss,
+    depth_normals,
+    disc_normals,
+    flatness_loss,
+    measured_depth,
+    normal_loss,
+)
 
 CAMERA = Pinhole(48, 36, 40.0, 40.0, 24.0, 18.0)
 POSE = torch.eye(4)
@@ -103,3 +110,9 @@ def test_depth_is_held_to_the_points_that_are_seen_in_it() -> None:
     elsewhere[2, 3] = 1.0
     far = depth_loss(depth.detach(), alpha, points[:1], elsewhere, CAMERA)
     assert float(far) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_measured_depth_is_the_mean_on_the_surface_that_the_median_shows() -> None:
+    median = torch.tensor([[10.0, 10.0, 0.0]])
+    expected = torch.tensor([[10.05, 7.0, 3.0]])  # on the surface, haze before it, haze alone
+    torch.testing.assert_close(measured_depth(median, expected), torch.tensor([[10.05, 10.0, 0.0]]))

@@ -1,7 +1,7 @@
 """The gsplat backend without a GPU: what it says when it cannot run, and what it makes of gsplat's results.
 
-A stand-in plays gsplat on the CPU: it renders by the reference and lists intersections by brute force, in the
-shapes and the order of gsplat 1.5.3. What the real kernels return is for a machine that has a GPU.
+A stand-in plays gsplat on the CPU: it projects by the reference, and blends and lists intersections by brute force,
+in the shapes and the order of gsplat 1.5.3. What the real kernels return is for a machine that has a GPU.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ BACKGROUND = (0.1, 0.7, 0.4)
 
 
 class StandIn:
-    """gsplat's two functions that the backend calls."""
+    """gsplat's three functions that the backend calls."""
 
     def rasterization(self, means, quats, scales, opacities, colors, viewmats, Ks, width, height, **options):
         assert options["packed"] and viewmats.shape == (1, 4, 4) and Ks.shape == (1, 3, 3)
@@ -30,28 +30,42 @@ class StandIn:
         gaussians = Gaussians(means, quats, scales.log(), torch.logit(opacities), colors)
         camera = self.camera
         assert (width, height, Ks[0, 0, 2].item()) == (camera.width, camera.height, camera.cx)
-        depth = options["render_mode"] == "RGB+ED"
-        settings = RasterSettings(options["sh_degree"], BACKGROUND, options["near_plane"], options["eps2d"], depth)
-        render = render_reference(gaussians, viewmats[0], camera, settings)
-        rows = render.stats.visible
+        settings = RasterSettings(options["sh_degree"], BACKGROUND, options["near_plane"], options["eps2d"])
+        with torch.no_grad():
+            rows = render_reference(gaussians, viewmats[0], camera, settings).stats.visible
         seen, pose = gaussians.select(rows), viewmats[0]
         in_cam = seen.means @ pose[:3, :3].T + pose[:3, 3]
         means2d, cov = project(seen, in_cam, pose, camera, options["eps2d"])
         inverse = torch.linalg.inv(cov)
         conics = torch.stack([inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 1, 1]], dim=-1)
         meta = {"means2d": means2d, "conics": conics, "opacities": opacities[rows], "depths": in_cam[:, 2]}
-        meta |= {"gaussian_ids": rows, "tile_size": 16, "isect_offsets": None, "flatten_ids": None}
-        image = render.colour + 0 * (means2d.sum() + view_colours(seen, pose, 0).sum())
-        if depth:
-            image = torch.cat([image, render.expected_depth[..., None]], dim=-1)
-        return image[None], render.alpha[None, ..., None], meta
+        meta |= {"gaussian_ids": rows, "tile_size": 16, "isect_offsets": None}
+        meta["flatten_ids"] = torch.argsort(meta["depths"])
+        colours = view_colours(seen, pose, options["sh_degree"])
+        image, alpha = self.rasterize_to_pixels(
+            means2d, conics, colours, opacities[rows], width, height, 16, None, meta["flatten_ids"], packed=True
+        )
+        return image + (1 - alpha) * options["backgrounds"], alpha, meta
+
+    def rasterize_to_pixels(
+        self, means2d, conics, colors, opacities, width, height, tile_size, offsets, order, *, packed
+    ):
+        assert packed and tile_size == 16 and colors.shape == (len(means2d), 3)
+        v, u = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+        dx, dy = (center[order, None, None] - at for center, at in zip(means2d.T, (u, v), strict=True))
+        a, b, c = conics[order].T[:, :, None, None]
+        alpha = opacities[order, None, None] * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
+        alpha = torch.where(alpha >= ALPHA_MIN, alpha.clamp(max=ALPHA_MAX), 0.0)
+        after = torch.cumprod(1 - alpha, dim=0)
+        counted = after > TRANSMITTANCE_MIN
+        weight = torch.where(counted, alpha * torch.cat([torch.ones_like(after[:1]), after[:-1]]), 0.0)
+        return torch.einsum("nhw,nc->hwc", weight, colors[order])[None], weight.sum(dim=0)[None, ..., None]
 
     def rasterize_to_indices_in_range(
-        self, start, end, transmittances, means2d, conics, opacities, width, height, *_
+        self, start, end, transmittances, means2d, conics, opacities, width, height, tile_size, offsets, order
     ):
         assert start == 0 and end > 1_000_000 and transmittances.shape == (1, height, width)
         found = []
-        order = torch.argsort(self.depths(means2d))
         for pixel in range(width * height):
             left = 1.0
             for index in order.tolist():
@@ -113,17 +127,32 @@ def test_images_statistics_and_median(make_scene, leaves, camera, backend):
     small = type(camera)(20, 14, 18.0, 18.0, 10.0, 7.0)
     stand_in.camera = small
     truth = render_reference(gaussians, pose, small, settings)
-    in_cam = gaussians.means.detach() @ pose[:3, :3].T.float() + pose[:3, 3].float()
-    stand_in.depths = lambda means2d: in_cam[truth.stats.visible, 2]
     render = rasteriser.render(gaussians, pose, small, settings)
     torch.testing.assert_close(render.colour, truth.colour, rtol=0, atol=1e-5)
     torch.testing.assert_close(render.alpha, truth.alpha, rtol=0, atol=1e-5)
     torch.testing.assert_close(render.median_depth, truth.median_depth, rtol=0, atol=1e-5)
     assert (truth.median_depth > 0).any() and (truth.median_depth == 0).any()
+    torch.testing.assert_close(render.expected_depth, truth.expected_depth, rtol=0, atol=1e-4)
     assert torch.equal(render.stats.visible, truth.stats.visible)
     torch.testing.assert_close(render.stats.radius_px, truth.stats.radius_px, rtol=1e-4, atol=1e-4)
     render.colour.sum().backward()
     assert render.stats.mean_gradient.shape == (len(render.stats.visible), 2)
+
+
+def test_gradients_of_depth(make_scene, leaves, camera, backend, loss_of):
+    rasteriser, stand_in = backend
+    small = stand_in.camera = type(camera)(20, 14, 18.0, 18.0, 9.0, 8.0)
+    settings, scene = RasterSettings(0, BACKGROUND, depth=True), make_scene(12, seed=4, log_scale=-0.5)
+    (gaussians, pose), (truth, truth_pose) = leaves(scene, torch.float32), leaves(scene, torch.float64)
+    render = rasteriser.render(gaussians, pose, small, settings)
+    expected = render_reference(truth, truth_pose, small, settings)
+    loss_of(render).backward()
+    loss_of(expected).backward()
+    # float32 throughout: some 1e3 terms of either sign, and planes that tilt by metres over the image.
+    pairs = [(ours.grad, truth.tensors()[name].grad) for name, ours in gaussians.tensors().items()]
+    pairs += [(pose.grad, truth_pose.grad), (render.stats.mean_gradient, expected.stats.mean_gradient)]
+    for ours, theirs in pairs:
+        assert (ours - theirs).abs().max() < 1e-3 * theirs.abs().max()
 
 
 def test_without_depth_there_is_none(make_scene, camera, backend):
@@ -146,3 +175,4 @@ def test_nothing_visible(make_scene, camera, backend):
     render = rasteriser.render(gaussians, pose, camera, RasterSettings(0, BACKGROUND, depth=True))
     assert len(render.stats.visible) == 0
     assert render.median_depth.abs().max() == 0
+    assert render.expected_depth.abs().max() == 0

@@ -1,0 +1,68 @@
+"""`georef compare`."""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any
+
+import click
+
+from georef_cli import boundary, options, tables
+from georef_cli.display import progress_for
+from georef_cli.output import document_of, print_json, print_rich
+from pipelines.compare import NAMES, TRAIN_OPTIONS, chosen, compare
+from pipelines.config import TrainConfig
+
+
+def _compare(ctx: click.Context, **values: Any) -> None:
+    configurations = chosen(values["configs"])
+    workspace = values["workspace"]
+    table, ran = compare(
+        workspace,
+        configurations,
+        options.given(ctx, TRAIN_OPTIONS),
+        force=values["force"],
+        progress=progress_for(ctx.obj),
+        around=lambda variant, spec: boundary.written(variant.log_file(spec)),
+    )
+    if values["as_json"]:
+        stages = [{"configuration": each.configuration, **document_of(each.outcome)} for each in ran]
+        print_json({"workspace": str(workspace.root), **table.model_dump(mode="json"), "stages": stages})
+    else:
+        print_rich(*tables.comparison(table))
+
+
+command = click.Command(
+    "compare",
+    params=[
+        options.workspace_argument(),
+        click.Option(
+            ["--configs"],
+            default=",".join(NAMES),
+            help=f"Configurations to compare, with commas. [default: {','.join(NAMES)}]",
+        ),
+        *options.stage_options(TrainConfig, TRAIN_OPTIONS),
+        options.force_option("Run the stages of the configurations even if their products are current."),
+        options.json_option(),
+    ],
+    callback=click.pass_context(_compare),
+    help=inspect.cleandoc(
+        """Run the ablation on one survey and put its figures into one table.
+
+        baseline: bundle adjustment with the fixes, then 3DGS. A: 3DGS, aligned afterwards with the fixes. B: its
+        Gaussians, placed by the paper's initial similarity. C: similarity and cameras trained too, with L_abs.
+        D: C with L_gcp and L_rel. E: D with a rising weight, the full method.
+
+        Stages up to geolocate are shared, and run first where they are not current. Each configuration is kept in
+        WS/compare/NAME; a second call skips what is current and resumes what was interrupted. All are trained with
+        the same options: those of the last comparison and of georef train, unless given. The table is
+        WS/compare/table.json, table.md and plot.png.
+
+        \b
+        Examples:
+          georef compare flight --preset fast
+          georef compare flight --configs baseline,A,E --preset fast --iterations 600 --max-image-size 320
+          georef compare flight --configs E --json
+        """
+    ),
+)

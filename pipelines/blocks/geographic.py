@@ -1,0 +1,116 @@
+"""The geographic half of a training, from the products of the stages before it and the options of training."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from pipelines.blocks.measurements import attitudes_of, control_marks, depth_marks, fixes_of, pairs_of
+from pipelines.blocks.scene import Scene
+from pipelines.config import AUTO, TrainConfig
+from pipelines.errors import InputError
+from pipelines.geometry.rotations import matrix_from_quat_xyzw
+from pipelines.geometry.similarity import moved_pivot
+from pipelines.georef.adjustment import RotationPrior
+from pipelines.georef.cameras import CameraCorrections
+from pipelines.georef.measured import ControlMarks, Measured
+from pipelines.georef.problem import GeoProblem
+from pipelines.georef.similarity import LearnableSimilarity
+from pipelines.georef.start import begin, bias_pays
+from pipelines.georef.systematic import SystematicErrors
+from pipelines.products import GeolocatedPoints, InitialSimilarity, Survey
+
+# Fewer control points cannot tell a bias of the fixes from a blunder of their own.
+_LEAST_CONTROL = 3
+
+
+def geo_problem(
+    scene: Scene,
+    survey: Survey,
+    initial: InitialSimilarity,
+    config: TrainConfig,
+    points: GeolocatedPoints | None = None,
+) -> GeoProblem:
+    """The similarity, the cameras and the measurements that hold them, ready to be optimised.
+
+    Args:
+        points: of `geolocate`, for L_rel; None: it takes the cameras and their fixes.
+
+    Raises:
+        InputError: a constant error is to be estimated of something that was not measured.
+    """
+    record = initial.geo_from_local
+    pivot = scene.geo_from_model.apply(scene.poses.cam_center_in_model[scene.train]).mean(axis=0)
+    covariance = moved_pivot(np.array(record.covariance), record.pivot, pivot)
+    basis = scene.correction_basis if config.optimize_cameras else None
+    matrix = np.zeros((len(scene.sparse.image_name), 6, 0)) if basis is None else basis.matrix
+    measured = _measured(scene, survey, config, points) if config.geo_loss else Measured()
+    problem = GeoProblem(
+        LearnableSimilarity(scene.geo_from_model, covariance, pivot, _attitude(scene, initial)),
+        CameraCorrections(scene.poses, matrix),
+        measured,
+        weighting=config.weighting,
+        hold_prior=_leaves_open(measured, initial),
+        errors=_errors(measured, config) if config.geo_loss else None,
+        learned_weights=config.loss_weights == "learned",
+    )
+    if len(problem.errors):
+        saved = begin(problem)
+        if config.estimate == AUTO and not bias_pays(problem, saved):
+            problem.errors = SystematicErrors()
+    return problem
+
+
+def _attitude(scene: Scene, initial: InitialSimilarity) -> RotationPrior | None:
+    """What attitudes said of the rotation geo ← model, where the initial similarity needed them."""
+    if initial.attitude is None:
+        return None
+    geo_from_local = matrix_from_quat_xyzw(initial.attitude.quat_xyzw)
+    return RotationPrior(geo_from_local @ scene.model_from_local.rotation.T, np.array(initial.attitude.cov_rad2))
+
+
+def _leaves_open(measured: Measured, initial: InitialSimilarity) -> bool:
+    """Whether the observations leave some of the similarity to what was known of it beforehand."""
+    if initial.layout == "line":
+        return measured.attitudes is None
+    return measured.fixes is None and not _determined_by(measured.marks)
+
+
+def _determined_by(marks: ControlMarks | None) -> bool:
+    """Whether control points alone fix all seven unknowns of the similarity."""
+    return marks is not None and len(marks.position_in_geo) >= _LEAST_CONTROL
+
+
+def _measured(scene: Scene, survey: Survey, config: TrainConfig, points: GeolocatedPoints | None) -> Measured:
+    fixes = fixes_of(scene, survey)
+    measured = Measured(fixes, control_marks(scene, survey) if config.gcp_loss else None)
+    if measured.marks is not None and config.gcp_mode == "depth":
+        by_depth, marks = depth_marks(scene, survey, measured.marks)
+        measured = replace(measured, marks=marks, depth_marks=by_depth)
+    if fixes is not None and config.rel_loss:
+        measured = replace(measured, pairs=pairs_of(scene, fixes, points, config.seed))
+    if "boresight" in config.estimated:
+        measured = replace(measured, attitudes=attitudes_of(scene, survey))
+    return measured
+
+
+def _errors(measured: Measured, config: TrainConfig) -> SystematicErrors:
+    """The constant errors that are asked for; with `auto` the bias, wherever control points could show it."""
+    fixes, attitudes, wanted = measured.fixes, measured.attitudes, config.estimated
+    if config.estimate == AUTO:
+        possible = config.weighting == "whitened" and fixes is not None and _determined_by(measured.marks)
+        wanted = ("bias",) if possible else ()
+    for name, source, what in (
+        ("bias", fixes, "positions"),
+        ("lever-arm", fixes, "positions"),
+        ("boresight", attitudes, "attitudes"),
+    ):
+        if name in wanted and source is None:
+            raise InputError(f"{name} cannot be estimated: no {what} were recorded", field="--estimate")
+    flights = 1 if fixes is None or fixes.flight is None else int(fixes.flight.max()) + 1
+    return SystematicErrors(
+        flights if "bias" in wanted else 0,
+        arm="lever-arm" in wanted,
+        attitude_sigma_rad=None if attitudes is None else float((1.0 / attitudes.root_information).median()),
+    )

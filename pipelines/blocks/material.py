@@ -1,0 +1,74 @@
+"""What there is to train from, and the Gaussians that training starts with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pipelines.blocks.background import background
+from pipelines.blocks.scene import Scene
+from pipelines.blocks.surface import SceneSurface, SurfacePoints
+from pipelines.formats.image_cache import ImageCache
+from pipelines.splat.gaussians import Gaussians
+from pipelines.splat.initialise import InitialisationOptions, gaussians_from_points, gaussians_of_size
+
+_SURFACE_SHARE = 0.5  # of the Gaussians that there may be start on the surface; density control places the others
+_STRIDE = 2  # every other pixel of a depth map is enough to hold Gaussians, which are wider
+_KEPT_VIEWS = 128  # views whose points stay on the device
+
+
+@dataclass(frozen=True)
+class Material:
+    """Cameras and SfM points, photographs, and the surface, if it was looked for."""
+
+    scene: Scene
+    images: ImageCache
+    surface: SceneSurface | None = None
+
+
+def initial_gaussians(material: Material, options: InitialisationOptions, most: int, seed: int) -> Gaussians:
+    """One at each SfM point, on the surface as densely as photographs show it, and those of the background.
+
+    Args:
+        material: what there is.
+        options: how each of them starts.
+        most: how many there may be.
+        seed: of the choice of points.
+
+    Raises:
+        DegenerateGeometryError: too few points.
+    """
+    scene = material.scene
+    found = SurfacePoints(scene.point_in_model, scene.sparse.point_rgb)
+    if material.surface is not None:
+        more = material.surface.sample(max(int(_SURFACE_SHARE * most) - len(found.rgb), 0), seed)
+        found = SurfacePoints(
+            np.concatenate([found.point_in_model, more.point_in_model]), np.concatenate([found.rgb, more.rgb])
+        )
+    near = gaussians_from_points(found.point_in_model, found.rgb, options)
+    behind = background(scene, material.images, found.point_in_model)
+    far = gaussians_of_size(behind.point_in_model, behind.rgb, behind.sigma_m, options)
+    room = max(most - len(near), 0)
+    keep = torch.linspace(0, max(len(far) - 1, 0), min(room, len(far))).long()
+    return Gaussians.concatenate([near, far.select(keep)])
+
+
+def points_to_hold(material: Material, device: torch.device) -> Callable[[int], Tensor]:
+    """By image, the points (K, 3) in `model`, float32, of SfM and of the surface that it shows."""
+    scene = material.scene
+    shown = set(map(int, scene.train))
+
+    @lru_cache(maxsize=_KEPT_VIEWS)
+    def points(index: int) -> Tensor:
+        seen = np.unique(scene.sparse.obs_point[scene.sparse.obs_image == index])
+        found = scene.point_in_model[seen]
+        if material.surface is not None and index in shown:
+            found = np.concatenate([found, material.surface.points(index, _STRIDE)])
+        return torch.from_numpy(found).float().to(device)
+
+    return points

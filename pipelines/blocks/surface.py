@@ -1,0 +1,231 @@
+"""The scene's surface from multi-view stereo: a depth for each pixel of the training photographs where views agree.
+
+Training starts from it and holds the Gaussians to it. On ground with little texture they would otherwise float
+metres above where they belong, with the photographs none the worse for it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.blocks.scene import Scene
+from pipelines.formats.image_cache import ImageCache, save_array
+from pipelines.geometry.cameras import Pinhole
+from pipelines.products import FloatArray
+from pipelines.progress import SILENT, Progress
+from pipelines.stereo.agreement import AgreementSettings, Surface, agreed_depth
+from pipelines.stereo.neighbours import Sightings, best_neighbours, planes_for
+from pipelines.stereo.sweep import FloatImage, Planes, StereoView, SweepSettings, Swept, plane_sweep
+
+log = logging.getLogger(__name__)
+
+_CANDIDATES = 8  # drawn for each point wanted: enough to cover what few views see
+
+
+@dataclass(frozen=True)
+class SurfaceOptions:
+    """How to look for the surface.
+
+    Attributes:
+        max_size_px: longest side of the photographs that are compared.
+        neighbours: views that each is compared with.
+        sweep: how they are compared.
+        agreement: when views agree.
+    """
+
+    max_size_px: int = 400
+    neighbours: int = 10
+    sweep: SweepSettings = field(default_factory=SweepSettings)
+    agreement: AgreementSettings = field(default_factory=AgreementSettings)
+
+
+@dataclass(frozen=True)
+class SurfacePoints:
+    """P points of the surface: in `model` (P, 3) metres, and their colours (P, 3) uint8."""
+
+    point_in_model: FloatArray
+    rgb: NDArray[np.uint8]
+
+
+class SceneSurface:
+    """Depth maps of the training photographs, made once and kept on disk.
+
+    Memory holds no more than a view and its neighbours.
+
+    Args:
+        folder: where the maps are kept.
+        scene: cameras and points.
+        images: the photographs.
+        options: how.
+    """
+
+    def __init__(
+        self, folder: Path, scene: Scene, images: ImageCache, options: SurfaceOptions | None = None
+    ) -> None:
+        self._scene, self._images = scene, images
+        self._options = options or SurfaceOptions()
+        sparse = scene.sparse
+        self._sightings = Sightings(
+            scene.point_in_model, scene.poses.cam_center_in_model, sparse.obs_point, sparse.obs_image
+        )
+        self._neighbours: dict[int, list[int]] = {}
+        self.folder = folder / self._key()
+
+    def build(self, progress: Progress = SILENT) -> None:
+        """Make the maps that are not there yet: first each view's own, then what they agree on."""
+        train = [int(index) for index in self._scene.train]
+        with progress.task("surface", 2 * len(train)) as task:
+            for index in train:
+                if not self._path(index, "swept").exists() and not self._path(index, "depth").exists():
+                    self._sweep(index)
+                task.advance()
+            for index in train:
+                if not self._path(index, "depth").exists():
+                    save_array(self._path(index, "depth"), self._agreed(index))
+                task.advance()
+
+    def camera(self, index: int) -> Pinhole:
+        """Camera of a depth map."""
+        full = self._images.pinhole(index)
+        scale = min(1.0, self._options.max_size_px / max(full.width, full.height))
+        width, height = max(1, round(scale * full.width)), max(1, round(scale * full.height))
+        sx, sy = width / full.width, height / full.height
+        return Pinhole(width, height, sx * full.fx, sy * full.fy, sx * full.cx, sy * full.cy)
+
+    def depth(self, index: int) -> FloatImage:
+        """Depth (H, W) in metres along the optical axis of a training view, 0 where unknown; mapped from disk."""
+        array: FloatImage = np.load(self._path(index, "depth"), mmap_mode="r", allow_pickle=False)
+        return array
+
+    def points(self, index: int, stride: int = 1) -> FloatArray:
+        """Surface points (P, 3) in `model` that a training view sees, of every `stride`-th row and column."""
+        return self._points(index, *np.nonzero(self._thinned(index, stride)))
+
+    def sample(self, count: int, seed: int) -> SurfacePoints:
+        """At most `count` points of the whole surface, as dense as the photographs show it."""
+        rng = np.random.default_rng(seed)
+        share = -(-_CANDIDATES * count // max(len(self._scene.train), 1))
+        points, colours, sizes = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)], [np.zeros(0)]
+        for index in map(int, self._scene.train):
+            rows, columns = np.nonzero(self.depth(index))
+            chosen = rng.permutation(len(rows))[:share]
+            rows, columns = rows[chosen], columns[chosen]
+            points.append(self._points(index, rows, columns))
+            colours.append(self._rgb(index)[rows, columns])
+            sizes.append(self.depth(index)[rows, columns].astype(np.float64) / self.camera(index).fx)
+        everywhere, rgb = np.concatenate(points), np.concatenate(colours)
+        kept = spread_evenly(everywhere, np.concatenate(sizes), count)
+        return SurfacePoints(everywhere[kept], rgb[kept])
+
+    def _thinned(self, index: int, stride: int) -> FloatImage:
+        thin = np.zeros_like(self.depth(index))
+        thin[::stride, ::stride] = self.depth(index)[::stride, ::stride]
+        return thin
+
+    def _points(self, index: int, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> FloatArray:
+        camera, depth = self.camera(index), self.depth(index)[rows, columns].astype(np.float64)
+        ray = np.stack(
+            [
+                (columns + 0.5 - camera.cx) / camera.fx,
+                (rows + 0.5 - camera.cy) / camera.fy,
+                np.ones(len(rows)),
+            ],
+            axis=1,
+        )
+        poses = self._scene.poses
+        turned = (depth[:, None] * ray) @ poses.cam_from_model[index]
+        return np.asarray(poses.cam_center_in_model[index] + turned)
+
+    def _sweep(self, index: int) -> None:
+        """Write (3, H, W): offset, score and step of each pixel."""
+        camera = self.camera(index)
+        swept = np.zeros((3, camera.height, camera.width), dtype=np.float32)
+        swept[0], swept[1] = np.nan, -1.0
+        planes, others = self._planes(index)
+        if planes is not None:
+            found = plane_sweep(self._view(index), [self._view(j) for j in others], planes, self._options.sweep)
+            swept[:] = found.offset_m, found.score, found.step_m
+        save_array(self._path(index, "swept"), swept)
+
+    def _agreed(self, index: int) -> FloatImage:
+        own = self._surface(index)
+        if own is None:
+            camera = self.camera(index)
+            return np.zeros((camera.height, camera.width), dtype=np.float32)
+        others = [self._surface(j) for j in self._neighbours_of(index)]
+        return agreed_depth(own, [other for other in others if other is not None], self._options.agreement)
+
+    def _surface(self, index: int) -> Surface | None:
+        planes, _ = self._planes(index)
+        if planes is None:
+            return None
+        offset, score, step = np.load(self._path(index, "swept"), mmap_mode="r", allow_pickle=False)
+        return Surface(self._view(index), planes, Swept(offset, score, step))
+
+    def _planes(self, index: int) -> tuple[Planes | None, list[int]]:
+        others = self._neighbours_of(index)
+        if not others:
+            return None, []
+        points = self._scene.point_in_model[self._sightings.seen_by(index)]
+        return planes_for(self._view(index), [self._view(j) for j in others], points), others
+
+    def _neighbours_of(self, index: int) -> list[int]:
+        if index not in self._neighbours:
+            count = self._options.neighbours
+            self._neighbours[index] = best_neighbours(self._sightings, index, self._scene.train, count)
+        return self._neighbours[index]
+
+    def _view(self, index: int) -> StereoView:
+        grey = cv2.cvtColor(self._rgb(index), cv2.COLOR_RGB2GRAY).astype(np.float32) + 1
+        camera, poses = self.camera(index), self._scene.poses
+        mask = np.array(self._images.mask(index), dtype=np.uint8)
+        grey[cv2.resize(mask, (camera.width, camera.height), interpolation=cv2.INTER_NEAREST) == 0] = 0
+        return StereoView(grey, camera, poses.cam_from_model[index], poses.cam_center_in_model[index])
+
+    def _rgb(self, index: int) -> NDArray[np.uint8]:
+        camera = self.camera(index)
+        image = np.array(self._images.image(index))
+        return np.asarray(cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA), np.uint8)
+
+    def _path(self, index: int, kind: str) -> Path:
+        return self.folder / f"{index:06d}.{kind}.npy"
+
+    def _key(self) -> str:
+        """Changes with all that the maps depend on."""
+        digest = hashlib.sha256()
+        poses, sparse = self._scene.poses, self._scene.sparse
+        arrays = (
+            poses.cam_from_model, poses.cam_center_in_model, self._scene.point_in_model, self._scene.train,
+            sparse.obs_point, sparse.obs_image,
+        )  # fmt: skip
+        for array in arrays:
+            digest.update(np.ascontiguousarray(array).tobytes())
+        for index in range(len(sparse.image_name)):
+            digest.update(self._images.key(index).encode())
+        digest.update(repr(self._options).encode())
+        return digest.hexdigest()[:32]
+
+
+def spread_evenly(points: FloatArray, size_m: FloatArray, count: int) -> NDArray[np.int64]:
+    """Indices of points (P, 3), at most `count`, one in each cube whose side is proportional to their size (P,)."""
+    if len(points) <= count:
+        return np.arange(len(points))
+    fine, coarse = 2.0**-4, 2.0**12
+    kept = np.arange(1)
+    for _ in range(16):
+        middle = float(np.sqrt(fine * coarse))
+        level = np.round(np.log2(np.maximum(middle * size_m, 1e-9)))
+        cube = np.floor((points - points.min(axis=0)) / (2.0**level)[:, None])
+        _, first = np.unique(np.column_stack([level, cube]).astype(np.int64), axis=0, return_index=True)
+        if len(first) > count:
+            fine = middle
+        else:
+            coarse, kept = middle, first
+    return np.sort(kept)

@@ -1,0 +1,146 @@
+"""The way from a CRS to WGS84 that serves a set of points, or why there is none.
+
+PROJ would rather answer than fail: without a geoid's grid it applies a *ballpark* transformation, that is none, and
+a grid that a PROJ string calls optional (`+nadgrids=@file`) is a shift of zero where it is missing. Here both are
+errors that name the grid.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from pyproj import CRS, Transformer
+from pyproj.crs import CoordinateOperation
+from pyproj.datadir import get_user_data_dir
+from pyproj.transformer import AreaOfInterest, TransformerGroup
+
+from pipelines.errors import InputError
+from pipelines.geodesy.vertical import missing_grid_error
+from pipelines.products import FloatArray
+
+WGS84 = "EPSG:4326"
+_WGS84_3D = "EPSG:4979"
+_NO_SHIFT = "@null"  # a PROJ string's way to say that there is none
+# Ellipsoids of frames that follow the Earth's centre, as WGS84 does: semi-major axis and inverse flattening.
+_MODERN_AXIS_M, _MODERN_FLATTENING = 6378137.0, (298.25, 298.26)
+
+
+@dataclass(frozen=True)
+class Operation:
+    """How PROJ gets from a CRS to WGS84.
+
+    Attributes:
+        name: PROJ's description.
+        accuracy_m: as published; None if unknown.
+        missing_grids: grids with which there would be a better one.
+    """
+
+    name: str
+    accuracy_m: float | None
+    missing_grids: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Way:
+    """A CRS, what to call it in errors, whether its heights are transformed too, and the file of the points."""
+
+    crs: CRS
+    name: str
+    three_dimensional: bool
+    path: Path | str | None = None
+
+
+def best_operation(way: Way, lon: FloatArray, lat: FloatArray) -> tuple[Transformer, Operation]:
+    """The best transformation for points at `lon`, `lat` (N,) in degrees: one for all, so that none is torn off.
+
+    Raises:
+        InputError: a missing grid, or no transformation.
+    """
+    group = _group(way.crs, _WGS84_3D if way.three_dimensional else WGS84, _area(lon, lat))
+    if group is None:
+        raise _no_way(way)
+    real = [found for found in group.transformers if not _does_nothing(found)]
+    if real:
+        best = real[0]
+        better = () if group.best_available else _missing(group.unavailable_operations[:1])
+        return best, Operation(best.description, best.accuracy if best.accuracy >= 0 else None, better)
+    # The fewest files to fetch; where as many would do, the way that PROJ likes best.
+    lacking = [grids for one in group.unavailable_operations if (grids := _missing([one]))]
+    lacking += [_missing(one.operations or ()) for one in group.transformers]
+    if lacking:
+        datum = way.crs.sub_crs_list[1].name if way.crs.is_compound else None
+        raise missing_grid_error(datum, way.name, min(lacking, key=len), get_user_data_dir(), way.path)
+    raise _no_way(way)
+
+
+def _group(crs: CRS, target: str, area: AreaOfInterest | None) -> TransformerGroup | None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # "best transformation is not available": told by us
+        try:
+            return TransformerGroup(crs, target, always_xy=True, allow_ballpark=False, area_of_interest=area)
+        except IndexError:  # pyproj's, for a few CRS of the nineteenth century
+            return None
+
+
+def _does_nothing(transformer: Transformer) -> bool:
+    """Whether a step is a shift of zero because every one of its optional grids is missing."""
+    steps = [operation.grids for operation in transformer.operations or ()]
+    named = [grids for grids in steps if grids and all(grid.short_name != _NO_SHIFT for grid in grids)]
+    return any(not any(grid.available for grid in grids) for grids in named)
+
+
+def _missing(operations: Iterable[CoordinateOperation]) -> tuple[str, ...]:
+    names = (
+        grid.short_name.removeprefix("@")
+        for operation in operations
+        for grid in operation.grids
+        if not grid.available and grid.short_name != _NO_SHIFT
+    )
+    return tuple(dict.fromkeys(names))
+
+
+def _no_way(way: Way) -> InputError:
+    """The error for a CRS that PROJ's database does not connect with WGS84."""
+    horizontal = way.crs.sub_crs_list[0] if way.crs.is_compound else way.crs
+    flat = _group(horizontal, WGS84, None) if way.crs.is_compound else None
+    if flat is not None and (flat.transformers or flat.unavailable_operations):
+        message = (
+            f"heights above {way.crs.sub_crs_list[1].name} cannot be made ellipsoidal: PROJ knows no geoid for "
+            "them. Give ellipsoidal heights, the horizontal CRS alone and `--vertical ellipsoidal`"
+        )
+        return InputError(message, path=way.path)
+    message = (
+        f"no transformation from {way.name} to WGS84 is known here: name its datum (+datum=… or +towgs84=… in a "
+        "PROJ string), or give another CRS"
+    )
+    ellipsoid = horizontal.ellipsoid
+    if ellipsoid is not None and _is_modern(ellipsoid.semi_major_metre, ellipsoid.inverse_flattening):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # "you will lose information": the datum, which is stated
+            projection = horizontal.to_proj4().replace(" +no_defs", "").replace(" +type=crs", "")
+        message += f". If its datum is WGS84 as closely as you need: {projection} +towgs84=0,0,0"
+    return InputError(message, path=way.path)
+
+
+def _is_modern(axis_m: float, inverse_flattening: float) -> bool:
+    low, high = _MODERN_FLATTENING
+    return abs(axis_m - _MODERN_AXIS_M) < 1e-3 and low < inverse_flattening < high
+
+
+def _area(lon: FloatArray, lat: FloatArray) -> AreaOfInterest:
+    """Box around points, widened by a metre or so; its west lies east of its east where it spans the date line."""
+    margin = 1e-5
+    near = lon - 360.0 * ((lon - lon[0]) / 360.0).round()
+    west, east = float(near.min()) - margin, float(near.max()) + margin
+    if east - west >= 180.0:  # around a pole
+        west, east = -180.0, 180.0
+    return AreaOfInterest(
+        _wrapped(west), max(float(lat.min()) - margin, -90.0), _wrapped(east), min(float(lat.max()) + margin, 90.0)
+    )
+
+
+def _wrapped(lon_deg: float) -> float:
+    return lon_deg - 360.0 * round(lon_deg / 360.0) if abs(lon_deg) > 180.0 else lon_deg

@@ -1,0 +1,123 @@
+"""Can these coordinates be of this CRS? What catches degrees in a projection, swapped axes and wrong zones."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pyproj import CRS, Transformer
+
+from pipelines.errors import InputError
+from pipelines.geodesy.enu import lla_from_ecef
+from pipelines.products import FloatArray
+
+# Surveys lawfully run over the border of their zone; further than this from it the CRS is a mistake.
+_AREA_MARGIN_DEG = 3.0
+# A projection with false coordinates beyond this has no points at its zero; a site's own grid may.
+_FALSE_ORIGIN_M = 100_000.0
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Points (N, 3) of a CRS and where they stand, to blame the right one."""
+
+    points: FloatArray
+    crs_name: str
+    path: Path | str | None = None
+    lines: Sequence[int] | None = None
+
+    def require(self, accepted: ArrayLike, message: str, field: str | None = None) -> None:
+        """Raise an InputError for the first point that is not accepted (N,)."""
+        good = np.asarray(accepted)
+        if good.all():
+            return
+        worst = int(np.argmin(good))
+        text = ", ".join(f"{value:.10g}" for value in self.points[worst])
+        count = int((~good).sum())
+        more = f" ({count} such points)" if count > 1 else ""
+        line = self.lines[worst] if self.lines is not None else None
+        raise InputError(f"({text}): {message}{more}", path=self.path, line=line, field=field)
+
+
+def horizontal_of(crs: CRS) -> CRS:
+    """A compound CRS's horizontal part; any other CRS itself."""
+    return crs.sub_crs_list[0] if crs.is_compound else crs
+
+
+def rough_lon_lat(crs: CRS, rows: Rows) -> tuple[FloatArray, FloatArray]:
+    """Longitude and latitude (N,) from Greenwich in the CRS's own datum, within a kilometre of WGS84.
+
+    Raises:
+        InputError: a point that is not finite, out of range, in degrees where metres are due, or far outside the
+            CRS's area.
+    """
+    points, name = rows.points, rows.crs_name
+    rows.require(np.isfinite(points).all(axis=1), "not a number")
+    if crs.is_geocentric:
+        lla = lla_from_ecef(points)
+        rows.require(np.abs(lla[:, 2]) < 1e5, f"not near the Earth's surface in {name}")
+        return lla[:, 1], lla[:, 0]
+    horizontal = horizontal_of(crs)
+    geodetic = horizontal.geodetic_crs or horizontal
+    if horizontal.is_geographic:
+        lon, lat = _from_greenwich(geodetic, points[:, 0], points[:, 1])
+        order = f"(in {name} x is the longitude, y the latitude)"
+        rows.require(np.abs(lat) <= 90.0, f"latitude out of range −90 … 90 {order}", "latitude")
+        rows.require(np.abs(lon) <= 360.0, "longitude out of range −180 … 180", "longitude")
+    else:
+        to_degrees = Transformer.from_crs(horizontal, geodetic, always_xy=True)
+        lon, lat = _from_greenwich(geodetic, *to_degrees.transform(points[:, 0], points[:, 1]))
+        rows.require(np.isfinite(lon + lat), f"outside the domain of {name}")
+        degrees = _look_like_degrees(horizontal, points, lon, lat)
+        rows.require(~degrees, f"degrees? {name} has eastings and northings: wrong CRS")
+    check_area(crs, lon, lat, rows)
+    return lon, lat
+
+
+def check_area(crs: CRS, lon: FloatArray, lat: FloatArray, rows: Rows) -> None:
+    """Refuse points at `lon`, `lat` (N,) more than 3° outside the CRS's area of use, if it has one.
+
+    Raises:
+        InputError: names the first such point.
+    """
+    area = horizontal_of(crs).area_of_use
+    if area is not None:
+        bounds = f"{area.south:g} … {area.north:g}° N, {area.west:g} … {area.east:g}° E"
+        message = f"far outside the area of {rows.crs_name} ({bounds}): wrong CRS, or x and y swapped?"
+        rows.require(_within(horizontal_of(crs), lon, lat, _AREA_MARGIN_DEG), message)
+
+
+def _from_greenwich(geodetic: CRS, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Degrees from Greenwich: old surveys count grads from Paris, or degrees from Ferro."""
+    meridian, unit = geodetic.prime_meridian, np.degrees(geodetic.axis_info[0].unit_conversion_factor)
+    shift = 0.0 if meridian is None else meridian.longitude * np.degrees(meridian.unit_conversion_factor)
+    return np.asarray(x * unit + shift), np.asarray(y * unit)
+
+
+def _look_like_degrees(projected: CRS, points: FloatArray, lon: FloatArray, lat: FloatArray) -> NDArray[np.bool_]:
+    """Which points (N,) of a projection are as small as degrees although no metres near its zero can be meant."""
+    small = (np.abs(points[:, 0]) <= 180.0) & (np.abs(points[:, 1]) <= 90.0)
+    if projected.area_of_use is not None:
+        return np.asarray(small & ~_within(projected, lon, lat, 0.0))
+    conversion = (projected.source_crs or projected if projected.is_bound else projected).coordinate_operation
+    false_origin_m = [
+        abs(float(parameter.value) * parameter.unit_conversion_factor)
+        for parameter in ([] if conversion is None else conversion.params)
+        if "asting" in parameter.name or "orthing" in parameter.name
+    ]
+    return small & (max(false_origin_m, default=0.0) > _FALSE_ORIGIN_M)
+
+
+def _within(horizontal: CRS, lon: FloatArray, lat: FloatArray, margin_deg: float) -> NDArray[np.bool_]:
+    area = horizontal.area_of_use
+    if area is None:
+        return np.ones(len(lon), dtype=bool)
+    width = (area.east - area.west) % 360.0 or 360.0
+    return np.asarray(
+        ((lon - area.west + margin_deg) % 360.0 <= width + 2 * margin_deg)
+        & (lat >= area.south - margin_deg)
+        & (lat <= area.north + margin_deg)
+    )

@@ -1,0 +1,1 @@
+"""Multi-view stereo: a depth for every pixel, from photographs whose cameras are known."""

@@ -1,0 +1,75 @@
+"""Agreement between the depths of several views: what other views see too is a surface, the rest is chance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.products import FloatArray
+from pipelines.stereo.sweep import FloatImage, Planes, StereoView, Swept
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A view with the surface that a sweep found in it."""
+
+    view: StereoView
+    planes: Planes
+    swept: Swept
+
+
+@dataclass(frozen=True)
+class AgreementSettings:
+    """When views agree.
+
+    Attributes:
+        least_score: correlation that counts.
+        steps: largest difference, in steps of the sweep.
+        least_views: other views that must agree.
+    """
+
+    least_score: float = 0.4
+    steps: float = 1.5
+    least_views: int = 2
+
+
+def agreed_depth(reference: Surface, others: list[Surface], settings: AgreementSettings) -> FloatImage:
+    """Depth (H, W) along the optical axis of `reference`, the mean of the views that agree; 0 where too few do.
+
+    A point of the reference is looked up in each other view. The difference is taken along the normal of the
+    other view's planes: on a surface that these follow, it does not matter that pixels do not coincide.
+    """
+    rays = reference.view.rays()
+    depth = reference.planes.depth(reference.view, reference.swept.offset_m)
+    good = (reference.swept.score > settings.least_score) & np.isfinite(depth) & (depth > 0)
+    total, count = np.zeros(depth.shape), np.zeros(depth.shape, dtype=np.int64)
+    rows, columns = np.nonzero(good)
+    point = reference.view.cam_center_in_world + depth[rows, columns, None] * rays[rows, columns]
+    for other in others:
+        seen, missed = _missed(point, other, settings)
+        along = rays[rows[seen], columns[seen]] @ other.planes.normal_in_world
+        with np.errstate(divide="ignore"):
+            longer = missed / along
+        fits = np.abs(longer) < 0.1 * depth[rows[seen], columns[seen]]  # not where the ray grazes the planes
+        place = rows[seen][fits], columns[seen][fits]
+        total[place] += longer[fits]
+        count[place] += 1
+    agreed = count >= settings.least_views
+    return np.where(agreed, depth + total / (count + 1), 0.0).astype(np.float32)
+
+
+def _missed(point: FloatArray, other: Surface, settings: AgreementSettings) -> tuple[NDArray[np.int64], FloatArray]:
+    """Indices of the points (P, 3) that lie on another view's surface, and how far from it along its normal."""
+    view, camera = other.view, other.view.camera
+    in_cam = (point - view.cam_center_in_world) @ view.cam_from_world.T
+    ahead = np.flatnonzero(in_cam[:, 2] > 0)
+    column = np.floor(camera.fx * in_cam[ahead, 0] / in_cam[ahead, 2] + camera.cx)
+    row = np.floor(camera.fy * in_cam[ahead, 1] / in_cam[ahead, 2] + camera.cy)
+    inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    ahead, place = ahead[inside], (row[inside].astype(np.int64), column[inside].astype(np.int64))
+    missed = other.swept.offset_m[place] - point[ahead] @ other.planes.normal_in_world
+    near = np.abs(missed) < settings.steps * other.swept.step_m[place]
+    near &= other.swept.score[place] > settings.least_score
+    return ahead[near], np.asarray(missed[near])

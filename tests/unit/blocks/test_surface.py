@@ -1,0 +1,139 @@
+"""The surface of a rendered hill: right, kept on disk, and made again when what it depends on changes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from scenes import write_workspace
+from splat_scenes import CAMERA, GEO_FROM_LOCAL, Rendered, ground_height, make_rendered
+
+from pipelines.blocks.material import Material, initial_gaussians, points_to_hold
+from pipelines.blocks.scene import Scene, make_scene, photographs
+from pipelines.blocks.surface import SceneSurface, spread_evenly
+from pipelines.formats.image_cache import ImageCache
+from pipelines.splat.initialise import InitialisationOptions
+
+# A pixel of these small photographs is half a metre wide on the ground, neighbours are 20° to 50° apart: a quarter
+# of a pixel is 0.25 m of height.
+QUARTER_PX_M = 0.25
+
+
+def _photograph(rendered: Rendered, folder: Path) -> None:
+    """Pictures of the textured hill by ray casting: rendered Gaussians, ordered by their centres, bulge."""
+    folder.mkdir()
+    noise = np.random.default_rng(5).uniform(0, 255, (160, 160, 3)).astype(np.float32)
+    texture = np.clip(4 * cv2.GaussianBlur(noise, (0, 0), 1.2) - 380, 0, 255)
+    x, y = np.meshgrid(np.arange(CAMERA.width) + 0.5, np.arange(CAMERA.height) + 0.5)
+    fx, fy, cx, cy = CAMERA.params
+    in_cam = np.stack([(x - cx) / fx, (y - cy) / fy, np.ones_like(x)], axis=-1)
+    scene = rendered.scene
+    for name, center, rotation in zip(scene.names, scene.center_in_geo, scene.geo_from_cam, strict=True):
+        ray = in_cam @ rotation.T
+        height = np.zeros(x.shape)
+        for _ in range(30):  # the hill is flatter than any ray: this converges
+            place = center + ((height - center[2]) / ray[..., 2])[..., None] * ray
+            height = ground_height(place[..., 0], place[..., 1])
+        column, row = ((place[..., axis] / 0.5 + 80).astype(np.float32) for axis in (0, 1))
+        picture = cv2.remap(texture, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+        (folder / name).write_bytes(cv2.imencode(".png", picture.round().astype(np.uint8))[1].tobytes())
+
+
+@pytest.fixture(scope="module")
+def material(tmp_path_factory: pytest.TempPathFactory) -> tuple[Rendered, Scene, ImageCache]:
+    rendered = make_rendered()
+    root = tmp_path_factory.mktemp("hill")
+    _photograph(rendered, root / "photos")
+    workspace = write_workspace(root, rendered.survey, rendered.sparse)
+    scene = make_scene(rendered.sparse, rendered.survey, GEO_FROM_LOCAL, np.zeros(3))
+    return rendered, scene, photographs(rendered.sparse, rendered.survey, workspace, 640)
+
+
+@pytest.fixture(scope="module")
+def surface(material: tuple[Rendered, Scene, ImageCache], tmp_path_factory: pytest.TempPathFactory) -> SceneSurface:
+    found = SceneSurface(tmp_path_factory.mktemp("surface"), *material[1:])
+    found.build()
+    return found
+
+
+def test_surface_is_the_hill(surface: SceneSurface, material: tuple[Rendered, Scene, ImageCache]) -> None:
+    errors, seen = [], []
+    for index in material[1].train:
+        points = surface.points(int(index))
+        near = points[(np.abs(points[:, :2]) < 26).all(axis=1)]
+        errors.append(near[:, 2] - ground_height(near[:, 0], near[:, 1]))
+        seen.append((surface.depth(int(index)) > 0).mean())
+    error = np.abs(np.concatenate(errors))
+    assert np.median(error) < QUARTER_PX_M
+    assert (error < 4 * QUARTER_PX_M).mean() > 0.9
+    assert np.mean(seen) > 0.3
+
+
+def test_sample_is_thinned_and_coloured(surface: SceneSurface) -> None:
+    some = surface.sample(300, seed=0)
+    assert 150 < len(some.rgb) <= 300
+    assert some.rgb.std() > 20  # not all alike
+    np.testing.assert_array_equal(some.point_in_model, surface.sample(300, seed=0).point_in_model)
+
+
+def test_maps_are_kept_and_continued(surface: SceneSurface, material: tuple[Rendered, Scene, ImageCache]) -> None:
+    folder = surface.folder
+    first = sorted(folder.glob("*.depth.npy"))
+    before = {path: path.stat().st_mtime_ns for path in first}
+    lost = first[3]
+    content = lost.read_bytes()
+    lost.unlink()
+    again = SceneSurface(folder.parent, *material[1:])
+    again.build()
+    assert lost.read_bytes() == content
+    assert all(path.stat().st_mtime_ns == before[path] for path in first if path != lost)
+
+
+def test_another_scene_has_other_maps(surface: SceneSurface, material: tuple[Rendered, Scene, ImageCache]) -> None:
+    _, scene, images = material
+    fewer = replace(scene, train=scene.train[:-1])
+    assert SceneSurface(surface.folder.parent, fewer, images).folder != surface.folder
+
+
+def test_test_views_show_nothing_of_the_surface(
+    surface: SceneSurface, material: tuple[Rendered, Scene, ImageCache]
+) -> None:
+    held_out = {f"{int(index):06d}" for index in material[1].test}
+    assert not held_out & {path.name.split(".")[0] for path in surface.folder.iterdir()}
+
+
+def test_gaussians_start_on_the_surface(
+    surface: SceneSurface, material: tuple[Rendered, Scene, ImageCache]
+) -> None:
+    _, scene, images = material
+    options = InitialisationOptions(sh_degree=0)
+    without = initial_gaussians(Material(scene, images), options, 3000, 0)
+    start = initial_gaussians(Material(scene, images, surface), options, 3000, 0)
+    assert len(without) < len(start) <= 3000
+    place = start.means.numpy()
+    near = place[(np.abs(place[:, :2]) < 26).all(axis=1)]
+    assert np.median(np.abs(near[:, 2] - ground_height(near[:, 0], near[:, 1]))) < QUARTER_PX_M
+
+
+def test_points_to_hold_are_those_of_the_view(
+    surface: SceneSurface, material: tuple[Rendered, Scene, ImageCache]
+) -> None:
+    _, scene, images = material
+    hold = points_to_hold(Material(scene, images, surface), torch.device("cpu"))
+    train, test = int(scene.train[0]), int(scene.test[0])
+    seen = len(np.unique(scene.sparse.obs_point[scene.sparse.obs_image == train]))
+    assert len(hold(train)) > seen
+    assert len(hold(test)) == len(np.unique(scene.sparse.obs_point[scene.sparse.obs_image == test]))
+
+
+def test_spreading_keeps_few_enough_and_covers_all() -> None:
+    rng = np.random.default_rng(0)
+    points = np.concatenate([rng.uniform(0, 1, (5000, 3)), rng.uniform(9, 10, (50, 3))])
+    kept = spread_evenly(points, np.full(len(points), 0.01), 200)
+    assert 60 < len(kept) <= 200
+    assert (kept >= 5000).sum() > 10  # the sparse corner has its cubes too
+    np.testing.assert_array_equal(spread_evenly(points[:10], np.ones(10), 200), np.arange(10))

@@ -1,0 +1,149 @@
+"""Plane sweeps and agreement on a scene that is known exactly: a step in level ground, seen from a ring."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from pipelines.geometry.cameras import Pinhole
+from pipelines.stereo.agreement import AgreementSettings, Surface, agreed_depth
+from pipelines.stereo.neighbours import Sightings, best_neighbours, planes_for
+from pipelines.stereo.sweep import Planes, StereoView, SweepSettings, plane_sweep
+
+CAMERA = Pinhole(120, 90, 110.0, 110.0, 60.0, 45.0)
+GROUND_M, ROOF_M, ROOF_SIDE_M = 0.0, 6.0, 8.0
+TEXEL_M = 0.1
+LEVEL = Planes(np.array([0.0, 0.0, 1.0]), np.arange(-4.0, 10.0, 0.5))
+# A pixel is 0.36 m wide on the ground, neighbours are 20° apart: a tenth of a pixel is 0.1 m of height.
+TENTH_PX_M = 0.1
+
+
+def looking_at_origin(azimuth_deg: float, height_m: float = 30.0, radius_m: float = 25.0) -> tuple[np.ndarray, ...]:
+    azimuth = np.radians(azimuth_deg)
+    center = np.array([radius_m * np.cos(azimuth), radius_m * np.sin(azimuth), height_m])
+    axis = -center / np.linalg.norm(center)
+    right = np.cross(axis, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(axis, right), axis]), center
+
+
+def texture(seed: int) -> np.ndarray:
+    noise = np.random.default_rng(seed).uniform(60, 200, (800, 800)).astype(np.float32)
+    return cv2.GaussianBlur(noise, (0, 0), 3.0) * 4 - 390
+
+
+def true_depth(view: StereoView) -> np.ndarray:
+    """First surface along each ray: the square roof, or the ground."""
+    rays, center = view.rays(), view.cam_center_in_world
+    roof = (ROOF_M - center[2]) / rays[..., 2]
+    on_roof = center + roof[..., None] * rays
+    hit = (np.abs(on_roof[..., :2]) < ROOF_SIDE_M / 2).all(axis=-1)
+    return np.where(hit, roof, (GROUND_M - center[2]) / rays[..., 2])
+
+
+def shot(azimuth_deg: float, brightness: float = 1.0) -> StereoView:
+    rotation, center = looking_at_origin(azimuth_deg)
+    blank = StereoView(np.zeros((90, 120), np.float32), CAMERA, rotation, center)
+    place = center + true_depth(blank)[..., None] * blank.rays()
+    column, row = ((place[..., axis] / TEXEL_M + 400).astype(np.float32) for axis in (0, 1))
+    high = place[..., 2] > 0.5 * ROOF_M
+    painted = [
+        cv2.remap(texture(seed), column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP) for seed in (1, 2)
+    ]
+    grey = brightness * np.where(high, painted[1], painted[0]) + 1
+    return StereoView(np.clip(grey, 1, 256).astype(np.float32), CAMERA, rotation, center)
+
+
+@pytest.fixture(scope="module")
+def ring() -> list[StereoView]:
+    """Views of different brightness, as the exposure of a flight varies."""
+    return [shot(azimuth, 1 + 0.1 * (index % 3)) for index, azimuth in enumerate(range(0, 120, 20))]
+
+
+def swept(ring: list[StereoView], index: int) -> Surface:
+    others = [view for place, view in enumerate(ring) if 0 < abs(place - index) <= 2]
+    return Surface(ring[index], LEVEL, plane_sweep(ring[index], others, LEVEL, SweepSettings()))
+
+
+def test_sweep_finds_ground_and_roof(ring: list[StereoView]) -> None:
+    found = swept(ring, 2)
+    depth = LEVEL.depth(ring[2], found.swept.offset_m)
+    error = (depth - true_depth(ring[2])) * np.abs(ring[2].rays()[..., 2])
+    inner = np.s_[8:-8, 8:-8]
+    assert np.median(np.abs(error[inner])) < TENTH_PX_M
+    # The strips beside the roof that fewer than three neighbours see are a tenth of the picture.
+    assert (np.abs(error[inner]) < 0.5).mean() > 0.85
+
+
+def test_views_that_agree_leave_few_errors(ring: list[StereoView]) -> None:
+    surfaces = [swept(ring, index) for index in range(len(ring))]
+    depth = agreed_depth(surfaces[2], [surfaces[index] for index in (0, 1, 3, 4)], AgreementSettings())
+    known = depth > 0
+    height_error = (depth - true_depth(ring[2])) * np.abs(ring[2].rays()[..., 2])
+    alone = np.abs(LEVEL.depth(ring[2], surfaces[2].swept.offset_m) - true_depth(ring[2])) > 0.5
+    assert known.mean() > 0.7
+    assert (np.abs(height_error[known]) < 0.5).mean() > 0.97
+    # What one view gets wrong, others see differently.
+    assert (np.abs(height_error[known]) >= 0.5).mean() < 0.5 * alone.mean()
+
+
+def test_what_no_other_view_confirms_is_left_out(ring: list[StereoView]) -> None:
+    own = swept(ring, 2)
+    assert not agreed_depth(own, [], AgreementSettings()).any()
+
+
+def test_planes_behind_the_camera_are_never_chosen(ring: list[StereoView]) -> None:
+    above = Planes(np.array([0.0, 0.0, 1.0]), np.array([31.0, 32.0, 33.0, 0.0]))
+    found = plane_sweep(ring[2], ring[3:5], above, SweepSettings())
+    assert np.nanmin(np.abs(found.offset_m - 33.0)) > 1  # all on the only plane in front, or none at all
+
+
+def test_a_sweep_needs_neighbours_and_planes(ring: list[StereoView]) -> None:
+    with pytest.raises(ValueError, match="0 neighbours"):
+        plane_sweep(ring[0], [], LEVEL, SweepSettings())
+    with pytest.raises(ValueError, match="2 planes"):
+        plane_sweep(ring[0], ring[1:2], Planes(LEVEL.normal_in_world, np.array([0.0, 1.0])), SweepSettings())
+
+
+def grid_points() -> np.ndarray:
+    x, y = np.meshgrid(np.linspace(-8, 8, 9), np.linspace(-8, 8, 9))
+    high = (np.abs(x) < 4) & (np.abs(y) < 4)
+    return np.stack([x, y, np.where(high, ROOF_M, GROUND_M)], axis=-1).reshape(-1, 3)
+
+
+def test_neighbours_are_those_under_good_angles(ring: list[StereoView]) -> None:
+    points = grid_points()
+    count = len(points)
+    sightings = Sightings(
+        points,
+        np.array([view.cam_center_in_world for view in ring]),
+        np.tile(np.arange(count), len(ring)),
+        np.repeat(np.arange(len(ring)), count),
+    )
+    found = best_neighbours(sightings, 2, np.arange(len(ring)), 2)
+    assert set(found) == {1, 3}  # 13° and less from the scene; the next ones are at 26°
+    assert 5 not in best_neighbours(sightings, 2, np.array([0, 1, 3, 4]), 9)
+
+
+def test_planes_follow_the_view(ring: list[StereoView]) -> None:
+    points = grid_points()
+    planes = planes_for(ring[2], ring[3:5], points)
+    assert planes is not None
+    np.testing.assert_allclose(planes.normal_in_world, [0, 0, 1])
+    assert planes.offset_m.min() < GROUND_M < ROOF_M < planes.offset_m.max()
+    level = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
+    rotation = np.stack([level[1], -np.array([0.0, 0, 1]), np.cross(level[1], [0.0, 0, -1])])
+    facade = StereoView(ring[0].grey, CAMERA, rotation, np.array([-40.0, 0.0, 3.0]) * np.sign(rotation[2, 0]))
+    side = StereoView(ring[0].grey, CAMERA, rotation, facade.cam_center_in_world + np.array([0.0, 6.0, 0.0]))
+    across = planes_for(facade, [side], points)
+    assert across is not None
+    np.testing.assert_allclose(np.abs(across.normal_in_world), [1, 0, 0], atol=1e-12)
+    depth = across.offset_m - across.normal_in_world @ facade.cam_center_in_world
+    assert depth.min() > 0
+    assert depth.min() < 32  # the points are 32 to 48 m away
+    assert depth.max() > 48
+
+
+def test_too_few_points_give_no_planes(ring: list[StereoView]) -> None:
+    assert planes_for(ring[2], ring[3:5], grid_points()[:3]) is None
