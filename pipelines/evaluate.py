@@ -119,7 +119,7 @@ def evaluate(
             "model": _checks_by_model(eye, checks, depth),
         },
         "cross_validation": _cross_validation(trained, known, config),
-        "accuracy": _accuracy(known),
+        "accuracy": _accuracy(known, config),
         "fit": {"gnss": _gnss_fit(trained), "gcp": _control_fit(trained)},
         "similarity": {
             "sigma_ln_scale": float(np.sqrt(trained.model.geo_from_model.covariance[0][0])),
@@ -230,13 +230,16 @@ def _cross_validation(trained: Trained, known: Known | str, config: EvaluateConf
     return {**report, "reason": reason}
 
 
-def _accuracy(known: Known | str) -> dict[str, Any]:
+def _accuracy(known: Known | str, config: EvaluateConfig) -> dict[str, Any]:
     """The predicted accuracy over the scene in short; the grid is in `accuracy.csv`."""
     if isinstance(known, str):
-        return {"cells": 0, "reason": known}
+        return {"cells": 0, "reason": known, "cautions": []}
+    cautions = list(known.prediction.cautions)
+    if config.similarity == "initial":
+        cautions.append("measured with the initial similarity: the prediction is that of the trained one")
     if known.area is None:
-        return {"cells": 0, "reason": "the scene has too few points"}
-    return {**known.area.figures(), "reason": None}
+        return {"cells": 0, "reason": "the scene has too few points", "cautions": cautions}
+    return {**known.area.figures(), "reason": None, "cautions": cautions}
 
 
 def _control_fit(trained: Trained) -> dict[str, Any]:
@@ -286,7 +289,7 @@ def _summarise(report: dict[str, Any], config: EvaluateConfig) -> Summary:
 
 
 def _warnings(report: dict[str, Any], config: EvaluateConfig) -> tuple[str, ...]:
-    warnings, checks = [], report["checkpoints"]
+    warnings, checks = list(report["accuracy"]["cautions"]), report["checkpoints"]
     count = checks["camera"]["count"]
     if 0 < count < LEAST_POINTS:
         warnings.append(few_points(count))

@@ -30,6 +30,20 @@ class Prediction:
         self._lens = _lens_doubt(restored) if self._basis.shape[2] else None
         self._posterior = posterior(restored.problem, self._lens)
 
+    @property
+    def cautions(self) -> tuple[str, ...]:
+        """Where the prediction is not that of this training."""
+        found, config = [], self._restored.config
+        if not self._basis.shape[2]:
+            found.append("the cameras were held: the prediction leaves out their own error, and is too good")
+        if not config.geo_loss:
+            found.append("trained without geographic losses: the prediction is that of the initial similarity")
+        elif config.weighting != "whitened":
+            found.append(
+                f"trained with --weighting {config.weighting}: the prediction is that of whitened residuals"
+            )
+        return tuple(found)
+
     def of_sights(self, point_in_geo: FloatArray, seen: Sights) -> FloatArray:
         """Covariance (J, 3, 3) in m² of points (J, 3) that are intersected from their marks, these included.
 

@@ -29,11 +29,13 @@ class Restored:
         trained: the product.
         scene: as at the start of the training.
         problem: similarity, cameras and measurements, at the minimum of the whitened loss.
+        config: what it was trained with.
     """
 
     trained: Trained
     scene: Scene
     problem: GeoProblem
+    config: TrainConfig
 
 
 def training_config(workspace: Workspace) -> TrainConfig:
@@ -56,7 +58,7 @@ def restore(trained: Trained, initial: InitialSimilarity, config: TrainConfig) -
     problem = geo_problem(scene, trained.survey, initial, config.model_copy(update={"rel_loss": False}))
     _place(problem.similarity, trained.geo_from_model)
     minimise(problem)
-    return Restored(trained, scene, problem)
+    return Restored(trained, scene, problem, config)
 
 
 def _place(similarity: LearnableSimilarity, at: Similarity) -> None:

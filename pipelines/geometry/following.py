@@ -27,8 +27,9 @@ class Following:
 
     def by(self, basis: FloatArray) -> FloatArray:
         """Metres (N, 3, k) per unit of each of the k corrections of a basis (n, 6, k)."""
-        moved = self.by_poses @ basis.reshape(self.by_poses.shape[1], basis.shape[2])
-        return np.asarray(moved).reshape(len(self.by_lens), 3, basis.shape[2])
+        n, rows, width = basis.shape
+        moved = np.asarray(self.by_poses @ basis.reshape(rows * n, width))
+        return moved.reshape(len(moved) // 3, 3, width)
 
 
 def follow(marks: Network, sigma_px: FloatArray) -> Following:

@@ -22,10 +22,10 @@ from scipy.spatial.transform import Rotation
 from pipelines.formats.colmap import SparseModel, write_sparse
 from pipelines.geometry.cameras import Camera
 from pipelines.geometry.similarity import Similarity
-from pipelines.products import Survey, TrainedCamera, TrainedModel, load_json, save_json
+from pipelines.products import InitialSimilarity, Survey, TrainedCamera, TrainedModel, load_json, save_json
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.storage import write_gaussians
-from pipelines.stages import GAUSSIANS, MODEL, REPORT, SPARSE, SURVEY
+from pipelines.stages import GAUSSIANS, MODEL, REPORT, SIM3, SPARSE, SURVEY
 from tests.cli_runs import Georef
 from tests.map_projections import US_FOOT_M, long_island, utm
 from tests.photos import jpeg
@@ -180,6 +180,17 @@ def write_perfect_model(root: Path, made: Site) -> None:
         backend="cpu",
     )
     save_json(model, root / MODEL)
+    initial = InitialSimilarity(
+        geo_from_local=Similarity(translation=shift).to_record("local", "geo", covariance=1e-6 * np.eye(7)),
+        method="robust",
+        correspondences={},
+        inliers={},
+        residuals={},
+        condition_number=1.0,
+        layout="volume",
+        attitude_used=False,
+    )
+    save_json(initial, root / SIM3)
     # One far from everything: by model, no point is found.
     speck = Gaussians(
         torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.zeros(1, 3), torch.zeros(1), torch.zeros(1, 1, 3)

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from splat_scenes import NOISE, SIGMA_M, TEST_VIEWS, TRAINING, Flight, ground_height
 
+from pipelines.blocks.prediction import Prediction
 from pipelines.blocks.restored import restore, training_config
 from pipelines.blocks.trained import load_trained
 from pipelines.errors import InputError
@@ -194,6 +195,21 @@ def test_accuracy_is_stated_after_the_standard(evaluated: tuple[Workspace, Outco
     assert found["asprs"]["horizontal_class"] == f"{np.ceil(100 * found['with_survey']['rmse_h_m']):.0f} cm"
     assert found["asprs"]["enough_points"] is False
     assert found["blunders"] == []
+
+
+def test_a_prediction_that_is_not_of_this_training_is_told(trained: list[tuple[Workspace, Workspace]]) -> None:
+    outcome = run_stage(trained[0][1], EVALUATE, {"renders": 0})
+    assert "without geographic losses" in report_of(trained[0][1])["accuracy"]["cautions"][0]
+    assert any("without geographic losses" in text for text in outcome.manifest.warnings)
+
+
+def test_held_cameras_make_the_prediction_too_good(evaluated: tuple[Workspace, Outcome]) -> None:
+    workspace = evaluated[0]
+    trained, initial = load_trained(workspace), load_json(InitialSimilarity, workspace.path(SIM3))
+    config = training_config(workspace)
+    held = Prediction(restore(trained, initial, config.model_copy(update={"optimize_cameras": False})))
+    assert "too good" in held.cautions[0]
+    assert Prediction(restore(trained, initial, config)).cautions == ()
 
 
 def test_a_blunder_is_named_and_kept(altered: Workspace) -> None:

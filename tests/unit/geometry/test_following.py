@@ -26,6 +26,11 @@ def test_points_follow_as_least_squares_says() -> None:
     np.testing.assert_allclose(found.cov_of_marks, own, rtol=1e-5)
 
 
+def test_cameras_that_are_held_move_nothing() -> None:
+    network = exact_network(images=5, points=12)
+    assert follow(network, np.ones(len(network.obs_point))).by(np.zeros((5, 6, 0))).shape == (12, 3, 0)
+
+
 def test_parallel_rays_determine_no_point() -> None:
     network = exact_network(images=2, points=1)
     away = network.cam_center_in_world[0] - network.point_in_world[0]

@@ -122,6 +122,16 @@ def test_three_points_alone_cannot_spare_one() -> None:
     assert np.isnan(found.cov_in_geo).all()
 
 
+def test_cameras_that_are_held_leave_the_similarity() -> None:
+    block = replace(BLOCK, basis=np.zeros((12, 6, 0)))
+    _, problem = solved(0, RTK, CONTROL, block)
+    joint = posterior(problem)
+    assert joint.covariance.shape == (7, 7)
+    np.testing.assert_allclose(joint.covariance, problem.covariance(), rtol=1e-6, atol=1e-12)
+    found = joint.at(np.zeros((2, 3)), np.zeros((2, 3, 0)), np.zeros((2, 3, 0)))
+    assert found.shape == (2, 3, 3)
+
+
 def test_without_control_points_there_is_nothing_to_leave_out() -> None:
     _, problem = solved(0, RTK, None)
     assert leave_one_out(problem).error_in_geo.shape == (0, 3)
