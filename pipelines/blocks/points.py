@@ -11,6 +11,7 @@ from pipelines.blocks.trained import Trained
 from pipelines.geometry.cameras import Pinhole, undistort
 from pipelines.geometry.rays import Rays, Views, intersect
 from pipelines.products import FloatArray, SurveyedPoint
+from pipelines.robust.statistics import spatial_median
 
 # Rays of a mark are held to agree within their mark's σ and this much of the cameras' own error.
 _SIGMA_CENTER_M = 0.02
@@ -77,7 +78,7 @@ def points_by_camera(trained: Trained, seen: Sights, count: int) -> FloatArray:
 def points_by_model(
     trained: Trained, seen: Sights, depth_m: dict[int, FloatArray], pinholes: dict[int, Pinhole], count: int
 ) -> FloatArray:
-    """Points (J, 3) in `geo` where the model's surface lies behind their marks: median over the views.
+    """Points (J, 3) in `geo` where the model's surface lies behind their marks: spatial median of the views.
 
     Where a mark lies beside an edge of the surface, a fraction of a pixel decides between roof and ground: such
     views do not count for a point that two or more others show on unbroken surface.
@@ -96,7 +97,7 @@ def points_by_model(
             kind = beside if _at_edge(depth_m[int(i)], pinholes[int(i)], xy) else clear
             kind[j].append(trained.poses.cam_from_model[i].T @ ray + trained.poses.cam_center_in_model[i])
     hits = [good if len(good) >= 2 else good + poor for good, poor in zip(clear, beside, strict=True)]
-    middle = np.array([np.median(np.array(hit), axis=0) if len(hit) >= 2 else np.full(3, np.nan) for hit in hits])
+    middle = np.array([spatial_median(hit) if len(hit) >= 2 else np.full(3, np.nan) for hit in hits])
     return trained.geo_from_model.apply(middle.reshape(-1, 3))
 
 

@@ -9,6 +9,8 @@ from scipy.stats import chi2
 from pipelines.products import FloatArray, ResidualStats
 
 _NORMAL_MAD = 1.4826  # σ / MAD of a normal distribution
+_WEISZFELD_STEPS = 50
+_WEISZFELD_NEAR = 1e-6  # a point that is met weighs no more than this distance
 
 
 def chi2_quantile(probability: float, degrees: ArrayLike) -> FloatArray:
@@ -23,6 +25,19 @@ def mad_sigma(values: ArrayLike) -> float:
     """σ of values (N,) from the median absolute deviation: half of them may be outliers."""
     array = np.asarray(values, dtype=np.float64)
     return float(_NORMAL_MAD * np.median(np.abs(array - np.median(array))))
+
+
+def spatial_median(points: ArrayLike) -> FloatArray:
+    """The place (3,) with the least sum of distances to points (N, 3), N ≥ 1, by Weiszfeld's iteration.
+
+    Half of the points may be anywhere; and unlike the median of each coordinate it does not depend on the axes.
+    """
+    array = np.asarray(points, dtype=np.float64)
+    place = np.median(array, axis=0)
+    for _ in range(_WEISZFELD_STEPS):
+        weight = 1.0 / np.maximum(np.linalg.norm(array - place, axis=1), _WEISZFELD_NEAR)
+        place = weight @ array / weight.sum()
+    return np.asarray(place)
 
 
 def squared_mahalanobis(residuals: ArrayLike, covariances: ArrayLike) -> FloatArray:
