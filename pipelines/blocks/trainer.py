@@ -224,9 +224,10 @@ class JointTrainer:
             points = self.views.surface(index)
             depth = depth_loss(render.expected_depth, render.alpha, points, pose, target.camera)
             loss = loss + wanted.depth * depth
-        if self.iteration > wanted.normals_from * self.options.iterations:
+        late = self.iteration > wanted.normals_from * self.options.iterations
+        if late and self.iteration % wanted.normals_every == 0:
             normals = normal_loss(gaussians, pose, target.camera, self.rasterizer, wanted.edge)
-            loss = loss + wanted.normals * normals
+            loss = loss + wanted.normals_every * wanted.normals * normals
         return loss
 
     def _watched(self) -> dict[str, Tensor]:

@@ -29,7 +29,8 @@ class SurfaceSettings:
         depth: of the mean relative difference of depth at the SfM points.
         flatness: of the mean smallest standard deviation, in scene extents.
         normals: of the depth–normal consistency,
-        normals_from: from this fraction of the training.
+        normals_from: from this fraction of the training,
+        normals_every: at every so many iterations, since it takes a render of its own, and with as much more weight.
         edge: depth steps larger than this fraction of the depth between neighbouring pixels are edges, where
             the depth has no normal.
     """
@@ -38,6 +39,7 @@ class SurfaceSettings:
     flatness: float = 1.0
     normals: float = 0.01
     normals_from: float = 0.5
+    normals_every: int = 4
     edge: float = 0.05
 
 
