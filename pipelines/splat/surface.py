@@ -30,7 +30,7 @@ class SurfaceSettings:
         flatness: of the mean smallest standard deviation, in scene extents.
         normals: of the depth–normal consistency,
         normals_from: from this fraction of the training,
-        normals_every: at every so many iterations, since it takes a render of its own, and with as much more weight.
+        normals_every: at every so many iterations, since it takes a render of its own; with as much more weight.
         edge: depth steps larger than this fraction of the depth between neighbouring pixels are edges, where
             the depth has no normal.
     """
