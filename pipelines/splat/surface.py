@@ -35,7 +35,7 @@ class SurfaceSettings:
             the depth has no normal.
     """
 
-    depth: float = 2.0
+    depth: float = 1.0
     flatness: float = 1.0
     normals: float = 0.01
     normals_from: float = 0.5
