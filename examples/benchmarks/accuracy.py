@@ -35,6 +35,7 @@ PROFILES = {
     "consumer, 8 GCPs": ("consumer", True),
     "consumer": ("consumer", False),
     "outliers": ("outliers", False),
+    "outliers, 8 GCPs": ("outliers", True),
     "PPK": ("ppk", False),
 }
 ORBIT_FILES = {

@@ -24,7 +24,7 @@ from pipelines.workspace import Workspace
 pytest.importorskip("pycolmap")
 pytestmark = pytest.mark.usefixtures("one_thread")
 Compared = tuple[Workspace, Comparison, list[Ran]]
-SHORT = {"iterations": 60, "sh_degree": 0, "log_every": 5, "checkpoint_every": 10}
+SHORT = {"iterations": 60, "dense": False, "sh_degree": 0, "log_every": 5, "checkpoint_every": 10}
 # Marks of 0.1 px are 5 cm from 45 m, over 14 rays 1.5 cm; the similarity of 14 fixes adds 1.5 cm and 2.4 cm up.
 BY_CAMERA_M = 0.08
 
