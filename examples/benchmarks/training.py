@@ -167,7 +167,7 @@ def main() -> None:
     time_line.add_argument("--every", type=int, default=500, help="iterations between measurements")
     time_line.add_argument("--max-image-size", type=int, default=600)
     time_line.add_argument("--max-gaussians", type=int, default=80_000)
-    time_line.add_argument("--faithful-surface", action="store_true", help="with the surface losses")
+    time_line.add_argument("--faithful-surface", action=argparse.BooleanOptionalAction, default=True)
     time_line.set_defaults(run=curve)
     arguments = parser.parse_args()
     arguments.run(arguments)
