@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pipelines.blocks.scene import Scene
 from pipelines.formats.image_cache import ImageCache
 from pipelines.geometry.cameras import Pinhole
+from pipelines.geometry.thinning import one_a_cube
 from pipelines.products import FloatArray
 
 _COLUMNS = 24  # cells across an image
@@ -80,9 +81,7 @@ def _empty_cells(scene: Scene, index: int, camera: Pinhole, points: FloatArray) 
 
 
 def _rays(pixel: FloatArray, camera: Pinhole) -> FloatArray:
-    ray = np.stack(
-        [(pixel[:, 0] - camera.cx) / camera.fx, (pixel[:, 1] - camera.cy) / camera.fy, np.ones(len(pixel))], axis=1
-    )
+    ray = camera.rays(pixel)
     return np.asarray(ray / np.linalg.norm(ray, axis=1, keepdims=True))
 
 
@@ -125,8 +124,5 @@ def _thinned(all_points: Background) -> Background:
     """One point a cube of its own size: neighbouring views see the same places."""
     if not len(all_points.sigma_m):
         return all_points
-    level = np.round(np.log2(np.maximum(all_points.sigma_m, 1e-6)))
-    cube = np.floor(all_points.point_in_model / (2.0 ** (level + 1))[:, None])
-    _, first = np.unique(np.column_stack([level, cube]), axis=0, return_index=True)
-    first.sort()
+    first = one_a_cube(all_points.point_in_model, 2 * all_points.sigma_m)
     return Background(all_points.point_in_model[first], all_points.rgb[first], all_points.sigma_m[first])

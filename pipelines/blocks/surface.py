@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import logging
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -18,11 +19,12 @@ from numpy.typing import NDArray
 from pipelines.blocks.scene import Scene
 from pipelines.formats.image_cache import ImageCache, save_array
 from pipelines.geometry.cameras import Pinhole
+from pipelines.geometry.thinning import one_a_cube
 from pipelines.products import FloatArray
 from pipelines.progress import SILENT, Progress
 from pipelines.stereo.agreement import AgreementSettings, Surface, agreed_depth
 from pipelines.stereo.neighbours import Sightings, best_neighbours, planes_for
-from pipelines.stereo.sweep import FloatImage, Planes, StereoView, SweepSettings, Swept, plane_sweep
+from pipelines.stereo.sweep import FloatImage, Planes, StereoCamera, StereoView, SweepSettings, Swept, plane_sweep
 
 log = logging.getLogger(__name__)
 
@@ -75,7 +77,9 @@ class SceneSurface:
         self._sightings = Sightings(
             scene.point_in_model, scene.poses.cam_center_in_model, sparse.obs_point, sparse.obs_image
         )
-        self._neighbours: dict[int, list[int]] = {}
+        # Asked for again by each of a view's neighbours, and the same each time.
+        self._neighbours = cache(self._find_neighbours)
+        self._planes = cache(self._find_planes)
         self.folder = folder / self._key()
 
     def build(self, progress: Progress = SILENT) -> None:
@@ -93,11 +97,7 @@ class SceneSurface:
 
     def camera(self, index: int) -> Pinhole:
         """Camera of a depth map."""
-        full = self._images.pinhole(index)
-        scale = min(1.0, self._options.max_size_px / max(full.width, full.height))
-        width, height = max(1, round(scale * full.width)), max(1, round(scale * full.height))
-        sx, sy = width / full.width, height / full.height
-        return Pinhole(width, height, sx * full.fx, sy * full.fy, sx * full.cx, sy * full.cy)
+        return self._images.pinhole(index).limited(self._options.max_size_px)
 
     def depth(self, index: int) -> FloatImage:
         """Depth (H, W) in metres along the optical axis of a training view, 0 where unknown; mapped from disk."""
@@ -106,7 +106,8 @@ class SceneSurface:
 
     def points(self, index: int, stride: int = 1) -> FloatArray:
         """Surface points (P, 3) in `model` that a training view sees, of every `stride`-th row and column."""
-        return self._points(index, *np.nonzero(self._thinned(index, stride)))
+        rows, columns = np.nonzero(self.depth(index)[::stride, ::stride])
+        return self._points(index, stride * rows, stride * columns)
 
     def sample(self, count: int, seed: int) -> SurfacePoints:
         """At most `count` points of the whole surface, as dense as the photographs show it."""
@@ -124,22 +125,9 @@ class SceneSurface:
         kept = spread_evenly(everywhere, np.concatenate(sizes), count)
         return SurfacePoints(everywhere[kept], rgb[kept])
 
-    def _thinned(self, index: int, stride: int) -> FloatImage:
-        thin = np.zeros_like(self.depth(index))
-        thin[::stride, ::stride] = self.depth(index)[::stride, ::stride]
-        return thin
-
     def _points(self, index: int, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> FloatArray:
-        camera, depth = self.camera(index), self.depth(index)[rows, columns].astype(np.float64)
-        ray = np.stack(
-            [
-                (columns + 0.5 - camera.cx) / camera.fx,
-                (rows + 0.5 - camera.cy) / camera.fy,
-                np.ones(len(rows)),
-            ],
-            axis=1,
-        )
-        poses = self._scene.poses
+        depth, poses = self.depth(index)[rows, columns].astype(np.float64), self._scene.poses
+        ray = self.camera(index).rays(np.stack([columns, rows], axis=1) + 0.5)
         turned = (depth[:, None] * ray) @ poses.cam_from_model[index]
         return np.asarray(poses.cam_center_in_model[index] + turned)
 
@@ -148,7 +136,7 @@ class SceneSurface:
         camera = self.camera(index)
         swept = np.zeros((3, camera.height, camera.width), dtype=np.float32)
         swept[0], swept[1] = np.nan, -1.0
-        planes, others = self._planes(index)
+        planes, others = self._planes(index), self._neighbours(index)
         if planes is not None:
             found = plane_sweep(self._view(index), [self._view(j) for j in others], planes, self._options.sweep)
             swept[:] = found.offset_m, found.score, found.step_m
@@ -159,35 +147,35 @@ class SceneSurface:
         if own is None:
             camera = self.camera(index)
             return np.zeros((camera.height, camera.width), dtype=np.float32)
-        others = [self._surface(j) for j in self._neighbours_of(index)]
+        others = [self._surface(j) for j in self._neighbours(index)]
         return agreed_depth(own, [other for other in others if other is not None], self._options.agreement)
 
     def _surface(self, index: int) -> Surface | None:
-        planes, _ = self._planes(index)
+        planes = self._planes(index)
         if planes is None:
             return None
         offset, score, step = np.load(self._path(index, "swept"), mmap_mode="r", allow_pickle=False)
-        return Surface(self._view(index), planes, Swept(offset, score, step))
+        return Surface(self._camera(index), planes, Swept(offset, score, step))
 
-    def _planes(self, index: int) -> tuple[Planes | None, list[int]]:
-        others = self._neighbours_of(index)
+    def _find_planes(self, index: int) -> Planes | None:
+        others = self._neighbours(index)
         if not others:
-            return None, []
+            return None
         points = self._scene.point_in_model[self._sightings.seen_by(index)]
-        return planes_for(self._view(index), [self._view(j) for j in others], points), others
+        return planes_for(self._camera(index), [self._camera(j) for j in others], points)
 
-    def _neighbours_of(self, index: int) -> list[int]:
-        if index not in self._neighbours:
-            count = self._options.neighbours
-            self._neighbours[index] = best_neighbours(self._sightings, index, self._scene.train, count)
-        return self._neighbours[index]
+    def _find_neighbours(self, index: int) -> list[int]:
+        return best_neighbours(self._sightings, index, self._scene.train, self._options.neighbours)
+
+    def _camera(self, index: int) -> StereoCamera:
+        poses = self._scene.poses
+        return StereoCamera(self.camera(index), poses.cam_from_model[index], poses.cam_center_in_model[index])
 
     def _view(self, index: int) -> StereoView:
         grey = cv2.cvtColor(self._rgb(index), cv2.COLOR_RGB2GRAY).astype(np.float32) + 1
-        camera, poses = self.camera(index), self._scene.poses
         mask = np.array(self._images.mask(index), dtype=np.uint8)
-        grey[cv2.resize(mask, (camera.width, camera.height), interpolation=cv2.INTER_NEAREST) == 0] = 0
-        return StereoView(grey, camera, poses.cam_from_model[index], poses.cam_center_in_model[index])
+        grey[cv2.resize(mask, grey.shape[::-1], interpolation=cv2.INTER_NEAREST) == 0] = 0
+        return StereoView(self._camera(index), grey)
 
     def _rgb(self, index: int) -> NDArray[np.uint8]:
         camera = self.camera(index)
@@ -218,14 +206,12 @@ def spread_evenly(points: FloatArray, size_m: FloatArray, count: int) -> NDArray
     if len(points) <= count:
         return np.arange(len(points))
     fine, coarse = 2.0**-4, 2.0**12
-    kept = np.arange(1)
+    low, kept = points.min(axis=0), np.arange(1)
     for _ in range(16):
         middle = float(np.sqrt(fine * coarse))
-        level = np.round(np.log2(np.maximum(middle * size_m, 1e-9)))
-        cube = np.floor((points - points.min(axis=0)) / (2.0**level)[:, None])
-        _, first = np.unique(np.column_stack([level, cube]).astype(np.int64), axis=0, return_index=True)
+        first = one_a_cube(points - low, middle * size_m)
         if len(first) > count:
             fine = middle
         else:
             coarse, kept = middle, first
-    return np.sort(kept)
+    return kept

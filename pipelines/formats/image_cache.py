@@ -37,11 +37,7 @@ def pinhole_of(camera: Camera, max_size_px: int) -> Pinhole:
 
     The focal length is kept; distortion parameters are dropped.
     """
-    scale = min(1.0, max_size_px / max(camera.width, camera.height))
-    width, height = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
-    fx, fy, cx, cy = _focal_and_centre(camera)
-    sx, sy = width / camera.width, height / camera.height
-    return Pinhole(width, height, fx * sx, fy * sy, cx * sx, cy * sy)
+    return Pinhole(camera.width, camera.height, *_focal_and_centre(camera)).limited(max_size_px)
 
 
 def _focal_and_centre(camera: Camera) -> tuple[float, float, float, float]:

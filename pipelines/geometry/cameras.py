@@ -42,6 +42,18 @@ class Pinhole:
     cx: float
     cy: float
 
+    def limited(self, max_size_px: int) -> Pinhole:
+        """The same view at a size of at most `max_size_px` along the longer side."""
+        scale = min(1.0, max_size_px / max(self.width, self.height))
+        width, height = max(1, round(self.width * scale)), max(1, round(self.height * scale))
+        sx, sy = width / self.width, height / self.height
+        return Pinhole(width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy)
+
+    def rays(self, xy_px: ArrayLike) -> FloatArray:
+        """Viewing rays (…, 3) of pixels (…, 2) in the camera's frame, of length one along the optical axis."""
+        slope = (np.asarray(xy_px, dtype=np.float64) - [self.cx, self.cy]) / [self.fx, self.fy]
+        return np.concatenate([slope, np.ones((*slope.shape[:-1], 1))], axis=-1)
+
 
 @dataclass(frozen=True)
 class Camera:

@@ -8,14 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.products import FloatArray
-from pipelines.stereo.sweep import FloatImage, Planes, StereoView, Swept
+from pipelines.stereo.sweep import FloatImage, Planes, StereoCamera, Swept
 
 
 @dataclass(frozen=True)
 class Surface:
-    """A view with the surface that a sweep found in it."""
+    """The surface that a sweep found in a view."""
 
-    view: StereoView
+    camera: StereoCamera
     planes: Planes
     swept: Swept
 
@@ -41,12 +41,12 @@ def agreed_depth(reference: Surface, others: list[Surface], settings: AgreementS
     A point of the reference is looked up in each other view. The difference is taken along the normal of the
     other view's planes: on a surface that these follow, it does not matter that pixels do not coincide.
     """
-    rays = reference.view.rays()
-    depth = reference.planes.depth(reference.view, reference.swept.offset_m)
+    rays = reference.camera.rays()
+    depth = reference.planes.depth(reference.camera, reference.swept.offset_m)
     good = (reference.swept.score > settings.least_score) & np.isfinite(depth) & (depth > 0)
     total, count = np.zeros(depth.shape), np.zeros(depth.shape, dtype=np.int64)
     rows, columns = np.nonzero(good)
-    point = reference.view.cam_center_in_world + depth[rows, columns, None] * rays[rows, columns]
+    point = reference.camera.center_in_world + depth[rows, columns, None] * rays[rows, columns]
     for other in others:
         seen, missed = _missed(point, other, settings)
         along = rays[rows[seen], columns[seen]] @ other.planes.normal_in_world
@@ -62,8 +62,8 @@ def agreed_depth(reference: Surface, others: list[Surface], settings: AgreementS
 
 def _missed(point: FloatArray, other: Surface, settings: AgreementSettings) -> tuple[NDArray[np.int64], FloatArray]:
     """Indices of the points (P, 3) that lie on another view's surface, and how far from it along its normal."""
-    view, camera = other.view, other.view.camera
-    in_cam = (point - view.cam_center_in_world) @ view.cam_from_world.T
+    camera = other.camera.pinhole
+    in_cam = (point - other.camera.center_in_world) @ other.camera.cam_from_world.T
     ahead = np.flatnonzero(in_cam[:, 2] > 0)
     column = np.floor(camera.fx * in_cam[ahead, 0] / in_cam[ahead, 2] + camera.cx)
     row = np.floor(camera.fy * in_cam[ahead, 1] / in_cam[ahead, 2] + camera.cy)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.products import FloatArray
-from pipelines.stereo.sweep import Planes, StereoView
+from pipelines.stereo.sweep import Planes, StereoCamera
 
 IntArray = NDArray[np.int64]
 
@@ -65,7 +65,7 @@ def best_neighbours(sightings: Sightings, view: int, among: IntArray, count: int
     return [int(index) for index in order if worth[index] > 0]
 
 
-def planes_for(view: StereoView, neighbours: list[StereoView], points: FloatArray) -> Planes | None:
+def planes_for(view: StereoCamera, neighbours: list[StereoCamera], points: FloatArray) -> Planes | None:
     """Planes through points (P, 3) that the view sees: level ones, or across a view that hardly looks down.
 
     Level planes suit ground and roofs seen at a slant, where planes across the view do not. None where the points
@@ -79,7 +79,7 @@ def planes_for(view: StereoView, neighbours: list[StereoView], points: FloatArra
         return None
     low, high = np.percentile(along, _RANGE)
     low, high = low - _MARGIN * (high - low), high + _MARGIN * (high - low)
-    own = float(normal @ view.cam_center_in_world)
+    own = float(normal @ view.center_in_world)
     if not level:
         nearest = own + 0.5 * max(float(np.percentile(along, _RANGE[0])) - own, 1e-6)
         low = max(low, nearest)
@@ -93,14 +93,16 @@ def planes_for(view: StereoView, neighbours: list[StereoView], points: FloatArra
     return Planes(normal, own + 1 / np.linspace(1 / (low - own), 1 / (high - own), count))
 
 
-def _pixels_a_metre(view: StereoView, neighbours: list[StereoView], point: FloatArray, normal: FloatArray) -> float:
+def _pixels_a_metre(
+    view: StereoCamera, neighbours: list[StereoCamera], point: FloatArray, normal: FloatArray
+) -> float:
     """How fast the neighbours see a point move that moves along the ray of `view`, by a metre of its plane."""
-    ray = point - view.cam_center_in_world
+    ray = point - view.center_in_world
     ray = ray / max(abs(float(normal @ ray)), 1e-9)
     speeds = []
     for other in neighbours:
-        ends = (point + np.outer([-0.05, 0.05], ray) - other.cam_center_in_world) @ other.cam_from_world.T
+        ends = (point + np.outer([-0.05, 0.05], ray) - other.center_in_world) @ other.cam_from_world.T
         if (ends[:, 2] > 0).all():
-            on_image = ends[:, :2] / ends[:, 2:] * [other.camera.fx, other.camera.fy]
+            on_image = ends[:, :2] / ends[:, 2:] * [other.pinhole.fx, other.pinhole.fy]
             speeds.append(float(np.linalg.norm(on_image[1] - on_image[0])) / 0.1)
     return float(np.median(speeds)) if speeds else 0.0

@@ -27,27 +27,36 @@ _UNSEEN = -1.0  # correlation where a neighbour does not look
 
 
 @dataclass(frozen=True)
-class StereoView:
-    """A photograph with its camera, in a frame `world` in metres.
+class StereoCamera:
+    """A camera in a frame `world` in metres.
 
     Attributes:
-        grey: (H, W), 1 … 256; 0 where the photograph shows nothing.
-        camera: of H × W pixels.
+        pinhole: of H × W pixels.
         cam_from_world: (3, 3) rotation.
-        cam_center_in_world: (3,).
+        center_in_world: (3,).
     """
 
-    grey: FloatImage
-    camera: Pinhole
+    pinhole: Pinhole
     cam_from_world: FloatArray
-    cam_center_in_world: FloatArray
+    center_in_world: FloatArray
 
     def rays(self) -> FloatArray:
         """Viewing rays (H, W, 3) in `world`, of length one along the optical axis."""
-        camera = self.camera
-        x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-        in_cam = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], axis=-1)
-        return np.asarray(in_cam @ self.cam_from_world)
+        x, y = np.meshgrid(np.arange(self.pinhole.width) + 0.5, np.arange(self.pinhole.height) + 0.5)
+        return np.asarray(self.pinhole.rays(np.stack([x, y], axis=-1)) @ self.cam_from_world)
+
+
+@dataclass(frozen=True)
+class StereoView:
+    """A photograph with its camera.
+
+    Attributes:
+        camera: of H × W pixels.
+        grey: (H, W), 1 … 256; 0 where the photograph shows nothing.
+    """
+
+    camera: StereoCamera
+    grey: FloatImage
 
 
 @dataclass(frozen=True)
@@ -62,11 +71,11 @@ class Planes:
     normal_in_world: FloatArray
     offset_m: FloatArray
 
-    def depth(self, view: StereoView, offset_m: FloatImage) -> FloatArray:
-        """Depth (H, W) along the optical axis at which the rays of a view meet planes of offsets (H, W)."""
+    def depth(self, camera: StereoCamera, offset_m: FloatImage) -> FloatArray:
+        """Depth (H, W) along the optical axis at which the rays of a camera meet planes of offsets (H, W)."""
         with np.errstate(divide="ignore"):
-            distance = offset_m - self.normal_in_world @ view.cam_center_in_world
-            return np.asarray(distance / (view.rays() @ self.normal_in_world))
+            distance = offset_m - self.normal_in_world @ camera.center_in_world
+            return np.asarray(distance / (camera.rays() @ self.normal_in_world))
 
 
 @dataclass(frozen=True)
@@ -124,7 +133,8 @@ def plane_sweep(
     smooth = cv2.ximgproc.createGuidedFilter(reference.grey, settings.reach_px, settings.edge_grey**2)
     used = min(settings.views, len(neighbours))
     # Rays meet a plane in front of the camera where both lie on one side of it.
-    sign, own = reference.rays() @ planes.normal_in_world, planes.normal_in_world @ reference.cam_center_in_world
+    sign = reference.camera.rays() @ planes.normal_in_world
+    own = planes.normal_in_world @ reference.camera.center_in_world
     peak = _Peak(reference.grey.shape)
     for offset in planes.offset_m:
         scores = (correlation(_seen_on_plane(reference, view, planes, offset)) for view in neighbours)
@@ -148,26 +158,27 @@ def _mean_of_best(scores: Iterable[FloatImage], count: int) -> FloatImage:
 
 def _seen_on_plane(reference: StereoView, other: StereoView, planes: Planes, offset_m: float) -> FloatImage:
     """What `other` shows of the plane, at the pixels of `reference`; 0 where it shows nothing."""
-    camera = reference.camera
-    turn = other.cam_from_world @ reference.cam_from_world.T
-    shift = other.cam_from_world @ (reference.cam_center_in_world - other.cam_center_in_world)
-    normal_in_cam = reference.cam_from_world @ planes.normal_in_world
-    distance = offset_m - planes.normal_in_world @ reference.cam_center_in_world
+    here, there, pinhole = reference.camera, other.camera, reference.camera.pinhole
+    turn = there.cam_from_world @ here.cam_from_world.T
+    shift = there.cam_from_world @ (here.center_in_world - there.center_in_world)
+    normal_in_cam = here.cam_from_world @ planes.normal_in_world
+    distance = offset_m - planes.normal_in_world @ here.center_in_world
     if abs(distance) < 1e-9:
         return np.zeros_like(reference.grey)
     by_ray = turn + np.outer(shift, normal_in_cam) / distance
-    homography = _matrix(other.camera) @ by_ray @ np.linalg.inv(_matrix(camera))
+    homography = _matrix(there.pinhole) @ by_ray @ np.linalg.inv(_matrix(pinhole))
     image = cv2.warpPerspective(
         other.grey,
         homography,
-        (camera.width, camera.height),
+        (pinhole.width, pinhole.height),
         flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
         borderMode=cv2.BORDER_CONSTANT,
         borderValue=0,
     )
-    corners = np.array([[0, 0, 1], [camera.width, 0, 1], [0, camera.height, 1], [camera.width, camera.height, 1]])
+    width, height = pinhole.width, pinhole.height
+    corners = np.array([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]])
     if not (corners @ homography[2] > 0).all():  # part of the plane lies behind the other camera
-        x, y = np.arange(camera.width), np.arange(camera.height)[:, None]
+        x, y = np.arange(width), np.arange(height)[:, None]
         image[homography[2, 0] * x + homography[2, 1] * y + homography[2, 2] <= 0] = 0
     return np.asarray(image, dtype=np.float32)
 

@@ -9,7 +9,7 @@ import pytest
 from pipelines.geometry.cameras import Pinhole
 from pipelines.stereo.agreement import AgreementSettings, Surface, agreed_depth
 from pipelines.stereo.neighbours import Sightings, best_neighbours, planes_for
-from pipelines.stereo.sweep import Planes, StereoView, SweepSettings, plane_sweep
+from pipelines.stereo.sweep import Planes, StereoCamera, StereoView, SweepSettings, plane_sweep
 
 CAMERA = Pinhole(120, 90, 110.0, 110.0, 60.0, 45.0)
 GROUND_M, ROOF_M, ROOF_SIDE_M = 0.0, 6.0, 8.0
@@ -33,9 +33,9 @@ def texture(seed: int) -> np.ndarray:
     return cv2.GaussianBlur(noise, (0, 0), 3.0) * 4 - 390
 
 
-def true_depth(view: StereoView) -> np.ndarray:
+def true_depth(camera: StereoCamera) -> np.ndarray:
     """First surface along each ray: the square roof, or the ground."""
-    rays, center = view.rays(), view.cam_center_in_world
+    rays, center = camera.rays(), camera.center_in_world
     roof = (ROOF_M - center[2]) / rays[..., 2]
     on_roof = center + roof[..., None] * rays
     hit = (np.abs(on_roof[..., :2]) < ROOF_SIDE_M / 2).all(axis=-1)
@@ -44,15 +44,15 @@ def true_depth(view: StereoView) -> np.ndarray:
 
 def shot(azimuth_deg: float, brightness: float = 1.0) -> StereoView:
     rotation, center = looking_at_origin(azimuth_deg)
-    blank = StereoView(np.zeros((90, 120), np.float32), CAMERA, rotation, center)
-    place = center + true_depth(blank)[..., None] * blank.rays()
+    camera = StereoCamera(CAMERA, rotation, center)
+    place = center + true_depth(camera)[..., None] * camera.rays()
     column, row = ((place[..., axis] / TEXEL_M + 400).astype(np.float32) for axis in (0, 1))
     high = place[..., 2] > 0.5 * ROOF_M
     painted = [
         cv2.remap(texture(seed), column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP) for seed in (1, 2)
     ]
     grey = brightness * np.where(high, painted[1], painted[0]) + 1
-    return StereoView(np.clip(grey, 1, 256).astype(np.float32), CAMERA, rotation, center)
+    return StereoView(camera, np.clip(grey, 1, 256).astype(np.float32))
 
 
 @pytest.fixture(scope="module")
@@ -63,13 +63,13 @@ def ring() -> list[StereoView]:
 
 def swept(ring: list[StereoView], index: int) -> Surface:
     others = [view for place, view in enumerate(ring) if 0 < abs(place - index) <= 2]
-    return Surface(ring[index], LEVEL, plane_sweep(ring[index], others, LEVEL, SweepSettings()))
+    return Surface(ring[index].camera, LEVEL, plane_sweep(ring[index], others, LEVEL, SweepSettings()))
 
 
 def test_sweep_finds_ground_and_roof(ring: list[StereoView]) -> None:
     found = swept(ring, 2)
-    depth = LEVEL.depth(ring[2], found.swept.offset_m)
-    error = (depth - true_depth(ring[2])) * np.abs(ring[2].rays()[..., 2])
+    depth = LEVEL.depth(ring[2].camera, found.swept.offset_m)
+    error = (depth - true_depth(ring[2].camera)) * np.abs(ring[2].camera.rays()[..., 2])
     inner = np.s_[8:-8, 8:-8]
     assert np.median(np.abs(error[inner])) < TENTH_PX_M
     # The strips beside the roof that fewer than three neighbours see are a tenth of the picture.
@@ -80,8 +80,8 @@ def test_views_that_agree_leave_few_errors(ring: list[StereoView]) -> None:
     surfaces = [swept(ring, index) for index in range(len(ring))]
     depth = agreed_depth(surfaces[2], [surfaces[index] for index in (0, 1, 3, 4)], AgreementSettings())
     known = depth > 0
-    height_error = (depth - true_depth(ring[2])) * np.abs(ring[2].rays()[..., 2])
-    alone = np.abs(LEVEL.depth(ring[2], surfaces[2].swept.offset_m) - true_depth(ring[2])) > 0.5
+    height_error = (depth - true_depth(ring[2].camera)) * np.abs(ring[2].camera.rays()[..., 2])
+    alone = np.abs(LEVEL.depth(ring[2].camera, surfaces[2].swept.offset_m) - true_depth(ring[2].camera)) > 0.5
     assert known.mean() > 0.7
     assert (np.abs(height_error[known]) < 0.5).mean() > 0.97
     # What one view gets wrong, others see differently.
@@ -117,7 +117,7 @@ def test_neighbours_are_those_under_good_angles(ring: list[StereoView]) -> None:
     count = len(points)
     sightings = Sightings(
         points,
-        np.array([view.cam_center_in_world for view in ring]),
+        np.array([view.camera.center_in_world for view in ring]),
         np.tile(np.arange(count), len(ring)),
         np.repeat(np.arange(len(ring)), count),
     )
@@ -128,22 +128,22 @@ def test_neighbours_are_those_under_good_angles(ring: list[StereoView]) -> None:
 
 def test_planes_follow_the_view(ring: list[StereoView]) -> None:
     points = grid_points()
-    planes = planes_for(ring[2], ring[3:5], points)
+    planes = planes_for(ring[2].camera, [view.camera for view in ring[3:5]], points)
     assert planes is not None
     np.testing.assert_allclose(planes.normal_in_world, [0, 0, 1])
     assert planes.offset_m.min() < GROUND_M < ROOF_M < planes.offset_m.max()
     level = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
     rotation = np.stack([level[1], -np.array([0.0, 0, 1]), np.cross(level[1], [0.0, 0, -1])])
-    facade = StereoView(ring[0].grey, CAMERA, rotation, np.array([-40.0, 0.0, 3.0]) * np.sign(rotation[2, 0]))
-    side = StereoView(ring[0].grey, CAMERA, rotation, facade.cam_center_in_world + np.array([0.0, 6.0, 0.0]))
+    facade = StereoCamera(CAMERA, rotation, np.array([-40.0, 0.0, 3.0]) * np.sign(rotation[2, 0]))
+    side = StereoCamera(CAMERA, rotation, facade.center_in_world + np.array([0.0, 6.0, 0.0]))
     across = planes_for(facade, [side], points)
     assert across is not None
     np.testing.assert_allclose(np.abs(across.normal_in_world), [1, 0, 0], atol=1e-12)
-    depth = across.offset_m - across.normal_in_world @ facade.cam_center_in_world
+    depth = across.offset_m - across.normal_in_world @ facade.center_in_world
     assert depth.min() > 0
     assert depth.min() < 32  # the points are 32 to 48 m away
     assert depth.max() > 48
 
 
 def test_too_few_points_give_no_planes(ring: list[StereoView]) -> None:
-    assert planes_for(ring[2], ring[3:5], grid_points()[:3]) is None
+    assert planes_for(ring[2].camera, [view.camera for view in ring[3:5]], grid_points()[:3]) is None
