@@ -16,11 +16,15 @@ from pipelines.products import (
     Attitude,
     CameraPrior,
     Fix,
+    InitialSimilarity,
     Mark,
     Origin,
+    SimilarityRecord,
     Survey,
     SurveyedPoint,
     SurveyImage,
+    TrainedCamera,
+    TrainedModel,
     VerticalDatum,
     save_json,
 )
@@ -29,6 +33,7 @@ from pipelines.workspace import Workspace
 
 CAMERA = Camera("OPENCV", 1200, 900, np.array([1020.0, 1018.0, 603.0, 447.0, -0.045, 0.012, 3e-4, -2e-4]))
 GEO_FROM_LOCAL = Similarity(12.5, exp_so3([0.4, -1.1, 2.0]), np.array([30.0, -45.0, 70.0]))
+IDENTITY = Similarity()
 Layout = Literal["orbit", "grid", "line"]
 
 
@@ -44,6 +49,11 @@ class Noise:
     outliers: tuple[int, ...] = ()
     outlier_m: float = 15.0
     bias_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+STATED = Noise()
+# Positions and marks as good as exact, with σ that can still be divided by.
+NOISELESS = Noise(pixel_px=0.2, mark_px=1e-9, gcp_m=1e-9, fix_m=(1e-9, 1e-9, 1e-9), attitude_deg=0.5)
 
 
 @dataclass(frozen=True)
@@ -141,6 +151,9 @@ class Measured:
     gcps: bool = False
 
 
+WITH_GCPS = Measured(gcps=True)
+
+
 def survey_of(scene: Scene, noise: Noise, measured: Measured, rng: np.random.Generator) -> Survey:
     """The measurements, with noise of exactly the σ that they state (but for outliers and bias)."""
     fixes = scene.center_in_geo + rng.normal(size=scene.center_in_geo.shape) * noise.fix_m + noise.bias_m
@@ -194,6 +207,56 @@ def _control(scene: Scene, noise: Noise, rng: np.random.Generator) -> tuple[Surv
             ),
         )
         for index, position in enumerate(surveyed)
+    )
+
+
+def material(
+    noise: Noise = STATED, measured: Measured = WITH_GCPS, images: int = 8, points: int = 60
+) -> tuple[Scene, SparseModel, Survey]:
+    """An orbit, its SfM model and its survey."""
+    scene, rng = make_scene(images=images, points=points), np.random.default_rng(0)
+    survey = survey_of(scene, noise, measured, rng)
+    return scene, sparse_model(scene, noise, rng), survey
+
+
+def initial(layout: str = "volume") -> InitialSimilarity:
+    """The true similarity, with σ of 1 % of scale, 0.01 rad and 1 cm about a place in the scene."""
+    covariance, pivot = np.eye(7) * 1e-4, (5.0, -3.0, 60.0)
+    return initial_product(GEO_FROM_LOCAL.to_record("local", "geo", covariance=covariance, pivot=pivot), layout)
+
+
+def initial_product(geo_from_local: SimilarityRecord, layout: str = "volume") -> InitialSimilarity:
+    """What `init-sim3` writes of a similarity, but for what it counts on the way."""
+    return InitialSimilarity(
+        geo_from_local=geo_from_local,
+        method="robust",
+        correspondences={},
+        inliers={},
+        residuals={},
+        condition_number=1.0,
+        layout=layout,  # type: ignore[arg-type]
+        attitude_used=False,
+    )
+
+
+def trained_model(
+    geo_from_model: Similarity,
+    model_from_local: Similarity = IDENTITY,
+    *,
+    max_image_size: int = 320,
+    cameras: tuple[TrainedCamera, ...] = (),
+) -> TrainedModel:
+    """What `train` writes beside a single Gaussian without bands."""
+    return TrainedModel(
+        geo_from_model=geo_from_model.to_record("model", "geo"),
+        model_from_local=model_from_local.to_record("local", "model"),
+        max_image_size=max_image_size,
+        cameras=cameras,
+        background=(0.0, 0.0, 0.0),
+        sh_degree=0,
+        iterations=1,
+        gaussians=1,
+        backend="cpu",
     )
 
 

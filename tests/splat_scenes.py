@@ -8,7 +8,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from scenes import GEO_FROM_LOCAL, Measured, Noise, Scene, looking_at, sparse_model, survey_of, write_workspace
+from scenes import (
+    GEO_FROM_LOCAL,
+    Measured,
+    Noise,
+    Scene,
+    initial_product,
+    looking_at,
+    sparse_model,
+    survey_of,
+    write_workspace,
+)
 
 from pipelines.config import GeolocateConfig
 from pipelines.formats.colmap import SparseModel
@@ -127,16 +137,7 @@ def initial_similarity(
     delta = np.linalg.cholesky(covariance) @ rng.normal(size=7)
     turn, grow = exp_so3(delta[1:4]), float(np.exp(delta[0]))
     off = Similarity(grow, turn, pivot + delta[4:] - grow * turn @ pivot)
-    return InitialSimilarity(
-        geo_from_local=(off @ truth).to_record("local", "geo", covariance=covariance, pivot=pivot),
-        method="robust",
-        correspondences={"gnss": 14, "gcp": 0, "points": 0},
-        inliers={"gnss": 14, "gcp": 0, "points": 0},
-        residuals={},
-        condition_number=1.0,
-        layout="volume",
-        attitude_used=False,
-    )
+    return initial_product((off @ truth).to_record("local", "geo", covariance=covariance, pivot=pivot))
 
 
 def write_rendered(root: Path, rendered: Rendered, initial: InitialSimilarity) -> Workspace:

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from pipelines.products import GeolocatedPoints, SimilarityRecord, Survey, TrainedModel, load_json, save_json
+from pipelines.geometry.similarity import Similarity
+from pipelines.products import GeolocatedPoints, Survey, load_json, save_json
 from pipelines.stages import BY_NAME, GAUSSIANS, MODEL, POINTS, SIM3, SPARSE, SURVEY
 from tests.cli_runs import Georef, products_in, write_files
 from tests.photos import jpeg
-from tests.scenes import Measured, Noise, make_scene, sparse_model, survey_of, write_workspace
+from tests.scenes import Measured, Noise, make_scene, sparse_model, survey_of, trained_model, write_workspace
 
 
 @pytest.fixture
@@ -80,15 +81,7 @@ def test_damaged_product(real_georef: Georef, made: Path, case: tuple[str, str, 
     ids=["no PLY", "text", "forged"],
 )
 def test_damaged_gaussians(real_georef: Georef, made: Path, data: bytes, told: str) -> None:
-    same = SimilarityRecord(
-        from_frame="model", to_frame="geo", scale=1.0, quat_xyzw=(0, 0, 0, 1), translation=(0, 0, 0),
-        covariance=((0.0,) * 7,) * 7,
-    )  # fmt: skip
-    model = TrainedModel(
-        geo_from_model=same, model_from_local=same, max_image_size=64, cameras=(), background=(0, 0, 0),
-        sh_degree=0, iterations=1, gaussians=1, backend="cpu",
-    )  # fmt: skip
-    save_json(model, made / MODEL)
+    save_json(trained_model(Similarity()), made / MODEL)
     write_files(made, {GAUSSIANS: data})
     result = real_georef("export-ply", made)
     assert (result.code, result.out) == (1, "")

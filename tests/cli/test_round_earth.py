@@ -22,13 +22,14 @@ from scipy.spatial.transform import Rotation
 from pipelines.formats.colmap import SparseModel, write_sparse
 from pipelines.geometry.cameras import Camera
 from pipelines.geometry.similarity import Similarity
-from pipelines.products import InitialSimilarity, Survey, TrainedCamera, TrainedModel, load_json, save_json
+from pipelines.products import Survey, TrainedCamera, load_json, save_json
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.storage import write_gaussians
 from pipelines.stages import GAUSSIANS, MODEL, REPORT, SIM3, SPARSE, SURVEY
 from tests.cli_runs import Georef
 from tests.map_projections import US_FOOT_M, long_island, utm
 from tests.photos import jpeg
+from tests.scenes import initial_product, trained_model
 
 CAMERA = Camera("PINHOLE", 64, 48, np.array([40.0, 40.0, 32.0, 24.0]))
 HALF_M, HEIGHT_M = 5_000.0, 60.0
@@ -168,29 +169,9 @@ def write_perfect_model(root: Path, made: Site) -> None:
         )
         for name, rotation, place in zip(made.names, cam_from_model, translation, strict=True)
     )
-    model = TrainedModel(
-        geo_from_model=Similarity(translation=shift).to_record("model", "geo"),
-        model_from_local=Similarity().to_record("local", "model"),
-        max_image_size=64,
-        cameras=cameras,
-        background=(0.0, 0.0, 0.0),
-        sh_degree=0,
-        iterations=1,
-        gaussians=1,
-        backend="cpu",
-    )
-    save_json(model, root / MODEL)
-    initial = InitialSimilarity(
-        geo_from_local=Similarity(translation=shift).to_record("local", "geo", covariance=1e-6 * np.eye(7)),
-        method="robust",
-        correspondences={},
-        inliers={},
-        residuals={},
-        condition_number=1.0,
-        layout="volume",
-        attitude_used=False,
-    )
-    save_json(initial, root / SIM3)
+    save_json(trained_model(Similarity(translation=shift), max_image_size=64, cameras=cameras), root / MODEL)
+    start = Similarity(translation=shift).to_record("local", "geo", covariance=1e-6 * np.eye(7))
+    save_json(initial_product(start), root / SIM3)
     # One far from everything: by model, no point is found.
     speck = Gaussians(
         torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.zeros(1, 3), torch.zeros(1), torch.zeros(1, 1, 3)

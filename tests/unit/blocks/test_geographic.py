@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from scenes import GEO_FROM_LOCAL, Measured, Noise, Scene, make_scene, sparse_model, survey_of, without_fixes
+from scenes import NOISELESS, initial, material, without_fixes
 
 from pipelines.blocks.geographic import geo_problem
 from pipelines.blocks.measurements import SURFACE_SIGMA
@@ -18,33 +18,10 @@ from pipelines.formats.colmap import SparseModel
 from pipelines.geometry.cameras import Camera
 from pipelines.georef.losses import depth_residuals
 from pipelines.georef.problem import GeoProblem
-from pipelines.products import AttitudeRecord, InitialSimilarity, Mark, Survey
+from pipelines.products import AttitudeRecord, Mark, Survey
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-NOISELESS = Noise(pixel_px=0.2, mark_px=1e-9, gcp_m=1e-9, fix_m=(1e-9, 1e-9, 1e-9), attitude_deg=0.5)
-STATED = Noise()
 CONFIG = TrainConfig()
-
-
-def initial(layout: str = "volume") -> InitialSimilarity:
-    return InitialSimilarity(
-        geo_from_local=GEO_FROM_LOCAL.to_record(
-            "local", "geo", covariance=np.eye(7) * 1e-4, pivot=(5.0, -3.0, 60.0)
-        ),
-        method="robust",
-        correspondences={},
-        inliers={},
-        residuals={},
-        condition_number=1.0,
-        layout=layout,  # type: ignore[arg-type]
-        attitude_used=False,
-    )
-
-
-def material(noise: Noise = STATED, gcps: bool = True) -> tuple[Scene, SparseModel, Survey]:
-    scene, rng = make_scene(images=8, points=60), np.random.default_rng(0)
-    survey = survey_of(scene, noise, Measured(gcps=gcps), rng)
-    return scene, sparse_model(scene, noise, rng), survey
 
 
 def test_truth_fits_exact_measurements() -> None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from scenes import GEO_FROM_LOCAL, Measured, Noise, Scene, make_scene, sparse_model, survey_of
+from scenes import Measured, Noise, Scene, initial, material
 
 from pipelines.blocks.geographic import geo_problem
 from pipelines.blocks.measurements import fixes_of, flights, pairs_of, root_information
@@ -17,26 +17,15 @@ from pipelines.config import GeolocateConfig, TrainConfig
 from pipelines.errors import InputError
 from pipelines.geolocate import geolocate
 from pipelines.georef.losses import pair_residuals
-from pipelines.products import GeolocatedPoints, InitialSimilarity, Survey
+from pipelines.products import GeolocatedPoints, Survey
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-INITIAL = InitialSimilarity(
-    geo_from_local=GEO_FROM_LOCAL.to_record("local", "geo", covariance=np.eye(7) * 1e-4, pivot=(5.0, -3.0, 60.0)),
-    method="robust",
-    correspondences={},
-    inliers={},
-    residuals={},
-    condition_number=1.0,
-    layout="volume",
-    attitude_used=False,
-)
 
 
-def material(noise: Noise) -> tuple[Scene, InModel, Survey, GeolocatedPoints]:
-    truth, rng = make_scene(images=12, points=200), np.random.default_rng(0)
-    survey, sparse = survey_of(truth, noise, Measured(), rng), sparse_model(truth, noise, rng)
+def located(noise: Noise) -> tuple[Scene, InModel, Survey, GeolocatedPoints]:
+    truth, sparse, survey = material(noise, Measured(), images=12, points=200)
     points = geolocate(survey, sparse, GeolocateConfig()).points
-    return truth, initial_scene(sparse, survey, INITIAL), survey, points
+    return truth, initial_scene(sparse, survey, initial()), survey, points
 
 
 def test_flights_are_told_apart_by_their_gaps() -> None:
@@ -46,7 +35,7 @@ def test_flights_are_told_apart_by_their_gaps() -> None:
 
 
 def test_times_of_the_images_make_the_flights() -> None:
-    _, scene, survey, _ = material(Noise())
+    _, scene, survey, _ = located(Noise())
     images = tuple(
         image.model_copy(update={"timestamp_s": 1e9 + 3.0 * index + 1200.0 * (index >= 7)})
         for index, image in enumerate(survey.images)
@@ -58,7 +47,7 @@ def test_times_of_the_images_make_the_flights() -> None:
 
 
 def test_distances_agree_with_the_truth_within_their_sigma() -> None:
-    _, scene, survey, points = material(Noise())
+    _, scene, survey, points = located(Noise())
     fixes = fixes_of(scene, survey)
     assert fixes is not None
     pairs = pairs_of(scene, fixes, points, 0)
@@ -76,7 +65,7 @@ def test_distances_agree_with_the_truth_within_their_sigma() -> None:
 
 def test_distances_say_of_the_scale_a_tenth_of_what_the_fixes_say() -> None:
     for noise in (Noise(), Noise(fix_m=(1.5, 1.5, 3.0), attitude_deg=0.01)):
-        _, scene, survey, points = material(noise)
+        _, scene, survey, points = located(noise)
         fixes = fixes_of(scene, survey)
         assert fixes is not None
         pairs = pairs_of(scene, fixes, points, 0)
@@ -88,7 +77,7 @@ def test_distances_say_of_the_scale_a_tenth_of_what_the_fixes_say() -> None:
 
 
 def test_without_located_points_the_cameras_serve() -> None:
-    _, scene, survey, points = material(Noise())
+    _, scene, survey, points = located(Noise())
     fixes = fixes_of(scene, survey)
     assert fixes is not None
     lost = replace(points, inlier=np.zeros_like(points.inlier))
@@ -98,7 +87,7 @@ def test_without_located_points_the_cameras_serve() -> None:
         assert pairs.distance_in_model is None
         assert pairs.camera is not None
         assert (pairs.camera[:, 0] != pairs.camera[:, 1]).all()
-    problem = geo_problem(scene, survey, INITIAL, TrainConfig())
+    problem = geo_problem(scene, survey, initial(), TrainConfig())
     assert problem.measured.pairs is not None
     missed = pair_residuals(problem.estimate(), problem.measured.pairs).detach()
     # Fixes of 2 to 3 cm at either end.
@@ -106,7 +95,7 @@ def test_without_located_points_the_cameras_serve() -> None:
 
 
 def test_points_of_another_model_are_refused() -> None:
-    _, scene, survey, points = material(Noise())
+    _, scene, survey, points = located(Noise())
     fixes = fixes_of(scene, survey)
     assert fixes is not None
     with pytest.raises(InputError, match="another model"):
@@ -115,10 +104,10 @@ def test_points_of_another_model_are_refused() -> None:
 
 def test_distances_do_not_overrule_the_fixes() -> None:
     """A geolocation that is a per cent too large, of many precise points, moves the scale by a tenth of that."""
-    truth, scene, survey, points = material(Noise(attitude_deg=0.01))
+    truth, scene, survey, points = located(Noise(attitude_deg=0.01))
     middle = truth.point_in_geo.mean(axis=0)
     blown = replace(points, position_in_geo=middle + 1.01 * (points.position_in_geo - middle))
-    problem = geo_problem(scene, survey, INITIAL, TrainConfig(optimize_cameras=False), blown)
+    problem = geo_problem(scene, survey, initial(), TrainConfig(optimize_cameras=False), blown)
     adam = torch.optim.Adam([problem.similarity.y], lr=0.02)
     for _ in range(300):
         adam.zero_grad()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scenes import GEO_FROM_LOCAL, Measured, Noise, make_scene, sparse_model, survey_of
+from scenes import GEO_FROM_LOCAL, Measured, Noise, make_scene, sparse_model, survey_of, trained_model
 
 from pipelines.blocks.points import points_by_camera, points_by_model, sights
 from pipelines.blocks.trained import Trained
@@ -12,7 +12,7 @@ from pipelines.geometry.cameras import Pinhole
 from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.similarity import Similarity
 from pipelines.georef.cameras import CameraPoses
-from pipelines.products import SurveyedPoint, TrainedModel
+from pipelines.products import SurveyedPoint
 from pipelines.splat.initialise import gaussians_of_size
 
 EXACT = Noise(mark_px=1e-7, gcp_m=1e-9)
@@ -29,17 +29,7 @@ def trained() -> Trained:
     return Trained(
         survey=survey_of(truth, EXACT, Measured(gcps=True), rng),
         sparse=sparse_model(truth, EXACT, rng),
-        model=TrainedModel(
-            geo_from_model=geo_from_model.to_record("model", "geo"),
-            model_from_local=(MODEL_FROM_GEO @ GEO_FROM_LOCAL).to_record("local", "model"),
-            max_image_size=320,
-            cameras=(),
-            background=(0.0, 0.0, 0.0),
-            sh_degree=0,
-            iterations=1,
-            gaussians=1,
-            backend="cpu",
-        ),
+        model=trained_model(geo_from_model, MODEL_FROM_GEO @ GEO_FROM_LOCAL),
         poses=CameraPoses(rotation, MODEL_FROM_GEO.apply(truth.center_in_geo)),
         gaussians=gaussians_of_size(np.zeros((1, 3)), np.zeros((1, 3)), np.ones(1)),
     )
