@@ -63,6 +63,40 @@ class SimulationSummary:
         return f"{self.images} photographs, {self.control_points} control and {self.check_points} check points"
 
 
+@dataclass(frozen=True)
+class Flown:
+    """A flight over a world, and all that was recorded on it but the photographs.
+
+    Attributes:
+        world: everything that is true.
+        renderer: what takes photographs of it.
+        recording: of the instruments and the surveyor.
+        photo_seed: of the photographs' noise.
+    """
+
+    world: World
+    renderer: Renderer
+    recording: Recording
+    photo_seed: np.random.SeedSequence
+
+
+def fly_survey(config: SimulateConfig) -> Flown:
+    """Make the world of these options, fly over it and record, without taking the photographs.
+
+    World, flight and photographs' noise are drawn apart from what is recorded: options that differ in the receiver
+    alone give the same flight.
+
+    Raises:
+        InputError: the options cannot be flown or photographed.
+        BackendUnavailableError: the ray caster is not installed.
+    """
+    world_seed, record_seed, photo_seed = np.random.SeedSequence(config.seed).spawn(3)
+    world = make_world(config, world_seed)
+    renderer = Renderer(world.scene, world.lens, int(config.samples))
+    check_clearance(world, renderer.raycaster)
+    return Flown(world, renderer, record(config, world, renderer.raycaster, record_seed), photo_seed)
+
+
 def simulate(
     config: SimulateConfig, directory: Path, progress: Progress = SILENT, *, overwrite: bool = False
 ) -> SimulationSummary:
@@ -75,15 +109,11 @@ def simulate(
         BackendUnavailableError: the ray caster is not installed.
     """
     check_target(directory, overwrite=overwrite)
-    seeds = np.random.SeedSequence(config.seed).spawn(3)
-    world = make_world(config, seeds[0])
-    renderer = Renderer(world.scene, world.lens, int(config.samples))
-    check_clearance(world, renderer.raycaster)
-    recording = record(config, world, renderer.raycaster, seeds[1])
+    flown = fly_survey(config)
+    recording = flown.recording
     with _draft(directory) as draft:
-        shoot = _Shoot(config, world, recording, renderer, draft)
-        shoot.run(np.random.default_rng(seeds[2]), progress)
-        messages = _write_records(config, world, recording, draft)
+        _Shoot(config, flown, draft).run(progress)
+        messages = _write_records(config, flown.world, recording, draft)
     summary = SimulationSummary(
         directory,
         config.images,
@@ -143,14 +173,12 @@ class _Shoot:
     """Renders and writes the photographs, and depth maps where asked, into `folder`."""
 
     config: SimulateConfig
-    world: World
-    recording: Recording
-    renderer: Renderer
+    flown: Flown
     folder: Path
 
-    def run(self, rng: np.random.Generator, progress: Progress) -> None:
+    def run(self, progress: Progress) -> None:
         """All photographs, several at a time; each has its own stream of noise, whatever the order."""
-        count = self.config.images
+        count, rng = self.config.images, np.random.default_rng(self.flown.photo_seed)
         (self.folder / "images").mkdir()
         if self.config.depth:
             (self.folder / "depth").mkdir()
@@ -168,15 +196,16 @@ class _Shoot:
                 raise
 
     def _one(self, i: int, sensor: Sensor, rng: np.random.Generator) -> None:
-        pose, name = self.world.poses[i], self.recording.photos.names[i]
-        rgb = self.renderer.photograph(pose, sensor, rng)
+        world, recording = self.flown.world, self.flown.recording
+        pose, name = world.poses[i], recording.photos.names[i]
+        rgb = self.flown.renderer.photograph(pose, sensor, rng)
         _, encoded = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, self.config.quality])
         jpeg = encoded.tobytes()
         if self.config.exif:
-            jpeg = with_tags(jpeg, _tags(self.config, self.world, self.recording, i))
+            jpeg = with_tags(jpeg, _tags(self.config, world, recording, i))
         (self.folder / "images" / name).write_bytes(jpeg)
         if self.config.depth:
-            np.save(self.folder / "depth" / f"{Path(name).stem}.npy", self.renderer.depth(pose))
+            np.save(self.folder / "depth" / f"{Path(name).stem}.npy", self.flown.renderer.depth(pose))
 
 
 def _sensors(config: SimulateConfig, rng: np.random.Generator) -> list[Sensor]:

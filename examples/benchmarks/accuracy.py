@@ -22,10 +22,8 @@ from typing import Any
 import numpy as np
 
 from pipelines.config import resolve
+from pipelines.simulate import fly_survey
 from pipelines.simulate_config import SimulateConfig
-from pipelines.simulation.recording import record
-from pipelines.simulation.render import Renderer
-from pipelines.simulation.world import make_world
 from pipelines.simulation.write import write_trajectory
 
 # Name of the profile, receiver, whether there are control points.
@@ -105,10 +103,7 @@ def simulated(seed: int, arguments: argparse.Namespace) -> Survey:
         if not files[receiver].exists():
             options = {"images": arguments.images, "size": arguments.size, "seed": seed, "gnss": receiver}
             config = resolve(SimulateConfig, {}, options, Path("georef.toml"))
-            seeds = np.random.SeedSequence(seed).spawn(3)  # as `pipelines.simulate` spawns them
-            world = make_world(config, seeds[0])
-            caster = Renderer(world.scene, world.lens, int(config.samples)).raycaster
-            write_trajectory(files[receiver], record(config, world, caster, seeds[1]).photos)
+            write_trajectory(files[receiver], fly_survey(config).recording.photos)
     return Survey(f"seed{seed}", folder, files)
 
 
@@ -137,7 +132,6 @@ def measured(survey: Survey, profile: str, arguments: argparse.Namespace) -> lis
             "configuration": row["configuration"],
             "test_psnr": row["test_psnr"],
             **{f"{way}_{key}": row[way][key] for way in ("camera", "model") for key in row[way] if key != "count"},
-            "camera_rmse_h_m": row["camera"]["rmse_h_m"],
             "bound_rms_h_m": None if bound is None else bound["rms_h_m"],
             "bound_rms_v_m": None if bound is None else bound["rms_v_m"],
         }

@@ -22,12 +22,12 @@ from pipelines.geodesy.enu import enu_from_lla, lla_from_enu
 from pipelines.geometry.rotations import geo_from_cam, log_so3
 from pipelines.ingest import build_survey, survey_and_track
 from pipelines.products import Origin, load_json
-from pipelines.simulate import SimulationSummary, simulate
+from pipelines.simulate import SimulationSummary, fly_survey, simulate
 from pipelines.simulate_config import SimulateConfig
 from pipelines.simulation.render import Renderer, Sensor
-from pipelines.simulation.scene import make_scene
 from pipelines.simulation.truth import Truth
 from pipelines.simulation.world import make_world
+from pipelines.simulation.write import write_trajectory
 
 ORIGIN = "-33.86,151.21,-20"  # south, east, below the ellipsoid
 SMALL: dict[str, Any] = {"size": "160x120", "samples": "1", "images": 4, "targets": 30}
@@ -110,8 +110,7 @@ def test_point_files_hold_the_targets(made: Made) -> None:
 def test_targets_are_in_the_photographs(tmp_path: Path) -> None:
     """The boards that were painted lie where the marks say: two white quarters across from each other."""
     made = Made(tmp_path / "survey", size="320x240", samples="4", images=3, target_size=4.0, noise=0.0)
-    seed = np.random.SeedSequence(made.config.seed).spawn(3)[0].spawn(3)[0]
-    east, north, _ = make_scene(made.config.scene, seed).axes
+    east, north, _ = fly_survey(made.config).world.scene.axes
     contrasts = []
     for target in made.truth.targets:
         if target.surface == "wall":  # those boards stand; the others lie, along the axes of the town
@@ -242,6 +241,18 @@ def test_same_seed_same_bytes_other_seed_other_survey(tmp_path: Path) -> None:
     names = [name for name in names if not name.endswith((".txt", ".yaml"))]
     same, _, _ = filecmp.cmpfiles(tmp_path / "a", tmp_path / "c", names, shallow=False)
     assert same == []
+
+
+def test_flight_without_photographs_is_that_of_the_survey(made: Made, tmp_path: Path) -> None:
+    write_trajectory(tmp_path / "trajectory.csv", fly_survey(made.config).recording.photos)
+    assert (tmp_path / "trajectory.csv").read_bytes() == (made.folder / "trajectory.csv").read_bytes()
+
+
+def test_receivers_record_the_same_flight(made: Made) -> None:
+    other = fly_survey(made.config.model_copy(update={"gnss": "consumer"})).recording
+    assert other.truth.centers == made.truth.centers
+    assert other.truth.targets == made.truth.targets
+    assert other.truth.fix_errors != made.truth.fix_errors
 
 
 def test_neighbours_match_by_sift() -> None:
