@@ -65,8 +65,7 @@ def points_to_hold(material: Material, device: torch.device) -> Callable[[int], 
 
     @lru_cache(maxsize=_KEPT_VIEWS)
     def points(index: int) -> Tensor:
-        seen = np.unique(scene.sparse.obs_point[scene.sparse.obs_image == index])
-        found = scene.point_in_model[seen]
+        found = scene.point_in_model[scene.sparse.points_in(index)]
         if material.surface is not None and index in shown:
             found = np.concatenate([found, material.surface.points(index, _STRIDE)])
         return torch.from_numpy(found).float().to(device)

@@ -82,6 +82,10 @@ class SparseModel:
         """Intrinsics of the image with that index."""
         return self.cameras[int(self.image_camera_id[image])]
 
+    def points_in(self, image: int) -> IntArray:
+        """Indices (K,), ascending, of the points that are observed in the image with that index."""
+        return np.unique(self.obs_point[self.obs_image == image])
+
 
 def read_sparse(path: Path) -> SparseModel:
     """Read the COLMAP model (cameras, images, points3D as .bin or .txt) in a folder.
