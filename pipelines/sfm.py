@@ -112,16 +112,24 @@ def reconstruct(colmap: Any, job: SfmJob, progress: Progress) -> Any:
         sizes = sorted((model.num_reg_images() for model in models), reverse=True)
         log.warning("the survey fell apart into %d models of %s images; the largest is used", len(models), sizes)
     model = max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()))
-    if job.config.principal_point and model.num_reg_images() >= _FEWEST_FOR_PRINCIPAL_POINT:
-        _adjust_with_principal_point(colmap, model)
+    if job.config.principal_point:
+        adjust_with_principal_point(colmap, model)
     return model
 
 
-def _adjust_with_principal_point(colmap: Any, model: Any) -> None:
+def adjust_with_principal_point(colmap: Any, model: Any) -> None:
     """Adjust the bundle once more, with the principal point free, which the mapper holds at the image's centre.
 
-    A few pixels of it, as most lenses have, move points by decimetres once the cameras are laid on GNSS.
+    A few pixels of it, as most lenses have, move points by decimetres once the cameras are laid on GNSS. Fewer than
+    ten images do not determine it, and are left as they are; so is a model whose principal point would leave the
+    middle of the image.
+
+    Args:
+        colmap: the pycolmap module.
+        model: a `pycolmap.Reconstruction`, adjusted in place.
     """
+    if model.num_reg_images() < _FEWEST_FOR_PRINCIPAL_POINT:
+        return
     options = colmap.BundleAdjustmentOptions()
     options.print_summary = False
     options.refine_principal_point = True
