@@ -26,8 +26,9 @@ class Prediction:
 
     def __init__(self, restored: Restored) -> None:
         self._restored = restored
-        self._basis = restored.problem.cameras.basis.cpu().numpy()
-        self._lens = _lens_doubt(restored) if self._basis.shape[2] else None
+        cameras = restored.problem.cameras
+        self._basis, self._lens_basis = cameras.basis.cpu().numpy(), cameras.lens_basis.cpu().numpy()
+        self._lens = _lens_doubt(restored) if len(self._lens_basis) else None
         self._posterior = posterior(restored.problem, self._lens)
 
     @property
@@ -64,8 +65,9 @@ class Prediction:
 
     def _of(self, point_in_geo: FloatArray, moved: Following) -> FloatArray:
         turn = _turn(self._restored)
-        by_lens = turn @ moved.by_lens if self._lens is not None else np.zeros((len(point_in_geo), 3, 0))
-        return self._posterior.at(point_in_geo, turn @ moved.by(self._basis), by_lens)
+        by_lens = turn @ moved.by_lens[:, :, : len(self._lens_basis)]
+        by_cameras = turn @ moved.by(self._basis) + by_lens @ self._lens_basis
+        return self._posterior.at(point_in_geo, by_cameras, by_lens)
 
 
 def following(restored: Restored, point_in_geo: FloatArray, seen: Sights) -> Following:
@@ -74,6 +76,7 @@ def following(restored: Restored, point_in_geo: FloatArray, seen: Sights) -> Fol
     position = restored.trained.geo_from_model.inverse().apply(point_in_geo)
     marks = replace(
         _marked(restored.scene.network, position, seen),
+        cameras=restored.trained.sparse.cameras,
         cam_from_world=poses.cam_from_model,
         cam_center_in_world=poses.cam_center_in_model,
     )
@@ -102,7 +105,7 @@ def _lens_doubt(restored: Restored) -> LensDoubt | None:
     if marks is not None:
         moved = following(restored, marks.position_in_geo.cpu().numpy(), control_sights(restored))
         by_control = _turn(restored) @ moved.by_lens
-    return LensDoubt(found.lens_matrix, found.lens_cov, by_control)
+    return LensDoubt(found.lens_cov, by_control)
 
 
 def _turn(restored: Restored) -> FloatArray:
