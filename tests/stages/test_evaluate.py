@@ -107,6 +107,23 @@ def test_check_points_by_camera_are_as_good_as_the_measurements(evaluated: tuple
     assert found["mean_h_m"] == pytest.approx(np.hypot(errors[:, 0], errors[:, 1]).mean())
 
 
+def test_check_points_are_measured_through_the_trained_lens(altered: Workspace) -> None:
+    run_stage(altered, EVALUATE, {"renders": 0})
+    before, cached = report_of(altered), sorted(path.name for path in (altered.cache / "undistorted").iterdir())
+    model = load_json(TrainedModel, altered.path(MODEL))
+    (lens,) = model.lenses
+    fx, fy, cx, cy = lens.params
+    longer = lens.model_copy(update={"params": (1.05 * fx, 1.05 * fy, cx, cy)})
+    save_json(model.model_copy(update={"lenses": (longer,)}), altered.root / MODEL)
+    run_stage(altered, EVALUATE, {"renders": 0})
+    after = report_of(altered)
+    # Narrower rays from the same cameras meet farther away, and what is rendered no longer fills the photographs.
+    assert after["checkpoints"]["camera"]["mean_u_m"] < before["checkpoints"]["camera"]["mean_u_m"] - 0.3
+    assert after["photometric"]["test"]["psnr"] < before["photometric"]["test"]["psnr"] - 1.0
+    # The photographs stay as they were undistorted once.
+    assert sorted(path.name for path in (altered.cache / "undistorted").iterdir()) == cached
+
+
 def test_check_points_by_model_lie_on_the_surface(evaluated: tuple[Workspace, Outcome]) -> None:
     found = report_of(evaluated[0])["checkpoints"]["model"]
     assert found["count"] == 6

@@ -28,7 +28,7 @@ def trained() -> Trained:
     rotation = np.swapaxes(truth.geo_from_cam, 1, 2) @ geo_from_model.rotation
     return Trained(
         survey=survey_of(truth, EXACT, Measured(gcps=True), rng),
-        sparse=sparse_model(truth, EXACT, rng),
+        sfm=sparse_model(truth, EXACT, rng),
         model=TrainedModel(
             geo_from_model=geo_from_model.to_record("model", "geo"),
             model_from_local=(MODEL_FROM_GEO @ GEO_FROM_LOCAL).to_record("local", "model"),
