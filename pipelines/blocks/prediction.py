@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from pipelines.blocks.points import Sights
 from pipelines.blocks.restored import Restored
@@ -12,6 +14,7 @@ from pipelines.errors import DegenerateGeometryError
 from pipelines.geometry.bound import Anchors, CameraInformation
 from pipelines.geometry.bundle import IntArray, Network
 from pipelines.geometry.following import Following, follow
+from pipelines.geometry.lens import Lenses
 from pipelines.geometry.similarity import Similarity
 from pipelines.georef.posterior import LeftOut, LensDoubt, leave_one_out, posterior
 from pipelines.products import FloatArray
@@ -84,17 +87,23 @@ def following(restored: Restored, point_in_geo: FloatArray, seen: Sights) -> Fol
 
 
 def control_sights(restored: Restored) -> Sights:
-    """The marks of the control points that entered the training; none without these."""
+    """The marks of the control points that entered the training, through its lens; none without these."""
     marks = restored.problem.marks
     if marks is None:
         return Sights(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty((0, 2)), np.empty(0))
-    bearing = marks.bearing_in_cam.cpu().numpy()
+    bearing = marks.bearings(trained_lens(restored)).cpu().numpy()
     return Sights(
         marks.point.cpu().numpy(),
         marks.camera.cpu().numpy(),
         bearing[:, :2] / bearing[:, 2:],
         marks.sigma_rad.cpu().numpy(),
     )
+
+
+def trained_lens(restored: Restored) -> Tensor:
+    """Change (L,) of the lens parameters that training made, in the order of `geometry.lens.Lenses`."""
+    trained, lenses = restored.trained, restored.scene.lenses
+    return torch.from_numpy(lenses.change_to(Lenses(trained.sparse.cameras, lenses.camera_id)))
 
 
 def _lens_doubt(restored: Restored) -> LensDoubt | None:

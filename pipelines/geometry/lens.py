@@ -48,6 +48,13 @@ class Lenses:
         }
         return Lenses(cameras, self.camera_id)
 
+    def change_to(self, other: Lenses) -> FloatArray:
+        """What `moved` would have to be given (L,) to make the parameters those of another state of the same."""
+        change = np.zeros((len(self.cameras), self.longest))
+        for row, (key, camera) in zip(change, self.cameras.items(), strict=True):
+            row[: len(camera.params)] = other.cameras[key].params - camera.params
+        return change.ravel()
+
     def bearings_by_parameters(self, image: NDArray[np.int64], xy_px: FloatArray) -> FloatArray:
         """Derivatives (K, 3, L) of `bearings` of pixels (K, 2) in images (K,) by all parameters."""
         image, longest = np.asarray(image, dtype=np.int64), self.longest

@@ -68,6 +68,9 @@ def test_parameters_of_all_cameras_are_one_vector() -> None:
     np.testing.assert_allclose(moved.of(1).params - simple.params, change[:4], atol=1e-12)
     np.testing.assert_allclose(moved.of(0).params - BENT.params, change[8:], atol=1e-12)
     assert lenses.of(2) is BENT
+    unused = [4, 5, 6, 7]  # the simple camera has four
+    np.testing.assert_allclose(np.delete(lenses.change_to(moved), unused), np.delete(change, unused), atol=1e-12)
+    assert not lenses.change_to(moved)[unused].any()
 
 
 def test_bearings_change_with_the_parameters_as_they_are_said_to() -> None:
