@@ -56,7 +56,7 @@ def restore(trained: Trained, initial: InitialSimilarity, config: TrainConfig) -
     scene = make_scene(trained.sfm, trained.survey, model_from_local, start.translation)
     # Distances repeat what the fixes say, and have no part in the whitened residuals.
     changed: dict[str, object] = {"rel_loss": False}
-    if config.weighting != "whitened":
+    if config.weighting != "whitened":  # which estimates no constant errors
         changed |= {"weighting": "whitened", "estimate": "none"}
     problem = geo_problem(scene, trained.survey, initial, config.model_copy(update=changed))
     _place(problem.similarity, trained.geo_from_model)

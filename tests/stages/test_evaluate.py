@@ -117,8 +117,8 @@ def test_check_points_are_measured_through_the_trained_lens(altered: Workspace) 
     save_json(model.model_copy(update={"lenses": (longer,)}), altered.root / MODEL)
     run_stage(altered, EVALUATE, {"renders": 0})
     after = report_of(altered)
-    # Narrower rays from cameras that look inward meet lower, though their axes hold the middle; and what is rendered
-    # no longer fits the photographs.
+    # Narrower rays from cameras that look inward meet lower, though their axes hold the middle; and what is
+    # rendered no longer fits the photographs.
     assert after["checkpoints"]["camera"]["mean_u_m"] < before["checkpoints"]["camera"]["mean_u_m"] - 0.15
     assert after["photometric"]["test"]["psnr"] < before["photometric"]["test"]["psnr"] - 1.0
     # The photographs stay as they were undistorted once.
@@ -188,8 +188,8 @@ def test_prediction_agrees_with_the_errors_by_camera(evaluated: tuple[Workspace,
     # cameras' share of a few centimetres, and more than a fifth, which is the marks'.
     assert 0.2 * predicted["rms_h_m"] < found["rmse_h_m"] < 1.5 * predicted["rms_h_m"]
     assert all(0 < value < 2 for value in predicted["normalised_error_squared"].values())
-    # The prediction counts what robustness costs, the bound does not. In pictures of 96 px the lens is weak, and its
-    # principal point goes into the heights: they come near the bound because the lens follows what the fixes tell.
+    # The prediction counts what robustness costs, the bound does not. In pictures of 96 px the lens is weak, and
+    # its principal point goes into the heights: they come near the bound because the lens follows what the fixes tell.
     assert bound["rms_h_m"] < 1.02 * predicted["rms_h_m"] < 1.25 * bound["rms_h_m"]
     assert bound["rms_v_m"] < 1.02 * predicted["rms_v_m"] < 1.25 * bound["rms_v_m"]
 
