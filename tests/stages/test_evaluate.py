@@ -189,7 +189,7 @@ def test_prediction_agrees_with_the_errors_by_camera(evaluated: tuple[Workspace,
     assert 0.2 * predicted["rms_h_m"] < found["rmse_h_m"] < 1.5 * predicted["rms_h_m"]
     assert all(0 < value < 2 for value in predicted["normalised_error_squared"].values())
     # The prediction counts what robustness costs, the bound does not. In pictures of 96 px the lens is weak, and
-    # its principal point goes into the heights: they come near the bound because the lens follows what the fixes tell.
+    # its principal point goes into the heights: near the bound, since the lens follows what the fixes tell.
     assert bound["rms_h_m"] < 1.02 * predicted["rms_h_m"] < 1.25 * bound["rms_h_m"]
     assert bound["rms_v_m"] < 1.02 * predicted["rms_v_m"] < 1.25 * bound["rms_v_m"]
 
