@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from pipelines.blocks.scene import photographs
-from pipelines.blocks.trained import Trained, load_trained
+from pipelines.blocks.trained import Trained, load_trained, trained_pinholes
 from pipelines.formats.georef_sidecar import read_sidecar
 from pipelines.geodesy.enu import ecef_from_enu, ecef_from_enu_rotation, lla_of
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
@@ -64,7 +64,8 @@ def main() -> None:
         image for image in trained.survey.images if image.name in trained.sparse.image_index() and image.fix
     ]
     chosen = registered[:: max(1, len(registered) // options.images)][: options.images]
-    images = photographs(trained.sparse, trained.survey, workspace, options.size)
+    images = photographs(trained.sfm, trained.survey, workspace, options.size)
+    pinholes = trained_pinholes(trained, images)
     gaussians, backend = read_gaussians(options.splat), rasterizer("auto")
     options.output.mkdir(parents=True, exist_ok=True)
     for image in chosen:
@@ -72,7 +73,7 @@ def main() -> None:
         rotation = geo_from_cam(image, trained, options.attitude == "recorded")
         pose = cam_from_ply(image.fix, rotation, trained.survey.origin, options.splat)
         with torch.no_grad():
-            render = backend.render(gaussians, pose, images.pinhole(index), RasterSettings())
+            render = backend.render(gaussians, pose, pinholes.of(index), RasterSettings())
         colour = render.colour.clamp(0, 1).mul(255).byte().numpy()
         strip = np.concatenate([images.image(index), colour], axis=1)
         path = options.output / f"{Path(image.name).stem}.png"

@@ -208,7 +208,8 @@ class TrainConfig(StageConfig):
     faithful_surface: bool = Field(True, description="Hold the Gaussians to the surface, for depths to measure in.")
     geo_loss: bool = Field(True, description="Use the geographic losses.")
     weighting: Literal["whitened", "paper"] = Field(
-        "whitened", description="Residuals divided by their σ, or plain mean squares as in the paper."
+        "whitened",
+        description="Residuals divided by their σ, or plain mean squares as in the paper.",
     )
     gcp_loss: bool = Field(True, description="Use the control points, L_gcp.")
     gcp_mode: Literal["camera", "depth"] = Field(
@@ -227,7 +228,10 @@ class TrainConfig(StageConfig):
         description="Constant errors to estimate: any of bias (of the positions of a flight), lever-arm and "
         "boresight, with commas; auto: a bias that 3 or more control points show; or none.",
     )
-    optimize_cameras: bool = Field(True, description="Correct the training cameras while training.")
+    optimize_cameras: bool = Field(
+        True,
+        description="Correct the training cameras while training; unless weighted as in the paper, the lens too.",
+    )
     checkpoint_every: int = Field(500, ge=1, description="Iterations between checkpoints.")
     log_every: int = Field(10, ge=1, description="Iterations between lines of metrics.jsonl.")
     seed: int = Field(0, ge=0, description="Seed of every random choice.")

@@ -23,10 +23,11 @@ from pipelines.blocks.points import Sights, points_by_camera, points_by_model, s
 from pipelines.blocks.prediction import Prediction, cramer_rao, left_out
 from pipelines.blocks.restored import Restored, restore, training_config
 from pipelines.blocks.scene import photographs
-from pipelines.blocks.trained import Trained, load_trained
+from pipelines.blocks.trained import Trained, load_trained, trained_pinholes
 from pipelines.config import EvaluateConfig
 from pipelines.errors import DegenerateGeometryError
 from pipelines.formats.image_cache import ImageCache
+from pipelines.geometry.cameras import Pinhole
 from pipelines.products import FloatArray, InitialSimilarity, SurveyedPoint, dump_json, load_json
 from pipelines.progress import Progress
 from pipelines.robust.asprs import LEAST_POINTS, few_points
@@ -61,7 +62,7 @@ def run(stage: StageRun, config: EvaluateConfig) -> Summary:
     trained = load_trained(stage.workspace, config.similarity)
     crs = None if config.crs is None else target_crs(config.crs, trained.survey)
     initial = load_json(InitialSimilarity, stage.workspace.path(SIM3))
-    images = photographs(trained.sparse, trained.survey, stage.workspace, trained.model.max_image_size)
+    images = photographs(trained.sfm, trained.survey, stage.workspace, trained.model.max_image_size)
     images.build(stage.progress)
     eye = Eye(trained, images, rasterizer(config.backend))
     known: Known | str
@@ -85,8 +86,13 @@ class Eye:
 
     def __init__(self, trained: Trained, images: ImageCache, backend: Rasterizer) -> None:
         self.trained, self.images, self._backend = trained, images, backend
+        self._pinholes = trained_pinholes(trained, images)
         device = torch.device("cuda" if backend.name == "cuda" else "cpu")
         self._gaussians = trained.gaussians.to(device)
+
+    def pinhole(self, index: int) -> Pinhole:
+        """Camera of what `look` shows."""
+        return self._pinholes.of(index)
 
     def look(self, index: int, *, depth: bool = False) -> Render:
         """The model from camera `index`, at training size."""
@@ -97,7 +103,7 @@ class Eye:
         settings = RasterSettings(sh_degree=model.sh_degree, background=model.background, depth=depth)
         pose = torch.as_tensor(matrix, dtype=torch.float32, device=self._gaussians.means.device)
         with torch.no_grad():
-            return self._backend.render(self._gaussians, pose, self.images.pinhole(index), settings)
+            return self._backend.render(self._gaussians, pose, self.pinhole(index), settings)
 
 
 def evaluate(
@@ -209,7 +215,7 @@ def _checks_by_camera(trained: Trained, seen: Sights, known: Known | str) -> dic
 
 def _checks_by_model(eye: Eye, seen: Sights, depth: dict[int, FloatArray]) -> dict[str, Any]:
     points = eye.trained.survey.check_points
-    pinholes = {index: eye.images.pinhole(index) for index in depth}
+    pinholes = {index: eye.pinhole(index) for index in depth}
     found = points_by_model(eye.trained, seen, depth, pinholes, len(points))
     return point_report(found - _surveyed(points), points, rays=ray_counts(seen, len(points)))
 

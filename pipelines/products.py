@@ -268,6 +268,14 @@ class TrainedCamera(Product):
     exposure: Matrix34 | None = None
 
 
+class TrainedLens(Product):
+    """The lens of a camera of the SfM model after training: COLMAP's parameters of COLMAP's camera model."""
+
+    camera_id: int
+    model: str
+    params: tuple[float, ...]
+
+
 class EstimatedError(Product):
     """A constant error of the measurements that training estimated, with its σ, by axis.
 
@@ -285,13 +293,17 @@ class EstimatedError(Product):
 
 
 class TrainedModel(Product):
-    """Product of `train` beside the Gaussians: frames, cameras and what was optimised."""
+    """Product of `train` beside the Gaussians: frames, cameras and what was optimised.
+
+    `lenses`: of the cameras of the SfM model; one that is not among them is as SfM found it.
+    """
 
     format_version: Literal[1] = 1
     geo_from_model: SimilarityRecord
     model_from_local: SimilarityRecord
     max_image_size: int = Field(gt=0)
     cameras: tuple[TrainedCamera, ...]
+    lenses: tuple[TrainedLens, ...] = ()
     background: Vector3
     sh_degree: int
     iterations: int

@@ -32,6 +32,7 @@ from pipelines.products import (
     InitialSimilarity,
     Survey,
     TrainedCamera,
+    TrainedLens,
     TrainedModel,
     load_json,
     save_json,
@@ -141,11 +142,12 @@ def make_trainer(material: Material, problem: GeoProblem, backend: Rasterizer, c
     gaussians = initial_gaussians(material, options, preset.max_gaussians, config.seed).to(device)
     extent_m = scene_extent(scene.poses.cam_center_in_model)
     train = torch.from_numpy(scene.train)
+    hold = points_to_hold(material, device) if config.faithful_surface else None
     return JointTrainer(
         GaussianAdam(gaussians, extent_m, preset.iterations),
         _strategy(config, extent_m, len(gaussians)),
         problem.to(device),
-        Views(scene.train, images, points_to_hold(material, device) if config.faithful_surface else None),
+        Views(scene.train, images, hold, scene.lenses),
         rasterizer=backend,
         options=JointOptions(
             preset.iterations,
@@ -188,6 +190,7 @@ def _save(trainer: JointTrainer, scene: Scene, out: Path, outcome: Outcome) -> S
         model_from_local=scene.model_from_local.to_record("local", "model"),
         max_image_size=trainer.views.images.max_size_px,
         cameras=_cameras(trainer, scene),
+        lenses=_lenses(trainer, scene),
         background=trainer.options.background,
         sh_degree=gaussians.sh_degree,
         iterations=trainer.iteration,
@@ -254,4 +257,15 @@ def _cameras(trainer: JointTrainer, scene: Scene) -> tuple[TrainedCamera, ...]:
             exposure=None if exposure is None or index not in train else tuple(map(tuple, exposure[index])),
         )
         for index, name in enumerate(scene.sparse.image_name)
+    )
+
+
+def _lenses(trainer: JointTrainer, scene: Scene) -> tuple[TrainedLens, ...]:
+    """The lenses that have followed the cameras; none where they stayed."""
+    change = trainer.problem.cameras.lens().detach().cpu().numpy()
+    if not len(change):
+        return ()
+    return tuple(
+        TrainedLens(camera_id=key, model=camera.model, params=tuple(camera.params.tolist()))
+        for key, camera in scene.lenses.moved(change).cameras.items()
     )

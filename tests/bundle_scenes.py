@@ -24,17 +24,18 @@ def adjuster(network: Network) -> np.ndarray:
     return scale[:, None] * (seen @ seen.T) @ (design * scale).T
 
 
-def exact_network(images: int = 6, points: int = 60, seed: int = 0) -> Network:
+def exact_network(images: int = 6, points: int = 60, seed: int = 0, *, rolled: bool = True) -> Network:
     """Two rings of cameras about points that all of them see, with exact pixels.
 
-    Every other camera stands on its side: only then is the principal point well determined.
+    Every other camera stands on its side: only then is the principal point well determined. Unless `rolled`, all
+    are held level.
     """
     rng = np.random.default_rng(seed)
     angle = np.linspace(0, 2 * np.pi, images, endpoint=False)
     height = np.where(np.arange(images) % 2, 18.0, 36.0)
     center = np.column_stack([30 * np.cos(angle), 30 * np.sin(angle), height])
     rotation = np.swapaxes(looking_at(center, rng.normal(0, 1, center.shape)), 1, 2)
-    rotation = exp_so3(np.arange(images)[:, None] * [0.0, 0.0, np.pi / 2]) @ rotation
+    rotation = exp_so3(rolled * np.arange(images)[:, None] * [0.0, 0.0, np.pi / 2]) @ rotation
     cloud = rng.uniform([-9, -9, -6], [9, 9, 9], (points, 3))
     network = Network(
         cameras={1: LENS},

@@ -1,11 +1,11 @@
 """How near the estimates come to the Cramér–Rao bound: `python examples/benchmarks/cramer_rao.py WORKSPACE`.
 
-The trained cameras, and control and check points where their marks show them there, are taken for the truth. Each
-run draws anew what was measured of it, with the σ that the survey states: the fixes, survey and marks of the
-control points, marks of the check points, and what the noise of the image observations does to cameras and lens.
-Then it estimates as the tool does: the similarity of `init-sim3`, and from there similarity and cameras as in
-training, but without the photographs, solved to the end. The RMS errors at the check points are divided by the
-bound.
+The trained cameras and lens, and control and check points where their marks show them there, are taken for the
+truth. Each run draws anew what was measured of it, with the σ that the survey states: the fixes, survey and marks
+of the control points, marks of the check points, and what the noise of the image observations does to cameras and
+lens. Then it estimates as the tool does: the similarity of `init-sim3`, and from there similarity, cameras and
+the lens that follows them as in training, but without the photographs, solved to the end. The RMS errors at the
+check points are divided by the bound.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from pipelines.blocks.points import Sights, points_by_camera, sights
-from pipelines.blocks.prediction import control_sights, cramer_rao, following
+from pipelines.blocks.prediction import control_sights, cramer_rao, following, trained_lens
 from pipelines.blocks.restored import Restored, restore, training_config
 from pipelines.blocks.trained import load_trained
 from pipelines.geometry.following import Following
@@ -72,10 +72,11 @@ def draw(truth: Truth, rng: np.random.Generator, *, images: bool) -> Drawn:
     """Draw the measurements; without `images`, image observations and the check points' marks are exact."""
     problem, found = truth.restored.problem, truth.restored.scene.correction_basis
     geo_from_model, basis = truth.restored.trained.geo_from_model, problem.cameras.basis.numpy()
+    follows = problem.cameras.lens_basis.numpy()
     z = rng.normal(size=basis.shape[2]) * images
     lens = np.zeros(truth.check.follow.by_lens.shape[2])
-    if images and found is not None:
-        lens = found.lens_matrix @ z + _noise(found.lens_cov[None], rng)[0]
+    if images and found is not None and len(follows):
+        lens = follows @ z + _noise(found.lens_cov[None], rng)[0]
 
     def true(marked: Marked) -> FloatArray:
         return marked.position + marked.follow.by(basis) @ z + marked.follow.by_lens @ lens
@@ -106,17 +107,26 @@ def _noise(cov: FloatArray, rng: np.random.Generator) -> FloatArray:
 
 def estimate(truth: Truth, drawn: Drawn, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
     """The check points (J, 3) in `geo`: by the similarity of `init-sim3`, and by similarity and cameras."""
-    poses, basis = truth.restored.trained.poses, truth.restored.problem.cameras.basis.numpy()
+    poses, cameras = truth.restored.trained.poses, truth.restored.problem.cameras
+    basis, follows = cameras.basis.numpy(), cameras.lens_basis.numpy()
     solution = align(_correspondences(truth, drawn), rng).solution
     start = solution.state.geo_from_local
     problem = GeoProblem(
         LearnableSimilarity(start, solution.covariance, solution.pivot),
-        CameraCorrections(poses, basis),
-        Measured(drawn.fixes, drawn.marks),
+        CameraCorrections(poses, basis, follows),
+        Measured(drawn.fixes, _through_trained_lens(truth, drawn.marks)),
     )
     minimise(problem)
-    followed = truth.check.position + truth.check.follow.by(basis) @ problem.cameras.z.detach().numpy()
+    by_lens = truth.check.follow.by_lens[:, :, : len(follows)] @ follows
+    followed = truth.check.position + (truth.check.follow.by(basis) + by_lens) @ problem.cameras.z.detach().numpy()
     return start.apply(truth.check.position), problem.similarity.current().apply(followed)
+
+
+def _through_trained_lens(truth: Truth, marks: ControlMarks | None) -> ControlMarks | None:
+    """The marks as the cameras see them from which the estimate starts."""
+    if marks is None:
+        return None
+    return replace(marks, bearing_in_cam=marks.bearings(trained_lens(truth.restored)))
 
 
 def _correspondences(truth: Truth, drawn: Drawn) -> Correspondences:

@@ -129,7 +129,7 @@ def _test_psnr(trainer: JointTrainer, scene: Scene, images: ImageCache) -> float
     for index in map(int, scene.test):
         pose = trainer.problem.cameras.cam_from_model(index)
         colour = trainer.rasterizer.render(
-            trainer.optimizer.gaussians, pose, images.pinhole(index), settings
+            trainer.optimizer.gaussians, pose, trainer.pinhole(index), settings
         ).colour
         photo = torch.from_numpy(np.array(images.image(index))).float() / 255.0
         values.append(psnr(colour.cpu(), photo, torch.from_numpy(np.array(images.mask(index)))))

@@ -43,12 +43,10 @@ def geo_problem(
     record = initial.geo_from_local
     pivot = scene.geo_from_model.apply(scene.poses.cam_center_in_model[scene.train]).mean(axis=0)
     covariance = moved_pivot(np.array(record.covariance), record.pivot, pivot)
-    basis = scene.correction_basis if config.optimize_cameras else None
-    matrix = np.zeros((len(scene.sparse.image_name), 6, 0)) if basis is None else basis.matrix
     measured = _measured(scene, survey, config, points) if config.geo_loss else Measured()
     problem = GeoProblem(
         LearnableSimilarity(scene.geo_from_model, covariance, pivot, _attitude(scene, initial)),
-        CameraCorrections(scene.poses, matrix),
+        _corrections(scene, config),
         measured,
         weighting=config.weighting,
         hold_prior=_leaves_open(measured, initial),
@@ -60,6 +58,20 @@ def geo_problem(
         if config.estimate == AUTO and not bias_pays(problem, saved):
             problem.errors = SystematicErrors()
     return problem
+
+
+def _corrections(scene: Scene, config: TrainConfig) -> CameraCorrections:
+    """Cameras and lens that follow the measurements, as far as they may.
+
+    Plain mean squares have nothing that holds a lens where the photographs have it: with `paper` it stays.
+    """
+    follows = config.weighting == "whitened"
+    basis = None
+    if config.optimize_cameras:
+        basis = scene.correction_basis if follows else scene.correction_basis_through_sfm_lens
+    if basis is None:
+        return CameraCorrections(scene.poses, np.zeros((len(scene.sparse.image_name), 6, 0)))
+    return CameraCorrections(scene.poses, basis.matrix, basis.lens_matrix if follows else None)
 
 
 def _attitude(scene: Scene, initial: InitialSimilarity) -> RotationPrior | None:

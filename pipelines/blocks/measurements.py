@@ -11,7 +11,7 @@ from torch import Tensor
 from pipelines.blocks.observations import recorded_rotations
 from pipelines.blocks.scene import Scene
 from pipelines.errors import InputError
-from pipelines.geometry.cameras import undistort
+from pipelines.geometry.lens import bearings
 from pipelines.georef.measured import Attitudes, ControlMarks, DepthMarks, Fixes, Pairs, scale_share
 from pipelines.products import FloatArray, GeolocatedPoints, Survey, SurveyedPoint
 
@@ -53,18 +53,21 @@ def flights(times_s: list[float | None]) -> np.ndarray:
 def control_marks(scene: Scene, survey: Survey) -> ControlMarks | None:
     """Marks of the control points in training images, where a point is seen in two or more of them."""
     rays = [(point, _rays(scene, point)) for point in survey.control_points]
-    kept = [(point, found) for point, found in rays if len({camera for camera, _, _ in found}) >= 2]
+    kept = [(point, found) for point, found in rays if len({ray[0] for ray in found}) >= 2]
     if not kept:
         return None
     flat = [(j, *ray) for j, (_, found) in enumerate(kept) for ray in found]
+    bearing, pixel = (np.array([row[column] for row in flat]) for column in (2, 4))
+    camera = np.array([row[1] for row in flat])
     marks = ControlMarks(
         point=torch.tensor([row[0] for row in flat]),
-        camera=torch.tensor([row[1] for row in flat]),
-        bearing_in_cam=torch.from_numpy(np.array([row[2] for row in flat])),
+        camera=torch.from_numpy(camera),
+        bearing_in_cam=torch.from_numpy(bearing),
         sigma_rad=torch.tensor([row[3] for row in flat], dtype=torch.float64),
         position_in_geo=torch.tensor([point.position_in_geo for point, _ in kept], dtype=torch.float64),
         root_information=torch.eye(3, dtype=torch.float64).repeat(len(kept), 1, 1),
         name=tuple(point.name for point, _ in kept),
+        bearing_by_lens=torch.from_numpy(scene.lenses.bearings_by_parameters(camera, pixel)),
     )
     return _with_covariance(marks, _survey_covariance(kept) + _mark_covariance(scene, marks))
 
@@ -95,10 +98,19 @@ def depth_marks(scene: Scene, survey: Survey, marks: ControlMarks) -> tuple[Dept
         share=1.0 / count[point],
         views=len(scene.train),
         rows={index: slice(first, first + int((camera == index).sum())) for index, first in starts.items()},
+        xy_by_lens=_slopes(bearing, marks.bearing_by_lens, order),
     )
     mean = torch.zeros(len(count), dtype=torch.float64).index_add(0, point, surface.square()) / count
     all_in = covariance.numpy() + _mark_covariance(scene, marks) + mean.numpy()[:, None, None] * np.eye(3)
     return found, _with_covariance(marks, all_in)
+
+
+def _slopes(bearing: Tensor, by_lens: Tensor | None, order: Tensor) -> Tensor | None:
+    """Derivatives (K, 2, L) of x/z and y/z of bearings (K, 3), from those of the bearings in another order."""
+    if by_lens is None:
+        return None
+    by_lens, z = by_lens[order], bearing[:, 2:, None]
+    return by_lens[:, :2] / z - bearing[:, :2, None] * by_lens[:, 2:] / z**2
 
 
 def attitudes_of(scene: Scene, survey: Survey) -> Attitudes | None:
@@ -180,8 +192,11 @@ def _scale_information(fixes: Fixes) -> float:
     return float((root @ arm[:, :, None]).square().sum())
 
 
-def _rays(scene: Scene, point: SurveyedPoint) -> list[tuple[int, FloatArray, float]]:
-    """Of each mark in a training image: camera index, bearing (3,) in the camera, angular σ."""
+_Ray = tuple[int, FloatArray, float, tuple[float, float]]
+
+
+def _rays(scene: Scene, point: SurveyedPoint) -> list[_Ray]:
+    """Of each mark in a training image: camera index, bearing (3,) in the camera, angular σ, pixel."""
     index, trained = scene.sparse.image_index(), set(map(int, scene.train))
     rays = []
     for mark in point.marks:
@@ -189,14 +204,14 @@ def _rays(scene: Scene, point: SurveyedPoint) -> list[tuple[int, FloatArray, flo
         if camera_index is None or camera_index not in trained:
             continue
         camera = scene.sparse.camera_of(camera_index)
-        ray = np.append(undistort(camera, np.array([mark.x_px, mark.y_px])), 1.0)
-        if not np.isfinite(ray).all():  # a mark where the lens model maps no ray
+        bearing = bearings(camera, np.array([[mark.x_px, mark.y_px]]))[0]
+        if not np.isfinite(bearing).all():  # a mark where the lens model maps no ray
             continue
-        rays.append((camera_index, ray / np.linalg.norm(ray), mark.sigma_px / float(camera.params[0])))
+        rays.append((camera_index, bearing, mark.sigma_px / float(camera.params[0]), (mark.x_px, mark.y_px)))
     return rays
 
 
-def _survey_covariance(kept: list[tuple[SurveyedPoint, list[tuple[int, FloatArray, float]]]]) -> FloatArray:
+def _survey_covariance(kept: list[tuple[SurveyedPoint, list[_Ray]]]) -> FloatArray:
     return np.array([point.cov_in_geo for point, _ in kept])
 
 

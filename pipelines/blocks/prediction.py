@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from pipelines.blocks.points import Sights
 from pipelines.blocks.restored import Restored
@@ -12,6 +14,7 @@ from pipelines.errors import DegenerateGeometryError
 from pipelines.geometry.bound import Anchors, CameraInformation
 from pipelines.geometry.bundle import IntArray, Network
 from pipelines.geometry.following import Following, follow
+from pipelines.geometry.lens import Lenses
 from pipelines.geometry.similarity import Similarity
 from pipelines.georef.posterior import LeftOut, LensDoubt, leave_one_out, posterior
 from pipelines.products import FloatArray
@@ -26,8 +29,9 @@ class Prediction:
 
     def __init__(self, restored: Restored) -> None:
         self._restored = restored
-        self._basis = restored.problem.cameras.basis.cpu().numpy()
-        self._lens = _lens_doubt(restored) if self._basis.shape[2] else None
+        cameras = restored.problem.cameras
+        self._basis, self._lens_basis = cameras.basis.cpu().numpy(), cameras.lens_basis.cpu().numpy()
+        self._lens = _lens_doubt(restored) if len(self._lens_basis) else None
         self._posterior = posterior(restored.problem, self._lens)
 
     @property
@@ -64,8 +68,9 @@ class Prediction:
 
     def _of(self, point_in_geo: FloatArray, moved: Following) -> FloatArray:
         turn = _turn(self._restored)
-        by_lens = turn @ moved.by_lens if self._lens is not None else np.zeros((len(point_in_geo), 3, 0))
-        return self._posterior.at(point_in_geo, turn @ moved.by(self._basis), by_lens)
+        by_lens = turn @ moved.by_lens[:, :, : len(self._lens_basis)]
+        by_cameras = turn @ moved.by(self._basis) + by_lens @ self._lens_basis
+        return self._posterior.at(point_in_geo, by_cameras, by_lens)
 
 
 def following(restored: Restored, point_in_geo: FloatArray, seen: Sights) -> Following:
@@ -74,6 +79,7 @@ def following(restored: Restored, point_in_geo: FloatArray, seen: Sights) -> Fol
     position = restored.trained.geo_from_model.inverse().apply(point_in_geo)
     marks = replace(
         _marked(restored.scene.network, position, seen),
+        cameras=restored.trained.sparse.cameras,
         cam_from_world=poses.cam_from_model,
         cam_center_in_world=poses.cam_center_in_model,
     )
@@ -81,17 +87,23 @@ def following(restored: Restored, point_in_geo: FloatArray, seen: Sights) -> Fol
 
 
 def control_sights(restored: Restored) -> Sights:
-    """The marks of the control points that entered the training; none without these."""
+    """The marks of the control points that entered the training, through its lens; none without these."""
     marks = restored.problem.marks
     if marks is None:
         return Sights(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty((0, 2)), np.empty(0))
-    bearing = marks.bearing_in_cam.cpu().numpy()
+    bearing = marks.bearings(trained_lens(restored)).cpu().numpy()
     return Sights(
         marks.point.cpu().numpy(),
         marks.camera.cpu().numpy(),
         bearing[:, :2] / bearing[:, 2:],
         marks.sigma_rad.cpu().numpy(),
     )
+
+
+def trained_lens(restored: Restored) -> Tensor:
+    """Change (L,) of the lens parameters that training made, in the order of `geometry.lens.Lenses`."""
+    trained, lenses = restored.trained, restored.scene.lenses
+    return torch.from_numpy(lenses.change_to(Lenses(trained.sparse.cameras, lenses.camera_id)))
 
 
 def _lens_doubt(restored: Restored) -> LensDoubt | None:
@@ -102,7 +114,7 @@ def _lens_doubt(restored: Restored) -> LensDoubt | None:
     if marks is not None:
         moved = following(restored, marks.position_in_geo.cpu().numpy(), control_sights(restored))
         by_control = _turn(restored) @ moved.by_lens
-    return LensDoubt(found.lens_matrix, found.lens_cov, by_control)
+    return LensDoubt(found.lens_cov, by_control)
 
 
 def _turn(restored: Restored) -> FloatArray:

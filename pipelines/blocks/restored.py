@@ -53,9 +53,12 @@ def restore(trained: Trained, initial: InitialSimilarity, config: TrainConfig) -
     """
     model_from_local = Similarity.from_record(trained.model.model_from_local)
     start = Similarity.from_record(initial.geo_from_local) @ model_from_local.inverse()
-    scene = make_scene(trained.sparse, trained.survey, model_from_local, start.translation)
+    scene = make_scene(trained.sfm, trained.survey, model_from_local, start.translation)
     # Distances repeat what the fixes say, and have no part in the whitened residuals.
-    problem = geo_problem(scene, trained.survey, initial, config.model_copy(update={"rel_loss": False}))
+    changed: dict[str, object] = {"rel_loss": False}
+    if config.weighting != "whitened":  # which estimates no constant errors
+        changed |= {"weighting": "whitened", "estimate": "none"}
+    problem = geo_problem(scene, trained.survey, initial, config.model_copy(update=changed))
     _place(problem.similarity, trained.geo_from_model)
     minimise(problem)
     return Restored(trained, scene, problem, config)

@@ -17,6 +17,7 @@ from pipelines.errors import DegenerateGeometryError, InputError
 from pipelines.formats.colmap import SparseModel
 from pipelines.formats.image_cache import ImageCache, Photograph
 from pipelines.geometry.bundle import CorrectionBasis, Network, correction_basis
+from pipelines.geometry.lens import Lenses
 from pipelines.geometry.similarity import Similarity
 from pipelines.georef.cameras import CameraPoses
 from pipelines.products import FloatArray, InitialSimilarity, Survey
@@ -73,12 +74,25 @@ class Scene:
             sparse.obs_xy_px,
         )
 
+    @property
+    def lenses(self) -> Lenses:
+        """The lenses as SfM left them."""
+        return Lenses(self.sparse.cameras, self.sparse.image_camera_id)
+
     @cached_property
     def correction_basis(self) -> CorrectionBasis | None:
         """What the image observations know of the cameras; None where there are too many of them."""
+        return self._basis(lens_follows=True)
+
+    @cached_property
+    def correction_basis_through_sfm_lens(self) -> CorrectionBasis | None:
+        """The same for cameras that move while the lens stays."""
+        return self._basis(lens_follows=False)
+
+    def _basis(self, lens_follows: bool) -> CorrectionBasis | None:
         if len(self.sparse.image_name) > _MOST_CORRECTED_CAMERAS:
             return None
-        return correction_basis(self.network)
+        return correction_basis(self.network, lens_follows=lens_follows)
 
 
 def make_scene(sparse: SparseModel, survey: Survey, model_from_local: Similarity, shift: FloatArray) -> Scene:

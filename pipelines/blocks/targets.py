@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from pipelines.blocks.pinholes import Pinholes
 from pipelines.formats.image_cache import ImageCache
 from pipelines.splat.raster.api import Pinhole
 
@@ -24,7 +25,7 @@ class Target:
     Attributes:
         colour: (H, W, 3) float32 from 0 to 1.
         mask: (H, W) bool, the pixels that count; None: all.
-        camera: of these pixels.
+        camera: of these pixels, with the lens as it is now.
     """
 
     colour: Tensor
@@ -39,8 +40,8 @@ class Targets:
     iteration waits for either. On a CPU reading ahead would only take a core from the kernels.
     """
 
-    def __init__(self, images: ImageCache, device: torch.device) -> None:
-        self._images, self._device = images, device
+    def __init__(self, images: ImageCache, pinholes: Pinholes, device: torch.device) -> None:
+        self._images, self._pinholes, self._device = images, pinholes, device
         self._masks: OrderedDict[tuple[str, int], Tensor | None] = OrderedDict()
         self._reader = ThreadPoolExecutor(1, "photographs") if device.type == "cuda" else None
         self._next: tuple[int, Future[Tensor]] | None = None
@@ -57,7 +58,7 @@ class Targets:
         if self._reader is not None and upcoming is not None:
             self._next = (upcoming, self._reader.submit(self._read, upcoming))
         colour = pixels.to(self._device, non_blocking=True).float() / 255.0
-        camera = self._images.pinhole(index)
+        camera = self._pinholes.of(index)
         if shrink > 1:
             colour = functional.avg_pool2d(colour.permute(2, 0, 1), shrink).permute(1, 2, 0).contiguous()
             camera = shrunken(camera, shrink)

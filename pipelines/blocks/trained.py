@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
 
+from pipelines.blocks.pinholes import Pinholes
 from pipelines.errors import InputError
 from pipelines.formats.colmap import SparseModel, read_sparse
+from pipelines.formats.image_cache import ImageCache
+from pipelines.geometry.lens import Lenses
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.similarity import Similarity
 from pipelines.georef.cameras import CameraPoses
@@ -25,17 +29,26 @@ class Trained:
 
     Attributes:
         survey: what was measured.
-        sparse: the SfM model; its images have the order of `poses`.
+        sfm: the SfM model, with SfM's lenses; its images have the order of `poses`.
         model: similarity, cameras, settings.
         poses: refined cameras in `model`.
         gaussians: in `model`.
     """
 
     survey: Survey
-    sparse: SparseModel
+    sfm: SparseModel
     model: TrainedModel
     poses: CameraPoses
     gaussians: Gaussians
+
+    @cached_property
+    def sparse(self) -> SparseModel:
+        """The SfM model with the trained lenses."""
+        trained = {
+            lens.camera_id: replace(self.sfm.cameras[lens.camera_id], params=np.array(lens.params))
+            for lens in self.model.lenses
+        }
+        return replace(self.sfm, cameras=self.sfm.cameras | trained)
 
     @property
     def geo_from_model(self) -> Similarity:
@@ -64,6 +77,10 @@ def load_trained(workspace: Workspace, similarity: Literal["trained", "initial"]
     names = tuple(camera.name for camera in model.cameras)
     if names != sparse.image_name:
         raise InputError("its cameras are not those of sfm/sparse: train again", path=model_path, field="cameras")
+    for lens in model.lenses:
+        camera = sparse.cameras.get(lens.camera_id)
+        if camera is None or (camera.model, len(camera.params)) != (lens.model, len(lens.params)):
+            raise InputError("its lenses are not those of sfm/sparse: train again", path=model_path, field="lenses")
     if similarity == "initial":
         record = _placed(model, load_json(InitialSimilarity, workspace.path(SIM3)))
         model = model.model_copy(update={"geo_from_model": record})
@@ -71,11 +88,18 @@ def load_trained(workspace: Workspace, similarity: Literal["trained", "initial"]
     translation = np.array([camera.translation for camera in model.cameras])
     return Trained(
         survey=load_json(Survey, workspace.path(SURVEY)),
-        sparse=sparse,
+        sfm=sparse,
         model=model,
         poses=CameraPoses(rotation, -np.einsum("nji,nj->ni", rotation, translation)),
         gaussians=read_gaussians(workspace.path(GAUSSIANS)),
     )
+
+
+def trained_pinholes(trained: Trained, images: ImageCache) -> Pinholes:
+    """Cameras of the photographs that were undistorted with SfM's lenses, as the trained ones have them."""
+    found = Pinholes(images, Lenses(trained.sfm.cameras, trained.sfm.image_camera_id))
+    found.renew(Lenses(trained.sparse.cameras, trained.sparse.image_camera_id))
+    return found
 
 
 def _placed(model: TrainedModel, initial: InitialSimilarity) -> SimilarityRecord:

@@ -10,8 +10,10 @@ import torch
 from torch import Tensor
 
 from pipelines.blocks.checkpoint import prefixed, unprefixed
+from pipelines.blocks.pinholes import Pinholes
 from pipelines.blocks.targets import Target, Targets
 from pipelines.formats.image_cache import ImageCache
+from pipelines.geometry.lens import Lenses
 from pipelines.georef.losses import Schedule, rising_weight
 from pipelines.georef.problem import GeoProblem
 from pipelines.splat.densify import Strategy
@@ -27,6 +29,7 @@ from pipelines.splat.watch import FiniteWatch
 _FINAL_RATE = 0.05  # of the geographic learning rates, relative to the first
 _TOLD = {"y": "the similarity", "z": "the cameras", "x": "the constant errors", "u": "the weights of the losses"}
 # A gradient that is not finite shows in one of these: colours pass theirs on to the opacities.
+_LENS_EVERY = 100  # iterations: to look where the lens has come to waits for the device
 _WATCHED = ("means", "quats_wxyz", "log_scales", "logit_opacities")
 
 
@@ -74,11 +77,13 @@ class Views:
         camera: (V,) indices into the cameras (and the images) of those to train on.
         images: all undistorted images.
         surface: gives the points (K, 3) in `model` that an image shows; only the surface losses need them.
+        lenses: that the images were undistorted with; None: they stay.
     """
 
     camera: np.ndarray
     images: ImageCache
     surface: Callable[[int], Tensor] | None = None
+    lenses: Lenses | None = None
 
 
 @dataclass(frozen=True)
@@ -95,7 +100,8 @@ class StepReport:
 class JointTrainer:
     """State of a joint optimisation; every iteration is a pure function of it.
 
-    Nothing in an iteration waits for the device.
+    Nothing in an iteration waits for the device, but for the lens: views are rendered through the one that followed
+    the cameras when it was last looked at, each hundred iterations.
 
     Args:
         optimizer: the Gaussians and their moments.
@@ -123,7 +129,9 @@ class JointTrainer:
         self.exposures = exposures
         self.iteration = 0
         self.device = optimizer.gaussians.means.device
-        self._targets = Targets(views.images, self.device)
+        self._pinholes = Pinholes(views.images, views.lenses)
+        self._lens = np.zeros(len(problem.cameras.lens_basis))
+        self._targets = Targets(views.images, self._pinholes, self.device)
         names = ("photometric loss", "geographic loss", *(f"gradient of {name}" for name in self._watched()))
         self._watch = FiniteWatch(names, self.device)
         rates = {
@@ -139,6 +147,8 @@ class JointTrainer:
     def step(self) -> StepReport:
         """Render one view, compare, and move everything a little."""
         self.iteration += 1
+        if self.iteration % _LENS_EVERY == 1:
+            self._look_through(self.problem.cameras.lens().detach().cpu().numpy())
         index = self._view_of(self.iteration)
         target = self._targets.get(index, self._shrink(index), self._view_of(self.iteration + 1))
         pose = self.problem.cameras.cam_from_model(index)
@@ -184,6 +194,10 @@ class JointTrainer:
             found.append(Evidence(shrink**2 * seen.weight_px, shrink**2 * seen.high_error_px))
         return found
 
+    def pinhole(self, index: int) -> Pinhole:
+        """Camera of an undistorted photograph, with the lens in use."""
+        return self._pinholes.of(index)
+
     def check_finite(self) -> None:
         """Wait for the device and stop before a divergence spoils everything.
 
@@ -196,6 +210,12 @@ class JointTrainer:
         """Lower all learning rates from here on; forget what was not finite."""
         self.optimizer.rate_factor *= factor
         self._watch.reset()
+
+    def _look_through(self, lens: np.ndarray) -> None:
+        """Use SfM's lenses with a change (L,) of their parameters."""
+        self._lens = lens.copy()
+        if self.views.lenses is not None and len(lens):
+            self._pinholes.renew(self.views.lenses.moved(self._lens))
 
     def _geo_weight(self) -> float:
         options = self.options
@@ -282,6 +302,7 @@ class JointTrainer:
         return {
             "iteration": torch.tensor(self.iteration),
             "rate_factor": torch.tensor(self.optimizer.rate_factor, dtype=torch.float64),
+            "lens": torch.from_numpy(self._lens),
             **prefixed("gaussians", self.optimizer.gaussians.tensors()),
             **prefixed("optimizer", self.optimizer.state()),
             **prefixed("strategy", self.strategy.state()),
@@ -293,6 +314,7 @@ class JointTrainer:
         """Go on from `state`."""
         self.iteration = int(state["iteration"])
         self.optimizer.rate_factor = float(state["rate_factor"])
+        self._look_through(state["lens"].cpu().numpy())
         self._watch.reset()
         tensors = {name: tensor.to(self.device) for name, tensor in unprefixed("gaussians", state).items()}
         gaussians = Gaussians(**tensors)

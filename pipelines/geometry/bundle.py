@@ -66,8 +66,8 @@ class CorrectionBasis:
 
     `δω` [rad] turns a camera about its centre, axes of the world: `R' = R Exp(−δω)`; `δc` [m] moves the centre.
 
-    The lens is not corrected. How far it is from the true one, (L,) for the parameters of all cameras in the order
-    of `Network.cameras`, each list as long as the longest, is lens_matrix @ z + a rest with covariance `lens_cov`.
+    The lens goes with them: how far it is from the true one, (L,) in the order of `geometry.lens.Lenses`, is
+    lens_matrix @ z + a rest with covariance `lens_cov`, which is independent of z.
 
     Attributes:
         matrix: (n, 6, k), rows (δω, δc), k = 6 n − 7.
@@ -99,16 +99,20 @@ class Linearised:
     by_intrinsics: FloatArray
 
 
-def correction_basis(network: Network) -> CorrectionBasis:
+def correction_basis(network: Network, *, lens_follows: bool = True) -> CorrectionBasis:
     """Whitened, gauge-free coordinates of the camera corrections.
 
-    Robust: observations are weighted by Cauchy's kernel. The gauge is held at the points: each correction, with the
-    points following the cameras, leaves them in place on the average (mean similarity zero, weighted by how well
-    each is seen). So the uncertainty of the similarity is that of the scene, not that of the cameras' mean.
+    Robust: observations are weighted by Cauchy's kernel. The lens is uncertain, hence eliminated from the
+    information. The gauge is held at the points: each correction, with the points following the cameras and the
+    lens that goes with these, leaves them in place on the average (mean similarity zero, weighted by how well each
+    is seen). So the uncertainty of the similarity is that of the scene, not that of the cameras' mean; and a wrong
+    focal length or principal point shows as a common shift of the cameras against a scene that stays, which costs
+    the images little, and fixes can tell. Cost O((6 n)³).
 
-    The lens is uncertain, hence eliminated from the information; but training renders through a fixed one, hence
-    the points follow the cameras through that. A wrong focal length or principal point then shows as a common shift
-    of the cameras against the scene, which costs little, as it should. Cost O((6 n)³).
+    Args:
+        network: the bundle at its minimum.
+        lens_follows: whether whoever moves the cameras moves the lens by `lens_matrix` with them. Where it is held,
+            the points follow through the lens as it is.
 
     Raises:
         DegenerateGeometryError: fewer observations than unknowns.
@@ -123,7 +127,7 @@ def correction_basis(network: Network) -> CorrectionBasis:
         )
     weight = _robust_weights(lin.residual)
     variance = (weight[:, None] * lin.residual**2).sum() / (_MEAN_WEIGHTED_SQUARE * redundancy)
-    reduced = _reduced(network, lin, np.sqrt(weight / (_MEAN_WEIGHT * variance)))
+    reduced = _reduced(network, lin, np.sqrt(weight / (_MEAN_WEIGHT * variance)), lens_follows)
     basis = _whitened(network, reduced.information)
     flat = basis.reshape(-1, basis.shape[2])
     modes = similarity_modes(network.cam_center_in_world).reshape(-1, 7)
@@ -204,13 +208,13 @@ def _robust_weights(residual: FloatArray) -> FloatArray:
 @dataclass(frozen=True)
 class _Reduced:
     information: FloatArray  # (6 n, 6 n) of the poses, points and intrinsics eliminated
-    points_follow: FloatArray  # (7, 6 n) mean similarity of the points when the cameras move
+    points_follow: FloatArray  # (7, 6 n) mean similarity of the points when the cameras (and their lens) move
     lens_follows: FloatArray  # (L, 6 n) expected lens parameters when the cameras move
     lens_cov: FloatArray  # (L, L) about that
 
 
-def _reduced(network: Network, lin: Linearised, root_weight: FloatArray) -> _Reduced:
-    """Schur complement of points and intrinsics, and how the points follow the poses through a fixed lens."""
+def _reduced(network: Network, lin: Linearised, root_weight: FloatArray, lens_follows: bool) -> _Reduced:
+    """Schur complement of points and intrinsics, and how points and lens follow the poses."""
     n, points = len(network.camera_id), len(network.point_in_world)
     scaled = root_weight[:, None, None]
     slot = lens_slots(network)
@@ -236,7 +240,10 @@ def _reduced(network: Network, lin: Linearised, root_weight: FloatArray) -> _Red
     cov[np.ix_(used, used)] = scale[:, None] * np.linalg.solve(block, np.eye(len(used))) * scale
     cc += ci @ follows
     moved = (np.swapaxes(root, 1, 2) @ _displacements(network)).reshape(3 * points, 7)
-    points_follow = -np.linalg.solve(moved.T @ moved, (pose_point @ moved).T)
+    pull = pose_point @ moved
+    if lens_follows:
+        pull = pull + follows.T @ (intrinsics_point @ moved)
+    points_follow = -np.linalg.solve(moved.T @ moved, pull.T)
     return _Reduced((cc + cc.T) / 2, points_follow, follows, cov)
 
 

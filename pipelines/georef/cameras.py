@@ -1,4 +1,4 @@
-"""Cameras that may move while training: corrections in the coordinates that bundle adjustment left."""
+"""Cameras and lens that may move while training: corrections in the coordinates that bundle adjustment left."""
 
 from __future__ import annotations
 
@@ -30,26 +30,35 @@ class CameraCorrections(torch.nn.Module):
 
     With the basis of `geometry.bundle.correction_basis`, |z|² is what the correction costs the image
     observations, and no z moves all cameras by a similarity: the gauge is held by construction. A test camera
-    gives no gradient; it is carried along by its ties to the others, as it would be in the bundle.
+    gives no gradient; it is carried along by its ties to the others, as it would be in the bundle. The lens, which
+    the observations tell together with the poses, is carried along likewise.
 
     Args:
         base: poses before training.
         basis: (n, 6, k); k = 0 holds the cameras fixed.
+        lens_basis: (L, k), how the lens parameters follow: `CorrectionBasis.lens_matrix`. None: the lens stays.
     """
 
-    def __init__(self, base: CameraPoses, basis: FloatArray) -> None:
+    def __init__(self, base: CameraPoses, basis: FloatArray, lens_basis: FloatArray | None = None) -> None:
         super().__init__()
         self.z = torch.nn.Parameter(torch.zeros(basis.shape[2], dtype=torch.float64))
         self.basis: Tensor
+        self.lens_basis: Tensor
         self.rotation: Tensor
         self.center: Tensor
         self.register_buffer("basis", torch.from_numpy(np.ascontiguousarray(basis)))
+        follows = np.zeros((0, basis.shape[2])) if lens_basis is None else lens_basis
+        self.register_buffer("lens_basis", torch.from_numpy(np.ascontiguousarray(follows)))
         self.register_buffer("rotation", torch.from_numpy(np.ascontiguousarray(base.cam_from_model)))
         self.register_buffer("center", torch.from_numpy(np.ascontiguousarray(base.cam_center_in_model)))
 
     def corrections(self) -> Tensor:
         """(δω, δc) of all cameras (n, 6)."""
         return (self.basis.flatten(0, 1) @ self.z).view(-1, 6)
+
+    def lens(self) -> Tensor:
+        """Change (L,) of the lens parameters, in the order of `geometry.lens.Lenses`; L = 0: it stays."""
+        return self.lens_basis @ self.z
 
     def centers(self) -> Tensor:
         """Corrected projection centres (n, 3) in `model`."""

@@ -61,16 +61,17 @@ def linearise(
     """Differentiate whitened residuals.
 
     Args:
-        residuals: (M, 3) of the similarity's coordinates y (7,), the cameras' corrections (n, 6), the errors (p,).
-        at: y, corrections, v and the cameras' coordinates z (k,).
-        basis: (n, 6, k), corrections = basis · z.
+        residuals: (M, 3) of the similarity's coordinates y (7,), everything that the cameras' corrections move
+            (c,), the errors (p,).
+        at: y, what is moved, v and the cameras' coordinates z (k,).
+        basis: (c, k), what is moved = basis · z.
         precision: (7 + p,) of the prior of y and v.
     """
-    y, correction, v, z = (each.detach() for each in at)
-    by_y, by_cameras, by_v = torch.func.jacrev(residuals, argnums=(0, 1, 2), chunk_size=_CHUNK)(y, correction, v)
-    by_z = by_cameras.flatten(0, 1).flatten(1) @ basis.flatten(0, 1)
+    y, moved, v, z = (each.detach() for each in at)
+    by_y, by_moved, by_v = torch.func.jacrev(residuals, argnums=(0, 1, 2), chunk_size=_CHUNK)(y, moved, v)
+    by_z = by_moved.flatten(0, 1) @ basis
     by_x = torch.cat([by_y, by_v], dim=2).flatten(0, 1)
-    white, x = residuals(y, correction, v).detach().flatten(), torch.cat([y, v])
+    white, x = residuals(y, moved, v).detach().flatten(), torch.cat([y, v])
     base = white - by_x @ x - by_z @ z
     return Linearised(*(each.detach().cpu() for each in (base, by_x, by_z @ by_z.T, precision, x, white)))
 

@@ -13,7 +13,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from pipelines.georef.measured import Attitudes, ControlMarks, DepthMarks, Fixes, Pairs
+from pipelines.georef.measured import Attitudes, ControlMarks, Fixes, Pairs
 from pipelines.georef.similarity import Mapping, exp_so3, log_so3
 from pipelines.georef.systematic import Errors
 
@@ -44,12 +44,14 @@ class Estimate:
         center: (n, 3) projection centres in `model`.
         geo_from_model: the similarity.
         errors: constant errors of the measurements.
+        lens: (L,) change of the lens parameters; L = 0 where the lens stays.
     """
 
     rotation: Tensor
     center: Tensor
     geo_from_model: Mapping
     errors: Errors
+    lens: Tensor
 
     def geo_from_cam(self, camera: Tensor) -> Tensor:
         """Rotations (K, 3, 3) of cameras (K,)."""
@@ -72,21 +74,21 @@ def control_residuals(at: Estimate, marks: ControlMarks) -> Tensor:
 
 
 def depth_residuals(
-    pose: tuple[Tensor, Tensor], geo_from_model: Mapping, marks: DepthMarks, rows: slice, depth_m: Tensor
+    pose: tuple[Tensor, Tensor], geo_from_model: Mapping, position_in_geo: Tensor, xy: Tensor, depth_m: Tensor
 ) -> Tensor:
-    """T(c_i + R_iᵀ z (x, y, 1)) − X_j (K, 3) in metres of the marks `rows` of one camera: L_gcp by depth.
+    """T(c_i + R_iᵀ z (x, y, 1)) − X_j (K, 3) in metres of the K marks of one camera: L_gcp by depth.
 
     Args:
         pose: rotation cam ← model (3, 3) and centre (3,) of that camera.
         geo_from_model: the similarity.
-        marks: of all cameras.
-        rows: those of this one.
+        position_in_geo: (K, 3) surveyed, of each mark.
+        xy: (K, 2) x/z and y/z of the marks' rays.
         depth_m: (K,) rendered depth along the camera's z axis at the marks.
     """
     rotation, center = pose
-    ray = torch.nn.functional.pad(marks.xy[rows], (0, 1), value=1.0)
+    ray = torch.nn.functional.pad(xy, (0, 1), value=1.0)
     point = center + (depth_m[:, None] * ray) @ rotation
-    return geo_from_model.apply(point) - marks.position_in_geo[rows]
+    return geo_from_model.apply(point) - position_in_geo
 
 
 def attitude_residuals(at: Estimate, attitudes: Attitudes) -> Tensor:
@@ -116,12 +118,12 @@ def pair_residuals(at: Estimate, pairs: Pairs) -> Tensor:
 
 
 def intersect(at: Estimate, marks: ControlMarks) -> Tensor:
-    """Points (J, 3) in `model` nearest to the rays of their marks, differentiable in the cameras.
+    """Points (J, 3) in `model` nearest to the rays of their marks, differentiable in the cameras and the lens.
 
     Rays are weighted by the inverse of their lateral σ at the point (angular σ × distance); GeoRefGS eqs 4–8.
     """
     rotation, center = at.rotation[marks.camera], at.center[marks.camera]
-    direction = (rotation.transpose(1, 2) @ marks.bearing_in_cam[:, :, None])[:, :, 0]
+    direction = (rotation.transpose(1, 2) @ marks.bearings(at.lens)[:, :, None])[:, :, 0]
     projector = torch.eye(3, dtype=direction.dtype, device=direction.device) - (
         direction[:, :, None] * direction[:, None, :]
     )

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from typing import TypeVar
 
+import torch
 from torch import Tensor
 
 RecordT = TypeVar("RecordT")
@@ -42,6 +43,8 @@ class ControlMarks:
         root_information: (J, 3, 3) float64 of survey and intersection together, and of the surface where the points
             are found by depth.
         name: of the points (J).
+        bearing_by_lens: (K, 3, L) float64, derivative of the bearings by the lens parameters, in the order of
+            `geometry.lens.Lenses`; None: the lens that they were read through is taken for exact.
     """
 
     point: Tensor
@@ -51,6 +54,13 @@ class ControlMarks:
     position_in_geo: Tensor
     root_information: Tensor
     name: tuple[str, ...] = ()
+    bearing_by_lens: Tensor | None = None
+
+    def bearings(self, lens: Tensor) -> Tensor:
+        """Unit vectors (K, 3) with the lens changed by (L,), to first order; L = 0: as it was."""
+        if self.bearing_by_lens is None or not len(lens):
+            return self.bearing_in_cam
+        return torch.nn.functional.normalize(self.bearing_in_cam + self.bearing_by_lens @ lens, dim=1)
 
 
 @dataclass(frozen=True)
@@ -65,6 +75,7 @@ class DepthMarks:
         share: (K,) float64, one over the number of marks of the same point.
         views: number of training views, each of which is rendered equally often.
         rows: by camera, its rows among the K.
+        xy_by_lens: (K, 2, L) float64, derivative of `xy` by the lens parameters, as in `ControlMarks`.
     """
 
     camera: Tensor
@@ -74,6 +85,13 @@ class DepthMarks:
     share: Tensor
     views: int
     rows: dict[int, slice]
+    xy_by_lens: Tensor | None = None
+
+    def rays(self, rows: slice, lens: Tensor) -> Tensor:
+        """x/z and y/z (K', 2) of some marks with the lens changed by (L,), to first order."""
+        if self.xy_by_lens is None or not len(lens):
+            return self.xy[rows]
+        return self.xy[rows] + self.xy_by_lens[rows] @ lens
 
 
 @dataclass(frozen=True)

@@ -49,26 +49,25 @@ class _Linear:
 
 @dataclass(frozen=True)
 class LensDoubt:
-    """What is not known of the lens, whose L parameters stay as SfM found them.
+    """What is not known of the L parameters of the lens when it has followed the cameras.
 
     Attributes:
-        follows: (L, k) how far it is off for each unit of a camera correction: `CorrectionBasis.lens_matrix`.
-        cov: (L, L) beyond that.
+        cov: (L, L), `CorrectionBasis.lens_cov`.
         by_control: (J, 3, L) metres by which each control point in geo is found elsewhere with another lens.
     """
 
-    follows: FloatArray
     cov: FloatArray
     by_control: FloatArray
 
 
 @dataclass(frozen=True)
 class Posterior:
-    """Joint covariance of the errors of the similarity, of k camera corrections, and of the lens.
+    """Joint covariance of the errors of the similarity, of k camera corrections, and of the lens beyond these.
 
     Attributes:
         covariance: (7 + k + L, 7 + k + L) of (δ ln s, δω, δt) about `pivot`, as in `SimilarityRecord`, of
-            `CameraCorrections.z`, and of the lens parameters; whatever else was estimated is marginalised out.
+            `CameraCorrections.z`, and of what the lens parameters differ by from those that follow z; whatever else
+            was estimated is marginalised out.
         pivot: (3,) in geo.
     """
 
@@ -80,8 +79,9 @@ class Posterior:
 
         Args:
             point_in_geo: (J, 3).
-            by_cameras: (J, 3, k) metres in geo by which they follow the corrections.
-            by_lens: (J, 3, L) likewise the lens.
+            by_cameras: (J, 3, k) metres in geo by which they follow the corrections, and the lens that goes with
+                these.
+            by_lens: (J, 3, L) likewise the rest of the lens.
         """
         jacobian = np.concatenate([jacobian_at(point_in_geo, self.pivot), by_cameras, by_lens], axis=2)
         return np.asarray(jacobian @ self.covariance @ np.swapaxes(jacobian, 1, 2))
@@ -127,12 +127,12 @@ def minimise(problem: GeoProblem) -> None:
 def posterior(problem: GeoProblem, lens: LensDoubt | None = None) -> Posterior:
     """The joint covariance at the present state.
 
-    The lens is not estimated here, and control points are intersected through the one that SfM found: its error d
-    pulls the estimate by −G d, with G the response to the control points, and is itself what the camera corrections
-    (with error e₁ before) let expect, and a rest. So e = e₁ − G d, and d is correlated with e₁ as z is.
+    Of the lens, only what follows the cameras is estimated here. The rest d, which is independent of the estimate's
+    own error e₁, shifts the intersections of the control points, and so pulls the estimate by −G d, with G the
+    response to the control points: e = e₁ − G d.
 
     Args:
-        lens: None where it is known.
+        lens: None where there is no such rest.
 
     Raises:
         DegenerateGeometryError: the measurements leave the similarity open.
@@ -143,9 +143,8 @@ def posterior(problem: GeoProblem, lens: LensDoubt | None = None) -> Posterior:
     covariance = cho_solve(factor, np.eye(len(linear.prior)))
     similarity, cameras = linear.place[_SIMILARITY], linear.place[_CAMERAS]
     kept = np.r_[similarity, cameras]
-    doubt = LensDoubt(np.zeros((0, len(kept) - 7)), np.zeros((0, 0)), np.zeros((0, 3, 0))) if lens is None else lens
-    of_lens = doubt.follows @ doubt.follows.T + doubt.cov
-    shared = covariance[:, cameras] @ doubt.follows.T
+    of_lens = np.zeros((0, 0)) if lens is None else lens.cov
+    shared = np.zeros((len(covariance), len(of_lens)))
     if lens is not None and problem.marks is not None:
         rows = _control_rows(problem)
         root = problem.marks.root_information.cpu().numpy()
@@ -153,8 +152,8 @@ def posterior(problem: GeoProblem, lens: LensDoubt | None = None) -> Posterior:
         pulled = cho_solve(
             factor, linear.jacobian.reshape(len(white), 3, -1)[rows].reshape(len(moved), -1).T @ moved
         )
-        covariance = covariance - shared @ pulled.T - pulled @ shared.T + pulled @ of_lens @ pulled.T
-        shared = shared - pulled @ of_lens
+        shared = -pulled @ of_lens
+        covariance = covariance - shared @ pulled.T
     joint = np.block([[covariance[np.ix_(kept, kept)], shared[kept]], [shared[kept].T, of_lens]])
     unit = np.eye(len(joint))
     unit[:7, :7] = problem.similarity.root.cpu().numpy()

@@ -114,11 +114,12 @@ class GeoProblem(torch.nn.Module):
 
     def estimate(self) -> Estimate:
         """The present estimate, differentiable in all of `learned`."""
-        return self._estimate(self.similarity.y, self.cameras.corrections(), self.errors.vector())
+        cameras = self.cameras
+        return self._estimate(self.similarity.y, cameras.corrections(), cameras.lens(), self.errors.vector())
 
-    def _estimate(self, y: Tensor, correction: Tensor, vector: Tensor) -> Estimate:
+    def _estimate(self, y: Tensor, correction: Tensor, lens: Tensor, vector: Tensor) -> Estimate:
         rotation, center = self.cameras.moved(correction)
-        return Estimate(rotation, center, self.similarity.at(y), self.errors.split(vector))
+        return Estimate(rotation, center, self.similarity.at(y), self.errors.split(vector), lens)
 
     def terms(self) -> GeoTerms:
         """The losses, each a mean, as the method states them."""
@@ -169,15 +170,16 @@ class GeoProblem(torch.nn.Module):
             camera: index of the view.
             depth_m: (H, W) expected depth, differentiable.
             alpha: (H, W).
-            pinhole: of these pixels.
+            pinhole: of these pixels, with the lens as it is now.
         """
         marks = self.measured.depth_marks
         if marks is None or not self.sees_by_depth(camera):
             return None
         rows = marks.rows[camera]
-        depth, seen = depth_at(depth_m, alpha, marks.xy[rows], pinhole)
-        mapping = self.similarity.at(self.similarity.y)
-        missed = depth_residuals(self.cameras.pose(camera), mapping, marks, rows, depth)
+        xy = marks.rays(rows, self.cameras.lens())
+        depth, seen = depth_at(depth_m, alpha, xy, pinhole)
+        mapping, surveyed = self.similarity.at(self.similarity.y), marks.position_in_geo[rows]
+        missed = depth_residuals(self.cameras.pose(camera), mapping, surveyed, xy, depth)
         rho = self._rho("control", self._white(missed, marks.root_information[rows]))
         points = 1 if self.marks is None else len(self.marks.position_in_geo)
         share = marks.share[rows] * seen
@@ -207,15 +209,17 @@ class GeoProblem(torch.nn.Module):
 
     def linearised(self) -> Linearised:
         """The problem about the present estimate."""
+        cameras, turns = self.cameras, 6 * len(self.cameras.center)
 
-        def residuals(y: Tensor, correction: Tensor, vector: Tensor) -> Tensor:
-            return self.whitened(self._estimate(y, correction, vector))
+        def residuals(y: Tensor, moved: Tensor, vector: Tensor) -> Tensor:
+            return self.whitened(self._estimate(y, moved[:turns].view(-1, 6), moved[turns:], vector))
 
         held = float(self.hold_prior) * self.similarity.held
         precision = torch.cat([held, self.errors.sigma**-2])
         with torch.no_grad():
-            at = (self.similarity.y, self.cameras.corrections(), self.errors.vector(), self.cameras.z)
-        return linearise(residuals, at, self.cameras.basis, precision)
+            moved = torch.cat([cameras.corrections().flatten(), cameras.lens()])
+            at = (self.similarity.y, moved, self.errors.vector(), cameras.z)
+        return linearise(residuals, at, torch.cat([cameras.basis.flatten(0, 1), cameras.lens_basis]), precision)
 
     def covariance(self) -> FloatArray:
         """Covariance (7, 7) of the similarity about its pivot, cameras and constant errors marginalised out.

@@ -107,6 +107,24 @@ def test_check_points_by_camera_are_as_good_as_the_measurements(evaluated: tuple
     assert found["mean_h_m"] == pytest.approx(np.hypot(errors[:, 0], errors[:, 1]).mean())
 
 
+def test_check_points_are_measured_through_the_trained_lens(altered: Workspace) -> None:
+    run_stage(altered, EVALUATE, {"renders": 0})
+    before, cached = report_of(altered), sorted(path.name for path in (altered.cache / "undistorted").iterdir())
+    model = load_json(TrainedModel, altered.path(MODEL))
+    (lens,) = model.lenses
+    fx, fy, cx, cy = lens.params
+    longer = lens.model_copy(update={"params": (1.05 * fx, 1.05 * fy, cx, cy)})
+    save_json(model.model_copy(update={"lenses": (longer,)}), altered.root / MODEL)
+    run_stage(altered, EVALUATE, {"renders": 0})
+    after = report_of(altered)
+    # Narrower rays from cameras that look inward meet lower, though their axes hold the middle; and what is
+    # rendered no longer fits the photographs.
+    assert after["checkpoints"]["camera"]["mean_u_m"] < before["checkpoints"]["camera"]["mean_u_m"] - 0.15
+    assert after["photometric"]["test"]["psnr"] < before["photometric"]["test"]["psnr"] - 1.0
+    # The photographs stay as they were undistorted once.
+    assert sorted(path.name for path in (altered.cache / "undistorted").iterdir()) == cached
+
+
 def test_check_points_by_model_lie_on_the_surface(evaluated: tuple[Workspace, Outcome]) -> None:
     found = report_of(evaluated[0])["checkpoints"]["model"]
     assert found["count"] == 6
@@ -170,10 +188,10 @@ def test_prediction_agrees_with_the_errors_by_camera(evaluated: tuple[Workspace,
     # cameras' share of a few centimetres, and more than a fifth, which is the marks'.
     assert 0.2 * predicted["rms_h_m"] < found["rmse_h_m"] < 1.5 * predicted["rms_h_m"]
     assert all(0 < value < 2 for value in predicted["normalised_error_squared"].values())
-    # The prediction counts what robustness costs, and a lens that stays although the fixes could tell a better one
-    # (in pictures of 96 px it is weak, and its principal point goes into the heights); the bound does not.
-    assert bound["rms_h_m"] < 1.02 * predicted["rms_h_m"] < 2 * bound["rms_h_m"]
-    assert bound["rms_v_m"] < 1.02 * predicted["rms_v_m"]
+    # The prediction counts what robustness costs, the bound does not. In pictures of 96 px the lens is weak, and
+    # its principal point goes into the heights: near the bound, since the lens follows what the fixes tell.
+    assert bound["rms_h_m"] < 1.02 * predicted["rms_h_m"] < 1.25 * bound["rms_h_m"]
+    assert bound["rms_v_m"] < 1.02 * predicted["rms_v_m"] < 1.25 * bound["rms_v_m"]
 
 
 def test_restored_solution_is_that_of_the_training(evaluated: tuple[Workspace, Outcome]) -> None:

@@ -49,14 +49,15 @@ def view_psnr(workspace: Workspace, flight: Flight, split: str) -> float:
     """Mean PSNR of the views of a split, as the trained cameras see them, against renders of the true scene."""
     model, gaussians = load_json(TrainedModel, workspace.path(MODEL)), read_gaussians(workspace.path(GAUSSIANS))
     scene = flight.rendered.scene
-    camera = Pinhole(scene.camera.width, scene.camera.height, *scene.camera.params)
+    size = scene.camera.width, scene.camera.height
+    camera, own_camera = Pinhole(*size, *scene.camera.params), Pinhole(*size, *model.lenses[0].params)
     found = []
     for index, seen_by in enumerate(model.cameras):
         if seen_by.split == split:
             rotation, center = scene.geo_from_cam[index].T, scene.center_in_geo[index]
             truth = _render(flight.rendered.gaussians, rotation, -rotation @ center, camera)
             own = matrix_from_quat_xyzw(seen_by.quat_xyzw)
-            found.append(psnr(_render(gaussians, own, np.array(seen_by.translation), camera), truth))
+            found.append(psnr(_render(gaussians, own, np.array(seen_by.translation), own_camera), truth))
     return float(np.mean(found))
 
 
@@ -120,7 +121,8 @@ def test_similarity_started_outside_of_it(trained: Pairs) -> None:
         record = model.geo_from_model
         truth = GEO_FROM_LOCAL @ Similarity.from_record(model.model_from_local).inverse()
         start = Similarity.from_record(initial.geo_from_model)  # without the losses nothing moves it
-        assert squared_error(truth, start, np.array(record.covariance), np.array(record.pivot)) > 10 * FAR
+        # Scale and height are known less well than the rest: the lens, to be told by small images, goes with them.
+        assert squared_error(truth, start, np.array(record.covariance), np.array(record.pivot)) > 5 * FAR
         assert error_of(without) < FAR  # and its covariance stays that of the start
 
 
@@ -223,6 +225,7 @@ def test_cameras_can_be_held(flights: list[Flight]) -> None:
     workspace = flights[0].workspace("held")
     run_stage(workspace, TRAIN, {**SHORT, "optimize_cameras": False})
     model = load_json(TrainedModel, workspace.path(MODEL))
+    assert model.lenses == ()
     rotation = matrix_from_quat_xyzw([camera.quat_xyzw for camera in model.cameras])
     translation = np.array([camera.translation for camera in model.cameras])
     center = Similarity.from_record(model.model_from_local).apply(flights[0].rendered.sparse.cam_center_in_local)
@@ -243,6 +246,16 @@ def test_without_any_measurement_the_start_is_kept(flights: list[Flight]) -> Non
     found = Similarity.from_record(model.geo_from_model) @ Similarity.from_record(model.model_from_local)
     assert found.scale == pytest.approx(initial.geo_from_local.scale, rel=1e-12)
     np.testing.assert_allclose(found.translation, initial.geo_from_local.translation, atol=1e-9)
+
+
+def test_lens_follows_the_cameras_and_is_told(trained: Pairs, flights: list[Flight]) -> None:
+    model = load_json(TrainedModel, trained[0][0].path(MODEL))
+    (lens,) = model.lenses
+    camera = flights[0].rendered.sparse.cameras[lens.camera_id]
+    moved = np.array(lens.params) - camera.params
+    assert lens.model == camera.model
+    # SfM's is the true one here, which fixes of 5 cm from 45 m away confirm to some thousandths of 90 px.
+    assert 1e-6 < np.abs(moved).max() < 1.0
 
 
 def test_two_cameras_are_needed(flights: list[Flight]) -> None:

@@ -16,6 +16,7 @@ from pipelines.config import TrainConfig
 from pipelines.errors import InputError
 from pipelines.formats.colmap import SparseModel
 from pipelines.geometry.cameras import Camera
+from pipelines.geometry.lens import Lenses, bearings
 from pipelines.georef.losses import depth_residuals
 from pipelines.georef.problem import GeoProblem
 from pipelines.products import AttitudeRecord, Mark, Survey
@@ -207,7 +208,8 @@ def test_depth_mode_finds_control_points_by_the_surface() -> None:
         pose = found.cameras.pose(camera)
         position = marks.position_in_geo[rows].numpy() - truth.center_in_geo[camera]
         depth = torch.from_numpy(position @ truth.geo_from_cam[camera][:, 2])
-        missed = depth_residuals(pose, found.estimate().geo_from_model, marks, rows, depth)
+        ray, surveyed = marks.rays(rows, found.cameras.lens()), marks.position_in_geo[rows]
+        missed = depth_residuals(pose, found.estimate().geo_from_model, surveyed, ray, depth)
         np.testing.assert_allclose(missed.detach(), 0.0, atol=1e-6)
         sigma = 1 / np.linalg.svd(marks.root_information[rows].numpy(), compute_uv=False)
         distance = np.linalg.norm(position, axis=1)
@@ -215,3 +217,37 @@ def test_depth_mode_finds_control_points_by_the_surface() -> None:
     # The intersected points stand for them in the covariance, with the same σ.
     sigma = 1 / np.linalg.svd(control.root_information.numpy(), compute_uv=False)
     assert (sigma > 0.5 * SURFACE_SIGMA * 100).all()
+
+
+def test_marks_follow_the_lens_as_the_lens_itself_would_have_them() -> None:
+    _, sparse, survey = material(NOISELESS)
+    found = problem_of(survey, sparse, gcp_mode="depth")
+    marks, by_depth = found.marks, found.measured.depth_marks
+    lenses = Lenses(sparse.cameras, sparse.image_camera_id)
+    assert marks is not None
+    assert by_depth is not None
+    change = np.zeros(found.cameras.lens_basis.shape[0])
+    change[:3] = 0.5, -0.4, 0.3  # pixels
+    index, moved = sparse.image_index(), lenses.moved(change)
+    wanted = [
+        bearings(moved.of(index[mark.image]), np.array([[mark.x_px, mark.y_px]]))[0]
+        for point in survey.control_points
+        for mark in point.marks
+    ]
+    told = marks.bearings(torch.from_numpy(change)).numpy()
+    # Second order: half a pixel over a focal length of a thousand, squared.
+    np.testing.assert_allclose(told, np.array(wanted), atol=1e-6)
+    assert np.abs(told - marks.bearing_in_cam.numpy()).max() > 2e-4
+    order = np.argsort(marks.camera.numpy(), kind="stable")
+    slope = by_depth.rays(slice(None), torch.from_numpy(change)).numpy()
+    np.testing.assert_allclose(slope, told[order, :2] / told[order, 2:], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("options", "follows"), [({}, True), ({"weighting": "paper"}, False), ({"optimize_cameras": False}, False)]
+)
+def test_lens_follows_where_something_holds_it(options: dict[str, object], follows: bool) -> None:
+    _, sparse, survey = material()
+    cameras = problem_of(survey, sparse, **options).cameras
+    assert len(cameras.lens()) == follows * len(sparse.cameras[1].params)
+    assert len(cameras.z) == (0 if "optimize_cameras" in options else 6 * 8 - 7)

@@ -28,7 +28,7 @@ def trained() -> Trained:
     rotation = np.swapaxes(truth.geo_from_cam, 1, 2) @ geo_from_model.rotation
     return Trained(
         survey=survey_of(truth, EXACT, Measured(gcps=True), rng),
-        sparse=sparse_model(truth, EXACT, rng),
+        sfm=sparse_model(truth, EXACT, rng),
         model=trained_model(geo_from_model, MODEL_FROM_GEO @ GEO_FROM_LOCAL),
         poses=CameraPoses(rotation, MODEL_FROM_GEO.apply(truth.center_in_geo)),
         gaussians=gaussians_of_size(np.zeros((1, 3)), np.zeros((1, 3)), np.ones(1)),

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from pipelines.blocks.pinholes import Pinholes
 from pipelines.blocks.targets import Targets, shrunken
 from pipelines.formats.image_cache import ImageCache, Photograph
 from pipelines.geometry.cameras import Camera
@@ -30,7 +31,7 @@ def cache(folder: Path, camera: Camera, count: int = 1) -> ImageCache:
 
 def test_a_shrunken_photograph_is_the_mean_of_its_blocks(tmp_path: Path) -> None:
     images = cache(tmp_path, PINHOLE)
-    target = Targets(images, torch.device("cpu")).get(0, shrink=4)
+    target = Targets(images, Pinholes(images), torch.device("cpu")).get(0, shrink=4)
     full = images.image(0)[:28, :40].astype(np.float64) / 255
     blocks = full.reshape(7, 4, 10, 4, 3).mean(axis=(1, 3))
     assert np.abs(target.colour.numpy() - blocks).max() < 1e-6
@@ -50,7 +51,7 @@ def test_a_block_counts_only_where_all_of_its_pixels_do(tmp_path: Path) -> None:
     images = cache(tmp_path, BARREL)
     covered = np.array(images.mask(0))
     assert covered.any() and not covered.all()
-    targets = Targets(images, torch.device("cpu"))
+    targets = Targets(images, Pinholes(images), torch.device("cpu"))
     mask = targets.get(0, shrink=2).mask
     assert mask is not None
     assert np.array_equal(mask.numpy(), covered.reshape(15, 2, 21, 2).all(axis=(1, 3)))
@@ -65,5 +66,5 @@ def test_images_of_one_camera_share_a_mask_and_only_one_map_is_kept(tmp_path: Pa
     for index in range(3):
         images.mask(index)
     assert len(list((tmp_path / "cache").glob("*.mask.npy"))) == 1
-    targets = Targets(images, torch.device("cpu"))
+    targets = Targets(images, Pinholes(images), torch.device("cpu"))
     assert targets.get(0).mask is targets.get(2).mask

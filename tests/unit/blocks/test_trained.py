@@ -12,7 +12,7 @@ from pipelines.blocks.trained import load_trained
 from pipelines.errors import InputError, MissingProductError
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
 from pipelines.geometry.similarity import Similarity
-from pipelines.products import TrainedCamera, TrainedModel, load_json, save_json
+from pipelines.products import TrainedCamera, TrainedLens, TrainedModel, load_json, save_json
 from pipelines.splat.initialise import gaussians_of_size
 from pipelines.splat.storage import write_gaussians
 from pipelines.stages import GAUSSIANS, MODEL
@@ -70,4 +70,26 @@ def test_order_of_another_reconstruction_is_refused(workspace: Workspace) -> Non
 def test_untrained_workspace_names_the_command(workspace: Workspace) -> None:
     (workspace.root / MODEL).unlink()
     with pytest.raises(MissingProductError, match="georef train"):
+        load_trained(workspace)
+
+
+def with_lens(workspace: Workspace, lens: TrainedLens) -> Workspace:
+    model = load_json(TrainedModel, workspace.path(MODEL))
+    save_json(model.model_copy(update={"lenses": (lens,)}), workspace.root / MODEL)
+    return workspace
+
+
+def test_lenses_come_back_beside_those_of_sfm(workspace: Workspace) -> None:
+    before = load_trained(workspace)
+    ((key, camera),) = before.sfm.cameras.items()
+    assert before.sparse.cameras[key] == camera
+    params = tuple(camera.params + 1.0)
+    after = load_trained(with_lens(workspace, TrainedLens(camera_id=key, model=camera.model, params=params)))
+    np.testing.assert_array_equal(after.sparse.cameras[key].params, params)
+    np.testing.assert_array_equal(after.sfm.cameras[key].params, camera.params)
+
+
+def test_lenses_of_another_reconstruction_are_refused(workspace: Workspace) -> None:
+    with_lens(workspace, TrainedLens(camera_id=77, model="PINHOLE", params=(1.0, 1.0, 1.0, 1.0)))
+    with pytest.raises(InputError, match="train again"):
         load_trained(workspace)

@@ -110,3 +110,22 @@ def test_state_of_a_run_that_has_not_begun(rendered: Rendered, workspace: Worksp
     save_checkpoint(tmp_path / "c.npz", one.state())
     two.restore(load_checkpoint(tmp_path / "c.npz"))
     assert float(one.step().photometric) == float(two.step().photometric)
+
+
+def test_views_are_seen_through_the_lens_that_follows(rendered: Rendered, workspace: Workspace) -> None:
+    one, two = trainer_of(rendered, workspace), trainer_of(rendered, workspace)
+    before, basis = one.pinhole(0), one.problem.cameras.lens_basis
+    with torch.no_grad():  # toward a focal length two per cent longer
+        one.problem.cameras.z.copy_(2 * basis[0] / basis[0].square().sum())
+    one.step()
+    fx = float((basis[0] @ one.problem.cameras.z).detach()) + before.fx
+    assert one.pinhole(0).fx == pytest.approx(fx, abs=0.1)  # but for the step itself
+    # It stays for a hundred iterations, whatever the cameras do, also for who goes on from there.
+    with torch.no_grad():
+        one.problem.cameras.z.zero_()
+    two.restore(one.state())
+    one.step(), two.step()
+    assert two.pinhole(0) == one.pinhole(0) != before
+    one.iteration = 100
+    one.step()
+    assert one.pinhole(0).fx == pytest.approx(before.fx, abs=0.1)

@@ -33,11 +33,11 @@ def free_covariance(network: Network) -> np.ndarray:
     return hold @ inverse[: 6 * n, : 6 * n] @ hold.T
 
 
-def points_follow(network: Network, corrections: np.ndarray) -> np.ndarray:
-    """Mean similarity (7, c) of the points when they follow corrections (6 n, c) through a fixed lens."""
+def points_follow(network: Network, corrections: np.ndarray, *, lens_follows: bool = True) -> np.ndarray:
+    """Mean similarity (7, c) of the points when they, and the lens or not, follow corrections (6 n, c)."""
     n, points = len(network.camera_id), len(network.point_in_world)
     design, modes = jacobian(network), point_modes(network)
-    rest = design[:, 6 * n : 6 * n + 3 * points]
+    rest = design[:, 6 * n :] if lens_follows else design[:, 6 * n : 6 * n + 3 * points]
     follow = np.linalg.lstsq(rest, -design[:, : 6 * n] @ corrections, rcond=None)[0][: 3 * points]
     own = [design[:, 6 * n + 3 * j : 6 * n + 3 * j + 3] for j in range(points)]
     pull = sum(m.T @ d.T @ d @ follow[3 * j : 3 * j + 3] for j, (m, d) in enumerate(zip(modes, own, strict=True)))
@@ -65,17 +65,43 @@ def test_basis_is_the_root_of_the_full_bundles_covariance() -> None:
     np.testing.assert_allclose(shape, expected, atol=0.01 * np.abs(expected).max())
 
 
-def test_no_correction_moves_the_points_by_a_similarity() -> None:
+@pytest.mark.parametrize("lens_follows", [True, False])
+def test_no_correction_moves_the_points_by_a_similarity(lens_follows: bool) -> None:
     network = exact_network()
     # Equal residuals everywhere: the robust weights are all the same, as they are in the design below.
-    basis = correction_basis(replace(network, obs_xy_px=network.obs_xy_px + SIGMA_PX)).matrix
+    equal = replace(network, obs_xy_px=network.obs_xy_px + SIGMA_PX)
+    basis = correction_basis(equal, lens_follows=lens_follows).matrix
     assert basis.shape == (6, 6, 6 * 6 - 7)
     assert np.linalg.matrix_rank(basis.reshape(36, -1) / units(network)[:, None]) == 29
     flat = basis.reshape(36, -1)
     # Both derivatives are numerical, with steps of 1e-6.
-    mean = points_follow(network, flat)
+    mean = points_follow(network, flat, lens_follows=lens_follows)
     assert np.abs(mean[4:]).max() < 1e-3 * np.abs(flat.reshape(6, 6, -1)[:, 3:]).max()
     assert np.abs(mean[:4]).max() < 1e-3 * np.abs(flat.reshape(6, 6, -1)[:, :3]).max()
+
+
+def test_lens_follows_as_a_readjustment_with_held_cameras_would_have_it() -> None:
+    network = exact_network()
+    found = correction_basis(replace(network, obs_xy_px=network.obs_xy_px + SIGMA_PX))
+    design, flat = jacobian(network), found.matrix.reshape(36, -1)
+    unit = np.linalg.norm(design[:, 36:], axis=0)
+    wanted = np.linalg.lstsq(design[:, 36:] / unit, -design[:, :36] @ flat, rcond=None)[0] / unit[:, None]
+    # Both derivatives are numerical, with steps of 1e-6.
+    np.testing.assert_allclose(found.lens_matrix, wanted[-4:], atol=1e-4 * np.abs(wanted[-4:]).max(axis=1).min())
+
+
+def test_a_wrong_focal_length_moves_the_cameras_and_not_the_points() -> None:
+    network = exact_network()
+    found = correction_basis(replace(network, obs_xy_px=network.obs_xy_px + SIGMA_PX))
+    # The correction that is expected of a focal length one σ off.
+    focal = found.lens_matrix[0] / np.linalg.norm(found.lens_matrix[0])
+    moved = (found.matrix @ focal)[:, 3:]
+    along = network.cam_center_in_world - network.point_in_world.mean(axis=0)
+    farther = (moved * along).sum(axis=1) / np.linalg.norm(along, axis=1)
+    relative = np.linalg.norm(found.lens_matrix[0]) / network.cameras[1].params[0]
+    # A longer lens sees the same from farther away, in proportion; less what the perspective of the scene forbids.
+    assert (farther > 0).all()
+    assert farther.mean() == pytest.approx(relative * np.linalg.norm(along, axis=1).mean(), rel=0.5)
 
 
 def test_modes_are_what_a_similarity_does_to_the_pixels() -> None:

@@ -81,7 +81,7 @@ def test_leaving_out_is_what_solving_again_would_give(sigma_m: np.ndarray | None
         again = problem_of(BLOCK, problem.fixes, without(problem.marks, j))
         minimise(again)
         with torch.no_grad():
-            measured = again.similarity(intersect(again.cameras, problem.marks))[j]
+            measured = again.similarity(intersect(again.estimate(), problem.marks))[j]
         error = (measured - problem.marks.position_in_geo[j]).numpy()
         # The weights of the others change a little when it is gone: a fifth of what is expected of the error.
         sigma = np.sqrt(np.diag(found.cov_in_geo[j]))
