@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.blocks.last_adjustment import LastAdjustment, adjust_finally
 from pipelines.config import SfmConfig
 from pipelines.errors import DegenerateGeometryError, InputError
 from pipelines.formats.colmap import load_reconstruction, quiet_colmap
@@ -35,8 +36,6 @@ _EXHAUSTIVE_UP_TO = 20
 _IMAGES_A_CHUNK = 4
 _PAIRS_A_CHUNK = 48
 _FEW_REGISTERED = 0.8
-_FEWEST_FOR_PRINCIPAL_POINT = 10
-_FURTHEST_PRINCIPAL_POINT = 0.05  # of the longer side: beyond, it has taken up something else
 
 
 def run(stage: StageRun, config: SfmConfig) -> Summary:
@@ -75,7 +74,7 @@ class SfmJob:
 
 
 def reconstruct(colmap: Any, job: SfmJob, progress: Progress) -> Any:
-    """Features, matches and mapping.
+    """Features, matches, mapping and a last, robust adjustment.
 
     Args:
         colmap: the pycolmap module.
@@ -112,42 +111,9 @@ def reconstruct(colmap: Any, job: SfmJob, progress: Progress) -> Any:
         sizes = sorted((model.num_reg_images() for model in models), reverse=True)
         log.warning("the survey fell apart into %d models of %s images; the largest is used", len(models), sizes)
     model = max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()))
-    if job.config.principal_point:
-        adjust_with_principal_point(colmap, model)
+    last = LastAdjustment(job.config.principal_point, job.config.threads)
+    adjust_finally(colmap, model, last, progress)
     return model
-
-
-def adjust_with_principal_point(colmap: Any, model: Any) -> None:
-    """Adjust the bundle once more, with the principal point free, which the mapper holds at the image's centre.
-
-    A few pixels of it, as most lenses have, move points by decimetres once the cameras are laid on GNSS. Fewer than
-    ten images do not determine it, and are left as they are; so is a model whose principal point would leave the
-    middle of the image.
-
-    Args:
-        colmap: the pycolmap module.
-        model: a `pycolmap.Reconstruction`, adjusted in place.
-    """
-    if model.num_reg_images() < _FEWEST_FOR_PRINCIPAL_POINT:
-        return
-    options = colmap.BundleAdjustmentOptions()
-    options.print_summary = False
-    options.refine_principal_point = True
-    before = {key: camera.params.copy() for key, camera in model.cameras.items()}
-    colmap.bundle_adjustment(model, options)
-    for key, camera in model.cameras.items():
-        moved = np.linalg.norm(np.asarray(camera.params)[camera.principal_point_idxs()] - _center(camera))
-        if moved > _FURTHEST_PRINCIPAL_POINT * max(camera.width, camera.height):
-            log.warning("the principal point of camera %d is not determined and stays where it was", key)
-            for each, params in before.items():
-                model.cameras[each].params = params
-            options.refine_principal_point = False
-            colmap.bundle_adjustment(model, options)
-            return
-
-
-def _center(camera: Any) -> NDArray[np.float64]:
-    return np.array([camera.width / 2, camera.height / 2])
 
 
 def candidate_pairs(survey: Survey, config: SfmConfig) -> NDArray[np.int64]:

@@ -96,7 +96,13 @@ def read_sparse(path: Path) -> SparseModel:
         InputError: unreadable, inconsistent, or with values that are not finite.
         BackendUnavailableError: pycolmap is not installed.
     """
-    reconstruction = load_reconstruction(path)
+    model = flatten(load_reconstruction(path))
+    _check(model, path)
+    return model
+
+
+def flatten(reconstruction: Any) -> SparseModel:
+    """A `pycolmap.Reconstruction` as arrays; what `read_sparse` leaves out is left out here."""
     cameras = {
         int(camera_id): Camera(
             camera.model_name, int(camera.width), int(camera.height), np.array(camera.params, dtype=np.float64)
@@ -109,7 +115,7 @@ def read_sparse(path: Path) -> SparseModel:
     ids = np.array(sorted(reconstruction.point3D_ids()), dtype=np.int64)
     points = [reconstruction.points3D[int(point_id)] for point_id in ids]
     obs_point, obs_image, obs_xy = _observations(images, ids)
-    model = SparseModel(
+    return SparseModel(
         cameras=cameras,
         image_id=np.array([image.image_id for image in images], dtype=np.int64),
         image_name=tuple(image.name for image in images),
@@ -124,8 +130,6 @@ def read_sparse(path: Path) -> SparseModel:
         obs_image=obs_image,
         obs_xy_px=obs_xy,
     )
-    _check(model, path)
-    return model
 
 
 def write_sparse(model: SparseModel, path: Path) -> None:
