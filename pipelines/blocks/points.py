@@ -16,8 +16,9 @@ from pipelines.robust.statistics import spatial_median
 # Rays of a mark are held to agree within their mark's σ and this much of the cameras' own error.
 _SIGMA_CENTER_M = 0.02
 _SIGMA_ATTITUDE_RAD = 2e-4
-_EDGE_REACH_PX = 2
+_REACH_PX = 2  # of what is looked at around a mark
 _EDGE_STEP = 0.04  # of the depth; ground seen under 30° changes by 1 % within the reach
+_SAME_SURFACE = 0.01  # of the depth
 
 
 @dataclass(frozen=True)
@@ -102,21 +103,36 @@ def points_by_model(
 
 
 def _at_edge(depth_m: FloatArray, camera: Pinhole, xy: FloatArray) -> bool:
-    """Whether the depth changes by more than a slope does within two pixels of a ray."""
-    x, y = int(camera.fx * xy[0] + camera.cx), int(camera.fy * xy[1] + camera.cy)
-    around = depth_m[max(y - _EDGE_REACH_PX, 0) : y + _EDGE_REACH_PX + 1]
-    around = around[:, max(x - _EDGE_REACH_PX, 0) : x + _EDGE_REACH_PX + 1]
+    """Whether the depth around a ray changes by more than a slope does."""
+    around = _around(depth_m, *_pixel(camera, xy))
     return bool(around.size == 0 or around.max() > (1 + _EDGE_STEP) * around.min())
 
 
 def _depth_at(depth_m: FloatArray, camera: Pinhole, xy: FloatArray) -> float:
-    """Depth at a ray: bilinear where the four pixels around it have a surface, else the nearest, 0 outside."""
-    x, y = camera.fx * xy[0] + camera.cx - 0.5, camera.fy * xy[1] + camera.cy - 0.5
-    if not (0 <= x <= camera.width - 1 and 0 <= y <= camera.height - 1):
+    """Depth at a ray, of a plane through what lies around it on the same surface; 0 where there is none.
+
+    Gaussians make the surface rough from pixel to pixel, which a plane through some of them evens out. Its inverse
+    depth is linear on the image.
+    """
+    x, y = _pixel(camera, xy)
+    if not (0 <= x < camera.width and 0 <= y < camera.height):
         return 0.0
-    x0, y0 = min(int(x), camera.width - 2), min(int(y), camera.height - 2)
-    patch = np.asarray(depth_m[y0 : y0 + 2, x0 : x0 + 2], dtype=np.float64)
-    if (patch <= 0).any():
-        return float(depth_m[round(y), round(x)])
-    weight = np.outer([1 - (y - y0), y - y0], [1 - (x - x0), x - x0])
-    return float(1.0 / (weight / patch).sum())  # inverse depth is linear across a plane
+    here = float(depth_m[int(y), int(x)])
+    around = np.asarray(_around(depth_m, x, y), dtype=np.float64)
+    rows, columns = np.nonzero((np.abs(around - here) < _SAME_SURFACE * here) & (around > 0))
+    right = columns + max(int(x) - _REACH_PX, 0) + 0.5 - x
+    down = rows + max(int(y) - _REACH_PX, 0) + 0.5 - y
+    if len(rows) < 3 or np.ptp(rows) == 0 or np.ptp(columns) == 0:  # no plane
+        return here
+    design = np.stack([np.ones(len(rows)), right, down], axis=1)
+    return float(1.0 / np.linalg.lstsq(design, 1.0 / around[rows, columns])[0][0])
+
+
+def _pixel(camera: Pinhole, xy: FloatArray) -> tuple[float, float]:
+    return camera.fx * float(xy[0]) + camera.cx, camera.fy * float(xy[1]) + camera.cy
+
+
+def _around(depth_m: FloatArray, x: float, y: float) -> FloatArray:
+    """The depths within the reach of a place on the image."""
+    top, left = max(int(y) - _REACH_PX, 0), max(int(x) - _REACH_PX, 0)
+    return depth_m[top : int(y) + _REACH_PX + 1, left : int(x) + _REACH_PX + 1]

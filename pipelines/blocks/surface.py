@@ -28,6 +28,9 @@ from pipelines.stereo.sweep import FloatImage, Planes, StereoCamera, StereoView,
 
 log = logging.getLogger(__name__)
 
+_NORMAL_REACH_PX = 2
+_EDGE_STEP = 0.05  # of the depth
+_FORM = b"offset, score, step, sharpness"  # of what is kept: other forms have other folders
 _CANDIDATES = 8  # drawn for each point wanted: enough to cover what few views see
 
 
@@ -50,10 +53,29 @@ class SurfaceOptions:
 
 @dataclass(frozen=True)
 class SurfacePoints:
-    """P points of the surface: in `model` (P, 3) metres, and their colours (P, 3) uint8."""
+    """P points of the surface.
+
+    Attributes:
+        point_in_model: (P, 3) metres.
+        rgb: (P, 3) uint8.
+        normal_in_model: (P, 3) unit vectors, of either sign; NaN where unknown.
+    """
 
     point_in_model: FloatArray
     rgb: NDArray[np.uint8]
+    normal_in_model: FloatArray
+
+    def __add__(self, other: SurfacePoints) -> SurfacePoints:
+        """These, and the others after them."""
+        return SurfacePoints(
+            np.concatenate([self.point_in_model, other.point_in_model]),
+            np.concatenate([self.rgb, other.rgb]),
+            np.concatenate([self.normal_in_model, other.normal_in_model]),
+        )
+
+    def part(self, rows: NDArray[np.int64]) -> SurfacePoints:
+        """Some of them."""
+        return SurfacePoints(self.point_in_model[rows], self.rgb[rows], self.normal_in_model[rows])
 
 
 class SceneSurface:
@@ -113,17 +135,34 @@ class SceneSurface:
         """At most `count` points of the whole surface, as dense as the photographs show it."""
         rng = np.random.default_rng(seed)
         share = -(-_CANDIDATES * count // max(len(self._scene.train), 1))
-        points, colours, sizes = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)], [np.zeros(0)]
+        found = SurfacePoints(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros((0, 3)))
+        sizes = [np.zeros(0)]
         for index in map(int, self._scene.train):
             rows, columns = np.nonzero(self.depth(index))
             chosen = rng.permutation(len(rows))[:share]
             rows, columns = rows[chosen], columns[chosen]
-            points.append(self._points(index, rows, columns))
-            colours.append(self._rgb(index)[rows, columns])
+            normals = self._normals(index, rows, columns)
+            found += SurfacePoints(self._points(index, rows, columns), self._rgb(index)[rows, columns], normals)
             sizes.append(self.depth(index)[rows, columns].astype(np.float64) / self.camera(index).fx)
-        everywhere, rgb = np.concatenate(points), np.concatenate(colours)
-        kept = spread_evenly(everywhere, np.concatenate(sizes), count)
-        return SurfacePoints(everywhere[kept], rgb[kept])
+        return found.part(spread_evenly(found.point_in_model, np.concatenate(sizes), count))
+
+    def _normals(self, index: int, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> FloatArray:
+        """Unit vectors (P, 3) across the surface at pixels of a view; NaN at its edges."""
+        depth = self.depth(index)
+        inside = (rows >= _NORMAL_REACH_PX) & (rows < depth.shape[0] - _NORMAL_REACH_PX)
+        inside &= (columns >= _NORMAL_REACH_PX) & (columns < depth.shape[1] - _NORMAL_REACH_PX)
+        found = np.full((len(rows), 3), np.nan)
+        kept = np.flatnonzero(inside)
+        places = [
+            (rows[kept] + _NORMAL_REACH_PX * down, columns[kept] + _NORMAL_REACH_PX * right)
+            for down, right in ((0, 1), (0, -1), (1, 0), (-1, 0))
+        ]
+        around = np.stack([depth[place] for place in places])
+        smooth = around.min(axis=0) * (1 + _EDGE_STEP) > around.max(axis=0)
+        right, left, below, above = (self._points(index, *place) for place in places)
+        normal = np.cross(right - left, below - above)[smooth]
+        found[kept[smooth]] = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+        return found
 
     def _points(self, index: int, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> FloatArray:
         depth, poses = self.depth(index)[rows, columns].astype(np.float64), self._scene.poses
@@ -132,14 +171,14 @@ class SceneSurface:
         return np.asarray(poses.cam_center_in_model[index] + turned)
 
     def _sweep(self, index: int) -> None:
-        """Write (3, H, W): offset, score and step of each pixel."""
+        """Write (4, H, W): offset, score, step and sharpness of each pixel."""
         camera = self.camera(index)
-        swept = np.zeros((3, camera.height, camera.width), dtype=np.float32)
+        swept = np.zeros((4, camera.height, camera.width), dtype=np.float32)
         swept[0], swept[1] = np.nan, -1.0
         planes, others = self._planes(index), self._neighbours(index)
         if planes is not None:
             found = plane_sweep(self._view(index), [self._view(j) for j in others], planes, self._options.sweep)
-            swept[:] = found.offset_m, found.score, found.step_m
+            swept[:] = found.offset_m, found.score, found.step_m, found.sharpness
         save_array(self._path(index, "swept"), swept)
 
     def _agreed(self, index: int) -> FloatImage:
@@ -154,8 +193,8 @@ class SceneSurface:
         planes = self._planes(index)
         if planes is None:
             return None
-        offset, score, step = np.load(self._path(index, "swept"), mmap_mode="r", allow_pickle=False)
-        return Surface(self._camera(index), planes, Swept(offset, score, step))
+        offset, score, step, sharpness = np.load(self._path(index, "swept"), mmap_mode="r", allow_pickle=False)
+        return Surface(self._camera(index), planes, Swept(offset, score, step, sharpness))
 
     def _find_planes(self, index: int) -> Planes | None:
         others = self._neighbours(index)
@@ -187,7 +226,7 @@ class SceneSurface:
 
     def _key(self) -> str:
         """Changes with all that the maps depend on."""
-        digest = hashlib.sha256()
+        digest = hashlib.sha256(_FORM)
         poses, sparse = self._scene.poses, self._scene.sparse
         arrays = (
             poses.cam_from_model, poses.cam_center_in_model, self._scene.point_in_model, self._scene.train,

@@ -23,7 +23,7 @@ from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.losses import photometric_loss
 from pipelines.splat.optimizer import GaussianAdam
 from pipelines.splat.raster.api import Pinhole, Rasterizer, RasterSettings, Render
-from pipelines.splat.surface import SurfaceSettings, depth_loss, flatness_loss, normal_loss
+from pipelines.splat.surface import SurfaceSettings, compactness_loss, depth_loss, flatness_loss, normal_loss
 from pipelines.splat.watch import FiniteWatch
 
 _FINAL_RATE = 0.05  # of the geographic learning rates, relative to the first
@@ -240,6 +240,9 @@ class JointTrainer:
         if wanted is None:
             return None
         loss = wanted.flatness * flatness_loss(gaussians, render.stats.visible, self.optimizer.extent_m)
+        if render.expected_depth is not None and render.depth_variance is not None:
+            spread = compactness_loss(render.expected_depth, render.depth_variance, render.alpha)
+            loss = loss + wanted.compactness * spread
         if self.views.surface is not None and render.expected_depth is not None:
             points = self.views.surface(index)
             depth = depth_loss(render.expected_depth, render.alpha, points, pose, target.camera)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,7 +31,9 @@ class InitialisationOptions:
 
     Attributes:
         sh_degree: degree of the spherical harmonics; all but the constant start at zero.
-        opacity: opacity of every Gaussian.
+        opacity: opacity of every Gaussian without a normal.
+        disc_opacity: of one with a normal: its place is known, and it need not make room for others.
+        thickness: of one with a normal, as a part of its standard deviation across that.
         far: points farther from the cloud's median centre than this many median distances are left out: they
             are mismatches, or the sky.
         max_gaussians: thin a larger cloud evenly down to this number.
@@ -38,22 +41,29 @@ class InitialisationOptions:
 
     sh_degree: int = 3
     opacity: float = 0.1
+    disc_opacity: float = 0.5
+    thickness: float = 0.1
     far: float = 50.0
     max_gaussians: int | None = None
 
 
 def gaussians_from_points(
-    points_in_model: ArrayLike, colours: ArrayLike, options: InitialisationOptions | None = None
+    points_in_model: ArrayLike,
+    colours: ArrayLike,
+    options: InitialisationOptions | None = None,
+    normals_in_model: ArrayLike | None = None,
 ) -> Gaussians:
-    """Isotropic Gaussians at SfM points, as 3D Gaussian Splatting starts (doi 10.1145/3592433, section 5.1).
+    """Gaussians at points, as 3D Gaussian Splatting starts (doi 10.1145/3592433, section 5.1).
 
     A Gaussian's standard deviation is the mean distance to the three nearest other points. Points that are not
-    finite, repeated or far out are left out.
+    finite, repeated or far out are left out. They are isotropic, but for points with a known normal, which become
+    discs: a ball as wide as the gaps between the points reaches as far before the surface, and behind it.
 
     Args:
         points_in_model: (N, 3) metres in the model frame.
         colours: (N, 3) uint8, or floats from 0 to 1.
         options: how to start.
+        normals_in_model: (N, 3) unit vectors, NaN where unknown; None: of none.
 
     Returns:
         At most N Gaussians, float32, in spatial order.
@@ -73,7 +83,10 @@ def gaussians_from_points(
     if options.max_gaussians is not None and len(order) > options.max_gaussians:
         order = order[np.linspace(0, len(order) - 1, max(options.max_gaussians, 2)).astype(np.int64)]
         log.info("thinned %d SfM points to %d", len(keep), len(order))
-    return gaussians_of_size(points[order], rgb[order], _gap(points[order]), options)
+    gaussians = gaussians_of_size(points[order], rgb[order], _gap(points[order]), options)
+    if normals_in_model is not None:
+        _make_discs(gaussians, np.asarray(normals_in_model, dtype=np.float64)[order], options)
+    return gaussians
 
 
 def scene_extent(camera_centers: ArrayLike) -> float:
@@ -108,6 +121,17 @@ def gaussians_of_size(
         logit_opacities=torch.logit(torch.full((count,), options.opacity)),
         sh=sh,
     )
+
+
+def _make_discs(gaussians: Gaussians, normals: FloatArray, options: InitialisationOptions) -> None:
+    """Turn the third axis of Gaussians into their normals (N, 3), where these are known, and shorten it."""
+    rows = np.flatnonzero(np.isfinite(normals).all(axis=1))
+    normal = torch.as_tensor(normals[rows] * np.where(normals[rows, 2:] < 0, -1.0, 1.0)).float()
+    # The shortest turn from z to n is about z × n; upward normals keep clear of the opposite of z.
+    quats = torch.stack([1 + normal[:, 2], -normal[:, 1], normal[:, 0], torch.zeros(len(rows))], dim=1)
+    gaussians.quats_wxyz[rows] = torch.nn.functional.normalize(quats, dim=1)
+    gaussians.log_scales[rows, 2] += math.log(options.thickness)
+    gaussians.logit_opacities[rows] = math.log(options.disc_opacity / (1 - options.disc_opacity))
 
 
 def _gap(points: FloatArray) -> FloatArray:

@@ -19,6 +19,7 @@ from pipelines.splat.raster.api import Pinhole, Rasterizer, RasterSettings
 from pipelines.splat.sh import sh_from_rgb
 
 _SAME_SURFACE = 0.01  # of the depth
+_SPREAD = 0.005  # of the depth: what less of it costs grows with its square
 
 
 @dataclass(frozen=True)
@@ -26,7 +27,8 @@ class SurfaceSettings:
     """Weights of the losses.
 
     Attributes:
-        depth: of the mean relative difference of depth at the SfM points.
+        depth: of the mean relative difference of depth at the points of the surface.
+        compactness: of the logarithm that bounds what haze before and behind a surface costs.
         flatness: of the mean smallest standard deviation, in scene extents.
         normals: of the depth–normal consistency,
         normals_from: from this fraction of the training,
@@ -36,6 +38,7 @@ class SurfaceSettings:
     """
 
     depth: float = 1.0
+    compactness: float = 0.01
     flatness: float = 1.0
     normals: float = 0.01
     normals_from: float = 0.5
@@ -67,6 +70,21 @@ def depth_loss(
     found = functional.grid_sample(maps, place[None, None], align_corners=False, padding_mode="border")[0, :, 0]
     counts = ((place.abs() < 1).all(dim=1) & (in_cam[:, 2] > 1e-3) & (found[1] > 0.5)).to(depth_m.dtype)
     return ((found[0] / z - 1).abs() * counts).sum() / counts.sum().clamp_min(1)
+
+
+def compactness_loss(depth_m: Tensor, variance_m2: Tensor, alpha: Tensor) -> Tensor:
+    """Mean of α ln(1 + σ²/s²), σ the spread of depth in a pixel, and s a two-hundredth of the depth; scalar.
+
+    The mean depth can be right in a haze that no surface is in. The logarithm, because a pixel at an edge shows
+    what is before and behind it, and rightly so.
+
+    Args:
+        depth_m: (H, W) expected depth.
+        variance_m2: (H, W) of the depth.
+        alpha: (H, W).
+    """
+    allowed = (_SPREAD * depth_m.detach()).clamp_min(1e-6)
+    return (alpha.detach() * torch.log1p(variance_m2 / allowed.square())).mean()
 
 
 def measured_depth(median_m: Tensor, expected_m: Tensor) -> Tensor:

@@ -39,29 +39,37 @@ def agreed_depth(reference: Surface, others: list[Surface], settings: AgreementS
     """Depth (H, W) along the optical axis of `reference`, the mean of the views that agree; 0 where too few do.
 
     A point of the reference is looked up in each other view. The difference is taken along the normal of the
-    other view's planes: on a surface that these follow, it does not matter that pixels do not coincide.
+    other view's planes: on a surface that these follow, it does not matter that pixels do not coincide. Views weigh
+    by the square of the sharpness of their peaks, since noise of the score moves a blunt one further: a view
+    without a baseline agrees with anything.
     """
     rays = reference.camera.rays()
     depth = reference.planes.depth(reference.camera, reference.swept.offset_m)
     good = (reference.swept.score > settings.least_score) & np.isfinite(depth) & (depth > 0)
-    total, count = np.zeros(depth.shape), np.zeros(depth.shape, dtype=np.int64)
     rows, columns = np.nonzero(good)
+    total, weight, count = np.zeros(depth.shape), np.ones(depth.shape), np.zeros(depth.shape, dtype=np.int64)
+    own = rays[rows, columns] @ reference.planes.normal_in_world
+    weight[rows, columns] = (own * reference.swept.sharpness[rows, columns]) ** 2
     point = reference.camera.center_in_world + depth[rows, columns, None] * rays[rows, columns]
     for other in others:
-        seen, missed = _missed(point, other, settings)
+        seen, missed, sharpness = _missed(point, other, settings)
         along = rays[rows[seen], columns[seen]] @ other.planes.normal_in_world
         with np.errstate(divide="ignore"):
             longer = missed / along
         fits = np.abs(longer) < 0.1 * depth[rows[seen], columns[seen]]  # not where the ray grazes the planes
-        place = rows[seen][fits], columns[seen][fits]
-        total[place] += longer[fits]
+        place, of_view = (rows[seen][fits], columns[seen][fits]), ((along * sharpness) ** 2)[fits]
+        total[place] += of_view * longer[fits]
+        weight[place] += of_view
         count[place] += 1
     agreed = count >= settings.least_views
-    return np.where(agreed, depth + total / (count + 1), 0.0).astype(np.float32)
+    return np.where(agreed, depth + total / weight, 0.0).astype(np.float32)
 
 
-def _missed(point: FloatArray, other: Surface, settings: AgreementSettings) -> tuple[NDArray[np.int64], FloatArray]:
-    """Indices of the points (P, 3) that lie on another view's surface, and how far from it along its normal."""
+def _missed(
+    point: FloatArray, other: Surface, settings: AgreementSettings
+) -> tuple[NDArray[np.int64], FloatArray, FloatImage]:
+    """Indices of the points (P, 3) that lie on another view's surface, how far from it along its normal, and how
+    sharply that was found."""
     camera = other.camera.pinhole
     in_cam = (point - other.camera.center_in_world) @ other.camera.cam_from_world.T
     ahead = np.flatnonzero(in_cam[:, 2] > 0)
@@ -72,4 +80,4 @@ def _missed(point: FloatArray, other: Surface, settings: AgreementSettings) -> t
     missed = other.swept.offset_m[place] - point[ahead] @ other.planes.normal_in_world
     near = np.abs(missed) < settings.steps * other.swept.step_m[place]
     near &= other.swept.score[place] > settings.least_score
-    return ahead[near], np.asarray(missed[near])
+    return ahead[near], np.asarray(missed[near]), other.swept.sharpness[place][near]

@@ -87,11 +87,14 @@ class Swept:
             none lies in front of the camera.
         score: (H, W) correlation, −1 … 1.
         step_m: (H, W) distance between the planes there.
+        sharpness: (H, W) 1/m², minus the second derivative of the score by the offset: small where neighbours look
+            from nearly the same place, or see little texture. The σ of the offset goes with its inverse.
     """
 
     offset_m: FloatImage
     score: FloatImage
     step_m: FloatImage
+    sharpness: FloatImage
 
 
 @dataclass(frozen=True)
@@ -243,4 +246,4 @@ class _Peak:
         offset = np.interp(self._place + shift, np.arange(len(offset_m)), offset_m).astype(np.float32)
         offset[self._best <= _UNSEEN] = np.nan
         step = np.abs(np.gradient(offset_m)).astype(np.float32)[self._place]
-        return Swept(offset, self._best, step)
+        return Swept(offset, self._best, step, np.where(inner, -curvature, 1e-6).astype(np.float32) / step**2)

@@ -72,18 +72,21 @@ class Render:
     Attributes:
         colour: (H, W, 3), linear in the Gaussians' colours, background blended in.
         alpha: (H, W), 1 − final transmittance.
+        stats: for densification.
         expected_depth: (H, W), Σ w z / Σ w along the camera's z axis in metres, each Gaussian's z at the pixel,
             0 where alpha is 0; or None.
+        depth_variance: (H, W), Σ w z² / Σ w − expected_depth² in m²: 0 where all that is seen lies on one surface;
+            or None.
         median_depth: (H, W), z at the pixel of the Gaussian at which the transmittance falls to one half, 0
             where it never does; not differentiable; or None.
-        stats: for densification.
     """
 
     colour: Tensor
     alpha: Tensor
-    expected_depth: Tensor | None
-    median_depth: Tensor | None
     stats: ScreenStats
+    expected_depth: Tensor | None = None
+    depth_variance: Tensor | None = None
+    median_depth: Tensor | None = None
 
 
 class Rasterizer(Protocol):

@@ -55,14 +55,16 @@ class CpuRasterizer:
         pose = cam_from_model[:3].to(torch.float64)
         center_in_model = -torch.linalg.solve(pose[:, :3], pose[:, 3])
         frame = _Frame(camera, settings)
-        colour, alpha, depth_sum, median = _Rasterize.apply(
+        colour, alpha, depth_sum, square_sum, median = _Rasterize.apply(
             *gaussians.tensors().values(), pose, center_in_model, frame
         )
         if not settings.depth:
-            return Render(colour, alpha, None, None, frame.stats)
+            return Render(colour, alpha, frame.stats)
         opaque = alpha > 0
-        expected = torch.where(opaque, depth_sum / torch.where(opaque, alpha, 1.0), 0.0)
-        return Render(colour, alpha, expected, median, frame.stats)
+        total = torch.where(opaque, alpha, 1.0)
+        expected = torch.where(opaque, depth_sum / total, 0.0)
+        variance = (square_sum / total - expected.square()).clamp_min(0.0)
+        return Render(colour, alpha, frame.stats, expected, variance, median)
 
 
 def predicted_bytes(
@@ -82,8 +84,8 @@ def predicted_bytes(
     splats = cpu_project.SPLAT_WIDTH + cpu_project.ELLIPSE_WIDTH
     in_view = count if visible is None else visible
     hits = in_view * hits_per_visible * (16 + 4 * cpu_blend.HIT_GRADIENT_WIDTH)
-    # Colour, alpha, two depths, and the gradients of the first three.
-    images = camera.width * camera.height * 11 * 4
+    # Colour, alpha, mean, mean square and median depth, and the gradients of all but the last.
+    images = camera.width * camera.height * 13 * 4
     return int(gradients + in_view * (4 * splats + 48) + hits + images)
 
 
@@ -140,7 +142,7 @@ class _TileLists:
 
 
 class _Rasterize(torch.autograd.Function):
-    """Raw parameters, pose (3, 4) and centre (3,) in; colour, alpha, Σ w z and median depth out."""
+    """Raw parameters, pose (3, 4) and centre (3,) in; colour, alpha, Σ w z, Σ w z² and median depth out."""
 
     @staticmethod
     def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, ...]:
@@ -152,7 +154,7 @@ class _Rasterize(torch.autograd.Function):
         outputs = tuple(torch.from_numpy(image) for image in images)
         ctx.frame = frame
         ctx.save_for_backward(*tensors, *outputs)
-        ctx.mark_non_differentiable(outputs[3])
+        ctx.mark_non_differentiable(outputs[4])
         return outputs
 
     @staticmethod
@@ -161,7 +163,7 @@ class _Rasterize(torch.autograd.Function):
         frame: _Frame = ctx.frame
         saved = [_array(tensor) for tensor in ctx.saved_tensors]
         *parameters, pose, center = saved[:7]
-        grads = tuple(_array(grad) for grad in grad_outputs[:3])
+        grads = tuple(_array(grad) for grad in grad_outputs[:4])
         outputs = [np.empty_like(parameter) for parameter in parameters]
         with _ONE_AT_A_TIME:
             hit_gradient = _hit_gradient(frame, tuple(saved[7:]), grads)
@@ -224,10 +226,10 @@ def _list_tiles(ellipses: _Array, camera: Pinhole) -> _TileLists:
 
 
 def _blend(frame: _Frame) -> tuple[_Array, ...]:
-    """Colour, alpha, Σ w z and median depth, the last two of size (0, 0) if they are not wanted."""
+    """Colour, alpha, Σ w z, Σ w z² and median depth, the last three of size (0, 0) if they are not wanted."""
     size = (frame.camera.height, frame.camera.width)
     depth_size = size if frame.settings.depth else (0, 0)
-    shapes: tuple[tuple[int, ...], ...] = ((*size, 3), size, depth_size, depth_size)
+    shapes: tuple[tuple[int, ...], ...] = ((*size, 3), size, *3 * (depth_size,))
     images = tuple(np.empty(shape, dtype=frame.table.dtype) for shape in shapes)
     lists = frame.lists
     cpu_blend.blend(

@@ -46,10 +46,10 @@ TILE_PIXELS = TILE_WIDTH * TILE_HEIGHT
 HITS_PER_LOOK = 16
 
 # Planes of a tile's scratch memory.
-T, R, G, B, D, MEDIAN = range(6)
-FORWARD_PLANES = 6
-G_RED, G_GREEN, G_BLUE, G_DEPTH, G_REST, REMAINING = 1, 2, 3, 4, 5, 6
-BACKWARD_PLANES = 7
+T, R, G, B, D, D2, MEDIAN = range(7)
+FORWARD_PLANES = 7
+G_RED, G_GREEN, G_BLUE, G_DEPTH, G_DEPTH2, G_REST, REMAINING = 1, 2, 3, 4, 5, 6, 7
+BACKWARD_PLANES = 8
 
 # Places in the gradient of one hit: Σ q and its moments in dx and dy, where q = ∂L/∂(exponent) at each pixel, and
 # ∂L/∂ depth, its slopes and colour; in fours, because they are summed in fours.
@@ -138,6 +138,7 @@ def _blend_tile(table: Any, hits: Any, first: int, last: int, tile_x: int, tile_
             if depth:
                 z = _row_depth(table, index, dx, dy)
                 store(scratch, D * TILE_PIXELS + at, load(scratch, D * TILE_PIXELS + at) + weight * z)
+                store(scratch, D2 * TILE_PIXELS + at, load(scratch, D2 * TILE_PIXELS + at) + weight * z * z)
                 median = load(scratch, MEDIAN * TILE_PIXELS + at)
                 crossed = where_greater(t, half, where_greater(t_next, half, median, z), median)
                 store(scratch, MEDIAN * TILE_PIXELS + at, crossed)
@@ -147,7 +148,7 @@ def _blend_tile(table: Any, hits: Any, first: int, last: int, tile_x: int, tile_
 @jit
 def _finish_tile(scratch: Any, tile_x: int, tile_y: int, background: Any, images: Any) -> None:
     """Write a blended tile into the images."""
-    colour, alpha, depth, median = images
+    colour, alpha, depth, depth2, median = images
     for row in range(min(TILE_HEIGHT, colour.shape[0] - tile_y)):
         for column in range(min(TILE_WIDTH, colour.shape[1] - tile_x)):
             at = row * TILE_WIDTH + column
@@ -159,6 +160,7 @@ def _finish_tile(scratch: Any, tile_x: int, tile_y: int, background: Any, images
             alpha[y, x] = 1 - final
             if depth.shape[0] > 0:
                 depth[y, x] = scratch[D * TILE_PIXELS + at]
+                depth2[y, x] = scratch[D2 * TILE_PIXELS + at]
                 median[y, x] = scratch[MEDIAN * TILE_PIXELS + at]
 
 
@@ -191,8 +193,8 @@ def blend(
         hits: (H,) packed hits by tile, nearest first.
         tile_start: (tiles + 1,) into `hits`.
         background: (3,) float64.
-        images: colour (H, W, 3), alpha (H, W), Σ w z (H, W), median depth (H, W), written; the depths may be
-            of size (0, 0).
+        images: colour (H, W, 3), alpha (H, W), Σ w z (H, W), Σ w z² (H, W), median depth (H, W), written; the
+            depths may be of size (0, 0).
         tile_end: (tiles,) hit after the last one that was looked at, written.
         workers: number of threads.
     """
@@ -204,11 +206,11 @@ def blend(
 def _start_tile_gradient(scratch: Any, tile_x: int, tile_y: int, background: Any, images: Any, grads: Any) -> None:
     """Gather what each pixel's loss depends on.
 
-    With v_i = g·c_i + g_z z_i − (g·background − g_alpha) the loss is Σ w_i v_i plus a constant, so that
+    With v_i = g·c_i + g_z z_i + g_zz z_i² − (g·background − g_alpha) the loss is Σ w_i v_i plus a constant, so that
     background and alpha need no term of their own further on. `REMAINING` starts as the whole sum.
     """
-    colour, alpha, depth, _ = images
-    g_colour, g_alpha, g_depth = grads
+    colour, alpha, depth, depth2, _ = images
+    g_colour, g_alpha, g_depth, g_depth2 = grads
     for row in range(min(TILE_HEIGHT, colour.shape[0] - tile_y)):
         for column in range(min(TILE_WIDTH, colour.shape[1] - tile_x)):
             at = row * TILE_WIDTH + column
@@ -223,7 +225,8 @@ def _start_tile_gradient(scratch: Any, tile_x: int, tile_y: int, background: Any
             whole += g_alpha[y, x] * alpha[y, x]
             if depth.shape[0] > 0:
                 scratch[G_DEPTH * TILE_PIXELS + at] = g_depth[y, x]
-                whole += g_depth[y, x] * depth[y, x]
+                scratch[G_DEPTH2 * TILE_PIXELS + at] = g_depth2[y, x]
+                whole += g_depth[y, x] * depth[y, x] + g_depth2[y, x] * depth2[y, x]
             scratch[REMAINING * TILE_PIXELS + at] = whole
 
 
@@ -246,9 +249,8 @@ def _blend_tile_gradient(table: Any, hits: Any, first: int, last: int, tile_x: i
     ∂L/∂α_i = T_i v_i − (Σ_{j>i} w_j v_j) / (1 − α_i), and q_i = ∂L/∂ln α_i = α_i ∂L/∂α_i.
     """
     number = table.dtype.type
-    zero, one = splat(number(0.0)), splat(number(1.0))
+    zero, one, t_min = splat(number(0.0)), splat(number(1.0)), splat(number(TRANSMITTANCE_MIN))
     cutoff, alpha_max = splat(number(LOG_ALPHA_MIN)), splat(number(ALPHA_MAX))
-    t_min = splat(number(TRANSMITTANCE_MIN))
     pixel_x = load(lane_x, 0) + splat(number(tile_x))
     top, bottom = 0, TILE_HEIGHT - 1
     for place in range(first, last):
@@ -257,8 +259,9 @@ def _blend_tile_gradient(table: Any, hits: Any, first: int, last: int, tile_x: i
         index, first_row, last_row = unpack_hit(hits[place])
         red, green, blue = splat(table[index, RED]), splat(table[index, GREEN]), splat(table[index, BLUE])
         dx = pixel_x - splat(table[index, X])
-        q_sum, qy_sum, qyy_sum = zero, zero, zero
-        red_sum, green_sum, blue_sum, depth_sum, slope_y_sum = zero, zero, zero, zero, zero
+        q_sum, qy_sum, qyy_sum, red_sum, green_sum, blue_sum, depth_sum, slope_y_sum = (
+            zero, zero, zero, zero, zero, zero, zero, zero,
+        )  # fmt: skip
         for row in range(max(first_row, top), min(last_row, bottom) + 1):
             at = row * TILE_WIDTH
             dy = number(tile_y + row) + number(0.5) - table[index, Y]
@@ -279,9 +282,11 @@ def _blend_tile_gradient(table: Any, hits: Any, first: int, last: int, tile_x: i
             g_blue = load(scratch, G_BLUE * TILE_PIXELS + at)
             value = g_red * red + g_green * green + g_blue * blue - load(scratch, G_REST * TILE_PIXELS + at)
             if depth:
-                g_depth = load(scratch, G_DEPTH * TILE_PIXELS + at)
-                value = value + g_depth * _row_depth(table, index, dx, dy)
-                g_depth = weight * g_depth
+                z = _row_depth(table, index, dx, dy)
+                g_depth2 = z * load(scratch, G_DEPTH2 * TILE_PIXELS + at)
+                g_depth = g_depth2 + load(scratch, G_DEPTH * TILE_PIXELS + at)
+                value = value + g_depth * z
+                g_depth = weight * (g_depth + g_depth2)
                 depth_sum = depth_sum + g_depth
                 slope_y_sum = slope_y_sum + g_depth * splat(dy)
             part = weight * value
@@ -327,7 +332,7 @@ def blend_gradient(
 
     Args:
         table, hits, tile_start, tile_end, background, images: as `blend` had and left them.
-        grads: ∂L/∂ colour (H, W, 3), alpha (H, W), Σ w z (H, W or 0, 0).
+        grads: ∂L/∂ colour (H, W, 3), alpha (H, W), Σ w z and Σ w z² (H, W or 0, 0).
         gradient: (H · HIT_GRADIENT_WIDTH,) of the hits, one after the other, written.
         workers: number of threads.
     """

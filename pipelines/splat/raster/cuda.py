@@ -29,6 +29,8 @@ from pipelines.splat.raster.api import (
 from pipelines.splat.raster.reference import bounded_slope, screen_depth_covariance
 
 _EVERY_BATCH = 2**31 - 1
+# Pairs of the three numbers of a plane.
+_PRODUCTS = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
 
 
 def cuda_available() -> bool:
@@ -69,24 +71,29 @@ class CudaRasterizer:
             packed=True,
             backgrounds=_row(settings.background, device),
         )
-        expected, median = None, None
+        found = Render(image[0], alpha[0, ..., 0], _screen_stats(meta))
         if settings.depth:
             slope = _depth_slope(gaussians, cam_from_model, camera, meta)
-            expected = self._expected_depth(meta, slope, camera, alpha)
-            median = self._median_depth(meta, slope, camera)
-        return Render(image[0], alpha[0, ..., 0], expected, median, _screen_stats(meta))
+            found.expected_depth, found.depth_variance = self._depth_moments(meta, slope, camera, found.alpha)
+            found.median_depth = self._median_depth(meta, slope, camera)
+        return found
 
-    def _expected_depth(self, meta: dict[str, Any], slope: Tensor, camera: Pinhole, alpha: Tensor) -> Tensor:
-        """(H, W) Σ w z / Σ w: the blend of z = z₀ + q · (p − middle of the image), whose three numbers are blended.
+    def _depth_moments(
+        self, meta: dict[str, Any], slope: Tensor, camera: Pinhole, alpha: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Mean and variance (H, W) of z = z₀ + q · (p − middle of the image), with the weights of blending.
 
-        About the middle, because a plane's depth at (0, 0) can be far from those that it is seen at.
+        The three numbers of each Gaussian are blended, and the six products of them that make z². About the middle,
+        because a plane's depth at (0, 0) can be far from those that it is seen at.
         """
         middle = 0.5 * _row((float(camera.width), float(camera.height)), slope.device)
         at_middle = meta["depths"] + (slope * (middle - meta["means2d"])).sum(dim=-1)
+        plane = torch.cat([at_middle[:, None], slope], dim=-1)
+        rows, columns = _PRODUCTS
         planes, _ = self._gsplat.rasterize_to_pixels(
             meta["means2d"],
             meta["conics"],
-            torch.cat([at_middle[:, None], slope], dim=-1),
+            torch.cat([plane, plane[:, rows] * plane[:, columns]], dim=-1),
             meta["opacities"],
             camera.width,
             camera.height,
@@ -95,10 +102,14 @@ class CudaRasterizer:
             meta["flatten_ids"],
             packed=True,
         )
-        constant, per_column, per_row = planes[0].unbind(-1)
-        u = torch.arange(camera.width, device=slope.device) + 0.5 * (1 - camera.width)
+        u = (torch.arange(camera.width, device=slope.device) + 0.5 * (1 - camera.width)).expand(camera.height, -1)
         v = torch.arange(camera.height, device=slope.device) + 0.5 * (1 - camera.height)
-        return (constant + per_column * u + per_row * v[:, None]) / alpha[0, ..., 0].clamp(min=1e-10)
+        at = torch.stack([torch.ones_like(u), u, v[:, None].expand_as(u)], dim=-1)
+        twice = torch.tensor([1.0 if i == j else 2.0 for i, j in zip(*_PRODUCTS, strict=True)], device=u.device)
+        total = alpha.clamp(min=1e-10)
+        mean = (planes[0, ..., :3] * at).sum(dim=-1) / total
+        square = (planes[0, ..., 3:] * at[..., rows] * at[..., columns] * twice).sum(dim=-1) / total
+        return mean, (square - mean.square()).clamp_min(0.0)
 
     @torch.no_grad()
     def _median_depth(self, meta: dict[str, Any], slope: Tensor, camera: Pinhole) -> Tensor:

@@ -62,7 +62,7 @@ def render_reference(
     background = torch.tensor(settings.background, dtype=dtype)
     colour = torch.einsum("gp,gc->pc", weight, colours) + final[:, None] * background
     size = (camera.height, camera.width)
-    expected, median = None, None
+    expected, variance, median = None, None, None
     if settings.depth:
         quats_wxyz, log_scales = sorted_gaussians.quats_wxyz, sorted_gaussians.log_scales
         cov_px_m = screen_depth_covariance(quats_wxyz, log_scales, mean_in_cam, pose, camera)
@@ -70,10 +70,13 @@ def render_reference(
         depth = mean_in_cam[:, 2:] + (slope[:, None] * offset_px).sum(dim=-1)
         opaque = final < 1
         depth_sum = (depth * weight).sum(dim=0)
-        expected = torch.where(opaque, depth_sum / torch.where(opaque, 1 - final, 1.0), 0.0).view(size)
+        total = torch.where(opaque, 1 - final, 1.0)
+        mean = torch.where(opaque, depth_sum / total, 0.0)
+        variance = (((depth - mean).square() * weight).sum(dim=0) / total).view(size)
+        expected = mean.view(size)
         median = _median_depth(depth, before, after, counted).view(size)
     stats = _screen_stats(front, mean_px, cov_px2, sorted_gaussians.logit_opacities, camera)
-    return Render(colour.view(*size, 3), (1 - final).view(size), expected, median, stats)
+    return Render(colour.view(*size, 3), (1 - final).view(size), stats, expected, variance, median)
 
 
 def project(

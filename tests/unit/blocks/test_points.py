@@ -74,6 +74,20 @@ def test_surface_at_another_height_is_measured_as_such(trained: Trained) -> None
     assert found[0, 2] - points[0].position_in_geo[2] == pytest.approx(-1.0, abs=0.05)
 
 
+def test_roughness_of_the_surface_is_evened_out(trained: Trained) -> None:
+    # 25 pixels of independent noise leave a fifth of it in the middle of their plane.
+    points, rng = trained.survey.control_points[:1], np.random.default_rng(5)
+    seen = sights(trained, points)
+    depth = planes(trained, points[0].position_in_geo[2])
+    roughness = 0.002
+    rough = {i: each * (1 + roughness * rng.standard_normal(each.shape)) for i, each in depth.items()}
+    found = points_by_model(trained, seen, rough, dict.fromkeys(depth, PINHOLE), 1)
+    centers = trained.geo_from_model.apply(trained.poses.cam_center_in_model[seen.camera])
+    distance = float(np.linalg.norm(centers - surveyed(points), axis=1).max())
+    sigma_of_view = roughness * distance / 5
+    assert np.linalg.norm(found - surveyed(points)) < 3 * sigma_of_view * 1.25 / np.sqrt(len(seen.point))
+
+
 def test_wrong_surface_in_few_views_is_outvoted(trained: Trained) -> None:
     points = trained.survey.control_points[:1]
     seen = sights(trained, points)

@@ -80,6 +80,22 @@ def test_sample_is_thinned_and_coloured(surface: SceneSurface) -> None:
     np.testing.assert_array_equal(some.point_in_model, surface.sample(300, seed=0).point_in_model)
 
 
+def test_sample_knows_the_slope_of_the_hill(surface: SceneSurface) -> None:
+    some = surface.sample(2000, seed=0)
+    near = (np.abs(some.point_in_model[:, :2]) < 26).all(axis=1) & np.isfinite(some.normal_in_model).all(axis=1)
+    assert near.sum() > 300
+    x, y, step = some.point_in_model[near, 0], some.point_in_model[near, 1], 0.5
+    slope = [
+        (ground_height(x + step, y) - ground_height(x - step, y)) / (2 * step),
+        (ground_height(x, y + step) - ground_height(x, y - step)) / (2 * step),
+    ]
+    true = np.stack([-slope[0], -slope[1], np.ones_like(x)], axis=1)
+    true /= np.linalg.norm(true, axis=1, keepdims=True)
+    angle = np.degrees(np.arccos(np.clip(np.abs((true * some.normal_in_model[near]).sum(axis=1)), 0, 1)))
+    # A quarter of a pixel of height against four pixels across is 3.6°.
+    assert np.median(angle) < 2 * 3.6
+
+
 def test_maps_are_kept_and_continued(surface: SceneSurface, material: tuple[Rendered, Scene, ImageCache]) -> None:
     folder = surface.folder
     first = sorted(folder.glob("*.depth.npy"))

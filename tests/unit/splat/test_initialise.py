@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from pipelines.errors import DegenerateGeometryError
+from pipelines.splat.gaussians import rotation_matrices
 from pipelines.splat.initialise import InitialisationOptions, gaussians_from_points, scene_extent
 from pipelines.splat.sh import rgb_from_sh
 
@@ -29,6 +30,25 @@ def test_a_grid_gives_gaussians_of_its_spacing() -> None:
     rows = same.all(axis=2).argmax(axis=1)
     np.testing.assert_allclose(rgb_from_sh(gaussians.sh[:, 0]).numpy(), colours[rows] / 255, atol=1e-6)
     assert all(tensor.dtype == torch.float32 for tensor in gaussians.tensors().values())
+
+
+def test_known_normals_make_discs() -> None:
+    points, rng = grid(), np.random.default_rng(2)
+    normals = rng.normal(size=points.shape)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals[0], normals[1], normals[2] = [0, 0, 1], [0, 0, -1], np.nan
+    options = InitialisationOptions(thickness=0.2, disc_opacity=0.6)
+    gaussians = gaussians_from_points(points, np.zeros_like(points), options, normals)
+    rows = (gaussians.means.numpy()[:, None] == points.astype(np.float32)).all(axis=2).argmax(axis=1)
+    third = rotation_matrices(gaussians.quats_wxyz)[:, :, 2].numpy()
+    known = rows != 2
+    along = np.abs((third * normals[rows]).sum(axis=1))
+    np.testing.assert_allclose(along[known], 1.0, atol=1e-6)
+    scales = gaussians.log_scales.exp().numpy()
+    np.testing.assert_allclose(scales[known], np.tile([0.5, 0.5, 0.1], (len(points) - 1, 1)), rtol=1e-5)
+    np.testing.assert_allclose(scales[~known], [[0.5, 0.5, 0.5]], rtol=1e-5)
+    opacity = torch.sigmoid(gaussians.logit_opacities).numpy()
+    np.testing.assert_allclose(opacity, np.where(known, 0.6, 0.1), rtol=1e-5)
 
 
 def test_float_colours_are_taken_as_they_are() -> None:

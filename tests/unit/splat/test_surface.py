@@ -8,9 +8,10 @@ import pytest
 import torch
 
 from pipelines.splat.gaussians import Gaussians
-from pipelines.splat.raster.api import Pinhole
+from pipelines.splat.raster.api import Pinhole, RasterSettings, Render
 from pipelines.splat.raster.cpu import CpuRasterizer
 from pipelines.splat.surface import (
+    compactness_loss,
     depth_loss,
     depth_normals,
     disc_normals,
@@ -116,3 +117,48 @@ def test_measured_depth_is_the_mean_on_the_surface_that_the_median_shows() -> No
     median = torch.tensor([[10.0, 10.0, 0.0]])
     expected = torch.tensor([[10.05, 7.0, 3.0]])  # on the surface, haze before it, haze alone
     torch.testing.assert_close(measured_depth(median, expected), torch.tensor([[10.05, 10.0, 0.0]]))
+
+
+def haze(apart_m: float) -> Gaussians:
+    """Two walls that half hide what is behind them, and an opaque third, about 5 m ahead."""
+    walls = [wall(0.0) for _ in range(3)]
+    for place, each in enumerate(walls):
+        each.means[:, 2] += (place - 1) * apart_m
+        each.logit_opacities[:] = -1.5 if place < 2 else 3.0
+    return Gaussians.concatenate(walls)
+
+
+def seen(gaussians: Gaussians) -> Render:
+    return CpuRasterizer().render(gaussians, POSE, CAMERA, RasterSettings(sh_degree=0, depth=True))
+
+
+def compactness(render: Render) -> torch.Tensor:
+    assert render.expected_depth is not None and render.depth_variance is not None
+    return compactness_loss(render.expected_depth, render.depth_variance, render.alpha)
+
+
+def test_one_surface_is_compact_and_haze_is_not() -> None:
+    # 1 cm thick discs spread far less than the 2.5 cm that a two-hundredth of 5 m is; 0.3 m is twelve times that.
+    assert float(compactness(seen(haze(0.0)))) < 0.05
+    assert float(compactness(seen(haze(0.3)))) > 3
+
+
+def test_an_edge_costs_little_more_than_haze() -> None:
+    # Ten times as far apart would cost a hundred times as much, were it not for the logarithm.
+    assert float(compactness(seen(haze(3.0)))) < 2.5 * float(compactness(seen(haze(0.3))))
+
+
+def test_the_gradient_clears_the_haze() -> None:
+    gaussians = haze(0.2)
+    gaussians.means.requires_grad_()
+    gaussians.logit_opacities.requires_grad_()
+    optimizer = torch.optim.Adam([gaussians.means, gaussians.logit_opacities], lr=0.02)
+    before = seen(gaussians).depth_variance
+    for _ in range(25):
+        optimizer.zero_grad()
+        compactness(seen(gaussians)).backward()
+        optimizer.step()
+    after = seen(gaussians)
+    assert before is not None and after.depth_variance is not None
+    assert float(after.depth_variance.mean().detach()) < 0.05 * float(before.mean().detach())
+    assert float(after.alpha.min().detach()) > 0.8  # not by clearing the surface, too

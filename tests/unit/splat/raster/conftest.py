@@ -46,10 +46,10 @@ def as_leaves(scene: Scene, dtype: torch.dtype) -> Scene:
 
 
 def weighted_loss(render: Render, *, seed: int = 0) -> Tensor:
-    """A loss to which every pixel of colour, alpha and expected depth contributes with its own random weight."""
+    """A loss to which every pixel of every differentiable image contributes with its own random weight."""
     random = torch.Generator().manual_seed(seed)
     loss = torch.zeros((), dtype=torch.float64)
-    for image in (render.colour, render.alpha, render.expected_depth):
+    for image in (render.colour, render.alpha, render.expected_depth, render.depth_variance):
         if image is not None:
             loss = loss + (image * torch.randn(image.shape, generator=random, dtype=torch.float64)).sum()
     return loss

@@ -31,12 +31,14 @@ def test_images_and_gradients(make_scene, leaves, loss_of, camera, dtype, case):
     render = CpuRasterizer().render(gaussians, pose, camera, settings)
 
     image_error, gradient_error = TOLERANCE[dtype]
-    for name in ("colour", "alpha", "expected_depth", "median_depth"):
+    for name in ("colour", "alpha", "expected_depth", "depth_variance", "median_depth"):
         ours, theirs = getattr(render, name), getattr(expected, name)
         assert (ours is None) == (theirs is None)
         if ours is not None:
             assert ours.dtype == dtype
-            torch.testing.assert_close(ours.double(), theirs, rtol=0, atol=10 * image_error)
+            # The variance is what is left of squares of up to 100 m².
+            scale = 100 if name == "depth_variance" else 10
+            torch.testing.assert_close(ours.double(), theirs, rtol=0, atol=scale * image_error)
     assert torch.equal(render.stats.visible, expected.stats.visible)
     torch.testing.assert_close(render.stats.radius_px, expected.stats.radius_px, rtol=1e-4, atol=1e-3)
 

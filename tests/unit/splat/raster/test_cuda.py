@@ -50,7 +50,7 @@ class StandIn:
     def rasterize_to_pixels(
         self, means2d, conics, colors, opacities, width, height, tile_size, offsets, order, *, packed
     ):
-        assert packed and tile_size == 16 and colors.shape == (len(means2d), 3)
+        assert packed and tile_size == 16 and colors.shape in ((len(means2d), 3), (len(means2d), 9))
         v, u = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
         dx, dy = (center[order, None, None] - at for center, at in zip(means2d.T, (u, v), strict=True))
         a, b, c = conics[order].T[:, :, None, None]
@@ -133,6 +133,7 @@ def test_images_statistics_and_median(make_scene, leaves, camera, backend):
     torch.testing.assert_close(render.median_depth, truth.median_depth, rtol=0, atol=1e-5)
     assert (truth.median_depth > 0).any() and (truth.median_depth == 0).any()
     torch.testing.assert_close(render.expected_depth, truth.expected_depth, rtol=0, atol=1e-4)
+    torch.testing.assert_close(render.depth_variance, truth.depth_variance, rtol=0, atol=1e-3)
     assert torch.equal(render.stats.visible, truth.stats.visible)
     torch.testing.assert_close(render.stats.radius_px, truth.stats.radius_px, rtol=1e-4, atol=1e-4)
     render.colour.sum().backward()
@@ -163,6 +164,7 @@ def test_without_depth_there_is_none(make_scene, camera, backend):
     render = rasteriser.render(gaussians, pose, camera, RasterSettings(0, BACKGROUND))
     assert render.colour.shape == (45, 70, 3)
     assert render.expected_depth is None
+    assert render.depth_variance is None
     assert render.median_depth is None
 
 
