@@ -1,8 +1,9 @@
-"""The options of every stage, each with its default, range and meaning, in one place.
+"""Options, each with its default, range and meaning in one place, and how they are given.
 
 Precedence: default < the workspace's `georef.toml` (one table a stage) < command-line flag. The command line
 derives its flags from these classes, so that a default exists once. Unknown keys and values out of range are
-errors that name the key.
+errors that name the key. Stages with many options have a file of their own: `ingest_config.py`,
+`train_config.py`.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 from pydantic.fields import FieldInfo
 
 from pipelines.errors import InputError
@@ -21,7 +22,6 @@ CONFIG_FILE = "georef.toml"
 AUTO = "auto"
 RigParameter = Literal["time-offset", "boresight", "lever-arm"]
 RIG_PARAMETERS: tuple[RigParameter, ...] = get_args(RigParameter)
-ERROR_PARAMETERS = ("bias", "lever-arm", "boresight")
 
 
 class InputMarker:
@@ -35,102 +35,6 @@ class StageConfig(BaseModel):
     """Base of all stage options: immutable, no unknown keys."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class IngestConfig(StageConfig):
-    """What `georef ingest` reads, and what it assumes where the files are silent."""
-
-    images: InputPath | None = Field(None, description="Folder of photographs.")
-    bag: InputPath | None = Field(
-        None, description="ROS bag with photographs and navigation: rosbag2 folder, .mcap, .db3 or ROS 1 .bag."
-    )
-    image_topic: str | None = Field(None, description="Topic of the photographs in the bag (default: by rule).")
-    fix_topic: str | None = Field(None, description="Topic of the positions in the bag (default: by rule).")
-    attitude_topic: str | None = Field(None, description="Topic of the attitudes in the bag (default: by rule).")
-    every: str | None = Field(
-        None, description="Take a frame of the bag every 2s, or every 5m flown (default: all)."
-    )
-    skip_blurred: bool = Field(False, description="Pass over blurred frames of the bag.")
-    origin: str | None = Field(
-        None,
-        description="Zero of a bag's local frame (odometry, poses): latitude,longitude,ellipsoidal height.",
-    )
-    time_offset: str = Field(
-        "0", description="Navigation clock minus camera clock in seconds; auto: estimate it after sfm."
-    )
-    estimate: str | None = Field(
-        None,
-        description="Estimate any of time-offset, boresight and lever-arm (with commas) after sfm, from the SfM "
-        "cameras against the recorded navigation.",
-    )
-    lever_arm: str | None = Field(
-        None,
-        description="Antenna seen from the camera in the body's axes, forward,right,down in metres (default: /tf).",
-    )
-    camera_mount: str | None = Field(
-        None,
-        description="How the camera is turned in the body, yaw,pitch,roll in degrees; 0,-90,0 looks down "
-        "(default: /tf).",
-    )
-    boresight: str = Field(
-        "0,0,0", description="Rotation vector from the true to the nominal camera axes, x,y,z in degrees."
-    )
-    trajectory: InputPath | None = Field(None, description="CSV with a header: image and/or timestamp, position …")
-    geo: InputPath | None = Field(None, description="ODM geo.txt with the image positions.")
-    gcp: InputPath | None = Field(None, description="ODM gcp_list.txt: ground control points and their marks.")
-    checkpoints: InputPath | None = Field(None, description="Check points, in the form of gcp_list.txt.")
-    check: tuple[str, ...] = Field((), description="Name of a control point to use as a check point instead.")
-    test_every: int = Field(8, ge=0, description="Hold out every N-th image for testing (0: none).")
-    crs: str | None = Field(None, description="CRS of x,y,z columns in the trajectory, e.g. EPSG:32632+5773.")
-    vertical: str | None = Field(
-        None, description="Vertical datum of the heights: ellipsoidal, EGM96, EGM2008 or EPSG:n."
-    )
-    sigma_h: float | None = Field(None, gt=0, description="Horizontal σ of every position in metres.")
-    sigma_v: float | None = Field(None, gt=0, description="Vertical σ of every position in metres.")
-    sigma_attitude: float | None = Field(None, gt=0, description="σ of the attitude in degrees.")
-    sigma_gcp_h: float = Field(0.02, gt=0, description="Horizontal σ of surveyed points in metres.")
-    sigma_gcp_v: float = Field(0.03, gt=0, description="Vertical σ of surveyed points in metres.")
-    sigma_mark: float = Field(0.5, gt=0, description="σ of an image mark in pixels.")
-    max_gap: float = Field(1.0, gt=0, description="Longest gap to interpolate over in the trajectory, in seconds.")
-    focal_px: float | None = Field(None, gt=0, description="Focal length in pixels, instead of the one from EXIF.")
-    copy_images: bool = Field(
-        False, description="Copy the photographs into the workspace.", json_schema_extra={"flag": "--copy"}
-    )
-
-    @property
-    def time_offset_s(self) -> float:
-        """Seconds; zero while it is still to be estimated."""
-        return 0.0 if self.time_offset == AUTO else float(self.time_offset)
-
-    @property
-    def wanted(self) -> tuple[RigParameter, ...]:
-        """What of the rig is to be estimated, in the usual order."""
-        asked = {*(self.estimate or "").split(","), *(["time-offset"] if self.time_offset == AUTO else [])}
-        return tuple(name for name in RIG_PARAMETERS if name in asked)
-
-    @field_validator("estimate")
-    @classmethod
-    def _are_parameters(cls, text: str | None) -> str | None:
-        return text if text is None else rig_parameters(text)
-
-    @field_validator("time_offset")
-    @classmethod
-    def _is_offset(cls, text: str) -> str:
-        if text != AUTO and not abs(float(text)) < 1e6:
-            raise ValueError("a number of seconds, or auto")
-        return text
-
-    @field_validator("lever_arm", "camera_mount", "boresight")
-    @classmethod
-    def _is_triple(cls, text: str | None) -> str | None:
-        if text is not None:
-            triple(text)
-        return text
-
-    @field_validator("origin")
-    @classmethod
-    def _is_on_earth(cls, text: str | None) -> str | None:
-        return text if text is None else on_earth(text)
 
 
 class SfmConfig(StageConfig):
@@ -186,75 +90,6 @@ class InitSim3Config(StageConfig):
     )
     control_points: bool = Field(True, description="Use the control points.")
     seed: int = Field(0, ge=0, description="Seed of the RANSAC.")
-
-
-class TrainConfig(StageConfig):
-    """Joint optimisation of Gaussians, similarity and camera corrections."""
-
-    preset: Literal["smoke", "fast", "standard", "high"] = Field("standard", description="Effort.")
-    iterations: int | None = Field(None, ge=1, description="Iterations (default: the preset's).")
-    max_image_size: int | None = Field(
-        None, ge=32, description="Longest image side for training in pixels (default: the preset's)."
-    )
-    max_gaussians: int | None = Field(None, ge=100, description="Limit of Gaussians (default: the preset's).")
-    backend: Literal["auto", "cpu", "cuda"] = Field("auto", description="Rasteriser.")
-    sh_degree: int = Field(3, ge=0, le=3, description="Degree of the spherical harmonics.")
-    strategy: Literal["default", "mcmc", "fast"] = Field(
-        "default", description="Where Gaussians are added and removed: as 3DGS, by MCMC, or as several views agree."
-    )
-    coarse_to_fine: bool = Field(True, description="Start with shrunken photographs.")
-    exposure: bool = Field(True, description="Fit the exposure of each training photograph.")
-    dense: bool = Field(True, description="Find the scene's surface by multi-view stereo first, to start from.")
-    faithful_surface: bool = Field(True, description="Hold the Gaussians to the surface, for depths to measure in.")
-    geo_loss: bool = Field(True, description="Use the geographic losses.")
-    weighting: Literal["whitened", "paper"] = Field(
-        "whitened",
-        description="Residuals divided by their σ, or plain mean squares as in the paper.",
-    )
-    gcp_loss: bool = Field(True, description="Use the control points, L_gcp.")
-    gcp_mode: Literal["camera", "depth"] = Field(
-        "camera", description="Find control points by intersecting their marks, or through the rendered depth."
-    )
-    rel_loss: bool = Field(True, description="Use distances between located points, L_rel.")
-    geo_weight: float = Field(0.05, gt=0, description="Final weight w_max of the geographic losses (eq. 27).")
-    geo_schedule: Literal["rising", "constant"] = Field(
-        "rising", description="Let that weight rise as in eq. 27, or be final from the first iteration."
-    )
-    loss_weights: Literal["fixed", "learned"] = Field(
-        "fixed", description="Weigh the geographic losses by the stated σ, or learn a variance factor for each."
-    )
-    estimate: str = Field(
-        "auto",
-        description="Constant errors to estimate: any of bias (of the positions of a flight), lever-arm and "
-        "boresight, with commas; auto: a bias that 3 or more control points show; or none.",
-    )
-    optimize_cameras: bool = Field(
-        True,
-        description="Correct the training cameras while training; unless weighted as in the paper, the lens too.",
-    )
-    checkpoint_every: int = Field(500, ge=1, description="Iterations between checkpoints.")
-    log_every: int = Field(10, ge=1, description="Iterations between lines of metrics.jsonl.")
-    seed: int = Field(0, ge=0, description="Seed of every random choice.")
-
-    @property
-    def estimated(self) -> tuple[str, ...]:
-        """The constant errors that are asked for by name."""
-        return tuple(name for name in ERROR_PARAMETERS if name in self.estimate.split(","))
-
-    @field_validator("estimate")
-    @classmethod
-    def _are_errors(cls, text: str) -> str:
-        unknown = [name for name in text.split(",") if name not in ERROR_PARAMETERS]
-        if unknown and text not in (AUTO, "none"):
-            raise ValueError(f"{unknown[0]!r} is none of {', '.join(ERROR_PARAMETERS)}; or auto, or none")
-        return text
-
-    @field_validator("estimate")
-    @classmethod
-    def _has_sigma(cls, text: str, info: ValidationInfo) -> str:
-        if info.data.get("weighting") == "paper" and text not in (AUTO, "none"):
-            raise ValueError("constant errors are estimated with --weighting whitened only")
-        return text
 
 
 class EvaluateConfig(StageConfig):

@@ -18,7 +18,6 @@ from numpy.typing import ArrayLike
 
 from pipelines.blocks.intake import LEAST_IMAGES, pose_options, take_in
 from pipelines.blocks.rig import require_estimable
-from pipelines.config import IngestConfig
 from pipelines.errors import InputError
 from pipelines.formats.ground_points import GroundFile, GroundPoint, read_ground_file, require_near, split_checks
 from pipelines.formats.measured import Measured
@@ -27,6 +26,7 @@ from pipelines.formats.photo_folder import Photo
 from pipelines.formats.poses import complete
 from pipelines.geodesy import enu
 from pipelines.geometry.rotations import matrix_from_quat_xyzw, quat_xyzw_from_matrix
+from pipelines.ingest_config import IngestConfig
 from pipelines.products import (
     Attitude,
     Fix,

@@ -13,13 +13,13 @@ from pipelines.config import (
     EvaluateConfig,
     ExportPlyConfig,
     GeolocateConfig,
-    IngestConfig,
     InitSim3Config,
     SfmConfig,
     StageConfig,
-    TrainConfig,
 )
 from pipelines.errors import GeorefError
+from pipelines.ingest_config import IngestConfig
+from pipelines.train_config import TrainConfig
 
 SURVEY = "ingest/survey.json"
 TRACK = "ingest/track.npz"  # not always there

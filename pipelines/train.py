@@ -21,7 +21,6 @@ from pipelines.blocks.material import Material, initial_gaussians, points_to_hol
 from pipelines.blocks.scene import Scene, initial_scene, photographs
 from pipelines.blocks.surface import SceneSurface
 from pipelines.blocks.trainer import JointOptions, JointTrainer, Views
-from pipelines.config import TrainConfig
 from pipelines.formats.colmap import read_sparse
 from pipelines.formats.image_cache import ImageCache
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
@@ -48,6 +47,7 @@ from pipelines.splat.raster.api import Rasterizer, rasterizer
 from pipelines.splat.storage import write_gaussians
 from pipelines.splat.surface import SurfaceSettings
 from pipelines.stages import POINTS, SIM3, SPARSE, SURVEY
+from pipelines.train_config import TrainConfig
 from pipelines.workspace import StageRun, Summary
 
 log = logging.getLogger(__name__)

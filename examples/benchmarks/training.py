@@ -28,7 +28,6 @@ from pipelines.blocks.material import Material
 from pipelines.blocks.scene import Scene, initial_scene, photographs
 from pipelines.blocks.surface import SceneSurface
 from pipelines.blocks.trainer import JointTrainer
-from pipelines.config import TrainConfig
 from pipelines.formats.colmap import read_sparse
 from pipelines.formats.image_cache import ImageCache
 from pipelines.products import InitialSimilarity, Survey, load_json
@@ -40,6 +39,7 @@ from pipelines.splat.optimizer import GaussianAdam
 from pipelines.splat.raster.api import Pinhole, RasterSettings, rasterizer
 from pipelines.stages import SIM3, SPARSE, SURVEY
 from pipelines.train import make_trainer
+from pipelines.train_config import TrainConfig
 from pipelines.workspace import Workspace
 
 

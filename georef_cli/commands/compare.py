@@ -11,7 +11,7 @@ from georef_cli import boundary, options, tables
 from georef_cli.display import progress_for
 from georef_cli.output import document_of, print_json, print_rich
 from pipelines.compare import NAMES, TRAIN_OPTIONS, chosen, compare
-from pipelines.config import TrainConfig
+from pipelines.train_config import TrainConfig
 
 
 def _compare(ctx: click.Context, **values: Any) -> None:

@@ -11,8 +11,8 @@ from georef_cli import boundary, options
 from georef_cli.display import progress_for
 from georef_cli.output import print_outcomes
 from pipelines import runner
-from pipelines.config import IngestConfig
 from pipelines.errors import GeorefError
+from pipelines.ingest_config import IngestConfig
 from pipelines.stages import BY_NAME, PIPELINE, StageSpec, stage_slice
 
 # Options of later stages that `run` offers too, and the stages that each is for. The others are set in

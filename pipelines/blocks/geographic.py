@@ -8,7 +8,7 @@ import numpy as np
 
 from pipelines.blocks.measurements import attitudes_of, control_marks, depth_marks, fixes_of, pairs_of
 from pipelines.blocks.scene import Scene
-from pipelines.config import AUTO, TrainConfig
+from pipelines.config import AUTO
 from pipelines.errors import InputError
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.similarity import moved_pivot
@@ -20,6 +20,7 @@ from pipelines.georef.similarity import LearnableSimilarity
 from pipelines.georef.start import begin, bias_pays
 from pipelines.georef.systematic import SystematicErrors
 from pipelines.products import GeolocatedPoints, InitialSimilarity, Survey
+from pipelines.train_config import TrainConfig
 
 # Fewer control points cannot tell a bias of the fixes from a blunder of their own.
 _LEAST_CONTROL = 3

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.config import IngestConfig, triple
+from pipelines.config import triple
 from pipelines.errors import InputError
 from pipelines.formats.bag_photos import FrameOptions, parse_every
 from pipelines.formats.bag_survey import BagOptions, RawTrack, read_flight
@@ -25,6 +25,7 @@ from pipelines.geodesy import enu
 from pipelines.geodesy.vertical import parse_vertical
 from pipelines.geometry.rig import Rig, boresight, mount
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
+from pipelines.ingest_config import IngestConfig
 from pipelines.products import CameraPrior, FloatArray, NavigationTrack, Origin
 from pipelines.progress import SILENT, Progress
 

@@ -10,7 +10,6 @@ import torch
 from pipelines.blocks.geographic import geo_problem
 from pipelines.blocks.scene import Scene, make_scene
 from pipelines.blocks.trained import Trained
-from pipelines.config import TrainConfig
 from pipelines.geometry.rotations import log_so3
 from pipelines.geometry.similarity import Similarity
 from pipelines.georef.posterior import minimise
@@ -18,6 +17,7 @@ from pipelines.georef.problem import GeoProblem
 from pipelines.georef.similarity import LearnableSimilarity
 from pipelines.products import InitialSimilarity
 from pipelines.stages import BY_NAME
+from pipelines.train_config import TrainConfig
 from pipelines.workspace import Workspace
 
 

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 
-from pipelines.config import IngestConfig
 from pipelines.geodesy.enu import enu_from_lla, lla_from_enu
 from pipelines.geometry.rotations import log_so3, matrix_from_quat_xyzw
 from pipelines.ingest import build_survey, survey_and_track
+from pipelines.ingest_config import IngestConfig
 from pipelines.products import Survey, load_json
 from pipelines.simulate import simulate
 from pipelines.simulate_config import SimulateConfig

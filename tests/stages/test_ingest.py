@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipelines.config import IngestConfig
 from pipelines.errors import InputError
 from pipelines.geodesy import enu
 from pipelines.geodesy.crs import parse_crs
 from pipelines.geometry.rotations import geo_from_cam, matrix_from_quat_xyzw
 from pipelines.ingest import build_survey
+from pipelines.ingest_config import IngestConfig
 from pipelines.products import Survey, load_json
 from pipelines.runner import run_stage
 from pipelines.stages import BY_NAME, SURVEY

@@ -16,11 +16,12 @@ import pycolmap
 import pytest
 from rosbags.highlevel import AnyReader
 
-from pipelines.config import IngestConfig, resolve
+from pipelines.config import resolve
 from pipelines.errors import InputError
 from pipelines.geodesy.enu import enu_from_lla, lla_from_enu
 from pipelines.geometry.rotations import geo_from_cam, log_so3
 from pipelines.ingest import build_survey, survey_and_track
+from pipelines.ingest_config import IngestConfig
 from pipelines.products import Origin, load_json
 from pipelines.simulate import SimulationSummary, fly_survey, simulate
 from pipelines.simulate_config import SimulateConfig

@@ -18,7 +18,6 @@ from scipy.stats import chi2
 from splat_scenes import TRAINING, Flight
 from threads import single_thread
 
-from pipelines.config import TrainConfig
 from pipelines.errors import BackendUnavailableError, DegenerateGeometryError, InputError
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.similarity import Similarity
@@ -31,6 +30,7 @@ from pipelines.splat.raster.cpu import CpuRasterizer
 from pipelines.splat.storage import read_gaussians
 from pipelines.stages import BY_NAME, GAUSSIANS, MODEL, SIM3, SURVEY
 from pipelines.train import PRESETS, Preset, effort
+from pipelines.train_config import TrainConfig
 from pipelines.workspace import Workspace
 
 pytestmark = pytest.mark.usefixtures("one_thread")

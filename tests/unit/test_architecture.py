@@ -23,8 +23,8 @@ PACKAGES = ("georef_cli", "pipelines")
 FOUNDATION = {
     f"pipelines.{name}"
     for name in (
-        "config", "errors", "fingerprints", "interrupts", "products", "progress", "simulate_config", "stages",
-        "states", "validators", "workspace",
+        "config", "errors", "fingerprints", "ingest_config", "interrupts", "products", "progress",
+        "simulate_config", "stages", "states", "train_config", "validators", "workspace",
     )
 }  # fmt: skip
 # Those that make no product of the workspace are called and built as stages are.

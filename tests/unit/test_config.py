@@ -8,18 +8,11 @@ from typing import Any
 import pytest
 from pydantic.fields import FieldInfo
 
-from pipelines.config import (
-    IngestConfig,
-    SfmConfig,
-    StageConfig,
-    TrainConfig,
-    flag_name,
-    input_paths,
-    load_toml,
-    resolve,
-)
+from pipelines.config import SfmConfig, StageConfig, flag_name, input_paths, load_toml, resolve
 from pipelines.errors import InputError
+from pipelines.ingest_config import IngestConfig
 from pipelines.stages import CONFIGS
+from pipelines.train_config import TrainConfig
 
 TOML = Path("/surveys/flight/georef.toml")
 

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from pipelines import runner, states
-from pipelines.config import IngestConfig
 from pipelines.errors import ConvergenceError, GeorefError, InputError, MissingProductError
 from pipelines.fingerprints import fingerprints
+from pipelines.ingest_config import IngestConfig
 from pipelines.stages import BY_NAME, PIPELINE, SPARSE, stage_slice
 from pipelines.workspace import StageRun, Summary, Workspace
 from tests import fakes

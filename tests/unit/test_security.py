@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from pipelines.blocks.scene import photographs
-from pipelines.config import IngestConfig
 from pipelines.errors import InputError
 from pipelines.formats.colmap import read_sparse, write_sparse
 from pipelines.ingest import build_survey
+from pipelines.ingest_config import IngestConfig
 from pipelines.products import GeolocatedPoints, Survey, load_json
 from pipelines.stages import POINTS, SPARSE, SURVEY
 from pipelines.workspace import Workspace

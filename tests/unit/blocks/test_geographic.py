@@ -12,7 +12,6 @@ from scenes import NOISELESS, initial, material, without_fixes
 from pipelines.blocks.geographic import geo_problem
 from pipelines.blocks.measurements import SURFACE_SIGMA
 from pipelines.blocks.scene import initial_scene
-from pipelines.config import TrainConfig
 from pipelines.errors import InputError
 from pipelines.formats.colmap import SparseModel
 from pipelines.geometry.cameras import Camera
@@ -20,6 +19,7 @@ from pipelines.geometry.lens import Lenses, bearings
 from pipelines.georef.losses import depth_residuals
 from pipelines.georef.problem import GeoProblem
 from pipelines.products import AttitudeRecord, Mark, Survey
+from pipelines.train_config import TrainConfig
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 CONFIG = TrainConfig()

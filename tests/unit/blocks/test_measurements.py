@@ -13,11 +13,12 @@ from pipelines.blocks.geographic import geo_problem
 from pipelines.blocks.measurements import fixes_of, flights, pairs_of, root_information
 from pipelines.blocks.scene import Scene as InModel
 from pipelines.blocks.scene import initial_scene
-from pipelines.config import GeolocateConfig, TrainConfig
+from pipelines.config import GeolocateConfig
 from pipelines.errors import InputError
 from pipelines.geolocate import geolocate
 from pipelines.georef.losses import pair_residuals
 from pipelines.products import GeolocatedPoints, Survey
+from pipelines.train_config import TrainConfig
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -22,9 +22,9 @@ from pipelines.blocks.geographic import geo_problem
 from pipelines.blocks.material import Material
 from pipelines.blocks.scene import initial_scene, photographs
 from pipelines.blocks.trainer import JointTrainer
-from pipelines.config import TrainConfig
 from pipelines.splat.raster.api import rasterizer
 from pipelines.train import make_trainer
+from pipelines.train_config import TrainConfig
 from pipelines.workspace import Workspace
 
 pytestmark = pytest.mark.usefixtures("one_thread")
