@@ -21,9 +21,10 @@ from pipelines.blocks.trained import Trained, load_trained, trained_pinholes
 from pipelines.formats.georef_sidecar import read_sidecar
 from pipelines.geodesy.enu import ecef_from_enu, ecef_from_enu_rotation, lla_of
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
-from pipelines.products import Fix, FloatArray, Origin, SurveyImage
+from pipelines.products import FloatArray
 from pipelines.splat.raster.api import RasterSettings, rasterizer
 from pipelines.splat.storage import read_gaussians
+from pipelines.survey import Fix, Origin, SurveyImage
 from pipelines.workspace import Workspace
 
 

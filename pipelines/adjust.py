@@ -18,9 +18,10 @@ from pipelines.errors import ConvergenceError, DegenerateGeometryError
 from pipelines.formats.colmap import SparseModel, load_reconstruction, pycolmap_module, quiet_colmap, read_sparse
 from pipelines.geometry.similarity import Similarity
 from pipelines.georef.alignment import Alignment, align
-from pipelines.products import Fix, FloatArray, InitialSimilarity, Survey, load_json, save_json
+from pipelines.products import FloatArray, InitialSimilarity, load_json, save_json
 from pipelines.robust.statistics import residual_stats
 from pipelines.stages import SPARSE, SURVEY
+from pipelines.survey import Fix, Survey
 from pipelines.workspace import StageRun, Summary
 
 _PRIOR_SCALE = 2.7955  # of Cauchy's kernel: root of the 95 % point of χ² with 3 degrees of freedom

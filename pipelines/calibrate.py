@@ -27,8 +27,9 @@ from pipelines.georef.rig_fit import (
     RigData,
     fit_rig,
 )
-from pipelines.products import FloatArray, NavigationTrack, RigCalibration, RigEstimate, Survey, load_json
+from pipelines.products import FloatArray, load_json
 from pipelines.stages import SPARSE, SURVEY, TRACK
+from pipelines.survey import NavigationTrack, RigCalibration, RigEstimate, Survey
 from pipelines.workspace import Workspace
 
 log = logging.getLogger(__name__)

@@ -28,7 +28,7 @@ from pipelines.config import EvaluateConfig
 from pipelines.errors import DegenerateGeometryError
 from pipelines.formats.image_cache import ImageCache
 from pipelines.geometry.cameras import Pinhole
-from pipelines.products import FloatArray, InitialSimilarity, SurveyedPoint, dump_json, load_json
+from pipelines.products import FloatArray, InitialSimilarity, dump_json, load_json
 from pipelines.progress import Progress
 from pipelines.robust.asprs import LEAST_POINTS, few_points
 from pipelines.robust.statistics import residual_stats
@@ -37,6 +37,7 @@ from pipelines.splat.metrics import lpips, psnr, ssim
 from pipelines.splat.raster.api import Rasterizer, RasterSettings, Render, rasterizer
 from pipelines.splat.surface import measured_depth
 from pipelines.stages import SIM3
+from pipelines.survey import SurveyedPoint
 from pipelines.workspace import StageRun, Summary
 
 log = logging.getLogger(__name__)

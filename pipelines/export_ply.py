@@ -21,20 +21,12 @@ from pipelines.geodesy.crs import ECEF, parse_crs
 from pipelines.geodesy.enu import ecef_from_enu, ecef_from_enu_rotation, ecef_from_lla, lla_from_ecef, lla_of
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
 from pipelines.geometry.similarity import Similarity, moved_pivot
-from pipelines.products import (
-    FloatArray,
-    Origin,
-    Quaternion,
-    SimilarityRecord,
-    Survey,
-    TrainedModel,
-    Vector3,
-    load_json,
-)
+from pipelines.products import FloatArray, Quaternion, SimilarityRecord, TrainedModel, Vector3, load_json
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.storage import read_gaussians, write_gaussians
 from pipelines.splat.transform import transformed
 from pipelines.stages import GAUSSIANS, MODEL, SPLAT, SURVEY
+from pipelines.survey import Origin, Survey
 from pipelines.workspace import StageRun, Summary
 
 _ORIGIN_DECIMALS_DEG = 6  # 0.1 m: short numbers that a person can pass on without loss

@@ -7,8 +7,9 @@ from pathlib import Path
 
 from pipelines.config import StageConfig, flag_name, input_paths
 from pipelines.errors import InputError
-from pipelines.products import Survey, load_json
+from pipelines.products import load_json
 from pipelines.stages import SURVEY, StageSpec
+from pipelines.survey import Survey
 from pipelines.workspace import Workspace
 
 Memo = dict[Path, str]

@@ -30,8 +30,9 @@ from pipelines.geometry.rays import CommonRotation, Intersections, Rays, Views, 
 from pipelines.geometry.rotations import log_so3
 from pipelines.georef.adjustment import BoolArray, Correspondences, RotationPrior
 from pipelines.georef.alignment import Alignment, align
-from pipelines.products import FloatArray, GeolocatedPoints, Survey, load_json
+from pipelines.products import FloatArray, GeolocatedPoints, load_json
 from pipelines.stages import SPARSE, SURVEY
+from pipelines.survey import Survey
 from pipelines.workspace import StageRun, Summary
 
 log = logging.getLogger(__name__)

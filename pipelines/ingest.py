@@ -27,21 +27,18 @@ from pipelines.formats.poses import complete
 from pipelines.geodesy import enu
 from pipelines.geometry.rotations import matrix_from_quat_xyzw, quat_xyzw_from_matrix
 from pipelines.ingest_config import IngestConfig
-from pipelines.products import (
+from pipelines.products import FloatArray, Matrix3, Vector3, save_json
+from pipelines.progress import SILENT, Progress
+from pipelines.survey import (
     Attitude,
     Fix,
-    FloatArray,
-    Matrix3,
     NavigationTrack,
     Origin,
     Survey,
     SurveyedPoint,
     SurveyImage,
-    Vector3,
     VerticalDatum,
-    save_json,
 )
-from pipelines.progress import SILENT, Progress
 from pipelines.workspace import StageRun, Summary
 
 log = logging.getLogger(__name__)

@@ -26,13 +26,13 @@ from pipelines.products import (
     GeolocatedPoints,
     InitialSimilarity,
     ResidualStats,
-    Survey,
     load_json,
     save_json,
 )
 from pipelines.robust.ransac import RansacOptions, ransac
 from pipelines.robust.statistics import residual_stats, squared_mahalanobis
 from pipelines.stages import POINTS, SPARSE, SURVEY
+from pipelines.survey import Survey
 from pipelines.workspace import StageRun, Summary
 
 _GUESS_POINTS = 1000

@@ -15,7 +15,7 @@ from typing import Any
 
 from pipelines.errors import GeorefError, InputError, MissingProductError
 from pipelines.fingerprints import Memo
-from pipelines.products import Survey, load_json
+from pipelines.products import load_json
 from pipelines.progress import SILENT, Progress
 from pipelines.stages import (
     CALIBRATE,
@@ -27,6 +27,7 @@ from pipelines.stages import (
     products_of,
 )
 from pipelines.states import BY_HAND, Flags, Request, must_exist, request, stage_config, status, why_stale
+from pipelines.survey import Survey
 from pipelines.workspace import Manifest, Resume, StageRun, Summary, Workspace, now
 
 log = logging.getLogger(__name__)

@@ -25,9 +25,10 @@ from pipelines.formats.colmap import load_reconstruction, quiet_colmap
 from pipelines.geometry.pairs import Views, all_pairs, select_pairs
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.interrupts import interruptible
-from pipelines.products import CameraPrior, Survey, load_json
+from pipelines.products import load_json
 from pipelines.progress import Progress
 from pipelines.stages import SURVEY
+from pipelines.survey import CameraPrior, Survey
 from pipelines.workspace import StageRun, Summary
 
 log = logging.getLogger(__name__)

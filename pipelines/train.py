@@ -29,7 +29,6 @@ from pipelines.products import (
     EstimatedError,
     GeolocatedPoints,
     InitialSimilarity,
-    Survey,
     TrainedCamera,
     TrainedLens,
     TrainedModel,
@@ -47,6 +46,7 @@ from pipelines.splat.raster.api import Rasterizer, rasterizer
 from pipelines.splat.storage import write_gaussians
 from pipelines.splat.surface import SurfaceSettings
 from pipelines.stages import POINTS, SIM3, SPARSE, SURVEY
+from pipelines.survey import Survey
 from pipelines.train_config import TrainConfig
 from pipelines.workspace import StageRun, Summary
 

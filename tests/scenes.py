@@ -12,23 +12,19 @@ from pipelines.formats.colmap import SparseModel, write_sparse
 from pipelines.geometry.cameras import Camera, project
 from pipelines.geometry.rotations import exp_so3, quat_xyzw_from_matrix
 from pipelines.geometry.similarity import Similarity
-from pipelines.products import (
+from pipelines.products import InitialSimilarity, SimilarityRecord, TrainedCamera, TrainedModel, save_json
+from pipelines.stages import SPARSE, SURVEY
+from pipelines.survey import (
     Attitude,
     CameraPrior,
     Fix,
-    InitialSimilarity,
     Mark,
     Origin,
-    SimilarityRecord,
     Survey,
     SurveyedPoint,
     SurveyImage,
-    TrainedCamera,
-    TrainedModel,
     VerticalDatum,
-    save_json,
 )
-from pipelines.stages import SPARSE, SURVEY
 from pipelines.workspace import Workspace
 
 CAMERA = Camera("OPENCV", 1200, 900, np.array([1020.0, 1018.0, 603.0, 447.0, -0.045, 0.012, 3e-4, -2e-4]))

@@ -26,12 +26,13 @@ from pipelines.geolocate import geolocate
 from pipelines.geometry.cameras import Camera
 from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.similarity import Similarity
-from pipelines.products import InitialSimilarity, Survey, save_json
+from pipelines.products import InitialSimilarity, save_json
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.raster.api import Pinhole, RasterSettings
 from pipelines.splat.raster.cpu import CpuRasterizer
 from pipelines.splat.sh import sh_from_rgb
 from pipelines.stages import POINTS, SIM3
+from pipelines.survey import Survey
 from pipelines.workspace import Workspace
 
 CAMERA = Camera("PINHOLE", 96, 72, np.array([90.0, 90.0, 48.0, 36.0]))

@@ -30,7 +30,7 @@ from pipelines.blocks.surface import SceneSurface
 from pipelines.blocks.trainer import JointTrainer
 from pipelines.formats.colmap import read_sparse
 from pipelines.formats.image_cache import ImageCache
-from pipelines.products import InitialSimilarity, Survey, load_json
+from pipelines.products import InitialSimilarity, load_json
 from pipelines.splat.densify import DefaultSettings, DefaultStrategy
 from pipelines.splat.losses import photometric_loss
 from pipelines.splat.memory import TrainingSize, predicted_peak_bytes
@@ -38,6 +38,7 @@ from pipelines.splat.metrics import psnr
 from pipelines.splat.optimizer import GaussianAdam
 from pipelines.splat.raster.api import Pinhole, RasterSettings, rasterizer
 from pipelines.stages import SIM3, SPARSE, SURVEY
+from pipelines.survey import Survey
 from pipelines.train import make_trainer
 from pipelines.train_config import TrainConfig
 from pipelines.workspace import Workspace

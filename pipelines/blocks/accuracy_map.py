@@ -17,7 +17,8 @@ from pipelines.blocks.prediction import Prediction
 from pipelines.blocks.restored import Restored
 from pipelines.blocks.trained import Trained
 from pipelines.geodesy.enu import ecef_from_enu, lla_from_ecef
-from pipelines.products import FloatArray, Origin
+from pipelines.products import FloatArray
+from pipelines.survey import Origin
 
 _CELLS = 48  # of the longer side
 _LEAST_RAYS = 3  # of an SfM point that stands for the scene

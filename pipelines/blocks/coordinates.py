@@ -8,7 +8,8 @@ import numpy as np
 
 from pipelines.geodesy.crs import PointCrs, parse_crs
 from pipelines.geodesy.enu import ecef_from_enu, lla_from_ecef, lla_of
-from pipelines.products import FloatArray, Survey
+from pipelines.products import FloatArray
+from pipelines.survey import Survey
 
 _WAYS = ("camera", "model")
 

@@ -19,7 +19,8 @@ from pipelines.georef.problem import GeoProblem
 from pipelines.georef.similarity import LearnableSimilarity
 from pipelines.georef.start import begin, bias_pays
 from pipelines.georef.systematic import SystematicErrors
-from pipelines.products import GeolocatedPoints, InitialSimilarity, Survey
+from pipelines.products import GeolocatedPoints, InitialSimilarity
+from pipelines.survey import Survey
 from pipelines.train_config import TrainConfig
 
 # Fewer control points cannot tell a bias of the fixes from a blunder of their own.

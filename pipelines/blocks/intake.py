@@ -26,8 +26,9 @@ from pipelines.geodesy.vertical import parse_vertical
 from pipelines.geometry.rig import Rig, boresight, mount
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.ingest_config import IngestConfig
-from pipelines.products import CameraPrior, FloatArray, NavigationTrack, Origin
+from pipelines.products import FloatArray
 from pipelines.progress import SILENT, Progress
+from pipelines.survey import CameraPrior, NavigationTrack, Origin
 
 LEAST_IMAGES = 3
 _BAG_ONLY = ("image_topic", "fix_topic", "attitude_topic", "every", "origin")

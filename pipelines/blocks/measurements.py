@@ -13,7 +13,8 @@ from pipelines.blocks.scene import Scene
 from pipelines.errors import InputError
 from pipelines.geometry.lens import bearings
 from pipelines.georef.measured import Attitudes, ControlMarks, DepthMarks, Fixes, Pairs, scale_share
-from pipelines.products import FloatArray, GeolocatedPoints, Survey, SurveyedPoint
+from pipelines.products import FloatArray, GeolocatedPoints
+from pipelines.survey import Survey, SurveyedPoint
 
 # Between the times of two consecutive fixes: longer, and the receiver may have started anew.
 FLIGHT_GAP_S = 600.0

@@ -12,7 +12,8 @@ from pipelines.geometry.rays import Rays, Views, intersect
 from pipelines.geometry.rotations import log_so3, matrix_from_quat_xyzw
 from pipelines.georef.adjustment import Correspondences, RotationPrior
 from pipelines.georef.alignment import mean_rotation
-from pipelines.products import FloatArray, Mark, Survey, SurveyedPoint
+from pipelines.products import FloatArray
+from pipelines.survey import Mark, Survey, SurveyedPoint
 
 _CONTRADICTION_SIGMAS = 6.0
 _CONTRADICTION_RAD = np.radians(15.0)  # never less: σ of an attitude are often optimistic

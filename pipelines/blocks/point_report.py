@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.blocks.points import Sights
-from pipelines.products import FloatArray, SurveyedPoint
+from pipelines.products import FloatArray
 from pipelines.robust.asprs import assess
+from pipelines.survey import SurveyedPoint
 
 
 def point_report(

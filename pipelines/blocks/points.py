@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from pipelines.blocks.trained import Trained
 from pipelines.geometry.cameras import Pinhole, undistort
 from pipelines.geometry.rays import Rays, Views, intersect
-from pipelines.products import FloatArray, SurveyedPoint
+from pipelines.products import FloatArray
 from pipelines.robust.statistics import spatial_median
+from pipelines.survey import SurveyedPoint
 
 # Rays of a mark are held to agree within their mark's σ and this much of the cameras' own error.
 _SIGMA_CENTER_M = 0.02

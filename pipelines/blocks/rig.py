@@ -12,7 +12,8 @@ from pipelines.errors import InputError
 from pipelines.geometry.rig import boresight
 from pipelines.geometry.rotations import matrix_from_quat_xyzw, quat_xyzw_from_matrix
 from pipelines.geometry.track import covered, places_at, turns_at
-from pipelines.products import Attitude, Fix, FloatArray, NavigationTrack, RigCalibration, Survey, SurveyImage
+from pipelines.products import FloatArray
+from pipelines.survey import Attitude, Fix, NavigationTrack, RigCalibration, Survey, SurveyImage
 
 # A position this far from the middle of all is a blunder, as `ingest` has it.
 _RANGE_M = 100_000.0

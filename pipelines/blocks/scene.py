@@ -20,8 +20,9 @@ from pipelines.geometry.bundle import CorrectionBasis, Network, correction_basis
 from pipelines.geometry.lens import Lenses
 from pipelines.geometry.similarity import Similarity
 from pipelines.georef.cameras import CameraPoses
-from pipelines.products import FloatArray, InitialSimilarity, Survey
+from pipelines.products import FloatArray, InitialSimilarity
 from pipelines.stages import SPARSE
+from pipelines.survey import Survey
 from pipelines.workspace import Workspace
 
 # Beyond this the dense normal matrix of the cameras no longer fits a laptop.

@@ -16,10 +16,11 @@ from pipelines.geometry.lens import Lenses
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.similarity import Similarity
 from pipelines.georef.cameras import CameraPoses
-from pipelines.products import InitialSimilarity, SimilarityRecord, Survey, TrainedModel, load_json
+from pipelines.products import InitialSimilarity, SimilarityRecord, TrainedModel, load_json
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.storage import read_gaussians
 from pipelines.stages import GAUSSIANS, MODEL, SIM3, SPARSE, SURVEY
+from pipelines.survey import Survey
 from pipelines.workspace import Workspace
 
 

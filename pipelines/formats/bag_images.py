@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.formats.image_file import MAX_BYTES, MAX_PIXELS, header_size
-from pipelines.products import CameraPrior
+from pipelines.survey import CameraPrior
 
 IMAGE, COMPRESSED, INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/CameraInfo"
 _PNG_EFFORT = 1

@@ -27,8 +27,9 @@ from pipelines.geodesy.operations import WGS84
 from pipelines.geodesy.vertical import assumed_ellipsoidal
 from pipelines.geometry.rig import Rig, frame_from_frd
 from pipelines.geometry.rotations import matrix_from_quat_xyzw, quat_xyzw_from_matrix
-from pipelines.products import CameraPrior, FloatArray, Origin, VerticalDatum
+from pipelines.products import FloatArray
 from pipelines.progress import SILENT, Progress
+from pipelines.survey import CameraPrior, Origin, VerticalDatum
 
 _MANY_FRAMES = 1000
 

@@ -9,7 +9,7 @@ from typing import Literal
 from pipelines.formats.exif import PhotoTags
 from pipelines.formats.notes import Notes
 from pipelines.formats.photo_folder import Photo
-from pipelines.products import CameraPrior
+from pipelines.survey import CameraPrior
 
 # Longer side of the sensor in mm, for cameras that survey; a crop to 16:9 keeps the full width.
 _SENSOR_WIDTH_MM = {

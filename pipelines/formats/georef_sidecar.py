@@ -18,7 +18,8 @@ from pydantic.alias_generators import to_camel
 
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.similarity import Similarity, covariance_at
-from pipelines.products import FloatArray, Product, Quaternion, Vector3, VerticalDatum, load_json
+from pipelines.products import FloatArray, Product, Quaternion, Vector3, load_json
+from pipelines.survey import VerticalDatum
 
 SUFFIX = ".georef.json"
 

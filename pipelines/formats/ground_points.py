@@ -15,7 +15,8 @@ from pipelines.formats.notes import Notes
 from pipelines.formats.odm import GroundMark, read_ground_points
 from pipelines.geodesy.crs import parse_crs
 from pipelines.geodesy.enu import ecef_from_lla
-from pipelines.products import FloatArray, Mark, VerticalDatum
+from pipelines.products import FloatArray
+from pipelines.survey import Mark, VerticalDatum
 
 _LEAST_MARKS = 2
 # Two names at one place are one point; a point this far from the cameras is in another country.

@@ -22,7 +22,8 @@ from pipelines.geodesy.enu import ecef_from_lla, lla_from_ecef, median_lla
 from pipelines.geodesy.operations import WGS84
 from pipelines.geodesy.vertical import VerticalChoice, assumed_ellipsoidal
 from pipelines.geometry.rotations import geo_from_cam, quat_xyzw_from_matrix
-from pipelines.products import FloatArray, VerticalDatum
+from pipelines.products import FloatArray
+from pipelines.survey import VerticalDatum
 
 SigmaSource = Literal["file", "option", "default"]
 AttitudeSource = Literal["gimbal", "csv", "geo.txt", "bag"]

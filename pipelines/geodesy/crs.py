@@ -25,7 +25,8 @@ from pipelines.errors import InputError
 from pipelines.geodesy.operations import Operation, Way, best_operation
 from pipelines.geodesy.plausible import Rows, check_area, horizontal_of, rough_lon_lat
 from pipelines.geodesy.vertical import ELLIPSOIDAL, VerticalChoice, assumed_ellipsoidal, name_of
-from pipelines.products import FloatArray, VerticalDatum
+from pipelines.products import FloatArray
+from pipelines.survey import VerticalDatum
 
 ECEF = "EPSG:4978"
 _MAX_TEXT = 20_000

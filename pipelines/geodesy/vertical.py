@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipelines.errors import InputError
-from pipelines.products import VerticalDatum
+from pipelines.survey import VerticalDatum
 
 ELLIPSOIDAL = "ellipsoidal"
 _EPSG_OF = {"EGM84": 5798, "EGM96": 5773, "EGM2008": 3855}

@@ -25,9 +25,10 @@ from pipelines.errors import DegenerateGeometryError
 from pipelines.geometry.rotations import exp_so3, log_so3
 from pipelines.geometry.similarity import Similarity, umeyama
 from pipelines.geometry.track import covered, places_at, turns_at
-from pipelines.products import FloatArray, NavigationTrack
+from pipelines.products import FloatArray
 from pipelines.robust.kernels import cauchy_weight
 from pipelines.robust.statistics import mad_sigma
+from pipelines.survey import NavigationTrack
 
 # A parameter counts as observed if its σ is below this: seconds, degrees, metres.
 LIMIT_OFFSET_S, LIMIT_BORESIGHT_DEG, LIMIT_ARM_M = 0.05, 0.5, 0.1

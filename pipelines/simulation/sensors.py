@@ -10,8 +10,9 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from pipelines.geodesy.enu import geo_from_enu_at, lla_from_enu
 from pipelines.geometry.rotations import exp_so3
-from pipelines.products import FloatArray, Origin
+from pipelines.products import FloatArray
 from pipelines.simulation.flight import LEAD_S, Track
+from pipelines.survey import Origin
 
 START_NS = 1_700_000_000_000_000_000  # 2023-11-14 22:13:20 UTC
 GNSS_STEP_NS, IMU_STEP_NS = 100_000_000, 10_000_000

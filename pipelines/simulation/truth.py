@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pipelines.products import Matrix3, Origin, Product, Vector3
+from pipelines.products import Matrix3, Product, Vector3
+from pipelines.survey import Origin
 
 
 class TrueLens(Product):

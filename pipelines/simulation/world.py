@@ -9,7 +9,6 @@ import numpy as np
 from pipelines.config import triple
 from pipelines.errors import InputError
 from pipelines.geometry.rotations import exp_so3
-from pipelines.products import Origin
 from pipelines.simulate_config import SimulateConfig
 from pipelines.simulation.buildings import Spot
 from pipelines.simulation.flight import DEFAULT_HEIGHTS_M, DEFAULT_RADIUS_M, FlightPlan, Track, fly
@@ -20,6 +19,7 @@ from pipelines.simulation.render import Pose
 from pipelines.simulation.scene import Scene, make_scene, with_targets
 from pipelines.simulation.sensors import Mounting
 from pipelines.simulation.targets import choose, sightings
+from pipelines.survey import Origin
 
 _CLEARANCE_M = 2.0
 _TARGET_PX = 5.0

@@ -10,8 +10,9 @@ import numpy as np
 
 from pipelines.geodesy.enu import lla_from_enu
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
-from pipelines.products import FloatArray, Origin
+from pipelines.products import FloatArray
 from pipelines.simulation.sensors import GnssLog, ImuLog, NanoArray
+from pipelines.survey import Origin
 
 POINTS_CRS = "EPSG:4979"
 

@@ -10,8 +10,9 @@ import pytest
 import torch
 
 from pipelines.geometry.similarity import Similarity
-from pipelines.products import GeolocatedPoints, Survey, load_json, save_json
+from pipelines.products import GeolocatedPoints, load_json, save_json
 from pipelines.stages import BY_NAME, GAUSSIANS, MODEL, POINTS, SIM3, SPARSE, SURVEY
+from pipelines.survey import Survey
 from tests.cli_runs import Georef, products_in, write_files
 from tests.photos import jpeg
 from tests.scenes import Measured, Noise, make_scene, sparse_model, survey_of, trained_model, write_workspace

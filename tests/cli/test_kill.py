@@ -18,9 +18,10 @@ import pytest
 from pipelines import states
 from pipelines.blocks.checkpoint import load_checkpoint
 from pipelines.formats.georef_sidecar import read_sidecar
-from pipelines.products import Survey, load_json
+from pipelines.products import load_json
 from pipelines.splat.storage import read_gaussians
 from pipelines.stages import PIPELINE, SPLAT, SURVEY
+from pipelines.survey import Survey
 from pipelines.workspace import Workspace
 from tests.cli_runs import Result, finish, start
 

@@ -10,9 +10,10 @@ from threads import single_thread
 
 from georef_cli import boundary
 from georef_cli.main import cli
-from pipelines.products import Survey, load_json
+from pipelines.products import load_json
 from pipelines.runner import run_stage
 from pipelines.stages import BY_NAME
+from pipelines.survey import Survey
 from pipelines.workspace import Workspace
 from tests import bags
 from tests.bags import Message

@@ -15,10 +15,11 @@ from pipelines.geodesy.enu import enu_from_lla, lla_from_enu
 from pipelines.geometry.rotations import log_so3, matrix_from_quat_xyzw
 from pipelines.ingest import build_survey, survey_and_track
 from pipelines.ingest_config import IngestConfig
-from pipelines.products import Survey, load_json
+from pipelines.products import load_json
 from pipelines.simulate import simulate
 from pipelines.simulate_config import SimulateConfig
 from pipelines.simulation.truth import Truth
+from pipelines.survey import Survey
 from tests import bags
 
 ARM = "0.3,-0.1,-0.2"

@@ -18,11 +18,12 @@ from pipelines.formats.colmap import write_sparse
 from pipelines.geodesy.enu import enu_from_lla, lla_from_enu
 from pipelines.geometry.rig import boresight
 from pipelines.geometry.rotations import log_so3, matrix_from_quat_xyzw
-from pipelines.products import Survey, load_json
+from pipelines.products import load_json
 from pipelines.simulate import simulate
 from pipelines.simulate_config import SimulateConfig
 from pipelines.simulation.truth import Truth
 from pipelines.stages import SURVEY
+from pipelines.survey import Survey
 from tests import bags
 from tests.scenes import Noise, Scene, sparse_model
 

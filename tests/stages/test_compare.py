@@ -17,8 +17,9 @@ from pipelines.blocks.trained import load_trained
 from pipelines.compare import CONFIGURATIONS, Ran, chosen, compare
 from pipelines.comparison import ComparedRow, Comparison
 from pipelines.geometry.similarity import Similarity
-from pipelines.products import InitialSimilarity, SimilarityRecord, Survey, load_json, save_json
+from pipelines.products import InitialSimilarity, SimilarityRecord, load_json, save_json
 from pipelines.stages import GAUSSIANS, REPORT, SIM3, SURVEY
+from pipelines.survey import Survey
 from pipelines.workspace import Workspace
 
 pytest.importorskip("pycolmap")

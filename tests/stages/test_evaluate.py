@@ -19,11 +19,12 @@ from pipelines.blocks.restored import restore, training_config
 from pipelines.blocks.trained import load_trained
 from pipelines.errors import InputError
 from pipelines.evaluate import render_name
-from pipelines.products import InitialSimilarity, Mark, Survey, TrainedModel, load_json, save_json
+from pipelines.products import InitialSimilarity, TrainedModel, load_json, save_json
 from pipelines.robust.asprs import few_points
 from pipelines.runner import Outcome, run_stage
 from pipelines.splat.storage import read_gaussians, write_gaussians
 from pipelines.stages import BY_NAME, GAUSSIANS, MODEL, REPORT, SIM3, SURVEY
+from pipelines.survey import Mark, Survey
 from pipelines.workspace import Workspace
 
 pytestmark = pytest.mark.usefixtures("one_thread")

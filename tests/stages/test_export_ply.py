@@ -16,12 +16,13 @@ from pipelines.formats.georef_sidecar import read_sidecar, sidecar_path
 from pipelines.geodesy.enu import ecef_from_enu, ecef_from_lla, enu_from_ecef
 from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.similarity import Similarity, covariance_at
-from pipelines.products import Origin, Survey, TrainedModel, VerticalDatum, save_json
+from pipelines.products import TrainedModel, save_json
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.raster.api import Pinhole, RasterSettings
 from pipelines.splat.raster.reference import render_reference
 from pipelines.splat.storage import read_gaussians, write_gaussians
 from pipelines.stages import GAUSSIANS, MODEL, SURVEY
+from pipelines.survey import Origin, Survey, VerticalDatum
 from pipelines.workspace import StageRun, Workspace
 
 CONFIG = ExportPlyConfig()

@@ -14,9 +14,10 @@ from pipelines.config import GeolocateConfig
 from pipelines.errors import DegenerateGeometryError, InputError
 from pipelines.geolocate import geolocate
 from pipelines.geometry.rotations import exp_so3, matrix_from_quat_xyzw, quat_xyzw_from_matrix
-from pipelines.products import GeolocatedPoints, Survey
+from pipelines.products import GeolocatedPoints
 from pipelines.runner import run_stage
 from pipelines.stages import BY_NAME, POINTS
+from pipelines.survey import Survey
 
 CONFIG = GeolocateConfig()
 CONSUMER = Noise(fix_m=(1.5, 1.5, 3.0))

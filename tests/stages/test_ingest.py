@@ -14,9 +14,10 @@ from pipelines.geodesy.crs import parse_crs
 from pipelines.geometry.rotations import geo_from_cam, matrix_from_quat_xyzw
 from pipelines.ingest import build_survey
 from pipelines.ingest_config import IngestConfig
-from pipelines.products import Survey, load_json
+from pipelines.products import load_json
 from pipelines.runner import run_stage
 from pipelines.stages import BY_NAME, SURVEY
+from pipelines.survey import Survey
 from pipelines.workspace import Workspace
 from tests.photos import FLIGHT_START_S, Exif, dji_xmp, gps_entries, jpeg, write_flight
 

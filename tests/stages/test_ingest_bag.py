@@ -11,7 +11,7 @@ from rosbags.rosbag2 import StoragePlugin
 
 from pipelines.geometry.rig import mount
 from pipelines.geometry.rotations import log_so3, matrix_from_quat_xyzw
-from pipelines.products import NavigationTrack
+from pipelines.survey import NavigationTrack
 from tests import bags
 from tests.bags import Flight, Form, Message
 from tests.ingested_bags import Ingest, Refused, check, warned

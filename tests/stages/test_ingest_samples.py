@@ -15,7 +15,8 @@ from pipelines.geodesy import enu
 from pipelines.geometry.rotations import log_so3, matrix_from_quat_xyzw
 from pipelines.ingest import build_survey, survey_and_track
 from pipelines.ingest_config import IngestConfig
-from pipelines.products import FloatArray, Origin, Survey
+from pipelines.products import FloatArray
+from pipelines.survey import Origin, Survey
 
 DATA = Path(os.environ.get("GEOREF_DATA", Path(__file__).parents[2].parent / "shared" / "data"))
 ORBIT, BEACH = DATA / "orbit_dev", DATA / "brighton_beach"

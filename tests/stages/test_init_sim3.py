@@ -25,9 +25,10 @@ from pipelines.geolocate import geolocate
 from pipelines.geometry.rotations import log_so3
 from pipelines.geometry.similarity import Similarity
 from pipelines.init_sim3 import estimate_similarity
-from pipelines.products import GeolocatedPoints, InitialSimilarity, Survey, load_json
+from pipelines.products import GeolocatedPoints, InitialSimilarity, load_json
 from pipelines.runner import run_stage
 from pipelines.stages import BY_NAME, SIM3
+from pipelines.survey import Survey
 
 CONFIG = InitSim3Config()
 CONSUMER = Noise(fix_m=(1.5, 1.5, 3.0))

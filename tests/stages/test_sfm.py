@@ -18,17 +18,7 @@ from pipelines.config import SfmConfig
 from pipelines.errors import DegenerateGeometryError, InputError
 from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.similarity import umeyama
-from pipelines.products import (
-    CameraPrior,
-    Fix,
-    Origin,
-    Survey,
-    SurveyedPoint,
-    SurveyImage,
-    VerticalDatum,
-    load_json,
-    save_json,
-)
+from pipelines.products import load_json, save_json
 from pipelines.progress import SILENT
 from pipelines.runner import run_stage
 from pipelines.sfm import SfmJob, _summarise, candidate_pairs, import_model, quiet_colmap, reconstruct, run
@@ -36,6 +26,7 @@ from pipelines.simulate import simulate
 from pipelines.simulate_config import SimulateConfig
 from pipelines.stages import BY_NAME, SPARSE, SURVEY
 from pipelines.states import status
+from pipelines.survey import CameraPrior, Fix, Origin, Survey, SurveyedPoint, SurveyImage, VerticalDatum
 from pipelines.workspace import StageRun, Workspace
 
 pycolmap = pytest.importorskip("pycolmap")

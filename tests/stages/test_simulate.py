@@ -22,13 +22,14 @@ from pipelines.geodesy.enu import enu_from_lla, lla_from_enu
 from pipelines.geometry.rotations import geo_from_cam, log_so3
 from pipelines.ingest import build_survey, survey_and_track
 from pipelines.ingest_config import IngestConfig
-from pipelines.products import Origin, load_json
+from pipelines.products import load_json
 from pipelines.simulate import SimulationSummary, fly_survey, simulate
 from pipelines.simulate_config import SimulateConfig
 from pipelines.simulation.render import Renderer, Sensor
 from pipelines.simulation.truth import Truth
 from pipelines.simulation.world import make_world
 from pipelines.simulation.write import write_trajectory
+from pipelines.survey import Origin
 
 ORIGIN = "-33.86,151.21,-20"  # south, east, below the ellipsoid
 SMALL: dict[str, Any] = {"size": "160x120", "samples": "1", "images": 4, "targets": 30}

@@ -21,7 +21,7 @@ from threads import single_thread
 from pipelines.errors import BackendUnavailableError, DegenerateGeometryError, InputError
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.similarity import Similarity
-from pipelines.products import InitialSimilarity, Survey, TrainedModel, load_json, save_json
+from pipelines.products import InitialSimilarity, TrainedModel, load_json, save_json
 from pipelines.runner import run_stage
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.metrics import psnr
@@ -29,6 +29,7 @@ from pipelines.splat.raster.api import Pinhole, RasterSettings
 from pipelines.splat.raster.cpu import CpuRasterizer
 from pipelines.splat.storage import read_gaussians
 from pipelines.stages import BY_NAME, GAUSSIANS, MODEL, SIM3, SURVEY
+from pipelines.survey import Survey
 from pipelines.train import PRESETS, Preset, effort
 from pipelines.train_config import TrainConfig
 from pipelines.workspace import Workspace

@@ -24,7 +24,7 @@ FOUNDATION = {
     f"pipelines.{name}"
     for name in (
         "config", "errors", "fingerprints", "ingest_config", "interrupts", "products", "progress",
-        "simulate_config", "stages", "states", "train_config", "validators", "workspace",
+        "simulate_config", "stages", "states", "survey", "train_config", "validators", "workspace",
     )
 }  # fmt: skip
 # Those that make no product of the workspace are called and built as stages are.

@@ -18,8 +18,9 @@ from pipelines.errors import InputError
 from pipelines.formats.colmap import read_sparse, write_sparse
 from pipelines.ingest import build_survey
 from pipelines.ingest_config import IngestConfig
-from pipelines.products import GeolocatedPoints, Survey, load_json
+from pipelines.products import GeolocatedPoints, load_json
 from pipelines.stages import POINTS, SPARSE, SURVEY
+from pipelines.survey import Survey
 from pipelines.workspace import Workspace
 from tests.photos import Exif, gps_entries, jpeg, write_flight
 from tests.scenes import Measured, Noise, make_scene, sparse_model, survey_of, write_workspace

@@ -15,8 +15,9 @@ import pytest
 
 from pipelines import runner, states
 from pipelines.errors import InputError, MissingProductError, WorkspaceBusyError
-from pipelines.products import VerticalDatum, load_json, save_json
+from pipelines.products import load_json, save_json
 from pipelines.stages import BY_NAME, MODEL, PIPELINE, POINTS, SIM3, SPARSE, SURVEY
+from pipelines.survey import VerticalDatum
 from pipelines.workspace import Workspace
 from tests import fakes
 

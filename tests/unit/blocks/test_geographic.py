@@ -18,7 +18,8 @@ from pipelines.geometry.cameras import Camera
 from pipelines.geometry.lens import Lenses, bearings
 from pipelines.georef.losses import depth_residuals
 from pipelines.georef.problem import GeoProblem
-from pipelines.products import AttitudeRecord, Mark, Survey
+from pipelines.products import AttitudeRecord
+from pipelines.survey import Mark, Survey
 from pipelines.train_config import TrainConfig
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -17,7 +17,8 @@ from pipelines.config import GeolocateConfig
 from pipelines.errors import InputError
 from pipelines.geolocate import geolocate
 from pipelines.georef.losses import pair_residuals
-from pipelines.products import GeolocatedPoints, Survey
+from pipelines.products import GeolocatedPoints
+from pipelines.survey import Survey
 from pipelines.train_config import TrainConfig
 
 pytestmark = pytest.mark.usefixtures("one_thread")

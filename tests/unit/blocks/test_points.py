@@ -12,8 +12,8 @@ from pipelines.geometry.cameras import Pinhole
 from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.similarity import Similarity
 from pipelines.georef.cameras import CameraPoses
-from pipelines.products import SurveyedPoint
 from pipelines.splat.initialise import gaussians_of_size
+from pipelines.survey import SurveyedPoint
 
 EXACT = Noise(mark_px=1e-7, gcp_m=1e-9)
 MODEL_FROM_GEO = Similarity(1.0, exp_so3([0.01, 0.02, -0.03]), np.array([-10.0, 20.0, -5.0]))

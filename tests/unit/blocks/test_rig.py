@@ -8,19 +8,12 @@ import numpy as np
 import pytest
 
 from pipelines.blocks.rig import require_estimable, with_rig
+from pipelines.config import RigParameter
 from pipelines.errors import InputError
 from pipelines.fingerprints import layout_of
 from pipelines.geometry.rig import boresight
 from pipelines.geometry.rotations import exp_so3, log_so3, matrix_from_quat_xyzw, quat_xyzw_from_matrix
-from pipelines.products import (
-    Attitude,
-    NavigationTrack,
-    RigCalibration,
-    RigEstimate,
-    RigParameter,
-    Survey,
-    SurveyImage,
-)
+from pipelines.survey import Attitude, NavigationTrack, RigCalibration, RigEstimate, Survey, SurveyImage
 from tests.scenes import Measured, Noise, make_scene, survey_of
 
 COUNT, SPEED = 5, np.array([4.0, 1.0, 0.5])

@@ -15,7 +15,7 @@ from pipelines.errors import InputError
 from pipelines.geodesy import enu
 from pipelines.geodesy.crs import parse_crs
 from pipelines.geodesy.vertical import parse_vertical
-from pipelines.products import Origin
+from pipelines.survey import Origin
 
 US_FOOT_M = 1200.0 / 3937.0
 UTM16_WKT = parse_crs("EPSG:32616").wkt

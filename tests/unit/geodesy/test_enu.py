@@ -7,7 +7,7 @@ import pytest
 from pyproj import Transformer
 
 from pipelines.geodesy import enu
-from pipelines.products import Origin
+from pipelines.survey import Origin
 
 # A survey at 70° N whose far end is 10 km east: curvature 7.8 m, meridian convergence 0.25°.
 NORTH = Origin(lat_deg=70.0, lon_deg=24.0, alt_m=120.0)

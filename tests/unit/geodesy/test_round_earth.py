@@ -18,7 +18,7 @@ from pipelines.errors import InputError
 from pipelines.geodesy import enu
 from pipelines.geodesy.crs import parse_crs
 from pipelines.geodesy.vertical import parse_vertical
-from pipelines.products import Origin
+from pipelines.survey import Origin
 from tests.map_projections import (
     FOOT_M,
     GRS80_FLATTENING,

@@ -12,9 +12,10 @@ from pipelines.geometry.rig import boresight
 from pipelines.geometry.rotations import exp_so3, log_so3
 from pipelines.geometry.similarity import Similarity
 from pipelines.georef.rig_fit import LIMIT_ARM_M, LIMIT_OFFSET_S, FitOptions, RigData, fit_rig
-from pipelines.products import FloatArray, NavigationTrack
+from pipelines.products import FloatArray
 from pipelines.simulation.flight import FlightPlan, Track, fly
 from pipelines.simulation.sensors import RECEIVERS, Mounting, record_gnss, record_imu
+from pipelines.survey import NavigationTrack
 
 OFFSET_S, BORESIGHT_DEG, ARM_M = 0.2, np.array([0.6, -0.5, 0.62]), np.array([0.25, -0.1, -0.15])
 PIXEL_RAD = 1 / 3000  # 3 cm at 100 m
