@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from pipelines.errors import ConvergenceError
 from pipelines.formats.colmap import flatten
 from pipelines.geometry.bundle import CAUCHY_SCALE, RAYLEIGH_MEDIAN
 from pipelines.geometry.cameras import project
-from pipelines.interrupts import interruptible
 from pipelines.products import FloatArray
 from pipelines.progress import SILENT, Progress, ProgressTask
 
@@ -25,6 +25,7 @@ log = logging.getLogger(__name__)
 _FEWEST_FOR_PRINCIPAL_POINT = 10
 _FURTHEST_PRINCIPAL_POINT = 0.05  # of the longer side: beyond, it has taken up something else
 _ROBUST_ROUNDS = 3
+_STEPS_A_TIME, _MOST_STEPS = 5, 100  # of a round: the solver lets no signal through while it works
 _SETTLED = 0.01  # relative change of the residuals' scale
 _LEAST_SCALE_PX = 1e-3  # of observations without noise, which have no tails either
 # A step that gains less, of the whole cost and times the number of observations, is the last: a parameter that is
@@ -59,6 +60,9 @@ def adjust_finally(colmap: Any, model: Any, options: LastAdjustment, progress: P
 
     Args:
         colmap: the pycolmap module.
+
+    Raises:
+        ConvergenceError: COLMAP found no solution.
     """
     if model.num_points3D() == 0:
         return
@@ -68,6 +72,7 @@ def adjust_finally(colmap: Any, model: Any, options: LastAdjustment, progress: P
     least_gain = min(_LEAST_GAIN / model.compute_num_observations(), _LEAST_GAIN_OF_FEW)
     adjustment.ceres.solver_options.function_tolerance = _COARSE * least_gain
     adjustment.ceres.solver_options.num_threads = options.threads
+    adjustment.ceres.solver_options.max_num_iterations = _STEPS_A_TIME
     with progress.task("last adjustment", _ROBUST_ROUNDS + int(free)) as task:
         if free:
             adjustment.refine_principal_point = _free_principal_point(colmap, model, adjustment)
@@ -76,11 +81,24 @@ def adjust_finally(colmap: Any, model: Any, options: LastAdjustment, progress: P
     model.update_point_3d_errors()
 
 
+def _adjust(colmap: Any, model: Any, adjustment: Any) -> None:
+    bundle = colmap.BundleAdjustmentConfig()
+    for image_id in model.reg_image_ids():
+        bundle.add_image(image_id)
+    bundle.fix_gauge(colmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    for _ in range(_MOST_STEPS // _STEPS_A_TIME):
+        summary = colmap.create_default_bundle_adjuster(adjustment, bundle, model).solve()
+        if not summary.is_solution_usable():
+            raise ConvergenceError(f"the last bundle adjustment found no solution: {summary.brief_report()}")
+        if summary.termination_type != colmap.BundleAdjustmentTerminationType.NO_CONVERGENCE:
+            return
+
+
 def _free_principal_point(colmap: Any, model: Any, adjustment: Any) -> bool:
     """Adjust with the principal point free; whether it was accepted. If not, all is adjusted without it."""
     adjustment.refine_principal_point = True
     before = {key: camera.params.copy() for key, camera in model.cameras.items()}
-    interruptible(lambda: colmap.bundle_adjustment(model, adjustment))
+    _adjust(colmap, model, adjustment)
     astray = [key for key, camera in model.cameras.items() if _has_left_the_middle(camera)]
     if not astray:
         return True
@@ -88,7 +106,7 @@ def _free_principal_point(colmap: Any, model: Any, adjustment: Any) -> bool:
     for key, params in before.items():
         model.cameras[key].params = params
     adjustment.refine_principal_point = False
-    interruptible(lambda: colmap.bundle_adjustment(model, adjustment))
+    _adjust(colmap, model, adjustment)
     return False
 
 
@@ -107,7 +125,7 @@ def _adjust_robustly(colmap: Any, model: Any, adjustment: Any, least_gain: float
         if is_last:
             adjustment.ceres.solver_options.function_tolerance = least_gain
         adjustment.ceres.loss_function_scale = CAUCHY_SCALE * scale_px
-        interruptible(lambda: colmap.bundle_adjustment(model, adjustment))
+        _adjust(colmap, model, adjustment)
         task.advance(1 + left if is_last else 1, note=f"σ {scale_px:.2f} px")
         if is_last:
             return
