@@ -22,7 +22,7 @@ from pipelines.geometry.cameras import Pinhole
 from pipelines.geometry.thinning import one_a_cube
 from pipelines.products import FloatArray
 from pipelines.progress import SILENT, Progress
-from pipelines.stereo.agreement import AgreementSettings, Surface, agreed_depth
+from pipelines.stereo.agreement import AgreementSettings, Surface, agreed_depth, without_rims
 from pipelines.stereo.neighbours import Sightings, best_neighbours, planes_for
 from pipelines.stereo.sweep import FloatImage, Planes, StereoCamera, StereoView, SweepSettings, Swept, plane_sweep
 
@@ -186,8 +186,9 @@ class SceneSurface:
         if own is None:
             camera = self.camera(index)
             return np.zeros((camera.height, camera.width), dtype=np.float32)
-        others = [self._surface(j) for j in self._neighbours(index)]
-        return agreed_depth(own, [other for other in others if other is not None], self._options.agreement)
+        others, options = [self._surface(j) for j in self._neighbours(index)], self._options
+        depth = agreed_depth(own, [other for other in others if other is not None], options.agreement)
+        return without_rims(depth, options.sweep.window_px // 2, options.agreement.rim)
 
     def _surface(self, index: int) -> Surface | None:
         planes = self._planes(index)

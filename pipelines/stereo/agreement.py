@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,11 +29,13 @@ class AgreementSettings:
         least_score: correlation that counts.
         steps: largest difference, in steps of the sweep.
         least_views: other views that must agree.
+        rim: a surface ends where what follows lies further away than its plane goes on by this part of the depth.
     """
 
     least_score: float = 0.4
     steps: float = 1.5
     least_views: int = 2
+    rim: float = 0.01
 
 
 def agreed_depth(reference: Surface, others: list[Surface], settings: AgreementSettings) -> FloatImage:
@@ -81,3 +84,26 @@ def _missed(
     near = np.abs(missed) < settings.steps * other.swept.step_m[place]
     near &= other.swept.score[place] > settings.least_score
     return ahead[near], np.asarray(missed[near]), other.swept.sharpness[place][near]
+
+
+def without_rims(depth: FloatImage, reach_px: int, rim: float) -> FloatImage:
+    """A depth map (H, W) with 0 where a surface ends before another within so many pixels.
+
+    A window across an edge is compared by its contrast, and takes the ground beside a roof for roof: of a surface,
+    the outermost half window is not one. On planes the inverse depth is linear, however steeply they are seen.
+
+    Args:
+        depth: along the optical axis, 0 where unknown.
+        reach_px: half the window's side.
+        rim: see `AgreementSettings`.
+    """
+    height, width = depth.shape
+    inverse = np.where(depth > 0, 1 / np.maximum(depth, 1e-9), np.nan)
+    ends = np.zeros(depth.shape, dtype=np.bool_)
+    for reach in range(1, reach_px + 1):
+        around = np.pad(inverse, reach, constant_values=np.nan)
+        for down, right in itertools.product((-reach, 0, reach), repeat=2):
+            ahead = around[reach + down :, reach + right :][:height, :width]
+            behind = around[reach - down :, reach - right :][:height, :width]
+            ends |= ahead < (2 - rim) * inverse - behind
+    return np.where(ends, np.float32(0), depth)
