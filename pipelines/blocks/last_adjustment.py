@@ -15,10 +15,11 @@ import numpy as np
 
 from pipelines.errors import ConvergenceError
 from pipelines.formats.colmap import flatten
-from pipelines.geometry.bundle import CAUCHY_SCALE, RAYLEIGH_MEDIAN
+from pipelines.geometry.bundle import RAYLEIGH_MEDIAN
 from pipelines.geometry.cameras import project
 from pipelines.products import FloatArray
 from pipelines.progress import SILENT, Progress, ProgressTask
+from pipelines.robust.kernels import CAUCHY_95
 
 log = logging.getLogger(__name__)
 
@@ -124,7 +125,7 @@ def _adjust_robustly(colmap: Any, model: Any, adjustment: Any, least_gain: float
         is_last = left == 0 or abs(scale_px / used_px - 1) < _SETTLED
         if is_last:
             adjustment.ceres.solver_options.function_tolerance = least_gain
-        adjustment.ceres.loss_function_scale = CAUCHY_SCALE * scale_px
+        adjustment.ceres.loss_function_scale = CAUCHY_95 * scale_px
         _adjust(colmap, model, adjustment)
         task.advance(1 + left if is_last else 1, note=f"σ {scale_px:.2f} px")
         if is_last:

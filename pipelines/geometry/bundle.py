@@ -22,17 +22,17 @@ from pipelines.errors import DegenerateGeometryError
 from pipelines.geometry.cameras import Camera, project
 from pipelines.geometry.rotations import skew
 from pipelines.products import FloatArray
+from pipelines.robust.kernels import CAUCHY_95, cauchy_weight
 
 IntArray = NDArray[np.int64]
 
 # A camera that hangs on few observations is held to a tenth of its distance from the scene.
 _LOOSEST_RELATIVE_SIGMA = 0.1
 _STEP = 1e-6
-CAUCHY_SCALE = 2.385  # of σ: 95 % efficiency on Gaussian noise
 RAYLEIGH_MEDIAN = 1.1774  # of the length of a residual, of σ = 1 in either coordinate
 # Means of the weight w and of w r²/2 under Gaussian noise of σ = 1, where r²/2 is exponentially distributed:
 # without them the weights would take noise for outliers, and state a σ that is a fifth too small.
-_HALF_SCALE2 = CAUCHY_SCALE**2 / 2
+_HALF_SCALE2 = CAUCHY_95**2 / 2
 _MEAN_WEIGHT = float(_HALF_SCALE2 * np.exp(_HALF_SCALE2) * exp1(_HALF_SCALE2))
 _MEAN_WEIGHTED_SQUARE = _HALF_SCALE2 * (1 - _MEAN_WEIGHT)
 
@@ -203,7 +203,7 @@ def _by_parameter(camera: Camera, index: int, points: FloatArray) -> FloatArray:
 def _robust_weights(residual: FloatArray) -> FloatArray:
     length = np.linalg.norm(residual, axis=1)
     scale = max(float(np.median(length)) / RAYLEIGH_MEDIAN, 1e-9)
-    return 1.0 / (1.0 + (length / (CAUCHY_SCALE * scale)) ** 2)
+    return cauchy_weight((length / scale) ** 2)
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from pipelines.georef.linear import WEIGHT_OF_NOISE
 from pipelines.georef.losses import CAUCHY_SCALE2
 from pipelines.georef.problem import GeoProblem
 from pipelines.products import FloatArray
+from pipelines.robust.kernels import cauchy_weight
 
 _SIMILARITY, _CAMERAS, _ERRORS = "similarity.y", "cameras.z", "errors.x"
 _STEPS = 10  # new derivatives
@@ -250,7 +251,7 @@ def _white(problem: GeoProblem) -> FloatArray:
 
 
 def _weights(white: FloatArray) -> FloatArray:
-    return np.asarray(1.0 / (1.0 + (white**2).sum(axis=1) / CAUCHY_SCALE2))
+    return cauchy_weight((white**2).sum(axis=1), CAUCHY_SCALE2**0.5)
 
 
 def _move(problem: GeoProblem, linear: _Linear, step: FloatArray) -> None:
