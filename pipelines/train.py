@@ -147,7 +147,7 @@ def make_trainer(material: Material, problem: GeoProblem, backend: Rasterizer, c
         GaussianAdam(gaussians, extent_m, preset.iterations),
         _strategy(config, extent_m, len(gaussians)),
         problem.to(device),
-        Views(scene.train, images, hold, scene.lenses),
+        Views(scene.train, images, hold, scene.sparse.lenses),
         rasterizer=backend,
         options=JointOptions(
             preset.iterations,
@@ -267,5 +267,5 @@ def _lenses(trainer: JointTrainer, scene: Scene) -> tuple[TrainedLens, ...]:
         return ()
     return tuple(
         TrainedLens(camera_id=key, model=camera.model, params=tuple(camera.params.tolist()))
-        for key, camera in scene.lenses.moved(change).cameras.items()
+        for key, camera in scene.sparse.lenses.moved(change).cameras.items()
     )

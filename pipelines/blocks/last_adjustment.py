@@ -15,11 +15,11 @@ import numpy as np
 
 from pipelines.errors import ConvergenceError
 from pipelines.formats.colmap import flatten
-from pipelines.geometry.bundle import RAYLEIGH_MEDIAN
-from pipelines.geometry.cameras import project
+from pipelines.geometry.cameras import project_each
 from pipelines.products import FloatArray
 from pipelines.progress import SILENT, Progress, ProgressTask
 from pipelines.robust.kernels import CAUCHY_95
+from pipelines.robust.statistics import rayleigh_sigma
 
 log = logging.getLogger(__name__)
 
@@ -121,7 +121,7 @@ def _adjust_robustly(colmap: Any, model: Any, adjustment: Any, least_gain: float
     adjustment.ceres.loss_function_type = colmap.LossFunctionType.CAUCHY
     used_px = np.inf
     for left in reversed(range(_ROBUST_ROUNDS)):
-        scale_px = max(float(np.nanmedian(_residual_px(model))) / RAYLEIGH_MEDIAN, _LEAST_SCALE_PX)
+        scale_px = max(rayleigh_sigma(_residual_px(model)), _LEAST_SCALE_PX)
         is_last = left == 0 or abs(scale_px / used_px - 1) < _SETTLED
         if is_last:
             adjustment.ceres.solver_options.function_tolerance = least_gain
@@ -139,9 +139,5 @@ def _residual_px(model: Any) -> FloatArray:
     rotation = flat.rotation_cam_from_local[flat.obs_image]
     in_cam = np.einsum("mij,mj->mi", rotation, flat.point_in_local[flat.obs_point])
     in_cam += flat.translation_cam_from_local[flat.obs_image]
-    camera_of = flat.image_camera_id[flat.obs_image]
-    length = np.empty(len(in_cam))
-    for key, camera in flat.cameras.items():
-        rows = np.flatnonzero(camera_of == key)
-        length[rows] = np.linalg.norm(project(camera, in_cam[rows]) - flat.obs_xy_px[rows], axis=1)
-    return length
+    projected = project_each(flat.cameras, flat.image_camera_id[flat.obs_image], in_cam)
+    return np.asarray(np.linalg.norm(projected - flat.obs_xy_px, axis=1))

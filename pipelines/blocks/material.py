@@ -46,7 +46,8 @@ def initial_gaussians(material: Material, options: InitialisationOptions, most: 
     scene = material.scene
     found = SurfacePoints(scene.point_in_model, scene.sparse.point_rgb, np.full_like(scene.point_in_model, np.nan))
     if material.surface is not None:
-        found += material.surface.sample(max(int(_SURFACE_SHARE * most) - len(found.rgb), 0), seed)
+        more = material.surface.sample(max(int(_SURFACE_SHARE * most) - len(found.rgb), 0), seed)
+        found = SurfacePoints.concatenate([found, more])
     near = gaussians_from_points(found.point_in_model, found.rgb, options, found.normal_in_model)
     behind = background(scene, material.images, found.point_in_model)
     far = gaussians_of_size(behind.point_in_model, behind.rgb, behind.sigma_m, options)

@@ -14,7 +14,6 @@ from pipelines.errors import DegenerateGeometryError
 from pipelines.geometry.bound import Anchors, CameraInformation
 from pipelines.geometry.bundle import IntArray, Network
 from pipelines.geometry.following import Following, follow
-from pipelines.geometry.lens import Lenses
 from pipelines.geometry.similarity import Similarity
 from pipelines.georef.posterior import LeftOut, LensDoubt, leave_one_out, posterior
 from pipelines.products import FloatArray
@@ -102,8 +101,7 @@ def control_sights(restored: Restored) -> Sights:
 
 def trained_lens(restored: Restored) -> Tensor:
     """Change (L,) of the lens parameters that training made, in the order of `geometry.lens.Lenses`."""
-    trained, lenses = restored.trained, restored.scene.lenses
-    return torch.from_numpy(lenses.change_to(Lenses(trained.sparse.cameras, lenses.camera_id)))
+    return torch.from_numpy(restored.trained.sfm.lenses.change_to(restored.trained.sparse.lenses))
 
 
 def _lens_doubt(restored: Restored) -> LensDoubt | None:

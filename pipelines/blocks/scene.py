@@ -17,7 +17,6 @@ from pipelines.errors import DegenerateGeometryError, InputError
 from pipelines.formats.colmap import SparseModel
 from pipelines.formats.image_cache import ImageCache, Photograph
 from pipelines.geometry.bundle import CorrectionBasis, Network, correction_basis
-from pipelines.geometry.lens import Lenses
 from pipelines.geometry.similarity import Similarity
 from pipelines.georef.cameras import CameraPoses
 from pipelines.products import FloatArray, InitialSimilarity
@@ -74,11 +73,6 @@ class Scene:
             sparse.obs_image,
             sparse.obs_xy_px,
         )
-
-    @property
-    def lenses(self) -> Lenses:
-        """The lenses as SfM left them."""
-        return Lenses(self.sparse.cameras, self.sparse.image_camera_id)
 
     @cached_property
     def correction_basis(self) -> CorrectionBasis | None:

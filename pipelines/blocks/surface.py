@@ -65,12 +65,13 @@ class SurfacePoints:
     rgb: NDArray[np.uint8]
     normal_in_model: FloatArray
 
-    def __add__(self, other: SurfacePoints) -> SurfacePoints:
-        """These, and the others after them."""
+    @staticmethod
+    def concatenate(parts: list[SurfacePoints]) -> SurfacePoints:
+        """All of some, one after the other; at least one."""
         return SurfacePoints(
-            np.concatenate([self.point_in_model, other.point_in_model]),
-            np.concatenate([self.rgb, other.rgb]),
-            np.concatenate([self.normal_in_model, other.normal_in_model]),
+            np.concatenate([part.point_in_model for part in parts]),
+            np.concatenate([part.rgb for part in parts]),
+            np.concatenate([part.normal_in_model for part in parts]),
         )
 
     def part(self, rows: NDArray[np.int64]) -> SurfacePoints:
@@ -135,15 +136,16 @@ class SceneSurface:
         """At most `count` points of the whole surface, as dense as the photographs show it."""
         rng = np.random.default_rng(seed)
         share = -(-_CANDIDATES * count // max(len(self._scene.train), 1))
-        found = SurfacePoints(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros((0, 3)))
-        sizes = [np.zeros(0)]
+        views, sizes = [], []
         for index in map(int, self._scene.train):
             rows, columns = np.nonzero(self.depth(index))
             chosen = rng.permutation(len(rows))[:share]
             rows, columns = rows[chosen], columns[chosen]
             normals = self._normals(index, rows, columns)
-            found += SurfacePoints(self._points(index, rows, columns), self._rgb(index)[rows, columns], normals)
+            rgb = self._rgb(index)[rows, columns]
+            views.append(SurfacePoints(self._points(index, rows, columns), rgb, normals))
             sizes.append(self.depth(index)[rows, columns].astype(np.float64) / self.camera(index).fx)
+        found = SurfacePoints.concatenate(views)
         return found.part(spread_evenly(found.point_in_model, np.concatenate(sizes), count))
 
     def _normals(self, index: int, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> FloatArray:

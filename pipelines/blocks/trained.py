@@ -12,7 +12,6 @@ from pipelines.blocks.pinholes import Pinholes
 from pipelines.errors import InputError
 from pipelines.formats.colmap import SparseModel, read_sparse
 from pipelines.formats.image_cache import ImageCache
-from pipelines.geometry.lens import Lenses
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.similarity import Similarity
 from pipelines.georef.cameras import CameraPoses
@@ -98,8 +97,8 @@ def load_trained(workspace: Workspace, similarity: Literal["trained", "initial"]
 
 def trained_pinholes(trained: Trained, images: ImageCache) -> Pinholes:
     """Cameras of the photographs that were undistorted with SfM's lenses, as the trained ones have them."""
-    found = Pinholes(images, Lenses(trained.sfm.cameras, trained.sfm.image_camera_id))
-    found.renew(Lenses(trained.sparse.cameras, trained.sparse.image_camera_id))
+    found = Pinholes(images, trained.sfm.lenses)
+    found.renew(trained.sparse.lenses)
     return found
 
 

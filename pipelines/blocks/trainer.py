@@ -28,8 +28,8 @@ from pipelines.splat.watch import FiniteWatch
 
 _FINAL_RATE = 0.05  # of the geographic learning rates, relative to the first
 _TOLD = {"y": "the similarity", "z": "the cameras", "x": "the constant errors", "u": "the weights of the losses"}
-# A gradient that is not finite shows in one of these: colours pass theirs on to the opacities.
 _LENS_EVERY = 100  # iterations: to look where the lens has come to waits for the device
+# A gradient that is not finite shows in one of these: colours pass theirs on to the opacities.
 _WATCHED = ("means", "quats_wxyz", "log_scales", "logit_opacities")
 
 

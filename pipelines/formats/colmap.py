@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from pipelines.errors import BackendUnavailableError, InputError
 from pipelines.geometry.cameras import Camera
+from pipelines.geometry.lens import Lenses
 from pipelines.products import FloatArray
 from pipelines.validators import stays_inside
 
@@ -81,6 +82,11 @@ class SparseModel:
     def camera_of(self, image: int) -> Camera:
         """Intrinsics of the image with that index."""
         return self.cameras[int(self.image_camera_id[image])]
+
+    @property
+    def lenses(self) -> Lenses:
+        """The cameras of the images, whose parameters may change."""
+        return Lenses(self.cameras, self.image_camera_id)
 
     def points_in(self, image: int) -> IntArray:
         """Indices (K,), ascending, of the points that are observed in the image with that index."""

@@ -19,17 +19,18 @@ from scipy.sparse import csr_matrix
 from scipy.special import exp1
 
 from pipelines.errors import DegenerateGeometryError
-from pipelines.geometry.cameras import Camera, project
+from pipelines.geometry.cameras import Camera, project, project_each
+from pipelines.geometry.lens import by_parameter
 from pipelines.geometry.rotations import skew
 from pipelines.products import FloatArray
 from pipelines.robust.kernels import CAUCHY_95, cauchy_weight
+from pipelines.robust.statistics import rayleigh_sigma
 
 IntArray = NDArray[np.int64]
 
 # A camera that hangs on few observations is held to a tenth of its distance from the scene.
 _LOOSEST_RELATIVE_SIGMA = 0.1
 _STEP = 1e-6
-RAYLEIGH_MEDIAN = 1.1774  # of the length of a residual, of σ = 1 in either coordinate
 # Means of the weight w and of w r²/2 under Gaussian noise of σ = 1, where r²/2 is exponentially distributed:
 # without them the weights would take noise for outliers, and state a σ that is a fifth too small.
 _HALF_SCALE2 = CAUCHY_95**2 / 2
@@ -164,16 +165,15 @@ def linearise(network: Network) -> Linearised:
     in_cam = np.einsum("mij,mj->mi", rotation, ray)
     count = len(ray)
     longest = max(len(camera.params) for camera in network.cameras.values())
-    residual, by_cam = np.zeros((count, 2)), np.zeros((count, 2, 3))
-    by_intrinsics = np.zeros((count, 2, longest))
     camera_of = network.camera_id[network.obs_image]
+    residual = project_each(network.cameras, camera_of, in_cam) - network.obs_xy_px
+    by_cam, by_intrinsics = np.zeros((count, 2, 3)), np.zeros((count, 2, longest))
     for key, camera in network.cameras.items():
         rows = np.flatnonzero(camera_of == key)
         local = in_cam[rows]
-        residual[rows] = project(camera, local) - network.obs_xy_px[rows]
         by_cam[rows] = _differences(partial(project, camera), local)
         for index in range(len(camera.params)):
-            by_intrinsics[rows, :, index] = _by_parameter(camera, index, local)
+            by_intrinsics[rows, :, index] = by_parameter(partial(project, point_in_cam=local), camera, index, _STEP)
     by_point = by_cam @ rotation
     by_pose = np.concatenate([by_point @ skew(ray), -by_point], axis=2)
     return Linearised(residual, by_pose, by_point, by_intrinsics)
@@ -190,19 +190,9 @@ def _differences(function: Callable[[FloatArray], FloatArray], points: FloatArra
     return np.stack(columns, axis=2)
 
 
-def _by_parameter(camera: Camera, index: int, points: FloatArray) -> FloatArray:
-    step = _STEP * max(1.0, abs(float(camera.params[index])))
-    shifted = []
-    for sign in (1.0, -1.0):
-        params = camera.params.copy()
-        params[index] += sign * step
-        shifted.append(project(Camera(camera.model, camera.width, camera.height, params), points))
-    return (shifted[0] - shifted[1]) / (2 * step)
-
-
 def _robust_weights(residual: FloatArray) -> FloatArray:
     length = np.linalg.norm(residual, axis=1)
-    scale = max(float(np.median(length)) / RAYLEIGH_MEDIAN, 1e-9)
+    scale = max(rayleigh_sigma(length), 1e-9)
     return cauchy_weight((length / scale) ** 2)
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from pipelines.errors import InputError
 from pipelines.products import FloatArray
@@ -104,6 +104,18 @@ def project(camera: Camera, point_in_cam: ArrayLike) -> FloatArray:
     point = np.asarray(point_in_cam, dtype=np.float64)
     depth = np.where(point[..., 2:] > 0, point[..., 2:], np.nan)
     return distort(camera, point[..., :2] / depth)
+
+
+def project_each(cameras: dict[int, Camera], camera_of: NDArray[np.int64], points_in_cam: FloatArray) -> FloatArray:
+    """Pixels (M, 2) of points (M, 3), each in the frame of its own camera, whose key among `cameras` is given (M,).
+
+    NaN as in `project`.
+    """
+    found = np.empty((len(points_in_cam), 2))
+    for key, camera in cameras.items():
+        rows = np.flatnonzero(camera_of == key)
+        found[rows] = project(camera, points_in_cam[rows])
+    return found
 
 
 def distort(camera: Camera, ray: ArrayLike) -> FloatArray:

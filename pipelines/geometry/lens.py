@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,14 +64,21 @@ class Lenses:
         for slot, (key, camera) in enumerate(self.cameras.items()):
             rows = np.flatnonzero(self.camera_id[image] == key)
             for index in range(len(camera.params)):
-                step = _STEP * max(1.0, abs(float(camera.params[index])))
-                shift = np.zeros(len(camera.params))
-                shift[index] = step
-                ahead, behind = (
-                    bearings(replace(camera, params=camera.params + sign * shift), xy_px[rows]) for sign in (1, -1)
-                )
-                found[rows, :, slot, index] = (ahead - behind) / (2 * step)
+                towards = partial(bearings, xy_px=xy_px[rows])
+                found[rows, :, slot, index] = by_parameter(towards, camera, index, _STEP)
         return found.reshape(len(image), 3, -1)
+
+
+def by_parameter(function: Callable[[Camera], FloatArray], camera: Camera, index: int, step: float) -> FloatArray:
+    """Central difference of a function of a camera by one of its parameters.
+
+    Args:
+        step: of the parameter, as a part of it, or of 1 where that is more.
+    """
+    shift = np.zeros(len(camera.params))
+    shift[index] = step * max(1.0, abs(float(camera.params[index])))
+    ahead, behind = (function(replace(camera, params=camera.params + sign * shift)) for sign in (1, -1))
+    return np.asarray((ahead - behind) / (2 * shift[index]))
 
 
 def bearings(camera: Camera, xy_px: FloatArray) -> FloatArray:

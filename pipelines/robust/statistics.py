@@ -9,6 +9,7 @@ from scipy.stats import chi2
 from pipelines.products import FloatArray, ResidualStats
 
 _NORMAL_MAD = 1.4826  # σ / MAD of a normal distribution
+_RAYLEIGH_MEDIAN = 1.1774  # of the length of a residual, of σ = 1 in either coordinate
 _WEISZFELD_STEPS = 50
 _WEISZFELD_NEAR = 1e-6  # a point that is met weighs no more than this distance
 
@@ -25,6 +26,11 @@ def mad_sigma(values: ArrayLike) -> float:
     """σ of values (N,) from the median absolute deviation: half of them may be outliers."""
     array = np.asarray(values, dtype=np.float64)
     return float(_NORMAL_MAD * np.median(np.abs(array - np.median(array))))
+
+
+def rayleigh_sigma(lengths: ArrayLike) -> float:
+    """σ of either coordinate of residuals of lengths (N,), from their median. NaN is left out."""
+    return float(np.nanmedian(np.asarray(lengths, dtype=np.float64))) / _RAYLEIGH_MEDIAN
 
 
 def spatial_median(points: ArrayLike) -> FloatArray:

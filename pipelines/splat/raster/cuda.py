@@ -29,8 +29,6 @@ from pipelines.splat.raster.api import (
 from pipelines.splat.raster.reference import bounded_slope, screen_depth_covariance
 
 _EVERY_BATCH = 2**31 - 1
-# Pairs of the three numbers of a plane.
-_PRODUCTS = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
 
 
 def cuda_available() -> bool:
@@ -87,13 +85,13 @@ class CudaRasterizer:
         because a plane's depth at (0, 0) can be far from those that it is seen at.
         """
         middle = 0.5 * _row((float(camera.width), float(camera.height)), slope.device)
-        at_middle = meta["depths"] + (slope * (middle - meta["means2d"])).sum(dim=-1)
-        plane = torch.cat([at_middle[:, None], slope], dim=-1)
-        rows, columns = _PRODUCTS
+        z = meta["depths"] + (slope * (middle - meta["means2d"])).sum(dim=-1)
+        by_u, by_v = slope.unbind(-1)
+        of_square = (z * z, 2 * z * by_u, 2 * z * by_v, by_u * by_u, 2 * by_u * by_v, by_v * by_v)
         planes, _ = self._gsplat.rasterize_to_pixels(
             meta["means2d"],
             meta["conics"],
-            torch.cat([plane, plane[:, rows] * plane[:, columns]], dim=-1),
+            torch.stack([z, by_u, by_v, *of_square], dim=-1),
             meta["opacities"],
             camera.width,
             camera.height,
@@ -102,13 +100,12 @@ class CudaRasterizer:
             meta["flatten_ids"],
             packed=True,
         )
-        u = (torch.arange(camera.width, device=slope.device) + 0.5 * (1 - camera.width)).expand(camera.height, -1)
-        v = torch.arange(camera.height, device=slope.device) + 0.5 * (1 - camera.height)
-        at = torch.stack([torch.ones_like(u), u, v[:, None].expand_as(u)], dim=-1)
-        twice = torch.tensor([1.0 if i == j else 2.0 for i, j in zip(*_PRODUCTS, strict=True)], device=u.device)
+        u = torch.arange(camera.width, device=slope.device) + 0.5 * (1 - camera.width)
+        v = (torch.arange(camera.height, device=slope.device) + 0.5 * (1 - camera.height))[:, None]
+        z, by_u, by_v, zz, zu, zv, uu, uv, vv = planes[0].unbind(-1)
         total = alpha.clamp(min=1e-10)
-        mean = (planes[0, ..., :3] * at).sum(dim=-1) / total
-        square = (planes[0, ..., 3:] * at[..., rows] * at[..., columns] * twice).sum(dim=-1) / total
+        mean = (z + by_u * u + by_v * v) / total
+        square = (zz + zu * u + zv * v + uu * u * u + uv * u * v + vv * v * v) / total
         return mean, (square - mean.square()).clamp_min(0.0)
 
     @torch.no_grad()

@@ -15,7 +15,7 @@ from pipelines.blocks.scene import initial_scene
 from pipelines.errors import InputError
 from pipelines.formats.colmap import SparseModel
 from pipelines.geometry.cameras import Camera
-from pipelines.geometry.lens import Lenses, bearings
+from pipelines.geometry.lens import bearings
 from pipelines.georef.losses import depth_residuals
 from pipelines.georef.problem import GeoProblem
 from pipelines.products import AttitudeRecord
@@ -224,7 +224,7 @@ def test_marks_follow_the_lens_as_the_lens_itself_would_have_them() -> None:
     _, sparse, survey = material(NOISELESS)
     found = problem_of(survey, sparse, gcp_mode="depth")
     marks, by_depth = found.marks, found.measured.depth_marks
-    lenses = Lenses(sparse.cameras, sparse.image_camera_id)
+    lenses = sparse.lenses
     assert marks is not None
     assert by_depth is not None
     change = np.zeros(found.cameras.lens_basis.shape[0])

@@ -6,7 +6,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scenes import GEO_FROM_LOCAL, Measured, Noise, make_scene, sparse_model, survey_of, write_workspace
+from scenes import (
+    GEO_FROM_LOCAL,
+    Measured,
+    Noise,
+    make_scene,
+    sparse_model,
+    survey_of,
+    trained_model,
+    write_workspace,
+)
 
 from pipelines.blocks.trained import load_trained
 from pipelines.errors import InputError, MissingProductError
@@ -34,17 +43,8 @@ def workspace(tmp_path: Path) -> Workspace:
         )
         for index, name in enumerate(scene.names)
     )
-    model = TrainedModel(
-        geo_from_model=Similarity(translation=np.array([5.0, 6.0, 7.0])).to_record("model", "geo"),
-        model_from_local=GEO_FROM_LOCAL.to_record("local", "model"),
-        max_image_size=320,
-        cameras=cameras,
-        background=(0.0, 0.0, 0.0),
-        sh_degree=0,
-        iterations=1,
-        gaussians=2,
-        backend="cpu",
-    )
+    geo_from_model = Similarity(translation=np.array([5.0, 6.0, 7.0]))
+    model = trained_model(geo_from_model, GEO_FROM_LOCAL, cameras=cameras)
     save_json(model, tmp_path / MODEL)
     write_gaussians(tmp_path / GAUSSIANS, gaussians_of_size(np.zeros((2, 3)), np.zeros((2, 3)), np.ones(2)))
     return workspace

@@ -10,6 +10,7 @@ from pipelines.geometry.rotations import exp_so3
 from pipelines.robust.statistics import (
     chi2_quantile,
     mad_sigma,
+    rayleigh_sigma,
     residual_stats,
     spatial_median,
     squared_mahalanobis,
@@ -68,3 +69,13 @@ def test_spatial_median_turns_with_the_axes() -> None:
     points, turn = rng.normal(size=(7, 3)), exp_so3(np.array([0.3, -1.0, 0.4]))
     np.testing.assert_allclose(spatial_median(points @ turn.T), turn @ spatial_median(points), atol=1e-4)
     np.testing.assert_allclose(spatial_median(np.ones((4, 3))), [1.0, 1.0, 1.0])
+
+
+def test_rayleigh_sigma_is_that_of_a_coordinate() -> None:
+    residual = np.random.default_rng(4).normal(0.0, 0.7, (20_000, 2))
+    length = np.linalg.norm(residual, axis=1)
+    # The median of 20 000 lengths is known to a hundredth; with 40 % outliers it is their 83rd percentile.
+    assert rayleigh_sigma(length) == pytest.approx(0.7, rel=0.03)
+    assert rayleigh_sigma(np.append(length, np.nan)) == rayleigh_sigma(length)
+    length[:8000] += 1000.0
+    assert rayleigh_sigma(length) < 2 * 0.7
