@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from pipelines.blocks.depth_maps import DepthMaps
 from pipelines.blocks.geographic import geo_problem
 from pipelines.blocks.loop import LoopOptions, Outcome, optimise
 from pipelines.blocks.material import Material, initial_gaussians, points_to_hold
@@ -106,9 +107,11 @@ def run(stage: StageRun, config: TrainConfig) -> Summary:
     images = photographs(scene.sparse, survey, workspace, effort(config).max_image_size)
     require_memory(training_size(scene, images, config), free_memory_bytes(device_of(backend)))
     images.build(stage.progress)
-    surface = SceneSurface(workspace.cache / "surface", scene, images) if config.dense else None
-    if surface is not None:
-        surface.build(stage.progress)
+    surface = None
+    if config.dense:
+        maps = DepthMaps(workspace.cache / "surface", scene, images)
+        maps.build(stage.progress)
+        surface = SceneSurface(maps)
     problem = geo_problem(scene, survey, initial, config, GeolocatedPoints.load(workspace.path(POINTS)))
     trainer = make_trainer(Material(scene, images, surface), problem, backend, config)
     options = LoopOptions(

@@ -23,6 +23,7 @@ import numpy as np
 import torch
 from raster import make_scene
 
+from pipelines.blocks.depth_maps import DepthMaps
 from pipelines.blocks.geographic import geo_problem
 from pipelines.blocks.material import Material
 from pipelines.blocks.scene import Scene, initial_scene, photographs
@@ -103,10 +104,10 @@ def curve(arguments: argparse.Namespace) -> None:
         )
         images = photographs(scene.sparse, survey, workspace, arguments.max_image_size)
         images.build()
-        surface = SceneSurface(workspace.cache / "surface", scene, images)
-        surface.build()
+        maps = DepthMaps(workspace.cache / "surface", scene, images)
+        maps.build()
         trainer = make_trainer(
-            Material(scene, images, surface),
+            Material(scene, images, SceneSurface(maps)),
             geo_problem(scene, survey, initial, config),
             rasterizer(config.backend),
             config,

@@ -18,7 +18,7 @@ from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.initialise import InitialisationOptions, gaussians_from_points, gaussians_of_size
 
 _SURFACE_SHARE = 0.5  # of the Gaussians that there may be start on the surface; density control places the others
-_STRIDE = 2  # every other pixel of a depth map is enough to hold Gaussians, which are wider
+_STRIDE = 3  # every third pixel of a depth map is enough to hold Gaussians, which are wider
 _KEPT_VIEWS = 128  # views whose points stay on the device
 
 

@@ -29,12 +29,16 @@ class AgreementSettings:
         least_score: correlation that counts.
         steps: largest difference, in steps of the sweep.
         least_views: other views that must agree.
+        free: a view that sees a surface further away than a place by this part of its distance looks through it.
+        most_through: views that look through, as a part of those that agree: with more there is nothing.
         rim: a surface ends where what follows lies further away than its plane goes on by this part of the depth.
     """
 
     least_score: float = 0.4
     steps: float = 1.5
     least_views: int = 2
+    free: float = 0.02
+    most_through: float = 0.5
     rim: float = 0.01
 
 
@@ -44,46 +48,68 @@ def agreed_depth(reference: Surface, others: list[Surface], settings: AgreementS
     A point of the reference is looked up in each other view. The difference is taken along the normal of the
     other view's planes: on a surface that these follow, it does not matter that pixels do not coincide. Views weigh
     by the square of the sharpness of their peaks, since noise of the score moves a blunt one further: a view
-    without a baseline agrees with anything.
+    without a baseline agrees with anything. Where views look through the point there is no surface, though others
+    err alike: beside a roof all of those on one side take the ground for roof.
     """
     rays = reference.camera.rays()
     depth = reference.planes.depth(reference.camera, reference.swept.offset_m)
     good = (reference.swept.score > settings.least_score) & np.isfinite(depth) & (depth > 0)
     rows, columns = np.nonzero(good)
-    total, weight, count = np.zeros(depth.shape), np.ones(depth.shape), np.zeros(depth.shape, dtype=np.int64)
-    own = rays[rows, columns] @ reference.planes.normal_in_world
-    weight[rows, columns] = (own * reference.swept.sharpness[rows, columns]) ** 2
-    point = reference.camera.center_in_world + depth[rows, columns, None] * rays[rows, columns]
+    length, ray = depth[rows, columns], rays[rows, columns]
+    point = reference.camera.center_in_world + length[:, None] * ray
+    weight = ((ray @ reference.planes.normal_in_world) * reference.swept.sharpness[rows, columns]) ** 2
+    total, count, through = np.zeros(len(rows)), np.zeros(len(rows)), np.zeros(len(rows))
     for other in others:
-        seen, missed, sharpness = _missed(point, other, settings)
-        along = rays[rows[seen], columns[seen]] @ other.planes.normal_in_world
+        seen = _look_up(point, other, settings)
+        along = ray[seen.near] @ other.planes.normal_in_world
         with np.errstate(divide="ignore"):
-            longer = missed / along
-        fits = np.abs(longer) < 0.1 * depth[rows[seen], columns[seen]]  # not where the ray grazes the planes
-        place, of_view = (rows[seen][fits], columns[seen][fits]), ((along * sharpness) ** 2)[fits]
+            longer = seen.missed_m / along
+        fits = np.abs(longer) < 0.1 * length[seen.near]  # not where the ray grazes the planes
+        place, of_view = seen.near[fits], ((along * seen.sharpness) ** 2)[fits]
         total[place] += of_view * longer[fits]
         weight[place] += of_view
         count[place] += 1
-    agreed = count >= settings.least_views
-    return np.where(agreed, depth + total / weight, 0.0).astype(np.float32)
+        through[seen.through] += 1
+    agreed = (count >= settings.least_views) & (through < settings.most_through * count)
+    found = np.zeros(depth.shape, dtype=np.float32)
+    found[rows[agreed], columns[agreed]] = length[agreed] + total[agreed] / weight[agreed]
+    return found
 
 
-def _missed(
-    point: FloatArray, other: Surface, settings: AgreementSettings
-) -> tuple[NDArray[np.int64], FloatArray, FloatImage]:
-    """Indices of the points (P, 3) that lie on another view's surface, how far from it along its normal, and how
-    sharply that was found."""
-    camera = other.camera.pinhole
+@dataclass(frozen=True)
+class _Seen:
+    """Points as another view sees them.
+
+    Attributes:
+        near: indices (N,) of those on its surface.
+        missed_m: (N,) how far that surface is from them, along its normal.
+        sharpness: (N,) with which it was found.
+        through: indices of those that it looks through.
+    """
+
+    near: NDArray[np.int64]
+    missed_m: FloatArray
+    sharpness: FloatImage
+    through: NDArray[np.int64]
+
+
+def _look_up(point: FloatArray, other: Surface, settings: AgreementSettings) -> _Seen:
+    """Points (P, 3) in another view."""
+    camera, normal = other.camera.pinhole, other.planes.normal_in_world
     in_cam = (point - other.camera.center_in_world) @ other.camera.cam_from_world.T
     ahead = np.flatnonzero(in_cam[:, 2] > 0)
     column = np.floor(camera.fx * in_cam[ahead, 0] / in_cam[ahead, 2] + camera.cx)
     row = np.floor(camera.fy * in_cam[ahead, 1] / in_cam[ahead, 2] + camera.cy)
     inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
     ahead, place = ahead[inside], (row[inside].astype(np.int64), column[inside].astype(np.int64))
-    missed = other.swept.offset_m[place] - point[ahead] @ other.planes.normal_in_world
+    known = other.swept.score[place] > settings.least_score
+    ahead, place = ahead[known], (place[0][known], place[1][known])
+    offset = point[ahead] @ normal
+    missed = np.asarray(other.swept.offset_m[place] - offset, np.float64)
     near = np.abs(missed) < settings.steps * other.swept.step_m[place]
-    near &= other.swept.score[place] > settings.least_score
-    return ahead[near], np.asarray(missed[near]), other.swept.sharpness[place][near]
+    with np.errstate(divide="ignore"):
+        further = missed / (offset - normal @ other.camera.center_in_world)
+    return _Seen(ahead[near], missed[near], other.swept.sharpness[place][near], ahead[further > settings.free])
 
 
 def without_rims(depth: FloatImage, reach_px: int, rim: float) -> FloatImage:

@@ -12,6 +12,7 @@ import torch
 from scenes import write_workspace
 from splat_scenes import CAMERA, GEO_FROM_LOCAL, Rendered, ground_height, make_rendered
 
+from pipelines.blocks.depth_maps import DepthMaps
 from pipelines.blocks.material import Material, initial_gaussians, points_to_hold
 from pipelines.blocks.scene import Scene, make_scene, photographs
 from pipelines.blocks.surface import SceneSurface, spread_evenly
@@ -54,19 +55,26 @@ def material(tmp_path_factory: pytest.TempPathFactory) -> tuple[Rendered, Scene,
 
 
 @pytest.fixture(scope="module")
-def surface(material: tuple[Rendered, Scene, ImageCache], tmp_path_factory: pytest.TempPathFactory) -> SceneSurface:
-    found = SceneSurface(tmp_path_factory.mktemp("surface"), *material[1:])
+def maps(material: tuple[Rendered, Scene, ImageCache], tmp_path_factory: pytest.TempPathFactory) -> DepthMaps:
+    found = DepthMaps(tmp_path_factory.mktemp("surface"), *material[1:])
     found.build()
     return found
 
 
-def test_surface_is_the_hill(surface: SceneSurface, material: tuple[Rendered, Scene, ImageCache]) -> None:
+@pytest.fixture(scope="module")
+def surface(maps: DepthMaps) -> SceneSurface:
+    return SceneSurface(maps)
+
+
+def test_surface_is_the_hill(
+    maps: DepthMaps, surface: SceneSurface, material: tuple[Rendered, Scene, ImageCache]
+) -> None:
     errors, seen = [], []
     for index in material[1].train:
         points = surface.points(int(index))
         near = points[(np.abs(points[:, :2]) < 26).all(axis=1)]
         errors.append(near[:, 2] - ground_height(near[:, 0], near[:, 1]))
-        seen.append((surface.depth(int(index)) > 0).mean())
+        seen.append((maps.depth(int(index)) > 0).mean())
     error = np.abs(np.concatenate(errors))
     assert np.median(error) < QUARTER_PX_M
     assert (error < 4 * QUARTER_PX_M).mean() > 0.9
@@ -96,30 +104,30 @@ def test_sample_knows_the_slope_of_the_hill(surface: SceneSurface) -> None:
     assert np.median(angle) < 2 * 3.6
 
 
-def test_maps_are_kept_and_continued(surface: SceneSurface, material: tuple[Rendered, Scene, ImageCache]) -> None:
-    folder = surface.folder
-    first = sorted(folder.glob("*.depth.npy"))
+def test_maps_are_kept_and_continued(maps: DepthMaps, material: tuple[Rendered, Scene, ImageCache]) -> None:
+    first = sorted(maps.folder.iterdir())
     before = {path: path.stat().st_mtime_ns for path in first}
     lost = first[3]
     content = lost.read_bytes()
     lost.unlink()
-    again = SceneSurface(folder.parent, *material[1:])
+    again = DepthMaps(maps.folder.parent, *material[1:])
     again.build()
     assert lost.read_bytes() == content
+    assert sorted(maps.folder.iterdir()) == first  # nothing of what is on the way stays
     assert all(path.stat().st_mtime_ns == before[path] for path in first if path != lost)
 
 
-def test_another_scene_has_other_maps(surface: SceneSurface, material: tuple[Rendered, Scene, ImageCache]) -> None:
+def test_another_scene_has_other_maps(maps: DepthMaps, material: tuple[Rendered, Scene, ImageCache]) -> None:
     _, scene, images = material
     fewer = replace(scene, train=scene.train[:-1])
-    assert SceneSurface(surface.folder.parent, fewer, images).folder != surface.folder
+    assert DepthMaps(maps.folder.parent, fewer, images).folder != maps.folder
 
 
 def test_test_views_show_nothing_of_the_surface(
-    surface: SceneSurface, material: tuple[Rendered, Scene, ImageCache]
+    maps: DepthMaps, material: tuple[Rendered, Scene, ImageCache]
 ) -> None:
     held_out = {f"{int(index):06d}" for index in material[1].test}
-    assert not held_out & {path.name.split(".")[0] for path in surface.folder.iterdir()}
+    assert not held_out & {path.name.split(".")[0] for path in maps.folder.iterdir()}
 
 
 def test_gaussians_start_on_the_surface(

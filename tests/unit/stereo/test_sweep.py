@@ -2,68 +2,19 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import pytest
+from stereo_scenes import CAMERA, GROUND_M, LEVEL, ROOF_M, TENTH_PX_M, ring_of_views, swept, true_depth
 
-from pipelines.geometry.cameras import Pinhole
 from pipelines.stereo.agreement import AgreementSettings, Surface, agreed_depth
+from pipelines.stereo.matching import MatchSettings
 from pipelines.stereo.neighbours import Sightings, best_neighbours, planes_for
-from pipelines.stereo.sweep import Planes, StereoCamera, StereoView, SweepSettings, plane_sweep
-
-CAMERA = Pinhole(120, 90, 110.0, 110.0, 60.0, 45.0)
-GROUND_M, ROOF_M, ROOF_SIDE_M = 0.0, 6.0, 8.0
-TEXEL_M = 0.1
-LEVEL = Planes(np.array([0.0, 0.0, 1.0]), np.arange(-4.0, 10.0, 0.5))
-# A pixel is 0.36 m wide on the ground, neighbours are 20° apart: a tenth of a pixel is 0.1 m of height.
-TENTH_PX_M = 0.1
-
-
-def looking_at_origin(azimuth_deg: float, height_m: float = 30.0, radius_m: float = 25.0) -> tuple[np.ndarray, ...]:
-    azimuth = np.radians(azimuth_deg)
-    center = np.array([radius_m * np.cos(azimuth), radius_m * np.sin(azimuth), height_m])
-    axis = -center / np.linalg.norm(center)
-    right = np.cross(axis, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(axis, right), axis]), center
-
-
-def texture(seed: int) -> np.ndarray:
-    noise = np.random.default_rng(seed).uniform(60, 200, (800, 800)).astype(np.float32)
-    return cv2.GaussianBlur(noise, (0, 0), 3.0) * 4 - 390
-
-
-def true_depth(camera: StereoCamera) -> np.ndarray:
-    """First surface along each ray: the square roof, or the ground."""
-    rays, center = camera.rays(), camera.center_in_world
-    roof = (ROOF_M - center[2]) / rays[..., 2]
-    on_roof = center + roof[..., None] * rays
-    hit = (np.abs(on_roof[..., :2]) < ROOF_SIDE_M / 2).all(axis=-1)
-    return np.where(hit, roof, (GROUND_M - center[2]) / rays[..., 2])
-
-
-def shot(azimuth_deg: float, brightness: float = 1.0) -> StereoView:
-    rotation, center = looking_at_origin(azimuth_deg)
-    camera = StereoCamera(CAMERA, rotation, center)
-    place = center + true_depth(camera)[..., None] * camera.rays()
-    column, row = ((place[..., axis] / TEXEL_M + 400).astype(np.float32) for axis in (0, 1))
-    high = place[..., 2] > 0.5 * ROOF_M
-    painted = [
-        cv2.remap(texture(seed), column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP) for seed in (1, 2)
-    ]
-    grey = brightness * np.where(high, painted[1], painted[0]) + 1
-    return StereoView(camera, np.clip(grey, 1, 256).astype(np.float32))
+from pipelines.stereo.sweep import Planes, StereoCamera, StereoView, Swept, plane_sweep
 
 
 @pytest.fixture(scope="module")
 def ring() -> list[StereoView]:
-    """Views of different brightness, as the exposure of a flight varies."""
-    return [shot(azimuth, 1 + 0.1 * (index % 3)) for index, azimuth in enumerate(range(0, 120, 20))]
-
-
-def swept(ring: list[StereoView], index: int) -> Surface:
-    others = [view for place, view in enumerate(ring) if 0 < abs(place - index) <= 2]
-    return Surface(ring[index].camera, LEVEL, plane_sweep(ring[index], others, LEVEL, SweepSettings()))
+    return ring_of_views()
 
 
 def test_sweep_finds_ground_and_roof(ring: list[StereoView]) -> None:
@@ -93,17 +44,39 @@ def test_what_no_other_view_confirms_is_left_out(ring: list[StereoView]) -> None
     assert not agreed_depth(own, [], AgreementSettings()).any()
 
 
+def test_a_place_that_views_look_through_is_no_surface(ring: list[StereoView]) -> None:
+    """Two views that err alike, as beside a roof, against two that see the ground behind."""
+    raised = (slice(20, 40), slice(20, 40))
+
+    def flat(index: int, height_m: float) -> Surface:
+        camera = ring[index].camera
+        offset = np.zeros((CAMERA.height, CAMERA.width), np.float32)
+        if height_m:
+            offset[raised] = height_m
+        one = np.ones_like(offset)
+        return Surface(camera, LEVEL, Swept(offset, one, 0.5 * one, one))
+
+    own, alike, clear = flat(2, 4.0), [flat(2, 4.0), flat(2, 4.0)], [flat(2, 0.0), flat(2, 0.0)]
+    assert (agreed_depth(own, alike, AgreementSettings())[raised] > 0).all()
+    outvoted = agreed_depth(own, alike + clear, AgreementSettings())
+    assert not outvoted[raised].any()
+    assert (outvoted[45:] > 0).all()
+    # Views that see something nearer have it in their way, which says nothing.
+    hidden = agreed_depth(flat(2, 0.0), [*clear, *alike], AgreementSettings())
+    assert (hidden > 0).all()
+
+
 def test_planes_behind_the_camera_are_never_chosen(ring: list[StereoView]) -> None:
     above = Planes(np.array([0.0, 0.0, 1.0]), np.array([31.0, 32.0, 33.0, 0.0]))
-    found = plane_sweep(ring[2], ring[3:5], above, SweepSettings())
+    found = plane_sweep(ring[2], ring[3:5], above, MatchSettings())
     assert np.nanmin(np.abs(found.offset_m - 33.0)) > 1  # all on the only plane in front, or none at all
 
 
 def test_a_sweep_needs_neighbours_and_planes(ring: list[StereoView]) -> None:
     with pytest.raises(ValueError, match="0 neighbours"):
-        plane_sweep(ring[0], [], LEVEL, SweepSettings())
+        plane_sweep(ring[0], [], LEVEL, MatchSettings())
     with pytest.raises(ValueError, match="2 planes"):
-        plane_sweep(ring[0], ring[1:2], Planes(LEVEL.normal_in_world, np.array([0.0, 1.0])), SweepSettings())
+        plane_sweep(ring[0], ring[1:2], Planes(LEVEL.normal_in_world, np.array([0.0, 1.0])), MatchSettings())
 
 
 def grid_points() -> np.ndarray:

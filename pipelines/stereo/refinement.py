@@ -1,0 +1,111 @@
+"""Refinement of a surface on finer pixels: only what lies near to what is known of it is compared.
+
+As in cascades of cost volumes (Gu et al., doi 10.1109/CVPR42600.2020.00257): each pixel starts from its own guess.
+A window across the edge of a roof sees the roof where the roof is, and the ground beside it where the ground is; a
+sweep of planes takes that ground for roof.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from pipelines.products import FloatArray
+from pipelines.stereo.agreement import Surface
+from pipelines.stereo.matching import UNSEEN, FloatImage, Matcher, MatchSettings, Peak
+from pipelines.stereo.sweep import StereoCamera, StereoView, Swept, calibration, swept_from
+
+_REACH = 4  # steps on either side of the guess
+_STEPS = 2  # to one of the sweep that the guess is from
+_SPECKLE_PX = 5  # of what only one view has found, smaller parts than half of this are chance
+_LEAST_DEPTH = 1e-3
+_OUTSIDE = -10.0
+
+
+@dataclass(frozen=True)
+class Guess:
+    """Where a surface is, roughly.
+
+    Attributes:
+        normal_in_world: (3,) unit vector that offsets are counted along.
+        offset_m: (H, W) of the surface at each pixel of a view.
+        step_m: (H, W) between two places to be compared.
+    """
+
+    normal_in_world: FloatArray
+    offset_m: FloatImage
+    step_m: FloatImage
+
+
+def guess_from(surface: Surface, agreed: FloatImage, camera: StereoCamera) -> Guess:
+    """What views agree on (H, W), and elsewhere what the view itself found, at the pixels of a finer camera."""
+    planes, swept = surface.planes, surface.swept
+    own = np.where(np.isfinite(swept.offset_m), swept.offset_m, np.median(planes.offset_m)).astype(np.float32)
+    own = np.asarray(cv2.medianBlur(own, _SPECKLE_PX), np.float32)
+    known = np.where(agreed > 0, planes.offset(surface.camera, agreed), own)
+    size = (camera.pinhole.width, camera.pinhole.height)
+    offset, step = (
+        # Between roof and ground is nothing that an interpolated offset could mean.
+        np.asarray(cv2.resize(image.astype(np.float32), size, interpolation=cv2.INTER_NEAREST), np.float32)
+        for image in (known, swept.step_m / _STEPS)
+    )
+    return Guess(planes.normal_in_world, offset, step)
+
+
+def refine(reference: StereoView, neighbours: list[StereoView], guess: Guess, settings: MatchSettings) -> Swept:
+    """Compare a view with its neighbours at offsets around a guess.
+
+    A best match at either end of these says only that the surface is elsewhere: its score is −1.
+
+    Args:
+        reference: view to find the surface of.
+        neighbours: one or more views of the same place from elsewhere.
+        guess: where it is, roughly, at the pixels of `reference`.
+        settings: how to compare.
+
+    Raises:
+        ValueError: no neighbours.
+    """
+    if not neighbours:
+        raise ValueError("no neighbours to compare with")
+    matcher, peak = Matcher(reference.grey, settings), Peak(reference.grey.shape)
+    sights = [_Sight(reference.camera, view) for view in neighbours]
+    along = reference.camera.rays() @ guess.normal_in_world
+    with np.errstate(divide="ignore", invalid="ignore"):
+        middle = (guess.offset_m - guess.normal_in_world @ reference.camera.center_in_world) / along
+        step = (guess.step_m / along).astype(np.float32)
+    for number in range(-_REACH, _REACH + 1):
+        depth = middle.astype(np.float32) + np.float32(number) * step
+        score = matcher(sight.shown(depth) for sight in sights)
+        score[~(depth > 0)] = UNSEEN
+        peak.add(score)
+    found = peak.found()
+    swept = swept_from(found, guess.offset_m + (found.place - _REACH) * guess.step_m, guess.step_m)
+    return replace(swept, score=np.where(found.inner, swept.score, np.float32(UNSEEN)))
+
+
+class _Sight:
+    """What a neighbour shows at the pixels of a view, at any depth of each."""
+
+    def __init__(self, reference: StereoCamera, other: StereoView) -> None:
+        pixel_from_world = calibration(other.camera.pinhole) @ other.camera.cam_from_world
+        by_depth = (reference.rays() @ pixel_from_world.T).astype(np.float32)
+        self._by_depth = [np.ascontiguousarray(by_depth[..., axis]) for axis in range(3)]
+        self._start = (pixel_from_world @ (reference.center_in_world - other.camera.center_in_world)).astype(
+            np.float32
+        )
+        self._grey = other.grey
+
+    def shown(self, depth: FloatImage) -> FloatImage:
+        """Picture (H, W) of the neighbour; 0 where it shows nothing of depths (H, W)."""
+        x, y, z = (depth * by_depth + start for by_depth, start in zip(self._by_depth, self._start, strict=True))
+        behind = ~(z > _LEAST_DEPTH)
+        z[behind] = 1.0
+        x /= z
+        y /= z
+        x[behind] = _OUTSIDE
+        y[behind] = _OUTSIDE
+        found = cv2.remap(self._grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+        return np.asarray(found, np.float32)

@@ -1,0 +1,116 @@
+"""Refinement on finer pixels of what a sweep found on coarse ones."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from stereo_scenes import CAMERA, GROUND_M, LEVEL, TENTH_PX_M, around, ring_of_views, swept, true_depth
+
+from pipelines.geometry.cameras import Pinhole
+from pipelines.stereo.agreement import AgreementSettings, Surface, agreed_depth
+from pipelines.stereo.matching import UNSEEN, FloatImage, MatchSettings
+from pipelines.stereo.refinement import Guess, guess_from, refine
+from pipelines.stereo.sweep import StereoCamera, StereoView, plane_sweep
+
+FINE = Pinhole(240, 180, 220.0, 220.0, 120.0, 90.0)  # pixels of half the width
+INNER = np.s_[16:-16, 16:-16]
+STEP_M = 0.25
+
+
+@pytest.fixture(scope="module")
+def fine() -> list[StereoView]:
+    return ring_of_views(FINE)
+
+
+@pytest.fixture(scope="module")
+def coarse() -> list[Surface]:
+    ring = ring_of_views()
+    return [swept(ring, index) for index in range(5)]
+
+
+def height_error(camera: StereoCamera, offset_m: FloatImage) -> np.ndarray:
+    return np.asarray(offset_m - LEVEL.offset(camera, true_depth(camera).astype(np.float32)))
+
+
+def guessed(camera: StereoCamera, off_m: float) -> Guess:
+    """The truth, but so much higher."""
+    offset = LEVEL.offset(camera, true_depth(camera).astype(np.float32)) + off_m
+    return Guess(LEVEL.normal_in_world, offset.astype(np.float32), np.full(offset.shape, STEP_M, np.float32))
+
+
+def test_offsets_are_the_inverse_of_depths(fine: list[StereoView]) -> None:
+    camera = fine[1].camera
+    offset = np.random.default_rng(0).uniform(-3, 9, (FINE.height, FINE.width)).astype(np.float32)
+    depth = LEVEL.depth(camera, offset).astype(np.float32)
+    np.testing.assert_allclose(LEVEL.offset(camera, depth), offset, atol=1e-4)  # of 30 m in single precision
+
+
+@pytest.mark.parametrize("off_m", [0.0, 0.6, -0.6])
+def test_a_guess_within_reach_is_corrected(fine: list[StereoView], off_m: float) -> None:
+    found = refine(fine[2], around(fine, 2), guessed(fine[2].camera, off_m), MatchSettings())
+    error = height_error(fine[2].camera, found.offset_m)[INNER]
+    trusted = found.score[INNER] > AgreementSettings().least_score
+    assert trusted.mean() > 0.9
+    assert np.median(np.abs(error[trusted])) < TENTH_PX_M / 2  # pixels are half as wide
+    np.testing.assert_array_equal(found.step_m, STEP_M)
+
+
+def test_a_guess_out_of_reach_has_no_score(fine: list[StereoView]) -> None:
+    found = refine(fine[2], around(fine, 2), guessed(fine[2].camera, 3.0), MatchSettings())
+    # By chance some texture fits itself elsewhere: less than half, and not well.
+    assert (found.score[INNER] > AgreementSettings().least_score).mean() < 0.25
+    assert (found.score[INNER] == UNSEEN).any()
+
+
+def test_the_ground_beside_a_roof_is_not_taken_for_roof(fine: list[StereoView], coarse: list[Surface]) -> None:
+    """As a sweep of planes does on the same fine pixels."""
+    camera = fine[2].camera
+    depth = true_depth(camera)
+    height = LEVEL.offset(camera, depth.astype(np.float32))
+    roof = (height > GROUND_M + 3).astype(np.uint8)
+    beside = (cv2.dilate(roof, np.ones((9, 9), np.uint8)) > roof)[INNER]
+    agreed = agreed_depth(coarse[2], [coarse[index] for index in (0, 1, 3, 4)], AgreementSettings())
+    refined = refine(fine[2], around(fine, 2), guess_from(coarse[2], agreed, camera), MatchSettings())
+    planes = plane_sweep(fine[2], around(fine, 2), LEVEL, MatchSettings())
+    trusted = AgreementSettings().least_score
+    wrong = [
+        ((np.abs(height_error(camera, found.offset_m)) > 0.5) & (found.score > trusted))[INNER]
+        for found in (refined, planes)
+    ]
+    assert wrong[0][beside].mean() < 0.5 * wrong[1][beside].mean()
+    assert wrong[0].mean() < 0.1
+
+
+def test_guesses_are_what_views_agree_on(fine: list[StereoView], coarse: list[Surface]) -> None:
+    own = coarse[2]
+    agreed = np.zeros((CAMERA.height, CAMERA.width), np.float32)
+    agreed[10:20, 10:20] = LEVEL.depth(own.camera, np.full(agreed.shape, 7.0, np.float32))[10:20, 10:20]
+    found = guess_from(own, agreed, fine[2].camera)
+    assert found.offset_m.shape == (FINE.height, FINE.width)
+    np.testing.assert_allclose(found.offset_m[20:40, 20:40], 7.0, atol=1e-4)
+    elsewhere = found.offset_m[60:120, 60:180]
+    np.testing.assert_array_equal(
+        elsewhere,
+        cv2.resize(
+            cv2.medianBlur(own.swept.offset_m, 5), (FINE.width, FINE.height), interpolation=cv2.INTER_NEAREST
+        )[60:120, 60:180],
+    )
+    np.testing.assert_allclose(found.step_m, 0.25)  # half of that of the sweep
+
+
+def test_pixels_that_nothing_fits_start_in_the_middle(fine: list[StereoView], coarse: list[Surface]) -> None:
+    empty = Surface(coarse[2].camera, LEVEL, plane_sweep(*_nothing_to_see(), LEVEL, MatchSettings()))
+    assert np.isnan(empty.swept.offset_m).all()
+    found = guess_from(empty, np.zeros((CAMERA.height, CAMERA.width), np.float32), fine[2].camera)
+    np.testing.assert_allclose(found.offset_m, np.median(LEVEL.offset_m))
+
+
+def _nothing_to_see() -> tuple[StereoView, list[StereoView]]:
+    ring = ring_of_views()
+    return ring[2], [StereoView(ring[3].camera, np.zeros_like(ring[3].grey))]
+
+
+def test_refinement_needs_neighbours(fine: list[StereoView]) -> None:
+    with pytest.raises(ValueError, match="no neighbours"):
+        refine(fine[2], [], guessed(fine[2].camera, 0.0), MatchSettings())
