@@ -11,6 +11,7 @@ configuration, and the medians over the surveys; `--json` FILE keeps them.
 from __future__ import annotations
 
 import argparse
+import csv
 import json
 import subprocess
 import sys
@@ -34,6 +35,7 @@ PROFILES = {
     "consumer": ("consumer", False),
     "outliers": ("outliers", False),
     "outliers, 8 GCPs": ("outliers", True),
+    "RTK, 15 % outliers": ("rtk_outliers", False),
     "PPK": ("ppk", False),
 }
 ORBIT_FILES = {
@@ -41,6 +43,9 @@ ORBIT_FILES = {
     "consumer": "trajectory_consumer.csv",
     "outliers": "trajectory_outlier.csv",
 }
+# What `georef simulate` is asked for, where a receiver is none of its own.
+SIMULATED: dict[str, dict[str, Any]] = {"rtk_outliers": {"gnss": "rtk", "outlier_share": 0.15}}
+OUTLIER_DEG = 5.0 / 111_000
 FIGURES = (
     "test_psnr",
     "camera_mean_h_m",
@@ -86,9 +91,25 @@ def surveys(arguments: argparse.Namespace) -> Iterator[Survey]:
     """The surveys, simulated where they are not there yet."""
     if arguments.orbit is not None:
         files = {receiver: arguments.orbit / name for receiver, name in ORBIT_FILES.items()}
+        files["rtk_outliers"] = arguments.out / arguments.orbit.name / "trajectory_rtk_outliers.csv"
+        replace_outliers(files["rtk"], files["outliers"], files["rtk_outliers"])
         yield Survey(arguments.orbit.name, arguments.orbit, files)
     for seed in filter(None, arguments.seeds.split(",")):
         yield simulated(int(seed), arguments)
+
+
+def replace_outliers(exact: Path, with_outliers: Path, path: Path) -> None:
+    """Write the fixes of one trajectory, but another's where that is metres off: the σ do not say which."""
+    exact_rows, other_rows = (list(csv.DictReader(file.open(encoding="utf-8"))) for file in (exact, with_outliers))
+    for row, other in zip(exact_rows, other_rows, strict=True):
+        away = max(abs(float(row[key]) - float(other[key])) for key in ("latitude", "longitude"))
+        if away > OUTLIER_DEG:
+            row.update({key: other[key] for key in ("latitude", "longitude", "altitude")})
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", encoding="utf-8", newline="") as handle:
+        writer = csv.DictWriter(handle, exact_rows[0].keys())
+        writer.writeheader()
+        writer.writerows(exact_rows)
 
 
 def simulated(seed: int, arguments: argparse.Namespace) -> Survey:
@@ -101,7 +122,8 @@ def simulated(seed: int, arguments: argparse.Namespace) -> Survey:
     for receiver in {PROFILES[profile][0] for profile in arguments.profiles.split(";")}:
         files[receiver] = folder / f"trajectory_{receiver}.csv"
         if not files[receiver].exists():
-            options = {"images": arguments.images, "size": arguments.size, "seed": seed, "gnss": receiver}
+            options = {"images": arguments.images, "size": arguments.size, "seed": seed}
+            options |= SIMULATED.get(receiver, {"gnss": receiver})
             config = resolve(SimulateConfig, {}, options, Path("georef.toml"))
             write_trajectory(files[receiver], fly_survey(config).recording.photos)
     return Survey(f"seed{seed}", folder, files)
