@@ -8,7 +8,7 @@ import numpy as np
 from pipelines.geometry.cameras import Pinhole
 from pipelines.stereo.agreement import Surface
 from pipelines.stereo.matching import MatchSettings
-from pipelines.stereo.sweep import Planes, StereoCamera, StereoView, plane_sweep
+from pipelines.stereo.sweep import Facing, Planes, StereoCamera, StereoView, plane_sweep
 
 CAMERA = Pinhole(120, 90, 110.0, 110.0, 60.0, 45.0)
 GROUND_M, ROOF_M, ROOF_SIDE_M = 0.0, 6.0, 8.0
@@ -54,6 +54,11 @@ def shot(azimuth_deg: float, brightness: float = 1.0, pinhole: Pinhole = CAMERA)
     return StereoView(camera, np.clip(grey, 1, 256).astype(np.float32))
 
 
+def facing_up(pinhole: Pinhole = CAMERA) -> Facing:
+    """All pixels on level planes."""
+    return Facing(LEVEL.normal_in_world[None], np.zeros((pinhole.height, pinhole.width), np.uint8))
+
+
 def ring_of_views(pinhole: Pinhole = CAMERA) -> list[StereoView]:
     """Views of different brightness, as the exposure of a flight varies."""
     return [shot(azimuth, 1 + 0.1 * (index % 3), pinhole) for index, azimuth in enumerate(range(0, 120, 20))]
@@ -66,4 +71,4 @@ def around(ring: list[StereoView], index: int) -> list[StereoView]:
 
 def swept(ring: list[StereoView], index: int) -> Surface:
     """What planes find in a view."""
-    return Surface(ring[index].camera, LEVEL, plane_sweep(ring[index], around(ring, index), LEVEL, MatchSettings()))
+    return Surface(ring[index].camera, plane_sweep(ring[index], around(ring, index), [LEVEL], MatchSettings()))

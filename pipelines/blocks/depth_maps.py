@@ -23,11 +23,13 @@ from pipelines.stereo.agreement import AgreementSettings, Surface, agreed_depth,
 from pipelines.stereo.matching import UNSEEN, FloatImage, MatchSettings
 from pipelines.stereo.neighbours import Sightings, best_neighbours, planes_for
 from pipelines.stereo.refinement import guess_from, refine
-from pipelines.stereo.sweep import Planes, StereoCamera, StereoView, Swept, plane_sweep
+from pipelines.stereo.sweep import Facing, Planes, StereoCamera, StereoView, Swept, plane_sweep
 
 log = logging.getLogger(__name__)
 
-_FORM = b"coarse, fine: offset, score, step, sharpness"  # of what is kept: other forms have other folders
+_FORM = (
+    b"coarse, fine: direction, offset, score, step, sharpness"  # of what is kept: other forms have other folders
+)
 
 
 @dataclass(frozen=True)
@@ -105,11 +107,11 @@ class DepthMaps:
         return self._rgb(self.camera(index), index)
 
     def _sweep(self, index: int) -> FloatImage:
-        planes, others = self._planes(index), self._neighbours(index)
-        if planes is None:
+        sweeps, others = self._planes(index), self._neighbours(index)
+        if not sweeps:
             return _nothing(self._coarse(index))
         views = [self._view(self._coarse(j), j) for j in others]
-        return _packed(plane_sweep(self._view(self._coarse(index), index), views, planes, self._options.matching))
+        return _packed(plane_sweep(self._view(self._coarse(index), index), views, sweeps, self._options.matching))
 
     def _refine(self, index: int) -> FloatImage:
         own = self._surface(index, "coarse")
@@ -135,17 +137,18 @@ class DepthMaps:
         return without_rims(depth, int(window_px / 2), options.agreement.rim)
 
     def _surface(self, index: int, kind: str) -> Surface | None:
-        planes = self._planes(index)
-        if planes is None:
+        sweeps = self._planes(index)
+        if not sweeps:
             return None
         pinhole = self._coarse(index) if kind == "coarse" else self.camera(index)
-        offset, score, step, sharpness = np.load(self._path(index, kind), mmap_mode="r", allow_pickle=False)
-        return Surface(self._camera(pinhole, index), planes, Swept(offset, score, step, sharpness))
+        which, *rest = np.load(self._path(index, kind), mmap_mode="r", allow_pickle=False)
+        facing = Facing(np.stack([planes.normal_in_world for planes in sweeps]), which.astype(np.uint8))
+        return Surface(self._camera(pinhole, index), Swept(facing, *rest))
 
-    def _find_planes(self, index: int) -> Planes | None:
+    def _find_planes(self, index: int) -> list[Planes]:
         others = self._neighbours(index)
         if not others:
-            return None
+            return []
         points = self.scene.point_in_model[self._sightings.seen_by(index)]
         cameras = [self._camera(self._coarse(j), j) for j in others]
         return planes_for(self._camera(self._coarse(index), index), cameras, points)
@@ -191,12 +194,13 @@ class DepthMaps:
 
 
 def _packed(swept: Swept) -> FloatImage:
-    """(4, H, W): offset, score, step and sharpness of each pixel."""
-    return np.stack([swept.offset_m, swept.score, swept.step_m, swept.sharpness])
+    """(5, H, W): direction, offset, score, step and sharpness of each pixel."""
+    which = swept.facing.which.astype(np.float32)
+    return np.stack([which, swept.offset_m, swept.score, swept.step_m, swept.sharpness])
 
 
 def _nothing(pinhole: Pinhole) -> FloatImage:
     """The same of a view without neighbours."""
-    found = np.zeros((4, pinhole.height, pinhole.width), dtype=np.float32)
-    found[0], found[1] = np.nan, UNSEEN
+    found = np.zeros((5, pinhole.height, pinhole.width), dtype=np.float32)
+    found[1], found[2] = np.nan, UNSEEN
     return found

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.products import FloatArray
-from pipelines.stereo.sweep import FloatImage, Planes, StereoCamera, Swept
+from pipelines.stereo.sweep import FloatImage, StereoCamera, Swept
 
 
 @dataclass(frozen=True)
@@ -17,8 +17,11 @@ class Surface:
     """The surface that a sweep found in a view."""
 
     camera: StereoCamera
-    planes: Planes
     swept: Swept
+
+    def depth(self) -> FloatArray:
+        """Depth (H, W) along the optical axis."""
+        return self.swept.facing.depth(self.camera, self.swept.offset_m)
 
 
 @dataclass(frozen=True)
@@ -45,23 +48,24 @@ class AgreementSettings:
 def agreed_depth(reference: Surface, others: list[Surface], settings: AgreementSettings) -> FloatImage:
     """Depth (H, W) along the optical axis of `reference`, the mean of the views that agree; 0 where too few do.
 
-    A point of the reference is looked up in each other view. The difference is taken along the normal of the
-    other view's planes: on a surface that these follow, it does not matter that pixels do not coincide. Views weigh
-    by the square of the sharpness of their peaks, since noise of the score moves a blunt one further: a view
+    A point of the reference is looked up in each other view. The difference is taken along the normal of the plane
+    that was found there: on a surface that planes follow, it does not matter that pixels do not coincide. Views
+    weigh by the square of the sharpness of their peaks, since noise of the score moves a blunt one further: a view
     without a baseline agrees with anything. Where views look through the point there is no surface, though others
     err alike: beside a roof all of those on one side take the ground for roof.
     """
     rays = reference.camera.rays()
-    depth = reference.planes.depth(reference.camera, reference.swept.offset_m)
+    depth = reference.depth()
     good = (reference.swept.score > settings.least_score) & np.isfinite(depth) & (depth > 0)
     rows, columns = np.nonzero(good)
     length, ray = depth[rows, columns], rays[rows, columns]
     point = reference.camera.center_in_world + length[:, None] * ray
-    weight = ((ray @ reference.planes.normal_in_world) * reference.swept.sharpness[rows, columns]) ** 2
+    own = reference.swept.facing.along(reference.camera)
+    weight = (own * reference.swept.sharpness)[rows, columns] ** 2
     total, count, through = np.zeros(len(rows)), np.zeros(len(rows)), np.zeros(len(rows))
     for other in others:
         seen = _look_up(point, other, settings)
-        along = ray[seen.near] @ other.planes.normal_in_world
+        along = np.einsum("ni,ni->n", ray[seen.near], seen.normal_in_world)
         with np.errstate(divide="ignore"):
             longer = seen.missed_m / along
         fits = np.abs(longer) < 0.1 * length[seen.near]  # not where the ray grazes the planes
@@ -82,12 +86,14 @@ class _Seen:
 
     Attributes:
         near: indices (N,) of those on its surface.
+        normal_in_world: (N, 3) of that surface.
         missed_m: (N,) how far that surface is from them, along its normal.
         sharpness: (N,) with which it was found.
         through: indices of those that it looks through.
     """
 
     near: NDArray[np.int64]
+    normal_in_world: FloatArray
     missed_m: FloatArray
     sharpness: FloatImage
     through: NDArray[np.int64]
@@ -95,7 +101,7 @@ class _Seen:
 
 def _look_up(point: FloatArray, other: Surface, settings: AgreementSettings) -> _Seen:
     """Points (P, 3) in another view."""
-    camera, normal = other.camera.pinhole, other.planes.normal_in_world
+    camera, facing = other.camera.pinhole, other.swept.facing
     in_cam = (point - other.camera.center_in_world) @ other.camera.cam_from_world.T
     ahead = np.flatnonzero(in_cam[:, 2] > 0)
     column = np.floor(camera.fx * in_cam[ahead, 0] / in_cam[ahead, 2] + camera.cx)
@@ -104,12 +110,15 @@ def _look_up(point: FloatArray, other: Surface, settings: AgreementSettings) -> 
     ahead, place = ahead[inside], (row[inside].astype(np.int64), column[inside].astype(np.int64))
     known = other.swept.score[place] > settings.least_score
     ahead, place = ahead[known], (place[0][known], place[1][known])
-    offset = point[ahead] @ normal
+    normal = facing.normals_in_world[facing.which[place]]
+    offset = np.einsum("ni,ni->n", point[ahead], normal)
     missed = np.asarray(other.swept.offset_m[place] - offset, np.float64)
     near = np.abs(missed) < settings.steps * other.swept.step_m[place]
     with np.errstate(divide="ignore"):
         further = missed / (offset - normal @ other.camera.center_in_world)
-    return _Seen(ahead[near], missed[near], other.swept.sharpness[place][near], ahead[further > settings.free])
+    return _Seen(
+        ahead[near], normal[near], missed[near], other.swept.sharpness[place][near], ahead[further > settings.free]
+    )
 
 
 def without_rims(depth: FloatImage, reach_px: int, rim: float) -> FloatImage:

@@ -20,9 +20,10 @@ _LEAST_SHARED = 5
 
 _UP = np.array([0.0, 0.0, 1.0])
 _LEVEL = np.sin(np.radians(15.0))  # a view that looks down less than this sees walls rather than ground
+_NEAREST = 0.3  # of the distance of most points
 _RANGE = (0.5, 99.5)  # percentiles of the points
 _MARGIN = 0.25  # of their range, on either side: ground without texture has no points
-_STEP_PX = 0.75  # between two planes in the neighbours
+_STEP_PX = 1.0  # between two planes in the neighbours
 _LEAST_PLANES, _MOST_PLANES = 16, 256
 
 
@@ -65,32 +66,60 @@ def best_neighbours(sightings: Sightings, view: int, among: IntArray, count: int
     return [int(index) for index in order if worth[index] > 0]
 
 
-def planes_for(view: StereoCamera, neighbours: list[StereoCamera], points: FloatArray) -> Planes | None:
-    """Planes through points (P, 3) that the view sees: level ones, or across a view that hardly looks down.
+def planes_for(view: StereoCamera, neighbours: list[StereoCamera], points: FloatArray) -> list[Planes]:
+    """Planes through points (P, 3) that the view sees, by direction; none where the points are too few.
 
-    Level planes suit ground and roofs seen at a slant, where planes across the view do not. None where the points
-    are too few or too near each other.
+    Level ones suit ground and roofs, upright ones across the view the walls. A view that hardly looks down needs
+    planes across its axis alone.
     """
-    axis = view.cam_from_world[2]
-    level = -axis[2] > _LEVEL
-    normal = _UP if level else axis
-    along = points @ normal
     if len(points) < _LEAST_SHARED:
-        return None
-    low, high = np.percentile(along, _RANGE)
-    low, high = low - _MARGIN * (high - low), high + _MARGIN * (high - low)
-    own = float(normal @ view.center_in_world)
-    if not level:
-        nearest = own + 0.5 * max(float(np.percentile(along, _RANGE[0])) - own, 1e-6)
-        low = max(low, nearest)
-    middle = points[np.argsort(along)[len(points) // 2]]
-    step = _STEP_PX / max(_pixels_a_metre(view, neighbours, middle, normal), 1e-9)
-    count = int(np.clip(np.ceil((high - low) / step), _LEAST_PLANES, _MOST_PLANES))
+        return []
+    axis = view.cam_from_world[2]
+    ahead = axis * [1.0, 1.0, 0.0]
+    forward = float(np.linalg.norm(ahead))
+    if -axis[2] <= _LEVEL:
+        found = [_planes_across(view, neighbours, points, axis)]
+    elif forward <= _LEVEL:  # from straight above walls are not seen
+        found = [_level_planes(view, neighbours, points)]
+    else:
+        found = [_level_planes(view, neighbours, points), _planes_across(view, neighbours, points, ahead / forward)]
+    return [planes for planes in found if planes is not None]
+
+
+def _level_planes(view: StereoCamera, neighbours: list[StereoCamera], points: FloatArray) -> Planes | None:
+    low, high = _range(points @ _UP)
     if not high > low:
         return None
-    if level:
-        return Planes(normal, np.linspace(low, high, count))
-    return Planes(normal, own + 1 / np.linspace(1 / (low - own), 1 / (high - own), count))
+    return Planes(_UP, np.linspace(low, high, _count(view, neighbours, points, _UP, high - low)))
+
+
+def _planes_across(
+    view: StereoCamera, neighbours: list[StereoCamera], points: FloatArray, normal: FloatArray
+) -> Planes | None:
+    """Planes at distances whose inverses are evenly spaced, as pixels have it."""
+    away = points @ normal - normal @ view.center_in_world
+    low, high = _range(away)
+    low = max(low, _NEAREST * float(np.median(away)))
+    if not high > low > 0:
+        return None
+    count = _count(view, neighbours, points, normal, high - low)
+    offset = normal @ view.center_in_world + 1 / np.linspace(1 / low, 1 / high, count)
+    return Planes(normal, offset)
+
+
+def _range(along: FloatArray) -> tuple[float, float]:
+    low, high = np.percentile(along, _RANGE)
+    margin = _MARGIN * (high - low)
+    return float(low - margin), float(high + margin)
+
+
+def _count(
+    view: StereoCamera, neighbours: list[StereoCamera], points: FloatArray, normal: FloatArray, range_m: float
+) -> int:
+    """How many planes are a step apart in the neighbours."""
+    middle = points[np.argsort(points @ normal)[len(points) // 2]]
+    step = _STEP_PX / max(_pixels_a_metre(view, neighbours, middle, normal), 1e-9)
+    return int(np.clip(np.ceil(range_m / step), _LEAST_PLANES, _MOST_PLANES))
 
 
 def _pixels_a_metre(

@@ -12,10 +12,9 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from pipelines.products import FloatArray
 from pipelines.stereo.agreement import Surface
 from pipelines.stereo.matching import UNSEEN, FloatImage, Matcher, MatchSettings, Peak
-from pipelines.stereo.sweep import StereoCamera, StereoView, Swept, calibration, swept_from
+from pipelines.stereo.sweep import Facing, StereoCamera, StereoView, Swept, calibration, swept_from
 
 _REACH = 4  # steps on either side of the guess
 _STEPS = 2  # to one of the sweep that the guess is from
@@ -29,29 +28,32 @@ class Guess:
     """Where a surface is, roughly.
 
     Attributes:
-        normal_in_world: (3,) unit vector that offsets are counted along.
+        facing: directions that offsets are counted along.
         offset_m: (H, W) of the surface at each pixel of a view.
         step_m: (H, W) between two places to be compared.
     """
 
-    normal_in_world: FloatArray
+    facing: Facing
     offset_m: FloatImage
     step_m: FloatImage
 
 
 def guess_from(surface: Surface, agreed: FloatImage, camera: StereoCamera) -> Guess:
     """What views agree on (H, W), and elsewhere what the view itself found, at the pixels of a finer camera."""
-    planes, swept = surface.planes, surface.swept
-    own = np.where(np.isfinite(swept.offset_m), swept.offset_m, np.median(planes.offset_m)).astype(np.float32)
+    facing, own = surface.swept.facing, surface.depth()
+    own = np.where(np.isfinite(own) & (own > 0), own, 0).astype(np.float32)
     own = np.asarray(cv2.medianBlur(own, _SPECKLE_PX), np.float32)
-    known = np.where(agreed > 0, planes.offset(surface.camera, agreed), own)
+    offset = facing.offset(surface.camera, np.where(agreed > 0, agreed, own))
     size = (camera.pinhole.width, camera.pinhole.height)
-    offset, step = (
+    finer = [
         # Between roof and ground is nothing that an interpolated offset could mean.
-        np.asarray(cv2.resize(image.astype(np.float32), size, interpolation=cv2.INTER_NEAREST), np.float32)
-        for image in (known, swept.step_m / _STEPS)
+        cv2.resize(image, size, interpolation=cv2.INTER_NEAREST)
+        for image in (facing.which, offset.astype(np.float32), surface.swept.step_m / np.float32(_STEPS))
+    ]
+    which = np.asarray(finer[0], np.uint8)
+    return Guess(
+        Facing(facing.normals_in_world, which), np.asarray(finer[1], np.float32), np.asarray(finer[2], np.float32)
     )
-    return Guess(planes.normal_in_world, offset, step)
 
 
 def refine(reference: StereoView, neighbours: list[StereoView], guess: Guess, settings: MatchSettings) -> Swept:
@@ -72,17 +74,17 @@ def refine(reference: StereoView, neighbours: list[StereoView], guess: Guess, se
         raise ValueError("no neighbours to compare with")
     matcher, peak = Matcher(reference.grey, settings), Peak(reference.grey.shape)
     sights = [_Sight(reference.camera, view) for view in neighbours]
-    along = reference.camera.rays() @ guess.normal_in_world
-    with np.errstate(divide="ignore", invalid="ignore"):
-        middle = (guess.offset_m - guess.normal_in_world @ reference.camera.center_in_world) / along
-        step = (guess.step_m / along).astype(np.float32)
+    middle = guess.facing.depth(reference.camera, guess.offset_m)
+    with np.errstate(divide="ignore"):
+        step = (guess.step_m / guess.facing.along(reference.camera)).astype(np.float32)
     for number in range(-_REACH, _REACH + 1):
         depth = middle.astype(np.float32) + np.float32(number) * step
         score = matcher(sight.shown(depth) for sight in sights)
         score[~(depth > 0)] = UNSEEN
         peak.add(score)
     found = peak.found()
-    swept = swept_from(found, guess.offset_m + (found.place - _REACH) * guess.step_m, guess.step_m)
+    offset = guess.offset_m + (found.place - _REACH) * guess.step_m
+    swept = swept_from(found, guess.facing, offset, guess.step_m)
     return replace(swept, score=np.where(found.inner, swept.score, np.float32(UNSEEN)))
 
 

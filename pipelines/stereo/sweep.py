@@ -10,10 +10,13 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from pipelines.geometry.cameras import Pinhole
 from pipelines.products import FloatArray
 from pipelines.stereo.matching import UNSEEN, FloatImage, Found, Matcher, MatchSettings, Peak
+
+_CLEARLY = 0.05  # of the score: by so much other planes must fit better than the first
 
 
 @dataclass(frozen=True)
@@ -61,16 +64,36 @@ class Planes:
     normal_in_world: FloatArray
     offset_m: FloatArray
 
+
+@dataclass(frozen=True)
+class Facing:
+    """Which way each pixel's surface is taken to face: offsets along that normal tell where it is.
+
+    Attributes:
+        normals_in_world: (F, 3) unit vectors.
+        which: (H, W) the number of a pixel's own.
+    """
+
+    normals_in_world: FloatArray
+    which: NDArray[np.uint8]
+
+    @property
+    def normal_in_world(self) -> FloatArray:
+        """(H, W, 3)."""
+        return self.normals_in_world[self.which]
+
+    def along(self, camera: StereoCamera) -> FloatArray:
+        """Offset (H, W) that a ray of a camera gains by a metre of depth."""
+        return np.asarray(np.einsum("hwi,hwi->hw", camera.rays(), self.normal_in_world))
+
     def depth(self, camera: StereoCamera, offset_m: FloatImage) -> FloatArray:
         """Depth (H, W) along the optical axis at which the rays of a camera meet planes of offsets (H, W)."""
-        with np.errstate(divide="ignore"):
-            distance = offset_m - self.normal_in_world @ camera.center_in_world
-            return np.asarray(distance / (camera.rays() @ self.normal_in_world))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray((offset_m - self.normal_in_world @ camera.center_in_world) / self.along(camera))
 
     def offset(self, camera: StereoCamera, depth: FloatImage) -> FloatArray:
         """Offsets (H, W) of the points at depths (H, W) of a camera: the inverse of `depth`."""
-        along = camera.rays() @ self.normal_in_world
-        return np.asarray(self.normal_in_world @ camera.center_in_world + depth * along)
+        return np.asarray(self.normal_in_world @ camera.center_in_world + depth * self.along(camera))
 
 
 @dataclass(frozen=True)
@@ -78,6 +101,7 @@ class Swept:
     """The best plane at each pixel.
 
     Attributes:
+        facing: the direction of that plane.
         offset_m: (H, W) between the planes where a parabola through the neighbouring scores says so; NaN where
             none lies in front of the camera.
         score: (H, W) correlation, −1 … 1.
@@ -86,6 +110,7 @@ class Swept:
             from nearly the same place, or see little texture. The σ of the offset goes with its inverse.
     """
 
+    facing: Facing
     offset_m: FloatImage
     score: FloatImage
     step_m: FloatImage
@@ -93,24 +118,39 @@ class Swept:
 
 
 def plane_sweep(
-    reference: StereoView, neighbours: list[StereoView], planes: Planes, settings: MatchSettings
+    reference: StereoView, neighbours: list[StereoView], sweeps: list[Planes], settings: MatchSettings
 ) -> Swept:
-    """Compare a view with its neighbours on every plane.
+    """Compare a view with its neighbours on every plane, and keep at each pixel the best of all.
+
+    A window fits best on the planes that face as its surface does: walls need others than the ground.
 
     Memory does not depend on the number of planes. Time: planes × neighbours × pixels.
 
     Args:
         reference: view to find the surface of.
         neighbours: one or more views of the same place from elsewhere.
-        planes: hypotheses.
+        sweeps: hypotheses, by direction, the likelier ones first.
         settings: how to compare.
 
     Raises:
-        ValueError: no neighbours, or fewer than three planes.
+        ValueError: no neighbours, no sweep, or one of fewer than three planes.
     """
-    if not neighbours or len(planes.offset_m) < 3:
-        raise ValueError(f"{len(neighbours)} neighbours and {len(planes.offset_m)} planes are too few to sweep")
+    fewest = min((len(planes.offset_m) for planes in sweeps), default=0)
+    if not neighbours or fewest < 3:
+        raise ValueError(f"{len(neighbours)} neighbours and {fewest} planes are too few to sweep")
     matcher = Matcher(reference.grey, settings)
+    found = [_sweep(reference, neighbours, planes, matcher) for planes in sweeps]
+    best = np.argmax([each.score - (_CLEARLY if number else 0) for number, each in enumerate(found)], axis=0)
+    facing = Facing(np.stack([planes.normal_in_world for planes in sweeps]), best.astype(np.uint8))
+    offset, score, step, sharpness = (
+        np.choose(best, [getattr(each, name) for each in found])
+        for name in ("offset_m", "score", "step_m", "sharpness")
+    )
+    return Swept(facing, offset, score, step, sharpness)
+
+
+def _sweep(reference: StereoView, neighbours: list[StereoView], planes: Planes, matcher: Matcher) -> Swept:
+    """The best planes of one direction."""
     # Rays meet a plane in front of the camera where both lie on one side of it.
     sign = reference.camera.rays() @ planes.normal_in_world
     own = planes.normal_in_world @ reference.camera.center_in_world
@@ -123,13 +163,14 @@ def plane_sweep(
     offset_m = np.interp(found.place, np.arange(len(planes.offset_m)), planes.offset_m)
     offset_m[found.score <= UNSEEN] = np.nan
     step_m = np.abs(np.gradient(planes.offset_m))[np.rint(found.place).astype(np.int64)]
-    return swept_from(found, offset_m, step_m)
+    facing = Facing(planes.normal_in_world[None], np.zeros(offset_m.shape, np.uint8))
+    return swept_from(found, facing, offset_m, step_m)
 
 
-def swept_from(found: Found, offset_m: FloatArray, step_m: FloatArray | FloatImage) -> Swept:
+def swept_from(found: Found, facing: Facing, offset_m: FloatArray, step_m: FloatArray | FloatImage) -> Swept:
     """What was found, at these offsets (H, W), among hypotheses so far (H, W) apart."""
     sharpness = (found.curvature / step_m**2).astype(np.float32)
-    return Swept(offset_m.astype(np.float32), found.score, step_m.astype(np.float32), sharpness)
+    return Swept(facing, offset_m.astype(np.float32), found.score, step_m.astype(np.float32), sharpness)
 
 
 def _seen_on_plane(reference: StereoView, other: StereoView, planes: Planes, offset_m: float) -> FloatImage:

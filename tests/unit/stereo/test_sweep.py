@@ -2,9 +2,23 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
-from stereo_scenes import CAMERA, GROUND_M, LEVEL, ROOF_M, TENTH_PX_M, ring_of_views, swept, true_depth
+from stereo_scenes import (
+    CAMERA,
+    GROUND_M,
+    LEVEL,
+    ROOF_M,
+    TENTH_PX_M,
+    TEXEL_M,
+    facing_up,
+    looking_at_origin,
+    ring_of_views,
+    swept,
+    texture,
+    true_depth,
+)
 
 from pipelines.stereo.agreement import AgreementSettings, Surface, agreed_depth
 from pipelines.stereo.matching import MatchSettings
@@ -19,7 +33,7 @@ def ring() -> list[StereoView]:
 
 def test_sweep_finds_ground_and_roof(ring: list[StereoView]) -> None:
     found = swept(ring, 2)
-    depth = LEVEL.depth(ring[2].camera, found.swept.offset_m)
+    depth = found.depth()
     error = (depth - true_depth(ring[2].camera)) * np.abs(ring[2].camera.rays()[..., 2])
     inner = np.s_[8:-8, 8:-8]
     assert np.median(np.abs(error[inner])) < TENTH_PX_M
@@ -32,7 +46,7 @@ def test_views_that_agree_leave_few_errors(ring: list[StereoView]) -> None:
     depth = agreed_depth(surfaces[2], [surfaces[index] for index in (0, 1, 3, 4)], AgreementSettings())
     known = depth > 0
     height_error = (depth - true_depth(ring[2].camera)) * np.abs(ring[2].camera.rays()[..., 2])
-    alone = np.abs(LEVEL.depth(ring[2].camera, surfaces[2].swept.offset_m) - true_depth(ring[2].camera)) > 0.5
+    alone = np.abs(surfaces[2].depth() - true_depth(ring[2].camera)) > 0.5
     assert known.mean() > 0.7
     assert (np.abs(height_error[known]) < 0.5).mean() > 0.97
     # What one view gets wrong, others see differently.
@@ -54,7 +68,7 @@ def test_a_place_that_views_look_through_is_no_surface(ring: list[StereoView]) -
         if height_m:
             offset[raised] = height_m
         one = np.ones_like(offset)
-        return Surface(camera, LEVEL, Swept(offset, one, 0.5 * one, one))
+        return Surface(camera, Swept(facing_up(), offset, one, 0.5 * one, one))
 
     own, alike, clear = flat(2, 4.0), [flat(2, 4.0), flat(2, 4.0)], [flat(2, 0.0), flat(2, 0.0)]
     assert (agreed_depth(own, alike, AgreementSettings())[raised] > 0).all()
@@ -68,15 +82,15 @@ def test_a_place_that_views_look_through_is_no_surface(ring: list[StereoView]) -
 
 def test_planes_behind_the_camera_are_never_chosen(ring: list[StereoView]) -> None:
     above = Planes(np.array([0.0, 0.0, 1.0]), np.array([31.0, 32.0, 33.0, 0.0]))
-    found = plane_sweep(ring[2], ring[3:5], above, MatchSettings())
+    found = plane_sweep(ring[2], ring[3:5], [above], MatchSettings())
     assert np.nanmin(np.abs(found.offset_m - 33.0)) > 1  # all on the only plane in front, or none at all
 
 
 def test_a_sweep_needs_neighbours_and_planes(ring: list[StereoView]) -> None:
     with pytest.raises(ValueError, match="0 neighbours"):
-        plane_sweep(ring[0], [], LEVEL, MatchSettings())
+        plane_sweep(ring[0], [], [LEVEL], MatchSettings())
     with pytest.raises(ValueError, match="2 planes"):
-        plane_sweep(ring[0], ring[1:2], Planes(LEVEL.normal_in_world, np.array([0.0, 1.0])), MatchSettings())
+        plane_sweep(ring[0], ring[1:2], [Planes(LEVEL.normal_in_world, np.array([0.0, 1.0]))], MatchSettings())
 
 
 def grid_points() -> np.ndarray:
@@ -101,22 +115,62 @@ def test_neighbours_are_those_under_good_angles(ring: list[StereoView]) -> None:
 
 def test_planes_follow_the_view(ring: list[StereoView]) -> None:
     points = grid_points()
-    planes = planes_for(ring[2].camera, [view.camera for view in ring[3:5]], points)
-    assert planes is not None
-    np.testing.assert_allclose(planes.normal_in_world, [0, 0, 1])
-    assert planes.offset_m.min() < GROUND_M < ROOF_M < planes.offset_m.max()
+    flat, upright = planes_for(ring[2].camera, [view.camera for view in ring[3:5]], points)
+    np.testing.assert_allclose(flat.normal_in_world, [0, 0, 1])
+    assert flat.offset_m.min() < GROUND_M < ROOF_M < flat.offset_m.max()
+    ahead = ring[2].camera.cam_from_world[2] * [1, 1, 0]
+    np.testing.assert_allclose(upright.normal_in_world, ahead / np.linalg.norm(ahead))
+    along = points @ upright.normal_in_world
+    assert upright.offset_m.min() < along.min() < along.max() < upright.offset_m.max()
+
+
+def test_a_level_view_needs_planes_across_it_alone() -> None:
     level = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
     rotation = np.stack([level[1], -np.array([0.0, 0, 1]), np.cross(level[1], [0.0, 0, -1])])
     facade = StereoCamera(CAMERA, rotation, np.array([-40.0, 0.0, 3.0]) * np.sign(rotation[2, 0]))
     side = StereoCamera(CAMERA, rotation, facade.center_in_world + np.array([0.0, 6.0, 0.0]))
-    across = planes_for(facade, [side], points)
-    assert across is not None
+    (across,) = planes_for(facade, [side], grid_points())
     np.testing.assert_allclose(np.abs(across.normal_in_world), [1, 0, 0], atol=1e-12)
     depth = across.offset_m - across.normal_in_world @ facade.center_in_world
-    assert depth.min() > 0
-    assert depth.min() < 32  # the points are 32 to 48 m away
+    assert 0 < depth.min() < 32  # the points are 32 to 48 m away
     assert depth.max() > 48
 
 
+def test_from_straight_above_there_are_level_planes_alone() -> None:
+    rotation = np.diag([1.0, -1.0, -1.0])
+    above = StereoCamera(CAMERA, rotation, np.array([0.0, 0.0, 40.0]))
+    side = StereoCamera(CAMERA, rotation, np.array([8.0, 0.0, 40.0]))
+    (found,) = planes_for(above, [side], grid_points())
+    np.testing.assert_allclose(found.normal_in_world, [0, 0, 1])
+
+
+def test_walls_are_found_on_upright_planes() -> None:
+    """A wall turned by 30° from the views, which look down on it: level planes cut it, and see other texture."""
+    normal = np.array([np.cos(np.radians(30)), np.sin(np.radians(30)), 0.0])
+    side = np.cross([0.0, 0.0, 1.0], normal)
+    views = []
+    for azimuth in (-24, -12, 0, 12, 24):
+        rotation, center = looking_at_origin(azimuth, 18.0, 34.0)
+        camera = StereoCamera(CAMERA, rotation, center)
+        depth = -(center @ normal) / (camera.rays() @ normal)
+        place = center + depth[..., None] * camera.rays()
+        column, row = ((along / TEXEL_M + 400).astype(np.float32) for along in (place @ side, place[..., 2]))
+        grey = cv2.remap(texture(3), column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP) + 1
+        views.append(StereoView(camera, np.clip(grey, 1, 256).astype(np.float32)))
+    reference, others = views[2], [*views[:2], *views[3:]]
+    ahead = reference.camera.cam_from_world[2] * [1, 1, 0]
+    ahead /= np.linalg.norm(ahead)
+    upright = Planes(ahead, np.arange(-10.0, 10.0, 0.5))
+    flat = Planes(LEVEL.normal_in_world, np.arange(-12.0, 12.0, 0.5))
+    truth = -(reference.camera.center_in_world @ normal) / (reference.camera.rays() @ normal)
+    inner = np.s_[10:-10, 10:-10]
+    wrong = []
+    for sweeps in ([flat], [flat, upright]):
+        found = Surface(reference.camera, plane_sweep(reference, others, sweeps, MatchSettings()))
+        wrong.append((np.abs(found.depth() - truth)[inner] > 0.5).mean())
+    assert wrong[1] < 0.5 * wrong[0]
+    assert wrong[1] < 0.15
+
+
 def test_too_few_points_give_no_planes(ring: list[StereoView]) -> None:
-    assert planes_for(ring[2].camera, [view.camera for view in ring[3:5]], grid_points()[:3]) is None
+    assert planes_for(ring[2].camera, [view.camera for view in ring[3:5]], grid_points()[:3]) == []
