@@ -32,6 +32,12 @@ def texture(seed: int) -> np.ndarray:
     return cv2.GaussianBlur(noise, (0, 0), 3.0) * 4 - 390
 
 
+def painted(seed: int, right_m: np.ndarray, up_m: np.ndarray) -> np.ndarray:
+    """The texture at places on a plane."""
+    column, row = ((along / TEXEL_M + 400).astype(np.float32) for along in (right_m, up_m))
+    return np.asarray(cv2.remap(texture(seed), column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP))
+
+
 def true_depth(camera: StereoCamera) -> np.ndarray:
     """First surface along each ray: the square roof, or the ground."""
     rays, center = camera.rays(), camera.center_in_world
@@ -45,12 +51,8 @@ def shot(azimuth_deg: float, brightness: float = 1.0, pinhole: Pinhole = CAMERA)
     rotation, center = looking_at_origin(azimuth_deg)
     camera = StereoCamera(pinhole, rotation, center)
     place = center + true_depth(camera)[..., None] * camera.rays()
-    column, row = ((place[..., axis] / TEXEL_M + 400).astype(np.float32) for axis in (0, 1))
-    high = place[..., 2] > 0.5 * ROOF_M
-    painted = [
-        cv2.remap(texture(seed), column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP) for seed in (1, 2)
-    ]
-    grey = brightness * np.where(high, painted[1], painted[0]) + 1
+    ground, roof = (painted(seed, place[..., 0], place[..., 1]) for seed in (1, 2))
+    grey = brightness * np.where(place[..., 2] > 0.5 * ROOF_M, roof, ground) + 1
     return StereoView(camera, np.clip(grey, 1, 256).astype(np.float32))
 
 

@@ -100,7 +100,9 @@ def surveys(arguments: argparse.Namespace) -> Iterator[Survey]:
 
 def replace_outliers(exact: Path, with_outliers: Path, path: Path) -> None:
     """Write the fixes of one trajectory, but another's where that is metres off: the σ do not say which."""
-    exact_rows, other_rows = (list(csv.DictReader(file.open(encoding="utf-8"))) for file in (exact, with_outliers))
+    exact_rows, other_rows = (
+        list(csv.DictReader(file.read_text(encoding="utf-8").splitlines())) for file in (exact, with_outliers)
+    )
     for row, other in zip(exact_rows, other_rows, strict=True):
         away = max(abs(float(row[key]) - float(other[key])) for key in ("latitude", "longitude"))
         if away > OUTLIER_DEG:

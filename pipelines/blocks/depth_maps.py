@@ -6,7 +6,6 @@ Each view is swept by planes on coarse pixels; what views agree on is refined on
 from __future__ import annotations
 
 import hashlib
-import logging
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -25,11 +24,8 @@ from pipelines.stereo.neighbours import Sightings, best_neighbours, planes_for
 from pipelines.stereo.refinement import guess_from, refine
 from pipelines.stereo.sweep import Facing, Planes, StereoCamera, StereoView, Swept, plane_sweep
 
-log = logging.getLogger(__name__)
-
-_FORM = (
-    b"coarse, fine: direction, offset, score, step, sharpness"  # of what is kept: other forms have other folders
-)
+# Of what is kept: other forms have other folders.
+_FORM = b"coarse, fine: direction, offset, score, step, sharpness"
 
 
 @dataclass(frozen=True)
@@ -80,18 +76,17 @@ class DepthMaps:
     def build(self, progress: Progress = SILENT) -> None:
         """Make them, one step for all views after the other: each needs what its neighbours have found."""
         train = [int(index) for index in self.scene.train]
-        if all(self._path(index, "depth").exists() for index in train):
-            return
         steps = (("coarse", self._sweep), ("fine", self._refine), ("depth", self._agree))
-        with progress.task("surface", len(steps) * len(train)) as task:
-            for kind, make in steps:
-                for index in train:
-                    if not self._path(index, kind).exists():
-                        save_array(self._path(index, kind), make(index))
-                    task.advance()
-        for kind, _ in steps[:-1]:
+        if not all(self._path(index, "depth").exists() for index in train):
+            with progress.task("surface", len(steps) * len(train)) as task:
+                for kind, make in steps:
+                    for index in train:
+                        if not self._path(index, kind).exists():
+                            save_array(self._path(index, kind), make(index))
+                        task.advance()
+        for kind, _ in steps[:-1]:  # also those that an interrupted run has left
             for index in train:
-                self._path(index, kind).unlink()
+                self._path(index, kind).unlink(missing_ok=True)
 
     def camera(self, index: int) -> Pinhole:
         """Camera of a depth map."""

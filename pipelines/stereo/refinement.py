@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from pipelines.products import FloatArray
 from pipelines.stereo.agreement import Surface
 from pipelines.stereo.matching import UNSEEN, FloatImage, Matcher, MatchSettings, Peak
 from pipelines.stereo.sweep import Facing, StereoCamera, StereoView, Swept, calibration, swept_from
@@ -73,12 +74,13 @@ def refine(reference: StereoView, neighbours: list[StereoView], guess: Guess, se
     if not neighbours:
         raise ValueError("no neighbours to compare with")
     matcher, peak = Matcher(reference.grey, settings), Peak(reference.grey.shape)
-    sights = [_Sight(reference.camera, view) for view in neighbours]
-    middle = guess.facing.depth(reference.camera, guess.offset_m)
+    rays = reference.camera.rays()
+    sights = [_Sight(rays, reference.camera.center_in_world, view) for view in neighbours]
+    middle = guess.facing.depth(reference.camera, guess.offset_m).astype(np.float32)
     with np.errstate(divide="ignore"):
         step = (guess.step_m / guess.facing.along(reference.camera)).astype(np.float32)
     for number in range(-_REACH, _REACH + 1):
-        depth = middle.astype(np.float32) + np.float32(number) * step
+        depth = middle + np.float32(number) * step
         score = matcher(sight.shown(depth) for sight in sights)
         score[~(depth > 0)] = UNSEEN
         peak.add(score)
@@ -89,15 +91,14 @@ def refine(reference: StereoView, neighbours: list[StereoView], guess: Guess, se
 
 
 class _Sight:
-    """What a neighbour shows at the pixels of a view, at any depth of each."""
+    """What a neighbour shows along rays (H, W, 3) from a centre (3,), at any depth of each."""
 
-    def __init__(self, reference: StereoCamera, other: StereoView) -> None:
+    def __init__(self, rays: FloatArray, center_in_world: FloatArray, other: StereoView) -> None:
         pixel_from_world = calibration(other.camera.pinhole) @ other.camera.cam_from_world
-        by_depth = (reference.rays() @ pixel_from_world.T).astype(np.float32)
+        by_depth = (rays @ pixel_from_world.T).astype(np.float32)
         self._by_depth = [np.ascontiguousarray(by_depth[..., axis]) for axis in range(3)]
-        self._start = (pixel_from_world @ (reference.center_in_world - other.camera.center_in_world)).astype(
-            np.float32
-        )
+        start = pixel_from_world @ (center_in_world - other.camera.center_in_world)
+        self._start = start.astype(np.float32)
         self._grey = other.grey
 
     def shown(self, depth: FloatImage) -> FloatImage:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import pytest
 from stereo_scenes import (
@@ -11,12 +10,11 @@ from stereo_scenes import (
     LEVEL,
     ROOF_M,
     TENTH_PX_M,
-    TEXEL_M,
     facing_up,
     looking_at_origin,
+    painted,
     ring_of_views,
     swept,
-    texture,
     true_depth,
 )
 
@@ -65,8 +63,7 @@ def test_a_place_that_views_look_through_is_no_surface(ring: list[StereoView]) -
     def flat(index: int, height_m: float) -> Surface:
         camera = ring[index].camera
         offset = np.zeros((CAMERA.height, CAMERA.width), np.float32)
-        if height_m:
-            offset[raised] = height_m
+        offset[raised] = height_m
         one = np.ones_like(offset)
         return Surface(camera, Swept(facing_up(), offset, one, 0.5 * one, one))
 
@@ -154,8 +151,7 @@ def test_walls_are_found_on_upright_planes() -> None:
         camera = StereoCamera(CAMERA, rotation, center)
         depth = -(center @ normal) / (camera.rays() @ normal)
         place = center + depth[..., None] * camera.rays()
-        column, row = ((along / TEXEL_M + 400).astype(np.float32) for along in (place @ side, place[..., 2]))
-        grey = cv2.remap(texture(3), column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP) + 1
+        grey = painted(3, place @ side, place[..., 2]) + 1
         views.append(StereoView(camera, np.clip(grey, 1, 256).astype(np.float32)))
     reference, others = views[2], [*views[:2], *views[3:]]
     ahead = reference.camera.cam_from_world[2] * [1, 1, 0]
