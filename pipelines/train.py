@@ -61,7 +61,9 @@ _CAUSES = {
     "lever-arm": "`georef ingest --lever-arm` can apply it, in the axes of the body",
     "boresight": "`georef ingest --boresight` can apply it",
 }
-_COARSE = ((4, 0.1), (2, 0.3))  # shrunken so much, up to this fraction of the training
+# Shrunken so much, up to this fraction of the training. More would push Gaussians, which are then smaller than a
+# pixel, off the surface that they start on.
+_COARSE = ((2, 0.3),)
 
 
 @dataclass(frozen=True)

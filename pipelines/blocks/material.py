@@ -8,6 +8,8 @@ from functools import lru_cache
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from pipelines.blocks.background import background
@@ -17,9 +19,10 @@ from pipelines.formats.image_cache import ImageCache
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.initialise import InitialisationOptions, gaussians_from_points, gaussians_of_size
 
-_SURFACE_SHARE = 0.5  # of the Gaussians that there may be start on the surface; density control places the others
+_SURFACE_SHARE = 0.8  # of the Gaussians that there may be start on the surface; density control places the others
 _STRIDE = 3  # every third pixel of a depth map is enough to hold Gaussians, which are wider
 _KEPT_VIEWS = 128  # views whose points stay on the device
+_OFF_SURFACE = 3.0  # gaps between points of the surface: an SfM point so near to one lies on it
 
 
 @dataclass(frozen=True)
@@ -32,7 +35,10 @@ class Material:
 
 
 def initial_gaussians(material: Material, options: InitialisationOptions, most: int, seed: int) -> Gaussians:
-    """One at each SfM point, on the surface as densely as photographs show it, and those of the background.
+    """On the surface as densely as photographs show it, at SfM points where none is known, and in the background.
+
+    Where the surface is known its discs are the better start: an SfM point says nothing of where it faces, and a
+    ball reaches as far behind a wall as the wall's next point is away.
 
     Args:
         material: what there is.
@@ -46,14 +52,24 @@ def initial_gaussians(material: Material, options: InitialisationOptions, most: 
     scene = material.scene
     found = SurfacePoints(scene.point_in_model, scene.sparse.point_rgb, np.full_like(scene.point_in_model, np.nan))
     if material.surface is not None:
-        more = material.surface.sample(max(int(_SURFACE_SHARE * most) - len(found.rgb), 0), seed)
-        found = SurfacePoints.concatenate([found, more])
+        surface = material.surface.sample(int(_SURFACE_SHARE * most), seed)
+        found = SurfacePoints.concatenate([found.part(_off_surface(found, surface)), surface])
     near = gaussians_from_points(found.point_in_model, found.rgb, options, found.normal_in_model)
     behind = background(scene, material.images, found.point_in_model)
     far = gaussians_of_size(behind.point_in_model, behind.rgb, behind.sigma_m, options)
     room = max(most - len(near), 0)
     keep = torch.linspace(0, max(len(far) - 1, 0), min(room, len(far))).long()
     return Gaussians.concatenate([near, far.select(keep)])
+
+
+def _off_surface(points: SurfacePoints, surface: SurfacePoints) -> NDArray[np.int64]:
+    """Rows of the points that no point of the surface is near to."""
+    if len(surface.rgb) < 2:
+        return np.arange(len(points.rgb))
+    tree = cKDTree(surface.point_in_model)
+    gap, _ = tree.query(surface.point_in_model, k=2)
+    distance, nearest = tree.query(points.point_in_model)
+    return np.flatnonzero(distance > _OFF_SURFACE * gap[nearest, 1])
 
 
 def points_to_hold(material: Material, device: torch.device) -> Callable[[int], Tensor]:

@@ -16,7 +16,7 @@ from pipelines.geometry.thinning import one_a_cube
 from pipelines.products import FloatArray
 
 _NORMAL_REACH_PX = 3
-_EDGE_STEP = 0.05  # of the depth
+_BEND = 0.02  # of the depth, by which a pixel departs from the middle between those on either side
 _CANDIDATES = 8  # drawn for each point wanted: enough to cover what few views see
 
 
@@ -91,8 +91,10 @@ class SceneSurface:
             (rows[kept] + _NORMAL_REACH_PX * down, columns[kept] + _NORMAL_REACH_PX * right)
             for down, right in ((0, 1), (0, -1), (1, 0), (-1, 0))
         ]
-        around = np.stack([depth[place] for place in places])
-        smooth = around.min(axis=0) * (1 + _EDGE_STEP) > around.max(axis=0)
+        # On a plane the inverse depth is linear, however steeply it is seen.
+        with np.errstate(divide="ignore"):
+            around = np.stack([depth[rows[kept], columns[kept]] / depth[place] for place in places])
+        smooth = (np.abs(around[::2] + around[1::2] - 2) < _BEND).all(axis=0)
         right, left, below, above = (self._points(index, *place) for place in places)
         normal = np.cross(right - left, below - above)[smooth]
         found[kept[smooth]] = normal / np.linalg.norm(normal, axis=1, keepdims=True)

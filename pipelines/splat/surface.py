@@ -20,6 +20,8 @@ from pipelines.splat.sh import sh_from_rgb
 
 _SAME_SURFACE = 0.01  # of the depth
 _SPREAD = 0.005  # of the depth: what less of it costs grows with its square
+_NEAR = 0.002  # of the depth
+_FIRMNESS = 4.0  # how much more a depth so near to a point is drawn to it
 
 
 @dataclass(frozen=True)
@@ -27,7 +29,7 @@ class SurfaceSettings:
     """Weights of the losses.
 
     Attributes:
-        depth: of the mean relative difference of depth at the points of the surface.
+        depth: of the mean relative difference of depth at the points of the surface, see `depth_loss`.
         compactness: of the logarithm that bounds what haze before and behind a surface costs.
         flatness: of the mean smallest standard deviation, in scene extents.
         normals: of the depth–normal consistency,
@@ -49,7 +51,12 @@ class SurfaceSettings:
 def depth_loss(
     depth_m: Tensor, alpha: Tensor, point_in_model: Tensor, cam_from_model: Tensor, camera: Pinhole
 ) -> Tensor:
-    """Mean |z_rendered / z − 1| of points (K, 3) that the view observes; scalar.
+    """Mean of r + F s (1 − exp(−r/s)), r = |z_rendered / z − 1|, of points (K, 3) that the view observes; scalar.
+
+    Gaussians are blended in the order of their centres: on a surface that is seen at a slant the nearer ones hide
+    the others, and the photographs are met best by a surface behind the true one, by a part of the Gaussians' size.
+    Within s of a point its pull is 1 + F times as strong as further away, and withstands that; further away it is
+    rather the point that is wrong, and photographs may have their way.
 
     Points that fall outside, or where the render is nearly transparent, do not count: there is no surface yet.
 
@@ -69,7 +76,9 @@ def depth_loss(
     maps = torch.stack([depth_m, alpha.detach()])[None]
     found = functional.grid_sample(maps, place[None, None], align_corners=False, padding_mode="border")[0, :, 0]
     counts = ((place.abs() < 1).all(dim=1) & (in_cam[:, 2] > 1e-3) & (found[1] > 0.5)).to(depth_m.dtype)
-    return ((found[0] / z - 1).abs() * counts).sum() / counts.sum().clamp_min(1)
+    off = (found[0] / z - 1).abs()
+    pull = off + _FIRMNESS * _NEAR * (1 - torch.exp(-off / _NEAR))
+    return (pull * counts).sum() / counts.sum().clamp_min(1)
 
 
 def compactness_loss(depth_m: Tensor, variance_m2: Tensor, alpha: Tensor) -> Tensor:

@@ -143,6 +143,21 @@ def test_gaussians_start_on_the_surface(
     assert np.median(np.abs(near[:, 2] - ground_height(near[:, 0], near[:, 1]))) < QUARTER_PX_M
 
 
+def test_gaussians_start_as_discs_however_many_sfm_points_there_are(
+    surface: SceneSurface, material: tuple[Rendered, Scene, ImageCache]
+) -> None:
+    _, scene, images = material
+    most = len(scene.point_in_model)  # as many as there may be: balls at all of them would leave no room for discs
+    start = initial_gaussians(Material(scene, images, surface), InitialisationOptions(sh_degree=0), most, 0)
+    scale = start.log_scales.exp()
+    discs = int((scale.amin(dim=1) < 0.2 * scale.amax(dim=1)).sum())
+    sfm = torch.from_numpy(scene.point_in_model).float()
+    on_hill = (sfm[:, :2].abs() < 20).all(dim=1)
+    balls = int((torch.cdist(sfm[on_hill], start.means).amin(dim=1) < 1e-4).sum())
+    assert discs > most // 4  # half of the start is the surface's, and normals are known of more than half of that
+    assert balls < 0.1 * on_hill.sum()
+
+
 def test_points_to_hold_are_those_of_the_view(
     surface: SceneSurface, material: tuple[Rendered, Scene, ImageCache]
 ) -> None:
