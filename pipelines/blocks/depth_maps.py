@@ -36,7 +36,9 @@ class StereoOptions:
         coarse_px: longest side of the photographs that planes are swept through.
         fine_px: longest side of the photographs that the result is refined on.
         neighbours: views that each is compared with.
-        matching: how they are compared.
+        matching: how they are compared,
+        refining: and how on the finer ones. A wide window finds the surface where there is little texture; with its
+            place nearly known, a small one does not lay it across the foot of a wall.
         agreement: when views agree.
     """
 
@@ -44,6 +46,7 @@ class StereoOptions:
     fine_px: int = 640
     neighbours: int = 10
     matching: MatchSettings = field(default_factory=MatchSettings)
+    refining: MatchSettings = field(default_factory=lambda: MatchSettings(window_px=3, reach_px=2))
     agreement: AgreementSettings = field(default_factory=AgreementSettings)
 
 
@@ -115,7 +118,7 @@ class DepthMaps:
         reference = self._view(self.camera(index), index)
         guess = guess_from(own, self._agreed(own, index, "coarse"), reference.camera)
         views = [self._view(self.camera(j), j) for j in self._neighbours(index)]
-        return _packed(refine(reference, views, guess, self._options.matching))
+        return _packed(refine(reference, views, guess, self._options.refining))
 
     def _agree(self, index: int) -> FloatImage:
         own = self._surface(index, "fine")

@@ -18,7 +18,7 @@ from pipelines.stereo.matching import UNSEEN, FloatImage, Matcher, MatchSettings
 from pipelines.stereo.sweep import Facing, StereoCamera, StereoView, Swept, calibration, swept_from
 
 _REACH = 4  # steps on either side of the guess
-_STEPS = 2  # to one of the sweep that the guess is from
+_STEPS = 3  # to one of the sweep that the guess is from
 _SPECKLE_PX = 5  # of what only one view has found, smaller parts than half of this are chance
 _LEAST_DEPTH = 1e-3
 _OUTSIDE = -10.0

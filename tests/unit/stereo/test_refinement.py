@@ -5,8 +5,21 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from stereo_scenes import CAMERA, GROUND_M, LEVEL, TENTH_PX_M, around, facing_up, ring_of_views, swept, true_depth
+from stereo_scenes import (
+    CAMERA,
+    GROUND_M,
+    LEVEL,
+    TENTH_PX_M,
+    around,
+    facing_up,
+    looking_at_origin,
+    painted,
+    ring_of_views,
+    swept,
+    true_depth,
+)
 
+from pipelines.blocks.depth_maps import StereoOptions
 from pipelines.geometry.cameras import Pinhole
 from pipelines.stereo.agreement import AgreementSettings, Surface, agreed_depth
 from pipelines.stereo.matching import UNSEEN, FloatImage, MatchSettings
@@ -86,6 +99,41 @@ def test_the_ground_beside_a_roof_is_not_taken_for_roof(fine: list[StereoView], 
     assert wrong[0].mean() < 0.1
 
 
+WALL = np.array([np.cos(np.radians(20)), np.sin(np.radians(20)), 0.0])  # through the origin, turned from the views
+
+
+def _foot_of_a_wall(azimuth_deg: float) -> tuple[StereoView, np.ndarray, np.ndarray]:
+    """A view, its true depth, and where it shows the wall, below which the ground begins."""
+    rotation, center = looking_at_origin(azimuth_deg, 22.0, 30.0)
+    camera = StereoCamera(FINE, rotation, center)
+    rays = camera.rays()
+    wall, ground = -(center @ WALL) / (rays @ WALL), -center[2] / rays[..., 2]
+    upright = wall < ground
+    depth = np.where(upright, wall, ground)
+    place = center + depth[..., None] * rays
+    side = np.cross([0.0, 0.0, 1.0], WALL)
+    grey = np.where(upright, painted(3, place @ side, place[..., 2]), painted(4, place[..., 0], place[..., 1])) + 1
+    return StereoView(camera, np.clip(grey, 1, 256).astype(np.float32)), depth, upright
+
+
+def test_small_windows_leave_the_foot_of_a_wall_where_it_is() -> None:
+    """A wide one lays the surface across the corner, within a reach of some pixels."""
+    (view, depth, upright), *others = [_foot_of_a_wall(azimuth) for azimuth in (0, -24, -12, 12, 24)]
+    facing = Facing(np.stack([LEVEL.normal_in_world, WALL]), upright.astype(np.uint8))
+    offset = facing.offset(view.camera, (depth + 0.3).astype(np.float32)).astype(np.float32)
+    guess = Guess(facing, offset, np.full(offset.shape, STEP_M, np.float32))
+    edge = cv2.dilate(upright.astype(np.uint8), np.ones((9, 9), np.uint8)) > cv2.erode(
+        upright.astype(np.uint8), np.ones((9, 9), np.uint8)
+    )
+    wrong = []
+    for settings in (StereoOptions().refining, StereoOptions().matching):
+        found = refine(view, [other[0] for other in others], guess, settings)
+        error = np.abs(facing.depth(view.camera, found.offset_m) - depth)
+        wrong.append(np.median(error[INNER][edge[INNER]]))
+    assert wrong[0] < TENTH_PX_M
+    assert wrong[0] < 0.8 * wrong[1]
+
+
 def test_guesses_are_what_views_agree_on(fine: list[StereoView], coarse: list[Surface]) -> None:
     own = coarse[2]
     agreed = np.zeros((CAMERA.height, CAMERA.width), np.float32)
@@ -97,7 +145,7 @@ def test_guesses_are_what_views_agree_on(fine: list[StereoView], coarse: list[Su
     elsewhere = np.s_[60:120, 60:180]
     own_error = height_error(fine[2].camera, found.offset_m)[elsewhere]
     assert np.median(np.abs(own_error)) < 2 * TENTH_PX_M  # and half a coarse pixel of slope
-    np.testing.assert_allclose(found.step_m, 0.25)  # half of that of the sweep
+    np.testing.assert_allclose(found.step_m, 0.5 / 3, rtol=1e-6)  # a third of that of the sweep
 
 
 def test_pixels_that_nothing_fits_find_nothing(fine: list[StereoView], coarse: list[Surface]) -> None:
