@@ -48,24 +48,49 @@ class Matcher:
     def __init__(self, grey: FloatImage, settings: MatchSettings) -> None:
         self._correlation = _Correlation(grey, settings.window_px)
         self._smooth = cv2.ximgproc.createGuidedFilter(grey, settings.reach_px, settings.edge_grey**2)
-        self._views = settings.views
+        self._best = _Best(grey.shape, settings.views)
 
     def __call__(self, shown: Iterable[FloatImage]) -> FloatImage:
         """Score (H, W) of a hypothesis, by what neighbours, at least one, show of it (H, W): 0 where nothing."""
-        scores = (self._correlation(image) for image in shown)
-        return np.asarray(self._smooth.filter(_mean_of_best(scores, self._views)), dtype=np.float32)
+        self._best.clear()
+        for image in shown:
+            self._best.add(self._correlation(image))
+        return np.asarray(self._smooth.filter(self._best.mean()), dtype=np.float32)
 
 
-def _mean_of_best(scores: Iterable[FloatImage], count: int) -> FloatImage:
-    """Mean (H, W) of the `count` largest scores at each pixel, or of all where there are fewer."""
-    largest: list[FloatImage] = []
-    for score in scores:
-        rest = score
-        for place, kept in enumerate(largest):
-            largest[place], rest = np.maximum(kept, rest), np.minimum(kept, rest)
-        if len(largest) < count:
-            largest.append(rest)
-    return np.asarray(sum(largest[1:], start=largest[0]) / np.float32(len(largest)))
+# Some hundred thousand images go through these two: they write into arrays of their own, as it takes longer to get
+# fresh memory than to fill it.
+class _Best:
+    """The `most` largest of images (H, W) at each pixel."""
+
+    def __init__(self, shape: tuple[int, ...], most: int) -> None:
+        self._largest = [np.empty(shape, np.float32) for _ in range(most)]
+        self._spare, self._rest = np.empty(shape, np.float32), np.empty(shape, np.float32)
+        self._count = 0
+
+    def clear(self) -> None:
+        """Begin anew."""
+        self._count = 0
+
+    def add(self, image: FloatImage) -> None:
+        """One more, which is not kept."""
+        np.copyto(self._rest, image)
+        for place in range(self._count):
+            kept = self._largest[place]
+            np.maximum(kept, self._rest, out=self._spare)
+            np.minimum(kept, self._rest, out=self._rest)
+            self._largest[place], self._spare = self._spare, kept
+        if self._count < len(self._largest):
+            self._largest[self._count], self._rest = self._rest, self._largest[self._count]
+            self._count += 1
+
+    def mean(self) -> FloatImage:
+        """Their mean (H, W), of all where there were fewer; written over by what follows."""
+        np.copyto(self._spare, self._largest[0])
+        for kept in self._largest[1 : self._count]:
+            self._spare += kept
+        self._spare /= np.float32(self._count)
+        return self._spare
 
 
 class _Correlation:
@@ -73,25 +98,27 @@ class _Correlation:
 
     def __init__(self, image: FloatImage, window_px: int) -> None:
         self._image, self._window = image, (window_px, window_px)
-        self._mean = self._smooth(image)
-        variance = self._smooth(image * image) - self._mean * self._mean
+        self._mean = self._smooth(image, np.empty_like(image))
+        variance = self._smooth(image * image, np.empty_like(image)) - self._mean * self._mean
         self._inverse_sigma = 1 / np.sqrt(np.maximum(variance, _NOISE_VARIANCE))
+        self._other_mean, self._variance, self._product, self._found = (np.empty_like(image) for _ in range(4))
 
     def __call__(self, other: FloatImage) -> FloatImage:
-        """Correlation (H, W); −1 where `other` is 0."""
-        mean = self._smooth(other)
-        variance = self._smooth(other * other)
-        variance -= mean * mean
+        """Correlation (H, W), −1 where `other` is 0; written over by the next one."""
+        mean, product = self._smooth(other, self._other_mean), self._product
+        variance = self._smooth(np.multiply(other, other, out=product), self._variance)
+        found = self._smooth(np.multiply(self._image, other, out=product), self._found)
+        variance -= np.multiply(mean, mean, out=product)
         np.maximum(variance, _NOISE_VARIANCE, out=variance)
-        found = self._smooth(self._image * other)
-        found -= self._mean * mean
+        found -= np.multiply(self._mean, mean, out=product)
         found *= self._inverse_sigma
         found /= np.sqrt(variance, out=variance)
-        found[other == 0] = UNSEEN
+        np.copyto(found, np.float32(UNSEEN), where=other == 0)
         return found
 
-    def _smooth(self, image: FloatImage) -> FloatImage:
-        return np.asarray(cv2.boxFilter(image, -1, self._window, borderType=cv2.BORDER_REFLECT), np.float32)
+    def _smooth(self, image: FloatImage, out: FloatImage) -> FloatImage:
+        cv2.boxFilter(image, -1, self._window, dst=out, borderType=cv2.BORDER_REFLECT)
+        return out
 
 
 @dataclass(frozen=True)

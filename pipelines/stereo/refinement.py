@@ -100,10 +100,13 @@ class _Sight:
         start = pixel_from_world @ (center_in_world - other.camera.center_in_world)
         self._start = start.astype(np.float32)
         self._grey = other.grey
+        self._place = [np.empty_like(by_depth) for by_depth in self._by_depth]
 
     def shown(self, depth: FloatImage) -> FloatImage:
         """Picture (H, W) of the neighbour; 0 where it shows nothing of depths (H, W)."""
-        x, y, z = (depth * by_depth + start for by_depth, start in zip(self._by_depth, self._start, strict=True))
+        for place, by_depth, start in zip(self._place, self._by_depth, self._start, strict=True):
+            np.add(np.multiply(depth, by_depth, out=place), start, out=place)
+        x, y, z = self._place
         behind = ~(z > _LEAST_DEPTH)
         z[behind] = 1.0
         x /= z
