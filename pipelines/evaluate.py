@@ -191,8 +191,9 @@ def _depth_maps(eye: Eye, seen: Sights, progress: Progress) -> dict[int, FloatAr
     with progress.task("depth maps", len(cameras)) as task:
         for index in cameras:
             view = eye.look(index, depth=True)
-            if view.median_depth is not None and view.expected_depth is not None:
-                depth[index] = measured_depth(view.median_depth, view.expected_depth).cpu().numpy()
+            assert view.median_depth is not None and view.expected_depth is not None
+            assert view.depth_variance is not None  # of every render with depth
+            depth[index] = measured_depth(view.median_depth, view.expected_depth, view.depth_variance).cpu().numpy()
             task.advance()
     return depth
 

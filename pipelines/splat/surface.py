@@ -18,7 +18,7 @@ from pipelines.splat.gaussians import Gaussians, rotation_matrices
 from pipelines.splat.raster.api import Pinhole, Rasterizer, RasterSettings
 from pipelines.splat.sh import sh_from_rgb
 
-_SAME_SURFACE = 0.01  # of the depth
+_ONE_SURFACE = 0.003  # of the depth, that what lies on one surface spreads over
 _SPREAD = 0.005  # of the depth: what less of it costs grows with its square
 _NEAR = 0.002  # of the depth
 _FIRMNESS = 4.0  # how much more a depth so near to a point is drawn to it
@@ -96,14 +96,14 @@ def compactness_loss(depth_m: Tensor, variance_m2: Tensor, alpha: Tensor) -> Ten
     return (alpha.detach() * torch.log1p(variance_m2 / allowed.square())).mean()
 
 
-def measured_depth(median_m: Tensor, expected_m: Tensor) -> Tensor:
-    """Depth (H, W) to measure in, 0 where there is no surface.
+def measured_depth(median_m: Tensor, expected_m: Tensor, variance_m2: Tensor) -> Tensor:
+    """Depth (H, W) to measure in, 0 where there is no surface, of a render's depths and their variance.
 
-    The median says which surface a pixel shows, through whatever haze there is before and behind it; where the mean
-    lies on the same surface, it is the less noisy of the two.
+    The median says which surface a pixel shows, through whatever haze there is before and behind it; where all that
+    is seen lies on one surface, the mean is the less noisy of the two.
     """
-    same = (expected_m - median_m).abs() < _SAME_SURFACE * median_m
-    return torch.where(same, expected_m, median_m)
+    one_surface = variance_m2 < (_ONE_SURFACE * median_m).square()
+    return torch.where(one_surface, expected_m, median_m)
 
 
 def flatness_loss(gaussians: Gaussians, visible: Tensor, extent_m: float) -> Tensor:

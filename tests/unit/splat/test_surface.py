@@ -128,10 +128,13 @@ def test_depth_is_held_firmly_where_it_is_nearly_right() -> None:
     assert pull(3.9996) == pytest.approx(-5 * 0.25, rel=0.06)
 
 
-def test_measured_depth_is_the_mean_on_the_surface_that_the_median_shows() -> None:
-    median = torch.tensor([[10.0, 10.0, 0.0]])
-    expected = torch.tensor([[10.05, 7.0, 3.0]])  # on the surface, haze before it, haze alone
-    torch.testing.assert_close(measured_depth(median, expected), torch.tensor([[10.05, 10.0, 0.0]]))
+def test_measured_depth_is_the_mean_where_there_is_but_one_surface() -> None:
+    median = torch.tensor([[10.0, 10.0, 10.0, 0.0]])
+    # On one surface; one with haze behind it; haze before it, far off; haze alone.
+    expected = torch.tensor([[10.01, 10.05, 7.0, 3.0]])
+    sigma = torch.tensor([[0.02, 0.2, 4.0, 2.0]])
+    found = measured_depth(median, expected, sigma.square())
+    torch.testing.assert_close(found, torch.tensor([[10.01, 10.0, 10.0, 0.0]]))
 
 
 def haze(apart_m: float) -> Gaussians:
