@@ -38,6 +38,11 @@ def painted(seed: int, right_m: np.ndarray, up_m: np.ndarray) -> np.ndarray:
     return np.asarray(cv2.remap(texture(seed), column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP))
 
 
+def photographed(camera: StereoCamera, grey: np.ndarray) -> StereoView:
+    """A view of grey levels (H, W), cut off where they leave 0 … 255."""
+    return StereoView(camera, np.clip(grey + 1, 1, 256).astype(np.float32))
+
+
 def true_depth(camera: StereoCamera) -> np.ndarray:
     """First surface along each ray: the square roof, or the ground."""
     rays, center = camera.rays(), camera.center_in_world
@@ -52,8 +57,7 @@ def shot(azimuth_deg: float, brightness: float = 1.0, pinhole: Pinhole = CAMERA)
     camera = StereoCamera(pinhole, rotation, center)
     place = center + true_depth(camera)[..., None] * camera.rays()
     ground, roof = (painted(seed, place[..., 0], place[..., 1]) for seed in (1, 2))
-    grey = brightness * np.where(place[..., 2] > 0.5 * ROOF_M, roof, ground) + 1
-    return StereoView(camera, np.clip(grey, 1, 256).astype(np.float32))
+    return photographed(camera, brightness * np.where(place[..., 2] > 0.5 * ROOF_M, roof, ground))
 
 
 def facing_up(pinhole: Pinhole = CAMERA) -> Facing:

@@ -154,7 +154,7 @@ def test_gaussians_start_as_discs_however_many_sfm_points_there_are(
     sfm = torch.from_numpy(scene.point_in_model).float()
     on_hill = (sfm[:, :2].abs() < 20).all(dim=1)
     balls = int((torch.cdist(sfm[on_hill], start.means).amin(dim=1) < 1e-4).sum())
-    assert discs > most // 4  # half of the start is the surface's, and normals are known of more than half of that
+    assert discs > most // 4  # most of the start is the surface's, and normals are known of more than half of that
     assert balls < 0.1 * on_hill.sum()
 
 

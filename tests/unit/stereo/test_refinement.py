@@ -14,6 +14,7 @@ from stereo_scenes import (
     facing_up,
     looking_at_origin,
     painted,
+    photographed,
     ring_of_views,
     swept,
     true_depth,
@@ -112,8 +113,8 @@ def _foot_of_a_wall(azimuth_deg: float) -> tuple[StereoView, np.ndarray, np.ndar
     depth = np.where(upright, wall, ground)
     place = center + depth[..., None] * rays
     side = np.cross([0.0, 0.0, 1.0], WALL)
-    grey = np.where(upright, painted(3, place @ side, place[..., 2]), painted(4, place[..., 0], place[..., 1])) + 1
-    return StereoView(camera, np.clip(grey, 1, 256).astype(np.float32)), depth, upright
+    grey = np.where(upright, painted(3, place @ side, place[..., 2]), painted(4, place[..., 0], place[..., 1]))
+    return photographed(camera, grey), depth, upright
 
 
 def test_small_windows_leave_the_foot_of_a_wall_where_it_is() -> None:
@@ -122,9 +123,7 @@ def test_small_windows_leave_the_foot_of_a_wall_where_it_is() -> None:
     facing = Facing(np.stack([LEVEL.normal_in_world, WALL]), upright.astype(np.uint8))
     offset = facing.offset(view.camera, (depth + 0.3).astype(np.float32)).astype(np.float32)
     guess = Guess(facing, offset, np.full(offset.shape, STEP_M, np.float32))
-    edge = cv2.dilate(upright.astype(np.uint8), np.ones((9, 9), np.uint8)) > cv2.erode(
-        upright.astype(np.uint8), np.ones((9, 9), np.uint8)
-    )
+    edge = cv2.morphologyEx(upright.astype(np.uint8), cv2.MORPH_GRADIENT, np.ones((9, 9), np.uint8)) > 0
     wrong = []
     for settings in (StereoOptions().refining, StereoOptions().matching):
         found = refine(view, [other[0] for other in others], guess, settings)

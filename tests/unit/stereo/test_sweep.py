@@ -13,6 +13,7 @@ from stereo_scenes import (
     facing_up,
     looking_at_origin,
     painted,
+    photographed,
     ring_of_views,
     swept,
     true_depth,
@@ -151,8 +152,7 @@ def test_walls_are_found_on_upright_planes() -> None:
         camera = StereoCamera(CAMERA, rotation, center)
         depth = -(center @ normal) / (camera.rays() @ normal)
         place = center + depth[..., None] * camera.rays()
-        grey = painted(3, place @ side, place[..., 2]) + 1
-        views.append(StereoView(camera, np.clip(grey, 1, 256).astype(np.float32)))
+        views.append(photographed(camera, painted(3, place @ side, place[..., 2])))
     reference, others = views[2], [*views[:2], *views[3:]]
     ahead = reference.camera.cam_from_world[2] * [1, 1, 0]
     ahead /= np.linalg.norm(ahead)
