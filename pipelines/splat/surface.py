@@ -20,8 +20,8 @@ from pipelines.splat.sh import sh_from_rgb
 
 _ONE_SURFACE = 0.003  # of the depth, that what lies on one surface spreads over
 _SPREAD = 0.005  # of the depth: what less of it costs grows with its square
-_NEAR = 0.002  # of the depth
-_FIRMNESS = 4.0  # how much more a depth so near to a point is drawn to it
+_NEAR = 0.003  # of the depth
+_FIRMNESS = 9.0  # how much more a depth so near to a point is drawn to it
 
 
 @dataclass(frozen=True)

@@ -102,8 +102,8 @@ def test_depth_is_held_to_the_points_that_are_seen_in_it() -> None:
         [0.0, 0.0, -4.0],  # behind
     ])  # fmt: skip
     loss = depth_loss(depth, alpha, points, POSE, CAMERA)
-    # (0.25 + what being off at all costs: 4 · 0.002) / 2 that count.
-    assert float(loss.detach()) == pytest.approx(0.5 * (0.25 + 0.008), rel=1e-5)
+    # (0.25 + what being off at all costs: 9 · 0.003) / 2 that count.
+    assert float(loss.detach()) == pytest.approx(0.5 * (0.25 + 0.027), rel=1e-5)
     loss.backward()
     assert depth.grad is not None
     # Only the four pixels around the middle are pulled, and nearer.
@@ -124,8 +124,8 @@ def test_depth_is_held_firmly_where_it_is_nearly_right() -> None:
         return float(depth.grad.sum())
 
     assert pull(4.4) == pytest.approx(0.25, rel=1e-3)  # 1 / z: 10 % off
-    assert pull(4.0004) == pytest.approx(5 * 0.25, rel=0.06)  # 0.01 % off
-    assert pull(3.9996) == pytest.approx(-5 * 0.25, rel=0.06)
+    assert pull(4.0004) == pytest.approx(10 * 0.25, rel=0.06)  # 0.01 % off
+    assert pull(3.9996) == pytest.approx(-10 * 0.25, rel=0.06)
 
 
 def test_measured_depth_is_the_mean_where_there_is_but_one_surface() -> None:
