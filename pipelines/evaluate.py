@@ -32,10 +32,10 @@ from pipelines.products import FloatArray, InitialSimilarity, dump_json, load_js
 from pipelines.progress import Progress
 from pipelines.robust.asprs import LEAST_POINTS, few_points
 from pipelines.robust.statistics import residual_stats
+from pipelines.splat.depth import measured_depth
 from pipelines.splat.exposure import fitted_affine, with_affine
 from pipelines.splat.metrics import lpips, psnr, ssim
 from pipelines.splat.raster.api import Rasterizer, RasterSettings, Render, rasterizer
-from pipelines.splat.surface import measured_depth
 from pipelines.stages import SIM3
 from pipelines.survey import SurveyedPoint
 from pipelines.workspace import StageRun, Summary

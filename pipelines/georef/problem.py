@@ -11,7 +11,6 @@ from torch import Tensor
 
 from pipelines.geometry.cameras import Pinhole
 from pipelines.georef.cameras import CameraCorrections
-from pipelines.georef.depth import depth_at
 from pipelines.georef.linear import Linearised, linearise, posterior
 from pipelines.georef.losses import (
     CAUCHY_SCALE2,
@@ -30,6 +29,7 @@ from pipelines.georef.similarity import LearnableSimilarity
 from pipelines.georef.systematic import SystematicErrors
 from pipelines.georef.weights import TermWeights
 from pipelines.products import FloatArray
+from pipelines.splat.depth import depth_at
 
 # A measurement further out than this (99.9 % of χ² with 3 degrees of freedom) is called an outlier.
 _OUTLIER_CHI2 = 16.27

@@ -14,11 +14,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from pipelines.splat.depth import depth_at
 from pipelines.splat.gaussians import Gaussians, rotation_matrices
 from pipelines.splat.raster.api import Pinhole, Rasterizer, RasterSettings
 from pipelines.splat.sh import sh_from_rgb
 
-_ONE_SURFACE = 0.003  # of the depth, that what lies on one surface spreads over
 _SPREAD = 0.005  # of the depth: what less of it costs grows with its square
 _NEAR = 0.003  # of the depth
 _FIRMNESS = 9.0  # how much more a depth so near to a point is drawn to it
@@ -70,13 +70,9 @@ def depth_loss(
     pose = cam_from_model.detach()
     in_cam = point_in_model @ pose[:3, :3].T + pose[:3, 3]
     z = in_cam[:, 2].clamp_min(1e-3)
-    x = (camera.fx * in_cam[:, 0] / z + camera.cx) / camera.width
-    y = (camera.fy * in_cam[:, 1] / z + camera.cy) / camera.height
-    place = 2 * torch.stack([x, y], dim=1) - 1
-    maps = torch.stack([depth_m, alpha.detach()])[None]
-    found = functional.grid_sample(maps, place[None, None], align_corners=False, padding_mode="border")[0, :, 0]
-    counts = ((place.abs() < 1).all(dim=1) & (in_cam[:, 2] > 1e-3) & (found[1] > 0.5)).to(depth_m.dtype)
-    off = (found[0] / z - 1).abs()
+    found, seen = depth_at(depth_m, alpha, in_cam[:, :2] / z[:, None], camera)
+    counts = seen * (in_cam[:, 2] > 1e-3)
+    off = (found / z - 1).abs()
     pull = off + _FIRMNESS * _NEAR * (1 - torch.exp(-off / _NEAR))
     return (pull * counts).sum() / counts.sum().clamp_min(1)
 
@@ -94,16 +90,6 @@ def compactness_loss(depth_m: Tensor, variance_m2: Tensor, alpha: Tensor) -> Ten
     """
     allowed = (_SPREAD * depth_m.detach()).clamp_min(1e-6)
     return (alpha.detach() * torch.log1p(variance_m2 / allowed.square())).mean()
-
-
-def measured_depth(median_m: Tensor, expected_m: Tensor, variance_m2: Tensor) -> Tensor:
-    """Depth (H, W) to measure in, 0 where there is no surface, of a render's depths and their variance.
-
-    The median says which surface a pixel shows, through whatever haze there is before and behind it; where all that
-    is seen lies on one surface, the mean is the less noisy of the two.
-    """
-    one_surface = variance_m2 < (_ONE_SURFACE * median_m).square()
-    return torch.where(one_surface, expected_m, median_m)
 
 
 def flatness_loss(gaussians: Gaussians, visible: Tensor, extent_m: float) -> Tensor:

@@ -1,4 +1,4 @@
-"""Control points through the rendered depth: sampling, gradients through everything, and a flight brought home."""
+"""Control points through the rendered depth: gradients through everything, and a flight brought home."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from georef_scenes import SHIFT
 from pipelines.geometry.cameras import Pinhole
 from pipelines.geometry.similarity import Similarity
 from pipelines.georef.cameras import CameraCorrections, CameraPoses
-from pipelines.georef.depth import depth_at
 from pipelines.georef.measured import ControlMarks, DepthMarks, Measured
 from pipelines.georef.problem import GeoProblem
 from pipelines.georef.similarity import LearnableSimilarity
@@ -84,16 +83,6 @@ def loss_of_view(problem: GeoProblem, gaussians: Gaussians, index: int) -> torch
     found = problem.depth_loss(index, render.expected_depth, render.alpha, PINHOLE)
     assert found is not None
     return found
-
-
-def test_depth_is_bilinear_between_pixel_centres() -> None:
-    depth = torch.arange(24.0)[None] + 100 * torch.arange(18.0)[:, None]
-    xy = torch.tensor([[0.0, 0.0], [0.025, -0.05], [0.7, 0.0]], dtype=torch.float64)
-    found, seen = depth_at(depth, torch.ones(18, 24), xy, PINHOLE)
-    # The principal point is the corner between pixels 11 and 12, rows 8 and 9; half a pixel right, one up.
-    np.testing.assert_allclose(found[:2], [11.5 + 850, 12.0 + 750], rtol=1e-6)
-    assert seen.tolist() == [1.0, 1.0, 0.0]
-    assert depth_at(depth, torch.full((18, 24), 0.3), xy, PINHOLE)[1].tolist() == [0.0, 0.0, 0.0]
 
 
 def test_gradients_reach_similarity_cameras_and_gaussians() -> None:

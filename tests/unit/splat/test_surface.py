@@ -16,7 +16,6 @@ from pipelines.splat.surface import (
     depth_normals,
     disc_normals,
     flatness_loss,
-    measured_depth,
     normal_loss,
 )
 
@@ -126,15 +125,6 @@ def test_depth_is_held_firmly_where_it_is_nearly_right() -> None:
     assert pull(4.4) == pytest.approx(0.25, rel=1e-3)  # 1 / z: 10 % off
     assert pull(4.0004) == pytest.approx(10 * 0.25, rel=0.06)  # 0.01 % off
     assert pull(3.9996) == pytest.approx(-10 * 0.25, rel=0.06)
-
-
-def test_measured_depth_is_the_mean_where_there_is_but_one_surface() -> None:
-    median = torch.tensor([[10.0, 10.0, 10.0, 0.0]])
-    # On one surface; one with haze behind it; haze before it, far off; haze alone.
-    expected = torch.tensor([[10.01, 10.05, 7.0, 3.0]])
-    sigma = torch.tensor([[0.02, 0.2, 4.0, 2.0]])
-    found = measured_depth(median, expected, sigma.square())
-    torch.testing.assert_close(found, torch.tensor([[10.01, 10.0, 10.0, 0.0]]))
 
 
 def haze(apart_m: float) -> Gaussians:

@@ -1,4 +1,4 @@
-"""Depth of a render at image marks."""
+"""Depth to read off a render: which of its depths to measure in, and that at a ray."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from torch.nn import functional
 from pipelines.geometry.cameras import Pinhole
 
 _SOLID = 0.5  # of the opacity: below, there is no surface yet
+_ONE_SURFACE = 0.003  # of the depth, that what lies on one surface spreads over
 
 
 def depth_at(depth_m: Tensor, alpha: Tensor, xy: Tensor, camera: Pinhole) -> tuple[Tensor, Tensor]:
@@ -29,3 +30,13 @@ def depth_at(depth_m: Tensor, alpha: Tensor, xy: Tensor, camera: Pinhole) -> tup
     )[0, :, 0].to(xy.dtype)
     seen = ((place.abs() < 1).all(dim=1) & (found[1] > _SOLID)).to(xy.dtype)
     return found[0], seen
+
+
+def measured_depth(median_m: Tensor, expected_m: Tensor, variance_m2: Tensor) -> Tensor:
+    """Depth (H, W) to measure in, 0 where there is no surface, of a render's depths and their variance.
+
+    The median says which surface a pixel shows, through whatever haze there is before and behind it; where all that
+    is seen lies on one surface, the mean is the less noisy of the two.
+    """
+    one_surface = variance_m2 < (_ONE_SURFACE * median_m).square()
+    return torch.where(one_surface, expected_m, median_m)
