@@ -41,6 +41,11 @@ class MatchSettings:
     edge_grey: float = 10.0
     views: int = 3
 
+    @property
+    def support_px(self) -> int:
+        """How far from a pixel that is which its score depends on: the guided filter averages averages."""
+        return self.window_px // 2 + 2 * self.reach_px
+
 
 class Matcher:
     """Compares one photograph (H, W) with what its neighbours show under a hypothesis."""

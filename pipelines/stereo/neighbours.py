@@ -82,7 +82,10 @@ def planes_for(view: StereoCamera, neighbours: list[StereoCamera], points: Float
     elif forward <= _LEVEL:  # from straight above walls are not seen
         found = [_level_planes(view, neighbours, points)]
     else:
-        found = [_level_planes(view, neighbours, points), _planes_across(view, neighbours, points, ahead / forward)]
+        found = [
+            _level_planes(view, neighbours, points),
+            _planes_across(view, neighbours, points, ahead / forward, height_m=_range(points @ _UP)),
+        ]
     return [planes for planes in found if planes is not None]
 
 
@@ -94,7 +97,11 @@ def _level_planes(view: StereoCamera, neighbours: list[StereoCamera], points: Fl
 
 
 def _planes_across(
-    view: StereoCamera, neighbours: list[StereoCamera], points: FloatArray, normal: FloatArray
+    view: StereoCamera,
+    neighbours: list[StereoCamera],
+    points: FloatArray,
+    normal: FloatArray,
+    height_m: tuple[float, float] = (-np.inf, np.inf),
 ) -> Planes | None:
     """Planes at distances whose inverses are evenly spaced, as pixels have it."""
     away = points @ normal - normal @ view.center_in_world
@@ -104,7 +111,7 @@ def _planes_across(
         return None
     count = _count(view, neighbours, points, normal, high - low)
     offset = normal @ view.center_in_world + 1 / np.linspace(1 / low, 1 / high, count)
-    return Planes(normal, offset)
+    return Planes(normal, offset, height_m)
 
 
 def _range(along: FloatArray) -> tuple[float, float]:

@@ -6,7 +6,10 @@ After Collins (doi 10.1109/CVPR.1996.517097) and, for planes along a scene's dom
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -16,6 +19,7 @@ from pipelines.geometry.cameras import Pinhole
 from pipelines.products import FloatArray
 from pipelines.stereo.matching import UNSEEN, FloatImage, Found, Matcher, MatchSettings, Peak
 
+_ROWS = 8  # strips begin and end at multiples of so many
 _CLEARLY = 0.05  # of the score: by so much other planes must fit better than the first
 
 
@@ -38,6 +42,11 @@ class StereoCamera:
         x, y = np.meshgrid(np.arange(self.pinhole.width) + 0.5, np.arange(self.pinhole.height) + 0.5)
         return np.asarray(self.pinhole.rays(np.stack([x, y], axis=-1)) @ self.cam_from_world)
 
+    def rows(self, part: slice) -> StereoCamera:
+        """The camera of some rows of its pictures."""
+        pinhole = replace(self.pinhole, height=part.stop - part.start, cy=self.pinhole.cy - part.start)
+        return replace(self, pinhole=pinhole)
+
 
 @dataclass(frozen=True)
 class StereoView:
@@ -51,6 +60,10 @@ class StereoView:
     camera: StereoCamera
     grey: FloatImage
 
+    def rows(self, part: slice) -> StereoView:
+        """Some rows of it."""
+        return StereoView(self.camera.rows(part), self.grey[part])
+
 
 @dataclass(frozen=True)
 class Planes:
@@ -59,10 +72,12 @@ class Planes:
     Attributes:
         normal_in_world: (3,) unit vector.
         offset_m: (D,) monotonic, at least three.
+        height_m: lowest and highest place of the scene; beyond, there is nothing to be found on a plane.
     """
 
     normal_in_world: FloatArray
     offset_m: FloatArray
+    height_m: tuple[float, float] = (-math.inf, math.inf)
 
 
 @dataclass(frozen=True)
@@ -124,7 +139,8 @@ def plane_sweep(
 
     A window fits best on the planes that face as its surface does: walls need others than the ground.
 
-    Memory does not depend on the number of planes. Time: planes × neighbours × pixels.
+    Memory does not depend on the number of planes. Time: planes × neighbours × pixels, of those
+    rows that see the scene on a plane.
 
     Args:
         reference: view to find the surface of.
@@ -138,8 +154,7 @@ def plane_sweep(
     fewest = min((len(planes.offset_m) for planes in sweeps), default=0)
     if not neighbours or fewest < 3:
         raise ValueError(f"{len(neighbours)} neighbours and {fewest} planes are too few to sweep")
-    matcher = Matcher(reference.grey, settings)
-    found = [_sweep(reference, neighbours, planes, matcher) for planes in sweeps]
+    found = [_sweep(reference, neighbours, planes, settings) for planes in sweeps]
     best = np.argmax([each.score - (_CLEARLY if number else 0) for number, each in enumerate(found)], axis=0)
     facing = Facing(np.stack([planes.normal_in_world for planes in sweeps]), best.astype(np.uint8))
     offset, score, step, sharpness = (
@@ -149,15 +164,22 @@ def plane_sweep(
     return Swept(facing, offset, score, step, sharpness)
 
 
-def _sweep(reference: StereoView, neighbours: list[StereoView], planes: Planes, matcher: Matcher) -> Swept:
+def _sweep(reference: StereoView, neighbours: list[StereoView], planes: Planes, settings: MatchSettings) -> Swept:
     """The best planes of one direction."""
-    # Rays meet a plane in front of the camera where both lie on one side of it.
-    sign = reference.camera.rays() @ planes.normal_in_world
-    own = planes.normal_in_world @ reference.camera.center_in_world
+
+    @lru_cache(maxsize=1)  # one plane is mostly seen in the rows of the one before
+    def strip(first: int, last: int) -> tuple[StereoView, Matcher]:
+        view = reference.rows(slice(first, last))
+        return view, Matcher(view.grey, settings)
+
     peak = Peak(reference.grey.shape)
-    for offset in planes.offset_m:
-        score = matcher(_seen_on_plane(reference, view, planes, offset) for view in neighbours)
-        score[~(sign * (offset - own) > 0)] = UNSEEN
+    for offset, there in zip(planes.offset_m, _scene_on(planes, reference.camera), strict=True):
+        score = np.full(reference.grey.shape, UNSEEN, np.float32)
+        if there.any():
+            first, last = _rows(there, settings.support_px)
+            view, matcher = strip(first, last)
+            score[first:last] = matcher(_seen_on_plane(view, other, planes, offset) for other in neighbours)
+            score[~there] = UNSEEN
         peak.add(score)
     found = peak.found()
     offset_m = np.interp(found.place, np.arange(len(planes.offset_m)), planes.offset_m)
@@ -165,6 +187,25 @@ def _sweep(reference: StereoView, neighbours: list[StereoView], planes: Planes, 
     step_m = np.abs(np.gradient(planes.offset_m))[np.rint(found.place).astype(np.int64)]
     facing = Facing(planes.normal_in_world[None], np.zeros(offset_m.shape, np.uint8))
     return swept_from(found, facing, offset_m, step_m)
+
+
+def _scene_on(planes: Planes, camera: StereoCamera) -> Iterator[NDArray[np.bool_]]:
+    """Where (H, W) a camera sees the scene if it lies on a plane, for each of them."""
+    rays, center = camera.rays(), camera.center_in_world
+    along, (lowest, highest) = rays @ planes.normal_in_world, planes.height_m
+    with np.errstate(divide="ignore", invalid="ignore"):
+        climb = rays[..., 2] / along
+    for gap in planes.offset_m - planes.normal_in_world @ center:
+        height = center[2] + gap * climb
+        # Rays meet a plane in front of the camera where both lie on one side of it.
+        yield (gap * along > 0) & (height >= lowest) & (height <= highest)
+
+
+def _rows(there: NDArray[np.bool_], around_px: int) -> tuple[int, int]:
+    """First row and the one after the last that show something or lie around, of (H, W)."""
+    rows = np.flatnonzero(there.any(axis=1))
+    first, last = rows[0] - around_px, rows[-1] + 1 + around_px
+    return max(int(first) // _ROWS * _ROWS, 0), min(-int(-last // _ROWS) * _ROWS, len(there))
 
 
 def swept_from(found: Found, facing: Facing, offset_m: FloatArray, step_m: FloatArray | FloatImage) -> Swept:

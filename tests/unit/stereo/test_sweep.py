@@ -113,13 +113,14 @@ def test_neighbours_are_those_under_good_angles(ring: list[StereoView]) -> None:
 
 def test_planes_follow_the_view(ring: list[StereoView]) -> None:
     points = grid_points()
-    flat, upright = planes_for(ring[2].camera, [view.camera for view in ring[3:5]], points)
+    flat, across = planes_for(ring[2].camera, [view.camera for view in ring[3:5]], points)
     np.testing.assert_allclose(flat.normal_in_world, [0, 0, 1])
     assert flat.offset_m.min() < GROUND_M < ROOF_M < flat.offset_m.max()
     ahead = ring[2].camera.cam_from_world[2] * [1, 1, 0]
-    np.testing.assert_allclose(upright.normal_in_world, ahead / np.linalg.norm(ahead))
-    along = points @ upright.normal_in_world
-    assert upright.offset_m.min() < along.min() < along.max() < upright.offset_m.max()
+    np.testing.assert_allclose(across.normal_in_world, ahead / np.linalg.norm(ahead))
+    along = points @ across.normal_in_world
+    assert across.offset_m.min() < along.min() < along.max() < across.offset_m.max()
+    assert across.height_m == pytest.approx((flat.offset_m.min(), flat.offset_m.max()))
 
 
 def test_a_level_view_needs_planes_across_it_alone() -> None:
@@ -142,30 +143,63 @@ def test_from_straight_above_there_are_level_planes_alone() -> None:
     np.testing.assert_allclose(found.normal_in_world, [0, 0, 1])
 
 
-def test_walls_are_found_on_upright_planes() -> None:
-    """A wall turned by 30° from the views, which look down on it: level planes cut it, and see other texture."""
+@pytest.fixture(scope="module")
+def wall() -> tuple[StereoView, list[StereoView], np.ndarray]:
+    """A view down on a wall that is turned by 30°, its neighbours, and the true depth (H, W)."""
     normal = np.array([np.cos(np.radians(30)), np.sin(np.radians(30)), 0.0])
     side = np.cross([0.0, 0.0, 1.0], normal)
-    views = []
+    views, depths = [], []
     for azimuth in (-24, -12, 0, 12, 24):
         rotation, center = looking_at_origin(azimuth, 18.0, 34.0)
         camera = StereoCamera(CAMERA, rotation, center)
-        depth = -(center @ normal) / (camera.rays() @ normal)
-        place = center + depth[..., None] * camera.rays()
+        depths.append(-(center @ normal) / (camera.rays() @ normal))
+        place = center + depths[-1][..., None] * camera.rays()
         views.append(photographed(camera, painted(3, place @ side, place[..., 2])))
-    reference, others = views[2], [*views[:2], *views[3:]]
-    ahead = reference.camera.cam_from_world[2] * [1, 1, 0]
-    ahead /= np.linalg.norm(ahead)
-    upright = Planes(ahead, np.arange(-10.0, 10.0, 0.5))
+    return views[2], [*views[:2], *views[3:]], depths[2]
+
+
+def upright(view: StereoView, height_m: tuple[float, float] = (-np.inf, np.inf)) -> Planes:
+    """Planes across a view."""
+    ahead = view.camera.cam_from_world[2] * [1, 1, 0]
+    return Planes(ahead / np.linalg.norm(ahead), np.arange(-10.0, 10.0, 0.5), height_m)
+
+
+def test_walls_are_found_on_upright_planes(wall: tuple[StereoView, list[StereoView], np.ndarray]) -> None:
+    """Level planes cut it, and see other texture."""
+    reference, others, truth = wall
     flat = Planes(LEVEL.normal_in_world, np.arange(-12.0, 12.0, 0.5))
-    truth = -(reference.camera.center_in_world @ normal) / (reference.camera.rays() @ normal)
     inner = np.s_[10:-10, 10:-10]
     wrong = []
-    for sweeps in ([flat], [flat, upright]):
+    for sweeps in ([flat], [flat, upright(reference)]):
         found = Surface(reference.camera, plane_sweep(reference, others, sweeps, MatchSettings()))
         wrong.append((np.abs(found.depth() - truth)[inner] > 0.5).mean())
     assert wrong[1] < 0.5 * wrong[0]
     assert wrong[1] < 0.15
+
+
+def test_only_the_rows_that_may_show_the_scene_are_compared(
+    wall: tuple[StereoView, list[StereoView], np.ndarray],
+) -> None:
+    reference, others, truth = wall
+    heights = (-4.0, 3.0)
+    whole, part = (
+        Surface(reference.camera, plane_sweep(reference, others, [planes], MatchSettings()))
+        for planes in (upright(reference), upright(reference, heights))
+    )
+
+    def height(depth: np.ndarray) -> np.ndarray:
+        return reference.camera.center_in_world[2] + depth * reference.camera.rays()[..., 2]
+
+    found = height(part.depth())
+    # Nothing beyond; a parabola goes half a step of 0.5 m from a plane, on rays that fall by 18 m in 34 m.
+    assert np.nanmin(found) > heights[0] - 0.2
+    assert np.nanmax(found) < heights[1] + 0.2
+    # Within, planes before and after it are compared as well, and it is what a sweep of all rows finds.
+    inner = (height(truth) > heights[0] + 1) & (height(truth) < heights[1] - 1)
+    inner &= np.abs(whole.depth() - truth) < 0.3
+    assert inner.mean() > 0.05
+    np.testing.assert_allclose(part.swept.offset_m[inner], whole.swept.offset_m[inner], atol=1e-3)
+    np.testing.assert_allclose(part.swept.score[inner], whole.swept.score[inner], atol=1e-3)
 
 
 def test_too_few_points_give_no_planes(ring: list[StereoView]) -> None:
