@@ -20,7 +20,7 @@ from pipelines.splat.raster.api import Pinhole, Rasterizer, RasterSettings
 from pipelines.splat.sh import sh_from_rgb
 
 _SPREAD = 0.005  # of the depth: what less of it costs grows with its square
-_NEAR = 0.003  # of the depth
+_NEAR = 0.002  # of the depth
 _FIRMNESS = 9.0  # how much more a depth so near to a point is drawn to it
 
 
