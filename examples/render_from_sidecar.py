@@ -62,17 +62,19 @@ def main() -> None:
     workspace = Workspace(options.workspace)
     trained = load_trained(workspace)
     registered = [
-        image for image in trained.survey.images if image.name in trained.sparse.image_index() and image.fix
+        (image, image.fix)
+        for image in trained.survey.images
+        if image.name in trained.sparse.image_index() and image.fix is not None
     ]
     chosen = registered[:: max(1, len(registered) // options.images)][: options.images]
     images = photographs(trained.sfm, trained.survey, workspace, options.size)
     pinholes = trained_pinholes(trained, images)
     gaussians, backend = read_gaussians(options.splat), rasterizer("auto")
     options.output.mkdir(parents=True, exist_ok=True)
-    for image in chosen:
+    for image, fix in chosen:
         index = trained.sparse.image_index()[image.name]
         rotation = geo_from_cam(image, trained, options.attitude == "recorded")
-        pose = cam_from_ply(image.fix, rotation, trained.survey.origin, options.splat)
+        pose = cam_from_ply(fix, rotation, trained.survey.origin, options.splat)
         with torch.no_grad():
             render = backend.render(gaussians, pose, pinholes.of(index), RasterSettings())
         colour = render.colour.clamp(0, 1).mul(255).byte().numpy()

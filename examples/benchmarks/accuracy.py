@@ -136,8 +136,8 @@ def measured(survey: Survey, profile: str, arguments: argparse.Namespace) -> lis
     receiver, control = PROFILES[profile]
     home = arguments.out / survey.name
     base = home / "reconstruction"
-    common = ("--images", survey.folder / "images", "--vertical", "ellipsoidal")
-    common += ("--checkpoints", survey.folder / "checkpoints.txt", "--sigma-mark", "0.2")
+    files = ("--images", survey.folder / "images", "--checkpoints", survey.folder / "checkpoints.txt")
+    common = (*files, "--vertical", "ellipsoidal", "--sigma-mark", "0.2")
     if not (base / "sfm" / "sparse").exists():
         georef("ingest", base, *common, "--trajectory", survey.trajectories["rtk"])
         georef("sfm", base)

@@ -131,7 +131,7 @@ def _through_trained_lens(truth: Truth, marks: ControlMarks | None) -> ControlMa
 
 def _correspondences(truth: Truth, drawn: Drawn) -> Correspondences:
     """What `init-sim3` would be given, the frame `model` standing for `local`."""
-    local, cov_local, geo, cov, control = [np.empty((0, 3))], [], [np.empty((0, 3))], [], []
+    local, geo, cov, control = [np.empty((0, 3))], [np.empty((0, 3))], [], []
     if drawn.fixes is not None:
         local.append(truth.restored.trained.poses.cam_center_in_model[drawn.fixes.camera.numpy()])
         geo.append(drawn.fixes.position_in_geo.numpy())
@@ -143,10 +143,13 @@ def _correspondences(truth: Truth, drawn: Drawn) -> Correspondences:
         cov.append(_covariance(drawn.marks.root_information))
         control += [True] * len(geo[-1])
     count = len(control)
-    cov_local = np.zeros((count, 3, 3))
-    names = tuple(str(index) for index in range(count))
     return Correspondences(
-        names, np.array(control), np.concatenate(local), cov_local, np.concatenate(geo), np.concatenate(cov)
+        tuple(str(index) for index in range(count)),
+        np.array(control),
+        np.concatenate(local),
+        np.zeros((count, 3, 3)),
+        np.concatenate(geo),
+        np.concatenate(cov),
     )
 
 
