@@ -139,8 +139,8 @@ def plane_sweep(
 
     A window fits best on the planes that face as its surface does: walls need others than the ground.
 
-    Memory does not depend on the number of planes. Time: planes × neighbours × pixels, of those
-    rows that see the scene on a plane.
+    Memory does not depend on the number of planes. Time: planes × neighbours × pixels, of those rows that see the
+    scene on a plane.
 
     Args:
         reference: view to find the surface of.
@@ -193,8 +193,7 @@ def _scene_on(planes: Planes, camera: StereoCamera) -> Iterator[NDArray[np.bool_
     """Where (H, W) a camera sees the scene if it lies on a plane, for each of them."""
     rays, center = camera.rays(), camera.center_in_world
     along, (lowest, highest) = rays @ planes.normal_in_world, planes.height_m
-    with np.errstate(divide="ignore", invalid="ignore"):
-        climb = rays[..., 2] / along
+    climb = np.divide(rays[..., 2], along, out=np.zeros_like(along), where=along != 0)
     for gap in planes.offset_m - planes.normal_in_world @ center:
         height = center[2] + gap * climb
         # Rays meet a plane in front of the camera where both lie on one side of it.
