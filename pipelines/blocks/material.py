@@ -20,6 +20,7 @@ from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.initialise import InitialisationOptions, gaussians_from_points, gaussians_of_size
 
 _SURFACE_SHARE = 0.8  # of the Gaussians that there may be start on the surface; density control places the others
+_MOSTLY_KNOWN = 0.6  # of the pixels: where less is known of the surface, more Gaussians are needed elsewhere
 _STRIDE = 3  # every third pixel of a depth map is enough to hold Gaussians, which are wider
 _KEPT_VIEWS = 128  # views whose points stay on the device
 _OFF_SURFACE = 3.0  # gaps between points of the surface: an SfM point so near to one lies on it
@@ -52,7 +53,8 @@ def initial_gaussians(material: Material, options: InitialisationOptions, most: 
     scene = material.scene
     found = SurfacePoints(scene.point_in_model, scene.sparse.point_rgb, np.full_like(scene.point_in_model, np.nan))
     if material.surface is not None:
-        surface = material.surface.sample(int(_SURFACE_SHARE * most), seed)
+        share = _SURFACE_SHARE * min(1.0, material.surface.known() / _MOSTLY_KNOWN)
+        surface = material.surface.sample(int(share * most), seed)
         found = SurfacePoints.concatenate([found.part(_off_surface(found, surface)), surface])
     near = gaussians_from_points(found.point_in_model, found.rgb, options, found.normal_in_model)
     behind = background(scene, material.images, found.point_in_model)

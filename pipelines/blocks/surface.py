@@ -64,6 +64,11 @@ class SceneSurface:
         rows, columns = np.nonzero(self._maps.depth(index)[::stride, ::stride])
         return self._points(index, stride * rows, stride * columns)
 
+    def known(self) -> float:
+        """Part of the training photographs' pixels whose surface is known, 0 … 1."""
+        depths = (self._maps.depth(index) for index in map(int, self._train))
+        return float(np.mean([np.mean(depth > 0) for depth in depths]))
+
     def sample(self, count: int, seed: int) -> SurfacePoints:
         """At most `count` points of the whole surface, as dense as the photographs show it."""
         rng = np.random.default_rng(seed)

@@ -16,7 +16,7 @@ from pipelines.blocks.depth_maps import DepthMaps
 from pipelines.blocks.material import Material, initial_gaussians, points_to_hold
 from pipelines.blocks.scene import Scene, make_scene, photographs
 from pipelines.blocks.surface import SceneSurface, spread_evenly
-from pipelines.formats.image_cache import ImageCache
+from pipelines.formats.image_cache import ImageCache, save_array
 from pipelines.splat.initialise import InitialisationOptions
 
 # A pixel of these small photographs is half a metre wide on the ground, neighbours are 20° to 50° apart: a quarter
@@ -156,6 +156,27 @@ def test_gaussians_start_as_discs_however_many_sfm_points_there_are(
     balls = int((torch.cdist(sfm[on_hill], start.means).amin(dim=1) < 1e-4).sum())
     assert discs > most // 4  # most of the start is the surface's, and normals are known of more than half of that
     assert balls < 0.1 * on_hill.sum()
+
+
+def test_fewer_start_on_a_surface_of_which_less_is_known(
+    maps: DepthMaps, surface: SceneSurface, material: tuple[Rendered, Scene, ImageCache], tmp_path: Path
+) -> None:
+    _, scene, images = material
+    part = DepthMaps(tmp_path, scene, images)
+    for path in maps.folder.glob("*.depth.npy"):
+        depth = np.load(path)
+        depth[:, depth.shape[1] // 4 :] = 0
+        save_array(part.folder / path.name, depth)
+    most, options = 3000, InitialisationOptions(sh_degree=0)
+
+    def discs(found: SceneSurface) -> int:
+        scale = initial_gaussians(Material(scene, images, found), options, most, 0).log_scales.exp()
+        return int((scale.amin(dim=1) < 0.2 * scale.amax(dim=1)).sum())
+
+    quarter = SceneSurface(part)
+    assert quarter.known() < 0.3 * surface.known()
+    # Known of a quarter of the pixels, it starts with no more than a third of the Gaussians: trees have the others.
+    assert 0 < discs(quarter) < most / 3 < discs(surface)
 
 
 def test_points_to_hold_are_those_of_the_view(
