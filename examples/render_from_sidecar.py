@@ -16,16 +16,17 @@ import cv2
 import numpy as np
 import torch
 
-from pipelines.blocks.scene import photographs
-from pipelines.blocks.trained import Trained, load_trained, trained_pinholes
+from pipelines.core.types import FloatArray
+from pipelines.core.workspace import Workspace
 from pipelines.formats.georef_sidecar import read_sidecar
-from pipelines.geodesy.enu import ecef_from_enu, ecef_from_enu_rotation, lla_of
+from pipelines.geodesy.enu import Origin, ecef_from_enu, ecef_from_enu_rotation, lla_of
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
-from pipelines.products import FloatArray
-from pipelines.splat.raster.api import RasterSettings, rasterizer
+from pipelines.scene.scene import photographs
+from pipelines.scene.survey import Fix, SurveyImage
+from pipelines.scene.trained import Trained, load_trained, trained_pinholes
+from pipelines.splat.rasterizer.api import RasterSettings
+from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.splat.storage import read_gaussians
-from pipelines.survey import Fix, Origin, SurveyImage
-from pipelines.workspace import Workspace
 
 
 def geo_from_cam(image: SurveyImage, trained: Trained, recorded: bool) -> FloatArray:

@@ -14,33 +14,19 @@ import sys
 import traceback as tracebacks
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
 import click
 
-from pipelines.errors import GeorefError
+from georef_cli.verbosity import LineFormatter, Verbosity
+from pipelines.core.errors import GeorefError
 
 FAILED, INTERRUPTED = 1, 130
 OURS = ("pipelines", "georef_cli")
 FILE_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class Manners:
-    """How the program talks: the options of the group."""
-
-    verbose: bool = False
-    quiet: bool = False
-    traceback: bool = False
-
-    @property
-    def level(self) -> int:
-        """The least severe level that is told on stderr."""
-        return logging.DEBUG if self.verbose else logging.WARNING if self.quiet else logging.INFO
 
 
 def guarded(group: click.Group, arguments: Sequence[str] | None) -> int:
@@ -85,15 +71,15 @@ def _sigterm_interrupts() -> Iterator[None]:
 
 
 @contextmanager
-def told(manners: Manners) -> Iterator[None]:
+def told(verbosity: Verbosity) -> Iterator[None]:
     """Tell log records on stderr while the context lasts, and the traceback of its error if asked."""
     handler = _terminal_handler() if sys.stderr.isatty() else _line_handler()
-    handler.setLevel(manners.level)
-    with _attached(handler, logging.DEBUG if manners.verbose else logging.INFO):
+    handler.setLevel(verbosity.level)
+    with _attached(handler, logging.DEBUG if verbosity.verbose else logging.INFO):
         try:
             yield
         except GeorefError:
-            if manners.traceback:
+            if verbosity.traceback:
                 tracebacks.print_exc()
             raise
 
@@ -138,14 +124,6 @@ def _line_handler() -> logging.Handler:
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(LineFormatter())
     return handler
-
-
-class LineFormatter(logging.Formatter):
-    """`message`, or `warning: message`."""
-
-    def format(self, record: logging.LogRecord) -> str:
-        text = super().format(record)
-        return text if record.levelno == logging.INFO else f"{record.levelname.lower()}: {text}"
 
 
 class _LateFileHandler(logging.FileHandler):

@@ -23,8 +23,8 @@ from rich.progress import Progress as Bars
 from rich.progress import ProgressColumn as Column
 from rich.text import Text
 
-from georef_cli.boundary import LineFormatter, Manners
-from pipelines.progress import SILENT, Progress, ProgressTask
+from georef_cli.verbosity import LineFormatter, Verbosity
+from pipelines.core.progress import SILENT, Progress, ProgressTask
 
 LINE_EVERY_S = 30.0
 LEVEL_STYLES = {logging.ERROR: "red", logging.WARNING: "yellow", logging.INFO: ""}
@@ -52,9 +52,9 @@ class ConsoleHandler(logging.Handler):
         self._console.print(Text(self.format(record), style=style))
 
 
-def progress_for(manners: Manners) -> Progress:
+def progress_for(verbosity: Verbosity) -> Progress:
     """Bars on a terminal, sparse log lines elsewhere, nothing with `--quiet`."""
-    if manners.quiet:
+    if verbosity.quiet:
         return SILENT
     return BarProgress(stderr_console()) if sys.stderr.isatty() else LineProgress()
 

@@ -16,6 +16,7 @@ from typing import Any
 import click
 
 from georef_cli import boundary
+from georef_cli.verbosity import Verbosity
 
 PROGRAM = "georef"
 
@@ -68,10 +69,10 @@ class LazyGroup(click.Group):
         return command
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run a subcommand with the manners that the group's options ask for."""
+        """Run a subcommand with the verbosity that the group's options ask for."""
         if ctx.params["verbose"] and ctx.params["quiet"]:
             raise click.UsageError("--verbose and --quiet exclude each other.", ctx)
-        ctx.obj = boundary.Manners(**ctx.params)
+        ctx.obj = Verbosity(**ctx.params)
         with boundary.told(ctx.obj):
             return super().invoke(ctx)
 
@@ -103,7 +104,7 @@ def _print_version(ctx: click.Context, _param: click.Parameter, value: bool) -> 
     callback=_print_version,
     help="Show the version.",
 )
-def cli(**_manners: bool) -> None:
+def cli(**_verbosity: bool) -> None:
     """From drone flights to georeferenced 3D Gaussian splats.
 
     Every command works on a workspace, a folder that holds the products of the stages.

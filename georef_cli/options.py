@@ -13,8 +13,8 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 import click
 from pydantic.fields import FieldInfo
 
-from pipelines.config import StageConfig, flag_name
-from pipelines.workspace import Workspace
+from pipelines.core.options import StageOptions, flag_name
+from pipelines.core.workspace import Workspace
 
 FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
 
@@ -47,13 +47,13 @@ def force_option(help_text: str = "Run even if the product is current.") -> clic
     return click.Option(["--force"], is_flag=True, help=help_text)
 
 
-def stage_options(config_type: type[StageConfig], only: Iterable[str] | None = None) -> list[click.Option]:
+def stage_options(config_type: type[StageOptions], only: Iterable[str] | None = None) -> list[click.Option]:
     """One click option for each field of a config, or for those named in `only`."""
     wanted = list(config_type.model_fields) if only is None else list(only)
     return [config_option(config_type, name) for name in wanted]
 
 
-def config_option(config_type: type[StageConfig], name: str) -> click.Option:
+def config_option(config_type: type[StageOptions], name: str) -> click.Option:
     """The click option of one field: it has no default of its own, only a text that tells the config's."""
     info = config_type.model_fields[name]
     flag, kind = flag_name(config_type, name), _bare_type(info.annotation)

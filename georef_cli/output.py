@@ -10,9 +10,9 @@ import click
 from rich.console import Console, RenderableType
 
 from georef_cli import tables
-from pipelines.products import dump_json
-from pipelines.runner import Outcome
-from pipelines.workspace import Workspace
+from pipelines.core.products import dump_json
+from pipelines.core.runner import Outcome
+from pipelines.core.workspace import Workspace
 
 PIPED_WIDTH = 120
 

@@ -11,8 +11,8 @@ import click
 from georef_cli import boundary, options
 from georef_cli.display import progress_for
 from georef_cli.output import print_outcome
-from pipelines import runner
-from pipelines.stages import BY_NAME
+from pipelines.core import runner
+from pipelines.core.stages import BY_NAME
 
 
 class StageCommand(click.Command):
@@ -30,7 +30,7 @@ class StageCommand(click.Command):
             name,
             params=[
                 options.workspace_argument(),
-                *options.stage_options(self.spec.config),
+                *options.stage_options(self.spec.options),
                 *extra,
                 options.force_option(),
                 options.json_option(),
@@ -46,7 +46,7 @@ class StageCommand(click.Command):
 
     def run(self, ctx: click.Context, values: Mapping[str, Any], *, resume: bool = False) -> runner.Outcome:
         """Run the stage with the options that the user gave; to resume, on top of those given before."""
-        flags = options.given(ctx, self.spec.config.model_fields)
+        flags = options.given(ctx, self.spec.options.model_fields)
         workspace = values["workspace"]
         if resume:
             flags = runner.remembered(workspace, self.spec, flags)

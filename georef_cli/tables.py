@@ -11,12 +11,12 @@ from rich.console import Group
 from rich.markup import escape
 from rich.table import Table
 
-from pipelines.comparison import Comparison, cells, remarks_on
-from pipelines.errors import InputError
-from pipelines.runner import Outcome
-from pipelines.stages import REPORT
-from pipelines.states import StageState
-from pipelines.workspace import Workspace
+from pipelines.compare.table import Comparison, cells, remarks_on
+from pipelines.core.errors import InputError
+from pipelines.core.runner import Outcome
+from pipelines.core.stages import REPORT
+from pipelines.core.staleness import StageState
+from pipelines.core.workspace import Workspace
 
 STATE_STYLE = {
     "current": "green",

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scenes import looking_at
 
 from pipelines.geometry.bundle import Network
 from pipelines.geometry.cameras import Camera, project
 from pipelines.geometry.rotations import exp_so3
+from tests.scenes import looking_at
 
 LENS = Camera("SIMPLE_RADIAL", 600, 450, np.array([500.0, 300.0, 225.0, -0.05]))
 SIGMA_PX = 0.5

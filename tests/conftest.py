@@ -6,12 +6,18 @@ import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 
-from pipelines.stages import STAGES
-from pipelines.workspace import Workspace
+from pipelines.core.stages import BY_NAME, STAGES
+from pipelines.core.workspace import Workspace
 from tests import fakes
+
+if TYPE_CHECKING:
+    from tests.splat_scenes import Flight
+
+SEEDS = 3
 
 # As the command line does, and for the same reason: see georef_cli/main.py.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -44,3 +50,35 @@ def one_thread() -> Iterator[None]:
 
     with single_thread():
         yield
+
+
+@pytest.fixture(scope="session")
+def flights(tmp_path_factory: pytest.TempPathFactory) -> list[Flight]:
+    """Rendered surveys that differ in everything random, made once for the tests of training and evaluation."""
+    from tests.splat_scenes import Flight, make_rendered, write_photographs
+    from tests.threads import single_thread
+
+    made = []
+    for seed in range(SEEDS):
+        rendered, root = make_rendered(seed), tmp_path_factory.mktemp(f"rendered{seed}")
+        with single_thread():
+            write_photographs(rendered, root / "photos")
+        made.append(Flight(rendered, root, seed))
+    return made
+
+
+@pytest.fixture(scope="session")
+def trained(flights: list[Flight]) -> list[tuple[Workspace, Workspace]]:
+    """Each survey trained with the geographic losses and without."""
+    from pipelines.core.runner import run_stage
+    from tests.splat_scenes import TRAINING
+    from tests.threads import single_thread
+
+    pairs = []
+    for flight in flights:
+        pair = flight.workspace("with"), flight.workspace("without")
+        with single_thread():
+            run_stage(pair[0], BY_NAME["train"], TRAINING)
+            run_stage(pair[1], BY_NAME["train"], {**TRAINING, "geo_loss": False})
+        pairs.append(pair)
+    return pairs

@@ -13,11 +13,11 @@ from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
-from pipelines.config import StageConfig
-from pipelines.stages import PIPELINE, STAGES, StageSpec, products_of
-from pipelines.workspace import StageRun, Summary, Workspace
+from pipelines.core.options import StageOptions
+from pipelines.core.stages import PIPELINE, STAGES, StageSpec, products_of
+from pipelines.core.workspace import StageRun, Summary, Workspace
 
-Run = Callable[[StageRun, StageConfig], Summary]
+Run = Callable[[StageRun, StageOptions], Summary]
 
 
 def write_products(stage: StageRun, spec: StageSpec, text: str) -> None:
@@ -41,7 +41,7 @@ def read_products(workspace: Workspace, spec: StageSpec) -> list[str]:
 def fake_run(spec: StageSpec) -> Run:
     """The `run` of a fake stage."""
 
-    def run(stage: StageRun, config: StageConfig) -> Summary:
+    def run(stage: StageRun, config: StageOptions) -> Summary:
         read = "".join(read_products(stage.workspace, s)[0] for s in PIPELINE if _reads(spec, s))
         told = {"stage": spec.name, "options": config.model_dump(mode="json"), "read": _digest(read)}
         text = json.dumps(told, separators=(",", ":"))

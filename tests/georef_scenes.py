@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scenes import looking_at
 
 from pipelines.geometry.bundle import similarity_modes
 from pipelines.geometry.rotations import exp_so3, log_so3
@@ -17,6 +16,7 @@ from pipelines.georef.measured import Attitudes, ControlMarks, Fixes, Measured, 
 from pipelines.georef.problem import GeoProblem
 from pipelines.georef.similarity import LearnableSimilarity
 from pipelines.georef.systematic import SystematicErrors
+from tests.scenes import looking_at
 
 SHIFT = np.array([100.0, 50.0, 20.0])
 # Of an initial similarity that is far from the truth: 1 % of scale, 1°, 2 m.

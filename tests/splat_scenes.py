@@ -8,7 +8,23 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from scenes import (
+
+from pipelines.core.products import save_json
+from pipelines.core.stages import POINTS, SIM3
+from pipelines.core.workspace import Workspace
+from pipelines.geolocate.options import GeolocateOptions
+from pipelines.geolocate.stage import geolocate
+from pipelines.geometry.cameras import Camera
+from pipelines.geometry.rotations import exp_so3
+from pipelines.geometry.similarity import Similarity
+from pipelines.geometry.sparse_model import SparseModel
+from pipelines.scene.initial_similarity import InitialSimilarity
+from pipelines.scene.survey import Survey
+from pipelines.splat.gaussians import Gaussians
+from pipelines.splat.rasterizer.api import Pinhole, RasterSettings
+from pipelines.splat.rasterizer.cpu import CpuRasterizer
+from pipelines.splat.sh import sh_from_rgb
+from tests.scenes import (
     GEO_FROM_LOCAL,
     Measured,
     Noise,
@@ -19,21 +35,6 @@ from scenes import (
     survey_of,
     write_workspace,
 )
-
-from pipelines.config import GeolocateConfig
-from pipelines.formats.colmap import SparseModel
-from pipelines.geolocate import geolocate
-from pipelines.geometry.cameras import Camera
-from pipelines.geometry.rotations import exp_so3
-from pipelines.geometry.similarity import Similarity
-from pipelines.products import InitialSimilarity, save_json
-from pipelines.splat.gaussians import Gaussians
-from pipelines.splat.raster.api import Pinhole, RasterSettings
-from pipelines.splat.raster.cpu import CpuRasterizer
-from pipelines.splat.sh import sh_from_rgb
-from pipelines.stages import POINTS, SIM3
-from pipelines.survey import Survey
-from pipelines.workspace import Workspace
 
 CAMERA = Camera("PINHOLE", 96, 72, np.array([90.0, 90.0, 48.0, 36.0]))
 # Of the surface's Gaussians: metres between them, and their standard deviation along the ground.
@@ -145,7 +146,7 @@ def write_rendered(root: Path, rendered: Rendered, initial: InitialSimilarity) -
     """A workspace as the stages before training leave it; the photographs must be in `root/photos`."""
     workspace = write_workspace(root, rendered.survey, rendered.sparse)
     save_json(initial, root / SIM3)
-    geolocate(rendered.survey, rendered.sparse, GeolocateConfig()).points.save(root / POINTS)
+    geolocate(rendered.survey, rendered.sparse, GeolocateOptions()).points.save(root / POINTS)
     return workspace
 
 

@@ -9,20 +9,20 @@ import cv2
 import numpy as np
 import torch
 
-from pipelines.blocks.trainer import JointOptions, JointTrainer, Views
-from pipelines.formats.image_cache import ImageCache, Photograph
 from pipelines.geometry.cameras import Camera
 from pipelines.geometry.similarity import Similarity
 from pipelines.georef.cameras import CameraCorrections, CameraPoses
 from pipelines.georef.measured import Measured
 from pipelines.georef.problem import GeoProblem
 from pipelines.georef.similarity import LearnableSimilarity
+from pipelines.scene.photographs import ImageCache, Photograph
 from pipelines.splat.densify import DefaultSettings, DefaultStrategy, Strategy
 from pipelines.splat.exposure import Exposures
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.optimizer import GaussianAdam
-from pipelines.splat.raster.api import Pinhole, RasterSettings
-from pipelines.splat.raster.cpu import CpuRasterizer
+from pipelines.splat.rasterizer.api import Pinhole, RasterSettings
+from pipelines.splat.rasterizer.cpu import CpuRasterizer
+from pipelines.train.trainer import JointOptions, JointTrainer, Views
 
 CAMERA = Camera("PINHOLE", 64, 48, np.array([60.0, 60.0, 32.0, 24.0]))
 PINHOLE = Pinhole(64, 48, 60.0, 60.0, 32.0, 24.0)

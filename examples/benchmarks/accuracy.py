@@ -22,10 +22,10 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.config import resolve
-from pipelines.simulate import fly_survey
-from pipelines.simulate_config import SimulateConfig
-from pipelines.simulation.write import write_trajectory
+from pipelines.core.options import resolve
+from pipelines.simulate.options import SimulateOptions
+from pipelines.simulate.stage import fly_survey
+from pipelines.simulate.write import write_trajectory
 
 # Name of the profile, receiver, whether there are control points.
 PROFILES = {
@@ -126,7 +126,7 @@ def simulated(seed: int, arguments: argparse.Namespace) -> Survey:
         if not files[receiver].exists():
             options = {"images": arguments.images, "size": arguments.size, "seed": seed}
             options |= SIMULATED.get(receiver, {"gnss": receiver})
-            config = resolve(SimulateConfig, {}, options, Path("georef.toml"))
+            config = resolve(SimulateOptions, {}, options, Path("georef.toml"))
             write_trajectory(files[receiver], fly_survey(config).recording.photos)
     return Survey(f"seed{seed}", folder, files)
 

@@ -18,11 +18,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from pipelines.blocks.points import Sights, points_by_camera, sights
-from pipelines.blocks.prediction import control_sights, cramer_rao, following, trained_lens
-from pipelines.blocks.restored import Restored, restore, training_config
-from pipelines.blocks.trained import load_trained
-from pipelines.geometry.following import Following
+from pipelines.core.products import load_json
+from pipelines.core.stages import SIM3
+from pipelines.core.types import FloatArray
+from pipelines.core.workspace import Workspace
+from pipelines.evaluate.following import Following
+from pipelines.evaluate.points import Sights, points_by_camera, sights
+from pipelines.evaluate.prediction import control_sights, cramer_rao, following, trained_lens
 from pipelines.georef.adjustment import Correspondences
 from pipelines.georef.alignment import align
 from pipelines.georef.cameras import CameraCorrections
@@ -30,9 +32,9 @@ from pipelines.georef.measured import ControlMarks, Fixes, Measured
 from pipelines.georef.posterior import minimise
 from pipelines.georef.problem import GeoProblem
 from pipelines.georef.similarity import LearnableSimilarity
-from pipelines.products import FloatArray, InitialSimilarity, load_json
-from pipelines.stages import SIM3
-from pipelines.workspace import Workspace
+from pipelines.scene.initial_similarity import InitialSimilarity
+from pipelines.scene.restored import Restored, geographic_options_of, restore
+from pipelines.scene.trained import load_trained
 
 
 @dataclass(frozen=True)
@@ -169,7 +171,7 @@ def main() -> None:
     workspace = Workspace(options.workspace)
     trained = load_trained(workspace)
     initial = load_json(InitialSimilarity, workspace.path(SIM3))
-    restored = restore(trained, initial, training_config(workspace))
+    restored = restore(trained, initial, geographic_options_of(workspace))
     seen, points = sights(trained, trained.survey.check_points), trained.survey.check_points
     control, marks = control_sights(restored), restored.problem.marks
     truth = Truth(

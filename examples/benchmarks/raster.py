@@ -14,7 +14,8 @@ import time
 import torch
 
 from pipelines.splat.gaussians import Gaussians
-from pipelines.splat.raster.api import Pinhole, RasterSettings, Render, rasterizer
+from pipelines.splat.rasterizer.api import Pinhole, RasterSettings, Render
+from pipelines.splat.rasterizer.backends import rasterizer
 
 
 def make_scene(count: int, camera: Pinhole, visible: float, device: str, seed: int = 0) -> Gaussians:

@@ -23,26 +23,28 @@ import numpy as np
 import torch
 from raster import make_scene
 
-from pipelines.blocks.depth_maps import DepthMaps
-from pipelines.blocks.geographic import geo_problem
-from pipelines.blocks.material import Material
-from pipelines.blocks.scene import Scene, initial_scene, photographs
-from pipelines.blocks.surface import SceneSurface
-from pipelines.blocks.trainer import JointTrainer
+from pipelines.core.products import load_json
+from pipelines.core.stages import SIM3, SPARSE, SURVEY
+from pipelines.core.workspace import Workspace
 from pipelines.formats.colmap import read_sparse
-from pipelines.formats.image_cache import ImageCache
-from pipelines.products import InitialSimilarity, load_json
+from pipelines.scene.geographic import geo_problem
+from pipelines.scene.initial_similarity import InitialSimilarity
+from pipelines.scene.photographs import ImageCache
+from pipelines.scene.scene import Scene, initial_scene, photographs
+from pipelines.scene.survey import Survey
 from pipelines.splat.densify import DefaultSettings, DefaultStrategy
 from pipelines.splat.losses import photometric_loss
 from pipelines.splat.memory import TrainingSize, predicted_peak_bytes
 from pipelines.splat.metrics import psnr
 from pipelines.splat.optimizer import GaussianAdam
-from pipelines.splat.raster.api import Pinhole, RasterSettings, rasterizer
-from pipelines.stages import SIM3, SPARSE, SURVEY
-from pipelines.survey import Survey
-from pipelines.train import make_trainer
-from pipelines.train_config import TrainConfig
-from pipelines.workspace import Workspace
+from pipelines.splat.rasterizer.api import Pinhole, RasterSettings
+from pipelines.splat.rasterizer.backends import rasterizer
+from pipelines.train.depth_maps import DepthMaps
+from pipelines.train.material import Material
+from pipelines.train.options import TrainOptions
+from pipelines.train.stage import make_trainer
+from pipelines.train.surface import SceneSurface
+from pipelines.train.trainer import JointTrainer
 
 
 def iterations(count: int, camera: Pinhole, visible: float, repeats: int, backend_name: str) -> Iterator[float]:
@@ -91,7 +93,7 @@ def curve(arguments: argparse.Namespace) -> None:
     scene = initial_scene(read_sparse(workspace.path(SPARSE)), survey, initial)
     print("strategy   seconds  iteration  gaussians  test PSNR dB")
     for strategy in arguments.strategies:
-        config = TrainConfig.model_validate(
+        config = TrainOptions.model_validate(
             {
                 "preset": "standard",
                 "strategy": strategy,

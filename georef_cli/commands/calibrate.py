@@ -10,15 +10,16 @@ import click
 
 from georef_cli import boundary, options, tables
 from georef_cli.output import print_json, print_rich
-from pipelines.config import CONFIG_FILE, CalibrateConfig, resolve
-from pipelines.stages import CALIBRATE
+from pipelines.calibrate.options import CalibrateOptions
+from pipelines.core.options import CONFIG_FILE, resolve
+from pipelines.core.stages import CALIBRATE
 
 
 def _calibrate(ctx: click.Context, **values: Any) -> None:
-    from pipelines.calibrate import apply_calibration, calibrate
+    from pipelines.calibrate.stage import apply_calibration, calibrate
 
     workspace = values["workspace"]
-    config = resolve(CalibrateConfig, {}, options.given(ctx, CalibrateConfig.model_fields), Path(CONFIG_FILE))
+    config = resolve(CalibrateOptions, {}, options.given(ctx, CalibrateOptions.model_fields), Path(CONFIG_FILE))
     found = calibrate(workspace, config)
     applied: list[str] = []
     if values["apply"]:
@@ -37,7 +38,7 @@ command = click.Command(
     "calibrate",
     params=[
         options.workspace_argument(),
-        *options.stage_options(CalibrateConfig),
+        *options.stage_options(CalibrateOptions),
         click.Option(["--apply"], is_flag=True, help="Put what is observable into the survey."),
         options.json_option(),
     ],

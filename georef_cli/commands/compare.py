@@ -10,8 +10,8 @@ import click
 from georef_cli import boundary, options, tables
 from georef_cli.display import progress_for
 from georef_cli.output import document_of, print_json, print_rich
-from pipelines.compare import NAMES, TRAIN_OPTIONS, chosen, compare
-from pipelines.train_config import TrainConfig
+from pipelines.compare.stage import NAMES, TRAIN_OPTIONS, chosen, compare
+from pipelines.train.options import TrainOptions
 
 
 def _compare(ctx: click.Context, **values: Any) -> None:
@@ -41,7 +41,7 @@ command = click.Command(
             default=",".join(NAMES),
             help=f"Configurations to compare, with commas. [default: {','.join(NAMES)}]",
         ),
-        *options.stage_options(TrainConfig, TRAIN_OPTIONS),
+        *options.stage_options(TrainOptions, TRAIN_OPTIONS),
         options.force_option("Run the stages of the configurations even if their products are current."),
         options.json_option(),
     ],

@@ -10,7 +10,7 @@ import click
 from georef_cli.delivery import check_target, deliver
 from georef_cli.output import print_outcome
 from georef_cli.stage import StageCommand
-from pipelines.stages import SPLAT
+from pipelines.core.stages import SPLAT
 
 
 class ExportCommand(StageCommand):

@@ -15,7 +15,7 @@ from georef_cli.output import print_json, print_rich
 
 
 def _inspect(ctx: click.Context, bag: Path, as_json: bool) -> None:
-    from pipelines.inspect_bag import inspect_bag
+    from pipelines.ingest.bag.inspection import inspect_bag
 
     report = inspect_bag(bag, progress_for(ctx.obj))
     document = dataclasses.asdict(report)

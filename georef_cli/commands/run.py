@@ -10,10 +10,10 @@ import click
 from georef_cli import boundary, options
 from georef_cli.display import progress_for
 from georef_cli.output import print_outcomes
-from pipelines import runner
-from pipelines.errors import GeorefError
-from pipelines.ingest_config import IngestConfig
-from pipelines.stages import BY_NAME, PIPELINE, StageSpec, stage_slice
+from pipelines.core import runner
+from pipelines.core.errors import GeorefError
+from pipelines.core.stages import BY_NAME, PIPELINE, StageSpec, stage_slice
+from pipelines.ingest.options import IngestOptions
 
 # Options of later stages that `run` offers too, and the stages that each is for. The others are set in
 # georef.toml, or with the stage's own command.
@@ -28,7 +28,7 @@ LATER: dict[str, tuple[str, ...]] = {
     "backend": ("train", "evaluate"),
     "seed": ("sfm", "init-sim3", "train"),
 }
-OWNERS: dict[str, tuple[str, ...]] = {**dict.fromkeys(IngestConfig.model_fields, ("ingest",)), **LATER}
+OWNERS: dict[str, tuple[str, ...]] = {**dict.fromkeys(IngestOptions.model_fields, ("ingest",)), **LATER}
 
 
 def _run(ctx: click.Context, **values: Any) -> None:
@@ -65,7 +65,7 @@ def _flags(ctx: click.Context, stages: tuple[StageSpec, ...]) -> dict[str, dict[
         owners = [owner for owner in OWNERS[name] if owner in running]
         if not owners:
             raise click.UsageError(
-                f"{options.config_option(BY_NAME[OWNERS[name][0]].config, name).opts[0]} is for "
+                f"{options.config_option(BY_NAME[OWNERS[name][0]].options, name).opts[0]} is for "
                 f"{' and '.join(OWNERS[name])}, which is not among the stages to run."
             )
         for owner in owners:
@@ -83,7 +83,7 @@ command = click.Command(
         options.workspace_argument(),
         _stage_option("--from", "first", "First stage to run."),
         _stage_option("--to", "last", "Last stage to run."),
-        *(options.config_option(BY_NAME[owners[0]].config, name) for name, owners in OWNERS.items()),
+        *(options.config_option(BY_NAME[owners[0]].options, name) for name, owners in OWNERS.items()),
         options.force_option("Run the stages even if their products are current."),
         options.json_option(),
     ],

@@ -13,14 +13,14 @@ import click
 from georef_cli import options, tables
 from georef_cli.display import progress_for
 from georef_cli.output import print_json, print_rich
-from pipelines.config import CONFIG_FILE, resolve
-from pipelines.simulate_config import SimulateConfig
+from pipelines.core.options import CONFIG_FILE, resolve
+from pipelines.simulate.options import SimulateOptions
 
 
 def _simulate(ctx: click.Context, **values: Any) -> None:
-    from pipelines.simulate import simulate
+    from pipelines.simulate.stage import simulate
 
-    config = resolve(SimulateConfig, {}, options.given(ctx, SimulateConfig.model_fields), Path(CONFIG_FILE))
+    config = resolve(SimulateOptions, {}, options.given(ctx, SimulateOptions.model_fields), Path(CONFIG_FILE))
     started = time.monotonic()
     summary = simulate(config, values["directory"], progress_for(ctx.obj), overwrite=values["force"])
     if values["as_json"]:
@@ -36,7 +36,7 @@ command = click.Command(
         click.Argument(
             ["directory"], type=click.Path(file_okay=False, resolve_path=True, path_type=Path), metavar="DIR"
         ),
-        *options.stage_options(SimulateConfig),
+        *options.stage_options(SimulateOptions),
         options.force_option("Replace an earlier simulation in DIR."),
         options.json_option(),
     ],

@@ -8,8 +8,8 @@ import click
 
 from georef_cli import options, tables
 from georef_cli.output import print_json, print_rich
-from pipelines import states
-from pipelines.workspace import Workspace
+from pipelines.core import staleness as states
+from pipelines.core.workspace import Workspace
 
 
 def _status(workspace: Workspace, as_json: bool) -> None:

@@ -14,7 +14,7 @@ from datetime import UTC, datetime
 from fractions import Fraction
 from xml.sax.saxutils import quoteattr
 
-from pipelines.errors import InputError
+from pipelines.core.errors import InputError
 
 _SHORT, _ASCII, _LONG, _RATIONAL, _BYTE = 3, 2, 4, 5, 1
 _SENSOR_MM = 13.2  # width of a 1-inch sensor

@@ -16,14 +16,14 @@ from numpy.typing import ArrayLike
 from pydantic import ConfigDict, Field, field_validator
 from pydantic.alias_generators import to_camel
 
+from pipelines.core.products import Product, load_json
+from pipelines.core.types import FloatArray, Quaternion, Row7, Vector3
+from pipelines.geodesy.vertical import VerticalDatum
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.similarity import Similarity, covariance_at
-from pipelines.products import FloatArray, Product, Quaternion, Vector3, load_json
-from pipelines.survey import VerticalDatum
 
 SUFFIX = ".georef.json"
 
-Row7 = tuple[float, float, float, float, float, float, float]
 Covariance7 = Annotated[tuple[Row7, ...], Field(min_length=7, max_length=7)]
 
 

@@ -11,12 +11,12 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.errors import InputError
-from pipelines.formats.notes import Notes
-from pipelines.formats.poses import PoseTable, complete
+from pipelines.core.errors import InputError
+from pipelines.core.types import FloatArray
+from pipelines.formats.pose_table import PoseTable, complete
 from pipelines.formats.text import number, read_lines
 from pipelines.geometry.rotations import geo_from_cam, quat_xyzw_from_matrix
-from pipelines.products import FloatArray
+from pipelines.ingest.notes import Notes
 
 _GEO_COUNTS = "image x y [z] [yaw pitch roll] [h_acc v_acc]"
 _GCP_FORM = "x y z px py image [name]"

@@ -5,10 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement
 
-from pipelines.products import FloatArray
+from pipelines.core.types import BoolArray, ByteArray, FloatArray
 
 _VERTEX = [
     ("x", "<f8"), ("y", "<f8"), ("z", "<f8"),
@@ -18,7 +17,7 @@ _VERTEX = [
 
 
 def write_point_ply(
-    path: Path, position: FloatArray, rgb: NDArray[np.uint8], sigma_m: FloatArray, inlier: NDArray[np.bool_]
+    path: Path, position: FloatArray, rgb: ByteArray, sigma_m: FloatArray, inlier: BoolArray
 ) -> None:
     """Write points (N, 3) with colour (N, 3), σ along their worst axis (N,) and an inlier flag (N,), in binary.
 

@@ -14,9 +14,10 @@ from numpy.lib import recfunctions
 from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement, PlyParseError
 
-from pipelines.errors import InputError
+from pipelines.core.errors import InputError
+from pipelines.core.types import Float32Array
 
-FloatRows = NDArray[np.float32]
+FloatRows = Float32Array
 
 _HEADER_LIMIT = 64 * 1024
 _POSITION = ("x", "y", "z")

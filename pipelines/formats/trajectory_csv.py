@@ -13,12 +13,12 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.errors import InputError
-from pipelines.formats.notes import Notes
-from pipelines.formats.poses import PoseTable, complete
+from pipelines.core.errors import InputError
+from pipelines.core.types import FloatArray
+from pipelines.formats.pose_table import PoseTable, complete
 from pipelines.formats.text import number, read_lines
 from pipelines.geometry.rotations import geo_from_cam, quat_xyzw_from_matrix
-from pipelines.products import FloatArray
+from pipelines.ingest.notes import Notes
 
 _ALIASES = {
     "image": ("image_name", "filename", "file_name", "file", "name"),

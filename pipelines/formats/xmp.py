@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 from xml.etree.ElementTree import Element, ParseError
 
-from pipelines.products import Vector3
+from pipelines.core.types import Vector3
 
 _SEARCHED = 1024 * 1024
 _MAX_PACKET = 256 * 1024

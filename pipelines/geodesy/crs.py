@@ -21,12 +21,11 @@ from pyproj.crs import CompoundCRS
 from pyproj.enums import TransformDirection
 from pyproj.exceptions import CRSError
 
-from pipelines.errors import InputError
+from pipelines.core.errors import InputError
+from pipelines.core.types import FloatArray
 from pipelines.geodesy.operations import Operation, Way, best_operation
 from pipelines.geodesy.plausible import Rows, check_area, horizontal_of, rough_lon_lat
-from pipelines.geodesy.vertical import ELLIPSOIDAL, VerticalChoice, assumed_ellipsoidal, name_of
-from pipelines.products import FloatArray
-from pipelines.survey import VerticalDatum
+from pipelines.geodesy.vertical import ELLIPSOIDAL, VerticalChoice, VerticalDatum, assumed_ellipsoidal, name_of
 
 ECEF = "EPSG:4978"
 _MAX_TEXT = 20_000

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import Field
 
-from pipelines.products import FloatArray
-from pipelines.survey import Origin
+from pipelines.core.products import Product
+from pipelines.core.types import FloatArray
 
 SEMI_MAJOR_M = 6378137.0
 FLATTENING = 1.0 / 298.257223563
@@ -115,3 +116,11 @@ def _checked(points: ArrayLike) -> FloatArray:
     if array.ndim < 1 or array.shape[-1] != 3:
         raise ValueError(f"expected points of shape (…, 3), got {array.shape}")
     return array
+
+
+class Origin(Product):
+    """Origin of the `geo` frame: WGS84 degrees and ellipsoidal metres."""
+
+    lat_deg: float = Field(ge=-90, le=90)
+    lon_deg: float = Field(ge=-180, le=180)
+    alt_m: float

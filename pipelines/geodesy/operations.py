@@ -17,9 +17,9 @@ from pyproj.crs import CoordinateOperation
 from pyproj.datadir import get_user_data_dir
 from pyproj.transformer import AreaOfInterest, TransformerGroup
 
-from pipelines.errors import InputError
+from pipelines.core.errors import InputError
+from pipelines.core.types import FloatArray
 from pipelines.geodesy.vertical import missing_grid_error
-from pipelines.products import FloatArray
 
 WGS84 = "EPSG:4326"
 _WGS84_3D = "EPSG:4979"

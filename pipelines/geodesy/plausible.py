@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pyproj import CRS, Transformer
 
-from pipelines.errors import InputError
+from pipelines.core.errors import InputError
+from pipelines.core.types import BoolArray, FloatArray
 from pipelines.geodesy.enu import lla_from_ecef
-from pipelines.products import FloatArray
 
 # Surveys lawfully run over the border of their zone; further than this from it the CRS is a mistake.
 _AREA_MARGIN_DEG = 3.0
@@ -97,7 +97,7 @@ def _from_greenwich(geodetic: CRS, x: FloatArray, y: FloatArray) -> tuple[FloatA
     return np.asarray(x * unit + shift), np.asarray(y * unit)
 
 
-def _look_like_degrees(projected: CRS, points: FloatArray, lon: FloatArray, lat: FloatArray) -> NDArray[np.bool_]:
+def _look_like_degrees(projected: CRS, points: FloatArray, lon: FloatArray, lat: FloatArray) -> BoolArray:
     """Which points (N,) of a projection are as small as degrees although no metres near its zero can be meant."""
     small = (np.abs(points[:, 0]) <= 180.0) & (np.abs(points[:, 1]) <= 90.0)
     if projected.area_of_use is not None:
@@ -111,7 +111,7 @@ def _look_like_degrees(projected: CRS, points: FloatArray, lon: FloatArray, lat:
     return small & (max(false_origin_m, default=0.0) > _FALSE_ORIGIN_M)
 
 
-def _within(horizontal: CRS, lon: FloatArray, lat: FloatArray, margin_deg: float) -> NDArray[np.bool_]:
+def _within(horizontal: CRS, lon: FloatArray, lat: FloatArray, margin_deg: float) -> BoolArray:
     area = horizontal.area_of_use
     if area is None:
         return np.ones(len(lon), dtype=bool)

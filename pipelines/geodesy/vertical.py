@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipelines.errors import InputError
-from pipelines.survey import VerticalDatum
+from pipelines.core.errors import InputError
+from pipelines.core.products import Product
 
 ELLIPSOIDAL = "ellipsoidal"
 _EPSG_OF = {"EGM84": 5798, "EGM96": 5773, "EGM2008": 3855}
@@ -85,3 +85,11 @@ def missing_grid_error(
         f"{instead}",
         path=path,
     )
+
+
+class VerticalDatum(Product):
+    """What the input heights refer to, and whether the user (or file) said so or it was assumed."""
+
+    name: str
+    stated: bool
+    note: str = ""

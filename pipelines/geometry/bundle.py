@@ -13,20 +13,17 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.sparse import csr_matrix
 from scipy.special import exp1
 
-from pipelines.errors import DegenerateGeometryError
+from pipelines.core.errors import DegenerateGeometryError
+from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.geometry.cameras import Camera, project, project_each
 from pipelines.geometry.lens import by_parameter
 from pipelines.geometry.rotations import skew
-from pipelines.products import FloatArray
 from pipelines.robust.kernels import CAUCHY_95, cauchy_weight
 from pipelines.robust.statistics import rayleigh_sigma
-
-IntArray = NDArray[np.int64]
 
 # A camera that hangs on few observations is held to a tenth of its distance from the scene.
 _LOOSEST_RELATIVE_SIGMA = 0.1
@@ -152,7 +149,7 @@ def in_front(network: Network) -> Network:
     )
 
 
-def is_ahead(network: Network) -> NDArray[np.bool_]:
+def is_ahead(network: Network) -> BoolArray:
     """Which observations (M,) are of points in front of their camera."""
     ray = network.point_in_world[network.obs_point] - network.cam_center_in_world[network.obs_image]
     return np.asarray(np.einsum("mj,mj->m", network.cam_from_world[network.obs_image, 2], ray) > 0)

@@ -10,10 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from pipelines.errors import InputError
-from pipelines.products import FloatArray
+from pipelines.core.errors import InputError
+from pipelines.core.types import FloatArray, IntArray
 
 # Where each of COLMAP's parameters goes: fx fy cx cy | k1 k2 p1 p2 k3 k4 k5 k6 (fisheye: k1 k2 k3 k4).
 _LAYOUT: dict[str, tuple[tuple[int, ...], ...]] = {
@@ -106,7 +106,7 @@ def project(camera: Camera, point_in_cam: ArrayLike) -> FloatArray:
     return distort(camera, point[..., :2] / depth)
 
 
-def project_each(cameras: dict[int, Camera], camera_of: NDArray[np.int64], points_in_cam: FloatArray) -> FloatArray:
+def project_each(cameras: dict[int, Camera], camera_of: IntArray, points_in_cam: FloatArray) -> FloatArray:
     """Pixels (M, 2) of points (M, 3), each in the frame of its own camera, whose key among `cameras` is given (M,).
 
     NaN as in `project`.

@@ -7,10 +7,9 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.core.types import FloatArray, IntArray
 from pipelines.geometry.cameras import Camera, Pinhole, distort, undistort
-from pipelines.products import FloatArray
 
 _STEP = 1e-5  # of a parameter, or of 1 where that is less
 _GRID = 24  # rays along each side of an image that a pinhole is fitted to
@@ -30,7 +29,7 @@ class Lenses:
     """
 
     cameras: dict[int, Camera]
-    camera_id: NDArray[np.int64]
+    camera_id: IntArray
 
     @property
     def longest(self) -> int:
@@ -57,7 +56,7 @@ class Lenses:
             row[: len(camera.params)] = other.cameras[key].params - camera.params
         return change.ravel()
 
-    def bearings_by_parameters(self, image: NDArray[np.int64], xy_px: FloatArray) -> FloatArray:
+    def bearings_by_parameters(self, image: IntArray, xy_px: FloatArray) -> FloatArray:
         """Derivatives (K, 3, L) of `bearings` of pixels (K, 2) in images (K,) by all parameters."""
         image, longest = np.asarray(image, dtype=np.int64), self.longest
         found = np.zeros((len(image), 3, len(self.cameras), longest))

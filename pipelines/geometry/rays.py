@@ -18,13 +18,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.geometry.rotations import skew
-from pipelines.products import FloatArray
 from pipelines.robust.kernels import cauchy_weight, huber_weight
 from pipelines.robust.statistics import chi2_quantile
-
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
 _CHUNK_RAYS = 60_000  # working arrays of a chunk stay in the processor's cache
 _CONVEX_SCALE = 0.5  # near enough to a sum of distances that the fit is a median

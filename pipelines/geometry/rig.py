@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
+from pipelines.core.types import FloatArray
 from pipelines.geometry.rotations import ENU_FROM_NED, exp_so3, geo_from_cam
-from pipelines.products import FloatArray
 
 FLU_FROM_FRD = np.diag([1.0, -1.0, -1.0])
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from pipelines.products import FloatArray
+from pipelines.core.types import FloatArray
 
 # Columns: the gimbal's forward, right and down axes seen from a camera (x right, y down, z forward).
 _CAM_FROM_GIMBAL = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])

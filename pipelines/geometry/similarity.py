@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import Field
 
-from pipelines.errors import DegenerateGeometryError
+from pipelines.core.errors import DegenerateGeometryError
+from pipelines.core.products import Product, Rotation
+from pipelines.core.types import FloatArray, Row7, Vector3
 from pipelines.geometry.rotations import matrix_from_quat_xyzw, quat_xyzw_from_matrix, skew
-from pipelines.products import FloatArray, SimilarityRecord
 
 
 @dataclass(frozen=True)
@@ -135,3 +138,19 @@ def _checked(
 
 def _tuple(values: ArrayLike) -> tuple:
     return tuple(float(value) for value in np.asarray(values))
+
+
+class SimilarityRecord(Product):
+    """A similarity `p_to = scale · R(quat_xyzw) p_from + translation` with its uncertainty.
+
+    `covariance` is 7×7 over (δ ln s, δω [rad], δt [m]) of a perturbation applied in the target frame about
+    `pivot`: `p' = pivot + δt + e^{δ ln s} Exp(δω) (p − pivot)`.
+    """
+
+    from_frame: str
+    to_frame: str
+    scale: float = Field(gt=0)
+    quat_xyzw: Rotation
+    translation: Vector3
+    pivot: Vector3 = (0.0, 0.0, 0.0)
+    covariance: Annotated[tuple[Row7, ...], Field(min_length=7, max_length=7)]

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pipelines.products import FloatArray
+from pipelines.core.types import FloatArray, IntArray
 
 _SMALLEST_M = 1e-6
 
 
-def one_a_cube(points: FloatArray, side_m: FloatArray) -> NDArray[np.int64]:
+def one_a_cube(points: FloatArray, side_m: FloatArray) -> IntArray:
     """Ascending indices of the first of the points (P, 3) in each cube of about its side (P,), a power of two."""
     level = np.round(np.log2(np.maximum(side_m, _SMALLEST_M)))
     cube = np.floor(points / (2.0**level)[:, None])

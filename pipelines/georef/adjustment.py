@@ -9,14 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.core.types import BoolArray, FloatArray
 from pipelines.geometry.rotations import exp_so3, log_so3
 from pipelines.geometry.similarity import Similarity, jacobian_at
-from pipelines.products import FloatArray
 from pipelines.robust.statistics import chi2_quantile, squared_mahalanobis
-
-BoolArray = NDArray[np.bool_]
 
 OUTLIER_GATE = float(chi2_quantile(0.999, 3))
 _MEDIAN_CHI2 = float(chi2_quantile(0.5, 3))

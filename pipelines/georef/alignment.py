@@ -25,7 +25,8 @@ from typing import Literal
 
 import numpy as np
 
-from pipelines.errors import DegenerateGeometryError
+from pipelines.core.errors import DegenerateGeometryError
+from pipelines.core.types import FloatArray
 from pipelines.geometry.rotations import exp_so3, log_so3
 from pipelines.geometry.similarity import Similarity, umeyama
 from pipelines.georef.adjustment import (
@@ -38,7 +39,6 @@ from pipelines.georef.adjustment import (
     covariances,
     residuals,
 )
-from pipelines.products import FloatArray
 from pipelines.robust.kernels import cauchy_weight
 from pipelines.robust.ransac import RansacOptions, ransac
 from pipelines.robust.statistics import squared_mahalanobis

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pipelines.core.types import FloatArray
 from pipelines.georef.similarity import exp_so3
-from pipelines.products import FloatArray
 
 
 @dataclass(frozen=True)

@@ -13,12 +13,12 @@ import torch
 from scipy.linalg import block_diag, cho_factor, cho_solve
 from torch import Tensor
 
-from pipelines.errors import DegenerateGeometryError
+from pipelines.core.errors import DegenerateGeometryError
+from pipelines.core.types import FloatArray
 from pipelines.geometry.similarity import jacobian_at
 from pipelines.georef.linear import WEIGHT_OF_NOISE
 from pipelines.georef.losses import CAUCHY_SCALE2
 from pipelines.georef.problem import GeoProblem
-from pipelines.products import FloatArray
 from pipelines.robust.kernels import cauchy_weight
 
 _SIMILARITY, _CAMERAS, _ERRORS = "similarity.y", "cameras.z", "errors.x"

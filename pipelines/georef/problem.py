@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pipelines.core.types import FloatArray
 from pipelines.geometry.cameras import Pinhole
 from pipelines.georef.cameras import CameraCorrections
 from pipelines.georef.linear import Linearised, linearise, posterior
@@ -28,7 +29,6 @@ from pipelines.georef.measured import ControlMarks, Fixes, Measured
 from pipelines.georef.similarity import LearnableSimilarity
 from pipelines.georef.systematic import SystematicErrors
 from pipelines.georef.weights import TermWeights
-from pipelines.products import FloatArray
 from pipelines.splat.depth import depth_at
 
 # A measurement further out than this (99.9 % of χ² with 3 degrees of freedom) is called an outlier.

@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pipelines.core.types import FloatArray
 from pipelines.geometry import rotations
 from pipelines.geometry.similarity import Similarity
 from pipelines.georef.adjustment import RotationPrior
-from pipelines.products import FloatArray
 
 
 def cross_matrix(vector: Tensor) -> Tensor:

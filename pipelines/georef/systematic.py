@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pipelines.products import EstimatedError, FloatArray
+from pipelines.core.types import FloatArray
 
 # Weak priors: wide enough for whatever a flight brings, finite so that what is not observable is recognised.
 SIGMA_BIAS_M = (5.0, 5.0, 10.0)
@@ -47,11 +47,23 @@ class Errors:
 
 @dataclass(frozen=True)
 class Part:
-    """One error in the vector of all: `name` as in `TrainConfig.estimate` or "common", flight counted from 0."""
+    """One error in the vector of all: `name` as in `TrainOptions.estimate` or "common", flight counted from 0."""
 
     name: Literal["bias", "lever-arm", "boresight", "common"]
     flight: int | None
     sigma: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class ErrorEstimate:
+    """One error as it was estimated: value and σ (3,) in `unit`, and which components were observed."""
+
+    name: Literal["bias", "lever-arm", "boresight"]
+    flight: int | None
+    unit: Literal["m", "deg"]
+    value: tuple[float, float, float]
+    sigma: tuple[float, float, float]
+    observed: tuple[bool, bool, bool]
 
 
 class SystematicErrors(torch.nn.Module):
@@ -114,7 +126,7 @@ class SystematicErrors(torch.nn.Module):
             found.get("common"),
         )
 
-    def found(self, covariance: FloatArray) -> tuple[EstimatedError, ...]:
+    def found(self, covariance: FloatArray) -> tuple[ErrorEstimate, ...]:
         """The present values with the σ of their covariance (p, p); what all attitudes share is not told."""
         value, prior = self.vector().detach().cpu().numpy(), self.sigma.cpu().numpy()
         sigma = np.sqrt(np.diag(covariance))
@@ -125,7 +137,7 @@ class SystematicErrors(torch.nn.Module):
             here, turned = slice(3 * index, 3 * index + 3), part.name == "boresight"
             unit = math.degrees(1.0) if turned else 1.0
             told.append(
-                EstimatedError(
+                ErrorEstimate(
                     name=part.name,
                     flight=part.flight,
                     unit="deg" if turned else "m",

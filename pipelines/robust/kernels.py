@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pipelines.products import FloatArray
+from pipelines.core.types import FloatArray
 
 HUBER_95 = 1.345
 CAUCHY_95 = 2.385

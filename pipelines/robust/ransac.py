@@ -8,10 +8,9 @@ from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pipelines.errors import DegenerateGeometryError
-from pipelines.products import FloatArray
+from pipelines.core.errors import DegenerateGeometryError
+from pipelines.core.types import BoolArray, FloatArray, IntArray
 
 ModelT = TypeVar("ModelT")
 
@@ -38,13 +37,13 @@ class RansacResult(Generic[ModelT]):
     """The best model, its inliers (N,) and its truncated cost."""
 
     model: ModelT
-    inlier: NDArray[np.bool_]
+    inlier: BoolArray
     cost: float
 
 
 def ransac(
     count: int,
-    fit: Callable[[NDArray[np.int64]], ModelT],
+    fit: Callable[[IntArray], ModelT],
     squared_residuals: Callable[[ModelT], FloatArray],
     options: RansacOptions,
     rng: np.random.Generator,

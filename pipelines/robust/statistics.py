@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import chi2
 
-from pipelines.products import FloatArray, ResidualStats
+from pipelines.core.products import Product
+from pipelines.core.types import FloatArray
 
 _NORMAL_MAD = 1.4826  # σ / MAD of a normal distribution
 _RAYLEIGH_MEDIAN = 1.1774  # of the length of a residual, of σ = 1 in either coordinate
@@ -71,3 +72,16 @@ def residual_stats(residuals_in_geo: ArrayLike) -> ResidualStats:
         rmse_3d_m=float(np.sqrt(mean_square.sum())),
         max_3d_m=float(np.sqrt((r**2).sum(axis=1).max())),
     )
+
+
+class ResidualStats(Product):
+    """Residuals of a fit in metres. Not an accuracy."""
+
+    count: int
+    mean_h_m: float | None
+    rmse_e_m: float | None
+    rmse_n_m: float | None
+    rmse_h_m: float | None
+    rmse_v_m: float | None
+    rmse_3d_m: float | None
+    max_3d_m: float | None

@@ -18,7 +18,7 @@ from pipelines.splat.evidence import Probe
 from pipelines.splat.gaussians import Gaussians, rotation_matrices
 from pipelines.splat.morton import morton_order
 from pipelines.splat.optimizer import GaussianAdam
-from pipelines.splat.raster.api import Pinhole, ScreenStats
+from pipelines.splat.rasterizer.api import Pinhole, ScreenStats
 
 _CHILDREN = 2
 _SHRINK = 0.8 * _CHILDREN  # 3DGS: a child of a split has 1/1.6 of its parent's standard deviations

@@ -18,7 +18,7 @@ from pipelines.splat.evidence import Probe
 from pipelines.splat.gaussians import Gaussians, rotation_matrices
 from pipelines.splat.morton import morton_order
 from pipelines.splat.optimizer import GaussianAdam
-from pipelines.splat.raster.api import Pinhole, ScreenStats
+from pipelines.splat.rasterizer.api import Pinhole, ScreenStats
 
 _MOST_COPIES = 51  # of one Gaussian in one edit: the binomials of eq. 9 are tabulated
 _SIGMOID_STEEPNESS, _SIGMOID_CENTRE = 100.0, 0.995

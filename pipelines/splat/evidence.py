@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from pipelines.splat.gaussians import Gaussians
-from pipelines.splat.raster.api import Pinhole, Rasterizer, RasterSettings
+from pipelines.splat.rasterizer.api import Pinhole, Rasterizer, RasterSettings
 from pipelines.splat.sh import C0
 
 # An error counts as high from this fraction of the view's largest (FastGS takes maps normalised to 0 … 1).

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
+
+from pipelines.core.types import Float32Array
 
 
 @dataclass
@@ -45,12 +45,12 @@ class Gaussians:
         """The same values without gradient history."""
         return Gaussians(**{name: tensor.detach() for name, tensor in self.tensors().items()})
 
-    def arrays(self) -> dict[str, NDArray[np.float32]]:
+    def arrays(self) -> dict[str, Float32Array]:
         """The values as numpy arrays by name, for files."""
         return {name: tensor.detach().cpu().numpy() for name, tensor in self.tensors().items()}
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, NDArray[np.float32]]) -> Gaussians:
+    def from_arrays(cls, arrays: Mapping[str, Float32Array]) -> Gaussians:
         """From arrays by the names of the attributes; copied."""
         return cls(**{field.name: torch.tensor(arrays[field.name]) for field in fields(cls)})
 

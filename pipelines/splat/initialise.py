@@ -8,11 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from pipelines.errors import DegenerateGeometryError
-from pipelines.products import FloatArray
+from pipelines.core.errors import DegenerateGeometryError
+from pipelines.core.types import FloatArray, IntArray
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.morton import morton_order
 from pipelines.splat.sh import coefficient_count, sh_from_rgb
@@ -143,7 +143,7 @@ def _gap(points: FloatArray) -> FloatArray:
     return np.clip(gap, median / _SCALE_SPREAD, median * _SCALE_SPREAD)
 
 
-def _usable(points: FloatArray, far: float) -> NDArray[np.int64]:
+def _usable(points: FloatArray, far: float) -> IntArray:
     """Rows of points that are finite, the first of their kind (in float32, as they will be kept), and not far."""
     rows = np.flatnonzero(np.isfinite(points).all(axis=1))
     if len(rows) == 0:

@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from pipelines.errors import InputError
-from pipelines.products import load_npz
+from pipelines.core.errors import InputError
+from pipelines.core.products import load_npz
 
 # VGG-16's convolutions by their index among its layers; each slice ends where a feature is taken.
 _SLICES = ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))

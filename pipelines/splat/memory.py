@@ -8,8 +8,8 @@ from pathlib import Path
 
 import torch
 
-from pipelines.errors import ResourceError
-from pipelines.splat.raster.api import Pinhole
+from pipelines.core.errors import ResourceError
+from pipelines.splat.rasterizer.api import Pinhole
 from pipelines.splat.sh import coefficient_count
 
 _FLOAT = 4
@@ -88,7 +88,7 @@ def free_memory_bytes(device: torch.device) -> int | None:
 
 def _raster_bytes() -> int:
     """Of the CPU rasteriser, for one visible Gaussian on six tiles; the GPU's needs less."""
-    from pipelines.splat.raster.cpu import predicted_bytes
+    from pipelines.splat.rasterizer.cpu import predicted_bytes
 
     nothing = Pinhole(1, 1, 1.0, 1.0, 0.5, 0.5)
     return predicted_bytes(1000, nothing, 0) // 1000

@@ -16,7 +16,7 @@ from torch.nn import functional
 
 from pipelines.splat.depth import depth_at
 from pipelines.splat.gaussians import Gaussians, rotation_matrices
-from pipelines.splat.raster.api import Pinhole, Rasterizer, RasterSettings
+from pipelines.splat.rasterizer.api import Pinhole, Rasterizer, RasterSettings
 from pipelines.splat.sh import sh_from_rgb
 
 _SPREAD = 0.005  # of the depth: what less of it costs grows with its square

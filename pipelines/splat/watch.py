@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from pipelines.errors import ConvergenceError
+from pipelines.core.errors import ConvergenceError
 
 _NEVER = 2**62
 

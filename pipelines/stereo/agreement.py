@@ -6,10 +6,9 @@ import itertools
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pipelines.products import FloatArray
-from pipelines.stereo.sweep import FloatImage, StereoCamera, Swept
+from pipelines.core.types import FloatArray, IntArray
+from pipelines.stereo.sweep import Float32Array, StereoCamera, Swept
 
 
 @dataclass(frozen=True)
@@ -45,7 +44,7 @@ class AgreementSettings:
     rim: float = 0.01
 
 
-def agreed_depth(reference: Surface, others: list[Surface], settings: AgreementSettings) -> FloatImage:
+def agreed_depth(reference: Surface, others: list[Surface], settings: AgreementSettings) -> Float32Array:
     """Depth (H, W) along the optical axis of `reference`, the mean of the views that agree; 0 where too few do.
 
     A point of the reference is looked up in each other view. The difference is taken along the normal of the plane
@@ -92,11 +91,11 @@ class _Seen:
         through: indices of those that it looks through.
     """
 
-    near: NDArray[np.int64]
+    near: IntArray
     normal_in_world: FloatArray
     missed_m: FloatArray
-    sharpness: FloatImage
-    through: NDArray[np.int64]
+    sharpness: Float32Array
+    through: IntArray
 
 
 def _look_up(point: FloatArray, other: Surface, settings: AgreementSettings) -> _Seen:
@@ -121,7 +120,7 @@ def _look_up(point: FloatArray, other: Surface, settings: AgreementSettings) -> 
     )
 
 
-def without_rims(depth: FloatImage, reach_px: int, rim: float) -> FloatImage:
+def without_rims(depth: Float32Array, reach_px: int, rim: float) -> Float32Array:
     """A depth map (H, W) with 0 where a surface ends before another within so many pixels.
 
     A window across an edge is compared by its contrast, and takes the ground beside a roof for roof: of a surface,

@@ -14,11 +14,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from pipelines.products import FloatArray
-
-FloatImage = NDArray[np.float32]
+from pipelines.core.types import BoolArray, Float32Array, FloatArray
 
 UNSEEN = -1.0  # correlation where a neighbour does not look
 _NOISE_VARIANCE = 0.3  # grey levels²: what varies less than the sensor's noise does not correlate
@@ -50,12 +47,12 @@ class MatchSettings:
 class Matcher:
     """Compares one photograph (H, W) with what its neighbours show under a hypothesis."""
 
-    def __init__(self, grey: FloatImage, settings: MatchSettings) -> None:
+    def __init__(self, grey: Float32Array, settings: MatchSettings) -> None:
         self._correlation = _Correlation(grey, settings.window_px)
         self._smooth = cv2.ximgproc.createGuidedFilter(grey, settings.reach_px, settings.edge_grey**2)
         self._best = _Best(grey.shape, settings.views)
 
-    def __call__(self, shown: Iterable[FloatImage]) -> FloatImage:
+    def __call__(self, shown: Iterable[Float32Array]) -> Float32Array:
         """Score (H, W) of a hypothesis, by what neighbours, at least one, show of it (H, W): 0 where nothing."""
         self._best.clear()
         for image in shown:
@@ -77,7 +74,7 @@ class _Best:
         """Begin anew."""
         self._count = 0
 
-    def add(self, image: FloatImage) -> None:
+    def add(self, image: Float32Array) -> None:
         """One more, which is not kept."""
         np.copyto(self._rest, image)
         for place in range(self._count):
@@ -89,7 +86,7 @@ class _Best:
             self._largest[self._count], self._rest = self._rest, self._largest[self._count]
             self._count += 1
 
-    def mean(self) -> FloatImage:
+    def mean(self) -> Float32Array:
         """Their mean (H, W), of all where there were fewer; written over by what follows."""
         np.copyto(self._spare, self._largest[0])
         for kept in self._largest[1 : self._count]:
@@ -101,14 +98,14 @@ class _Best:
 class _Correlation:
     """Normalised cross-correlation of one image with others, over square windows."""
 
-    def __init__(self, image: FloatImage, window_px: int) -> None:
+    def __init__(self, image: Float32Array, window_px: int) -> None:
         self._image, self._window = image, (window_px, window_px)
         self._mean = self._smooth(image, np.empty_like(image))
         variance = self._smooth(image * image, np.empty_like(image)) - self._mean * self._mean
         self._inverse_sigma = 1 / np.sqrt(np.maximum(variance, _NOISE_VARIANCE))
         self._other_mean, self._variance, self._product, self._found = (np.empty_like(image) for _ in range(4))
 
-    def __call__(self, other: FloatImage) -> FloatImage:
+    def __call__(self, other: Float32Array) -> Float32Array:
         """Correlation (H, W), −1 where `other` is 0; written over by the next one."""
         mean, product = self._smooth(other, self._other_mean), self._product
         variance = self._smooth(np.multiply(other, other, out=product), self._variance)
@@ -121,7 +118,7 @@ class _Correlation:
         np.copyto(found, np.float32(UNSEEN), where=other == 0)
         return found
 
-    def _smooth(self, image: FloatImage, out: FloatImage) -> FloatImage:
+    def _smooth(self, image: Float32Array, out: Float32Array) -> Float32Array:
         cv2.boxFilter(image, -1, self._window, dst=out, borderType=cv2.BORDER_REFLECT)
         return out
 
@@ -138,9 +135,9 @@ class Found:
     """
 
     place: FloatArray
-    score: FloatImage
-    curvature: FloatImage
-    inner: NDArray[np.bool_]
+    score: Float32Array
+    curvature: Float32Array
+    inner: BoolArray
 
 
 class Peak:
@@ -152,7 +149,7 @@ class Peak:
         self._best, self._before, self._after = (np.full(shape, -2.0, dtype=np.float32) for _ in range(3))
         self._last = np.full(shape, -2.0, dtype=np.float32)
 
-    def add(self, score: FloatImage) -> None:
+    def add(self, score: Float32Array) -> None:
         """The next plane's scores."""
         follows = (self._place == self._count - 1) & (self._count > 0)
         np.copyto(self._after, score, where=follows)

@@ -5,12 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pipelines.products import FloatArray
+from pipelines.core.types import FloatArray, IntArray
 from pipelines.stereo.sweep import Planes, StereoCamera
-
-IntArray = NDArray[np.int64]
 
 # Smaller angles give no depth, larger ones another picture of the same place (after Yao et al.,
 # doi 10.1007/978-3-030-01237-3_47, section 4.1, for the wider angles of flights).

@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from pipelines.products import FloatArray
+from pipelines.core.types import FloatArray
 from pipelines.stereo.agreement import Surface
-from pipelines.stereo.matching import UNSEEN, FloatImage, Matcher, MatchSettings, Peak
+from pipelines.stereo.matching import UNSEEN, Float32Array, Matcher, MatchSettings, Peak
 from pipelines.stereo.sweep import Facing, StereoCamera, StereoView, Swept, calibration, swept_from
 
 _REACH = 4  # steps on either side of the guess
@@ -35,11 +35,11 @@ class Guess:
     """
 
     facing: Facing
-    offset_m: FloatImage
-    step_m: FloatImage
+    offset_m: Float32Array
+    step_m: Float32Array
 
 
-def guess_from(surface: Surface, agreed: FloatImage, camera: StereoCamera) -> Guess:
+def guess_from(surface: Surface, agreed: Float32Array, camera: StereoCamera) -> Guess:
     """What views agree on (H, W), and elsewhere what the view itself found, at the pixels of a finer camera."""
     facing, own = surface.swept.facing, surface.depth()
     own = np.where(np.isfinite(own) & (own > 0), own, 0).astype(np.float32)
@@ -102,7 +102,7 @@ class _Sight:
         self._grey = other.grey
         self._place = [np.empty_like(by_depth) for by_depth in self._by_depth]
 
-    def shown(self, depth: FloatImage) -> FloatImage:
+    def shown(self, depth: Float32Array) -> Float32Array:
         """Picture (H, W) of the neighbour; 0 where it shows nothing of depths (H, W)."""
         for place, by_depth, start in zip(self._place, self._by_depth, self._start, strict=True):
             np.add(np.multiply(depth, by_depth, out=place), start, out=place)

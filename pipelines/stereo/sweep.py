@@ -13,11 +13,10 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.core.types import BoolArray, ByteArray, FloatArray
 from pipelines.geometry.cameras import Pinhole
-from pipelines.products import FloatArray
-from pipelines.stereo.matching import UNSEEN, FloatImage, Found, Matcher, MatchSettings, Peak
+from pipelines.stereo.matching import UNSEEN, Float32Array, Found, Matcher, MatchSettings, Peak
 
 _ROWS = 8  # strips begin and end at multiples of so many
 _CLEARLY = 0.05  # of the score: by so much other planes must fit better than the first
@@ -58,7 +57,7 @@ class StereoView:
     """
 
     camera: StereoCamera
-    grey: FloatImage
+    grey: Float32Array
 
     def rows(self, part: slice) -> StereoView:
         """Some rows of it."""
@@ -90,7 +89,7 @@ class Facing:
     """
 
     normals_in_world: FloatArray
-    which: NDArray[np.uint8]
+    which: ByteArray
 
     @property
     def normal_in_world(self) -> FloatArray:
@@ -101,12 +100,12 @@ class Facing:
         """Offset (H, W) that a ray of a camera gains by a metre of depth."""
         return np.asarray(np.einsum("hwi,hwi->hw", camera.rays(), self.normal_in_world))
 
-    def depth(self, camera: StereoCamera, offset_m: FloatImage) -> FloatArray:
+    def depth(self, camera: StereoCamera, offset_m: Float32Array) -> FloatArray:
         """Depth (H, W) along the optical axis at which the rays of a camera meet planes of offsets (H, W)."""
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.asarray((offset_m - self.normal_in_world @ camera.center_in_world) / self.along(camera))
 
-    def offset(self, camera: StereoCamera, depth: FloatImage) -> FloatArray:
+    def offset(self, camera: StereoCamera, depth: Float32Array) -> FloatArray:
         """Offsets (H, W) of the points at depths (H, W) of a camera: the inverse of `depth`."""
         return np.asarray(self.normal_in_world @ camera.center_in_world + depth * self.along(camera))
 
@@ -126,10 +125,10 @@ class Swept:
     """
 
     facing: Facing
-    offset_m: FloatImage
-    score: FloatImage
-    step_m: FloatImage
-    sharpness: FloatImage
+    offset_m: Float32Array
+    score: Float32Array
+    step_m: Float32Array
+    sharpness: Float32Array
 
 
 def plane_sweep(
@@ -189,7 +188,7 @@ def _sweep(reference: StereoView, neighbours: list[StereoView], planes: Planes, 
     return swept_from(found, facing, offset_m, step_m)
 
 
-def _scene_on(planes: Planes, camera: StereoCamera) -> Iterator[NDArray[np.bool_]]:
+def _scene_on(planes: Planes, camera: StereoCamera) -> Iterator[BoolArray]:
     """Where (H, W) a camera sees the scene if it lies on a plane, for each of them."""
     rays, center = camera.rays(), camera.center_in_world
     along, (lowest, highest) = rays @ planes.normal_in_world, planes.height_m
@@ -200,20 +199,20 @@ def _scene_on(planes: Planes, camera: StereoCamera) -> Iterator[NDArray[np.bool_
         yield (gap * along > 0) & (height >= lowest) & (height <= highest)
 
 
-def _rows(there: NDArray[np.bool_], around_px: int) -> tuple[int, int]:
+def _rows(there: BoolArray, around_px: int) -> tuple[int, int]:
     """First row and the one after the last that show something or lie around, of (H, W)."""
     rows = np.flatnonzero(there.any(axis=1))
     first, last = rows[0] - around_px, rows[-1] + 1 + around_px
     return max(int(first) // _ROWS * _ROWS, 0), min(-int(-last // _ROWS) * _ROWS, len(there))
 
 
-def swept_from(found: Found, facing: Facing, offset_m: FloatArray, step_m: FloatArray | FloatImage) -> Swept:
+def swept_from(found: Found, facing: Facing, offset_m: FloatArray, step_m: FloatArray | Float32Array) -> Swept:
     """What was found, at these offsets (H, W), among hypotheses so far (H, W) apart."""
     sharpness = (found.curvature / step_m**2).astype(np.float32)
     return Swept(facing, offset_m.astype(np.float32), found.score, step_m.astype(np.float32), sharpness)
 
 
-def _seen_on_plane(reference: StereoView, other: StereoView, planes: Planes, offset_m: float) -> FloatImage:
+def _seen_on_plane(reference: StereoView, other: StereoView, planes: Planes, offset_m: float) -> Float32Array:
     """What `other` shows of the plane, at the pixels of `reference`; 0 where it shows nothing."""
     here, there, pinhole = reference.camera, other.camera, reference.camera.pinhole
     turn = there.cam_from_world @ here.cam_from_world.T

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 import torch
 
+from pipelines.core.products import load_json, save_json
+from pipelines.core.stages import BY_NAME, GAUSSIANS, MODEL, POINTS, SIM3, SPARSE, SURVEY
 from pipelines.geometry.similarity import Similarity
-from pipelines.products import GeolocatedPoints, load_json, save_json
-from pipelines.stages import BY_NAME, GAUSSIANS, MODEL, POINTS, SIM3, SPARSE, SURVEY
-from pipelines.survey import Survey
+from pipelines.scene.geolocated import GeolocatedPoints
+from pipelines.scene.survey import Survey
 from tests.cli_runs import Georef, products_in, write_files
 from tests.photos import jpeg
 from tests.scenes import Measured, Noise, make_scene, sparse_model, survey_of, trained_model, write_workspace

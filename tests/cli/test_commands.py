@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.errors import ConvergenceError
-from pipelines.stages import BY_NAME, PIPELINE
-from pipelines.workspace import StageRun, Summary, Workspace
+from pipelines.core.errors import ConvergenceError
+from pipelines.core.stages import BY_NAME, PIPELINE
+from pipelines.core.workspace import StageRun, Summary, Workspace
 from tests import fakes
 from tests.cli_runs import Georef
 
@@ -209,7 +209,7 @@ class TestTalk:
         fakes.install(train=fail)
         assert georef("-q", "train", done, "--force").code == 1
         text = (done / "logs/train.log").read_text()
-        assert "INFO pipelines.runner: train: train done" in text
+        assert "INFO pipelines.core.runner: train: train done" in text
         assert text.rstrip().endswith("ERROR georef_cli.boundary: diverged at iteration 7")
 
     def test_refused_command_leaves_nothing(self, georef: Georef, tmp_path: Path) -> None:

@@ -9,11 +9,11 @@ from typing import Any
 
 import pytest
 
-from pipelines.compare import NAMES
-from pipelines.config import StageConfig
-from pipelines.errors import ConvergenceError, InputError
-from pipelines.stages import BY_NAME, PIPELINE
-from pipelines.workspace import StageRun, Summary, Workspace
+from pipelines.compare.stage import NAMES
+from pipelines.core.errors import ConvergenceError, InputError
+from pipelines.core.options import StageOptions
+from pipelines.core.stages import BY_NAME, PIPELINE
+from pipelines.core.workspace import StageRun, Summary, Workspace
 from tests import fakes
 from tests.cli_runs import Georef, Result
 
@@ -26,7 +26,7 @@ def error_of(text: str) -> float:
     return int(hashlib.sha256(text.encode()).hexdigest()[:4], 16) / 1e6
 
 
-def reporting(stage: StageRun, config: StageConfig) -> Summary:
+def reporting(stage: StageRun, config: StageOptions) -> Summary:
     """A fake of `evaluate` whose report has figures."""
     spec = BY_NAME["evaluate"]
     text = fakes.fake_run(spec)(stage, config).values["text"]
@@ -193,7 +193,7 @@ def test_force_redoes_the_configurations_but_not_what_they_share(georef: Georef,
 def test_interrupted_comparison_goes_on(georef: Georef, survey: Path) -> None:
     whole = fakes.fake_run(BY_NAME["train"])
 
-    def interrupted(stage: StageRun, config: StageConfig) -> Summary:
+    def interrupted(stage: StageRun, config: StageOptions) -> Summary:
         if stage.out.parent.name == "C":
             raise KeyboardInterrupt
         return whole(stage, config)
@@ -210,7 +210,7 @@ def test_interrupted_comparison_goes_on(georef: Georef, survey: Path) -> None:
 
 
 def test_a_configuration_that_fails_has_a_row_that_says_why(georef: Georef, survey: Path) -> None:
-    def diverging(stage: StageRun, config: StageConfig) -> Summary:
+    def diverging(stage: StageRun, config: StageOptions) -> Summary:
         raise ConvergenceError("it diverged")
 
     fakes.install(evaluate=reporting, train=diverging, adjust=diverging)
@@ -227,7 +227,7 @@ def test_a_configuration_that_fails_has_a_row_that_says_why(georef: Georef, surv
 
 
 def test_other_errors_end_it(georef: Georef, survey: Path) -> None:
-    def refusing(stage: StageRun, config: StageConfig) -> Summary:
+    def refusing(stage: StageRun, config: StageOptions) -> Summary:
         raise InputError("no such thing")
 
     fakes.install(evaluate=reporting, train=refusing)
@@ -276,7 +276,7 @@ def test_busy_workspace_is_not_touched(georef: Georef, survey: Path) -> None:
 def test_workspace_is_held_while_configurations_run(georef: Georef, survey: Path) -> None:
     seen = []
 
-    def looking(stage: StageRun, config: StageConfig) -> Summary:
+    def looking(stage: StageRun, config: StageOptions) -> Summary:
         seen.append(Workspace(survey).writer())
         return reporting(stage, config)
 

@@ -10,8 +10,8 @@ import pytest
 from rich.console import Console
 
 from georef_cli import display, tables
-from georef_cli.boundary import Manners
-from pipelines.progress import SILENT
+from georef_cli.verbosity import Verbosity
+from pipelines.core.progress import SILENT
 
 REPORT: dict[str, Any] = {
     "photometric": {"test": {"views": 6, "psnr": 24.31, "ssim": 0.812, "lpips": None}},
@@ -134,7 +134,7 @@ def test_log_lines_on_a_terminal_are_marked_and_verbatim() -> None:
     console = Console(file=io.StringIO(), force_terminal=True, width=140, color_system="standard")
     handler = display.ConsoleHandler(console)
     for level, text in [(logging.INFO, "sfm: started"), (logging.WARNING, "only [red]30[/red] of 48")]:
-        handler.handle(logging.LogRecord("pipelines.sfm", level, "", 0, text, None, None))
+        handler.handle(logging.LogRecord("pipelines.sfm.stage", level, "", 0, text, None, None))
     assert isinstance(console.file, io.StringIO)
     plain, marked = console.file.getvalue().splitlines()
     assert plain == "sfm: started"
@@ -143,4 +143,4 @@ def test_log_lines_on_a_terminal_are_marked_and_verbatim() -> None:
 
 
 def test_quiet_is_silent() -> None:
-    assert display.progress_for(Manners(quiet=True)) is SILENT
+    assert display.progress_for(Verbosity(quiet=True)) is SILENT

@@ -15,14 +15,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines import states
-from pipelines.blocks.checkpoint import load_checkpoint
+from pipelines.core import staleness as states
+from pipelines.core.products import load_json
+from pipelines.core.stages import PIPELINE, SPLAT, SURVEY
+from pipelines.core.workspace import Workspace
 from pipelines.formats.georef_sidecar import read_sidecar
-from pipelines.products import load_json
+from pipelines.scene.survey import Survey
 from pipelines.splat.storage import read_gaussians
-from pipelines.stages import PIPELINE, SPLAT, SURVEY
-from pipelines.survey import Survey
-from pipelines.workspace import Workspace
+from pipelines.train.checkpoint import load_checkpoint
 from tests.cli_runs import Result, finish, start
 
 GEOREF = "from georef_cli.main import main; main()"

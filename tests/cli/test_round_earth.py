@@ -19,14 +19,16 @@ import torch
 from pyproj import Geod, Transformer
 from scipy.spatial.transform import Rotation
 
-from pipelines.formats.colmap import SparseModel, write_sparse
+from pipelines.core.products import load_json, save_json
+from pipelines.core.stages import GAUSSIANS, MODEL, REPORT, SIM3, SPARSE, SURVEY
+from pipelines.formats.colmap import write_sparse
 from pipelines.geometry.cameras import Camera
 from pipelines.geometry.similarity import Similarity
-from pipelines.products import TrainedCamera, load_json, save_json
+from pipelines.geometry.sparse_model import SparseModel
+from pipelines.scene.survey import Survey
+from pipelines.scene.trained_model import TrainedCamera
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.storage import write_gaussians
-from pipelines.stages import GAUSSIANS, MODEL, REPORT, SIM3, SPARSE, SURVEY
-from pipelines.survey import Survey
 from tests.cli_runs import Georef
 from tests.map_projections import US_FOOT_M, long_island, utm
 from tests.photos import jpeg

@@ -12,13 +12,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipelines.errors import InputError
+from pipelines.core.errors import InputError
 from pipelines.formats.exif import read_tags
 from pipelines.formats.image_file import header_size, inspect_image
-from pipelines.formats.notes import Notes
 from pipelines.formats.odm import read_geo, read_ground_points
 from pipelines.formats.trajectory_csv import read_trajectory
 from pipelines.geodesy.crs import parse_crs
+from pipelines.ingest.notes import Notes
 from tests.photos import Exif, dji_xmp, gps_entries, jpeg
 
 CELLS = st.one_of(

@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from pipelines.errors import InputError
+from pipelines.core.errors import InputError
 from pipelines.formats.splat_ply import SplatArrays, read_splat_ply, write_splat_ply
 
 finite = st.floats(width=32, allow_nan=False, allow_infinity=False)

@@ -1,0 +1,28 @@
+"""How much the program says, and how a record of its log reads."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Verbosity:
+    """How the program talks: the options of the group."""
+
+    verbose: bool = False
+    quiet: bool = False
+    traceback: bool = False
+
+    @property
+    def level(self) -> int:
+        """The least severe level that is told on stderr."""
+        return logging.DEBUG if self.verbose else logging.WARNING if self.quiet else logging.INFO
+
+
+class LineFormatter(logging.Formatter):
+    """`message`, or `warning: message`."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        text = super().format(record)
+        return text if record.levelno == logging.INFO else f"{record.levelname.lower()}: {text}"

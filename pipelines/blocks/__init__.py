@@ -1,1 +1,0 @@
-"""Pieces that several stages share: they join formats, splat and georef."""

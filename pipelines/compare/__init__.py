@@ -1,0 +1,1 @@
+"""`georef compare`: the ablation of the method on one survey."""

@@ -1,0 +1,170 @@
+"""The table of `georef compare`: what each configuration reached, as JSON, as Markdown and as a plot."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from pipelines.core.errors import InputError
+from pipelines.core.products import Product
+from pipelines.core.workspace import replace_text
+from pipelines.plots.bars import Panel, write_bars
+
+
+class PointAccuracy(Product):
+    """Check points against their survey, in metres; None where none was measured."""
+
+    count: int = 0
+    mean_h_m: float | None = None
+    median_h_m: float | None = None
+    rmse_h_m: float | None = None
+    rmse_v_m: float | None = None
+
+
+class ComparedRow(Product):
+    """What one configuration reached.
+
+    `failure` tells why it reached nothing; `training_s` is None where the training is another configuration's.
+    """
+
+    configuration: str
+    title: str
+    note: str
+    failure: str | None = None
+    test_psnr: float | None = None
+    test_ssim: float | None = None
+    camera: PointAccuracy = PointAccuracy()
+    model: PointAccuracy = PointAccuracy()
+    iterations: int | None = None
+    gaussians: int | None = None
+    training_s: float | None = None
+    warnings: tuple[str, ...] = ()
+
+
+class Comparison(Product):
+    """The table: options that all trainings share, and a row a configuration."""
+
+    format_version: Literal[1] = 1
+    options: dict[str, Any]
+    rows: tuple[ComparedRow, ...]
+
+
+def figures_of(report: Path) -> dict[str, Any]:
+    """The fields of a `ComparedRow` that `evaluate/report.json` holds.
+
+    Raises:
+        InputError: not a report.
+    """
+    try:
+        document = json.loads(report.read_text(encoding="utf-8"))
+        test, check = document["photometric"]["test"], document["checkpoints"]
+        return {
+            "test_psnr": test["psnr"],
+            "test_ssim": test["ssim"],
+            "camera": _accuracy(check["camera"]),
+            "model": _accuracy(check["model"]),
+        }
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise InputError(f"not a report of `georef evaluate`: {error!r}", path=report) from error
+
+
+def _accuracy(section: Mapping[str, Any]) -> PointAccuracy:
+    rows = [row for row in section["points"] if row["de_m"] is not None]
+    distance = np.hypot([row["de_m"] for row in rows], [row["dn_m"] for row in rows])
+    return PointAccuracy(
+        count=section["count"],
+        mean_h_m=section["mean_h_m"],
+        median_h_m=float(np.median(distance)) if rows else None,
+        rmse_h_m=section["rmse_h_m"],
+        rmse_v_m=section["rmse_v_m"],
+    )
+
+
+def write_comparison(folder: Path, table: Comparison) -> None:
+    """Write `table.json`, `table.md` and `plot.png`; nothing if they say this already."""
+    document, notes, plot = (folder / name for name in ("table.json", "table.md", "plot.png"))
+    text, told = table.model_dump_json(indent=1) + "\n", markdown(table)
+    if plot.exists() and _says(document, text) and _says(notes, told):
+        return
+    write_bars(plot, _panels(table.rows))
+    replace_text(notes, told)
+    replace_text(document, text)
+
+
+def _says(path: Path, text: str) -> bool:
+    return path.exists() and path.read_text(encoding="utf-8") == text
+
+
+def _panels(rows: Sequence[ComparedRow]) -> tuple[Panel, ...]:
+    members = tuple(row.configuration for row in rows)
+    points = {"camera": [row.camera for row in rows], "model": [row.model for row in rows]}
+    geometry = (
+        Panel(
+            f"Check points by {way}",
+            "RMSE in metres",
+            members,
+            {"horizontal": [one.rmse_h_m for one in found], "vertical": [one.rmse_v_m for one in found]},
+        )
+        for way, found in points.items()
+    )
+    images = Panel("Test views", "PSNR in dB", members, {"PSNR": [row.test_psnr for row in rows]}, digits=2)
+    return (*geometry, images)
+
+
+def markdown(table: Comparison) -> str:
+    """The table for people, with the notes below it."""
+    heads = (
+        *("", "test PSNR dB", "SSIM", "camera mean H", "camera RMSE H", "camera RMSE V"),
+        *("model mean H", "model median H", "model RMSE H", "model RMSE V", "check points", "training"),
+    )
+    lines = [
+        "# Comparison\n",
+        "Check points, which entered no solve, in metres: by *camera* their image marks intersected with the "
+        "cameras, by *model* where the Gaussians' surface lies behind the marks.\n",
+        _line(heads),
+        _line(["---", *["---:"] * (len(heads) - 1)]),
+        *(_line([f"**{row.configuration}**", *cells(row)]) for row in table.rows),
+        "",
+        *(f"- **{row.configuration}** {row.title}: {row.note}." for row in table.rows),
+    ]
+    remarks = [(row.configuration, text) for row in table.rows for text in remarks_on(row)]
+    if remarks:
+        lines += ["", "Remarks:", "", *(f"- {name}: {text}" for name, text in remarks)]
+    told = ", ".join(f"{name} {value}" for name, value in table.options.items())
+    return "\n".join([*lines, "", f"All trained with: {told or 'the default options'}."]) + "\n"
+
+
+def cells(row: ComparedRow) -> tuple[str, ...]:
+    """The figures of a row as text: images, check points by camera and by model, their number, time."""
+    camera, model = row.camera, row.model
+    counts = str(camera.count) if camera.count == model.count else f"{camera.count}, {model.count}"
+    return (
+        _number(row.test_psnr, 2),
+        _number(row.test_ssim, 4),
+        *(_metres(value) for value in (camera.mean_h_m, camera.rmse_h_m, camera.rmse_v_m)),
+        *(_metres(value) for value in (model.mean_h_m, model.median_h_m, model.rmse_h_m, model.rmse_v_m)),
+        counts,
+        "–" if row.training_s is None else f"{row.training_s:.0f} s",
+    )
+
+
+def remarks_on(row: ComparedRow) -> tuple[str, ...]:
+    """Why a row is empty, and what its stages warned of."""
+    return (*(() if row.failure is None else (f"failed: {row.failure}",)), *row.warnings)
+
+
+def _line(parts: Any) -> str:
+    return "| " + " | ".join(parts) + " |"
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "–" if value is None else f"{value:.{digits}f}"
+
+
+def _metres(value: float | None) -> str:
+    """Tenths of a millimetre below a metre."""
+    return _number(value, 4 if value is not None and value < 1 else 2)

@@ -1,0 +1,91 @@
+"""Typed products: what the stages hand to each other, and how each is stored. What `ingest` makes: `survey.py`.
+
+JSON products are pydantic models (validated on load: a product can be replaced by hand), arrays are NPZ
+without pickle. Frames and units are those of docs/conventions.md: `geo` is East-North-Up metres at the survey's
+origin, `local` the SfM model's frame, `model` the metric, origin-shifted frame in which the Gaussians live.
+"""
+
+from __future__ import annotations
+
+import json
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
+
+from pipelines.core.errors import InputError
+from pipelines.core.types import Matrix3, Quaternion
+from pipelines.core.validators import covariance, image_name, unit_quaternion
+
+# Products may be written by hand: larger than any survey's, and they are not even read.
+_MAX_JSON_BYTES = 1 << 30
+
+ImageName = Annotated[str, AfterValidator(image_name)]
+Rotation = Annotated[Quaternion, AfterValidator(unit_quaternion)]
+Covariance3 = Annotated[Matrix3, AfterValidator(covariance)]
+
+
+class Product(BaseModel):
+    """Base of the JSON products: immutable, no unknown keys, no NaN."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+ProductT = TypeVar("ProductT", bound=BaseModel)
+
+
+def save_json(product: BaseModel, path: Path) -> None:
+    """Write a JSON product, indented, UTF-8."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(product.model_dump_json(indent=1) + "\n", encoding="utf-8")
+
+
+def load_json(product_type: type[ProductT], path: Path) -> ProductT:
+    """Read and validate a JSON product.
+
+    Raises:
+        InputError: unreadable, not JSON, or not of that form; names file and field.
+    """
+    try:
+        if path.stat().st_size > _MAX_JSON_BYTES:
+            raise InputError("is too large for a product", path=path)
+        return product_type.model_validate_json(path.read_text(encoding="utf-8"))
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise InputError(first["msg"], path=path, field=where or None) from error
+    except UnicodeDecodeError as error:
+        raise InputError("not a UTF-8 text file", path=path) from error
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror}", path=path) from error
+
+
+def dump_json(document: Any) -> str:
+    """JSON text of a plain document: no NaN, stable order."""
+    return json.dumps(document, indent=1, allow_nan=False)
+
+
+def save_npz(path: Path, arrays: dict[str, Any]) -> None:
+    """Write arrays as an NPZ file."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.savez(path, **{name: np.asarray(array) for name, array in arrays.items()})  # type: ignore[arg-type]
+
+
+def load_npz(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
+    """Read the named arrays of an NPZ file, without pickle.
+
+    Raises:
+        InputError: unreadable, or an array is missing.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            missing = [name for name in names if name not in archive]
+            if missing:
+                raise InputError(f"array {missing[0]!r} is missing", path=path)
+            return {name: archive[name] for name in names}
+    except (OSError, ValueError, EOFError, MemoryError, zipfile.BadZipFile, zlib.error) as error:
+        raise InputError(f"not a readable NPZ file: {error}", path=path) from error

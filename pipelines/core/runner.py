@@ -1,0 +1,240 @@
+"""The conductor: runs stages in a workspace and skips what is current."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import json
+import logging
+import time
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from importlib import metadata
+from typing import Any
+
+from pipelines.core.errors import GeorefError, InputError, MissingProductError
+from pipelines.core.fingerprints import Memo
+from pipelines.core.products import load_json
+from pipelines.core.progress import SILENT, Progress
+from pipelines.core.stages import CALIBRATE, CALIBRATED_BEFORE, SPARSE, SURVEY, StageSpec, producer_of, products_of
+from pipelines.core.staleness import BY_HAND, Flags, Request, must_exist, request, stage_config, status, why_stale
+from pipelines.core.workspace import Manifest, Resume, StageRun, Summary, Workspace, now
+from pipelines.scene.survey import Survey
+
+log = logging.getLogger(__name__)
+
+VERSIONED = ("georefgs", "numpy", "pycolmap", "torch", "numba", "pyproj")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Result of asking for a stage: its manifest, and whether it was run or skipped as current."""
+
+    stage: str
+    ran: bool
+    manifest: Manifest
+
+
+def run_stage(
+    workspace: Workspace,
+    spec: StageSpec,
+    flags: Flags,
+    *,
+    force: bool = False,
+    resume: Resume = "never",
+    progress: Progress = SILENT,
+) -> Outcome:
+    """Run one stage, unless its product is current or was put there by hand.
+
+    The flags are remembered for `run_pipeline`, unless the stage refuses its input.
+
+    Args:
+        flags: options given by the user (only those given).
+        force: run even if current, and start afresh.
+        resume: whether to continue an interrupted run; see `Workspace.begin`.
+
+    Raises:
+        GeorefError: any known failure; the previous product is left whole.
+    """
+    if spec.reads:
+        must_exist(workspace)
+    with workspace.lock(spec.name):
+        memo: Memo = {}
+        asked = request(workspace, spec, flags, memo)
+        _warn_of_stale_inputs(workspace, spec, memo)
+        before = workspace.requests().get(spec.name, {})
+        workspace.remember({spec.name: flags})
+        previous = None if force else _current(workspace, asked)
+        if previous is not None:
+            return Outcome(spec.name, False, previous)
+        try:
+            manifest = _execute(workspace, asked, "never" if force else resume, progress)
+        except InputError:
+            workspace.remember({spec.name: before})
+            raise
+        return Outcome(spec.name, True, manifest)
+
+
+def run_pipeline(
+    workspace: Workspace,
+    stages: tuple[StageSpec, ...],
+    flags: Mapping[str, Flags],
+    *,
+    force: bool = False,
+    progress: Progress = SILENT,
+    around: Callable[[StageSpec], AbstractContextManager[None]] = lambda _: nullcontext(),
+) -> list[Outcome]:
+    """Run stages in order, skipping what is current and resuming what was interrupted.
+
+    What the survey wants to have estimated of the rig is estimated and applied ahead of the first stage that builds
+    on its positions.
+
+    All options are checked and remembered before the first stage begins: a bad option of a late stage costs no
+    hours, and a run that is killed early is completed as it was asked for.
+
+    Args:
+        flags: options by stage; they come on top of those that the stage was last asked for with.
+        around: a context to run each stage in.
+
+    Raises:
+        GeorefError: the first failure.
+    """
+    if stages[0].reads:
+        must_exist(workspace)
+    before = workspace.requests()
+    asked = {spec.name: remembered(workspace, spec, flags.get(spec.name, {})) for spec in stages}
+    for spec in stages:
+        stage_config(workspace, spec, asked[spec.name])
+    with workspace.lock("run"):
+        workspace.remember(asked)
+    outcomes: list[Outcome] = []
+    try:
+        for spec in stages:
+            if spec.name == CALIBRATED_BEFORE:
+                with around(CALIBRATE):
+                    outcomes += _calibrated(workspace)
+            with around(spec):
+                outcome = run_stage(
+                    workspace, spec, asked[spec.name], force=force, resume="if-same", progress=progress
+                )
+            outcomes.append(outcome)
+    except (InputError, MissingProductError):
+        done = {outcome.stage for outcome in outcomes}
+        refused = [spec.name for spec in stages if spec.name not in done]
+        with workspace.lock("run"):
+            workspace.remember({name: before.get(name, {}) for name in refused})
+        raise
+    return outcomes
+
+
+def _calibrated(workspace: Workspace) -> list[Outcome]:
+    """What `calibrate` did where the survey asks for it: one outcome, or none."""
+    try:
+        survey = load_json(Survey, workspace.path(SURVEY))
+    except GeorefError:  # the stage that reads it will tell
+        return []
+    if not survey.estimate and survey.rig is None:
+        return []
+    started, clock = now(), time.monotonic()
+    calibration = importlib.import_module(CALIBRATE.module)
+    with workspace.lock(CALIBRATE.name):
+        found, ran = calibration.calibrate_as_asked(workspace)
+    manifest = Manifest(
+        stage=CALIBRATE.name,
+        config={"estimate": list(found.wanted)},
+        inputs={SPARSE: found.model},
+        versions=_versions(),
+        started=started,
+        duration_s=round(time.monotonic() - clock, 3),
+        key_figure=calibration.told(found),
+        values=found.model_dump(mode="json"),
+        warnings=calibration.warnings_of(found),
+    )
+    return [Outcome(CALIBRATE.name, ran, manifest)]
+
+
+def remembered(workspace: Workspace, spec: StageSpec, flags: Flags) -> dict[str, Any]:
+    """The options that a stage was last asked for with, and `flags` on top of them."""
+    return {**workspace.requests().get(spec.name, {}), **flags}
+
+
+def _execute(workspace: Workspace, asked: Request, resume: Resume, progress: Progress) -> Manifest:
+    spec, resolved = asked.spec, asked.config.model_dump(mode="json")
+    token = hashlib.sha256(json.dumps([resolved, asked.inputs], sort_keys=True).encode()).hexdigest()
+    if resume == "never" and spec.resumable and workspace.partial(spec).exists():
+        log.warning("%s: starts afresh; what an interrupted run had done is dropped", spec.name)
+    out, resumed = workspace.begin(spec, token, resume)
+    started, clock = now(), time.monotonic()
+    log.info("%s: %s", spec.name, "resumed" if resumed else "started")
+    try:
+        run = importlib.import_module(spec.module).run
+        summary: Summary = run(StageRun(workspace, out, progress, resumed), asked.config)
+    except GeorefError as error:
+        workspace.fail(spec, str(error))
+        raise
+    for product in products_of(spec):
+        if not (out / product.removeprefix(f"{spec.folder}/")).exists():
+            raise RuntimeError(f"{spec.module} did not write {product}")
+    for warning in summary.warnings:
+        log.warning("%s: %s", spec.name, warning)
+    manifest = Manifest(
+        stage=spec.name,
+        config=resolved,
+        inputs=asked.inputs,
+        versions=_versions(),
+        started=started,
+        duration_s=round(time.monotonic() - clock, 3),
+        key_figure=summary.key_figure,
+        values=summary.values,
+        warnings=list(summary.warnings),
+    )
+    workspace.commit(spec, manifest)
+    log.info("%s: %s (%.1f s)", spec.name, summary.key_figure, manifest.duration_s)
+    return manifest
+
+
+def _current(workspace: Workspace, asked: Request) -> Manifest | None:
+    """The manifest of a product that need not be made again, or None."""
+    spec = asked.spec
+    if workspace.placed_by_hand(spec):
+        log.info("%s: %s was %s and is kept; --force replaces it", spec.name, spec.product, BY_HAND)
+        return Manifest(
+            stage=spec.name,
+            config={},
+            inputs=asked.inputs,
+            versions={},
+            started=now(),
+            duration_s=0.0,
+            key_figure=BY_HAND,
+            values={},
+            warnings=[],
+        )
+    try:
+        manifest = workspace.manifest(spec)
+    except InputError as error:
+        log.warning("%s: made again, because %s", spec.name, error)
+        return None
+    if manifest is None:
+        return None
+    reason = why_stale(workspace, asked, manifest)
+    log.info("%s: %s", spec.name, f"made again: {reason}" if reason else "current, nothing to do")
+    return None if reason else manifest
+
+
+def _warn_of_stale_inputs(workspace: Workspace, spec: StageSpec, memo: Memo) -> None:
+    """Say so when a stage is about to build on a product whose own inputs have changed."""
+    producers = {producer_of(product).name for product in spec.reads}
+    for row in status(workspace, memo, before=spec):
+        if row.stage in producers and row.state == "stale":
+            log.warning("%s builds on %s, which is stale (%s)", spec.name, row.stage, row.reason)
+
+
+def _versions() -> dict[str, str]:
+    found = {}
+    for name in VERSIONED:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            found[name] = "not installed"
+    return found

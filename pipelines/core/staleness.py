@@ -1,0 +1,155 @@
+"""The state of every stage: is its product there, and is it what its inputs and options would make now?"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from datetime import datetime, timedelta
+from typing import Any, Literal
+
+from pipelines.core.errors import InputError, MissingProductError
+from pipelines.core.fingerprints import Memo, fingerprints
+from pipelines.core.options import StageOptions, load_toml, resolve
+from pipelines.core.stages import BY_NAME, PIPELINE, StageSpec, producer_of, products_of
+from pipelines.core.workspace import Manifest, Workspace
+
+BY_HAND = "put there by hand"
+State = Literal["missing", "current", "stale", "running", "interrupted", "failed"]
+Flags = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class StageState:
+    """One row of `georef status`."""
+
+    stage: str
+    state: State
+    reason: str
+    finished: datetime | None = None
+    duration_s: float | None = None
+    key_figure: str = ""
+
+
+@dataclass(frozen=True)
+class Request:
+    """A stage as it is asked for now: its options, and the fingerprints of what it reads."""
+
+    spec: StageSpec
+    config: StageOptions
+    inputs: dict[str, str]
+
+
+def request(workspace: Workspace, spec: StageSpec, flags: Flags, memo: Memo) -> Request:
+    """Options (default < `georef.toml` < flags) and inputs of a stage.
+
+    Raises:
+        MissingProductError: a product that it reads is not there.
+        InputError: an unknown or invalid option, or a missing file.
+    """
+    config = stage_config(workspace, spec, flags)
+    return Request(spec, config, fingerprints(workspace, spec, config, memo))
+
+
+def stage_config(workspace: Workspace, spec: StageSpec, flags: Flags) -> StageOptions:
+    """Options of a stage: default < `georef.toml` < flags.
+
+    Raises:
+        InputError: unknown or invalid option.
+    """
+    tables = load_toml(workspace.config_file, BY_NAME)
+    return resolve(spec.options, tables.get(spec.name, {}), flags, workspace.config_file)
+
+
+def why_stale(workspace: Workspace, asked: Request, manifest: Manifest) -> str:
+    """Why a product is not what its inputs and options would make now; empty if it is."""
+    config = asked.config
+    try:
+        made_with = type(config).model_validate(manifest.config)
+    except ValueError:
+        return "made by a version with other options"
+    options = [name for name in type(config).model_fields if getattr(made_with, name) != getattr(config, name)]
+    if options:
+        return f"option {', '.join(options)} changed"
+    names = sorted({*asked.inputs, *manifest.inputs})
+    changed = [name for name in names if manifest.inputs.get(name) != asked.inputs.get(name)]
+    if changed:
+        return f"{', '.join(changed)} changed"
+    gone = [product for product in products_of(asked.spec) if not (workspace.root / product).exists()]
+    return f"{', '.join(gone)} is gone" if gone else ""
+
+
+def status(workspace: Workspace, memo: Memo | None = None, before: StageSpec | None = None) -> list[StageState]:
+    """The state of every stage, in order; of those ahead of `before`, if given.
+
+    Raises:
+        InputError: there is no such directory, or its `georef.toml` or `requests.json` is not valid.
+    """
+    must_exist(workspace)
+    look = _Look(workspace, {} if memo is None else memo, workspace.requests())
+    writer = workspace.writer()
+    rows = []
+    for spec in PIPELINE[: PIPELINE.index(before) if before in PIPELINE else len(PIPELINE)]:
+        row = look.at(spec)
+        rows.append(replace(row, state="running", reason="") if spec.name == writer else row)
+    return rows
+
+
+def must_exist(workspace: Workspace) -> None:
+    """Raise InputError where there is no workspace."""
+    if not workspace.root.is_dir():
+        raise InputError("no such workspace: `georef ingest` makes one", path=workspace.root)
+
+
+@dataclass
+class _Look:
+    """One look along the pipeline, which carries staleness downstream."""
+
+    workspace: Workspace
+    memo: Memo
+    requests: dict[str, dict[str, Any]]
+    stale: set[str] = field(default_factory=set)
+
+    def at(self, spec: StageSpec) -> StageState:
+        """The state of the next stage."""
+        row = self._state(spec)
+        if row.state == "stale":
+            self.stale.add(spec.name)
+        return row
+
+    def _state(self, spec: StageSpec) -> StageState:
+        if spec.folder in self.workspace.lent:  # who lends it has seen to it
+            return StageState(spec.name, "current", "")
+        if self.workspace.placed_by_hand(spec):
+            return StageState(spec.name, "current", BY_HAND)
+        failure = self.workspace.failure(spec)
+        interrupted = self.workspace.partial(spec).exists()
+        try:
+            manifest = self.workspace.manifest(spec)
+        except InputError as error:
+            return StageState(spec.name, "stale", str(error))
+        if manifest is None:
+            state: State = "failed" if failure else "interrupted" if interrupted else "missing"
+            return StageState(spec.name, state, failure or "")
+        reason = self._reason(spec, manifest)
+        later = "a later run was interrupted" if interrupted else ""
+        later = f"a later run failed: {failure}" if failure else later
+        return StageState(
+            spec.name,
+            "stale" if reason else "current",
+            "; ".join(filter(None, (reason, later))),
+            manifest.started + timedelta(seconds=manifest.duration_s),
+            manifest.duration_s,
+            manifest.key_figure,
+        )
+
+    def _reason(self, spec: StageSpec, manifest: Manifest) -> str:
+        """Why a product is stale, by itself or because one that it builds on is."""
+        flags = self.requests.get(spec.name, {})
+        stage_config(self.workspace, spec, flags)  # a bad georef.toml is an error, not a state
+        try:
+            own = why_stale(self.workspace, request(self.workspace, spec, flags, self.memo), manifest)
+        except (MissingProductError, InputError) as error:
+            return str(error)
+        producers = dict.fromkeys(producer_of(product).name for product in spec.reads)
+        upstream = [name for name in producers if name in self.stale]
+        return own or (f"{', '.join(upstream)} is stale" if upstream else "")

@@ -1,0 +1,22 @@
+"""Array and tuple types that the whole house shares.
+
+Arrays are numpy's; shapes, units and frames stand in the docstrings of whoever uses them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+Float32Array = NDArray[np.float32]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+ByteArray = NDArray[np.uint8]
+
+Vector3 = tuple[float, float, float]
+Vector4 = tuple[float, float, float, float]
+Quaternion = Vector4
+Matrix3 = tuple[Vector3, Vector3, Vector3]
+Matrix34 = tuple[Vector4, Vector4, Vector4]
+Row7 = tuple[float, float, float, float, float, float, float]

@@ -1,0 +1,1 @@
+"""What a surveyor takes away: one module a deliverable."""

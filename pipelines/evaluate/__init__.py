@@ -1,0 +1,1 @@
+"""Stage `evaluate`: test views, check points, predicted accuracy."""

@@ -1,0 +1,149 @@
+"""The Cramér–Rao bound: how well any unbiased estimate can know a point, from what was measured and how well.
+
+Fisher information of a Gaussian model of *all* observations: image observations of tie points, marks of control
+and wanted points, fixes of camera centres, surveyed control points. Unknown are every pose, every point and the
+lens, in the frame in which fixes and control points were measured, so that a similarity is not needed. Nothing is
+robust here, no observation is an outlier, and nothing is known beforehand: no unbiased estimate does better, and a
+good one comes near (Kay, Fundamentals of Statistical Signal Processing I, 1993, section 3.9).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.sparse import csr_matrix, hstack
+
+from pipelines.core.errors import DegenerateGeometryError
+from pipelines.core.types import BoolArray, FloatArray, IntArray
+from pipelines.geometry.bundle import Network, in_front, is_ahead, lens_slots, linearise, scatter
+
+_WORST_SCALED = 1e-10  # pivot of the scaled normal matrix below which a direction is open
+_RIDGE = 1e-12  # for a point that its rays leave open
+
+
+@dataclass(frozen=True)
+class Anchors:
+    """What ties a network to the Earth.
+
+    Attributes:
+        camera: (F,) index of the camera that each fix is of.
+        cov_fix: (F, 3, 3) m² of the fixes.
+        control: control points with their marks, or None; its cameras are those of the network.
+        control_sigma_px: (K,) of these marks.
+        cov_control: (J, 3, 3) m² of the surveyed positions.
+    """
+
+    camera: IntArray
+    cov_fix: FloatArray
+    control: Network | None = None
+    control_sigma_px: FloatArray | None = None
+    cov_control: FloatArray | None = None
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Whitened image observations of points: derivatives by cameras and lens, and by the points themselves."""
+
+    by_cameras: csr_matrix  # (2 M, 6 n + L)
+    by_point: FloatArray  # (M, 2, 3)
+
+
+class CameraInformation:
+    """Fisher information of n poses and L lens parameters, all tie and control points eliminated.
+
+    Args:
+        ties: the bundle, in the frame of the anchors; its own pixels are not looked at.
+        sigma_px: of its image observations, per coordinate.
+        anchors: fixes and control points.
+
+    Raises:
+        DegenerateGeometryError: the observations leave the cameras open.
+    """
+
+    def __init__(self, ties: Network, sigma_px: float, anchors: Anchors) -> None:
+        information = _eliminated(ties, np.full(len(ties.obs_point), sigma_px), None)
+        inverse = np.linalg.inv(anchors.cov_fix)
+        place = (6 * anchors.camera)[:, None] + np.arange(3, 6)
+        np.add.at(information, (place[:, :, None], place[:, None, :]), inverse)
+        if anchors.control is not None and anchors.control_sigma_px is not None:
+            information += _eliminated(anchors.control, anchors.control_sigma_px, anchors.cov_control)
+        diagonal = np.diag(information)
+        self._used = np.flatnonzero(diagonal > 0)  # shorter parameter lists leave empty columns
+        self._unit = 1.0 / np.sqrt(diagonal[self._used])
+        scaled = information[np.ix_(self._used, self._used)] * self._unit[:, None] * self._unit
+        try:
+            self._factor = cho_factor(scaled, lower=True)
+        except np.linalg.LinAlgError:
+            self._factor = (np.zeros_like(scaled), True)
+        if np.diag(self._factor[0]).min() ** 2 < _WORST_SCALED:
+            raise DegenerateGeometryError("the observations leave cameras or lens open: there is no bound")
+
+    def bound(self, wanted: Network, sigma_px: FloatArray) -> FloatArray:
+        """Least covariance (J, 3, 3) in m² of points that are known by their marks alone.
+
+        The marks of a point count for the cameras as well, those of the others do not. NaN for a point that its
+        marks do not determine.
+
+        Args:
+            wanted: the points and their K marks; its cameras are those of the bundle.
+            sigma_px: (K,) of the marks.
+        """
+        sigma_px, wanted = sigma_px[is_ahead(wanted)], in_front(wanted)
+        found = np.full((len(wanted.point_in_world), 3, 3), np.nan)
+        for j in np.unique(wanted.obs_point):
+            mine = wanted.obs_point == j
+            if mine.sum() >= 2:
+                found[j] = self._bound_of(_only(wanted, mine), sigma_px[mine])
+        return found
+
+    def _bound_of(self, marks: Network, sigma_px: FloatArray) -> FloatArray:
+        rows = _rows(marks, sigma_px)
+        by_point = rows.by_point.reshape(-1, 3)
+        left, value, right = np.linalg.svd(by_point)
+        if value[2] < 1e-6 * value[0]:
+            return np.full((3, 3), np.nan)
+        by_cameras = rows.by_cameras.toarray()[:, self._used] * self._unit
+        response = (right.T / value) @ left[:, :3].T @ by_cameras  # of the point, to the cameras
+        free = left[:, 3:].T @ by_cameras  # what the marks say of the cameras alone
+        solved = cho_solve(self._factor, np.concatenate([response, free]).T)
+        of_response, of_free = solved[:, :3], solved[:, 3:]
+        gain = np.linalg.solve(np.eye(len(free)) + free @ of_free, free @ of_response)
+        cov = (right.T / value**2) @ right + response @ of_response - (response @ of_free) @ gain
+        return np.asarray((cov + cov.T) / 2)
+
+
+def _only(network: Network, mine: BoolArray) -> Network:
+    """The marks of one point."""
+    owner = network.obs_point[mine][:1]
+    return replace(
+        network,
+        point_in_world=network.point_in_world[owner],
+        obs_point=np.zeros(int(mine.sum()), dtype=np.int64),
+        obs_image=network.obs_image[mine],
+        obs_xy_px=network.obs_xy_px[mine],
+    )
+
+
+def _rows(network: Network, sigma_px: FloatArray) -> _Rows:
+    lin = linearise(network)
+    whiten = 1.0 / sigma_px[:, None, None]
+    poses = scatter(lin.by_pose * whiten, network.obs_image, len(network.camera_id))
+    lens = scatter(lin.by_intrinsics * whiten, lens_slots(network), len(network.cameras))
+    return _Rows(hstack([poses, lens], format="csr"), lin.by_point * whiten)
+
+
+def _eliminated(network: Network, sigma_px: FloatArray, cov_known: FloatArray | None) -> FloatArray:
+    """Information of cameras and lens (6 n + L, 6 n + L), the points eliminated, which may be known beforehand."""
+    sigma_px, network = sigma_px[is_ahead(network)], in_front(network)
+    rows, count = _rows(network, sigma_px), len(network.point_in_world)
+    normal = np.zeros((count, 3, 3))
+    np.add.at(normal, network.obs_point, np.swapaxes(rows.by_point, 1, 2) @ rows.by_point)
+    if cov_known is not None:
+        normal += np.linalg.inv(cov_known)
+    normal += (_RIDGE * np.trace(normal, axis1=1, axis2=2) + _RIDGE)[:, None, None] * np.eye(3)
+    root = np.swapaxes(np.linalg.inv(np.linalg.cholesky(normal)), 1, 2)
+    point = scatter(rows.by_point @ root[network.obs_point], network.obs_point, count)
+    cross = rows.by_cameras.T @ point
+    return np.asarray((rows.by_cameras.T @ rows.by_cameras - cross @ cross.T).toarray())

@@ -1,0 +1,65 @@
+"""How intersected points follow the cameras that see them and their lens: the derivative of an intersection."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import csr_matrix
+
+from pipelines.core.types import FloatArray, IntArray
+from pipelines.geometry.bundle import Network, in_front, is_ahead, lens_slots, linearise
+
+
+@dataclass(frozen=True)
+class Following:
+    """What moves N intersected points, to first order.
+
+    Attributes:
+        by_poses: (3 N, 6 n) sparse, metres by (δω, δc) of each camera as in `geometry.bundle.CorrectionBasis`.
+        by_lens: (N, 3, L) metres by the lens parameters, in the order of `CorrectionBasis`.
+        cov_of_marks: (N, 3, 3) m², what the marks' own σ leaves; NaN for a point that its rays do not determine.
+    """
+
+    by_poses: csr_matrix
+    by_lens: FloatArray
+    cov_of_marks: FloatArray
+
+    def by(self, basis: FloatArray) -> FloatArray:
+        """Metres (N, 3, k) per unit of each of the k corrections of a basis (n, 6, k)."""
+        n, rows, width = basis.shape
+        moved = np.asarray(self.by_poses @ basis.reshape(rows * n, width))
+        return moved.reshape(len(moved) // 3, 3, width)
+
+
+def follow(marks: Network, sigma_px: FloatArray) -> Following:
+    """How the points of a network follow, each intersected from its own marks, the lens and the poses held.
+
+    Where the marks are does not enter, but the places where the points appear do.
+
+    Args:
+        marks: N points, M marks.
+        sigma_px: (M,) of the marks. Those of points behind their camera do not count.
+    """
+    sigma_px, marks = sigma_px[is_ahead(marks)], in_front(marks)
+    lin, count = linearise(marks), len(marks.point_in_world)
+    pull = np.swapaxes(lin.by_point, 1, 2) / (sigma_px**2)[:, None, None]
+    normal = np.zeros((count, 3, 3))
+    np.add.at(normal, marks.obs_point, pull @ lin.by_point)
+    value, vector = np.linalg.eigh(normal)
+    value[value[:, 0] <= 1e-9 * value[:, 2]] = np.nan
+    cov = (vector / value[:, None, :]) @ np.swapaxes(vector, 1, 2)
+    response = -cov[marks.obs_point] @ pull  # (M, 3, 2) metres per pixel
+    longest = lin.by_intrinsics.shape[2]
+    lens = _blocks(marks, response @ lin.by_intrinsics, lens_slots(marks), longest * len(marks.cameras))
+    poses = _blocks(marks, response @ lin.by_pose, marks.obs_image, 6 * len(marks.camera_id))
+    return Following(poses, lens.toarray().reshape(count, 3, -1), cov)
+
+
+def _blocks(marks: Network, blocks: FloatArray, column_block: IntArray, width: int) -> csr_matrix:
+    """Sparse (3 N, width) of blocks (M, 3, w) of each mark, those of one place added up."""
+    rows = (3 * marks.obs_point)[:, None, None] + np.arange(3)[:, None]
+    columns = (blocks.shape[2] * column_block)[:, None, None] + np.arange(blocks.shape[2])
+    rows, columns = np.broadcast_to(rows, blocks.shape), np.broadcast_to(columns, blocks.shape)
+    shape = (3 * len(marks.point_in_world), width)
+    return csr_matrix((blocks.ravel(), (rows.ravel(), columns.ravel())), shape=shape)

@@ -1,0 +1,277 @@
+"""ROS bags, read one message at a time: rosbag2 folders and bare files (mcap, sqlite3), and ROS 1 bags.
+
+Every message type is decoded by its own definition: the bag's, else the distribution's, or (PX4, whose messages no
+distribution has) that of `bag_definitions` which fits the message. A damaged definition harms its own
+topic only.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pipelines.core.errors import InputError
+from pipelines.formats.bag.definitions import DEFINITIONS
+
+# A chunk is unpacked in one piece, and held up to three times; ROS writes 0.8 to 4 MiB.
+_MAX_CHUNK_BYTES = 200 * 1024 * 1024
+# Schemas of mcap that have no place in a ROS bag, and with which the reader cannot open it.
+_FOREIGN_SCHEMAS = ("jsonschema", "protobuf", "flatbuffer", "ros1msg")
+# PX4 sends a message within milliseconds of the sample that it is made from.
+_SAMPLE_LAG_US = 60_000_000
+_REPAIR = "repair it with `mcap recover` (mcap) or `ros2 bag reindex` (sqlite3, or metadata.yaml missing)"
+
+
+class UndecodableError(ValueError):
+    """A message that does not fit its definition, or whose definition is not known."""
+
+
+@dataclass(frozen=True)
+class BagTopic:
+    """A topic: its name, message type (`sensor_msgs/msg/Imu`) and how many messages it has."""
+
+    name: str
+    type: str
+    count: int
+
+
+@dataclass(frozen=True)
+class RawMessage:
+    """A message as stored; `bag_ns` is when it was recorded, nanoseconds since 1970."""
+
+    topic: str
+    type: str
+    bag_ns: int
+    data: bytes
+
+
+class Bag:
+    """An open bag; see `open_bag`.
+
+    Attributes:
+        path: file or folder.
+        topics: by name.
+        damage: why reading ended before its end, once it did.
+        fallback_types: types decoded by a definition that the bag does not have itself.
+    """
+
+    def __init__(self, path: Path, reader: Any, ros2: bool) -> None:
+        self.path, self._reader, self._ros2 = path, reader, ros2
+        self._connections = list(reader.connections)
+        # Of a split bag, any file may be the one that has a definition.
+        links = [link for part in _parts(reader) for link in part.connections] + self._connections
+        self._definitions = {link.msgtype: link.msgdef for link in links if link.msgdef.data}
+        self._stores: dict[str, Any] = {}
+        self.damage: str | None = None
+        self.fallback_types: set[str] = set()
+        counts: dict[tuple[str, str], int] = {}
+        for link in self._connections:
+            key = (link.topic, link.msgtype)
+            counts[key] = counts.get(key, 0) + link.msgcount
+        self.topics = {
+            name: BagTopic(name, kind, count) for (name, kind), count in sorted(counts.items(), reverse=True)
+        }
+
+    @property
+    def message_count(self) -> int:
+        """Messages of all topics, as the bag's index has it."""
+        return sum(topic.count for topic in self.topics.values())
+
+    def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
+        """Messages of these topics by time of recording, one at a time.
+
+        Reading ends early where the bag is damaged; `damage` then tells.
+        """
+        wanted = {name: self.topics[name].type for name in topics}
+        links = [link for link in self._connections if wanted.get(link.topic) == link.msgtype]
+        if not links:
+            return
+        stream = self._reader.messages(connections=links)
+        while True:
+            try:
+                link, bag_ns, data = next(stream)
+            except StopIteration:
+                return
+            except Exception as error:  # the library lets out whatever its parsers meet
+                self.damage = f"{type(error).__name__}: {error}"
+                return
+            yield RawMessage(link.topic, link.msgtype, int(bag_ns), bytes(data))
+
+    def decode(self, message: RawMessage) -> Any:
+        """The message as an object with the fields of its definition.
+
+        Raises:
+            UndecodableError: it does not fit, or no definition is known.
+        """
+        store = self._store(message)
+        try:
+            if self._ros2:
+                return store.deserialize_cdr(message.data, message.type)
+            return store.deserialize_ros1(message.data, message.type)
+        except Exception as error:  # as above: hostile bytes meet generated code
+            raise UndecodableError(f"{type(error).__name__}: {error}") from error
+
+    def first(self, topic: str) -> Any | None:
+        """The first message of a topic that decodes, or None."""
+        for tried, message in enumerate(self.messages([topic])):
+            try:
+                return self.decode(message)
+            except UndecodableError:
+                if tried >= 9:
+                    break
+        return None
+
+    def header_stamp_ns(self, message: RawMessage) -> int | None:
+        """Stamp of a message that begins with a `std_msgs/Header`, read without decoding the rest; None if zero."""
+        try:
+            if not self._ros2:
+                sec, nanosec = struct.unpack_from("<II", message.data, 4)
+            else:
+                order = "<" if message.data[1] & 1 else ">"
+                sec, nanosec = struct.unpack_from(f"{order}iI", message.data, 4)
+        except (struct.error, IndexError):
+            return None
+        return sec * 1_000_000_000 + nanosec or None
+
+    def _store(self, message: RawMessage) -> Any:
+        """A typestore that knows the type of `message`."""
+        kind = message.type
+        if kind not in self._stores:
+            stated = self._definitions.get(kind)
+            if stated is None and kind in DEFINITIONS:
+                self._stores[kind] = self._store_that_fits(message)
+            else:
+                self._stores[kind] = self._make_store(kind, stated)
+        store = self._stores[kind]
+        if isinstance(store, str):
+            raise UndecodableError(store)
+        return store
+
+    def _make_store(self, kind: str, stated: Any | None) -> Any:
+        """A typestore that knows `kind` as the bag defines it, or by default, or why there is none."""
+        from rosbags.typesys import Stores, get_typestore
+
+        if stated is not None:
+            store = get_typestore(Stores.EMPTY)
+            try:
+                store.register(_parsed(stated, kind))
+                return store
+            except Exception as error:  # a grammar error, an unknown word, a name twice …
+                return f"its definition of {kind} cannot be read: {type(error).__name__}: {error}"
+        self.fallback_types.add(kind)
+        common = get_typestore(Stores.ROS2_JAZZY if self._ros2 else Stores.ROS1_NOETIC)
+        return common if kind in common.types else f"it has no definition of {kind}"
+
+    def _store_that_fits(self, message: RawMessage) -> Any:
+        """A typestore with that layout of `DEFINITIONS` which fits `message`."""
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+        for release, text in DEFINITIONS[message.type].items():
+            store = get_typestore(Stores.EMPTY)
+            store.register(get_types_from_msg(text, message.type))
+            try:
+                decoded: Any = store.deserialize_cdr(message.data, message.type)
+            except Exception:  # another length, or damaged
+                continue
+            sample = getattr(decoded, "timestamp_sample", 0)
+            if sample and abs(sample - decoded.timestamp) > _SAMPLE_LAG_US:
+                continue
+            self.fallback_types.add(f"{message.type} (as of PX4 {release})")
+            return store
+        # Not remembered: the next message may be whole.
+        raise UndecodableError(
+            f"{len(message.data)} bytes are none of the layouts of {message.type} that are known here"
+        )
+
+
+@contextmanager
+def open_bag(path: Path) -> Iterator[Bag]:
+    """Open a bag for reading.
+
+    Raises:
+        InputError: no bag, damaged so that it cannot be opened, or packed in pieces too large for memory.
+    """
+    ros2 = path.suffix != ".bag"
+    reader = _reader(path, ros2)
+    try:
+        reader.open()
+    except InputError:
+        raise
+    except KeyError as error:
+        if error.args[0] not in _FOREIGN_SCHEMAS:
+            raise InputError(f"is no bag, or is damaged ({_told(error)}): {_REPAIR}", path=path) from error
+        raise InputError(
+            f"has a topic in {error.args[0]!r}, which is not ROS 2's: leave it out with `mcap filter`", path=path
+        ) from error
+    except Exception as error:  # truncated and forged files raise whatever the parser trips over
+        raise InputError(f"is no bag, or is damaged ({_told(error)}): {_REPAIR}", path=path) from error
+    try:
+        _check_chunks(reader, path)
+        yield Bag(path, reader, ros2)
+    finally:
+        reader.close()
+
+
+def _reader(path: Path, ros2: bool) -> Any:
+    from rosbags import rosbag1, rosbag2
+
+    if not path.exists():
+        raise InputError("no such bag", path=path, field="--bag")
+    if path.is_dir() and not (path / "metadata.yaml").exists():
+        raise InputError(
+            "has no metadata.yaml: give the .mcap or .db3 file in it, or `ros2 bag reindex` the folder",
+            path=path,
+            field="--bag",
+        )
+    if path.is_file() and path.suffix not in (".bag", ".mcap", ".db3"):
+        raise InputError(
+            "is no bag: give a rosbag2 folder, or a .mcap, .db3 or .bag file", path=path, field="--bag"
+        )
+    try:
+        return rosbag2.Reader(path) if ros2 else rosbag1.Reader(path)
+    except Exception as error:
+        raise InputError(f"is no bag, or is damaged ({_told(error)}): {_REPAIR}", path=path) from error
+
+
+def _check_chunks(reader: Any, path: Path) -> None:
+    for storage in _parts(reader):
+        largest = max((chunk.uncompressed_size for chunk in getattr(storage, "chunks", ())), default=0)
+        if largest > _MAX_CHUNK_BYTES:
+            raise InputError(
+                f"has a chunk of {largest / 2**20:.0f} MiB (limit {_MAX_CHUNK_BYTES // 2**20}): rewrite it with "
+                "smaller ones, e.g. `mcap compress --chunk-size 4194304`",
+                path=path,
+            )
+
+
+def _parts(reader: Any) -> list[Any]:
+    """The files of a rosbag2."""
+    outer = getattr(reader, "storage", None)
+    return list(getattr(outer, "storages", [] if outer is None else [outer]))
+
+
+def _parsed(definition: Any, kind: str) -> Any:
+    """Types of a definition, in ROS's message language or in IDL."""
+    from rosbags.interfaces import MessageDefinitionFormat
+    from rosbags.typesys import get_types_from_idl, get_types_from_msg
+
+    if definition.format == MessageDefinitionFormat.MSG:
+        return get_types_from_msg(definition.data, kind)
+    rule = "=" * 80 + "\n"
+    # rosbags' parser takes no directives; what they include stands below.
+    text = re.sub(r"^[ \t]*#.*$", "", definition.data, flags=re.MULTILINE)
+    if not text.startswith(f"{rule}IDL: "):
+        return get_types_from_idl(text)
+    types: dict[str, Any] = {}
+    for part in text.split(rule)[1:]:
+        types.update(get_types_from_idl(part.partition("\n")[2]))
+    return types
+
+
+def _told(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}".rstrip(": ").rstrip(".")

@@ -1,0 +1,199 @@
+"""Writes a flight as a rosbag2, the way a ROS 2 drone would record it (REP-103, REP-105, REP-145).
+
+The world is East-North-Up, `base_link` Forward-Left-Up, the camera `_optical` (x right, y down, z forward).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from pipelines.core.types import FloatArray, IntArray
+from pipelines.geometry.rotations import quat_xyzw_from_matrix
+
+IMAGE_TOPIC = "/uav/camera/image/compressed"
+INFO_TOPIC = "/uav/camera/camera_info"
+FIX_TOPIC = "/uav/gnss/fix"
+IMU_TOPIC = "/uav/imu/data"
+TF_TOPIC = "/tf_static"
+BODY, CAMERA, ANTENNA, IMU = "base_link", "camera_optical", "gnss_antenna", "imu_link"
+_FLU_FROM_FRD = np.diag([1.0, -1.0, -1.0])
+_TYPES = {
+    IMAGE_TOPIC: "sensor_msgs/msg/CompressedImage",
+    INFO_TOPIC: "sensor_msgs/msg/CameraInfo",
+    FIX_TOPIC: "sensor_msgs/msg/NavSatFix",
+    IMU_TOPIC: "sensor_msgs/msg/Imu",
+    TF_TOPIC: "tf2_msgs/msg/TFMessage",
+}
+
+
+@dataclass(frozen=True)
+class BagCamera:
+    """The camera as `CameraInfo` tells it.
+
+    Attributes:
+        width, height: pixels.
+        focal_px: focal length; center_px: principal point, the centre of the top-left pixel being (0.5, 0.5).
+        distortion: (k1, k2, p1, p2, k3), model plumb_bob.
+        cam_from_body: (3, 3) nominal mounting, body forward-right-down.
+    """
+
+    width: int
+    height: int
+    focal_px: float
+    center_px: tuple[float, float]
+    distortion: tuple[float, float, float, float, float]
+    cam_from_body: FloatArray
+
+
+@dataclass(frozen=True)
+class BagFlight:
+    """What to record. Stamps are nanoseconds since 1970, each sensor's on its own clock.
+
+    Attributes:
+        camera: its calibration.
+        image_stamp_ns: (N,) and image_paths: the photographs.
+        fix_stamp_ns: (M,) fix_lla: (M, 3) degrees and ellipsoidal metres.
+        fix_sigma_enu_m: (3,) σ that the receiver states; fix_status: of `NavSatStatus`.
+        antenna_in_body: (3,) metres, forward-right-down.
+        imu_stamp_ns: (K,) imu_enu_from_body: (K, 3, 3), body forward-right-down.
+        imu_rate, imu_force: (K, 3) rad/s and m/s², forward-right-down.
+        imu_sigma_deg: σ of the attitude per axis.
+    """
+
+    camera: BagCamera
+    image_stamp_ns: IntArray
+    image_paths: tuple[Path, ...]
+    fix_stamp_ns: IntArray
+    fix_lla: FloatArray
+    fix_sigma_enu_m: FloatArray
+    fix_status: int
+    antenna_in_body: FloatArray
+    imu_stamp_ns: IntArray
+    imu_enu_from_body: FloatArray
+    imu_rate: FloatArray
+    imu_force: FloatArray
+    imu_sigma_deg: float
+
+
+def write_bag(path: Path, storage: Literal["mcap", "sqlite3"], flight: BagFlight) -> int:
+    """Write a bag folder in order of time; returns the number of messages."""
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    typestore = get_typestore(Stores.ROS2_JAZZY)
+    messages = _Messages(flight, typestore.types)
+    plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
+    count = 0
+    with Writer(path, version=9, storage_plugin=plugin) as writer:
+        links = {
+            topic: writer.add_connection(topic, kind, typestore=typestore, offered_qos_profiles=_qos(topic))
+            for topic, kind in _TYPES.items()
+        }
+        for topic, stamp_ns, message in messages.in_order():
+            writer.write(links[topic], stamp_ns, typestore.serialize_cdr(message, _TYPES[topic]))
+            count += 1
+    return count
+
+
+def _qos(topic: str) -> list[Any]:
+    """Static transforms must reach a listener that comes late; the rest takes the default."""
+    if topic != TF_TOPIC:
+        return []
+    from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+
+    endless = QosTime(9223372036, 854775807)
+    return [
+        Qos(
+            QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL, endless, endless,
+            QosLiveliness.AUTOMATIC, endless, False,
+        )
+    ]  # fmt: skip
+
+
+class _Messages:
+    """Makes the messages of a flight from a typestore's classes."""
+
+    def __init__(self, flight: BagFlight, types: Any) -> None:
+        self._flight, self._types = flight, types
+
+    def in_order(self) -> Iterator[tuple[str, int, Any]]:
+        """(topic, stamp, message) by time, made one at a time: photographs are read when their turn comes."""
+        flight = self._flight
+        streams = [(FIX_TOPIC, flight.fix_stamp_ns), (IMU_TOPIC, flight.imu_stamp_ns)]
+        streams += [(INFO_TOPIC, flight.image_stamp_ns), (IMAGE_TOPIC, flight.image_stamp_ns)]
+        first = min(int(stamps[0]) for _, stamps in streams)
+        yield TF_TOPIC, first, self._transforms(first)
+        rank = np.concatenate([np.full(len(stamps), k) for k, (_, stamps) in enumerate(streams)])
+        index = np.concatenate([np.arange(len(stamps)) for _, stamps in streams])
+        stamp = np.concatenate([stamps for _, stamps in streams])
+        make = (self._fix, self._imu, self._info, self._image)
+        for k in np.lexsort((rank, stamp)):
+            yield streams[rank[k]][0], int(stamp[k]), make[rank[k]](int(index[k]), int(stamp[k]))
+
+    def _new(self, kind: str, *values: Any) -> Any:
+        return self._types[kind](*values)
+
+    def _header(self, stamp_ns: int, frame: str) -> Any:
+        time = self._new("builtin_interfaces/msg/Time", stamp_ns // 1_000_000_000, stamp_ns % 1_000_000_000)
+        return self._new("std_msgs/msg/Header", time, frame)
+
+    def _vector(self, values: FloatArray) -> Any:
+        return self._new("geometry_msgs/msg/Vector3", *(float(value) for value in values))
+
+    def _quaternion(self, rotation: FloatArray) -> Any:
+        return self._new("geometry_msgs/msg/Quaternion", *(float(v) for v in quat_xyzw_from_matrix(rotation)))
+
+    def _fix(self, i: int, stamp_ns: int) -> Any:
+        status = self._new("sensor_msgs/msg/NavSatStatus", self._flight.fix_status, 1)
+        lat, lon, alt = (float(value) for value in self._flight.fix_lla[i])
+        cov = np.diag(np.square(self._flight.fix_sigma_enu_m)).ravel()
+        return self._new(
+            "sensor_msgs/msg/NavSatFix", self._header(stamp_ns, ANTENNA), status, lat, lon, alt, cov, 2
+        )
+
+    def _imu(self, i: int, stamp_ns: int) -> Any:
+        flight = self._flight
+        attitude = flight.imu_enu_from_body[i] @ _FLU_FROM_FRD
+        cov = np.eye(3).ravel() * np.radians(flight.imu_sigma_deg) ** 2
+        unknown = np.zeros(9)
+        return self._new(
+            "sensor_msgs/msg/Imu", self._header(stamp_ns, IMU), self._quaternion(attitude), cov,
+            self._vector(_FLU_FROM_FRD @ flight.imu_rate[i]), unknown,
+            self._vector(_FLU_FROM_FRD @ flight.imu_force[i]), unknown,
+        )  # fmt: skip
+
+    def _info(self, _i: int, stamp_ns: int) -> Any:
+        camera = self._flight.camera
+        # ROS counts pixels from the centre of the first one, COLMAP from its corner.
+        focal, cx, cy = camera.focal_px, camera.center_px[0] - 0.5, camera.center_px[1] - 0.5
+        return self._new(
+            "sensor_msgs/msg/CameraInfo", self._header(stamp_ns, CAMERA), camera.height, camera.width, "plumb_bob",
+            np.array(camera.distortion), np.array([focal, 0, cx, 0, focal, cy, 0, 0, 1.0]), np.eye(3).ravel(),
+            np.array([focal, 0, cx, 0, 0, focal, cy, 0, 0, 0, 1.0, 0]), 0, 0,
+            self._new("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False),
+        )  # fmt: skip
+
+    def _image(self, i: int, stamp_ns: int) -> Any:
+        data = np.frombuffer(self._flight.image_paths[i].read_bytes(), dtype=np.uint8)
+        return self._new("sensor_msgs/msg/CompressedImage", self._header(stamp_ns, CAMERA), "jpeg", data)
+
+    def _transforms(self, stamp_ns: int) -> Any:
+        flight = self._flight
+        links = (
+            (CAMERA, np.zeros(3), _FLU_FROM_FRD @ flight.camera.cam_from_body.T),
+            (ANTENNA, _FLU_FROM_FRD @ flight.antenna_in_body, np.eye(3)),
+            (IMU, np.zeros(3), np.eye(3)),
+        )
+        made = [
+            self._new(
+                "geometry_msgs/msg/TransformStamped", self._header(stamp_ns, BODY), child,
+                self._new("geometry_msgs/msg/Transform", self._vector(shift), self._quaternion(rotation)),
+            )
+            for child, shift, rotation in links
+        ]  # fmt: skip
+        return self._new("tf2_msgs/msg/TFMessage", made)

@@ -1,0 +1,1 @@
+"""Stage `geolocate`: every SfM point intersected on Earth."""

@@ -1,0 +1,263 @@
+"""Stage `geolocate`: every SfM point intersected on Earth from the measured positions and attitudes.
+
+Reads `ingest/survey.json` and `sfm/sparse`; writes `geolocate/points.npz` (`GeolocatedPoints`) and `points.ply`.
+GeoRefGS section 2.3, eqs 4–15 (doi 10.3390/drones10030195). Control and check points are not used.
+
+Fixes that contradict the layout of the cameras in the SfM model give no rays: in a point seen three times one bad
+fix cannot be told from two good ones, in the layout of all cameras it can.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from pipelines.core.errors import DegenerateGeometryError, InputError
+from pipelines.core.products import load_json
+from pipelines.core.stages import SPARSE, SURVEY
+from pipelines.core.types import BoolArray, FloatArray
+from pipelines.core.workspace import StageRun, Summary
+from pipelines.formats.colmap import read_sparse
+from pipelines.formats.point_ply import write_point_ply
+from pipelines.geolocate.options import GeolocateOptions
+from pipelines.geometry.rays import CommonRotation, Intersections, Rays, Views, intersect
+from pipelines.geometry.rotations import log_so3
+from pipelines.geometry.sparse_model import SparseModel
+from pipelines.georef.adjustment import Correspondences, RotationPrior
+from pipelines.georef.alignment import Alignment, align
+from pipelines.scene.geolocated import GeolocatedPoints
+from pipelines.scene.observations import (
+    RecordedRotations,
+    attitude_prior,
+    fix_correspondences,
+    observation_rays,
+    recorded_rotations,
+)
+from pipelines.scene.survey import Survey
+
+log = logging.getLogger(__name__)
+
+_LARGEST_RELATIVE_SIGMA = 0.3  # of the distance: beyond, the linear covariance says nothing
+_NO_FIXES = "no fixes: positions come from control points"
+_ALIGNMENT_SEED = 0
+
+
+@dataclass(frozen=True)
+class Geolocation:
+    """Result of `geolocate`: the points and what to say about them."""
+
+    points: GeolocatedPoints
+    sigma_m: FloatArray  # (N,) along the worst axis; NaN without a position
+    key_figure: str
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Measured:
+    """What was measured of a model, and how the fixes agree with its cameras."""
+
+    model: SparseModel
+    fixes: Correspondences
+    recorded: RecordedRotations
+    prior: RotationPrior | None
+    alignment: Alignment | None
+    problem: str  # why there is no alignment
+
+
+def run(stage: StageRun, config: GeolocateOptions) -> Summary:
+    """Intersect the points of the workspace's model and write them.
+
+    Raises:
+        GeorefError: unreadable products, or attitudes asked for that are not there.
+    """
+    survey = load_json(Survey, stage.workspace.path(SURVEY))
+    if survey.estimate and survey.rig is None:
+        log.warning(
+            "%s were to be estimated after sfm: `georef calibrate --apply`, or `georef run`, does",
+            ", ".join(survey.estimate),
+        )
+    model = read_sparse(stage.workspace.path(SPARSE))
+    found = geolocate(survey, model, config)
+    points = found.points
+    points.save(stage.out / "points.npz")
+    write_point_ply(stage.out / "points.ply", points.position_in_geo, model.point_rgb, found.sigma_m, points.inlier)
+    return Summary(found.key_figure, _values(found), found.warnings)
+
+
+def geolocate(survey: Survey, model: SparseModel, config: GeolocateOptions) -> Geolocation:
+    """Intersect the points of a model.
+
+    Raises:
+        InputError: `recorded` attitudes are asked for and fewer than two images have them.
+        DegenerateGeometryError: SfM's rotations are needed and the fixes do not fix their direction.
+    """
+    measured = _measured(survey, model)
+    if len(measured.fixes) == 0:
+        return _nothing(model, _NO_FIXES)
+    source = _rotation_source(measured, config)
+    if source == "sfm" and measured.alignment is None:
+        if len(survey.control_points) >= 3:
+            return _nothing(model, f"no directions: positions come from control points ({measured.problem})")
+        raise DegenerateGeometryError(f"SfM's rotations cannot be turned to the Earth: {measured.problem}")
+    warnings = _warnings(measured, source)
+    views, usable = _views(measured, source, config.sigma_px)
+    rays = _rays(model, usable)
+    found = intersect(rays, views, len(model.point_id))
+    sigma, inlier = _judge(found, rays, views, config)
+    points = GeolocatedPoints(
+        point_id=model.point_id,
+        position_in_geo=found.position_in_geo,
+        cov_in_geo=found.cov_in_geo,
+        ray_count=found.ray_count,
+        max_angle_deg=found.max_angle_deg,
+        condition=found.condition,
+        inlier=inlier,
+        rotation_source=source,
+    )
+    if inlier.sum() < 0.5 * len(inlier):
+        warnings.append(f"only {inlier.sum()} of {len(inlier)} points have rays that agree: check σ and attitudes")
+    middle = f", median σ {np.median(sigma[inlier]):.3g} m" if inlier.any() else ""
+    figure = f"{inlier.sum()} of {len(inlier)} points{middle} ({source} rotations)"
+    return Geolocation(points, sigma, figure, tuple(warnings))
+
+
+def _nothing(model: SparseModel, why: str) -> Geolocation:
+    """A product without positions, so that control points can carry the survey alone."""
+    count = len(model.point_id)
+    points = GeolocatedPoints(
+        point_id=model.point_id,
+        position_in_geo=np.full((count, 3), np.nan),
+        cov_in_geo=np.full((count, 3, 3), np.nan),
+        ray_count=np.zeros(count, dtype=np.int32),
+        max_angle_deg=np.zeros(count),
+        condition=np.full(count, np.inf),
+        inlier=np.zeros(count, dtype=bool),
+        rotation_source="sfm",
+    )
+    return Geolocation(points, np.full(count, np.nan), why, (why,))
+
+
+def _measured(survey: Survey, model: SparseModel) -> _Measured:
+    fixes, prior = fix_correspondences(survey, model), attitude_prior(survey, model)
+    alignment, problem = None, ""
+    try:
+        alignment = align(fixes, np.random.default_rng(_ALIGNMENT_SEED), attitude=prior)
+    except DegenerateGeometryError as error:
+        problem = str(error)
+        log.info("fixes cannot be compared with the SfM model: %s", error)
+    return _Measured(model, fixes, recorded_rotations(survey, model), prior, alignment, problem)
+
+
+def _rotation_source(measured: _Measured, config: GeolocateOptions) -> Literal["recorded", "sfm"]:
+    with_fix = measured.model.image_index()
+    both = int(np.isin([with_fix[name] for name in measured.fixes.name], measured.recorded.image).sum())
+    if config.attitude == "recorded" and both < 2:
+        raise InputError(
+            f"{both} images have a fix and an attitude, 2 are needed: use auto or sfm", field="--attitude"
+        )
+    complete = both == len(measured.fixes) or (measured.alignment is None and both >= 2)
+    return "recorded" if config.attitude == "recorded" or (config.attitude == "auto" and complete) else "sfm"
+
+
+def _warnings(measured: _Measured, source: str) -> list[str]:
+    warnings = []
+    turned = measured.recorded.contradicting
+    if turned:
+        warnings.append(
+            f"{len(turned)} attitudes contradict the SfM model and are not used: {', '.join(sorted(turned)[:8])}"
+            f"{' …' if len(turned) > 8 else ''}. Were these photographs turned in an image viewer?"
+        )
+    total, fixes, alignment = len(measured.model.image_name), measured.fixes, measured.alignment
+    if len(fixes) < total:
+        warnings.append(f"{total - len(fixes)} of {total} registered images have no fix and give no rays")
+    if alignment is None:
+        return warnings
+    rejected = [name for name, good in zip(fixes.name, alignment.solution.state.inlier, strict=True) if not good]
+    if rejected:
+        warnings.append(
+            f"{len(rejected)} of {len(fixes)} fixes contradict the SfM model and give no rays: "
+            + ", ".join(sorted(rejected)[:8])
+            + (" …" if len(rejected) > 8 else "")
+        )
+    prior = measured.prior
+    if source == "recorded" and prior is not None and not alignment.attitude_used:
+        turn = float(np.linalg.norm(log_so3(prior.rotation @ alignment.geo_from_local.rotation.T)))
+        sigma = np.hypot(np.sqrt(prior.cov_rad2[0, 0]), alignment.solution.rotation_sigma_rad)
+        if turn > 4 * sigma:
+            warnings.append(
+                f"recorded attitudes are turned by {np.degrees(turn):.1f}° against the fixes "
+                f"(σ {np.degrees(sigma):.1f}°): boresight or compass? `--attitude sfm` does without them"
+            )
+    return warnings
+
+
+def _views(measured: _Measured, source: str, sigma_px: float) -> tuple[Views, BoolArray]:
+    """All images as views (those without a fix are placeholders), and which give rays (n,)."""
+    model, fixes, alignment = measured.model, measured.fixes, measured.alignment
+    count, index = len(model.image_name), model.image_index()
+    place = np.array([index[name] for name in fixes.name])
+    center, cov = np.zeros((count, 3)), np.tile(np.eye(3), (count, 1, 1))
+    center[place], cov[place] = fixes.in_geo, fixes.cov_in_geo
+    usable = np.zeros(count, dtype=bool)
+    usable[place] = True if alignment is None else alignment.solution.state.inlier
+    sigma_ray = sigma_px / np.array([model.camera_of(image).mean_focal_px for image in range(count)])
+    rotation, sigma, common = np.tile(np.eye(3), (count, 1, 1)), np.ones(count), None
+    if source == "recorded" or alignment is None:
+        recorded = measured.recorded
+        rotation[recorded.image], sigma[recorded.image] = recorded.geo_from_cam, recorded.sigma_rad
+        usable &= np.isin(np.arange(count), recorded.image)
+    else:
+        rotation = alignment.geo_from_local.rotation @ np.swapaxes(model.rotation_cam_from_local, 1, 2)
+        # Within the model, bundle adjustment has averaged the pixel errors of a whole image.
+        sigma = sigma_ray / np.sqrt(np.maximum(np.bincount(model.obs_image, minlength=count), 1))
+        gain = np.zeros((count, 3, 3))
+        gain[place] = alignment.solution.response[:, 1:4]
+        common = CommonRotation(alignment.solution.covariance[1:4, 1:4], gain)
+    return Views(center, rotation, cov, sigma, sigma_ray, common), usable
+
+
+def _rays(model: SparseModel, usable: BoolArray) -> Rays:
+    """Rays of the usable images; a point that an image shows twice counts once, as the errors are the same."""
+    xy = observation_rays(model)
+    again = np.zeros(len(xy), dtype=bool)
+    again[1:] = (np.diff(model.obs_point) == 0) & (np.diff(model.obs_image) == 0)
+    keep = usable[model.obs_image] & np.isfinite(xy).all(axis=1) & ~again
+    return Rays(model.obs_point[keep], model.obs_image[keep], xy[keep])
+
+
+def _judge(
+    found: Intersections, rays: Rays, views: Views, config: GeolocateOptions
+) -> tuple[FloatArray, BoolArray]:
+    """σ along the worst axis (N,), and which points (N,) can be relied on."""
+    located: BoolArray = ~np.isnan(found.position_in_geo[:, 0])
+    sigma = np.full(len(located), np.nan)
+    sigma[located] = np.sqrt(np.linalg.eigvalsh(found.cov_in_geo[located])[:, 2])
+    away = np.linalg.norm(found.position_in_geo[rays.point] - views.center_in_geo[rays.view], axis=1)
+    count = np.bincount(rays.point, minlength=len(located))
+    distance = np.bincount(rays.point, away, minlength=len(located)) / np.maximum(count, 1)
+    limit = _LARGEST_RELATIVE_SIGMA * distance
+    if config.max_sigma is not None:
+        limit = np.minimum(limit, config.max_sigma)
+    wide = found.max_angle_deg >= config.min_angle
+    return sigma, found.consistent & wide & (np.nan_to_num(sigma, nan=np.inf) <= limit)
+
+
+def _values(found: Geolocation) -> dict[str, Any]:
+    points = found.points
+    good = points.inlier
+    values: dict[str, Any] = {
+        "points": len(good),
+        "inliers": int(good.sum()),
+        "rotation_source": points.rotation_source,
+    }
+    if good.any():
+        axes = np.sqrt(np.diagonal(points.cov_in_geo[good], axis1=1, axis2=2))
+        values |= {
+            "median_sigma_h_m": float(np.median(np.hypot(axes[:, 0], axes[:, 1]))),
+            "median_sigma_v_m": float(np.median(axes[:, 2])),
+            "mean_rays": float(points.ray_count[good].mean()),
+        }
+    return values

@@ -1,0 +1,1 @@
+"""ROS bags into the survey: topics, clocks, frames, photographs."""

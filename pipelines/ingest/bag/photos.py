@@ -1,0 +1,150 @@
+"""Photographs out of a bag: which frames to take, and each as a file, one at a time."""
+
+from __future__ import annotations
+
+import re
+from collections import deque
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from pipelines.core.errors import InputError
+from pipelines.core.progress import SILENT, Progress
+from pipelines.core.types import FloatArray
+from pipelines.formats.bag.images import BadImageError, ImageWriter, sharpness
+from pipelines.formats.bag.reader import Bag, UndecodableError
+from pipelines.formats.exif import PhotoTags
+from pipelines.formats.image_file import inspect_image
+from pipelines.ingest.bag.streams import Clock
+from pipelines.ingest.notes import Notes
+from pipelines.ingest.photo_folder import Photo
+
+# A frame is blurred if it is less than half as sharp as the frames around it.
+_BLURRED = 0.5
+_NEIGHBOURS = 15
+_LEAST_NEIGHBOURS = 3
+_STEP_SLACK_S = 1e-6
+
+
+@dataclass(frozen=True)
+class Every:
+    """Distance between frames, in seconds or in metres flown."""
+
+    step: float
+    unit: Literal["s", "m"]
+
+
+def parse_every(text: str) -> Every:
+    """Read `2s`, `0.5 s` or `5m`.
+
+    Raises:
+        InputError: anything else.
+    """
+    match = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*([sm])\s*", text)
+    if match is None or float(match[1]) <= 0:
+        raise InputError(f"{text!r} is neither seconds nor metres: give e.g. 2s or 5m", field="--every")
+    return Every(float(match[1]), "s" if match[2] == "s" else "m")
+
+
+@dataclass
+class _Chooser:
+    """Says which frames are due."""
+
+    every: Every | None
+    last: FloatArray | None = None  # time, or place, of the frame taken last
+
+    def due(self, time_s: float, place: FloatArray | None) -> bool:
+        if self.every is None or self.last is None:
+            return self.every is None or self.every.unit == "s" or place is not None
+        if self.every.unit == "s":
+            return bool(time_s - self.last[0] >= self.every.step - _STEP_SLACK_S)
+        return place is not None and bool(np.linalg.norm(place - self.last) >= self.every.step)
+
+    def took(self, time_s: float, place: FloatArray | None) -> None:
+        self.last = place if self.every is not None and self.every.unit == "m" else np.array([time_s])
+
+
+class _Blur:
+    """Judges sharpness against the frames looked at before, taken or not: a dull scene is not blurred for ever."""
+
+    def __init__(self) -> None:
+        self._seen: deque[float] = deque(maxlen=_NEIGHBOURS)
+
+    def blurred(self, data: bytes) -> bool:
+        value = sharpness(data)
+        usual = float(np.median(self._seen)) if len(self._seen) >= _LEAST_NEIGHBOURS else 0.0
+        self._seen.append(value)
+        return value < _BLURRED * usual
+
+
+@dataclass(frozen=True)
+class FrameOptions:
+    """Which frames to take: distance, and whether to pass over blurred ones."""
+
+    every: Every | None = None
+    skip_blurred: bool = False
+
+
+def write_photos(
+    bag: Bag,
+    topic: str,
+    clock: Clock,
+    place: FloatArray,
+    *,
+    options: FrameOptions,
+    folder: Path,
+    notes: Notes,
+    progress: Progress = SILENT,
+) -> tuple[list[Photo], list[int]]:
+    """Write the chosen frames of `topic` into `folder` as `frame_nnnnnn.jpg` or `.png`, numbered as in the bag.
+
+    Args:
+        clock: times of the topic's messages.
+        place: (N, 3) Cartesian positions at those times, NaN where unknown.
+
+    Returns:
+        The photographs, and the number of each one's message.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    writer, chooser, blur = ImageWriter(), _Chooser(options.every), _Blur()
+    photos: list[Photo] = []
+    taken: list[int] = []
+    failed: list[str] = []
+    blurred, hashes, copies = 0, set(), 0
+    with progress.task("photographs", len(clock.time_s)) as task:
+        for number, message in enumerate(bag.messages([topic])):
+            task.advance()
+            if number >= len(clock.time_s) or not clock.usable[number]:
+                continue
+            time_s = float(clock.time_s[number])
+            here = place[number] if np.isfinite(place[number]).all() else None
+            if not chooser.due(time_s, here):
+                continue
+            try:
+                data, suffix = writer.encoded(message.type, bag.decode(message))
+                name = f"frame_{number:06d}{suffix}"
+                file = inspect_image(data, Path(name))
+            except (UndecodableError, BadImageError, InputError) as error:
+                failed.append(f"message {number} ({str(error)[:120]})")
+                continue
+            if options.skip_blurred and blur.blurred(data):
+                blurred += 1
+                continue
+            if file.sha256 in hashes:
+                copies += 1
+                continue
+            hashes.add(file.sha256)
+            (folder / name).write_bytes(data)
+            photos.append(Photo(name, file, PhotoTags(timestamp_s=time_s)))
+            taken.append(number)
+            chooser.took(time_s, here)
+    notes.warn_counted(failed, f"image of {topic} was left out", f"images of {topic} were left out")
+    if blurred:
+        notes.warn(f"{blurred} frames are blurred and were passed over")
+    if copies:
+        notes.warn(f"{copies} frames are copies of earlier ones and were left out")
+    if writer.bits is not None:
+        notes.assume(f"16-bit images of {topic} have {writer.bits} bits in use, as the first one has")
+    return photos, taken

@@ -1,0 +1,112 @@
+"""The options of `georef ingest`: what it reads, and what it assumes where the files are silent."""
+
+from __future__ import annotations
+
+from pydantic import Field, field_validator
+
+from pipelines.core.options import (
+    AUTO,
+    RIG_PARAMETERS,
+    InputPath,
+    RigParameter,
+    StageOptions,
+    on_earth,
+    rig_parameters,
+    triple,
+)
+
+
+class IngestOptions(StageOptions):
+    """What `georef ingest` reads, and what it assumes where the files are silent."""
+
+    images: InputPath | None = Field(None, description="Folder of photographs.")
+    bag: InputPath | None = Field(
+        None, description="ROS bag with photographs and navigation: rosbag2 folder, .mcap, .db3 or ROS 1 .bag."
+    )
+    image_topic: str | None = Field(None, description="Topic of the photographs in the bag (default: by rule).")
+    fix_topic: str | None = Field(None, description="Topic of the positions in the bag (default: by rule).")
+    attitude_topic: str | None = Field(None, description="Topic of the attitudes in the bag (default: by rule).")
+    every: str | None = Field(
+        None, description="Take a frame of the bag every 2s, or every 5m flown (default: all)."
+    )
+    skip_blurred: bool = Field(False, description="Pass over blurred frames of the bag.")
+    origin: str | None = Field(
+        None,
+        description="Zero of a bag's local frame (odometry, poses): latitude,longitude,ellipsoidal height.",
+    )
+    time_offset: str = Field(
+        "0", description="Navigation clock minus camera clock in seconds; auto: estimate it after sfm."
+    )
+    estimate: str | None = Field(
+        None,
+        description="Estimate any of time-offset, boresight and lever-arm (with commas) after sfm, from the SfM "
+        "cameras against the recorded navigation.",
+    )
+    lever_arm: str | None = Field(
+        None,
+        description="Antenna seen from the camera in the body's axes, forward,right,down in metres (default: /tf).",
+    )
+    camera_mount: str | None = Field(
+        None,
+        description="How the camera is turned in the body, yaw,pitch,roll in degrees; 0,-90,0 looks down "
+        "(default: /tf).",
+    )
+    boresight: str = Field(
+        "0,0,0", description="Rotation vector from the true to the nominal camera axes, x,y,z in degrees."
+    )
+    trajectory: InputPath | None = Field(None, description="CSV with a header: image and/or timestamp, position …")
+    geo: InputPath | None = Field(None, description="ODM geo.txt with the image positions.")
+    gcp: InputPath | None = Field(None, description="ODM gcp_list.txt: ground control points and their marks.")
+    checkpoints: InputPath | None = Field(None, description="Check points, in the form of gcp_list.txt.")
+    check: tuple[str, ...] = Field((), description="Name of a control point to use as a check point instead.")
+    test_every: int = Field(8, ge=0, description="Hold out every N-th image for testing (0: none).")
+    crs: str | None = Field(None, description="CRS of x,y,z columns in the trajectory, e.g. EPSG:32632+5773.")
+    vertical: str | None = Field(
+        None, description="Vertical datum of the heights: ellipsoidal, EGM96, EGM2008 or EPSG:n."
+    )
+    sigma_h: float | None = Field(None, gt=0, description="Horizontal σ of every position in metres.")
+    sigma_v: float | None = Field(None, gt=0, description="Vertical σ of every position in metres.")
+    sigma_attitude: float | None = Field(None, gt=0, description="σ of the attitude in degrees.")
+    sigma_gcp_h: float = Field(0.02, gt=0, description="Horizontal σ of surveyed points in metres.")
+    sigma_gcp_v: float = Field(0.03, gt=0, description="Vertical σ of surveyed points in metres.")
+    sigma_mark: float = Field(0.5, gt=0, description="σ of an image mark in pixels.")
+    max_gap: float = Field(1.0, gt=0, description="Longest gap to interpolate over in the trajectory, in seconds.")
+    focal_px: float | None = Field(None, gt=0, description="Focal length in pixels, instead of the one from EXIF.")
+    copy_images: bool = Field(
+        False, description="Copy the photographs into the workspace.", json_schema_extra={"flag": "--copy"}
+    )
+
+    @property
+    def time_offset_s(self) -> float:
+        """Seconds; zero while it is still to be estimated."""
+        return 0.0 if self.time_offset == AUTO else float(self.time_offset)
+
+    @property
+    def wanted(self) -> tuple[RigParameter, ...]:
+        """What of the rig is to be estimated, in the usual order."""
+        asked = {*(self.estimate or "").split(","), *(["time-offset"] if self.time_offset == AUTO else [])}
+        return tuple(name for name in RIG_PARAMETERS if name in asked)
+
+    @field_validator("estimate")
+    @classmethod
+    def _are_parameters(cls, text: str | None) -> str | None:
+        return text if text is None else rig_parameters(text)
+
+    @field_validator("time_offset")
+    @classmethod
+    def _is_offset(cls, text: str) -> str:
+        if text != AUTO and not abs(float(text)) < 1e6:
+            raise ValueError("a number of seconds, or auto")
+        return text
+
+    @field_validator("lever_arm", "camera_mount", "boresight")
+    @classmethod
+    def _is_triple(cls, text: str | None) -> str | None:
+        if text is not None:
+            triple(text)
+        return text
+
+    @field_validator("origin")
+    @classmethod
+    def _is_on_earth(cls, text: str | None) -> str | None:
+        return text if text is None else on_earth(text)

@@ -1,0 +1,1 @@
+"""Every picture with axes. Sole home of matplotlib."""

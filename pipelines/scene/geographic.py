@@ -1,0 +1,136 @@
+"""The geographic half of a training, from the products of the stages before it and the options of training."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from pipelines.core.errors import InputError
+from pipelines.core.options import AUTO
+from pipelines.geometry.rotations import matrix_from_quat_xyzw
+from pipelines.geometry.similarity import moved_pivot
+from pipelines.georef.adjustment import RotationPrior
+from pipelines.georef.cameras import CameraCorrections
+from pipelines.georef.measured import ControlMarks, Measured
+from pipelines.georef.problem import GeoProblem
+from pipelines.georef.similarity import LearnableSimilarity
+from pipelines.georef.start import begin, bias_pays
+from pipelines.georef.systematic import SystematicErrors
+from pipelines.scene.geographic_options import GeographicOptions
+from pipelines.scene.geolocated import GeolocatedPoints
+from pipelines.scene.initial_similarity import InitialSimilarity
+from pipelines.scene.measurements import attitudes_of, control_marks, depth_marks, fixes_of, pairs_of
+from pipelines.scene.scene import Scene
+from pipelines.scene.survey import Survey
+
+# Fewer control points cannot tell a bias of the fixes from a blunder of their own.
+_LEAST_CONTROL = 3
+
+
+def geo_problem(
+    scene: Scene,
+    survey: Survey,
+    initial: InitialSimilarity,
+    options: GeographicOptions,
+    *,
+    points: GeolocatedPoints | None = None,
+    seed: int = 0,
+) -> GeoProblem:
+    """The similarity, the cameras and the measurements that hold them, ready to be optimised.
+
+    Args:
+        points: of `geolocate`, for L_rel; None: it takes the cameras and their fixes.
+        seed: of the choice of pairs for L_rel.
+
+    Raises:
+        InputError: a constant error is to be estimated of something that was not measured.
+    """
+    record = initial.geo_from_local
+    pivot = scene.geo_from_model.apply(scene.poses.cam_center_in_model[scene.train]).mean(axis=0)
+    covariance = moved_pivot(np.array(record.covariance), record.pivot, pivot)
+    measured = _measured(scene, survey, options, points, seed) if options.geo_loss else Measured()
+    problem = GeoProblem(
+        LearnableSimilarity(scene.geo_from_model, covariance, pivot, _attitude(scene, initial)),
+        _corrections(scene, options),
+        measured,
+        weighting=options.weighting,
+        hold_prior=_leaves_open(measured, initial),
+        errors=_errors(measured, options) if options.geo_loss else None,
+        learned_weights=options.loss_weights == "learned",
+    )
+    if len(problem.errors):
+        saved = begin(problem)
+        if options.estimate == AUTO and not bias_pays(problem, saved):
+            problem.errors = SystematicErrors()
+    return problem
+
+
+def _corrections(scene: Scene, options: GeographicOptions) -> CameraCorrections:
+    """Cameras and lens that follow the measurements, as far as they may.
+
+    Plain mean squares have nothing that holds a lens where the photographs have it: with `paper` it stays.
+    """
+    follows = options.weighting == "whitened"
+    basis = None
+    if options.optimize_cameras:
+        basis = scene.correction_basis if follows else scene.correction_basis_through_sfm_lens
+    if basis is None:
+        return CameraCorrections(scene.poses, np.zeros((len(scene.sparse.image_name), 6, 0)))
+    return CameraCorrections(scene.poses, basis.matrix, basis.lens_matrix if follows else None)
+
+
+def _attitude(scene: Scene, initial: InitialSimilarity) -> RotationPrior | None:
+    """What attitudes said of the rotation geo ← model, where the initial similarity needed them."""
+    if initial.attitude is None:
+        return None
+    geo_from_local = matrix_from_quat_xyzw(initial.attitude.quat_xyzw)
+    return RotationPrior(geo_from_local @ scene.model_from_local.rotation.T, np.array(initial.attitude.cov_rad2))
+
+
+def _leaves_open(measured: Measured, initial: InitialSimilarity) -> bool:
+    """Whether the observations leave some of the similarity to what was known of it beforehand."""
+    if initial.layout == "line":
+        return measured.attitudes is None
+    return measured.fixes is None and not _determined_by(measured.marks)
+
+
+def _determined_by(marks: ControlMarks | None) -> bool:
+    """Whether control points alone fix all seven unknowns of the similarity."""
+    return marks is not None and len(marks.position_in_geo) >= _LEAST_CONTROL
+
+
+def _measured(
+    scene: Scene, survey: Survey, options: GeographicOptions, points: GeolocatedPoints | None, seed: int
+) -> Measured:
+    fixes = fixes_of(scene, survey)
+    measured = Measured(fixes, control_marks(scene, survey) if options.gcp_loss else None)
+    if measured.marks is not None and options.gcp_mode == "depth":
+        by_depth, marks = depth_marks(scene, survey, measured.marks)
+        measured = replace(measured, marks=marks, depth_marks=by_depth)
+    if fixes is not None and options.rel_loss:
+        measured = replace(measured, pairs=pairs_of(scene, fixes, points, seed))
+    if "boresight" in options.estimated:
+        measured = replace(measured, attitudes=attitudes_of(scene, survey))
+    return measured
+
+
+def _errors(measured: Measured, options: GeographicOptions) -> SystematicErrors:
+    """The constant errors that are asked for; with `auto` the bias, wherever control points could show it."""
+    fixes, attitudes, wanted = measured.fixes, measured.attitudes, options.estimated
+    if options.estimate == AUTO:
+        possible = options.weighting == "whitened" and fixes is not None and _determined_by(measured.marks)
+        wanted = ("bias",) if possible else ()
+    for name, source, what in (
+        ("bias", fixes, "positions"),
+        ("lever-arm", fixes, "positions"),
+        ("boresight", attitudes, "attitudes"),
+    ):
+        if name in wanted and source is None:
+            raise InputError(f"{name} cannot be estimated: no {what} were recorded", field="--estimate")
+    flights = 1 if fixes is None or fixes.flight is None else int(fixes.flight.max()) + 1
+    return SystematicErrors(
+        flights if "bias" in wanted else 0,
+        arm="lever-arm" in wanted,
+        attitude_sigma_rad=None if attitudes is None else float((1.0 / attitudes.root_information).median()),
+    )

@@ -1,0 +1,90 @@
+"""The navigation as recorded, and how the cameras sit in it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.core.errors import InputError
+from pipelines.core.options import RigParameter
+from pipelines.core.products import load_npz, save_npz
+from pipelines.core.types import BoolArray, FloatArray
+
+
+@dataclass(frozen=True)
+class NavigationTrack:
+    """Product of `ingest` beside the survey: the navigation as recorded, and how n cameras sit in it.
+
+    What `calibrate` fits the SfM cameras to. Positions are the antenna's, attitudes the body's
+    (forward-right-down), both on the navigation's clock; nothing of the rig is applied to them. What is said of the
+    rig is what `ingest` was told.
+
+    Attributes:
+        position_time_s: (K,) float64, seconds.
+        antenna_in_geo: (K, 3) float64, metres.
+        sigma_m: (K, 3) float64, σ east, north, up; NaN where the receiver states none.
+        attitude_time_s: (M,) float64, seconds.
+        geo_from_body: (M, 3, 3) float64.
+        image: (n,) names of images.
+        image_time_s: (n,) float64, camera clock.
+        cam_from_body: (n, 3, 3) float64, mount; NaN where unknown.
+        antenna_in_body: (n, 3) float64, lever arm; NaN where unknown.
+        nominal_from_cam: (3, 3) float64, boresight.
+        time_offset_s: () float64, navigation clock minus camera clock.
+        max_gap_s: () float64, longest gap to interpolate over.
+        body_known: () bool; where not, the camera's nominal axes stand for the body's.
+    """
+
+    position_time_s: FloatArray
+    antenna_in_geo: FloatArray
+    sigma_m: FloatArray
+    attitude_time_s: FloatArray
+    geo_from_body: FloatArray
+    image: NDArray[np.str_]
+    image_time_s: FloatArray
+    cam_from_body: FloatArray
+    antenna_in_body: FloatArray
+    nominal_from_cam: FloatArray
+    time_offset_s: FloatArray
+    max_gap_s: FloatArray
+    body_known: BoolArray
+
+    def save(self, path: Path) -> None:
+        """Write as NPZ."""
+        save_npz(path, {field.name: getattr(self, field.name) for field in fields(self)})
+
+    @classmethod
+    def load(cls, path: Path) -> NavigationTrack:
+        """Read from NPZ.
+
+        Raises:
+            InputError: not an NPZ file of that form.
+        """
+        return cls(**load_npz(path, tuple(field.name for field in fields(cls))))
+
+
+def require_estimable(track: NavigationTrack | None, wanted: Sequence[RigParameter], field: str) -> None:
+    """See whether there is what estimates of the rig are made from.
+
+    Raises:
+        InputError: navigation that was not recorded by time, no attitudes, no mount.
+    """
+    if track is None or len(track.position_time_s) < 2:
+        raise InputError(
+            "needs the navigation recorded by time: a --bag, or a --trajectory without a column of images",
+            field=field,
+        )
+    turned = len(track.attitude_time_s) > 1
+    if "lever-arm" in wanted and not turned:
+        raise InputError("lever-arm needs attitudes, which were not recorded", field=field)
+    if "lever-arm" in wanted and not track.body_known:
+        raise InputError("lever-arm needs the body's axes: give --camera-mount YAW,PITCH,ROLL", field=field)
+    mounted = bool(np.isfinite(track.cam_from_body).all(axis=(1, 2)).any())
+    if "boresight" in wanted and not (turned and mounted):
+        raise InputError(
+            "boresight needs recorded attitudes and the camera's mount (/tf or --camera-mount)", field=field
+        )

@@ -1,0 +1,162 @@
+"""What a survey measured of an SfM model, as arrays: fixes, control points, attitudes and rays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipelines.core.types import FloatArray, IntArray
+from pipelines.geometry.cameras import undistort
+from pipelines.geometry.rays import Rays, Views, intersect
+from pipelines.geometry.rotations import log_so3, matrix_from_quat_xyzw
+from pipelines.geometry.sparse_model import SparseModel
+from pipelines.georef.adjustment import Correspondences, RotationPrior
+from pipelines.georef.alignment import mean_rotation
+from pipelines.scene.survey import Mark, Survey, SurveyedPoint
+
+_CONTRADICTION_SIGMAS = 6.0
+_CONTRADICTION_RAD = np.radians(15.0)  # never less: σ of an attitude are often optimistic
+_TINY = 1e-9  # stands for "exact" where a covariance must be regular
+
+
+@dataclass(frozen=True)
+class RecordedRotations:
+    """Recorded attitudes of k registered images.
+
+    Attributes:
+        image: (k,) index into the model's images.
+        geo_from_cam: (k, 3, 3).
+        sigma_rad: (k,) per axis.
+        contradicting: names of further images, whose attitudes the SfM model contradicts.
+    """
+
+    image: IntArray
+    geo_from_cam: FloatArray
+    sigma_rad: FloatArray
+    contradicting: tuple[str, ...] = ()
+
+
+def fix_correspondences(survey: Survey, model: SparseModel) -> Correspondences:
+    """Camera centres of registered images against their fixes.
+
+    SfM's own error of a centre is not known here (zero covariance): the adjustment measures it as excess scatter.
+    """
+    fixes = {image.name: image.fix for image in survey.images if image.fix is not None}
+    found = [(index, name) for index, name in enumerate(model.image_name) if name in fixes]
+    return Correspondences(
+        name=tuple(name for _, name in found),
+        control=np.zeros(len(found), dtype=bool),
+        in_local=model.cam_center_in_local[[index for index, _ in found]].reshape(-1, 3),
+        cov_in_local=np.zeros((len(found), 3, 3)),
+        in_geo=np.array([fixes[name].position_in_geo for _, name in found]).reshape(-1, 3),
+        cov_in_geo=np.array([fixes[name].cov_in_geo for _, name in found]).reshape(-1, 3, 3),
+    )
+
+
+def control_correspondences(survey: Survey, model: SparseModel) -> tuple[Correspondences, tuple[str, ...]]:
+    """Control points intersected in local from their marks, against their survey; and warnings.
+
+    Points that their marks do not determine are left out, with a warning each. The covariance is that of the marks
+    alone: the model's own error is not known here, the adjustment measures it as excess scatter.
+    """
+    index = model.image_index()
+    points, warnings = [], []
+    for point in survey.control_points:
+        marks = [mark for mark in point.marks if mark.image in index]
+        if len({mark.image for mark in marks}) < 2:
+            warnings.append(f"control point {point.name}: marked in fewer than 2 registered images, not used")
+        else:
+            points.append((point, marks))
+    position, cov, good = _intersect_marks(model, [marks for _, marks in points])
+    kept: list[SurveyedPoint] = []
+    for (point, marks), fine in zip(points, good, strict=True):
+        if fine:
+            kept.append(point)
+        else:
+            warnings.append(
+                f"control point {point.name}: its {len(marks)} marks do not meet in one point, not used; "
+                "check the marks"
+            )
+    return Correspondences(
+        name=tuple(point.name for point in kept),
+        control=np.ones(len(kept), dtype=bool),
+        in_local=position[good],
+        cov_in_local=cov[good],
+        in_geo=np.array([point.position_in_geo for point in kept]).reshape(-1, 3),
+        cov_in_geo=np.array([point.cov_in_geo for point in kept]).reshape(-1, 3, 3),
+    ), tuple(warnings)
+
+
+def _intersect_marks(model: SparseModel, marks: list[list[Mark]]) -> tuple[FloatArray, FloatArray, np.ndarray]:
+    """Position (K, 3), covariance (K, 3, 3) and success (K,) of points in local from their marks."""
+    if not marks:
+        return np.empty((0, 3)), np.empty((0, 3, 3)), np.empty(0, dtype=bool)
+    index = model.image_index()
+    owner = np.repeat(np.arange(len(marks)), [len(each) for each in marks])
+    flat = [mark for each in marks for mark in each]
+    image = np.array([index[mark.image] for mark in flat])
+    cameras = [model.camera_of(each) for each in image]
+    xy = np.array([undistort(camera, (mark.x_px, mark.y_px)) for camera, mark in zip(cameras, flat, strict=True)])
+    sigma_px = np.array([mark.sigma_px for mark in flat])
+    # Whether marks agree is judged with the model's own error added, as a lens is never modelled to 0.1 px.
+    own_px = float(np.nanmedian(model.point_error_px)) if np.isfinite(model.point_error_px).any() else 0.0
+    focal = np.array([camera.mean_focal_px for camera in cameras])
+    center = model.cam_center_in_local
+    extent = float(np.ptp(center, axis=0).max())
+    # One view for each mark, since marks of one image may have different σ.
+    views = Views(
+        center_in_geo=center[image],
+        rotation_geo_from_cam=np.swapaxes(model.rotation_cam_from_local[image], 1, 2),
+        cov_center_in_geo=np.tile(np.eye(3) * (_TINY * extent) ** 2, (len(flat), 1, 1)),
+        sigma_attitude_rad=np.full(len(flat), _TINY),
+        sigma_ray=np.hypot(sigma_px, own_px) / focal,
+    )
+    seen = np.isfinite(xy).all(axis=1)
+    found = intersect(Rays(owner[seen], np.flatnonzero(seen), xy[seen]), views, len(marks))
+    of_marks = np.bincount(owner, sigma_px**2) / np.bincount(owner, sigma_px**2 + own_px**2)
+    return found.position_in_geo, found.cov_in_geo * of_marks[:, None, None], found.consistent
+
+
+def recorded_rotations(survey: Survey, model: SparseModel) -> RecordedRotations:
+    """Attitudes of the registered images that have one, as far as the SfM model bears them out.
+
+    A photograph that was turned in an image viewer keeps the attitude that the drone wrote: it contradicts the
+    others by far more than its σ.
+    """
+    attitudes = {image.name: image.attitude for image in survey.images if image.attitude is not None}
+    image = np.array([index for index, name in enumerate(model.image_name) if name in attitudes], dtype=np.int64)
+    found = [attitudes[model.image_name[index]] for index in image]
+    rotation = matrix_from_quat_xyzw(np.array([each.quat_xyzw for each in found]).reshape(-1, 4))
+    sigma_rad = np.radians([each.sigma_deg for each in found])
+    agrees = np.ones(len(image), dtype=bool)
+    if len(image) > 2:
+        geo_from_local = rotation @ model.rotation_cam_from_local[image]
+        mean = mean_rotation(geo_from_local, sigma_rad).rotation
+        turn = np.linalg.norm(log_so3(geo_from_local @ mean.T), axis=1)
+        agrees = turn < np.maximum(_CONTRADICTION_SIGMAS * sigma_rad, _CONTRADICTION_RAD)
+    return RecordedRotations(
+        image=image[agrees],
+        geo_from_cam=rotation[agrees],
+        sigma_rad=sigma_rad[agrees],
+        contradicting=tuple(model.image_name[index] for index in image[~agrees]),
+    )
+
+
+def attitude_prior(survey: Survey, model: SparseModel) -> RotationPrior | None:
+    """Rotation geo ← local that the recorded attitudes say, or None without any."""
+    recorded = recorded_rotations(survey, model)
+    if len(recorded.image) == 0:
+        return None
+    geo_from_local = recorded.geo_from_cam @ model.rotation_cam_from_local[recorded.image]
+    return mean_rotation(geo_from_local, recorded.sigma_rad)
+
+
+def observation_rays(model: SparseModel) -> FloatArray:
+    """Undistorted x/z and y/z (M, 2) of all observations; NaN where the lens model maps no ray."""
+    xy = np.empty_like(model.obs_xy_px)
+    camera_id = model.image_camera_id[model.obs_image]
+    for each in np.unique(camera_id):
+        mine = camera_id == each
+        xy[mine] = undistort(model.cameras[int(each)], model.obs_xy_px[mine])
+    return xy

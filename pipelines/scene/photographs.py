@@ -1,0 +1,191 @@
+"""Undistorted photographs at training size, cached as plain arrays on disk and mapped into memory on use."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.core.errors import InputError
+from pipelines.core.progress import SILENT, Progress
+from pipelines.core.types import BoolArray, ByteArray, Float32Array
+from pipelines.geometry.cameras import Camera, Pinhole, distort, undistort
+
+log = logging.getLogger(__name__)
+
+# A pixel that needs light from beyond the photograph's edge is not compared.
+_EDGE_PX = 0.5
+_SAME_RAY = 1e-6  # of normalised coordinates
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """A photograph to undistort: its name, file, and camera at full size."""
+
+    name: str
+    file: Path
+    camera: Camera
+
+
+def pinhole_of(camera: Camera, max_size_px: int) -> Pinhole:
+    """The pinhole camera of the same view at a size of at most `max_size_px` along the longer side.
+
+    The focal length is kept; distortion parameters are dropped.
+    """
+    return Pinhole(camera.width, camera.height, *_focal_and_centre(camera)).limited(max_size_px)
+
+
+def _focal_and_centre(camera: Camera) -> tuple[float, float, float, float]:
+    p = camera.params
+    one_focal = camera.model.startswith("SIMPLE") or camera.model.startswith("RADIAL")
+    return (p[0], p[0], p[1], p[2]) if one_focal else (p[0], p[1], p[2], p[3])
+
+
+class ImageCache:
+    """Undistorted images on disk: uint8 RGB arrays, made once, mapped when asked for.
+
+    Memory does not grow with their number: of the distortion maps only the last is kept, and masks, one a camera,
+    lie on disk beside the images.
+
+    Args:
+        folder: where the arrays are kept.
+        photographs: what to undistort.
+        max_size_px: longest side.
+    """
+
+    def __init__(self, folder: Path, photographs: list[Photograph], max_size_px: int) -> None:
+        self._folder = folder
+        self._photographs = photographs
+        self.max_size_px = max_size_px
+        self._last_map: tuple[str, Float32Array, BoolArray] | None = None
+
+    def __len__(self) -> int:
+        return len(self._photographs)
+
+    def pinhole(self, index: int) -> Pinhole:
+        """Camera of an undistorted image."""
+        return pinhole_of(self._photographs[index].camera, self.max_size_px)
+
+    def build(self, progress: Progress = SILENT) -> None:
+        """Make what is not there yet.
+
+        Raises:
+            InputError: a photograph cannot be read, or has another size than its camera.
+        """
+        with progress.task("undistorting", len(self)) as task:
+            for index in range(len(self)):
+                if not self._path(index).exists():
+                    self._write(index)
+                task.advance()
+
+    def image(self, index: int) -> ByteArray:
+        """RGB of an image: (H, W, 3), mapped from disk; made if it is not there or not whole.
+
+        Raises:
+            InputError: as `build`.
+        """
+        path = self._path(index)
+        if not path.exists():
+            self._write(index)
+        try:
+            return self._open(path)
+        except (ValueError, EOFError):  # cut off, by a full disk or a power failure
+            log.warning("%s is damaged and made again", path)
+            self._write(index)
+            return self._open(path)
+
+    def mask(self, index: int) -> BoolArray:
+        """Pixels that the photograph covers: (H, W), mapped from disk."""
+        path = self._folder / f"{self.mask_key(index)}.mask.npy"
+        if not path.exists():
+            save_array(path, self._map(index)[1])
+        array: BoolArray = np.load(path, mmap_mode="r", allow_pickle=False)
+        return array
+
+    def mask_key(self, index: int) -> str:
+        """The same for photographs of the same camera, whose masks are the same."""
+        camera = self._photographs[index].camera
+        key = f"{camera.model}|{camera.width}x{camera.height}|{camera.params.tobytes().hex()}|{self.max_size_px}"
+        return hashlib.sha256(key.encode()).hexdigest()[:32]
+
+    @staticmethod
+    def _open(path: Path) -> ByteArray:
+        array: ByteArray = np.load(path, mmap_mode="r", allow_pickle=False)
+        return array
+
+    def _path(self, index: int) -> Path:
+        return self._folder / f"{self.key(index)}.npy"
+
+    def key(self, index: int) -> str:
+        """Changes with all that an undistorted image depends on.
+
+        Raises:
+            InputError: the photograph is gone.
+        """
+        photograph = self._photographs[index]
+        try:
+            stat = photograph.file.stat()
+        except OSError as error:
+            message = f"the photograph cannot be read ({error.strerror}): put it back, or run `georef ingest` again"
+            raise InputError(message, path=photograph.file) from error
+        camera = photograph.camera
+        key = (
+            f"{photograph.name}|{stat.st_size}|{stat.st_mtime_ns}|{camera.model}|{camera.width}x{camera.height}|"
+            f"{camera.params.tobytes().hex()}|{self.max_size_px}"
+        )
+        return hashlib.sha256(key.encode()).hexdigest()[:32]
+
+    def _write(self, index: int) -> None:
+        photograph, pinhole = self._photographs[index], self.pinhole(index)
+        # COLMAP does not turn images by their EXIF orientation, so neither do we.
+        full = cv2.imread(str(photograph.file), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        if full is None:
+            raise InputError("the photograph cannot be read", path=photograph.file)
+        if (full.shape[1], full.shape[0]) != (photograph.camera.width, photograph.camera.height):
+            raise InputError(
+                f"the photograph is {full.shape[1]}×{full.shape[0]}, its camera "
+                f"{photograph.camera.width}×{photograph.camera.height}",
+                path=photograph.file,
+            )
+        small = cv2.resize(full, (pinhole.width, pinhole.height), interpolation=cv2.INTER_AREA)
+        source, _ = self._map(index)
+        flat = cv2.remap(small, source[..., 0], source[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+        save_array(self._path(index), np.ascontiguousarray(flat[..., ::-1]))
+
+    def _map(self, index: int) -> tuple[Float32Array, BoolArray]:
+        """Where each undistorted pixel lies in the shrunken photograph, and whether it lies inside."""
+        key = self.mask_key(index)
+        if self._last_map is None or self._last_map[0] != key:
+            self._last_map = (key, *_distortion_map(self._photographs[index].camera, self.pinhole(index)))
+        return self._last_map[1:]
+
+
+def save_array(path: Path, array: NDArray[Any]) -> None:
+    """Write an array; it appears whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draft = path.with_suffix(".tmp")
+    with draft.open("wb") as handle:
+        np.save(handle, array, allow_pickle=False)
+    draft.rename(path)
+
+
+def _distortion_map(camera: Camera, pinhole: Pinhole) -> tuple[Float32Array, BoolArray]:
+    u, v = np.meshgrid(np.arange(pinhole.width) + 0.5, np.arange(pinhole.height) + 0.5)
+    ray = np.stack([(u - pinhole.cx) / pinhole.fx, (v - pinhole.cy) / pinhole.fy], axis=-1)
+    full = distort(camera, ray)
+    # Beyond its fold a lens polynomial leads back into the picture, to a place that another ray shows.
+    with np.errstate(invalid="ignore"):
+        own = (np.abs(undistort(camera, full) - ray) < _SAME_RAY).all(axis=-1)
+    size = np.array([pinhole.width / camera.width, pinhole.height / camera.height])
+    small = full * size
+    limit = np.array([pinhole.width, pinhole.height]) - _EDGE_PX
+    inside = own & ((small >= _EDGE_PX) & (small <= limit)).all(axis=-1)
+    # cv2 counts from the centre of the first pixel, and takes long to reflect what lies far outside.
+    source = np.clip(np.nan_to_num(small - 0.5), -limit, 2 * limit)
+    return source.astype(np.float32), inside

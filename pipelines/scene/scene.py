@@ -1,0 +1,133 @@
+"""The scene as training and evaluation see it: cameras, points and photographs in the frame `model`.
+
+`model` has the axes and the metre of `geo`, and an origin near the scene, so that float32 holds it to fractions of
+a millimetre. Its relation to the SfM frame, `model_from_local`, is fixed when training starts; its relation to the
+Earth, `geo_from_model`, is what training refines.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from pipelines.core.errors import DegenerateGeometryError, InputError
+from pipelines.core.stages import SPARSE
+from pipelines.core.types import FloatArray, IntArray
+from pipelines.core.workspace import Workspace
+from pipelines.geometry.bundle import CorrectionBasis, Network, correction_basis
+from pipelines.geometry.similarity import Similarity
+from pipelines.geometry.sparse_model import SparseModel
+from pipelines.georef.cameras import CameraPoses
+from pipelines.scene.initial_similarity import InitialSimilarity
+from pipelines.scene.photographs import ImageCache, Photograph
+from pipelines.scene.survey import Survey
+
+# Beyond this the dense normal matrix of the cameras no longer fits a laptop.
+_MOST_CORRECTED_CAMERAS = 1200
+
+
+@dataclass(frozen=True)
+class Scene:
+    """n registered cameras and N points in `model`.
+
+    Attributes:
+        sparse: the SfM model (frame `local`).
+        model_from_local: fixed.
+        geo_from_model: initial estimate; a pure shift.
+        train, test: indices of the cameras in each split.
+    """
+
+    sparse: SparseModel
+    model_from_local: Similarity
+    geo_from_model: Similarity
+    train: IntArray
+    test: IntArray
+
+    @cached_property
+    def poses(self) -> CameraPoses:
+        """The cameras as SfM left them."""
+        turn = self.model_from_local.rotation
+        return CameraPoses(
+            self.sparse.rotation_cam_from_local @ turn.T,
+            self.model_from_local.apply(self.sparse.cam_center_in_local),
+        )
+
+    @cached_property
+    def point_in_model(self) -> FloatArray:
+        """SfM points (N, 3) in metres."""
+        return self.model_from_local.apply(self.sparse.point_in_local)
+
+    @cached_property
+    def network(self) -> Network:
+        """Cameras, points and image observations as SfM left them, in `model`."""
+        sparse, poses = self.sparse, self.poses
+        return Network(
+            sparse.cameras,
+            sparse.image_camera_id,
+            poses.cam_from_model,
+            poses.cam_center_in_model,
+            self.point_in_model,
+            sparse.obs_point,
+            sparse.obs_image,
+            sparse.obs_xy_px,
+        )
+
+    @cached_property
+    def correction_basis(self) -> CorrectionBasis | None:
+        """What the image observations know of the cameras; None where there are too many of them."""
+        return self._basis(lens_follows=True)
+
+    @cached_property
+    def correction_basis_through_sfm_lens(self) -> CorrectionBasis | None:
+        """The same for cameras that move while the lens stays."""
+        return self._basis(lens_follows=False)
+
+    def _basis(self, lens_follows: bool) -> CorrectionBasis | None:
+        if len(self.sparse.image_name) > _MOST_CORRECTED_CAMERAS:
+            return None
+        return correction_basis(self.network, lens_follows=lens_follows)
+
+
+def make_scene(sparse: SparseModel, survey: Survey, model_from_local: Similarity, shift: FloatArray) -> Scene:
+    """Put a sparse model into the frame `model`, whose origin lies at `shift` (3,) in `geo`.
+
+    Raises:
+        DegenerateGeometryError: fewer than two registered training images.
+    """
+    index = sparse.image_index()
+    train = np.array([index[name] for name in survey.names("train") if name in index], dtype=np.int64)
+    test = np.array([index[name] for name in survey.names("test") if name in index], dtype=np.int64)
+    if len(train) < 2:
+        raise DegenerateGeometryError(f"{len(train)} registered training images are too few to train on")
+    return Scene(sparse, model_from_local, Similarity(translation=shift), train, test)
+
+
+def initial_scene(sparse: SparseModel, survey: Survey, initial: InitialSimilarity) -> Scene:
+    """The scene at the start of training: origin of `model` at the median SfM point, rounded to a metre."""
+    geo_from_local = Similarity.from_record(initial.geo_from_local)
+    shift = np.round(np.median(geo_from_local.apply(sparse.point_in_local), axis=0))
+    model_from_local = replace(geo_from_local, translation=geo_from_local.translation - shift)
+    return make_scene(sparse, survey, model_from_local, shift)
+
+
+def photographs(sparse: SparseModel, survey: Survey, workspace: Workspace, max_size_px: int) -> ImageCache:
+    """The registered photographs, undistorted to a longest side of `max_size_px`, cached in the workspace.
+
+    Raises:
+        InputError: an image of the model is not in the survey.
+    """
+    known = {image.name for image in survey.images}
+    foreign = [name for name in sparse.image_name if name not in known]
+    if foreign:
+        raise InputError(
+            f"{len(foreign)} images are not in the survey, the first is {foreign[0]!r}: take the model over with "
+            "`georef sfm --import`, which leaves them out",
+            path=workspace.root / SPARSE,
+        )
+    folder = workspace.photographs(survey.image_dir)
+    shots = [
+        Photograph(name, folder / name, sparse.camera_of(index)) for index, name in enumerate(sparse.image_name)
+    ]
+    return ImageCache(workspace.cache / "undistorted", shots, max_size_px)

@@ -1,0 +1,1 @@
+"""Stage `sfm`: cameras and points with COLMAP; and the adjustment with position priors, `compare`'s baseline."""

@@ -1,0 +1,38 @@
+"""The options of `georef sfm`, and of the adjustment with position priors."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from pipelines.core.options import InputPath, StageOptions
+
+
+class SfmOptions(StageOptions):
+    """Structure from motion with COLMAP."""
+
+    mapper: Literal["incremental", "global"] = Field("incremental", description="Mapper.")
+    camera_model: Literal["SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"] = Field(
+        "OPENCV", description="COLMAP camera model to estimate."
+    )
+    principal_point: bool = Field(True, description="Estimate the principal point, from 10 images on.")
+    pairs: Literal["auto", "exhaustive"] = Field(
+        "auto", description="Image pairs to match: from positions and view directions, or all."
+    )
+    max_neighbors: int = Field(16, ge=2, description="Neighbours that an image is matched with at the most.")
+    max_image_size: int = Field(1200, ge=128, description="Longest image side for features, in pixels.")
+    max_features: int = Field(5000, ge=200, description="Features an image at the most.")
+    import_model: InputPath | None = Field(
+        None,
+        description="Use this COLMAP model instead of reconstructing.",
+        json_schema_extra={"flag": "--import"},
+    )
+    threads: int = Field(-1, ge=-1, description="Threads (-1: all cores).")
+    seed: int = Field(0, ge=0, description="Seed of every random choice.")
+
+
+class AdjustOptions(StageOptions):
+    """Bundle adjustment with the fixes as priors, the baseline of `georef compare`."""
+
+    seed: int = Field(0, ge=0, description="Seed of every random choice.")

@@ -1,0 +1,74 @@
+"""Which images are worth matching, from where they were taken and where they look."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from pipelines.core.types import BoolArray, FloatArray, IntArray
+
+# SIFT matches fade out between views that differ by more than this.
+_MAX_ANGLE_DEG = 60.0
+_SECTORS = 8
+_CANDIDATES_PER_NEIGHBOR = 8
+
+
+@dataclass(frozen=True)
+class Views:
+    """Where N images were taken.
+
+    Attributes:
+        position_in_geo: (N, 3) metres, NaN where unknown.
+        axis_in_geo: (N, 3) unit vectors of the optical axes, NaN where unknown.
+    """
+
+    position_in_geo: FloatArray
+    axis_in_geo: FloatArray
+
+
+def all_pairs(count: int) -> IntArray:
+    """Every pair (i < j) of `count` images: (P, 2)."""
+    return np.stack(np.triu_indices(count, k=1), axis=1)
+
+
+def select_pairs(views: Views, max_neighbors: int) -> IntArray:
+    """Pairs (i < j) of images that may see the same place: (P, 2), sorted, unique.
+
+    Half of an image's neighbours are the nearest that look the same way; the others are the nearest in each of
+    eight directions, so that flight lines with a dense forward overlap are still tied to the lines beside them.
+    Images without a position are paired with all others, and each image with its successor in the list.
+    """
+    position = views.position_in_geo
+    count = len(position)
+    known = np.flatnonzero(np.isfinite(position).all(axis=1))
+    chosen = {(i, i + 1) for i in range(count - 1)}
+    for i in map(int, np.flatnonzero(~np.isfinite(position).all(axis=1))):
+        chosen.update((min(i, j), max(i, j)) for j in range(count) if j != i)
+    if len(known) > 1:
+        tree = cKDTree(position[known])
+        reach = min(len(known), max_neighbors * _CANDIDATES_PER_NEIGHBOR + 1)
+        for i in map(int, known):
+            near = known[tree.query(position[i], k=reach)[1]]
+            near = near[(near != i) & _look_alike(views.axis_in_geo, i, near)]
+            for j in _spread(position[near] - position[i], max_neighbors):
+                chosen.add((min(i, int(near[j])), max(i, int(near[j]))))
+    return np.array(sorted(chosen), dtype=np.int64).reshape(-1, 2)
+
+
+def _look_alike(axis: FloatArray, i: int, others: IntArray) -> BoolArray:
+    cosine = axis[others] @ axis[i]
+    return ~(cosine < np.cos(np.radians(_MAX_ANGLE_DEG)))  # unknown (NaN) passes
+
+
+def _spread(offset: FloatArray, limit: int) -> list[int]:
+    """Of candidates sorted by distance: the nearest half, then round the compass, nearest first."""
+    order = list(range(min(len(offset), limit // 2)))
+    sector = (np.arctan2(offset[:, 1], offset[:, 0]) // (2 * np.pi / _SECTORS)).astype(int)
+    rank = np.zeros(len(offset), dtype=int)
+    for value in np.unique(sector):
+        members = np.flatnonzero(sector == value)
+        rank[members] = np.arange(len(members))
+    rest = [int(j) for j in np.lexsort((np.arange(len(offset)), rank)) if j >= len(order)]
+    return order + rest[: limit - len(order)]

@@ -1,0 +1,157 @@
+"""Bundle adjustment with the fixes as priors of the camera positions: the usual way to a georeferenced model.
+
+Reads `ingest/survey.json` and `sfm/sparse`; writes `adjust/sparse`, the same model adjusted in the frame `geo`, and
+`adjust/geo_from_local.json`, which says so: the identity, with the covariance that the fixes leave it. This is the
+baseline "SfM-BBA" of GeoRefGS (doi 10.3390/drones10030195), and what COLMAP's `pose_prior_mapper` does at its end:
+image observations of σ = 1 px, fixes with their covariances under Cauchy's kernel. Control points do not enter.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from pipelines.core.errors import ConvergenceError, DegenerateGeometryError
+from pipelines.core.products import load_json, save_json
+from pipelines.core.stages import SPARSE, SURVEY
+from pipelines.core.types import FloatArray
+from pipelines.core.workspace import StageRun, Summary
+from pipelines.formats.colmap import load_reconstruction, pycolmap_module, quiet_colmap, read_sparse
+from pipelines.geometry.similarity import Similarity
+from pipelines.geometry.sparse_model import SparseModel
+from pipelines.georef.alignment import Alignment, align
+from pipelines.robust.statistics import residual_stats
+from pipelines.scene.initial_similarity import InitialSimilarity
+from pipelines.scene.observations import attitude_prior, fix_correspondences
+from pipelines.scene.survey import Fix, Survey
+from pipelines.sfm.options import AdjustOptions
+
+_PRIOR_SCALE = 2.7955  # of Cauchy's kernel: root of the 95 % point of χ² with 3 degrees of freedom
+_MOST_ITERATIONS = 100
+# COLMAP lays the model on the fixes before it adjusts. It may take for inliers what is so many times further off
+# than the inliers of our own alignment: too tight a limit would leave it with no start.
+_ALIGNMENT_SLACK = 3.0
+
+
+def run(stage: StageRun, config: AdjustOptions) -> Summary:
+    """Adjust the workspace's model and write it.
+
+    Raises:
+        GeorefError: unreadable products, or one of `adjust_to_fixes`.
+    """
+    survey = load_json(Survey, stage.workspace.path(SURVEY))
+    path, sparse = stage.workspace.path(SPARSE), stage.out / "sparse"
+    alignment = _aligned(read_sparse(path), survey, config.seed)
+    model = load_reconstruction(path)
+    with quiet_colmap(), stage.progress.task("adjustment", 1) as task:
+        adjust_to_fixes(model, survey, alignment, config.seed)
+        task.advance()
+    sparse.mkdir()
+    model.write_binary(str(sparse))
+    names = tuple(image.name for image, _ in _located(model, survey))
+    found = _placed(_aligned(read_sparse(sparse), survey, config.seed), names, _residuals(model, survey))
+    save_json(found, stage.out / "geo_from_local.json")
+    fixes = found.residuals["gnss"]
+    values = {"residuals": fixes.model_dump(), "reprojection_error_px": model.compute_mean_reprojection_error()}
+    return Summary(f"{fixes.rmse_3d_m:.3f} m RMS from {fixes.count} fixes", values)
+
+
+def adjust_to_fixes(model: Any, survey: Survey, alignment: Alignment, seed: int = 0) -> None:
+    """Adjust a `pycolmap.Reconstruction` in place: cameras, lenses and points, in `geo` from here on.
+
+    Args:
+        alignment: of the model with the fixes; says how far off fixes may be.
+
+    Raises:
+        DegenerateGeometryError: fixes on one line, on which positions alone cannot hold a model.
+        ConvergenceError: COLMAP found no solution.
+    """
+    if alignment.layout == "line":
+        raise DegenerateGeometryError(
+            "the fixes lie on one line: a bundle adjustment that knows positions only can turn the model about it"
+        )
+    colmap = pycolmap_module()
+    bundle = colmap.BundleAdjustmentConfig()
+    for image_id in model.reg_image_ids():
+        bundle.add_image(image_id)
+    priors = [_prior(colmap, image, fix) for image, fix in _located(model, survey)]
+    options = _prior_options(colmap, alignment, seed)
+    adjuster = colmap.create_pose_prior_bundle_adjuster(_image_options(colmap), options, bundle, priors, model)
+    summary = adjuster.solve()
+    if not summary.is_solution_usable():
+        raise ConvergenceError(f"the bundle adjustment found no solution: {summary.brief_report()}")
+    # Where COLMAP cannot lay the model on the fixes, it adjusts without them and says so in its log only.
+    limit_m = options.alignment_ransac.max_error
+    if np.median(np.linalg.norm(_residuals(model, survey), axis=1)) > limit_m:
+        raise ConvergenceError(f"the bundle adjustment left most cameras more than {limit_m:.2f} m off their fixes")
+    model.update_point_3d_errors()
+
+
+def _aligned(model: SparseModel, survey: Survey, seed: int) -> Alignment:
+    """The similarity between a model and the fixes."""
+    data = fix_correspondences(survey, model)
+    return align(data, np.random.default_rng(seed), attitude=attitude_prior(survey, model))
+
+
+def _placed(alignment: Alignment, names: tuple[str, ...], residual: FloatArray) -> InitialSimilarity:
+    """The identity: at its minimum the adjustment has no similarity left to gain.
+
+    Args:
+        alignment: of the adjusted model; its covariance is that of the identity too.
+        names: of the F images with a fix.
+        residual: (F, 3) of their cameras.
+    """
+    solution = alignment.solution
+    inlier = solution.state.inlier
+    return InitialSimilarity(
+        geo_from_local=Similarity().to_record("local", "geo", covariance=solution.covariance, pivot=solution.pivot),
+        method="adjusted",
+        correspondences={"gnss": len(inlier), "gcp": 0, "points": 0},
+        inliers={"gnss": int(inlier.sum()), "gcp": 0, "points": 0},
+        gnss_outliers=tuple(name for name, good in zip(names, inlier, strict=True) if not good),
+        residuals={"gnss": residual_stats(residual)},
+        condition_number=solution.condition_number,
+        layout=alignment.layout,
+        attitude_used=False,
+    )
+
+
+def _located(model: Any, survey: Survey) -> list[tuple[Any, Fix]]:
+    """Registered images that have a fix."""
+    fixes = {image.name: image.fix for image in survey.images if image.fix is not None}
+    images = (model.images[image_id] for image_id in sorted(model.reg_image_ids()))
+    return [(image, fixes[image.name]) for image in images if image.name in fixes]
+
+
+def _residuals(model: Any, survey: Survey) -> FloatArray:
+    """Camera centres less fixes (F, 3), once the model is in `geo`."""
+    rows = [image.projection_center() - np.array(fix.position_in_geo) for image, fix in _located(model, survey)]
+    return np.array(rows).reshape(-1, 3)
+
+
+def _image_options(colmap: Any) -> Any:
+    options = colmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.ceres.solver_options.max_num_iterations = _MOST_ITERATIONS
+    return options
+
+
+def _prior_options(colmap: Any, alignment: Alignment, seed: int) -> Any:
+    options = colmap.PosePriorBundleAdjustmentOptions()
+    options.ceres.prior_position_loss_function_type = colmap.LossFunctionType.CAUCHY
+    options.ceres.prior_position_loss_scale = _PRIOR_SCALE
+    solution = alignment.solution
+    furthest = np.linalg.norm(solution.residual[solution.state.inlier], axis=1).max()
+    options.alignment_ransac.max_error = float(_ALIGNMENT_SLACK * max(furthest, 1e-3))
+    options.alignment_ransac.random_seed = seed
+    return options
+
+
+def _prior(colmap: Any, image: Any, fix: Fix) -> Any:
+    return colmap.PosePrior(
+        corr_data_id=image.data_id,
+        position=np.array(fix.position_in_geo),
+        position_covariance=np.array(fix.cov_in_geo),
+        coordinate_system=colmap.PosePriorCoordinateSystem.CARTESIAN,
+    )

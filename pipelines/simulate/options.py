@@ -1,0 +1,103 @@
+"""The options of `georef simulate`: of a survey that is made up, not of a stage in a workspace."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field, field_validator
+
+from pipelines.core.options import StageOptions, on_earth, triple
+
+
+class SimulateOptions(StageOptions):
+    """A survey to simulate. Triples are written with commas: `46.02,7.75,1620`."""
+
+    scene: Literal["city", "village"] = Field("city", description="What stands there.")
+    flight: Literal["orbit", "grid", "facade"] = Field(
+        "orbit", description="Circles around the complex, nadir lines, or along its facades."
+    )
+    images: int = Field(48, ge=3, le=5000, description="Photographs.")
+    size: str = Field("640x480", pattern=r"^\d{2,5}x\d{2,5}$", description="Their size in pixels, WxH.")
+    seed: int = Field(0, ge=0, description="Seed of everything: scene, flight and noise.")
+    origin: str = Field("46.02,7.75,1620", description="Where on Earth: latitude,longitude,ellipsoidal height.")
+    heights: tuple[float, ...] = Field(
+        (),
+        description="Height of a circle, grid or round above the origin in metres (default: by flight).",
+        json_schema_extra={"flag": "--height"},
+    )
+    radius: float | None = Field(
+        None,
+        gt=0,
+        description="Radius of the circle, half side of the grid, or distance from facades in metres.",
+    )
+    interval: float | None = Field(
+        None,
+        ge=0.2,
+        le=600,
+        description="Seconds between photographs (default: 2, more above 8 m/s).",
+    )
+    gnss: Literal["rtk", "ppk", "consumer", "outliers"] = Field(
+        "rtk", description="Receiver: sets σ, slow bias and outliers, each of which can be set by itself."
+    )
+    sigma_h: float | None = Field(None, ge=0, description="White noise of the fixes, horizontal σ in metres.")
+    sigma_v: float | None = Field(None, ge=0, description="White noise of the fixes, vertical σ in metres.")
+    bias: float | None = Field(None, ge=0, description="RMS of the slow bias of the fixes per axis in metres.")
+    bias_period: float = Field(60.0, gt=0, description="Period of the slow bias in seconds.")
+    outlier_share: float | None = Field(None, ge=0, le=1, description="Share of photographs whose fixes are wrong.")
+    outlier_size: float = Field(15.0, gt=0, description="How far a wrong fix is off, in metres.")
+    sigma_attitude: float = Field(0.5, ge=0, description="White noise of the attitude per axis in degrees.")
+    lever_arm: str = Field(
+        "0,0,0", description="Antenna seen from the camera in the body's axes, forward,right,down in metres."
+    )
+    boresight: str = Field(
+        "0,0,0", description="Rotation vector from the true to the nominal camera axes, x,y,z in degrees."
+    )
+    clock_offset: float = Field(0.0, ge=-10, le=10, description="Navigation clock minus camera clock in seconds.")
+    lens: Literal["pinhole", "radial", "opencv"] = Field("opencv", description="Lens model.")
+    focal: float = Field(0.85, ge=0.3, le=10, description="Focal length as a multiple of the image's width.")
+    k1: float = Field(-0.045, ge=-0.5, le=0.5, description="Radial distortion.")
+    k2: float = Field(0.012, ge=-0.5, le=0.5, description="Radial distortion of the next order.")
+    p1: float = Field(0.0004, ge=-0.02, le=0.02, description="Tangential distortion (opencv).")
+    p2: float = Field(-0.0003, ge=-0.02, le=0.02, description="Tangential distortion (opencv).")
+    exposure: float = Field(0.08, ge=0, le=0.5, description="Variation of the exposure (σ of its logarithm).")
+    noise: float = Field(1.0, ge=0, le=20, description="Sensor noise; 1 is a small sensor at base sensitivity.")
+    samples: Literal["1", "4", "9", "16"] = Field("4", description="Rays for a pixel (anti-aliasing).")
+    quality: int = Field(95, ge=50, le=100, description="JPEG quality.")
+    targets: int = Field(60, ge=0, le=500, description="Survey targets to lay out.")
+    target_size: float | None = Field(
+        None, gt=0.05, le=20, description="Width of a target in metres (default: five pixels)."
+    )
+    control: int = Field(
+        8, ge=0, description="Targets to use as control points, a third at the most; the others are check points."
+    )
+    sigma_survey: float = Field(0.0, ge=0, description="σ of the targets' surveyed coordinates in metres.")
+    sigma_mark: float = Field(0.2, ge=0, description="σ of the image marks in pixels.")
+    bag: Literal["none", "mcap", "sqlite3"] = Field("none", description="Write the flight as a rosbag2 too.")
+    depth: bool = Field(False, description="Write true depth maps (float32, metres).")
+    exif: bool = Field(True, description="Write position, attitude and lens into the photographs.")
+    threads: int = Field(-1, ge=-1, le=256, description="Threads that render (-1: all cores).")
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """Width and height."""
+        width, height = self.size.split("x")
+        return int(width), int(height)
+
+    @field_validator("size")
+    @classmethod
+    def _sensible_size(cls, text: str) -> str:
+        sides = [int(side) for side in text.split("x")]
+        if min(sides) < 32 or max(sides) > 8192:
+            raise ValueError("sides from 32 to 8192 pixels")
+        return text
+
+    @field_validator("origin")
+    @classmethod
+    def _on_earth(cls, text: str) -> str:
+        return on_earth(text)
+
+    @field_validator("lever_arm", "boresight")
+    @classmethod
+    def _is_triple(cls, text: str) -> str:
+        triple(text)
+        return text

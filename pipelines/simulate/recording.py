@@ -1,0 +1,189 @@
+"""What the instruments and the surveyor recorded of a flight, and the truth behind it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from pipelines.core.types import FloatArray, Matrix3, Vector3
+from pipelines.geodesy.enu import lla_from_enu
+from pipelines.geometry.rotations import ENU_FROM_NED, geo_from_cam, yaw_pitch_roll_deg
+from pipelines.simulate.options import SimulateOptions
+from pipelines.simulate.raycast import Raycaster
+from pipelines.simulate.sensors import (
+    RECEIVERS,
+    GnssLog,
+    ImuLog,
+    Receiver,
+    against_local_north,
+    attitudes_at,
+    fixes_at,
+    photo_stamps,
+    record_gnss,
+    record_imu,
+)
+from pipelines.simulate.targets import LEAST_RAYS, choose_control, sightings
+from pipelines.simulate.truth import TrueLens, TrueMark, TrueNavigation, TrueTarget, Truth
+from pipelines.simulate.world import World
+from pipelines.simulate.write import PhotoRecords, SurveyedTarget
+
+_LEAST_SIGMA_M = 0.001  # no receiver claims less
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Everything that was recorded.
+
+    Attributes:
+        photos: position and attitude of the photographs.
+        body_yaw_pitch_roll_deg: (N, 3) attitude of the aircraft at the photographs.
+        gnss, imu: the logs; gnss_lla (M, 3) degrees and metres; imu_in_geo (K, 3) where the attitudes were taken.
+        control, check: surveyed targets.
+        truth: of it all.
+    """
+
+    photos: PhotoRecords
+    body_yaw_pitch_roll_deg: FloatArray
+    gnss: GnssLog
+    gnss_lla: FloatArray
+    imu: ImuLog
+    imu_in_geo: FloatArray
+    control: tuple[SurveyedTarget, ...]
+    check: tuple[SurveyedTarget, ...]
+    truth: Truth
+
+
+def receiver_of(config: SimulateOptions) -> Receiver:
+    """The receiver's profile with what the options change in it."""
+    asked = {
+        "sigma_h_m": config.sigma_h,
+        "sigma_v_m": config.sigma_v,
+        "bias_m": config.bias,
+        "bias_period_s": config.bias_period,
+        "outlier_share": config.outlier_share,
+        "outlier_m": config.outlier_size,
+    }
+    given = {name: value for name, value in asked.items() if value is not None}
+    return replace(RECEIVERS[config.gnss], **given)
+
+
+def record(config: SimulateOptions, world: World, raycaster: Raycaster, seed: np.random.SeedSequence) -> Recording:
+    """Run the sensors over the flight and mark the targets in the photographs."""
+    gnss_seed, imu_seed, mark_seed = seed.spawn(3)
+    receiver = receiver_of(config)
+    gnss = record_gnss(world.track, world.mounting, receiver, np.random.default_rng(gnss_seed))
+    imu = record_imu(world.track, world.mounting, config.sigma_attitude, np.random.default_rng(imu_seed))
+    photos, body_angles = _photo_records(world, receiver, gnss, imu)
+    targets = _mark(config, world, photos.names, raycaster, np.random.default_rng(mark_seed))
+    truth = _truth(config, world, gnss, photos)
+    imu_time_s = (imu.stamp_ns - photos.stamp_ns[0]) / 1e9 - world.mounting.clock_offset_s
+    return Recording(
+        photos=photos,
+        body_yaw_pitch_roll_deg=body_angles,
+        gnss=gnss,
+        gnss_lla=lla_from_enu(gnss.position_in_geo, world.origin),
+        imu=imu,
+        imu_in_geo=world.track.position(imu_time_s),
+        control=tuple(surveyed for true, surveyed in targets if true.role == "control"),
+        check=tuple(surveyed for true, surveyed in targets if true.role == "check"),
+        truth=truth.model_copy(update={"targets": tuple(true for true, _ in targets)}),
+    )
+
+
+def _photo_records(world: World, receiver: Receiver, gnss: GnssLog, imu: ImuLog) -> tuple[PhotoRecords, FloatArray]:
+    """Fix and attitude at each photograph's stamp, as a user reads them off the logs."""
+    stamps = photo_stamps(world.track)
+    fixes = fixes_at(gnss, stamps)
+    enu_from_body = against_local_north(attitudes_at(imu, stamps), fixes, world.origin)
+    angles = yaw_pitch_roll_deg(enu_from_body @ world.track.cam_from_body.T)
+    # The aircraft's angles are those of a camera that looks along its nose.
+    level_cam_from_body = geo_from_cam([0.0, 0.0, 0.0]).T @ ENU_FROM_NED
+    body_angles = yaw_pitch_roll_deg(enu_from_body @ level_cam_from_body.T)
+    # As the frames of a bag are named, so that the marks in one gcp_list.txt fit the photographs and the bag.
+    names = tuple(f"frame_{i:06d}.jpg" for i in range(len(stamps)))
+    stated = np.maximum([receiver.sigma_h_m, receiver.sigma_h_m, receiver.sigma_v_m], _LEAST_SIGMA_M)
+    return PhotoRecords(names, stamps, lla_from_enu(fixes, world.origin), angles, stated), body_angles
+
+
+def _mark(
+    config: SimulateOptions, world: World, names: tuple[str, ...], raycaster: Raycaster, rng: np.random.Generator
+) -> list[tuple[TrueTarget, SurveyedTarget]]:
+    """The targets that at least two photographs see: truth, and what the surveyor hands over."""
+    found = sightings(world.spots, world.poses, world.lens, raycaster, world.target_m)
+    rays = found.seen.sum(axis=1)
+    control = set(choose_control(world.spots, rays, config.control))
+    targets = []
+    for i in np.nonzero(rays >= LEAST_RAYS)[0]:
+        role: Literal["control", "check"] = "control" if i in control else "check"
+        name = f"{'G' if role == 'control' else 'C'}{i:02d}"
+        marks = []
+        for j in np.nonzero(found.seen[i])[0]:
+            x, y = found.pixels[i, j]
+            dx, dy = rng.normal(0, config.sigma_mark, 2)
+            # Three decimals are what the files hold.
+            marks.append(TrueMark(
+                image=names[j], x_px=x, y_px=y, written_x_px=round(x + dx, 3), written_y_px=round(y + dy, 3)
+            ))  # fmt: skip
+        position = world.spots[i].target_position
+        measured = position + rng.normal(0, config.sigma_survey, 3)
+        true = TrueTarget(
+            name=name, role=role, surface=world.spots[i].kind, position_in_geo=_vector(position), marks=tuple(marks)
+        )
+        written = tuple((mark.image, mark.written_x_px, mark.written_y_px) for mark in marks)
+        targets.append((true, SurveyedTarget(name, measured, written)))
+    return targets
+
+
+def _truth(config: SimulateOptions, world: World, gnss: GnssLog, photos: PhotoRecords) -> Truth:
+    """The truth, without the targets."""
+    lens = world.lens
+    true_fixes = fixes_at(replace(gnss, position_in_geo=gnss.true_in_geo), photos.stamp_ns)
+    errors = fixes_at(gnss, photos.stamp_ns) - true_fixes
+    return Truth(
+        scene=config.scene,
+        flight=config.flight,
+        seed=config.seed,
+        origin=world.origin,
+        lens=TrueLens(model=lens.colmap_model, width=lens.width, height=lens.height, params=lens.colmap_params),
+        images=photos.names,
+        stamp_ns=tuple(int(stamp) for stamp in photos.stamp_ns),
+        centers=tuple(_vector(pose.center) for pose in world.poses),
+        cam_from_enu=tuple(_matrix(pose.geo_from_cam.T) for pose in world.poses),
+        fix_errors=tuple(_vector(error) for error in errors),
+        navigation=_navigation(config, world, gnss, photos),
+        targets=(),
+        sigma_mark_px=config.sigma_mark,
+        sigma_survey_m=config.sigma_survey,
+        sun_in_geo=_vector(world.scene.sun),
+    )
+
+
+def _navigation(config: SimulateOptions, world: World, gnss: GnssLog, photos: PhotoRecords) -> TrueNavigation:
+    mounting, receiver = world.mounting, receiver_of(config)
+    return TrueNavigation(
+        receiver=config.gnss,
+        sigma_h_m=receiver.sigma_h_m,
+        sigma_v_m=receiver.sigma_v_m,
+        bias_amplitude_m=_vector(gnss.bias_amplitude_m),
+        bias_phase_rad=_vector(gnss.bias_phase_rad),
+        bias_period_s=receiver.bias_period_s,
+        outlier_m=receiver.outlier_m,
+        wrong_images=tuple(photos.names[i] for i in gnss.wrong_photos),
+        sigma_attitude_deg=config.sigma_attitude,
+        antenna_in_body_m=_vector(mounting.antenna_in_body),
+        nominal_from_cam=_matrix(mounting.nominal_from_cam),
+        cam_from_body=_matrix(world.track.cam_from_body),
+        clock_offset_s=mounting.clock_offset_s,
+    )
+
+
+def _vector(values: FloatArray) -> Vector3:
+    x, y, z = (float(value) for value in values)
+    return x, y, z
+
+
+def _matrix(values: FloatArray) -> Matrix3:
+    a, b, c = (_vector(row) for row in values)
+    return a, b, c

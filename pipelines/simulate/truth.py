@@ -1,0 +1,91 @@
+"""`truth.json`: everything that a simulated survey hides from the pipeline."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pipelines.core.products import Product
+from pipelines.core.types import Matrix3, Vector3
+from pipelines.geodesy.enu import Origin
+
+
+class TrueLens(Product):
+    """The lens as a COLMAP camera; the centre of the top-left pixel is (0.5, 0.5)."""
+
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+
+class TrueMark(Product):
+    """Exact projection of a target, and what was written with noise."""
+
+    image: str
+    x_px: float
+    y_px: float
+    written_x_px: float
+    written_y_px: float
+
+
+class TrueTarget(Product):
+    """A survey target: exact centre in geo."""
+
+    name: str
+    role: Literal["control", "check"]
+    surface: Literal["ground", "roof", "wall"]
+    position_in_geo: Vector3
+    marks: tuple[TrueMark, ...]
+
+
+class TrueNavigation(Product):
+    """Errors of the navigation.
+
+    The bias is amplitude · sin(2π t / period + phase), t in seconds of the camera's clock since the first
+    photograph. `wrong_images` are photographs around which the fixes are off. The boresight maps the true camera
+    axes into those that mounting and attitude suggest. `clock_offset_s` is navigation clock minus camera clock.
+    `cam_from_body` is the nominal mounting, the body forward-right-down.
+    """
+
+    receiver: str
+    sigma_h_m: float
+    sigma_v_m: float
+    bias_amplitude_m: Vector3
+    bias_phase_rad: Vector3
+    bias_period_s: float
+    outlier_m: float
+    wrong_images: tuple[str, ...]
+    sigma_attitude_deg: float
+    antenna_in_body_m: Vector3
+    nominal_from_cam: Matrix3
+    cam_from_body: Matrix3
+    clock_offset_s: float
+
+
+class Truth(Product):
+    """The whole truth. Lists run parallel to `images`; the geo frame is East-North-Up at `origin`.
+
+    Attributes:
+        centers: camera centres in geo.
+        cam_from_enu: rotations geo → camera.
+        stamp_ns: camera clock.
+        fix_errors: recorded minus true position of the antenna at the same stamp of the navigation clock.
+        sun_in_geo: towards the sun.
+    """
+
+    format_version: Literal[1] = 1
+    scene: str
+    flight: str
+    seed: int
+    origin: Origin
+    lens: TrueLens
+    images: tuple[str, ...]
+    stamp_ns: tuple[int, ...]
+    centers: tuple[Vector3, ...]
+    cam_from_enu: tuple[Matrix3, ...]
+    fix_errors: tuple[Vector3, ...]
+    navigation: TrueNavigation
+    targets: tuple[TrueTarget, ...]
+    sigma_mark_px: float
+    sigma_survey_m: float
+    sun_in_geo: Vector3

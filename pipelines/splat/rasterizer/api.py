@@ -1,0 +1,99 @@
+"""One interface to every rasteriser: Gaussians and a camera in, colour, alpha and depth out, all differentiable.
+
+The blending is that of 3D Gaussian Splatting (doi 10.1145/3592433), with gsplat's conventions: pixel centres at
+(0.5, 0.5), screen covariance dilated by `dilation_px2`, contributions below alpha 1/255 left out, alpha at most
+0.999, a pixel is done when its transmittance would fall to 1e-4.
+
+The depth of a Gaussian is that of its plane at the pixel, not of its centre: the conditional mean of z given the
+pixel, z + q · (p − µ) with q = C⁻¹ c, where C is the screen covariance and c the covariance of the screen position
+with z (RaDe-GS, doi 10.48550/arXiv.2406.01467, in the local affine approximation of the perspective). Where α
+reaches 1/255 this departs from the centre by at most 3.33 standard deviations along z; q is shortened where even
+that were more than `DEPTH_REACH` of the centre's depth, so that z stays positive. Gaussians are ordered by their
+centres.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal, Protocol
+
+from torch import Tensor
+
+from pipelines.geometry.cameras import Pinhole
+from pipelines.splat.gaussians import Gaussians
+
+ALPHA_MIN = 1.0 / 255.0
+ALPHA_MAX = 0.999
+TRANSMITTANCE_MIN = 1e-4
+DEPTH_REACH = 0.75
+
+BackendName = Literal["cpu", "cuda"]
+
+
+@dataclass(frozen=True)
+class RasterSettings:
+    """How to render.
+
+    Attributes:
+        sh_degree: degree of the spherical harmonics in use (≤ the stored one).
+        background: colour behind everything.
+        near_m: Gaussians whose centre is nearer are left out.
+        dilation_px2: added to the diagonal of the screen covariance, in px².
+        depth: whether to compute depths (colour and alpha always are).
+    """
+
+    sh_degree: int = 3
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    near_m: float = 0.05
+    dilation_px2: float = 0.3
+    depth: bool = False
+
+
+@dataclass
+class ScreenStats:
+    """What densification needs to know of one render.
+
+    Attributes:
+        visible: (M,) int64 rows of the Gaussians that touched the image.
+        radius_px: (M,) float32, three standard deviations along the longer axis, on the screen.
+        mean_gradient: (M, 2) float32, ∂L/∂(projected centre) in 1/pixel; filled by the backward pass.
+    """
+
+    visible: Tensor
+    radius_px: Tensor
+    mean_gradient: Tensor | None = field(default=None)
+
+
+@dataclass
+class Render:
+    """One rendered view of H × W pixels.
+
+    Attributes:
+        colour: (H, W, 3), linear in the Gaussians' colours, background blended in.
+        alpha: (H, W), 1 − final transmittance.
+        stats: for densification.
+        expected_depth: (H, W), Σ w z / Σ w along the camera's z axis in metres, each Gaussian's z at the pixel,
+            0 where alpha is 0; or None.
+        depth_variance: (H, W), Σ w z² / Σ w − expected_depth² in m²: 0 where all that is seen lies on one surface;
+            or None.
+        median_depth: (H, W), z at the pixel of the Gaussian at which the transmittance falls to one half, 0
+            where it never does; not differentiable; or None.
+    """
+
+    colour: Tensor
+    alpha: Tensor
+    stats: ScreenStats
+    expected_depth: Tensor | None = None
+    depth_variance: Tensor | None = None
+    median_depth: Tensor | None = None
+
+
+class Rasterizer(Protocol):
+    """A backend."""
+
+    name: BackendName
+
+    def render(
+        self, gaussians: Gaussians, cam_from_model: Tensor, camera: Pinhole, settings: RasterSettings
+    ) -> Render:
+        """Render `gaussians` from `cam_from_model` (4, 4), differentiable in both."""

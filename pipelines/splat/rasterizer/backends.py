@@ -1,0 +1,25 @@
+"""The rasteriser backends by name."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pipelines.core.errors import BackendUnavailableError
+from pipelines.splat.rasterizer.api import Rasterizer
+
+
+def rasterizer(name: Literal["auto", "cpu", "cuda"]) -> Rasterizer:
+    """The backend of that name; `auto` takes cuda where a device and gsplat are present.
+
+    Raises:
+        BackendUnavailableError: `cuda` without a device or without gsplat.
+    """
+    from pipelines.splat.rasterizer.cuda import CudaRasterizer, cuda_available
+
+    if name == "cuda" or (name == "auto" and cuda_available()):
+        return CudaRasterizer()
+    if name not in ("auto", "cpu"):
+        raise BackendUnavailableError(f"no rasteriser is called {name!r}: use auto, cpu or cuda")
+    from pipelines.splat.rasterizer.cpu import CpuRasterizer
+
+    return CpuRasterizer()

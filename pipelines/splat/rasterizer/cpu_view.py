@@ -1,0 +1,60 @@
+"""The camera as the kernels want it."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from pipelines.core.types import FloatArray
+from pipelines.splat.rasterizer.api import Pinhole, RasterSettings
+from pipelines.splat.rasterizer.reference import FRUSTUM_MARGIN
+
+
+class View(NamedTuple):
+    """The camera as kernels want it: lengths in pixels, slopes x/z and y/z, near plane in metres.
+
+    A standard deviation of 1 m at a depth of 1 m is at most `stretch_x` px wide and `stretch_y` px high.
+    """
+
+    width: float
+    height: float
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    slope_x_min: float
+    slope_x_max: float
+    slope_y_min: float
+    slope_y_max: float
+    near: float
+    dilation: float
+    stretch_x: float
+    stretch_y: float
+
+
+def make_view(camera: Pinhole, settings: RasterSettings, pose: FloatArray) -> View:
+    """The kernels' view of `camera`; the Jacobian is taken no further out than these slopes, as in gsplat."""
+    margin_x = FRUSTUM_MARGIN * 0.5 * camera.width / camera.fx
+    margin_y = FRUSTUM_MARGIN * 0.5 * camera.height / camera.fy
+    slope_x_min, slope_x_max = -camera.cx / camera.fx - margin_x, (camera.width - camera.cx) / camera.fx + margin_x
+    slope_y_min, slope_y_max = -camera.cy / camera.fy - margin_y, (camera.height - camera.cy) / camera.fy + margin_y
+    # 1 for a rotation, which is what it should be; but the derivative is taken in all of its entries.
+    norm = float(np.linalg.norm(pose[:, :3], 2))
+    return View(
+        width=float(camera.width),
+        height=float(camera.height),
+        fx=float(camera.fx),
+        fy=float(camera.fy),
+        cx=float(camera.cx),
+        cy=float(camera.cy),
+        slope_x_min=slope_x_min,
+        slope_x_max=slope_x_max,
+        slope_y_min=slope_y_min,
+        slope_y_max=slope_y_max,
+        near=float(settings.near_m),
+        dilation=float(settings.dilation_px2),
+        stretch_x=camera.fx * norm * math.hypot(1.0, max(-slope_x_min, slope_x_max)),
+        stretch_y=camera.fy * norm * math.hypot(1.0, max(-slope_y_min, slope_y_max)),
+    )

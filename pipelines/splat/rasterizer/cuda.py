@@ -1,0 +1,207 @@
+"""The rasteriser on a GPU: gsplat behind the common interface.
+
+gsplat (doi 10.48550/arXiv.2409.06765) blends by the rules of `api`; what it lacks, depth at the pixel, is made
+here: the expected one by blending the Gaussians' planes, the median one from its pixel–Gaussian intersections.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import sys
+from functools import lru_cache
+from types import ModuleType
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pipelines.core.errors import BackendUnavailableError
+from pipelines.splat.gaussians import Gaussians
+from pipelines.splat.rasterizer.api import ALPHA_MAX, BackendName, Pinhole, RasterSettings, Render, ScreenStats
+from pipelines.splat.rasterizer.reference import bounded_slope, screen_depth_covariance
+
+_EVERY_BATCH = 2**31 - 1
+
+
+def cuda_available() -> bool:
+    """Whether a CUDA device and gsplat are both present."""
+    return torch.cuda.is_available() and importlib.util.find_spec("gsplat") is not None
+
+
+class CudaRasterizer:
+    """gsplat ≥ 1.5.3. The tensors must be on the CUDA device.
+
+    Raises:
+        BackendUnavailableError: no CUDA device, no gsplat, or no kernels for it.
+    """
+
+    name: BackendName = "cuda"
+
+    def __init__(self) -> None:
+        self._gsplat = _import_gsplat()
+
+    def render(
+        self, gaussians: Gaussians, cam_from_model: Tensor, camera: Pinhole, settings: RasterSettings
+    ) -> Render:
+        """See `Rasterizer.render`; the view and its statistics stay on the device."""
+        device = gaussians.means.device
+        image, alpha, meta = self._gsplat.rasterization(
+            gaussians.means,
+            gaussians.quats_wxyz,
+            torch.exp(gaussians.log_scales),
+            torch.sigmoid(gaussians.logit_opacities),
+            gaussians.sh,
+            cam_from_model.float()[None],
+            _intrinsics(camera, device)[None],
+            camera.width,
+            camera.height,
+            near_plane=settings.near_m,
+            eps2d=settings.dilation_px2,
+            sh_degree=settings.sh_degree,
+            packed=True,
+            backgrounds=_row(settings.background, device),
+        )
+        found = Render(image[0], alpha[0, ..., 0], _screen_stats(meta))
+        if settings.depth:
+            slope = _depth_slope(gaussians, cam_from_model, camera, meta)
+            found.expected_depth, found.depth_variance = self._depth_moments(meta, slope, camera, found.alpha)
+            found.median_depth = self._median_depth(meta, slope, camera)
+        return found
+
+    def _depth_moments(
+        self, meta: dict[str, Any], slope: Tensor, camera: Pinhole, alpha: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Mean and variance (H, W) of z = z₀ + q · (p − middle of the image), with the weights of blending.
+
+        The three numbers of each Gaussian are blended, and the six products of them that make z². About the middle,
+        because a plane's depth at (0, 0) can be far from those that it is seen at.
+        """
+        middle = 0.5 * _row((float(camera.width), float(camera.height)), slope.device)
+        z = meta["depths"] + (slope * (middle - meta["means2d"])).sum(dim=-1)
+        by_u, by_v = slope.unbind(-1)
+        of_square = (z * z, 2 * z * by_u, 2 * z * by_v, by_u * by_u, 2 * by_u * by_v, by_v * by_v)
+        planes, _ = self._gsplat.rasterize_to_pixels(
+            meta["means2d"],
+            meta["conics"],
+            torch.stack([z, by_u, by_v, *of_square], dim=-1),
+            meta["opacities"],
+            camera.width,
+            camera.height,
+            meta["tile_size"],
+            meta["isect_offsets"],
+            meta["flatten_ids"],
+            packed=True,
+        )
+        u = torch.arange(camera.width, device=slope.device) + 0.5 * (1 - camera.width)
+        v = (torch.arange(camera.height, device=slope.device) + 0.5 * (1 - camera.height))[:, None]
+        z, by_u, by_v, zz, zu, zv, uu, uv, vv = planes[0].unbind(-1)
+        total = alpha.clamp(min=1e-10)
+        mean = (z + by_u * u + by_v * v) / total
+        square = (zz + zu * u + zv * v + uu * u * u + uv * u * v + vv * v * v) / total
+        return mean, (square - mean.square()).clamp_min(0.0)
+
+    @torch.no_grad()
+    def _median_depth(self, meta: dict[str, Any], slope: Tensor, camera: Pinhole) -> Tensor:
+        """(H, W) z of the Gaussian at which the transmittance falls to one half, 0 where it never does."""
+        means_px, conics, opacities = meta["means2d"], meta["conics"], meta["opacities"]
+        median = torch.zeros(camera.height * camera.width, device=means_px.device)
+        if len(means_px) == 0:
+            return median.view(camera.height, camera.width)
+        # The intersections come grouped by pixel, nearest first.
+        gaussian, pixel, _ = self._gsplat.rasterize_to_indices_in_range(
+            0,
+            _EVERY_BATCH,
+            torch.ones((1, camera.height, camera.width), device=means_px.device),
+            means_px[None],
+            conics[None],
+            opacities[None],
+            camera.width,
+            camera.height,
+            meta["tile_size"],
+            meta["isect_offsets"],
+            meta["flatten_ids"],
+        )
+        dx = means_px[gaussian, 0] - (pixel % camera.width + 0.5)
+        dy = means_px[gaussian, 1] - (pixel // camera.width + 0.5)
+        xx, xy, yy = conics[gaussian].unbind(-1)
+        sigma = 0.5 * (xx * dx * dx + yy * dy * dy) + xy * dx * dy
+        alpha = (opacities[gaussian] * torch.exp(-sigma)).clamp(max=ALPHA_MAX)
+        log_kept = torch.cumsum(torch.log1p(-alpha.double()), dim=0)
+        count = torch.bincount(pixel, minlength=len(median))
+        start = torch.cumsum(count, dim=0) - count
+        before_pixel = torch.cat([log_kept.new_zeros(1), log_kept])[start[pixel]]
+        half = torch.log(log_kept.new_tensor(0.5))
+        reached = log_kept - before_pixel <= half
+        first = reached.clone()
+        first[1:] &= ~(reached[:-1] & (pixel[1:] == pixel[:-1]))
+        at = torch.nonzero(first)[:, 0]
+        front, to_mean_px = gaussian[at], torch.stack([dx[at], dy[at]], dim=-1)
+        median[pixel[at]] = meta["depths"][front] - (slope[front] * to_mean_px).sum(dim=-1)
+        return median.view(camera.height, camera.width)
+
+
+def _import_gsplat() -> ModuleType:
+    if not torch.cuda.is_available():
+        raise BackendUnavailableError(
+            "no CUDA device found: install a driver and a CUDA build of torch, or use the cpu backend"
+        )
+    try:
+        # Its first import may compile for minutes, and says so on stdout, which belongs to results.
+        with contextlib.redirect_stdout(sys.stderr):
+            import gsplat
+            from gsplat.cuda import _backend
+    except ImportError as error:
+        raise BackendUnavailableError(
+            f"gsplat cannot be imported ({error}): pip install 'georefgs[cuda]', or use the cpu backend"
+        ) from error
+    if _backend._C is None:
+        raise BackendUnavailableError(
+            "gsplat found no CUDA toolkit (nvcc) to compile its kernels with: install one, install a prebuilt"
+            " gsplat wheel after pip install 'georefgs[cuda]', or use the cpu backend"
+        )
+    module: ModuleType = gsplat
+    return module
+
+
+# Small constants are made once: every copy to the device waits for all that was asked of it before.
+@lru_cache(maxsize=64)
+def _row(values: tuple[float, ...], device: torch.device) -> Tensor:
+    return torch.tensor([values], device=device)
+
+
+@lru_cache(maxsize=4096)
+def _intrinsics(camera: Pinhole, device: torch.device) -> Tensor:
+    return torch.tensor([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]], device=device)
+
+
+def _depth_slope(gaussians: Gaussians, cam_from_model: Tensor, camera: Pinhole, meta: dict[str, Any]) -> Tensor:
+    """∂z/∂(u, v) of the M visible Gaussians (M, 2), in m/px.
+
+    By gsplat's own conics: they decide how far from its centre a Gaussian is seen, hence how far its plane reaches.
+    """
+    rows, pose = meta["gaussian_ids"].long(), cam_from_model.to(gaussians.means.dtype)
+    mean_in_cam = gaussians.means[rows] @ pose[:3, :3].T + pose[:3, 3]
+    quats_wxyz, log_scales = gaussians.quats_wxyz[rows], gaussians.log_scales[rows]
+    cov_px_m = screen_depth_covariance(quats_wxyz, log_scales, mean_in_cam, pose, camera)
+    xx, xy, yy = meta["conics"].unbind(-1)
+    x, y = cov_px_m.unbind(-1)
+    slope = torch.stack([xx * x + xy * y, xy * x + yy * y], dim=-1)
+    return bounded_slope(slope, cov_px_m, meta["depths"])
+
+
+def _screen_stats(meta: dict[str, Any]) -> ScreenStats:
+    means_px = meta["means2d"]
+    with torch.no_grad():
+        xx, xy, yy = meta["conics"].unbind(-1)
+        smallest = 0.5 * (xx + yy) - torch.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
+        # The conic is the inverse covariance: its smaller eigenvalue belongs to the longer axis.
+        radius = 3.0 / torch.sqrt(smallest.clamp(min=1e-12))
+    stats = ScreenStats(visible=meta["gaussian_ids"].long(), radius_px=radius)
+    if means_px.requires_grad:
+
+        def keep_gradient(gradient: Tensor) -> None:
+            stats.mean_gradient = gradient
+
+        means_px.register_hook(keep_gradient)
+    return stats

@@ -1,0 +1,191 @@
+"""The rasteriser in plain torch, as close to the equations as it gets: the oracle of the fast ones.
+
+Dense (every Gaussian at every pixel), in the dtype of its inputs, differentiated by autograd. For tests and
+small images only: memory grows as Gaussians × pixels.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from pipelines.splat import sh
+from pipelines.splat.gaussians import Gaussians, rotation_matrices
+from pipelines.splat.rasterizer.api import (
+    ALPHA_MAX,
+    ALPHA_MIN,
+    DEPTH_REACH,
+    TRANSMITTANCE_MIN,
+    Pinhole,
+    RasterSettings,
+    Render,
+    ScreenStats,
+)
+
+# How far outside the image, in half widths, the projection is still linearised at the point itself.
+FRUSTUM_MARGIN = 0.3
+
+
+def render_reference(
+    gaussians: Gaussians, cam_from_model: Tensor, camera: Pinhole, settings: RasterSettings
+) -> Render:
+    """Render as `Rasterizer.render` does, by autograd through dense tensors.
+
+    Args:
+        gaussians: N Gaussians, float32 or float64.
+        cam_from_model: (4, 4) in the same dtype.
+        camera: the image.
+        settings: how to render.
+
+    Returns:
+        The view, in the dtype of the Gaussians.
+    """
+    dtype = gaussians.means.dtype
+    pose = cam_from_model.to(dtype)
+    mean_in_cam = gaussians.means @ pose[:3, :3].T + pose[:3, 3]
+    front = torch.nonzero(mean_in_cam[:, 2] >= settings.near_m).squeeze(1)
+    front = front[torch.argsort(mean_in_cam[front, 2].detach(), stable=True)]
+    sorted_gaussians, mean_in_cam = gaussians.select(front), mean_in_cam[front]
+
+    mean_px, cov_px2 = project(sorted_gaussians, mean_in_cam, pose, camera, settings.dilation_px2)
+    colours = view_colours(sorted_gaussians, pose, settings.sh_degree)
+    offset_px = _offsets(mean_px, camera)
+    alpha = _alpha(offset_px, cov_px2, torch.sigmoid(sorted_gaussians.logit_opacities))
+
+    after = torch.cumprod(1 - alpha, dim=0)
+    counted = after > TRANSMITTANCE_MIN
+    before = torch.cat([torch.ones_like(after[:1]), after[:-1]])
+    weight = torch.where(counted, alpha * before, 0.0)
+    final = torch.where(counted, 1 - alpha, 1.0).prod(dim=0)
+    background = torch.tensor(settings.background, dtype=dtype)
+    colour = torch.einsum("gp,gc->pc", weight, colours) + final[:, None] * background
+    size = (camera.height, camera.width)
+    expected, variance, median = None, None, None
+    if settings.depth:
+        quats_wxyz, log_scales = sorted_gaussians.quats_wxyz, sorted_gaussians.log_scales
+        cov_px_m = screen_depth_covariance(quats_wxyz, log_scales, mean_in_cam, pose, camera)
+        slope = bounded_slope(torch.linalg.solve(cov_px2, cov_px_m), cov_px_m, mean_in_cam[:, 2])
+        depth = mean_in_cam[:, 2:] + (slope[:, None] * offset_px).sum(dim=-1)
+        opaque = final < 1
+        depth_sum = (depth * weight).sum(dim=0)
+        total = torch.where(opaque, 1 - final, 1.0)
+        mean = torch.where(opaque, depth_sum / total, 0.0)
+        variance = (((depth - mean).square() * weight).sum(dim=0) / total).view(size)
+        expected = mean.view(size)
+        median = _median_depth(depth, before, after, counted).view(size)
+    stats = _screen_stats(front, mean_px, cov_px2, sorted_gaussians.logit_opacities, camera)
+    return Render(colour.view(*size, 3), (1 - final).view(size), stats, expected, variance, median)
+
+
+def project(
+    gaussians: Gaussians, mean_in_cam: Tensor, cam_from_model: Tensor, camera: Pinhole, dilation_px2: float
+) -> tuple[Tensor, Tensor]:
+    """Screen means (N, 2) in px and dilated screen covariances (N, 2, 2) in px²."""
+    x, y, z = mean_in_cam.unbind(-1)
+    screen_axes = _projected_axes(gaussians.quats_wxyz, gaussians.log_scales, mean_in_cam, cam_from_model, camera)[
+        :, :2
+    ]
+    cov_px2 = screen_axes @ screen_axes.mT + dilation_px2 * torch.eye(2, dtype=z.dtype)
+    mean_px = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], dim=-1)
+    return mean_px, cov_px2
+
+
+def screen_depth_covariance(
+    quats_wxyz: Tensor, log_scales: Tensor, mean_in_cam: Tensor, cam_from_model: Tensor, camera: Pinhole
+) -> Tensor:
+    """Covariances (N, 2) of the screen position (u, v) with z, in px · m, of Gaussians at (N, 3)."""
+    axes = _projected_axes(quats_wxyz, log_scales, mean_in_cam, cam_from_model, camera)
+    return (axes[:, :2] @ axes[:, 2, :, None])[..., 0]
+
+
+def bounded_slope(slope: Tensor, cov_px_m: Tensor, depth: Tensor) -> Tensor:
+    """∂z/∂(u, v) of the Gaussians (N, 2) in m/px, shortened where z would leave `DEPTH_REACH` of the centre's.
+
+    Args:
+        slope: (N, 2) q = C⁻¹ c.
+        cov_px_m: (N, 2) c. By Cauchy and Schwarz |q · d| ≤ √(c · q) √(dᵀ C⁻¹ d).
+        depth: (N,) z of the centres.
+    """
+    spread_m = torch.sqrt((cov_px_m * slope).sum(dim=-1).clamp_min(torch.finfo(slope.dtype).tiny))
+    most_m = DEPTH_REACH / math.sqrt(-2 * math.log(ALPHA_MIN)) * depth
+    return slope * (most_m / torch.maximum(spread_m, most_m))[:, None]
+
+
+def _projected_axes(
+    quats_wxyz: Tensor, log_scales: Tensor, mean_in_cam: Tensor, cam_from_model: Tensor, camera: Pinhole
+) -> Tensor:
+    """The principal axes, a standard deviation long, along (u, v, z): (N, 3, 3), one axis a column, px, px and m.
+
+    The perspective is linearised at the centre (EWA, doi 10.1109/TVCG.2002.1021576), but no further out than
+    `FRUSTUM_MARGIN` beyond the image, as in gsplat.
+    """
+    x, y, z = mean_in_cam.unbind(-1)
+    margin_x = FRUSTUM_MARGIN * 0.5 * camera.width / camera.fx
+    margin_y = FRUSTUM_MARGIN * 0.5 * camera.height / camera.fy
+    slope_x = (x / z).clamp(-camera.cx / camera.fx - margin_x, (camera.width - camera.cx) / camera.fx + margin_x)
+    slope_y = (y / z).clamp(-camera.cy / camera.fy - margin_y, (camera.height - camera.cy) / camera.fy + margin_y)
+    zero, one = torch.zeros_like(z), torch.ones_like(z)
+    rows = [
+        camera.fx / z, zero, -camera.fx * slope_x / z,
+        zero, camera.fy / z, -camera.fy * slope_y / z,
+        zero, zero, one,
+    ]  # fmt: skip
+    jacobian = torch.stack(rows, dim=-1).view(-1, 3, 3)
+    axes = rotation_matrices(quats_wxyz) * torch.exp(log_scales)[:, None, :]
+    return jacobian @ cam_from_model[:3, :3] @ axes
+
+
+def view_colours(gaussians: Gaussians, cam_from_model: Tensor, sh_degree: int) -> Tensor:
+    """(N, 3) colours of the Gaussians seen from the camera's centre, not negative."""
+    center_in_model = -torch.linalg.solve(cam_from_model[:3, :3], cam_from_model[:3, 3])
+    return (sh.evaluate(gaussians.sh, gaussians.means - center_in_model, sh_degree) + 0.5).clamp_min(0.0)
+
+
+def _offsets(mean_px: Tensor, camera: Pinhole) -> Tensor:
+    """(N, H·W, 2) from the screen means to the pixel centres."""
+    v, u = torch.meshgrid(
+        torch.arange(camera.height, dtype=mean_px.dtype) + 0.5,
+        torch.arange(camera.width, dtype=mean_px.dtype) + 0.5,
+        indexing="ij",
+    )
+    return torch.stack([u.reshape(-1), v.reshape(-1)], dim=-1) - mean_px[:, None]
+
+
+def _alpha(offset_px: Tensor, cov_px2: Tensor, opacity: Tensor) -> Tensor:
+    """(N, H·W) opacity of each Gaussian at each pixel centre, cut off below ALPHA_MIN and above ALPHA_MAX."""
+    dx, dy = offset_px.unbind(-1)
+    xx, xy, yy = cov_px2[:, 0, 0, None], cov_px2[:, 0, 1, None], cov_px2[:, 1, 1, None]
+    sigma = 0.5 * (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / (xx * yy - xy * xy)
+    alpha = opacity[:, None] * torch.exp(-sigma)
+    return torch.where(alpha >= ALPHA_MIN, alpha.clamp(max=ALPHA_MAX), 0.0)
+
+
+def _median_depth(depth: Tensor, before: Tensor, after: Tensor, counted: Tensor) -> Tensor:
+    """(P,) z, of (N, P), of the Gaussian at which the transmittance of each pixel falls to one half, else 0."""
+    crossing = counted & (before > 0.5) & (after <= 0.5)
+    return torch.where(crossing, depth.detach(), 0.0).sum(dim=0)
+
+
+def _screen_stats(
+    rows: Tensor, mean_px: Tensor, cov_px2: Tensor, logit_opacities: Tensor, camera: Pinhole
+) -> ScreenStats:
+    with torch.no_grad():
+        # alpha ≥ ALPHA_MIN is an ellipse: 2 ln(opacity / ALPHA_MIN) is its squared Mahalanobis radius.
+        level = 2 * (torch.nn.functional.logsigmoid(logit_opacities) - math.log(ALPHA_MIN))
+        extent = torch.sqrt(level.clamp_min(0)[:, None] * torch.diagonal(cov_px2, dim1=1, dim2=2))
+        size = torch.tensor([camera.width, camera.height], dtype=mean_px.dtype)
+        first = torch.ceil(mean_px - extent - 0.5).clamp_min(0)
+        last = torch.minimum(torch.floor(mean_px + extent - 0.5), size - 1)
+        seen = (level >= 0) & (first <= last).all(dim=1)
+        order = torch.argsort(rows[seen])
+        radius = 3 * torch.sqrt(torch.linalg.eigvalsh(cov_px2[seen])[:, 1])
+    stats = ScreenStats(visible=rows[seen][order], radius_px=radius[order].float())
+    if mean_px.requires_grad:
+
+        def keep_gradient(gradient: Tensor) -> None:
+            stats.mean_gradient = gradient[seen][order].float()
+
+        mean_px.register_hook(keep_gradient)
+    return stats

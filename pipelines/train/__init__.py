@@ -1,0 +1,1 @@
+"""Stage `train`: Gaussians, similarity and cameras together."""

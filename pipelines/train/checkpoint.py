@@ -1,0 +1,48 @@
+"""Checkpoints: named tensors in one NPZ file, replaced in one step, without pickle."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pipelines.core.errors import InputError
+
+
+def save_checkpoint(path: Path, state: Mapping[str, Tensor]) -> None:
+    """Write tensors; a file that is there is replaced when the new one is complete."""
+    draft = path.with_suffix(".tmp")
+    with draft.open("wb") as handle:
+        arrays = {name: tensor.detach().cpu().numpy() for name, tensor in state.items()}
+        np.savez(handle, **arrays)  # type: ignore[arg-type]
+    draft.rename(path)
+
+
+def load_checkpoint(path: Path) -> dict[str, Tensor]:
+    """Read tensors.
+
+    Raises:
+        InputError: unreadable.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            return {name: torch.from_numpy(archive[name]) for name in archive.files}
+    except (OSError, ValueError, EOFError, MemoryError, BadZipFile, zlib.error) as error:
+        raise InputError(f"not a readable checkpoint: {error}; train without --resume", path=path) from error
+
+
+def prefixed(prefix: str, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The same tensors under `prefix/name`."""
+    return {f"{prefix}/{name}": tensor for name, tensor in state.items()}
+
+
+def unprefixed(prefix: str, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Those tensors that `prefixed` put under `prefix`, under their own names."""
+    return {
+        name.removeprefix(f"{prefix}/"): tensor for name, tensor in state.items() if name.startswith(f"{prefix}/")
+    }

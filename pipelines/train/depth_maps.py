@@ -1,0 +1,204 @@
+"""Depth maps of the training photographs by multi-view stereo, kept on disk: a depth where views agree.
+
+Each view is swept by planes on coarse pixels; what views agree on is refined on finer ones, and agreed on again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from pipelines.core.progress import SILENT, Progress
+from pipelines.core.types import ByteArray
+from pipelines.geometry.cameras import Pinhole
+from pipelines.scene.photographs import ImageCache, save_array
+from pipelines.scene.scene import Scene
+from pipelines.stereo.agreement import AgreementSettings, Surface, agreed_depth, without_rims
+from pipelines.stereo.matching import UNSEEN, Float32Array, MatchSettings
+from pipelines.stereo.neighbours import Sightings, best_neighbours, planes_for
+from pipelines.stereo.refinement import guess_from, refine
+from pipelines.stereo.sweep import Facing, Planes, StereoCamera, StereoView, Swept, plane_sweep
+
+# Of what is kept: other forms have other folders.
+_FORM = b"coarse, fine: direction, offset, score, step, sharpness"
+
+
+@dataclass(frozen=True)
+class StereoOptions:
+    """How to look for depths.
+
+    Attributes:
+        coarse_px: longest side of the photographs that planes are swept through.
+        fine_px: longest side of the photographs that the result is refined on.
+        neighbours: views that each is compared with.
+        matching: how they are compared,
+        refining: and how on the finer ones. A wide window finds the surface where there is little texture; with its
+            place nearly known, a small one does not lay it across the foot of a wall.
+        agreement: when views agree.
+    """
+
+    coarse_px: int = 320
+    fine_px: int = 640
+    neighbours: int = 10
+    matching: MatchSettings = field(default_factory=MatchSettings)
+    refining: MatchSettings = field(default_factory=lambda: MatchSettings(window_px=3, reach_px=2))
+    agreement: AgreementSettings = field(default_factory=AgreementSettings)
+
+
+class DepthMaps:
+    """Depth maps of the training photographs, made once.
+
+    Memory holds no more than a view and its neighbours.
+
+    Args:
+        folder: where they are kept, each scene's in a folder of its own.
+        scene: cameras and points.
+        images: the photographs.
+        options: how.
+    """
+
+    def __init__(
+        self, folder: Path, scene: Scene, images: ImageCache, options: StereoOptions | None = None
+    ) -> None:
+        self.scene, self.images = scene, images
+        self._options = options or StereoOptions()
+        sparse = scene.sparse
+        self._sightings = Sightings(
+            scene.point_in_model, scene.poses.cam_center_in_model, sparse.obs_point, sparse.obs_image
+        )
+        # Asked for again by each of a view's neighbours, and the same each time.
+        self._neighbours = cache(self._find_neighbours)
+        self._planes = cache(self._find_planes)
+        self.folder = folder / self._key()
+
+    def build(self, progress: Progress = SILENT) -> None:
+        """Make them, one step for all views after the other: each needs what its neighbours have found."""
+        train = [int(index) for index in self.scene.train]
+        steps = (("coarse", self._sweep), ("fine", self._refine), ("depth", self._agree))
+        if not all(self._path(index, "depth").exists() for index in train):
+            with progress.task("surface", len(steps) * len(train)) as task:
+                for kind, make in steps:
+                    for index in train:
+                        if not self._path(index, kind).exists():
+                            save_array(self._path(index, kind), make(index))
+                        task.advance()
+        for kind, _ in steps[:-1]:  # also those that an interrupted run has left
+            for index in train:
+                self._path(index, kind).unlink(missing_ok=True)
+
+    def camera(self, index: int) -> Pinhole:
+        """Camera of a depth map."""
+        return self.images.pinhole(index).limited(self._options.fine_px)
+
+    def depth(self, index: int) -> Float32Array:
+        """Depth (H, W) in metres along the optical axis of a training view, 0 where unknown; mapped from disk."""
+        array: Float32Array = np.load(self._path(index, "depth"), mmap_mode="r", allow_pickle=False)
+        return array
+
+    def rgb(self, index: int) -> ByteArray:
+        """Photograph (H, W, 3) at the pixels of its depth map."""
+        return self._rgb(self.camera(index), index)
+
+    def _sweep(self, index: int) -> Float32Array:
+        sweeps, others = self._planes(index), self._neighbours(index)
+        if not sweeps:
+            return _nothing(self._coarse(index))
+        views = [self._view(self._coarse(j), j) for j in others]
+        return _packed(plane_sweep(self._view(self._coarse(index), index), views, sweeps, self._options.matching))
+
+    def _refine(self, index: int) -> Float32Array:
+        own = self._surface(index, "coarse")
+        if own is None:
+            return _nothing(self.camera(index))
+        reference = self._view(self.camera(index), index)
+        guess = guess_from(own, self._agreed(own, index, "coarse"), reference.camera)
+        views = [self._view(self.camera(j), j) for j in self._neighbours(index)]
+        return _packed(refine(reference, views, guess, self._options.refining))
+
+    def _agree(self, index: int) -> Float32Array:
+        own = self._surface(index, "fine")
+        if own is None:
+            return np.zeros((self.camera(index).height, self.camera(index).width), dtype=np.float32)
+        return self._agreed(own, index, "fine")
+
+    def _agreed(self, own: Surface, index: int, kind: str) -> Float32Array:
+        """Depths (H, W) that views agree on, 0 elsewhere."""
+        others, options = [self._surface(j, kind) for j in self._neighbours(index)], self._options
+        depth = agreed_depth(own, [other for other in others if other is not None], options.agreement)
+        # What is refined has started from what coarse windows saw.
+        window_px = options.matching.window_px * own.camera.pinhole.width / self._coarse(index).width
+        return without_rims(depth, int(window_px / 2), options.agreement.rim)
+
+    def _surface(self, index: int, kind: str) -> Surface | None:
+        sweeps = self._planes(index)
+        if not sweeps:
+            return None
+        pinhole = self._coarse(index) if kind == "coarse" else self.camera(index)
+        which, *rest = np.load(self._path(index, kind), mmap_mode="r", allow_pickle=False)
+        facing = Facing(np.stack([planes.normal_in_world for planes in sweeps]), which.astype(np.uint8))
+        return Surface(self._camera(pinhole, index), Swept(facing, *rest))
+
+    def _find_planes(self, index: int) -> list[Planes]:
+        others = self._neighbours(index)
+        if not others:
+            return []
+        points = self.scene.point_in_model[self._sightings.seen_by(index)]
+        cameras = [self._camera(self._coarse(j), j) for j in others]
+        return planes_for(self._camera(self._coarse(index), index), cameras, points)
+
+    def _find_neighbours(self, index: int) -> list[int]:
+        return best_neighbours(self._sightings, index, self.scene.train, self._options.neighbours)
+
+    def _coarse(self, index: int) -> Pinhole:
+        return self.images.pinhole(index).limited(self._options.coarse_px)
+
+    def _camera(self, pinhole: Pinhole, index: int) -> StereoCamera:
+        poses = self.scene.poses
+        return StereoCamera(pinhole, poses.cam_from_model[index], poses.cam_center_in_model[index])
+
+    def _view(self, pinhole: Pinhole, index: int) -> StereoView:
+        grey = cv2.cvtColor(self._rgb(pinhole, index), cv2.COLOR_RGB2GRAY).astype(np.float32) + 1
+        mask = np.array(self.images.mask(index), dtype=np.uint8)
+        grey[cv2.resize(mask, grey.shape[::-1], interpolation=cv2.INTER_NEAREST) == 0] = 0
+        return StereoView(self._camera(pinhole, index), grey)
+
+    def _rgb(self, pinhole: Pinhole, index: int) -> ByteArray:
+        image = np.array(self.images.image(index))
+        small = cv2.resize(image, (pinhole.width, pinhole.height), interpolation=cv2.INTER_AREA)
+        return np.asarray(small, np.uint8)
+
+    def _path(self, index: int, kind: str) -> Path:
+        return self.folder / f"{index:06d}.{kind}.npy"
+
+    def _key(self) -> str:
+        """Changes with all that the maps depend on."""
+        digest = hashlib.sha256(_FORM)
+        poses, sparse = self.scene.poses, self.scene.sparse
+        arrays = (
+            poses.cam_from_model, poses.cam_center_in_model, self.scene.point_in_model, self.scene.train,
+            sparse.obs_point, sparse.obs_image,
+        )  # fmt: skip
+        for array in arrays:
+            digest.update(np.ascontiguousarray(array).tobytes())
+        for index in range(len(sparse.image_name)):
+            digest.update(self.images.key(index).encode())
+        digest.update(repr(self._options).encode())
+        return digest.hexdigest()[:32]
+
+
+def _packed(swept: Swept) -> Float32Array:
+    """(5, H, W): direction, offset, score, step and sharpness of each pixel."""
+    which = swept.facing.which.astype(np.float32)
+    return np.stack([which, swept.offset_m, swept.score, swept.step_m, swept.sharpness])
+
+
+def _nothing(pinhole: Pinhole) -> Float32Array:
+    """The same of a view without neighbours."""
+    found = np.zeros((5, pinhole.height, pinhole.width), dtype=np.float32)
+    found[1], found[2] = np.nan, UNSEEN
+    return found

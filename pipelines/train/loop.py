@@ -1,0 +1,181 @@
+"""The training loop: iterations, metrics, checkpoints, interruption, and one recovery from a divergence."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from pipelines.core.errors import ConvergenceError
+from pipelines.core.interrupts import deferred_interrupts
+from pipelines.core.progress import Progress
+from pipelines.splat.watch import NonFiniteError
+from pipelines.train.checkpoint import load_checkpoint, save_checkpoint
+from pipelines.train.trainer import JointTrainer, StepReport
+
+log = logging.getLogger(__name__)
+
+_RECOVERY_RATE = 0.3  # of the learning rates, after a divergence
+
+
+@dataclass(frozen=True)
+class LoopOptions:
+    """Where and how often to write.
+
+    Attributes:
+        checkpoint: file of the latest checkpoint.
+        metrics: file of the metrics, a JSON object a line.
+        checkpoint_every: iterations between checkpoints.
+        log_every: iterations between lines of metrics.
+        resume: go on from the checkpoint, if it is there.
+    """
+
+    checkpoint: Path
+    metrics: Path
+    checkpoint_every: int = 500
+    log_every: int = 10
+    resume: bool = False
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a training took.
+
+    Attributes:
+        seconds: of all runs together, if it was interrupted.
+        recovery: what was not finite, and what was done about it; None: nothing was.
+    """
+
+    seconds: float
+    recovery: str | None
+
+
+def optimise(trainer: JointTrainer, options: LoopOptions, progress: Progress) -> Outcome:
+    """Iterate to the end.
+
+    Raises:
+        KeyboardInterrupt: the user asked to stop; a checkpoint was written.
+        ConvergenceError: a loss or gradient is not finite, again after going back to the last checkpoint and on at
+            a lower rate.
+    """
+    loop = _Loop(trainer, options)
+    with progress.task("training", trainer.options.iterations) as task, deferred_interrupts() as stop:
+        shown = 0
+
+        def show(row: dict[str, float]) -> None:
+            nonlocal shown
+            now = int(row["iteration"])
+            task.advance(max(now - shown, 0), f"psnr {row['psnr']:.1f} dB, {row['gaussians']:.0f} gaussians")
+            shown = max(shown, now)
+
+        while trainer.iteration < trainer.options.iterations:
+            try:
+                loop.iterate(show)
+                if stop.requested:
+                    loop.save()
+                    log.warning(
+                        "stopped at iteration %d of %d: --resume continues",
+                        trainer.iteration, trainer.options.iterations,
+                    )  # fmt: skip
+                    raise KeyboardInterrupt
+            except NonFiniteError as error:
+                loop.recover(error)
+        loop.save()
+    return Outcome(loop.seconds(), loop.recovery)
+
+
+class _Loop:
+    def __init__(self, trainer: JointTrainer, options: LoopOptions) -> None:
+        self.trainer, self.options = trainer, options
+        self.recovery: str | None = None
+        self._spent, self._clock = 0.0, time.monotonic()
+        if options.resume and options.checkpoint.exists():
+            self._spent = self._go_back()
+            log.info("resumed at iteration %d", trainer.iteration)
+        else:
+            options.metrics.write_text("", encoding="utf-8")
+            self.save()
+
+    def seconds(self) -> float:
+        """Spent so far, before a resume included."""
+        return self._spent + time.monotonic() - self._clock
+
+    def iterate(self, show: Callable[[dict[str, float]], None]) -> None:
+        """One iteration, and what is due after it."""
+        trainer, options = self.trainer, self.options
+        report = trainer.step()
+        due = trainer.iteration % options.log_every == 0 or trainer.iteration == trainer.options.iterations
+        if due or trainer.device.type == "cpu":  # elsewhere, a look at every iteration would make it wait
+            trainer.check_finite()
+        if due:
+            row = _metrics_row(trainer, report, self.seconds())
+            with options.metrics.open("a", encoding="utf-8") as lines:
+                lines.write(json.dumps(row) + "\n")
+            show(row)
+        if trainer.iteration % options.checkpoint_every == 0:
+            self.save()
+
+    def save(self) -> None:
+        """Write a checkpoint of a sound state.
+
+        Raises:
+            NonFiniteError: it is not sound.
+        """
+        self.trainer.check_finite()
+        more = {
+            "seconds": torch.tensor(self.seconds(), dtype=torch.float64),
+            "recovery": torch.tensor(list((self.recovery or "").encode()), dtype=torch.uint8),
+        }
+        save_checkpoint(self.options.checkpoint, {**self.trainer.state(), **more})
+
+    def recover(self, error: NonFiniteError) -> None:
+        """Go back to the last checkpoint, and on at a lower rate; once.
+
+        Raises:
+            ConvergenceError: that was tried before.
+        """
+        advice = "train again with a smaller --geo-weight, another --seed or fewer --max-gaussians"
+        if self.recovery is not None:
+            raise ConvergenceError(f"{error}, and before that {self.recovery}: {advice}") from error
+        self._go_back()
+        self.trainer.slow_down(_RECOVERY_RATE)
+        self.recovery = (
+            f"{error}; went back to iteration {self.trainer.iteration} and on at {_RECOVERY_RATE} × the rate"
+        )
+        log.warning("%s", self.recovery)
+        self.save()
+
+    def _go_back(self) -> float:
+        """Take over the checkpoint and drop the metrics that came after it; returns its seconds."""
+        state = load_checkpoint(self.options.checkpoint)
+        self.trainer.restore(state)
+        self.recovery = bytes(state["recovery"].tolist()).decode() or None
+        path = self.options.metrics
+        rows = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+        kept = [row for row in rows if row.endswith("}") and json.loads(row)["iteration"] <= self.trainer.iteration]
+        path.write_text("".join(row + "\n" for row in kept), encoding="utf-8")
+        return float(state["seconds"])
+
+
+def _metrics_row(trainer: JointTrainer, report: StepReport, seconds: float) -> dict[str, float]:
+    problem = trainer.problem
+    with torch.no_grad():
+        terms, factors = problem.terms().present(), problem.weights.variance_factors()
+    row = {
+        "iteration": trainer.iteration,
+        "seconds": round(seconds, 2),
+        "photometric": float(report.photometric),
+        "psnr": -10.0 * math.log10(max(float(report.mean_square_error), 1e-10)),
+        "gaussians": len(trainer.optimizer.gaussians),
+        "geo_weight": report.weight,
+    }
+    row |= {name: float(value) for name, value in terms.items()}
+    if report.by_depth is not None:
+        row["control_by_depth"] = float(report.by_depth)
+    return row | {f"variance_{name}": factors[name] for name in factors if name in terms}

@@ -1,0 +1,38 @@
+"""The options of `georef train`: of the splat, of the geographic losses, and of the run itself."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from pipelines.core.options import StageOptions
+from pipelines.scene.geographic_options import GeographicOptions
+
+
+class SplatOptions(StageOptions):
+    """Effort, and how the Gaussians are trained."""
+
+    preset: Literal["smoke", "fast", "standard", "high"] = Field("standard", description="Effort.")
+    iterations: int | None = Field(None, ge=1, description="Iterations (default: the preset's).")
+    max_image_size: int | None = Field(
+        None, ge=32, description="Longest image side for training in pixels (default: the preset's)."
+    )
+    max_gaussians: int | None = Field(None, ge=100, description="Limit of Gaussians (default: the preset's).")
+    backend: Literal["auto", "cpu", "cuda"] = Field("auto", description="Rasteriser.")
+    sh_degree: int = Field(3, ge=0, le=3, description="Degree of the spherical harmonics.")
+    strategy: Literal["default", "mcmc", "fast"] = Field(
+        "default", description="Where Gaussians are added and removed: as 3DGS, by MCMC, or as several views agree."
+    )
+    coarse_to_fine: bool = Field(True, description="Start with shrunken photographs.")
+    exposure: bool = Field(True, description="Fit the exposure of each training photograph.")
+    dense: bool = Field(True, description="Find the scene's surface by multi-view stereo first, to start from.")
+    faithful_surface: bool = Field(True, description="Hold the Gaussians to the surface, for depths to measure in.")
+
+
+class TrainOptions(GeographicOptions, SplatOptions):
+    """Joint optimisation of Gaussians, similarity and camera corrections."""
+
+    checkpoint_every: int = Field(500, ge=1, description="Iterations between checkpoints.")
+    log_every: int = Field(10, ge=1, description="Iterations between lines of metrics.jsonl.")
+    seed: int = Field(0, ge=0, description="Seed of every random choice.")

@@ -1,0 +1,99 @@
+"""Photographs on their way to the device: shrunken as the schedule asks, and read ahead where that saves time."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from pipelines.scene.photographs import ImageCache
+from pipelines.scene.pinholes import Pinholes
+from pipelines.splat.rasterizer.api import Pinhole
+
+_MASKS = 64  # on the device; one serves all photographs of a camera
+
+
+@dataclass(frozen=True)
+class Target:
+    """What a render is compared with.
+
+    Attributes:
+        colour: (H, W, 3) float32 from 0 to 1.
+        mask: (H, W) bool, the pixels that count; None: all.
+        camera: of these pixels, with the lens as it is now.
+    """
+
+    colour: Tensor
+    mask: Tensor | None
+    camera: Pinhole
+
+
+class Targets:
+    """Training photographs on `device`.
+
+    On a GPU the next photograph is read from disk into pinned memory while this one is trained on, so that no
+    iteration waits for either. On a CPU reading ahead would only take a core from the kernels.
+    """
+
+    def __init__(self, images: ImageCache, pinholes: Pinholes, device: torch.device) -> None:
+        self._images, self._pinholes, self._device = images, pinholes, device
+        self._masks: OrderedDict[tuple[str, int], Tensor | None] = OrderedDict()
+        self._reader = ThreadPoolExecutor(1, "photographs") if device.type == "cuda" else None
+        self._next: tuple[int, Future[Tensor]] | None = None
+
+    def get(self, index: int, shrink: int = 1, upcoming: int | None = None) -> Target:
+        """One photograph at 1/`shrink` of its size.
+
+        Args:
+            index: into the images.
+            shrink: every pixel is the mean of shrink × shrink.
+            upcoming: the photograph that will be asked for next, if known.
+        """
+        pixels = self._pixels(index)
+        if self._reader is not None and upcoming is not None:
+            self._next = (upcoming, self._reader.submit(self._read, upcoming))
+        colour = pixels.to(self._device, non_blocking=True).float() / 255.0
+        camera = self._pinholes.of(index)
+        if shrink > 1:
+            colour = functional.avg_pool2d(colour.permute(2, 0, 1), shrink).permute(1, 2, 0).contiguous()
+            camera = shrunken(camera, shrink)
+        return Target(colour, self._mask(index, shrink), camera)
+
+    def _pixels(self, index: int) -> Tensor:
+        if self._next is not None and self._next[0] == index:
+            return self._next[1].result()
+        return self._read(index)
+
+    def _read(self, index: int) -> Tensor:
+        pixels = torch.from_numpy(np.array(self._images.image(index)))
+        return pixels.pin_memory() if self._reader is not None else pixels
+
+    def _mask(self, index: int, shrink: int) -> Tensor | None:
+        key = (self._images.mask_key(index), shrink)
+        if key not in self._masks:
+            self._masks[key] = self._load_mask(index, shrink)
+            if len(self._masks) > _MASKS:
+                self._masks.popitem(last=False)
+        self._masks.move_to_end(key)
+        return self._masks[key]
+
+    def _load_mask(self, index: int, shrink: int) -> Tensor | None:
+        covered = np.array(self._images.mask(index))
+        height, width = (side // shrink for side in covered.shape)
+        blocks = covered[: height * shrink, : width * shrink].reshape(height, shrink, width, shrink)
+        whole = blocks.all(axis=(1, 3))
+        return None if whole.all() else torch.from_numpy(np.ascontiguousarray(whole)).to(self._device)
+
+
+def shrunken(camera: Pinhole, shrink: int) -> Pinhole:
+    """The camera of an image whose pixels are shrink × shrink blocks; what remains at the far edges is cut off."""
+    return Pinhole(
+        camera.width // shrink,
+        camera.height // shrink,
+        *(value / shrink for value in (camera.fx, camera.fy, camera.cx, camera.cy)),
+    )

@@ -1,0 +1,349 @@
+"""The joint optimisation: Gaussians, similarity and cameras, one training view an iteration (GeoRefGS 2.4)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pipelines.geometry.lens import Lenses
+from pipelines.georef.losses import Schedule, rising_weight
+from pipelines.georef.problem import GeoProblem
+from pipelines.scene.photographs import ImageCache
+from pipelines.scene.pinholes import Pinholes
+from pipelines.splat.densify import Strategy
+from pipelines.splat.evidence import Evidence, evidence
+from pipelines.splat.exposure import Exposures
+from pipelines.splat.gaussians import Gaussians
+from pipelines.splat.losses import photometric_loss
+from pipelines.splat.optimizer import GaussianAdam
+from pipelines.splat.rasterizer.api import Pinhole, Rasterizer, RasterSettings, Render
+from pipelines.splat.surface import SurfaceSettings, compactness_loss, depth_loss, flatness_loss, normal_loss
+from pipelines.splat.watch import FiniteWatch
+from pipelines.train.checkpoint import prefixed, unprefixed
+from pipelines.train.targets import Target, Targets
+
+_FINAL_RATE = 0.05  # of the geographic learning rates, relative to the first
+_TOLD = {"y": "the similarity", "z": "the cameras", "x": "the constant errors", "u": "the weights of the losses"}
+_LENS_EVERY = 100  # iterations: to look where the lens has come to waits for the device
+# A gradient that is not finite shows in one of these: colours pass theirs on to the opacities.
+_WATCHED = ("means", "quats_wxyz", "log_scales", "logit_opacities")
+
+
+@dataclass(frozen=True)
+class JointOptions:
+    """Schedule of the joint optimisation.
+
+    Attributes:
+        iterations: length of the training.
+        sh_degree: degree that the spherical harmonics reach.
+        geo_weight: w_max of eq. 27.
+        geo_rise: τ of eq. 27, as a fraction of the iterations.
+        geo_schedule: "rising" as in eq. 27, or "constant": w_max from the first iteration.
+        similarity_rate: first learning rate of the similarity and of constant errors of the measurements, in
+            standard deviations an iteration.
+        camera_rate: first learning rate of the camera corrections, likewise.
+        variance_rate: first learning rate of the log-variances of the geographic terms.
+        background: colour behind the scene.
+        seed: of the order of views.
+        coarse: (shrink, fraction) pairs: photographs are shrunken so much up to this fraction of the training.
+        coarse_least_px: but never to a longest side of less than this.
+        surface: weights of the surface losses; None: the photographs alone decide.
+    """
+
+    iterations: int
+    sh_degree: int = 3
+    geo_weight: float = 0.05
+    geo_rise: float = 0.1
+    geo_schedule: Schedule = "rising"
+    similarity_rate: float = 0.1
+    camera_rate: float = 0.01
+    variance_rate: float = 0.01
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    seed: int = 0
+    coarse: tuple[tuple[int, float], ...] = ()
+    coarse_least_px: int = 160
+    surface: SurfaceSettings | None = None
+
+
+@dataclass(frozen=True)
+class Views:
+    """Training views.
+
+    Attributes:
+        camera: (V,) indices into the cameras (and the images) of those to train on.
+        images: all undistorted images.
+        surface: gives the points (K, 3) in `model` that an image shows; only the surface losses need them.
+        lenses: that the images were undistorted with; None: they stay.
+    """
+
+    camera: np.ndarray
+    images: ImageCache
+    surface: Callable[[int], Tensor] | None = None
+    lenses: Lenses | None = None
+
+
+@dataclass(frozen=True)
+class StepReport:
+    """What one iteration saw: scalars, not yet fetched from the device; `by_depth` only of a view with marks."""
+
+    photometric: Tensor
+    mean_square_error: Tensor
+    geographic: Tensor
+    weight: float
+    by_depth: Tensor | None = None
+
+
+class JointTrainer:
+    """State of a joint optimisation; every iteration is a pure function of it.
+
+    Nothing in an iteration waits for the device, but for the lens: views are rendered through the one that followed
+    the cameras when it was last looked at, each hundred iterations.
+
+    Args:
+        optimizer: the Gaussians and their moments.
+        strategy: density control.
+        problem: the geographic half.
+        views: what to compare with.
+        rasterizer: backend.
+        options: schedule.
+        exposures: of the photographs; None: all alike.
+    """
+
+    def __init__(
+        self,
+        optimizer: GaussianAdam,
+        strategy: Strategy,
+        problem: GeoProblem,
+        views: Views,
+        *,
+        rasterizer: Rasterizer,
+        options: JointOptions,
+        exposures: Exposures | None = None,
+    ) -> None:
+        self.optimizer, self.strategy, self.problem = optimizer, strategy, problem
+        self.views, self.rasterizer, self.options = views, rasterizer, options
+        self.exposures = exposures
+        self.iteration = 0
+        self.device = optimizer.gaussians.means.device
+        self._pinholes = Pinholes(views.images, views.lenses)
+        self._lens = np.zeros(len(problem.cameras.lens_basis))
+        self._targets = Targets(views.images, self._pinholes, self.device)
+        names = ("photometric loss", "geographic loss", *(f"gradient of {name}" for name in self._watched()))
+        self._watch = FiniteWatch(names, self.device)
+        rates = {
+            "y": options.similarity_rate,
+            "z": options.camera_rate,
+            "x": options.similarity_rate,
+            "u": options.variance_rate,
+        }
+        self._geo_adam = torch.optim.Adam(
+            [{"params": [parameter], "rate": rates[name]} for name, parameter in problem.learned().items()]
+        )
+
+    def step(self) -> StepReport:
+        """Render one view, compare, and move everything a little."""
+        self.iteration += 1
+        if self.iteration % _LENS_EVERY == 1:
+            self._look_through(self.problem.cameras.lens().detach().cpu().numpy())
+        index = self._view_of(self.iteration)
+        target = self._targets.get(index, self._shrink(index), self._view_of(self.iteration + 1))
+        pose = self.problem.cameras.cam_from_model(index)
+        render = self._render(pose, target.camera, depth=self.problem.sees_by_depth(index))
+        colour = render.colour if self.exposures is None else self.exposures.apply(index, render.colour)
+        photometric = photometric_loss(colour, target.colour, target.mask)
+        weight, by_depth = self._geo_weight(), self._by_depth(index, render, target)
+        geographic = self.problem.loss() if by_depth is None else self.problem.loss() + by_depth
+        self.optimizer.zero_grad()
+        self._geo_adam.zero_grad()
+        total = photometric + weight * geographic
+        penalty = self.strategy.penalty(self.optimizer.gaussians, render.stats)
+        for term in (penalty, self._surface(render, pose, target, index)):
+            total = total if term is None else total + term
+        total.backward()
+        self._note(photometric, geographic)
+        self._apply(render.stats.visible)
+        self.strategy.observe(render.stats, target.camera)
+        self.strategy.update(self.iteration, self.optimizer, self.evidence)
+        return StepReport(
+            photometric.detach(),
+            _mean_square(colour, target),
+            geographic.detach(),
+            weight,
+            None if by_depth is None else by_depth.detach(),
+        )
+
+    @torch.no_grad()
+    def evidence(self, count: int, generator: torch.Generator) -> list[Evidence]:
+        """What `count` different training views say of the Gaussians; see `splat.evidence.Probe`."""
+        found = []
+        for place in torch.randperm(len(self.views.camera), generator=generator)[:count].tolist():
+            index = int(self.views.camera[place])
+            shrink, pose = self._shrink(index), self.problem.cameras.cam_from_model(index)
+            target = self._targets.get(index, shrink)
+            colour = self._render(pose, target.camera).colour
+            if self.exposures is not None:
+                colour = self.exposures.apply(index, colour)
+            error = (colour - target.colour).abs().mean(dim=-1)
+            error = error if target.mask is None else error * target.mask
+            seen = evidence(self.optimizer.gaussians, pose, target.camera, error, self.rasterizer)
+            # Strategies count pixels of the photographs, whatever the schedule makes of them.
+            found.append(Evidence(shrink**2 * seen.weight_px, shrink**2 * seen.high_error_px))
+        return found
+
+    def pinhole(self, index: int) -> Pinhole:
+        """Camera of an undistorted photograph, with the lens in use."""
+        return self._pinholes.of(index)
+
+    def check_finite(self) -> None:
+        """Wait for the device and stop before a divergence spoils everything.
+
+        Raises:
+            NonFiniteError: a loss or gradient was not finite; names the first and its iteration.
+        """
+        self._watch.check()
+
+    def slow_down(self, factor: float) -> None:
+        """Lower all learning rates from here on; forget what was not finite."""
+        self.optimizer.rate_factor *= factor
+        self._watch.reset()
+
+    def _look_through(self, lens: np.ndarray) -> None:
+        """Use SfM's lenses with a change (L,) of their parameters."""
+        self._lens = lens.copy()
+        if self.views.lenses is not None and len(lens):
+            self._pinholes.renew(self.views.lenses.moved(self._lens))
+
+    def _geo_weight(self) -> float:
+        options = self.options
+        if options.geo_schedule == "constant":
+            return options.geo_weight
+        return rising_weight(self.iteration, options.geo_weight, options.geo_rise * options.iterations)
+
+    def _by_depth(self, index: int, render: Render, target: Target) -> Tensor | None:
+        """The control points of this view, where they are found through the rendered depth."""
+        if render.expected_depth is None:
+            return None
+        return self.problem.depth_loss(index, render.expected_depth, render.alpha, target.camera)
+
+    def _render(self, pose: Tensor, camera: Pinhole, *, depth: bool = False) -> Render:
+        depth = depth or self.options.surface is not None
+        settings = RasterSettings(sh_degree=self._sh_degree(), background=self.options.background, depth=depth)
+        return self.rasterizer.render(self.optimizer.gaussians, pose, camera, settings)
+
+    def _surface(self, render: Render, pose: Tensor, target: Target, index: int) -> Tensor | None:
+        """The surface losses, where they are wanted."""
+        wanted, gaussians = self.options.surface, self.optimizer.gaussians
+        if wanted is None:
+            return None
+        loss = wanted.flatness * flatness_loss(gaussians, render.stats.visible, self.optimizer.extent_m)
+        if render.expected_depth is not None and render.depth_variance is not None:
+            spread = compactness_loss(render.expected_depth, render.depth_variance, render.alpha)
+            loss = loss + wanted.compactness * spread
+        if self.views.surface is not None and render.expected_depth is not None:
+            points = self.views.surface(index)
+            depth = depth_loss(render.expected_depth, render.alpha, points, pose, target.camera)
+            loss = loss + wanted.depth * depth
+        late = self.iteration > wanted.normals_from * self.options.iterations
+        if late and self.iteration % wanted.normals_every == 0:
+            normals = normal_loss(gaussians, pose, target.camera, self.rasterizer, wanted.edge)
+            loss = loss + wanted.normals_every * wanted.normals * normals
+        return loss
+
+    def _watched(self) -> dict[str, Tensor]:
+        tensors = self.optimizer.gaussians.tensors()
+        geo = {_TOLD[name]: parameter for name, parameter in self.problem.learned().items()}
+        return {name: tensors[name] for name in _WATCHED} | geo
+
+    def _note(self, photometric: Tensor, geographic: Tensor) -> None:
+        losses = {"photometric loss": photometric, "geographic loss": geographic}
+        gradients = {
+            f"gradient of {name}": geographic.new_zeros(()) if tensor.grad is None else tensor.grad.sum()
+            for name, tensor in self._watched().items()
+        }
+        self._watch.note(self.iteration, losses | gradients)
+
+    def _apply(self, visible: Tensor) -> None:
+        progress = self.iteration / self.options.iterations
+        for group in self._geo_adam.param_groups:
+            group["lr"] = self.optimizer.rate_factor * group["rate"] * _FINAL_RATE**progress
+        self._geo_adam.step()
+        self.optimizer.step(self.iteration, visible)
+        if self.exposures is not None:
+            self.exposures.step(self.iteration)
+
+    def _shrink(self, index: int) -> int:
+        """How much the photographs are shrunken at this iteration."""
+        camera = self.views.images.pinhole(index)
+        most = max(max(camera.width, camera.height) // self.options.coarse_least_px, 1)
+        progress = self.iteration / self.options.iterations
+        return min(next((shrink for shrink, until in self.options.coarse if progress <= until), 1), most)
+
+    def _view_of(self, iteration: int) -> int:
+        """Every view once an epoch, in an order that only depends on the seed and the epoch."""
+        count = len(self.views.camera)
+        epoch, place = divmod(iteration - 1, count)
+        order = np.random.default_rng([self.options.seed, epoch]).permutation(count)
+        return int(self.views.camera[order[place]])
+
+    def _sh_degree(self) -> int:
+        """One degree more each sixth of the training, up to half of it (3DGS: each 1 000 of 30 000)."""
+        every = max(self.options.iterations // 6, 1)
+        return min(self.options.sh_degree, self.iteration // every)
+
+    def state(self) -> dict[str, Tensor]:
+        """Everything that the next iteration depends on."""
+        parameters = self.problem.learned()
+        geo: dict[str, Tensor] = {**parameters}
+        for name, parameter in parameters.items():
+            moments = self._geo_adam.state[parameter]
+            geo |= {f"{name}_{key}": torch.as_tensor(value) for key, value in moments.items()}
+        exposures = {} if self.exposures is None else self.exposures.state()
+        return {
+            "iteration": torch.tensor(self.iteration),
+            "rate_factor": torch.tensor(self.optimizer.rate_factor, dtype=torch.float64),
+            "lens": torch.from_numpy(self._lens),
+            **prefixed("gaussians", self.optimizer.gaussians.tensors()),
+            **prefixed("optimizer", self.optimizer.state()),
+            **prefixed("strategy", self.strategy.state()),
+            **prefixed("geo", geo),
+            **prefixed("exposures", exposures),
+        }
+
+    def restore(self, state: Mapping[str, Tensor]) -> None:
+        """Go on from `state`."""
+        self.iteration = int(state["iteration"])
+        self.optimizer.rate_factor = float(state["rate_factor"])
+        self._look_through(state["lens"].cpu().numpy())
+        self._watch.reset()
+        tensors = {name: tensor.to(self.device) for name, tensor in unprefixed("gaussians", state).items()}
+        gaussians = Gaussians(**tensors)
+        fresh = torch.full((len(gaussians),), -1, dtype=torch.int64, device=self.device)
+        fresh[: min(len(gaussians), len(self.optimizer.gaussians))] = 0
+        self.optimizer.rearrange(gaussians, fresh)
+        self.optimizer.restore(unprefixed("optimizer", state))
+        self.strategy.restore(unprefixed("strategy", state))
+        if self.exposures is not None:
+            self.exposures.restore(unprefixed("exposures", state))
+        geo = unprefixed("geo", state)
+        for name, parameter in self.problem.learned().items():
+            with torch.no_grad():
+                parameter.copy_(geo[name])
+            # Adam counts its steps on the CPU, whatever the device.
+            self._geo_adam.state[parameter] = {
+                key: geo[f"{name}_{key}"].to("cpu" if key == "step" else self.device)
+                for key in ("step", "exp_avg", "exp_avg_sq")
+                if f"{name}_{key}" in geo
+            }
+
+
+@torch.no_grad()
+def _mean_square(colour: Tensor, target: Target) -> Tensor:
+    """Mean square error over the pixels that count, without waiting for the device to count them."""
+    error = (colour - target.colour).square()
+    if target.mask is None:
+        return error.mean()
+    return (error * target.mask[..., None]).sum() / (3 * target.mask.sum()).clamp_min(1)

@@ -1,0 +1,144 @@
+"""Options: precedence, ranges, unknown keys, and the errors that name them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pydantic.fields import FieldInfo
+
+from pipelines.core.errors import InputError
+from pipelines.core.options import StageOptions, flag_name, input_paths, load_toml, resolve
+from pipelines.core.stages import PIPELINE
+from pipelines.ingest.options import IngestOptions
+from pipelines.sfm.options import SfmOptions
+from pipelines.train.options import TrainOptions
+
+CONFIGS = {spec.name: spec.options for spec in PIPELINE}
+TOML = Path("/surveys/flight/georef.toml")
+
+
+def test_precedence() -> None:
+    assert resolve(SfmOptions, {}, {}, TOML).max_image_size == SfmOptions().max_image_size
+    assert resolve(SfmOptions, {"max_image_size": 900}, {}, TOML).max_image_size == 900
+    assert resolve(SfmOptions, {"max_image_size": 900}, {"max_image_size": 800}, TOML).max_image_size == 800
+
+
+@pytest.mark.parametrize(
+    ("table", "flags", "message"),
+    [
+        ({"max_image_sise": 9}, {}, r"^/surveys/flight/georef\.toml \[max_image_sise\]: unknown key; .*mapper"),
+        ({"max_image_size": 9}, {}, r"^/surveys/flight/georef\.toml \[max_image_size\]: .*equal to 128"),
+        ({}, {"max_image_size": 9}, r"^\[--max-image-size\]: .*greater than or equal to 128"),
+        ({"max_image_size": 9}, {"max_image_size": 8}, r"^\[--max-image-size\]"),
+        ({"mapper": "best"}, {}, r"georef\.toml \[mapper\]: .*'incremental' or 'global'"),
+        ({}, {"import_model": 3}, r"^\[--import\]"),
+        ({"seed": "one"}, {}, r"georef\.toml \[seed\]: .*integer"),
+    ],
+)  # fmt: skip
+def test_errors_name_place_and_key(table: dict[str, Any], flags: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        resolve(SfmOptions, table, flags, TOML)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -1.0, 0.0])
+def test_a_sigma_is_a_positive_number(value: float) -> None:
+    with pytest.raises(InputError, match=r"\[--sigma-gcp-h\]"):
+        resolve(IngestOptions, {}, {"sigma_gcp_h": value}, TOML)
+
+
+def test_paths_of_the_file_are_relative_to_it() -> None:
+    config = resolve(IngestOptions, {"images": "../photos", "gcp": "/control/gcp.txt"}, {"geo": "/g.txt"}, TOML)
+    assert input_paths(config) == {
+        "images": Path("/surveys/flight/../photos"),
+        "gcp": Path("/control/gcp.txt"),
+        "geo": Path("/g.txt"),
+    }
+
+
+def test_text_options_of_the_file_are_no_paths() -> None:
+    assert resolve(IngestOptions, {"crs": "EPSG:32632"}, {}, TOML).crs == "EPSG:32632"
+
+
+def test_options_survive_storage() -> None:
+    """A manifest stores options as JSON, a request stores flags: both must give the same options again."""
+    config = resolve(IngestOptions, {}, {"images": Path("/p"), "check": ("A", "B"), "sigma_h": 0.5}, TOML)
+    assert IngestOptions.model_validate(config.model_dump(mode="json")) == config
+
+
+class TestToml:
+    def load(self, folder: Path, text: bytes) -> dict[str, dict[str, Any]]:
+        (folder / "georef.toml").write_bytes(text)
+        return load_toml(folder / "georef.toml", CONFIGS)
+
+    def test_missing_file_is_empty(self, tmp_path: Path) -> None:
+        assert load_toml(tmp_path / "georef.toml", CONFIGS) == {}
+
+    def test_byte_order_mark_and_crlf(self, tmp_path: Path) -> None:
+        assert self.load(tmp_path, b"\xef\xbb\xbf[train]\r\nseed = 4\r\n") == {"train": {"seed": 4}}
+
+    @pytest.mark.parametrize(
+        ("text", "message"),
+        [
+            (b"[train\n", r"georef\.toml: not valid TOML: .*line 1"),
+            (b"\xff\xfe[train]\n", r"georef\.toml: not valid TOML"),
+            (b"[trian]\n", r"georef\.toml \[trian\]: unknown table; the stages are ingest, sfm"),
+            (b"train = 3\n", r"georef\.toml \[train\]: expected a table"),
+        ],
+    )
+    def test_errors(self, tmp_path: Path, text: bytes, message: str) -> None:
+        with pytest.raises(InputError, match=message):
+            self.load(tmp_path, text)
+
+    def test_folder_in_its_place(self, tmp_path: Path) -> None:
+        (tmp_path / "georef.toml").mkdir()
+        with pytest.raises(InputError, match="cannot be read"):
+            load_toml(tmp_path / "georef.toml", CONFIGS)
+
+
+def fields() -> list[tuple[type[StageOptions], str, FieldInfo]]:
+    return [(config, name, info) for config in CONFIGS.values() for name, info in config.model_fields.items()]
+
+
+@pytest.mark.parametrize(("config", "name", "info"), fields())
+def test_every_option_explains_itself(config: type[StageOptions], name: str, info: FieldInfo) -> None:
+    """Help, docs and errors all come from the field: it must have a meaning, a valid default and its own flag."""
+    assert info.description
+    assert info.description.endswith((".", "…", ")"))
+    config.model_validate({name: info.default})
+    flags = [flag_name(config, other) for other in config.model_fields]
+    assert flags.count(flag_name(config, name)) == 1
+
+
+def test_presets_leave_room_for_explicit_sizes() -> None:
+    config = TrainOptions()
+    assert (config.iterations, config.max_image_size, config.max_gaussians) == (None, None, None)
+
+
+@pytest.mark.parametrize(
+    ("text", "names"),
+    [
+        ("auto", ()),
+        ("none", ()),
+        ("bias", ("bias",)),
+        ("boresight,bias", ("bias", "boresight")),
+        ("lever-arm,boresight,bias", ("bias", "lever-arm", "boresight")),
+    ],
+)
+def test_constant_errors_are_named(text: str, names: tuple[str, ...]) -> None:
+    assert TrainOptions(estimate=text).estimated == names
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        ({"estimate": "drift"}, r"--estimate.*'drift' is none of bias, lever-arm, boresight"),
+        ({"estimate": "bias,auto"}, r"--estimate.*'auto' is none of"),
+        ({"estimate": ""}, r"--estimate.*'' is none of"),
+        ({"estimate": "bias", "weighting": "paper"}, r"--estimate.*--weighting whitened only"),
+    ],
+)
+def test_constant_errors_that_cannot_be(flags: dict[str, str], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        resolve(TrainOptions, {}, flags, Path("georef.toml"))

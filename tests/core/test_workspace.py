@@ -1,0 +1,263 @@
+"""The workspace: one writer, and no way to lose or damage a product by dying."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipelines.core import runner
+from pipelines.core import staleness as states
+from pipelines.core.errors import InputError, MissingProductError, WorkspaceBusyError
+from pipelines.core.products import load_json, save_json
+from pipelines.core.stages import BY_NAME, MODEL, PIPELINE, POINTS, SIM3, SPARSE, SURVEY
+from pipelines.core.workspace import Workspace
+from pipelines.geodesy.vertical import VerticalDatum
+from tests import fakes
+
+TRAIN = BY_NAME["train"]
+WRITING = os.O_WRONLY | os.O_RDWR
+CHANGES = ("os.rename", "os.remove", "os.rmdir", "os.mkdir")
+
+
+def die_at(step: int) -> Callable[[str, tuple[Any, ...]], None]:
+    """An audit hook that kills this process ahead of its `step`-th change of the file system."""
+    seen = 0
+
+    def hook(event: str, arguments: tuple[Any, ...]) -> None:
+        nonlocal seen
+        writes = event == "open" and isinstance(arguments[2], int) and bool(arguments[2] & WRITING)
+        if event in CHANGES or writes:
+            seen += 1
+            if seen == step:
+                os.kill(os.getpid(), signal.SIGKILL)
+
+    return hook
+
+
+def killed_at(step: int, work: Callable[[], object]) -> bool:
+    """Do `work` in a child process that dies ahead of change `step`; False if it got to its end."""
+    child = os.fork()
+    if child == 0:
+        sys.addaudithook(die_at(step))
+        try:
+            work()
+        except BaseException:
+            os._exit(1)
+        os._exit(0)
+    _, status = os.waitpid(child, 0)
+    assert os.waitstatus_to_exitcode(status) in (0, -signal.SIGKILL), "the work failed by itself"
+    return os.WIFSIGNALED(status)
+
+
+def kill_points(
+    make: Callable[[Path], Workspace], work: Callable[[Workspace], object], folder: Path
+) -> Iterator[Workspace]:
+    """Workspaces in which `work` was killed ahead of its 1st, 2nd, 3rd … change, and one where it was not."""
+    for step in range(1, 200):
+        workspace = make(folder / str(step))
+        killed = killed_at(step, partial(work, workspace))
+        yield workspace
+        if not killed:
+            assert step > 5, "hardly a kill point: the hook sees nothing"
+            return
+    raise AssertionError("the work never came to its end")
+
+
+def assert_whole(workspace: Workspace) -> None:
+    """Every product that is there is the one that its manifest tells of."""
+    for spec in PIPELINE:
+        manifest = workspace.manifest(spec)
+        if manifest is not None:
+            assert set(fakes.read_products(workspace, spec)) == {manifest.values["text"]}
+
+
+def assert_tidy(workspace: Workspace) -> None:
+    """Nothing of a killed run is left over."""
+    left = [path.name for path in workspace.root.iterdir() if path.name.endswith((".partial", ".old", ".tmp"))]
+    assert left == []
+
+
+@pytest.mark.usefixtures("fake_stages")
+class TestKilledAtAnyMoment:
+    """Every change of the file system is a kill point: the process dies ahead of each in turn."""
+
+    def test_first_run_is_completed_by_the_next(self, tmp_path: Path, photos: Path) -> None:
+        def work(workspace: Workspace) -> list[runner.Outcome]:
+            return runner.run_pipeline(workspace, PIPELINE[:2], {"ingest": {"images": photos}})
+
+        for workspace in kill_points(Workspace, work, tmp_path):
+            if workspace.root.exists():
+                states.status(workspace)  # can always be looked at
+            work(workspace)
+            assert_whole(workspace)
+            assert_tidy(workspace)
+            assert [row.state for row in states.status(workspace)][:2] == ["current", "current"]
+
+    def test_rerun_leaves_old_or_new_product(self, tmp_path: Path, photos: Path) -> None:
+        def make(root: Path) -> Workspace:
+            workspace = Workspace(root)
+            runner.run_pipeline(workspace, PIPELINE[:5], {"ingest": {"images": photos}})
+            return workspace
+
+        def work(workspace: Workspace) -> runner.Outcome:
+            return runner.run_stage(workspace, TRAIN, {"seed": 1})
+
+        old = fakes.read_products(make(tmp_path / "old"), TRAIN)
+        for workspace in kill_points(make, work, tmp_path):
+            with workspace.lock("test"):  # whoever writes next repairs first
+                found = fakes.read_products(workspace, TRAIN)
+            assert len(set(found)) == 1
+            assert found == old or '"seed":1' in found[0]
+            assert_whole(workspace)
+            work(workspace)
+            assert '"seed":1' in fakes.read_products(workspace, TRAIN)[0]
+            assert_tidy(workspace)
+
+    def test_half_deleted_run_is_never_resumed(self, tmp_path: Path) -> None:
+        folders = "abcdefgh"  # in whatever order the file system lists them, some are deleted before the token
+
+        def make(root: Path) -> Workspace:
+            workspace = Workspace(root)
+            out, _ = workspace.begin(TRAIN, "same", "never")
+            for name in folders:
+                (out / name).mkdir()
+                (out / name / "part").write_text("part of a checkpoint")
+            return workspace
+
+        def drop(workspace: Workspace) -> object:
+            return workspace.begin(TRAIN, "other", "if-same")
+
+        for workspace in kill_points(make, drop, tmp_path):
+            out, continued = workspace.begin(TRAIN, "same", "if-same")
+            assert all((out / name / "part").exists() == continued for name in folders)
+
+
+def test_replaced_product_is_the_old_one_or_the_new(tmp_path: Path) -> None:
+    """As `calibrate` makes a survey anew, killed ahead of each change."""
+    old, new = (VerticalDatum(name=name, stated=True) for name in ("old", "new"))
+    path = tmp_path / SURVEY
+    for step in range(1, 10):
+        save_json(old, path)
+        killed = killed_at(step, partial(Workspace(tmp_path).replace, SURVEY, new))
+        assert load_json(VerticalDatum, path) == (old if killed else new)
+        if not killed:
+            break
+    assert step > 2
+
+
+class TestLock:
+    def test_second_writer_is_told_who_writes(self, workspace: Workspace) -> None:
+        with (
+            workspace.lock("train"),
+            pytest.raises(WorkspaceBusyError, match=rf"train in process {os.getpid()}"),
+            workspace.lock("ingest"),
+        ):
+            pass
+
+    def test_writer_is_seen_while_it_writes(self, workspace: Workspace) -> None:
+        assert workspace.writer() is None
+        with workspace.lock("train"):
+            assert workspace.writer() == "train"
+        assert workspace.writer() is None
+
+    def test_lock_dies_with_its_holder(self, workspace: Workspace) -> None:
+        child = os.fork()
+        if child == 0:
+            with workspace.lock("train"):
+                os.kill(os.getpid(), signal.SIGKILL)
+        os.waitpid(child, 0)
+        with workspace.lock("ingest"):
+            assert workspace.writer() == "ingest"
+
+    def test_file_in_place_of_workspace(self, tmp_path: Path) -> None:
+        (tmp_path / "flight").write_text("not a folder")
+        with (
+            pytest.raises(InputError, match="cannot be used as a workspace"),
+            Workspace(tmp_path / "flight").lock("t"),
+        ):
+            pass
+
+
+class TestBegin:
+    def begin(self, workspace: Workspace) -> Path:
+        out, continued = workspace.begin(TRAIN, "same", "if-same")
+        assert not continued
+        (out / "checkpoint").write_text("1000")
+        return out
+
+    def test_same_run_is_continued(self, workspace: Workspace) -> None:
+        self.begin(workspace)
+        out, continued = workspace.begin(TRAIN, "same", "if-same")
+        assert continued
+        assert (out / "checkpoint").exists()
+
+    @pytest.mark.parametrize(("token", "resume"), [("other", "if-same"), ("same", "never")])
+    def test_other_run_starts_empty(self, workspace: Workspace, token: str, resume: Any) -> None:
+        self.begin(workspace)
+        out, continued = workspace.begin(TRAIN, token, resume)
+        assert not continued
+        assert not (out / "checkpoint").exists()
+
+    def test_insisting_on_another_run_is_refused_and_keeps_it(self, workspace: Workspace) -> None:
+        out = self.begin(workspace)
+        with pytest.raises(InputError, match="other inputs or options"):
+            workspace.begin(TRAIN, "other", "always")
+        assert (out / "checkpoint").exists()
+
+    def test_stage_that_cannot_resume_starts_empty(self, workspace: Workspace) -> None:
+        spec = BY_NAME["ingest"]
+        out, _ = workspace.begin(spec, "same", "if-same")
+        (out / "half").write_text("")
+        assert workspace.begin(spec, "same", "if-same") == (out, False)
+        assert not (out / "half").exists()
+
+
+def test_missing_product_names_the_command(workspace: Workspace) -> None:
+    with pytest.raises(MissingProductError, match=rf"georef geolocate {workspace.root}"):
+        workspace.path(POINTS)
+    with pytest.raises(MissingProductError, match="georef sfm"):
+        workspace.path(SPARSE)
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"train": 1}', "\xff\xfe"])
+def test_damaged_requests_are_named(workspace: Workspace, text: str) -> None:
+    workspace.root.mkdir()
+    path = workspace.root / "requests.json"
+    path.write_text(text, encoding="latin-1")
+    with pytest.raises(InputError, match=r"requests\.json.*delete it"):
+        workspace.requests()
+
+
+def test_requests_are_kept_by_stage(workspace: Workspace) -> None:
+    workspace.root.mkdir()
+    workspace.remember({"ingest": {"images": Path("/photos"), "check": ("P1", "P2")}})
+    workspace.remember({"train": {"preset": "fast"}})
+    workspace.remember({"train": {"seed": 3}})
+    assert workspace.requests() == {"ingest": {"images": "/photos", "check": ["P1", "P2"]}, "train": {"seed": 3}}
+    assert json.loads((workspace.root / "requests.json").read_text())
+
+
+def test_variant_reads_what_is_lent_and_writes_its_own(tmp_path: Path) -> None:
+    workspace, elsewhere = Workspace(tmp_path / "flight"), tmp_path / "elsewhere"
+    variant = workspace.variant("compare/A", {"sfm": workspace.root / "sfm", "geolocate": elsewhere})
+    for path in (workspace.root / SPARSE, elsewhere / "points.npz", variant.root / SIM3):
+        path.mkdir(parents=True)
+    assert variant.path(SPARSE) == workspace.root / SPARSE
+    assert variant.path(POINTS) == elsewhere / "points.npz"
+    assert variant.path(SIM3) == variant.root / SIM3
+    assert variant.partial(TRAIN).parent == variant.root == workspace.root / "compare/A"
+    assert variant.cache == workspace.cache
+    assert {row.stage: row.state for row in states.status(variant)}["sfm"] == "current"
+    assert variant.config_file == workspace.config_file
+    assert variant.photographs("ingest/images") == workspace.root / "ingest/images"
+    assert variant.photographs("/photos") == Path("/photos")
+    with pytest.raises(MissingProductError, match=f"georef compare {workspace.root}"):
+        variant.path(MODEL)  # not the workspace's own, even if it were there

@@ -1,0 +1,340 @@
+"""Stage `evaluate` on a trained survey of known truth: the report's form, and its figures."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from pipelines.core.errors import InputError
+from pipelines.core.products import load_json, save_json
+from pipelines.core.runner import Outcome, run_stage
+from pipelines.core.stages import BY_NAME, GAUSSIANS, MODEL, REPORT, SIM3, SURVEY
+from pipelines.core.workspace import Workspace
+from pipelines.evaluate.asprs import few_points
+from pipelines.evaluate.prediction import Prediction
+from pipelines.evaluate.stage import render_name
+from pipelines.scene.initial_similarity import InitialSimilarity
+from pipelines.scene.restored import geographic_options_of, restore
+from pipelines.scene.survey import Mark, Survey
+from pipelines.scene.trained import load_trained
+from pipelines.scene.trained_model import TrainedModel
+from pipelines.splat.storage import read_gaussians, write_gaussians
+from tests.splat_scenes import NOISE, SIGMA_M, TEST_VIEWS, Flight, ground_height
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+EVALUATE = BY_NAME["evaluate"]
+STATS = {"count", "mean_h_m", "rmse_h_m", "rmse_e_m", "rmse_n_m", "rmse_v_m", "rmse_3d_m", "max_3d_m"}
+
+
+@pytest.fixture(scope="module")
+def evaluated(trained: list[tuple[Workspace, Workspace]]) -> tuple[Workspace, Outcome]:
+    """The first survey, trained with the geographic losses and evaluated."""
+    workspace = trained[0][0]
+    return workspace, run_stage(workspace, EVALUATE, {"renders": 1})
+
+
+@pytest.fixture
+def altered(evaluated: tuple[Workspace, Outcome], tmp_path: Path) -> Workspace:
+    """A copy whose survey or model a test may change."""
+    root = tmp_path / "copy"
+    shutil.copytree(evaluated[0].root, root, symlinks=True, ignore=shutil.ignore_patterns("evaluate"))
+    return Workspace(root)
+
+
+def report_of(workspace: Workspace) -> dict[str, Any]:
+    document: dict[str, Any] = json.loads(workspace.path(REPORT).read_text(encoding="utf-8"))
+    return document
+
+
+def change_survey(workspace: Workspace, **update: object) -> None:
+    survey = load_json(Survey, workspace.path(SURVEY))
+    save_json(survey.model_copy(update=update), workspace.root / SURVEY)
+
+
+def test_report_has_the_form_that_scripts_read(evaluated: tuple[Workspace, Outcome]) -> None:
+    report = report_of(evaluated[0])
+    test = report["photometric"]["test"]
+    assert {"views", "psnr", "ssim", "lpips"} <= set(test)
+    assert set(report["checkpoints"]) == {"camera", "model"}
+    for way in ("camera", "model"):
+        assert set(report["checkpoints"][way]) >= STATS
+    assert set(report["fit"]) == {"gnss", "gcp"}
+    assert set(report["fit"]["gnss"]) >= STATS
+    assert report["fit"]["gcp"]["count"] == 0
+    assert report["fit"]["gcp"]["rmse_3d_m"] is None
+
+
+def test_test_views_are_those_held_out(evaluated: tuple[Workspace, Outcome]) -> None:
+    workspace, outcome = evaluated
+    test = report_of(workspace)["photometric"]["test"]
+    assert test["views"] == 2
+    assert [row["image"] for row in test["per_view"]] == [f"image_{index:03d}.jpg" for index in TEST_VIEWS]
+    assert test["psnr"] == pytest.approx(np.mean([row["psnr"] for row in test["per_view"]]))
+    assert 22.0 < test["psnr"] < 40.0
+    assert 0.5 < test["ssim"] < 1.0
+    assert test["lpips"] is None
+    assert "weights" in test["lpips_reason"]
+    assert outcome.manifest.values["psnr"] == test["psnr"]
+    assert f"test PSNR {test['psnr']:.2f} dB" in outcome.manifest.key_figure
+
+
+def test_renders_stand_beside_the_photographs(evaluated: tuple[Workspace, Outcome]) -> None:
+    workspace, _ = evaluated
+    renders = sorted((workspace.root / "evaluate" / "renders").iterdir())
+    assert [path.name for path in renders] == ["image_003.png"]
+    strip = cv2.imread(str(renders[0]))
+    assert strip.shape == (72, 3 * 96, 3)
+    photo = cv2.imread(str(workspace.root / "photos" / "image_003.jpg"))
+    np.testing.assert_array_equal(strip[:, :96], photo)
+    shown = np.abs(photo.astype(float) - strip[:, 96:192])
+    np.testing.assert_allclose(strip[:, 192:], np.minimum(3 * shown, 255), atol=4)
+
+
+def test_check_points_by_camera_are_as_good_as_the_measurements(evaluated: tuple[Workspace, Outcome]) -> None:
+    found = report_of(evaluated[0])["checkpoints"]["camera"]
+    assert found["count"] == 6
+    # Marks of 0.1 px are 5 cm from 45 m, over √12 rays 2 cm; the similarity's own 1.5 and 2.4 cm, and its turn.
+    assert found["rmse_h_m"] < 0.08
+    assert found["rmse_v_m"] < 0.12
+    assert [row["rays"] for row in found["points"]] == [14] * 6
+    errors = np.array([[row[key] for key in ("de_m", "dn_m", "du_m")] for row in found["points"]])
+    assert found["rmse_3d_m"] == pytest.approx(np.sqrt((errors**2).sum(axis=1).mean()))
+    assert found["mean_h_m"] == pytest.approx(np.hypot(errors[:, 0], errors[:, 1]).mean())
+
+
+def test_check_points_are_measured_through_the_trained_lens(altered: Workspace) -> None:
+    run_stage(altered, EVALUATE, {"renders": 0})
+    before, cached = report_of(altered), sorted(path.name for path in (altered.cache / "undistorted").iterdir())
+    model = load_json(TrainedModel, altered.path(MODEL))
+    (lens,) = model.lenses
+    fx, fy, cx, cy = lens.params
+    longer = lens.model_copy(update={"params": (1.05 * fx, 1.05 * fy, cx, cy)})
+    save_json(model.model_copy(update={"lenses": (longer,)}), altered.root / MODEL)
+    run_stage(altered, EVALUATE, {"renders": 0})
+    after = report_of(altered)
+    # Narrower rays from cameras that look inward meet lower, though their axes hold the middle; and what is
+    # rendered no longer fits the photographs.
+    assert after["checkpoints"]["camera"]["mean_u_m"] < before["checkpoints"]["camera"]["mean_u_m"] - 0.15
+    assert after["photometric"]["test"]["psnr"] < before["photometric"]["test"]["psnr"] - 1.0
+    # The photographs stay as they were undistorted once.
+    assert sorted(path.name for path in (altered.cache / "undistorted").iterdir()) == cached
+
+
+def test_check_points_by_model_lie_on_the_surface(evaluated: tuple[Workspace, Outcome]) -> None:
+    found = report_of(evaluated[0])["checkpoints"]["model"]
+    assert found["count"] == 6
+    # The surface is known to a Gaussian: its size, not the cameras, decides.
+    assert found["rmse_3d_m"] < 1.5 * SIGMA_M
+    assert found["rmse_h_m"] < SIGMA_M
+
+
+def test_fit_is_that_of_the_fixes(evaluated: tuple[Workspace, Outcome]) -> None:
+    fit = report_of(evaluated[0])["fit"]["gnss"]
+    assert fit["count"] == 12  # of the training views
+    assert fit["outliers"] == 0
+    # 5 cm in east and north and 8 cm up, less seven of 36 degrees of freedom.
+    assert fit["rmse_h_m"] == pytest.approx(0.07 * np.sqrt(29 / 36), rel=0.4)
+    assert fit["rmse_v_m"] == pytest.approx(0.08 * np.sqrt(29 / 36), rel=0.5)
+
+
+def test_few_check_points_are_remarked_on(evaluated: tuple[Workspace, Outcome]) -> None:
+    assert evaluated[1].manifest.warnings == [few_points(6)]
+
+
+def test_control_points_are_a_fit_and_not_an_accuracy(altered: Workspace, flights: list[Flight]) -> None:
+    survey = flights[0].rendered.survey
+    change_survey(altered, control_points=survey.check_points, check_points=())
+    run_stage(altered, EVALUATE, {"renders": 0})
+    report = report_of(altered)
+    assert report["checkpoints"]["camera"]["count"] == 0
+    assert report["checkpoints"]["model"]["rmse_3d_m"] is None
+    assert report["fit"]["gcp"]["count"] == 6
+    assert report["cross_validation"] is None  # nobody asked
+
+
+def test_cross_validation_is_of_control_points_and_stands_alone(altered: Workspace, flights: list[Flight]) -> None:
+    survey = flights[0].rendered.survey
+    change_survey(altered, control_points=survey.check_points[:5], check_points=survey.check_points[5:])
+    run_stage(altered, EVALUATE, {"renders": 0, "cross_validate": True})
+    report = report_of(altered)
+    found = report["cross_validation"]
+    assert found["count"] == 5
+    assert found["reason"] is None
+    assert "asprs" not in found
+    assert report["checkpoints"]["camera"]["count"] == 1
+    # Twelve fixes of 5 and 8 cm, and the other four points: each is found to a few centimetres, and no better than
+    # it fits when it is not left out.
+    assert found["rmse_h_m"] < 0.08
+    assert found["rmse_3d_m"] > report["fit"]["gcp"]["rmse_3d_m"] / 2
+    assert [row["name"] for row in found["points"]] == [point.name for point in survey.check_points[:5]]
+
+
+def test_cross_validation_without_control_points_says_so(altered: Workspace) -> None:
+    outcome = run_stage(altered, EVALUATE, {"renders": 0, "cross_validate": True})
+    assert report_of(altered)["cross_validation"]["count"] == 0
+    assert any(text.startswith("no cross-validation") for text in outcome.manifest.warnings)
+
+
+def test_prediction_agrees_with_the_errors_by_camera(evaluated: tuple[Workspace, Outcome]) -> None:
+    found = report_of(evaluated[0])["checkpoints"]["camera"]
+    predicted, bound = found["predicted"], found["cramer_rao"]
+    assert predicted["count"] == bound["count"] == 6
+    # This scene's cameras are exact, which the prediction cannot know: the errors are less than it says, by the
+    # cameras' share of a few centimetres, and more than a fifth, which is the marks'.
+    assert 0.2 * predicted["rms_h_m"] < found["rmse_h_m"] < 1.5 * predicted["rms_h_m"]
+    assert all(0 < value < 2 for value in predicted["normalised_error_squared"].values())
+    # The prediction counts what robustness costs, the bound does not. In pictures of 96 px the lens is weak, and
+    # its principal point goes into the heights: near the bound, since the lens follows what the fixes tell.
+    assert bound["rms_h_m"] < 1.02 * predicted["rms_h_m"] < 1.25 * bound["rms_h_m"]
+    assert bound["rms_v_m"] < 1.02 * predicted["rms_v_m"] < 1.25 * bound["rms_v_m"]
+
+
+def test_restored_solution_is_that_of_the_training(evaluated: tuple[Workspace, Outcome]) -> None:
+    workspace = evaluated[0]
+    trained, initial = load_trained(workspace), load_json(InitialSimilarity, workspace.path(SIM3))
+    found = restore(trained, initial, geographic_options_of(workspace)).problem.similarity.current()
+    center, sigma = trained.poses.cam_center_in_model, np.sqrt(np.diag(trained.model.geo_from_model.covariance))
+    # 150 iterations with photographs against the end of the road without: within σ of each other.
+    moved = (found.apply(center) - trained.geo_from_model.apply(center)).mean(axis=0)
+    assert (np.abs(moved) < 1.5 * sigma[4:]).all()
+
+
+def test_accuracy_is_stated_after_the_standard(evaluated: tuple[Workspace, Outcome]) -> None:
+    found = report_of(evaluated[0])["checkpoints"]["camera"]
+    assert found["survey"]["rmse_h_m"] == pytest.approx(np.sqrt(2) * NOISE.gcp_m)
+    assert found["with_survey"]["rmse_h_m"] == pytest.approx(np.hypot(found["rmse_h_m"], np.sqrt(2) * NOISE.gcp_m))
+    assert found["asprs"]["horizontal_class"] == f"{np.ceil(100 * found['with_survey']['rmse_h_m']):.0f} cm"
+    assert found["asprs"]["enough_points"] is False
+    assert found["blunders"] == []
+
+
+def test_a_prediction_that_is_not_of_this_training_is_told(trained: list[tuple[Workspace, Workspace]]) -> None:
+    assert not geographic_options_of(trained[0][1]).geo_loss
+    outcome = run_stage(trained[0][1], EVALUATE, {"renders": 0})
+    assert "without geographic losses" in report_of(trained[0][1])["accuracy"]["cautions"][0]
+    assert any("without geographic losses" in text for text in outcome.manifest.warnings)
+
+
+def test_held_cameras_make_the_prediction_too_good(evaluated: tuple[Workspace, Outcome]) -> None:
+    workspace = evaluated[0]
+    trained, initial = load_trained(workspace), load_json(InitialSimilarity, workspace.path(SIM3))
+    config = geographic_options_of(workspace)
+    held = Prediction(restore(trained, initial, config.model_copy(update={"optimize_cameras": False})))
+    assert "too good" in held.cautions[0]
+    assert Prediction(restore(trained, initial, config)).cautions == ()
+
+
+def test_a_blunder_is_named_and_kept(altered: Workspace) -> None:
+    survey = load_json(Survey, altered.path(SURVEY))
+    first, *rest = survey.check_points
+    east, north, up = first.position_in_geo
+    change_survey(
+        altered, check_points=(first.model_copy(update={"position_in_geo": (east + 3, north, up)}), *rest)
+    )
+    outcome = run_stage(altered, EVALUATE, {"renders": 0})
+    found = report_of(altered)["checkpoints"]["camera"]
+    assert found["blunders"] == [first.name]
+    assert found["count"] == 6
+    assert found["rmse_h_m"] > 1.0
+    assert found["without_blunders"]["rmse_h_m"] < 0.1
+    assert any("by camera, 1 of 6 check points" in text for text in outcome.manifest.warnings)
+
+
+def test_predicted_accuracy_is_mapped(evaluated: tuple[Workspace, Outcome]) -> None:
+    folder, accuracy = evaluated[0].root / "evaluate", report_of(evaluated[0])["accuracy"]
+    with (folder / "accuracy.csv").open(encoding="utf-8", newline="") as handle:
+        rows = [{key: float(value) for key, value in row.items()} for row in csv.DictReader(handle)]
+    assert len(rows) == accuracy["cells"] > 500
+    sigma_h = np.array([row["sigma_h_m"] for row in rows])
+    assert np.median(sigma_h) == pytest.approx(accuracy["median_sigma_h_m"], abs=1e-5)
+    place = np.array([[row["east_m"], row["north_m"], row["up_m"]] for row in rows])
+    assert np.abs(place[:, :2]).max() < 27  # where the points are
+    # The height is that of points nearby, on slopes of up to a third.
+    np.testing.assert_allclose(place[:, 2], ground_height(*place[:, :2].T), atol=1.5)
+    # Scale and tilt leave the rim less certain than the middle.
+    far = np.hypot(place[:, 0], place[:, 1])
+    assert sigma_h[far > 20].mean() > sigma_h[far < 10].mean()
+    picture = cv2.imread(str(folder / "accuracy.png"))
+    assert min(picture.shape[:2]) > 400
+
+
+def test_every_field_of_the_report_is_described(altered: Workspace, flights: list[Flight]) -> None:
+    survey = flights[0].rendered.survey
+    far = survey.check_points[0].model_copy(update={"position_in_geo": (9.0, 9.0, 9.0)})
+    change_survey(altered, control_points=survey.check_points[1:4], check_points=(far, *survey.check_points[1:]))
+    run_stage(altered, EVALUATE, {"renders": 0, "cross_validate": True})
+    text = (Path(__file__).parents[2] / "docs" / "formats.md").read_text(encoding="utf-8")
+    missing = {name for name in names_in(report_of(altered)) if f"`{name}`" not in text}
+    assert not missing
+
+
+def names_in(document: Any) -> set[str]:
+    """Every key of a document, however deep."""
+    if isinstance(document, list):
+        return set().union(*map(names_in, document))
+    if not isinstance(document, dict):
+        return set()
+    return set(document).union(*map(names_in, document.values()))
+
+
+def test_equal_images_are_reported_at_the_cap(altered: Workspace) -> None:
+    """An empty model against black photographs: PSNR has no limit, JSON no infinity."""
+    model = load_json(TrainedModel, altered.path(MODEL))
+    save_json(model.model_copy(update={"background": (0.0, 0.0, 0.0)}), altered.root / MODEL)
+    gaussians = read_gaussians(altered.path(GAUSSIANS))
+    write_gaussians(
+        altered.root / GAUSSIANS, replace(gaussians, logit_opacities=0 * gaussians.logit_opacities - 20)
+    )
+    (altered.root / "photos").unlink()
+    (altered.root / "photos").mkdir()
+    for camera in model.cameras:
+        black = cv2.imencode(".png", np.zeros((72, 96, 3), dtype=np.uint8))[1]
+        (altered.root / "photos" / camera.name).write_bytes(black.tobytes())
+    run_stage(altered, EVALUATE, {"renders": 0})
+    test = report_of(altered)["photometric"]["test"]
+    assert (test["psnr"], test["psnr_compensated"], test["ssim"]) == (100.0, 100.0, 1.0)
+
+
+def test_without_test_views_there_are_no_figures(altered: Workspace) -> None:
+    model = load_json(TrainedModel, altered.path(MODEL))
+    cameras = tuple(camera.model_copy(update={"split": "train"}) for camera in model.cameras)
+    save_json(model.model_copy(update={"cameras": cameras}), altered.root / MODEL)
+    outcome = run_stage(altered, EVALUATE, {})
+    test = report_of(altered)["photometric"]["test"]
+    assert (test["views"], test["psnr"], test["ssim"], test["lpips"]) == (0, None, None, None)
+    assert "no test views" in outcome.manifest.key_figure
+
+
+def test_unusable_marks_leave_a_point_unmeasured(altered: Workspace) -> None:
+    survey = load_json(Survey, altered.path(SURVEY))
+    first, second, *rest = survey.check_points
+    alone = first.model_copy(update={"marks": first.marks[:1]})
+    elsewhere = second.model_copy(
+        update={"marks": tuple(Mark(image="other.jpg", x_px=1, y_px=1, sigma_px=1) for _ in range(3))}
+    )
+    change_survey(altered, check_points=(alone, elsewhere, *rest))
+    run_stage(altered, EVALUATE, {"renders": 0})
+    found = report_of(altered)["checkpoints"]["camera"]
+    assert found["count"] == 4
+    assert [row["rays"] for row in found["points"][:2]] == [1, 0]
+    assert [row["de_m"] for row in found["points"][:2]] == [None, None]
+
+
+def test_images_of_one_name_in_two_folders_have_renders_of_their_own() -> None:
+    assert render_name("day 1/DJI_0001.JPG") == "day 1_DJI_0001.png"
+    assert len({render_name(f"{folder}/DJI_0001.JPG") for folder in ("a", "b", "a/b")}) == 3
+
+
+def test_cameras_of_another_reconstruction_are_refused(altered: Workspace) -> None:
+    model = load_json(TrainedModel, altered.path(MODEL))
+    save_json(model.model_copy(update={"cameras": model.cameras[1:]}), altered.root / MODEL)
+    with pytest.raises(InputError, match="train again"):
+        run_stage(altered, EVALUATE, {})

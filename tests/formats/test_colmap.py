@@ -1,0 +1,97 @@
+"""COLMAP models: round trip, agreement with pycolmap, and bad files."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipelines.core.errors import InputError
+from pipelines.formats.colmap import read_sparse, write_sparse
+from pipelines.geometry.sparse_model import SparseModel
+from tests.scenes import Noise, make_scene, sparse_model
+
+pycolmap = pytest.importorskip("pycolmap")
+
+
+@pytest.fixture
+def model() -> SparseModel:
+    return sparse_model(make_scene(images=6, points=60), Noise(), np.random.default_rng(0))
+
+
+def test_written_model_is_read_again(model: SparseModel, tmp_path: Path) -> None:
+    model = replace(model, image_id=model.image_id * 7, point_id=model.point_id * 3)
+    model.point_error_px[3] = np.nan
+    write_sparse(model, tmp_path / "sparse")
+    again = read_sparse(tmp_path / "sparse")
+    for name in (field.name for field in fields(SparseModel)):
+        if name in ("cameras", "image_name"):
+            continue
+        np.testing.assert_allclose(getattr(again, name), getattr(model, name), atol=1e-12, err_msg=name)
+    assert again.image_name == model.image_name
+    assert again.cameras[1].model == "OPENCV"
+    np.testing.assert_array_equal(again.cameras[1].params, model.cameras[1].params)
+
+
+def test_text_model_from_pycolmap_gives_its_tracks_and_centres(tmp_path: Path) -> None:
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_points3D = 2, 40
+    oracle = pycolmap.synthesize_dataset(options)
+    oracle.write_text(str(tmp_path))
+    model = read_sparse(tmp_path)
+    assert len(model.point_id) == 40
+    for index, name in enumerate(model.image_name):
+        image = oracle.find_image_with_name(name)
+        np.testing.assert_allclose(model.cam_center_in_local[index], image.projection_center(), atol=1e-9)
+    for index in (0, 7, 39):
+        point = oracle.points3D[int(model.point_id[index])]
+        seen_in = {int(model.image_id[i]) for i in range(len(model.image_id)) if index in model.points_in(i)}
+        assert seen_in == {element.image_id for element in point.track.elements}
+        expected = sorted(
+            (element.image_id, *oracle.images[element.image_id].points2D[element.point2D_idx].xy)
+            for element in point.track.elements
+        )
+        mine = model.obs_point == index
+        found = np.column_stack([model.image_id[model.obs_image[mine]], model.obs_xy_px[mine]])
+        np.testing.assert_allclose(found, expected)
+
+
+def test_unregistered_images_are_left_out(model: SparseModel, tmp_path: Path) -> None:
+    write_sparse(model, tmp_path)
+    reconstruction = pycolmap.Reconstruction(str(tmp_path))
+    reconstruction.deregister_frame(reconstruction.images[2].frame_id)
+    reconstruction.write(str(tmp_path))
+    again = read_sparse(tmp_path)
+    assert 2 not in again.image_id
+    assert len(again.image_name) == 5
+    assert again.image_index()["image_002.jpg"] == 1
+
+
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
+def test_forged_record_count_is_refused_before_reading(model: SparseModel, tmp_path: Path, name: str) -> None:
+    write_sparse(model, tmp_path)
+    with (tmp_path / name).open("r+b") as handle:
+        handle.write(struct.pack("<Q", 2**62))
+    with pytest.raises(InputError, match="truncated") as caught:
+        read_sparse(tmp_path)
+    assert caught.value.path == tmp_path / name
+
+
+def test_truncated_missing_and_not_finite_models_are_refused(model: SparseModel, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such folder"):
+        read_sparse(tmp_path / "nowhere")
+    with pytest.raises(InputError, match="not a readable COLMAP model"):
+        read_sparse(tmp_path)
+    broken = replace(model, point_in_local=model.point_in_local.copy())
+    broken.point_in_local[0] = np.nan
+    write_sparse(broken, tmp_path / "nan")
+    with pytest.raises(InputError, match="not finite"):
+        read_sparse(tmp_path / "nan")
+    write_sparse(model, tmp_path / "cut")
+    with (tmp_path / "cut" / "points3D.bin").open("r+b") as handle:
+        handle.truncate(1000)
+    with pytest.raises(InputError):
+        read_sparse(tmp_path / "cut")

@@ -1,0 +1,95 @@
+"""What is written into a photograph is read back by ExifRead and by an XML parser."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import replace
+from xml.etree import ElementTree as ET
+
+import cv2
+import exifread
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipelines.core.errors import InputError
+from pipelines.formats.exif_writer import PhotoTags, with_tags
+
+TAGS = PhotoTags(
+    width=64, height=48, focal_px=54.4, stamp_ns=1_700_000_002_250_000_000,
+    lat_deg=-33.856784321, lon_deg=151.215296789, alt_m=-12.3456, relative_alt_m=61.5,
+    yaw_pitch_roll_deg=(-91.25, -35.5, 1.75), body_yaw_pitch_roll_deg=(-91.0, 0.5, 1.5),
+    sigma_enu_m=(0.02, 0.021, 0.03),
+)  # fmt: skip
+JPEG = cv2.imencode(".jpg", np.full((48, 64, 3), 90, dtype=np.uint8))[1].tobytes()
+DJI = "{http://www.dji.com/drone-dji/1.0/}"
+
+
+def exif(jpeg: bytes) -> dict[str, exifread.core.exif_header.IfdTag]:
+    return dict(exifread.process_file(io.BytesIO(jpeg), details=False))
+
+
+def xmp(jpeg: bytes) -> dict[str, str]:
+    packet = jpeg[jpeg.index(b"<x:xmpmeta") : jpeg.index(b"</x:xmpmeta>") + 12]
+    description = next(ET.fromstring(packet).iter("{http://www.w3.org/1999/02/22-rdf-syntax-ns#}Description"))
+    return {key.removeprefix(DJI): value for key, value in description.attrib.items() if key.startswith(DJI)}
+
+
+def degrees(tag: exifread.core.exif_header.IfdTag, ref: object) -> float:
+    whole, minutes, seconds = (float(part) for part in tag.values)
+    return (whole + minutes / 60 + seconds / 3600) * (-1 if str(ref) in "SW" else 1)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    lat=st.floats(-90, 90),
+    lon=st.floats(-180, 180),
+    alt=st.floats(-500, 9000),
+    second=st.integers(0, 4_000_000_000),
+)
+def test_position_and_time_are_read_back(lat: float, lon: float, alt: float, second: int) -> None:
+    stamp_ns = second * 1_000_000_000 + 250_000_000
+    tags = exif(with_tags(JPEG, replace(TAGS, lat_deg=lat, lon_deg=lon, alt_m=alt, stamp_ns=stamp_ns)))
+    # Seconds of arc are written to 1e-6: half of it is 1.4e-10 degrees.
+    assert degrees(tags["GPS GPSLatitude"], tags["GPS GPSLatitudeRef"]) == pytest.approx(lat, abs=2e-10)
+    assert degrees(tags["GPS GPSLongitude"], tags["GPS GPSLongitudeRef"]) == pytest.approx(lon, abs=2e-10)
+    below = tags["GPS GPSAltitudeRef"].values[0]
+    height = float(tags["GPS GPSAltitude"].values[0])
+    assert (-height if below else height) == pytest.approx(alt, abs=1e-4)
+    time = np.datetime64(second, "s").item().strftime("%Y:%m:%d %H:%M:%S")
+    assert str(tags["EXIF DateTimeOriginal"]) == time
+    assert str(tags["EXIF SubSecTimeOriginal"]) == "250000000"
+
+
+def test_focal_length_gives_back_the_pixels() -> None:
+    tags = exif(with_tags(JPEG, TAGS))
+    focal_mm = float(tags["EXIF FocalLength"].values[0])
+    per_cm = float(tags["EXIF FocalPlaneXResolution"].values[0])
+    assert focal_mm * per_cm / 10 == pytest.approx(54.4, rel=1e-6)
+    assert tags["EXIF FocalPlaneResolutionUnit"].values == [3]  # centimetres
+
+
+def test_xmp_is_what_dji_writes() -> None:
+    found = xmp(with_tags(JPEG, TAGS))
+    assert [float(found[f"Gimbal{axis}Degree"]) for axis in ("Yaw", "Pitch", "Roll")] == [-91.25, -35.5, 1.75]
+    assert float(found["GpsLatitude"]) == pytest.approx(TAGS.lat_deg, abs=1e-9)
+    assert float(found["GpsLongitude"]) == pytest.approx(TAGS.lon_deg, abs=1e-9)
+    assert float(found["AbsoluteAltitude"]) == pytest.approx(TAGS.alt_m, abs=1e-4)
+    assert (found["RtkFlag"], found["RtkStdLon"], found["RtkStdLat"], found["RtkStdHgt"]) == (
+        "50", "0.02000", "0.02100", "0.03000",
+    )  # fmt: skip
+
+
+def test_plain_receiver_states_no_sigma() -> None:
+    assert not [key for key in xmp(with_tags(JPEG, replace(TAGS, sigma_enu_m=None))) if key.startswith("Rtk")]
+
+
+def test_picture_is_untouched() -> None:
+    before, after = (cv2.imdecode(np.frombuffer(data, np.uint8), 1) for data in (JPEG, with_tags(JPEG, TAGS)))
+    np.testing.assert_array_equal(before, after)
+
+
+def test_other_files_are_refused() -> None:
+    with pytest.raises(InputError, match="not a JPEG"):
+        with_tags(b"\x89PNG\r\n", TAGS)

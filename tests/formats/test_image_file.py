@@ -1,0 +1,68 @@
+"""Sizes come from headers; whatever does not decode to its end is refused before it costs memory."""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from pipelines.core.errors import InputError
+from pipelines.formats.image_file import MAX_BYTES, header_size, inspect_image, read_bytes
+from tests.photos import Exif, jpeg
+
+PATH = Path("a.jpg")
+
+
+def _encoded(suffix: str) -> bytes:
+    pixels = np.random.default_rng(1).integers(0, 255, (30, 70, 3), dtype=np.uint8)
+    return cv2.imencode(suffix, pixels)[1].tobytes()
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif"])
+def test_size_and_hash(suffix: str) -> None:
+    data = _encoded(suffix)
+    found = inspect_image(data, PATH)
+    assert (found.width, found.height) == (70, 30)
+    assert found.sha256 == hashlib.sha256(data).hexdigest()
+
+
+def test_orientation_does_not_turn_the_size() -> None:
+    found = inspect_image(jpeg(size=(64, 48), exif=Exif(image=[(0x0112, 3, 6)])), PATH)
+    assert (found.width, found.height) == (64, 48)
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif"])
+@pytest.mark.parametrize("part", [0.3, 0.9])
+def test_truncated_is_damaged(suffix: str, part: float) -> None:
+    data = _encoded(suffix)
+    with pytest.raises(InputError, match=r"a\.jpg: is (damaged|no JPEG)"):
+        inspect_image(data[: int(len(data) * part)], PATH)
+
+
+@pytest.mark.parametrize("data", [b"hello", b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"II*\x00\xff\xff\xff\xff", b""])
+def test_no_image(data: bytes) -> None:
+    with pytest.raises(InputError, match="is no JPEG, PNG or TIFF image"):
+        inspect_image(data, PATH)
+
+
+def test_a_claim_of_too_many_pixels_is_refused_by_the_header() -> None:
+    bomb = b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + b"IHDR" + struct.pack(">II", 60000, 60000)
+    assert header_size(bomb) == (60000, 60000)
+    with pytest.raises(InputError, match="claims 60000×60000 pixels"):
+        inspect_image(bomb, PATH)
+
+
+def test_empty_and_huge_files(tmp_path: Path) -> None:
+    (tmp_path / "empty.jpg").touch()
+    with pytest.raises(InputError, match=r"empty\.jpg: is empty"):
+        read_bytes(tmp_path / "empty.jpg")
+    with (tmp_path / "huge.jpg").open("wb") as handle:
+        handle.truncate(MAX_BYTES + 1)  # a sparse file
+    with pytest.raises(InputError, match="too large for a photograph"):
+        read_bytes(tmp_path / "huge.jpg")
+    with pytest.raises(InputError, match="cannot be read"):
+        read_bytes(tmp_path / "absent.jpg")

@@ -1,0 +1,103 @@
+"""OpenDroneMap's two text files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipelines.core.errors import InputError
+from pipelines.formats.odm import read_geo, read_ground_points
+from pipelines.geometry.rotations import matrix_from_quat_xyzw
+from pipelines.ingest.notes import Notes
+
+
+def _write(tmp_path: Path, text: str, name: str = "geo.txt") -> Path:
+    path = tmp_path / name
+    path.write_bytes(text.encode())
+    return path
+
+
+@pytest.mark.parametrize("crs", ["EPSG:4326", "+proj=utm +zone=16 +datum=WGS84 +units=m +no_defs", "WGS84 UTM 16N"])
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+def test_geo_of_every_width(tmp_path: Path, crs: str, end: str) -> None:
+    lines = [
+        "\ufeff" + crs,
+        "a.jpg 7.75 46.02",
+        "# comment",
+        "b.jpg\t7.75\t46.02\t1620.5",
+        "c.jpg 7.75 46.02 1620.5 90 0 0",
+        "d.jpg 7.75 46.02 1620.5 90 0 0 0.02 0.05",
+        "e.jpg 7.75 46.02 1620.5 90 0 0 0.02 0.05 and more words",
+        "f.jpg nan 46.02 1620.5",
+    ]
+    notes = Notes()
+    table = read_geo(_write(tmp_path, end.join(lines)), notes)
+    assert table.crs_text == crs
+    assert table.names == ("a.jpg", "b.jpg", "c.jpg", "d.jpg", "e.jpg")
+    assert table.lines.tolist() == [2, 4, 5, 6, 7]
+    assert np.isnan(table.xyz[0, 2]) and table.xyz[1].tolist() == [7.75, 46.02, 1620.5]
+    assert table.sigma_enu_m is not None and table.sigma_enu_m[3].tolist() == [0.02, 0.02, 0.05]
+    assert notes.warnings == ["1 row has no position (NaN): geo.txt:8"]
+
+
+def test_pitch_zero_of_geo_txt_looks_straight_down(tmp_path: Path) -> None:
+    table = read_geo(_write(tmp_path, "EPSG:4326\na.jpg 7 46 100 90 0 0\n"), Notes())
+    assert table.quat_xyzw is not None
+    rotation = matrix_from_quat_xyzw(table.quat_xyzw[0])
+    np.testing.assert_allclose(rotation @ [0, 0, 1], [0, 0, -1], atol=1e-15)
+    # Yaw 90: the top of the image (−y of the camera) points east.
+    np.testing.assert_allclose(rotation @ [0, -1, 0], [1, 0, 0], atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", r"geo\.txt: is empty"),
+        ("EPSG:4326\n", r"geo\.txt: has a CRS but no rows"),
+        ("a.jpg 7.75 46.02 1620\nb.jpg 7.75 46.02 1620\n", r"geo\.txt:1: the first line must be the CRS"),
+        ("EPSG:4326\na.jpg 7.75\n", r"geo\.txt:2: has 2 columns, expected 3, 4, 7 or 9"),
+        ("EPSG:4326\na.jpg 7.75 46.02 1620 0.02 0.03\n", r"geo\.txt:2: has 6 columns, expected 3, 4, 7 or 9"),
+        ("EPSG:4326\na.jpg,7.75,46.02\n", r"geo\.txt:2: has 1 columns.*separate columns by spaces"),
+        ("EPSG:4326\na.jpg 7,75 46,02 3\n", r"geo\.txt:2 \[x\]: '7,75' is no number: write decimals with a point"),
+        ("EPSG:4326\na.jpg nan nan 3\n", r"geo\.txt: no row has a position"),
+        ("EPSG:4326\na.jpg 7 46 3 0 0 0 0 0.1\n", r"geo\.txt:2 \[h_acc, v_acc\]: must be above zero"),
+    ],
+)
+def test_geo_refusals(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        read_geo(_write(tmp_path, text), Notes())
+
+
+def test_ground_points_with_and_without_names(tmp_path: Path) -> None:
+    text = (
+        "\ufeffWGS84 UTM 16N\r\n"
+        "500000 4000000 10 100.5 200.25 a.jpg G1 extra words\r\n"
+        "500000 4000000 10 110.5 210.25 b.jpg G1\r\n"
+        "500010.5\t4000000\t10\t1\t2\ta.jpg\r\n"
+        "500010.5 4000000 10 3 4 b.jpg\r\n"
+        "500020 4000000 10 5 6 b.jpg\r\n"
+    )
+    found = read_ground_points(_write(tmp_path, text, "gcp_list.txt"))
+    assert found.crs_text == "WGS84 UTM 16N"
+    assert [mark.name for mark in found.marks] == ["G1", "G1", "point-1", "point-1", "point-2"]
+    assert found.marks[2].xyz == (500010.5, 4000000.0, 10.0)
+    assert (found.marks[0].x_px, found.marks[0].y_px, found.marks[0].image) == (100.5, 200.25, "a.jpg")
+    assert [mark.line for mark in found.marks] == [2, 3, 4, 5, 6]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("7.75 46.02 1620 100 200 a.jpg G1\n", r"gcp_list\.txt:1: the first line must be the CRS"),
+        ("EPSG:4326\n7.75 46.02 1620 100 200\n", r"gcp_list\.txt:2: has 5 columns, expected at least 6"),
+        ("EPSG:4326\n7.75,46.02,1620,100,200,a.jpg\n", r"gcp_list\.txt:2: .*separate columns by spaces or tabs"),
+        ("EPSG:4326\n7.75 46.02 nan 100 200 a.jpg G1\n", r"gcp_list\.txt:2 \[z\]: is not a number"),
+        ("EPSG:4326\n7,75 46,02 1620 100 200 a.jpg G1\n", r"gcp_list\.txt:2 \[x\]: '7,75' is no number"),
+        ("EPSG:4326\n", r"gcp_list\.txt: has a CRS but no rows"),
+    ],
+)
+def test_ground_point_refusals(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        read_ground_points(_write(tmp_path, text, "gcp_list.txt"))

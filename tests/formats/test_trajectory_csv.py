@@ -1,0 +1,141 @@
+"""CSV as people, loggers and spreadsheets write it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipelines.core.errors import InputError
+from pipelines.formats.pose_table import PoseTable
+from pipelines.formats.trajectory_csv import read_trajectory
+from pipelines.geometry.rotations import geo_from_cam, matrix_from_quat_xyzw
+from pipelines.ingest.notes import Notes
+
+
+def _read(tmp_path: Path, text: str | bytes, notes: Notes | None = None) -> PoseTable:
+    path = tmp_path / "t.csv"
+    path.write_bytes(text.encode() if isinstance(text, str) else text)
+    return read_trajectory(path, notes or Notes())
+
+
+PLAIN = "image,latitude,longitude,altitude\na.jpg,46.02,7.75,1620.5\nb.jpg,46.03,7.76,1621.5\n"
+EXPECTED = [[7.75, 46.02, 1620.5], [7.76, 46.03, 1621.5]]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        PLAIN,
+        "\ufeff" + PLAIN,
+        PLAIN.replace("\n", "\r\n"),
+        PLAIN.replace("\n", "\r"),
+        PLAIN.replace(",", ";"),
+        PLAIN.replace(",", "\t"),
+        PLAIN.replace(",", ";").replace(".5", ",5").replace("6.0", "6,0").replace("7.7", "7,7"),
+        "# " + PLAIN + "# a comment\n\n",
+        PLAIN.replace("image,latitude,longitude,altitude", 'Filename, LAT ,"lon",Height'),
+    ],
+    ids=["plain", "BOM", "CRLF", "CR", "semicolon", "tab", "decimal comma", "comments", "aliases"],
+)
+def test_ways_to_write_the_same(tmp_path: Path, text: str) -> None:
+    table = _read(tmp_path, text)
+    assert table.names == ("a.jpg", "b.jpg")
+    assert table.lines.tolist() == [2, 3]
+    assert table.geographic
+    np.testing.assert_array_equal(table.xyz, EXPECTED)
+
+
+def test_all_columns(tmp_path: Path) -> None:
+    notes = Notes()
+    table = _read(
+        tmp_path,
+        "timestamp,x,y,z,yaw,pitch,roll,sigma_e,sigma_n,sigma_u,battery\n"
+        "1700000000.5,500000,5100000,1600,10,-90,0,0.02,0.03,0.04,77\n"
+        "2023-11-14T22:13:21.5Z,500001,5100000,1600,,,,,,,76\n",
+        notes,
+    )
+    assert table.names is None and not table.geographic
+    assert table.time_s is not None and table.quat_xyzw is not None and table.sigma_enu_m is not None
+    np.testing.assert_allclose(table.time_s, [1700000000.5, 1700000001.5], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(
+        matrix_from_quat_xyzw(table.quat_xyzw[0]), geo_from_cam([10.0, -90.0, 0.0]), rtol=0, atol=1e-14
+    )
+    assert table.sigma_enu_m[0].tolist() == [0.02, 0.03, 0.04]
+    assert np.isnan(table.quat_xyzw[1]).all() and np.isnan(table.sigma_enu_m[1]).all()
+    assert notes.warnings == ["1 column is unknown and was ignored: t.csv:1 (battery)"]
+
+
+def test_quaternion_turns_the_camera_into_east_north_up(tmp_path: Path) -> None:
+    # Half a turn about x: the camera's z axis looks down, its y axis south.
+    table = _read(tmp_path, "image,x,y,z,qx,qy,qz,qw\na.jpg,0,0,0,1,0,0,0\n")
+    assert table.quat_xyzw is not None
+    np.testing.assert_allclose(matrix_from_quat_xyzw(table.quat_xyzw[0]) @ [0, 0, 1], [0, 0, -1], atol=1e-15)
+    np.testing.assert_allclose(matrix_from_quat_xyzw(table.quat_xyzw[0]) @ [0, 1, 0], [0, -1, 0], atol=1e-15)
+
+
+def test_times_without_zone_are_called_utc(tmp_path: Path) -> None:
+    notes = Notes()
+    table = _read(tmp_path, "time,x,y,z\n2023-11-14 22:13:20,1,2,3\n", notes)
+    assert table.time_s is not None and table.time_s[0] == 1700000000.0
+    assert notes.assumptions == ["times without a zone in t.csv are UTC"]
+
+
+def test_rows_without_position_are_counted(tmp_path: Path) -> None:
+    notes = Notes()
+    table = _read(tmp_path, "image,x,y,z\na,1,2,3\nb,nan,2,3\nc,,,\nd,inf,1,2\n", notes)
+    assert table.names == ("a",)
+    assert notes.warnings == ["3 rows have no position (empty or NaN): t.csv:3, t.csv:4, t.csv:5"]
+
+
+def test_repeated_times_are_counted(tmp_path: Path) -> None:
+    notes = Notes()
+    table = _read(tmp_path, "time,x,y,z\n5,1,2,3\n4,1,2,3\n5,9,9,9\n", notes)
+    assert table.xyz.tolist() == [[1, 2, 3], [1, 2, 3]]
+    assert notes.warnings == ["1 row repeats an earlier time and was left out: t.csv:4"]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", r"t\.csv: is empty"),
+        ("image,x,y,z\n", r"t\.csv: has a header but no rows"),
+        ("a.jpg,46.0,7.0,1620\n", r"t\.csv:1: the first line must be a header"),
+        ("image\na.jpg\n", r"t\.csv:1: the header has one column only"),
+        ("image,speed\na,1\n", r"t\.csv:1: has neither of latitude,longitude,altitude and x,y,z"),
+        ("x,y,z\n1,2,3\n", r"t\.csv:1: needs a column image or timestamp"),
+        ("image,x,y\na,1,2\n", r"t\.csv:1: has x, y but not z"),
+        ("image,x,y,z,lat,lon,alt\na,1,2,3,4,5,6\n", r"has both latitude,longitude,altitude and x,y,z"),
+        ("image,x,y,z,X\na,1,2,3,4\n", r"two columns for x: x, X"),
+        ("image,x,y,z,yaw\na,1,2,3,4\n", r"has yaw but not pitch, roll"),
+        ("image,x,y,z,yaw,pitch,roll,qx,qy,qz,qw\na,1,2,3,1,1,1,0,0,0,1\n", r"has both yaw,pitch,roll and qx"),
+        ("image,x,y,z\na,1,two,3\n", r"t\.csv:2 \[y\]: 'two' is no number"),
+        ("image,x,y,z\na,1,1_000,3\n", r"t\.csv:2 \[y\]: '1_000' is no number"),
+        (
+            "image,lat,lon,alt\na,46,02,7,75,1620\n",
+            r"t\.csv:2: has 6 cells, the header has 4; decimal commas need ;",
+        ),
+        ("image,lat,lon,alt\na,46.0,7.0,1\nb,96.0,7.0,1\n", r"t\.csv:3 \[latitude\]: 96 is out of range -90 … 90"),
+        ("image,lat,lon,alt\na,46.0,700.0,1\n", r"t\.csv:2 \[longitude\]: 700 is out of range"),
+        ("image,x,y,z\na,nan,nan,nan\n", r"t\.csv: no row has a position"),
+        ("image,x,y,z,sigma_e,sigma_n,sigma_u\na,1,2,3,0.1,0,0.1\n", r"t\.csv:2 \[sigma_n\]: 0 is out of range"),
+        ("image,x,y,z,yaw,pitch,roll\na,1,2,3,0,-270,0\n", r"t\.csv:2 \[pitch\]: -270 is out of range"),
+        (
+            "image,x,y,z,qx,qy,qz,qw\na,1,2,3,1,1,0,0\n",
+            r"t\.csv:2 \[qx,qy,qz,qw\]: the quaternion has length 1\.41",
+        ),
+        ("time,x,y,z\n1700000000000,1,2,3\n", r"t\.csv:2 \[timestamp\]: 1700000000000 looks like milliseconds"),
+        ("time,x,y,z\n2023-13-45T00:00:00,1,2,3\n", r"t\.csv:2 \[timestamp\]: .* is no ISO 8601 time"),
+        (b"image,x,y,z\na\xff,1,2,3\n", r"t\.csv:2: not UTF-8 text"),
+        ("image,x,y,z\na,1,2,3\n".encode("utf-16-le"), r"contains zero bytes"),
+    ],
+)
+def test_refusals_name_file_line_and_column(tmp_path: Path, text: str | bytes, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        _read(tmp_path, text)
+
+
+def test_absent_file(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"absent\.csv: cannot be read: No such file"):
+        read_trajectory(tmp_path / "absent.csv", Notes())

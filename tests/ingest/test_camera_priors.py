@@ -1,0 +1,68 @@
+"""Focal lengths against the pinhole's own geometry: pixels = mm on the sensor × pixels per mm."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from pipelines.formats.exif import LensTags, PhotoTags
+from pipelines.formats.image_file import ImageFile
+from pipelines.ingest.camera_priors import camera_priors, focal_px
+from pipelines.ingest.notes import Notes
+from pipelines.ingest.photo_folder import Photo
+
+
+def _photo(name: str, width: int, height: int, tags: PhotoTags) -> Photo:
+    return Photo(name, ImageFile(width, height, name), tags)
+
+
+def test_known_sensor_of_a_scaled_image() -> None:
+    tags = PhotoTags(make="DJI", model="FC300S", lens=LensTags(focal_mm=3.61, taken_width_px=4000.0))
+    assert focal_px(tags, 2000, 1125)[0] == pytest.approx(3.61 / 6.17 * 2000)
+
+
+def test_focal_plane_resolution_counts_pixels_before_scaling() -> None:
+    # 35 mm lens on 36 mm with 6000 px, later scaled to 1500 px, also when it is turned upright.
+    lens = LensTags(focal_mm=35.0, px_per_mm=6000 / 36.0, taken_width_px=6000.0)
+    for width, height in ((1500, 1000), (1000, 1500)):
+        assert focal_px(PhotoTags(model="?", lens=lens), width, height)[0] == pytest.approx(35 / 36 * 1500)
+
+
+def test_nonsense_resolution_falls_back_to_35_mm() -> None:
+    lens = LensTags(focal_mm=35.0, px_per_mm=0.001, focal_35mm_mm=35.0)
+    focal, source, how = focal_px(PhotoTags(lens=lens), 3000, 2000)
+    assert focal == pytest.approx(35.0 / math.hypot(36, 24) * math.hypot(3000, 2000))
+    assert source == "exif" and "35 mm film" in how
+
+
+def test_nothing_known_is_called_assumed() -> None:
+    focal, source, _ = focal_px(PhotoTags(), 900, 1200)
+    assert (focal, source) == (1020.0, "assumed")
+
+
+def test_digital_zoom_lengthens() -> None:
+    lens = LensTags(focal_mm=3.61, zoom=2.0)
+    assert focal_px(PhotoTags(model="FC300S", lens=lens), 4000, 3000)[0] == pytest.approx(2 * 3.61 / 6.17 * 4000)
+
+
+def test_one_camera_for_each_size_model_and_focal_length() -> None:
+    near = PhotoTags(make="A", model="B", lens=LensTags(focal_35mm_mm=24.0))
+    far = PhotoTags(make="A", model="B", lens=LensTags(focal_35mm_mm=70.0))
+    photos = [
+        _photo("1", 60, 40, near),
+        _photo("2", 60, 40, near),
+        _photo("3", 60, 40, far),
+        _photo("4", 30, 20, near),
+    ]
+    notes = Notes()
+    cameras, camera_of = camera_priors(photos, None, notes)
+    assert camera_of == {"1": 1, "2": 1, "3": 2, "4": 3}
+    assert cameras[0].model == "SIMPLE_RADIAL" and cameras[0].params[1:] == (30.0, 20.0, 0.0)
+    assert notes.warnings == ["images have 2 sizes (30×20, 60×40): each is a camera of its own"]
+
+
+def test_an_option_overrides_exif() -> None:
+    photos = [_photo("1", 60, 40, PhotoTags(model="FC300S", lens=LensTags(focal_mm=3.61)))]
+    cameras, _ = camera_priors(photos, 77.0, Notes())
+    assert cameras[0].params[0] == 77.0 and cameras[0].focal_source == "option"

@@ -1,0 +1,86 @@
+"""Ground points tied to images; control and check points kept apart."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipelines.core.errors import InputError
+from pipelines.ingest.ground_points import GroundFile, read_ground_file, require_near, split_checks
+from pipelines.ingest.image_poses import PoseOptions
+from pipelines.ingest.notes import Notes
+
+SIZES = {"a.jpg": (64, 48), "b.jpg": (64, 48)}
+G1 = "7.75 46.02 1620 10.5 20.5 a.jpg G1\n7.75 46.02 1620 11.5 21.5 b.jpg G1\n"
+G2 = "7.76 46.02 1620 10.5 20.5 a.jpg G2\n7.76 46.02 1620 11.5 21.5 b.jpg G2\n"
+
+
+def _read(tmp_path: Path, rows: str, name: str = "gcp_list.txt", notes: Notes | None = None) -> GroundFile:
+    path = tmp_path / name
+    path.write_text("EPSG:4979\n" + rows)
+    return read_ground_file(path, SIZES, 0.5, PoseOptions(), notes or Notes())
+
+
+def test_points_and_marks(tmp_path: Path) -> None:
+    notes = Notes()
+    rows = G1 + G2 + "7.75 46.02 1620 1 1 absent.jpg G1\n7.77 46.02 1620 1 1 a.jpg G3\n"
+    found = _read(tmp_path, rows, notes=notes)
+    assert [point.name for point in found.points] == ["G1", "G2"]
+    np.testing.assert_allclose(found.points[0].lla, [46.02, 7.75, 1620.0], rtol=0, atol=1e-9)
+    mark = found.points[0].marks[1]
+    assert (mark.image, mark.x_px, mark.y_px, mark.sigma_px) == ("b.jpg", 11.5, 21.5, 0.5)
+    assert found.vertical.stated and found.vertical.name == "ellipsoidal"
+    assert notes.warnings == [
+        "1 mark is in an image that is not here: gcp_list.txt:6 (absent.jpg)",
+        "1 ground point has marks in fewer than 2 images and was left out: G3 (gcp_list.txt:7)",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        (G1 + "7.75 46.02 1621 1 1 a.jpg G1\n", r"gcp_list\.txt:4 \[x y z\]: G1 has other coordinates in line 2"),
+        (G1 + "7.75 46.02 1620 1 1 a.jpg G1\n", r"gcp_list\.txt:4 \[image\]: G1 is marked in a\.jpg already"),
+        (
+            "7.75 46.02 1620 65 20 a.jpg G1\n",
+            r"gcp_list\.txt:2 \[px py\]: the mark of G1 at \(65, 20\) lies outside",
+        ),
+        ("7.75 46.02 1620 -1 20 a.jpg G1\n", r"lies outside a\.jpg \(64×48 pixels\)"),
+        ("7.75 46.02 1620 1 1 x.jpg G1\n", r"names none of the images: it has 'x\.jpg' …, the folder 'a\.jpg' …"),
+        ("7.75 46.02 1620 1 1 ../a.jpg G1\n", r"gcp_list\.txt:2 \[image\]: .*leaves the image folder"),
+        ("46.02 97.75 1620 1 1 a.jpg G1\n", r"gcp_list\.txt:2 \[latitude\]: .*out of range.*x is the longitude"),
+    ],
+)
+def test_refusals(tmp_path: Path, rows: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        _read(tmp_path, rows)
+
+
+def test_named_control_points_become_check_points(tmp_path: Path) -> None:
+    control, check = split_checks(_read(tmp_path, G1 + G2), None, ["G2"])
+    assert [point.name for point in control] == ["G1"]
+    assert [point.name for point in check] == ["G2"]
+
+
+def test_an_unknown_name_is_refused_with_the_known_ones(tmp_path: Path) -> None:
+    with pytest.raises(
+        InputError, match=r"gcp_list\.txt \[--check\]: 'G9' is no usable point there: it has G1, G2"
+    ):
+        split_checks(_read(tmp_path, G1 + G2), None, ["G9"])
+
+
+@pytest.mark.parametrize("rows", [G1, G1.replace("G1", "other")])
+def test_a_point_in_both_files_is_refused_whatever_its_name(tmp_path: Path, rows: str) -> None:
+    control = _read(tmp_path, G1 + G2)
+    check = _read(tmp_path, rows, "checkpoints.txt")
+    with pytest.raises(InputError, match=r"checkpoints\.txt:2: .* is also control point G1 \(line 2\)"):
+        split_checks(control, check, [])
+
+
+def test_points_in_another_country_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(
+        InputError, match=r"gcp_list\.txt:2: G1 is \d+ km from the images: wrong CRS, or x and y swapped"
+    ):
+        require_near(_read(tmp_path, G1), np.array([7.75, 46.02, 1620.0]))

@@ -1,0 +1,184 @@
+"""Stage `init-sim3` on synthetic surveys, through the runner and as a pure function."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipelines.core.errors import ConvergenceError, DegenerateGeometryError, InputError
+from pipelines.core.products import load_json
+from pipelines.core.runner import run_stage
+from pipelines.core.stages import BY_NAME, SIM3
+from pipelines.geolocate.options import GeolocateOptions
+from pipelines.geolocate.stage import geolocate
+from pipelines.geometry.rotations import log_so3
+from pipelines.geometry.similarity import Similarity
+from pipelines.geometry.sparse_model import SparseModel
+from pipelines.init_sim3.options import InitSim3Options
+from pipelines.init_sim3.stage import estimate_similarity
+from pipelines.scene.geolocated import GeolocatedPoints
+from pipelines.scene.initial_similarity import InitialSimilarity
+from pipelines.scene.survey import Survey
+from tests.scenes import (
+    GEO_FROM_LOCAL,
+    Measured,
+    Noise,
+    make_scene,
+    sparse_model,
+    survey_of,
+    without_fixes,
+    write_workspace,
+)
+
+CONFIG = InitSim3Options()
+CONSUMER = Noise(fix_m=(1.5, 1.5, 3.0))
+
+
+def material(
+    noise: Noise, measured: Measured, seed: int = 0, layout: str = "orbit"
+) -> tuple[Survey, SparseModel, GeolocatedPoints]:
+    scene, rng = make_scene(layout, points=120), np.random.default_rng(seed)
+    survey, model = survey_of(scene, noise, measured, rng), sparse_model(scene, noise, rng)
+    return survey, model, geolocate(survey, model, GeolocateOptions()).points
+
+
+def squared_error(found: InitialSimilarity) -> float:
+    record = found.geo_from_local
+    away = GEO_FROM_LOCAL @ Similarity.from_record(record).inverse()
+    pivot = np.array(record.pivot)
+    error = np.array([np.log(away.scale), *log_so3(away.rotation), *(away.apply(pivot) - pivot)])
+    return float(error @ np.linalg.solve(np.array(record.covariance), error))
+
+
+def test_stage_recovers_the_truth_with_rtk(tmp_path: Path) -> None:
+    scene, noise, rng = make_scene(points=120), Noise(), np.random.default_rng(1)
+    survey = survey_of(scene, noise, Measured(), rng)
+    workspace = write_workspace(tmp_path, survey, sparse_model(scene, noise, rng))
+    run_stage(workspace, BY_NAME["geolocate"], {})
+    outcome = run_stage(workspace, BY_NAME["init-sim3"], {})
+    found = load_json(InitialSimilarity, workspace.path(SIM3))
+    assert found.geo_from_local.scale == pytest.approx(GEO_FROM_LOCAL.scale, rel=1e-3)
+    away = Similarity.from_record(found.geo_from_local).apply(GEO_FROM_LOCAL.inverse().apply(np.eye(3) * 50))
+    # 2–3 cm over √24, and a lever of the size of the orbit: 3 σ are 2.5 cm.
+    np.testing.assert_allclose(away, np.eye(3) * 50, atol=0.025)
+    assert found.correspondences == {"gnss": 24, "gcp": 0, "points": 120}
+    assert found.residuals["gnss"].rmse_h_m == pytest.approx(0.028, rel=0.4)
+    assert found.layout == "volume"
+    assert outcome.manifest.warnings == []
+
+
+@pytest.mark.parametrize("noise", [Noise(), CONSUMER], ids=["rtk", "consumer"])
+@pytest.mark.parametrize("gcps", [False, True])
+def test_covariance_is_calibrated(noise: Noise, gcps: bool) -> None:
+    squared = []
+    for seed in range(30):
+        scene, rng = make_scene(points=1), np.random.default_rng(seed)
+        survey, model = survey_of(scene, noise, Measured(gcps=gcps), rng), sparse_model(scene, noise, rng)
+        points = geolocate(without_fixes(survey, scene.names), model, GeolocateOptions()).points
+        squared.append(squared_error(estimate_similarity(survey, model, points, CONFIG)[0]))
+    # The mean of 30 χ²₇ has σ 0.68, 10 % of 7.
+    assert np.mean(squared) == pytest.approx(7.0, rel=0.25)
+
+
+def test_outlying_fixes_are_listed() -> None:
+    noise = replace(Noise(fix_m=(0.05, 0.05, 0.08)), outliers=(2, 7, 11, 20))
+    survey, model, points = material(noise, Measured())
+    found, warnings = estimate_similarity(survey, model, points, CONFIG)
+    assert found.gnss_outliers == tuple(f"image_{index:03d}.jpg" for index in noise.outliers)
+    assert found.inliers["gnss"] == 20
+    assert squared_error(found) < 24.3  # χ²₇ at 0.999
+    assert any("4 of 24 fixes are outliers: image_002.jpg (" in text for text in warnings)
+
+
+def test_control_points_alone_carry_the_survey() -> None:
+    survey, model, points = material(Noise(), Measured(fixes=False, attitudes=False, gcps=True))
+    found, _ = estimate_similarity(survey, model, points, CONFIG)
+    assert found.inliers == {"gnss": 0, "gcp": 6, "points": 0}
+    assert found.residuals["gnss"].count == 0
+    assert squared_error(found) < 24.3
+
+
+def test_fixes_that_contradict_control_points_are_told_with_numbers() -> None:
+    noise = replace(Noise(), bias_m=(0.4, 0.0, -1.2))
+    survey, model, points = material(noise, Measured(gcps=True))
+    found, warnings = estimate_similarity(survey, model, points, CONFIG)
+    assert squared_error(found) < 24.3
+    assert any("all fixes are off the control points by (+0.3" in w or "by (+0.4" in w for w in warnings)
+
+
+def test_paper_method_is_coarse_but_near() -> None:
+    survey, model, points = material(Noise(), Measured())
+    found, _ = estimate_similarity(survey, model, points, InitSim3Options(method="paper"))
+    assert found.method == "paper"
+    away = Similarity.from_record(found.geo_from_local).apply(model.point_in_local)
+    error = np.linalg.norm(away - GEO_FROM_LOCAL.apply(model.point_in_local), axis=1)
+    # 0.5° attitudes over 100 m, averaged over 24 cameras: 0.2 m.
+    assert error.mean() < 0.6
+    robust, _ = estimate_similarity(survey, model, points, CONFIG)
+    assert found.residuals["gnss"].rmse_3d_m > robust.residuals["gnss"].rmse_3d_m
+
+
+def test_paper_method_without_points_says_what_to_use() -> None:
+    survey, model, points = material(Noise(), Measured(fixes=False, gcps=True))
+    with pytest.raises(DegenerateGeometryError, match="--method robust"):
+        estimate_similarity(survey, model, points, InitSim3Options(method="paper"))
+
+
+def test_max_residual_fails_with_the_figures() -> None:
+    survey, model, points = material(CONSUMER, Measured())
+    with pytest.raises(ConvergenceError, match=r"RMS residual of 24 camera centres is \d\.\d+ m .*0\.1 m"):
+        estimate_similarity(survey, model, points, InitSim3Options(max_residual=0.1))
+    assert estimate_similarity(survey, model, points, InitSim3Options(max_residual=10.0))[0].inliers["gnss"] == 24
+
+
+def test_line_needs_attitude() -> None:
+    survey, model, points = material(Noise(), Measured(), layout="line")
+    found, _ = estimate_similarity(survey, model, points, CONFIG)
+    assert found.layout == "line"
+    assert found.attitude_used and found.attitude is not None
+    assert squared_error(found) < 24.3
+    bare = survey.model_copy(
+        update={"images": tuple(image.model_copy(update={"attitude": None}) for image in survey.images)}
+    )
+    with pytest.raises(DegenerateGeometryError, match="control points"):
+        estimate_similarity(bare, model, points, CONFIG)
+
+
+def test_nothing_measured_is_refused() -> None:
+    survey, model, points = material(Noise(), Measured(fixes=False, attitudes=False))
+    with pytest.raises(DegenerateGeometryError, match="0 positions"):
+        estimate_similarity(survey, model, points, CONFIG)
+
+
+def test_unusable_control_points_are_named() -> None:
+    survey, model, points = material(Noise(), Measured(gcps=True))
+    first, second, *rest = survey.control_points
+    lonely = first.model_copy(update={"marks": first.marks[:1]})
+    shifted = tuple(
+        mark.model_copy(update={"x_px": mark.x_px + 40.0 * index}) for index, mark in enumerate(second.marks)
+    )
+    broken = second.model_copy(update={"marks": shifted})
+    spoilt = survey.model_copy(update={"control_points": (lonely, broken, *rest)})
+    found, warnings = estimate_similarity(spoilt, model, points, CONFIG)
+    assert found.correspondences["gcp"] == 4
+    assert any("gcp0: marked in fewer than 2" in text for text in warnings)
+    assert any("gcp1: its" in text and "do not meet" in text for text in warnings)
+
+
+def test_points_of_another_model_are_refused() -> None:
+    survey, model, points = material(Noise(), Measured())
+    with pytest.raises(InputError, match="another model"):
+        estimate_similarity(survey, model, replace(points, point_id=points.point_id + 1), CONFIG)
+
+
+def test_control_points_can_be_left_out() -> None:
+    survey, model, points = material(CONSUMER, Measured(gcps=True))
+    with_control, _ = estimate_similarity(survey, model, points, CONFIG)
+    without, _ = estimate_similarity(survey, model, points, InitSim3Options(control_points=False))
+    assert with_control.correspondences["gcp"] == 6
+    assert without.correspondences["gcp"] == without.residuals["gcp"].count == 0
+    alone, _ = estimate_similarity(survey.model_copy(update={"control_points": ()}), model, points, CONFIG)
+    assert without == alone

@@ -1,0 +1,163 @@
+"""A survey made anew from the recorded navigation: exact where that is exact, nothing invented where it is not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipelines.core.errors import InputError
+from pipelines.core.fingerprints import layout_of
+from pipelines.core.options import RigParameter
+from pipelines.geometry.rig import boresight
+from pipelines.geometry.rotations import exp_so3, log_so3, matrix_from_quat_xyzw, quat_xyzw_from_matrix
+from pipelines.scene.calibrated import with_rig
+from pipelines.scene.navigation import NavigationTrack, require_estimable
+from pipelines.scene.rig import RigCalibration, RigEstimate
+from pipelines.scene.survey import Attitude, Survey, SurveyImage
+from tests.scenes import Measured, Noise, make_scene, survey_of
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+COUNT, SPEED = 5, np.array([4.0, 1.0, 0.5])
+ARM, MOUNT = np.array([0.3, -0.1, -0.2]), exp_so3([0.4, -0.3, 0.9])
+
+
+def bodies(time_s: np.ndarray) -> np.ndarray:
+    return exp_so3(np.outer(time_s, [0.02, 0.05, -0.2]))  # about one axis: exact on the shortest arc
+
+
+def cameras(time_s: np.ndarray) -> np.ndarray:
+    return np.outer(time_s, SPEED)
+
+
+@pytest.fixture
+def track() -> NavigationTrack:
+    """Navigation from 0 to 5 s, and images at 0 … 4 s of a clock that is 0.5 s behind it."""
+    clock = np.linspace(0, 5, 51)
+    fine = np.linspace(0, 5, 2001)
+    return NavigationTrack(
+        position_time_s=fine,
+        antenna_in_geo=cameras(fine) + bodies(fine) @ ARM,
+        sigma_m=np.full((2001, 3), 0.02),
+        attitude_time_s=clock,
+        geo_from_body=bodies(clock),
+        image=np.array([f"{i}.jpg" for i in range(COUNT)]),
+        image_time_s=np.arange(COUNT, dtype=np.float64),
+        cam_from_body=np.tile(MOUNT, (COUNT, 1, 1)),
+        antenna_in_body=np.tile(ARM, (COUNT, 1)),
+        nominal_from_cam=np.eye(3),
+        time_offset_s=np.array(0.0),
+        max_gap_s=np.array(1.0),
+        body_known=np.array(True),
+    )
+
+
+@pytest.fixture
+def survey() -> Survey:
+    """Images 0 … 4 with whatever positions and attitudes, the last without; one that the navigation lacks."""
+    made = survey_of(make_scene(images=COUNT + 1), Noise(), Measured(), np.random.default_rng(0))
+    images = [image.model_copy(update={"name": f"{i}.jpg"}) for i, image in enumerate(made.images)]
+    images[4] = SurveyImage(name="4.jpg", camera_id=1, sha256="0" * 64)
+    return made.model_copy(update={"images": tuple(images)})
+
+
+def estimate(name: RigParameter, value: np.ndarray, start: np.ndarray, *, seen: bool = True) -> RigEstimate:
+    unit = {"time-offset": "s", "boresight": "deg", "lever-arm": "m"}[name]
+    values, starts = tuple(value.tolist()), tuple(start.tolist())
+    return RigEstimate(
+        name=name,
+        unit=unit,
+        value=values,
+        sigma=(0.0,) * len(values),
+        start=starts,
+        observable=(seen,) * len(values),
+    )
+
+
+def of(*estimates: RigEstimate) -> RigCalibration:
+    return RigCalibration(wanted=tuple(one.name for one in estimates), estimates=estimates)
+
+
+def places(survey: Survey) -> np.ndarray:
+    return np.array([image.fix.position_in_geo if image.fix else [np.nan] * 3 for image in survey.images])
+
+
+def test_offset_boresight_and_arm_are_applied(survey: Survey, track: NavigationTrack) -> None:
+    track = replace(track, antenna_in_body=np.full((COUNT, 3), np.nan))
+    turned_deg = np.array([0.5, -1.0, 0.3])
+    rig = of(
+        estimate("time-offset", np.array([0.5]), np.zeros(1)),
+        estimate("boresight", turned_deg, np.zeros(3)),
+        estimate("lever-arm", ARM, np.zeros(3)),
+    )
+    found = with_rig(survey, track, rig)
+    at = track.image_time_s + 0.5
+    np.testing.assert_allclose(places(found)[:COUNT], cameras(at), atol=1e-5)
+    quats = [image.attitude.quat_xyzw for image in found.images[:COUNT] if image.attitude]
+    expected = bodies(at) @ MOUNT.T @ boresight(turned_deg)
+    assert np.abs(log_so3(matrix_from_quat_xyzw(quats) @ np.swapaxes(expected, 1, 2))).max() < 1e-9
+    # What the navigation does not know stays; what it now knows takes σ from the nearest.
+    assert found.images[5] == survey.images[5]
+    assert found.images[4].fix is not None and survey.images[3].fix is not None
+    assert found.images[4].fix.cov_in_geo == survey.images[3].fix.cov_in_geo
+    assert found.rig == rig
+
+
+def test_what_is_not_observable_stays_as_told(survey: Survey, track: NavigationTrack) -> None:
+    rig = of(
+        estimate("time-offset", np.array([0.5]), np.zeros(1), seen=False),
+        estimate("boresight", np.array([9.0, 9.0, 9.0]), np.zeros(3), seen=False),
+    )
+    found = with_rig(survey, track, rig)
+    np.testing.assert_allclose(places(found)[:COUNT], cameras(track.image_time_s), atol=1e-5)
+
+
+def test_nothing_is_invented_beyond_the_ends_or_without_attitude(survey: Survey, track: NavigationTrack) -> None:
+    found = with_rig(survey, track, of(estimate("time-offset", np.array([2.5]), np.zeros(1))))
+    assert [image.fix is None for image in found.images] == [False, False, False, True, True, False]
+    gap = (track.attitude_time_s < 0.9) | (track.attitude_time_s > 2.9)
+    torn = replace(track, attitude_time_s=track.attitude_time_s[gap], geo_from_body=track.geo_from_body[gap])
+    found = with_rig(survey, torn, of(estimate("time-offset", np.array([0.0]), np.zeros(1))))
+    # Without attitude the arm could point anywhere: no position either.
+    assert [image.fix is None for image in found.images] == [False, True, True, False, False, False]
+    assert [image.attitude is None for image in found.images] == [False, True, True, False, False, False]
+
+
+def test_attitudes_that_came_with_the_photographs_carry_the_arm(survey: Survey, track: NavigationTrack) -> None:
+    turns = bodies(track.image_time_s) @ MOUNT.T
+    images = list(survey.images)
+    for i, quat in enumerate(quat_xyzw_from_matrix(turns)):
+        attitude = Attitude(quat_xyzw=tuple(quat.tolist()), sigma_deg=1.0, source="gimbal")
+        images[i] = images[i].model_copy(update={"attitude": attitude})
+    survey = survey.model_copy(update={"images": tuple(images)})
+    bare = replace(track, attitude_time_s=np.empty(0), geo_from_body=np.empty((0, 3, 3)))
+    found = with_rig(survey, bare, of(estimate("time-offset", np.array([0.0]), np.zeros(1))))
+    np.testing.assert_allclose(places(found)[:COUNT], cameras(track.image_time_s), atol=1e-5)
+    assert [image.attitude for image in found.images] == [image.attitude for image in survey.images]
+
+
+def test_layout_is_of_what_was_recorded(survey: Survey, track: NavigationTrack) -> None:
+    rig = of(estimate("time-offset", np.array([0.5]), np.zeros(1)))
+    applied = with_rig(survey, track, rig.model_copy(update={"layout": layout_of(survey)}))
+    assert layout_of(applied) == layout_of(survey)
+    moved = survey.model_copy(update={"images": survey.images[1:]})
+    assert layout_of(moved) != layout_of(survey)
+
+
+@pytest.mark.parametrize(
+    ("change", "wanted", "message"),
+    [
+        (None, "time-offset", "needs the navigation recorded by time"),
+        ({"attitude_time_s": np.empty(0)}, "lever-arm", "lever-arm needs attitudes"),
+        ({"body_known": np.array(False)}, "lever-arm", "give --camera-mount"),
+        ({"cam_from_body": np.full((COUNT, 3, 3), np.nan)}, "boresight", "camera's mount"),
+    ],
+)
+def test_what_cannot_be_estimated(
+    track: NavigationTrack, change: dict[str, np.ndarray] | None, wanted: RigParameter, message: str
+) -> None:
+    given = None if change is None else replace(track, **change)
+    with pytest.raises(InputError, match=message):
+        require_estimable(given, [wanted], "--estimate")

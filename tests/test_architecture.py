@@ -1,0 +1,267 @@
+"""Who may call whom (docs/architecture.md), read off the imports of every file.
+
+Imports inside functions count as well: they put off the cost of a library, not the dependence on it.
+"""
+
+from __future__ import annotations
+
+import ast
+import functools
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import pytest
+
+from georef_cli.main import COMMANDS
+from pipelines.core.stages import PIPELINE
+
+REPOSITORY = Path(__file__).parents[1]
+PACKAGES = ("georef_cli", "pipelines")
+
+# From the ground up. A file may import what lies on a lower floor, or in its own room. Rooms of one floor may use
+# each other as long as no circle arises; stage rooms never do: they meet in the workspace.
+FLOORS: tuple[tuple[str, ...], ...] = (
+    ("pipelines.core",),
+    ("pipelines.geodesy", "pipelines.geometry", "pipelines.robust"),
+    ("pipelines.formats",),
+    ("pipelines.georef", "pipelines.plots", "pipelines.scene", "pipelines.splat", "pipelines.stereo"),
+    (
+        "pipelines.calibrate",
+        "pipelines.compare",
+        "pipelines.deliver",
+        "pipelines.evaluate",
+        "pipelines.geolocate",
+        "pipelines.ingest",
+        "pipelines.init_sim3",
+        "pipelines.sfm",
+        "pipelines.simulate",
+        "pipelines.train",
+    ),
+    ("georef_cli",),
+)
+STAGE_FLOOR = 4
+STAGE_ROOMS = FLOORS[STAGE_FLOOR]
+# The command line starts stages through the runner and shows products; what makes them is none of its business.
+SEEN_BY_CLI = ("pipelines.core", "pipelines.scene", "georef_cli", *STAGE_ROOMS)
+
+HOMES: dict[str, tuple[str, ...]] = {
+    "click": ("georef_cli",),
+    "rich": ("georef_cli",),
+    "pyproj": ("pipelines.geodesy",),
+    "pycolmap": ("pipelines.sfm", "pipelines.formats"),
+    "numba": ("pipelines.splat", "pipelines.geometry", "pipelines.robust"),
+    "gsplat": ("pipelines.splat.rasterizer.cuda",),
+    "torch": ("pipelines.splat", "pipelines.georef", "pipelines.scene", *STAGE_ROOMS),
+    "plyfile": ("pipelines.formats",),
+    "exifread": ("pipelines.formats",),
+    "defusedxml": ("pipelines.formats",),
+    "rosbags": ("pipelines.formats",),
+    "embreex": ("pipelines.simulate",),
+    "matplotlib": ("pipelines.plots",),
+}
+# Arrows that are still to be turned round; none may be added.
+PENDING = {
+    ("pipelines.core.fingerprints", "pipelines.scene.survey"),
+    ("pipelines.core.runner", "pipelines.scene.survey"),
+    ("pipelines.formats.odm", "pipelines.ingest.notes"),
+    ("pipelines.formats.trajectory_csv", "pipelines.ingest.notes"),
+}
+CORE_LIBRARIES = {"numpy", "pydantic"}
+
+
+def inside(module: str, room: str) -> bool:
+    return module == room or module.startswith(room + ".")
+
+
+@functools.cache
+def sources() -> dict[str, ast.Module]:
+    """Syntax trees of all files by module name."""
+    found = {}
+    for package in PACKAGES:
+        for path in sorted((REPOSITORY / package).rglob("*.py")):
+            parts = path.relative_to(REPOSITORY).with_suffix("").parts
+            name = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+            found[name] = ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
+    return found
+
+
+def imports(tree: ast.AST) -> Iterator[str]:
+    """Full names of everything that a file imports; relative imports are not used here, and fail."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"line {node.lineno}: relative import"
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def own_imports() -> list[tuple[str, str]]:
+    """(importer, imported module) for all imports among our own files."""
+    pairs = []
+    for module, tree in sources().items():
+        for name in imports(tree):
+            if name.startswith(PACKAGES):
+                target = name if name in sources() else name.rpartition(".")[0]
+                if (module, target) not in PENDING:
+                    pairs.append((module, target))
+    return pairs
+
+
+def room_of(module: str) -> tuple[int, str] | None:
+    """Floor and room of a module; None for the bare packages."""
+    rooms = ((floor, room) for floor, members in enumerate(FLOORS) for room in members)
+    return next(((floor, room) for floor, room in rooms if inside(module, room)), None)
+
+
+def why_wrong(importer: str, imported: str) -> str | None:
+    """Which rule an import breaks, or None."""
+    above, below = room_of(importer), room_of(imported)
+    if above is None or below is None or above[1] == below[1]:
+        return None
+    if below[0] > above[0]:
+        return "points upwards"
+    if above[0] == below[0] == STAGE_FLOOR:
+        return "ties two stages"
+    if above[1] == "georef_cli" and below[1] not in SEEN_BY_CLI:
+        return "goes past the stages"
+    return None
+
+
+def circles(arrows: Mapping[str, set[str]]) -> list[set[str]]:
+    """Members of each circle: the strongly connected parts of more than one member (Tarjan 1972)."""
+    index: dict[str, int] = {}
+    low: dict[str, int] = {}
+    stack: list[str] = []
+    found: list[set[str]] = []
+
+    def visit(node: str) -> None:
+        index[node] = low[node] = len(index)
+        stack.append(node)
+        for other in sorted(arrows.get(node, ())):
+            if other not in index:
+                visit(other)
+                low[node] = min(low[node], low[other])
+            elif other in stack:
+                low[node] = min(low[node], index[other])
+        if low[node] == index[node]:
+            part = {stack.pop()}
+            while node not in part:
+                part.add(stack.pop())
+            if len(part) > 1:
+                found.append(part)
+
+    for node in sorted(arrows):
+        if node not in index:
+            visit(node)
+    return found
+
+
+def test_every_file_has_a_room() -> None:
+    homeless = [name for name in sources() if room_of(name) is None and name not in PACKAGES]
+    assert not homeless, f"give it a floor in this test and in docs/architecture.md: {homeless}"
+
+
+def test_arrows_point_down() -> None:
+    pairs = ((importer, imported, why_wrong(importer, imported)) for importer, imported in own_imports())
+    assert [f"{importer} → {imported} {rule}" for importer, imported, rule in pairs if rule] == []
+
+
+def test_rooms_form_no_circle() -> None:
+    arrows: dict[str, set[str]] = {}
+    for importer, imported in own_imports():
+        above, below = room_of(importer), room_of(imported)
+        if above and below and above[1] != below[1]:
+            arrows.setdefault(above[1], set()).add(below[1])
+    assert circles(arrows) == []
+
+
+def test_files_form_no_circle() -> None:
+    """Imports inside functions count: a circle of files is one thing that was cut in two at the wrong place."""
+    arrows: dict[str, set[str]] = {}
+    for importer, imported in own_imports():
+        arrows.setdefault(importer, set()).add(imported)
+    assert circles(arrows) == []
+
+
+@pytest.mark.parametrize(
+    ("importer", "imported", "rule"),
+    [
+        ("pipelines.core.runner", "pipelines.scene.survey", "points upwards"),
+        ("pipelines.geometry.rays", "pipelines.formats.colmap", "points upwards"),
+        ("pipelines.evaluate.stage", "pipelines.train.trainer", "ties two stages"),
+        ("pipelines.compare.stage", "pipelines.evaluate.report", "ties two stages"),
+        ("pipelines.formats.odm", "pipelines.ingest.notes", "points upwards"),
+        ("georef_cli.tables", "pipelines.splat.gaussians", "goes past the stages"),
+        ("pipelines.train.stage", "pipelines.scene.scene", None),
+        ("georef_cli.commands.run", "pipelines.core.runner", None),
+    ],
+)
+def test_a_planted_import_is_judged(importer: str, imported: str, rule: str | None) -> None:
+    """The rule itself: a check that finds nothing must be one that would."""
+    assert why_wrong(importer, imported) == rule
+
+
+def test_a_planted_circle_is_found() -> None:
+    arrows = {"a": {"b"}, "b": {"c"}, "c": {"a", "d"}, "d": {"e"}, "e": set()}
+    assert circles(arrows) == [{"a", "b", "c"}]
+
+
+@pytest.mark.parametrize("library", HOMES)
+def test_library_stays_at_home(library: str) -> None:
+    users = {module for module, tree in sources().items() for name in imports(tree) if inside(name, library)}
+    strangers = [user for user in sorted(users) if not any(inside(user, home) for home in HOMES[library])]
+    assert strangers == []
+
+
+def test_core_is_light() -> None:
+    for module, tree in sources().items():
+        if inside(module, "pipelines.core"):
+            libraries = {name.partition(".")[0] for name in imports(tree)}
+            assert libraries <= {*sys.stdlib_module_names, *CORE_LIBRARIES, "pipelines"}, module
+
+
+def test_building_the_commands_imports_nothing_heavy() -> None:
+    """What a stage computes with is imported when it runs: `georef --help` and `status` answer at once."""
+    modules = [f"georef_cli.commands.{entry.module}" for entry in COMMANDS.values()]
+    code = f"import importlib, sys; [importlib.import_module(name) for name in {modules}]; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=REPOSITORY)
+    assert not {"torch", "pycolmap", "numba", "matplotlib", "scipy", "cv2", "pyproj"} & set(done.stdout.split())
+
+
+def test_table_of_commands_is_complete() -> None:
+    """Every module in commands/ is a command, and every command has its module."""
+    modules = {path.stem for path in (REPOSITORY / "georef_cli/commands").glob("*.py")} - {"__init__"}
+    assert modules == {entry.module for entry in COMMANDS.values()}
+    assert {spec.name for spec in PIPELINE} <= set(COMMANDS)
+
+
+def calls(tree: ast.AST) -> Iterator[tuple[str, ast.Call]]:
+    """All calls with the dotted name of what is called."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call):
+            yield ast.unparse(node.func), node
+
+
+def keyword(call: ast.Call, name: str) -> object:
+    found = next((word.value for word in call.keywords if word.arg == name), None)
+    return found.value if isinstance(found, ast.Constant) else None
+
+
+@pytest.mark.parametrize("module", sorted(sources()))
+def test_files_are_read_safely_and_talk_through_logs(module: str) -> None:
+    """No code from data: no pickle, no eval. No print and no log handlers in the library."""
+    tree = sources()[module]
+    assert not {"pickle", "marshal", "shelve", "dill"} & {name.partition(".")[0] for name in imports(tree)}
+    for name, call in calls(tree):
+        where = f"{module}:{call.lineno}"
+        assert name not in ("eval", "exec", "os.system"), where
+        assert keyword(call, "shell") is not True, where
+        if name in ("np.load", "numpy.load"):
+            assert keyword(call, "allow_pickle") is False, where
+        if name == "torch.load":
+            assert keyword(call, "weights_only") is True, where
+        if inside(module, "pipelines"):
+            assert name not in ("print", "sys.exit", "logging.basicConfig"), where
+            assert not name.endswith(".addHandler"), where

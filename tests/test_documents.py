@@ -1,0 +1,49 @@
+"""The documents lead where they say: every relative link is to a file, every anchor to a heading."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).parents[1]
+DOCUMENTS = sorted(
+    path
+    for pattern in ("*.md", "docs/*.md", "examples/**/*.md")
+    for path in REPOSITORY.glob(pattern)
+    if not any(part.startswith(".") for part in path.relative_to(REPOSITORY).parts)
+)
+LINK = re.compile(r"!?\[[^\]]*\]\(<?([^)\s>]+)>?(?:\s+\"[^\"]*\")?\)")
+# `docs/x.md` and `tests/…/x.py` named in passing are promises too.
+NAMED = re.compile(r"`((?:docs|examples|tests|pipelines|georef_cli)/[\w./-]+\.(?:md|py|toml))`")
+
+
+def text_of(path: Path) -> str:
+    """Without blocks of code."""
+    return re.sub(r"```.*?```", "", path.read_text(encoding="utf-8"), flags=re.DOTALL)
+
+
+def anchors(path: Path) -> set[str]:
+    """Headings as forges write them into addresses."""
+    headings = re.findall(r"^#+\s+(.*)$", text_of(path), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.relative_to(REPOSITORY).as_posix())
+def test_links_lead_somewhere(document: Path) -> None:
+    broken = []
+    for link in LINK.findall(text_of(document)):
+        if re.match(r"[a-z]+:", link):
+            continue
+        name, _, anchor = link.partition("#")
+        target = document.parent / name if name else document
+        if not target.exists() or (anchor and anchor not in anchors(target)):
+            broken.append(link)
+    broken += [name for name in NAMED.findall(text_of(document)) if not (REPOSITORY / name).exists()]
+    assert broken == []
+
+
+def test_there_are_documents_with_links() -> None:
+    assert {"README.md", "inputs.md"} <= {path.name for path in DOCUMENTS}
+    assert sum(len(LINK.findall(text_of(path))) for path in DOCUMENTS) > 10

@@ -1,0 +1,210 @@
+"""Input is hostile until parsed: nothing is executed, nothing leaves its folder, sizes are checked first."""
+
+from __future__ import annotations
+
+import ast
+import json
+import os
+import struct
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipelines.core.errors import InputError
+from pipelines.core.products import load_json
+from pipelines.core.stages import POINTS, SPARSE, SURVEY
+from pipelines.core.workspace import Workspace
+from pipelines.formats.colmap import read_sparse, write_sparse
+from pipelines.ingest.options import IngestOptions
+from pipelines.ingest.stage import build_survey
+from pipelines.scene.geolocated import GeolocatedPoints
+from pipelines.scene.scene import photographs
+from pipelines.scene.survey import Survey
+from tests.photos import Exif, gps_entries, jpeg, write_flight
+from tests.scenes import Measured, Noise, make_scene, sparse_model, survey_of, write_workspace
+
+REPOSITORY = Path(__file__).parents[1]
+FORBIDDEN = {
+    "eval", "exec", "compile", "pickle", "marshal", "shelve", "yaml", "subprocess", "os.system", "os.popen",
+    "torch.load", "torch.save",
+}  # fmt: skip
+ESCAPES = ["../secret.jpg", "/etc/passwd", "a/../../secret.jpg", "", "a\nb.jpg", "a\x00b.jpg"]
+
+
+def _calls(tree: ast.AST) -> list[tuple[str, ast.AST]]:
+    """Names that are called or imported."""
+    found: list[tuple[str, ast.AST]] = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call):
+            found.append((ast.unparse(node.func), node))
+        elif isinstance(node, ast.Import):
+            found += [(alias.name, node) for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            found.append((node.module or "", node))
+    return found
+
+
+@pytest.mark.parametrize("package", ["georef_cli", "pipelines"])
+def test_nothing_that_is_read_can_be_executed(package: str) -> None:
+    files = list((REPOSITORY / package).rglob("*.py"))
+    assert files
+    for file in files:
+        for name, node in _calls(ast.parse(file.read_text("utf-8"))):
+            assert name not in FORBIDDEN, f"{file}:{node.lineno} uses {name}"  # type: ignore[attr-defined]
+            if name in ("np.load", "numpy.load"):
+                assert isinstance(node, ast.Call)
+                pickle = {keyword.arg: ast.unparse(keyword.value) for keyword in node.keywords}
+                assert pickle.get("allow_pickle") == "False", f"{file}:{node.lineno} may unpickle"
+
+
+@pytest.fixture
+def workspace(tmp_path: Path) -> Workspace:
+    """A survey and its SfM model, as the stages leave them."""
+    rng = np.random.default_rng(4)
+    scene = make_scene()
+    survey = survey_of(scene, Noise(), Measured(), rng)
+    return write_workspace(tmp_path / "ws", survey, sparse_model(scene, Noise(), rng))
+
+
+def _edited(workspace: Workspace, *keys: Any, value: Any) -> Path:
+    """The survey with one value replaced by hand."""
+    path = workspace.path(SURVEY)
+    document = json.loads(path.read_text("utf-8"))
+    place = document
+    for key in keys[:-1]:
+        place = place[key]
+    place[keys[-1]] = value
+    path.write_text(json.dumps(document), "utf-8")
+    return path
+
+
+@pytest.mark.parametrize("name", ESCAPES)
+def test_image_names_of_a_survey_stay_inside(workspace: Workspace, name: str) -> None:
+    path = _edited(workspace, "images", 0, "name", value=name)
+    with pytest.raises(InputError, match=r"survey\.json \[images\.0\.name\].*leaves the folder of photographs"):
+        load_json(Survey, path)
+
+
+@pytest.mark.parametrize(
+    ("keys", "value", "message"),
+    [
+        (("image_dir",), "../elsewhere", r"\[image_dir\].*leaves the workspace: give an absolute path"),
+        (("images", 1, "camera_id"), 7, "which is not among the cameras"),
+        (("images", 1, "name"), "DUPLICATE", "two have the same name"),
+        (("images", 0, "fix", "cov_in_geo"), [[0.0] * 3] * 3, r"cov_in_geo\].*positive definite"),
+        (
+            ("images", 0, "fix", "cov_in_geo"),
+            [[1, 0, 0], [0, -1, 0], [0, 0, 1]],
+            r"cov_in_geo\].*positive definite",
+        ),
+        (("images", 0, "fix", "position_in_geo"), [1e999, 0, 0], r"position_in_geo\.0\].*finite number"),
+        (("images", 0, "attitude"), {"quat_xyzw": [0, 0, 0, 0], "sigma_deg": 1, "source": "csv"}, "length 1"),
+        (("format_version",), 2, r"\[format_version\]"),
+        (("surprise",), 1, r"\[surprise\].*not permitted"),
+    ],
+)
+def test_survey_by_hand_is_checked(workspace: Workspace, keys: tuple[Any, ...], value: Any, message: str) -> None:
+    if value == "DUPLICATE":
+        value = load_json(Survey, workspace.path(SURVEY)).images[0].name
+    path = _edited(workspace, *keys, value=value)
+    with pytest.raises(InputError, match=message):
+        load_json(Survey, path)
+
+
+@pytest.mark.parametrize("name", ["../secret.jpg", "/etc/passwd"])
+def test_image_names_of_a_colmap_model_stay_inside(workspace: Workspace, name: str) -> None:
+    model = read_sparse(workspace.path(SPARSE))
+    names = (name, *model.image_name[1:])
+    write_sparse(type(model)(**{**vars(model), "image_name": names}), workspace.path(SPARSE))
+    with pytest.raises(InputError, match="leaves the folder of photographs"):
+        read_sparse(workspace.path(SPARSE))
+
+
+def test_a_model_with_images_of_another_survey_is_not_read_from(workspace: Workspace) -> None:
+    model = read_sparse(workspace.path(SPARSE))
+    survey = load_json(Survey, workspace.path(SURVEY))
+    fewer = survey.model_copy(update={"images": survey.images[1:]})
+    with pytest.raises(InputError, match=r"1 images are not in the survey, the first is .*sfm --import"):
+        photographs(model, fewer, workspace, 64)
+
+
+def test_cached_photographs_are_named_by_hash(tmp_path: Path, workspace: Workspace) -> None:
+    model = read_sparse(workspace.path(SPARSE))
+    survey = load_json(Survey, workspace.path(SURVEY)).model_copy(update={"image_dir": str(tmp_path / "photos")})
+    camera = model.camera_of(0)
+    for name in model.image_name:
+        file = tmp_path / "photos" / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(jpeg(size=(camera.width, camera.height)))
+    photographs(model, survey, workspace, 64).build()
+    names = [path.name for path in workspace.cache.rglob("*") if path.is_file()]
+    assert len(names) == len(model.image_name)
+    assert all(len(name) == 36 and name.endswith(".npy") for name in names)
+
+
+def test_a_photograph_that_is_gone_is_told(workspace: Workspace) -> None:
+    survey = load_json(Survey, workspace.path(SURVEY))
+    with pytest.raises(InputError, match=r"the photograph cannot be read \(No such file.*georef ingest"):
+        photographs(read_sparse(workspace.path(SPARSE)), survey, workspace, 64).build()
+
+
+def _points(count: int) -> dict[str, np.ndarray]:
+    return {
+        "point_id": np.arange(count),
+        "position_in_geo": np.zeros((count, 3)),
+        "cov_in_geo": np.zeros((count, 3, 3)),
+        "ray_count": np.ones(count, np.int32),
+        "max_angle_deg": np.ones(count),
+        "condition": np.ones(count),
+        "inlier": np.ones(count, bool),
+        "rotation_source": np.array("sfm"),
+    }
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("position_in_geo", np.zeros((3, 2)), r"\[position_in_geo\]: has the form \(3, 2\)"),
+        ("inlier", np.ones(2, bool), r"\[inlier\]: has the form \(2,\)"),
+        ("point_id", np.zeros(3), r"\[point_id\]: has the form \(3,\) float64"),
+        ("condition", np.array([{}] * 3, dtype=object), "not a readable NPZ file: .*allow_pickle=False"),
+    ],
+)
+def test_points_by_hand_are_checked(tmp_path: Path, name: str, value: np.ndarray, message: str) -> None:
+    path = tmp_path / Path(POINTS).name
+    np.savez(path, **{**_points(3), name: value})
+    with pytest.raises(InputError, match=message):
+        GeolocatedPoints.load(path)
+
+
+def test_an_array_that_claims_to_be_huge_is_refused(tmp_path: Path) -> None:
+    header = b"{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000000,), }".ljust(117) + b"\n"
+    path = tmp_path / "points.npz"
+    np.savez(path, **{key: array for key, array in _points(3).items() if key != "condition"})
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr("condition.npy", b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header)
+    with pytest.raises(InputError, match="not a readable NPZ file"):
+        GeolocatedPoints.load(path)
+
+
+def test_names_that_are_no_text_are_left_out_of_a_survey(tmp_path: Path) -> None:
+    write_flight(tmp_path, 3)
+    photograph = jpeg(9, exif=Exif(gps=gps_entries(46.02, 7.75)))
+    (tmp_path / "new\nline.jpg").write_bytes(photograph)
+    Path(os.fsdecode(os.fsencode(tmp_path) + b"/\xff.jpg")).write_bytes(photograph)
+    survey = build_survey(IngestOptions(images=tmp_path))
+    assert len(survey.images) == 3
+    assert any(
+        text.startswith("2 images have names that are no text and were left out") for text in survey.warnings
+    )
+
+
+def test_links_that_leave_the_folder_are_left_out(tmp_path: Path) -> None:
+    write_flight(tmp_path / "photos", 3)
+    (tmp_path / "private.jpg").write_bytes(jpeg(9))
+    (tmp_path / "photos/link.jpg").symlink_to(tmp_path / "private.jpg")
+    survey = build_survey(IngestOptions(images=tmp_path / "photos"))
+    assert "1 image is a link that leaves the folder and was left out: link.jpg" in survey.warnings

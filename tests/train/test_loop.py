@@ -1,0 +1,136 @@
+"""The training loop: the same from the same seed, through interruptions, and through one divergence."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+from pipelines.core.errors import ConvergenceError
+from pipelines.core.progress import SILENT
+from pipelines.scene.photographs import ImageCache
+from pipelines.splat.densify import Strategy
+from pipelines.splat.densify_fast import FastSettings, FastStrategy
+from pipelines.splat.densify_mcmc import McmcSettings, McmcStrategy
+from pipelines.splat.surface import SurfaceSettings
+from pipelines.train.loop import LoopOptions, optimise
+from pipelines.train.trainer import JointOptions, JointTrainer
+from tests import tiny_training as tiny
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+ITERATIONS = 40
+OPTIONS = JointOptions(
+    ITERATIONS, sh_degree=1, coarse=((2, 0.3),), coarse_least_px=32, surface=SurfaceSettings(normals_from=0.5)
+)
+STRATEGIES: dict[str, Callable[[], Strategy | None]] = {
+    "default": lambda: None,
+    "mcmc": lambda: McmcStrategy(McmcSettings(start=4, stop=30, every=8, max_gaussians=300), tiny.EXTENT_M),
+    "fast": lambda: FastStrategy(
+        tiny.SETTINGS, FastSettings(views=3, prune_stop=35, high_error_px=0.1), tiny.EXTENT_M, 200
+    ),
+}
+
+
+@pytest.fixture(scope="module")
+def images(tmp_path_factory: pytest.TempPathFactory) -> ImageCache:
+    return tiny.photographs(tmp_path_factory.mktemp("photographs"), tiny.true_gaussians())
+
+
+def files(folder: Path, *, resume: bool = False) -> LoopOptions:
+    return LoopOptions(folder / "checkpoint.npz", folder / "metrics.jsonl", 10, 5, resume)
+
+
+def result(trainer: JointTrainer) -> dict[str, torch.Tensor]:
+    return {name: value.detach().clone() for name, value in trainer.state().items()}
+
+
+def assert_same(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> None:
+    assert one.keys() == other.keys()
+    different = [name for name in one if not torch.equal(one[name], other[name])]
+    assert different == []
+
+
+@pytest.mark.parametrize("name", STRATEGIES)
+def test_the_same_seed_gives_the_same_bits_also_through_an_interruption(
+    images: ImageCache, tmp_path: Path, name: str
+) -> None:
+    def new() -> JointTrainer:
+        return tiny.trainer(images, OPTIONS, strategy=STRATEGIES[name](), with_exposures=True)
+
+    whole, again, first, second = (new() for _ in range(4))
+    for trainer, folder in ((whole, "a"), (again, "b")):
+        (tmp_path / folder).mkdir()
+        optimise(trainer, files(tmp_path / folder), SILENT)
+    assert_same(result(whole), result(again))
+    (tmp_path / "c").mkdir()
+    _stop_at(first, 17, files(tmp_path / "c"))
+    optimise(second, files(tmp_path / "c", resume=True), SILENT)
+    assert_same(result(whole), result(second))
+    rows = [json.loads(row) for row in (tmp_path / "c" / "metrics.jsonl").read_text().splitlines()]
+    assert [row["iteration"] for row in rows] == list(range(5, ITERATIONS + 1, 5))
+
+
+def _stop_at(trainer: JointTrainer, iteration: int, options: LoopOptions) -> None:
+    """Kill a training at an iteration between two checkpoints: nothing is written on the way out."""
+    step = trainer.step
+
+    def killed() -> object:
+        if trainer.iteration + 1 == iteration:
+            raise SystemExit
+        return step()
+
+    trainer.step = killed  # type: ignore[method-assign,assignment]
+    with pytest.raises(SystemExit):
+        optimise(trainer, options, SILENT)
+
+
+def _spoil(trainer: JointTrainer, iterations: set[int]) -> None:
+    """Make one Gaussian's colour not a number before these iterations, each time that they come."""
+    step, left = trainer.step, sorted(iterations)
+
+    def spoiled() -> object:
+        if left and trainer.iteration + 1 == left[0]:
+            left.pop(0)
+            with torch.no_grad():
+                trainer.optimizer.gaussians.sh[:, 0] = float("nan")
+        return step()
+
+    trainer.step = spoiled  # type: ignore[method-assign,assignment]
+
+
+def test_a_divergence_is_recovered_from_once_at_a_lower_rate(images: ImageCache, tmp_path: Path) -> None:
+    trainer = tiny.trainer(images, OPTIONS)
+    _spoil(trainer, {23})
+    outcome = optimise(trainer, files(tmp_path), SILENT)
+    assert outcome.recovery is not None
+    assert "photometric loss is not finite at iteration 23" in outcome.recovery
+    assert "went back to iteration 20" in outcome.recovery
+    assert trainer.iteration == ITERATIONS and trainer.optimizer.rate_factor < 0.5
+    assert all(bool(value.isfinite().all()) for value in result(trainer).values())
+    rows = [json.loads(row) for row in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    assert [row["iteration"] for row in rows] == list(range(5, ITERATIONS + 1, 5))
+    assert all(abs(row["psnr"]) < 100 for row in rows)
+
+
+def test_a_second_divergence_stops_and_names_both(images: ImageCache, tmp_path: Path) -> None:
+    trainer = tiny.trainer(images, OPTIONS)
+    _spoil(trainer, {3, 33})
+    with pytest.raises(ConvergenceError, match=r"iteration 33, and before that .* iteration 3; went back.*--seed"):
+        optimise(trainer, files(tmp_path), SILENT)
+    # Whoever resumes does so from a sound state that knows of the first one.
+    resumed = tiny.trainer(images, OPTIONS)
+    outcome = optimise(resumed, files(tmp_path, resume=True), SILENT)
+    assert outcome.recovery is not None and "iteration 3" in outcome.recovery
+    assert resumed.iteration == ITERATIONS
+
+
+def test_training_brings_the_renders_to_the_photographs(images: ImageCache, tmp_path: Path) -> None:
+    trainer = tiny.trainer(images, JointOptions(80, sh_degree=0))
+    optimise(trainer, files(tmp_path), SILENT)
+    rows = [json.loads(row)["psnr"] for row in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    # From grey blobs at 64 × 48 pixels: these are renders of just as many Gaussians.
+    assert rows[-1] > rows[0] + 6 and rows[-1] > 20

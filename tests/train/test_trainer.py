@@ -1,0 +1,133 @@
+"""The joint optimisation step by step: order of views, schedule, state, and its guard."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from pipelines.core.workspace import Workspace
+from pipelines.scene.geographic import geo_problem
+from pipelines.scene.scene import initial_scene, photographs
+from pipelines.splat.rasterizer.backends import rasterizer
+from pipelines.train.checkpoint import load_checkpoint, save_checkpoint
+from pipelines.train.material import Material
+from pipelines.train.options import TrainOptions
+from pipelines.train.stage import make_trainer
+from pipelines.train.trainer import JointTrainer
+from tests.splat_scenes import (
+    START_COVARIANCE,
+    Rendered,
+    initial_similarity,
+    make_rendered,
+    write_photographs,
+    write_rendered,
+)
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+CONFIG = TrainOptions(iterations=60, sh_degree=2, max_gaussians=1000)
+
+
+@pytest.fixture(scope="module")
+def rendered() -> Rendered:
+    return make_rendered()
+
+
+@pytest.fixture(scope="module")
+def workspace(rendered: Rendered, tmp_path_factory: pytest.TempPathFactory) -> Workspace:
+    root = tmp_path_factory.mktemp("flight")
+    write_photographs(rendered, root / "photos")
+    return write_rendered(root, rendered, _initial(rendered))
+
+
+def _initial(rendered: Rendered) -> object:
+    pivot = rendered.scene.center_in_geo.mean(axis=0)
+    return initial_similarity(np.random.default_rng(0), START_COVARIANCE, pivot)
+
+
+def trainer_of(rendered: Rendered, workspace: Workspace, config: TrainOptions = CONFIG) -> JointTrainer:
+    initial = _initial(rendered)
+    scene = initial_scene(rendered.sparse, rendered.survey, initial)  # type: ignore[arg-type]
+    images = photographs(scene.sparse, rendered.survey, workspace, 640)
+    problem = geo_problem(scene, rendered.survey, initial, config)  # type: ignore[arg-type]
+    return make_trainer(Material(scene, images), problem, rasterizer("cpu"), config)
+
+
+def test_every_view_is_seen_once_an_epoch_and_no_test_view_ever(rendered: Rendered, workspace: Workspace) -> None:
+    trainer = trainer_of(rendered, workspace)
+    seen = [trainer._view_of(iteration) for iteration in range(1, 37)]
+    assert Counter(seen) == dict.fromkeys((0, 1, 2, 4, 5, 6, 7, 8, 10, 11, 12, 13), 3)
+    for epoch in range(3):
+        assert len(set(seen[12 * epoch : 12 * epoch + 12])) == 12
+    assert seen[:12] != seen[12:24]
+    other = trainer_of(rendered, workspace, CONFIG.model_copy(update={"seed": 1}))
+    assert seen != [other._view_of(iteration) for iteration in range(1, 37)]
+
+
+def test_harmonics_grow_up_to_half_of_the_training(rendered: Rendered, workspace: Workspace) -> None:
+    trainer = trainer_of(rendered, workspace)
+    degrees = []
+    for iteration in range(1, 61):
+        trainer.iteration = iteration
+        degrees.append(trainer._sh_degree())
+    assert degrees == [0] * 9 + [1] * 10 + [2] * 41
+
+
+def test_a_step_moves_everything_but_test_cameras_by_themselves(rendered: Rendered, workspace: Workspace) -> None:
+    trainer = trainer_of(rendered, workspace)
+    before = {name: tensor.detach().clone() for name, tensor in trainer.optimizer.gaussians.tensors().items()}
+    report = trainer.step()
+    assert trainer.iteration == 1
+    assert 0 < report.weight < 0.05
+    assert float(report.photometric) > 0
+    after = trainer.optimizer.gaussians.tensors()
+    assert any(not torch.equal(before[name], after[name].detach()) for name in before)
+    assert float(trainer.problem.similarity.y.detach().abs().max()) > 0
+    assert float(trainer.problem.cameras.z.detach().abs().max()) > 0
+
+
+def test_state_restores_the_next_step_exactly(rendered: Rendered, workspace: Workspace, tmp_path: Path) -> None:
+    one, two = trainer_of(rendered, workspace), trainer_of(rendered, workspace)
+    for _ in range(5):
+        one.step()
+    save_checkpoint(tmp_path / "c.npz", one.state())
+    two.restore(load_checkpoint(tmp_path / "c.npz"))
+    for _ in range(3):
+        first, second = one.step(), two.step()
+        assert float(first.photometric) == float(second.photometric)
+        assert float(first.geographic) == float(second.geographic)
+    state, again = one.state(), two.state()
+    assert state.keys() == again.keys()
+    for name in state:
+        assert torch.equal(state[name], again[name]), name
+
+
+def test_state_of_a_run_that_has_not_begun(rendered: Rendered, workspace: Workspace, tmp_path: Path) -> None:
+    one, two = trainer_of(rendered, workspace), trainer_of(rendered, workspace)
+    save_checkpoint(tmp_path / "c.npz", one.state())
+    two.restore(load_checkpoint(tmp_path / "c.npz"))
+    assert float(one.step().photometric) == float(two.step().photometric)
+
+
+def test_views_are_seen_through_the_lens_that_follows(rendered: Rendered, workspace: Workspace) -> None:
+    one, two = trainer_of(rendered, workspace), trainer_of(rendered, workspace)
+    before, basis = one.pinhole(0), one.problem.cameras.lens_basis
+    with torch.no_grad():  # toward a focal length two per cent longer
+        one.problem.cameras.z.copy_(2 * basis[0] / basis[0].square().sum())
+    one.step()
+    fx = float((basis[0] @ one.problem.cameras.z).detach()) + before.fx
+    assert one.pinhole(0).fx == pytest.approx(fx, abs=0.1)  # but for the step itself
+    # It stays for a hundred iterations, whatever the cameras do, also for who goes on from there.
+    with torch.no_grad():
+        one.problem.cameras.z.zero_()
+    two.restore(one.state())
+    one.step(), two.step()
+    assert two.pinhole(0) == one.pinhole(0) != before
+    one.iteration = 100
+    one.step()
+    assert one.pinhole(0).fx == pytest.approx(before.fx, abs=0.1)
