@@ -12,7 +12,6 @@ import torch
 from pipelines.geometry.cameras import Camera
 from pipelines.geometry.similarity import Similarity
 from pipelines.georef.cameras import CameraCorrections, CameraPoses
-from pipelines.georef.measured import Measured
 from pipelines.georef.problem import GeoProblem
 from pipelines.georef.similarity import LearnableSimilarity
 from pipelines.scene.photographs import ImageCache, Photograph
@@ -80,7 +79,7 @@ def trainer(
     return JointTrainer(
         GaussianAdam(start, EXTENT_M, options.iterations),
         strategy or DefaultStrategy(SETTINGS, EXTENT_M, len(start)),
-        GeoProblem(similarity, cameras, Measured()),
+        GeoProblem(similarity, cameras, ()),
         Views(train, images),
         rasterizer=CpuRasterizer(),
         options=options,

@@ -28,10 +28,10 @@ from pipelines.evaluate.prediction import control_sights, cramer_rao, following,
 from pipelines.georef.adjustment import Correspondences
 from pipelines.georef.alignment import align
 from pipelines.georef.cameras import CameraCorrections
-from pipelines.georef.measured import ControlMarks, Fixes, Measured
 from pipelines.georef.posterior import minimise
 from pipelines.georef.problem import GeoProblem
 from pipelines.georef.similarity import LearnableSimilarity
+from pipelines.georef.terms import ControlTerm, FixTerm
 from pipelines.scene.initial_similarity import InitialSimilarity
 from pipelines.scene.restored import Restored, geographic_options_of, restore
 from pipelines.scene.trained import load_trained
@@ -65,8 +65,8 @@ class Truth:
 class Drawn:
     """One run's measurements, and where the check points (J, 3) truly are in `geo`."""
 
-    fixes: Fixes | None
-    marks: ControlMarks | None
+    fixes: FixTerm | None
+    marks: ControlTerm | None
     check_in_geo: FloatArray
 
 
@@ -83,7 +83,7 @@ def draw(truth: Truth, rng: np.random.Generator, *, images: bool) -> Drawn:
     def true(marked: Marked) -> FloatArray:
         return marked.position + marked.follow.by(basis) @ z + marked.follow.by_lens @ lens
 
-    fixes, marks = problem.fixes, problem.marks
+    fixes, marks = problem.fixes, problem.control
     if fixes is not None:
         moved = truth.restored.trained.poses.cam_center_in_model + basis[:, 3:] @ z
         position = geo_from_model.apply(moved[fixes.camera.numpy()])
@@ -116,7 +116,7 @@ def estimate(truth: Truth, drawn: Drawn, rng: np.random.Generator) -> tuple[Floa
     problem = GeoProblem(
         LearnableSimilarity(start, solution.covariance, solution.pivot),
         CameraCorrections(poses, basis, follows),
-        Measured(drawn.fixes, _through_trained_lens(truth, drawn.marks)),
+        [term for term in (drawn.fixes, _through_trained_lens(truth, drawn.marks)) if term is not None],
     )
     minimise(problem)
     by_lens = truth.check.follow.by_lens[:, :, : len(follows)] @ follows
@@ -124,7 +124,7 @@ def estimate(truth: Truth, drawn: Drawn, rng: np.random.Generator) -> tuple[Floa
     return start.apply(truth.check.position), problem.similarity.current().apply(followed)
 
 
-def _through_trained_lens(truth: Truth, marks: ControlMarks | None) -> ControlMarks | None:
+def _through_trained_lens(truth: Truth, marks: ControlTerm | None) -> ControlTerm | None:
     """The marks as the cameras see them from which the estimate starts."""
     if marks is None:
         return None
@@ -173,7 +173,7 @@ def main() -> None:
     initial = load_json(InitialSimilarity, workspace.path(SIM3))
     restored = restore(trained, initial, geographic_options_of(workspace))
     seen, points = sights(trained, trained.survey.check_points), trained.survey.check_points
-    control, marks = control_sights(restored), restored.problem.marks
+    control, marks = control_sights(restored), restored.problem.control
     truth = Truth(
         restored,
         None if marks is None else Marked.of(restored, control, len(marks.position_in_geo)),

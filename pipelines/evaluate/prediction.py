@@ -15,7 +15,7 @@ from pipelines.evaluate.following import Following, follow
 from pipelines.evaluate.points import Sights
 from pipelines.geometry.bundle import Network
 from pipelines.geometry.similarity import Similarity
-from pipelines.georef.posterior import LeftOut, LensDoubt, leave_one_out, posterior
+from pipelines.georef.posterior import FreeLens, LeftOut, leave_one_out, posterior
 from pipelines.scene.restored import Restored
 
 
@@ -30,7 +30,7 @@ class Prediction:
         self._restored = restored
         cameras = restored.problem.cameras
         self._basis, self._lens_basis = cameras.basis.cpu().numpy(), cameras.lens_basis.cpu().numpy()
-        self._lens = _lens_doubt(restored) if len(self._lens_basis) else None
+        self._lens = _free_lens(restored) if len(self._lens_basis) else None
         self._posterior = posterior(restored.problem, self._lens)
 
     @property
@@ -87,7 +87,7 @@ def following(restored: Restored, point_in_geo: FloatArray, seen: Sights) -> Fol
 
 def control_sights(restored: Restored) -> Sights:
     """The marks of the control points that entered the training, through its lens; none without these."""
-    marks = restored.problem.marks
+    marks = restored.problem.control
     if marks is None:
         return Sights(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty((0, 2)), np.empty(0))
     bearing = marks.bearings(trained_lens(restored)).cpu().numpy()
@@ -104,15 +104,15 @@ def trained_lens(restored: Restored) -> Tensor:
     return torch.from_numpy(restored.trained.sfm.lenses.change_to(restored.trained.sparse.lenses))
 
 
-def _lens_doubt(restored: Restored) -> LensDoubt | None:
-    found, marks = restored.scene.correction_basis, restored.problem.marks
+def _free_lens(restored: Restored) -> FreeLens | None:
+    found, marks = restored.scene.correction_basis, restored.problem.control
     if found is None:
         return None
     by_control = np.zeros((0, 3, len(found.lens_cov)))
     if marks is not None:
         moved = following(restored, marks.position_in_geo.cpu().numpy(), control_sights(restored))
         by_control = _turn(restored) @ moved.by_lens
-    return LensDoubt(found.lens_cov, by_control)
+    return FreeLens(found.lens_cov, by_control)
 
 
 def _turn(restored: Restored) -> FloatArray:
@@ -141,8 +141,8 @@ def cramer_rao(restored: Restored, seen: Sights) -> FloatArray:
         root = problem.fixes.root_information.cpu().numpy()
         camera, cov_fix = problem.fixes.camera.cpu().numpy(), np.linalg.inv(np.swapaxes(root, 1, 2) @ root)
     anchors = Anchors(camera, cov_fix)
-    if problem.marks is not None:
-        position = problem.marks.position_in_geo.cpu().numpy()
+    if problem.control is not None:
+        position = problem.control.position_in_geo.cpu().numpy()
         surveyed = {point.position_in_geo: point.cov_in_geo for point in trained.survey.control_points}
         control = control_sights(restored)
         anchors = replace(
@@ -161,7 +161,7 @@ def left_out(restored: Restored) -> LeftOut:
 
     The covariance is that of the solution and the marks: the survey's own is taken off again.
     """
-    points, marks = restored.trained.survey.control_points, restored.problem.marks
+    points, marks = restored.trained.survey.control_points, restored.problem.control
     error, cov = np.full((len(points), 3), np.nan), np.full((len(points), 3, 3), np.nan)
     if marks is None:
         return LeftOut(error, cov)

@@ -22,7 +22,7 @@ from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.geometry.cameras import Camera, project, project_each
 from pipelines.geometry.lens import by_parameter
 from pipelines.geometry.rotations import skew
-from pipelines.robust.kernels import CAUCHY_95, cauchy_weight
+from pipelines.robust.kernels import CAUCHY_SCALE2, cauchy_weight
 from pipelines.robust.statistics import rayleigh_sigma
 
 # A camera that hangs on few observations is held to a tenth of its distance from the scene.
@@ -30,7 +30,7 @@ _LOOSEST_RELATIVE_SIGMA = 0.1
 _STEP = 1e-6
 # Means of the weight w and of w r²/2 under Gaussian noise of σ = 1, where r²/2 is exponentially distributed:
 # without them the weights would take noise for outliers, and state a σ that is a fifth too small.
-_HALF_SCALE2 = CAUCHY_95**2 / 2
+_HALF_SCALE2 = CAUCHY_SCALE2[2] / 2
 _MEAN_WEIGHT = float(_HALF_SCALE2 * np.exp(_HALF_SCALE2) * exp1(_HALF_SCALE2))
 _MEAN_WEIGHTED_SQUARE = _HALF_SCALE2 * (1 - _MEAN_WEIGHT)
 
@@ -190,7 +190,7 @@ def _differences(function: Callable[[FloatArray], FloatArray], points: FloatArra
 def _robust_weights(residual: FloatArray) -> FloatArray:
     length = np.linalg.norm(residual, axis=1)
     scale = max(rayleigh_sigma(length), 1e-9)
-    return cauchy_weight((length / scale) ** 2)
+    return cauchy_weight((length / scale) ** 2, 2)
 
 
 @dataclass(frozen=True)

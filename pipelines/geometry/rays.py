@@ -241,7 +241,7 @@ def _fit_robust(bundle: _Bundle, views: Views, start: _Fit) -> _Fit:
     squares over the rays within the gate: these have their full weight, as the covariance assumes.
     """
     position, whitener, information = start.position, start.whitener, start.information
-    for steps, weigh in ((_CONVEX_STEPS, _near_median_weight), (_REDESCENDING_STEPS, cauchy_weight)):
+    for steps, weigh in ((_CONVEX_STEPS, _near_median_weight), (_REDESCENDING_STEPS, _redescending_weight)):
         pull = (information @ bundle.center[..., None])[..., 0]
         for _ in range(steps):
             weight = weigh(_squared(whitener, position[bundle.owner] - bundle.center))
@@ -253,6 +253,10 @@ def _fit_robust(bundle: _Bundle, views: Views, start: _Fit) -> _Fit:
         used = _squared(whitener, position[bundle.owner] - bundle.center) <= _RAY_GATE
         position = _solve(bundle, information * used[:, None, None])
     return _Fit(position, whitener, information, used)
+
+
+def _redescending_weight(squared: FloatArray) -> FloatArray:
+    return cauchy_weight(squared, 2)
 
 
 def _near_median_weight(squared: FloatArray) -> FloatArray:

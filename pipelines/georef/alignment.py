@@ -30,21 +30,21 @@ from pipelines.core.types import FloatArray
 from pipelines.geometry.rotations import exp_so3, log_so3
 from pipelines.geometry.similarity import Similarity, umeyama
 from pipelines.georef.adjustment import (
+    BIAS_COST,
     OUTLIER_GATE,
-    Adjusted,
+    AdjustedSimilarity,
     Correspondences,
     RotationPrior,
-    State,
+    SimilarityState,
     adjust,
     covariances,
     residuals,
 )
 from pipelines.robust.kernels import cauchy_weight
 from pipelines.robust.ransac import RansacOptions, ransac
-from pipelines.robust.statistics import squared_mahalanobis
+from pipelines.robust.statistics import median_chi2, squared_mahalanobis
 
 _WORST_ROTATION_RAD = np.radians(5.0)  # beyond, the linear covariance says nothing
-_BIAS_COST = OUTLIER_GATE - 1.0
 _LONE_BIAS_SIGMAS = 5.0
 _FLAT = 0.02  # third extent of the layout over the first
 _LOOSER = (1.0, 3.0, 10.0, 30.0, 100.0)
@@ -65,7 +65,7 @@ class Alignment:
         attitude: the recorded attitudes, where they resolved the rotation.
     """
 
-    solution: Adjusted
+    solution: AdjustedSimilarity
     layout: Literal["volume", "plane", "line"]
     attitude: RotationPrior | None
 
@@ -131,12 +131,12 @@ def mean_rotation(rotations: FloatArray, sigma_rad: FloatArray) -> RotationPrior
     weight = np.ones(len(rotations))
     for _ in range(20):
         error = log_so3(rotations @ mean.T)
-        weight = cauchy_weight((error**2).sum(axis=1) / (3 * sigma_rad**2)) / sigma_rad**2
+        weight = cauchy_weight((error**2).sum(axis=1) / sigma_rad**2, 3) / sigma_rad**2
         step = weight @ error / weight.sum()
         mean = exp_so3(step) @ mean
         if np.linalg.norm(step) < 1e-12:
             break
-    scatter = float(np.median(np.linalg.norm(log_so3(rotations @ mean.T), axis=1)) / np.sqrt(2.366))
+    scatter = float(np.median(np.linalg.norm(log_so3(rotations @ mean.T), axis=1)) / np.sqrt(median_chi2(3)))
     return RotationPrior(mean, max(float(np.median(sigma_rad)), scatter) ** 2 * np.eye(3))
 
 
@@ -194,19 +194,21 @@ def _start_with_rotation(data: Correspondences, rotation: FloatArray, rng: np.ra
 
 
 def _squared(data: Correspondences, model: Similarity) -> FloatArray:
-    state = State(model, np.ones(len(data), dtype=bool))
+    state = SimilarityState(model, np.ones(len(data), dtype=bool))
     return squared_mahalanobis(residuals(data, state), covariances(data, state))
 
 
-def _candidates(data: Correspondences, starts: list[Similarity], prior: RotationPrior | None) -> list[Adjusted]:
+def _candidates(
+    data: Correspondences, starts: list[Similarity], prior: RotationPrior | None
+) -> list[AdjustedSimilarity]:
     everything = np.ones(len(data), dtype=bool)
-    states = [State(start, everything) for start in starts]
+    states = [SimilarityState(start, everything) for start in starts]
     if data.control.any() and not data.control.all():
         states += [_with_bias(data, state) for state in list(states)]
     return [adjust(data, state, prior) for state in states]
 
 
-def _with_bias(data: Correspondences, state: State) -> State:
+def _with_bias(data: Correspondences, state: SimilarityState) -> SimilarityState:
     """The state moved onto the control points, the fixes' offset from it taken as their bias."""
     missed = residuals(data, state)
     shift = np.median(missed[data.control], axis=0)
@@ -215,10 +217,10 @@ def _with_bias(data: Correspondences, state: State) -> State:
     return replace(state, geo_from_local=onto, fix_bias_in_geo=np.median(missed[~data.control], axis=0) - shift)
 
 
-def _choose(candidates: list[Adjusted], data: Correspondences) -> Adjusted:
+def _choose(candidates: list[AdjustedSimilarity], data: Correspondences) -> AdjustedSimilarity:
     """The likeliest candidate, a bias of the fixes costing as much as an outlier."""
 
-    def cost(found: Adjusted) -> float:
+    def cost(found: AdjustedSimilarity) -> float:
         bias = found.state.fix_bias_in_geo
         if bias is None:
             return found.cost
@@ -226,6 +228,6 @@ def _choose(candidates: list[Adjusted], data: Correspondences) -> Adjusted:
         allowed = data.cov_in_geo[~data.control].mean(axis=0)
         if lone and squared_mahalanobis(bias[None], allowed)[0] > _LONE_BIAS_SIGMAS**2:
             return np.inf
-        return found.cost + _BIAS_COST
+        return found.cost + BIAS_COST
 
     return min(candidates, key=cost)

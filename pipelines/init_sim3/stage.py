@@ -21,7 +21,7 @@ from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
 from pipelines.geometry.similarity import Similarity, jacobian_at, spread_ratio_similarity, umeyama
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.georef.adjustment import OUTLIER_GATE, Adjusted, Correspondences, RotationPrior
+from pipelines.georef.adjustment import OUTLIER_GATE, AdjustedSimilarity, Correspondences, RotationPrior
 from pipelines.georef.alignment import Alignment, align, layout_of
 from pipelines.init_sim3.options import InitSim3Options
 from pipelines.robust.ransac import RansacOptions, ransac
@@ -201,7 +201,7 @@ def _check_residual(found: InitialSimilarity, limit_m: float | None) -> None:
     )
 
 
-def _warnings(data: Correspondences, solution: Adjusted) -> tuple[str, ...]:
+def _warnings(data: Correspondences, solution: AdjustedSimilarity) -> tuple[str, ...]:
     state, warnings = solution.state, []
     if state.fix_bias_in_geo is not None:
         sigma = np.sqrt(np.diag(solution.bias_cov))

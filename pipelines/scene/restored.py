@@ -4,16 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-import torch
-
 from pipelines.core.stages import BY_NAME
 from pipelines.core.workspace import Workspace
-from pipelines.geometry.rotations import log_so3
 from pipelines.geometry.similarity import Similarity
 from pipelines.georef.posterior import minimise
 from pipelines.georef.problem import GeoProblem
-from pipelines.georef.similarity import LearnableSimilarity
 from pipelines.scene.geographic import geo_problem
 from pipelines.scene.geographic_options import GeographicOptions
 from pipelines.scene.initial_similarity import InitialSimilarity
@@ -61,16 +56,6 @@ def restore(trained: Trained, initial: InitialSimilarity, options: GeographicOpt
     if options.weighting != "whitened":  # which estimates no constant errors
         changed |= {"weighting": "whitened", "estimate": "none"}
     problem = geo_problem(scene, trained.survey, initial, options.model_copy(update=changed))
-    _place(problem.similarity, trained.geo_from_model)
+    problem.similarity.place(trained.geo_from_model)
     minimise(problem)
     return Restored(trained, scene, problem, options)
-
-
-def _place(similarity: LearnableSimilarity, at: Similarity) -> None:
-    """Give a similarity its value."""
-    away = at @ similarity.base.inverse()
-    shift = away.apply(similarity.pivot_in_geo) - similarity.pivot_in_geo
-    delta = np.array([np.log(away.scale), *log_so3(away.rotation), *shift])
-    y = np.linalg.solve(similarity.root.numpy(), delta)
-    with torch.no_grad():
-        similarity.y.copy_(torch.from_numpy(y))

@@ -20,8 +20,10 @@ from pipelines.core.stages import POINTS, SIM3, SPARSE, SURVEY
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
+from pipelines.georef.posterior import covariances
 from pipelines.georef.problem import GeoProblem
 from pipelines.georef.systematic import ErrorEstimate
+from pipelines.georef.terms import ControlTerm, FixTerm
 from pipelines.scene.geographic import geo_problem
 from pipelines.scene.geolocated import GeolocatedPoints
 from pipelines.scene.initial_similarity import InitialSimilarity
@@ -179,11 +181,12 @@ def _strategy(config: TrainOptions, extent_m: float, count: int) -> Strategy:
 
 def _save(trainer: JointTrainer, scene: Scene, out: Path, outcome: Outcome) -> Summary:
     problem, gaussians = trainer.problem, trainer.optimizer.gaussians.detached()
-    measured = problem.fixes is not None or problem.marks is not None
-    covariance, of_errors = problem.covariances() if measured else (problem.similarity.prior_covariance(), None)
-    outliers = tuple(sorted(scene.sparse.image_name[index] for index in problem.outliers()))
-    blunders = () if problem.marks is None else tuple(problem.marks.name[j] for j in problem.control_outliers())
-    errors = () if of_errors is None else _errors(problem.errors.found(of_errors))
+    fixes, control = problem.fixes, problem.control
+    measured = fixes is not None or control is not None
+    covariance, of_errors = covariances(problem) if measured else (problem.similarity.prior_covariance(), None)
+    outliers = () if fixes is None else _contradicting_fixes(problem, fixes, scene)
+    blunders = () if control is None else tuple(control.point_id[j] for j in problem.contradicting(ControlTerm))
+    errors = () if of_errors is None else _errors(problem.errors.estimates(of_errors))
     model = TrainedModel(
         geo_from_model=problem.similarity.current().to_record(
             "model",
@@ -228,6 +231,11 @@ def _save(trainer: JointTrainer, scene: Scene, out: Path, outcome: Outcome) -> S
     if outcome.recovery is not None:
         warnings.append(outcome.recovery)
     return Summary(figure, values, tuple(warnings))
+
+
+def _contradicting_fixes(problem: GeoProblem, fixes: FixTerm, scene: Scene) -> tuple[str, ...]:
+    rows = problem.contradicting(FixTerm)
+    return tuple(sorted(scene.sparse.image_name[int(fixes.camera[row])] for row in rows))
 
 
 def _errors(estimates: tuple[ErrorEstimate, ...]) -> tuple[EstimatedError, ...]:

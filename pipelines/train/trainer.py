@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from pipelines.geometry.lens import Lenses
-from pipelines.georef.losses import Schedule, rising_weight
 from pipelines.georef.problem import GeoProblem
+from pipelines.georef.weights import Schedule, rising_weight
 from pipelines.scene.photographs import ImageCache
 from pipelines.scene.pinholes import Pinholes
 from pipelines.splat.densify import Strategy
