@@ -10,13 +10,13 @@ from torch import Tensor
 
 from pipelines.core.errors import InputError
 from pipelines.core.types import FloatArray
-from pipelines.geometry.lens import bearings
 from pipelines.georef.control_by_depth import ControlByDepth
 from pipelines.georef.terms import AttitudeTerm, ControlTerm, DistanceTerm, FixTerm
 from pipelines.scene.geolocated import GeolocatedPoints
+from pipelines.scene.marks import mark_rays
 from pipelines.scene.observations import recorded_rotations
 from pipelines.scene.scene import Scene
-from pipelines.scene.survey import Survey, SurveyedPoint
+from pipelines.scene.survey import Survey
 
 # Between the times of two consecutive fixes: longer, and the receiver may have started anew.
 FLIGHT_GAP_S = 600.0
@@ -56,24 +56,24 @@ def flights(times_s: list[float | None]) -> np.ndarray:
 
 def control_term(scene: Scene, survey: Survey) -> ControlTerm | None:
     """Marks of the control points in training images, where a point is seen in two or more of them."""
-    rays = [(point, _rays(scene, point)) for point in survey.control_points]
-    kept = [(point, found) for point, found in rays if len({ray[0] for ray in found}) >= 2]
-    if not kept:
+    rays = mark_rays(survey.control_points, scene.sparse, scene.train)
+    kept = rays.images_of_point >= 2
+    if not kept.any():
         return None
-    flat = [(j, *ray) for j, (_, found) in enumerate(kept) for ray in found]
-    bearing, pixel = (np.array([row[column] for row in flat]) for column in (2, 4))
-    camera = np.array([row[1] for row in flat])
-    marks = ControlTerm(
-        point=torch.tensor([row[0] for row in flat]),
-        camera=torch.from_numpy(camera),
-        bearing_in_cam=torch.from_numpy(bearing),
-        sigma_rad=torch.tensor([row[3] for row in flat], dtype=torch.float64),
-        position_in_geo=torch.tensor([point.position_in_geo for point, _ in kept], dtype=torch.float64),
-        root_information=torch.eye(3, dtype=torch.float64).repeat(len(kept), 1, 1),
-        point_id=tuple(point.name for point, _ in kept),
-        bearing_by_lens=torch.from_numpy(scene.sparse.lenses.bearings_by_parameters(camera, pixel)),
+    rays = rays.of_points(kept)
+    surveyed = [point for point, keep in zip(survey.control_points, kept, strict=True) if keep]
+    control = ControlTerm(
+        point=torch.from_numpy(rays.point),
+        camera=torch.from_numpy(rays.camera),
+        bearing_in_cam=torch.from_numpy(rays.bearing_in_cam),
+        sigma_rad=torch.from_numpy(rays.sigma_rad),
+        position_in_geo=torch.tensor([point.position_in_geo for point in surveyed], dtype=torch.float64),
+        root_information=torch.eye(3, dtype=torch.float64).repeat(len(surveyed), 1, 1),
+        point_id=rays.point_id,
+        bearing_by_lens=torch.from_numpy(scene.sparse.lenses.bearings_by_parameters(rays.camera, rays.xy_px)),
     )
-    return _with_covariance(marks, _survey_covariance(kept) + _mark_covariance(scene, marks))
+    of_survey = np.array([point.cov_in_geo for point in surveyed])
+    return _with_covariance(control, of_survey + _mark_covariance(scene, control))
 
 
 def control_by_depth(scene: Scene, survey: Survey, marks: ControlTerm) -> tuple[ControlByDepth, ControlTerm]:
@@ -209,29 +209,6 @@ def _scale_information(fixes: FixTerm) -> float:
     weight = information.diagonal(dim1=1, dim2=2).sum(dim=1)
     arm = fixes.position_in_geo - (weight @ fixes.position_in_geo) / weight.sum()
     return float((root @ arm[:, :, None]).square().sum())
-
-
-_Ray = tuple[int, FloatArray, float, tuple[float, float]]
-
-
-def _rays(scene: Scene, point: SurveyedPoint) -> list[_Ray]:
-    """Of each mark in a training image: camera index, bearing (3,) in the camera, angular σ, pixel."""
-    index, trained = scene.sparse.image_index(), set(map(int, scene.train))
-    rays = []
-    for mark in point.marks:
-        camera_index = index.get(mark.image)
-        if camera_index is None or camera_index not in trained:
-            continue
-        camera = scene.sparse.camera_of(camera_index)
-        bearing = bearings(camera, np.array([[mark.x_px, mark.y_px]]))[0]
-        if not np.isfinite(bearing).all():  # a mark where the lens model maps no ray
-            continue
-        rays.append((camera_index, bearing, mark.sigma_px / float(camera.params[0]), (mark.x_px, mark.y_px)))
-    return rays
-
-
-def _survey_covariance(kept: list[tuple[SurveyedPoint, list[_Ray]]]) -> FloatArray:
-    return np.array([point.cov_in_geo for point, _ in kept])
 
 
 def _with_covariance(marks: ControlTerm, covariance: FloatArray) -> ControlTerm:
