@@ -17,7 +17,7 @@ from torch import Tensor
 from pipelines.georef.terms import Weighting
 from pipelines.robust.kernels import MEAN_WEIGHTED_CHI2
 
-Schedule = Literal["rising", "constant"]
+WeightSchedule = Literal["rising", "constant"]
 
 # A learned variance stays within this factor of the stated one, or of 1 m² where residuals are not whitened.
 _BOUND = {"whitened": 100.0, "paper": 1e4}

@@ -44,8 +44,8 @@ class LoopOptions:
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """What a training took.
+class TrainingRecord:
+    """Time and incidents of a training.
 
     Attributes:
         seconds: of all runs together, if it was interrupted.
@@ -56,7 +56,7 @@ class Outcome:
     recovery: str | None
 
 
-def optimise(trainer: JointTrainer, options: LoopOptions, progress: Progress) -> Outcome:
+def optimise(trainer: JointTrainer, options: LoopOptions, progress: Progress) -> TrainingRecord:
     """Iterate to the end.
 
     Raises:
@@ -87,7 +87,7 @@ def optimise(trainer: JointTrainer, options: LoopOptions, progress: Progress) ->
             except NonFiniteError as error:
                 loop.recover(error)
         loop.save()
-    return Outcome(loop.seconds(), loop.recovery)
+    return TrainingRecord(loop.seconds(), loop.recovery)
 
 
 class _Loop:
