@@ -22,7 +22,7 @@ from pipelines.core.progress import Progress
 from pipelines.core.stages import SIM3
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import StageRun, Summary
-from pipelines.evaluate.accuracy_map import AccuracyMap, accuracy_map, write_area
+from pipelines.evaluate.accuracy_map import AccuracyGrid, accuracy_grid, write_csv
 from pipelines.evaluate.asprs import LEAST_POINTS, few_points
 from pipelines.evaluate.coordinates import in_crs, target_crs
 from pipelines.evaluate.options import EvaluateOptions
@@ -30,6 +30,7 @@ from pipelines.evaluate.point_report import point_report, point_rows, ray_counts
 from pipelines.evaluate.points import Sights, points_by_camera, points_by_model, sights
 from pipelines.evaluate.prediction import Prediction, cramer_rao, left_out
 from pipelines.geometry.cameras import Pinhole
+from pipelines.plots.accuracy_map import MapPoints, SigmaRaster, write_accuracy_map
 from pipelines.robust.statistics import residual_stats
 from pipelines.scene.initial_similarity import InitialSimilarity
 from pipelines.scene.photographs import ImageCache
@@ -53,12 +54,12 @@ class Known:
     Attributes:
         restored: the geographic half, solved.
         prediction: covariances that follow from it.
-        area: the prediction over the scene; None for a scene of too few points.
+        grid: the prediction over the scene; None for a scene of too few points.
     """
 
     restored: Restored
     prediction: Prediction
-    area: AccuracyMap | None
+    grid: AccuracyGrid | None
 
 
 def run(stage: StageRun, config: EvaluateOptions) -> Summary:
@@ -73,14 +74,15 @@ def run(stage: StageRun, config: EvaluateOptions) -> Summary:
     try:
         restored = restore(trained, initial, geographic_options_of(stage.workspace))
         prediction = Prediction(restored)
-        known = Known(restored, prediction, accuracy_map(restored, prediction))
+        known = Known(restored, prediction, accuracy_grid(restored, prediction))
     except DegenerateGeometryError as error:
         known = str(error)
     report = evaluate(eye, known, config, stage.out / "renders", stage.progress)
     if crs is not None:
         report["coordinates"] = in_crs(report["checkpoints"], trained.survey, crs)
-    if isinstance(known, Known) and known.area is not None:
-        write_area(known.area, trained, stage.out)
+    if isinstance(known, Known) and known.grid is not None:
+        write_csv(known.grid, trained.survey.origin, stage.out / "accuracy.csv")
+        _draw(known.grid, trained, stage.out / "accuracy.png")
     (stage.out / "report.json").write_text(dump_json(report) + "\n", encoding="utf-8")
     return _summarise(report, config)
 
@@ -248,9 +250,9 @@ def _accuracy(known: Known | str, config: EvaluateOptions) -> dict[str, Any]:
     cautions = list(known.prediction.cautions)
     if config.similarity == "initial":
         cautions.append("measured with the initial similarity: the prediction is that of the trained one")
-    if known.area is None:
+    if known.grid is None:
         return {"cells": 0, "reason": "the scene has too few points", "cautions": cautions}
-    return {**known.area.figures(), "reason": None, "cautions": cautions}
+    return {**known.grid.figures(), "reason": None, "cautions": cautions}
 
 
 def _control_fit(trained: Trained) -> dict[str, Any]:
@@ -316,3 +318,19 @@ def _warnings(report: dict[str, Any], config: EvaluateOptions) -> tuple[str, ...
     if config.cross_validate and crossed["reason"] is not None:
         warnings.append(f"no cross-validation: {crossed['reason']}")
     return tuple(warnings)
+
+
+def _draw(grid: AccuracyGrid, trained: Trained, path: Path) -> None:
+    """Draw the predicted accuracy with cameras, control and check points."""
+    raster = SigmaRaster(grid.raster(grid.sigma_h_m), grid.raster(grid.sigma_v_m), grid.corner_in_geo, grid.size_m)
+    points = MapPoints(
+        trained.geo_from_model.apply(trained.poses.cam_center_in_model)[:, :2],
+        _plan(trained.survey.control_points),
+        _plan(trained.survey.check_points),
+    )
+    write_accuracy_map(path, raster, points)
+
+
+def _plan(points: tuple[SurveyedPoint, ...]) -> FloatArray:
+    """East and north (K, 2) of surveyed points in metres."""
+    return np.array([point.position_in_geo for point in points]).reshape(-1, 3)[:, :2]
