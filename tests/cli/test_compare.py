@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from pipelines.compare.stage import NAMES
+from pipelines.compare.configurations import BY_CONFIGURATION
 from pipelines.core.errors import ConvergenceError, InputError
 from pipelines.core.options import StageOptions
 from pipelines.core.stages import BY_NAME, PIPELINE
@@ -17,6 +17,7 @@ from pipelines.core.workspace import StageRun, Summary, Workspace
 from tests import fakes
 from tests.cli_runs import Georef, Result
 
+NAMES = tuple(BY_CONFIGURATION)
 SHARED = ["ingest", "sfm", "geolocate"]
 OWN = ["init-sim3", "train", "evaluate"]
 
