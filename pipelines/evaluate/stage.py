@@ -29,19 +29,16 @@ from pipelines.evaluate.options import EvaluateOptions
 from pipelines.evaluate.point_report import point_report, point_rows, ray_counts
 from pipelines.evaluate.points import Sights, points_by_camera, points_by_model, sights
 from pipelines.evaluate.prediction import Prediction, cramer_rao, left_out
-from pipelines.geometry.cameras import Pinhole
 from pipelines.plots.accuracy_map import MapPoints, SigmaRaster, write_accuracy_map
 from pipelines.robust.statistics import residual_stats
 from pipelines.scene.initial_similarity import InitialSimilarity
-from pipelines.scene.photographs import ImageCache
+from pipelines.scene.renderer import ModelRenderer
 from pipelines.scene.restored import Restored, geographic_options_of, restore
 from pipelines.scene.scene import photographs
 from pipelines.scene.survey import SurveyedPoint
-from pipelines.scene.trained import Trained, load_trained, trained_pinholes
-from pipelines.splat.depth import measured_depth
+from pipelines.scene.trained import Trained, load_trained
 from pipelines.splat.exposure import fitted_affine, with_affine
 from pipelines.splat.metrics import lpips, psnr, ssim
-from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings, Render
 from pipelines.splat.rasterizer.backends import rasterizer
 
 log = logging.getLogger(__name__)
@@ -69,7 +66,7 @@ def run(stage: StageRun, config: EvaluateOptions) -> Summary:
     initial = load_json(InitialSimilarity, stage.workspace.path(SIM3))
     images = photographs(trained.sfm, trained.survey, stage.workspace, trained.model.max_image_size)
     images.build(stage.progress)
-    eye = Eye(trained, images, rasterizer(config.backend))
+    renderer = ModelRenderer(trained, images, rasterizer(config.backend))
     known: Known | str
     try:
         restored = restore(trained, initial, geographic_options_of(stage.workspace))
@@ -77,7 +74,7 @@ def run(stage: StageRun, config: EvaluateOptions) -> Summary:
         known = Known(restored, prediction, accuracy_grid(restored, prediction))
     except DegenerateGeometryError as error:
         known = str(error)
-    report = evaluate(eye, known, config, stage.out / "renders", stage.progress)
+    report = evaluate(renderer, known, config, stage.out / "renders", stage.progress)
     if crs is not None:
         report["coordinates"] = in_crs(report["checkpoints"], trained.survey, crs)
     if isinstance(known, Known) and known.grid is not None:
@@ -87,48 +84,23 @@ def run(stage: StageRun, config: EvaluateOptions) -> Summary:
     return _summarise(report, config)
 
 
-class Eye:
-    """Looks at the trained model through its own cameras."""
-
-    def __init__(self, trained: Trained, images: ImageCache, backend: Rasterizer) -> None:
-        self.trained, self.images, self._backend = trained, images, backend
-        self._pinholes = trained_pinholes(trained, images)
-        device = torch.device("cuda" if backend.name == "cuda" else "cpu")
-        self._gaussians = trained.gaussians.to(device)
-
-    def pinhole(self, index: int) -> Pinhole:
-        """Camera of what `look` shows."""
-        return self._pinholes.of(index)
-
-    def look(self, index: int, *, depth: bool = False) -> Render:
-        """The model from camera `index`, at training size."""
-        model, poses = self.trained.model, self.trained.poses
-        matrix = np.eye(4)
-        matrix[:3, :3] = poses.cam_from_model[index]
-        matrix[:3, 3] = -poses.cam_from_model[index] @ poses.cam_center_in_model[index]
-        settings = RasterSettings(sh_degree=model.sh_degree, background=model.background, depth=depth)
-        pose = torch.as_tensor(matrix, dtype=torch.float32, device=self._gaussians.means.device)
-        with torch.no_grad():
-            return self._backend.render(self._gaussians, pose, self.pinhole(index), settings)
-
-
 def evaluate(
-    eye: Eye, known: Known | str, config: EvaluateOptions, renders: Path, progress: Progress
+    renderer: ModelRenderer, known: Known | str, config: EvaluateOptions, renders: Path, progress: Progress
 ) -> dict[str, Any]:
     """The report as a plain document; side-by-side renders go to the folder `renders`.
 
     Args:
         known: what is known of the accuracy, or why nothing is.
     """
-    trained = eye.trained
+    trained = renderer.trained
     checks = sights(trained, trained.survey.check_points)
-    depth = _depth_maps(eye, checks, progress)
+    depth = _depth_maps(renderer, checks, progress)
     return {
         "format_version": 1,
-        "photometric": {"test": _photometric(eye, config, renders, progress)},
+        "photometric": {"test": _photometric(renderer, config, renders, progress)},
         "checkpoints": {
             "camera": _checks_by_camera(trained, checks, known),
-            "model": _checks_by_model(eye, checks, depth),
+            "model": _checks_by_model(renderer, checks, depth),
         },
         "cross_validation": _cross_validation(trained, known, config),
         "accuracy": _accuracy(known, config),
@@ -142,21 +114,23 @@ def evaluate(
     }
 
 
-def _photometric(eye: Eye, config: EvaluateOptions, renders: Path, progress: Progress) -> dict[str, Any]:
+def _photometric(
+    renderer: ModelRenderer, config: EvaluateOptions, renders: Path, progress: Progress
+) -> dict[str, Any]:
     """PSNR, SSIM and LPIPS of the test views; cameras of test views were never fitted to them.
 
     `psnr` compares the render as it is. `psnr_compensated` first gives it the photograph's own exposure, an affine
     change of colour fitted to that very photograph: what is left then is not a matter of exposure.
     """
-    indices, rows = eye.trained.indices("test"), []
+    indices, rows = renderer.trained.indices("test"), []
     renders.mkdir(parents=True, exist_ok=True)
     distance = lpips(config.lpips_weights)
     with progress.task("test views", len(indices)) as task:
         for place, index in enumerate(indices):
-            colour = eye.look(index).colour.clamp(0, 1).cpu()
-            photo = torch.from_numpy(np.array(eye.images.image(index))).float() / 255.0
-            mask = torch.from_numpy(np.array(eye.images.mask(index)))
-            name = eye.trained.sparse.image_name[index]
+            colour = renderer.render(index).colour.clamp(0, 1).cpu()
+            photo = torch.from_numpy(np.array(renderer.images.image(index))).float() / 255.0
+            mask = torch.from_numpy(np.array(renderer.images.mask(index)))
+            name = renderer.trained.sparse.image_name[index]
             rows.append(
                 {
                     "image": name,
@@ -190,15 +164,12 @@ def _write_side_by_side(path: Path, photo: torch.Tensor, colour: torch.Tensor) -
     cv2.imwrite(str(path), np.ascontiguousarray(strip[..., ::-1]))
 
 
-def _depth_maps(eye: Eye, seen: Sights, progress: Progress) -> dict[int, FloatArray]:
+def _depth_maps(renderer: ModelRenderer, seen: Sights, progress: Progress) -> dict[int, FloatArray]:
     depth = {}
     cameras = sorted({int(i) for i in seen.camera})
     with progress.task("depth maps", len(cameras)) as task:
         for index in cameras:
-            view = eye.look(index, depth=True)
-            assert view.median_depth is not None and view.expected_depth is not None
-            assert view.depth_variance is not None  # of every render with depth
-            depth[index] = measured_depth(view.median_depth, view.expected_depth, view.depth_variance).cpu().numpy()
+            depth[index] = renderer.depth_m(index)
             task.advance()
     return depth
 
@@ -220,10 +191,10 @@ def _checks_by_camera(trained: Trained, seen: Sights, known: Known | str) -> dic
     return point_report(found - _surveyed(points), points, rays=rays, predicted=predicted, bound=bound)
 
 
-def _checks_by_model(eye: Eye, seen: Sights, depth: dict[int, FloatArray]) -> dict[str, Any]:
-    points = eye.trained.survey.check_points
-    pinholes = {index: eye.pinhole(index) for index in depth}
-    found = points_by_model(eye.trained, seen, depth, pinholes, len(points))
+def _checks_by_model(renderer: ModelRenderer, seen: Sights, depth: dict[int, FloatArray]) -> dict[str, Any]:
+    points = renderer.trained.survey.check_points
+    pinholes = {index: renderer.pinhole(index) for index in depth}
+    found = points_by_model(renderer.trained, seen, depth, pinholes, len(points))
     return point_report(found - _surveyed(points), points, rays=ray_counts(seen, len(points)))
 
 
