@@ -13,13 +13,14 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 
 from pipelines.compare.configurations import BY_CONFIGURATION, COMMON_TRAIN_OPTIONS, Configuration
-from pipelines.compare.table import ComparedRow, Comparison, JsonScalar, figures_of, write_comparison
+from pipelines.compare.table import ComparedRow, Comparison, JsonScalar, point_accuracy, write_comparison
 from pipelines.core.errors import ConvergenceError, DegenerateGeometryError, GeorefError
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.runner import Outcome, run_pipeline, run_stage
 from pipelines.core.stages import ADJUST, BY_NAME, REPORT, StageSpec, stage_slice
 from pipelines.core.staleness import Flags, must_exist, stage_config
 from pipelines.core.workspace import Workspace
+from pipelines.scene.report import read_report
 
 log = logging.getLogger(__name__)
 
@@ -179,11 +180,15 @@ def _row(configuration: Configuration, plan: Sequence[PlannedStage], runner: _Pl
         )
     del manifests[_EVALUATE.name]  # it warns of the survey, which is that of all rows
     training = manifests[_TRAIN.name].values
+    report = read_report(plan[-1].variant.path(REPORT))
     return ComparedRow(
         configuration=configuration.name,
         title=configuration.title,
         note=configuration.note,
-        **figures_of(plan[-1].variant.path(REPORT)),
+        test_psnr=report.photometric.test.psnr,
+        test_ssim=report.photometric.test.ssim,
+        camera=point_accuracy(report.checkpoints.camera),
+        model=point_accuracy(report.checkpoints.model),
         iterations=training.get("iterations"),
         gaussians=training.get("gaussians"),
         training_s=training.get("seconds") if configuration.trained_by is None else None,

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Literal
 
-import numpy as np
-
-from pipelines.core.errors import InputError
 from pipelines.core.products import Product
 from pipelines.core.workspace import replace_text
 from pipelines.plots.bars import Panel, write_bars
+
+if TYPE_CHECKING:  # with its statistics it would load SciPy to print a table
+    from pipelines.scene.report import CheckPointErrors
 
 JsonScalar = bool | int | float | str
 
@@ -55,34 +54,14 @@ class Comparison(Product):
     rows: tuple[ComparedRow, ...]
 
 
-def figures_of(report: Path) -> dict[str, Any]:
-    """The fields of a `ComparedRow` that `evaluate/report.json` holds.
-
-    Raises:
-        InputError: not a report.
-    """
-    try:
-        document = json.loads(report.read_text(encoding="utf-8"))
-        test, check = document["photometric"]["test"], document["checkpoints"]
-        return {
-            "test_psnr": test["psnr"],
-            "test_ssim": test["ssim"],
-            "camera": _accuracy(check["camera"]),
-            "model": _accuracy(check["model"]),
-        }
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise InputError(f"not a report of `georef evaluate`: {error!r}", path=report) from error
-
-
-def _accuracy(section: Mapping[str, Any]) -> PointAccuracy:
-    rows = [row for row in section["points"] if row["de_m"] is not None]
-    distance = np.hypot([row["de_m"] for row in rows], [row["dn_m"] for row in rows])
+def point_accuracy(errors: CheckPointErrors) -> PointAccuracy:
+    """Return the figures of check points for the table."""
     return PointAccuracy(
-        count=section["count"],
-        mean_h_m=section["mean_h_m"],
-        median_h_m=float(np.median(distance)) if rows else None,
-        rmse_h_m=section["rmse_h_m"],
-        rmse_v_m=section["rmse_v_m"],
+        count=errors.count,
+        mean_h_m=errors.mean_h_m,
+        median_h_m=errors.median_h_m,
+        rmse_h_m=errors.rmse_h_m,
+        rmse_v_m=errors.rmse_v_m,
     )
 
 

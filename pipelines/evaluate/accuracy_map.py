@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -13,6 +12,7 @@ from scipy.spatial import cKDTree
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.evaluate.prediction import Prediction
 from pipelines.geodesy.enu import Origin, ecef_from_enu, lla_from_ecef
+from pipelines.scene.report import AccuracySummary
 from pipelines.scene.restored import Restored
 
 _CELLS = 48  # of the longer side
@@ -62,19 +62,21 @@ class AccuracyGrid:
         raster[self.cell[:, 1], self.cell[:, 0]] = values
         return raster
 
-    def figures(self) -> dict[str, Any]:
-        """Return the grid in short, as plain values."""
+    def summary(self, cautions: tuple[str, ...]) -> AccuracySummary:
+        """Return the grid in short, with limits of the prediction."""
         horizontal, vertical = self.sigma_h_m, self.sigma_v_m
-        return {
-            "cells": len(self.cell),
-            "cell_m": self.size_m,
-            "least_sigma_h_m": float(horizontal.min()),
-            "median_sigma_h_m": float(np.median(horizontal)),
-            "largest_sigma_h_m": float(horizontal.max()),
-            "least_sigma_v_m": float(vertical.min()),
-            "median_sigma_v_m": float(np.median(vertical)),
-            "largest_sigma_v_m": float(vertical.max()),
-        }
+        return AccuracySummary(
+            cells=len(self.cell),
+            cell_m=self.size_m,
+            least_sigma_h_m=float(horizontal.min()),
+            median_sigma_h_m=float(np.median(horizontal)),
+            largest_sigma_h_m=float(horizontal.max()),
+            least_sigma_v_m=float(vertical.min()),
+            median_sigma_v_m=float(np.median(vertical)),
+            largest_sigma_v_m=float(vertical.max()),
+            reason=None,
+            cautions=cautions,
+        )
 
 
 def accuracy_grid(restored: Restored, prediction: Prediction) -> AccuracyGrid | None:
