@@ -10,10 +10,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from pipelines.core.types import FloatArray, IntArray
-from pipelines.evaluate.prediction import Prediction
+from pipelines.evaluate.prediction import AccuracyPrediction
 from pipelines.geodesy.enu import Origin, ecef_from_enu, lla_from_ecef
 from pipelines.scene.report import AccuracySummary
-from pipelines.scene.restored import Restored
+from pipelines.scene.solved_survey import SolvedSurvey
 
 _CELLS = 48  # of the longer side
 _LEAST_RAYS = 3  # of an SfM point that stands for the scene
@@ -79,17 +79,17 @@ class AccuracyGrid:
         )
 
 
-def accuracy_grid(restored: Restored, prediction: Prediction) -> AccuracyGrid | None:
+def accuracy_grid(solved: SolvedSurvey, prediction: AccuracyPrediction) -> AccuracyGrid | None:
     """Predict σ at the middle of each cell, seen by the cameras that see the SfM points there.
 
     None for a scene of too few points.
     """
-    sparse, geo_from_model = restored.scene.sparse, restored.trained.geo_from_model
+    sparse, geo_from_model = solved.scene.sparse, solved.trained.geo_from_model
     rays = np.bincount(sparse.obs_point, minlength=len(sparse.point_id))
     chosen = np.flatnonzero(rays >= _LEAST_RAYS)
     if len(chosen) < _NEIGHBOURS:
         return None
-    point = geo_from_model.apply(restored.scene.point_in_model[chosen])
+    point = geo_from_model.apply(solved.scene.point_in_model[chosen])
     low, high = np.quantile(point[:, :2], [_RIM, 1 - _RIM], axis=0)
     size = float((high - low).max()) / _CELLS
     if size <= 0:
@@ -119,7 +119,7 @@ def _seen_by(obs_point: IntArray, obs_image: IntArray, near: IntArray) -> tuple[
     return owner, np.concatenate(cameras)
 
 
-def _sigma(prediction: Prediction, position: FloatArray, owner: IntArray, camera: IntArray) -> FloatArray:
+def _sigma(prediction: AccuracyPrediction, position: FloatArray, owner: IntArray, camera: IntArray) -> FloatArray:
     """σ (C, 3) at cells, of pairs of cell and camera."""
     sigma = []
     for first in range(0, len(position), _CHUNK):

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.evaluate.accuracy_map import AccuracyGrid, accuracy_grid
-from pipelines.evaluate.prediction import Prediction
+from pipelines.evaluate.prediction import AccuracyPrediction
 from pipelines.scene.geographic_options import GeographicOptions
 from pipelines.scene.initial_similarity import InitialSimilarity
 from pipelines.scene.report import AccuracySummary
-from pipelines.scene.restored import Restored, restore
-from pipelines.scene.trained import Trained
+from pipelines.scene.solved_survey import SolvedSurvey, solve_survey
+from pipelines.scene.trained_survey import TrainedSurvey
 
 
 @dataclass(frozen=True)
@@ -19,13 +19,13 @@ class ErrorPropagation:
     """Covariances of a trained survey that follow from its measurements.
 
     Attributes:
-        restored: the geographic half of the training, solved.
+        solved: the geographic half of the training, solved.
         prediction: covariance of any point.
         grid: σ over the scene; None for a scene of too few points.
     """
 
-    restored: Restored
-    prediction: Prediction
+    solved: SolvedSurvey
+    prediction: AccuracyPrediction
     grid: AccuracyGrid | None
 
 
@@ -37,7 +37,7 @@ class NoErrorPropagation:
 
 
 def propagate_errors(
-    trained: Trained, initial: InitialSimilarity, options: GeographicOptions
+    trained: TrainedSurvey, initial: InitialSimilarity, options: GeographicOptions
 ) -> ErrorPropagation | NoErrorPropagation:
     """Return the covariances of a trained survey, or why there are none.
 
@@ -47,9 +47,9 @@ def propagate_errors(
         options: those of the training.
     """
     try:
-        restored = restore(trained, initial, options)
-        prediction = Prediction(restored)
-        return ErrorPropagation(restored, prediction, accuracy_grid(restored, prediction))
+        solved = solve_survey(trained, initial, options)
+        prediction = AccuracyPrediction(solved)
+        return ErrorPropagation(solved, prediction, accuracy_grid(solved, prediction))
     except DegenerateGeometryError as error:
         return NoErrorPropagation(str(error))
 

@@ -35,10 +35,10 @@ from pipelines.plots.accuracy_map import MapPoints, SigmaRaster, write_accuracy_
 from pipelines.scene.initial_similarity import InitialSimilarity
 from pipelines.scene.renderer import ModelRenderer
 from pipelines.scene.report import EvaluationReport, Photometric, SimilaritySigma, write_report
-from pipelines.scene.restored import geographic_options_of
 from pipelines.scene.scene import photographs
+from pipelines.scene.solved_survey import geographic_options_of
 from pipelines.scene.survey import SurveyedPoint
-from pipelines.scene.trained import Trained, load_trained
+from pipelines.scene.trained_survey import TrainedSurvey, load_trained
 from pipelines.splat.rasterizer.backends import rasterizer
 
 
@@ -101,7 +101,7 @@ def _similarity_sigma(record: SimilarityRecord) -> SimilaritySigma:
     return SimilaritySigma(sigma_ln_scale=log_scale, sigma_translation_m=(east, north, up))
 
 
-def _draw(grid: AccuracyGrid, trained: Trained, path: Path) -> None:
+def _draw(grid: AccuracyGrid, trained: TrainedSurvey, path: Path) -> None:
     """Draw the predicted accuracy with cameras, control and check points."""
     raster = SigmaRaster(grid.raster(grid.sigma_h_m), grid.raster(grid.sigma_v_m), grid.corner_in_geo, grid.size_m)
     points = MapPoints(

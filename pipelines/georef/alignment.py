@@ -103,11 +103,11 @@ def align(
             f"model lies; 3 are needed: {ADVICE}"
         )
     candidates = _candidates(data, _starts(data, rng, guesses), None)
-    firm = [found for found in candidates if found.rotation_sigma_rad <= _WORST_ROTATION_RAD]
+    firm = [candidate for candidate in candidates if candidate.rotation_sigma_rad <= _WORST_ROTATION_RAD]
     if firm:
         best = _choose(firm, data)
         return Alignment(best, layout_of(data.in_local[best.state.inlier]), None)
-    worst = min((np.degrees(found.rotation_sigma_rad) for found in candidates), default=np.inf)
+    worst = min((np.degrees(candidate.rotation_sigma_rad) for candidate in candidates), default=np.inf)
     if attitude is None:
         size = f"is known to {worst:.0f}° only" if worst < 90 else "is not determined"
         raise DegenerateGeometryError(f"the positions lie on one line: the rotation about it {size}; {ADVICE}")
@@ -162,7 +162,7 @@ def _ransac_start(data: Correspondences, rng: np.random.Generator) -> list[Simil
     def fit(chosen: np.ndarray) -> Similarity:
         return umeyama(data.in_local[chosen], data.in_geo[chosen])
 
-    found = []
+    starts = []
     for looser in _LOOSER:
         # The excess scatter of SfM is not known yet: stated σ may be far too tight.
         options = RansacOptions(3, OUTLIER_GATE * looser**2, max_draws=300)
@@ -170,12 +170,12 @@ def _ransac_start(data: Correspondences, rng: np.random.Generator) -> list[Simil
             result = ransac(len(data), fit, lambda model: _squared(data, model), options, rng)
         except DegenerateGeometryError:
             return []
-        found = [result.model]
+        starts = [result.model]
         if result.inlier.mean() > 0.5:
             with suppress(DegenerateGeometryError):
-                found = [umeyama(data.in_local[result.inlier], data.in_geo[result.inlier])]
+                starts = [umeyama(data.in_local[result.inlier], data.in_geo[result.inlier])]
             break
-    return found
+    return starts
 
 
 def _start_with_rotation(data: Correspondences, rotation: FloatArray, rng: np.random.Generator) -> Similarity:
@@ -220,14 +220,14 @@ def _with_bias(data: Correspondences, state: SimilarityState) -> SimilarityState
 def _choose(candidates: list[AdjustedSimilarity], data: Correspondences) -> AdjustedSimilarity:
     """The likeliest candidate, a bias of the fixes costing as much as an outlier."""
 
-    def cost(found: AdjustedSimilarity) -> float:
-        bias = found.state.fix_bias_in_geo
+    def cost(candidate: AdjustedSimilarity) -> float:
+        bias = candidate.state.fix_bias_in_geo
         if bias is None:
-            return found.cost
-        lone = int((data.control & found.state.inlier).sum()) <= 1
+            return candidate.cost
+        lone = int((data.control & candidate.state.inlier).sum()) <= 1
         allowed = data.cov_in_geo[~data.control].mean(axis=0)
         if lone and squared_mahalanobis(bias[None], allowed)[0] > _LONE_BIAS_SIGMAS**2:
             return np.inf
-        return found.cost + BIAS_COST
+        return candidate.cost + BIAS_COST
 
     return min(candidates, key=cost)

@@ -46,14 +46,8 @@ class MarkRays:
 
     @property
     def marks_of_point(self) -> IntArray:
-        """(J,) number of marks of each point."""
+        """(J,) number of marks of each point, each in another image."""
         return np.bincount(self.point, minlength=len(self.point_id)).astype(np.int64)
-
-    @property
-    def images_of_point(self) -> IntArray:
-        """(J,) number of images that show each point."""
-        pairs = np.unique(np.column_stack([self.point, self.camera]), axis=0)
-        return np.bincount(pairs[:, 0], minlength=len(self.point_id)).astype(np.int64)
 
     def part(self, chosen: BoolArray | IntArray) -> MarkRays:
         """Return some of the marks, of the same points."""

@@ -57,7 +57,7 @@ def flights(times_s: list[float | None]) -> np.ndarray:
 def control_term(scene: Scene, survey: Survey) -> ControlTerm | None:
     """Marks of the control points in training images, where a point is seen in two or more of them."""
     rays = mark_rays(survey.control_points, scene.sparse, scene.train)
-    kept = rays.images_of_point >= 2
+    kept = rays.marks_of_point >= 2
     if not kept.any():
         return None
     rays = rays.of_points(kept)

@@ -62,7 +62,7 @@ def control_correspondences(survey: Survey, model: SparseModel) -> tuple[Corresp
     """
     points = survey.control_points
     rays = mark_rays(points, model)
-    marked = rays.images_of_point >= 2
+    marked = rays.marks_of_point >= 2
     warnings = {
         point.name: f"control point {point.name}: marked in fewer than 2 registered images, not used"
         for point, enough in zip(points, marked, strict=True)

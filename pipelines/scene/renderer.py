@@ -8,7 +8,7 @@ import torch
 from pipelines.core.types import FloatArray
 from pipelines.geometry.cameras import Pinhole
 from pipelines.scene.photographs import ImageCache
-from pipelines.scene.trained import Trained, trained_pinholes
+from pipelines.scene.trained_survey import TrainedSurvey, trained_pinholes
 from pipelines.splat.depth import measured_depth
 from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings, Render
 
@@ -22,7 +22,7 @@ class ModelRenderer:
         backend: the rasteriser.
     """
 
-    def __init__(self, trained: Trained, images: ImageCache, backend: Rasterizer) -> None:
+    def __init__(self, trained: TrainedSurvey, images: ImageCache, backend: Rasterizer) -> None:
         self.trained, self.images = trained, images
         self._backend = backend
         self._pinholes = trained_pinholes(trained, images)

@@ -21,7 +21,7 @@ from pipelines.core.workspace import Workspace
 from pipelines.geometry.similarity import Similarity, SimilarityRecord
 from pipelines.scene.initial_similarity import InitialSimilarity
 from pipelines.scene.survey import Survey
-from pipelines.scene.trained import load_trained
+from pipelines.scene.trained_survey import load_trained
 from tests.splat_scenes import Flight
 
 pytest.importorskip("pycolmap")

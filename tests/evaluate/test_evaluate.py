@@ -16,12 +16,12 @@ from pipelines.core.runner import Outcome, run_stage
 from pipelines.core.stages import BY_NAME, MODEL, SIM3, SURVEY
 from pipelines.core.workspace import Workspace
 from pipelines.evaluate.asprs import few_points
-from pipelines.evaluate.prediction import Prediction
+from pipelines.evaluate.prediction import AccuracyPrediction
 from pipelines.scene.initial_similarity import InitialSimilarity
-from pipelines.scene.restored import geographic_options_of, restore
+from pipelines.scene.solved_survey import geographic_options_of, solve_survey
 from pipelines.scene.survey import Mark, Survey
-from pipelines.scene.trained import load_trained
 from pipelines.scene.trained_model import TrainedModel
+from pipelines.scene.trained_survey import load_trained
 from tests.reports import report_of
 from tests.splat_scenes import NOISE, SIGMA_M, Flight, ground_height
 
@@ -162,10 +162,10 @@ def test_prediction_agrees_with_the_errors_by_camera(evaluated: tuple[Workspace,
     assert bound["rms_v_m"] < 1.02 * predicted["rms_v_m"] < 1.25 * bound["rms_v_m"]
 
 
-def test_restored_solution_is_that_of_the_training(evaluated: tuple[Workspace, Outcome]) -> None:
+def test_solution_without_photographs_is_that_of_the_training(evaluated: tuple[Workspace, Outcome]) -> None:
     workspace = evaluated[0]
     trained, initial = load_trained(workspace), load_json(InitialSimilarity, workspace.path(SIM3))
-    solved = restore(trained, initial, geographic_options_of(workspace)).problem.similarity.current()
+    solved = solve_survey(trained, initial, geographic_options_of(workspace)).problem.similarity.current()
     center, sigma = trained.poses.cam_center_in_model, np.sqrt(np.diag(trained.model.geo_from_model.covariance))
     # 150 iterations with photographs against the end of the road without: within σ of each other.
     moved = (solved.apply(center) - trained.geo_from_model.apply(center)).mean(axis=0)
@@ -194,9 +194,9 @@ def test_held_cameras_make_the_prediction_too_good(evaluated: tuple[Workspace, O
     workspace = evaluated[0]
     trained, initial = load_trained(workspace), load_json(InitialSimilarity, workspace.path(SIM3))
     config = geographic_options_of(workspace)
-    held = Prediction(restore(trained, initial, config.model_copy(update={"optimize_cameras": False})))
+    held = AccuracyPrediction(solve_survey(trained, initial, config.model_copy(update={"optimize_cameras": False})))
     assert "too good" in held.cautions[0]
-    assert Prediction(restore(trained, initial, config)).cautions == ()
+    assert AccuracyPrediction(solve_survey(trained, initial, config)).cautions == ()
 
 
 def test_a_blunder_is_named_and_kept(altered: Workspace) -> None:
@@ -257,7 +257,7 @@ def test_unusable_marks_leave_a_point_unmeasured(altered: Workspace) -> None:
     first, second, *rest = survey.check_points
     alone = first.model_copy(update={"marks": first.marks[:1]})
     elsewhere = second.model_copy(
-        update={"marks": tuple(Mark(image="other.jpg", x_px=1, y_px=1, sigma_px=1) for _ in range(3))}
+        update={"marks": tuple(Mark(image=f"{row}.jpg", x_px=1, y_px=1, sigma_px=1) for row in range(3))}
     )
     change_survey(altered, check_points=(alone, elsewhere, *rest))
     run_stage(altered, EVALUATE, {"renders": 0})

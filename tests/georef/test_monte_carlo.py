@@ -16,7 +16,7 @@ import pytest
 import torch
 
 from pipelines.evaluate.cramer_rao import Anchors, CameraInformation
-from pipelines.evaluate.following import follow
+from pipelines.evaluate.intersection_jacobian import intersection_jacobian
 from pipelines.geometry.bundle import Network, correction_basis
 from pipelines.geometry.lens import Lenses, bearings
 from pipelines.geometry.similarity import Similarity
@@ -66,7 +66,7 @@ def marked(points: np.ndarray, truth: Network, network: Network | None = None) -
 def marks_of(seen: Network, cov_survey: np.ndarray, rng: np.random.Generator) -> ControlTerm:
     """Noisy marks, read through the adjusted lens, and a noisy survey."""
     xy_px = seen.obs_xy_px + rng.normal(0, MARK_PX, seen.obs_xy_px.shape)
-    cov = follow(seen, np.full(len(xy_px), MARK_PX)).cov_of_marks + cov_survey
+    cov = intersection_jacobian(seen, np.full(len(xy_px), MARK_PX)).cov_of_marks + cov_survey
     surveyed = seen.point_in_world + rng.multivariate_normal(np.zeros(3), cov_survey, len(cov))
     return ControlTerm(
         torch.from_numpy(seen.obs_point),
@@ -112,13 +112,13 @@ def one_run(seed: int, setting: Setting, solve: np.ndarray) -> Run:
         terms(fixes, marks_of(at_control, SURVEY_M**2 * np.eye(3), rng) if setting.control else None),
     )
     minimise(problem)
-    by_control = follow(at_control, np.full(len(at_control.obs_point), MARK_PX)).by_lens
+    by_control = intersection_jacobian(at_control, np.full(len(at_control.obs_point), MARK_PX)).by_lens
     joint = posterior(problem, FreeLens(found.lens_cov, by_control))
     at_check = marked(CHECK, truth, network)
     with torch.no_grad():
         measured = problem.similarity(marks_of(at_check, np.zeros((3, 3)), rng).intersected(problem.estimate()))
-    moved = follow(at_check, np.full(len(at_check.obs_point), MARK_PX))
-    by_cameras = moved.by(found.matrix) + moved.by_lens @ found.lens_matrix
+    moved = intersection_jacobian(at_check, np.full(len(at_check.obs_point), MARK_PX))
+    by_cameras = moved.by_corrections(found.matrix) + moved.by_lens @ found.lens_matrix
     predicted = joint.at(measured.numpy(), by_cameras, moved.by_lens) + moved.cov_of_marks
     return Run(measured.numpy() - CHECK, predicted)
 

@@ -9,7 +9,7 @@ from pipelines.geometry.similarity import Similarity
 from pipelines.georef.cameras import CameraPoses
 from pipelines.scene.renderer import ModelRenderer
 from pipelines.scene.scene import photographs
-from pipelines.scene.trained import Trained
+from pipelines.scene.trained_survey import TrainedSurvey
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
 from tests.scenes import trained_model
 from tests.splat_scenes import CAMERA, SPACING_M, Flight, ground_height
@@ -23,7 +23,7 @@ def renderer(flights: list[Flight]) -> ModelRenderer:
     rendered, scene = flights[0].rendered, flights[0].rendered.scene
     model = trained_model(Similarity(), max_image_size=CAMERA.width).model_copy(update={"sh_degree": 0})
     poses = CameraPoses(np.swapaxes(scene.geo_from_cam, 1, 2), scene.center_in_geo)
-    trained = Trained(rendered.survey, rendered.sparse, model, poses, rendered.gaussians)
+    trained = TrainedSurvey(rendered.survey, rendered.sparse, model, poses, rendered.gaussians)
     workspace = flights[0].workspace("renderer")
     images = photographs(rendered.sparse, rendered.survey, workspace, CAMERA.width)
     return ModelRenderer(trained, images, CpuRasterizer())

@@ -1,4 +1,4 @@
-"""The geographic half of a training, restored from its products and brought to its minimum."""
+"""The geographic half of a training: set up again from its products, and brought to its minimum."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from pipelines.scene.geographic import geo_problem
 from pipelines.scene.geographic_options import GeographicOptions
 from pipelines.scene.initial_similarity import InitialSimilarity
 from pipelines.scene.scene import Scene, make_scene
-from pipelines.scene.trained import Trained
+from pipelines.scene.trained_survey import TrainedSurvey
 
 
 @dataclass(frozen=True)
-class Restored:
+class SolvedSurvey:
     """A trained survey with what was measured of it.
 
     Attributes:
@@ -27,7 +27,7 @@ class Restored:
         options: what it was trained with.
     """
 
-    trained: Trained
+    trained: TrainedSurvey
     scene: Scene
     problem: GeoProblem
     options: GeographicOptions
@@ -36,13 +36,13 @@ class Restored:
 def geographic_options_of(workspace: Workspace) -> GeographicOptions:
     """What a workspace's model was trained with; the defaults for one that was put there by hand."""
     manifest = workspace.manifest(BY_NAME["train"])
-    known = {} if manifest is None else manifest.config
+    recorded = {} if manifest is None else manifest.config
     return GeographicOptions.model_validate(
-        {key: known[key] for key in GeographicOptions.model_fields if key in known}
+        {name: recorded[name] for name in GeographicOptions.model_fields if name in recorded}
     )
 
 
-def restore(trained: Trained, initial: InitialSimilarity, options: GeographicOptions) -> Restored:
+def solve_survey(trained: TrainedSurvey, initial: InitialSimilarity, options: GeographicOptions) -> SolvedSurvey:
     """Set up the measurements as for the training, and solve them without the photographs, from its result.
 
     Raises:
@@ -58,4 +58,4 @@ def restore(trained: Trained, initial: InitialSimilarity, options: GeographicOpt
     problem = geo_problem(scene, trained.survey, initial, options.model_copy(update=changed))
     problem.similarity.place(trained.geo_from_model)
     minimise(problem)
-    return Restored(trained, scene, problem, options)
+    return SolvedSurvey(trained, scene, problem, options)
