@@ -55,8 +55,8 @@ class StageSpec:
     def options(self) -> type[StageOptions]:
         """The class of its options, imported when it is asked for."""
         module, _, name = self.options_place.partition(":")
-        found: type[StageOptions] = getattr(importlib.import_module(module), name)
-        return found
+        options: type[StageOptions] = getattr(importlib.import_module(module), name)
+        return options
 
 
 PIPELINE: tuple[StageSpec, ...] = (

@@ -62,7 +62,7 @@ def best_operation(way: Way, lon: FloatArray, lat: FloatArray) -> tuple[Transfor
     group = _group(way.crs, _WGS84_3D if way.three_dimensional else WGS84, _area(lon, lat))
     if group is None:
         raise _no_way(way)
-    real = [found for found in group.transformers if not _does_nothing(found)]
+    real = [transformer for transformer in group.transformers if not _does_nothing(transformer)]
     if real:
         best = real[0]
         better = () if group.best_available else _missing(group.unavailable_operations[:1])

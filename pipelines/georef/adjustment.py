@@ -295,7 +295,7 @@ def _redundancy(data: Correspondences, solution: AdjustedSimilarity, members: Bo
     """Mean redundancy of the members: 1 less the part of an error that the adjustment absorbs."""
     mapped = solution.state.geo_from_local.apply(data.in_local[members])
     absorbed = jacobian_at(mapped, solution.pivot) @ solution.response[members]
-    taken = float(np.trace(absorbed, axis1=1, axis2=2).sum())
+    absorbed_part = float(np.trace(absorbed, axis1=1, axis2=2).sum())
     if solution.state.fix_bias_in_geo is not None and not data.control[members].all():
-        taken += 3.0
-    return max(1 - taken / (3 * int(members.sum())), 0.05)
+        absorbed_part += 3.0
+    return max(1 - absorbed_part / (3 * int(members.sum())), 0.05)

@@ -123,25 +123,25 @@ class SystematicErrors(torch.nn.Module):
     def split(self, vector: Tensor) -> Errors:
         """The errors of a vector (p,)."""
         rows = vector.view(-1, 3)
-        found = {part.name: row for part, row in zip(self.parts, rows, strict=True) if part.flight is None}
+        common = {part.name: row for part, row in zip(self.parts, rows, strict=True) if part.flight is None}
         return Errors(
             rows[: self.flights] if self.flights else None,
-            found.get("lever-arm"),
-            found.get("boresight"),
-            found.get("common"),
+            common.get("lever-arm"),
+            common.get("boresight"),
+            common.get("common"),
         )
 
     def estimates(self, covariance: FloatArray) -> tuple[ErrorEstimate, ...]:
-        """The present values with the σ of their covariance (p, p); what all attitudes share is not told."""
+        """The present values with the σ of their covariance (p, p); what all attitudes share is not among them."""
         value, prior = self.vector().detach().cpu().numpy(), self.sigma.cpu().numpy()
         sigma = np.sqrt(np.diag(covariance))
-        told = []
+        estimates = []
         for index, part in enumerate(self.parts):
             if part.name == "common":
                 continue
             here, turned = slice(3 * index, 3 * index + 3), part.name == "boresight"
             unit = math.degrees(1.0) if turned else 1.0
-            told.append(
+            estimates.append(
                 ErrorEstimate(
                     name=part.name,
                     flight=part.flight,
@@ -151,4 +151,4 @@ class SystematicErrors(torch.nn.Module):
                     observed=tuple(sigma[here] <= OBSERVED_PART * prior[here]),
                 )
             )
-        return tuple(told)
+        return tuple(estimates)

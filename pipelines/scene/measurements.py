@@ -30,8 +30,8 @@ _DRAWN = 3
 
 def fix_term(scene: Scene, survey: Survey) -> FixTerm | None:
     """Fixes of the training cameras; those of test cameras stay unused, as their photographs do."""
-    found = [(int(i), survey.image(scene.sparse.image_name[i])) for i in scene.train]
-    fixed = [(index, image, image.fix) for index, image in found if image is not None and image.fix is not None]
+    images = [(int(index), survey.image(scene.sparse.image_name[index])) for index in scene.train]
+    fixed = [(index, image, image.fix) for index, image in images if image is not None and image.fix is not None]
     if len(fixed) < 3:
         return None
     covariance = np.array([fix.cov_in_geo for _, _, fix in fixed])
@@ -57,11 +57,11 @@ def flights(times_s: list[float | None]) -> np.ndarray:
 def control_term(scene: Scene, survey: Survey) -> ControlTerm | None:
     """Marks of the control points in training images, where a point is seen in two or more of them."""
     rays = mark_rays(survey.control_points, scene.sparse, scene.train)
-    kept = rays.marks_of_point >= 2
-    if not kept.any():
+    marked = rays.marks_of_point >= 2
+    if not marked.any():
         return None
-    rays = rays.of_points(kept)
-    surveyed = [point for point, keep in zip(survey.control_points, kept, strict=True) if keep]
+    rays = rays.of_points(marked)
+    surveyed = [point for point, enough in zip(survey.control_points, marked, strict=True) if enough]
     control = ControlTerm(
         point=torch.from_numpy(rays.point),
         camera=torch.from_numpy(rays.camera),
@@ -94,7 +94,7 @@ def control_by_depth(scene: Scene, survey: Survey, marks: ControlTerm) -> tuple[
     bearing = marks.bearing_in_cam[order]
     count = torch.bincount(point, minlength=len(marks.position_in_geo))
     starts = {int(index): int(torch.searchsorted(camera, index)) for index in torch.unique(camera)}
-    found = ControlByDepth(
+    by_depth = ControlByDepth(
         camera=camera,
         xy=bearing[:, :2] / bearing[:, 2:],
         position_in_geo=marks.position_in_geo[point],
@@ -106,7 +106,7 @@ def control_by_depth(scene: Scene, survey: Survey, marks: ControlTerm) -> tuple[
     )
     mean = torch.zeros(len(count), dtype=torch.float64).index_add(0, point, surface.square()) / count
     all_in = covariance.numpy() + _mark_covariance(scene, marks) + mean.numpy()[:, None, None] * np.eye(3)
-    return found, _with_covariance(marks, all_in)
+    return by_depth, _with_covariance(marks, all_in)
 
 
 def _slopes(bearing: Tensor, by_lens: Tensor | None, order: Tensor) -> Tensor | None:
@@ -138,11 +138,11 @@ def distance_term(scene: Scene, fixes: FixTerm, points: GeolocatedPoints | None,
     Raises:
         InputError: `points` does not belong to the scene.
     """
-    found = _pairs_of_points(scene, points, seed) if points is not None else None
-    found = _pairs_of_cameras(scene, fixes, seed) if found is None else found
-    weight = (found.distance_in_geo * found.root_information[:, 0, 0]).square().sum()
+    distances = _pairs_of_points(scene, points, seed) if points is not None else None
+    distances = _pairs_of_cameras(scene, fixes, seed) if distances is None else distances
+    weight = (distances.distance_in_geo * distances.root_information[:, 0, 0]).square().sum()
     share = scale_share(_scale_information(fixes), float(weight))
-    return replace(found, share=share) if share > 0 else None
+    return replace(distances, share=share) if share > 0 else None
 
 
 def scale_share(information_of_fixes: float, information_of_pairs: float) -> float:

@@ -43,14 +43,14 @@ def fix_correspondences(survey: Survey, model: SparseModel) -> Correspondences:
     SfM's own error of a centre is not known here (zero covariance): the adjustment measures it as excess scatter.
     """
     fixes = {image.name: image.fix for image in survey.images if image.fix is not None}
-    found = [(index, name) for index, name in enumerate(model.image_name) if name in fixes]
+    fixed = [(index, name) for index, name in enumerate(model.image_name) if name in fixes]
     return Correspondences(
-        name=tuple(name for _, name in found),
-        control=np.zeros(len(found), dtype=bool),
-        in_local=model.cam_center_in_local[[index for index, _ in found]].reshape(-1, 3),
-        cov_in_local=np.zeros((len(found), 3, 3)),
-        in_geo=np.array([fixes[name].position_in_geo for _, name in found]).reshape(-1, 3),
-        cov_in_geo=np.array([fixes[name].cov_in_geo for _, name in found]).reshape(-1, 3, 3),
+        name=tuple(name for _, name in fixed),
+        control=np.zeros(len(fixed), dtype=bool),
+        in_local=model.cam_center_in_local[[index for index, _ in fixed]].reshape(-1, 3),
+        cov_in_local=np.zeros((len(fixed), 3, 3)),
+        in_geo=np.array([fixes[name].position_in_geo for _, name in fixed]).reshape(-1, 3),
+        cov_in_geo=np.array([fixes[name].cov_in_geo for _, name in fixed]).reshape(-1, 3, 3),
     )
 
 
@@ -75,14 +75,14 @@ def control_correspondences(survey: Survey, model: SparseModel) -> tuple[Corresp
             warnings[name] = (
                 f"control point {name}: its {count} marks do not meet in one point, not used; check the marks"
             )
-    kept = [point for point in points if point.name not in warnings]
+    meeting = [point for point in points if point.name not in warnings]
     return Correspondences(
-        name=tuple(point.name for point in kept),
-        control=np.ones(len(kept), dtype=bool),
+        name=tuple(point.name for point in meeting),
+        control=np.ones(len(meeting), dtype=bool),
         in_local=position[meets],
         cov_in_local=cov[meets],
-        in_geo=np.array([point.position_in_geo for point in kept]).reshape(-1, 3),
-        cov_in_geo=np.array([point.cov_in_geo for point in kept]).reshape(-1, 3, 3),
+        in_geo=np.array([point.position_in_geo for point in meeting]).reshape(-1, 3),
+        cov_in_geo=np.array([point.cov_in_geo for point in meeting]).reshape(-1, 3, 3),
     ), tuple(warnings.values())
 
 
@@ -109,9 +109,9 @@ def recorded_rotations(survey: Survey, model: SparseModel) -> RecordedRotations:
     """
     attitudes = {image.name: image.attitude for image in survey.images if image.attitude is not None}
     image = np.array([index for index, name in enumerate(model.image_name) if name in attitudes], dtype=np.int64)
-    found = [attitudes[model.image_name[index]] for index in image]
-    rotation = matrix_from_quat_xyzw(np.array([each.quat_xyzw for each in found]).reshape(-1, 4))
-    sigma_rad = np.radians([each.sigma_deg for each in found])
+    of_images = [attitudes[model.image_name[index]] for index in image]
+    rotation = matrix_from_quat_xyzw(np.array([attitude.quat_xyzw for attitude in of_images]).reshape(-1, 4))
+    sigma_rad = np.radians([attitude.sigma_deg for attitude in of_images])
     agrees = np.ones(len(image), dtype=bool)
     if len(image) > 2:
         geo_from_local = rotation @ model.rotation_cam_from_local[image]
@@ -139,7 +139,7 @@ def observation_rays(model: SparseModel) -> FloatArray:
     """Undistorted x/z and y/z (M, 2) of all observations; NaN where the lens model maps no ray."""
     xy = np.empty_like(model.obs_xy_px)
     camera_id = model.image_camera_id[model.obs_image]
-    for each in np.unique(camera_id):
-        mine = camera_id == each
-        xy[mine] = undistort(model.cameras[int(each)], model.obs_xy_px[mine])
+    for camera in np.unique(camera_id):
+        mine = camera_id == camera
+        xy[mine] = undistort(model.cameras[int(camera)], model.obs_xy_px[mine])
     return xy

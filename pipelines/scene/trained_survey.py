@@ -85,7 +85,7 @@ def load_trained(workspace: Workspace, similarity: Literal["trained", "initial"]
         if camera is None or (camera.model, len(camera.params)) != (lens.model, len(lens.params)):
             raise InputError("its lenses are not those of sfm/sparse: train again", path=model_path, field="lenses")
     if similarity == "initial":
-        record = _placed(model, load_json(InitialSimilarity, workspace.path(SIM3)))
+        record = _initially_placed(model, load_json(InitialSimilarity, workspace.path(SIM3)))
         model = model.model_copy(update={"geo_from_model": record})
     rotation = matrix_from_quat_xyzw([camera.quat_xyzw for camera in model.cameras])
     translation = np.array([camera.translation for camera in model.cameras])
@@ -100,12 +100,12 @@ def load_trained(workspace: Workspace, similarity: Literal["trained", "initial"]
 
 def trained_pinholes(trained: TrainedSurvey, images: ImageCache) -> Pinholes:
     """Cameras of the photographs that were undistorted with SfM's lenses, as the trained ones have them."""
-    found = Pinholes(images, trained.sfm.lenses)
-    found.renew(trained.sparse.lenses)
-    return found
+    pinholes = Pinholes(images, trained.sfm.lenses)
+    pinholes.renew(trained.sparse.lenses)
+    return pinholes
 
 
-def _placed(model: TrainedModel, initial: InitialSimilarity) -> SimilarityRecord:
+def _initially_placed(model: TrainedModel, initial: InitialSimilarity) -> SimilarityRecord:
     """`geo_from_model` of a similarity geo ← local; its covariance, of a movement on Earth, stays as it is."""
     geo_from_local = Similarity.from_record(initial.geo_from_local)
     geo_from_model = geo_from_local @ Similarity.from_record(model.model_from_local).inverse()

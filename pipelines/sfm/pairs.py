@@ -16,8 +16,8 @@ _CANDIDATES_PER_NEIGHBOR = 8
 
 
 @dataclass(frozen=True)
-class Views:
-    """Where N images were taken.
+class CameraDirections:
+    """Where N images were taken from, and which way they look.
 
     Attributes:
         position_in_geo: (N, 3) metres, NaN where unknown.
@@ -33,25 +33,25 @@ def all_pairs(count: int) -> IntArray:
     return np.stack(np.triu_indices(count, k=1), axis=1)
 
 
-def select_pairs(views: Views, max_neighbors: int) -> IntArray:
+def select_pairs(cameras: CameraDirections, max_neighbors: int) -> IntArray:
     """Pairs (i < j) of images that may see the same place: (P, 2), sorted, unique.
 
     Half of an image's neighbours are the nearest that look the same way; the others are the nearest in each of
     eight directions, so that flight lines with a dense forward overlap are still tied to the lines beside them.
     Images without a position are paired with all others, and each image with its successor in the list.
     """
-    position = views.position_in_geo
+    position = cameras.position_in_geo
     count = len(position)
-    known = np.flatnonzero(np.isfinite(position).all(axis=1))
+    located = np.flatnonzero(np.isfinite(position).all(axis=1))
     chosen = {(i, i + 1) for i in range(count - 1)}
     for i in map(int, np.flatnonzero(~np.isfinite(position).all(axis=1))):
         chosen.update((min(i, j), max(i, j)) for j in range(count) if j != i)
-    if len(known) > 1:
-        tree = cKDTree(position[known])
-        reach = min(len(known), max_neighbors * _CANDIDATES_PER_NEIGHBOR + 1)
-        for i in map(int, known):
-            near = known[tree.query(position[i], k=reach)[1]]
-            near = near[(near != i) & _look_alike(views.axis_in_geo, i, near)]
+    if len(located) > 1:
+        tree = cKDTree(position[located])
+        reach = min(len(located), max_neighbors * _CANDIDATES_PER_NEIGHBOR + 1)
+        for i in map(int, located):
+            near = located[tree.query(position[i], k=reach)[1]]
+            near = near[(near != i) & _look_alike(cameras.axis_in_geo, i, near)]
             for j in _spread(position[near] - position[i], max_neighbors):
                 chosen.add((min(i, int(near[j])), max(i, int(near[j]))))
     return np.array(sorted(chosen), dtype=np.int64).reshape(-1, 2)

@@ -8,6 +8,7 @@ image observations of σ = 1 px, fixes with their covariances under Cauchy's ker
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -21,20 +22,20 @@ from pipelines.formats.colmap import load_reconstruction, pycolmap_module, quiet
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.georef.alignment import Alignment, align
+from pipelines.robust.kernels import CAUCHY_SCALE2
 from pipelines.robust.statistics import residual_stats
 from pipelines.scene.initial_similarity import InitialSimilarity
 from pipelines.scene.observations import attitude_prior, fix_correspondences
 from pipelines.scene.survey import Fix, Survey
 from pipelines.sfm.options import AdjustOptions
 
-_PRIOR_SCALE = 2.7955  # of Cauchy's kernel: root of the 95 % point of χ² with 3 degrees of freedom
 _MOST_ITERATIONS = 100
 # COLMAP lays the model on the fixes before it adjusts. It may take for inliers what is so many times further off
 # than the inliers of our own alignment: too tight a limit would leave it with no start.
 _ALIGNMENT_SLACK = 3.0
 
 
-def run(stage: StageRun, config: AdjustOptions) -> Summary:
+def run(stage: StageRun, options: AdjustOptions) -> Summary:
     """Adjust the workspace's model and write it.
 
     Raises:
@@ -42,17 +43,17 @@ def run(stage: StageRun, config: AdjustOptions) -> Summary:
     """
     survey = load_json(Survey, stage.workspace.path(SURVEY))
     path, sparse = stage.workspace.path(SPARSE), stage.out / "sparse"
-    alignment = _aligned(read_sparse(path), survey, config.seed)
+    alignment = _aligned(read_sparse(path), survey, options.seed)
     model = load_reconstruction(path)
     with quiet_colmap(), stage.progress.task("adjustment", 1) as task:
-        adjust_to_fixes(model, survey, alignment, config.seed)
+        adjust_to_fixes(model, survey, alignment, options.seed)
         task.advance()
     sparse.mkdir()
     model.write_binary(str(sparse))
     names = tuple(image.name for image, _ in _located(model, survey))
-    found = _placed(_aligned(read_sparse(sparse), survey, config.seed), names, _residuals(model, survey))
-    save_json(found, stage.out / "geo_from_local.json")
-    fixes = found.residuals["gnss"]
+    similarity = _identity(_aligned(read_sparse(sparse), survey, options.seed), names, _residuals(model, survey))
+    save_json(similarity, stage.out / "geo_from_local.json")
+    fixes = similarity.residuals["gnss"]
     values = {"residuals": fixes.model_dump(), "reprojection_error_px": model.compute_mean_reprojection_error()}
     return Summary(f"{fixes.rmse_3d_m:.3f} m RMS from {fixes.count} fixes", values)
 
@@ -94,7 +95,7 @@ def _aligned(model: SparseModel, survey: Survey, seed: int) -> Alignment:
     return align(data, np.random.default_rng(seed), attitude=attitude_prior(survey, model))
 
 
-def _placed(alignment: Alignment, names: tuple[str, ...], residual: FloatArray) -> InitialSimilarity:
+def _identity(alignment: Alignment, names: tuple[str, ...], residual: FloatArray) -> InitialSimilarity:
     """The identity: at its minimum the adjustment has no similarity left to gain.
 
     Args:
@@ -140,7 +141,7 @@ def _image_options(colmap: Any) -> Any:
 def _prior_options(colmap: Any, alignment: Alignment, seed: int) -> Any:
     options = colmap.PosePriorBundleAdjustmentOptions()
     options.ceres.prior_position_loss_function_type = colmap.LossFunctionType.CAUCHY
-    options.ceres.prior_position_loss_scale = _PRIOR_SCALE
+    options.ceres.prior_position_loss_scale = math.sqrt(CAUCHY_SCALE2[3])
     solution = alignment.solution
     furthest = np.linalg.norm(solution.residual[solution.state.inlier], axis=1).max()
     options.alignment_ransac.max_error = float(_ALIGNMENT_SLACK * max(furthest, 1e-3))

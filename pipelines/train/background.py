@@ -48,7 +48,7 @@ def background(scene: Scene, images: ImageCache, points: FloatArray) -> Backgrou
     middle = np.median(points, axis=0)
     radius = float(np.percentile(np.linalg.norm(points - middle, axis=1), 90))
     ground = ground_plane(points)
-    found, colours, sigmas = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)], [np.zeros(0)]
+    points_beyond, colours, sigmas = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)], [np.zeros(0)]
     step = max(1, len(scene.train) // _MOST_VIEWS)
     for index in map(int, scene.train[::step]):
         camera, center = images.pinhole(index), scene.poses.cam_center_in_model[index]
@@ -56,10 +56,10 @@ def background(scene: Scene, images: ImageCache, points: FloatArray) -> Backgrou
         pixel = (cells + 0.5) * (camera.width / _COLUMNS)
         ray = _rays(pixel, camera) @ scene.poses.cam_from_model[index]
         distance = _distance(ray, center, ground, radius)
-        found.append(center + distance[:, None] * ray)
+        points_beyond.append(center + distance[:, None] * ray)
         colours.append(_colours(images.image(index), pixel))
         sigmas.append(0.5 * distance * camera.width / (_COLUMNS * camera.fx))
-    return _thinned(Background(np.concatenate(found), np.concatenate(colours), np.concatenate(sigmas)))
+    return _thinned(Background(np.concatenate(points_beyond), np.concatenate(colours), np.concatenate(sigmas)))
 
 
 def _empty_cells(scene: Scene, index: int, camera: Pinhole, points: FloatArray) -> FloatArray:
@@ -70,12 +70,12 @@ def _empty_cells(scene: Scene, index: int, camera: Pinhole, points: FloatArray) 
     x = (camera.fx * in_cam[:, 0] / in_cam[:, 2] + camera.cx) * _COLUMNS / camera.width
     y = (camera.fy * in_cam[:, 1] / in_cam[:, 2] + camera.cy) * rows / camera.height
     inside = (x >= 0) & (x < _COLUMNS) & (y >= 0) & (y < rows)
-    taken = np.zeros((rows + 2, _COLUMNS + 2), dtype=bool)
+    occupied = np.zeros((rows + 2, _COLUMNS + 2), dtype=bool)
     column, row = x[inside].astype(int), y[inside].astype(int)
     for shift_row in (0, 1, 2):
         for shift_column in (0, 1, 2):
-            taken[row + shift_row, column + shift_column] = True
-    empty_row, empty_column = np.nonzero(~taken[1:-1, 1:-1])
+            occupied[row + shift_row, column + shift_column] = True
+    empty_row, empty_column = np.nonzero(~occupied[1:-1, 1:-1])
     return np.stack([empty_column, empty_row], axis=1).astype(np.float64)
 
 

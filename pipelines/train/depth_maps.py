@@ -107,14 +107,14 @@ class DepthMaps:
     def _sweep(self, index: int) -> Float32Array:
         sweeps, others = self._planes(index), self._neighbours(index)
         if not sweeps:
-            return _nothing(self._coarse(index))
+            return _empty_maps(self._coarse(index))
         views = [self._view(self._coarse(j), j) for j in others]
         return _packed(plane_sweep(self._view(self._coarse(index), index), views, sweeps, self._options.matching))
 
     def _refine(self, index: int) -> Float32Array:
         own = self._surface(index, "coarse")
         if own is None:
-            return _nothing(self.camera(index))
+            return _empty_maps(self.camera(index))
         reference = self._view(self.camera(index), index)
         guess = guess_from(own, self._agreed(own, index, "coarse"), reference.camera)
         views = [self._view(self.camera(j), j) for j in self._neighbours(index)]
@@ -197,8 +197,8 @@ def _packed(swept: Swept) -> Float32Array:
     return np.stack([which, swept.offset_m, swept.score, swept.step_m, swept.sharpness])
 
 
-def _nothing(pinhole: Pinhole) -> Float32Array:
+def _empty_maps(pinhole: Pinhole) -> Float32Array:
     """The same of a view without neighbours."""
-    found = np.zeros((5, pinhole.height, pinhole.width), dtype=np.float32)
-    found[1], found[2] = np.nan, UNSEEN
-    return found
+    empty = np.zeros((5, pinhole.height, pinhole.width), dtype=np.float32)
+    empty[1], empty[2] = np.nan, UNSEEN
+    return empty

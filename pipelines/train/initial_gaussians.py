@@ -53,7 +53,7 @@ def initial_gaussians(training: TrainingScene, options: InitialisationOptions, m
     scene = training.scene
     start = SurfacePoints(scene.point_in_model, scene.sparse.point_rgb, np.full_like(scene.point_in_model, np.nan))
     if training.surface is not None:
-        share = _SURFACE_SHARE * min(1.0, training.surface.known() / _MOSTLY_KNOWN)
+        share = _SURFACE_SHARE * min(1.0, training.surface.known_share() / _MOSTLY_KNOWN)
         surface = training.surface.sample(int(share * most), seed)
         start = SurfacePoints.concatenate([start.part(_off_surface(start, surface)), surface])
     near = gaussians_from_points(start.point_in_model, start.rgb, options, start.normal_in_model)

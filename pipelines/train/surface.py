@@ -63,7 +63,7 @@ class SceneSurface:
         rows, columns = np.nonzero(self._maps.depth(index)[::stride, ::stride])
         return self._points(index, stride * rows, stride * columns)
 
-    def known(self) -> float:
+    def known_share(self) -> float:
         """Part of the training photographs' pixels whose surface is known, 0 … 1."""
         depths = (self._maps.depth(index) for index in map(int, self._train))
         return float(np.mean([np.mean(depth > 0) for depth in depths]))
@@ -81,28 +81,28 @@ class SceneSurface:
             rgb = self._maps.rgb(index)[rows, columns]
             views.append(SurfacePoints(self._points(index, rows, columns), rgb, normals))
             sizes.append(self._maps.depth(index)[rows, columns].astype(np.float64) / self._maps.camera(index).fx)
-        found = SurfacePoints.concatenate(views)
-        return found.part(spread_evenly(found.point_in_model, np.concatenate(sizes), count))
+        candidates = SurfacePoints.concatenate(views)
+        return candidates.part(spread_evenly(candidates.point_in_model, np.concatenate(sizes), count))
 
     def _normals(self, index: int, rows: IntArray, columns: IntArray) -> FloatArray:
         """Unit vectors (P, 3) across the surface at pixels of a view; NaN at its edges."""
         depth = self._maps.depth(index)
         inside = (rows >= _NORMAL_REACH_PX) & (rows < depth.shape[0] - _NORMAL_REACH_PX)
         inside &= (columns >= _NORMAL_REACH_PX) & (columns < depth.shape[1] - _NORMAL_REACH_PX)
-        found = np.full((len(rows), 3), np.nan)
-        kept = np.flatnonzero(inside)
+        normals = np.full((len(rows), 3), np.nan)
+        inner = np.flatnonzero(inside)
         places = [
-            (rows[kept] + _NORMAL_REACH_PX * down, columns[kept] + _NORMAL_REACH_PX * right)
+            (rows[inner] + _NORMAL_REACH_PX * down, columns[inner] + _NORMAL_REACH_PX * right)
             for down, right in ((0, 1), (0, -1), (1, 0), (-1, 0))
         ]
         # On a plane the inverse depth is linear, however steeply it is seen.
         with np.errstate(divide="ignore"):
-            around = np.stack([depth[rows[kept], columns[kept]] / depth[place] for place in places])
+            around = np.stack([depth[rows[inner], columns[inner]] / depth[place] for place in places])
         smooth = (np.abs(around[::2] + around[1::2] - 2) < _BEND).all(axis=0)
         right, left, below, above = (self._points(index, *place) for place in places)
         normal = np.cross(right - left, below - above)[smooth]
-        found[kept[smooth]] = normal / np.linalg.norm(normal, axis=1, keepdims=True)
-        return found
+        normals[inner[smooth]] = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+        return normals
 
     def _points(self, index: int, rows: IntArray, columns: IntArray) -> FloatArray:
         depth, poses = self._maps.depth(index)[rows, columns].astype(np.float64), self._poses

@@ -9,13 +9,15 @@ from hypothesis import strategies as st
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from pipelines.sfm.pairs import Views, all_pairs, select_pairs
+from pipelines.sfm.pairs import CameraDirections, all_pairs, select_pairs
 
 DOWN = np.array([0.0, 0.0, -1.0])
 
 
-def looking(position: np.ndarray, axis: np.ndarray = DOWN) -> Views:
-    return Views(np.asarray(position, dtype=np.float64), np.broadcast_to(axis, (len(position), 3)).copy())
+def looking(position: np.ndarray, axis: np.ndarray = DOWN) -> CameraDirections:
+    return CameraDirections(
+        np.asarray(position, dtype=np.float64), np.broadcast_to(axis, (len(position), 3)).copy()
+    )
 
 
 def test_all_pairs_are_every_unordered_pair_once() -> None:
@@ -40,7 +42,7 @@ def test_views_that_look_apart_are_not_matched() -> None:
     # An orbit that looks outwards: opposite images are near each other and have nothing in common.
     angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
     outwards = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(24)])
-    pairs = select_pairs(Views(5.0 * outwards, outwards), 20)
+    pairs = select_pairs(CameraDirections(5.0 * outwards, outwards), 20)
     cosine = (outwards[pairs[:, 0]] * outwards[pairs[:, 1]]).sum(axis=1)
     assert np.degrees(np.arccos(cosine.clip(-1, 1))).max() <= 60.0 + 1e-6
     assert len(pairs) >= 24 * 3  # 15° apart: up to four neighbours on either side look alike
@@ -50,7 +52,7 @@ def test_back_to_back_views_stay_apart() -> None:
     # Two facades, photographed back to back from one lane.
     position = np.column_stack([np.tile(3.0 * np.arange(12), 2), np.repeat([0.0, 1.0], 12), np.full(24, 10.0)])
     axis = np.repeat([[0.0, -1.0, 0.0], [0.0, 1.0, 0.0]], 12, axis=0)
-    pairs = select_pairs(Views(position, axis), 8)
+    pairs = select_pairs(CameraDirections(position, axis), 8)
     crossing = pairs[(pairs[:, 0] < 12) & (pairs[:, 1] >= 12)]
     assert crossing.tolist() == [[11, 12]]  # successors in the list, which may well be a turn
 
@@ -96,7 +98,7 @@ def test_pairs_are_sorted_unique_ordered_and_connected(
     axis = rng.normal(size=(count, 3))
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)
     axis[rng.random(count) < unknown] = np.nan
-    pairs = select_pairs(Views(position, axis), neighbours)
+    pairs = select_pairs(CameraDirections(position, axis), neighbours)
     assert pairs.shape[1] == 2
     assert (pairs[:, 0] < pairs[:, 1]).all()
     assert pairs.tolist() == [list(pair) for pair in sorted({tuple(pair) for pair in pairs.tolist()})]

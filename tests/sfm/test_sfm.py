@@ -21,13 +21,14 @@ from pipelines.core.runner import run_stage
 from pipelines.core.stages import BY_NAME, SPARSE, SURVEY
 from pipelines.core.staleness import status
 from pipelines.core.workspace import StageRun, Workspace
-from pipelines.formats.colmap import read_sparse
+from pipelines.formats.colmap import quiet_colmap, read_sparse
 from pipelines.geodesy.enu import Origin
 from pipelines.geodesy.vertical import VerticalDatum
 from pipelines.geometry.similarity import umeyama
 from pipelines.scene.survey import CameraPrior, Fix, Survey, SurveyedPoint, SurveyImage
 from pipelines.sfm.options import SfmOptions
-from pipelines.sfm.stage import SfmJob, _summarise, candidate_pairs, import_model, quiet_colmap, reconstruct, run
+from pipelines.sfm.reconstruction import SfmJob, candidate_pairs, reconstruct
+from pipelines.sfm.stage import _summarise, import_model, run
 from pipelines.simulate.options import SimulateOptions
 from pipelines.simulate.stage import simulate
 
@@ -227,7 +228,7 @@ def test_file_names_with_blanks(photographs: Photographs, tmp_path: Path, monkey
         shutil.copy(photographs.folder / name, photos / f"# flight 1 {name}")
     survey = survey_of(sorted(path.name for path in photos.iterdir()))
     asked = np.array([(0, 1), (1, 2), (2, 3), (3, 4), (0, 2), (1, 3), (2, 4)])
-    monkeypatch.setattr("pipelines.sfm.stage.candidate_pairs", lambda *_: asked)
+    monkeypatch.setattr("pipelines.sfm.reconstruction.candidate_pairs", lambda *_: asked)
     job = SfmJob(survey, photos, tmp_path / "database.db", CONFIG)
     with quiet_colmap() as colmap:
         model = reconstruct(colmap, job, SILENT)

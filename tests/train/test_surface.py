@@ -176,7 +176,7 @@ def test_fewer_start_on_a_surface_of_which_less_is_known(
         return int((scale.amin(dim=1) < 0.2 * scale.amax(dim=1)).sum())
 
     quarter = SceneSurface(part)
-    assert quarter.known() < 0.3 * surface.known()
+    assert quarter.known_share() < 0.3 * surface.known_share()
     # Known of a quarter of the pixels, it starts with no more than a third of the Gaussians: trees have the others.
     assert 0 < discs(quarter) < most / 3 < discs(surface)
 
