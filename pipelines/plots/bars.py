@@ -50,7 +50,7 @@ def write_bars(path: Path, panels: Sequence[Panel]) -> None:
     draft = path.with_suffix(".tmp")
     with draft.open("wb") as handle:
         FigureCanvasAgg(figure).print_png(handle, metadata={"Software": None})
-    draft.rename(path)
+    draft.replace(path)
 
 
 def _draw(axes: Axes, panel: Panel) -> None:
