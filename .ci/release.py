@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import re
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -89,7 +90,9 @@ def run_checks() -> None:
     Raises:
         SystemExit: a check failed.
     """
-    if subprocess.run(["bash", ".ci/run"], cwd=ROOT, check=False).returncode:
+    # Without its path, Windows would take the bash of its Linux subsystem.
+    bash = shutil.which("bash") or "bash"
+    if subprocess.run([bash, ".ci/run"], cwd=ROOT, check=False).returncode:
         raise SystemExit("the checks failed: nothing was released")
 
 
