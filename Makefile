@@ -1,18 +1,17 @@
-# `make demo` and `make test` set up everything they need in .venv.
+# `make demo` and `make test` set up everything they need in .venv. What the checks are stands in .ci/run.
 PYTHON ?= python3
+export PYTHON
 VENV := .venv
-BIN := $(VENV)/bin
-STAMP := $(VENV)/.installed
+BIN := $(VENV)/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
 DEMO := demo
 
-.PHONY: setup demo test lint types check clean
+.PHONY: setup demo test lint types docs check release clean
 
-setup: $(STAMP)
+setup test lint types docs:
+	@.ci/run $@
 
-$(STAMP): pyproject.toml constraints.txt
-	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
-	touch $@
+check:
+	@.ci/run
 
 # A simulated flight, the whole pipeline on it, and what the check points say.
 demo: setup
@@ -25,17 +24,9 @@ demo: setup
 	$(BIN)/georef evaluate $(DEMO)/workspace
 	@echo "The splat: $(DEMO)/workspace/export/splat.ply (and splat.ply.georef.json beside it)"
 
-test: setup
-	$(BIN)/python -m pytest
-
-lint: setup
-	$(BIN)/ruff check .
-	$(BIN)/ruff format --check .
-
-types: setup
-	$(BIN)/mypy
-
-check: test lint types
+# `make release VERSION=0.2.0`: checks, version, changelog, commit, tag. Nothing is pushed.
+release: setup
+	$(BIN)/python .ci/release.py $(VERSION)
 
 clean:
-	rm -rf $(VENV) $(DEMO) build dist *.egg-info
+	rm -rf $(VENV) $(DEMO) build dist site .cache .coverage *.egg-info

@@ -54,7 +54,7 @@ def _spelling(option: click.Option) -> str:
     if option.is_flag:
         return names
     choices = getattr(option.type, "choices", None)
-    value = "\\|".join(choices) if choices else option.metavar or option.type.name.upper()
+    value = f"{{{', '.join(choices)}}}" if choices else option.metavar or option.type.name.upper()
     return f"{names} {value}"
 
 

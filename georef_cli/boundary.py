@@ -6,7 +6,9 @@ traceback. Everything said here goes to stderr; stdout is the result's.
 
 from __future__ import annotations
 
+import codecs
 import errno
+import io
 import logging
 import os
 import signal
@@ -21,6 +23,7 @@ import click
 
 from georef_cli.verbosity import LineFormatter, Verbosity
 from pipelines.core.errors import GeorefError
+from pipelines.core.interrupts import SIGNALS
 
 FAILED, INTERRUPTED = 1, 130
 OURS = ("pipelines", "georef_cli")
@@ -32,7 +35,8 @@ log = logging.getLogger(__name__)
 def guarded(group: click.Group, arguments: Sequence[str] | None) -> int:
     """Run the command line and turn how it ended into an exit code."""
     try:
-        with _sigterm_interrupts():
+        _escape_on_stdout()
+        with _signals_interrupt():
             code = group.main(args=arguments, prog_name=group.name, standalone_mode=False)
             sys.stdout.flush()
     except click.ClickException as error:
@@ -56,18 +60,25 @@ def guarded(group: click.Group, arguments: Sequence[str] | None) -> int:
     return code if isinstance(code, int) else 0
 
 
+def _escape_on_stdout() -> None:
+    """Let stdout escape the signs that its encoding lacks, as stderr does: a pipe on Windows has no σ."""
+    if isinstance(sys.stdout, io.TextIOWrapper) and codecs.lookup(sys.stdout.encoding).name != "utf-8":
+        sys.stdout.reconfigure(errors="backslashreplace")
+
+
 @contextmanager
-def _sigterm_interrupts() -> Iterator[None]:
-    """Let SIGTERM end the work as Ctrl-C does, so that a stage can save what it has."""
+def _signals_interrupt() -> Iterator[None]:
+    """Let every signal that asks for an end do as Ctrl-C does, so that a stage can save what it has."""
 
     def interrupt(_signal: int, _frame: FrameType | None) -> None:
         raise KeyboardInterrupt
 
-    before = signal.signal(signal.SIGTERM, interrupt)
+    before = {number: signal.signal(number, interrupt) for number in SIGNALS if number != signal.SIGINT}
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 @contextmanager

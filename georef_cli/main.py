@@ -17,6 +17,7 @@ import click
 
 from georef_cli import boundary
 from georef_cli.verbosity import Verbosity
+from pipelines import __version__
 
 PROGRAM = "georef"
 
@@ -86,9 +87,7 @@ class LazyGroup(click.Group):
 def _print_version(ctx: click.Context, _param: click.Parameter, value: bool) -> None:
     if not value or ctx.resilient_parsing:
         return
-    from importlib.metadata import version
-
-    click.echo(f"{PROGRAM} {version('georefgs')}")
+    click.echo(f"{PROGRAM} {__version__}")
     ctx.exit()
 
 

@@ -1,1 +1,3 @@
 """The GeoRefGS library: every stage and building block, importable without the command line."""
+
+__version__ = "0.1.0"

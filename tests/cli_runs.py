@@ -51,7 +51,7 @@ def finish(process: subprocess.Popen[str]) -> Result:
 
 def products_in(workspace: Path) -> dict[str, bytes]:
     """Every product in a workspace."""
-    kept = (path for path in sorted(workspace.rglob("*")) if path.is_file() and path.name != ".lock")
+    kept = (path for path in sorted(workspace.rglob("*")) if path.is_file() and not path.name.startswith(".lock"))
     found = {path.relative_to(workspace).as_posix(): path.read_bytes() for path in kept}
     return {name: data for name, data in found.items() if not name.startswith(("logs/", "ingest.partial/"))}
 

@@ -54,6 +54,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     "numba": ("pipelines.splat", "pipelines.geometry", "pipelines.robust"),
     "gsplat": ("pipelines.splat.rasterizer.cuda",),
     "torch": ("pipelines.splat", "pipelines.georef", "pipelines.scene", *STAGE_ROOMS),
+    "filelock": ("pipelines.core",),
     "plyfile": ("pipelines.formats",),
     "exifread": ("pipelines.formats",),
     "defusedxml": ("pipelines.formats",),
@@ -68,7 +69,7 @@ PENDING = {
     ("pipelines.formats.odm", "pipelines.ingest.notes"),
     ("pipelines.formats.trajectory_csv", "pipelines.ingest.notes"),
 }
-CORE_LIBRARIES = {"numpy", "pydantic"}
+CORE_LIBRARIES = {"filelock", "numpy", "pydantic"}
 
 
 def inside(module: str, room: str) -> bool:

@@ -10,11 +10,14 @@ import pytest
 REPOSITORY = Path(__file__).parents[1]
 DOCUMENTS = sorted(
     path
-    for pattern in ("*.md", "docs/*.md", "examples/**/*.md")
+    for pattern in ("*.md", "docs/**/*.md", "examples/**/*.md")
     for path in REPOSITORY.glob(pattern)
     if not any(part.startswith(".") for part in path.relative_to(REPOSITORY).parts)
 )
 LINK = re.compile(r"!?\[[^\]]*\]\(<?([^)\s>]+)>?(?:\s+\"[^\"]*\")?\)")
+# `[text][name]` leads to what `[name]: x.md` says at the end of the document.
+NAMED_LINK = re.compile(r"\[[^\]]+\]\[([^\]]+)\]")
+DEFINITION = re.compile(r"^\[([^\]]+)\]: (\S+)$", re.MULTILINE)
 # `docs/x.md` and `tests/…/x.py` named in passing are promises too.
 NAMED = re.compile(r"`((?:docs|examples|tests|pipelines|georef_cli)/[\w./-]+\.(?:md|py|toml))`")
 
@@ -32,8 +35,9 @@ def anchors(path: Path) -> set[str]:
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.relative_to(REPOSITORY).as_posix())
 def test_links_lead_somewhere(document: Path) -> None:
-    broken = []
-    for link in LINK.findall(text_of(document)):
+    defined = dict(DEFINITION.findall(text_of(document)))
+    broken = [name for name in NAMED_LINK.findall(text_of(document)) if name not in defined]
+    for link in [*LINK.findall(text_of(document)), *defined.values()]:
         if re.match(r"[a-z]+:", link):
             continue
         name, _, anchor = link.partition("#")
@@ -45,5 +49,5 @@ def test_links_lead_somewhere(document: Path) -> None:
 
 
 def test_there_are_documents_with_links() -> None:
-    assert {"README.md", "inputs.md"} <= {path.name for path in DOCUMENTS}
+    assert {"README.md", "CONTRIBUTING.md", "inputs.md"} <= {path.name for path in DOCUMENTS}
     assert sum(len(LINK.findall(text_of(path))) for path in DOCUMENTS) > 10

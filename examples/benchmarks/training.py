@@ -147,6 +147,8 @@ def _now(device: str) -> float:
 
 
 def _peak_bytes() -> int:
+    if sys.platform == "win32":
+        raise SystemExit("measures memory, which Windows tells otherwise: run it on Linux or macOS")
     import resource
 
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

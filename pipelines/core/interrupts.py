@@ -4,6 +4,7 @@ looks up is left to itself."""
 from __future__ import annotations
 
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -12,7 +13,9 @@ from types import FrameType
 from typing import TypeVar
 
 ResultT = TypeVar("ResultT")
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
+SIGNALS = [signal.SIGINT, signal.SIGTERM]
+if sys.platform == "win32":  # where SIGTERM ends a process unheard, Ctrl-Break is what another process can send
+    SIGNALS.append(signal.SIGBREAK)
 _LOOK_UP_S = 0.2
 
 
@@ -25,7 +28,7 @@ class StopRequest:
 
 @contextmanager
 def deferred_interrupts() -> Iterator[StopRequest]:
-    """Hold back SIGINT and SIGTERM while the context lasts: the first sets `requested`, a second one interrupts.
+    """Hold back `SIGNALS` while the context lasts: the first sets `requested`, a second one interrupts.
 
     The loop inside looks at `requested` after each step, saves, and raises `KeyboardInterrupt` itself. Only the
     main thread receives signals; in any other the request stays unset.
@@ -52,8 +55,8 @@ def deferred_interrupts() -> Iterator[StopRequest]:
 def interruptible(work: Callable[[], ResultT]) -> ResultT:
     """The result of long work in a library that lets go of Python but hears no signals.
 
-    It runs in a thread of its own, so that SIGINT and SIGTERM interrupt the wait for it; the thread then goes on
-    until the process ends, which it does not hold up.
+    It runs in a thread of its own, so that `SIGNALS` interrupt the wait for it; the thread then goes on until the
+    process ends, which it does not hold up.
     """
     results: list[ResultT] = []
     errors: list[BaseException] = []

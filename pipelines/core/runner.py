@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from importlib import metadata
 from typing import Any
 
+from pipelines import __version__
 from pipelines.core.errors import GeorefError, InputError, MissingProductError
 from pipelines.core.fingerprints import Memo
 from pipelines.core.products import load_json
@@ -24,7 +25,7 @@ from pipelines.scene.survey import Survey
 
 log = logging.getLogger(__name__)
 
-VERSIONED = ("georefgs", "numpy", "pycolmap", "torch", "numba", "pyproj")
+LIBRARIES = ("numpy", "pycolmap", "torch", "numba", "pyproj")
 
 
 @dataclass(frozen=True)
@@ -231,10 +232,10 @@ def _warn_of_stale_inputs(workspace: Workspace, spec: StageSpec, memo: Memo) -> 
 
 
 def _versions() -> dict[str, str]:
-    found = {}
-    for name in VERSIONED:
+    versions = {"georefgs": __version__}
+    for name in LIBRARIES:
         try:
-            found[name] = metadata.version(name)
+            versions[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
-            found[name] = "not installed"
-    return found
+            versions[name] = "not installed"
+    return versions

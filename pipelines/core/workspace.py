@@ -2,26 +2,24 @@
 
 Every stage owns one folder with a `manifest.json`. A stage writes into `<folder>.partial` and the folder is
 renamed when complete, so that a killed stage leaves the previous product whole; the next writer finishes or undoes
-a rename that was cut off. One writer at a time holds an advisory lock, which the system drops when it dies.
+a rename that was cut off. One writer at a time holds the workspace's lock.
 """
 
 from __future__ import annotations
 
-import fcntl
 import json
-import os
 import shutil
-import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Literal, TextIO
+from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict
 
-from pipelines.core.errors import InputError, MissingProductError, WorkspaceBusyError
+from pipelines.core.errors import InputError, MissingProductError
+from pipelines.core.lock import WriteLock
 from pipelines.core.options import CONFIG_FILE
 from pipelines.core.products import load_json, save_json
 from pipelines.core.progress import SILENT, Progress
@@ -31,8 +29,6 @@ MANIFEST = "manifest.json"
 TOKEN = "token.txt"
 FAILURE = "failure.txt"
 REQUESTS = "requests.json"
-LOCK = ".lock"
-LOCK_ATTEMPTS, LOCK_PAUSE_S = 3, 0.1
 
 Resume = Literal["never", "if-same", "always"]
 
@@ -180,44 +176,14 @@ class Workspace:
             WorkspaceBusyError: another process holds it.
             InputError: the directory cannot be made or written.
         """
-        try:
-            self.root.mkdir(parents=True, exist_ok=True)
-            handle = (self.root / LOCK).open("a+", encoding="utf-8")
-        except OSError as error:
-            raise InputError(f"cannot be used as a workspace: {error.strerror}", path=self.root) from error
-        with handle:
-            self._acquire(handle)
-            handle.truncate(0)
-            handle.write(f"{activity} in process {os.getpid()}")
-            handle.flush()
+        with WriteLock(self.root).hold(activity):
             for spec in STAGES:
                 self._recover(spec)
             yield
 
-    def _acquire(self, handle: TextIO) -> None:
-        # `writer` holds the lock for an instant, which must not turn a writer away: hence more than one attempt.
-        for _ in range(LOCK_ATTEMPTS):
-            try:
-                return fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                time.sleep(LOCK_PAUSE_S)
-            except OSError as error:
-                raise InputError(f"cannot be locked: {error.strerror}", path=self.root) from error
-        handle.seek(0)
-        holder = handle.read().strip() or "another process"
-        raise WorkspaceBusyError(f"{self.root} is being written by {holder}: wait for it, or stop it")
-
     def writer(self) -> str | None:
         """The activity of the process that is writing now (`train`), or None."""
-        try:
-            with (self.root / LOCK).open(encoding="utf-8") as handle:
-                try:
-                    fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
-                except BlockingIOError:
-                    return handle.read().partition(" in process ")[0]
-        except OSError:
-            pass  # no lock file, or none that can be opened: nobody writes
-        return None
+        return WriteLock(self.root).activity()
 
     def _recover(self, spec: StageSpec) -> None:
         final, old = self.root / spec.folder, self._old(spec)
@@ -280,7 +246,7 @@ class Workspace:
         partial = self.partial(spec)
         draft = partial / f"{MANIFEST}.tmp"
         save_json(manifest, draft)
-        draft.rename(partial / MANIFEST)  # from here on it counts as complete, whatever happens
+        draft.replace(partial / MANIFEST)  # from here on it counts as complete, whatever happens
         self._swap(spec)
 
     def replace(self, product: str, document: BaseModel) -> None:
@@ -288,7 +254,7 @@ class Workspace:
         path = self.path(product)
         draft = path.with_suffix(".tmp")
         save_json(document, draft)
-        draft.rename(path)
+        draft.replace(path)
 
     def requests(self) -> dict[str, dict[str, Any]]:
         """The flags that each stage was last asked for with, so that `georef run` can complete them.
@@ -317,7 +283,7 @@ def replace_text(path: Path, text: str) -> None:
     """Write a file; one that is there is replaced when the new one is complete."""
     draft = path.with_suffix(".tmp")
     draft.write_text(text, encoding="utf-8")
-    draft.rename(path)
+    draft.replace(path)
 
 
 def now() -> datetime:

@@ -172,7 +172,7 @@ def save_array(path: Path, array: NDArray[Any]) -> None:
     draft = path.with_suffix(".tmp")
     with draft.open("wb") as handle:
         np.save(handle, array, allow_pickle=False)
-    draft.rename(path)
+    draft.replace(path)
 
 
 def _distortion_map(camera: Camera, pinhole: Pinhole) -> tuple[Float32Array, BoolArray]:

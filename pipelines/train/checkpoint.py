@@ -20,7 +20,7 @@ def save_checkpoint(path: Path, state: Mapping[str, Tensor]) -> None:
     with draft.open("wb") as handle:
         arrays = {name: tensor.detach().cpu().numpy() for name, tensor in state.items()}
         np.savez(handle, **arrays)  # type: ignore[arg-type]
-    draft.rename(path)
+    draft.replace(path)
 
 
 def load_checkpoint(path: Path) -> dict[str, Tensor]:

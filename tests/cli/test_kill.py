@@ -9,6 +9,7 @@ import contextlib
 import json
 import signal
 import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -24,6 +25,8 @@ from pipelines.scene.survey import Survey
 from pipelines.splat.storage import read_gaussians
 from pipelines.train.checkpoint import load_checkpoint
 from tests.cli_runs import Result, finish, start
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="no process can be sent SIGTERM or SIGKILL")
 
 GEOREF = "from georef_cli.main import main; main()"
 

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 
 import pytest
 
-from tests.cli_runs import finish, start
+from tests.cli_runs import REPOSITORY, finish, start
 
 SLEEPING = """
 import time
@@ -86,9 +89,20 @@ def test_reader_that_has_enough(tmp_path: Path, photos: Path) -> None:
     assert process.wait(timeout=60) == 1
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
-def test_ended_from_outside_and_completed_after(tmp_path: Path, photos: Path, number: signal.Signals) -> None:
-    workspace = tmp_path / "flight"
+def test_signs_that_stdout_lacks_are_escaped() -> None:
+    """As a pipe on Windows, which has no ≥ and no σ."""
+    code = "from georef_cli.main import main; main(['train', '--help'])"
+    environment = {**os.environ, "PYTHONIOENCODING": "cp1252"}
+    command = [sys.executable, "-c", code]
+    run = subprocess.run(command, check=True, capture_output=True, env=environment, cwd=REPOSITORY)
+    assert run.stderr == b""
+    assert rb"[\u2265 1]" in run.stdout
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no process can be sent these")
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGKILL"])
+def test_ended_from_outside_and_completed_after(tmp_path: Path, photos: Path, name: str) -> None:
+    workspace, number = tmp_path / "flight", signal.Signals[name]
     process = start("run", workspace, "--images", photos, code=SLEEPING)
     deadline = time.monotonic() + 60
     while not (workspace / "train.partial/begun").exists():
@@ -103,7 +117,7 @@ def test_ended_from_outside_and_completed_after(tmp_path: Path, photos: Path, nu
     process.send_signal(number)
     ended = finish(process)
     assert ended.out == ""
-    assert ended.code == (-number if number == signal.SIGKILL else 130)
+    assert ended.code == (-number if name == "SIGKILL" else 130)
     assert "Traceback" not in ended.err
     again = finish(start("run", workspace, "--json"))
     assert again.code == 0

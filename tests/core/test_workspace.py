@@ -23,6 +23,7 @@ from pipelines.geodesy.vertical import VerticalDatum
 from tests import fakes
 
 TRAIN = BY_NAME["train"]
+FORKS = pytest.mark.skipif(sys.platform == "win32", reason="no fork, no SIGKILL")
 WRITING = os.O_WRONLY | os.O_RDWR
 CHANGES = ("os.rename", "os.remove", "os.rmdir", "os.mkdir")
 
@@ -85,6 +86,7 @@ def assert_tidy(workspace: Workspace) -> None:
     assert left == []
 
 
+@FORKS
 @pytest.mark.usefixtures("fake_stages")
 class TestKilledAtAnyMoment:
     """Every change of the file system is a kill point: the process dies ahead of each in turn."""
@@ -140,6 +142,7 @@ class TestKilledAtAnyMoment:
             assert all((out / name / "part").exists() == continued for name in folders)
 
 
+@FORKS
 def test_replaced_product_is_the_old_one_or_the_new(tmp_path: Path) -> None:
     """As `calibrate` makes a survey anew, killed ahead of each change."""
     old, new = (VerticalDatum(name=name, stated=True) for name in ("old", "new"))
@@ -168,6 +171,7 @@ class TestLock:
             assert workspace.writer() == "train"
         assert workspace.writer() is None
 
+    @FORKS
     def test_lock_dies_with_its_holder(self, workspace: Workspace) -> None:
         child = os.fork()
         if child == 0:

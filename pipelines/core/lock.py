@@ -1,0 +1,100 @@
+"""One writer at a time in a folder.
+
+The operating system holds the lock and drops it when its holder dies: no stale lock is left to be removed. The
+holder's name stands in a file of its own, because Windows lets no other process read a locked file.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+from filelock import lock_descriptor, unlock_descriptor
+
+from pipelines.core.errors import InputError, WorkspaceBusyError
+
+LOCK = ".lock"
+HOLDER = ".lock.holder"
+# Asking who writes takes the lock for an instant, which must neither turn a writer away nor look like one.
+_ATTEMPTS, _PAUSE_S = 3, 0.05
+_IN_PROCESS = " in process "
+
+
+@dataclass(frozen=True)
+class WriteLock:
+    """The right to write in a folder, which one process has at a time.
+
+    Attributes:
+        folder: the folder; made when the lock is first held.
+    """
+
+    folder: Path
+
+    @contextmanager
+    def hold(self, activity: str) -> Iterator[None]:
+        """Hold the lock while the context lasts.
+
+        Args:
+            activity: the command that writes, for those who find the folder busy.
+
+        Raises:
+            WorkspaceBusyError: another process holds it; names that process and its activity.
+            InputError: the folder cannot be made, written or locked.
+        """
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            handle = (self.folder / LOCK).open("ab")
+        except OSError as error:
+            raise InputError(f"cannot be used as a workspace: {error.strerror}", path=self.folder) from error
+        with handle:
+            try:
+                locked = _lock(handle, _ATTEMPTS)
+            except OSError as error:
+                raise InputError(f"cannot be locked: {error.strerror}", path=self.folder) from error
+            if not locked:
+                raise WorkspaceBusyError(
+                    f"{self.folder} is being written by {self._holder()}: wait for it, or stop it"
+                )
+            try:
+                (self.folder / HOLDER).write_text(f"{activity}{_IN_PROCESS}{os.getpid()}", encoding="utf-8")
+                yield
+            finally:
+                unlock_descriptor(handle.fileno())
+
+    def activity(self) -> str | None:
+        """Return the activity of the process that holds the lock now, or None."""
+        path = self.folder / LOCK
+        try:
+            # A network file system locks only a file that is open for writing.
+            with path.open("r+b" if os.access(path, os.W_OK) else "rb") as handle:
+                # A stage under way asks as well, and need not wait for itself.
+                own = self._holder().endswith(f"{_IN_PROCESS}{os.getpid()}")
+                if not _lock(handle, attempts=1 if own else _ATTEMPTS):
+                    return self._holder().partition(_IN_PROCESS)[0]
+                unlock_descriptor(handle.fileno())
+        except OSError:
+            pass  # no lock file, or none that can be opened: nobody writes
+        return None
+
+    def _holder(self) -> str:
+        """Return the holder's activity and process: true only while the lock is held."""
+        try:
+            text = (self.folder / HOLDER).read_text(encoding="utf-8").strip()
+        except (OSError, UnicodeDecodeError):
+            text = ""
+        return text or "another process"
+
+
+def _lock(handle: BinaryIO, attempts: int) -> bool:
+    """Return whether the lock of an open file was had within the attempts."""
+    for attempt in range(attempts):
+        if attempt:
+            time.sleep(_PAUSE_S)
+        if lock_descriptor(handle.fileno(), blocking=False):
+            return True
+    return False

@@ -1,0 +1,98 @@
+"""The files around the code agree with it: version, hosted checks, forms, API pages, types for users."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+from ruamel.yaml import YAML
+
+import pipelines
+from tests.cli_runs import finish, start
+
+REPOSITORY = Path(__file__).parents[1]
+FORMS = sorted((REPOSITORY / ".github/ISSUE_TEMPLATE").glob("*.yml"))
+
+
+def load_yaml(path: Path) -> Any:
+    return YAML(typ="safe").load(path.read_text(encoding="utf-8"))
+
+
+def project() -> dict[str, Any]:
+    return tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))
+
+
+class TestVersion:
+    def test_package_is_built_with_it(self) -> None:
+        assert project()["project"]["dynamic"] == ["version"]
+        assert project()["tool"]["setuptools"]["dynamic"]["version"] == {"attr": "pipelines.__version__"}
+        assert re.fullmatch(r"\d+\.\d+\.\d+", pipelines.__version__)
+
+    def test_command_line_tells_it(self) -> None:
+        assert finish(start("--version")).out == f"georef {pipelines.__version__}\n"
+
+    def test_citation_has_it(self) -> None:
+        assert str(load_yaml(REPOSITORY / "CITATION.cff")["version"]) == pipelines.__version__
+
+    def test_changelog_is_at_it(self) -> None:
+        """Above the version's own part there is nothing but changes that are not released."""
+        headings = re.findall(r"^## (\S+)", (REPOSITORY / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
+        assert headings[0] == "Unreleased" or headings[0] == pipelines.__version__
+
+
+def test_citation_names_the_paper() -> None:
+    """The keys that the format's schema 1.2.0 asks for, and the paper."""
+    citation = load_yaml(REPOSITORY / "CITATION.cff")
+    assert str(citation["cff-version"]) == "1.2.0"
+    assert all(citation[key] for key in ("message", "title", "authors"))
+    (paper,) = citation["references"]
+    assert all(paper[key] for key in ("type", "title", "authors"))
+    assert paper["doi"] == "10.3390/drones10030195"
+
+
+class TestHostedChecks:
+    def job(self) -> Any:
+        (job,) = load_yaml(REPOSITORY / ".github/workflows/ci.yml")["jobs"].values()
+        return job
+
+    def test_run_what_every_change_must_pass(self) -> None:
+        runs = [step for step in self.job()["steps"] if "run" in step]
+        assert [(step["run"], step["shell"]) for step in runs] == [(".ci/run", "bash")]
+
+    def test_cover_every_python_and_system_that_the_package_claims(self) -> None:
+        matrix, about = self.job()["strategy"]["matrix"], project()["project"]
+        claims = "\n".join(about["classifiers"])
+        assert matrix["python"] == re.findall(r"Python :: (3\.\d+)$", claims, re.MULTILINE)
+        assert about["requires-python"] == f">={matrix['python'][0]}"
+        systems = {"ubuntu-latest": "Linux", "macos-latest": "MacOS", "windows-latest": "Windows"}
+        assert {systems[name] for name in matrix["system"]} == set(re.findall(r"System ::.* (\w+)$", claims, re.M))
+
+
+@pytest.mark.parametrize("path", [path for path in FORMS if path.name != "config.yml"], ids=lambda path: path.stem)
+def test_form_of_an_issue_is_complete(path: Path) -> None:
+    form = load_yaml(path)
+    assert form["name"] and form["description"]
+    fields = [part for part in form["body"] if part["type"] != "markdown"]
+    names = [part["id"] for part in fields]
+    assert len(names) == len(set(names))
+    assert all(part["attributes"]["label"] for part in fields)
+
+
+def test_every_room_has_its_api_page() -> None:
+    rooms = {path.parent.name for path in (REPOSITORY / "pipelines").glob("*/__init__.py")}
+    pages = {path.stem: path.read_text(encoding="utf-8") for path in (REPOSITORY / "docs/api").glob("*.md")}
+    overview = pages.pop("index")
+    assert set(pages) == rooms
+    for room, text in pages.items():
+        assert f"::: pipelines.{room}\n" in text
+        assert f"({room}.md)" in overview
+        assert f"api/{room}.md" in (REPOSITORY / "mkdocs.yml").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("package", ["georef_cli", "pipelines"])
+def test_types_are_delivered(package: str) -> None:
+    assert (REPOSITORY / package / "py.typed").is_file()
+    assert project()["tool"]["setuptools"]["package-data"][package] == ["py.typed"]
