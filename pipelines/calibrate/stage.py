@@ -31,7 +31,7 @@ from pipelines.core.workspace import Workspace
 from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.rotations import log_so3
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.scene.calibrated import with_rig
+from pipelines.scene.calibrated import apply_calibration as with_calibration
 from pipelines.scene.navigation import NavigationTrack, require_estimable
 from pipelines.scene.observations import control_correspondences
 from pipelines.scene.rig import RigCalibration, RigEstimate
@@ -64,7 +64,7 @@ def calibrate(workspace: Workspace, config: CalibrateOptions) -> RigCalibration:
 def apply_calibration(workspace: Workspace, rig: RigCalibration) -> None:
     """Make the survey of a workspace anew with what is usable of `rig`; the lock is the caller's to hold."""
     survey = load_json(Survey, workspace.path(SURVEY))
-    workspace.replace(SURVEY, with_rig(survey, _track(workspace), rig))
+    workspace.replace(SURVEY, with_calibration(survey, _track(workspace), rig))
 
 
 def calibrate_as_asked(workspace: Workspace) -> tuple[RigCalibration | None, bool]:

@@ -19,17 +19,40 @@ FLU_FROM_FRD = np.diag([1.0, -1.0, -1.0])
 
 @dataclass(frozen=True)
 class Rig:
-    """What is known of an aircraft's rig.
+    """Mount, lever arm and boresight of one camera, or mount and lever arm of each of N photographs.
 
     Attributes:
-        cam_from_body: (3, 3) mount, or None where nobody said.
-        antenna_in_body: (3,) metres from the camera's centre, forward-right-down, or None.
+        cam_from_body: (3, 3) or (N, 3, 3) mount; None or NaN where nothing is known of it.
+        antenna_in_body: (3,) or (N, 3) lever arm: metres from the camera's centre, forward-right-down; None or NaN
+            where nothing is known of it.
         nominal_from_cam: (3, 3) boresight.
     """
 
     cam_from_body: FloatArray | None = None
     antenna_in_body: FloatArray | None = None
     nominal_from_cam: FloatArray = field(default_factory=lambda: np.eye(3))
+
+
+def with_rig(antenna: FloatArray, frame_from_body: FloatArray, rig: Rig) -> tuple[FloatArray, FloatArray]:
+    """Return camera centres (N, 3) and rotations frame ← camera (N, 3, 3), from the navigation of N photographs.
+
+    Where the lever arm is not known, the antenna stands for the camera. A lever arm without an attitude gives no
+    centre, because the arm could point anywhere; no mount or no attitude gives no rotation: both are NaN.
+
+    Args:
+        antenna: (N, 3) metres in any Cartesian frame, or in one for each photograph.
+        frame_from_body: (N, 3, 3) attitudes of the body, forward-right-down, in that frame.
+        rig: of the photographs.
+    """
+    count = len(antenna)
+    center, frame_from_cam = antenna.copy(), np.full((count, 3, 3), np.nan)
+    if rig.antenna_in_body is not None:
+        arm = np.broadcast_to(np.nan_to_num(rig.antenna_in_body), (count, 3))
+        moved = arm.any(axis=1)
+        center[moved] -= np.einsum("nij,nj->ni", frame_from_body[moved], arm[moved])
+    if rig.cam_from_body is not None:
+        frame_from_cam = frame_from_body @ np.swapaxes(rig.cam_from_body, -1, -2) @ rig.nominal_from_cam
+    return center, frame_from_cam
 
 
 def mount(yaw_pitch_roll_deg: ArrayLike) -> FloatArray:

@@ -2,71 +2,64 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
 
-from pipelines.core.types import FloatArray
-from pipelines.geometry.rig import boresight
+from pipelines.core.types import BoolArray, FloatArray
+from pipelines.geometry.rig import boresight, with_rig
 from pipelines.geometry.rotations import matrix_from_quat_xyzw, quat_xyzw_from_matrix
-from pipelines.geometry.trajectory import covered, places_at, turns_at
 from pipelines.scene.navigation import NavigationTrack
 from pipelines.scene.rig import RigCalibration
 from pipelines.scene.survey import Attitude, Fix, Survey, SurveyImage
 
-# A position this far from the middle of all is a blunder, as `ingest` has it.
-_RANGE_M = 100_000.0
+# A position this far from the middle of all is a blunder.
+FIX_RANGE_M = 100_000.0
 ValueT = TypeVar("ValueT")
 
 
-def with_rig(survey: Survey, track: NavigationTrack, rig: RigCalibration) -> Survey:
-    """The survey with everything usable of `rig` in its positions and attitudes, the rest as `ingest` was told.
+def apply_calibration(survey: Survey, track: NavigationTrack, calibration: RigCalibration) -> Survey:
+    """Return the survey with everything usable of a calibration in its positions and attitudes.
 
-    An image that only now lies within the navigation takes σ from the nearest one in time.
+    The rest of the rig stays as `ingest` was told. An image that only now lies within the navigation takes σ from
+    the nearest one in time.
     """
-    found = {one.name: np.array(one.value) for one in rig.estimates if one.usable}
-    start = {one.name: np.array(one.start) for one in rig.estimates}
-    offset_s = float(found["time-offset"][0]) if "time-offset" in found else float(track.time_offset_s)
-    nominal_from_cam = boresight(found["boresight"]) if "boresight" in found else track.nominal_from_cam
-    arm = track.antenna_in_body
-    if "lever-arm" in found:
-        arm = np.nan_to_num(arm) + (found["lever-arm"] - start["lever-arm"])
-    bodies = _bodies(survey, track, offset_s)
-    places = _cameras(track, offset_s, bodies, np.nan_to_num(arm))
-    turned = bodies @ np.swapaxes(track.cam_from_body, 1, 2) @ nominal_from_cam
-    return survey.model_copy(update={"rig": rig, "images": _images(survey, track, places, turned)})
+    values = {estimate.name: np.array(estimate.value) for estimate in calibration.estimates if estimate.usable}
+    starts = {estimate.name: np.array(estimate.start) for estimate in calibration.estimates}
+    offset_s = float(values["time-offset"][0]) if "time-offset" in values else float(track.time_offset_s)
+    rig = track.rig
+    if "boresight" in values:
+        rig = replace(rig, nominal_from_cam=boresight(values["boresight"]))
+    if "lever-arm" in values:
+        arm = np.nan_to_num(track.antenna_in_body) + (values["lever-arm"] - starts["lever-arm"])
+        rig = replace(rig, antenna_in_body=arm)
+    time_s = track.image_time_s + offset_s
+    center, geo_from_cam = with_rig(track.positions.at(time_s).position, _bodies(survey, track, time_s), rig)
+    center[_far_from_others(center)] = np.nan
+    return survey.model_copy(update={"rig": calibration, "images": _images(survey, track, center, geo_from_cam)})
 
 
-def _bodies(survey: Survey, track: NavigationTrack, offset_s: float) -> FloatArray:
-    """Attitudes geo ← body (n, 3, 3) at the track's images, NaN where unknown."""
-    count = len(track.image)
+def _bodies(survey: Survey, track: NavigationTrack, time_s: FloatArray) -> FloatArray:
+    """Return attitudes geo ← body (n, 3, 3) of the track's images at times (n,), NaN where unknown."""
     if len(track.attitude_time_s) > 1:
-        bodies = np.full((count, 3, 3), np.nan)
-        at = track.image_time_s + offset_s
-        known = covered(track.attitude_time_s, at, float(track.max_gap_s))
-        bodies[known] = turns_at(track.attitude_time_s, track.geo_from_body, at[known])
-        return bodies
+        return track.attitudes.at(time_s).rotation
     # Attitudes that came with the photographs, whose boresight nothing has changed.
     recorded = {image.name: image.attitude.quat_xyzw for image in survey.images if image.attitude}
     unknown = (np.nan,) * 4
     quat = np.array([recorded.get(name, unknown) for name in track.image.tolist()]).reshape(-1, 4)
-    cameras = np.full((count, 3, 3), np.nan)
+    geo_from_cam = np.full((len(quat), 3, 3), np.nan)
     known = np.isfinite(quat).all(axis=1)
-    cameras[known] = matrix_from_quat_xyzw(quat[known])
-    return cameras @ track.nominal_from_cam.T @ track.cam_from_body
+    geo_from_cam[known] = matrix_from_quat_xyzw(quat[known])
+    return geo_from_cam @ track.nominal_from_cam.T @ track.cam_from_body
 
 
-def _cameras(track: NavigationTrack, offset_s: float, bodies: FloatArray, arm: FloatArray) -> FloatArray:
-    """Camera centres (n, 3) in geo, NaN where unknown: without attitude no lever arm can be applied."""
-    at = track.image_time_s + offset_s
-    places = np.full((len(at), 3), np.nan)
-    known = covered(track.position_time_s, at, float(track.max_gap_s))
-    places[known] = places_at(track.position_time_s, track.antenna_in_geo, at[known])
-    moved = arm.any(axis=1)
-    places[moved] -= np.einsum("nij,nj->ni", bodies[moved], arm[moved])
-    middle = np.nanmedian(places, axis=0) if known.any() else np.zeros(3)
-    places[np.linalg.norm(np.nan_to_num(places - middle), axis=1) > _RANGE_M] = np.nan
-    return places
+def _far_from_others(center: FloatArray) -> BoolArray:
+    """Return which of the places (n, 3) are blunders; NaN is none."""
+    if np.isnan(center).all():
+        return np.zeros(len(center), dtype=bool)
+    distance_m = np.linalg.norm(center - np.nanmedian(center, axis=0), axis=1)
+    return np.asarray(distance_m > FIX_RANGE_M)
 
 
 def _images(

@@ -13,6 +13,8 @@ from pipelines.core.errors import InputError
 from pipelines.core.options import RigParameter
 from pipelines.core.products import load_npz, save_npz
 from pipelines.core.types import BoolArray, FloatArray
+from pipelines.geometry.rig import Rig
+from pipelines.geometry.trajectory import Trajectory
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,28 @@ class NavigationTrack:
     time_offset_s: FloatArray
     max_gap_s: FloatArray
     body_known: BoolArray
+
+    @property
+    def positions(self) -> Trajectory:
+        """The antenna in geo, on the navigation's clock."""
+        return Trajectory.from_samples(
+            self.position_time_s,
+            position=self.antenna_in_geo,
+            sigma_m=self.sigma_m,
+            max_gap_s=float(self.max_gap_s),
+        )
+
+    @property
+    def attitudes(self) -> Trajectory:
+        """The body in geo, on the navigation's clock."""
+        return Trajectory.from_samples(
+            self.attitude_time_s, rotation=self.geo_from_body, max_gap_s=float(self.max_gap_s)
+        )
+
+    @property
+    def rig(self) -> Rig:
+        """The rig of the n images as `ingest` was told."""
+        return Rig(self.cam_from_body, self.antenna_in_body, self.nominal_from_cam)
 
     def save(self, path: Path) -> None:
         """Write as NPZ."""

@@ -12,7 +12,7 @@ from pipelines.core.fingerprints import layout_of
 from pipelines.core.options import RigParameter
 from pipelines.geometry.rig import boresight
 from pipelines.geometry.rotations import exp_so3, log_so3, matrix_from_quat_xyzw, quat_xyzw_from_matrix
-from pipelines.scene.calibrated import with_rig
+from pipelines.scene.calibrated import apply_calibration
 from pipelines.scene.navigation import NavigationTrack, require_estimable
 from pipelines.scene.rig import RigCalibration, RigEstimate
 from pipelines.scene.survey import Attitude, Survey, SurveyImage
@@ -92,7 +92,7 @@ def test_offset_boresight_and_arm_are_applied(survey: Survey, track: NavigationT
         estimate("boresight", turned_deg, np.zeros(3)),
         estimate("lever-arm", ARM, np.zeros(3)),
     )
-    found = with_rig(survey, track, rig)
+    found = apply_calibration(survey, track, rig)
     at = track.image_time_s + 0.5
     np.testing.assert_allclose(places(found)[:COUNT], cameras(at), atol=1e-5)
     quats = [image.attitude.quat_xyzw for image in found.images[:COUNT] if image.attitude]
@@ -110,16 +110,16 @@ def test_what_is_not_observable_stays_as_told(survey: Survey, track: NavigationT
         estimate("time-offset", np.array([0.5]), np.zeros(1), seen=False),
         estimate("boresight", np.array([9.0, 9.0, 9.0]), np.zeros(3), seen=False),
     )
-    found = with_rig(survey, track, rig)
+    found = apply_calibration(survey, track, rig)
     np.testing.assert_allclose(places(found)[:COUNT], cameras(track.image_time_s), atol=1e-5)
 
 
 def test_nothing_is_invented_beyond_the_ends_or_without_attitude(survey: Survey, track: NavigationTrack) -> None:
-    found = with_rig(survey, track, of(estimate("time-offset", np.array([2.5]), np.zeros(1))))
+    found = apply_calibration(survey, track, of(estimate("time-offset", np.array([2.5]), np.zeros(1))))
     assert [image.fix is None for image in found.images] == [False, False, False, True, True, False]
     gap = (track.attitude_time_s < 0.9) | (track.attitude_time_s > 2.9)
     torn = replace(track, attitude_time_s=track.attitude_time_s[gap], geo_from_body=track.geo_from_body[gap])
-    found = with_rig(survey, torn, of(estimate("time-offset", np.array([0.0]), np.zeros(1))))
+    found = apply_calibration(survey, torn, of(estimate("time-offset", np.array([0.0]), np.zeros(1))))
     # Without attitude the arm could point anywhere: no position either.
     assert [image.fix is None for image in found.images] == [False, True, True, False, False, False]
     assert [image.attitude is None for image in found.images] == [False, True, True, False, False, False]
@@ -133,14 +133,14 @@ def test_attitudes_that_came_with_the_photographs_carry_the_arm(survey: Survey, 
         images[i] = images[i].model_copy(update={"attitude": attitude})
     survey = survey.model_copy(update={"images": tuple(images)})
     bare = replace(track, attitude_time_s=np.empty(0), geo_from_body=np.empty((0, 3, 3)))
-    found = with_rig(survey, bare, of(estimate("time-offset", np.array([0.0]), np.zeros(1))))
+    found = apply_calibration(survey, bare, of(estimate("time-offset", np.array([0.0]), np.zeros(1))))
     np.testing.assert_allclose(places(found)[:COUNT], cameras(track.image_time_s), atol=1e-5)
     assert [image.attitude for image in found.images] == [image.attitude for image in survey.images]
 
 
 def test_layout_is_of_what_was_recorded(survey: Survey, track: NavigationTrack) -> None:
     rig = of(estimate("time-offset", np.array([0.5]), np.zeros(1)))
-    applied = with_rig(survey, track, rig.model_copy(update={"layout": layout_of(survey)}))
+    applied = apply_calibration(survey, track, rig.model_copy(update={"layout": layout_of(survey)}))
     assert layout_of(applied) == layout_of(survey)
     moved = survey.model_copy(update={"images": survey.images[1:]})
     assert layout_of(moved) != layout_of(survey)
