@@ -65,8 +65,6 @@ HOMES: dict[str, tuple[str, ...]] = {
 PENDING = {
     ("pipelines.core.fingerprints", "pipelines.scene.survey"),
     ("pipelines.core.runner", "pipelines.scene.survey"),
-    ("pipelines.formats.odm", "pipelines.ingest.notes"),
-    ("pipelines.formats.trajectory_csv", "pipelines.ingest.notes"),
 }
 CORE_LIBRARIES = {"numpy", "pydantic"}
 

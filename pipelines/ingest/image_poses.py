@@ -23,6 +23,7 @@ from pipelines.geometry.rotations import geo_from_cam, quat_xyzw_from_matrix
 from pipelines.ingest.notes import Notes
 from pipelines.ingest.photo_folder import Photo
 from pipelines.ingest.pose_matching import interpolate, match_by_name
+from pipelines.ingest.pose_tables import usable_rows
 
 SigmaSource = Literal["file", "option", "default"]
 AttitudeSource = Literal["gimbal", "csv", "geo.txt", "bag"]
@@ -96,7 +97,7 @@ def from_tags(photos: Sequence[Photo], options: PoseOptions, notes: Notes) -> Me
     """
     xyz = np.array([_xyz(photo.tags) for photo in photos])
     known = complete(xyz)
-    flat = [photo.name for photo in photos if photo.tags.gps is not None and photo.tags.gps.alt_m is None]
+    flat = [photo.name for photo in photos if photo.tags.gps is not None and altitude_m(photo.tags) is None]
     notes.warn_counted(
         flat, "image has a GPS position without altitude", "images have GPS positions without altitude"
     )
@@ -130,8 +131,10 @@ def from_table(table: PoseTable, photos: Sequence[Photo], options: PoseOptions, 
     even if its EXIF has one: two receivers are not mixed unseen.
 
     Raises:
-        InputError: no CRS for x,y,z, contradicting options, impossible coordinates, or no image matched.
+        InputError: no row with a position, no CRS for x,y,z, contradicting options, impossible coordinates, or no
+            image matched.
     """
+    table = usable_rows(table, notes)
     crs = _crs_of(table, options, notes)
     images = [photo.name for photo in photos]
     rows = match_by_name(table, images, notes) if table.names is not None else table
@@ -240,7 +243,7 @@ def _with_heights(rows: PoseTable, photos: Sequence[Photo], crs: PointCrs, notes
     lacking = np.flatnonzero(np.isnan(rows.xyz[:, 2]))
     if not len(lacking) or rows.names is None:
         return rows
-    altitude = {photo.name: photo.tags.gps.alt_m for photo in photos if photo.tags.gps is not None}
+    altitude = {photo.name: altitude_m(photo.tags) for photo in photos}
     xyz = rows.xyz.copy()
     if crs.height_unit == "metre":
         xyz[lacking, 2] = [_or_nan(altitude.get(rows.names[row])) for row in lacking]
@@ -279,6 +282,15 @@ def _match_by_time(
 def _span(times: FloatArray) -> str:
     ends = (datetime.fromtimestamp(float(end), UTC) for end in (np.nanmin(times), np.nanmax(times)))
     return " to ".join(end.strftime("%Y-%m-%d %H:%M:%S UTC") for end in ends)
+
+
+def altitude_m(tags: PhotoTags) -> float | None:
+    """Return the height of a photograph that has a GPS position: EXIF's, else that of DJI's XMP."""
+    if tags.gps is None:
+        return None
+    if tags.gps.alt_m is None and tags.dji is not None:
+        return tags.dji.absolute_altitude_m
+    return tags.gps.alt_m
 
 
 def _tag_sigma(tags: PhotoTags) -> tuple[FloatArray, str]:
@@ -343,7 +355,7 @@ def _spread(values: FloatArray | None, at: IntArray, count: int, width: int) -> 
 
 def _xyz(tags: PhotoTags) -> tuple[float, float, float]:
     gps = tags.gps
-    return (np.nan, np.nan, np.nan) if gps is None else (gps.lon_deg, gps.lat_deg, _or_nan(gps.alt_m))
+    return (np.nan, np.nan, np.nan) if gps is None else (gps.lon_deg, gps.lat_deg, _or_nan(altitude_m(tags)))
 
 
 def _or_nan(value: float | None) -> float:

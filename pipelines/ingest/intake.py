@@ -113,9 +113,9 @@ def _from_folder(config: IngestOptions, notes: Notes, progress: Progress) -> Int
     options = pose_options(config)
     table: PoseTable | None = None
     if config.trajectory is not None:
-        table = read_trajectory(config.trajectory, notes)
+        table = read_trajectory(config.trajectory)
     elif config.geo is not None:
-        table = read_geo(config.geo, notes)
+        table = read_geo(config.geo)
     measured = from_tags(photos, options, notes) if table is None else from_table(table, photos, options, notes)
     names, recorded = [photo.name for photo in photos], measured.recorded
     if config.time_offset_s and recorded is None:

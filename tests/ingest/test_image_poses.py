@@ -105,6 +105,14 @@ def test_images_without_altitude_and_with_other_datums_are_noted() -> None:
     assert "GPSMapDatum TOKYO is taken as WGS84" in notes.assumptions
 
 
+def test_height_is_of_exif_or_else_of_xmp() -> None:
+    flat, dji = replace(GPS, alt_m=None), DjiTags(absolute_altitude_m=198.31)
+    photos = _photos(PhotoTags(gps=flat, dji=dji), PhotoTags(gps=GPS, dji=dji), PhotoTags(dji=dji))
+    found = from_tags(photos, PoseOptions(), Notes())
+    assert found.located.tolist() == [True, True, False]
+    np.testing.assert_allclose(found.lla[:2, 2], [198.31, 1620.0], rtol=0, atol=1e-8)
+
+
 def test_a_table_by_name_wins_over_exif_and_does_not_mix_with_it() -> None:
     notes = Notes()
     photos = _photos(*[PhotoTags(gps=replace(GPS, lat_deg=10.0), timestamp_s=5.0)] * 3)
