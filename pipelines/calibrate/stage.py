@@ -23,7 +23,6 @@ from pipelines.calibrate.rig_fit import (
 )
 from pipelines.core.errors import DegenerateGeometryError, InputError
 from pipelines.core.fingerprints import layout_of, product_hash
-from pipelines.core.options import RigParameter
 from pipelines.core.products import load_json
 from pipelines.core.stages import SPARSE, SURVEY, TRACK
 from pipelines.core.types import FloatArray
@@ -34,7 +33,7 @@ from pipelines.geometry.sparse_model import SparseModel
 from pipelines.scene.calibrated import apply_calibration as with_calibration
 from pipelines.scene.navigation import NavigationTrack, require_estimable
 from pipelines.scene.observations import control_correspondences
-from pipelines.scene.rig import RigCalibration, RigEstimate
+from pipelines.scene.rig import RigCalibration, RigEstimate, RigParameter
 from pipelines.scene.survey import Survey
 
 log = logging.getLogger(__name__)
@@ -82,7 +81,7 @@ def calibrate_as_asked(workspace: Workspace) -> tuple[RigCalibration | None, boo
     if survey.rig is not None and survey.rig.model == product_hash(workspace, SPARSE):
         return survey.rig, False
     try:
-        found = calibrate(workspace, CalibrateOptions(estimate=",".join(wanted)))
+        found = calibrate(workspace, CalibrateOptions(estimate=wanted))
     except DegenerateGeometryError as error:
         found = RigCalibration(
             wanted=wanted, problem=str(error), model=product_hash(workspace, SPARSE), layout=layout_of(survey)
@@ -120,7 +119,7 @@ def estimate_rig(
     survey: Survey, model: SparseModel, track: NavigationTrack, config: CalibrateOptions
 ) -> RigCalibration:
     """As `calibrate`, of products."""
-    wanted = config.wanted
+    wanted = config.estimate
     require_estimable(track, wanted, "--estimate")
     data = _data(survey, model, track)
     start_s = float(track.time_offset_s)

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.core.errors import InputError
-from pipelines.core.options import triple
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import FloatArray
 from pipelines.formats.odm import read_geo
@@ -21,7 +20,7 @@ from pipelines.geodesy.vertical import parse_vertical
 from pipelines.geometry.rig import Rig, boresight, mount
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.ingest.bag.flight import BagOptions, RawTrack, read_flight
-from pipelines.ingest.bag.photos import FrameOptions, parse_every
+from pipelines.ingest.bag.photos import FrameOptions
 from pipelines.ingest.bag.topics import AskedTopics
 from pipelines.ingest.camera_priors import camera_priors
 from pipelines.ingest.image_poses import Measured, PoseOptions, from_table, from_tags
@@ -73,10 +72,10 @@ def take_in(config: IngestOptions, frames: Path | None, notes: Notes, progress: 
         InputError: options that contradict each other, anything wrong with the inputs, too few photographs.
     """
     _check_options(config, frames)
-    if config.wanted:
+    if config.estimated:
         notes.assume(
-            f"{', '.join(config.wanted)}: as given, until `georef run` or `georef calibrate --apply` has estimated "
-            "it after sfm"
+            f"{', '.join(config.estimated)}: as given, until `georef run` or `georef calibrate --apply` has "
+            "estimated it after sfm"
         )
     if config.bag is not None and frames is not None:
         return _from_bag(config, config.bag, frames, notes, progress)
@@ -86,11 +85,11 @@ def take_in(config: IngestOptions, frames: Path | None, notes: Notes, progress: 
 def _from_bag(config: IngestOptions, bag: Path, frames: Path, notes: Notes, progress: Progress) -> Intake:
     origin = None
     if config.origin is not None:
-        lat, lon, alt = triple(config.origin)
+        lat, lon, alt = config.origin
         origin = Origin(lat_deg=lat, lon_deg=lon, alt_m=alt)
     options = BagOptions(
         topics=AskedTopics(config.image_topic, config.fix_topic, config.attitude_topic),
-        frames=FrameOptions(parse_every(config.every) if config.every else None, config.skip_blurred),
+        frames=FrameOptions(config.every, config.skip_blurred),
         local_origin=origin,
         time_offset_s=config.time_offset_s,
         rig=_rig(config),
@@ -166,9 +165,9 @@ def _check_options(config: IngestOptions, frames: Path | None) -> None:
 
 def _rig(config: IngestOptions) -> Rig:
     return Rig(
-        cam_from_body=mount(triple(config.camera_mount)) if config.camera_mount is not None else None,
-        antenna_in_body=np.array(triple(config.lever_arm)) if config.lever_arm is not None else None,
-        nominal_from_cam=boresight(triple(config.boresight)),
+        cam_from_body=mount(config.camera_mount) if config.camera_mount is not None else None,
+        antenna_in_body=np.array(config.lever_arm) if config.lever_arm is not None else None,
+        nominal_from_cam=boresight(config.boresight),
     )
 
 

@@ -109,8 +109,8 @@ def survey_and_track(
     if config.test_every and not _held_out(len(photos), config.test_every):
         notes.warn(f"{len(photos)} images are too few to hold any out for testing")
     track = taken.track(origin)
-    if config.wanted:
-        require_estimable(track, config.wanted, "--estimate" if config.estimate else "--time-offset")
+    if config.estimated:
+        require_estimable(track, config.estimated, "--estimate" if config.estimate else "--time-offset")
     survey = Survey(
         origin=origin,
         source_crs=measured.crs_name if control_file is None or measured.located.any() else control_file.crs_name,
@@ -122,7 +122,7 @@ def survey_and_track(
         check_points=_surveyed(check, origin, config),
         assumptions=tuple(notes.assumptions),
         warnings=tuple(notes.warnings),
-        estimate=config.wanted,
+        estimate=config.estimated,
     )
     return survey, track
 

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 
 from pipelines.core.errors import InputError
-from pipelines.core.options import AUTO
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.similarity import moved_pivot
 from pipelines.georef.adjustment import RotationPrior
@@ -61,7 +60,7 @@ def geo_problem(
     )
     if len(problem.errors):
         saved = begin(problem)
-        if options.estimate == AUTO and not bias_pays(problem, saved):
+        if options.estimate == "auto" and not bias_pays(problem, saved):
             problem.errors = SystematicErrors()
     return problem
 
@@ -118,7 +117,7 @@ def _measured(
 def _errors(measured: Measured, options: GeographicOptions) -> SystematicErrors:
     """The constant errors that are asked for; with `auto` the bias, wherever control points could show it."""
     fixes, attitudes, wanted = measured.fixes, measured.attitudes, options.estimated
-    if options.estimate == AUTO:
+    if options.estimate == "auto":
         possible = options.weighting == "whitened" and fixes is not None and _determined_by(measured.marks)
         wanted = ("bias",) if possible else ()
     for name, source, what in (

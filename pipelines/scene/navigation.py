@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.core.errors import InputError
-from pipelines.core.options import RigParameter
 from pipelines.core.products import load_npz, save_npz
 from pipelines.core.types import BoolArray, FloatArray
 from pipelines.geometry.rig import Rig
 from pipelines.geometry.trajectory import Trajectory
+from pipelines.scene.rig import RigParameter
 
 
 @dataclass(frozen=True)

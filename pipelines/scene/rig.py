@@ -2,10 +2,30 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Collection
+from typing import Annotated, Literal, get_args
 
-from pipelines.core.options import RigParameter
+from pydantic import AfterValidator
+
+from pipelines.core.options import WRITTEN, from_text, listed_names
 from pipelines.core.products import Product
+
+RigParameter = Literal["time-offset", "boresight", "lever-arm"]
+RIG_PARAMETERS: tuple[RigParameter, ...] = get_args(RigParameter)
+
+
+def in_usual_order(names: Collection[RigParameter]) -> tuple[RigParameter, ...]:
+    """Return parameters of the rig in their usual order, each once."""
+    return tuple(name for name in RIG_PARAMETERS if name in names)
+
+
+# An option: parameters of the rig.
+RigParameters = Annotated[
+    tuple[RigParameter, ...],
+    from_text(lambda text: listed_names(text, RIG_PARAMETERS)),
+    AfterValidator(in_usual_order),
+    WRITTEN,
+]
 
 
 class RigEstimate(Product):

@@ -9,13 +9,12 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from pipelines.core.options import RigParameter
 from pipelines.core.products import Covariance3, ImageName, Product, Rotation
 from pipelines.core.types import Vector3
 from pipelines.core.validators import image_dir
 from pipelines.geodesy.enu import Origin
 from pipelines.geodesy.vertical import VerticalDatum
-from pipelines.scene.rig import RigCalibration
+from pipelines.scene.rig import RigCalibration, RigParameter
 
 
 class CameraPrior(Product):

@@ -208,7 +208,7 @@ def test_workspace_without_navigation_by_time(tmp_path: Path, command: Command) 
 
 
 def test_wanted_is_checked() -> None:
-    assert CalibrateOptions(estimate="lever-arm,time-offset").wanted == ("time-offset", "lever-arm")
+    assert CalibrateOptions(estimate="lever-arm,time-offset").estimate == ("time-offset", "lever-arm")
     with pytest.raises(ValueError, match="none of"):
         CalibrateOptions(estimate="")
 

@@ -9,12 +9,11 @@ import pytest
 
 from pipelines.core.errors import InputError
 from pipelines.core.fingerprints import layout_of
-from pipelines.core.options import RigParameter
 from pipelines.geometry.rig import boresight
 from pipelines.geometry.rotations import exp_so3, log_so3, matrix_from_quat_xyzw, quat_xyzw_from_matrix
 from pipelines.scene.calibrated import apply_calibration
 from pipelines.scene.navigation import NavigationTrack, require_estimable
-from pipelines.scene.rig import RigCalibration, RigEstimate
+from pipelines.scene.rig import RigCalibration, RigEstimate, RigParameter
 from pipelines.scene.survey import Attitude, Survey, SurveyImage
 from tests.scenes import Measured, Noise, make_scene, survey_of
 

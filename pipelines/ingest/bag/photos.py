@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import re
 from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -19,6 +17,7 @@ from pipelines.formats.exif import PhotoTags
 from pipelines.formats.image_file import inspect_image
 from pipelines.ingest.bag.streams import Clock
 from pipelines.ingest.notes import Notes
+from pipelines.ingest.options import Every
 from pipelines.ingest.photo_folder import Photo
 
 # A frame is blurred if it is less than half as sharp as the frames around it.
@@ -26,26 +25,6 @@ _BLURRED = 0.5
 _NEIGHBOURS = 15
 _LEAST_NEIGHBOURS = 3
 _STEP_SLACK_S = 1e-6
-
-
-@dataclass(frozen=True)
-class Every:
-    """Distance between frames, in seconds or in metres flown."""
-
-    step: float
-    unit: Literal["s", "m"]
-
-
-def parse_every(text: str) -> Every:
-    """Read `2s`, `0.5 s` or `5m`.
-
-    Raises:
-        InputError: anything else.
-    """
-    match = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*([sm])\s*", text)
-    if match is None or float(match[1]) <= 0:
-        raise InputError(f"{text!r} is neither seconds nor metres: give e.g. 2s or 5m", field="--every")
-    return Every(float(match[1]), "s" if match[2] == "s" else "m")
 
 
 @dataclass
