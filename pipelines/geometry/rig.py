@@ -32,6 +32,12 @@ class Rig:
     antenna_in_body: FloatArray | None = None
     nominal_from_cam: FloatArray = field(default_factory=lambda: np.eye(3))
 
+    def of_each(self, count: int) -> tuple[FloatArray, FloatArray]:
+        """Return the mount (N, 3, 3) and the lever arm (N, 3) of each of N photographs, NaN where unknown."""
+        mounts = np.nan if self.cam_from_body is None else self.cam_from_body
+        arms = np.nan if self.antenna_in_body is None else self.antenna_in_body
+        return np.broadcast_to(mounts, (count, 3, 3)).copy(), np.broadcast_to(arms, (count, 3)).copy()
+
 
 def with_rig(antenna: FloatArray, frame_from_body: FloatArray, rig: Rig) -> tuple[FloatArray, FloatArray]:
     """Return camera centres (N, 3) and rotations frame ← camera (N, 3, 3), from the navigation of N photographs.
@@ -44,15 +50,11 @@ def with_rig(antenna: FloatArray, frame_from_body: FloatArray, rig: Rig) -> tupl
         frame_from_body: (N, 3, 3) attitudes of the body, forward-right-down, in that frame.
         rig: of the photographs.
     """
-    count = len(antenna)
-    center, frame_from_cam = antenna.copy(), np.full((count, 3, 3), np.nan)
-    if rig.antenna_in_body is not None:
-        arm = np.broadcast_to(np.nan_to_num(rig.antenna_in_body), (count, 3))
-        moved = arm.any(axis=1)
-        center[moved] -= np.einsum("nij,nj->ni", frame_from_body[moved], arm[moved])
-    if rig.cam_from_body is not None:
-        frame_from_cam = frame_from_body @ np.swapaxes(rig.cam_from_body, -1, -2) @ rig.nominal_from_cam
-    return center, frame_from_cam
+    mounts, arms = rig.of_each(len(antenna))
+    arms = np.nan_to_num(arms)
+    center, moved = antenna.copy(), arms.any(axis=1)
+    center[moved] -= np.einsum("nij,nj->ni", frame_from_body[moved], arms[moved])
+    return center, frame_from_body @ np.swapaxes(mounts, -1, -2) @ rig.nominal_from_cam
 
 
 def mount(yaw_pitch_roll_deg: ArrayLike) -> FloatArray:

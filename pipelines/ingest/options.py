@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field
 
 from pipelines.core.options import WRITTEN, InputPath, PlaceOnEarth, StageOptions, Triple, from_text
+from pipelines.geodesy.vertical import VerticalChoice, parse_vertical
 from pipelines.scene.rig import RigParameter, RigParameters, in_usual_order
 
 
@@ -40,6 +41,7 @@ def _sensible(offset: float | Literal["auto"]) -> float | Literal["auto"]:
     return offset
 
 
+Vertical = Annotated[VerticalChoice, from_text(parse_vertical), WRITTEN]
 FrameDistance = Annotated[Every, from_text(_every), WRITTEN]
 TimeOffset = Annotated[float | Literal["auto"], from_text(_seconds), AfterValidator(_sensible), WRITTEN]
 
@@ -89,7 +91,7 @@ class IngestOptions(StageOptions):
     check: tuple[str, ...] = Field((), description="Name of a control point to use as a check point instead.")
     test_every: int = Field(8, ge=0, description="Hold out every N-th image for testing (0: none).")
     crs: str | None = Field(None, description="CRS of x,y,z columns in the trajectory, e.g. EPSG:32632+5773.")
-    vertical: str | None = Field(
+    vertical: Vertical | None = Field(
         None, description="Vertical datum of the heights: ellipsoidal, EGM96, EGM2008 or EPSG:n."
     )
     sigma_h: float | None = Field(None, gt=0, description="Horizontal σ of every position in metres.")
