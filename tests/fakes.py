@@ -14,7 +14,7 @@ from pathlib import Path
 from types import ModuleType
 
 from pipelines.core.options import StageOptions
-from pipelines.core.stages import PIPELINE, STAGES, StageSpec, products_of
+from pipelines.core.stages import PIPELINE, STAGES, StageSpec, producer_of, products_of
 from pipelines.core.workspace import StageRun, Summary, Workspace
 
 Run = Callable[[StageRun, StageOptions], Summary]
@@ -41,10 +41,10 @@ def read_products(workspace: Workspace, spec: StageSpec) -> list[str]:
 def fake_run(spec: StageSpec) -> Run:
     """The `run` of a fake stage."""
 
-    def run(stage: StageRun, config: StageOptions) -> Summary:
+    def run(stage: StageRun, options: StageOptions) -> Summary:
         read = "".join(read_products(stage.workspace, s)[0] for s in PIPELINE if _reads(spec, s))
-        told = {"stage": spec.name, "options": config.model_dump(mode="json"), "read": _digest(read)}
-        text = json.dumps(told, separators=(",", ":"))
+        document = {"stage": spec.name, "options": options.model_dump(mode="json"), "read": _digest(read)}
+        text = json.dumps(document, separators=(",", ":"))
         with stage.progress.task(spec.name, 2) as task:
             task.advance(note="half")
             task.advance()
@@ -75,4 +75,4 @@ def _digest(text: str) -> str:
 
 
 def _reads(spec: StageSpec, other: StageSpec) -> bool:
-    return any(product.startswith(f"{other.folder}/") for product in spec.reads)
+    return any(producer_of(part.product) is other for part in spec.reads if not part.optional)

@@ -61,11 +61,6 @@ HOMES: dict[str, tuple[str, ...]] = {
     "embreex": ("pipelines.simulate",),
     "matplotlib": ("pipelines.plots",),
 }
-# Arrows that are still to be turned round; none may be added.
-PENDING = {
-    ("pipelines.core.fingerprints", "pipelines.scene.survey"),
-    ("pipelines.core.runner", "pipelines.scene.survey"),
-}
 CORE_LIBRARIES = {"numpy", "pydantic"}
 
 
@@ -101,9 +96,7 @@ def own_imports() -> list[tuple[str, str]]:
     for module, tree in sources().items():
         for name in imports(tree):
             if name.startswith(PACKAGES):
-                target = name if name in sources() else name.rpartition(".")[0]
-                if (module, target) not in PENDING:
-                    pairs.append((module, target))
+                pairs.append((module, name if name in sources() else name.rpartition(".")[0]))
     return pairs
 
 

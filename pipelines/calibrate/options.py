@@ -9,11 +9,17 @@ from pipelines.scene.rig import RigParameters
 
 
 class CalibrateOptions(StageOptions):
-    """What `georef calibrate` estimates from the SfM cameras and the recorded navigation."""
+    """What `georef calibrate` estimates from the SfM cameras and the recorded navigation, and what it applies."""
 
-    estimate: RigParameters = Field(
-        ("time-offset", "boresight"), description="Any of time-offset, boresight and lever-arm, with commas."
+    estimate: RigParameters | None = Field(
+        None,
+        description="Any of time-offset, boresight and lever-arm, with commas (default: what ingest was asked to "
+        "estimate).",
     )
     max_offset: float = Field(
         2.0, gt=0, le=60, description="Search the time offset so many seconds on either side of the present one."
+    )
+    apply: bool | None = Field(
+        None,
+        description="Apply the estimates that are observable, or none (default: those that ingest was asked for).",
     )

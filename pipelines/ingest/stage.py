@@ -82,8 +82,8 @@ def _read_inputs(options: IngestOptions, frames: Path | None, notes: Notes, prog
     check_options(options, frames)
     if options.estimated:
         notes.assume(
-            f"{', '.join(options.estimated)}: as given, until `georef run` or `georef calibrate --apply` has "
-            "estimated it after sfm"
+            f"{', '.join(options.estimated)}: as given, until `georef run` or `georef calibrate` has estimated it "
+            "after sfm"
         )
     flight = _read_flight(options, frames, notes, progress)
     sizes = {photo.name: (photo.file.width, photo.file.height) for photo in flight.photos}

@@ -1,32 +1,59 @@
-"""What is known of the rig after sfm, put into a survey: positions and attitudes anew from the navigation."""
+"""The survey with the calibration of its rig: positions and attitudes anew from the navigation."""
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
 
+from pipelines.core.errors import MissingProductError
+from pipelines.core.products import load_json
+from pipelines.core.stages import RIG, SURVEY
 from pipelines.core.types import BoolArray, FloatArray
+from pipelines.core.workspace import Workspace
 from pipelines.geometry.rig import boresight, with_rig
 from pipelines.geometry.rotations import matrix_from_quat_xyzw, quat_xyzw_from_matrix
-from pipelines.scene.navigation import NavigationTrack
+from pipelines.scene.navigation import NavigationTrack, load_track
 from pipelines.scene.rig import RigCalibration
 from pipelines.scene.survey import Attitude, Fix, Survey, SurveyImage
+
+log = logging.getLogger(__name__)
 
 # A position this far from the middle of all is a blunder.
 FIX_RANGE_M = 100_000.0
 ValueT = TypeVar("ValueT")
 
 
+def load_survey(workspace: Workspace) -> Survey:
+    """Return the survey of a workspace, with the calibration of the rig in its positions and attitudes.
+
+    Raises:
+        MissingProductError: there is no survey.
+        InputError: a product is damaged, or there is no navigation to apply the calibration to.
+    """
+    survey = load_json(Survey, workspace.path(SURVEY))
+    try:
+        calibration = load_json(RigCalibration, workspace.path(RIG))
+    except MissingProductError:
+        if survey.estimate:
+            log.warning(
+                "%s were to be estimated after sfm: `georef calibrate` or `georef run` does it",
+                ", ".join(survey.estimate),
+            )
+        return survey
+    return apply_calibration(survey, load_track(workspace), calibration) if calibration.applied else survey
+
+
 def apply_calibration(survey: Survey, track: NavigationTrack, calibration: RigCalibration) -> Survey:
-    """Return the survey with everything usable of a calibration in its positions and attitudes.
+    """Return the survey with the applied estimates of a calibration in its positions and attitudes.
 
     The rest of the rig stays as `ingest` was told. An image that only now lies within the navigation takes σ from
     the nearest one in time.
     """
-    values = {estimate.name: np.array(estimate.value) for estimate in calibration.estimates if estimate.usable}
-    starts = {estimate.name: np.array(estimate.start) for estimate in calibration.estimates}
+    values = {estimate.name: np.array(estimate.value) for estimate in calibration.applied}
+    starts = {estimate.name: np.array(estimate.start) for estimate in calibration.applied}
     offset_s = float(values["time-offset"][0]) if "time-offset" in values else float(track.time_offset_s)
     rig = track.rig
     if "boresight" in values:
@@ -37,7 +64,7 @@ def apply_calibration(survey: Survey, track: NavigationTrack, calibration: RigCa
     time_s = track.image_time_s + offset_s
     center, geo_from_cam = with_rig(track.positions.at(time_s).position, _bodies(survey, track, time_s), rig)
     center[_far_from_others(center)] = np.nan
-    return survey.model_copy(update={"rig": calibration, "images": _images(survey, track, center, geo_from_cam)})
+    return survey.model_copy(update={"images": _images(survey, track, center, geo_from_cam)})
 
 
 def _bodies(survey: Survey, track: NavigationTrack, time_s: FloatArray) -> FloatArray:
@@ -63,28 +90,28 @@ def _far_from_others(center: FloatArray) -> BoolArray:
 
 
 def _images(
-    survey: Survey, track: NavigationTrack, places: FloatArray, turned: FloatArray
+    survey: Survey, track: NavigationTrack, center: FloatArray, geo_from_cam: FloatArray
 ) -> tuple[SurveyImage, ...]:
-    own = {image.name: image for image in survey.images}
-    images = [own.get(name) for name in track.image.tolist()]
-    fixes = _filled([None if image is None else image.fix for image in images], track.image_time_s)
-    attitudes = _filled([None if image is None else image.attitude for image in images], track.image_time_s)
+    by_name = {image.name: image for image in survey.images}
+    recorded = [by_name.get(name) for name in track.image.tolist()]
+    fixes = _filled([None if image is None else image.fix for image in recorded], track.image_time_s)
+    attitudes = _filled([None if image is None else image.attitude for image in recorded], track.image_time_s)
     row_of = {name: row for row, name in enumerate(track.image.tolist())}
-    found = []
+    images = []
     for image in survey.images:
         row = row_of.get(image.name)
         if row is None:
-            found.append(image)
+            images.append(image)
             continue
-        update: dict[str, Fix | Attitude | None] = {"fix": _fix(fixes[row], places[row])}
+        update: dict[str, Fix | Attitude | None] = {"fix": _fix(fixes[row], center[row])}
         if len(track.attitude_time_s) > 1:
-            update["attitude"] = _attitude(attitudes[row], turned[row])
-        found.append(image.model_copy(update=update))
-    return tuple(found)
+            update["attitude"] = _attitude(attitudes[row], geo_from_cam[row])
+        images.append(image.model_copy(update=update))
+    return tuple(images)
 
 
 def _filled(values: list[ValueT | None], time_s: FloatArray) -> list[ValueT | None]:
-    """The values, with that of the nearest in time where there is none."""
+    """Return the values, with that of the nearest in time where there is none."""
     known = np.array([row for row, value in enumerate(values) if value is not None], dtype=np.int64)
     if not len(known):
         return values
@@ -94,15 +121,15 @@ def _filled(values: list[ValueT | None], time_s: FloatArray) -> list[ValueT | No
     ]
 
 
-def _fix(like: Fix | None, place: FloatArray) -> Fix | None:
-    if like is None or not np.isfinite(place).all():
+def _fix(like: Fix | None, center: FloatArray) -> Fix | None:
+    if like is None or not np.isfinite(center).all():
         return None
-    x, y, z = (float(value) for value in place)
+    x, y, z = (float(value) for value in center)
     return like.model_copy(update={"position_in_geo": (x, y, z)})
 
 
-def _attitude(like: Attitude | None, turned: FloatArray) -> Attitude | None:
-    if like is None or not np.isfinite(turned).all():
+def _attitude(like: Attitude | None, geo_from_cam: FloatArray) -> Attitude | None:
+    if like is None or not np.isfinite(geo_from_cam).all():
         return None
-    x, y, z, w = (float(value) for value in quat_xyzw_from_matrix(turned))
+    x, y, z, w = (float(value) for value in quat_xyzw_from_matrix(geo_from_cam))
     return like.model_copy(update={"quat_xyzw": (x, y, z, w)})

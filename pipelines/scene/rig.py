@@ -1,8 +1,8 @@
-"""The rig as `calibrate` finds it: time offset, boresight and lever arm with their σ."""
+"""The rig as `calibrate` estimates it: time offset, boresight and lever arm with their σ."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Container
 from typing import Annotated, Literal, get_args
 
 from pydantic import AfterValidator
@@ -14,7 +14,7 @@ RigParameter = Literal["time-offset", "boresight", "lever-arm"]
 RIG_PARAMETERS: tuple[RigParameter, ...] = get_args(RigParameter)
 
 
-def in_usual_order(names: Collection[RigParameter]) -> tuple[RigParameter, ...]:
+def in_usual_order(names: Container[RigParameter]) -> tuple[RigParameter, ...]:
     """Return parameters of the rig in their usual order, each once."""
     return tuple(name for name in RIG_PARAMETERS if name in names)
 
@@ -31,8 +31,8 @@ RigParameters = Annotated[
 class RigEstimate(Product):
     """A parameter of the rig, estimated from the SfM cameras, in sense and unit of `ingest`'s option of that name.
 
-    `start` is what `ingest` was told, `sigma` of each component; `observable` by component: whether σ is small
-    enough to use it.
+    `start` is the value that `ingest` was told, `sigma` of each component; `observable` by component: whether σ is
+    small enough to use it.
     """
 
     name: RigParameter
@@ -49,18 +49,24 @@ class RigEstimate(Product):
 
 
 class RigCalibration(Product):
-    """Estimates of the rig, and what is left over: robust σ per axis of positions (m) and attitudes (degrees).
+    """Product of `calibrate`: estimates of the rig, and which of them are applied when the survey is read.
 
-    `problem` tells why there are none. `model` is the fingerprint of the SfM model that they are from, `layout`
-    that of the survey's positions and attitudes before what is usable was applied to them.
+    `wanted` names the parameters that were to be estimated, `problem` tells why none could be. `rms_position_m` and
+    `rms_attitude_deg` are the robust σ per axis of what is left over.
     """
 
-    wanted: tuple[RigParameter, ...]
-    estimates: tuple[RigEstimate, ...] = ()
+    format_version: Literal[1] = 1
+    wanted: tuple[RigParameter, ...] = ()
+    applied: tuple[RigEstimate, ...] = ()
+    not_applied: tuple[RigEstimate, ...] = ()
     images: int = 0
     control_points: int = 0
     rms_position_m: float | None = None
     rms_attitude_deg: float | None = None
     problem: str = ""
-    model: str = ""
-    layout: str = ""
+
+    @property
+    def estimates(self) -> tuple[RigEstimate, ...]:
+        """All estimates, in the usual order of the parameters."""
+        by_name = {estimate.name: estimate for estimate in (*self.applied, *self.not_applied)}
+        return tuple(by_name[name] for name in in_usual_order(by_name))

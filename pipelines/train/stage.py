@@ -16,18 +16,18 @@ import numpy as np
 import torch
 
 from pipelines.core.products import load_json, save_json
-from pipelines.core.stages import POINTS, SIM3, SPARSE, SURVEY
+from pipelines.core.stages import POINTS, SIM3, SPARSE
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
 from pipelines.georef.problem import GeoProblem
 from pipelines.georef.systematic import ErrorEstimate
+from pipelines.scene.calibrated import load_survey
 from pipelines.scene.geographic import geo_problem
 from pipelines.scene.geolocated import GeolocatedPoints
 from pipelines.scene.initial_similarity import InitialSimilarity
 from pipelines.scene.photographs import ImageCache
 from pipelines.scene.scene import Scene, initial_scene, photographs
-from pipelines.scene.survey import Survey
 from pipelines.scene.trained_model import EstimatedError, TrainedCamera, TrainedLens, TrainedModel
 from pipelines.splat.densify import DefaultSettings, DefaultStrategy, Strategy
 from pipelines.splat.densify_fast import FastSettings, FastStrategy
@@ -99,7 +99,7 @@ def run(stage: StageRun, config: TrainOptions) -> Summary:
     """
     backend = rasterizer(config.backend)  # first: without a GPU, `--backend cuda` need not wait for its refusal
     workspace = stage.workspace
-    survey = load_json(Survey, workspace.path(SURVEY))
+    survey = load_survey(workspace)
     initial = load_json(InitialSimilarity, workspace.path(SIM3))
     scene = initial_scene(read_sparse(workspace.path(SPARSE)), survey, initial)
     images = photographs(scene.sparse, survey, workspace, effort(config).max_image_size)

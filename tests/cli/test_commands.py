@@ -74,7 +74,7 @@ class TestRunOptions:
 
     def test_slice(self, georef: Georef, done: Path) -> None:
         result = georef("run", done, "--from", "sfm", "--to", "init-sim3", "--force", "--json")
-        assert [row["stage"] for row in result.document["stages"]] == ["sfm", "geolocate", "init-sim3"]
+        assert [row["stage"] for row in result.document["stages"]] == ["sfm", "calibrate", "geolocate", "init-sim3"]
         assert all(row["ran"] for row in result.document["stages"])
 
     @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from pipelines.core.workspace import StageRun, Summary, Workspace
 from tests import fakes
 from tests.cli_runs import Georef, Result
 
-SHARED = ["ingest", "sfm", "geolocate"]
+SHARED = ["ingest", "sfm", "calibrate", "geolocate"]
 OWN = ["init-sim3", "train", "evaluate"]
 
 

@@ -20,7 +20,7 @@ from tests import fakes
 
 pytestmark = pytest.mark.usefixtures("fake_stages")
 
-ALL = ["ingest", "sfm", "geolocate", "init-sim3", "train", "evaluate", "export-ply"]
+ALL = ["ingest", "sfm", "calibrate", "geolocate", "init-sim3", "train", "evaluate", "export-ply"]
 
 
 def complete(workspace: Workspace, **flags: dict[str, object]) -> list[str]:
