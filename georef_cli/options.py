@@ -6,17 +6,15 @@ A stage's options are read off its class of options (names, types, meaning, defa
 from __future__ import annotations
 
 import types
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import click
 from pydantic.fields import FieldInfo
 
 from pipelines.core.options import StageOptions, flag_name, is_written, notation
 from pipelines.core.workspace import Workspace
-
-FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
 
 _BOUNDS = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
 
@@ -28,32 +26,32 @@ class WorkspaceType(click.Path):
         super().__init__(file_okay=False, resolve_path=True, path_type=Path)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """The workspace at that path."""
+        """Return the workspace at that path."""
         return value if isinstance(value, Workspace) else Workspace(Path(str(super().convert(value, param, ctx))))
 
 
 def workspace_argument() -> click.Argument:
-    """The workspace, shown as WS."""
+    """Return the workspace as an argument, shown as WS."""
     return click.Argument(["workspace"], type=WorkspaceType(), metavar="WS")
 
 
 def json_option() -> click.Option:
-    """`--json`."""
+    """Return `--json`."""
     return click.Option(["--json", "as_json"], is_flag=True, help="Print the result as one JSON document.")
 
 
 def force_option(help_text: str = "Run even if the product is current.") -> click.Option:
-    """`--force`."""
+    """Return `--force`."""
     return click.Option(["--force"], is_flag=True, help=help_text)
 
 
 def stage_options(options_type: type[StageOptions], only: Iterable[str] | None = None) -> list[click.Option]:
     """Return a click option for each field, or for those named in `only`."""
     names = list(options_type.model_fields) if only is None else list(only)
-    return [config_option(options_type, name) for name in names]
+    return [stage_option(options_type, name) for name in names]
 
 
-def config_option(options_type: type[StageOptions], name: str) -> click.Option:
+def stage_option(options_type: type[StageOptions], name: str) -> click.Option:
     """Return the click option of one field: without a default of its own, only a text that states the field's."""
     info, flag = options_type.model_fields[name], flag_name(options_type, name)
     help_text = " ".join(filter(None, [info.description, _default_and_range(info)]))

@@ -31,11 +31,11 @@ def write_products(stage: StageRun, spec: StageSpec, text: str) -> None:
 
 def read_products(workspace: Workspace, spec: StageSpec) -> list[str]:
     """The texts of all products of a finished stage."""
-    found = []
+    texts = []
     for product in products_of(spec):
         path = workspace.path(product)
-        found.append((path if path.is_file() else path / "content.txt").read_text(encoding="utf-8"))
-    return found
+        texts.append((path if path.is_file() else path / "content.txt").read_text(encoding="utf-8"))
+    return texts
 
 
 def fake_run(spec: StageSpec) -> Run:

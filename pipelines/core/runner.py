@@ -121,7 +121,7 @@ def run_pipeline(
 
 
 def remembered(workspace: Workspace, spec: StageSpec, flags: Flags) -> dict[str, Any]:
-    """The options that a stage was last asked for with, and `flags` on top of them."""
+    """Return the options that a stage was last asked for with, and `flags` on top of them."""
     return {**workspace.requests().get(spec.name, {}), **flags}
 
 
@@ -161,7 +161,7 @@ def _execute(workspace: Workspace, asked: Request, resume: Resume, progress: Pro
 
 
 def _current(workspace: Workspace, asked: Request) -> Manifest | None:
-    """The manifest of a product that need not be made again, or None."""
+    """Return the manifest of a product that need not be made again, or None."""
     spec = asked.spec
     if workspace.placed_by_hand(spec):
         log.info("%s: %s was %s and is kept; --force replaces it", spec.name, spec.product, BY_HAND)

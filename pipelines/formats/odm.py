@@ -106,7 +106,7 @@ def read_ground_points(path: Path) -> GroundPoints:
 
 
 def _rows(path: Path) -> tuple[str, list[tuple[int, list[str]]]]:
-    """The CRS, and line number and cells of each further line; blank lines and comments are passed over."""
+    """Return the CRS, and line number and cells of each further line but blank ones and comments."""
     lines = [(at, text.strip()) for at, text in enumerate(read_lines(path), start=1)]
     lines = [(at, text) for at, text in lines if text and not text.startswith("#")]
     if not lines:

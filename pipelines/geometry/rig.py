@@ -58,7 +58,7 @@ def with_rig(antenna: FloatArray, frame_from_body: FloatArray, rig: Rig) -> tupl
 
 
 def mount(yaw_pitch_roll_deg: ArrayLike) -> FloatArray:
-    """Rotation (3, 3) body → camera of a camera turned by yaw, pitch, roll (Z-Y-X) from the body's forward axis.
+    """Return the rotation (3, 3) body → camera of yaw, pitch, roll (Z-Y-X) from the body's forward axis.
 
     (0, 0, 0) looks ahead, (0, −90, 0) straight down with the top of the image ahead.
     """
@@ -66,12 +66,12 @@ def mount(yaw_pitch_roll_deg: ArrayLike) -> FloatArray:
 
 
 def boresight(rotation_vector_deg: ArrayLike) -> FloatArray:
-    """Rotation (3, 3) true camera axes → nominal camera axes of a rotation vector (3,) in degrees."""
+    """Return the rotation (3, 3) true → nominal camera axes of a rotation vector (3,) in degrees."""
     return exp_so3(np.radians(np.asarray(rotation_vector_deg, dtype=np.float64)))
 
 
 def frame_from_frd(axes: str) -> FloatArray:
-    """Rotation (3, 3) from forward-right-down into a frame's own axes: "frd", "flu" or "optical"."""
+    """Return the rotation (3, 3) from forward-right-down into a frame's own axes: "frd", "flu" or "optical"."""
     if axes == "optical":
         return mount([0.0, 0.0, 0.0])
     return FLU_FROM_FRD.copy() if axes == "flu" else np.eye(3)

@@ -124,9 +124,9 @@ class Survey(Product):
         return self
 
     def image(self, name: str) -> SurveyImage | None:
-        """The image of that name, or None."""
+        """Return the image of that name, or None."""
         return next((image for image in self.images if image.name == name), None)
 
     def names(self, split: Literal["train", "test"]) -> tuple[str, ...]:
-        """Names of the images in a split, in order."""
+        """Return the names of the images in a split, in order."""
         return tuple(image.name for image in self.images if image.split == split)

@@ -50,9 +50,9 @@ def command(capsys: pytest.CaptureFixture[str]) -> Command:
 
     def call(*arguments: object, fails: bool = False) -> Any:
         code = boundary.guarded(cli, [*map(str, arguments), *([] if fails else ["--json"])])
-        told = capsys.readouterr()
-        assert code == (1 if fails else 0), told.err
-        return told.err if fails else {**json.loads(told.out), "err": told.err}
+        captured = capsys.readouterr()
+        assert code == (1 if fails else 0), captured.err
+        return captured.err if fails else {**json.loads(captured.out), "err": captured.err}
 
     return call
 
@@ -105,11 +105,11 @@ def missed(workspace: Path, flight: bags.Flight) -> tuple[np.ndarray, np.ndarray
     """Errors of a survey's positions (n, 3) in metres and of its attitudes (n,) in degrees."""
     survey = load_survey(Workspace(workspace))
     truth = enu_from_lla(lla_from_enu(flight.camera(flight.image_ns), bags.ORIGIN), survey.origin)
-    found = np.array([image.fix.position_in_geo for image in survey.images if image.fix])
+    positions = np.array([image.fix.position_in_geo for image in survey.images if image.fix])
     quats = [image.attitude.quat_xyzw for image in survey.images if image.attitude]
     true_turns = bags.expected(flight, survey.origin)[1] @ boresight(BORESIGHT_DEG)
     turned = log_so3(matrix_from_quat_xyzw(quats) @ np.swapaxes(true_turns, 1, 2))
-    return found - truth, np.degrees(np.linalg.norm(turned, axis=1))
+    return positions - truth, np.degrees(np.linalg.norm(turned, axis=1))
 
 
 def test_run_estimates_after_sfm_and_goes_on(tmp_path: Path, command: Command) -> None:
@@ -121,9 +121,9 @@ def test_run_estimates_after_sfm_and_goes_on(tmp_path: Path, command: Command) -
     assert all(row["ran"] for row in stages.values())
     assert "calibrate: time-offset 0.2" in document["err"]
     assert stages["calibrate"]["values"]["applied"] == ["time-offset", "boresight"]
-    found = {row["name"]: row for row in stages["calibrate"]["values"]["estimates"]}
-    assert found["time-offset"]["value"][0] == pytest.approx(OFFSET_S, abs=0.02)
-    np.testing.assert_allclose(found["boresight"]["value"], BORESIGHT_DEG, atol=0.1)
+    estimates = {row["name"]: row for row in stages["calibrate"]["values"]["estimates"]}
+    assert estimates["time-offset"]["value"][0] == pytest.approx(OFFSET_S, abs=0.02)
+    np.testing.assert_allclose(estimates["boresight"]["value"], BORESIGHT_DEG, atol=0.1)
     position, turned = missed(workspace, flight)
     # 20 ms at 15 m/s, were it all of the offset's error; positions at the start were 3 m off.
     assert np.abs(position).max() < 0.1
@@ -183,14 +183,14 @@ def test_calibrate_and_apply(tmp_path: Path, command: Command, capsys: pytest.Ca
     assert document["stages"][2]["key_figure"] == "nothing to estimate"
     before = load_json(Survey, workspace / SURVEY)
     both = ("--estimate", "time-offset,boresight")
-    found = command("calibrate", workspace, *both)["values"]
-    assert [row["name"] for row in found["estimates"]] == ["time-offset", "boresight"]
+    values = command("calibrate", workspace, *both)["values"]
+    assert [row["name"] for row in values["estimates"]] == ["time-offset", "boresight"]
     # Ingest was asked for nothing: the estimates change nothing that follows.
-    assert found["applied"] == []
+    assert values["applied"] == []
     assert load_survey(Workspace(workspace)) == before
     assert states(command, workspace)["geolocate"] == "current"
-    found = command("calibrate", workspace, *both, "--apply")["values"]
-    assert found["applied"] == ["time-offset", "boresight"]
+    values = command("calibrate", workspace, *both, "--apply")["values"]
+    assert values["applied"] == ["time-offset", "boresight"]
     position, turned = missed(workspace, flight)
     assert np.abs(position).max() < 0.1 and turned.max() < 0.15
     assert load_json(Survey, workspace / SURVEY) == before
@@ -207,11 +207,11 @@ def test_calibrate_and_apply(tmp_path: Path, command: Command, capsys: pytest.Ca
 def test_what_ingest_asked_for_can_be_left_unapplied(tmp_path: Path, command: Command) -> None:
     inputs, workspace = flown(tmp_path, Winding(count=24)), tmp_path / "ws"
     command("run", workspace, *arguments(inputs), "--time-offset", "auto", "--to", "calibrate")
-    found = command("calibrate", workspace, "--no-apply")["values"]
-    assert [row["name"] for row in found["estimates"]] == ["time-offset"] and found["applied"] == []
+    values = command("calibrate", workspace, "--no-apply")["values"]
+    assert [row["name"] for row in values["estimates"]] == ["time-offset"] and values["applied"] == []
     assert load_survey(Workspace(workspace)) == load_json(Survey, workspace / SURVEY)
-    told = command("calibrate", workspace, "--estimate", "boresight")["warnings"]
-    assert "--estimate leaves out what ingest was asked to estimate: time-offset" in told
+    warnings = command("calibrate", workspace, "--estimate", "boresight")["warnings"]
+    assert "--estimate leaves out what ingest was asked to estimate: time-offset" in warnings
 
 
 def test_a_comparison_reads_the_calibration_where_it_is(tmp_path: Path, command: Command) -> None:
@@ -235,8 +235,8 @@ def test_stages_one_by_one_are_reminded(tmp_path: Path, command: Command) -> Non
     inputs, workspace = flown(tmp_path, Winding(count=24)), tmp_path / "ws"
     command("ingest", workspace, "--bag", inputs["--bag"], "--time-offset", "auto")
     command("sfm", workspace, "--import", inputs["--import"])
-    told = command("geolocate", workspace)["err"]
-    assert "time-offset were to be estimated after sfm: `georef calibrate`" in told
+    message = command("geolocate", workspace)["err"]
+    assert "time-offset were to be estimated after sfm: `georef calibrate`" in message
 
 
 def test_what_cannot_be_estimated_is_said_before_sfm(tmp_path: Path, command: Command) -> None:
@@ -250,16 +250,16 @@ def test_what_cannot_be_estimated_is_said_before_sfm(tmp_path: Path, command: Co
     assert "[--estimate]: boresight needs recorded attitudes" in refused("--estimate", "boresight,time-offset")
     assert "[--estimate]: Value error, 'focus' is none of time-offset" in refused("--estimate", "focus")
     empty = bags.write(tmp_path / "empty", bags.images(flight))
-    told = command("ingest", tmp_path / "ws", "--bag", empty, "--time-offset", "auto", fails=True)
-    assert "no image has a position" in told
+    message = command("ingest", tmp_path / "ws", "--bag", empty, "--time-offset", "auto", fails=True)
+    assert "no image has a position" in message
 
 
 def test_workspace_without_navigation_by_time(tmp_path: Path, command: Command) -> None:
     inputs, workspace = flown(tmp_path, Winding(count=24)), tmp_path / "ws"
     command("run", workspace, *arguments(inputs), "--to", "sfm")
     (workspace / "ingest/track.npz").unlink()
-    told = command("calibrate", workspace, "--estimate", "boresight", fails=True)
-    assert "only a position for each image" in told
+    message = command("calibrate", workspace, "--estimate", "boresight", fails=True)
+    assert "only a position for each image" in message
 
 
 def test_wanted_is_checked() -> None:
@@ -278,9 +278,9 @@ def test_offset_of_a_trajectory_by_time(tmp_path: Path, command: Command) -> Non
     files = tmp_path / "survey"
     table = ["--images", files / "images", "--trajectory", files / "gnss.csv", "--import", model]
     document = command("run", tmp_path / "ws", *table, "--time-offset", "auto", "--to", "geolocate")
-    (found,) = next(row for row in document["stages"] if row["stage"] == "calibrate")["values"]["estimates"]
-    assert found["value"][0] == pytest.approx(OFFSET_S, abs=0.02)
-    assert found["observable"] == [True]
+    (estimate,) = next(row for row in document["stages"] if row["stage"] == "calibrate")["values"]["estimates"]
+    assert estimate["value"][0] == pytest.approx(OFFSET_S, abs=0.02)
+    assert estimate["observable"] == [True]
     survey = load_survey(Workspace(tmp_path / "ws"))
     places = enu_from_lla(lla_from_enu(np.array(truth.centers), truth.origin), survey.origin)
     errors = np.array([image.fix.position_in_geo for image in survey.images if image.fix]) - places
@@ -288,8 +288,8 @@ def test_offset_of_a_trajectory_by_time(tmp_path: Path, command: Command) -> Non
     assert np.sqrt((errors**2).mean()) < 0.06
     assert all(image.attitude for image in survey.images)  # the gimbal's, from XMP
     # A lever arm needs to know the body.
-    told = command("ingest", tmp_path / "new", *table[:4], "--estimate", "lever-arm", fails=True)
-    assert "lever-arm needs attitudes" in told
+    message = command("ingest", tmp_path / "new", *table[:4], "--estimate", "lever-arm", fails=True)
+    assert "lever-arm needs attitudes" in message
     by_name = [*table[:2], "--trajectory", files / "trajectory.csv"]
-    told = command("ingest", tmp_path / "new", *by_name, "--time-offset", "auto", fails=True)
-    assert "[--time-offset]: needs the navigation recorded by time" in told
+    message = command("ingest", tmp_path / "new", *by_name, "--time-offset", "auto", fails=True)
+    assert "[--time-offset]: needs the navigation recorded by time" in message

@@ -16,7 +16,7 @@ from pipelines.ingest.options import Every, IngestOptions
 from pipelines.sfm.options import SfmOptions
 from pipelines.train.options import TrainOptions
 
-CONFIGS = {spec.name: spec.options for spec in PIPELINE}
+OPTIONS = {spec.name: spec.options for spec in PIPELINE}
 TOML = Path("/surveys/flight/georef.toml")
 
 
@@ -50,8 +50,8 @@ def test_a_sigma_is_a_positive_number(value: float) -> None:
 
 
 def test_paths_of_the_file_are_relative_to_it() -> None:
-    config = resolve(IngestOptions, {"images": "../photos", "gcp": "/control/gcp.txt"}, {"geo": "/g.txt"}, TOML)
-    assert input_paths(config) == {
+    options = resolve(IngestOptions, {"images": "../photos", "gcp": "/control/gcp.txt"}, {"geo": "/g.txt"}, TOML)
+    assert input_paths(options) == {
         "images": Path("/surveys/flight/../photos"),
         "gcp": Path("/control/gcp.txt"),
         "geo": Path("/g.txt"),
@@ -132,10 +132,10 @@ def test_a_value_is_shown_as_it_is_written(value: object, text: str) -> None:
 class TestToml:
     def load(self, folder: Path, text: bytes) -> dict[str, dict[str, Any]]:
         (folder / "georef.toml").write_bytes(text)
-        return load_toml(folder / "georef.toml", CONFIGS)
+        return load_toml(folder / "georef.toml", OPTIONS)
 
     def test_missing_file_is_empty(self, tmp_path: Path) -> None:
-        assert load_toml(tmp_path / "georef.toml", CONFIGS) == {}
+        assert load_toml(tmp_path / "georef.toml", OPTIONS) == {}
 
     def test_byte_order_mark_and_crlf(self, tmp_path: Path) -> None:
         assert self.load(tmp_path, b"\xef\xbb\xbf[train]\r\nseed = 4\r\n") == {"train": {"seed": 4}}
@@ -156,26 +156,26 @@ class TestToml:
     def test_folder_in_its_place(self, tmp_path: Path) -> None:
         (tmp_path / "georef.toml").mkdir()
         with pytest.raises(InputError, match="cannot be read"):
-            load_toml(tmp_path / "georef.toml", CONFIGS)
+            load_toml(tmp_path / "georef.toml", OPTIONS)
 
 
 def fields() -> list[tuple[type[StageOptions], str, FieldInfo]]:
-    return [(config, name, info) for config in CONFIGS.values() for name, info in config.model_fields.items()]
+    return [(options, name, info) for options in OPTIONS.values() for name, info in options.model_fields.items()]
 
 
-@pytest.mark.parametrize(("config", "name", "info"), fields())
-def test_every_option_explains_itself(config: type[StageOptions], name: str, info: FieldInfo) -> None:
+@pytest.mark.parametrize(("options", "name", "info"), fields())
+def test_every_option_explains_itself(options: type[StageOptions], name: str, info: FieldInfo) -> None:
     """Help, docs and errors all come from the field: it must have a meaning, a valid default and its own flag."""
     assert info.description
     assert info.description.endswith((".", "…", ")"))
-    config.model_validate({name: info.default})
-    flags = [flag_name(config, other) for other in config.model_fields]
-    assert flags.count(flag_name(config, name)) == 1
+    options.model_validate({name: info.default})
+    flags = [flag_name(options, other) for other in options.model_fields]
+    assert flags.count(flag_name(options, name)) == 1
 
 
 def test_presets_leave_room_for_explicit_sizes() -> None:
-    config = TrainOptions()
-    assert (config.iterations, config.max_image_size, config.max_gaussians) == (None, None, None)
+    options = TrainOptions()
+    assert (options.iterations, options.max_image_size, options.max_gaussians) == (None, None, None)
 
 
 @pytest.mark.parametrize(

@@ -111,9 +111,9 @@ class TestKilledAtAnyMoment:
         old = fakes.read_products(make(tmp_path / "old"), TRAIN)
         for workspace in kill_points(make, work, tmp_path):
             with workspace.lock("test"):  # whoever writes next repairs first
-                found = fakes.read_products(workspace, TRAIN)
-            assert len(set(found)) == 1
-            assert found == old or '"seed":1' in found[0]
+                texts = fakes.read_products(workspace, TRAIN)
+            assert len(set(texts)) == 1
+            assert texts == old or '"seed":1' in texts[0]
             assert_whole(workspace)
             work(workspace)
             assert '"seed":1' in fakes.read_products(workspace, TRAIN)[0]

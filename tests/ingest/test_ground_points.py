@@ -27,14 +27,14 @@ def _read(tmp_path: Path, rows: str, name: str = "gcp_list.txt", notes: Notes | 
 def test_points_and_marks(tmp_path: Path) -> None:
     notes = Notes()
     rows = G1 + G2 + "7.75 46.02 1620 1 1 absent.jpg G1\n7.77 46.02 1620 1 1 a.jpg G3\n"
-    found = _read(tmp_path, rows, notes=notes)
-    assert [point.name for point in found.points] == ["G1", "G2"]
+    file = _read(tmp_path, rows, notes=notes)
+    assert [point.name for point in file.points] == ["G1", "G2"]
     np.testing.assert_allclose(
-        found.points[0].position_in_ecef, ecef_from_lla([46.02, 7.75, 1620.0]), rtol=0, atol=1e-8
+        file.points[0].position_in_ecef, ecef_from_lla([46.02, 7.75, 1620.0]), rtol=0, atol=1e-8
     )
-    mark = found.points[0].marks[1]
+    mark = file.points[0].marks[1]
     assert (mark.image, mark.x_px, mark.y_px, mark.sigma_px) == ("b.jpg", 11.5, 21.5, 0.5)
-    assert found.vertical.stated and found.vertical.name == "ellipsoidal"
+    assert file.vertical.stated and file.vertical.name == "ellipsoidal"
     assert notes.warnings == [
         "1 mark is in an image that is not here: gcp_list.txt:6 (absent.jpg)",
         "1 ground point has marks in fewer than 2 images and was left out: G3 (gcp_list.txt:7)",

@@ -60,7 +60,7 @@ def test_sigma_by_receiver_and_precedence() -> None:
         PhotoTags(gps=GPS),
     )
     notes = Notes()
-    found = poses_from_tags(photos, IngestOptions(), notes)
+    poses = poses_from_tags(photos, IngestOptions(), notes)
     expected = [
         [0.02, 0.02, 0.03],
         [0.5, 0.5, 1.0],
@@ -69,8 +69,8 @@ def test_sigma_by_receiver_and_precedence() -> None:
         [1.2, 1.2, 2.4],
         [2.5, 2.5, 5.0],
     ]
-    np.testing.assert_allclose(found.sigma_enu_m, expected)
-    assert found.sigma_source == ("default", "default", "default", "file", "file", "default")
+    np.testing.assert_allclose(poses.sigma_enu_m, expected)
+    assert poses.sigma_source == ("default", "default", "default", "file", "file", "default")
     assert "σ of positions without one (1): 0.02 m horizontal, 0.03 m vertical (RTK fixed)" in notes.assumptions
 
     notes = Notes()
@@ -82,9 +82,9 @@ def test_sigma_by_receiver_and_precedence() -> None:
 
 
 def test_exif_heights_are_assumed_not_refused() -> None:
-    found = poses_from_tags(_photos(PhotoTags(gps=GPS)), IngestOptions(), Notes())
-    assert found.vertical.name == "ellipsoidal" and not found.vertical.stated
-    assert "often above a geoid" in found.vertical.note
+    poses = poses_from_tags(_photos(PhotoTags(gps=GPS)), IngestOptions(), Notes())
+    assert poses.vertical.name == "ellipsoidal" and not poses.vertical.stated
+    assert "often above a geoid" in poses.vertical.note
     stated = poses_from_tags(_photos(PhotoTags(gps=GPS)), IngestOptions(vertical="ellipsoidal"), Notes())
     assert stated.vertical.stated
 
@@ -96,10 +96,10 @@ def test_exif_heights_stated_above_a_geoid_need_its_grid() -> None:
 
 def test_a_gimbal_is_kept_with_or_without_position() -> None:
     tags = PhotoTags(dji=DjiTags(gimbal_yaw_pitch_roll_deg=(45.0, -89.9, 0.0)))
-    found = poses_from_tags(_photos(tags, PhotoTags()), IngestOptions(), Notes())
-    assert not found.located.any()
-    np.testing.assert_allclose(found.enu_from_cam[0], geo_from_cam([45.0, -89.9, 0.0]), atol=1e-14)
-    assert np.isnan(found.enu_from_cam[1]).all()
+    poses = poses_from_tags(_photos(tags, PhotoTags()), IngestOptions(), Notes())
+    assert not poses.located.any()
+    np.testing.assert_allclose(poses.enu_from_cam[0], geo_from_cam([45.0, -89.9, 0.0]), atol=1e-14)
+    assert np.isnan(poses.enu_from_cam[1]).all()
 
 
 def test_images_without_altitude_and_with_other_datums_are_noted() -> None:
@@ -113,24 +113,24 @@ def test_images_without_altitude_and_with_other_datums_are_noted() -> None:
 def test_height_is_of_exif_or_else_of_xmp() -> None:
     flat, dji = replace(GPS, alt_m=None), DjiTags(absolute_altitude_m=198.31)
     photos = _photos(PhotoTags(gps=flat, dji=dji), PhotoTags(gps=GPS, dji=dji), PhotoTags(dji=dji))
-    found = poses_from_tags(photos, IngestOptions(), Notes())
-    assert found.located.tolist() == [True, True, False]
-    np.testing.assert_allclose(_lla(found)[:2, 2], [198.31, 1620.0], rtol=0, atol=1e-8)
+    poses = poses_from_tags(photos, IngestOptions(), Notes())
+    assert poses.located.tolist() == [True, True, False]
+    np.testing.assert_allclose(_lla(poses)[:2, 2], [198.31, 1620.0], rtol=0, atol=1e-8)
 
 
 def test_a_table_by_name_wins_over_exif_and_does_not_mix_with_it() -> None:
     notes = Notes()
     photos = _photos(*[PhotoTags(gps=replace(GPS, lat_deg=10.0), timestamp_s=5.0)] * 3)
-    found = poses_from_table(_table(), photos, IngestOptions(), notes)
-    assert found.located.tolist() == [True, True, False]
-    np.testing.assert_allclose(_lla(found)[1], [46.02, 7.7502, 1622.0], rtol=0, atol=1e-9)
-    assert found.time_s.tolist() == [100.0, 101.0, 5.0]
+    poses = poses_from_table(_table(), photos, IngestOptions(), notes)
+    assert poses.located.tolist() == [True, True, False]
+    np.testing.assert_allclose(_lla(poses)[1], [46.02, 7.7502, 1622.0], rtol=0, atol=1e-9)
+    assert poses.time_s.tolist() == [100.0, 101.0, 5.0]
     assert notes.warnings == [
         "positions in t.csv are 3927 km from those in EXIF: wrong CRS or zone?",
         "1 image has no position in t.csv: 2.jpg",
     ]
     assert "latitude and longitude in t.csv are WGS84 (EPSG:4326)" in notes.assumptions
-    np.testing.assert_allclose(found.sigma_enu_m[0], np.array(RECEIVER_SIGMA_M["unknown receiver"])[[0, 0, 1]])
+    np.testing.assert_allclose(poses.sigma_enu_m[0], np.array(RECEIVER_SIGMA_M["unknown receiver"])[[0, 0, 1]])
 
 
 def test_a_table_by_time_interpolates_along_the_line() -> None:
@@ -138,10 +138,10 @@ def test_a_table_by_time_interpolates_along_the_line() -> None:
     photos = _photos(
         PhotoTags(timestamp_s=100.5, time_source="assumed UTC"), PhotoTags(timestamp_s=105.0), PhotoTags()
     )
-    found = poses_from_table(_table(names=None), photos, IngestOptions(), notes)
-    assert found.located.tolist() == [True, False, False]
+    poses = poses_from_table(_table(names=None), photos, IngestOptions(), notes)
+    assert poses.located.tolist() == [True, False, False]
     ends = enu.ecef_from_lla([[46.02, 7.75, 1620.0], [46.02, 7.7502, 1622.0]])
-    np.testing.assert_allclose(found.position_in_ecef[0], ends.mean(axis=0), rtol=0, atol=1e-7)
+    np.testing.assert_allclose(poses.position_in_ecef[0], ends.mean(axis=0), rtol=0, atol=1e-7)
     assert "EXIF times without a zone are UTC" in notes.assumptions
     assert "1 image has no time in EXIF: 2.jpg" in notes.warnings
     assert "2 images have no position in t.csv: 1.jpg, 2.jpg" in notes.warnings
@@ -159,8 +159,8 @@ def test_clocks_that_never_meet_are_explained() -> None:
 def test_rows_without_a_time_do_not_count(tmp_path: Path) -> None:
     times = np.array([100.0, np.nan])
     photos = _photos(PhotoTags(timestamp_s=100.0), PhotoTags(timestamp_s=100.5))
-    found = poses_from_table(_table(names=None, time_s=times), photos, IngestOptions(), Notes())
-    assert found.located.tolist() == [True, False]
+    poses = poses_from_table(_table(names=None, time_s=times), photos, IngestOptions(), Notes())
+    assert poses.located.tolist() == [True, False]
     with pytest.raises(InputError, match=r"t\.csv \[timestamp\]: no row has a time"):
         poses_from_table(_table(names=None, time_s=times * np.nan), photos, IngestOptions(), Notes())
 
@@ -169,9 +169,9 @@ def test_missing_heights_are_taken_from_exif() -> None:
     notes = Notes()
     xyz = np.array([[7.75, 46.02, np.nan], [7.7502, 46.02, np.nan]])
     table = _table(xyz=xyz, geographic=None, crs_text="EPSG:4326", source="geo.txt", path=Path("geo.txt"))
-    found = poses_from_table(table, _photos(PhotoTags(gps=GPS), PhotoTags()), IngestOptions(), notes)
-    assert found.located.tolist() == [True, False]
-    assert _lla(found)[0, 2] == pytest.approx(1620.0, abs=1e-8)
+    poses = poses_from_table(table, _photos(PhotoTags(gps=GPS), PhotoTags()), IngestOptions(), notes)
+    assert poses.located.tolist() == [True, False]
+    assert _lla(poses)[0, 2] == pytest.approx(1620.0, abs=1e-8)
     assert "heights that geo.txt lacks are from EXIF (1)" in notes.assumptions
     assert "1 row has no height and was left out: geo.txt:3" in notes.warnings
     with pytest.raises(InputError, match=r"geo\.txt: has no heights"):
@@ -215,10 +215,10 @@ def test_a_file_that_states_its_datum_keeps_it_and_says_so() -> None:
 def test_feet_and_the_accuracy_of_a_datum_are_told() -> None:
     notes = Notes()
     xyz = np.array([[1450000.0, 540000.0, 1000.0], [1450010.0, 540000.0, 1000.0]])
-    found = poses_from_table(
+    poses = poses_from_table(
         _table(xyz=xyz, geographic=False), _photos(PhotoTags(), PhotoTags()), IngestOptions(crs="EPSG:2264"), notes
     )
-    assert _lla(found)[0, 2] == pytest.approx(1000.0 * 1200 / 3937)
+    assert _lla(poses)[0, 2] == pytest.approx(1000.0 * 1200 / 3937)
     assert "heights of EPSG:2264 are in US survey foot" in notes.assumptions
     assert any("published with 4 m" in text for text in notes.assumptions)
     assert any("us_noaa_nchpgn.tif" in text for text in notes.warnings)

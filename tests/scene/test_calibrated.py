@@ -95,16 +95,16 @@ def test_offset_boresight_and_arm_are_applied(survey: Survey, track: NavigationT
         estimate("boresight", turned_deg, np.zeros(3)),
         estimate("lever-arm", ARM, np.zeros(3)),
     )
-    found = apply_calibration(survey, track, rig)
+    calibrated = apply_calibration(survey, track, rig)
     at = track.image_time_s + 0.5
-    np.testing.assert_allclose(places(found)[:COUNT], cameras(at), atol=1e-5)
-    quats = [image.attitude.quat_xyzw for image in found.images[:COUNT] if image.attitude]
+    np.testing.assert_allclose(places(calibrated)[:COUNT], cameras(at), atol=1e-5)
+    quats = [image.attitude.quat_xyzw for image in calibrated.images[:COUNT] if image.attitude]
     expected = bodies(at) @ MOUNT.T @ boresight(turned_deg)
     assert np.abs(log_so3(matrix_from_quat_xyzw(quats) @ np.swapaxes(expected, 1, 2))).max() < 1e-9
     # What the navigation does not know stays; what it now knows takes σ from the nearest.
-    assert found.images[5] == survey.images[5]
-    assert found.images[4].fix is not None and survey.images[3].fix is not None
-    assert found.images[4].fix.cov_in_geo == survey.images[3].fix.cov_in_geo
+    assert calibrated.images[5] == survey.images[5]
+    assert calibrated.images[4].fix is not None and survey.images[3].fix is not None
+    assert calibrated.images[4].fix.cov_in_geo == survey.images[3].fix.cov_in_geo
 
 
 def test_what_is_not_applied_stays_as_told(survey: Survey, track: NavigationTrack) -> None:
@@ -112,19 +112,19 @@ def test_what_is_not_applied_stays_as_told(survey: Survey, track: NavigationTrac
         estimate("time-offset", np.array([0.5]), np.zeros(1)),
         estimate("boresight", np.array([9.0, 9.0, 9.0]), np.zeros(3)),
     )
-    found = apply_calibration(survey, track, RigCalibration(not_applied=withheld))
-    np.testing.assert_allclose(places(found)[:COUNT], cameras(track.image_time_s), atol=1e-5)
+    calibrated = apply_calibration(survey, track, RigCalibration(not_applied=withheld))
+    np.testing.assert_allclose(places(calibrated)[:COUNT], cameras(track.image_time_s), atol=1e-5)
 
 
 def test_nothing_is_invented_beyond_the_ends_or_without_attitude(survey: Survey, track: NavigationTrack) -> None:
-    found = apply_calibration(survey, track, of(estimate("time-offset", np.array([2.5]), np.zeros(1))))
-    assert [image.fix is None for image in found.images] == [False, False, False, True, True, False]
+    calibrated = apply_calibration(survey, track, of(estimate("time-offset", np.array([2.5]), np.zeros(1))))
+    assert [image.fix is None for image in calibrated.images] == [False, False, False, True, True, False]
     gap = (track.attitude_time_s < 0.9) | (track.attitude_time_s > 2.9)
     torn = replace(track, attitude_time_s=track.attitude_time_s[gap], geo_from_body=track.geo_from_body[gap])
-    found = apply_calibration(survey, torn, of(estimate("time-offset", np.array([0.0]), np.zeros(1))))
+    calibrated = apply_calibration(survey, torn, of(estimate("time-offset", np.array([0.0]), np.zeros(1))))
     # Without attitude the arm could point anywhere: no position either.
-    assert [image.fix is None for image in found.images] == [False, True, True, False, False, False]
-    assert [image.attitude is None for image in found.images] == [False, True, True, False, False, False]
+    assert [image.fix is None for image in calibrated.images] == [False, True, True, False, False, False]
+    assert [image.attitude is None for image in calibrated.images] == [False, True, True, False, False, False]
 
 
 def test_attitudes_that_came_with_the_photographs_carry_the_arm(survey: Survey, track: NavigationTrack) -> None:
@@ -135,9 +135,9 @@ def test_attitudes_that_came_with_the_photographs_carry_the_arm(survey: Survey, 
         images[i] = images[i].model_copy(update={"attitude": attitude})
     survey = survey.model_copy(update={"images": tuple(images)})
     bare = replace(track, attitude_time_s=np.empty(0), geo_from_body=np.empty((0, 3, 3)))
-    found = apply_calibration(survey, bare, of(estimate("time-offset", np.array([0.0]), np.zeros(1))))
-    np.testing.assert_allclose(places(found)[:COUNT], cameras(track.image_time_s), atol=1e-5)
-    assert [image.attitude for image in found.images] == [image.attitude for image in survey.images]
+    calibrated = apply_calibration(survey, bare, of(estimate("time-offset", np.array([0.0]), np.zeros(1))))
+    np.testing.assert_allclose(places(calibrated)[:COUNT], cameras(track.image_time_s), atol=1e-5)
+    assert [image.attitude for image in calibrated.images] == [image.attitude for image in survey.images]
 
 
 class TestLoadSurvey:

@@ -78,7 +78,7 @@ class AttitudeType:
 
 
 def axes_of(frame: str) -> Axes:
-    """Axes of a frame by its name: `…_frd`, `…_ned` forward-right-down, `…optical…` the camera's, else FLU."""
+    """Return a frame's axes by its name: FRD for `…_frd`, `…_ned`, the camera's for `…optical…`, else FLU."""
     name = frame.lower()
     if name.endswith(("_frd", "_ned")):
         return "frd"
@@ -191,7 +191,7 @@ ATTITUDES: dict[str, AttitudeType] = {
 
 
 def stamp_ns(message: Any) -> int | None:
-    """A message's own stamp in nanoseconds: of its header, or PX4's microseconds; None where it is zero."""
+    """Return a message's own stamp in nanoseconds: its header's, or PX4's microseconds; None where it is zero."""
     header = getattr(message, "header", None)
     if header is not None:
         return header.stamp.sec * 1_000_000_000 + header.stamp.nanosec or None
@@ -209,7 +209,7 @@ def _geodetic_problem(place: Sequence[float]) -> str:
 
 
 def _sigmas(variance: Any) -> tuple[float, float, float]:
-    """σ of three variances; NaN all where one is not positive, or absurd."""
+    """Return σ of three variances; NaN all where one is not positive, or absurd."""
     values = np.asarray(variance, dtype=np.float64)
     if not (np.isfinite(values).all() and (values > 0).all() and (values < _LARGEST_SIGMA_M**2).all()):
         return _NAN3
