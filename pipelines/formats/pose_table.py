@@ -32,7 +32,7 @@ class PoseTable:
     """
 
     path: Path
-    source: Literal["csv", "geo.txt", "bag"]
+    source: Literal["csv", "geo.txt"]
     lines: IntArray
     names: tuple[str, ...] | None
     time_s: FloatArray | None

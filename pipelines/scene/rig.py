@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Container
 from typing import Annotated, Literal, get_args
 
-from pydantic import AfterValidator
+from pydantic import AfterValidator, model_validator
 
 from pipelines.core.options import WRITTEN, from_text, listed_names
 from pipelines.core.products import Product
 
 RigParameter = Literal["time-offset", "boresight", "lever-arm"]
 RIG_PARAMETERS: tuple[RigParameter, ...] = get_args(RigParameter)
+_COMPONENTS: dict[RigParameter, int] = {"time-offset": 1, "boresight": 3, "lever-arm": 3}
 
 
 def in_usual_order(names: Container[RigParameter]) -> tuple[RigParameter, ...]:
@@ -42,6 +43,15 @@ class RigEstimate(Product):
     start: tuple[float, ...]
     observable: tuple[bool, ...]
 
+    @model_validator(mode="after")
+    def _has_all_components(self) -> RigEstimate:
+        lengths = {len(self.value), len(self.sigma), len(self.start), len(self.observable)}
+        if lengths != {_COMPONENTS[self.name]}:
+            raise ValueError(
+                f"{self.name} has {_COMPONENTS[self.name]} components: value, sigma, start, observable"
+            )
+        return self
+
     @property
     def usable(self) -> bool:
         """Whether every component is observable."""
@@ -64,6 +74,13 @@ class RigCalibration(Product):
     rms_position_m: float | None = None
     rms_attitude_deg: float | None = None
     problem: str = ""
+
+    @model_validator(mode="after")
+    def _names_each_once(self) -> RigCalibration:
+        names = [estimate.name for estimate in (*self.applied, *self.not_applied)]
+        if len(set(names)) != len(names):
+            raise ValueError("a parameter is estimated twice")
+        return self
 
     @property
     def estimates(self) -> tuple[RigEstimate, ...]:

@@ -183,6 +183,28 @@ class TestLoadSurvey:
         with pytest.raises(InputError, match=r"ingest/track\.npz: the survey has no navigation recorded by time"):
             load_survey(workspace)
 
+    @pytest.mark.parametrize(
+        ("change", "message"),
+        [
+            ({"value": []}, r"rig\.json \[applied\.0\]: .*time-offset has 1 components"),
+            ({"name": "boresight"}, r"rig\.json \[applied\.0\]: .*boresight has 3 components"),
+            ({"name": "focus"}, r"rig\.json \[applied\.0\.name\]"),
+        ],
+    )
+    def test_refuses_a_calibration_of_another_form(
+        self, workspace: Workspace, change: dict[str, object], message: str
+    ) -> None:
+        document = self.OFFSET.model_dump(mode="json")
+        document["applied"][0].update(change)
+        (workspace.root / RIG).parent.mkdir()
+        (workspace.root / RIG).write_text(json.dumps(document))
+        with pytest.raises(InputError, match=message):
+            load_survey(workspace)
+        document = self.OFFSET.model_dump(mode="json")
+        (workspace.root / RIG).write_text(json.dumps({**document, "not_applied": document["applied"]}))
+        with pytest.raises(InputError, match="a parameter is estimated twice"):
+            load_survey(workspace)
+
     def test_a_variant_reads_what_it_is_lent(self, workspace: Workspace, survey: Survey) -> None:
         save_json(self.OFFSET, workspace.root / RIG)
         lent = {folder: workspace.root / folder for folder in ("ingest", "calibrate")}
