@@ -43,7 +43,7 @@ COMMANDS: dict[str, Entry] = {
     "status": Entry("status", "Pipeline", "Show the state of every stage."),
     "ingest": Entry("ingest", "Stages", "Read photographs, positions and control points into one survey."),
     "sfm": Entry("sfm", "Stages", "Reconstruct cameras and points with COLMAP."),
-    "calibrate": Entry("calibrate", "Pipeline", "Estimate time offset, boresight and lever arm after sfm."),
+    "calibrate": Entry("calibrate", "Stages", "Estimate time offset, boresight and lever arm after sfm."),
     "compare": Entry("compare", "Pipeline", "Run the ablation and put its figures into one table."),
     "geolocate": Entry("geolocate", "Stages", "Intersect every SfM point on Earth."),
     "init-sim3": Entry("init_sim3", "Stages", "Estimate the similarity from the SfM model to the Earth."),

@@ -1,22 +1,20 @@
-"""Options of the commands: what all share, and what follows from a stage's config.
+"""Options of the commands: what all share, and what follows from a stage's own options.
 
-A stage's options are read off its config class (names, types, meaning, defaults), so that each exists once.
+A stage's options are read off its class of options (names, types, meaning, defaults), so that each exists once.
 """
 
 from __future__ import annotations
 
 import types
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import click
 from pydantic.fields import FieldInfo
 
-from pipelines.core.options import StageOptions, flag_name
+from pipelines.core.options import StageOptions, flag_name, is_written, notation
 from pipelines.core.workspace import Workspace
-
-FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
 
 _BOUNDS = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
 
@@ -28,36 +26,38 @@ class WorkspaceType(click.Path):
         super().__init__(file_okay=False, resolve_path=True, path_type=Path)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """The workspace at that path."""
+        """Return the workspace at that path."""
         return value if isinstance(value, Workspace) else Workspace(Path(str(super().convert(value, param, ctx))))
 
 
 def workspace_argument() -> click.Argument:
-    """The workspace, shown as WS."""
+    """Return the workspace as an argument, shown as WS."""
     return click.Argument(["workspace"], type=WorkspaceType(), metavar="WS")
 
 
 def json_option() -> click.Option:
-    """`--json`."""
+    """Return `--json`."""
     return click.Option(["--json", "as_json"], is_flag=True, help="Print the result as one JSON document.")
 
 
 def force_option(help_text: str = "Run even if the product is current.") -> click.Option:
-    """`--force`."""
+    """Return `--force`."""
     return click.Option(["--force"], is_flag=True, help=help_text)
 
 
-def stage_options(config_type: type[StageOptions], only: Iterable[str] | None = None) -> list[click.Option]:
-    """One click option for each field of a config, or for those named in `only`."""
-    wanted = list(config_type.model_fields) if only is None else list(only)
-    return [config_option(config_type, name) for name in wanted]
+def stage_options(options_type: type[StageOptions], only: Iterable[str] | None = None) -> list[click.Option]:
+    """Return a click option for each field, or for those named in `only`."""
+    names = list(options_type.model_fields) if only is None else list(only)
+    return [stage_option(options_type, name) for name in names]
 
 
-def config_option(config_type: type[StageOptions], name: str) -> click.Option:
-    """The click option of one field: it has no default of its own, only a text that tells the config's."""
-    info = config_type.model_fields[name]
-    flag, kind = flag_name(config_type, name), _bare_type(info.annotation)
-    help_text = " ".join(filter(None, [info.description, _told_default(info)]))
+def stage_option(options_type: type[StageOptions], name: str) -> click.Option:
+    """Return the click option of one field: without a default of its own, only a text that states the field's."""
+    info, flag = options_type.model_fields[name], flag_name(options_type, name)
+    help_text = " ".join(filter(None, [info.description, _default_and_range(info)]))
+    if is_written(info):
+        return click.Option([flag, name], type=click.STRING, default=None, help=help_text)
+    kind = _bare_type(info.annotation)
     if kind is bool:
         return click.Option(
             [f"{flag}/--no-{flag.removeprefix('--')}", name], is_flag=True, default=None, help=help_text
@@ -70,7 +70,7 @@ def config_option(config_type: type[StageOptions], name: str) -> click.Option:
 
 
 def given(ctx: click.Context, names: Iterable[str]) -> dict[str, Any]:
-    """Values of those options that the user gave; the others are the config's and `georef.toml`'s to decide."""
+    """Return those values that the user gave; `georef.toml` and the defaults decide the others."""
     return {
         name: ctx.params[name]
         for name in names
@@ -79,7 +79,7 @@ def given(ctx: click.Context, names: Iterable[str]) -> dict[str, Any]:
 
 
 def _bare_type(annotation: Any) -> Any:
-    """The type without `| None` and `Annotated`."""
+    """Return the type without `| None` and `Annotated`."""
     if get_origin(annotation) in (Union, types.UnionType):
         (annotation,) = [member for member in get_args(annotation) if member is not type(None)]
     return get_args(annotation)[0] if get_origin(annotation) is Annotated else annotation
@@ -94,12 +94,17 @@ def _click_type(kind: Any) -> click.ParamType:
     return known[kind]
 
 
-def _told_default(info: FieldInfo) -> str:
-    """`[default: 1200; ≥ 128]`: default and range, as far as there are any."""
+def _default_and_range(info: FieldInfo) -> str:
+    """Return `[default: 1200; ≥ 128]`: default and range, as far as there are any."""
     parts = []
     if info.default not in (None, ()):
-        value = {True: "on", False: "off"}[info.default] if isinstance(info.default, bool) else info.default
-        parts.append(f"default: {value}")
+        parts.append(f"default: {_shown(info)}")
     for bound, sign in _BOUNDS.items():
         parts += [f"{sign} {getattr(mark, bound)}" for mark in info.metadata if hasattr(mark, bound)]
     return f" [{'; '.join(parts)}]" if parts else ""
+
+
+def _shown(info: FieldInfo) -> str:
+    if is_written(info):
+        return notation(info.default)
+    return {True: "on", False: "off"}[info.default] if isinstance(info.default, bool) else str(info.default)

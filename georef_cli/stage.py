@@ -16,7 +16,7 @@ from pipelines.core.stages import BY_NAME
 
 
 class StageCommand(click.Command):
-    """`georef STAGE WS …`: the options of the stage's config, `--force` and `--json`.
+    """`georef STAGE WS …`: the options of the stage, `--force` and `--json`.
 
     Args:
         name: of the stage.

@@ -89,25 +89,6 @@ def outcomes(results: Sequence[Outcome]) -> Table:
     return table
 
 
-def calibration(document: Mapping[str, Any]) -> list[Renderable]:
-    """`georef calibrate`: a line a component, and what is left."""
-    table = _table("", "estimated", "± σ", "ingest", "unit", "")
-    for column in table.columns[1:4]:
-        column.justify = "right"
-    for row in document["estimates"]:
-        axes = {"boresight": "xyz", "lever-arm": ("forward", "right", "down")}.get(row["name"], ("",))
-        for axis, value, sigma, start, seen in zip(
-            axes, row["value"], row["sigma"], row["start"], row["observable"], strict=True
-        ):
-            remark = "" if seen else "[yellow]not observable in this flight[/]"
-            name = f"{row['name']} {axis}".strip()
-            table.add_row(name, f"{value:.4f}", f"{sigma:.4f}", f"{start:.4f}", row["unit"], remark)
-    left = f"left over: {document['rms_position_m']:.3f} m an axis"
-    if document["rms_attitude_deg"] is not None:
-        left += f", {document['rms_attitude_deg']:.2f}°"
-    return [table, f"{left} ({document['images']} images, {document['control_points']} control points)"]
-
-
 def comparison(table: Comparison) -> list[Renderable]:
     """`georef compare`: a line a configuration, and what sets it apart below."""
     heads = [f"{way}\n{name}" for way in ("camera", "model") for name in ("mean H", "median H", "RMSE H", "RMSE V")]

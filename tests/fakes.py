@@ -16,7 +16,7 @@ from types import ModuleType
 
 from pipelines.core.options import StageOptions
 from pipelines.core.products import dump_json
-from pipelines.core.stages import PIPELINE, STAGES, StageSpec, products_of
+from pipelines.core.stages import PIPELINE, STAGES, StageSpec, producer_of, products_of
 from pipelines.core.workspace import StageRun, Summary, Workspace
 
 Run = Callable[[StageRun, StageOptions], Summary]
@@ -33,20 +33,20 @@ def write_products(stage: StageRun, spec: StageSpec, text: str) -> None:
 
 def read_products(workspace: Workspace, spec: StageSpec) -> list[str]:
     """The texts of all products of a finished stage."""
-    found = []
+    texts = []
     for product in products_of(spec):
         path = workspace.path(product)
-        found.append((path if path.is_file() else path / "content.txt").read_text(encoding="utf-8"))
-    return found
+        texts.append((path if path.is_file() else path / "content.txt").read_text(encoding="utf-8"))
+    return texts
 
 
 def fake_run(spec: StageSpec) -> Run:
     """The `run` of a fake stage."""
 
-    def run(stage: StageRun, config: StageOptions) -> Summary:
+    def run(stage: StageRun, options: StageOptions) -> Summary:
         read = "".join(read_products(stage.workspace, s)[0] for s in PIPELINE if _reads(spec, s))
-        told = {"stage": spec.name, "options": config.model_dump(mode="json"), "read": _digest(read)}
-        text = _in_form(spec, json.dumps(told, separators=(",", ":")))
+        document = {"stage": spec.name, "options": options.model_dump(mode="json"), "read": _digest(read)}
+        text = _in_form(spec, json.dumps(document, separators=(",", ":")))
         with stage.progress.task(spec.name, 2) as task:
             task.advance(note="half")
             task.advance()
@@ -86,4 +86,4 @@ def _digest(text: str) -> str:
 
 
 def _reads(spec: StageSpec, other: StageSpec) -> bool:
-    return any(product.startswith(f"{other.folder}/") for product in spec.reads)
+    return any(producer_of(part.product) is other for part in spec.reads if not part.optional)

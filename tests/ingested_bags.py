@@ -18,8 +18,8 @@ def check(survey: Survey, flight: bags.Flight, *, tolerance_m: float = 1e-3, att
     """The survey has the flight's cameras, to a millimetre and a hundredth of a degree."""
     centers, rotations = bags.expected(flight, survey.origin)
     assert len(survey.images) == flight.count
-    found = np.array([image.fix.position_in_geo for image in survey.images if image.fix])
-    np.testing.assert_allclose(found, centers, rtol=0, atol=tolerance_m)
+    positions = np.array([image.fix.position_in_geo for image in survey.images if image.fix])
+    np.testing.assert_allclose(positions, centers, rtol=0, atol=tolerance_m)
     if attitude:
         quats = [image.attitude.quat_xyzw for image in survey.images if image.attitude]
         turned = log_so3(matrix_from_quat_xyzw(quats) @ np.swapaxes(rotations, 1, 2))

@@ -62,13 +62,6 @@ HOMES: dict[str, tuple[str, ...]] = {
     "embreex": ("pipelines.simulate",),
     "matplotlib": ("pipelines.plots",),
 }
-# Arrows that are still to be turned round; none may be added.
-PENDING = {
-    ("pipelines.core.fingerprints", "pipelines.scene.survey"),
-    ("pipelines.core.runner", "pipelines.scene.survey"),
-    ("pipelines.formats.odm", "pipelines.ingest.notes"),
-    ("pipelines.formats.trajectory_csv", "pipelines.ingest.notes"),
-}
 CORE_LIBRARIES = {"filelock", "numpy", "pydantic"}
 
 
@@ -104,9 +97,7 @@ def own_imports() -> list[tuple[str, str]]:
     for module, tree in sources().items():
         for name in imports(tree):
             if name.startswith(PACKAGES):
-                target = name if name in sources() else name.rpartition(".")[0]
-                if (module, target) not in PENDING:
-                    pairs.append((module, target))
+                pairs.append((module, name if name in sources() else name.rpartition(".")[0]))
     return pairs
 
 

@@ -24,14 +24,14 @@ import torch
 from raster import make_scene
 
 from pipelines.core.products import load_json
-from pipelines.core.stages import SIM3, SPARSE, SURVEY
+from pipelines.core.stages import SIM3, SPARSE
 from pipelines.core.workspace import Workspace
 from pipelines.formats.colmap import read_sparse
+from pipelines.scene.calibrated import load_survey
 from pipelines.scene.geographic import geo_problem
 from pipelines.scene.initial_similarity import InitialSimilarity
 from pipelines.scene.photographs import ImageCache
 from pipelines.scene.scene import Scene, initial_scene, photographs
-from pipelines.scene.survey import Survey
 from pipelines.splat.densify import DefaultSettings, DefaultStrategy
 from pipelines.splat.losses import photometric_loss
 from pipelines.splat.memory import TrainingSize, predicted_peak_bytes
@@ -88,7 +88,7 @@ def scaling(arguments: argparse.Namespace) -> None:
 def curve(arguments: argparse.Namespace) -> None:
     """Print PSNR on the test views against time, for each strategy."""
     workspace = Workspace(arguments.workspace)
-    survey = load_json(Survey, workspace.path(SURVEY))
+    survey = load_survey(workspace)
     initial = load_json(InitialSimilarity, workspace.path(SIM3))
     scene = initial_scene(read_sparse(workspace.path(SPARSE)), survey, initial)
     print("strategy   seconds  iteration  gaussians  test PSNR dB")

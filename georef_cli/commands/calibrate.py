@@ -2,59 +2,77 @@
 
 from __future__ import annotations
 
-import inspect
-from pathlib import Path
 from typing import Any
 
 import click
+from rich.markup import escape
+from rich.table import Table
 
-from georef_cli import boundary, options, tables
-from georef_cli.output import print_json, print_rich
-from pipelines.calibrate.options import CalibrateOptions
-from pipelines.core.options import CONFIG_FILE, resolve
-from pipelines.core.stages import CALIBRATE
+from georef_cli.output import print_outcome, print_rich
+from georef_cli.stage import StageCommand
+from pipelines.core.products import load_json
+from pipelines.core.stages import RIG
+from pipelines.scene.rig import RigCalibration
 
-
-def _calibrate(ctx: click.Context, **values: Any) -> None:
-    from pipelines.calibrate.stage import apply_calibration, calibrate
-
-    workspace = values["workspace"]
-    config = resolve(CalibrateOptions, {}, options.given(ctx, CalibrateOptions.model_fields), Path(CONFIG_FILE))
-    found = calibrate(workspace, config)
-    applied: list[str] = []
-    if values["apply"]:
-        applied = [one.name for one in found.estimates if one.usable]
-        with workspace.lock(CALIBRATE.name), boundary.written(workspace.log_file(CALIBRATE)):
-            apply_calibration(workspace, found)
-    if values["as_json"]:
-        print_json({**found.model_dump(mode="json"), "applied": applied})
-        return
-    print_rich(*tables.calibration(found.model_dump(mode="json")))
-    if values["apply"]:
-        print_rich(f"applied to the survey: {', '.join(applied) or 'nothing'}")
+_COMPONENTS = {"boresight": ("x", "y", "z"), "lever-arm": ("forward", "right", "down"), "time-offset": ("",)}
 
 
-command = click.Command(
+class CalibrateCommand(StageCommand):
+    """`georef calibrate`: prints the table of the estimates too."""
+
+    def act(self, ctx: click.Context, **values: Any) -> None:
+        """Run the stage and print its result."""
+        workspace, outcome = values["workspace"], self.run(ctx, values)
+        print_outcome(workspace, outcome, as_json=values["as_json"])
+        if values["as_json"]:
+            return
+        calibration = load_json(RigCalibration, workspace.path(RIG))
+        if calibration.estimates:
+            print_rich(_estimates(calibration), _residuals(calibration))
+
+
+def _estimates(calibration: RigCalibration) -> Table:
+    """Return a line for each component."""
+    table = Table("", "estimated", "± σ", "ingest", "unit", "", box=None, pad_edge=False)
+    for column in table.columns[1:4]:
+        column.justify = "right"
+    for estimate in calibration.estimates:
+        applied = "applied" if estimate in calibration.applied else "[dim]not applied[/]"
+        components = zip(
+            _COMPONENTS[estimate.name],
+            estimate.value,
+            estimate.sigma,
+            estimate.start,
+            estimate.observable,
+            strict=True,
+        )
+        for component, value, sigma, start, observable in components:
+            name = f"{estimate.name} {component}".strip()
+            remark = applied if observable else "[yellow]not observable in this flight[/]"
+            table.add_row(name, f"{value:.4f}", f"{sigma:.4f}", f"{start:.4f}", estimate.unit, remark)
+    return table
+
+
+def _residuals(calibration: RigCalibration) -> str:
+    parts = [] if calibration.rms_position_m is None else [f"{calibration.rms_position_m:.3f} m an axis"]
+    parts += [] if calibration.rms_attitude_deg is None else [f"{calibration.rms_attitude_deg:.2f}°"]
+    images, points = calibration.images, calibration.control_points
+    return escape(f"left over: {', '.join(parts)} ({images} images, {points} control points)")
+
+
+command = CalibrateCommand(
     "calibrate",
-    params=[
-        options.workspace_argument(),
-        *options.stage_options(CalibrateOptions),
-        click.Option(["--apply"], is_flag=True, help="Put what is observable into the survey."),
-        options.json_option(),
-    ],
-    callback=click.pass_context(_calibrate),
-    help=inspect.cleandoc(
-        """Estimate time offset, boresight and lever arm from the SfM cameras.
+    """Estimate time offset, boresight and lever arm from the SfM cameras.
 
-        After sfm, the track of the cameras is laid on the navigation that ingest kept from a bag or a trajectory by
-        time. Each parameter comes with its σ; one that the flight does not show is said to be not observable, and
-        is not applied. `georef run` does this itself where ingest was asked to (--time-offset auto, --estimate).
+    After sfm, the track of the cameras is laid on the navigation that ingest kept from a bag or a trajectory by
+    time. Each parameter comes with its σ; one that the flight does not show is said to be not observable, and
+    is not applied. What ingest was asked to estimate (--time-offset auto, --estimate) is applied to the positions
+    and attitudes that later stages use, other parameters only with --apply. The survey itself stays as recorded.
 
-        \b
-        Examples:
-          georef calibrate flight
-          georef calibrate flight --estimate time-offset --max-offset 5
-          georef calibrate flight --estimate time-offset,boresight,lever-arm --apply
-        """
-    ),
+    \b
+    Examples:
+      georef calibrate flight
+      georef calibrate flight --estimate time-offset --max-offset 5
+      georef calibrate flight --estimate time-offset,boresight,lever-arm --apply
+    """,
 )

@@ -54,7 +54,7 @@ def _stages(first: str | None, last: str | None) -> tuple[StageSpec, ...]:
 
 
 def _flags(ctx: click.Context, stages: tuple[StageSpec, ...]) -> dict[str, dict[str, Any]]:
-    """The given options by stage.
+    """Return the given options by stage.
 
     Raises:
         click.UsageError: an option is for stages that are not to run.
@@ -65,7 +65,7 @@ def _flags(ctx: click.Context, stages: tuple[StageSpec, ...]) -> dict[str, dict[
         owners = [owner for owner in OWNERS[name] if owner in running]
         if not owners:
             raise click.UsageError(
-                f"{options.config_option(BY_NAME[OWNERS[name][0]].options, name).opts[0]} is for "
+                f"{options.stage_option(BY_NAME[OWNERS[name][0]].options, name).opts[0]} is for "
                 f"{' and '.join(OWNERS[name])}, which is not among the stages to run."
             )
         for owner in owners:
@@ -73,7 +73,7 @@ def _flags(ctx: click.Context, stages: tuple[StageSpec, ...]) -> dict[str, dict[
     return flags
 
 
-def _stage_option(flag: str, dest: str, help_text: str) -> click.Option:
+def _slice_option(flag: str, dest: str, help_text: str) -> click.Option:
     return click.Option([flag, dest], type=click.Choice([spec.name for spec in PIPELINE]), help=help_text)
 
 
@@ -81,9 +81,9 @@ command = click.Command(
     "run",
     params=[
         options.workspace_argument(),
-        _stage_option("--from", "first", "First stage to run."),
-        _stage_option("--to", "last", "Last stage to run."),
-        *(options.config_option(BY_NAME[owners[0]].options, name) for name, owners in OWNERS.items()),
+        _slice_option("--from", "first", "First stage to run."),
+        _slice_option("--to", "last", "Last stage to run."),
+        *(options.stage_option(BY_NAME[owners[0]].options, name) for name, owners in OWNERS.items()),
         options.force_option("Run the stages even if their products are current."),
         options.json_option(),
     ],

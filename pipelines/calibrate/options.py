@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
-from pydantic import Field, field_validator
+from pydantic import Field
 
-from pipelines.core.options import RIG_PARAMETERS, RigParameter, StageOptions, rig_parameters
+from pipelines.core.options import StageOptions
+from pipelines.scene.rig import RigParameters
 
 
 class CalibrateOptions(StageOptions):
-    """What `georef calibrate` estimates from the SfM cameras and the recorded navigation."""
+    """What `georef calibrate` estimates from the SfM cameras and the recorded navigation, and what it applies."""
 
-    estimate: str = Field(
-        "time-offset,boresight", description="Any of time-offset, boresight and lever-arm, with commas."
+    estimate: RigParameters | None = Field(
+        None,
+        description="Any of time-offset, boresight and lever-arm, with commas (default: what ingest was asked to "
+        "estimate).",
     )
     max_offset: float = Field(
         2.0, gt=0, le=60, description="Search the time offset so many seconds on either side of the present one."
     )
-
-    @property
-    def wanted(self) -> tuple[RigParameter, ...]:
-        """The parameters, in their usual order."""
-        return tuple(name for name in RIG_PARAMETERS if name in self.estimate.split(","))
-
-    @field_validator("estimate")
-    @classmethod
-    def _are_parameters(cls, text: str) -> str:
-        return rig_parameters(text)
+    apply: bool | None = Field(
+        None,
+        description="Apply the estimates that are observable, or none (default: those that ingest was asked for).",
+    )

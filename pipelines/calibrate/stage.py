@@ -1,12 +1,12 @@
-"""`georef calibrate`: time offset, boresight and lever arm, from the SfM cameras against the recorded navigation.
+"""Stage `calibrate`: time offset, boresight and lever arm, from the SfM cameras against the recorded navigation.
 
-Reads `ingest/survey.json`, `ingest/track.npz` and `sfm/sparse`. What it finds is applied to the survey: positions
-and attitudes anew from the navigation, the estimates beside them. What SfM made of the photographs stays as it is.
+Reads: `ingest/survey.json`, and `ingest/track.npz` and `sfm/sparse` where there is anything to estimate.
+Writes: `calibrate/rig.json`. What is applied of it enters positions and attitudes when later stages read the survey
+(`scene.calibrated.load_survey`). What SfM made of the photographs stays as it is.
 """
 
 from __future__ import annotations
 
-import logging
 from typing import Literal
 
 import numpy as np
@@ -19,25 +19,21 @@ from pipelines.calibrate.rig_fit import (
     LIMIT_OFFSET_S,
     FitOptions,
     RigData,
+    RigFit,
     fit_rig,
 )
-from pipelines.core.errors import DegenerateGeometryError, InputError
-from pipelines.core.fingerprints import layout_of, product_hash
-from pipelines.core.options import RigParameter
-from pipelines.core.products import load_json
-from pipelines.core.stages import SPARSE, SURVEY, TRACK
+from pipelines.core.errors import DegenerateGeometryError
+from pipelines.core.products import load_json, save_json
+from pipelines.core.stages import SPARSE, SURVEY
 from pipelines.core.types import FloatArray
-from pipelines.core.workspace import Workspace
+from pipelines.core.workspace import StageRun, Summary
 from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.rotations import log_so3
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.scene.calibrated import with_rig
-from pipelines.scene.navigation import NavigationTrack, require_estimable
+from pipelines.scene.navigation import NavigationTrack, load_track, require_estimable
 from pipelines.scene.observations import control_correspondences
-from pipelines.scene.rig import RigCalibration, RigEstimate
+from pipelines.scene.rig import RigCalibration, RigEstimate, RigParameter
 from pipelines.scene.survey import Survey
-
-log = logging.getLogger(__name__)
 
 _LIMITS: dict[RigParameter, tuple[float, Literal["s", "deg", "m"]]] = {
     "time-offset": (LIMIT_OFFSET_S, "s"),
@@ -47,103 +43,115 @@ _LIMITS: dict[RigParameter, tuple[float, Literal["s", "deg", "m"]]] = {
 _ENDLESS = 1e6
 
 
-def calibrate(workspace: Workspace, config: CalibrateOptions) -> RigCalibration:
-    """Estimate the rig of a workspace's flight; changes nothing.
+def run(stage: StageRun, options: CalibrateOptions) -> Summary:
+    """Estimate the rig of the flight and save the estimates; where nothing is to be estimated, read nothing for it.
 
     Raises:
-        MissingProductError: there is no survey or no SfM model.
-        InputError: the navigation was not recorded by time, or there are no attitudes for what is asked.
-        DegenerateGeometryError: the flight shows nothing of it: a hover, a straight line.
+        InputError: the navigation was not recorded by time, or there are no attitudes for what is to be estimated.
     """
+    workspace = stage.workspace
     survey = load_json(Survey, workspace.path(SURVEY))
-    model = read_sparse(workspace.path(SPARSE))
-    found = estimate_rig(survey, model, _track(workspace), config)
-    return found.model_copy(update={"model": product_hash(workspace, SPARSE), "layout": layout_of(survey)})
+    calibration = RigCalibration()
+    if _wanted(survey, options):
+        calibration = calibrate(survey, read_sparse(workspace.path(SPARSE)), load_track(workspace), options)
+    save_json(calibration, stage.out / "rig.json")
+    return _summary(calibration, survey)
 
 
-def apply_calibration(workspace: Workspace, rig: RigCalibration) -> None:
-    """Make the survey of a workspace anew with what is usable of `rig`; the lock is the caller's to hold."""
-    survey = load_json(Survey, workspace.path(SURVEY))
-    workspace.replace(SURVEY, with_rig(survey, _track(workspace), rig))
-
-
-def calibrate_as_asked(workspace: Workspace) -> tuple[RigCalibration | None, bool]:
-    """Estimate and apply what the survey asks for, unless that is done and the SfM model still the same.
-
-    A flight that shows nothing of the rig is no failure here: the survey then says so.
-
-    Returns:
-        The estimates, None if nothing is asked for; and whether they were made now.
-    """
-    survey = load_json(Survey, workspace.path(SURVEY))
-    wanted = survey.rig.wanted if survey.rig is not None else survey.estimate
-    if not wanted:
-        return None, False
-    if survey.rig is not None and survey.rig.model == product_hash(workspace, SPARSE):
-        return survey.rig, False
-    try:
-        found = calibrate(workspace, CalibrateOptions(estimate=",".join(wanted)))
-    except DegenerateGeometryError as error:
-        found = RigCalibration(
-            wanted=wanted, problem=str(error), model=product_hash(workspace, SPARSE), layout=layout_of(survey)
-        )
-    for warning in warnings_of(found):
-        log.warning("calibrate: %s", warning)
-    log.info("calibrate: %s", told(found))
-    apply_calibration(workspace, found)
-    return found, True
-
-
-def told(rig: RigCalibration) -> str:
-    """The estimates in a line."""
-    parts = []
-    for one in rig.estimates:
-        value = ", ".join(f"{number:.3f}" for number in one.value)
-        sigma = ", ".join(f"{number:.3f}" for number in one.sigma)
-        unit = {"s": " s", "deg": "°", "m": " m"}[one.unit]
-        parts.append(f"{one.name} {value} ± {sigma}{unit}{'' if one.usable else ' (not observable, not applied)'}")
-    return "; ".join(parts) or "nothing of the rig is observable"
-
-
-def warnings_of(rig: RigCalibration) -> list[str]:
-    """What could not be estimated, and what counts instead."""
-    if rig.problem:
-        return [f"{rig.problem}; {', '.join(rig.wanted)} stay as told"]
-    return [
-        f"{one.name} is not observable in this flight (σ {max(one.sigma):.2g} {one.unit}): it stays as told"
-        for one in rig.estimates
-        if not one.usable
-    ]
-
-
-def estimate_rig(
-    survey: Survey, model: SparseModel, track: NavigationTrack, config: CalibrateOptions
+def calibrate(
+    survey: Survey, model: SparseModel, track: NavigationTrack, options: CalibrateOptions
 ) -> RigCalibration:
-    """As `calibrate`, of products."""
-    wanted = config.wanted
+    """Return estimates of the rig, those that ingest was asked for applied unless `--apply` says otherwise.
+
+    A flight that shows nothing of the rig is no failure: the calibration then says so.
+
+    Raises:
+        InputError: as `run`.
+    """
+    wanted = _wanted(survey, options)
     require_estimable(track, wanted, "--estimate")
-    data = _data(survey, model, track)
-    start_s = float(track.time_offset_s)
-    options = FitOptions("time-offset" in wanted, "lever-arm" in wanted, config.max_offset)
-    found = fit_rig(data, start_s, track.nominal_from_cam, options)
+    data, start_s = _data(survey, model, track), float(track.time_offset_s)
+    free = FitOptions("time-offset" in wanted, "lever-arm" in wanted, options.max_offset)
+    try:
+        fit = fit_rig(data, start_s, track.nominal_from_cam, free)
+    except DegenerateGeometryError as error:
+        return RigCalibration(wanted=wanted, problem=str(error))
+    estimates = [_estimates(fit, track)[name] for name in wanted]
+    to_apply = survey.estimate if options.apply is None else wanted if options.apply else ()
+    applied = tuple(estimate for estimate in estimates if estimate.usable and estimate.name in to_apply)
+    attitude = fit.rms_attitude_deg
+    return RigCalibration(
+        wanted=wanted,
+        applied=applied,
+        not_applied=tuple(estimate for estimate in estimates if estimate not in applied),
+        images=fit.images,
+        control_points=len(data.control_in_local),
+        rms_position_m=fit.rms_position_m,
+        rms_attitude_deg=attitude if np.isfinite(attitude) else None,
+    )
+
+
+def _wanted(survey: Survey, options: CalibrateOptions) -> tuple[RigParameter, ...]:
+    """Return the parameters to estimate: those of the options, else those that ingest was asked for."""
+    return survey.estimate if options.estimate is None else options.estimate
+
+
+def _estimates(fit: RigFit, track: NavigationTrack) -> dict[RigParameter, RigEstimate]:
     arm = np.nan_to_num(track.antenna_in_body).mean(axis=0)
-    state, sigma = found.state, found.sigma
-    rows: dict[RigParameter, RigEstimate] = {
-        "time-offset": _estimate("time-offset", [state.offset_s], sigma[7:8], [start_s]),
+    state, sigma = fit.state, fit.sigma
+    return {
+        "time-offset": _estimate("time-offset", [state.offset_s], sigma[7:8], [float(track.time_offset_s)]),
         "boresight": _estimate(
             "boresight", _degrees(state.boresight), np.degrees(sigma[8:11]), _degrees(track.nominal_from_cam)
         ),
         "lever-arm": _estimate("lever-arm", arm + state.arm, sigma[11:14], arm),
     }
-    attitude = found.rms_attitude_deg
-    return RigCalibration(
-        wanted=wanted,
-        estimates=tuple(rows[name] for name in wanted),
-        images=found.images,
-        control_points=len(data.control_in_local),
-        rms_position_m=found.rms_position_m,
-        rms_attitude_deg=attitude if np.isfinite(attitude) else None,
-    )
+
+
+def _summary(calibration: RigCalibration, survey: Survey) -> Summary:
+    residuals = {
+        "images": calibration.images,
+        "control_points": calibration.control_points,
+        "rms_position_m": calibration.rms_position_m,
+        "rms_attitude_deg": calibration.rms_attitude_deg,
+    }
+    values = {
+        "wanted": list(calibration.wanted),
+        "estimates": [estimate.model_dump(mode="json") for estimate in calibration.estimates],
+        "applied": [estimate.name for estimate in calibration.applied],
+        "residuals": residuals,
+    }
+    return Summary(_key_figure(calibration), values, _warnings(calibration, survey))
+
+
+def _key_figure(calibration: RigCalibration) -> str:
+    if not calibration.wanted:
+        return "nothing to estimate"
+    parts = []
+    for estimate in calibration.estimates:
+        value = ", ".join(f"{number:.3f}" for number in estimate.value)
+        sigma = ", ".join(f"{number:.3f}" for number in estimate.sigma)
+        unit = {"s": " s", "deg": "°", "m": " m"}[estimate.unit]
+        remark = "" if estimate in calibration.applied else " (not applied)"
+        remark = remark if estimate.usable else " (not observable, not applied)"
+        parts.append(f"{estimate.name} {value} ± {sigma}{unit}{remark}")
+    return "; ".join(parts) or "nothing of the rig is observable"
+
+
+def _warnings(calibration: RigCalibration, survey: Survey) -> tuple[str, ...]:
+    """Return parameters that stay as `ingest` was told although they were to be estimated."""
+    if calibration.problem:
+        return (f"{calibration.problem}; {', '.join(calibration.wanted)} stay as told",)
+    warnings = [
+        f"{estimate.name} is not observable in this flight (σ {max(estimate.sigma):.2g} {estimate.unit}): it stays "
+        "as told"
+        for estimate in calibration.estimates
+        if not estimate.usable
+    ]
+    missed = [name for name in survey.estimate if name not in calibration.wanted]
+    if missed:
+        warnings.append(f"--estimate leaves out what ingest was asked to estimate: {', '.join(missed)}")
+    return tuple(warnings)
 
 
 def _data(survey: Survey, model: SparseModel, track: NavigationTrack) -> RigData:
@@ -169,7 +177,7 @@ def _data(survey: Survey, model: SparseModel, track: NavigationTrack) -> RigData
 
 
 def _pixel(model: SparseModel) -> tuple[float, float]:
-    """A pixel's angle in radians, and its width at the distance of the points in units of local."""
+    """Return a pixel's angle in radians, and its width at the distance of the points in units of local."""
     arm = model.point_in_local[model.obs_point] - model.cam_center_in_local[model.obs_image]
     focal = np.array([model.camera_of(image).mean_focal_px for image in range(len(model.image_name))])
     footprint = np.median(np.linalg.norm(arm, axis=1) / focal[model.obs_image])
@@ -179,7 +187,7 @@ def _pixel(model: SparseModel) -> tuple[float, float]:
 def _estimate(name: RigParameter, value: ArrayLike, sigma: ArrayLike, start: ArrayLike) -> RigEstimate:
     values, sigmas, starts = (tuple(float(number) for number in np.ravel(row)) for row in (value, sigma, start))
     limit, unit = _LIMITS[name]
-    # What nothing was said of has an endless σ, which JSON does not have.
+    # A parameter that nothing tells of has an endless σ, which JSON does not have.
     sigmas = tuple(min(number, _ENDLESS) for number in sigmas)
     return RigEstimate(
         name=name,
@@ -189,17 +197,6 @@ def _estimate(name: RigParameter, value: ArrayLike, sigma: ArrayLike, start: Arr
         start=starts,
         observable=tuple(number <= limit for number in sigmas),
     )
-
-
-def _track(workspace: Workspace) -> NavigationTrack:
-    path = workspace.root / TRACK
-    if not path.exists():
-        raise InputError(
-            "the survey has no navigation recorded by time, only a position for each image: ingest a --bag, or a "
-            "--trajectory by time",
-            path=path,
-        )
-    return NavigationTrack.load(path)
 
 
 def _degrees(rotation: FloatArray) -> FloatArray:

@@ -3,76 +3,96 @@
 from __future__ import annotations
 
 import hashlib
+import json
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
-from pipelines.core.errors import InputError
+from pipelines.core.errors import InputError, MissingProductError
 from pipelines.core.options import StageOptions, flag_name, input_paths
-from pipelines.core.products import load_json
-from pipelines.core.stages import SURVEY, StageSpec
+from pipelines.core.stages import ProductPart, StageSpec
 from pipelines.core.workspace import Workspace
-from pipelines.scene.survey import Survey
 
 Memo = dict[Path, str]
 _WHOLE_BYTES = 256 * 1024 * 1024
 
 
-def fingerprints(workspace: Workspace, spec: StageSpec, config: StageOptions, memo: Memo) -> dict[str, str]:
-    """Hashes of everything that decides a stage's result, by product or flag.
+def fingerprints(workspace: Workspace, spec: StageSpec, options: StageOptions, memo: Memo) -> dict[str, str]:
+    """Return hashes of everything that decides a stage's result, by product or flag.
 
-    Workspace products by content; files that the options name by content, those beyond 256 MiB (bags) and folders
-    by the name, size and modification time of each file (reading gigabytes at each look would be too slow). Of the
-    survey, sfm reads the photographs, their cameras, and the positions and attitudes as recorded.
+    Workspace products, or parts of them, by content; files that the options name by content, those beyond 256 MiB
+    (bags) and folders by the name, size and modification time of each file (reading gigabytes at each look would be
+    too slow).
 
     Args:
-        memo: hashes found so far; a product that several stages read is hashed once.
+        workspace: where the products are.
+        spec: the stage.
+        options: its options.
+        memo: hashes of whole products; one that several stages read is hashed once.
 
     Raises:
         MissingProductError: a product is not there.
         InputError: a path that an option names does not exist, or something cannot be read.
     """
+    hashes: dict[str, str] = {}
     try:
-        found = {product: _hash_read(workspace, spec, product, memo) for product in spec.reads}
-        for name, path in input_paths(config).items():
-            flag = flag_name(type(config), name)
+        for part in spec.reads:
+            hashes |= _hash_part(workspace, part, memo)
+        for name, path in input_paths(options).items():
+            flag = flag_name(type(options), name)
             if not path.exists():
                 raise InputError("no such file or folder", path=path, field=flag)
-            found[flag] = _hash_input(path, workspace.root)
+            hashes[flag] = _hash_input(path, workspace.root)
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}", path=error.filename) from error
-    return found
+    return hashes
 
 
-def product_hash(workspace: Workspace, product: str) -> str:
-    """The hash of a product by content.
-
-    Raises:
-        MissingProductError: it is not there.
-    """
-    return _hash_product(workspace.path(product), {})
-
-
-def layout_of(survey: Survey) -> str:
-    """Hash of a survey's positions and attitudes as they were recorded, whatever was applied to them after sfm."""
-    if survey.rig is not None and survey.rig.layout:
-        return survey.rig.layout
-    layout = [
-        (image.fix and image.fix.position_in_geo, image.attitude and image.attitude.quat_xyzw)
-        for image in survey.images
-    ]
-    return hashlib.sha256(repr(layout).encode()).hexdigest()
-
-
-def _hash_read(workspace: Workspace, spec: StageSpec, product: str, memo: Memo) -> str:
-    path = workspace.path(product)
-    if not (spec.photographs_only and product == SURVEY):
-        return _hash_product(path, memo)
+def _hash_part(workspace: Workspace, part: ProductPart, memo: Memo) -> dict[str, str]:
+    """Return the hash of a part and of the products that it brings; nothing where the stage does without it."""
     try:
-        survey = load_json(Survey, path)
-    except InputError:  # the stage will tell
-        return _hash_product(path, memo)
-    cameras = [camera.model_dump() for camera in survey.cameras]
-    images = [(image.name, image.camera_id, image.sha256) for image in survey.images]
-    return hashlib.sha256(repr((survey.image_dir, cameras, images, layout_of(survey))).encode()).hexdigest()
+        path = workspace.path(part.product)
+    except MissingProductError:
+        if part.optional:
+            return {}
+        raise
+    try:
+        values = _values(path, part.fields)
+    except ValueError:  # no such document: the stage that reads it will tell
+        values = None
+    if values is None or (_is_empty(values) and not part.optional):
+        return {part.product: _hash_product(path, memo)}
+    if _is_empty(values):
+        return {}
+    text = json.dumps(dict(zip(part.fields, values, strict=True)), sort_keys=True)
+    hashes = {part.product: hashlib.sha256(text.encode()).hexdigest()}
+    for product in part.brings:
+        hashes |= _hash_part(workspace, ProductPart(product, optional=True), memo)
+    return hashes
+
+
+def _values(path: Path, fields: Sequence[str]) -> list[Any] | None:
+    """Return the values of a JSON document's fields; None where no fields are asked for."""
+    if not fields:
+        return None
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except RecursionError as error:
+        raise ValueError("nested too deeply") from error
+    return [_value(document, field.split(".")) for field in fields]
+
+
+def _value(document: Any, keys: Sequence[str]) -> Any:
+    """Return the value at a path of keys, of every item of a list; None where there is none."""
+    if not keys or document is None:
+        return document
+    if isinstance(document, list):
+        return [_value(item, keys) for item in document]
+    return _value(document.get(keys[0]), keys[1:]) if isinstance(document, dict) else None
+
+
+def _is_empty(value: Any) -> bool:
+    return value is None or (isinstance(value, list) and all(_is_empty(item) for item in value))
 
 
 def _hash_input(path: Path, workspace_root: Path) -> str:
@@ -103,7 +123,7 @@ def _hash_folder(path: Path) -> str:
 
 
 def _hash_listing(path: Path, workspace_root: Path) -> str:
-    """Hash of the visible files' names, sizes and times; a workspace inside the folder is no input of itself."""
+    """Return the hash of the visible files' names, sizes and times, but for a workspace inside the folder."""
     digest = hashlib.sha256()
     for file in _files(path):
         hidden = any(part.startswith(".") for part in file.relative_to(path).parts)

@@ -2,33 +2,39 @@
 
 Precedence: default < the workspace's `georef.toml` (one table a stage) < command-line flag. The command line
 derives its flags from these classes, so that a default exists once. Unknown keys and values out of range are
-errors that name the key. Stages with many options have a file of their own: `ingest_config.py`,
-`train_config.py`.
+errors that name the key. The options of a stage stand in `options.py` of its room.
+
+Options hold parsed values. An option that users write as text (`0.1,0,-0.3`, `2s`, `auto`) has a type with
+`from_text`, which reads the text of a flag, of `georef.toml` and of an earlier version's manifest once, and with
+`WRITTEN`, which tells the command line that it takes text.
 """
 
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, get_args
+from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, ValidationError
 from pydantic.fields import FieldInfo
 
 from pipelines.core.errors import InputError
+from pipelines.core.types import Vector3
 
 CONFIG_FILE = "georef.toml"
-AUTO = "auto"
-RigParameter = Literal["time-offset", "boresight", "lever-arm"]
-RIG_PARAMETERS: tuple[RigParameter, ...] = get_args(RigParameter)
 
 
 class InputMarker:
     """Marks a path whose content decides the stage's result: its fingerprint enters the manifest."""
 
 
+class WrittenMarker:
+    """Marks an option that users write as text; `notation` writes its value as they do."""
+
+
 InputPath = Annotated[Path, InputMarker()]
+WRITTEN = WrittenMarker()
 
 
 class StageOptions(BaseModel):
@@ -37,84 +43,106 @@ class StageOptions(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
-def rig_parameters(text: str) -> str:
-    """The text, if it is parameters of the rig with commas between.
+def from_text(parse: Callable[[str], object]) -> BeforeValidator:
+    """Return the validator that parses a text; other values (a TOML array, a manifest's JSON) pass unparsed."""
+    return BeforeValidator(lambda value: parse(value) if isinstance(value, str) else value)
+
+
+def listed_names(text: str, known: Collection[str], otherwise: str = "") -> tuple[str, ...]:
+    """Return the names in a text with commas.
+
+    Args:
+        text: e.g. `boresight,lever-arm`.
+        known: the names there are.
+        otherwise: what else may be given, for the error.
 
     Raises:
-        ValueError: it is not.
+        ValueError: a name that is not known.
     """
-    unknown = [name for name in text.split(",") if name not in RIG_PARAMETERS]
+    names = tuple(text.split(","))
+    unknown = [name for name in names if name not in known]
     if unknown:
-        raise ValueError(f"{unknown[0]!r} is none of {', '.join(RIG_PARAMETERS)}")
-    return text
+        raise ValueError(f"{unknown[0]!r} is none of {', '.join(known)}{otherwise}")
+    return names
 
 
-def on_earth(text: str) -> str:
-    """The text, if it is latitude,longitude,height of a place on Earth.
-
-    Raises:
-        ValueError: it is not.
-    """
-    lat, lon, alt = triple(text)
-    if abs(lat) > 90 or abs(lon) > 180 or not -1000 <= alt <= 10000:
-        raise ValueError("latitude −90 … 90, longitude −180 … 180, height −1000 … 10000")
-    return text
+def notation(value: object) -> str:
+    """Return an option's value as a user writes it: `0.1,0,-0.3`, `2s`, `auto`."""
+    if isinstance(value, tuple):
+        return ",".join(notation(part) for part in value)
+    return f"{value:.15g}" if isinstance(value, float) else str(value)
 
 
-def triple(text: str) -> tuple[float, float, float]:
-    """Three finite numbers written with commas.
-
-    Raises:
-        ValueError: anything else.
-    """
+def _triple(text: str) -> tuple[float, ...]:
     parts = text.split(",")
     if len(parts) != 3:
         raise ValueError("three numbers with commas, like 46.02,7.75,1620")
-    x, y, z = (float(part) for part in parts)
-    if not all(abs(number) < 1e6 for number in (x, y, z)):
+    return tuple(float(part) for part in parts)
+
+
+def _finite(numbers: Vector3) -> Vector3:
+    if not all(abs(number) < 1e6 for number in numbers):
         raise ValueError("three finite numbers")
-    return x, y, z
+    return numbers
 
 
-ConfigT = TypeVar("ConfigT", bound=StageOptions)
+def _on_earth(place: Vector3) -> Vector3:
+    lat, lon, alt = place
+    if abs(lat) > 90 or abs(lon) > 180 or not -1000 <= alt <= 10000:
+        raise ValueError("latitude −90 … 90, longitude −180 … 180, height −1000 … 10000")
+    return place
 
 
-def flag_name(config_type: type[StageOptions], name: str) -> str:
-    """The command-line flag of a field: its name with dashes, or what the field says."""
-    info = config_type.model_fields.get(name)
+Triple = Annotated[Vector3, from_text(_triple), AfterValidator(_finite), WRITTEN]
+# Latitude and longitude in degrees, ellipsoidal height in metres.
+PlaceOnEarth = Annotated[Vector3, from_text(_triple), AfterValidator(_finite), AfterValidator(_on_earth), WRITTEN]
+
+OptionsT = TypeVar("OptionsT", bound=StageOptions)
+
+
+def flag_name(options_type: type[StageOptions], name: str) -> str:
+    """Return the command-line flag of a field: its name with dashes, or what the field says."""
+    info = options_type.model_fields.get(name)
     extra = info.json_schema_extra if info is not None else None
     stated = extra.get("flag") if isinstance(extra, dict) else None
     return str(stated) if stated else "--" + name.replace("_", "-")
 
 
-def input_paths(config: StageOptions) -> dict[str, Path]:
-    """The paths among a config's values whose content decides the stage's result, by field."""
-    fields = type(config).model_fields
+def input_paths(options: StageOptions) -> dict[str, Path]:
+    """Return the paths among the options whose content decides the stage's result, by field."""
+    fields = type(options).model_fields
     return {
         name: Path(value)
         for name, info in fields.items()
-        if _is_input(info) and (value := getattr(config, name)) is not None
+        if _is_input(info) and (value := getattr(options, name)) is not None
     }
 
 
-def resolve(config_type: type[ConfigT], table: Mapping[str, Any], flags: Mapping[str, Any], toml: Path) -> ConfigT:
-    """Merge default < `table` of `toml` < `flags` into a validated config.
+def is_written(info: FieldInfo) -> bool:
+    """Return whether users write an option as text."""
+    return any(isinstance(mark, WrittenMarker) for mark in _marks(info))
+
+
+def resolve(
+    options_type: type[OptionsT], table: Mapping[str, Any], flags: Mapping[str, Any], toml: Path
+) -> OptionsT:
+    """Merge default < `table` of `toml` < `flags` into validated options.
 
     Relative paths in the table are relative to the folder of `toml`.
 
     Raises:
         InputError: an unknown key or a value out of range; names the file (or flag) and the key.
     """
-    merged = {**_anchored(config_type, table, toml.parent), **flags}
+    merged = {**_anchored(options_type, table, toml.parent), **flags}
     try:
-        return config_type.model_validate(merged)
+        return options_type.model_validate(merged)
     except ValidationError as error:
         first = error.errors()[0]
         key = str(first["loc"][0]) if first["loc"] else "?"
         from_file = key in table and key not in flags
-        known = ", ".join(sorted(config_type.model_fields))
+        known = ", ".join(sorted(options_type.model_fields))
         hint = f"unknown key; known keys: {known}" if first["type"] == "extra_forbidden" else first["msg"]
-        name = key if from_file else flag_name(config_type, key)
+        name = key if from_file else flag_name(options_type, key)
         raise InputError(hint, path=toml if from_file else None, field=name) from error
 
 
@@ -141,15 +169,18 @@ def load_toml(path: Path, stages: Collection[str]) -> dict[str, dict[str, Any]]:
 
 
 def _is_input(info: FieldInfo) -> bool:
-    """Whether a field is an `InputPath`, also where `InputPath | None` hides the marker in a union's member."""
+    return any(isinstance(mark, InputMarker) for mark in _marks(info))
+
+
+def _marks(info: FieldInfo) -> list[object]:
+    """Return a field's marks, also those that `… | None` hides in a union's member."""
     members = getattr(info.annotation, "__args__", ())
-    marks = [*info.metadata, *(mark for member in members for mark in getattr(member, "__metadata__", ()))]
-    return any(isinstance(mark, InputMarker) for mark in marks)
+    return [*info.metadata, *(mark for member in members for mark in getattr(member, "__metadata__", ()))]
 
 
-def _anchored(config_type: type[StageOptions], table: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """The table with its input paths made absolute."""
-    fields = config_type.model_fields
+def _anchored(options_type: type[StageOptions], table: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """Return the table with its input paths made absolute."""
+    fields = options_type.model_fields
     return {
         key: str(folder / value) if isinstance(value, str) and key in fields and _is_input(fields[key]) else value
         for key, value in table.items()

@@ -16,12 +16,10 @@ from typing import Any
 from pipelines import __version__
 from pipelines.core.errors import GeorefError, InputError, MissingProductError
 from pipelines.core.fingerprints import Memo
-from pipelines.core.products import load_json
 from pipelines.core.progress import SILENT, Progress
-from pipelines.core.stages import CALIBRATE, CALIBRATED_BEFORE, SPARSE, SURVEY, StageSpec, producer_of, products_of
+from pipelines.core.stages import StageSpec, producer_of, products_of
 from pipelines.core.staleness import BY_HAND, Flags, Request, must_exist, request, stage_config, status, why_stale
 from pipelines.core.workspace import Manifest, Resume, StageRun, Summary, Workspace, now
-from pipelines.scene.survey import Survey
 
 log = logging.getLogger(__name__)
 
@@ -88,9 +86,6 @@ def run_pipeline(
 ) -> list[Outcome]:
     """Run stages in order, skipping what is current and resuming what was interrupted.
 
-    What the survey wants to have estimated of the rig is estimated and applied ahead of the first stage that builds
-    on its positions.
-
     All options are checked and remembered before the first stage begins: a bad option of a late stage costs no
     hours, and a run that is killed early is completed as it was asked for.
 
@@ -112,9 +107,6 @@ def run_pipeline(
     outcomes: list[Outcome] = []
     try:
         for spec in stages:
-            if spec.name == CALIBRATED_BEFORE:
-                with around(CALIBRATE):
-                    outcomes += _calibrated(workspace)
             with around(spec):
                 outcome = run_stage(
                     workspace, spec, asked[spec.name], force=force, resume="if-same", progress=progress
@@ -129,39 +121,13 @@ def run_pipeline(
     return outcomes
 
 
-def _calibrated(workspace: Workspace) -> list[Outcome]:
-    """What `calibrate` did where the survey asks for it: one outcome, or none."""
-    try:
-        survey = load_json(Survey, workspace.path(SURVEY))
-    except GeorefError:  # the stage that reads it will tell
-        return []
-    if not survey.estimate and survey.rig is None:
-        return []
-    started, clock = now(), time.monotonic()
-    calibration = importlib.import_module(CALIBRATE.module)
-    with workspace.lock(CALIBRATE.name):
-        found, ran = calibration.calibrate_as_asked(workspace)
-    manifest = Manifest(
-        stage=CALIBRATE.name,
-        config={"estimate": list(found.wanted)},
-        inputs={SPARSE: found.model},
-        versions=_versions(),
-        started=started,
-        duration_s=round(time.monotonic() - clock, 3),
-        key_figure=calibration.told(found),
-        values=found.model_dump(mode="json"),
-        warnings=calibration.warnings_of(found),
-    )
-    return [Outcome(CALIBRATE.name, ran, manifest)]
-
-
 def remembered(workspace: Workspace, spec: StageSpec, flags: Flags) -> dict[str, Any]:
-    """The options that a stage was last asked for with, and `flags` on top of them."""
+    """Return the options that a stage was last asked for with, and `flags` on top of them."""
     return {**workspace.requests().get(spec.name, {}), **flags}
 
 
 def _execute(workspace: Workspace, asked: Request, resume: Resume, progress: Progress) -> Manifest:
-    spec, resolved = asked.spec, asked.config.model_dump(mode="json")
+    spec, resolved = asked.spec, asked.options.model_dump(mode="json")
     token = hashlib.sha256(json.dumps([resolved, asked.inputs], sort_keys=True).encode()).hexdigest()
     if resume == "never" and spec.resumable and workspace.partial(spec).exists():
         log.warning("%s: starts afresh; what an interrupted run had done is dropped", spec.name)
@@ -170,7 +136,7 @@ def _execute(workspace: Workspace, asked: Request, resume: Resume, progress: Pro
     log.info("%s: %s", spec.name, "resumed" if resumed else "started")
     try:
         run = importlib.import_module(spec.module).run
-        summary: Summary = run(StageRun(workspace, out, progress, resumed), asked.config)
+        summary: Summary = run(StageRun(workspace, out, progress, resumed), asked.options)
     except GeorefError as error:
         workspace.fail(spec, str(error))
         raise
@@ -196,7 +162,7 @@ def _execute(workspace: Workspace, asked: Request, resume: Resume, progress: Pro
 
 
 def _current(workspace: Workspace, asked: Request) -> Manifest | None:
-    """The manifest of a product that need not be made again, or None."""
+    """Return the manifest of a product that need not be made again, or None."""
     spec = asked.spec
     if workspace.placed_by_hand(spec):
         log.info("%s: %s was %s and is kept; --force replaces it", spec.name, spec.product, BY_HAND)
@@ -225,7 +191,7 @@ def _current(workspace: Workspace, asked: Request) -> Manifest | None:
 
 def _warn_of_stale_inputs(workspace: Workspace, spec: StageSpec, memo: Memo) -> None:
     """Say so when a stage is about to build on a product whose own inputs have changed."""
-    producers = {producer_of(product).name for product in spec.reads}
+    producers = {producer_of(part.product).name for part in spec.reads}
     for row in status(workspace, memo, before=spec):
         if row.stage in producers and row.state == "stale":
             log.warning("%s builds on %s, which is stale (%s)", spec.name, row.stage, row.reason)

@@ -14,6 +14,7 @@ from pipelines.core.options import StageOptions
 SURVEY = "ingest/survey.json"
 TRACK = "ingest/track.npz"  # not always there
 SPARSE = "sfm/sparse"
+RIG = "calibrate/rig.json"
 POINTS = "geolocate/points.npz"
 SIM3 = "sim3/geo_from_local.json"
 MODEL = "train/model.json"
@@ -23,18 +24,59 @@ SPLAT = "export/splat.ply"
 
 
 @dataclass(frozen=True)
+class ProductPart:
+    """A product of another stage, or the part of it that decides a stage's result.
+
+    Attributes:
+        product: its workspace path, a file or a folder.
+        fields: paths of keys in its JSON document, through every item of a list: `images.fix.position_in_geo`.
+            Nothing else in the document makes the stage stale. Without fields, the whole product counts.
+        optional: whether the stage does without it. A part without any value then counts as not there.
+        brings: further products that count where this part has a value, if they are there.
+    """
+
+    product: str
+    fields: tuple[str, ...] = ()
+    optional: bool = False
+    brings: tuple[str, ...] = ()
+
+
+def whole(*products: str) -> tuple[ProductPart, ...]:
+    """Return products that count as a whole."""
+    return tuple(ProductPart(product) for product in products)
+
+
+# The photographs, and the positions and attitudes by which `sfm` chooses the pairs to match. Control points, σ and
+# the split of a survey do not make an SfM model stale.
+PHOTOGRAPHS = ProductPart(
+    SURVEY,
+    fields=(
+        "image_dir",
+        "cameras",
+        "images.name",
+        "images.camera_id",
+        "images.sha256",
+        "images.fix.position_in_geo",
+        "images.attitude.quat_xyzw",
+    ),
+)
+# The estimates that are applied to the survey when it is read, with the navigation that they are applied to.
+APPLIED_RIG = ProductPart(
+    RIG, fields=("applied.name", "applied.value", "applied.start"), optional=True, brings=(TRACK,)
+)
+
+
+@dataclass(frozen=True)
 class StageSpec:
     """One stage.
 
     Attributes:
         name: the subcommand.
-        module: where `run(stage, config) -> Summary` lives.
+        module: where `run(stage, options) -> Summary` lives.
         options_place: where the class of its options lives, `module:class`.
         folder: its folder in the workspace.
-        reads: workspace paths (files or folders) that decide its result.
+        reads: products, or parts of them, that decide its result.
         product: the path that later stages and people look for.
-        photographs_only: whether it reads nothing of the survey but photographs, cameras, and the positions and
-            attitudes as recorded: control points, σ and what `calibrate` applies do not make it stale.
         title: one line of help.
         resumable: whether a partial product can be continued.
         also: further paths in its folder that others look for, besides what the stages of the pipeline read.
@@ -44,12 +86,11 @@ class StageSpec:
     module: str
     options_place: str
     folder: str
-    reads: tuple[str, ...]
+    reads: tuple[ProductPart, ...]
     product: str
     title: str
     resumable: bool = False
     also: tuple[str, ...] = ()
-    photographs_only: bool = False
 
     @property
     def options(self) -> type[StageOptions]:
@@ -74,18 +115,26 @@ PIPELINE: tuple[StageSpec, ...] = (
         module="pipelines.sfm.stage",
         options_place="pipelines.sfm.options:SfmOptions",
         folder="sfm",
-        reads=(SURVEY,),
+        reads=(PHOTOGRAPHS,),
         product=SPARSE,
         title="Reconstruct cameras and points with COLMAP.",
         resumable=True,
-        photographs_only=True,
+    ),
+    StageSpec(
+        name="calibrate",
+        module="pipelines.calibrate.stage",
+        options_place="pipelines.calibrate.options:CalibrateOptions",
+        folder="calibrate",
+        reads=(*whole(SURVEY, SPARSE), ProductPart(TRACK, optional=True)),
+        product=RIG,
+        title="Estimate time offset, boresight and lever arm after sfm.",
     ),
     StageSpec(
         name="geolocate",
         module="pipelines.geolocate.stage",
         options_place="pipelines.geolocate.options:GeolocateOptions",
         folder="geolocate",
-        reads=(SURVEY, SPARSE),
+        reads=(*whole(SURVEY, SPARSE), APPLIED_RIG),
         product=POINTS,
         title="Intersect every SfM point on Earth from the measured positions and attitudes.",
     ),
@@ -94,7 +143,7 @@ PIPELINE: tuple[StageSpec, ...] = (
         module="pipelines.init_sim3.stage",
         options_place="pipelines.init_sim3.options:InitSim3Options",
         folder="sim3",
-        reads=(SURVEY, SPARSE, POINTS),
+        reads=(*whole(SURVEY, SPARSE, POINTS), APPLIED_RIG),
         product=SIM3,
         title="Estimate the similarity from the SfM model to the Earth.",
     ),
@@ -103,7 +152,7 @@ PIPELINE: tuple[StageSpec, ...] = (
         module="pipelines.train.stage",
         options_place="pipelines.train.options:TrainOptions",
         folder="train",
-        reads=(SURVEY, SPARSE, SIM3, POINTS),
+        reads=(*whole(SURVEY, SPARSE, SIM3, POINTS), APPLIED_RIG),
         product=MODEL,
         title="Train the Gaussians together with the similarity and the cameras.",
         resumable=True,
@@ -113,7 +162,7 @@ PIPELINE: tuple[StageSpec, ...] = (
         module="pipelines.evaluate.stage",
         options_place="pipelines.evaluate.options:EvaluateOptions",
         folder="evaluate",
-        reads=(SURVEY, SPARSE, MODEL, GAUSSIANS, SIM3),
+        reads=(*whole(SURVEY, SPARSE, MODEL, GAUSSIANS, SIM3), APPLIED_RIG),
         product=REPORT,
         title="Measure test views and check points.",
     ),
@@ -122,7 +171,7 @@ PIPELINE: tuple[StageSpec, ...] = (
         module="pipelines.deliver.ply",
         options_place="pipelines.deliver.options:ExportPlyOptions",
         folder="export",
-        reads=(SURVEY, MODEL, GAUSSIANS),
+        reads=(*whole(SURVEY, MODEL, GAUSSIANS), APPLIED_RIG),
         product=SPLAT,
         title="Write the splat as a PLY that knows where it is.",
     ),
@@ -135,42 +184,31 @@ ADJUST = StageSpec(
     module="pipelines.sfm.pose_prior",
     options_place="pipelines.sfm.options:AdjustOptions",
     folder="adjust",
-    reads=(SURVEY, SPARSE),
+    reads=(*whole(SURVEY, SPARSE), APPLIED_RIG),
     product="adjust/sparse",
     title="Adjust the bundle with the fixes as priors of the camera positions.",
     also=("adjust/geo_from_local.json",),
 )
 
 STAGES = (*PIPELINE, ADJUST)
-# Between sfm and what builds on the survey's positions: makes the survey anew where it asks for that.
-CALIBRATE = StageSpec(
-    name="calibrate",
-    module="pipelines.calibrate.stage",
-    options_place="pipelines.calibrate.options:CalibrateOptions",
-    folder="ingest",
-    reads=(SURVEY, SPARSE),
-    product=SURVEY,
-    title="Estimate time offset, boresight and lever arm after sfm.",
-)
-CALIBRATED_BEFORE = "geolocate"
-
 BY_NAME = {spec.name: spec for spec in PIPELINE}
 
 
 def producer_of(path: str) -> StageSpec:
-    """The stage that writes a workspace path."""
+    """Return the stage that writes a workspace path."""
     folder = path.split("/", maxsplit=1)[0]
     return next(spec for spec in STAGES if spec.folder == folder)
 
 
 def products_of(spec: StageSpec) -> tuple[str, ...]:
-    """Everything in a stage's folder that people or later stages look for."""
-    read = (path for other in PIPELINE for path in other.reads if producer_of(path) is spec)
-    return tuple(dict.fromkeys((spec.product, *spec.also, *read)))
+    """Return everything in a stage's folder that people or later stages look for."""
+    needed = (part.product for other in PIPELINE for part in other.reads if not part.optional)
+    own = (product for product in needed if producer_of(product) is spec)
+    return tuple(dict.fromkeys((spec.product, *spec.also, *own)))
 
 
 def stage_slice(first: str | None, last: str | None) -> tuple[StageSpec, ...]:
-    """The stages from `first` to `last`, both included.
+    """Return the stages from `first` to `last`, both included.
 
     Raises:
         GeorefError: `first` comes after `last`.

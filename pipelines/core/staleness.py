@@ -35,23 +35,23 @@ class Request:
     """A stage as it is asked for now: its options, and the fingerprints of what it reads."""
 
     spec: StageSpec
-    config: StageOptions
+    options: StageOptions
     inputs: dict[str, str]
 
 
 def request(workspace: Workspace, spec: StageSpec, flags: Flags, memo: Memo) -> Request:
-    """Options (default < `georef.toml` < flags) and inputs of a stage.
+    """Return options (default < `georef.toml` < flags) and inputs of a stage.
 
     Raises:
         MissingProductError: a product that it reads is not there.
         InputError: an unknown or invalid option, or a missing file.
     """
-    config = stage_config(workspace, spec, flags)
-    return Request(spec, config, fingerprints(workspace, spec, config, memo))
+    options = stage_config(workspace, spec, flags)
+    return Request(spec, options, fingerprints(workspace, spec, options, memo))
 
 
 def stage_config(workspace: Workspace, spec: StageSpec, flags: Flags) -> StageOptions:
-    """Options of a stage: default < `georef.toml` < flags.
+    """Return the options of a stage: default < `georef.toml` < flags.
 
     Raises:
         InputError: unknown or invalid option.
@@ -61,17 +61,17 @@ def stage_config(workspace: Workspace, spec: StageSpec, flags: Flags) -> StageOp
 
 
 def why_stale(workspace: Workspace, asked: Request, manifest: Manifest) -> str:
-    """Why a product is not what its inputs and options would make now; empty if it is."""
-    config = asked.config
+    """Return why a product is not what its inputs and options would make now; empty if it is."""
+    options = asked.options
     try:
-        made_with = type(config).model_validate(manifest.config)
+        made_with = type(options).model_validate(manifest.config)
     except ValueError:
         return "made by a version with other options"
-    options = [name for name in type(config).model_fields if getattr(made_with, name) != getattr(config, name)]
-    if options:
-        return f"option {', '.join(options)} changed"
-    names = sorted({*asked.inputs, *manifest.inputs})
-    changed = [name for name in names if manifest.inputs.get(name) != asked.inputs.get(name)]
+    names = [name for name in type(options).model_fields if getattr(made_with, name) != getattr(options, name)]
+    if names:
+        return f"option {', '.join(names)} changed"
+    inputs = sorted({*asked.inputs, *manifest.inputs})
+    changed = [name for name in inputs if manifest.inputs.get(name) != asked.inputs.get(name)]
     if changed:
         return f"{', '.join(changed)} changed"
     gone = [product for product in products_of(asked.spec) if not (workspace.root / product).exists()]
@@ -79,7 +79,7 @@ def why_stale(workspace: Workspace, asked: Request, manifest: Manifest) -> str:
 
 
 def status(workspace: Workspace, memo: Memo | None = None, before: StageSpec | None = None) -> list[StageState]:
-    """The state of every stage, in order; of those ahead of `before`, if given.
+    """Return the state of every stage, in order; of those ahead of `before`, if given.
 
     Raises:
         InputError: there is no such directory, or its `georef.toml` or `requests.json` is not valid.
@@ -110,7 +110,7 @@ class _Look:
     stale: set[str] = field(default_factory=set)
 
     def at(self, spec: StageSpec) -> StageState:
-        """The state of the next stage."""
+        """Return the state of the next stage."""
         row = self._state(spec)
         if row.state == "stale":
             self.stale.add(spec.name)
@@ -143,13 +143,13 @@ class _Look:
         )
 
     def _reason(self, spec: StageSpec, manifest: Manifest) -> str:
-        """Why a product is stale, by itself or because one that it builds on is."""
+        """Return why a product is stale, by itself or because one that it builds on is."""
         flags = self.requests.get(spec.name, {})
         stage_config(self.workspace, spec, flags)  # a bad georef.toml is an error, not a state
         try:
             own = why_stale(self.workspace, request(self.workspace, spec, flags, self.memo), manifest)
         except (MissingProductError, InputError) as error:
             return str(error)
-        producers = dict.fromkeys(producer_of(product).name for product in spec.reads)
+        producers = dict.fromkeys(producer_of(part.product).name for part in spec.reads)
         upstream = [name for name in producers if name in self.stale]
         return own or (f"{', '.join(upstream)} is stale" if upstream else "")

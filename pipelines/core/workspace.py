@@ -249,13 +249,6 @@ class Workspace:
         draft.replace(partial / MANIFEST)  # from here on it counts as complete, whatever happens
         self._swap(spec)
 
-    def replace(self, product: str, document: BaseModel) -> None:
-        """Put another JSON product in the place of a finished one; what builds on it becomes stale."""
-        path = self.path(product)
-        draft = path.with_suffix(".tmp")
-        save_json(document, draft)
-        draft.replace(path)
-
     def requests(self) -> dict[str, dict[str, Any]]:
         """The flags that each stage was last asked for with, so that `georef run` can complete them.
 

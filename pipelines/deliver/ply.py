@@ -16,7 +16,7 @@ import torch
 
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.products import load_json
-from pipelines.core.stages import GAUSSIANS, MODEL, SPLAT, SURVEY
+from pipelines.core.stages import GAUSSIANS, MODEL, SPLAT
 from pipelines.core.types import FloatArray, Quaternion, Row7, Vector3
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.deliver.options import ExportPlyOptions
@@ -32,6 +32,7 @@ from pipelines.geodesy.enu import (
 )
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
 from pipelines.geometry.similarity import Similarity, SimilarityRecord, moved_pivot
+from pipelines.scene.calibrated import load_survey
 from pipelines.scene.survey import Survey
 from pipelines.scene.trained_model import TrainedModel
 from pipelines.splat.gaussians import Gaussians
@@ -65,7 +66,7 @@ def run(stage: StageRun, config: ExportPlyOptions) -> Summary:
         InputError: a product that is not of its form.
         DegenerateGeometryError: no Gaussian is opaque enough.
     """
-    survey = load_json(Survey, stage.workspace.path(SURVEY))
+    survey = load_survey(stage.workspace)
     model = load_json(TrainedModel, stage.workspace.path(MODEL))
     gaussians = read_gaussians(stage.workspace.path(GAUSSIANS))
     export = exported(gaussians, model, survey, config)

@@ -109,7 +109,7 @@ def read_tags(data: bytes) -> PhotoTags:
         lens=_lens(tags),
         timestamp_s=timestamp_s,
         time_source=time_source,
-        gps=_gps(tags, dji, problems),
+        gps=_gps(tags, problems),
         dji=dji,
         problems=tuple(problems),
     )
@@ -130,7 +130,7 @@ def _exif(data: bytes, problems: list[str]) -> Mapping[str, Any]:
     return found
 
 
-def _gps(tags: Mapping[str, Any], dji: DjiTags | None, problems: list[str]) -> GpsTag | None:
+def _gps(tags: Mapping[str, Any], problems: list[str]) -> GpsTag | None:
     lat = _degrees(tags, "GPS GPSLatitude")
     lon = _degrees(tags, "GPS GPSLongitude")
     if lat is None or lon is None:
@@ -151,15 +151,13 @@ def _gps(tags: Mapping[str, Any], dji: DjiTags | None, problems: list[str]) -> G
         return None
     datum = _text(tags, "GPS GPSMapDatum")
     plain = datum.upper().replace("-", "").replace(" ", "")
-    return GpsTag(
-        lat, lon, _altitude(tags, dji), _first(tags, _GPS_H_ERROR), "" if plain in _WGS84_NAMES else datum
-    )
+    return GpsTag(lat, lon, _altitude(tags), _first(tags, _GPS_H_ERROR), "" if plain in _WGS84_NAMES else datum)
 
 
-def _altitude(tags: Mapping[str, Any], dji: DjiTags | None) -> float | None:
+def _altitude(tags: Mapping[str, Any]) -> float | None:
     altitude = _number(tags, "GPS GPSAltitude")
     if altitude is None:
-        return dji.absolute_altitude_m if dji is not None else None
+        return None
     return -altitude if _number(tags, "GPS GPSAltitudeRef") in _BELOW_ZERO else altitude
 
 

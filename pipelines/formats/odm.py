@@ -16,7 +16,6 @@ from pipelines.core.types import FloatArray
 from pipelines.formats.pose_table import PoseTable, complete
 from pipelines.formats.text import number, read_lines
 from pipelines.geometry.rotations import geo_from_cam, quat_xyzw_from_matrix
-from pipelines.ingest.notes import Notes
 
 _GEO_COUNTS = "image x y [z] [yaw pitch roll] [h_acc v_acc]"
 _GCP_FORM = "x y z px py image [name]"
@@ -45,11 +44,11 @@ class GroundPoints:
     marks: tuple[GroundMark, ...]
 
 
-def read_geo(path: Path, notes: Notes) -> PoseTable:
-    """Read `geo.txt`. A position without z has NaN height; one that is not a number is left out and noted.
+def read_geo(path: Path) -> PoseTable:
+    """Read `geo.txt`. A position without z has NaN height.
 
     Raises:
-        InputError: no CRS line, a wrong number of columns, a cell that is no number, or no row with a position.
+        InputError: no CRS line, no row, a wrong number of columns, or a cell that is no number.
     """
     crs_text, rows = _rows(path)
     names, lines, values = [], [], []
@@ -59,19 +58,14 @@ def read_geo(path: Path, notes: Notes) -> PoseTable:
             message = f"has {len(cells)} columns, expected 3, 4, 7 or 9: {_GEO_COUNTS}{_comma_hint(cells)}"
             raise InputError(message, path=path, line=line)
         fields = ("x", "y", "z", "yaw", "pitch", "roll", "h_acc", "v_acc")
-        found = [
+        numbers = [
             number(text, path=path, line=line, field=field) for text, field in zip(texts, fields, strict=False)
         ]
         names.append(cells[0])
         lines.append(line)
-        values.append(found + [np.nan] * (8 - len(found)))
+        values.append(numbers + [np.nan] * (8 - len(numbers)))
     table = np.array(values, dtype=np.float64)
-    known = complete(table[:, :2])
-    places = [f"{path.name}:{line}" for line, good in zip(lines, known, strict=True) if not good]
-    notes.warn_counted(places, "row has no position (NaN)", "rows have no position (NaN)")
-    if not known.any():
-        raise InputError("no row has a position", path=path)
-    poses = PoseTable(
+    return PoseTable(
         path=path,
         source="geo.txt",
         lines=np.array(lines, dtype=np.int64),
@@ -83,7 +77,6 @@ def read_geo(path: Path, notes: Notes) -> PoseTable:
         sigma_enu_m=_sigmas(table[:, 6:8], path, lines),
         crs_text=crs_text,
     )
-    return poses.take(known)
 
 
 def read_ground_points(path: Path) -> GroundPoints:
@@ -113,7 +106,7 @@ def read_ground_points(path: Path) -> GroundPoints:
 
 
 def _rows(path: Path) -> tuple[str, list[tuple[int, list[str]]]]:
-    """The CRS, and line number and cells of each further line; blank lines and comments are passed over."""
+    """Return the CRS, and line number and cells of each further line but blank ones and comments."""
     lines = [(at, text.strip()) for at, text in enumerate(read_lines(path), start=1)]
     lines = [(at, text) for at, text in lines if text and not text.startswith("#")]
     if not lines:

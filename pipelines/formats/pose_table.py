@@ -1,4 +1,4 @@
-"""Positions and attitudes of images as a table states them."""
+"""Positions and attitudes of images as a table states them, row by row."""
 
 from __future__ import annotations
 
@@ -13,23 +13,26 @@ from pipelines.core.types import BoolArray, FloatArray, IntArray
 
 @dataclass(frozen=True)
 class PoseTable:
-    """N rows of a trajectory. Absent columns are None, absent cells NaN.
+    """N rows of a trajectory, all that the file has. Absent columns are None, absent cells NaN.
 
     Attributes:
         path: its file.
         source: kind of file.
         lines: (N,) line of each row.
         names: image of each row.
-        time_s: (N,) seconds since 1970 UTC.
+        time_s: (N,) seconds since 1970; a text without a zone is read as UTC.
         xyz: (N, 3) longitude or easting, latitude or northing, height, in the file's CRS.
         geographic: whether the columns were called latitude and longitude; None if the CRS alone decides.
         quat_xyzw: (N, 4) rotations camera → East-North-Up at the camera.
         sigma_enu_m: (N, 3) σ east, north, up.
         crs_text: the CRS that the file states.
+        zoneless_times: whether a time was a text without a zone.
+        unknown_columns: names in the header that mean nothing here.
+        header_line: line of the header.
     """
 
     path: Path
-    source: Literal["csv", "geo.txt", "bag"]
+    source: Literal["csv", "geo.txt"]
     lines: IntArray
     names: tuple[str, ...] | None
     time_s: FloatArray | None
@@ -38,12 +41,15 @@ class PoseTable:
     quat_xyzw: FloatArray | None = None
     sigma_enu_m: FloatArray | None = None
     crs_text: str | None = None
+    zoneless_times: bool = False
+    unknown_columns: tuple[str, ...] = ()
+    header_line: int = 1
 
     def __len__(self) -> int:
         return len(self.xyz)
 
     def take(self, rows: IntArray | BoolArray) -> PoseTable:
-        """The rows of an index (M,) or mask (N,)."""
+        """Return the rows of an index (M,) or mask (N,)."""
         names = None if self.names is None else tuple(np.array(self.names, dtype=object)[rows])
         return replace(
             self,
@@ -57,7 +63,7 @@ class PoseTable:
 
 
 def complete(values: FloatArray) -> BoolArray:
-    """Which rows of (N, k) values have no NaN: (N,)."""
+    """Return which rows of (N, k) values have no NaN: (N,)."""
     return np.asarray(np.isfinite(values).all(axis=1))
 
 

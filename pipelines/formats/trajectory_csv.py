@@ -18,7 +18,6 @@ from pipelines.core.types import FloatArray
 from pipelines.formats.pose_table import PoseTable, complete
 from pipelines.formats.text import number, read_lines
 from pipelines.geometry.rotations import geo_from_cam, quat_xyzw_from_matrix
-from pipelines.ingest.notes import Notes
 
 _ALIASES = {
     "image": ("image_name", "filename", "file_name", "file", "name"),
@@ -44,35 +43,37 @@ _SIGMAS = ("sigma_e", "sigma_n", "sigma_u")
 _LATEST_S = 1e11  # the year 5138; larger numbers are milliseconds or finer
 
 
-def read_trajectory(path: Path, notes: Notes) -> PoseTable:
+def read_trajectory(path: Path) -> PoseTable:
     """Read a trajectory.
 
-    Separators are `,`, `;` or tab; with the latter two, decimals may be written with commas. Rows without a
-    position are left out and noted; so are unknown columns, which are ignored.
+    Separators are `,`, `;` or tab; with the latter two, decimals may be written with commas.
 
     Raises:
-        InputError: no usable header, a cell that is no number, a latitude out of range, half a group of columns,
-            a row longer than the header, or no row with a position. Names file, line and column.
+        InputError: no usable header, no row, a cell that is no number, a latitude out of range, half a group of
+            columns, or a row longer than the header. Names file, line and column.
     """
-    cells = _Cells.read(path, notes)
+    cells = _Cells.read(path)
     position = _position_columns(cells)
     xyz = cells.group(position)
     geographic = position == _GEOGRAPHIC
     if geographic:
         cells.check_range(xyz[:, 1], 90.0, "latitude")
         cells.check_range(xyz[:, 0], 360.0, "longitude")
-    table = PoseTable(
+    moments = _times(cells) if "timestamp" in cells.columns else None
+    return PoseTable(
         path=path,
         source="csv",
         lines=np.array(cells.lines, dtype=np.int64),
         names=tuple(cells.texts("image")) if "image" in cells.columns else None,
-        time_s=_times(cells, notes) if "timestamp" in cells.columns else None,
+        time_s=None if moments is None else moments[0],
         xyz=xyz,
         geographic=geographic,
         quat_xyzw=_attitudes(cells),
         sigma_enu_m=_sigmas(cells),
+        zoneless_times=moments is not None and moments[1],
+        unknown_columns=cells.unknown_columns,
+        header_line=cells.header_line,
     )
-    return _with_positions(table, notes)
 
 
 @dataclass(frozen=True)
@@ -82,12 +83,13 @@ class _Cells:
     path: Path
     header_line: int
     columns: dict[str, int]
+    unknown_columns: tuple[str, ...]
     rows: list[list[str]]
     lines: list[int]
     decimal_comma: bool
 
     @classmethod
-    def read(cls, path: Path, notes: Notes) -> _Cells:
+    def read(cls, path: Path) -> _Cells:
         lines = read_lines(path)
         first = next(index for index, line in enumerate(lines) if line.strip())
         header = lines[first].lstrip("# ")
@@ -96,7 +98,7 @@ class _Cells:
             raise InputError(
                 "the header has one column only: separate columns by , ; or tab", path=path, line=first + 1
             )
-        columns = _columns(next(csv.reader([header], delimiter=separator)), path, first + 1, notes)
+        columns, unknown = _columns(next(csv.reader([header], delimiter=separator)), path, first + 1)
         width = header.count(separator) + 1
         rows, numbers = [], []
         reader = csv.reader(lines[first + 1 :], delimiter=separator)
@@ -114,14 +116,14 @@ class _Cells:
             raise InputError(f"is no CSV: {error}", path=path, line=first + 1 + reader.line_num) from error
         if not rows:
             raise InputError("has a header but no rows", path=path)
-        return cls(path, first + 1, columns, rows, numbers, separator != ",")
+        return cls(path, first + 1, columns, unknown, rows, numbers, separator != ",")
 
     def texts(self, column: str) -> list[str]:
         at = self.columns[column]
         return [row[at].strip() for row in self.rows]
 
     def numbers(self, column: str) -> FloatArray:
-        """(N,) numbers of a column; NaN where empty."""
+        """Return the numbers of a column (N,); NaN where empty."""
         return np.array(
             [
                 number(text, path=self.path, line=line, field=column, decimal_comma=self.decimal_comma)
@@ -130,7 +132,7 @@ class _Cells:
         )
 
     def has(self, columns: tuple[str, ...]) -> bool:
-        """Whether a group of columns is there: all of them, or none."""
+        """Return whether a group of columns is there: all of them, or none."""
         present = [name for name in columns if name in self.columns]
         if present and len(present) < len(columns):
             missing = ", ".join(name for name in columns if name not in self.columns)
@@ -138,7 +140,7 @@ class _Cells:
         return bool(present)
 
     def group(self, columns: tuple[str, ...]) -> FloatArray:
-        """(N, len(columns)) numbers."""
+        """Return the numbers of several columns (N, len(columns))."""
         return np.stack([self.numbers(column) for column in columns], axis=-1)
 
     def check_range(self, values: FloatArray, limit: float, column: str, least: float | None = None) -> None:
@@ -150,33 +152,29 @@ class _Cells:
             raise InputError(message, path=self.path, line=self.lines[bad[0]], field=column)
 
 
-def _columns(names: list[str], path: Path, line: int, notes: Notes) -> dict[str, int]:
-    found: dict[str, int] = {}
+def _columns(names: list[str], path: Path, line: int) -> tuple[dict[str, int], tuple[str, ...]]:
+    """Return the place of each canonical name in the header, and the names that mean nothing here."""
+    columns: dict[str, int] = {}
     unknown = []
     for at, name in enumerate(names):
         key = _CANONICAL.get(name.strip().lower().replace(" ", "_"))
         if key is None:
             unknown.append(name.strip())
-        elif key in found:
+        elif key in columns:
             raise InputError(
-                f"two columns for {key}: {names[found[key]].strip()}, {name.strip()}", path=path, line=line
+                f"two columns for {key}: {names[columns[key]].strip()}, {name.strip()}", path=path, line=line
             )
         else:
-            found[key] = at
-    if not found:
+            columns[key] = at
+    if not columns:
         raise InputError(
             "the first line must be a header: image and/or timestamp, then latitude,longitude,altitude or x,y,z",
             path=path,
             line=line,
         )
-    if "image" not in found and "timestamp" not in found:
+    if "image" not in columns and "timestamp" not in columns:
         raise InputError("needs a column image or timestamp", path=path, line=line)
-    notes.warn_counted(
-        [f"{path.name}:{line} ({name or 'unnamed'})" for name in unknown],
-        "column is unknown and was ignored",
-        "columns are unknown and were ignored",
-    )
-    return found
+    return columns, tuple(unknown)
 
 
 def _position_columns(cells: _Cells) -> tuple[str, ...]:
@@ -190,7 +188,7 @@ def _position_columns(cells: _Cells) -> tuple[str, ...]:
 
 
 def _attitudes(cells: _Cells) -> FloatArray | None:
-    """(N, 4) rotations camera → East-North-Up, NaN where a row has none."""
+    """Return rotations camera → East-North-Up (N, 4), NaN where a row has none."""
     angles, quaternion = cells.has(_ANGLES), cells.has(_QUATERNION)
     if angles and quaternion:
         raise InputError("has both yaw,pitch,roll and qx,qy,qz,qw", path=cells.path, line=cells.header_line)
@@ -223,48 +221,30 @@ def _sigmas(cells: _Cells) -> FloatArray | None:
     return values
 
 
-def _times(cells: _Cells, notes: Notes) -> FloatArray:
-    """(N,) seconds since 1970 UTC: numbers, or ISO 8601 (without a zone: UTC)."""
-    times = np.array(
-        [
-            _time(text, cells.path, line, cells.decimal_comma, notes)
-            for text, line in zip(cells.texts("timestamp"), cells.lines, strict=True)
-        ]
-    )
+def _times(cells: _Cells) -> tuple[FloatArray, bool]:
+    """Return seconds since 1970 (N,), of numbers or ISO 8601, and whether an ISO 8601 time has no zone.
+
+    A time without a zone is read as UTC.
+    """
+    moments = [
+        _time(text, cells.path, line, cells.decimal_comma)
+        for text, line in zip(cells.texts("timestamp"), cells.lines, strict=True)
+    ]
+    times = np.array([seconds for seconds, _ in moments])
     late = np.flatnonzero(np.abs(times) > _LATEST_S)
     if len(late):
         message = f"{times[late[0]]:.0f} looks like milliseconds or finer: give seconds since 1970"
         raise InputError(message, path=cells.path, line=cells.lines[late[0]], field="timestamp")
-    return times
+    return times, any(zoneless for _, zoneless in moments)
 
 
-def _time(text: str, path: Path, line: int, decimal_comma: bool, notes: Notes) -> float:
+def _time(text: str, path: Path, line: int, decimal_comma: bool) -> tuple[float, bool]:
+    """Return a time in seconds, and whether it is a text without a zone."""
     if text[4:5] == "-" and len(text) >= 10:
         try:
             moment = datetime.fromisoformat(text)
         except ValueError:
             raise InputError(f"{text!r} is no ISO 8601 time", path=path, line=line, field="timestamp") from None
-        if moment.tzinfo is None:
-            notes.assume(f"times without a zone in {path.name} are UTC")
-            moment = moment.replace(tzinfo=UTC)
-        return moment.timestamp()
-    return number(text, path=path, line=line, field="timestamp", decimal_comma=decimal_comma)
-
-
-def _with_positions(table: PoseTable, notes: Notes) -> PoseTable:
-    """Without the rows that have no position, and without repeats of a moment where there are no names."""
-    known = complete(table.xyz)
-    places = [f"{table.path.name}:{line}" for line in table.lines[~known]]
-    notes.warn_counted(places, "row has no position (empty or NaN)", "rows have no position (empty or NaN)")
-    if not known.any():
-        raise InputError("no row has a position", path=table.path)
-    table = table.take(known)
-    if table.names is not None or table.time_s is None:
-        return table
-    _, first = np.unique(table.time_s, return_index=True)
-    repeated = np.setdiff1d(np.arange(len(table)), first)
-    places = [f"{table.path.name}:{line}" for line in table.lines[repeated]]
-    notes.warn_counted(
-        places, "row repeats an earlier time and was left out", "rows repeat earlier times and were left out"
-    )
-    return table.take(np.sort(first))
+        zoneless = moment.tzinfo is None
+        return (moment.replace(tzinfo=UTC) if zoneless else moment).timestamp(), zoneless
+    return number(text, path=path, line=line, field="timestamp", decimal_comma=decimal_comma), False

@@ -4,7 +4,7 @@ The only module that uses pyproj, and the only one that thinks about axis order:
 longitude first, as in ODM's files and PROJ's visualisation order; `lla` is latitude first, as everywhere else.
 
 One operation serves all points of a call, or neighbours on two sides of an operation's border would be torn apart
-by metres; which one, and what happens where a grid is missing, is told in `pipelines.geodesy.operations`.
+by metres. `pipelines.geodesy.operations` chooses it, and refuses where a grid is missing.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class PointCrs:
     def lla_from_xyz(
         self, xyz: ArrayLike, *, path: Path | str | None = None, lines: Sequence[int] | None = None
     ) -> FloatArray:
-        """WGS84 latitude, longitude (degrees) and ellipsoidal height (m), (N, 3), of points (N, 3) in this CRS.
+        """Return WGS84 latitude, longitude (degrees), ellipsoidal height (m) (N, 3) of points (N, 3) in this CRS.
 
         Args:
             xyz: longitude or easting, latitude or northing, height; X, Y, Z of a geocentric CRS.
@@ -95,7 +95,7 @@ class PointCrs:
         return lla
 
     def xyz_from_lla(self, lla: ArrayLike) -> FloatArray:
-        """Points (N, 3) in this CRS of WGS84 latitude, longitude, ellipsoidal height (N, 3).
+        """Return points (N, 3) in this CRS of WGS84 latitude, longitude, ellipsoidal height (N, 3).
 
         Raises:
             InputError: a point far outside the CRS's area or domain, a missing grid, or no transformation.
@@ -121,7 +121,7 @@ class PointCrs:
         return xyz
 
     def operation(self, lla: ArrayLike) -> Operation:
-        """The transformation that serves points `lla` (N, 3), for the record.
+        """Return the transformation that serves points `lla` (N, 3), for the record.
 
         Raises:
             InputError: as `lla_from_xyz`.

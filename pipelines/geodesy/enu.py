@@ -24,7 +24,7 @@ _STEPS = 5
 
 
 def ecef_from_lla(lla: ArrayLike) -> FloatArray:
-    """Earth-centred coordinates (…, 3) in metres of latitude, longitude (degrees), ellipsoidal height (…, 3)."""
+    """Return Earth-centred metres (…, 3) of latitude, longitude (degrees) and ellipsoidal height (…, 3)."""
     points = _checked(lla)
     lat, lon, alt = np.radians(points[..., 0]), np.radians(points[..., 1]), points[..., 2]
     prime_vertical = SEMI_MAJOR_M / np.sqrt(1.0 - _E2 * np.sin(lat) ** 2)
@@ -34,7 +34,7 @@ def ecef_from_lla(lla: ArrayLike) -> FloatArray:
 
 
 def lla_from_ecef(ecef: ArrayLike) -> FloatArray:
-    """Latitude, longitude (degrees, −180 … 180) and ellipsoidal height (…, 3) of Earth-centred points (…, 3).
+    """Return latitude, longitude (degrees, −180 … 180), ellipsoidal height (…, 3) of Earth-centred points (…, 3).
 
     Bowring's iteration (doi 10.1179/sre.1976.23.181.323), for points more than 1 000 km from the Earth's centre.
     """
@@ -53,7 +53,7 @@ def lla_from_ecef(ecef: ArrayLike) -> FloatArray:
 
 
 def median_lla(lla: ArrayLike) -> FloatArray:
-    """Median latitude, longitude and height (3,) of points (N, 3), N ≥ 1; also across the date line."""
+    """Return the median latitude, longitude and height (3,) of points (N, 3), N ≥ 1; also across the date line."""
     points = _checked(lla)
     lon = points[:, 1] - 360.0 * np.round((points[:, 1] - points[0, 1]) / 360.0)
     middle = np.median(np.stack([points[:, 0], lon, points[:, 2]], axis=-1), axis=0)
@@ -62,17 +62,17 @@ def median_lla(lla: ArrayLike) -> FloatArray:
 
 
 def lla_of(origin: Origin) -> FloatArray:
-    """The origin as an array (3,) of latitude, longitude, height."""
+    """Return the origin as an array (3,) of latitude, longitude, height."""
     return np.array([origin.lat_deg, origin.lon_deg, origin.alt_m])
 
 
 def ecef_of(origin: Origin) -> FloatArray:
-    """The origin in Earth-centred metres (3,)."""
+    """Return the origin in Earth-centred metres (3,)."""
     return ecef_from_lla(lla_of(origin))
 
 
 def ecef_from_enu_rotation(lla: ArrayLike) -> FloatArray:
-    """Rotations (…, 3, 3) whose columns are east, north and up at `lla` (…, 3), in Earth-centred axes."""
+    """Return rotations (…, 3, 3) whose columns are east, north, up at `lla` (…, 3), in Earth-centred axes."""
     points = _checked(lla)
     lat, lon = np.radians(points[..., 0]), np.radians(points[..., 1])
     sin_lat, cos_lat, sin_lon, cos_lon = np.sin(lat), np.cos(lat), np.sin(lon), np.cos(lon)
@@ -83,27 +83,27 @@ def ecef_from_enu_rotation(lla: ArrayLike) -> FloatArray:
 
 
 def ecef_from_enu(enu: ArrayLike, origin: Origin) -> FloatArray:
-    """Earth-centred points (…, 3) of tangent-plane points (…, 3) at `origin`; all in metres."""
+    """Return Earth-centred points (…, 3) of tangent-plane points (…, 3) at `origin`; all in metres."""
     return _checked(enu) @ ecef_from_enu_rotation(lla_of(origin)).T + ecef_of(origin)
 
 
 def enu_from_ecef(ecef: ArrayLike, origin: Origin) -> FloatArray:
-    """Tangent-plane points (…, 3) at `origin` of Earth-centred points (…, 3); all in metres."""
+    """Return tangent-plane points (…, 3) at `origin` of Earth-centred points (…, 3); all in metres."""
     return (_checked(ecef) - ecef_of(origin)) @ ecef_from_enu_rotation(lla_of(origin))
 
 
 def enu_from_lla(lla: ArrayLike, origin: Origin) -> FloatArray:
-    """Tangent-plane points (…, 3) in metres at `origin` of geodetic points (…, 3)."""
+    """Return tangent-plane points (…, 3) in metres at `origin` of geodetic points (…, 3)."""
     return enu_from_ecef(ecef_from_lla(lla), origin)
 
 
 def lla_from_enu(enu: ArrayLike, origin: Origin) -> FloatArray:
-    """Geodetic points (…, 3) of tangent-plane points (…, 3) in metres at `origin`."""
+    """Return geodetic points (…, 3) of tangent-plane points (…, 3) in metres at `origin`."""
     return lla_from_ecef(ecef_from_enu(enu, origin))
 
 
 def geo_from_enu_at(lla: ArrayLike, origin: Origin) -> FloatArray:
-    """Rotations (…, 3, 3) from East-North-Up at each point `lla` (…, 3) into the frame at `origin`.
+    """Return rotations (…, 3, 3) from East-North-Up at each point `lla` (…, 3) into the frame at `origin`.
 
     Attitudes and σ are measured against the vertical and north of the place where they are measured. The
     meridians converge: 10 km east at 70° N, north has turned by 0.25°.

@@ -45,7 +45,7 @@ class Operation:
 
 @dataclass(frozen=True)
 class Way:
-    """A CRS, what to call it in errors, whether its heights are transformed too, and the file of the points."""
+    """A CRS, its name in errors, whether its heights are transformed too, and the file of the points."""
 
     crs: CRS
     name: str
@@ -54,7 +54,7 @@ class Way:
 
 
 def best_operation(way: Way, lon: FloatArray, lat: FloatArray) -> tuple[Transformer, Operation]:
-    """The best transformation for points at `lon`, `lat` (N,) in degrees: one for all, so that none is torn off.
+    """Return the best transformation for points at `lon`, `lat` (N,) in degrees: one for all of them.
 
     Raises:
         InputError: a missing grid, or no transformation.
@@ -68,8 +68,8 @@ def best_operation(way: Way, lon: FloatArray, lat: FloatArray) -> tuple[Transfor
         better = () if group.best_available else _missing(group.unavailable_operations[:1])
         return best, Operation(best.description, best.accuracy if best.accuracy >= 0 else None, better)
     # The fewest files to fetch; where as many would do, the way that PROJ likes best.
-    lacking = [grids for one in group.unavailable_operations if (grids := _missing([one]))]
-    lacking += [_missing(one.operations or ()) for one in group.transformers]
+    lacking = [grids for operation in group.unavailable_operations if (grids := _missing([operation]))]
+    lacking += [_missing(transformer.operations or ()) for transformer in group.transformers]
     if lacking:
         datum = way.crs.sub_crs_list[1].name if way.crs.is_compound else None
         raise missing_grid_error(datum, way.name, min(lacking, key=len), get_user_data_dir(), way.path)
@@ -86,7 +86,7 @@ def _group(crs: CRS, target: str, area: AreaOfInterest | None) -> TransformerGro
 
 
 def _does_nothing(transformer: Transformer) -> bool:
-    """Whether a step is a shift of zero because every one of its optional grids is missing."""
+    """Return whether a step is a shift of zero because every one of its optional grids is missing."""
     steps = [operation.grids for operation in transformer.operations or ()]
     named = [grids for grids in steps if grids and all(grid.short_name != _NO_SHIFT for grid in grids)]
     return any(not any(grid.available for grid in grids) for grids in named)
@@ -103,7 +103,7 @@ def _missing(operations: Iterable[CoordinateOperation]) -> tuple[str, ...]:
 
 
 def _no_way(way: Way) -> InputError:
-    """The error for a CRS that PROJ's database does not connect with WGS84."""
+    """Return the error for a CRS that PROJ's database does not connect with WGS84."""
     horizontal = way.crs.sub_crs_list[0] if way.crs.is_compound else way.crs
     flat = _group(horizontal, WGS84, None) if way.crs.is_compound else None
     if flat is not None and (flat.transformers or flat.unavailable_operations):
@@ -131,7 +131,7 @@ def _is_modern(axis_m: float, inverse_flattening: float) -> bool:
 
 
 def _area(lon: FloatArray, lat: FloatArray) -> AreaOfInterest:
-    """Box around points, widened by a metre or so; its west lies east of its east where it spans the date line."""
+    """Return the box around points, a metre wider; its west lies east of its east across the date line."""
     margin = 1e-5
     near = lon - 360.0 * ((lon - lon[0]) / 360.0).round()
     west, east = float(near.min()) - margin, float(near.max()) + margin

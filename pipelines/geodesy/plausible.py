@@ -1,4 +1,4 @@
-"""Can these coordinates be of this CRS? What catches degrees in a projection, swapped axes and wrong zones."""
+"""Whether coordinates can be of a CRS: degrees in a projection, swapped axes and wrong zones are caught."""
 
 from __future__ import annotations
 
@@ -43,12 +43,12 @@ class Rows:
 
 
 def horizontal_of(crs: CRS) -> CRS:
-    """A compound CRS's horizontal part; any other CRS itself."""
+    """Return a compound CRS's horizontal part; any other CRS itself."""
     return crs.sub_crs_list[0] if crs.is_compound else crs
 
 
 def rough_lon_lat(crs: CRS, rows: Rows) -> tuple[FloatArray, FloatArray]:
-    """Longitude and latitude (N,) from Greenwich in the CRS's own datum, within a kilometre of WGS84.
+    """Return longitude and latitude (N,) from Greenwich in the CRS's own datum, within a kilometre of WGS84.
 
     Raises:
         InputError: a point that is not finite, out of range, in degrees where metres are due, or far outside the
@@ -91,14 +91,14 @@ def check_area(crs: CRS, lon: FloatArray, lat: FloatArray, rows: Rows) -> None:
 
 
 def _from_greenwich(geodetic: CRS, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Degrees from Greenwich: old surveys count grads from Paris, or degrees from Ferro."""
+    """Return degrees from Greenwich: old surveys count grads from Paris, or degrees from Ferro."""
     meridian, unit = geodetic.prime_meridian, np.degrees(geodetic.axis_info[0].unit_conversion_factor)
     shift = 0.0 if meridian is None else meridian.longitude * np.degrees(meridian.unit_conversion_factor)
     return np.asarray(x * unit + shift), np.asarray(y * unit)
 
 
 def _look_like_degrees(projected: CRS, points: FloatArray, lon: FloatArray, lat: FloatArray) -> BoolArray:
-    """Which points (N,) of a projection are as small as degrees although no metres near its zero can be meant."""
+    """Return which points (N,) of a projection are as small as degrees, far from where its metres can be."""
     small = (np.abs(points[:, 0]) <= 180.0) & (np.abs(points[:, 1]) <= 90.0)
     if projected.area_of_use is not None:
         return np.asarray(small & ~_within(projected, lon, lat, 0.0))

@@ -50,38 +50,38 @@ def parse_vertical(text: str) -> VerticalChoice:
 
 
 def name_of(epsg: int) -> str:
-    """The short name of a vertical CRS, so that `EPSG:5773` and `EGM96` are the same datum."""
+    """Return the short name of a vertical CRS, so that `EPSG:5773` and `EGM96` are the same datum."""
     return next((name for name, code in _EPSG_OF.items() if code == epsg), f"EPSG:{epsg}")
 
 
 def assumed_ellipsoidal(note: str) -> VerticalDatum:
-    """The datum of heights of which nothing is said; `note` tells what was read and what may be wrong with it."""
+    """Return the datum of heights that no file states; `note` names their source, and its usual fault."""
     return VerticalDatum(name=ELLIPSOIDAL, stated=False, note=note)
 
 
 def missing_grid_error(
     datum: str | None, crs_name: str, grids: Sequence[str], folder: str, path: Path | str | None
 ) -> InputError:
-    """The error for points of a CRS that need `grids`, of which none is in PROJ's data `folder`s.
+    """Return the error for points of a CRS that need `grids`, of which none is in PROJ's data `folder`.
 
     Args:
-        datum: what the heights count from, if they do not count from the ellipsoid.
+        datum: of the heights, if they do not count from the ellipsoid.
         crs_name: the CRS.
         grids: file names.
         folder: where PROJ looks.
         path: file of the points.
     """
-    what = f"points of {crs_name} cannot be brought to WGS84"
+    problem = f"points of {crs_name} cannot be brought to WGS84"
     instead = "Or give coordinates in another CRS"
     if datum is not None:
-        what = f"heights above {datum} cannot be made ellipsoidal"
+        problem = f"heights above {datum} cannot be made ellipsoidal"
         instead = (
             "If the heights are ellipsoidal after all, give the horizontal CRS alone and `--vertical ellipsoidal`"
         )
     files = f"the PROJ grid {grids[0]} is" if len(grids) == 1 else f"the PROJ grids {', '.join(grids)} are"
     command = " ".join(["pyproj sync", *(f"--file {grid}" for grid in grids)])
     return InputError(
-        f"{what}: {files} not installed. Run `{command}`, or copy from https://cdn.proj.org into {folder}. "
+        f"{problem}: {files} not installed. Run `{command}`, or copy from https://cdn.proj.org into {folder}. "
         f"{instead}",
         path=path,
     )

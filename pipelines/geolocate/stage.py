@@ -16,8 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 from pipelines.core.errors import DegenerateGeometryError, InputError
-from pipelines.core.products import load_json
-from pipelines.core.stages import SPARSE, SURVEY
+from pipelines.core.stages import SPARSE
 from pipelines.core.types import BoolArray, FloatArray
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.formats.colmap import read_sparse
@@ -28,6 +27,7 @@ from pipelines.geometry.rotations import log_so3
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.georef.adjustment import Correspondences, RotationPrior
 from pipelines.georef.alignment import Alignment, align
+from pipelines.scene.calibrated import load_survey
 from pipelines.scene.geolocated import GeolocatedPoints
 from pipelines.scene.observations import (
     RecordedRotations,
@@ -73,12 +73,7 @@ def run(stage: StageRun, options: GeolocateOptions) -> Summary:
     Raises:
         GeorefError: unreadable products, or attitudes asked for that are not there.
     """
-    survey = load_json(Survey, stage.workspace.path(SURVEY))
-    if survey.estimate and survey.rig is None:
-        log.warning(
-            "%s were to be estimated after sfm: `georef calibrate --apply`, or `georef run`, does",
-            ", ".join(survey.estimate),
-        )
+    survey = load_survey(stage.workspace)
     model = read_sparse(stage.workspace.path(SPARSE))
     geolocation = geolocate(survey, model, options)
     points = geolocation.points

@@ -1,31 +1,146 @@
-"""A recorded track at times between its samples: where it is known, and what it says there."""
+"""A motion recorded by time, and its places and rotations between the samples.
+
+The rules of every interpolation in time:
+
+1. Between two samples at most `max_gap_s` apart, places and σ change linearly, rotations on the shortest arc.
+2. Elsewhere an instant within a millisecond of a sample takes that sample: clocks write milliseconds.
+3. All other instants are NaN: nothing is extrapolated.
+4. A quantity that one of the two samples lacks (NaN) is NaN.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
-from pipelines.core.types import BoolArray, FloatArray
+from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.geometry.rotations import exp_so3, log_so3
+
+_SAME_TIME_S = 1e-3
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Samples of a motion on one clock; what was not recorded is NaN.
+
+    Positions are Cartesian: degrees jump at the date line. Rotations turn axes of the moving body into the axes of
+    the samples' frame, or into East-North-Up where each sample was taken.
+
+    Attributes:
+        time_s: (K,) increasing.
+        position: (K, 3) metres.
+        rotation: (K, 3, 3).
+        sigma_m: (K, 3) σ of the positions.
+        sigma_deg: (K,) σ of the rotations.
+        max_gap_s: longest time between two samples to interpolate over.
+    """
+
+    time_s: FloatArray
+    position: FloatArray
+    rotation: FloatArray
+    sigma_m: FloatArray
+    sigma_deg: FloatArray
+    max_gap_s: float
+
+    @classmethod
+    def from_samples(
+        cls,
+        time_s: FloatArray,
+        *,
+        position: FloatArray | None = None,
+        rotation: FloatArray | None = None,
+        sigma_m: FloatArray | None = None,
+        sigma_deg: FloatArray | None = None,
+        max_gap_s: float = np.inf,
+    ) -> Trajectory:
+        """Return the trajectory of the quantities that were recorded at times (K,)."""
+        count = len(time_s)
+        return cls(
+            time_s,
+            np.full((count, 3), np.nan) if position is None else position,
+            np.full((count, 3, 3), np.nan) if rotation is None else rotation,
+            np.full((count, 3), np.nan) if sigma_m is None else sigma_m,
+            np.full(count, np.nan) if sigma_deg is None else sigma_deg,
+            max_gap_s,
+        )
+
+    def __len__(self) -> int:
+        return len(self.time_s)
+
+    def at(self, time_s: FloatArray) -> Trajectory:
+        """Return the motion at times (n,), after the rules above; NaN where they give nothing."""
+        bracket = _bracket(self.time_s, time_s, self.max_gap_s)
+        return Trajectory(
+            time_s,
+            _linear(self.position, bracket),
+            _shortest_arc(self.rotation, bracket),
+            _linear(self.sigma_m, bracket),
+            _linear(self.sigma_deg[:, None], bracket)[:, 0],
+            self.max_gap_s,
+        )
 
 
 def covered(clock_s: FloatArray, time_s: FloatArray, max_gap_s: float) -> BoolArray:
-    """Which of the times (n,) lie between samples (k,) that are at most `max_gap_s` apart; NaN does not."""
-    if len(clock_s) < 2:
-        return np.zeros(len(time_s), dtype=bool)
-    after = np.clip(np.searchsorted(clock_s, time_s), 1, len(clock_s) - 1)
-    near = clock_s[after] - clock_s[after - 1] <= max_gap_s
-    return np.asarray((time_s >= clock_s[0]) & (time_s <= clock_s[-1]) & near)
+    """Return which of the times (n,) samples at `clock_s` (K,) give a value for."""
+    return _bracket(clock_s, time_s, max_gap_s).covered
 
 
 def places_at(clock_s: FloatArray, places: FloatArray, time_s: FloatArray) -> FloatArray:
-    """Places (n, 3) at times (n,), linearly between samples (k, 3)."""
-    return np.stack([np.interp(time_s, clock_s, places[:, axis]) for axis in range(3)], axis=1)
+    """Return places (n, 3) at covered times (n,) between samples (K, 3)."""
+    return _linear(places, _bracket(clock_s, time_s, np.inf))
 
 
 def turns_at(clock_s: FloatArray, rotations: FloatArray, time_s: FloatArray) -> FloatArray:
-    """Rotations (n, 3, 3) at times (n,), on the shortest arc between samples (k, 3, 3)."""
-    after = np.clip(np.searchsorted(clock_s, time_s), 1, len(clock_s) - 1)
-    before = after - 1
-    part = (time_s - clock_s[before]) / (clock_s[after] - clock_s[before])
-    arc = log_so3(np.swapaxes(rotations[before], 1, 2) @ rotations[after])
-    return rotations[before] @ exp_so3(part[:, None] * arc)
+    """Return rotations (n, 3, 3) at covered times (n,) between samples (K, 3, 3)."""
+    return _shortest_arc(rotations, _bracket(clock_s, time_s, np.inf))
+
+
+@dataclass(frozen=True)
+class _Bracket:
+    """The samples before and after each of n times, the part of the way between them, and whether they count."""
+
+    before: IntArray
+    after: IntArray
+    part: FloatArray
+    covered: BoolArray
+
+
+def _bracket(clock_s: FloatArray, time_s: FloatArray, max_gap_s: float) -> _Bracket:
+    count = len(time_s)
+    if not len(clock_s):
+        none = np.zeros(count, dtype=np.int64)
+        return _Bracket(none, none, np.zeros(count), np.zeros(count, dtype=bool))
+    last = len(clock_s) - 1
+    after = np.clip(np.searchsorted(clock_s, time_s), min(1, last), last)
+    before = np.maximum(after - 1, 0)
+    gap_s = clock_s[after] - clock_s[before]
+    part = np.clip((time_s - clock_s[before]) / np.where(gap_s > 0, gap_s, 1.0), 0.0, 1.0)
+    between = (time_s >= clock_s[before]) & (time_s <= clock_s[after]) & (gap_s <= max_gap_s)
+    nearest = np.where(part < 0.5, before, after)
+    same = ~between & (np.abs(clock_s[nearest] - time_s) <= _SAME_TIME_S)
+    return _Bracket(
+        before=np.where(same, nearest, before),
+        after=np.where(same, nearest, after),
+        part=np.where(same, 0.0, part),
+        covered=np.asarray(between | same),
+    )
+
+
+def _linear(values: FloatArray, bracket: _Bracket) -> FloatArray:
+    result = np.full((len(bracket.part), values.shape[1]), np.nan)
+    rows = bracket.covered
+    start, end = values[bracket.before[rows]], values[bracket.after[rows]]
+    result[rows] = start + bracket.part[rows, None] * (end - start)
+    return result
+
+
+def _shortest_arc(rotations: FloatArray, bracket: _Bracket) -> FloatArray:
+    result = np.full((len(bracket.part), 3, 3), np.nan)
+    known = np.asarray(np.isfinite(rotations).all(axis=(1, 2)))
+    rows = np.flatnonzero(bracket.covered)
+    rows = rows[known[bracket.before[rows]] & known[bracket.after[rows]]]
+    start, end = rotations[bracket.before[rows]], rotations[bracket.after[rows]]
+    arc = log_so3(np.swapaxes(start, 1, 2) @ end)
+    result[rows] = start @ exp_so3(bracket.part[rows, None] * arc)
+    return result

@@ -1,4 +1,4 @@
-"""Cameras before any reconstruction: focal length in pixels from what a photograph says of its lens."""
+"""Cameras before any reconstruction: focal length in pixels from a photograph's lens tags."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ _SENSOR_WIDTH_MM = {
     "M4E": 17.3, "FC6540": 23.5, "ZENMUSEP1": 35.9,
 }  # fmt: skip
 _FILM_DIAGONAL_MM = math.hypot(36.0, 24.0)
-# Where nothing is known: between a wide drone lens (0.6) and a phone's (0.8 …), what OpenDroneMap starts with too.
+# Without any lens tag: between a wide drone lens (0.6) and a phone's (0.8 …); OpenDroneMap starts with it too.
 ASSUMED_RATIO = 0.85
 FocalSource = Literal["exif", "assumed"]
 
 
 def focal_px(tags: PhotoTags, width: int, height: int) -> tuple[float, FocalSource, str]:
-    """Focal length in pixels of a stored image, where it came from, and a sentence on it.
+    """Return the focal length in pixels of a stored image, its source, and a sentence on it.
 
     In this order: real focal length and the sensor's width in a table; real focal length and focal plane
     resolution (scaled by how much smaller the image is than when it was taken); 35 mm equivalent by the diagonal
@@ -43,8 +43,8 @@ def focal_px(tags: PhotoTags, width: int, height: int) -> tuple[float, FocalSour
         focal = lens.focal_mm * lens.zoom / sensor_mm * long_side
         return focal, "exif", f"from {lens.focal_mm:g} mm on a sensor {sensor_mm:g} mm wide"
     if lens.focal_mm and lens.px_per_mm:
-        taken = lens.taken_width_px or long_side
-        focal = lens.focal_mm * lens.zoom * lens.px_per_mm * long_side / taken
+        original_width_px = lens.taken_width_px or long_side
+        focal = lens.focal_mm * lens.zoom * lens.px_per_mm * long_side / original_width_px
         if 0.2 * long_side < focal < 20.0 * long_side:  # the tag is often nonsense
             return focal, "exif", f"from {lens.focal_mm:g} mm and the focal plane resolution"
     if lens.focal_35mm_mm:
@@ -54,13 +54,13 @@ def focal_px(tags: PhotoTags, width: int, height: int) -> tuple[float, FocalSour
 
 
 def camera_priors(
-    photos: Sequence[Photo], asked_focal_px: float | None, notes: Notes
+    photos: Sequence[Photo], given_focal_px: float | None, notes: Notes
 ) -> tuple[tuple[CameraPrior, ...], dict[str, int]]:
-    """One prior for each size, camera model and focal length; and the id of each image's camera by name.
+    """Return a prior for each size, camera model and focal length; and the id of each image's camera by name.
 
     Args:
         photos: the images.
-        asked_focal_px: focal length to use instead of EXIF's.
+        given_focal_px: focal length to use instead of EXIF's.
         notes: how each focal length was found.
     """
     cameras: dict[tuple[int, int, str, float], CameraPrior] = {}
@@ -68,9 +68,9 @@ def camera_priors(
     for photo in photos:
         width, height = photo.file.width, photo.file.height
         name = photo.tags.make_model.strip()
-        focal, source, how = focal_px(photo.tags, width, height)
-        if asked_focal_px is not None:
-            focal, how = asked_focal_px, "from --focal-px"
+        focal, source, origin = focal_px(photo.tags, width, height)
+        if given_focal_px is not None:
+            focal, origin = given_focal_px, "from --focal-px"
         key = (width, height, name, round(focal, 1))
         if key not in cameras:
             cameras[key] = CameraPrior(
@@ -79,10 +79,10 @@ def camera_priors(
                 width=width,
                 height=height,
                 params=(focal, width / 2.0, height / 2.0, 0.0),
-                focal_source=source if asked_focal_px is None else "option",
+                focal_source=source if given_focal_px is None else "option",
                 make_model=name,
             )
-            notes.assume(f"focal length of {name or 'the camera'} at {width}×{height}: {focal:.1f} px, {how}")
+            notes.assume(f"focal length of {name or 'the camera'} at {width}×{height}: {focal:.1f} px, {origin}")
         camera_of[photo.name] = cameras[key].camera_id
     sizes = sorted({(width, height) for width, height, _, _ in cameras})
     if len(sizes) > 1:

@@ -11,12 +11,12 @@ import numpy as np
 from pipelines.core.errors import InputError
 from pipelines.core.types import FloatArray
 from pipelines.formats.odm import GroundMark, read_ground_points
-from pipelines.geodesy.crs import parse_crs
 from pipelines.geodesy.enu import ecef_from_lla
 from pipelines.geodesy.vertical import VerticalDatum
 from pipelines.ingest.image_names import ImageNames
-from pipelines.ingest.image_poses import PoseOptions, note_operation, settle_vertical
 from pipelines.ingest.notes import Notes
+from pipelines.ingest.options import IngestOptions
+from pipelines.ingest.reference_system import note_operation, stated_crs
 from pipelines.scene.survey import Mark
 
 _LEAST_MARKS = 2
@@ -27,10 +27,10 @@ _RANGE_M = 50_000.0
 
 @dataclass(frozen=True)
 class GroundPoint:
-    """A surveyed point: WGS84 position (3,), its marks, and the line where it first stands."""
+    """A surveyed point: position (3,) in ECEF, its marks, and the line where it first stands."""
 
     name: str
-    lla: FloatArray
+    position_in_ecef: FloatArray
     marks: tuple[Mark, ...]
     line: int
 
@@ -46,7 +46,7 @@ class GroundFile:
 
 
 def read_ground_file(
-    path: Path, sizes: Mapping[str, tuple[int, int]], sigma_px: float, options: PoseOptions, notes: Notes
+    path: Path, sizes: Mapping[str, tuple[int, int]], options: IngestOptions, notes: Notes
 ) -> GroundFile:
     """Read a `gcp_list.txt` and tie it to images.
 
@@ -55,8 +55,7 @@ def read_ground_file(
     Args:
         path: the file.
         sizes: width and height of each image by name.
-        sigma_px: σ of a mark.
-        options: for the vertical datum.
+        options: vertical datum, and σ of a mark.
         notes: what was left out.
 
     Raises:
@@ -64,19 +63,19 @@ def read_ground_file(
             image, impossible coordinates, or no mark in any image here.
     """
     listed = read_ground_points(path)
-    crs = parse_crs(listed.crs_text, vertical=options.vertical, path=path, line=1)
-    settle_vertical(crs, options, path.name, notes)
+    crs = stated_crs(listed.crs_text, path, options, notes)
     first = _first_lines(listed.marks, path)
     xyz = np.array([mark.xyz for mark in first.values()])
     lla = crs.lla_from_xyz(xyz, path=path, lines=[mark.line for mark in first.values()])
     note_operation(crs, lla, notes)
-    marks = _marks_by_point(listed.marks, sizes, sigma_px, path, notes)
+    marks = _marks_by_point(listed.marks, sizes, options.sigma_mark, path, notes)
+    position_in_ecef = ecef_from_lla(lla)
     points, lonely = [], []
     for row, (name, mark) in enumerate(first.items()):
         if len(marks[name]) < _LEAST_MARKS:
             lonely.append(f"{name} ({path.name}:{mark.line})")
         else:
-            points.append(GroundPoint(name, lla[row], tuple(marks[name].values()), mark.line))
+            points.append(GroundPoint(name, position_in_ecef[row], tuple(marks[name].values()), mark.line))
     notes.warn_counted(
         lonely,
         "ground point has marks in fewer than 2 images and was left out",
@@ -88,20 +87,20 @@ def read_ground_file(
 def split_checks(
     control: GroundFile | None, check: GroundFile | None, names: Sequence[str]
 ) -> tuple[tuple[GroundPoint, ...], tuple[GroundPoint, ...]]:
-    """Control and check points, after making check points of the control points in `names`.
+    """Return control and check points, after making check points of the control points in `names`.
 
     Raises:
         InputError: a name that is no control point, or a point that is both.
     """
     points = () if control is None else control.points
-    known = {point.name for point in points}
+    usable = {point.name for point in points}
     for name in names:
-        if name not in known:
-            message = f"{name!r} is no usable point there: it has {', '.join(sorted(known))}"
+        if name not in usable:
+            message = f"{name!r} is no usable point there: it has {', '.join(sorted(usable))}"
             raise InputError(message, path=None if control is None else control.path, field="--check")
     listed = () if check is None else check.points
     for point in listed:
-        twin = next((one for one in points if one.name == point.name or _apart_m(one, point) < _SAME_PLACE_M), None)
+        twin = next((other for other in points if _are_one(other, point)), None)
         if check is not None and twin is not None:
             message = (
                 f"{point.name} is also control point {twin.name} (line {twin.line}): it can be one of them only"
@@ -111,25 +110,27 @@ def split_checks(
     return kept, (*listed, *(point for point in points if point.name in names))
 
 
-def require_near(file: GroundFile | None, middle_lla: FloatArray) -> None:
-    """Refuse points that are nowhere near the cameras, whose middle is `middle_lla` (3,).
+def require_near(file: GroundFile, middle_in_ecef: FloatArray) -> None:
+    """Refuse points that are nowhere near the cameras, whose middle is (3,) in ECEF.
 
     Raises:
         InputError: a point more than 50 km away.
     """
-    for point in () if file is None else file.points:
-        distance_m = float(np.linalg.norm(ecef_from_lla(point.lla) - ecef_from_lla(middle_lla)))
-        if file is not None and distance_m > _RANGE_M:
+    for point in file.points:
+        distance_m = float(np.linalg.norm(point.position_in_ecef - middle_in_ecef))
+        if distance_m > _RANGE_M:
             message = f"{point.name} is {distance_m / 1000:.0f} km from the images: wrong CRS, or x and y swapped?"
             raise InputError(message, path=file.path, line=point.line)
 
 
-def _apart_m(first: GroundPoint, second: GroundPoint) -> float:
-    return float(np.linalg.norm(ecef_from_lla(first.lla) - ecef_from_lla(second.lla)))
+def _are_one(first: GroundPoint, second: GroundPoint) -> bool:
+    """Return whether two points have one name or one place."""
+    distance_m = float(np.linalg.norm(first.position_in_ecef - second.position_in_ecef))
+    return first.name == second.name or distance_m < _SAME_PLACE_M
 
 
 def _first_lines(marks: tuple[GroundMark, ...], path: Path) -> dict[str, GroundMark]:
-    """The first line of each point."""
+    """Return the first line of each point."""
     first: dict[str, GroundMark] = {}
     for mark in marks:
         other = first.setdefault(mark.name, mark)
@@ -146,9 +147,9 @@ def _marks_by_point(
     path: Path,
     notes: Notes,
 ) -> dict[str, dict[str, Mark]]:
-    """Marks by point and image."""
+    """Return marks by point and image."""
     names = ImageNames(sizes)
-    found: dict[str, dict[str, Mark]] = {mark.name: {} for mark in listed}
+    marks: dict[str, dict[str, Mark]] = {mark.name: {} for mark in listed}
     unknown = []
     for mark in listed:
         image = names.find(mark.image, path=path, line=mark.line)
@@ -164,11 +165,11 @@ def _marks_by_point(
                 line=mark.line,
                 field="px py",
             )
-        if image in found[mark.name]:
+        if image in marks[mark.name]:
             raise InputError(f"{mark.name} is marked in {image} already", path=path, line=mark.line, field="image")
-        found[mark.name][image] = Mark(image=image, x_px=mark.x_px, y_px=mark.y_px, sigma_px=sigma_px)
+        marks[mark.name][image] = Mark(image=image, x_px=mark.x_px, y_px=mark.y_px, sigma_px=sigma_px)
     if len(unknown) == len(listed):
         message = f"names none of the images: it has {listed[0].image!r} …, the folder {min(sizes)!r} …"
         raise InputError(message, path=path, field="image")
     notes.warn_counted(unknown, "mark is in an image that is not here", "marks are in images that are not here")
-    return found
+    return marks

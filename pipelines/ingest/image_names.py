@@ -23,7 +23,7 @@ class ImageNames:
                 form.setdefault(key, []).append(name)
 
     def find(self, text: str, *, path: Path, line: int) -> str | None:
-        """The image that `text` names, or None.
+        """Return the image that `text` names, or None.
 
         Args:
             text: as the table has it; backslashes separate folders too.
@@ -42,16 +42,16 @@ class ImageNames:
         if name in self._exact:
             return name
         for form, key in zip(self._forms, _keys(name), strict=True):
-            found = form.get(key, [])
-            if len(found) > 1:
+            candidates = form.get(key, [])
+            if len(candidates) > 1:
                 raise InputError(
-                    f"{text!r} may be {' or '.join(found[:3])}: name it with its folder and suffix",
+                    f"{text!r} may be {' or '.join(candidates[:3])}: name it with its folder and suffix",
                     path=path,
                     line=line,
                     field="image",
                 )
-            if found:
-                return found[0]
+            if candidates:
+                return candidates[0]
         return None
 
 

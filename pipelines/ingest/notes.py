@@ -1,4 +1,4 @@
-"""What a reader has to tell besides its result: assumptions it made, and what it left out and why."""
+"""Notes on the way to a survey: assumptions, and rows or files that were left out and why."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Notes:
 
         Args:
             items: file names or `file:line` places.
-            singular: what is wrong with one, e.g. "image is empty and was left out".
+            singular: the fault of one, e.g. "image is empty and was left out".
             plural: the same for many, e.g. "images are empty and were left out".
         """
         if items:
@@ -38,6 +38,6 @@ class Notes:
 
 
 def shortened(items: Sequence[str]) -> str:
-    """The first few of a list, and how many more there are."""
+    """Return the first few of a list, and how many more there are."""
     more = f" and {len(items) - _SHOWN} more" if len(items) > _SHOWN else ""
     return ", ".join(items[:_SHOWN]) + more

@@ -2,18 +2,48 @@
 
 from __future__ import annotations
 
-from pydantic import Field, field_validator
+import re
+from dataclasses import dataclass
+from typing import Annotated, Literal
 
-from pipelines.core.options import (
-    AUTO,
-    RIG_PARAMETERS,
-    InputPath,
-    RigParameter,
-    StageOptions,
-    on_earth,
-    rig_parameters,
-    triple,
-)
+from pydantic import AfterValidator, Field
+
+from pipelines.core.options import WRITTEN, InputPath, PlaceOnEarth, StageOptions, Triple, from_text
+from pipelines.geodesy.vertical import VerticalChoice, parse_vertical
+from pipelines.scene.rig import RigParameter, RigParameters, in_usual_order
+
+
+@dataclass(frozen=True)
+class Every:
+    """Distance between frames, in seconds or in metres flown."""
+
+    step: float
+    unit: Literal["s", "m"]
+
+    def __str__(self) -> str:
+        return f"{self.step:g}{self.unit}"
+
+
+def _every(text: str) -> Every:
+    match = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*([sm])\s*", text)
+    if match is None or float(match[1]) <= 0:
+        raise ValueError(f"{text!r} is neither seconds nor metres: give e.g. 2s or 5m")
+    return Every(float(match[1]), "s" if match[2] == "s" else "m")
+
+
+def _seconds(text: str) -> float | str:
+    return text if text == "auto" else float(text)
+
+
+def _sensible(offset: float | Literal["auto"]) -> float | Literal["auto"]:
+    if offset != "auto" and not abs(offset) < 1e6:
+        raise ValueError("a number of seconds, or auto")
+    return offset
+
+
+Vertical = Annotated[VerticalChoice, from_text(parse_vertical), WRITTEN]
+FrameDistance = Annotated[Every, from_text(_every), WRITTEN]
+TimeOffset = Annotated[float | Literal["auto"], from_text(_seconds), AfterValidator(_sensible), WRITTEN]
 
 
 class IngestOptions(StageOptions):
@@ -26,33 +56,33 @@ class IngestOptions(StageOptions):
     image_topic: str | None = Field(None, description="Topic of the photographs in the bag (default: by rule).")
     fix_topic: str | None = Field(None, description="Topic of the positions in the bag (default: by rule).")
     attitude_topic: str | None = Field(None, description="Topic of the attitudes in the bag (default: by rule).")
-    every: str | None = Field(
+    every: FrameDistance | None = Field(
         None, description="Take a frame of the bag every 2s, or every 5m flown (default: all)."
     )
     skip_blurred: bool = Field(False, description="Pass over blurred frames of the bag.")
-    origin: str | None = Field(
+    origin: PlaceOnEarth | None = Field(
         None,
         description="Zero of a bag's local frame (odometry, poses): latitude,longitude,ellipsoidal height.",
     )
-    time_offset: str = Field(
-        "0", description="Navigation clock minus camera clock in seconds; auto: estimate it after sfm."
+    time_offset: TimeOffset = Field(
+        0.0, description="Navigation clock minus camera clock in seconds; auto: estimate it after sfm."
     )
-    estimate: str | None = Field(
+    estimate: RigParameters | None = Field(
         None,
         description="Estimate any of time-offset, boresight and lever-arm (with commas) after sfm, from the SfM "
         "cameras against the recorded navigation.",
     )
-    lever_arm: str | None = Field(
+    lever_arm: Triple | None = Field(
         None,
         description="Antenna seen from the camera in the body's axes, forward,right,down in metres (default: /tf).",
     )
-    camera_mount: str | None = Field(
+    camera_mount: Triple | None = Field(
         None,
         description="How the camera is turned in the body, yaw,pitch,roll in degrees; 0,-90,0 looks down "
         "(default: /tf).",
     )
-    boresight: str = Field(
-        "0,0,0", description="Rotation vector from the true to the nominal camera axes, x,y,z in degrees."
+    boresight: Triple = Field(
+        (0.0, 0.0, 0.0), description="Rotation vector from the true to the nominal camera axes, x,y,z in degrees."
     )
     trajectory: InputPath | None = Field(None, description="CSV with a header: image and/or timestamp, position …")
     geo: InputPath | None = Field(None, description="ODM geo.txt with the image positions.")
@@ -61,7 +91,7 @@ class IngestOptions(StageOptions):
     check: tuple[str, ...] = Field((), description="Name of a control point to use as a check point instead.")
     test_every: int = Field(8, ge=0, description="Hold out every N-th image for testing (0: none).")
     crs: str | None = Field(None, description="CRS of x,y,z columns in the trajectory, e.g. EPSG:32632+5773.")
-    vertical: str | None = Field(
+    vertical: Vertical | None = Field(
         None, description="Vertical datum of the heights: ellipsoidal, EGM96, EGM2008 or EPSG:n."
     )
     sigma_h: float | None = Field(None, gt=0, description="Horizontal σ of every position in metres.")
@@ -78,35 +108,10 @@ class IngestOptions(StageOptions):
 
     @property
     def time_offset_s(self) -> float:
-        """Seconds; zero while it is still to be estimated."""
-        return 0.0 if self.time_offset == AUTO else float(self.time_offset)
+        """Seconds; zero while the offset is still to be estimated."""
+        return 0.0 if self.time_offset == "auto" else self.time_offset
 
     @property
-    def wanted(self) -> tuple[RigParameter, ...]:
-        """What of the rig is to be estimated, in the usual order."""
-        asked = {*(self.estimate or "").split(","), *(["time-offset"] if self.time_offset == AUTO else [])}
-        return tuple(name for name in RIG_PARAMETERS if name in asked)
-
-    @field_validator("estimate")
-    @classmethod
-    def _are_parameters(cls, text: str | None) -> str | None:
-        return text if text is None else rig_parameters(text)
-
-    @field_validator("time_offset")
-    @classmethod
-    def _is_offset(cls, text: str) -> str:
-        if text != AUTO and not abs(float(text)) < 1e6:
-            raise ValueError("a number of seconds, or auto")
-        return text
-
-    @field_validator("lever_arm", "camera_mount", "boresight")
-    @classmethod
-    def _is_triple(cls, text: str | None) -> str | None:
-        if text is not None:
-            triple(text)
-        return text
-
-    @field_validator("origin")
-    @classmethod
-    def _is_on_earth(cls, text: str | None) -> str | None:
-        return text if text is None else on_earth(text)
+    def estimated(self) -> tuple[RigParameter, ...]:
+        """Parameters of the rig that are to be estimated after sfm, in the usual order."""
+        return in_usual_order((*(self.estimate or ()), *(("time-offset",) if self.time_offset == "auto" else ())))

@@ -1,4 +1,4 @@
-"""A folder of photographs: which files are usable images, and what each says of itself."""
+"""A folder of photographs: which files are usable images, and their tags."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Photo:
 
 
 def scan_folder(root: Path, notes: Notes, progress: Progress = SILENT) -> list[Photo]:
-    """Every usable photograph below `root`, sorted by name; what was left out is noted.
+    """Return every usable photograph below `root`, sorted by name; files that are left out are noted.
 
     Left out are files that are empty, damaged or too large, links that lead out of the folder, and all but the
     first of identical files. Hidden files and folders are not looked at.
@@ -55,12 +55,12 @@ def scan_folder(root: Path, notes: Notes, progress: Progress = SILENT) -> list[P
     photos: list[Photo] = []
     damaged: list[str] = []
     with progress.task("images", len(inside)) as task, ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
-        for path, found in zip(inside, pool.map(lambda path: _inspect(path, root), inside), strict=True):
+        for path, photo in zip(inside, pool.map(lambda path: _inspect(path, root), inside), strict=True):
             task.advance()
-            if isinstance(found, Photo):
-                photos.append(found)
+            if isinstance(photo, Photo):
+                photos.append(photo)
             else:
-                damaged.append(f"{_name(path, root)} ({found})")
+                damaged.append(f"{_name(path, root)} ({photo})")
     notes.warn_counted(damaged, "image was left out", "images were left out")
     return _without_duplicates(photos, notes)
 
@@ -74,7 +74,7 @@ def _candidates(root: Path) -> Iterator[Path]:
 
 
 def _inspect(path: Path, root: Path) -> Photo | str:
-    """The photograph, or what is wrong with it."""
+    """Return the photograph, or the reason why it is none."""
     try:
         data = read_bytes(path)
         return Photo(_name(path, root), inspect_image(data, path), read_tags(data))

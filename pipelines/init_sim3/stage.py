@@ -13,8 +13,8 @@ from typing import Any, Literal
 import numpy as np
 
 from pipelines.core.errors import ConvergenceError, DegenerateGeometryError, InputError
-from pipelines.core.products import load_json, save_json
-from pipelines.core.stages import POINTS, SPARSE, SURVEY
+from pipelines.core.products import save_json
+from pipelines.core.stages import POINTS, SPARSE
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.formats.colmap import read_sparse
@@ -26,6 +26,7 @@ from pipelines.georef.alignment import Alignment, align, layout_of
 from pipelines.init_sim3.options import InitSim3Options
 from pipelines.robust.ransac import RansacOptions, ransac
 from pipelines.robust.statistics import ResidualStats, residual_stats, squared_mahalanobis
+from pipelines.scene.calibrated import load_survey
 from pipelines.scene.geolocated import GeolocatedPoints
 from pipelines.scene.initial_similarity import AttitudeRecord, InitialSimilarity
 from pipelines.scene.observations import attitude_prior, control_correspondences, fix_correspondences
@@ -41,7 +42,7 @@ def run(stage: StageRun, options: InitSim3Options) -> Summary:
     Raises:
         GeorefError: unreadable products, or one of `estimate_similarity`.
     """
-    survey = load_json(Survey, stage.workspace.path(SURVEY))
+    survey = load_survey(stage.workspace)
     model = read_sparse(stage.workspace.path(SPARSE))
     points = GeolocatedPoints.load(stage.workspace.path(POINTS))
     initial, warnings = estimate_similarity(survey, model, points, options)

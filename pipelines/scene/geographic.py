@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipelines.core.errors import InputError
-from pipelines.core.options import AUTO
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.similarity import moved_pivot
 from pipelines.georef.adjustment import RotationPrior
@@ -63,7 +62,7 @@ def geo_problem(
     )
     if len(problem.errors):
         saved = begin(problem)
-        if options.estimate == AUTO and not bias_pays(problem, saved):
+        if options.estimate == "auto" and not bias_pays(problem, saved):
             problem.errors = SystematicErrors()
     return problem
 
@@ -135,7 +134,7 @@ def _observed(
 def _errors(observed: Observed, options: GeographicOptions) -> SystematicErrors:
     """The constant errors that are asked for; with `auto` the bias, wherever control points could show it."""
     fixes, attitudes, wanted = observed.fixes, observed.attitudes, options.estimated
-    if options.estimate == AUTO:
+    if options.estimate == "auto":
         possible = options.weighting == "whitened" and fixes is not None and _determined_by(observed.control)
         wanted = ("bias",) if possible else ()
     for name, source, what in (

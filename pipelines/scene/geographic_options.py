@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal, get_args
 
 from pydantic import Field, ValidationInfo, field_validator
 
-from pipelines.core.options import AUTO, StageOptions
+from pipelines.core.options import WRITTEN, StageOptions, from_text, listed_names
 
-ERROR_PARAMETERS = ("bias", "lever-arm", "boresight")
+ConstantError = Literal["bias", "lever-arm", "boresight"]
+CONSTANT_ERRORS: tuple[ConstantError, ...] = get_args(ConstantError)
+
+
+def _constant_errors(text: str) -> tuple[str, ...] | str:
+    if text == "auto":
+        return text
+    return () if text == "none" else listed_names(text, CONSTANT_ERRORS, "; or auto, or none")
+
+
+ConstantErrors = Annotated[tuple[ConstantError, ...] | Literal["auto"], from_text(_constant_errors), WRITTEN]
 
 
 class GeographicOptions(StageOptions):
@@ -31,7 +41,7 @@ class GeographicOptions(StageOptions):
     loss_weights: Literal["fixed", "learned"] = Field(
         "fixed", description="Weigh the geographic losses by the stated σ, or learn a variance factor for each."
     )
-    estimate: str = Field(
+    estimate: ConstantErrors = Field(
         "auto",
         description="Constant errors to estimate: any of bias (of the positions of a flight), lever-arm and "
         "boresight, with commas; auto: a bias that 3 or more control points show; or none.",
@@ -42,21 +52,15 @@ class GeographicOptions(StageOptions):
     )
 
     @property
-    def estimated(self) -> tuple[str, ...]:
+    def estimated(self) -> tuple[ConstantError, ...]:
         """The constant errors that are asked for by name."""
-        return tuple(name for name in ERROR_PARAMETERS if name in self.estimate.split(","))
+        return tuple(name for name in CONSTANT_ERRORS if self.estimate != "auto" and name in self.estimate)
 
     @field_validator("estimate")
     @classmethod
-    def _are_errors(cls, text: str) -> str:
-        unknown = [name for name in text.split(",") if name not in ERROR_PARAMETERS]
-        if unknown and text not in (AUTO, "none"):
-            raise ValueError(f"{unknown[0]!r} is none of {', '.join(ERROR_PARAMETERS)}; or auto, or none")
-        return text
-
-    @field_validator("estimate")
-    @classmethod
-    def _has_sigma(cls, text: str, info: ValidationInfo) -> str:
-        if info.data.get("weighting") == "paper" and text not in (AUTO, "none"):
+    def _has_sigma(
+        cls, errors: tuple[ConstantError, ...] | Literal["auto"], info: ValidationInfo
+    ) -> tuple[ConstantError, ...] | Literal["auto"]:
+        if info.data.get("weighting") == "paper" and errors and errors != "auto":
             raise ValueError("constant errors are estimated with --weighting whitened only")
-        return text
+        return errors

@@ -9,19 +9,22 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.core.errors import InputError
-from pipelines.core.options import RigParameter
+from pipelines.core.errors import InputError, MissingProductError
 from pipelines.core.products import load_npz, save_npz
+from pipelines.core.stages import TRACK
 from pipelines.core.types import BoolArray, FloatArray
+from pipelines.core.workspace import Workspace
+from pipelines.geometry.rig import Rig
+from pipelines.geometry.trajectory import Trajectory
+from pipelines.scene.rig import RigParameter
 
 
 @dataclass(frozen=True)
 class NavigationTrack:
     """Product of `ingest` beside the survey: the navigation as recorded, and how n cameras sit in it.
 
-    What `calibrate` fits the SfM cameras to. Positions are the antenna's, attitudes the body's
-    (forward-right-down), both on the navigation's clock; nothing of the rig is applied to them. What is said of the
-    rig is what `ingest` was told.
+    `calibrate` fits the SfM cameras to it. Positions are the antenna's, attitudes the body's (forward-right-down),
+    both on the navigation's clock; nothing of the rig is applied to them. The rig is as `ingest` was told.
 
     Attributes:
         position_time_s: (K,) float64, seconds.
@@ -53,6 +56,28 @@ class NavigationTrack:
     max_gap_s: FloatArray
     body_known: BoolArray
 
+    @property
+    def positions(self) -> Trajectory:
+        """The antenna in geo, on the navigation's clock."""
+        return Trajectory.from_samples(
+            self.position_time_s,
+            position=self.antenna_in_geo,
+            sigma_m=self.sigma_m,
+            max_gap_s=float(self.max_gap_s),
+        )
+
+    @property
+    def attitudes(self) -> Trajectory:
+        """The body in geo, on the navigation's clock."""
+        return Trajectory.from_samples(
+            self.attitude_time_s, rotation=self.geo_from_body, max_gap_s=float(self.max_gap_s)
+        )
+
+    @property
+    def rig(self) -> Rig:
+        """The rig of the n images as `ingest` was told."""
+        return Rig(self.cam_from_body, self.antenna_in_body, self.nominal_from_cam)
+
     def save(self, path: Path) -> None:
         """Write as NPZ."""
         save_npz(path, {field.name: getattr(self, field.name) for field in fields(self)})
@@ -67,8 +92,30 @@ class NavigationTrack:
         return cls(**load_npz(path, tuple(field.name for field in fields(cls))))
 
 
+def load_track(workspace: Workspace) -> NavigationTrack:
+    """Return the navigation of a workspace's survey.
+
+    Raises:
+        InputError: it was not recorded by time, or the file is damaged.
+    """
+    try:
+        path = workspace.path(TRACK)
+    except MissingProductError as error:
+        raise InputError(
+            "the survey has no navigation recorded by time, only a position for each image: ingest a --bag, or a "
+            "--trajectory by time",
+            path=workspace.root / TRACK,
+        ) from error
+    return NavigationTrack.load(path)
+
+
 def require_estimable(track: NavigationTrack | None, wanted: Sequence[RigParameter], field: str) -> None:
-    """See whether there is what estimates of the rig are made from.
+    """Refuse to estimate parameters of the rig without the navigation for it.
+
+    Args:
+        track: the navigation, None where it was not recorded by time.
+        wanted: the parameters.
+        field: the option that asks for them.
 
     Raises:
         InputError: navigation that was not recorded by time, no attitudes, no mount.

@@ -54,7 +54,7 @@ def solve_survey(trained: TrainedSurvey, initial: InitialSimilarity, options: Ge
     # Distances repeat what the fixes say, and have no part in the whitened residuals.
     changed: dict[str, object] = {"rel_loss": False}
     if options.weighting != "whitened":  # which estimates no constant errors
-        changed |= {"weighting": "whitened", "estimate": "none"}
+        changed |= {"weighting": "whitened", "estimate": ()}
     problem = geo_problem(scene, trained.survey, initial, options.model_copy(update=changed))
     problem.similarity.place(trained.geo_from_model)
     minimise(problem)

@@ -5,17 +5,16 @@ All places are in the frame `geo`: East-North-Up metres at the survey's origin.
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from pipelines.core.options import RigParameter
 from pipelines.core.products import Covariance3, ImageName, Product, Rotation
 from pipelines.core.types import Vector3
 from pipelines.core.validators import image_dir
 from pipelines.geodesy.enu import Origin
 from pipelines.geodesy.vertical import VerticalDatum
-from pipelines.scene.rig import RigCalibration
+from pipelines.scene.rig import RigParameter
 
 
 class CameraPrior(Product):
@@ -90,7 +89,8 @@ class SurveyedPoint(Product):
 class Survey(Product):
     """Product of `ingest`: everything that was measured, in one frame.
 
-    `estimate` names what of the rig is to be estimated after sfm, `rig` is what came out.
+    Positions and attitudes are as recorded, with the rig that `ingest` was told; `scene.calibrated.load_survey`
+    puts the estimates of `calibrate` in its place. `estimate` names the parameters to be estimated after sfm.
     """
 
     format_version: Literal[1] = 1
@@ -105,7 +105,19 @@ class Survey(Product):
     assumptions: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     estimate: tuple[RigParameter, ...] = ()
-    rig: RigCalibration | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _as_recorded(cls, document: Any) -> Any:
+        """Read surveys of earlier versions, which had a field for the calibration of the rig."""
+        if not isinstance(document, dict) or "rig" not in document:
+            return document
+        if document["rig"] is not None:
+            raise ValueError(
+                "an earlier version has put a calibration of the rig into this survey: run `georef ingest` again "
+                "(`georef run WS --to ingest --force` knows its options)"
+            )
+        return {name: value for name, value in document.items() if name != "rig"}
 
     @model_validator(mode="after")
     def _belongs_together(self) -> Survey:
@@ -124,9 +136,9 @@ class Survey(Product):
         return self
 
     def image(self, name: str) -> SurveyImage | None:
-        """The image of that name, or None."""
+        """Return the image of that name, or None."""
         return next((image for image in self.images if image.name == name), None)
 
     def names(self, split: Literal["train", "test"]) -> tuple[str, ...]:
-        """Names of the images in a split, in order."""
+        """Return the names of the images in a split, in order."""
         return tuple(image.name for image in self.images if image.split == split)

@@ -10,13 +10,14 @@ import numpy as np
 
 from pipelines.core.errors import InputError
 from pipelines.core.products import load_json
-from pipelines.core.stages import GAUSSIANS, MODEL, SIM3, SPARSE, SURVEY
+from pipelines.core.stages import GAUSSIANS, MODEL, SIM3, SPARSE
 from pipelines.core.workspace import Workspace
 from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.similarity import Similarity, SimilarityRecord
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.georef.cameras import CameraPoses
+from pipelines.scene.calibrated import load_survey
 from pipelines.scene.initial_similarity import InitialSimilarity
 from pipelines.scene.photographs import ImageCache
 from pipelines.scene.pinholes import Pinholes
@@ -90,7 +91,7 @@ def load_trained(workspace: Workspace, similarity: Literal["trained", "initial"]
     rotation = matrix_from_quat_xyzw([camera.quat_xyzw for camera in model.cameras])
     translation = np.array([camera.translation for camera in model.cameras])
     return TrainedSurvey(
-        survey=load_json(Survey, workspace.path(SURVEY)),
+        survey=load_survey(workspace),
         sfm=sparse,
         model=model,
         poses=CameraPoses(rotation, -np.einsum("nji,nj->ni", rotation, translation)),

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from pipelines.core.errors import ConvergenceError, DegenerateGeometryError
-from pipelines.core.products import load_json, save_json
-from pipelines.core.stages import SPARSE, SURVEY
+from pipelines.core.products import save_json
+from pipelines.core.stages import SPARSE
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.formats.colmap import load_reconstruction, pycolmap_module, quiet_colmap, read_sparse
@@ -24,6 +24,7 @@ from pipelines.geometry.sparse_model import SparseModel
 from pipelines.georef.alignment import Alignment, align
 from pipelines.robust.kernels import CAUCHY_SCALE2
 from pipelines.robust.statistics import residual_stats
+from pipelines.scene.calibrated import load_survey
 from pipelines.scene.initial_similarity import InitialSimilarity
 from pipelines.scene.observations import attitude_prior, fix_correspondences
 from pipelines.scene.survey import Fix, Survey
@@ -41,7 +42,7 @@ def run(stage: StageRun, options: AdjustOptions) -> Summary:
     Raises:
         GeorefError: unreadable products, or one of `adjust_to_fixes`.
     """
-    survey = load_json(Survey, stage.workspace.path(SURVEY))
+    survey = load_survey(stage.workspace)
     path, sparse = stage.workspace.path(SPARSE), stage.out / "sparse"
     alignment = _aligned(read_sparse(path), survey, options.seed)
     model = load_reconstruction(path)

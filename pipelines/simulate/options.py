@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field, field_validator
 
-from pipelines.core.options import StageOptions, on_earth, triple
+from pipelines.core.options import PlaceOnEarth, StageOptions, Triple
 
 
 class SimulateOptions(StageOptions):
@@ -19,7 +19,9 @@ class SimulateOptions(StageOptions):
     images: int = Field(48, ge=3, le=5000, description="Photographs.")
     size: str = Field("640x480", pattern=r"^\d{2,5}x\d{2,5}$", description="Their size in pixels, WxH.")
     seed: int = Field(0, ge=0, description="Seed of everything: scene, flight and noise.")
-    origin: str = Field("46.02,7.75,1620", description="Where on Earth: latitude,longitude,ellipsoidal height.")
+    origin: PlaceOnEarth = Field(
+        (46.02, 7.75, 1620.0), description="Where on Earth: latitude,longitude,ellipsoidal height."
+    )
     heights: tuple[float, ...] = Field(
         (),
         description="Height of a circle, grid or round above the origin in metres (default: by flight).",
@@ -46,11 +48,12 @@ class SimulateOptions(StageOptions):
     outlier_share: float | None = Field(None, ge=0, le=1, description="Share of photographs whose fixes are wrong.")
     outlier_size: float = Field(15.0, gt=0, description="How far a wrong fix is off, in metres.")
     sigma_attitude: float = Field(0.5, ge=0, description="White noise of the attitude per axis in degrees.")
-    lever_arm: str = Field(
-        "0,0,0", description="Antenna seen from the camera in the body's axes, forward,right,down in metres."
+    lever_arm: Triple = Field(
+        (0.0, 0.0, 0.0),
+        description="Antenna seen from the camera in the body's axes, forward,right,down in metres.",
     )
-    boresight: str = Field(
-        "0,0,0", description="Rotation vector from the true to the nominal camera axes, x,y,z in degrees."
+    boresight: Triple = Field(
+        (0.0, 0.0, 0.0), description="Rotation vector from the true to the nominal camera axes, x,y,z in degrees."
     )
     clock_offset: float = Field(0.0, ge=-10, le=10, description="Navigation clock minus camera clock in seconds.")
     lens: Literal["pinhole", "radial", "opencv"] = Field("opencv", description="Lens model.")
@@ -89,15 +92,4 @@ class SimulateOptions(StageOptions):
         sides = [int(side) for side in text.split("x")]
         if min(sides) < 32 or max(sides) > 8192:
             raise ValueError("sides from 32 to 8192 pixels")
-        return text
-
-    @field_validator("origin")
-    @classmethod
-    def _on_earth(cls, text: str) -> str:
-        return on_earth(text)
-
-    @field_validator("lever_arm", "boresight")
-    @classmethod
-    def _is_triple(cls, text: str) -> str:
-        triple(text)
         return text

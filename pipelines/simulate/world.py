@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipelines.core.errors import InputError
-from pipelines.core.options import triple
 from pipelines.geodesy.enu import Origin
 from pipelines.geometry.rotations import exp_so3
 from pipelines.simulate.buildings import Spot
@@ -51,11 +50,11 @@ def make_world(config: SimulateOptions, seed: np.random.SeedSequence) -> World:
         InputError: the lens folds inside the image.
     """
     scene_seed, flight_seed, target_seed = seed.spawn(3)
-    lat, lon, alt = triple(config.origin)
+    lat, lon, alt = config.origin
     lens = _lens(config)
     mounting = Mounting(
-        antenna_in_body=np.array(triple(config.lever_arm)),
-        nominal_from_cam=exp_so3(np.radians(triple(config.boresight))),
+        antenna_in_body=np.array(config.lever_arm),
+        nominal_from_cam=exp_so3(np.radians(config.boresight)),
         clock_offset_s=config.clock_offset,
     )
     bare = make_scene(config.scene, scene_seed)

@@ -10,14 +10,14 @@ from __future__ import annotations
 import json
 
 from pipelines.core.products import load_json, save_json
-from pipelines.core.stages import POINTS, SIM3, SPARSE, SURVEY
+from pipelines.core.stages import POINTS, SIM3, SPARSE
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.formats.colmap import read_sparse
+from pipelines.scene.calibrated import load_survey
 from pipelines.scene.geographic import geo_problem
 from pipelines.scene.geolocated import GeolocatedPoints
 from pipelines.scene.initial_similarity import InitialSimilarity
 from pipelines.scene.scene import initial_scene, photographs
-from pipelines.scene.survey import Survey
 from pipelines.splat.memory import free_memory_bytes, require_memory
 from pipelines.splat.rasterizer.backends import device_of, rasterizer
 from pipelines.splat.storage import write_gaussians
@@ -41,7 +41,7 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     """
     backend = rasterizer(options.backend)  # first: without a GPU, `--backend cuda` need not wait for its refusal
     workspace = stage.workspace
-    survey = load_json(Survey, workspace.path(SURVEY))
+    survey = load_survey(workspace)
     initial = load_json(InitialSimilarity, workspace.path(SIM3))
     scene = initial_scene(read_sparse(workspace.path(SPARSE)), survey, initial)
     images = photographs(scene.sparse, survey, workspace, effort(options).max_image_size)

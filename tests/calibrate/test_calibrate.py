@@ -14,12 +14,16 @@ import pytest
 from georef_cli import boundary
 from georef_cli.main import cli
 from pipelines.calibrate.options import CalibrateOptions
+from pipelines.core.fingerprints import fingerprints
 from pipelines.core.products import load_json
-from pipelines.core.stages import SURVEY
+from pipelines.core.stages import BY_NAME, RIG, SURVEY, TRACK, stage_slice
+from pipelines.core.workspace import Workspace
 from pipelines.formats.colmap import write_sparse
 from pipelines.geodesy.enu import enu_from_lla, lla_from_enu
 from pipelines.geometry.rig import boresight
 from pipelines.geometry.rotations import log_so3, matrix_from_quat_xyzw
+from pipelines.scene.calibrated import load_survey
+from pipelines.scene.rig import RigCalibration
 from pipelines.scene.survey import Survey
 from pipelines.simulate.options import SimulateOptions
 from pipelines.simulate.stage import simulate
@@ -46,9 +50,9 @@ def command(capsys: pytest.CaptureFixture[str]) -> Command:
 
     def call(*arguments: object, fails: bool = False) -> Any:
         code = boundary.guarded(cli, [*map(str, arguments), *([] if fails else ["--json"])])
-        told = capsys.readouterr()
-        assert code == (1 if fails else 0), told.err
-        return told.err if fails else {**json.loads(told.out), "err": told.err}
+        captured = capsys.readouterr()
+        assert code == (1 if fails else 0), captured.err
+        return captured.err if fails else {**json.loads(captured.out), "err": captured.err}
 
     return call
 
@@ -93,15 +97,19 @@ def arguments(inputs: dict[str, Path]) -> list[object]:
     return [part for pair in inputs.items() for part in pair]
 
 
+def states(command: Command, workspace: Path) -> dict[str, str]:
+    return {row["stage"]: row["state"] for row in command("status", workspace)["stages"]}
+
+
 def missed(workspace: Path, flight: bags.Flight) -> tuple[np.ndarray, np.ndarray]:
     """Errors of a survey's positions (n, 3) in metres and of its attitudes (n,) in degrees."""
-    survey = load_json(Survey, workspace / SURVEY)
+    survey = load_survey(Workspace(workspace))
     truth = enu_from_lla(lla_from_enu(flight.camera(flight.image_ns), bags.ORIGIN), survey.origin)
-    found = np.array([image.fix.position_in_geo for image in survey.images if image.fix])
+    positions = np.array([image.fix.position_in_geo for image in survey.images if image.fix])
     quats = [image.attitude.quat_xyzw for image in survey.images if image.attitude]
     true_turns = bags.expected(flight, survey.origin)[1] @ boresight(BORESIGHT_DEG)
     turned = log_so3(matrix_from_quat_xyzw(quats) @ np.swapaxes(true_turns, 1, 2))
-    return found - truth, np.degrees(np.linalg.norm(turned, axis=1))
+    return positions - truth, np.degrees(np.linalg.norm(turned, axis=1))
 
 
 def test_run_estimates_after_sfm_and_goes_on(tmp_path: Path, command: Command) -> None:
@@ -112,14 +120,23 @@ def test_run_estimates_after_sfm_and_goes_on(tmp_path: Path, command: Command) -
     assert list(stages) == ["ingest", "sfm", "calibrate", "geolocate", "init-sim3"]
     assert all(row["ran"] for row in stages.values())
     assert "calibrate: time-offset 0.2" in document["err"]
-    found = {row["name"]: row for row in stages["calibrate"]["values"]["estimates"]}
-    assert found["time-offset"]["value"][0] == pytest.approx(OFFSET_S, abs=0.02)
-    np.testing.assert_allclose(found["boresight"]["value"], BORESIGHT_DEG, atol=0.1)
+    assert stages["calibrate"]["values"]["applied"] == ["time-offset", "boresight"]
+    estimates = {row["name"]: row for row in stages["calibrate"]["values"]["estimates"]}
+    assert estimates["time-offset"]["value"][0] == pytest.approx(OFFSET_S, abs=0.02)
+    np.testing.assert_allclose(estimates["boresight"]["value"], BORESIGHT_DEG, atol=0.1)
     position, turned = missed(workspace, flight)
     # 20 ms at 15 m/s, were it all of the offset's error; positions at the start were 3 m off.
     assert np.abs(position).max() < 0.1
     assert turned.max() < 0.15
     assert stages["geolocate"]["values"]["rotation_source"] == "recorded"
+    # The survey stays as recorded: positions were 3 m off.
+    recorded, applied = load_json(Survey, workspace / SURVEY), load_survey(Workspace(workspace))
+    shift_m = [
+        float(np.linalg.norm(np.subtract(before.fix.position_in_geo, after.fix.position_in_geo)))
+        for before, after in zip(recorded.images, applied.images, strict=True)
+        if before.fix and after.fix
+    ]
+    assert max(shift_m) > 1.0
     # What was estimated stays; nothing is done twice.
     again = command("run", workspace, *asked, "--to", "init-sim3")
     assert not any(row["ran"] for row in again["stages"])
@@ -130,13 +147,13 @@ def test_ingest_made_again_keeps_sfm_and_is_calibrated_again(tmp_path: Path, com
     flight, workspace = Winding(count=24), tmp_path / "ws"
     inputs = flown(tmp_path, flight)
     command("run", workspace, *arguments(inputs), "--time-offset", "auto", "--to", "geolocate")
-    before = load_json(Survey, workspace / SURVEY)
+    before, rig = load_survey(Workspace(workspace)), load_json(RigCalibration, workspace / RIG)
     document = command("run", workspace, "--sigma-h", 0.5, "--test-every", 5, "--to", "geolocate")
     assert [(row["stage"], row["ran"]) for row in document["stages"]] == [
         ("ingest", True), ("sfm", False), ("calibrate", True), ("geolocate", True),
     ]  # fmt: skip
-    after = load_json(Survey, workspace / SURVEY)
-    assert after.rig == before.rig
+    after = load_survey(Workspace(workspace))
+    assert load_json(RigCalibration, workspace / RIG) == rig
     places = [[image.fix.position_in_geo for image in one.images if image.fix] for one in (before, after)]
     assert places[0] == places[1]
     # Another model is another estimate.
@@ -152,8 +169,9 @@ def test_flight_that_shows_nothing_is_told_and_no_failure(tmp_path: Path, comman
     document = command("run", workspace, *arguments(inputs), "--time-offset", "auto", "--to", "geolocate")
     assert "nothing of the rig is observable" in document["err"]
     assert "time-offset stay as told" in document["err"]
-    rig = load_json(Survey, workspace / SURVEY).rig
-    assert rig is not None and rig.estimates == ()
+    rig = load_json(RigCalibration, workspace / RIG)
+    assert rig.wanted == ("time-offset",) and rig.estimates == ()
+    assert load_survey(Workspace(workspace)) == load_json(Survey, workspace / SURVEY)
     again = command("run", workspace, "--to", "geolocate")
     assert not any(row["ran"] for row in again["stages"])
 
@@ -161,28 +179,64 @@ def test_flight_that_shows_nothing_is_told_and_no_failure(tmp_path: Path, comman
 def test_calibrate_and_apply(tmp_path: Path, command: Command, capsys: pytest.CaptureFixture[str]) -> None:
     flight, workspace = Winding(count=24), tmp_path / "ws"
     inputs = flown(tmp_path, flight)
-    command("run", workspace, *arguments(inputs), "--to", "sfm")
+    document = command("run", workspace, *arguments(inputs), "--to", "geolocate")
+    assert document["stages"][2]["key_figure"] == "nothing to estimate"
     before = load_json(Survey, workspace / SURVEY)
-    found = command("calibrate", workspace)
-    assert [row["name"] for row in found["estimates"]] == ["time-offset", "boresight"]
-    assert load_json(Survey, workspace / SURVEY) == before
-    found = command("calibrate", workspace, "--apply")
-    assert found["applied"] == ["time-offset", "boresight"]
+    both = ("--estimate", "time-offset,boresight")
+    values = command("calibrate", workspace, *both)["values"]
+    assert [row["name"] for row in values["estimates"]] == ["time-offset", "boresight"]
+    # Ingest was asked for nothing: the estimates change nothing that follows.
+    assert values["applied"] == []
+    assert load_survey(Workspace(workspace)) == before
+    assert states(command, workspace)["geolocate"] == "current"
+    values = command("calibrate", workspace, *both, "--apply")["values"]
+    assert values["applied"] == ["time-offset", "boresight"]
     position, turned = missed(workspace, flight)
     assert np.abs(position).max() < 0.1 and turned.max() < 0.15
-    states = {row["stage"]: row["state"] for row in command("status", workspace)["stages"]}
-    assert states["ingest"] == states["sfm"] == "current"
+    assert load_json(Survey, workspace / SURVEY) == before
+    now = states(command, workspace)
+    assert now["ingest"] == now["sfm"] == now["calibrate"] == "current" and now["geolocate"] == "stale"
+    # `georef run` keeps to what calibrate was last asked for.
+    rows = {row["stage"]: row["ran"] for row in command("run", workspace, "--to", "geolocate")["stages"]}
+    assert rows == {"ingest": False, "sfm": False, "calibrate": False, "geolocate": True}
     assert boundary.guarded(cli, ["calibrate", str(workspace), "--estimate", "lever-arm"]) == 0
     table = capsys.readouterr().out
     assert "lever-arm forward" in table and "control points" in table
+
+
+def test_what_ingest_asked_for_can_be_left_unapplied(tmp_path: Path, command: Command) -> None:
+    inputs, workspace = flown(tmp_path, Winding(count=24)), tmp_path / "ws"
+    command("run", workspace, *arguments(inputs), "--time-offset", "auto", "--to", "calibrate")
+    values = command("calibrate", workspace, "--no-apply")["values"]
+    assert [row["name"] for row in values["estimates"]] == ["time-offset"] and values["applied"] == []
+    assert load_survey(Workspace(workspace)) == load_json(Survey, workspace / SURVEY)
+    warnings = command("calibrate", workspace, "--estimate", "boresight")["warnings"]
+    assert "--estimate leaves out what ingest was asked to estimate: time-offset" in warnings
+
+
+def test_a_comparison_reads_the_calibration_where_it_is(tmp_path: Path, command: Command) -> None:
+    """Configurations share the stages up to geolocate, and are stale with what these apply."""
+    inputs, workspace = flown(tmp_path, Winding(count=24)), tmp_path / "ws"
+    command("run", workspace, *arguments(inputs), "--time-offset", "auto", "--to", "geolocate")
+    root = Workspace(workspace)
+    variant = root.variant(
+        "compare/A", {spec.folder: workspace / spec.folder for spec in stage_slice(None, "geolocate")}
+    )
+    spec = BY_NAME["geolocate"]
+    before = fingerprints(variant, spec, spec.options(), {})
+    assert before == fingerprints(root, spec, spec.options(), {})
+    assert load_survey(variant) == load_survey(root)
+    command("calibrate", workspace, "--no-apply")
+    after = fingerprints(variant, spec, spec.options(), {})
+    assert set(before) - set(after) == {RIG, TRACK}
 
 
 def test_stages_one_by_one_are_reminded(tmp_path: Path, command: Command) -> None:
     inputs, workspace = flown(tmp_path, Winding(count=24)), tmp_path / "ws"
     command("ingest", workspace, "--bag", inputs["--bag"], "--time-offset", "auto")
     command("sfm", workspace, "--import", inputs["--import"])
-    told = command("geolocate", workspace)["err"]
-    assert "time-offset were to be estimated after sfm: `georef calibrate --apply`" in told
+    message = command("geolocate", workspace)["err"]
+    assert "time-offset were to be estimated after sfm: `georef calibrate`" in message
 
 
 def test_what_cannot_be_estimated_is_said_before_sfm(tmp_path: Path, command: Command) -> None:
@@ -196,19 +250,20 @@ def test_what_cannot_be_estimated_is_said_before_sfm(tmp_path: Path, command: Co
     assert "[--estimate]: boresight needs recorded attitudes" in refused("--estimate", "boresight,time-offset")
     assert "[--estimate]: Value error, 'focus' is none of time-offset" in refused("--estimate", "focus")
     empty = bags.write(tmp_path / "empty", bags.images(flight))
-    told = command("ingest", tmp_path / "ws", "--bag", empty, "--time-offset", "auto", fails=True)
-    assert "no image has a position" in told
+    message = command("ingest", tmp_path / "ws", "--bag", empty, "--time-offset", "auto", fails=True)
+    assert "no image has a position" in message
 
 
 def test_workspace_without_navigation_by_time(tmp_path: Path, command: Command) -> None:
     inputs, workspace = flown(tmp_path, Winding(count=24)), tmp_path / "ws"
     command("run", workspace, *arguments(inputs), "--to", "sfm")
     (workspace / "ingest/track.npz").unlink()
-    assert "only a position for each image" in command("calibrate", workspace, fails=True)
+    message = command("calibrate", workspace, "--estimate", "boresight", fails=True)
+    assert "only a position for each image" in message
 
 
 def test_wanted_is_checked() -> None:
-    assert CalibrateOptions(estimate="lever-arm,time-offset").wanted == ("time-offset", "lever-arm")
+    assert CalibrateOptions(estimate="lever-arm,time-offset").estimate == ("time-offset", "lever-arm")
     with pytest.raises(ValueError, match="none of"):
         CalibrateOptions(estimate="")
 
@@ -223,18 +278,18 @@ def test_offset_of_a_trajectory_by_time(tmp_path: Path, command: Command) -> Non
     files = tmp_path / "survey"
     table = ["--images", files / "images", "--trajectory", files / "gnss.csv", "--import", model]
     document = command("run", tmp_path / "ws", *table, "--time-offset", "auto", "--to", "geolocate")
-    (found,) = next(row for row in document["stages"] if row["stage"] == "calibrate")["values"]["estimates"]
-    assert found["value"][0] == pytest.approx(OFFSET_S, abs=0.02)
-    assert found["observable"] == [True]
-    survey = load_json(Survey, tmp_path / "ws" / SURVEY)
+    (estimate,) = next(row for row in document["stages"] if row["stage"] == "calibrate")["values"]["estimates"]
+    assert estimate["value"][0] == pytest.approx(OFFSET_S, abs=0.02)
+    assert estimate["observable"] == [True]
+    survey = load_survey(Workspace(tmp_path / "ws"))
     places = enu_from_lla(lla_from_enu(np.array(truth.centers), truth.origin), survey.origin)
     errors = np.array([image.fix.position_in_geo for image in survey.images if image.fix]) - places
     # White noise of σ 0.02 and 0.03 m, and 10 ms at some 5 m/s.
     assert np.sqrt((errors**2).mean()) < 0.06
     assert all(image.attitude for image in survey.images)  # the gimbal's, from XMP
     # A lever arm needs to know the body.
-    told = command("ingest", tmp_path / "new", *table[:4], "--estimate", "lever-arm", fails=True)
-    assert "lever-arm needs attitudes" in told
+    message = command("ingest", tmp_path / "new", *table[:4], "--estimate", "lever-arm", fails=True)
+    assert "lever-arm needs attitudes" in message
     by_name = [*table[:2], "--trajectory", files / "trajectory.csv"]
-    told = command("ingest", tmp_path / "new", *by_name, "--time-offset", "auto", fails=True)
-    assert "[--time-offset]: needs the navigation recorded by time" in told
+    message = command("ingest", tmp_path / "new", *by_name, "--time-offset", "auto", fails=True)
+    assert "[--time-offset]: needs the navigation recorded by time" in message

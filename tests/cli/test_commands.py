@@ -74,7 +74,7 @@ class TestRunOptions:
 
     def test_slice(self, georef: Georef, done: Path) -> None:
         result = georef("run", done, "--from", "sfm", "--to", "init-sim3", "--force", "--json")
-        assert [row["stage"] for row in result.document["stages"]] == ["sfm", "geolocate", "init-sim3"]
+        assert [row["stage"] for row in result.document["stages"]] == ["sfm", "calibrate", "geolocate", "init-sim3"]
         assert all(row["ran"] for row in result.document["stages"])
 
     @pytest.mark.parametrize(
@@ -143,7 +143,7 @@ class TestFlags:
 
 
 class TestTrainResume:
-    def stop(self, stage: StageRun, config: object) -> Summary:
+    def stop(self, stage: StageRun, options: object) -> Summary:
         (stage.out / "checkpoint").write_text("1000")
         raise KeyboardInterrupt
 
@@ -162,7 +162,7 @@ class TestTrainResume:
 class TestExport:
     @pytest.fixture(autouse=True)
     def splat_with_sidecar(self, georef: Georef) -> None:
-        def export(stage: StageRun, config: object) -> Summary:
+        def export(stage: StageRun, options: object) -> Summary:
             (stage.out / "splat.ply").write_text("ply")
             (stage.out / "splat.ply.georef.json").write_text("{}")
             return Summary("1 Gaussian")
@@ -203,7 +203,7 @@ class TestTalk:
         assert quiet.err.splitlines() == lines[:1]
 
     def test_log_keeps_the_story(self, georef: Georef, done: Path) -> None:
-        def fail(stage: StageRun, config: object) -> Summary:
+        def fail(stage: StageRun, options: object) -> Summary:
             raise ConvergenceError("diverged at iteration 7")
 
         fakes.install(train=fail)
@@ -229,7 +229,7 @@ class TestTalk:
         assert "exclude each other" in result.err
 
     def test_markup_in_results_is_text(self, georef: Georef, done: Path) -> None:
-        def run(stage: StageRun, config: object) -> Summary:
+        def run(stage: StageRun, options: object) -> Summary:
             fakes.write_products(stage, BY_NAME["sfm"], "")
             return Summary("[red]48[/red] of 48", {"[bold]a": "[b]"}, ("[i]w[/i]",))
 

@@ -20,7 +20,7 @@ from tests.cli_runs import Georef, Result
 from tests.reports import check_points_with, report_with
 
 NAMES = tuple(BY_CONFIGURATION)
-SHARED = ["ingest", "sfm", "geolocate"]
+SHARED = ["ingest", "sfm", "calibrate", "geolocate"]
 OWN = ["init-sim3", "train", "evaluate"]
 
 

@@ -17,7 +17,7 @@ from tests.cli_runs import REPOSITORY, finish, start
 SLEEPING = """
 import time
 from tests import fakes
-def sleep(stage, config):
+def sleep(stage, options):
     (stage.out / "begun").write_text("")
     time.sleep(60)
 fakes.install(train=sleep)
@@ -26,7 +26,7 @@ main()
 """
 BROKEN = """
 from tests import fakes
-def run(stage, config):
+def run(stage, options):
     raise ZeroDivisionError("a defect")
 fakes.install(ingest=run)
 from georef_cli.main import main

@@ -20,7 +20,7 @@ from tests import fakes
 
 pytestmark = pytest.mark.usefixtures("fake_stages")
 
-ALL = ["ingest", "sfm", "geolocate", "init-sim3", "train", "evaluate", "export-ply"]
+ALL = ["ingest", "sfm", "calibrate", "geolocate", "init-sim3", "train", "evaluate", "export-ply"]
 
 
 def complete(workspace: Workspace, **flags: dict[str, object]) -> list[str]:
@@ -107,7 +107,7 @@ class TestStatus:
         assert reason_of(done, "train") == "made by a version with other options"
 
     def test_failed_stage_tells_why(self, done: Workspace) -> None:
-        def fail(stage: StageRun, config: object) -> Summary:
+        def fail(stage: StageRun, options: object) -> Summary:
             raise ConvergenceError("residual 7 m > 5 m")
 
         fakes.install(init_sim3=fail)
@@ -118,10 +118,10 @@ class TestStatus:
         assert row.reason == "option max_residual changed; a later run failed: residual 7 m > 5 m"
 
     def test_first_failure_and_interruption(self, workspace: Workspace, photos: Path) -> None:
-        def fail(stage: StageRun, config: object) -> Summary:
+        def fail(stage: StageRun, options: object) -> Summary:
             raise GeorefError("2 of 48 registered")
 
-        def stop(stage: StageRun, config: object) -> Summary:
+        def stop(stage: StageRun, options: object) -> Summary:
             raise KeyboardInterrupt
 
         runner.run_stage(workspace, BY_NAME["ingest"], {"images": photos})
@@ -154,9 +154,9 @@ class TestByHand:
 
     def test_edited_product_makes_downstream_stale(self, done: Workspace) -> None:
         (done.root / SPARSE / "content.txt").write_text("a better model")
-        found = state_of(done)
-        assert found["sfm"] == "current"
-        assert found["geolocate"] == "stale"
+        states_now = state_of(done)
+        assert states_now["sfm"] == "current"
+        assert states_now["geolocate"] == "stale"
         assert reason_of(done, "train") == "sfm/sparse changed"
         assert "sfm" not in complete(done)
 
@@ -188,7 +188,7 @@ class TestRequests:
         assert done.requests()["train"] == {"preset": "fast"}
 
     def test_refused_options_are_not_remembered(self, done: Workspace, photos: Path, tmp_path: Path) -> None:
-        def refuse(stage: StageRun, config: object) -> Summary:
+        def refuse(stage: StageRun, options: object) -> Summary:
             raise InputError("no images: give --images")
 
         fakes.install(ingest=refuse)
@@ -205,7 +205,7 @@ class TestRequests:
     ) -> None:
         """A run that is killed early must be completed with the effort that was asked for."""
 
-        def killed(stage: StageRun, config: object) -> Summary:
+        def killed(stage: StageRun, options: object) -> Summary:
             raise KeyboardInterrupt
 
         fakes.install(sfm=killed)
@@ -232,7 +232,7 @@ class TestRequests:
     def test_failed_demand_is_remembered(self, done: Workspace) -> None:
         """A bound that did not hold must not be dropped by the next `georef run`."""
 
-        def fail(stage: StageRun, config: object) -> Summary:
+        def fail(stage: StageRun, options: object) -> Summary:
             raise ConvergenceError("too large")
 
         fakes.install(init_sim3=fail)
@@ -244,7 +244,7 @@ class TestRequests:
 
 
 class TestResume:
-    def interrupt(self, stage: StageRun, config: object) -> Summary:
+    def interrupt(self, stage: StageRun, options: object) -> Summary:
         (stage.out / "checkpoint").write_text("1000")
         raise KeyboardInterrupt
 
@@ -293,7 +293,7 @@ class TestFailure:
             runner.run_stage(workspace, BY_NAME["train"], {})
 
     def test_failed_stage_keeps_its_product(self, done: Workspace) -> None:
-        def fail(stage: StageRun, config: object) -> Summary:
+        def fail(stage: StageRun, options: object) -> Summary:
             fakes.write_products(stage, BY_NAME["train"], "half")
             raise GeorefError("diverged")
 
@@ -304,7 +304,7 @@ class TestFailure:
         assert fakes.read_products(done, BY_NAME["train"]) == before
 
     def test_stage_that_forgets_a_product_is_a_defect(self, done: Workspace) -> None:
-        fakes.install(train=lambda stage, config: Summary("done"))
+        fakes.install(train=lambda stage, options: Summary("done"))
         with pytest.raises(RuntimeError, match=r"did not write train/model\.json"):
             runner.run_stage(done, BY_NAME["train"], {}, force=True)
 
@@ -315,7 +315,7 @@ class TestFailure:
         assert "sfm builds on ingest, which is stale (--images changed)" in caplog.text
 
     def test_warnings_are_told_and_kept(self, done: Workspace, caplog: pytest.LogCaptureFixture) -> None:
-        def warn(stage: StageRun, config: object) -> Summary:
+        def warn(stage: StageRun, options: object) -> Summary:
             fakes.write_products(stage, BY_NAME["sfm"], "model")
             return Summary("30 of 48 registered", warnings=("only 62 % registered",))
 
@@ -342,10 +342,10 @@ def test_large_input_file_counts_by_size_and_time(tmp_path: Path, monkeypatch: p
     bag = tmp_path / "flight.mcap"
     bag.write_bytes(b"x" * 100)
     workspace, spec = Workspace(tmp_path / "ws"), BY_NAME["ingest"]
-    config = IngestOptions(bag=bag)
+    options = IngestOptions(bag=bag)
 
     def seen() -> str:
-        return fingerprints(workspace, spec, config, {})["--bag"]
+        return fingerprints(workspace, spec, options, {})["--bag"]
 
     whole = seen()
     monkeypatch.setattr("pipelines.core.fingerprints._WHOLE_BYTES", 99)

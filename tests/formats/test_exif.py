@@ -27,8 +27,9 @@ def test_without_altitude_dji_may_know_it() -> None:
     exif = _gps(gps_entries(46.0, 7.0, None))
     without = read_tags(jpeg(exif=exif)).gps
     assert without is not None and without.alt_m is None
-    with_xmp = read_tags(jpeg(exif=exif, xmp=dji_xmp(AbsoluteAltitude="+198.31"))).gps
-    assert with_xmp is not None and with_xmp.alt_m == 198.31
+    with_xmp = read_tags(jpeg(exif=exif, xmp=dji_xmp(AbsoluteAltitude="+198.31")))
+    assert with_xmp.gps == without
+    assert with_xmp.dji is not None and with_xmp.dji.absolute_altitude_m == 198.31
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,6 @@ import pytest
 from pipelines.core.errors import InputError
 from pipelines.formats.odm import read_geo, read_ground_points
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
-from pipelines.ingest.notes import Notes
 
 
 def _write(tmp_path: Path, text: str, name: str = "geo.txt") -> Path:
@@ -32,18 +31,17 @@ def test_geo_of_every_width(tmp_path: Path, crs: str, end: str) -> None:
         "e.jpg 7.75 46.02 1620.5 90 0 0 0.02 0.05 and more words",
         "f.jpg nan 46.02 1620.5",
     ]
-    notes = Notes()
-    table = read_geo(_write(tmp_path, end.join(lines)), notes)
+    table = read_geo(_write(tmp_path, end.join(lines)))
     assert table.crs_text == crs
-    assert table.names == ("a.jpg", "b.jpg", "c.jpg", "d.jpg", "e.jpg")
-    assert table.lines.tolist() == [2, 4, 5, 6, 7]
+    assert table.names == ("a.jpg", "b.jpg", "c.jpg", "d.jpg", "e.jpg", "f.jpg")
+    assert table.lines.tolist() == [2, 4, 5, 6, 7, 8]
     assert np.isnan(table.xyz[0, 2]) and table.xyz[1].tolist() == [7.75, 46.02, 1620.5]
     assert table.sigma_enu_m is not None and table.sigma_enu_m[3].tolist() == [0.02, 0.02, 0.05]
-    assert notes.warnings == ["1 row has no position (NaN): geo.txt:8"]
+    assert np.isnan(table.xyz[5, 0]) and table.xyz[5, 1:].tolist() == [46.02, 1620.5]
 
 
 def test_pitch_zero_of_geo_txt_looks_straight_down(tmp_path: Path) -> None:
-    table = read_geo(_write(tmp_path, "EPSG:4326\na.jpg 7 46 100 90 0 0\n"), Notes())
+    table = read_geo(_write(tmp_path, "EPSG:4326\na.jpg 7 46 100 90 0 0\n"))
     assert table.quat_xyzw is not None
     rotation = matrix_from_quat_xyzw(table.quat_xyzw[0])
     np.testing.assert_allclose(rotation @ [0, 0, 1], [0, 0, -1], atol=1e-15)
@@ -61,13 +59,12 @@ def test_pitch_zero_of_geo_txt_looks_straight_down(tmp_path: Path) -> None:
         ("EPSG:4326\na.jpg 7.75 46.02 1620 0.02 0.03\n", r"geo\.txt:2: has 6 columns, expected 3, 4, 7 or 9"),
         ("EPSG:4326\na.jpg,7.75,46.02\n", r"geo\.txt:2: has 1 columns.*separate columns by spaces"),
         ("EPSG:4326\na.jpg 7,75 46,02 3\n", r"geo\.txt:2 \[x\]: '7,75' is no number: write decimals with a point"),
-        ("EPSG:4326\na.jpg nan nan 3\n", r"geo\.txt: no row has a position"),
         ("EPSG:4326\na.jpg 7 46 3 0 0 0 0 0.1\n", r"geo\.txt:2 \[h_acc, v_acc\]: must be above zero"),
     ],
 )
 def test_geo_refusals(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        read_geo(_write(tmp_path, text), Notes())
+        read_geo(_write(tmp_path, text))
 
 
 def test_ground_points_with_and_without_names(tmp_path: Path) -> None:

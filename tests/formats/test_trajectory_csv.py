@@ -11,13 +11,12 @@ from pipelines.core.errors import InputError
 from pipelines.formats.pose_table import PoseTable
 from pipelines.formats.trajectory_csv import read_trajectory
 from pipelines.geometry.rotations import geo_from_cam, matrix_from_quat_xyzw
-from pipelines.ingest.notes import Notes
 
 
-def _read(tmp_path: Path, text: str | bytes, notes: Notes | None = None) -> PoseTable:
+def _read(tmp_path: Path, text: str | bytes) -> PoseTable:
     path = tmp_path / "t.csv"
     path.write_bytes(text.encode() if isinstance(text, str) else text)
-    return read_trajectory(path, notes or Notes())
+    return read_trajectory(path)
 
 
 PLAIN = "image,latitude,longitude,altitude\na.jpg,46.02,7.75,1620.5\nb.jpg,46.03,7.76,1621.5\n"
@@ -48,13 +47,11 @@ def test_ways_to_write_the_same(tmp_path: Path, text: str) -> None:
 
 
 def test_all_columns(tmp_path: Path) -> None:
-    notes = Notes()
     table = _read(
         tmp_path,
         "timestamp,x,y,z,yaw,pitch,roll,sigma_e,sigma_n,sigma_u,battery\n"
         "1700000000.5,500000,5100000,1600,10,-90,0,0.02,0.03,0.04,77\n"
         "2023-11-14T22:13:21.5Z,500001,5100000,1600,,,,,,,76\n",
-        notes,
     )
     assert table.names is None and not table.geographic
     assert table.time_s is not None and table.quat_xyzw is not None and table.sigma_enu_m is not None
@@ -64,7 +61,8 @@ def test_all_columns(tmp_path: Path) -> None:
     )
     assert table.sigma_enu_m[0].tolist() == [0.02, 0.03, 0.04]
     assert np.isnan(table.quat_xyzw[1]).all() and np.isnan(table.sigma_enu_m[1]).all()
-    assert notes.warnings == ["1 column is unknown and was ignored: t.csv:1 (battery)"]
+    assert (table.unknown_columns, table.header_line) == (("battery",), 1)
+    assert not table.zoneless_times
 
 
 def test_quaternion_turns_the_camera_into_east_north_up(tmp_path: Path) -> None:
@@ -75,25 +73,18 @@ def test_quaternion_turns_the_camera_into_east_north_up(tmp_path: Path) -> None:
     np.testing.assert_allclose(matrix_from_quat_xyzw(table.quat_xyzw[0]) @ [0, 1, 0], [0, -1, 0], atol=1e-15)
 
 
-def test_times_without_zone_are_called_utc(tmp_path: Path) -> None:
-    notes = Notes()
-    table = _read(tmp_path, "time,x,y,z\n2023-11-14 22:13:20,1,2,3\n", notes)
+def test_a_time_without_zone_is_read_as_utc_and_marked(tmp_path: Path) -> None:
+    table = _read(tmp_path, "time,x,y,z\n2023-11-14 22:13:20,1,2,3\n")
     assert table.time_s is not None and table.time_s[0] == 1700000000.0
-    assert notes.assumptions == ["times without a zone in t.csv are UTC"]
+    assert table.zoneless_times
 
 
-def test_rows_without_position_are_counted(tmp_path: Path) -> None:
-    notes = Notes()
-    table = _read(tmp_path, "image,x,y,z\na,1,2,3\nb,nan,2,3\nc,,,\nd,inf,1,2\n", notes)
-    assert table.names == ("a",)
-    assert notes.warnings == ["3 rows have no position (empty or NaN): t.csv:3, t.csv:4, t.csv:5"]
-
-
-def test_repeated_times_are_counted(tmp_path: Path) -> None:
-    notes = Notes()
-    table = _read(tmp_path, "time,x,y,z\n5,1,2,3\n4,1,2,3\n5,9,9,9\n", notes)
-    assert table.xyz.tolist() == [[1, 2, 3], [1, 2, 3]]
-    assert notes.warnings == ["1 row repeats an earlier time and was left out: t.csv:4"]
+def test_rows_without_position_and_repeated_times_stay(tmp_path: Path) -> None:
+    table = _read(tmp_path, "image,x,y,z\na,1,2,3\nb,nan,2,3\nc,,,\nd,inf,1,2\n")
+    assert table.names == ("a", "b", "c", "d")
+    assert np.isfinite(table.xyz).all(axis=1).tolist() == [True, False, False, False]
+    table = _read(tmp_path, "time,x,y,z\n5,1,2,3\n4,1,2,3\n5,9,9,9\n")
+    assert table.time_s is not None and table.time_s.tolist() == [5, 4, 5]
 
 
 @pytest.mark.parametrize(
@@ -118,7 +109,6 @@ def test_repeated_times_are_counted(tmp_path: Path) -> None:
         ),
         ("image,lat,lon,alt\na,46.0,7.0,1\nb,96.0,7.0,1\n", r"t\.csv:3 \[latitude\]: 96 is out of range -90 … 90"),
         ("image,lat,lon,alt\na,46.0,700.0,1\n", r"t\.csv:2 \[longitude\]: 700 is out of range"),
-        ("image,x,y,z\na,nan,nan,nan\n", r"t\.csv: no row has a position"),
         ("image,x,y,z,sigma_e,sigma_n,sigma_u\na,1,2,3,0.1,0,0.1\n", r"t\.csv:2 \[sigma_n\]: 0 is out of range"),
         ("image,x,y,z,yaw,pitch,roll\na,1,2,3,0,-270,0\n", r"t\.csv:2 \[pitch\]: -270 is out of range"),
         (
@@ -138,4 +128,4 @@ def test_refusals_name_file_line_and_column(tmp_path: Path, text: str | bytes, m
 
 def test_absent_file(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"absent\.csv: cannot be read: No such file"):
-        read_trajectory(tmp_path / "absent.csv", Notes())
+        read_trajectory(tmp_path / "absent.csv")

@@ -85,9 +85,9 @@ def test_both_utm_zones_at_their_border_at_70_north_over_10_km() -> None:
     lla = enu.lla_from_enu(truth, origin)
     for text in ("EPSG:32632", "EPSG:32633"):
         crs = parse_crs(text)
-        found = enu.enu_from_lla(crs.lla_from_xyz(crs.xyz_from_lla(lla)), origin)
+        returned = enu.enu_from_lla(crs.lla_from_xyz(crs.xyz_from_lla(lla)), origin)
         # PROJ's transverse Mercator is a sixth-order series: 1e-8 m within a few degrees of its meridian.
-        np.testing.assert_allclose(found, truth, rtol=0, atol=1e-6)
+        np.testing.assert_allclose(returned, truth, rtol=0, atol=1e-6)
     # What the projection would have done to a flat solution: 10 km measured on the map is metres too long or short.
     mapped = parse_crs("EPSG:32633").xyz_from_lla(lla)
     assert abs(np.linalg.norm(mapped[-1, :2] - mapped[0, :2]) - 10000.0) > 1.0

@@ -44,9 +44,9 @@ def test_enu_at_70_north_10_km_agrees_with_proj() -> None:
     expected = np.stack(
         pipeline.transform(np.radians(lla[:, 1]), np.radians(lla[:, 0]), lla[:, 2], radians=True), axis=-1
     )
-    found = enu.enu_from_lla(lla, NORTH)
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-8)
-    assert -8.5 < found[0, 2] < -7.0  # d²/2R: the Earth falls away from the tangent plane
+    computed = enu.enu_from_lla(lla, NORTH)
+    np.testing.assert_allclose(computed, expected, rtol=0, atol=1e-8)
+    assert -8.5 < computed[0, 2] < -7.0  # d²/2R: the Earth falls away from the tangent plane
 
 
 def test_rotation_is_east_north_up() -> None:

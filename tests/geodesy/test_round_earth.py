@@ -95,10 +95,10 @@ def test_the_ground_falls_away_from_the_tangent_plane() -> None:
     # Along the equator the ellipsoid is a circle of its semi-major axis: 10 km out, 7.84 m down.
     angle = 10_000.0 / enu.SEMI_MAJOR_M
     origin = Origin(lat_deg=0.0, lon_deg=-75.0, alt_m=0.0)
-    found = enu.enu_from_lla([0.0, -75.0 + np.degrees(angle), 0.0], origin)
+    computed = enu.enu_from_lla([0.0, -75.0 + np.degrees(angle), 0.0], origin)
     truth = enu.SEMI_MAJOR_M * np.array([np.sin(angle), 0.0, np.cos(angle) - 1.0])
-    np.testing.assert_allclose(found, truth, rtol=0, atol=1e-8)
-    assert found[2] == pytest.approx(-7.84, abs=0.005)
+    np.testing.assert_allclose(computed, truth, rtol=0, atol=1e-8)
+    assert computed[2] == pytest.approx(-7.84, abs=0.005)
     # A plan at one height is a bow in geo, and comes back level.
     plan = np.array([[0.0, -75.0 + np.degrees(angle) * part, 120.0] for part in np.linspace(0, 1, 11)])
     in_geo = enu.enu_from_lla(plan, origin)

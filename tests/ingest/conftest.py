@@ -23,8 +23,8 @@ def ingest(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Ingest:
         path = bag if isinstance(bag, Path) else bags.write(tmp_path / f"bag{len(list(tmp_path.iterdir()))}", bag)
         workspace = tmp_path / f"ws{len(list(tmp_path.iterdir()))}"
         code = boundary.guarded(cli, ["ingest", str(workspace), "--bag", str(path), *arguments])
-        told = capsys.readouterr()
-        assert code == 0, told.err
+        captured = capsys.readouterr()
+        assert code == 0, captured.err
         survey = load_json(Survey, workspace / "ingest/survey.json")
         assert all((workspace / survey.image_dir / image.name).is_file() for image in survey.images)
         return survey
@@ -39,8 +39,8 @@ def refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Refused:
     def call(bag: Path | list[Message], *arguments: str) -> str:
         path = bag if isinstance(bag, Path) else bags.write(tmp_path / "refused", bag)
         code = boundary.guarded(cli, ["ingest", str(tmp_path / "never"), "--bag", str(path), *arguments])
-        told = capsys.readouterr()
-        assert (code, told.out) == (1, "")
-        return told.err
+        captured = capsys.readouterr()
+        assert (code, captured.out) == (1, "")
+        return captured.err
 
     return call

@@ -264,19 +264,19 @@ class TestBadMessages:
 class TestWhatIsMissing:
     def test_local_frame_needs_an_origin(self, refused: Refused) -> None:
         flight = Flight()
-        told = refused([*bags.poses(flight, "nav_msgs/msg/Odometry"), *bags.images(flight)])
-        assert "give --origin LAT,LON,HEIGHT" in told
+        message = refused([*bags.poses(flight, "nav_msgs/msg/Odometry"), *bags.images(flight)])
+        assert "give --origin LAT,LON,HEIGHT" in message
 
     def test_no_photographs(self, refused: Refused) -> None:
         assert "has no topic of sensor_msgs/Image" in refused(bags.fixes(Flight()))
 
     def test_named_topic(self, refused: Refused) -> None:
-        told = refused(bags.usual(Flight()), "--fix-topic", "/imu/data")
-        assert "/imu/data is a sensor_msgs/msg/Imu; those with positions: /gnss/fix" in told
+        message = refused(bags.usual(Flight()), "--fix-topic", "/imu/data")
+        assert "/imu/data is a sensor_msgs/msg/Imu; those with positions: /gnss/fix" in message
 
     def test_crs_has_no_meaning(self, refused: Refused) -> None:
-        told = refused(bags.usual(Flight()), "--crs", "EPSG:32632")
-        assert "[--crs]: has no meaning for a --bag" in told and "--origin" in told
+        message = refused(bags.usual(Flight()), "--crs", "EPSG:32632")
+        assert "[--crs]: has no meaning for a --bag" in message and "--origin" in message
 
     def test_no_mount(self, ingest: Ingest) -> None:
         flight = Flight()

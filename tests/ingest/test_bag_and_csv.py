@@ -61,13 +61,13 @@ def test_lever_arm_is_applied_to_a_millimetre(flown: Path, tmp_path: Path) -> No
     truth = load_json(Truth, flown / "truth.json")
     survey, _ = survey_and_track(IngestOptions(bag=flown / "bag", boresight="1,0.5,-0.7"), tmp_path / "images")
     centers = enu_from_lla(lla_from_enu(np.array(truth.centers), truth.origin), survey.origin)
-    found, turned = _read(survey)
-    missed = found - centers - np.array(truth.fix_errors)
+    positions, rotations = _read(survey)
+    missed = positions - centers - np.array(truth.fix_errors)
     # The attitude's white noise of 0.5° turns an arm of 0.37 m by 3 mm; what is left beside it is below 1 mm.
     true_turn = np.swapaxes(np.array(truth.cam_from_enu), 1, 2)
     noise = np.einsum(
         "nij,njk,k->ni",
-        turned - true_turn,
+        rotations - true_turn,
         np.array(truth.navigation.nominal_from_cam)[None].transpose(0, 2, 1),
         np.array(truth.navigation.cam_from_body) @ np.array(truth.navigation.antenna_in_body_m),
     )

@@ -56,8 +56,8 @@ def test_px4_of_every_release(ingest: Ingest, tmp_path: Path, kind: str, release
     survey = ingest(path, *options)
     # 10⁻⁷ degrees are 11 mm.
     check(survey, flight, tolerance_m=0.01 if (kind, release) == ("SensorGps", "1.14") else 1e-3)
-    told = [text for text in survey.assumptions if "lacks definitions" in text]
-    assert told == [] if stated else f"{name} (as of PX4 {release})" in told[0]
+    assumptions = [text for text in survey.assumptions if "lacks definitions" in text]
+    assert assumptions == [] if stated else f"{name} (as of PX4 {release})" in assumptions[0]
 
 
 def test_px4_estimates_that_are_none(ingest: Ingest) -> None:

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from pipelines.core.errors import InputError
+from pipelines.geodesy.enu import ecef_from_lla
 from pipelines.ingest.ground_points import GroundFile, read_ground_file, require_near, split_checks
-from pipelines.ingest.image_poses import PoseOptions
 from pipelines.ingest.notes import Notes
+from pipelines.ingest.options import IngestOptions
 
 SIZES = {"a.jpg": (64, 48), "b.jpg": (64, 48)}
 G1 = "7.75 46.02 1620 10.5 20.5 a.jpg G1\n7.75 46.02 1620 11.5 21.5 b.jpg G1\n"
@@ -20,18 +21,20 @@ G2 = "7.76 46.02 1620 10.5 20.5 a.jpg G2\n7.76 46.02 1620 11.5 21.5 b.jpg G2\n"
 def _read(tmp_path: Path, rows: str, name: str = "gcp_list.txt", notes: Notes | None = None) -> GroundFile:
     path = tmp_path / name
     path.write_text("EPSG:4979\n" + rows)
-    return read_ground_file(path, SIZES, 0.5, PoseOptions(), notes or Notes())
+    return read_ground_file(path, SIZES, IngestOptions(), notes or Notes())
 
 
 def test_points_and_marks(tmp_path: Path) -> None:
     notes = Notes()
     rows = G1 + G2 + "7.75 46.02 1620 1 1 absent.jpg G1\n7.77 46.02 1620 1 1 a.jpg G3\n"
-    found = _read(tmp_path, rows, notes=notes)
-    assert [point.name for point in found.points] == ["G1", "G2"]
-    np.testing.assert_allclose(found.points[0].lla, [46.02, 7.75, 1620.0], rtol=0, atol=1e-9)
-    mark = found.points[0].marks[1]
+    file = _read(tmp_path, rows, notes=notes)
+    assert [point.name for point in file.points] == ["G1", "G2"]
+    np.testing.assert_allclose(
+        file.points[0].position_in_ecef, ecef_from_lla([46.02, 7.75, 1620.0]), rtol=0, atol=1e-8
+    )
+    mark = file.points[0].marks[1]
     assert (mark.image, mark.x_px, mark.y_px, mark.sigma_px) == ("b.jpg", 11.5, 21.5, 0.5)
-    assert found.vertical.stated and found.vertical.name == "ellipsoidal"
+    assert file.vertical.stated and file.vertical.name == "ellipsoidal"
     assert notes.warnings == [
         "1 mark is in an image that is not here: gcp_list.txt:6 (absent.jpg)",
         "1 ground point has marks in fewer than 2 images and was left out: G3 (gcp_list.txt:7)",
@@ -83,4 +86,4 @@ def test_points_in_another_country_are_refused(tmp_path: Path) -> None:
     with pytest.raises(
         InputError, match=r"gcp_list\.txt:2: G1 is \d+ km from the images: wrong CRS, or x and y swapped"
     ):
-        require_near(_read(tmp_path, G1), np.array([7.75, 46.02, 1620.0]))
+        require_near(_read(tmp_path, G1), ecef_from_lla([7.75, 46.02, 1620.0]))

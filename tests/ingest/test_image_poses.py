@@ -14,11 +14,14 @@ from pipelines.formats.image_file import ImageFile
 from pipelines.formats.pose_table import PoseTable
 from pipelines.formats.xmp import DjiTags
 from pipelines.geodesy import enu
-from pipelines.geodesy.vertical import parse_vertical
-from pipelines.geometry.rotations import geo_from_cam, matrix_from_quat_xyzw
-from pipelines.ingest.image_poses import SIGMA_M, PoseOptions, from_table, from_tags
+from pipelines.geometry.rotations import geo_from_cam
+from pipelines.ingest.image_poses import ImagePoses
 from pipelines.ingest.notes import Notes
+from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import Photo
+from pipelines.ingest.photo_poses import poses_from_tags
+from pipelines.ingest.position_sigma import RECEIVER_SIGMA_M
+from pipelines.ingest.table_poses import poses_from_table
 
 GPS = GpsTag(46.02, 7.75, 1620.0, None, "")
 
@@ -40,6 +43,10 @@ def _table(names: tuple[str, ...] | None = ("0.jpg", "1.jpg"), **changes: object
     return replace(table, **changes)  # type: ignore[arg-type]
 
 
+def _lla(poses: ImagePoses) -> np.ndarray:
+    return enu.lla_from_ecef(poses.position_in_ecef)
+
+
 def test_sigma_by_receiver_and_precedence() -> None:
     def dji(flag: int, sigma: tuple[float, float, float] | None = None) -> PhotoTags:
         return PhotoTags(gps=GPS, dji=DjiTags(rtk_flag=flag, rtk_sigma_enu_m=sigma))
@@ -53,7 +60,7 @@ def test_sigma_by_receiver_and_precedence() -> None:
         PhotoTags(gps=GPS),
     )
     notes = Notes()
-    found = from_tags(photos, PoseOptions(), notes)
+    poses = poses_from_tags(photos, IngestOptions(), notes)
     expected = [
         [0.02, 0.02, 0.03],
         [0.5, 0.5, 1.0],
@@ -62,12 +69,12 @@ def test_sigma_by_receiver_and_precedence() -> None:
         [1.2, 1.2, 2.4],
         [2.5, 2.5, 5.0],
     ]
-    np.testing.assert_allclose(found.sigma_enu_m, expected)
-    assert found.sigma_source == ("default", "default", "default", "file", "file", "default")
+    np.testing.assert_allclose(poses.sigma_enu_m, expected)
+    assert poses.sigma_source == ("default", "default", "default", "file", "file", "default")
     assert "σ of positions without one (1): 0.02 m horizontal, 0.03 m vertical (RTK fixed)" in notes.assumptions
 
     notes = Notes()
-    overridden = from_tags(photos, PoseOptions(sigma_h_m=0.7), notes)
+    overridden = poses_from_tags(photos, IngestOptions(sigma_h=0.7), notes)
     assert "σ of positions without one (1): 0.03 m vertical (RTK fixed)" in notes.assumptions
     np.testing.assert_allclose(overridden.sigma_enu_m[:, :2], 0.7)
     assert overridden.sigma_enu_m[3, 2] == 0.025
@@ -75,49 +82,55 @@ def test_sigma_by_receiver_and_precedence() -> None:
 
 
 def test_exif_heights_are_assumed_not_refused() -> None:
-    found = from_tags(_photos(PhotoTags(gps=GPS)), PoseOptions(), Notes())
-    assert found.vertical.name == "ellipsoidal" and not found.vertical.stated
-    assert "often above a geoid" in found.vertical.note
-    stated = from_tags(_photos(PhotoTags(gps=GPS)), PoseOptions(vertical=parse_vertical("ellipsoidal")), Notes())
+    poses = poses_from_tags(_photos(PhotoTags(gps=GPS)), IngestOptions(), Notes())
+    assert poses.vertical.name == "ellipsoidal" and not poses.vertical.stated
+    assert "often above a geoid" in poses.vertical.note
+    stated = poses_from_tags(_photos(PhotoTags(gps=GPS)), IngestOptions(vertical="ellipsoidal"), Notes())
     assert stated.vertical.stated
 
 
 def test_exif_heights_stated_above_a_geoid_need_its_grid() -> None:
     with pytest.raises(InputError, match=r"us_nga_egm96_15\.tif is not installed"):
-        from_tags(_photos(PhotoTags(gps=GPS)), PoseOptions(vertical=parse_vertical("EGM96")), Notes())
+        poses_from_tags(_photos(PhotoTags(gps=GPS)), IngestOptions(vertical="EGM96"), Notes())
 
 
 def test_a_gimbal_is_kept_with_or_without_position() -> None:
     tags = PhotoTags(dji=DjiTags(gimbal_yaw_pitch_roll_deg=(45.0, -89.9, 0.0)))
-    found = from_tags(_photos(tags, PhotoTags()), PoseOptions(), Notes())
-    assert not found.located.any()
-    np.testing.assert_allclose(
-        matrix_from_quat_xyzw(found.quat_xyzw[0]), geo_from_cam([45.0, -89.9, 0.0]), atol=1e-14
-    )
-    assert np.isnan(found.quat_xyzw[1]).all()
+    poses = poses_from_tags(_photos(tags, PhotoTags()), IngestOptions(), Notes())
+    assert not poses.located.any()
+    np.testing.assert_allclose(poses.enu_from_cam[0], geo_from_cam([45.0, -89.9, 0.0]), atol=1e-14)
+    assert np.isnan(poses.enu_from_cam[1]).all()
 
 
 def test_images_without_altitude_and_with_other_datums_are_noted() -> None:
     notes = Notes()
     photos = _photos(PhotoTags(gps=replace(GPS, alt_m=None)), PhotoTags(gps=replace(GPS, datum="TOKYO")))
-    assert from_tags(photos, PoseOptions(), notes).located.tolist() == [False, True]
+    assert poses_from_tags(photos, IngestOptions(), notes).located.tolist() == [False, True]
     assert notes.warnings == ["1 image has a GPS position without altitude: 0.jpg"]
     assert "GPSMapDatum TOKYO is taken as WGS84" in notes.assumptions
+
+
+def test_height_is_of_exif_or_else_of_xmp() -> None:
+    flat, dji = replace(GPS, alt_m=None), DjiTags(absolute_altitude_m=198.31)
+    photos = _photos(PhotoTags(gps=flat, dji=dji), PhotoTags(gps=GPS, dji=dji), PhotoTags(dji=dji))
+    poses = poses_from_tags(photos, IngestOptions(), Notes())
+    assert poses.located.tolist() == [True, True, False]
+    np.testing.assert_allclose(_lla(poses)[:2, 2], [198.31, 1620.0], rtol=0, atol=1e-8)
 
 
 def test_a_table_by_name_wins_over_exif_and_does_not_mix_with_it() -> None:
     notes = Notes()
     photos = _photos(*[PhotoTags(gps=replace(GPS, lat_deg=10.0), timestamp_s=5.0)] * 3)
-    found = from_table(_table(), photos, PoseOptions(), notes)
-    assert found.located.tolist() == [True, True, False]
-    np.testing.assert_allclose(found.lla[1], [46.02, 7.7502, 1622.0], rtol=0, atol=1e-9)
-    assert found.time_s.tolist() == [100.0, 101.0, 5.0]
+    poses = poses_from_table(_table(), photos, IngestOptions(), notes)
+    assert poses.located.tolist() == [True, True, False]
+    np.testing.assert_allclose(_lla(poses)[1], [46.02, 7.7502, 1622.0], rtol=0, atol=1e-9)
+    assert poses.time_s.tolist() == [100.0, 101.0, 5.0]
     assert notes.warnings == [
         "positions in t.csv are 3927 km from those in EXIF: wrong CRS or zone?",
         "1 image has no position in t.csv: 2.jpg",
     ]
     assert "latitude and longitude in t.csv are WGS84 (EPSG:4326)" in notes.assumptions
-    np.testing.assert_allclose(found.sigma_enu_m[0], np.array(SIGMA_M["unknown receiver"])[[0, 0, 1]])
+    np.testing.assert_allclose(poses.sigma_enu_m[0], np.array(RECEIVER_SIGMA_M["unknown receiver"])[[0, 0, 1]])
 
 
 def test_a_table_by_time_interpolates_along_the_line() -> None:
@@ -125,10 +138,10 @@ def test_a_table_by_time_interpolates_along_the_line() -> None:
     photos = _photos(
         PhotoTags(timestamp_s=100.5, time_source="assumed UTC"), PhotoTags(timestamp_s=105.0), PhotoTags()
     )
-    found = from_table(_table(names=None), photos, PoseOptions(), notes)
-    assert found.located.tolist() == [True, False, False]
+    poses = poses_from_table(_table(names=None), photos, IngestOptions(), notes)
+    assert poses.located.tolist() == [True, False, False]
     ends = enu.ecef_from_lla([[46.02, 7.75, 1620.0], [46.02, 7.7502, 1622.0]])
-    np.testing.assert_allclose(enu.ecef_from_lla(found.lla[0]), ends.mean(axis=0), rtol=0, atol=1e-7)
+    np.testing.assert_allclose(poses.position_in_ecef[0], ends.mean(axis=0), rtol=0, atol=1e-7)
     assert "EXIF times without a zone are UTC" in notes.assumptions
     assert "1 image has no time in EXIF: 2.jpg" in notes.warnings
     assert "2 images have no position in t.csv: 1.jpg, 2.jpg" in notes.warnings
@@ -138,52 +151,61 @@ def test_clocks_that_never_meet_are_explained() -> None:
     with pytest.raises(
         InputError, match=r"1970-01-01 00:01:40 UTC to .*another time zone\? Is --max-gap too small"
     ):
-        from_table(_table(names=None), _photos(PhotoTags(timestamp_s=3700.0)), PoseOptions(), Notes())
+        poses_from_table(_table(names=None), _photos(PhotoTags(timestamp_s=3700.0)), IngestOptions(), Notes())
     with pytest.raises(InputError, match="no column image, and no image has a time in EXIF"):
-        from_table(_table(names=None), _photos(PhotoTags()), PoseOptions(), Notes())
+        poses_from_table(_table(names=None), _photos(PhotoTags()), IngestOptions(), Notes())
+
+
+def test_rows_without_a_time_do_not_count(tmp_path: Path) -> None:
+    times = np.array([100.0, np.nan])
+    photos = _photos(PhotoTags(timestamp_s=100.0), PhotoTags(timestamp_s=100.5))
+    poses = poses_from_table(_table(names=None, time_s=times), photos, IngestOptions(), Notes())
+    assert poses.located.tolist() == [True, False]
+    with pytest.raises(InputError, match=r"t\.csv \[timestamp\]: no row has a time"):
+        poses_from_table(_table(names=None, time_s=times * np.nan), photos, IngestOptions(), Notes())
 
 
 def test_missing_heights_are_taken_from_exif() -> None:
     notes = Notes()
     xyz = np.array([[7.75, 46.02, np.nan], [7.7502, 46.02, np.nan]])
     table = _table(xyz=xyz, geographic=None, crs_text="EPSG:4326", source="geo.txt", path=Path("geo.txt"))
-    found = from_table(table, _photos(PhotoTags(gps=GPS), PhotoTags()), PoseOptions(), notes)
-    assert found.located.tolist() == [True, False]
-    assert found.lla[0, 2] == pytest.approx(1620.0, abs=1e-8)
+    poses = poses_from_table(table, _photos(PhotoTags(gps=GPS), PhotoTags()), IngestOptions(), notes)
+    assert poses.located.tolist() == [True, False]
+    assert _lla(poses)[0, 2] == pytest.approx(1620.0, abs=1e-8)
     assert "heights that geo.txt lacks are from EXIF (1)" in notes.assumptions
     assert "1 row has no height and was left out: geo.txt:3" in notes.warnings
     with pytest.raises(InputError, match=r"geo\.txt: has no heights"):
-        from_table(table, _photos(PhotoTags(), PhotoTags()), PoseOptions(), Notes())
+        poses_from_table(table, _photos(PhotoTags(), PhotoTags()), IngestOptions(), Notes())
 
 
 @pytest.mark.parametrize(
     ("changes", "options", "message"),
     [
-        ({"geographic": False}, PoseOptions(), r"t\.csv: columns x,y,z need their CRS: give --crs"),
+        ({"geographic": False}, IngestOptions(), r"t\.csv: columns x,y,z need their CRS: give --crs"),
         (
             {},
-            PoseOptions(crs="EPSG:32632"),
+            IngestOptions(crs="EPSG:32632"),
             r"\[--crs\]: t\.csv has latitude and longitude, but EPSG:32632 has none",
         ),
-        ({}, PoseOptions(crs="EPSG:0"), r"\[--crs\]: 'EPSG:0' is no CRS"),
+        ({}, IngestOptions(crs="EPSG:0"), r"\[--crs\]: 'EPSG:0' is no CRS"),
         (
             {},
-            PoseOptions(crs="EPSG:4979", vertical=parse_vertical("EGM96")),
+            IngestOptions(crs="EPSG:4979", vertical="EGM96"),
             r"\[--vertical\]: contradicts --crs EPSG:4979, whose heights are ellipsoidal",
         ),
-        ({"geographic": False}, PoseOptions(crs="EPSG:32632"), r"t\.csv:2: .*degrees\? EPSG:32632 has eastings"),
+        ({"geographic": False}, IngestOptions(crs="EPSG:32632"), r"t\.csv:2: .*degrees\? EPSG:32632 has eastings"),
     ],
 )
-def test_contradictions_about_the_crs(changes: dict[str, object], options: PoseOptions, message: str) -> None:
+def test_contradictions_about_the_crs(changes: dict[str, object], options: IngestOptions, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        from_table(_table(**changes), _photos(PhotoTags(), PhotoTags()), options, Notes())
+        poses_from_table(_table(**changes), _photos(PhotoTags(), PhotoTags()), options, Notes())
 
 
 def test_a_file_that_states_its_datum_keeps_it_and_says_so() -> None:
     notes = Notes()
     table = _table(geographic=None, crs_text="EPSG:4979", path=Path("geo.txt"))
-    options = PoseOptions(vertical=parse_vertical("EGM96"))
-    assert from_table(table, _photos(PhotoTags(), PhotoTags()), options, notes).vertical.name == "ellipsoidal"
+    options = IngestOptions(vertical="EGM96")
+    assert poses_from_table(table, _photos(PhotoTags(), PhotoTags()), options, notes).vertical.name == "ellipsoidal"
     assert (
         "heights of geo.txt are ellipsoidal, as its CRS says; --vertical does not apply to them"
         in notes.assumptions
@@ -193,10 +215,10 @@ def test_a_file_that_states_its_datum_keeps_it_and_says_so() -> None:
 def test_feet_and_the_accuracy_of_a_datum_are_told() -> None:
     notes = Notes()
     xyz = np.array([[1450000.0, 540000.0, 1000.0], [1450010.0, 540000.0, 1000.0]])
-    found = from_table(
-        _table(xyz=xyz, geographic=False), _photos(PhotoTags(), PhotoTags()), PoseOptions(crs="EPSG:2264"), notes
+    poses = poses_from_table(
+        _table(xyz=xyz, geographic=False), _photos(PhotoTags(), PhotoTags()), IngestOptions(crs="EPSG:2264"), notes
     )
-    assert found.lla[0, 2] == pytest.approx(1000.0 * 1200 / 3937)
+    assert _lla(poses)[0, 2] == pytest.approx(1000.0 * 1200 / 3937)
     assert "heights of EPSG:2264 are in US survey foot" in notes.assumptions
     assert any("published with 4 m" in text for text in notes.assumptions)
     assert any("us_noaa_nchpgn.tif" in text for text in notes.warnings)

@@ -59,8 +59,8 @@ def test_what_a_local_frame_needs(tmp_path: Path, capsys: pytest.CaptureFixture[
         *bags.images(flight),
     ]
     document = _inspected(bags.write(tmp_path / "bag", messages), capsys)
-    told = " ".join(document["missing"])
-    assert "give --origin LAT,LON,HEIGHT" in told and "give --camera-mount" in told
+    missing = " ".join(document["missing"])
+    assert "give --origin LAT,LON,HEIGHT" in missing and "give --camera-mount" in missing
 
 
 def test_unknown_type_and_truncated_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

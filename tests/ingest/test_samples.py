@@ -74,8 +74,8 @@ def test_orbit_attitudes_err_by_half_a_degree() -> None:
 def test_orbit_bag_says_what_it_lacks_and_takes_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """It was recorded without /tf: nobody but the user knows how the camera sits in the body."""
     assert boundary.guarded(cli, ["inspect", str(ORBIT / "bag")]) == 0
-    told = " ".join(capsys.readouterr().out.split())
-    assert "/tf does not link camera 'camera_optical' and body 'base_link': give --camera-mount" in told
+    output = " ".join(capsys.readouterr().out.split())
+    assert "/tf does not link camera 'camera_optical' and body 'base_link': give --camera-mount" in output
     bare, _ = survey_and_track(IngestOptions(bag=ORBIT / "bag"), tmp_path / "bare")
     assert not any(image.attitude for image in bare.images)
     assert any("give --camera-mount YAW,PITCH,ROLL" in warning for warning in bare.warnings)

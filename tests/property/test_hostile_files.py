@@ -18,7 +18,6 @@ from pipelines.formats.image_file import header_size, inspect_image
 from pipelines.formats.odm import read_geo, read_ground_points
 from pipelines.formats.trajectory_csv import read_trajectory
 from pipelines.geodesy.crs import parse_crs
-from pipelines.ingest.notes import Notes
 from tests.photos import Exif, dji_xmp, gps_entries, jpeg
 
 CELLS = st.one_of(
@@ -39,7 +38,7 @@ TABLES = st.tuples(HEADERS, st.sampled_from(",; \t"), st.lists(st.lists(CELLS, m
 @settings(deadline=None, max_examples=30)
 @pytest.mark.parametrize(
     "read",
-    [lambda path: read_trajectory(path, Notes()), lambda path: read_geo(path, Notes()), read_ground_points],
+    [read_trajectory, read_geo, read_ground_points],
     ids=["csv", "geo.txt", "gcp_list.txt"],
 )
 @given(table=TABLES)

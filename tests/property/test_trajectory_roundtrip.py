@@ -10,7 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipelines.formats.trajectory_csv import read_trajectory
-from pipelines.ingest.notes import Notes
 
 POSITIONS = st.tuples(st.floats(-90.0, 90.0), st.floats(-180.0, 180.0), st.floats(-500.0, 9000.0))
 STYLES = st.sampled_from([(",", "."), (";", "."), (";", ","), ("\t", ","), ("\t", ".")])
@@ -36,6 +35,6 @@ def test_csv_round_trip(
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "t.csv"
         path.write_text(("\ufeff" if mark else "") + end.join(lines), encoding="utf-8", newline="")
-        table = read_trajectory(path, Notes())
+        table = read_trajectory(path)
     np.testing.assert_array_equal(table.xyz, np.array(rows)[:, [1, 0, 2]])
     assert table.names == tuple(f"{index}.jpg" for index in range(len(rows)))

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from pipelines.core.errors import InputError
-from pipelines.core.fingerprints import layout_of
-from pipelines.core.options import RigParameter
+from pipelines.core.products import load_json, save_json
+from pipelines.core.stages import RIG, SURVEY, TRACK
+from pipelines.core.workspace import Workspace
 from pipelines.geometry.rig import boresight
 from pipelines.geometry.rotations import exp_so3, log_so3, matrix_from_quat_xyzw, quat_xyzw_from_matrix
-from pipelines.scene.calibrated import with_rig
+from pipelines.scene.calibrated import apply_calibration, load_survey
 from pipelines.scene.navigation import NavigationTrack, require_estimable
-from pipelines.scene.rig import RigCalibration, RigEstimate
+from pipelines.scene.rig import RigCalibration, RigEstimate, RigParameter
 from pipelines.scene.survey import Attitude, Survey, SurveyImage
 from tests.scenes import Measured, Noise, make_scene, survey_of
 
@@ -63,7 +66,7 @@ def survey() -> Survey:
     return made.model_copy(update={"images": tuple(images)})
 
 
-def estimate(name: RigParameter, value: np.ndarray, start: np.ndarray, *, seen: bool = True) -> RigEstimate:
+def estimate(name: RigParameter, value: np.ndarray, start: np.ndarray) -> RigEstimate:
     unit = {"time-offset": "s", "boresight": "deg", "lever-arm": "m"}[name]
     values, starts = tuple(value.tolist()), tuple(start.tolist())
     return RigEstimate(
@@ -72,12 +75,12 @@ def estimate(name: RigParameter, value: np.ndarray, start: np.ndarray, *, seen: 
         value=values,
         sigma=(0.0,) * len(values),
         start=starts,
-        observable=(seen,) * len(values),
+        observable=(True,) * len(values),
     )
 
 
 def of(*estimates: RigEstimate) -> RigCalibration:
-    return RigCalibration(wanted=tuple(one.name for one in estimates), estimates=estimates)
+    return RigCalibration(wanted=tuple(estimate.name for estimate in estimates), applied=estimates)
 
 
 def places(survey: Survey) -> np.ndarray:
@@ -92,37 +95,36 @@ def test_offset_boresight_and_arm_are_applied(survey: Survey, track: NavigationT
         estimate("boresight", turned_deg, np.zeros(3)),
         estimate("lever-arm", ARM, np.zeros(3)),
     )
-    found = with_rig(survey, track, rig)
+    calibrated = apply_calibration(survey, track, rig)
     at = track.image_time_s + 0.5
-    np.testing.assert_allclose(places(found)[:COUNT], cameras(at), atol=1e-5)
-    quats = [image.attitude.quat_xyzw for image in found.images[:COUNT] if image.attitude]
+    np.testing.assert_allclose(places(calibrated)[:COUNT], cameras(at), atol=1e-5)
+    quats = [image.attitude.quat_xyzw for image in calibrated.images[:COUNT] if image.attitude]
     expected = bodies(at) @ MOUNT.T @ boresight(turned_deg)
     assert np.abs(log_so3(matrix_from_quat_xyzw(quats) @ np.swapaxes(expected, 1, 2))).max() < 1e-9
     # What the navigation does not know stays; what it now knows takes σ from the nearest.
-    assert found.images[5] == survey.images[5]
-    assert found.images[4].fix is not None and survey.images[3].fix is not None
-    assert found.images[4].fix.cov_in_geo == survey.images[3].fix.cov_in_geo
-    assert found.rig == rig
+    assert calibrated.images[5] == survey.images[5]
+    assert calibrated.images[4].fix is not None and survey.images[3].fix is not None
+    assert calibrated.images[4].fix.cov_in_geo == survey.images[3].fix.cov_in_geo
 
 
-def test_what_is_not_observable_stays_as_told(survey: Survey, track: NavigationTrack) -> None:
-    rig = of(
-        estimate("time-offset", np.array([0.5]), np.zeros(1), seen=False),
-        estimate("boresight", np.array([9.0, 9.0, 9.0]), np.zeros(3), seen=False),
+def test_what_is_not_applied_stays_as_told(survey: Survey, track: NavigationTrack) -> None:
+    withheld = (
+        estimate("time-offset", np.array([0.5]), np.zeros(1)),
+        estimate("boresight", np.array([9.0, 9.0, 9.0]), np.zeros(3)),
     )
-    found = with_rig(survey, track, rig)
-    np.testing.assert_allclose(places(found)[:COUNT], cameras(track.image_time_s), atol=1e-5)
+    calibrated = apply_calibration(survey, track, RigCalibration(not_applied=withheld))
+    np.testing.assert_allclose(places(calibrated)[:COUNT], cameras(track.image_time_s), atol=1e-5)
 
 
 def test_nothing_is_invented_beyond_the_ends_or_without_attitude(survey: Survey, track: NavigationTrack) -> None:
-    found = with_rig(survey, track, of(estimate("time-offset", np.array([2.5]), np.zeros(1))))
-    assert [image.fix is None for image in found.images] == [False, False, False, True, True, False]
+    calibrated = apply_calibration(survey, track, of(estimate("time-offset", np.array([2.5]), np.zeros(1))))
+    assert [image.fix is None for image in calibrated.images] == [False, False, False, True, True, False]
     gap = (track.attitude_time_s < 0.9) | (track.attitude_time_s > 2.9)
     torn = replace(track, attitude_time_s=track.attitude_time_s[gap], geo_from_body=track.geo_from_body[gap])
-    found = with_rig(survey, torn, of(estimate("time-offset", np.array([0.0]), np.zeros(1))))
+    calibrated = apply_calibration(survey, torn, of(estimate("time-offset", np.array([0.0]), np.zeros(1))))
     # Without attitude the arm could point anywhere: no position either.
-    assert [image.fix is None for image in found.images] == [False, True, True, False, False, False]
-    assert [image.attitude is None for image in found.images] == [False, True, True, False, False, False]
+    assert [image.fix is None for image in calibrated.images] == [False, True, True, False, False, False]
+    assert [image.attitude is None for image in calibrated.images] == [False, True, True, False, False, False]
 
 
 def test_attitudes_that_came_with_the_photographs_carry_the_arm(survey: Survey, track: NavigationTrack) -> None:
@@ -133,17 +135,90 @@ def test_attitudes_that_came_with_the_photographs_carry_the_arm(survey: Survey, 
         images[i] = images[i].model_copy(update={"attitude": attitude})
     survey = survey.model_copy(update={"images": tuple(images)})
     bare = replace(track, attitude_time_s=np.empty(0), geo_from_body=np.empty((0, 3, 3)))
-    found = with_rig(survey, bare, of(estimate("time-offset", np.array([0.0]), np.zeros(1))))
-    np.testing.assert_allclose(places(found)[:COUNT], cameras(track.image_time_s), atol=1e-5)
-    assert [image.attitude for image in found.images] == [image.attitude for image in survey.images]
+    calibrated = apply_calibration(survey, bare, of(estimate("time-offset", np.array([0.0]), np.zeros(1))))
+    np.testing.assert_allclose(places(calibrated)[:COUNT], cameras(track.image_time_s), atol=1e-5)
+    assert [image.attitude for image in calibrated.images] == [image.attitude for image in survey.images]
 
 
-def test_layout_is_of_what_was_recorded(survey: Survey, track: NavigationTrack) -> None:
-    rig = of(estimate("time-offset", np.array([0.5]), np.zeros(1)))
-    applied = with_rig(survey, track, rig.model_copy(update={"layout": layout_of(survey)}))
-    assert layout_of(applied) == layout_of(survey)
-    moved = survey.model_copy(update={"images": survey.images[1:]})
-    assert layout_of(moved) != layout_of(survey)
+class TestLoadSurvey:
+    """The one function that reads a survey for the stages after `calibrate`."""
+
+    OFFSET = of(estimate("time-offset", np.array([0.5]), np.zeros(1)))
+
+    @pytest.fixture
+    def workspace(self, tmp_path: Path, survey: Survey, track: NavigationTrack) -> Workspace:
+        save_json(survey, tmp_path / SURVEY)
+        track.save(tmp_path / TRACK)
+        return Workspace(tmp_path)
+
+    def test_applies_what_calibrate_applied(
+        self, workspace: Workspace, survey: Survey, track: NavigationTrack
+    ) -> None:
+        save_json(self.OFFSET, workspace.root / RIG)
+        applied = load_survey(workspace)
+        assert applied == apply_calibration(survey, track, self.OFFSET)
+        assert applied.images != survey.images
+        assert load_json(Survey, workspace.root / SURVEY) == survey
+
+    def test_is_the_survey_as_recorded_where_nothing_is_applied(
+        self, workspace: Workspace, survey: Survey, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        assert load_survey(workspace) == survey
+        assert caplog.text == ""
+        (workspace.root / TRACK).unlink()
+        withheld = RigCalibration(not_applied=(estimate("boresight", np.ones(3), np.zeros(3)),))
+        save_json(withheld, workspace.root / RIG)
+        assert load_survey(workspace) == survey
+
+    def test_reminds_of_a_calibration_that_was_asked_for(
+        self, workspace: Workspace, survey: Survey, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        save_json(survey.model_copy(update={"estimate": ("time-offset",)}), workspace.root / SURVEY)
+        load_survey(workspace)
+        assert "time-offset were to be estimated after sfm: `georef calibrate`" in caplog.text
+
+    def test_needs_the_navigation_for_a_calibration(self, workspace: Workspace) -> None:
+        (workspace.root / TRACK).unlink()
+        save_json(self.OFFSET, workspace.root / RIG)
+        with pytest.raises(InputError, match=r"ingest/track\.npz: the survey has no navigation recorded by time"):
+            load_survey(workspace)
+
+    @pytest.mark.parametrize(
+        ("change", "message"),
+        [
+            ({"value": []}, r"rig\.json \[applied\.0\]: .*time-offset has 1 components"),
+            ({"name": "boresight"}, r"rig\.json \[applied\.0\]: .*boresight has 3 components"),
+            ({"name": "focus"}, r"rig\.json \[applied\.0\.name\]"),
+        ],
+    )
+    def test_refuses_a_calibration_of_another_form(
+        self, workspace: Workspace, change: dict[str, object], message: str
+    ) -> None:
+        document = self.OFFSET.model_dump(mode="json")
+        document["applied"][0].update(change)
+        (workspace.root / RIG).parent.mkdir()
+        (workspace.root / RIG).write_text(json.dumps(document))
+        with pytest.raises(InputError, match=message):
+            load_survey(workspace)
+        document = self.OFFSET.model_dump(mode="json")
+        (workspace.root / RIG).write_text(json.dumps({**document, "not_applied": document["applied"]}))
+        with pytest.raises(InputError, match="a parameter is estimated twice"):
+            load_survey(workspace)
+
+    def test_a_variant_reads_what_it_is_lent(self, workspace: Workspace, survey: Survey) -> None:
+        save_json(self.OFFSET, workspace.root / RIG)
+        lent = {folder: workspace.root / folder for folder in ("ingest", "calibrate")}
+        assert load_survey(workspace.variant("compare/A", lent)) == load_survey(workspace) != survey
+
+    def test_surveys_of_earlier_versions(self, workspace: Workspace, survey: Survey) -> None:
+        """A field that nothing was put into is passed over; a calibrated survey is no record of a flight."""
+        path = workspace.root / SURVEY
+        document = json.loads(path.read_text())
+        path.write_text(json.dumps({**document, "rig": None}))
+        assert load_survey(workspace) == survey
+        path.write_text(json.dumps({**document, "rig": {"wanted": ["boresight"]}}))
+        with pytest.raises(InputError, match=r"ingest/survey\.json: .*calibration .* run `georef ingest` again"):
+            load_survey(workspace)
 
 
 @pytest.mark.parametrize(

@@ -2,22 +2,56 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from pipelines.core.types import FloatArray
 from pipelines.formats.image_file import MAX_PIXELS
+from pipelines.ingest.bag.topics import SelectedTopics
+from pipelines.ingest.camera_priors import camera_priors
+from pipelines.ingest.notes import Notes
+from pipelines.ingest.options import IngestOptions
+from pipelines.ingest.photo_folder import Photo
 from pipelines.scene.survey import CameraPrior
 
 
+def lens_priors(
+    photos: Sequence[Photo], topics: SelectedTopics, info: Any | None, options: IngestOptions, notes: Notes
+) -> tuple[tuple[CameraPrior, ...], dict[str, int]]:
+    """Return one calibrated camera of all photographs, or else assumed ones; and the id of each one's camera.
+
+    Args:
+        photos: the photographs.
+        topics: whose names tell rectified images.
+        info: first `CameraInfo`.
+        options: `--focal-px` is stronger than the bag.
+        notes: how the lens was found.
+    """
+    sizes = {(photo.file.width, photo.file.height) for photo in photos}
+    if info is None or options.focal_px is not None or len(sizes) != 1:
+        return camera_priors(photos, options.focal_px, notes)
+    rectified = "rect" in str(topics.image).rpartition("/")[2] or "_rect" in str(topics.image)
+    prior, remark = camera_prior(info, rectified)
+    (width, height) = next(iter(sizes))
+    fitted = scaled_prior(prior, width, height) if prior is not None else None
+    if prior is not None and fitted is None:
+        remark = f"CameraInfo is of images of {prior.width}×{prior.height}, these are {width}×{height}"
+    if fitted is None:
+        notes.warn(f"{remark}: it is not used")
+        return camera_priors(photos, options.focal_px, notes)
+    notes.assume(f"lens from {topics.info}: {remark}")
+    return (fitted,), {photo.name: 1 for photo in photos}
+
+
 def camera_prior(message: Any, rectified: bool) -> tuple[CameraPrior | None, str]:
-    """The calibration of a `CameraInfo`, and what to say of it; no prior where it is not calibrated.
+    """Return the calibration of a `CameraInfo` and a remark on it; no prior where it is not calibrated.
 
     ROS counts pixels from the centre of the first one, COLMAP from its corner.
 
     Args:
-        message: it.
+        message: the `CameraInfo`.
         rectified: the images are rectified already: `p` applies, and no distortion is left.
     """
     matrix = _numbers(message, "p" if rectified else "k").reshape(3, -1)
@@ -28,7 +62,7 @@ def camera_prior(message: Any, rectified: bool) -> tuple[CameraPrior | None, str
     if not (np.isfinite(numbers).all() and fx > 0 and fy > 0 and 0 < width * height <= MAX_PIXELS):
         return None, "CameraInfo is not calibrated"
     name = str(message.distortion_model).strip().lower()
-    what = "rectified" if rectified else name or "no distortion"
+    state = "rectified" if rectified else name or "no distortion"
     if rectified or not lens.any():
         name, lens = "", lens[:0]
     model, extra = _lens(name, lens)
@@ -41,11 +75,11 @@ def camera_prior(message: Any, rectified: bool) -> tuple[CameraPrior | None, str
     prior = CameraPrior(
         camera_id=1, model=model, width=width, height=height, params=params, focal_source="calibrated"
     )
-    return prior, f"CameraInfo ({what}): {model} with a focal length of {fx:.1f} px"
+    return prior, f"CameraInfo ({state}): {model} with a focal length of {fx:.1f} px"
 
 
 def scaled_prior(prior: CameraPrior, width: int, height: int) -> CameraPrior | None:
-    """The calibration for images of another size but the same shape; None if the shape differs."""
+    """Return the calibration for images of another size but the same shape; None if the shape differs."""
     factor = width / prior.width
     if abs(prior.height * factor - height) > 1.0:
         return None
@@ -55,7 +89,7 @@ def scaled_prior(prior: CameraPrior, width: int, height: int) -> CameraPrior | N
 
 
 def _lens(name: str, lens: FloatArray) -> tuple[str, list[float]]:
-    """COLMAP's model and its distortion; an empty name if there is none that fits."""
+    """Return COLMAP's model and its distortion; an empty name if none fits."""
     if not len(lens):
         return "PINHOLE", []
     if name in ("equidistant", "fisheye") and len(lens) == 4:
@@ -69,6 +103,6 @@ def _lens(name: str, lens: FloatArray) -> tuple[str, list[float]]:
 
 
 def _numbers(message: Any, name: str) -> FloatArray:
-    """A field that ROS 2 writes in small letters, ROS 1 in capitals."""
-    found = getattr(message, name, None)
-    return np.asarray(getattr(message, name.upper()) if found is None else found, dtype=np.float64)
+    """Return a field that ROS 2 writes in small letters, ROS 1 in capitals."""
+    values = getattr(message, name, None)
+    return np.asarray(getattr(message, name.upper()) if values is None else values, dtype=np.float64)

@@ -1,4 +1,4 @@
-"""`georef inspect`: what a ROS bag holds, what `ingest` would choose of it, and what is missing.
+"""`georef inspect`: what a ROS bag holds, what `ingest` would select of it, and what is missing.
 
 Reads the bag once, message by message; writes nothing.
 """
@@ -16,8 +16,8 @@ from pipelines.core.progress import SILENT, Progress
 from pipelines.formats.bag.images import COMPRESSED, IMAGE, INFO
 from pipelines.formats.bag.reader import Bag, RawMessage, UndecodableError, open_bag
 from pipelines.ingest.bag import transforms as bag_transforms
-from pipelines.ingest.bag.navigation import ATTITUDES, BASE, POSITIONS
-from pipelines.ingest.bag.topics import AskedTopics, Choice, choose_topics
+from pipelines.ingest.bag.messages import ATTITUDES, BASE, POSITIONS
+from pipelines.ingest.bag.topics import RequestedTopics, SelectedTopics, select_topics
 from pipelines.ingest.bag.transforms import Transforms
 
 _KNOWN = {IMAGE, COMPRESSED, INFO, *POSITIONS, *ATTITUDES}
@@ -58,7 +58,7 @@ class TopicReport:
 
 @dataclass(frozen=True)
 class BagReport:
-    """A bag: its topics, what `ingest` would choose with which remarks, and what is missing."""
+    """A bag: its topics, remarks on those that `ingest` would select, and what is missing."""
 
     path: str
     messages: int
@@ -69,14 +69,14 @@ class BagReport:
 
 @dataclass
 class _Tally:
-    """What one pass collects of a topic."""
+    """Counts of one pass over a topic."""
 
     times: array = field(default_factory=lambda: array("q"))
     stamped: bool = False
     frame: str = ""
     child: str = ""
     problem: str = ""
-    looked: bool = False
+    described: bool = False
 
 
 def inspect_bag(path: Path, progress: Progress = SILENT) -> BagReport:
@@ -86,34 +86,34 @@ def inspect_bag(path: Path, progress: Progress = SILENT) -> BagReport:
         InputError: it cannot be opened.
     """
     with open_bag(path) as bag:
-        choice = choose_topics(bag, AskedTopics())
+        topics = select_topics(bag, RequestedTopics())
         tallies = {name: _Tally() for name in bag.topics}
         transforms = Transforms()
         with progress.task("bag", bag.message_count) as task:
             for message in bag.messages(list(bag.topics)):
-                _look(bag, message, tallies[message.topic], transforms)
+                _count(bag, message, tallies[message.topic], transforms)
                 task.advance()
         uses = {
-            choice.image: "photographs",
-            choice.info: "lens",
-            choice.fix: "positions",
-            choice.attitude: "attitudes",
+            topics.image: "photographs",
+            topics.info: "lens",
+            topics.fix: "positions",
+            topics.attitude: "attitudes",
         }
-        if choice.fix is not None and choice.fix == choice.attitude:
-            uses[choice.fix] = "positions, attitudes"
-        topics = tuple(
+        if topics.fix is not None and topics.fix == topics.attitude:
+            uses[topics.fix] = "positions, attitudes"
+        reports = tuple(
             _report(name, bag.topics[name].type, uses.get(name, ""), tally)
             for name, tally in sorted(tallies.items())
         )
-        missing = _missing(bag, choice, tallies, transforms)
+        missing = _missing(bag, topics, tallies, transforms)
         count = sum(len(tally.times) for tally in tallies.values())
-        return BagReport(str(path), count, topics, choice.remarks, missing)
+        return BagReport(str(path), count, reports, topics.remarks, missing)
 
 
-def _look(bag: Bag, message: RawMessage, tally: _Tally, transforms: Transforms) -> None:
+def _count(bag: Bag, message: RawMessage, tally: _Tally, transforms: Transforms) -> None:
     is_frames = message.type in (bag_transforms.TYPE, bag_transforms.OLD_TYPE)
-    if not tally.looked or is_frames:
-        tally.looked = True
+    if not tally.described or is_frames:
+        tally.described = True
         try:
             decoded = bag.decode(message)
             if is_frames:
@@ -155,30 +155,32 @@ def _report(name: str, kind: str, use: str, tally: _Tally) -> TopicReport:
     )
 
 
-def _missing(bag: Bag, choice: Choice, tallies: dict[str, _Tally], transforms: Transforms) -> tuple[str, ...]:
-    """What a survey would lack, and what to do about it."""
-    found: list[str] = []
+def _missing(
+    bag: Bag, topics: SelectedTopics, tallies: dict[str, _Tally], transforms: Transforms
+) -> tuple[str, ...]:
+    """Return what a survey would lack, and the remedies."""
+    missing: list[str] = []
     if bag.damage is not None:
-        found.append(f"the bag is damaged and could not be read to its end ({bag.damage})")
-    if choice.image is None:
-        found.append("no photographs: no topic of sensor_msgs/Image or CompressedImage")
-    if choice.info is None:
-        found.append("no CameraInfo for the photographs: the focal length is assumed, or give --focal-px")
-    if choice.fix is None:
-        found.append("no positions: ground control points alone can place the model (--gcp)")
-    elif not POSITIONS[bag.topics[choice.fix].type].geodetic:
-        found.append(f"{choice.fix} is in a local frame: give --origin LAT,LON,HEIGHT of its zero")
-    if choice.attitude is None:
-        found.append("no attitudes: a lever arm cannot be applied")
-        return tuple(found)
-    if choice.image is None:
-        return tuple(found)
-    body = tallies[choice.attitude].child or tallies[choice.attitude].frame or BASE
+        missing.append(f"the bag is damaged and could not be read to its end ({bag.damage})")
+    if topics.image is None:
+        missing.append("no photographs: no topic of sensor_msgs/Image or CompressedImage")
+    if topics.info is None:
+        missing.append("no CameraInfo for the photographs: the focal length is assumed, or give --focal-px")
+    if topics.fix is None:
+        missing.append("no positions: ground control points alone can place the model (--gcp)")
+    elif not POSITIONS[bag.topics[topics.fix].type].geodetic:
+        missing.append(f"{topics.fix} is in a local frame: give --origin LAT,LON,HEIGHT of its zero")
+    if topics.attitude is None:
+        missing.append("no attitudes: a lever arm cannot be applied")
+        return tuple(missing)
+    if topics.image is None:
+        return tuple(missing)
+    body = tallies[topics.attitude].child or tallies[topics.attitude].frame or BASE
     body = body if body in transforms or BASE not in transforms else BASE
-    camera, at = tallies[choice.image].frame, np.zeros(1)
+    camera, at = tallies[topics.image].frame, np.zeros(1)
     if transforms.between(body, camera, at) is None:
-        found.append(f"/tf does not link camera {camera!r} and body {body!r}: give --camera-mount YAW,PITCH,ROLL")
-    antenna = tallies[choice.fix].child or tallies[choice.fix].frame or BASE if choice.fix else None
+        missing.append(f"/tf does not link camera {camera!r} and body {body!r}: give --camera-mount YAW,PITCH,ROLL")
+    antenna = tallies[topics.fix].child or tallies[topics.fix].frame or BASE if topics.fix else None
     if antenna is not None and transforms.between(body, antenna, at) is None:
-        found.append(f"/tf does not link antenna {antenna!r} and body {body!r}: give --lever-arm")
-    return tuple(found)
+        missing.append(f"/tf does not link antenna {antenna!r} and body {body!r}: give --lever-arm")
+    return tuple(missing)

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 from array import array
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,8 +18,8 @@ from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import BoolArray, FloatArray
 from pipelines.formats.bag.reader import Bag, RawMessage, UndecodableError
 from pipelines.ingest.bag import transforms as bag_transforms
-from pipelines.ingest.bag.navigation import ATTITUDES, POSITIONS, Axes, stamp_ns
-from pipelines.ingest.bag.topics import Choice
+from pipelines.ingest.bag.messages import ATTITUDES, POSITIONS, Axes, stamp_ns
+from pipelines.ingest.bag.topics import SelectedTopics
 from pipelines.ingest.bag.transforms import Transforms
 from pipelines.ingest.notes import Notes
 
@@ -32,67 +34,81 @@ class Series:
 
     Attributes:
         topic: its name.
+        type: of its messages.
         stamps: nanoseconds of the message's own clock; 0 where it has none.
         bag_times: nanoseconds of the recorder's clock.
         values: `width` numbers a sample.
-        kinds: a word a sample.
+        receivers: the kind of receiver of each sample.
         frame: of the first sample; `world`: its local frame; `axes`: of the frame.
         problems: how many messages were left out, by reason.
     """
 
     topic: str
+    type: str
     width: int = 0
     stamps: array = field(default_factory=lambda: array("q"))
     bag_times: array = field(default_factory=lambda: array("q"))
     values: array = field(default_factory=lambda: array("d"))
-    kinds: list[str] = field(default_factory=list)
+    receivers: list[str] = field(default_factory=list)
     frame: str = ""
     world: str = ""
     axes: Axes = "flu"
     problems: Counter[str] = field(default_factory=Counter)
 
-    def add(self, stamp: int | None, bag_ns: int, values: tuple[float, ...] = (), kind: str = "") -> None:
+    def add(self, stamp: int | None, bag_ns: int, values: tuple[float, ...] = (), receiver: str = "") -> None:
         """Append a sample."""
         self.stamps.append(stamp or 0)
         self.bag_times.append(bag_ns)
         self.values.extend(values)
-        self.kinds.append(kind)
+        self.receivers.append(receiver)
 
     def table(self) -> FloatArray:
-        """(N, width) values."""
+        """Return the values (N, width)."""
         return np.frombuffer(self.values, dtype=np.float64).reshape(-1, self.width)
 
 
 @dataclass(frozen=True)
-class Streams:
-    """What one pass over a bag found.
+class Clock:
+    """When the samples of a topic were taken: seconds (N,), and which of them are usable (N,)."""
+
+    time_s: FloatArray
+    usable: BoolArray
+
+
+@dataclass(frozen=True)
+class BagStreams:
+    """The small messages of a bag.
 
     Attributes:
+        path: of the bag.
         images: stamps of every message of the image topic; `image_frame`: frame of the first.
         positions: latitude, longitude, height (or east, north, up) and their σ.
         attitudes: quaternion xyzw frame → East-North-Up, and σ in degrees.
         transforms: the frames.
         info: first `CameraInfo`, or None.
+        clocks: when the samples were taken, by topic.
     """
 
+    path: Path
     images: Series
     image_frame: str
     positions: Series | None
     attitudes: Series | None
     transforms: Transforms
     info: Any | None
+    clocks: Mapping[str, Clock]
 
 
-def read_streams(bag: Bag, choice: Choice, notes: Notes, progress: Progress = SILENT) -> Streams:
-    """Read everything but the pictures; what could not be used is counted and noted."""
-    assert choice.image is not None
-    images = Series(choice.image)
-    positions = Series(choice.fix, 6) if choice.fix else None
-    attitudes = Series(choice.attitude, 5) if choice.attitude else None
-    transforms, state = Transforms(), _Once()
+def read_streams(bag: Bag, topics: SelectedTopics, notes: Notes, progress: Progress = SILENT) -> BagStreams:
+    """Read everything but the pictures; messages that cannot be used are counted and noted."""
+    assert topics.image is not None
+    images = _series(bag, topics.image, 0)
+    positions = None if topics.fix is None else _series(bag, topics.fix, 6)
+    attitudes = None if topics.attitude is None else _series(bag, topics.attitude, 5)
+    transforms, image_frame, info = Transforms(), "", None
     kinds = (bag_transforms.TYPE, bag_transforms.OLD_TYPE)
     frames = [topic.name for topic in bag.topics.values() if topic.type in kinds]
-    wanted = {choice.image, *frames, *filter(None, (choice.info, choice.fix, choice.attitude))}
+    wanted = {topics.image, *frames, *filter(None, (topics.info, topics.fix, topics.attitude))}
     undecodable: dict[str, list[str]] = {}
     total = sum(bag.topics[name].count for name in wanted)
     with progress.task("bag", total) as task:
@@ -101,24 +117,23 @@ def read_streams(bag: Bag, choice: Choice, notes: Notes, progress: Progress = SI
             try:
                 if message.topic == images.topic:
                     images.add(bag.header_stamp_ns(message), message.bag_ns)
-                    state.image_frame = state.image_frame or _frame(bag, message)
-                elif message.topic == choice.info:
-                    state.info = state.info or bag.decode(message)
+                    image_frame = image_frame or _frame(bag, message)
+                elif message.topic == topics.info:
+                    info = info or bag.decode(message)
                 elif message.topic in frames:
                     transforms.add(bag.decode(message), static=message.topic.endswith("static"))
                 else:
                     _navigation(bag, message, positions, attitudes)
             except UndecodableError as error:
                 undecodable.setdefault(message.topic, []).append(str(error)[:120])
-    series = [one for one in (images, positions, attitudes) if one is not None]
+    series = [samples for samples in (images, positions, attitudes) if samples is not None]
     _note_losses(bag, series, undecodable, transforms.refused, notes)
-    return Streams(images, state.image_frame, positions, attitudes, transforms, state.info)
+    clocks = settle_clocks(series, notes)
+    return BagStreams(bag.path, images, image_frame, positions, attitudes, transforms, info, clocks)
 
 
-@dataclass
-class _Once:
-    image_frame: str = ""
-    info: Any | None = None
+def _series(bag: Bag, topic: str, width: int) -> Series:
+    return Series(topic, bag.topics[topic].type, width)
 
 
 def _note_losses(
@@ -129,19 +144,19 @@ def _note_losses(
     if refused:
         notes.warn(f"{refused} transforms in /tf are not finite or not possible and were left out")
     if bag.damage is not None:
-        read = sum(_count(one) for one in series)
-        notes.warn(f"{bag.path.name} is damaged: it could be read for {read} messages only ({bag.damage})")
+        count = sum(_count(samples) for samples in series)
+        notes.warn(f"{bag.path.name} is damaged: it could be read for {count} messages only ({bag.damage})")
     if bag.fallback_types:
         notes.assume(
             f"the bag lacks definitions of {', '.join(sorted(bag.fallback_types))}: the usual ones are used"
         )
-    for one in series:
-        for problem, count in one.problems.items():
-            notes.warn(f"{count} of {_count(one)} messages of {one.topic} were left out: {problem}")
+    for samples in series:
+        for problem, count in samples.problems.items():
+            notes.warn(f"{count} of {_count(samples)} messages of {samples.topic} were left out: {problem}")
 
 
 def _frame(bag: Bag, message: RawMessage) -> str:
-    """Frame of an image; one that does not decode is counted when the photographs are read."""
+    """Return the frame of an image; one that does not decode is counted when the photographs are read."""
     try:
         return str(bag.decode(message).header.frame_id) or "camera"
     except UndecodableError:
@@ -155,32 +170,26 @@ def _count(series: Series) -> int:
 def _navigation(bag: Bag, message: RawMessage, positions: Series | None, attitudes: Series | None) -> None:
     decoded = bag.decode(message)
     if positions is not None and message.topic == positions.topic:
-        place = POSITIONS[message.type].read(decoded)
-        if place.problem:
-            positions.problems[place.problem] += 1
+        position = POSITIONS[message.type].read(decoded)
+        if position.problem:
+            positions.problems[position.problem] += 1
         else:
-            positions.frame, positions.world = positions.frame or place.frame, positions.world or place.world
-            positions.add(stamp_ns(decoded), message.bag_ns, (*place.place, *place.sigma_enu_m), place.kind)
+            positions.frame = positions.frame or position.frame
+            positions.world = positions.world or position.world
+            values = (*position.place, *position.sigma_enu_m)
+            positions.add(stamp_ns(decoded), message.bag_ns, values, position.receiver)
     if attitudes is not None and message.topic == attitudes.topic:
-        turn = ATTITUDES[message.type].read(decoded)
-        if turn.problem:
-            attitudes.problems[turn.problem] += 1
+        attitude = ATTITUDES[message.type].read(decoded)
+        if attitude.problem:
+            attitudes.problems[attitude.problem] += 1
         else:
             if not attitudes.frame:
-                attitudes.frame, attitudes.axes = turn.frame, turn.axes
-            attitudes.add(stamp_ns(decoded), message.bag_ns, (*turn.quat_xyzw, turn.sigma_deg))
-
-
-@dataclass(frozen=True)
-class Clock:
-    """When the samples of a topic were taken: seconds (N,), and which of them are usable (N,)."""
-
-    time_s: FloatArray
-    usable: BoolArray
+                attitudes.frame, attitudes.axes = attitude.frame, attitude.axes
+            attitudes.add(stamp_ns(decoded), message.bag_ns, (*attitude.quat_xyzw, attitude.sigma_deg))
 
 
 def settle_clocks(series: list[Series], notes: Notes) -> dict[str, Clock]:
-    """One time for all topics, in seconds: the messages' own stamps, where they have any.
+    """Return times on one clock for all topics, in seconds: the messages' own stamps, where they have any.
 
     Messages without a stamp get the time of recording. Topics that count from another epoch than the rest (since
     boot) are brought to the recorder's clock by the median difference; if all do (a simulator's time), they keep
@@ -188,7 +197,8 @@ def settle_clocks(series: list[Series], notes: Notes) -> dict[str, Clock]:
     later than one before.
     """
     raw = {
-        one.topic: (np.array(one.stamps, dtype=np.int64), np.array(one.bag_times, dtype=np.int64)) for one in series
+        samples.topic: (np.array(samples.stamps, dtype=np.int64), np.array(samples.bag_times, dtype=np.int64))
+        for samples in series
     }
     offset = {
         topic: int(np.median((stamp - bag)[stamp != 0])) if (stamp != 0).any() else 0
@@ -203,7 +213,7 @@ def settle_clocks(series: list[Series], notes: Notes) -> dict[str, Clock]:
             notes.assume(f"{without} messages of {topic} have no stamp: the time of recording is used")
         time = np.where(stamp == 0, bag + offset[topic], stamp)
         jump = np.abs(time - bag - offset[topic]) > _JUMP_NS
-        _counted(notes, jump, topic, "have a stamp more than a minute off the others")
+        _note_left_out(notes, jump, topic, "have a stamp more than a minute off the others")
         if mixed and topic in other_epoch:
             time = time - offset[topic]
             notes.assume(
@@ -212,11 +222,11 @@ def settle_clocks(series: list[Series], notes: Notes) -> dict[str, Clock]:
         usable = ~jump
         latest = np.maximum.accumulate(np.where(usable, time, np.iinfo(np.int64).min))
         backwards = usable & np.concatenate([[False], time[1:] <= latest[:-1]])
-        _counted(notes, backwards, topic, "have a stamp that is not later than one before")
+        _note_left_out(notes, backwards, topic, "have a stamp that is not later than one before")
         clocks[topic] = Clock(time / 1e9, usable & ~backwards)
     return clocks
 
 
-def _counted(notes: Notes, bad: BoolArray, topic: str, what: str) -> None:
+def _note_left_out(notes: Notes, bad: BoolArray, topic: str, reason: str) -> None:
     if bad.any():
-        notes.warn(f"{int(bad.sum())} of {len(bad)} messages of {topic} {what}, and were left out")
+        notes.warn(f"{int(bad.sum())} of {len(bad)} messages of {topic} {reason}, and were left out")

@@ -7,9 +7,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
 
 from pipelines.core.types import FloatArray
+from pipelines.geometry.rotations import matrix_from_quat_xyzw
+from pipelines.geometry.trajectory import Trajectory
 
 TYPE = "tf2_msgs/msg/TFMessage"
 OLD_TYPE = "tf/msg/tfMessage"
@@ -37,7 +38,7 @@ class Transforms:
         return frame in self._links or any(link.parent == frame for link in self._links.values())
 
     def add(self, message: Any, *, static: bool) -> None:
-        """Take in a `TFMessage`; transforms that are not finite are counted in `refused`."""
+        """Add the links of a `TFMessage`; transforms that are not finite are counted in `refused`."""
         for transform in message.transforms:
             stamp, shift, turn = (
                 transform.header.stamp, transform.transform.translation, transform.transform.rotation,
@@ -57,9 +58,9 @@ class Transforms:
             link.samples.extend(values)
 
     def between(self, to: str, of: str, time_s: FloatArray) -> tuple[FloatArray, FloatArray] | None:
-        """Rotations (N, 3, 3) and origins (N, 3) of frame `of` in frame `to` at times (N,); None if not linked.
+        """Return rotations (N, 3, 3) and origins (N, 3) of frame `of` in `to` at times (N,); None if not linked.
 
-        Rows are NaN where a moving link on the way has no samples on both sides of the time.
+        Rows are NaN where a moving link on the way has no samples around the time.
         """
         to, of = _name(to), _name(of)
         up_to, up_of = self._ancestors(to), self._ancestors(of)
@@ -73,14 +74,14 @@ class Transforms:
         return back @ common_from_of[0], shift
 
     def _ancestors(self, frame: str) -> list[str]:
-        """The frame, its parent, and so on."""
-        found = [frame]
-        while found[-1] in self._links and len(found) < _MAX_STEPS:
-            parent = self._links[found[-1]].parent
-            if parent in found:
+        """Return the frame, its parent, and so on."""
+        line = [frame]
+        while line[-1] in self._links and len(line) < _MAX_STEPS:
+            parent = self._links[line[-1]].parent
+            if parent in line:
                 break
-            found.append(parent)
-        return found
+            line.append(parent)
+        return line
 
     def _upwards(self, frames: list[str], time_s: FloatArray) -> tuple[FloatArray, FloatArray]:
         rotation, shift = np.tile(np.eye(3), (len(time_s), 1, 1)), np.zeros((len(time_s), 3))
@@ -91,20 +92,17 @@ class Transforms:
 
 
 def _at(link: _Link, time_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return rotations (N, 3, 3) and origins (N, 3) of a link's frame in its parent at times (N,)."""
     samples = np.frombuffer(link.samples).reshape(-1, 8)
     if link.static:
-        turn = np.asarray(Rotation.from_quat(samples[-1, 4:]).as_matrix())
+        turn = matrix_from_quat_xyzw(samples[-1, 4:])
         return np.tile(turn, (len(time_s), 1, 1)), np.tile(samples[-1, 1:4], (len(time_s), 1))
-    _, first = np.unique(samples[:, 0], return_index=True)
-    samples = samples[first]
-    rotation, shift = np.full((len(time_s), 3, 3), np.nan), np.full((len(time_s), 3), np.nan)
-    inside = (time_s >= samples[0, 0]) & (time_s <= samples[-1, 0])
-    if len(samples) > 1 and inside.any():
-        clock = samples[:, 0]
-        at = time_s[inside]
-        rotation[inside] = Slerp(clock, Rotation.from_quat(samples[:, 4:]))(at).as_matrix()
-        shift[inside] = np.stack([np.interp(at, clock, samples[:, i]) for i in (1, 2, 3)], axis=1)
-    return rotation, shift
+    clock, first = np.unique(samples[:, 0], return_index=True)
+    motion = Trajectory.from_samples(
+        clock, position=samples[first, 1:4], rotation=matrix_from_quat_xyzw(samples[first, 4:])
+    )
+    there = motion.at(time_s)
+    return there.rotation, there.position
 
 
 def _name(frame: str) -> str:

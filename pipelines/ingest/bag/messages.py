@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -21,22 +21,22 @@ BASE = "base_link"
 _NAN3 = (math.nan, math.nan, math.nan)
 _LARGEST_SIGMA_M = 1e4
 _PX4_FIXES = range(3, 7)  # 3D, differential, RTK float, RTK fixed; 8 is extrapolated
-_PX4_KIND = {5: "RTK float", 6: "RTK fixed"}
+_PX4_RECEIVER = {5: "RTK float", 6: "RTK fixed"}
 _STATUS_NO_FIX = -1
 _COVARIANCE_UNKNOWN = 0
 _POSE_FRAME_NED = 1
 
 
 @dataclass(frozen=True)
-class Position:
-    """A position.
+class PositionSample:
+    """A position as a message states it.
 
     Attributes:
         place: (latitude, longitude, height), or metres east, north, up of the local frame's origin.
         sigma_enu_m: NaN where unknown.
-        frame: what is at that place.
+        frame: name of the frame that is at that place.
         world: the local frame; "" for geodetic positions.
-        kind: of receiver, for σ where the message has none.
+        receiver: kind of receiver, for σ where the message has none.
         problem: why it cannot be used, or "".
     """
 
@@ -44,13 +44,13 @@ class Position:
     sigma_enu_m: tuple[float, float, float]
     frame: str
     world: str = ""
-    kind: str = "unknown receiver"
+    receiver: str = "unknown receiver"
     problem: str = ""
 
 
 @dataclass(frozen=True)
-class Attitude:
-    """An attitude: rotation of a frame's own axes into East-North-Up, σ in degrees (NaN: unknown)."""
+class AttitudeSample:
+    """An attitude as a message states it: a frame's own axes into East-North-Up, σ in degrees or NaN."""
 
     quat_xyzw: tuple[float, float, float, float]
     sigma_deg: float
@@ -66,7 +66,7 @@ class PositionType:
     rank: int
     geodetic: bool
     heights: str
-    read: Callable[[Any], Position]
+    read: Callable[[Any], PositionSample]
 
 
 @dataclass(frozen=True)
@@ -74,60 +74,60 @@ class AttitudeType:
     """How to read attitudes of a message type; lower ranks are preferred."""
 
     rank: int
-    read: Callable[[Any], Attitude]
+    read: Callable[[Any], AttitudeSample]
 
 
 def axes_of(frame: str) -> Axes:
-    """Axes of a frame by its name: `…_frd`, `…_ned` forward-right-down, `…optical…` the camera's, else FLU."""
+    """Return a frame's axes by its name: FRD for `…_frd`, `…_ned`, the camera's for `…optical…`, else FLU."""
     name = frame.lower()
     if name.endswith(("_frd", "_ned")):
         return "frd"
     return "optical" if "optical" in name else "flu"
 
 
-def _fix(message: Any) -> Position:
+def _fix(message: Any) -> PositionSample:
     place = (float(message.latitude), float(message.longitude), float(message.altitude))
     covariance = np.asarray(message.position_covariance, dtype=np.float64).reshape(3, 3)
     known = message.position_covariance_type != _COVARIANCE_UNKNOWN
     sigma = _sigmas(np.diag(covariance)) if known else _NAN3
     problem = "no fix (status)" if message.status.status <= _STATUS_NO_FIX else _geodetic_problem(place)
-    return Position(place, sigma, message.header.frame_id, kind="single-frequency", problem=problem)
+    return PositionSample(place, sigma, message.header.frame_id, receiver="single-frequency", problem=problem)
 
 
-def _global_position(message: Any) -> Position:
+def _global_position(message: Any) -> PositionSample:
     place = (float(message.lat), float(message.lon), float(message.alt_ellipsoid))
     flags = ("lat_lon_valid", "alt_valid", "alt_ellipsoid_valid")  # since px4_msgs 1.16
     valid = all(getattr(message, flag, True) for flag in flags)
     problem = _geodetic_problem(place) if valid else "no fix (status)"
     if message.dead_reckoning:
         problem = "dead reckoning, without a receiver"
-    return Position(place, _eph_epv(message), BASE, problem=problem)
+    return PositionSample(place, _eph_epv(message), BASE, problem=problem)
 
 
-def _sensor_gps(message: Any) -> Position:
+def _sensor_gps(message: Any) -> PositionSample:
     if hasattr(message, "latitude_deg"):
         place = (message.latitude_deg, message.longitude_deg, message.altitude_ellipsoid_m)
     else:  # px4_msgs up to release 1.14: 1e-7 degrees and millimetres
         place = (message.lat * 1e-7, message.lon * 1e-7, message.alt_ellipsoid * 1e-3)
     place = (float(place[0]), float(place[1]), float(place[2]))
     problem = "no fix (status)" if message.fix_type not in _PX4_FIXES else _geodetic_problem(place)
-    kind = _PX4_KIND.get(int(message.fix_type), "single-frequency")
-    return Position(place, _eph_epv(message), "gps", kind=kind, problem=problem)
+    receiver = _PX4_RECEIVER.get(int(message.fix_type), "single-frequency")
+    return PositionSample(place, _eph_epv(message), "gps", receiver=receiver, problem=problem)
 
 
-def _odometry_position(message: Any) -> Position:
+def _odometry_position(message: Any) -> PositionSample:
     return _local(message.pose.pose.position, message, message.child_frame_id or BASE, message.pose.covariance)
 
 
-def _pose_cov_position(message: Any) -> Position:
+def _pose_cov_position(message: Any) -> PositionSample:
     return _local(message.pose.pose.position, message, BASE, message.pose.covariance)
 
 
-def _pose_position(message: Any) -> Position:
+def _pose_position(message: Any) -> PositionSample:
     return _local(message.pose.position, message, BASE, None)
 
 
-def _px4_odometry_position(message: Any) -> Position:
+def _px4_odometry_position(message: Any) -> PositionSample:
     ned, variance = _px4_pose(message)
     east, north, up = ENU_FROM_NED @ ned
     sigma = _sigmas(np.abs(ENU_FROM_NED) @ variance)
@@ -135,10 +135,10 @@ def _px4_odometry_position(message: Any) -> Position:
     problem = "" if _px4_is_ned(message) else "its frame is not North-East-Down"
     if not all(map(math.isfinite, place)):
         problem = "position is NaN"
-    return Position(place, sigma, BASE, world="PX4's local NED", problem=problem)
+    return PositionSample(place, sigma, BASE, world="PX4's local NED", problem=problem)
 
 
-def _imu(message: Any) -> Attitude:
+def _imu(message: Any) -> AttitudeSample:
     frame = message.header.frame_id
     covariance = np.asarray(message.orientation_covariance, dtype=np.float64)
     unknown = covariance[0] == -1.0
@@ -146,29 +146,27 @@ def _imu(message: Any) -> Attitude:
     return _attitude(message.orientation, covariance[[0, 4, 8]], frame or BASE, ned, unknown)
 
 
-def _odometry_attitude(message: Any) -> Attitude:
+def _odometry_attitude(message: Any) -> AttitudeSample:
     variance = np.asarray(message.pose.covariance, dtype=np.float64)[[21, 28, 35]]
     return _attitude(message.pose.pose.orientation, variance, message.child_frame_id or BASE, _is_ned(message))
 
 
-def _pose_cov_attitude(message: Any) -> Attitude:
+def _pose_cov_attitude(message: Any) -> AttitudeSample:
     variance = np.asarray(message.pose.covariance, dtype=np.float64)[[21, 28, 35]]
     return _attitude(message.pose.pose.orientation, variance, BASE, _is_ned(message))
 
 
-def _pose_attitude(message: Any) -> Attitude:
+def _pose_attitude(message: Any) -> AttitudeSample:
     return _attitude(message.pose.orientation, np.zeros(3), BASE, _is_ned(message))
 
 
-def _px4_attitude(message: Any) -> Attitude:
+def _px4_attitude(message: Any) -> AttitudeSample:
     return _from_ned_frd(message.q, np.full(3, np.nan))
 
 
-def _px4_odometry_attitude(message: Any) -> Attitude:
-    found = _from_ned_frd(message.q, getattr(message, "orientation_variance", np.full(3, np.nan)))
-    if _px4_is_ned(message):
-        return found
-    return Attitude(found.quat_xyzw, found.sigma_deg, BASE, "frd", "its frame is not North-East-Down")
+def _px4_odometry_attitude(message: Any) -> AttitudeSample:
+    attitude = _from_ned_frd(message.q, getattr(message, "orientation_variance", np.full(3, np.nan)))
+    return attitude if _px4_is_ned(message) else replace(attitude, problem="its frame is not North-East-Down")
 
 
 POSITIONS: dict[str, PositionType] = {
@@ -193,7 +191,7 @@ ATTITUDES: dict[str, AttitudeType] = {
 
 
 def stamp_ns(message: Any) -> int | None:
-    """A message's own stamp in nanoseconds: of its header, or PX4's microseconds; None where it is zero."""
+    """Return a message's own stamp in nanoseconds: its header's, or PX4's microseconds; None where it is zero."""
     header = getattr(message, "header", None)
     if header is not None:
         return header.stamp.sec * 1_000_000_000 + header.stamp.nanosec or None
@@ -211,7 +209,7 @@ def _geodetic_problem(place: Sequence[float]) -> str:
 
 
 def _sigmas(variance: Any) -> tuple[float, float, float]:
-    """σ of three variances; NaN all where one is not positive, or absurd."""
+    """Return σ of three variances; NaN all where one is not positive, or absurd."""
     values = np.asarray(variance, dtype=np.float64)
     if not (np.isfinite(values).all() and (values > 0).all() and (values < _LARGEST_SIGMA_M**2).all()):
         return _NAN3
@@ -229,14 +227,16 @@ def _is_ned(message: Any) -> bool:
     return str(message.header.frame_id).lower().endswith("_ned")
 
 
-def _local(position: Any, message: Any, frame: str, covariance: Any) -> Position:
+def _local(position: Any, message: Any, frame: str, covariance: Any) -> PositionSample:
     values = np.array([position.x, position.y, position.z], dtype=np.float64)
     variance = np.zeros(3) if covariance is None else np.asarray(covariance, dtype=np.float64)[[0, 7, 14]]
     if _is_ned(message):
         values, variance = ENU_FROM_NED @ values, np.abs(ENU_FROM_NED) @ variance
     x, y, z = (float(value) for value in values)
     problem = "" if np.isfinite(values).all() else "position is NaN"
-    return Position((x, y, z), _sigmas(variance), frame, world=message.header.frame_id or "odom", problem=problem)
+    return PositionSample(
+        (x, y, z), _sigmas(variance), frame, world=message.header.frame_id or "odom", problem=problem
+    )
 
 
 def _px4_pose(message: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -253,25 +253,25 @@ def _px4_is_ned(message: Any) -> bool:
     return bool(message.local_frame == 0)
 
 
-def _attitude(quaternion: Any, variance: Any, frame: str, ned: bool, unknown: bool = False) -> Attitude:
+def _attitude(quaternion: Any, variance: Any, frame: str, ned: bool, unknown: bool = False) -> AttitudeSample:
     values = np.array([quaternion.x, quaternion.y, quaternion.z, quaternion.w], dtype=np.float64)
     problem = "has no orientation" if unknown or not values.any() else _quaternion_problem(values)
     if ned and not problem:
         values = quat_xyzw_from_matrix(ENU_FROM_NED @ matrix_from_quat_xyzw(values))
     x, y, z, w = (float(value) for value in values)
-    return Attitude((x, y, z, w), _sigma_deg(variance), frame, axes_of(frame), problem)
+    return AttitudeSample((x, y, z, w), _sigma_deg(variance), frame, axes_of(frame), problem)
 
 
-def _from_ned_frd(quat_wxyz: Any, variance: Any) -> Attitude:
+def _from_ned_frd(quat_wxyz: Any, variance: Any) -> AttitudeSample:
     w, x, y, z = (float(value) for value in quat_wxyz)
     values = np.array([x, y, z, w])
     problem = _quaternion_problem(values)
     if problem:
-        return Attitude((0.0, 0.0, 0.0, 1.0), math.nan, BASE, "flu", problem)
+        return AttitudeSample((0.0, 0.0, 0.0, 1.0), math.nan, BASE, "flu", problem)
     # As base_link, whose axes are forward, left, up.
     enu_from_flu = ENU_FROM_NED @ matrix_from_quat_xyzw(values) @ np.diag([1.0, -1.0, -1.0])
     x, y, z, w = (float(value) for value in quat_xyzw_from_matrix(enu_from_flu))
-    return Attitude((x, y, z, w), _sigma_deg(variance), BASE, "flu")
+    return AttitudeSample((x, y, z, w), _sigma_deg(variance), BASE, "flu")
 
 
 def _quaternion_problem(values: np.ndarray) -> str:

@@ -1,0 +1,92 @@
+"""A flight out of a folder of photographs, with or without a table of poses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.core.errors import InputError
+from pipelines.core.progress import SILENT, Progress
+from pipelines.core.types import FloatArray
+from pipelines.formats.odm import read_geo
+from pipelines.formats.pose_table import PoseTable
+from pipelines.formats.trajectory_csv import read_trajectory
+from pipelines.geometry.rig import Rig
+from pipelines.geometry.trajectory import Trajectory
+from pipelines.ingest.camera_priors import camera_priors
+from pipelines.ingest.flight_record import FlightRecord, require_enough
+from pipelines.ingest.notes import Notes
+from pipelines.ingest.options import IngestOptions
+from pipelines.ingest.photo_folder import Photo, scan_folder
+from pipelines.ingest.photo_poses import poses_from_tags
+from pipelines.ingest.recorded_navigation import RecordedNavigation
+from pipelines.ingest.rig import at_cameras, body_mount, given_rig
+from pipelines.ingest.table_poses import poses_from_table
+
+
+def read_folder(folder: Path, options: IngestOptions, notes: Notes, progress: Progress = SILENT) -> FlightRecord:
+    """Read photographs, and the trajectory or `geo.txt` that the options name.
+
+    Raises:
+        InputError: anything wrong with the files, or too few photographs.
+    """
+    photos = _usable_photos(folder, notes, progress)
+    table = _pose_table(options)
+    if table is None:
+        poses = poses_from_tags(photos, options, notes)
+    else:
+        poses = poses_from_table(table, photos, options, notes)
+    if options.time_offset_s and poses.recorded is None:
+        raise InputError(
+            "is for navigation by time: a --bag, or a --trajectory without a column of images",
+            field="--time-offset",
+        )
+    rig, names = given_rig(options), [photo.name for photo in photos]
+    navigation = None
+    if poses.recorded is not None:
+        navigation = _navigation(poses.recorded, rig, names, poses.time_s, options)
+    poses = at_cameras(poses, rig, names, notes)
+    cameras, camera_of = camera_priors(photos, options.focal_px, notes)
+    return FlightRecord(folder.resolve(), photos, cameras, camera_of, poses, navigation)
+
+
+def _usable_photos(folder: Path, notes: Notes, progress: Progress) -> list[Photo]:
+    photos = scan_folder(folder, notes, progress)
+    require_enough(photos, folder, "--images", notes)
+    for problem in sorted({problem for photo in photos for problem in photo.tags.problems}):
+        names = [photo.name for photo in photos if problem in photo.tags.problems]
+        notes.warn_counted(names, f"image where {problem}", f"images where {problem}")
+    notes.warn_counted(
+        [photo.name for photo in photos if photo.tags.orientation != 1],
+        "image has an EXIF orientation, which is ignored: pixels count as stored",
+        "images have an EXIF orientation, which is ignored: pixels count as stored",
+    )
+    return photos
+
+
+def _pose_table(options: IngestOptions) -> PoseTable | None:
+    if options.trajectory is not None:
+        return read_trajectory(options.trajectory)
+    return None if options.geo is None else read_geo(options.geo)
+
+
+def _navigation(
+    recorded: Trajectory, rig: Rig, names: list[str], time_s: FloatArray, options: IngestOptions
+) -> RecordedNavigation:
+    """Return a table by time as navigation of the photographs that have a time (N,)."""
+    timed = np.flatnonzero(np.isfinite(time_s))
+    turned = np.isfinite(recorded.rotation).all(axis=(1, 2))
+    mount = body_mount(rig)
+    attitudes = Trajectory.from_samples(
+        recorded.time_s[turned], rotation=recorded.rotation[turned] @ mount, max_gap_s=recorded.max_gap_s
+    )
+    return RecordedNavigation(
+        positions=recorded,
+        attitudes=attitudes,
+        rig=Rig(mount, rig.antenna_in_body, rig.nominal_from_cam),
+        body_known=rig.cam_from_body is not None,
+        images=tuple(names[row] for row in timed),
+        image_time_s=time_s[timed],
+        time_offset_s=options.time_offset_s,
+    )

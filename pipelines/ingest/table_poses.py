@@ -1,0 +1,182 @@
+"""Poses of images from a table: a CSV trajectory, or OpenDroneMap's `geo.txt`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.core.errors import InputError
+from pipelines.core.types import FloatArray
+from pipelines.formats.pose_table import PoseTable, complete
+from pipelines.geodesy.crs import PointCrs
+from pipelines.geodesy.enu import ecef_from_lla, median_lla
+from pipelines.geometry.rotations import matrix_from_quat_xyzw
+from pipelines.geometry.trajectory import Trajectory
+from pipelines.ingest.image_poses import AttitudeSource, ImagePoses
+from pipelines.ingest.notes import Notes
+from pipelines.ingest.options import IngestOptions
+from pipelines.ingest.photo_folder import Photo
+from pipelines.ingest.photo_poses import altitude_m, gimbal_attitudes, photo_times
+from pipelines.ingest.pose_matching import match_by_name, match_by_time
+from pipelines.ingest.pose_tables import usable_rows
+from pipelines.ingest.position_sigma import with_defaults
+from pipelines.ingest.reference_system import crs_of_table, note_operation
+
+_DISAGREEMENT_M = 2_000.0
+
+
+def poses_from_table(table: PoseTable, photos: Sequence[Photo], options: IngestOptions, notes: Notes) -> ImagePoses:
+    """Return positions, and attitudes if the table has them; else attitudes from XMP.
+
+    Rows are matched by name if the table has names, else by time. An image without a row has no position here,
+    even if its EXIF has one: two receivers are not mixed unseen.
+
+    Raises:
+        InputError: no row with a position, no CRS for x,y,z, contradicting options, impossible coordinates, or no
+            image matched.
+    """
+    table = usable_rows(table, notes)
+    crs = crs_of_table(table, options, notes)
+    images = [photo.name for photo in photos]
+    if table.names is not None:
+        table = _with_heights(match_by_name(table, images, notes), photos, crs, notes)
+    lla = crs.lla_from_xyz(table.xyz, path=table.path, lines=table.lines.tolist())
+    note_operation(crs, lla, notes)
+    if table.sigma_enu_m is not None and "foot" in crs.units[0]:
+        notes.assume(f"σ in {table.path.name} are in metres, although {crs.name} counts in feet")
+    _compare_with_exif(median_lla(lla), photos, table.path, notes)
+    if table.names is not None:
+        placed = _by_name(table, ecef_from_lla(lla), photos)
+    else:
+        placed = _by_time(table, ecef_from_lla(lla), photos, options, notes)
+    located = complete(placed.position_in_ecef)
+    notes.warn_counted(
+        [images[row] for row in np.flatnonzero(~located)],
+        f"image has no position in {table.path.name}",
+        f"images have no position in {table.path.name}",
+    )
+    sigma, sigma_source = with_defaults(
+        placed.sigma_enu_m, ["unknown receiver"] * len(photos), located, options, notes
+    )
+    from_file = np.asarray(np.isfinite(placed.enu_from_cam).all(axis=(1, 2)))
+    attitude_source: list[AttitudeSource] = [table.source if row else "gimbal" for row in from_file]
+    return ImagePoses(
+        position_in_ecef=placed.position_in_ecef,
+        sigma_enu_m=sigma,
+        sigma_source=sigma_source,
+        enu_from_cam=np.where(from_file[:, None, None], placed.enu_from_cam, gimbal_attitudes(photos)),
+        attitude_source=tuple(attitude_source),
+        sigma_attitude_deg=np.full(len(photos), np.nan),
+        time_s=np.where(np.isfinite(placed.time_s), placed.time_s, photo_times(photos)),
+        source=table.source,
+        crs_name=crs.name,
+        vertical=crs.vertical,
+        recorded=placed.recorded,
+    )
+
+
+@dataclass(frozen=True)
+class _Placed:
+    """The table's rows at the N images, as `ImagePoses` names them; NaN where an image has none."""
+
+    position_in_ecef: FloatArray
+    enu_from_cam: FloatArray
+    sigma_enu_m: FloatArray
+    time_s: FloatArray
+    recorded: Trajectory | None
+
+
+def _by_name(table: PoseTable, position_in_ecef: FloatArray, photos: Sequence[Photo]) -> _Placed:
+    index = {photo.name: row for row, photo in enumerate(photos)}
+    rows = [index[name] for name in table.names or ()]
+
+    def spread(values: FloatArray) -> FloatArray:
+        placed = np.full((len(photos), *values.shape[1:]), np.nan)
+        placed[rows] = values
+        return placed
+
+    return _Placed(
+        position_in_ecef=spread(position_in_ecef),
+        enu_from_cam=spread(_attitudes(table)),
+        sigma_enu_m=spread(_sigma(table)),
+        time_s=spread(_times(table)),
+        recorded=None,
+    )
+
+
+def _by_time(
+    table: PoseTable, position_in_ecef: FloatArray, photos: Sequence[Photo], options: IngestOptions, notes: Notes
+) -> _Placed:
+    time_s = _times(table)
+    order = np.argsort(time_s, kind="stable")
+    order = order[np.isfinite(time_s[order])]
+    if not len(order):
+        raise InputError("no row has a time", path=table.path, field="timestamp")
+    recorded = Trajectory.from_samples(
+        time_s[order],
+        position=position_in_ecef[order],
+        rotation=_attitudes(table)[order],
+        sigma_m=_sigma(table)[order],
+        max_gap_s=options.max_gap,
+    )
+    matched = match_by_time(recorded, photos, table.path, options, notes)
+    return _Placed(
+        position_in_ecef=matched.position,
+        enu_from_cam=matched.rotation,
+        sigma_enu_m=matched.sigma_m,
+        time_s=photo_times(photos),
+        recorded=recorded,
+    )
+
+
+def _with_heights(table: PoseTable, photos: Sequence[Photo], crs: PointCrs, notes: Notes) -> PoseTable:
+    """Fill heights that a table by name lacks from EXIF, and leave out the rows where that has none either."""
+    lacking = np.flatnonzero(np.isnan(table.xyz[:, 2]))
+    if not len(lacking) or table.names is None:
+        return table
+    xyz = table.xyz.copy()
+    if crs.height_unit == "metre":
+        altitude = {photo.name: altitude_m(photo.tags) for photo in photos}
+        heights = [altitude[table.names[row]] for row in lacking]
+        xyz[lacking, 2] = [np.nan if height is None else height for height in heights]
+    filled = complete(xyz)
+    if filled[lacking].any():
+        notes.assume(f"heights that {table.path.name} lacks are from EXIF ({int(filled[lacking].sum())})")
+    places = [f"{table.path.name}:{line}" for line in table.lines[~filled]]
+    notes.warn_counted(places, "row has no height and was left out", "rows have no height and were left out")
+    if not filled.any():
+        raise InputError("has no heights (z), and EXIF has none either", path=table.path)
+    return replace(table, xyz=xyz).take(filled)
+
+
+def _compare_with_exif(middle: FloatArray, photos: Sequence[Photo], path: Path, notes: Notes) -> None:
+    """Warn when a table and EXIF disagree by kilometres: a wrong zone passes all other checks."""
+    tagged = [(tags.gps.lat_deg, tags.gps.lon_deg, 0.0) for tags in (photo.tags for photo in photos) if tags.gps]
+    if not tagged:
+        return
+    in_exif, in_table = ecef_from_lla(np.stack([median_lla(tagged), middle * [1.0, 1.0, 0.0]]))
+    distance_m = float(np.linalg.norm(in_exif - in_table))
+    if distance_m > _DISAGREEMENT_M:
+        notes.warn(
+            f"positions in {path.name} are {distance_m / 1000:.0f} km from those in EXIF: wrong CRS or zone?"
+        )
+
+
+def _times(table: PoseTable) -> FloatArray:
+    return np.full(len(table), np.nan) if table.time_s is None else table.time_s
+
+
+def _sigma(table: PoseTable) -> FloatArray:
+    return np.full((len(table), 3), np.nan) if table.sigma_enu_m is None else table.sigma_enu_m
+
+
+def _attitudes(table: PoseTable) -> FloatArray:
+    """Return rotations camera → East-North-Up (N, 3, 3), NaN where a row has none."""
+    enu_from_cam = np.full((len(table), 3, 3), np.nan)
+    if table.quat_xyzw is not None:
+        turned = complete(table.quat_xyzw)
+        enu_from_cam[turned] = matrix_from_quat_xyzw(table.quat_xyzw[turned])
+    return enu_from_cam
