@@ -8,7 +8,8 @@ import numpy as np
 
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.geometry.cameras import Pinhole, undistort
-from pipelines.geometry.rays import Rays, Views, intersect
+from pipelines.geometry.intersection import intersect_rays
+from pipelines.geometry.rays import Rays, UncertainCameras
 from pipelines.robust.statistics import spatial_median
 from pipelines.scene.survey import SurveyedPoint
 from pipelines.scene.trained import Trained
@@ -65,14 +66,14 @@ def points_by_camera(trained: Trained, seen: Sights, count: int) -> FloatArray:
     n = len(trained.poses.cam_center_in_model)
     sigma = np.full(n, 1e-3)
     sigma[seen.camera] = seen.sigma
-    views = Views(
+    views = UncertainCameras(
         trained.poses.cam_center_in_model,
         np.swapaxes(trained.poses.cam_from_model, 1, 2),
         np.tile(_SIGMA_CENTER_M**2 * np.eye(3), (n, 1, 1)),
         np.full(n, _SIGMA_ATTITUDE_RAD),
         sigma,
     )
-    found = intersect(Rays(seen.point, seen.camera, seen.xy), views, count)
+    found = intersect_rays(Rays(seen.point, seen.camera, seen.xy), views, count)
     return trained.geo_from_model.apply(found.position_in_geo)
 
 

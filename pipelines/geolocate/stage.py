@@ -23,7 +23,8 @@ from pipelines.core.workspace import StageRun, Summary
 from pipelines.formats.colmap import read_sparse
 from pipelines.formats.point_ply import write_point_ply
 from pipelines.geolocate.options import GeolocateOptions
-from pipelines.geometry.rays import CommonRotation, Intersections, Rays, Views, intersect
+from pipelines.geometry.intersection import intersect_rays
+from pipelines.geometry.rays import CommonRotation, Intersections, Rays, UncertainCameras
 from pipelines.geometry.rotations import log_so3
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.georef.adjustment import Correspondences, RotationPrior
@@ -105,7 +106,7 @@ def geolocate(survey: Survey, model: SparseModel, config: GeolocateOptions) -> G
     warnings = _warnings(measured, source)
     views, usable = _views(measured, source, config.sigma_px)
     rays = _rays(model, usable)
-    found = intersect(rays, views, len(model.point_id))
+    found = intersect_rays(rays, views, len(model.point_id))
     sigma, inlier = _judge(found, rays, views, config)
     points = GeolocatedPoints(
         point_id=model.point_id,
@@ -194,7 +195,7 @@ def _warnings(measured: _Measured, source: str) -> list[str]:
     return warnings
 
 
-def _views(measured: _Measured, source: str, sigma_px: float) -> tuple[Views, BoolArray]:
+def _views(measured: _Measured, source: str, sigma_px: float) -> tuple[UncertainCameras, BoolArray]:
     """All images as views (those without a fix are placeholders), and which give rays (n,)."""
     model, fixes, alignment = measured.model, measured.fixes, measured.alignment
     count, index = len(model.image_name), model.image_index()
@@ -216,7 +217,7 @@ def _views(measured: _Measured, source: str, sigma_px: float) -> tuple[Views, Bo
         gain = np.zeros((count, 3, 3))
         gain[place] = alignment.solution.response[:, 1:4]
         common = CommonRotation(alignment.solution.covariance[1:4, 1:4], gain)
-    return Views(center, rotation, cov, sigma, sigma_ray, common), usable
+    return UncertainCameras(center, rotation, cov, sigma, sigma_ray, common), usable
 
 
 def _rays(model: SparseModel, usable: BoolArray) -> Rays:
@@ -229,7 +230,7 @@ def _rays(model: SparseModel, usable: BoolArray) -> Rays:
 
 
 def _judge(
-    found: Intersections, rays: Rays, views: Views, config: GeolocateOptions
+    found: Intersections, rays: Rays, views: UncertainCameras, config: GeolocateOptions
 ) -> tuple[FloatArray, BoolArray]:
     """σ along the worst axis (N,), and which points (N,) can be relied on."""
     located: BoolArray = ~np.isnan(found.position_in_geo[:, 0])

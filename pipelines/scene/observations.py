@@ -8,7 +8,8 @@ import numpy as np
 
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.geometry.cameras import undistort
-from pipelines.geometry.rays import Rays, Views, intersect
+from pipelines.geometry.intersection import intersect_rays
+from pipelines.geometry.rays import Rays, UncertainCameras
 from pipelines.geometry.rotations import log_so3, matrix_from_quat_xyzw
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.georef.adjustment import Correspondences, RotationPrior
@@ -105,7 +106,7 @@ def _intersect_marks(model: SparseModel, marks: list[list[Mark]]) -> tuple[Float
     center = model.cam_center_in_local
     extent = float(np.ptp(center, axis=0).max())
     # One view for each mark, since marks of one image may have different σ.
-    views = Views(
+    views = UncertainCameras(
         center_in_geo=center[image],
         rotation_geo_from_cam=np.swapaxes(model.rotation_cam_from_local[image], 1, 2),
         cov_center_in_geo=np.tile(np.eye(3) * (_TINY * extent) ** 2, (len(flat), 1, 1)),
@@ -113,7 +114,7 @@ def _intersect_marks(model: SparseModel, marks: list[list[Mark]]) -> tuple[Float
         sigma_ray=np.hypot(sigma_px, own_px) / focal,
     )
     seen = np.isfinite(xy).all(axis=1)
-    found = intersect(Rays(owner[seen], np.flatnonzero(seen), xy[seen]), views, len(marks))
+    found = intersect_rays(Rays(owner[seen], np.flatnonzero(seen), xy[seen]), views, len(marks))
     of_marks = np.bincount(owner, sigma_px**2) / np.bincount(owner, sigma_px**2 + own_px**2)
     return found.position_in_geo, found.cov_in_geo * of_marks[:, None, None], found.consistent
 
