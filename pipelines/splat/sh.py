@@ -77,7 +77,7 @@ def basis(directions: Tensor, degree: int) -> Tensor:
     return torch.stack(values, dim=-1)
 
 
-def evaluate(sh: Tensor, directions: Tensor, degree: int | None = None) -> Tensor:
+def evaluate_sh(sh: Tensor, directions: Tensor, degree: int | None = None) -> Tensor:
     """Σ c_k Y_k(d), without the 0.5 and the clamp that make it a colour.
 
     Args:
@@ -94,8 +94,8 @@ def evaluate(sh: Tensor, directions: Tensor, degree: int | None = None) -> Tenso
     return (basis(unit, used)[..., None] * sh[..., :count, :]).sum(dim=-2)
 
 
-def rotate(sh: Tensor, rotation: ArrayLike | Tensor) -> Tensor:
-    """Coefficients of the turned functions: evaluate(rotate(sh, R), R d) = evaluate(sh, d).
+def rotate_sh(sh: Tensor, rotation: ArrayLike | Tensor) -> Tensor:
+    """Coefficients of the turned functions: evaluate_sh(rotate_sh(sh, R), R d) = evaluate_sh(sh, d).
 
     Args:
         sh: (…, K, 3) coefficients.

@@ -34,7 +34,7 @@ def transformed(gaussians: Gaussians, to_from_from: Similarity) -> Gaussians:
         quats_wxyz=_quaternion_product(quat_wxyz, unit).to(kind),
         log_scales=(gaussians.log_scales.double() + math.log(to_from_from.scale)).to(kind),
         logit_opacities=gaussians.logit_opacities.clone(),
-        sh=sh.rotate(gaussians.sh, turn.cpu()),
+        sh=sh.rotate_sh(gaussians.sh, turn.cpu()),
     )
 
 

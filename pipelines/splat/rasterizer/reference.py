@@ -49,7 +49,7 @@ def render_reference(
     front = front[torch.argsort(mean_in_cam[front, 2].detach(), stable=True)]
     sorted_gaussians, mean_in_cam = gaussians.select(front), mean_in_cam[front]
 
-    mean_px, cov_px2 = project(sorted_gaussians, mean_in_cam, pose, camera, settings.dilation_px2)
+    mean_px, cov_px2 = project_gaussians(sorted_gaussians, mean_in_cam, pose, camera, settings.dilation_px2)
     colours = view_colours(sorted_gaussians, pose, settings.sh_degree)
     offset_px = _offsets(mean_px, camera)
     alpha = _alpha(offset_px, cov_px2, torch.sigmoid(sorted_gaussians.logit_opacities))
@@ -79,7 +79,7 @@ def render_reference(
     return Render(colour.view(*size, 3), (1 - final).view(size), stats, expected, variance, median)
 
 
-def project(
+def project_gaussians(
     gaussians: Gaussians, mean_in_cam: Tensor, cam_from_model: Tensor, camera: Pinhole, dilation_px2: float
 ) -> tuple[Tensor, Tensor]:
     """Screen means (N, 2) in px and dilated screen covariances (N, 2, 2) in px²."""
@@ -140,7 +140,7 @@ def _projected_axes(
 def view_colours(gaussians: Gaussians, cam_from_model: Tensor, sh_degree: int) -> Tensor:
     """(N, 3) colours of the Gaussians seen from the camera's centre, not negative."""
     center_in_model = -torch.linalg.solve(cam_from_model[:3, :3], cam_from_model[:3, 3])
-    return (sh.evaluate(gaussians.sh, gaussians.means - center_in_model, sh_degree) + 0.5).clamp_min(0.0)
+    return (sh.evaluate_sh(gaussians.sh, gaussians.means - center_in_model, sh_degree) + 0.5).clamp_min(0.0)
 
 
 def _offsets(mean_px: Tensor, camera: Pinhole) -> Tensor:

@@ -17,7 +17,7 @@ from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.rasterizer import cuda
 from pipelines.splat.rasterizer.api import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, RasterSettings
 from pipelines.splat.rasterizer.backends import rasterizer
-from pipelines.splat.rasterizer.reference import project, render_reference, view_colours
+from pipelines.splat.rasterizer.reference import project_gaussians, render_reference, view_colours
 
 BACKGROUND = (0.1, 0.7, 0.4)
 
@@ -36,7 +36,7 @@ class StandIn:
             rows = render_reference(gaussians, viewmats[0], camera, settings).stats.visible
         seen, pose = gaussians.select(rows), viewmats[0]
         in_cam = seen.means @ pose[:3, :3].T + pose[:3, 3]
-        means2d, cov = project(seen, in_cam, pose, camera, options["eps2d"])
+        means2d, cov = project_gaussians(seen, in_cam, pose, camera, options["eps2d"])
         inverse = torch.linalg.inv(cov)
         conics = torch.stack([inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 1, 1]], dim=-1)
         meta = {"means2d": means2d, "conics": conics, "opacities": opacities[rows], "depths": in_cam[:, 2]}
