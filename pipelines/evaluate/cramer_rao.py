@@ -17,7 +17,14 @@ from scipy.sparse import csr_matrix, hstack
 
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import BoolArray, FloatArray, IntArray
-from pipelines.geometry.bundle import Network, in_front, is_ahead, lens_slots, linearise, scatter
+from pipelines.geometry.bundle import (
+    Network,
+    has_positive_depth,
+    lens_slots,
+    linearise,
+    scatter,
+    with_positive_depths,
+)
 
 _WORST_SCALED = 1e-10  # pivot of the scaled normal matrix below which a direction is open
 _RIDGE = 1e-12  # for a point that its rays leave open
@@ -90,7 +97,7 @@ class CameraInformation:
             wanted: the points and their K marks; its cameras are those of the bundle.
             sigma_px: (K,) of the marks.
         """
-        sigma_px, wanted = sigma_px[is_ahead(wanted)], in_front(wanted)
+        sigma_px, wanted = sigma_px[has_positive_depth(wanted)], with_positive_depths(wanted)
         found = np.full((len(wanted.point_in_world), 3, 3), np.nan)
         for j in np.unique(wanted.obs_point):
             mine = wanted.obs_point == j
@@ -136,7 +143,7 @@ def _rows(network: Network, sigma_px: FloatArray) -> _Rows:
 
 def _eliminated(network: Network, sigma_px: FloatArray, cov_known: FloatArray | None) -> FloatArray:
     """Information of cameras and lens (6 n + L, 6 n + L), the points eliminated, which may be known beforehand."""
-    sigma_px, network = sigma_px[is_ahead(network)], in_front(network)
+    sigma_px, network = sigma_px[has_positive_depth(network)], with_positive_depths(network)
     rows, count = _rows(network, sigma_px), len(network.point_in_world)
     normal = np.zeros((count, 3, 3))
     np.add.at(normal, network.obs_point, np.swapaxes(rows.by_point, 1, 2) @ rows.by_point)

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.sparse import csr_matrix
 
 from pipelines.core.types import FloatArray, IntArray
-from pipelines.geometry.bundle import Network, in_front, is_ahead, lens_slots, linearise
+from pipelines.geometry.bundle import Network, has_positive_depth, lens_slots, linearise, with_positive_depths
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ def follow(marks: Network, sigma_px: FloatArray) -> Following:
         marks: N points, M marks.
         sigma_px: (M,) of the marks. Those of points behind their camera do not count.
     """
-    sigma_px, marks = sigma_px[is_ahead(marks)], in_front(marks)
+    sigma_px, marks = sigma_px[has_positive_depth(marks)], with_positive_depths(marks)
     lin, count = linearise(marks), len(marks.point_in_world)
     pull = np.swapaxes(lin.by_point, 1, 2) / (sigma_px**2)[:, None, None]
     normal = np.zeros((count, 3, 3))

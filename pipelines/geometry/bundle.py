@@ -116,7 +116,7 @@ def correction_basis(network: Network, *, lens_follows: bool = True) -> Correcti
     Raises:
         DegenerateGeometryError: fewer observations than unknowns.
     """
-    network = in_front(network)
+    network = with_positive_depths(network)
     lin = linearise(network)
     n, points = len(network.camera_id), len(network.point_in_world)
     redundancy = 2 * len(lin.residual) - 6 * n - 3 * points
@@ -136,21 +136,21 @@ def correction_basis(network: Network, *, lens_follows: bool = True) -> Correcti
     )
 
 
-def in_front(network: Network) -> Network:
-    """Without the observations of points behind their camera, which an imported model may hold."""
-    ahead = is_ahead(network)
-    if ahead.all():
+def with_positive_depths(network: Network) -> Network:
+    """Return the network without observations of points behind their camera, which an imported model may hold."""
+    positive = has_positive_depth(network)
+    if positive.all():
         return network
     return replace(
         network,
-        obs_point=network.obs_point[ahead],
-        obs_image=network.obs_image[ahead],
-        obs_xy_px=network.obs_xy_px[ahead],
+        obs_point=network.obs_point[positive],
+        obs_image=network.obs_image[positive],
+        obs_xy_px=network.obs_xy_px[positive],
     )
 
 
-def is_ahead(network: Network) -> BoolArray:
-    """Which observations (M,) are of points in front of their camera."""
+def has_positive_depth(network: Network) -> BoolArray:
+    """Return the mask (M,) of the observations whose points lie in front of their camera."""
     ray = network.point_in_world[network.obs_point] - network.cam_center_in_world[network.obs_image]
     return np.asarray(np.einsum("mj,mj->m", network.cam_from_world[network.obs_image, 2], ray) > 0)
 
