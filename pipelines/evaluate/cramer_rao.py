@@ -21,8 +21,8 @@ from pipelines.geometry.bundle import (
     Network,
     has_positive_depth,
     lens_slots,
-    linearise,
-    scatter,
+    linearise_bundle,
+    sparse_jacobian,
     with_positive_depths,
 )
 
@@ -134,11 +134,11 @@ def _only(network: Network, mine: BoolArray) -> Network:
 
 
 def _rows(network: Network, sigma_px: FloatArray) -> _Rows:
-    lin = linearise(network)
+    lin = linearise_bundle(network)
     whiten = 1.0 / sigma_px[:, None, None]
-    poses = scatter(lin.by_pose * whiten, network.obs_image, len(network.camera_id))
-    lens = scatter(lin.by_intrinsics * whiten, lens_slots(network), len(network.cameras))
-    return _Rows(hstack([poses, lens], format="csr"), lin.by_point * whiten)
+    poses = sparse_jacobian(lin.jacobian_pose * whiten, network.obs_image, len(network.camera_id))
+    lens = sparse_jacobian(lin.jacobian_intrinsics * whiten, lens_slots(network), len(network.cameras))
+    return _Rows(hstack([poses, lens], format="csr"), lin.jacobian_point * whiten)
 
 
 def _eliminated(network: Network, sigma_px: FloatArray, cov_known: FloatArray | None) -> FloatArray:
@@ -151,6 +151,6 @@ def _eliminated(network: Network, sigma_px: FloatArray, cov_known: FloatArray | 
         normal += np.linalg.inv(cov_known)
     normal += (_RIDGE * np.trace(normal, axis1=1, axis2=2) + _RIDGE)[:, None, None] * np.eye(3)
     root = np.swapaxes(np.linalg.inv(np.linalg.cholesky(normal)), 1, 2)
-    point = scatter(rows.by_point @ root[network.obs_point], network.obs_point, count)
+    point = sparse_jacobian(rows.by_point @ root[network.obs_point], network.obs_point, count)
     cross = rows.by_cameras.T @ point
     return np.asarray((rows.by_cameras.T @ rows.by_cameras - cross @ cross.T).toarray())
