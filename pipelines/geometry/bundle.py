@@ -21,7 +21,7 @@ from scipy.special import exp1
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.geometry.cameras import Camera, project, project_each
-from pipelines.geometry.lens import by_parameter
+from pipelines.geometry.lens import parameter_derivative
 from pipelines.geometry.rotations import skew
 from pipelines.robust.kernels import CAUCHY_95, cauchy_weight
 from pipelines.robust.statistics import rayleigh_sigma
@@ -173,7 +173,7 @@ def linearise_bundle(network: Network) -> LinearisedBundle:
         local = in_cam[rows]
         jacobian_cam[rows] = _central_differences(partial(project, camera), local)
         for index in range(len(camera.params)):
-            jacobian_intrinsics[rows, :, index] = by_parameter(
+            jacobian_intrinsics[rows, :, index] = parameter_derivative(
                 partial(project, point_in_cam=local), camera, index, _STEP
             )
     jacobian_point = jacobian_cam @ rotation

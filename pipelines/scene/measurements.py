@@ -69,7 +69,7 @@ def control_marks(scene: Scene, survey: Survey) -> ControlMarks | None:
         position_in_geo=torch.tensor([point.position_in_geo for point, _ in kept], dtype=torch.float64),
         root_information=torch.eye(3, dtype=torch.float64).repeat(len(kept), 1, 1),
         name=tuple(point.name for point, _ in kept),
-        bearing_by_lens=torch.from_numpy(scene.sparse.lenses.bearings_by_parameters(camera, pixel)),
+        bearing_by_lens=torch.from_numpy(scene.sparse.lenses.bearing_jacobian(camera, pixel)),
     )
     return _with_covariance(marks, _survey_covariance(kept) + _mark_covariance(scene, marks))
 
