@@ -64,8 +64,8 @@ class Scene:
         return tuple(f"image_{index:03d}.jpg" for index in range(len(self.center_in_geo)))
 
     def pixels(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Where points (N, 3) in geo appear: point and image of each observation, exact pixels; by point."""
-        found = []
+        """Return the observations of points (N, 3) in geo, by point: indices of point and image, exact pixels."""
+        observations = []
         for image, (center, rotation) in enumerate(zip(self.center_in_geo, self.geo_from_cam, strict=True)):
             in_cam = (points - center) @ rotation
             ahead = np.flatnonzero(in_cam[:, 2] > 0.5)
@@ -73,14 +73,14 @@ class Scene:
             ahead = ahead[(np.abs(in_cam[ahead, :2]) < 0.8 * in_cam[ahead, 2:]).all(axis=1)]
             xy = project(self.camera, in_cam[ahead])
             inside = ((xy > 0) & (xy < [self.camera.width, self.camera.height])).all(axis=1)
-            found.append(np.column_stack([ahead[inside], np.full(inside.sum(), image), xy[inside]]))
-        rows = np.concatenate(found)
+            observations.append(np.column_stack([ahead[inside], np.full(inside.sum(), image), xy[inside]]))
+        rows = np.concatenate(observations)
         rows = rows[np.lexsort((rows[:, 1], rows[:, 0]))]
         return rows[:, 0].astype(np.int64), rows[:, 1].astype(np.int64), rows[:, 2:]
 
 
 def looking_at(center: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Rotations geo ← camera (n, 3, 3) of level cameras at centres (n, 3) that look at targets (n, 3)."""
+    """Return rotations geo ← camera (n, 3, 3) of level cameras at centres (n, 3) that look at targets (n, 3)."""
     forward = target - center
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
     right = np.cross(forward, [1e-9, 0.0, 1.0])
@@ -91,7 +91,7 @@ def looking_at(center: np.ndarray, target: np.ndarray) -> np.ndarray:
 def make_scene(
     layout: Layout = "orbit", images: int = 24, points: int = 300, gcps: int = 6, seed: int = 0
 ) -> Scene:
-    """A built-up area 100 m wide, seen from an orbit at two heights, a nadir grid, or one straight line."""
+    """Return a built-up area 100 m wide, seen from an orbit at two heights, a nadir grid, or one straight line."""
     rng = np.random.default_rng(seed)
     cloud = np.column_stack([rng.uniform(-50, 50, (points, 2)), rng.uniform(0, 20, points)])
     control = np.column_stack([rng.uniform(-45, 45, (gcps, 2)), rng.uniform(0, 5, gcps)])
@@ -110,7 +110,7 @@ def make_scene(
 
 
 def sparse_model(scene: Scene, noise: Noise, rng: np.random.Generator) -> SparseModel:
-    """What an SfM with perfect cameras would give: the scene in `local`, with noisy pixels."""
+    """Return the model of an SfM with perfect cameras: the scene in `local`, with noisy pixels."""
     local_from_geo = scene.geo_from_local.inverse()
     owner, image, xy = scene.pixels(scene.point_in_geo)
     rotation = np.swapaxes(scene.geo_from_cam, 1, 2) @ scene.geo_from_local.rotation
@@ -146,7 +146,7 @@ WITH_GCPS = Measured(gcps=True)
 
 
 def survey_of(scene: Scene, noise: Noise, measured: Measured, rng: np.random.Generator) -> Survey:
-    """The measurements, with noise of exactly the σ that they state (but for outliers and bias)."""
+    """Return the measurements, with noise of exactly the σ that they state (but for outliers and bias)."""
     fixes = scene.center_in_geo + rng.normal(size=scene.center_in_geo.shape) * noise.fix_m + noise.bias_m
     for index in noise.outliers:
         direction = rng.normal(size=3)
@@ -204,20 +204,20 @@ def _control(scene: Scene, noise: Noise, rng: np.random.Generator) -> tuple[Surv
 def material(
     noise: Noise = STATED, measured: Measured = WITH_GCPS, images: int = 8, points: int = 60
 ) -> tuple[Scene, SparseModel, Survey]:
-    """An orbit, its SfM model and its survey."""
+    """Return an orbit, its SfM model and its survey."""
     scene, rng = make_scene(images=images, points=points), np.random.default_rng(0)
     survey = survey_of(scene, noise, measured, rng)
     return scene, sparse_model(scene, noise, rng), survey
 
 
 def initial(layout: str = "volume") -> InitialSimilarity:
-    """The true similarity, with σ of 1 % of scale, 0.01 rad and 1 cm about a place in the scene."""
+    """Return the true similarity, with σ of 1 % of scale, 0.01 rad and 1 cm about a place in the scene."""
     covariance, pivot = np.eye(7) * 1e-4, (5.0, -3.0, 60.0)
     return initial_product(GEO_FROM_LOCAL.to_record("local", "geo", covariance=covariance, pivot=pivot), layout)
 
 
 def initial_product(geo_from_local: SimilarityRecord, layout: str = "volume") -> InitialSimilarity:
-    """What `init-sim3` writes of a similarity, but for what it counts on the way."""
+    """Return the product of `init-sim3` for a similarity, without counts of correspondences and residuals."""
     return InitialSimilarity(
         geo_from_local=geo_from_local,
         method="robust",
@@ -237,7 +237,7 @@ def trained_model(
     max_image_size: int = 320,
     cameras: tuple[TrainedCamera, ...] = (),
 ) -> TrainedModel:
-    """What `train` writes beside a single Gaussian without bands."""
+    """Return the product that `train` writes beside a single Gaussian without bands."""
     return TrainedModel(
         geo_from_model=geo_from_model.to_record("model", "geo"),
         model_from_local=model_from_local.to_record("local", "model"),
@@ -252,14 +252,14 @@ def trained_model(
 
 
 def write_workspace(root: Path, survey: Survey, model: SparseModel) -> Workspace:
-    """A workspace as `ingest` and `sfm` leave it."""
+    """Return a workspace as `ingest` and `sfm` leave it."""
     save_json(survey, root / SURVEY)
     write_sparse(model, root / SPARSE)
     return Workspace(root)
 
 
 def without_fixes(survey: Survey, names: tuple[str, ...]) -> Survey:
-    """The survey with the fixes of some images taken away."""
+    """Return the survey without the fixes of the named images."""
     images = tuple(
         image.model_copy(update={"fix": None}) if image.name in names else image for image in survey.images
     )
@@ -267,7 +267,7 @@ def without_fixes(survey: Survey, names: tuple[str, ...]) -> Survey:
 
 
 def moved(scene: Scene, geo_from_local: Similarity) -> Scene:
-    """The scene with another SfM frame."""
+    """Return the scene with another SfM frame."""
     return replace(scene, geo_from_local=geo_from_local)
 
 

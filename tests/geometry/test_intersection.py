@@ -49,7 +49,7 @@ def noisy(cameras: UncertainCameras, rays: Rays, rng: np.random.Generator) -> tu
 
 
 def few_rays(rays: Rays, most: int, rng: np.random.Generator) -> Rays:
-    """At most so many rays of each point, chosen at random."""
+    """Return at most `most` rays of each point, chosen at random."""
     order = rng.permutation(len(rays.point))
     order = order[np.argsort(rays.point[order], kind="stable")]
     rank = np.arange(len(order)) - np.searchsorted(rays.point[order], rays.point[order])
