@@ -8,7 +8,7 @@ import numpy as np
 from pipelines.geometry.cameras import Pinhole
 from pipelines.stereo.agreement import Surface
 from pipelines.stereo.matching import MatchSettings
-from pipelines.stereo.sweep import Facing, Planes, StereoCamera, StereoView, plane_sweep
+from pipelines.stereo.sweep import NormalMap, Planes, StereoCamera, StereoView, plane_sweep
 
 CAMERA = Pinhole(120, 90, 110.0, 110.0, 60.0, 45.0)
 GROUND_M, ROOF_M, ROOF_SIDE_M = 0.0, 6.0, 8.0
@@ -60,9 +60,9 @@ def shot(azimuth_deg: float, brightness: float = 1.0, pinhole: Pinhole = CAMERA)
     return photographed(camera, brightness * np.where(place[..., 2] > 0.5 * ROOF_M, roof, ground))
 
 
-def facing_up(pinhole: Pinhole = CAMERA) -> Facing:
+def facing_up(pinhole: Pinhole = CAMERA) -> NormalMap:
     """All pixels on level planes."""
-    return Facing(LEVEL.normal_in_world[None], np.zeros((pinhole.height, pinhole.width), np.uint8))
+    return NormalMap(LEVEL.normal_in_world[None], np.zeros((pinhole.height, pinhole.width), np.uint8))
 
 
 def ring_of_views(pinhole: Pinhole = CAMERA) -> list[StereoView]:

@@ -20,7 +20,7 @@ class Surface:
 
     def depth(self) -> FloatArray:
         """Depth (H, W) along the optical axis."""
-        return self.swept.facing.depth(self.camera, self.swept.offset_m)
+        return self.swept.normals.depth(self.camera, self.swept.offset_m)
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def agreed_depth(reference: Surface, others: list[Surface], settings: AgreementS
     rows, columns = np.nonzero(good)
     length, ray = depth[rows, columns], rays[rows, columns]
     point = reference.camera.center_in_world + length[:, None] * ray
-    own = reference.swept.facing.along(reference.camera)
+    own = reference.swept.normals.offset_per_metre(reference.camera)
     weight = (own * reference.swept.sharpness)[rows, columns] ** 2
     total, count, through = np.zeros(len(rows)), np.zeros(len(rows)), np.zeros(len(rows))
     for other in others:
@@ -100,7 +100,7 @@ class _Seen:
 
 def _look_up(point: FloatArray, other: Surface, settings: AgreementSettings) -> _Seen:
     """Points (P, 3) in another view."""
-    camera, facing = other.camera.pinhole, other.swept.facing
+    camera, normals = other.camera.pinhole, other.swept.normals
     in_cam = (point - other.camera.center_in_world) @ other.camera.cam_from_world.T
     ahead = np.flatnonzero(in_cam[:, 2] > 0)
     column = np.floor(camera.fx * in_cam[ahead, 0] / in_cam[ahead, 2] + camera.cx)
@@ -109,7 +109,7 @@ def _look_up(point: FloatArray, other: Surface, settings: AgreementSettings) -> 
     ahead, place = ahead[inside], (row[inside].astype(np.int64), column[inside].astype(np.int64))
     known = other.swept.score[place] > settings.least_score
     ahead, place = ahead[known], (place[0][known], place[1][known])
-    normal = facing.normals_in_world[facing.which[place]]
+    normal = normals.normals_in_world[normals.index[place]]
     offset = np.einsum("ni,ni->n", point[ahead], normal)
     missed = np.asarray(other.swept.offset_m[place] - offset, np.float64)
     near = np.abs(missed) < settings.steps * other.swept.step_m[place]

@@ -15,7 +15,7 @@ import numpy as np
 from pipelines.core.types import FloatArray
 from pipelines.stereo.agreement import Surface
 from pipelines.stereo.matching import UNSEEN, Float32Array, Matcher, MatchSettings, Peak
-from pipelines.stereo.sweep import Facing, StereoCamera, StereoView, Swept, calibration, swept_from
+from pipelines.stereo.sweep import NormalMap, StereoCamera, StereoView, Swept, calibration, swept_from
 
 _REACH = 4  # steps on either side of the guess
 _STEPS = 3  # to one of the sweep that the guess is from
@@ -34,26 +34,28 @@ class Guess:
         step_m: (H, W) between two places to be compared.
     """
 
-    facing: Facing
+    normals: NormalMap
     offset_m: Float32Array
     step_m: Float32Array
 
 
 def guess_from(surface: Surface, agreed: Float32Array, camera: StereoCamera) -> Guess:
     """What views agree on (H, W), and elsewhere what the view itself found, at the pixels of a finer camera."""
-    facing, own = surface.swept.facing, surface.depth()
+    normals, own = surface.swept.normals, surface.depth()
     own = np.where(np.isfinite(own) & (own > 0), own, 0).astype(np.float32)
     own = np.asarray(cv2.medianBlur(own, _SPECKLE_PX), np.float32)
-    offset = facing.offset(surface.camera, np.where(agreed > 0, agreed, own))
+    offset = normals.offset(surface.camera, np.where(agreed > 0, agreed, own))
     size = (camera.pinhole.width, camera.pinhole.height)
     finer = [
         # Between roof and ground is nothing that an interpolated offset could mean.
         cv2.resize(image, size, interpolation=cv2.INTER_NEAREST)
-        for image in (facing.which, offset.astype(np.float32), surface.swept.step_m / np.float32(_STEPS))
+        for image in (normals.index, offset.astype(np.float32), surface.swept.step_m / np.float32(_STEPS))
     ]
     which = np.asarray(finer[0], np.uint8)
     return Guess(
-        Facing(facing.normals_in_world, which), np.asarray(finer[1], np.float32), np.asarray(finer[2], np.float32)
+        NormalMap(normals.normals_in_world, which),
+        np.asarray(finer[1], np.float32),
+        np.asarray(finer[2], np.float32),
     )
 
 
@@ -76,9 +78,9 @@ def refine(reference: StereoView, neighbours: list[StereoView], guess: Guess, se
     matcher, peak = Matcher(reference.grey, settings), Peak(reference.grey.shape)
     rays = reference.camera.rays()
     sights = [_Sight(rays, reference.camera.center_in_world, view) for view in neighbours]
-    middle = guess.facing.depth(reference.camera, guess.offset_m).astype(np.float32)
+    middle = guess.normals.depth(reference.camera, guess.offset_m).astype(np.float32)
     with np.errstate(divide="ignore"):
-        step = (guess.step_m / guess.facing.along(reference.camera)).astype(np.float32)
+        step = (guess.step_m / guess.normals.offset_per_metre(reference.camera)).astype(np.float32)
     for number in range(-_REACH, _REACH + 1):
         depth = middle + np.float32(number) * step
         score = matcher(sight.shown(depth) for sight in sights)
@@ -86,7 +88,7 @@ def refine(reference: StereoView, neighbours: list[StereoView], guess: Guess, se
         peak.add(score)
     found = peak.found()
     offset = guess.offset_m + (found.place - _REACH) * guess.step_m
-    swept = swept_from(found, guess.facing, offset, guess.step_m)
+    swept = swept_from(found, guess.normals, offset, guess.step_m)
     return replace(swept, score=np.where(found.inner, swept.score, np.float32(UNSEEN)))
 
 

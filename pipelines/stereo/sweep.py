@@ -80,7 +80,7 @@ class Planes:
 
 
 @dataclass(frozen=True)
-class Facing:
+class NormalMap:
     """Which way each pixel's surface is taken to face: offsets along that normal tell where it is.
 
     Attributes:
@@ -89,25 +89,27 @@ class Facing:
     """
 
     normals_in_world: FloatArray
-    which: ByteArray
+    index: ByteArray
 
     @property
     def normal_in_world(self) -> FloatArray:
         """(H, W, 3)."""
-        return self.normals_in_world[self.which]
+        return self.normals_in_world[self.index]
 
-    def along(self, camera: StereoCamera) -> FloatArray:
+    def offset_per_metre(self, camera: StereoCamera) -> FloatArray:
         """Offset (H, W) that a ray of a camera gains by a metre of depth."""
         return np.asarray(np.einsum("hwi,hwi->hw", camera.rays(), self.normal_in_world))
 
     def depth(self, camera: StereoCamera, offset_m: Float32Array) -> FloatArray:
         """Depth (H, W) along the optical axis at which the rays of a camera meet planes of offsets (H, W)."""
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.asarray((offset_m - self.normal_in_world @ camera.center_in_world) / self.along(camera))
+            return np.asarray(
+                (offset_m - self.normal_in_world @ camera.center_in_world) / self.offset_per_metre(camera)
+            )
 
     def offset(self, camera: StereoCamera, depth: Float32Array) -> FloatArray:
         """Offsets (H, W) of the points at depths (H, W) of a camera: the inverse of `depth`."""
-        return np.asarray(self.normal_in_world @ camera.center_in_world + depth * self.along(camera))
+        return np.asarray(self.normal_in_world @ camera.center_in_world + depth * self.offset_per_metre(camera))
 
 
 @dataclass(frozen=True)
@@ -124,7 +126,7 @@ class Swept:
             from nearly the same place, or see little texture. The σ of the offset goes with its inverse.
     """
 
-    facing: Facing
+    normals: NormalMap
     offset_m: Float32Array
     score: Float32Array
     step_m: Float32Array
@@ -155,12 +157,12 @@ def plane_sweep(
         raise ValueError(f"{len(neighbours)} neighbours and {fewest} planes are too few to sweep")
     found = [_sweep(reference, neighbours, planes, settings) for planes in sweeps]
     best = np.argmax([each.score - (_CLEARLY if number else 0) for number, each in enumerate(found)], axis=0)
-    facing = Facing(np.stack([planes.normal_in_world for planes in sweeps]), best.astype(np.uint8))
+    normals = NormalMap(np.stack([planes.normal_in_world for planes in sweeps]), best.astype(np.uint8))
     offset, score, step, sharpness = (
         np.choose(best, [getattr(each, name) for each in found])
         for name in ("offset_m", "score", "step_m", "sharpness")
     )
-    return Swept(facing, offset, score, step, sharpness)
+    return Swept(normals, offset, score, step, sharpness)
 
 
 def _sweep(reference: StereoView, neighbours: list[StereoView], planes: Planes, settings: MatchSettings) -> Swept:
@@ -184,8 +186,8 @@ def _sweep(reference: StereoView, neighbours: list[StereoView], planes: Planes, 
     offset_m = np.interp(found.place, np.arange(len(planes.offset_m)), planes.offset_m)
     offset_m[found.score <= UNSEEN] = np.nan
     step_m = np.abs(np.gradient(planes.offset_m))[np.rint(found.place).astype(np.int64)]
-    facing = Facing(planes.normal_in_world[None], np.zeros(offset_m.shape, np.uint8))
-    return swept_from(found, facing, offset_m, step_m)
+    normals = NormalMap(planes.normal_in_world[None], np.zeros(offset_m.shape, np.uint8))
+    return swept_from(found, normals, offset_m, step_m)
 
 
 def _scene_on(planes: Planes, camera: StereoCamera) -> Iterator[BoolArray]:
@@ -206,10 +208,10 @@ def _rows(there: BoolArray, around_px: int) -> tuple[int, int]:
     return max(int(first) // _ROWS * _ROWS, 0), min(-int(-last // _ROWS) * _ROWS, len(there))
 
 
-def swept_from(found: Found, facing: Facing, offset_m: FloatArray, step_m: FloatArray | Float32Array) -> Swept:
+def swept_from(found: Found, normals: NormalMap, offset_m: FloatArray, step_m: FloatArray | Float32Array) -> Swept:
     """What was found, at these offsets (H, W), among hypotheses so far (H, W) apart."""
     sharpness = (found.curvature / step_m**2).astype(np.float32)
-    return Swept(facing, offset_m.astype(np.float32), found.score, step_m.astype(np.float32), sharpness)
+    return Swept(normals, offset_m.astype(np.float32), found.score, step_m.astype(np.float32), sharpness)
 
 
 def _seen_on_plane(reference: StereoView, other: StereoView, planes: Planes, offset_m: float) -> Float32Array:

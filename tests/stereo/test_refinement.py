@@ -10,7 +10,7 @@ from pipelines.geometry.cameras import Pinhole
 from pipelines.stereo.agreement import AgreementSettings, Surface, agreed_depth
 from pipelines.stereo.matching import UNSEEN, Float32Array, MatchSettings
 from pipelines.stereo.refinement import Guess, guess_from, refine
-from pipelines.stereo.sweep import Facing, StereoCamera, StereoView, plane_sweep
+from pipelines.stereo.sweep import NormalMap, StereoCamera, StereoView, plane_sweep
 from pipelines.train.depth_maps import StereoOptions
 from tests.stereo_scenes import (
     CAMERA,
@@ -56,12 +56,12 @@ def guessed(camera: StereoCamera, off_m: float) -> Guess:
 def test_offsets_are_the_inverse_of_depths(fine: list[StereoView]) -> None:
     camera = fine[1].camera
     offset = np.random.default_rng(0).uniform(-3, 9, (FINE.height, FINE.width)).astype(np.float32)
-    which = np.random.default_rng(1).integers(0, 2, offset.shape).astype(np.uint8)
-    facing = Facing(np.array([[0.0, 0.0, 1.0], [0.6, 0.8, 0.0]]), which)
-    depth = facing.depth(camera, offset).astype(np.float32)
-    steep = np.abs(facing.along(camera)) > 0.1
+    index = np.random.default_rng(1).integers(0, 2, offset.shape).astype(np.uint8)
+    normals = NormalMap(np.array([[0.0, 0.0, 1.0], [0.6, 0.8, 0.0]]), index)
+    depth = normals.depth(camera, offset).astype(np.float32)
+    steep = np.abs(normals.offset_per_metre(camera)) > 0.1
     # Depths of 30 m and, of rays along the planes, hundreds, in single precision.
-    np.testing.assert_allclose(facing.offset(camera, depth)[steep], offset[steep], atol=1e-4)
+    np.testing.assert_allclose(normals.offset(camera, depth)[steep], offset[steep], atol=1e-4)
 
 
 @pytest.mark.parametrize("off_m", [0.0, 0.6, -0.6])
@@ -120,14 +120,14 @@ def _foot_of_a_wall(azimuth_deg: float) -> tuple[StereoView, np.ndarray, np.ndar
 def test_small_windows_leave_the_foot_of_a_wall_where_it_is() -> None:
     """A wide one lays the surface across the corner, within a reach of some pixels."""
     (view, depth, upright), *others = [_foot_of_a_wall(azimuth) for azimuth in (0, -24, -12, 12, 24)]
-    facing = Facing(np.stack([LEVEL.normal_in_world, WALL]), upright.astype(np.uint8))
-    offset = facing.offset(view.camera, (depth + 0.3).astype(np.float32)).astype(np.float32)
-    guess = Guess(facing, offset, np.full(offset.shape, STEP_M, np.float32))
+    normals = NormalMap(np.stack([LEVEL.normal_in_world, WALL]), upright.astype(np.uint8))
+    offset = normals.offset(view.camera, (depth + 0.3).astype(np.float32)).astype(np.float32)
+    guess = Guess(normals, offset, np.full(offset.shape, STEP_M, np.float32))
     edge = cv2.morphologyEx(upright.astype(np.uint8), cv2.MORPH_GRADIENT, np.ones((9, 9), np.uint8)) > 0
     wrong = []
     for settings in (StereoOptions().refining, StereoOptions().matching):
         found = refine(view, [other[0] for other in others], guess, settings)
-        error = np.abs(facing.depth(view.camera, found.offset_m) - depth)
+        error = np.abs(normals.depth(view.camera, found.offset_m) - depth)
         wrong.append(np.median(error[INNER][edge[INNER]]))
     assert wrong[0] < TENTH_PX_M
     assert wrong[0] < 0.8 * wrong[1]
