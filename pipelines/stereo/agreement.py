@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipelines.core.types import FloatArray, IntArray
-from pipelines.stereo.sweep import Float32Array, StereoCamera, Swept
+from pipelines.stereo.sweep import Float32Array, StereoCamera, SweepResult
 
 
 @dataclass(frozen=True)
@@ -16,11 +16,11 @@ class Surface:
     """The surface that a sweep found in a view."""
 
     camera: StereoCamera
-    swept: Swept
+    sweep: SweepResult
 
     def depth(self) -> FloatArray:
         """Depth (H, W) along the optical axis."""
-        return self.swept.normals.depth(self.camera, self.swept.offset_m)
+        return self.sweep.normals.depth(self.camera, self.sweep.offset_m)
 
 
 @dataclass(frozen=True)
@@ -55,12 +55,12 @@ def agreed_depth(reference: Surface, others: list[Surface], settings: AgreementS
     """
     rays = reference.camera.rays()
     depth = reference.depth()
-    good = (reference.swept.score > settings.least_score) & np.isfinite(depth) & (depth > 0)
+    good = (reference.sweep.score > settings.least_score) & np.isfinite(depth) & (depth > 0)
     rows, columns = np.nonzero(good)
     length, ray = depth[rows, columns], rays[rows, columns]
     point = reference.camera.center_in_world + length[:, None] * ray
-    own = reference.swept.normals.offset_per_metre(reference.camera)
-    weight = (own * reference.swept.sharpness)[rows, columns] ** 2
+    own = reference.sweep.normals.offset_per_metre(reference.camera)
+    weight = (own * reference.sweep.sharpness)[rows, columns] ** 2
     total, count, through = np.zeros(len(rows)), np.zeros(len(rows)), np.zeros(len(rows))
     for other in others:
         seen = _look_up(point, other, settings)
@@ -100,23 +100,23 @@ class _Seen:
 
 def _look_up(point: FloatArray, other: Surface, settings: AgreementSettings) -> _Seen:
     """Points (P, 3) in another view."""
-    camera, normals = other.camera.pinhole, other.swept.normals
+    camera, normals = other.camera.pinhole, other.sweep.normals
     in_cam = (point - other.camera.center_in_world) @ other.camera.cam_from_world.T
     ahead = np.flatnonzero(in_cam[:, 2] > 0)
     column = np.floor(camera.fx * in_cam[ahead, 0] / in_cam[ahead, 2] + camera.cx)
     row = np.floor(camera.fy * in_cam[ahead, 1] / in_cam[ahead, 2] + camera.cy)
     inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
     ahead, place = ahead[inside], (row[inside].astype(np.int64), column[inside].astype(np.int64))
-    known = other.swept.score[place] > settings.least_score
+    known = other.sweep.score[place] > settings.least_score
     ahead, place = ahead[known], (place[0][known], place[1][known])
     normal = normals.normals_in_world[normals.index[place]]
     offset = np.einsum("ni,ni->n", point[ahead], normal)
-    missed = np.asarray(other.swept.offset_m[place] - offset, np.float64)
-    near = np.abs(missed) < settings.steps * other.swept.step_m[place]
+    missed = np.asarray(other.sweep.offset_m[place] - offset, np.float64)
+    near = np.abs(missed) < settings.steps * other.sweep.step_m[place]
     with np.errstate(divide="ignore"):
         further = missed / (offset - normal @ other.camera.center_in_world)
     return _Seen(
-        ahead[near], normal[near], missed[near], other.swept.sharpness[place][near], ahead[further > settings.free]
+        ahead[near], normal[near], missed[near], other.sweep.sharpness[place][near], ahead[further > settings.free]
     )
 
 

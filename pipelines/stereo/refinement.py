@@ -15,7 +15,7 @@ import numpy as np
 from pipelines.core.types import FloatArray
 from pipelines.stereo.agreement import Surface
 from pipelines.stereo.matching import UNSEEN, Float32Array, Matcher, MatchSettings, Peak
-from pipelines.stereo.sweep import NormalMap, StereoCamera, StereoView, Swept, calibration, swept_from
+from pipelines.stereo.sweep import NormalMap, StereoCamera, StereoView, SweepResult, calibration, sweep_result
 
 _REACH = 4  # steps on either side of the guess
 _STEPS = 3  # to one of the sweep that the guess is from
@@ -41,7 +41,7 @@ class Guess:
 
 def guess_from(surface: Surface, agreed: Float32Array, camera: StereoCamera) -> Guess:
     """What views agree on (H, W), and elsewhere what the view itself found, at the pixels of a finer camera."""
-    normals, own = surface.swept.normals, surface.depth()
+    normals, own = surface.sweep.normals, surface.depth()
     own = np.where(np.isfinite(own) & (own > 0), own, 0).astype(np.float32)
     own = np.asarray(cv2.medianBlur(own, _SPECKLE_PX), np.float32)
     offset = normals.offset(surface.camera, np.where(agreed > 0, agreed, own))
@@ -49,7 +49,7 @@ def guess_from(surface: Surface, agreed: Float32Array, camera: StereoCamera) -> 
     finer = [
         # Between roof and ground is nothing that an interpolated offset could mean.
         cv2.resize(image, size, interpolation=cv2.INTER_NEAREST)
-        for image in (normals.index, offset.astype(np.float32), surface.swept.step_m / np.float32(_STEPS))
+        for image in (normals.index, offset.astype(np.float32), surface.sweep.step_m / np.float32(_STEPS))
     ]
     which = np.asarray(finer[0], np.uint8)
     return Guess(
@@ -59,7 +59,9 @@ def guess_from(surface: Surface, agreed: Float32Array, camera: StereoCamera) -> 
     )
 
 
-def refine(reference: StereoView, neighbours: list[StereoView], guess: Guess, settings: MatchSettings) -> Swept:
+def refine(
+    reference: StereoView, neighbours: list[StereoView], guess: Guess, settings: MatchSettings
+) -> SweepResult:
     """Compare a view with its neighbours at offsets around a guess.
 
     A best match at either end of these says only that the surface is elsewhere: its score is −1.
@@ -88,8 +90,8 @@ def refine(reference: StereoView, neighbours: list[StereoView], guess: Guess, se
         peak.add(score)
     found = peak.found()
     offset = guess.offset_m + (found.place - _REACH) * guess.step_m
-    swept = swept_from(found, guess.normals, offset, guess.step_m)
-    return replace(swept, score=np.where(found.inner, swept.score, np.float32(UNSEEN)))
+    refined = sweep_result(found, guess.normals, offset, guess.step_m)
+    return replace(refined, score=np.where(found.inner, refined.score, np.float32(UNSEEN)))
 
 
 class _Sight:

@@ -113,7 +113,7 @@ class NormalMap:
 
 
 @dataclass(frozen=True)
-class Swept:
+class SweepResult:
     """The best plane at each pixel.
 
     Attributes:
@@ -135,7 +135,7 @@ class Swept:
 
 def plane_sweep(
     reference: StereoView, neighbours: list[StereoView], sweeps: list[Planes], settings: MatchSettings
-) -> Swept:
+) -> SweepResult:
     """Compare a view with its neighbours on every plane, and keep at each pixel the best of all.
 
     A window fits best on the planes that face as its surface does: walls need others than the ground.
@@ -162,10 +162,12 @@ def plane_sweep(
         np.choose(best, [getattr(each, name) for each in found])
         for name in ("offset_m", "score", "step_m", "sharpness")
     )
-    return Swept(normals, offset, score, step, sharpness)
+    return SweepResult(normals, offset, score, step, sharpness)
 
 
-def _sweep(reference: StereoView, neighbours: list[StereoView], planes: Planes, settings: MatchSettings) -> Swept:
+def _sweep(
+    reference: StereoView, neighbours: list[StereoView], planes: Planes, settings: MatchSettings
+) -> SweepResult:
     """The best planes of one direction."""
 
     @lru_cache(maxsize=1)  # one plane is mostly seen in the rows of the one before
@@ -187,7 +189,7 @@ def _sweep(reference: StereoView, neighbours: list[StereoView], planes: Planes, 
     offset_m[found.score <= UNSEEN] = np.nan
     step_m = np.abs(np.gradient(planes.offset_m))[np.rint(found.place).astype(np.int64)]
     normals = NormalMap(planes.normal_in_world[None], np.zeros(offset_m.shape, np.uint8))
-    return swept_from(found, normals, offset_m, step_m)
+    return sweep_result(found, normals, offset_m, step_m)
 
 
 def _scene_on(planes: Planes, camera: StereoCamera) -> Iterator[BoolArray]:
@@ -208,10 +210,12 @@ def _rows(there: BoolArray, around_px: int) -> tuple[int, int]:
     return max(int(first) // _ROWS * _ROWS, 0), min(-int(-last // _ROWS) * _ROWS, len(there))
 
 
-def swept_from(found: Found, normals: NormalMap, offset_m: FloatArray, step_m: FloatArray | Float32Array) -> Swept:
+def sweep_result(
+    found: Found, normals: NormalMap, offset_m: FloatArray, step_m: FloatArray | Float32Array
+) -> SweepResult:
     """What was found, at these offsets (H, W), among hypotheses so far (H, W) apart."""
     sharpness = (found.curvature / step_m**2).astype(np.float32)
-    return Swept(normals, offset_m.astype(np.float32), found.score, step_m.astype(np.float32), sharpness)
+    return SweepResult(normals, offset_m.astype(np.float32), found.score, step_m.astype(np.float32), sharpness)
 
 
 def _seen_on_plane(reference: StereoView, other: StereoView, planes: Planes, offset_m: float) -> Float32Array:

@@ -22,7 +22,7 @@ from pipelines.stereo.agreement import AgreementSettings, Surface, agreed_depth,
 from pipelines.stereo.matching import UNSEEN, Float32Array, MatchSettings
 from pipelines.stereo.neighbours import Sightings, best_neighbours, planes_for
 from pipelines.stereo.refinement import guess_from, refine
-from pipelines.stereo.sweep import NormalMap, Planes, StereoCamera, StereoView, Swept, plane_sweep
+from pipelines.stereo.sweep import NormalMap, Planes, StereoCamera, StereoView, SweepResult, plane_sweep
 
 # Of what is kept: other forms have other folders.
 _FORM = b"coarse, fine: direction, offset, score, step, sharpness"
@@ -141,7 +141,7 @@ class DepthMaps:
         pinhole = self._coarse(index) if kind == "coarse" else self.camera(index)
         which, *rest = np.load(self._path(index, kind), mmap_mode="r", allow_pickle=False)
         normals = NormalMap(np.stack([planes.normal_in_world for planes in sweeps]), which.astype(np.uint8))
-        return Surface(self._camera(pinhole, index), Swept(normals, *rest))
+        return Surface(self._camera(pinhole, index), SweepResult(normals, *rest))
 
     def _find_planes(self, index: int) -> list[Planes]:
         others = self._neighbours(index)
@@ -191,10 +191,10 @@ class DepthMaps:
         return digest.hexdigest()[:32]
 
 
-def _packed(swept: Swept) -> Float32Array:
+def _packed(sweep: SweepResult) -> Float32Array:
     """(5, H, W): direction, offset, score, step and sharpness of each pixel."""
-    which = swept.normals.index.astype(np.float32)
-    return np.stack([which, swept.offset_m, swept.score, swept.step_m, swept.sharpness])
+    which = sweep.normals.index.astype(np.float32)
+    return np.stack([which, sweep.offset_m, sweep.score, sweep.step_m, sweep.sharpness])
 
 
 def _nothing(pinhole: Pinhole) -> Float32Array:

@@ -149,7 +149,7 @@ def test_guesses_are_what_views_agree_on(fine: list[StereoView], coarse: list[Su
 
 def test_pixels_that_nothing_fits_find_nothing(fine: list[StereoView], coarse: list[Surface]) -> None:
     empty = Surface(coarse[2].camera, plane_sweep(*_nothing_to_see(), [LEVEL], MatchSettings()))
-    assert np.isnan(empty.swept.offset_m).all()
+    assert np.isnan(empty.sweep.offset_m).all()
     guess = guess_from(empty, np.zeros((CAMERA.height, CAMERA.width), np.float32), fine[2].camera)
     assert np.isfinite(guess.offset_m).all()
     found = refine(fine[2], around(fine, 2), guess, MatchSettings())

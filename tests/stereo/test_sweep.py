@@ -8,7 +8,7 @@ import pytest
 from pipelines.stereo.agreement import AgreementSettings, Surface, agreed_depth
 from pipelines.stereo.matching import MatchSettings
 from pipelines.stereo.neighbours import Sightings, best_neighbours, planes_for
-from pipelines.stereo.sweep import Planes, StereoCamera, StereoView, Swept, plane_sweep
+from pipelines.stereo.sweep import Planes, StereoCamera, StereoView, SweepResult, plane_sweep
 from tests.stereo_scenes import (
     CAMERA,
     GROUND_M,
@@ -66,7 +66,7 @@ def test_a_place_that_views_look_through_is_no_surface(ring: list[StereoView]) -
         offset = np.zeros((CAMERA.height, CAMERA.width), np.float32)
         offset[raised] = height_m
         one = np.ones_like(offset)
-        return Surface(camera, Swept(facing_up(), offset, one, 0.5 * one, one))
+        return Surface(camera, SweepResult(facing_up(), offset, one, 0.5 * one, one))
 
     own, alike, clear = flat(2, 4.0), [flat(2, 4.0), flat(2, 4.0)], [flat(2, 0.0), flat(2, 0.0)]
     assert (agreed_depth(own, alike, AgreementSettings())[raised] > 0).all()
@@ -198,8 +198,8 @@ def test_only_the_rows_that_may_show_the_scene_are_compared(
     inner = (height(truth) > heights[0] + 1) & (height(truth) < heights[1] - 1)
     inner &= np.abs(whole.depth() - truth) < 0.3
     assert inner.mean() > 0.05
-    np.testing.assert_allclose(part.swept.offset_m[inner], whole.swept.offset_m[inner], atol=1e-3)
-    np.testing.assert_allclose(part.swept.score[inner], whole.swept.score[inner], atol=1e-3)
+    np.testing.assert_allclose(part.sweep.offset_m[inner], whole.sweep.offset_m[inner], atol=1e-3)
+    np.testing.assert_allclose(part.sweep.score[inner], whole.sweep.score[inner], atol=1e-3)
 
 
 def test_too_few_points_give_no_planes(ring: list[StereoView]) -> None:
