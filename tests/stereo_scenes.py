@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from pipelines.geometry.cameras import Pinhole
-from pipelines.stereo.agreement import Surface
+from pipelines.stereo.agreement import DepthEstimate
 from pipelines.stereo.matching import MatchSettings
 from pipelines.stereo.sweep import NormalMap, Planes, StereoCamera, StereoView, plane_sweep
 
@@ -75,6 +75,8 @@ def around(ring: list[StereoView], index: int) -> list[StereoView]:
     return [view for place, view in enumerate(ring) if 0 < abs(place - index) <= 2]
 
 
-def swept(ring: list[StereoView], index: int) -> Surface:
+def swept(ring: list[StereoView], index: int) -> DepthEstimate:
     """What planes find in a view."""
-    return Surface(ring[index].camera, plane_sweep(ring[index], around(ring, index), [LEVEL], MatchSettings()))
+    return DepthEstimate(
+        ring[index].camera, plane_sweep(ring[index], around(ring, index), [LEVEL], MatchSettings())
+    )

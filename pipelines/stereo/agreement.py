@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.core.types import FloatArray, IntArray
-from pipelines.stereo.sweep import Float32Array, StereoCamera, SweepResult
+from pipelines.core.types import Float32Array, FloatArray, IntArray
+from pipelines.stereo.sweep import StereoCamera, SweepResult
 
 
 @dataclass(frozen=True)
-class Surface:
+class DepthEstimate:
     """The surface that a sweep found in a view."""
 
     camera: StereoCamera
@@ -44,7 +44,9 @@ class AgreementSettings:
     rim: float = 0.01
 
 
-def agreed_depth(reference: Surface, others: list[Surface], settings: AgreementSettings) -> Float32Array:
+def agreed_depth(
+    reference: DepthEstimate, others: list[DepthEstimate], settings: AgreementSettings
+) -> Float32Array:
     """Depth (H, W) along the optical axis of `reference`, the mean of the views that agree; 0 where too few do.
 
     A point of the reference is looked up in each other view. The difference is taken along the normal of the plane
@@ -98,7 +100,7 @@ class _Seen:
     through: IntArray
 
 
-def _look_up(point: FloatArray, other: Surface, settings: AgreementSettings) -> _Seen:
+def _look_up(point: FloatArray, other: DepthEstimate, settings: AgreementSettings) -> _Seen:
     """Points (P, 3) in another view."""
     camera, normals = other.camera.pinhole, other.sweep.normals
     in_cam = (point - other.camera.center_in_world) @ other.camera.cam_from_world.T

@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from pipelines.core.types import FloatArray
-from pipelines.stereo.agreement import Surface
-from pipelines.stereo.matching import UNSEEN, Float32Array, Matcher, MatchSettings, Peak
+from pipelines.core.types import Float32Array, FloatArray
+from pipelines.stereo.agreement import DepthEstimate
+from pipelines.stereo.matching import UNSEEN, Matcher, MatchSettings, Peak
 from pipelines.stereo.sweep import NormalMap, StereoCamera, StereoView, SweepResult, calibration, sweep_result
 
 _REACH = 4  # steps on either side of the guess
@@ -39,17 +39,17 @@ class Guess:
     step_m: Float32Array
 
 
-def guess_from(surface: Surface, agreed: Float32Array, camera: StereoCamera) -> Guess:
+def guess_from(estimate: DepthEstimate, agreed: Float32Array, camera: StereoCamera) -> Guess:
     """What views agree on (H, W), and elsewhere what the view itself found, at the pixels of a finer camera."""
-    normals, own = surface.sweep.normals, surface.depth()
+    normals, own = estimate.sweep.normals, estimate.depth()
     own = np.where(np.isfinite(own) & (own > 0), own, 0).astype(np.float32)
     own = np.asarray(cv2.medianBlur(own, _SPECKLE_PX), np.float32)
-    offset = normals.offset(surface.camera, np.where(agreed > 0, agreed, own))
+    offset = normals.offset(estimate.camera, np.where(agreed > 0, agreed, own))
     size = (camera.pinhole.width, camera.pinhole.height)
     finer = [
         # Between roof and ground is nothing that an interpolated offset could mean.
         cv2.resize(image, size, interpolation=cv2.INTER_NEAREST)
-        for image in (normals.index, offset.astype(np.float32), surface.sweep.step_m / np.float32(_STEPS))
+        for image in (normals.index, offset.astype(np.float32), estimate.sweep.step_m / np.float32(_STEPS))
     ]
     which = np.asarray(finer[0], np.uint8)
     return Guess(

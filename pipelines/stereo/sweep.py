@@ -14,9 +14,9 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from pipelines.core.types import BoolArray, ByteArray, FloatArray
+from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray
 from pipelines.geometry.cameras import Pinhole
-from pipelines.stereo.matching import UNSEEN, Float32Array, Found, Matcher, MatchSettings, Peak
+from pipelines.stereo.matching import UNSEEN, Found, Matcher, MatchSettings, Peak
 
 _ROWS = 8  # strips begin and end at multiples of so many
 _CLEARLY = 0.05  # of the score: by so much other planes must fit better than the first

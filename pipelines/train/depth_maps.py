@@ -14,12 +14,12 @@ import cv2
 import numpy as np
 
 from pipelines.core.progress import SILENT, Progress
-from pipelines.core.types import ByteArray
+from pipelines.core.types import ByteArray, Float32Array
 from pipelines.geometry.cameras import Pinhole
 from pipelines.scene.photographs import ImageCache, save_array
 from pipelines.scene.scene import Scene
-from pipelines.stereo.agreement import AgreementSettings, Surface, agreed_depth, without_rims
-from pipelines.stereo.matching import UNSEEN, Float32Array, MatchSettings
+from pipelines.stereo.agreement import AgreementSettings, DepthEstimate, agreed_depth, without_rims
+from pipelines.stereo.matching import UNSEEN, MatchSettings
 from pipelines.stereo.neighbours import Sightings, best_neighbours, planes_for
 from pipelines.stereo.refinement import guess_from, refine
 from pipelines.stereo.sweep import NormalMap, Planes, StereoCamera, StereoView, SweepResult, plane_sweep
@@ -126,7 +126,7 @@ class DepthMaps:
             return np.zeros((self.camera(index).height, self.camera(index).width), dtype=np.float32)
         return self._agreed(own, index, "fine")
 
-    def _agreed(self, own: Surface, index: int, kind: str) -> Float32Array:
+    def _agreed(self, own: DepthEstimate, index: int, kind: str) -> Float32Array:
         """Depths (H, W) that views agree on, 0 elsewhere."""
         others, options = [self._surface(j, kind) for j in self._neighbours(index)], self._options
         depth = agreed_depth(own, [other for other in others if other is not None], options.agreement)
@@ -134,14 +134,14 @@ class DepthMaps:
         window_px = options.matching.window_px * own.camera.pinhole.width / self._coarse(index).width
         return without_rims(depth, int(window_px / 2), options.agreement.rim)
 
-    def _surface(self, index: int, kind: str) -> Surface | None:
+    def _surface(self, index: int, kind: str) -> DepthEstimate | None:
         sweeps = self._planes(index)
         if not sweeps:
             return None
         pinhole = self._coarse(index) if kind == "coarse" else self.camera(index)
         which, *rest = np.load(self._path(index, kind), mmap_mode="r", allow_pickle=False)
         normals = NormalMap(np.stack([planes.normal_in_world for planes in sweeps]), which.astype(np.uint8))
-        return Surface(self._camera(pinhole, index), SweepResult(normals, *rest))
+        return DepthEstimate(self._camera(pinhole, index), SweepResult(normals, *rest))
 
     def _find_planes(self, index: int) -> list[Planes]:
         others = self._neighbours(index)

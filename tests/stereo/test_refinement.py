@@ -6,9 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
+from pipelines.core.types import Float32Array
 from pipelines.geometry.cameras import Pinhole
-from pipelines.stereo.agreement import AgreementSettings, Surface, agreed_depth
-from pipelines.stereo.matching import UNSEEN, Float32Array, MatchSettings
+from pipelines.stereo.agreement import AgreementSettings, DepthEstimate, agreed_depth
+from pipelines.stereo.matching import UNSEEN, MatchSettings
 from pipelines.stereo.refinement import Guess, guess_from, refine
 from pipelines.stereo.sweep import NormalMap, StereoCamera, StereoView, plane_sweep
 from pipelines.train.depth_maps import StereoOptions
@@ -38,7 +39,7 @@ def fine() -> list[StereoView]:
 
 
 @pytest.fixture(scope="module")
-def coarse() -> list[Surface]:
+def coarse() -> list[DepthEstimate]:
     ring = ring_of_views()
     return [swept(ring, index) for index in range(5)]
 
@@ -81,7 +82,9 @@ def test_a_guess_out_of_reach_has_no_score(fine: list[StereoView]) -> None:
     assert (found.score[INNER] == UNSEEN).any()
 
 
-def test_the_ground_beside_a_roof_is_not_taken_for_roof(fine: list[StereoView], coarse: list[Surface]) -> None:
+def test_the_ground_beside_a_roof_is_not_taken_for_roof(
+    fine: list[StereoView], coarse: list[DepthEstimate]
+) -> None:
     """As a sweep of planes does on the same fine pixels."""
     camera = fine[2].camera
     depth = true_depth(camera)
@@ -133,7 +136,7 @@ def test_small_windows_leave_the_foot_of_a_wall_where_it_is() -> None:
     assert wrong[0] < 0.8 * wrong[1]
 
 
-def test_guesses_are_what_views_agree_on(fine: list[StereoView], coarse: list[Surface]) -> None:
+def test_guesses_are_what_views_agree_on(fine: list[StereoView], coarse: list[DepthEstimate]) -> None:
     own = coarse[2]
     agreed = np.zeros((CAMERA.height, CAMERA.width), np.float32)
     agreed[10:20, 10:20] = facing_up().depth(own.camera, np.full(agreed.shape, 7.0, np.float32))[10:20, 10:20]
@@ -147,8 +150,8 @@ def test_guesses_are_what_views_agree_on(fine: list[StereoView], coarse: list[Su
     np.testing.assert_allclose(found.step_m, 0.5 / 3, rtol=1e-6)  # a third of that of the sweep
 
 
-def test_pixels_that_nothing_fits_find_nothing(fine: list[StereoView], coarse: list[Surface]) -> None:
-    empty = Surface(coarse[2].camera, plane_sweep(*_nothing_to_see(), [LEVEL], MatchSettings()))
+def test_pixels_that_nothing_fits_find_nothing(fine: list[StereoView], coarse: list[DepthEstimate]) -> None:
+    empty = DepthEstimate(coarse[2].camera, plane_sweep(*_nothing_to_see(), [LEVEL], MatchSettings()))
     assert np.isnan(empty.sweep.offset_m).all()
     guess = guess_from(empty, np.zeros((CAMERA.height, CAMERA.width), np.float32), fine[2].camera)
     assert np.isfinite(guess.offset_m).all()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipelines.stereo.agreement import AgreementSettings, Surface, agreed_depth
+from pipelines.stereo.agreement import AgreementSettings, DepthEstimate, agreed_depth
 from pipelines.stereo.matching import MatchSettings
 from pipelines.stereo.neighbours import Sightings, best_neighbours, planes_for
 from pipelines.stereo.sweep import Planes, StereoCamera, StereoView, SweepResult, plane_sweep
@@ -61,12 +61,12 @@ def test_a_place_that_views_look_through_is_no_surface(ring: list[StereoView]) -
     """Two views that err alike, as beside a roof, against two that see the ground behind."""
     raised = (slice(20, 40), slice(20, 40))
 
-    def flat(index: int, height_m: float) -> Surface:
+    def flat(index: int, height_m: float) -> DepthEstimate:
         camera = ring[index].camera
         offset = np.zeros((CAMERA.height, CAMERA.width), np.float32)
         offset[raised] = height_m
         one = np.ones_like(offset)
-        return Surface(camera, SweepResult(facing_up(), offset, one, 0.5 * one, one))
+        return DepthEstimate(camera, SweepResult(facing_up(), offset, one, 0.5 * one, one))
 
     own, alike, clear = flat(2, 4.0), [flat(2, 4.0), flat(2, 4.0)], [flat(2, 0.0), flat(2, 0.0)]
     assert (agreed_depth(own, alike, AgreementSettings())[raised] > 0).all()
@@ -171,7 +171,7 @@ def test_walls_are_found_on_upright_planes(wall: tuple[StereoView, list[StereoVi
     inner = np.s_[10:-10, 10:-10]
     wrong = []
     for sweeps in ([flat], [flat, upright(reference)]):
-        found = Surface(reference.camera, plane_sweep(reference, others, sweeps, MatchSettings()))
+        found = DepthEstimate(reference.camera, plane_sweep(reference, others, sweeps, MatchSettings()))
         wrong.append((np.abs(found.depth() - truth)[inner] > 0.5).mean())
     assert wrong[1] < 0.5 * wrong[0]
     assert wrong[1] < 0.15
@@ -183,7 +183,7 @@ def test_only_the_rows_that_may_show_the_scene_are_compared(
     reference, others, truth = wall
     heights = (-4.0, 3.0)
     whole, part = (
-        Surface(reference.camera, plane_sweep(reference, others, [planes], MatchSettings()))
+        DepthEstimate(reference.camera, plane_sweep(reference, others, [planes], MatchSettings()))
         for planes in (upright(reference), upright(reference, heights))
     )
 
