@@ -25,7 +25,7 @@ _LEAST_PLANES, _MOST_PLANES = 16, 256
 
 
 @dataclass(frozen=True)
-class Sightings:
+class PointVisibility:
     """Which of N points is seen in which of n views.
 
     Attributes:
@@ -39,25 +39,25 @@ class Sightings:
     obs_point: IntArray
     obs_view: IntArray
 
-    def seen_by(self, view: int) -> IntArray:
+    def points_in_view(self, view: int) -> IntArray:
         """Points that a view sees."""
         return np.unique(self.obs_point[self.obs_view == view])
 
 
-def best_neighbours(sightings: Sightings, view: int, among: IntArray, count: int) -> list[int]:
+def best_neighbours(visibility: PointVisibility, view: int, among: IntArray, count: int) -> list[int]:
     """The views that share most points with `view` under good angles, best first; at most `count`."""
-    seen = sightings.seen_by(view)
+    seen = visibility.points_in_view(view)
     seen = seen[np.linspace(0, len(seen) - 1, min(len(seen), _MOST_POINTS)).astype(np.int64)]
-    rows = np.isin(sightings.obs_point, seen) & np.isin(sightings.obs_view, among) & (sightings.obs_view != view)
-    point, other = sightings.obs_point[rows], sightings.obs_view[rows]
-    here = sightings.point_in_world[point] - sightings.center_in_world[view]
-    there = sightings.point_in_world[point] - sightings.center_in_world[other]
-    cosine = (here * there).sum(axis=1) / np.maximum(
-        np.linalg.norm(here, axis=1) * np.linalg.norm(there, axis=1), 1e-12
+    rows = np.isin(visibility.obs_point, seen) & np.isin(visibility.obs_view, among) & (visibility.obs_view != view)
+    point, other = visibility.obs_point[rows], visibility.obs_view[rows]
+    from_view = visibility.point_in_world[point] - visibility.center_in_world[view]
+    from_other = visibility.point_in_world[point] - visibility.center_in_world[other]
+    cosine = (from_view * from_other).sum(axis=1) / np.maximum(
+        np.linalg.norm(from_view, axis=1) * np.linalg.norm(from_other, axis=1), 1e-12
     )
     away = np.degrees(np.arccos(np.clip(cosine, -1, 1))) - _BEST_ANGLE_DEG
     sigma = np.where(away < 0, _SIGMA_BELOW_DEG, _SIGMA_ABOVE_DEG)
-    worth = np.bincount(other, np.exp(-0.5 * (away / sigma) ** 2), minlength=len(sightings.center_in_world))
+    worth = np.bincount(other, np.exp(-0.5 * (away / sigma) ** 2), minlength=len(visibility.center_in_world))
     worth[np.bincount(other, minlength=len(worth)) < _LEAST_SHARED] = 0
     order = np.argsort(-worth, kind="stable")[:count]
     return [int(index) for index in order if worth[index] > 0]
@@ -75,15 +75,15 @@ def planes_for(view: StereoCamera, neighbours: list[StereoCamera], points: Float
     ahead = axis * [1.0, 1.0, 0.0]
     forward = float(np.linalg.norm(ahead))
     if -axis[2] <= _LEVEL:
-        found = [_planes_across(view, neighbours, points, axis)]
+        candidates = [_planes_across(view, neighbours, points, axis)]
     elif forward <= _LEVEL:  # from straight above walls are not seen
-        found = [_level_planes(view, neighbours, points)]
+        candidates = [_level_planes(view, neighbours, points)]
     else:
-        found = [
+        candidates = [
             _level_planes(view, neighbours, points),
             _planes_across(view, neighbours, points, ahead / forward, height_m=_range(points @ _UP)),
         ]
-    return [planes for planes in found if planes is not None]
+    return [planes for planes in candidates if planes is not None]
 
 
 def _level_planes(view: StereoCamera, neighbours: list[StereoCamera], points: FloatArray) -> Planes | None:

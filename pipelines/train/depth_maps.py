@@ -20,7 +20,7 @@ from pipelines.scene.photographs import ImageCache, save_array
 from pipelines.scene.scene import Scene
 from pipelines.stereo.agreement import AgreementSettings, DepthEstimate, agreed_depth, without_rims
 from pipelines.stereo.matching import UNSEEN, MatchSettings
-from pipelines.stereo.neighbours import Sightings, best_neighbours, planes_for
+from pipelines.stereo.neighbours import PointVisibility, best_neighbours, planes_for
 from pipelines.stereo.refinement import guess_from, refine
 from pipelines.stereo.sweep import NormalMap, Planes, StereoCamera, StereoView, SweepResult, plane_sweep
 
@@ -68,7 +68,7 @@ class DepthMaps:
         self.scene, self.images = scene, images
         self._options = options or StereoOptions()
         sparse = scene.sparse
-        self._sightings = Sightings(
+        self._visibility = PointVisibility(
             scene.point_in_model, scene.poses.cam_center_in_model, sparse.obs_point, sparse.obs_image
         )
         # Asked for again by each of a view's neighbours, and the same each time.
@@ -147,12 +147,12 @@ class DepthMaps:
         others = self._neighbours(index)
         if not others:
             return []
-        points = self.scene.point_in_model[self._sightings.seen_by(index)]
+        points = self.scene.point_in_model[self._visibility.points_in_view(index)]
         cameras = [self._camera(self._coarse(j), j) for j in others]
         return planes_for(self._camera(self._coarse(index), index), cameras, points)
 
     def _find_neighbours(self, index: int) -> list[int]:
-        return best_neighbours(self._sightings, index, self.scene.train, self._options.neighbours)
+        return best_neighbours(self._visibility, index, self.scene.train, self._options.neighbours)
 
     def _coarse(self, index: int) -> Pinhole:
         return self.images.pinhole(index).limited(self._options.coarse_px)

@@ -7,7 +7,7 @@ import pytest
 
 from pipelines.stereo.agreement import AgreementSettings, DepthEstimate, agreed_depth
 from pipelines.stereo.matching import MatchSettings
-from pipelines.stereo.neighbours import Sightings, best_neighbours, planes_for
+from pipelines.stereo.neighbours import PointVisibility, best_neighbours, planes_for
 from pipelines.stereo.sweep import Planes, StereoCamera, StereoView, SweepResult, plane_sweep
 from tests.stereo_scenes import (
     CAMERA,
@@ -100,15 +100,15 @@ def grid_points() -> np.ndarray:
 def test_neighbours_are_those_under_good_angles(ring: list[StereoView]) -> None:
     points = grid_points()
     count = len(points)
-    sightings = Sightings(
+    visibility = PointVisibility(
         points,
         np.array([view.camera.center_in_world for view in ring]),
         np.tile(np.arange(count), len(ring)),
         np.repeat(np.arange(len(ring)), count),
     )
-    found = best_neighbours(sightings, 2, np.arange(len(ring)), 2)
+    found = best_neighbours(visibility, 2, np.arange(len(ring)), 2)
     assert set(found) == {1, 3}  # 13° and less from the scene; the next ones are at 26°
-    assert 5 not in best_neighbours(sightings, 2, np.array([0, 1, 3, 4]), 9)
+    assert 5 not in best_neighbours(visibility, 2, np.array([0, 1, 3, 4]), 9)
 
 
 def test_planes_follow_the_view(ring: list[StereoView]) -> None:
