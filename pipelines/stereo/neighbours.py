@@ -1,4 +1,4 @@
-"""Which views to compare with which, and on which planes, from the SfM points that they share."""
+"""Choice of the views and planes to compare a view with, from the SfM points that views share."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import numpy as np
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.stereo.sweep import Planes, StereoCamera
 
-# Smaller angles give no depth, larger ones another picture of the same place (after Yao et al.,
-# doi 10.1007/978-3-030-01237-3_47, section 4.1, for the wider angles of flights).
+# Smaller angles give no depth, larger angles another picture of the same place. After Yao et al.,
+# doi 10.1007/978-3-030-01237-3_47, section 4.1, adapted to the wider angles of flights.
 _BEST_ANGLE_DEG, _SIGMA_BELOW_DEG, _SIGMA_ABOVE_DEG = 12.0, 4.0, 10.0
-_MOST_POINTS = 400  # of a view, to judge by
+_MOST_POINTS = 400  # of a view
 _LEAST_SHARED = 5
 
 _UP = np.array([0.0, 0.0, 1.0])
-_LEVEL = np.sin(np.radians(15.0))  # a view that looks down less than this sees walls rather than ground
+_LEVEL = np.sin(np.radians(15.0))  # a view that looks down by less sees walls rather than ground
 _NEAREST = 0.3  # of the distance of most points
 _RANGE = (0.5, 99.5)  # percentiles of the points
 _MARGIN = 0.25  # of their range, on either side: ground without texture has no points
@@ -26,7 +26,7 @@ _LEAST_PLANES, _MOST_PLANES = 16, 256
 
 @dataclass(frozen=True)
 class PointVisibility:
-    """Which of N points is seen in which of n views.
+    """Observations of N points in n views.
 
     Attributes:
         point_in_world: (N, 3) metres.
@@ -40,12 +40,19 @@ class PointVisibility:
     obs_view: IntArray
 
     def points_in_view(self, view: int) -> IntArray:
-        """Points that a view sees."""
+        """Return ascending indices of the points that a view sees."""
         return np.unique(self.obs_point[self.obs_view == view])
 
 
 def best_neighbours(visibility: PointVisibility, view: int, among: IntArray, count: int) -> list[int]:
-    """The views that share most points with `view` under good angles, best first; at most `count`."""
+    """Return at most `count` views that share most points with `view` under good angles, best first.
+
+    Args:
+        visibility: of the SfM points.
+        view: index of the view.
+        among: indices of the views to choose from.
+        count: most views.
+    """
     seen = visibility.points_in_view(view)
     seen = seen[np.linspace(0, len(seen) - 1, min(len(seen), _MOST_POINTS)).astype(np.int64)]
     rows = np.isin(visibility.obs_point, seen) & np.isin(visibility.obs_view, among) & (visibility.obs_view != view)
@@ -64,10 +71,10 @@ def best_neighbours(visibility: PointVisibility, view: int, among: IntArray, cou
 
 
 def planes_for(view: StereoCamera, neighbours: list[StereoCamera], points: FloatArray) -> list[Planes]:
-    """Planes through points (P, 3) that the view sees, by direction; none where the points are too few.
+    """Return planes through points (P, 3) that the view sees, by direction; none if the points are too few.
 
-    Level ones suit ground and roofs, upright ones across the view the walls. A view that hardly looks down needs
-    planes across its axis alone.
+    Level planes suit ground and roofs; upright planes across the view suit walls. A view that hardly looks down
+    needs planes across its axis alone.
     """
     if len(points) < _LEAST_SHARED:
         return []
@@ -100,7 +107,7 @@ def _planes_across(
     normal: FloatArray,
     height_m: tuple[float, float] = (-np.inf, np.inf),
 ) -> Planes | None:
-    """Planes at distances whose inverses are evenly spaced, as pixels have it."""
+    """Return planes at distances with evenly spaced inverses, which are evenly spaced in pixels."""
     away = points @ normal - normal @ view.center_in_world
     low, high = _range(away)
     low = max(low, _NEAREST * float(np.median(away)))
@@ -120,7 +127,7 @@ def _range(along: FloatArray) -> tuple[float, float]:
 def _count(
     view: StereoCamera, neighbours: list[StereoCamera], points: FloatArray, normal: FloatArray, range_m: float
 ) -> int:
-    """How many planes are a step apart in the neighbours."""
+    """Return the number of planes that lie `_STEP_PX` apart in the neighbours."""
     middle = points[np.argsort(points @ normal)[len(points) // 2]]
     step = _STEP_PX / max(_pixels_a_metre(view, neighbours, middle, normal), 1e-9)
     return int(np.clip(np.ceil(range_m / step), _LEAST_PLANES, _MOST_PLANES))
@@ -129,7 +136,7 @@ def _count(
 def _pixels_a_metre(
     view: StereoCamera, neighbours: list[StereoCamera], point: FloatArray, normal: FloatArray
 ) -> float:
-    """How fast the neighbours see a point move that moves along the ray of `view`, by a metre of its plane."""
+    """Return the pixels by which a point moves in the neighbours (median) if its plane moves by a metre."""
     ray = point - view.center_in_world
     ray = ray / max(abs(float(normal @ ray)), 1e-9)
     speeds = []

@@ -21,7 +21,7 @@ from pipelines.scene.scene import Scene
 from pipelines.stereo.agreement import AgreementSettings, DepthEstimate, agreed_depth, without_rims
 from pipelines.stereo.matching import UNSEEN, MatchSettings
 from pipelines.stereo.neighbours import PointVisibility, best_neighbours, planes_for
-from pipelines.stereo.refinement import guess_from, refine
+from pipelines.stereo.refinement import refine, surface_prior
 from pipelines.stereo.sweep import NormalMap, Planes, StereoCamera, StereoView, SweepResult, plane_sweep
 
 # Of what is kept: other forms have other folders.
@@ -116,9 +116,9 @@ class DepthMaps:
         if own is None:
             return _nothing(self.camera(index))
         reference = self._view(self.camera(index), index)
-        guess = guess_from(own, self._agreed(own, index, "coarse"), reference.camera)
+        prior = surface_prior(own, self._agreed(own, index, "coarse"), reference.camera)
         views = [self._view(self.camera(j), j) for j in self._neighbours(index)]
-        return _packed(refine(reference, views, guess, self._options.refining))
+        return _packed(refine(reference, views, prior, self._options.refining))
 
     def _agree(self, index: int) -> Float32Array:
         own = self._surface(index, "fine")

@@ -29,10 +29,10 @@ def test_a_plane_has_no_rims_however_steep(tilt: tuple[float, float], reach: int
 def test_the_near_side_of_a_step_is_given_up(reach: int) -> None:
     depth = plane(0.3, 0.5)
     depth[:, :20] *= 0.95  # a roof 5 m before the ground
-    found = without_rims(depth, reach, 0.01)
-    assert (found[:, 20 - reach : 20] == 0).all()
-    np.testing.assert_array_equal(found[:, : 20 - reach], depth[:, : 20 - reach])
-    np.testing.assert_array_equal(found[:, 20:], depth[:, 20:])  # what lies behind is seen beside the edge, too
+    trimmed = without_rims(depth, reach, 0.01)
+    assert (trimmed[:, 20 - reach : 20] == 0).all()
+    np.testing.assert_array_equal(trimmed[:, : 20 - reach], depth[:, : 20 - reach])
+    np.testing.assert_array_equal(trimmed[:, 20:], depth[:, 20:])  # what lies behind is seen beside the edge, too
 
 
 def test_steps_below_the_noise_and_unknown_places_are_no_rims() -> None:
