@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from pipelines.splat.contributions import Probe, ViewContributions
 from pipelines.splat.densify import Change, DefaultSettings, DefaultStrategy
-from pipelines.splat.evidence import Evidence, Probe
 from pipelines.splat.optimizer import GaussianAdam
 
 
@@ -66,21 +66,21 @@ class FastStrategy(DefaultStrategy):
             return Change()
         if probe is None:
             raise ValueError("this strategy asks training views: it needs a probe")
-        seen = probe(self.fast.views, self._generator)
-        alive = self._alive(optimizer.gaussians.detached(), iteration) & ~self._redundant(seen)
-        chosen = self._agreed(alive, seen) if adds else torch.zeros_like(alive)
+        contributions = probe(self.fast.views, self._generator)
+        alive = self._alive(optimizer.gaussians.detached(), iteration) & ~self._redundant(contributions)
+        chosen = self._agreed(alive, contributions) if adds else torch.zeros_like(alive)
         return self._edit(optimizer, alive, chosen)
 
-    def _redundant(self, seen: list[Evidence]) -> Tensor:
+    def _redundant(self, contributions: list[ViewContributions]) -> Tensor:
         """Mask of the Gaussians that views see, but that no view would miss."""
-        weight = torch.stack([view.weight_px for view in seen])
+        weight = torch.stack([view.weight_px for view in contributions])
         views = (weight > 0).sum(dim=0)
         return (views >= self.fast.least_views) & (weight.amax(dim=0) < self.fast.least_px)
 
-    def _agreed(self, alive: Tensor, seen: list[Evidence]) -> Tensor:
+    def _agreed(self, alive: Tensor, contributions: list[ViewContributions]) -> Tensor:
         """Mask of the Gaussians to clone or split; where room is short, those with the most pixels in error."""
-        error = torch.stack([view.high_error_px for view in seen])
-        views = torch.stack([view.weight_px > 0 for view in seen]).sum(dim=0)
+        error = torch.stack([view.high_error_px for view in contributions])
+        views = torch.stack([view.weight_px > 0 for view in contributions]).sum(dim=0)
         score = error.sum(dim=0) / views.clamp_min(1)
         pulled = self._mean_gradient(alive.device) >= self.settings.gradient_threshold
         return self._within_room(alive, alive & pulled & (score >= self.fast.high_error_px), score)

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from pipelines.splat.contributions import Probe
 from pipelines.splat.densify import Change
-from pipelines.splat.evidence import Probe
 from pipelines.splat.gaussians import Gaussians, rotation_matrices
 from pipelines.splat.morton import morton_order
 from pipelines.splat.optimizer import GaussianAdam

@@ -14,8 +14,8 @@ from pipelines.georef.losses import Schedule, rising_weight
 from pipelines.georef.problem import GeoProblem
 from pipelines.scene.photographs import ImageCache
 from pipelines.scene.pinholes import Pinholes
+from pipelines.splat.contributions import ViewContributions, view_contributions
 from pipelines.splat.densify import Strategy
-from pipelines.splat.evidence import Evidence, evidence
 from pipelines.splat.exposure import Exposures
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.losses import photometric_loss
@@ -167,7 +167,7 @@ class JointTrainer:
         self._note(photometric, geographic)
         self._apply(render.stats.visible)
         self.strategy.observe(render.stats, target.camera)
-        self.strategy.update(self.iteration, self.optimizer, self.evidence)
+        self.strategy.update(self.iteration, self.optimizer, self.sample_contributions)
         return StepReport(
             photometric.detach(),
             _mean_square(colour, target),
@@ -177,8 +177,8 @@ class JointTrainer:
         )
 
     @torch.no_grad()
-    def evidence(self, count: int, generator: torch.Generator) -> list[Evidence]:
-        """What `count` different training views say of the Gaussians; see `splat.evidence.Probe`."""
+    def sample_contributions(self, count: int, generator: torch.Generator) -> list[ViewContributions]:
+        """Return the contributions to `count` different training views; see `splat.contributions.Probe`."""
         found = []
         for place in torch.randperm(len(self.views.camera), generator=generator)[:count].tolist():
             index = int(self.views.camera[place])
@@ -189,9 +189,9 @@ class JointTrainer:
                 colour = self.exposures.apply(index, colour)
             error = (colour - target.colour).abs().mean(dim=-1)
             error = error if target.mask is None else error * target.mask
-            seen = evidence(self.optimizer.gaussians, pose, target.camera, error, self.rasterizer)
+            seen = view_contributions(self.optimizer.gaussians, pose, target.camera, error, self.rasterizer)
             # Strategies count pixels of the photographs, whatever the schedule makes of them.
-            found.append(Evidence(shrink**2 * seen.weight_px, shrink**2 * seen.high_error_px))
+            found.append(ViewContributions(shrink**2 * seen.weight_px, shrink**2 * seen.high_error_px))
         return found
 
     def pinhole(self, index: int) -> Pinhole:

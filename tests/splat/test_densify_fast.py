@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
+from pipelines.splat.contributions import Probe, ViewContributions, view_contributions
 from pipelines.splat.densify import Change, DefaultSettings
 from pipelines.splat.densify_fast import FastSettings, FastStrategy
-from pipelines.splat.evidence import Evidence, Probe, evidence
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.optimizer import GaussianAdam
 from pipelines.splat.rasterizer.api import RasterSettings, ScreenStats
@@ -28,9 +28,9 @@ def setup(count: int = 4) -> tuple[GaussianAdam, FastStrategy]:
 
 
 def probe(*views: tuple[list[float], list[float]]) -> Probe:
-    def look(count: int, generator: torch.Generator) -> list[Evidence]:
+    def look(count: int, generator: torch.Generator) -> list[ViewContributions]:
         assert count == FAST.views
-        return [Evidence(torch.tensor(weight), torch.tensor(error)) for weight, error in views]
+        return [ViewContributions(torch.tensor(weight), torch.tensor(error)) for weight, error in views]
 
     return look
 
@@ -69,20 +69,20 @@ def test_it_cannot_work_without_views() -> None:
         strategy.update(10, adam)
 
 
-def test_evidence_is_what_each_gaussian_adds_to_the_pixels() -> None:
+def test_contributions_are_what_each_gaussian_adds_to_the_pixels() -> None:
     gaussians = tiny.true_gaussians(12)
     error = torch.zeros(48, 64)
     error[:, :32] = 0.5
     error[:, 32:] = 0.02  # below a tenth of the largest
-    found = evidence(gaussians, POSE, tiny.PINHOLE, error, CpuRasterizer())
+    contributions = view_contributions(gaussians, POSE, tiny.PINHOLE, error, CpuRasterizer())
 
     def alpha(part: Gaussians) -> torch.Tensor:
         return CpuRasterizer().render(part, POSE, tiny.PINHOLE, RasterSettings(sh_degree=0)).alpha
 
     # Σ over Gaussians of w is the image's alpha, and a lone Gaussian's weight is its own alpha.
     whole = alpha(gaussians)
-    assert float(found.weight_px.sum()) == pytest.approx(float(whole.sum()), rel=1e-4)
-    assert float(found.high_error_px.sum()) == pytest.approx(float(whole[:, :32].sum()), rel=1e-4)
+    assert float(contributions.weight_px.sum()) == pytest.approx(float(whole.sum()), rel=1e-4)
+    assert float(contributions.high_error_px.sum()) == pytest.approx(float(whole[:, :32].sum()), rel=1e-4)
     lone = gaussians.select(torch.tensor([3]))
-    single = evidence(lone, POSE, tiny.PINHOLE, error, CpuRasterizer())
+    single = view_contributions(lone, POSE, tiny.PINHOLE, error, CpuRasterizer())
     assert float(single.weight_px[0]) == pytest.approx(float(alpha(lone).sum()), rel=1e-4)
