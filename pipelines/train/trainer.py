@@ -17,12 +17,12 @@ from pipelines.scene.pinholes import Pinholes
 from pipelines.splat.contributions import ViewContributions, view_contributions
 from pipelines.splat.densify import Strategy
 from pipelines.splat.exposure import Exposures
+from pipelines.splat.finiteness import FinitenessMonitor
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.losses import photometric_loss
 from pipelines.splat.optimizer import GaussianAdam
 from pipelines.splat.rasterizer.api import Pinhole, Rasterizer, RasterSettings, Render
 from pipelines.splat.surface import SurfaceSettings, compactness_loss, depth_loss, flatness_loss, normal_loss
-from pipelines.splat.watch import FiniteWatch
 from pipelines.train.checkpoint import prefixed, unprefixed
 from pipelines.train.targets import Target, Targets
 
@@ -133,7 +133,7 @@ class JointTrainer:
         self._lens = np.zeros(len(problem.cameras.lens_basis))
         self._targets = Targets(views.images, self._pinholes, self.device)
         names = ("photometric loss", "geographic loss", *(f"gradient of {name}" for name in self._watched()))
-        self._watch = FiniteWatch(names, self.device)
+        self._watch = FinitenessMonitor(names, self.device)
         rates = {
             "y": options.similarity_rate,
             "z": options.camera_rate,
