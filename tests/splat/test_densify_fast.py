@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from pipelines.splat.contributions import Probe, ViewContributions, view_contributions
-from pipelines.splat.densify import Change, DefaultSettings
+from pipelines.splat.densify import DefaultSettings, DensityEdit
 from pipelines.splat.densify_fast import FastSettings, FastStrategy
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.optimizer import GaussianAdam
@@ -43,7 +43,7 @@ def test_only_what_views_agree_to_be_wrong_is_added_to() -> None:
     adam, strategy = setup()
     # All four are pulled. 0 is wrong in both views, 1 in one of two, 2 in the only one that sees it, 3 in none.
     seen = probe(([9.0, 9.0, 0.0, 9.0], [1.2, 1.8, 0.0, 0.1]), ([9.0, 9.0, 9.0, 9.0], [1.2, 0.0, 1.1, 0.1]))
-    assert strategy.update(10, adam, seen) == Change(cloned=2)
+    assert strategy.update(10, adam, seen) == DensityEdit(cloned=2)
     assert labels(adam) == [0, 0, 1, 2, 2, 3]
 
 
@@ -51,16 +51,16 @@ def test_what_no_view_would_miss_goes_if_enough_views_saw_it() -> None:
     adam, strategy = setup()
     # 0 is needed by one view, 1 by none of two, 2 was hardly seen by one alone, 3 was not seen.
     seen = probe(([0.1, 0.4, 0.2, 0.0], [0.0] * 4), ([2.0, 0.4, 0.0, 0.0], [0.0] * 4))
-    assert strategy.update(10, adam, seen) == Change(pruned=1)
+    assert strategy.update(10, adam, seen) == DensityEdit(pruned=1)
     assert labels(adam) == [0, 2, 3]
 
 
 def test_after_the_last_addition_it_only_removes() -> None:
     adam, strategy = setup()
     seen = probe(([9.0, 0.1, 9.0, 9.0], [9.0] * 4), ([9.0, 0.1, 9.0, 9.0], [9.0] * 4))
-    assert strategy.update(70, adam, seen) == Change()
-    assert strategy.update(80, adam, seen) == Change(pruned=1)
-    assert strategy.update(120, adam, seen) == Change()
+    assert strategy.update(70, adam, seen) == DensityEdit()
+    assert strategy.update(80, adam, seen) == DensityEdit(pruned=1)
+    assert strategy.update(120, adam, seen) == DensityEdit()
 
 
 def test_it_cannot_work_without_views() -> None:

@@ -130,9 +130,9 @@ def test_depth_is_held_firmly_where_it_is_nearly_right() -> None:
 def haze(apart_m: float) -> Gaussians:
     """Two walls that half hide what is behind them, and an opaque third, about 5 m ahead."""
     walls = [wall(0.0) for _ in range(3)]
-    for place, each in enumerate(walls):
-        each.means[:, 2] += (place - 1) * apart_m
-        each.logit_opacities[:] = -1.5 if place < 2 else 3.0
+    for place, layer in enumerate(walls):
+        layer.means[:, 2] += (place - 1) * apart_m
+        layer.logit_opacities[:] = -1.5 if place < 2 else 3.0
     return Gaussians.concatenate(walls)
 
 
