@@ -66,9 +66,9 @@ class StandIn:
         self, start, end, transmittances, means2d, conics, opacities, width, height, tile_size, offsets, order
     ):
         assert start == 0 and end > 1_000_000 and transmittances.shape == (1, height, width)
-        found = []
+        intersections = []
         for pixel in range(width * height):
-            left = 1.0
+            transmittance = 1.0
             for index in order.tolist():
                 dx, dy = means2d[0, index] - torch.tensor([pixel % width + 0.5, pixel // width + 0.5])
                 a, b, c = conics[0, index]
@@ -78,11 +78,11 @@ class StandIn:
                 )
                 if alpha < ALPHA_MIN:
                     continue
-                left *= 1 - alpha
-                if left <= TRANSMITTANCE_MIN:
+                transmittance *= 1 - alpha
+                if transmittance <= TRANSMITTANCE_MIN:
                     break
-                found.append((index, pixel))
-        gaussian, pixel = torch.tensor(found).T
+                intersections.append((index, pixel))
+        gaussian, pixel = torch.tensor(intersections).T
         return gaussian, pixel, torch.zeros_like(pixel)
 
 

@@ -18,7 +18,7 @@ RENDERERS = pytest.mark.parametrize("render", [CpuRasterizer().render, render_re
 
 
 def disc(center, tilt_rad, sigma_m, *, opacity=0.95):
-    """One flat Gaussian, turned by `tilt_rad` about the camera's x axis from facing it."""
+    """Return a flat Gaussian that faces the camera, turned by `tilt_rad` about the camera's x axis."""
     quat = [math.cos(tilt_rad / 2), math.sin(tilt_rad / 2), 0.0, 0.0]
     return Gaussians(
         means=torch.tensor([center], dtype=torch.float64),
@@ -30,7 +30,7 @@ def disc(center, tilt_rad, sigma_m, *, opacity=0.95):
 
 
 def rays():
-    """(H, W, 3) directions through the pixel centres, z = 1."""
+    """Return directions (H, W, 3) through the pixel centres, z = 1."""
     v, u = torch.meshgrid(
         torch.arange(CAMERA.height, dtype=torch.float64) + 0.5,
         torch.arange(CAMERA.width, dtype=torch.float64) + 0.5,
