@@ -38,7 +38,7 @@ class FlightPlan:
 
 
 @dataclass(frozen=True)
-class Track:
+class TrueTrajectory:
     """The true motion. Times are seconds of the camera's clock since the first photograph.
 
     Attributes:
@@ -68,7 +68,9 @@ class Track:
         return np.asarray(self.geo_from_nominal_cam(time_s) @ self.cam_from_body)
 
 
-def fly(plan: FlightPlan, complex_m: tuple[float, float], axes: FloatArray, rng: np.random.Generator) -> Track:
+def make_trajectory(
+    plan: FlightPlan, complex_m: tuple[float, float], axes: FloatArray, rng: np.random.Generator
+) -> TrueTrajectory:
     """Plan a flight over a scene.
 
     Args:
@@ -88,7 +90,7 @@ def fly(plan: FlightPlan, complex_m: tuple[float, float], axes: FloatArray, rng:
     angles = angles + wobble
     angles[:, 0] = np.degrees(np.unwrap(np.radians(angles[:, 0])))
     times = index * (plan.interval_s or _unhurried_s(positions))
-    return Track(
+    return TrueTrajectory(
         times[1:-1].astype(np.float64),
         # The mount tilts the camera as the flight needs, so that the body itself flies level.
         geo_from_cam([0.0, pitch, 0.0]).T @ ENU_FROM_NED,

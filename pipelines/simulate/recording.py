@@ -73,8 +73,8 @@ def record(config: SimulateOptions, world: World, raycaster: Raycaster, seed: np
     """Run the sensors over the flight and mark the targets in the photographs."""
     gnss_seed, imu_seed, mark_seed = seed.spawn(3)
     receiver = receiver_of(config)
-    gnss = record_gnss(world.track, world.mounting, receiver, np.random.default_rng(gnss_seed))
-    imu = record_imu(world.track, world.mounting, config.sigma_attitude, np.random.default_rng(imu_seed))
+    gnss = record_gnss(world.trajectory, world.mounting, receiver, np.random.default_rng(gnss_seed))
+    imu = record_imu(world.trajectory, world.mounting, config.sigma_attitude, np.random.default_rng(imu_seed))
     photos, body_angles = _photo_records(world, receiver, gnss, imu)
     targets = _mark(config, world, photos.names, raycaster, np.random.default_rng(mark_seed))
     truth = _truth(config, world, gnss, photos)
@@ -85,7 +85,7 @@ def record(config: SimulateOptions, world: World, raycaster: Raycaster, seed: np
         gnss=gnss,
         gnss_lla=lla_from_enu(gnss.position_in_geo, world.origin),
         imu=imu,
-        imu_in_geo=world.track.position(imu_time_s),
+        imu_in_geo=world.trajectory.position(imu_time_s),
         control=tuple(surveyed for true, surveyed in targets if true.role == "control"),
         check=tuple(surveyed for true, surveyed in targets if true.role == "check"),
         truth=truth.model_copy(update={"targets": tuple(true for true, _ in targets)}),
@@ -94,10 +94,10 @@ def record(config: SimulateOptions, world: World, raycaster: Raycaster, seed: np
 
 def _photo_records(world: World, receiver: Receiver, gnss: GnssLog, imu: ImuLog) -> tuple[PhotoRecords, FloatArray]:
     """Fix and attitude at each photograph's stamp, as a user reads them off the logs."""
-    stamps = photo_stamps(world.track)
+    stamps = photo_stamps(world.trajectory)
     fixes = fixes_at(gnss, stamps)
     enu_from_body = against_local_north(attitudes_at(imu, stamps), fixes, world.origin)
-    angles = yaw_pitch_roll_deg(enu_from_body @ world.track.cam_from_body.T)
+    angles = yaw_pitch_roll_deg(enu_from_body @ world.trajectory.cam_from_body.T)
     # The aircraft's angles are those of a camera that looks along its nose.
     level_cam_from_body = geo_from_cam([0.0, 0.0, 0.0]).T @ ENU_FROM_NED
     body_angles = yaw_pitch_roll_deg(enu_from_body @ level_cam_from_body.T)
@@ -174,7 +174,7 @@ def _navigation(config: SimulateOptions, world: World, gnss: GnssLog, photos: Ph
         sigma_attitude_deg=config.sigma_attitude,
         antenna_in_body_m=_vector(mounting.antenna_in_body),
         nominal_from_cam=_matrix(mounting.nominal_from_cam),
-        cam_from_body=_matrix(world.track.cam_from_body),
+        cam_from_body=_matrix(world.trajectory.cam_from_body),
         clock_offset_s=mounting.clock_offset_s,
     )
 

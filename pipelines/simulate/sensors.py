@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.geodesy.enu import Origin, geo_from_enu_at, lla_from_enu
 from pipelines.geometry.rotations import exp_so3
-from pipelines.simulate.flight import LEAD_S, Track
+from pipelines.simulate.flight import LEAD_S, TrueTrajectory
 
 START_NS = 1_700_000_000_000_000_000  # 2023-11-14 22:13:20 UTC
 GNSS_STEP_NS, IMU_STEP_NS = 100_000_000, 10_000_000
@@ -101,38 +101,40 @@ class ImuLog:
     specific_force_in_body: FloatArray
 
 
-def photo_stamps(track: Track) -> IntArray:
+def photo_stamps(trajectory: TrueTrajectory) -> IntArray:
     """Stamps (N,) of the photographs on the camera's clock."""
-    return np.asarray(START_NS + np.round(track.photo_s * 1e9).astype(np.int64))
+    return np.asarray(START_NS + np.round(trajectory.photo_s * 1e9).astype(np.int64))
 
 
-def record_gnss(track: Track, mounting: Mounting, receiver: Receiver, rng: np.random.Generator) -> GnssLog:
+def record_gnss(
+    trajectory: TrueTrajectory, mounting: Mounting, receiver: Receiver, rng: np.random.Generator
+) -> GnssLog:
     """Fixes at 10 Hz of the antenna's true time and place, with the receiver's errors."""
-    since_ns = _epochs(track, mounting, GNSS_STEP_NS)
+    since_ns = _epochs(trajectory, mounting, GNSS_STEP_NS)
     time_s = since_ns / 1e9
-    arm = track.geo_from_body(time_s) @ mounting.antenna_in_body
-    true = track.position(time_s) + arm
+    arm = trajectory.geo_from_body(time_s) @ mounting.antenna_in_body
+    true = trajectory.position(time_s) + arm
     amplitude = np.full(3, np.sqrt(2.0) * receiver.bias_m)
     phase = rng.uniform(0, 2 * np.pi, 3)
     bias = amplitude * np.sin(2 * np.pi * time_s[:, None] / receiver.bias_period_s + phase)
     white = rng.normal(size=true.shape) * [receiver.sigma_h_m, receiver.sigma_h_m, receiver.sigma_v_m]
-    count = len(track.photo_s)
+    count = len(trajectory.photo_s)
     wrong = np.sort(rng.permutation(count)[: round(receiver.outlier_share * count)])
     jumps = np.zeros((count, 3))
     jumps[wrong] = _jumps(len(wrong), receiver.outlier_m, rng)
     # A reflected signal is wrong for a while: from halfway before the photograph to halfway after it. The
     # photograph is matched by the navigation clock's stamp, as a user would who knows nothing of the offset.
     stamped_s = time_s + mounting.clock_offset_s
-    nearest = np.searchsorted((track.photo_s[1:] + track.photo_s[:-1]) / 2, stamped_s)
+    nearest = np.searchsorted((trajectory.photo_s[1:] + trajectory.photo_s[:-1]) / 2, stamped_s)
     outlier = jumps[nearest]
     stamp_ns = START_NS + since_ns + round(mounting.clock_offset_s * 1e9)
     return GnssLog(stamp_ns, true + bias + white + outlier, true, bias, outlier, amplitude, phase, wrong)
 
 
-def _epochs(track: Track, mounting: Mounting, step_ns: int) -> IntArray:
+def _epochs(trajectory: TrueTrajectory, mounting: Mounting, step_ns: int) -> IntArray:
     """Epochs (N,) in camera-clock nanoseconds since the first photograph, that cover all photographs."""
     lead_ns = round((LEAD_S + abs(mounting.clock_offset_s)) * 1e9)
-    last_ns = round(float(track.photo_s[-1]) * 1e9) + lead_ns
+    last_ns = round(float(trajectory.photo_s[-1]) * 1e9) + lead_ns
     return np.arange(-(-lead_ns // step_ns) * -step_ns, last_ns + step_ns, step_ns, dtype=np.int64)
 
 
@@ -143,15 +145,17 @@ def _jumps(count: int, size_m: float, rng: np.random.Generator) -> FloatArray:
     return np.asarray(direction * size_m * rng.uniform(0.7, 1.3, (count, 1)))
 
 
-def record_imu(track: Track, mounting: Mounting, sigma_deg: float, rng: np.random.Generator) -> ImuLog:
+def record_imu(
+    trajectory: TrueTrajectory, mounting: Mounting, sigma_deg: float, rng: np.random.Generator
+) -> ImuLog:
     """Attitude, rate and specific force at 100 Hz, with white noise on the attitude."""
-    since_ns = _epochs(track, mounting, IMU_STEP_NS)
+    since_ns = _epochs(trajectory, mounting, IMU_STEP_NS)
     time_s = since_ns / 1e9
-    true = track.geo_from_body(time_s)
+    true = trajectory.geo_from_body(time_s)
     half_s = 1e-3
-    ahead, behind = track.geo_from_body(time_s + half_s), track.geo_from_body(time_s - half_s)
+    ahead, behind = trajectory.geo_from_body(time_s + half_s), trajectory.geo_from_body(time_s - half_s)
     rate = Rotation.from_matrix(np.swapaxes(behind, 1, 2) @ ahead).as_rotvec() / (2 * half_s)
-    force = track.acceleration(time_s) + np.array([0.0, 0.0, GRAVITY_M_S2])
+    force = trajectory.acceleration(time_s) + np.array([0.0, 0.0, GRAVITY_M_S2])
     noise = exp_so3(np.radians(rng.normal(0, sigma_deg, (len(time_s), 3))))
     return ImuLog(
         START_NS + since_ns + round(mounting.clock_offset_s * 1e9),

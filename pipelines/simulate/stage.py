@@ -252,7 +252,7 @@ def _write_records(config: SimulateOptions, world: World, recording: Recording, 
     lens = world.lens
     camera = BagCamera(
         lens.width, lens.height, lens.focal_px, lens.center_px, (lens.k1, lens.k2, lens.p1, lens.p2, 0.0),
-        world.track.cam_from_body,
+        world.trajectory.cam_from_body,
     )  # fmt: skip
     flight = BagFlight(
         camera=camera,

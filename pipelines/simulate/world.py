@@ -11,7 +11,13 @@ from pipelines.core.options import triple
 from pipelines.geodesy.enu import Origin
 from pipelines.geometry.rotations import exp_so3
 from pipelines.simulate.buildings import Spot
-from pipelines.simulate.flight import DEFAULT_HEIGHTS_M, DEFAULT_RADIUS_M, FlightPlan, Track, fly
+from pipelines.simulate.flight import (
+    DEFAULT_HEIGHTS_M,
+    DEFAULT_RADIUS_M,
+    FlightPlan,
+    TrueTrajectory,
+    make_trajectory,
+)
 from pipelines.simulate.lens import Lens
 from pipelines.simulate.mesh import Material
 from pipelines.simulate.options import SimulateOptions
@@ -39,7 +45,7 @@ class World:
     spots: tuple[Spot, ...]
     target_m: float
     lens: Lens
-    track: Track
+    trajectory: TrueTrajectory
     poses: tuple[Pose, ...]
     mounting: Mounting
 
@@ -66,9 +72,9 @@ def make_world(config: SimulateOptions, seed: np.random.SeedSequence) -> World:
         config.heights or DEFAULT_HEIGHTS_M[config.flight],
         config.radius or DEFAULT_RADIUS_M[config.flight],
     )
-    track = fly(plan, bare.complex_m, bare.axes, np.random.default_rng(flight_seed))
-    centers = track.position(track.photo_s)
-    rotations = track.geo_from_nominal_cam(track.photo_s) @ mounting.nominal_from_cam
+    trajectory = make_trajectory(plan, bare.complex_m, bare.axes, np.random.default_rng(flight_seed))
+    centers = trajectory.position(trajectory.photo_s)
+    rotations = trajectory.geo_from_nominal_cam(trajectory.photo_s) @ mounting.nominal_from_cam
     poses = tuple(Pose(center, rotation) for center, rotation in zip(centers, rotations, strict=True))
     distance_m = float(np.median(np.linalg.norm(centers, axis=1)))
     width_m = config.target_size or max(0.3, _TARGET_PX * distance_m / lens.focal_px)
@@ -78,7 +84,7 @@ def make_world(config: SimulateOptions, seed: np.random.SeedSequence) -> World:
         spots = choose(bare.spots, found.seen, config.targets, np.random.default_rng(target_seed))
     scene = with_targets(bare, spots, width_m)
     origin = Origin(lat_deg=lat, lon_deg=lon, alt_m=alt)
-    return World(origin, scene, tuple(spots), width_m, lens, track, poses, mounting)
+    return World(origin, scene, tuple(spots), width_m, lens, trajectory, poses, mounting)
 
 
 def _lens(config: SimulateOptions) -> Lens:
