@@ -1,4 +1,4 @@
-"""The sensors' errors are those that were asked for."""
+"""The sensors' errors are those of the options."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def trajectory() -> TrueTrajectory:
 
 
 def within(sigma: float, errors: np.ndarray) -> bool:
-    """Whether the errors' variance fits σ² by a χ² test that fails a sound sensor once in a million times."""
+    """Return whether the errors' variance fits σ², by a χ² test that fails a sound sensor once in a million."""
     low, high = stats.chi2.interval(1 - 1e-6, errors.size)
     return bool(low < np.square(errors).sum() / sigma**2 < high)
 
