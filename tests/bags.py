@@ -123,14 +123,14 @@ def transforms(flight: Flight, base: str = "base_link", topic: str = "/tf_static
         ("gnss", from_frd @ flight.arm, np.eye(3)),
     ]
     kind = "tf2_msgs/msg/TFMessage"
-    made = [
+    stamped = [
         make(
             "geometry_msgs/msg/TransformStamped", header(START, base), child,
             make("geometry_msgs/msg/Transform", vector(shift), quaternion(turn)),
         )
         for child, shift, turn in links
     ]  # fmt: skip
-    return topic, kind, START - 500_000_000, make(kind, made)
+    return topic, kind, START - 500_000_000, make(kind, stamped)
 
 
 def fix(ns: int, lla: Iterable[float], status: int = 2, covariance_type: int = 2, sigma: float = 0.02) -> Any:
@@ -158,21 +158,21 @@ def imu(flight: Flight, frame: str = "base_link", topic: str = "/imu/data") -> l
     ned = frame.endswith("_ned")
     kind = "sensor_msgs/msg/Imu"
     covariance = np.eye(3).ravel() * np.radians(0.4) ** 2
-    found = []
+    messages = []
     for ns, enu_from_frd in zip(flight.imu_ns, at_place(flight, flight.imu_ns), strict=True):
         turn = ENU_FROM_NED.T @ enu_from_frd if ned else enu_from_frd @ FLU
         message = make(
             kind, header(ns, frame), quaternion(turn), covariance, vector(np.zeros(3)), np.zeros(9),
             vector(np.zeros(3)), np.zeros(9),
         )  # fmt: skip
-        found.append((topic, kind, int(ns), message))
-    return found
+        messages.append((topic, kind, int(ns), message))
+    return messages
 
 
 def poses(flight: Flight, kind: str, world: str = "map", body: str = "base_link") -> list[Message]:
     """Camera positions and body attitudes in a local frame, as Odometry or either kind of pose."""
     times = flight.fix_ns
-    found = []
+    messages = []
     for ns, place, enu_from_frd in zip(times, flight.camera(times), flight.enu_from_body(times), strict=True):
         from_enu = ENU_FROM_NED.T if world.endswith("_ned") else np.eye(3)
         frd_from_body = {"base_link": FLU, "base_link_frd": np.eye(3), "camera_optical": flight.cam_from_body.T}[
@@ -192,8 +192,8 @@ def poses(flight: Flight, kind: str, world: str = "map", body: str = "base_link"
             message = make(kind, header(ns, world), pose)
         else:
             message = make(kind, header(ns, world), make("geometry_msgs/msg/PoseWithCovariance", pose, covariance))
-        found.append(("/localization", kind, int(ns), message))
-    return found
+        messages.append(("/localization", kind, int(ns), message))
+    return messages
 
 
 def usual(flight: Flight) -> list[Message]:
@@ -217,7 +217,7 @@ def write(path: Path, messages: list[Message], form: Form = Form()) -> Path:
         writer.set_compression(form.compression, CompressionFormat.ZSTD)
     with writer:
         links: dict[str, Any] = {}
-        for topic, kind, ns, message in sorted(messages, key=lambda one: one[2]):
+        for topic, kind, ns, message in sorted(messages, key=lambda message: message[2]):
             if topic not in links:
                 stated = {"msgdef": form.definitions[kind], "rihs01": "-"} if kind in form.definitions else {}
                 links[topic] = writer.add_connection(topic, kind, typestore=TYPES, **stated)
@@ -236,7 +236,7 @@ def expected(flight: Flight, origin: Origin) -> tuple[np.ndarray, np.ndarray]:
 def raw_images(flight: Flight, encoding: str, coded_of: Callable[[np.ndarray], np.ndarray]) -> list[Message]:
     """Photographs as `sensor_msgs/Image` with seven bytes of padding a row."""
     kind = "sensor_msgs/msg/Image"
-    found: list[Message] = []
+    messages: list[Message] = []
     for i, ns in enumerate(flight.image_ns):
         rows = np.ascontiguousarray(coded_of(picture(i))).view(np.uint8).reshape(48, -1)
         padded = np.pad(rows, ((0, 0), (0, 7)))
@@ -244,8 +244,8 @@ def raw_images(flight: Flight, encoding: str, coded_of: Callable[[np.ndarray], n
         message = make(
             kind, header(ns, "camera_optical"), 48, 64, encoding, 0, step, padded.ravel()
         )  # fmt: skip
-        found.append(("/camera/image_raw", kind, int(ns), message))
-    return found
+        messages.append(("/camera/image_raw", kind, int(ns), message))
+    return messages
 
 
 def coded(bgr: np.ndarray, encoding: str) -> np.ndarray:
@@ -272,11 +272,11 @@ def join(path: Path, parts: list[Path]) -> None:
     merged["relative_file_paths"] = []
     counts: dict[str, dict] = {}
     for number, (part, document) in enumerate(zip(parts, documents, strict=True)):
-        one = document["rosbag2_bagfile_information"]
+        information = document["rosbag2_bagfile_information"]
         name = f"bag_{number}.mcap"
         (part / files[number]).rename(path / name)
         merged["relative_file_paths"].append(name)
-        for topic in one["topics_with_message_count"]:
+        for topic in information["topics_with_message_count"]:
             key = topic["topic_metadata"]["name"]
             if key in counts:
                 counts[key]["message_count"] += topic["message_count"]
@@ -292,7 +292,7 @@ def as_ros1(message: Any, store: Any) -> Any:
     """The same message with ROS 1's headers, which count."""
     kind = getattr(message, "__msgtype__", None)
     if isinstance(message, list):
-        return [as_ros1(one, store) for one in message]
+        return [as_ros1(element, store) for element in message]
     if kind is None:
         return message
     values = {

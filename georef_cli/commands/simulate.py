@@ -46,8 +46,8 @@ command = click.Command(
     help=inspect.cleandoc(
         """Simulate a survey whose truth is known exactly.
 
-        DIR gets photographs, a trajectory, raw navigation, control and check points as a surveyor would hand them
-        over, and truth.json with everything that they hide. The same options give the same bytes.
+        DIR gets photographs, a trajectory, raw navigation, control and check points in the form of a surveyor's
+        files, and truth.json with the truth behind them. The same options give the same bytes.
 
         \b
         Examples:

@@ -22,7 +22,7 @@ from pipelines.core.errors import InputError
 from pipelines.core.products import save_json
 from pipelines.core.progress import SILENT, Progress
 from pipelines.formats.bag.writer import BagCamera, BagFlight, write_bag
-from pipelines.formats.exif_writer import PhotoTags, with_tags
+from pipelines.formats.exif_writer import DroneTags, with_tags
 from pipelines.simulate.options import SimulateOptions
 from pipelines.simulate.recording import Recording, record
 from pipelines.simulate.render import Renderer, Sensor
@@ -218,12 +218,12 @@ def _sensors(options: SimulateOptions, rng: np.random.Generator) -> list[Sensor]
     ]
 
 
-def _tags(options: SimulateOptions, world: World, recording: Recording, i: int) -> PhotoTags:
+def _tags(options: SimulateOptions, world: World, recording: Recording, i: int) -> DroneTags:
     lat, lon, alt = (float(value) for value in recording.photos.lla[i])
     yaw, pitch, roll = (float(value) for value in recording.photos.yaw_pitch_roll_deg[i])
     body_yaw, body_pitch, body_roll = (float(value) for value in recording.body_yaw_pitch_roll_deg[i])
     east, north, up = (float(value) for value in recording.photos.sigma_enu_m)
-    return PhotoTags(
+    return DroneTags(
         width=world.lens.width,
         height=world.lens.height,
         focal_px=world.lens.focal_px,

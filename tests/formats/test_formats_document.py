@@ -17,9 +17,9 @@ DOCUMENT = (Path(__file__).parents[2] / "docs" / "formats.md").read_text(encodin
 
 
 def block(language: str) -> str:
-    found = re.search(rf"```{language}\n(.*?)```", DOCUMENT, re.DOTALL)
-    assert found is not None
-    return found[1]
+    block = re.search(rf"```{language}\n(.*?)```", DOCUMENT, re.DOTALL)
+    assert block is not None
+    return block[1]
 
 
 @pytest.fixture
@@ -61,8 +61,8 @@ def test_snippet_agrees_with_the_package(result: dict[str, Any]) -> None:
     assert cov is not None
     np.testing.assert_allclose(result["sigma_enu_m"], np.sqrt(np.diagonal(cov[0])), rtol=1e-12)
     assert sidecar.covariance is not None
-    there = predicted_accuracy(sidecar.covariance, result["p_ply"])
-    assert there.sigma_h_m == pytest.approx(np.hypot(*result["sigma_enu_m"][:2]))
+    accuracy = predicted_accuracy(sidecar.covariance, result["p_ply"])
+    assert accuracy.sigma_h_m == pytest.approx(np.hypot(*result["sigma_enu_m"][:2]))
     assert predicted_accuracy(sidecar.covariance, np.zeros(3)) == sidecar.accuracy
     assert sidecar.model_copy(update={"covariance": None}).covariance_at(result["p_ply"][None]) is None
 
