@@ -1,4 +1,4 @@
-"""Tiny bags by rosbags' writer: one and the same flight, told by every message type and in every convention."""
+"""Tiny bags by rosbags' writer: the same flight in every message type and in every convention."""
 
 from __future__ import annotations
 
@@ -48,12 +48,12 @@ class Flight:
         return START + 20_000_000 * np.arange(-25, 50 * self.count)
 
     def camera(self, time_ns: np.ndarray) -> np.ndarray:
-        """Camera centres (N, 3) in the frame at ORIGIN; exactly linear, so that interpolation adds nothing."""
+        """Return camera centres (N, 3) in the frame at ORIGIN, exactly linear: interpolation adds no error."""
         t = (time_ns - START) / 1e9
         return np.stack([5.0 * t, 20.0 - 3.0 * t, 60.0 + 0.5 * t], axis=1)
 
     def enu_from_body(self, time_ns: np.ndarray) -> np.ndarray:
-        """Attitudes (N, 3, 3) of the body, forward-right-down, in the frame at ORIGIN."""
+        """Return attitudes (N, 3, 3) of the body, forward-right-down, in the frame at ORIGIN."""
         t = (time_ns - START) / 1e9
         angles = np.stack([40.0 + 7.0 * t, 3.0 * np.sin(t), 4.0 * np.cos(t)], axis=1)
         return ENU_FROM_NED @ Rotation.from_euler("ZYX", angles, degrees=True).as_matrix()
@@ -149,7 +149,7 @@ def fixes(flight: Flight, topic: str = "/gnss/fix") -> list[Message]:
 
 
 def at_place(flight: Flight, ns: np.ndarray) -> np.ndarray:
-    """Attitudes against north and up where they are measured, as instruments tell them."""
+    """Return attitudes against north and up at their own places, as instruments measure them."""
     place = lla_from_enu(flight.camera(ns), ORIGIN)
     return np.swapaxes(geo_from_enu_at(place, ORIGIN), -1, -2) @ flight.enu_from_body(ns)
 
@@ -170,7 +170,7 @@ def imu(flight: Flight, frame: str = "base_link", topic: str = "/imu/data") -> l
 
 
 def poses(flight: Flight, kind: str, world: str = "map", body: str = "base_link") -> list[Message]:
-    """Camera positions and body attitudes in a local frame, as Odometry or either kind of pose."""
+    """Return camera positions and body attitudes in a local frame, as Odometry or either kind of pose."""
     times = flight.fix_ns
     messages = []
     for ns, place, enu_from_frd in zip(times, flight.camera(times), flight.enu_from_body(times), strict=True):
@@ -197,13 +197,13 @@ def poses(flight: Flight, kind: str, world: str = "map", body: str = "base_link"
 
 
 def usual(flight: Flight) -> list[Message]:
-    """NavSatFix, Imu, CameraInfo and /tf_static beside the photographs."""
+    """Return NavSatFix, Imu, CameraInfo and /tf_static beside the photographs."""
     return [transforms(flight), info(flight), *fixes(flight), *imu(flight), *images(flight)]
 
 
 @dataclass(frozen=True)
 class Form:
-    """How a bag is stored."""
+    """Storage of a bag."""
 
     storage: StoragePlugin = StoragePlugin.MCAP
     compression: CompressionMode | None = None
@@ -227,14 +227,14 @@ def write(path: Path, messages: list[Message], form: Form = Form()) -> Path:
 
 
 def expected(flight: Flight, origin: Origin) -> tuple[np.ndarray, np.ndarray]:
-    """Camera centres (N, 3) and rotations geo ← camera (N, 3, 3) in the frame at another origin."""
+    """Return camera centres (N, 3) and rotations geo ← camera (N, 3, 3) in the frame at another origin."""
     lla = lla_from_enu(flight.camera(flight.image_ns), ORIGIN)
     turn = geo_from_enu_at(lla_from_enu(np.zeros(3), ORIGIN), origin)
     return enu_from_lla(lla, origin), turn @ flight.enu_from_body(flight.image_ns) @ flight.cam_from_body.T
 
 
 def raw_images(flight: Flight, encoding: str, coded_of: Callable[[np.ndarray], np.ndarray]) -> list[Message]:
-    """Photographs as `sensor_msgs/Image` with seven bytes of padding a row."""
+    """Return photographs as `sensor_msgs/Image` with seven bytes of padding a row."""
     kind = "sensor_msgs/msg/Image"
     messages: list[Message] = []
     for i, ns in enumerate(flight.image_ns):
@@ -249,7 +249,7 @@ def raw_images(flight: Flight, encoding: str, coded_of: Callable[[np.ndarray], n
 
 
 def coded(bgr: np.ndarray, encoding: str) -> np.ndarray:
-    """A picture (48, 64) of one colour as a mosaic or as YUV 4:2:2 (BT.601, studio range)."""
+    """Return a picture (48, 64) of one colour as a mosaic or as YUV 4:2:2 (BT.601, studio range)."""
     blue, green, red = (float(value) for value in bgr)
     if encoding.startswith("bayer"):
         values = {"r": red, "g": green, "b": blue}
@@ -263,7 +263,7 @@ def coded(bgr: np.ndarray, encoding: str) -> np.ndarray:
 
 
 def join(path: Path, parts: list[Path]) -> None:
-    """One bag of several files, as a recorder splits it."""
+    """Make one bag of several files, as a recorder splits it."""
     path.mkdir()
     yaml = YAML(typ="safe")
     documents = [yaml.load((part / "metadata.yaml").read_text()) for part in parts]
@@ -289,7 +289,7 @@ def join(path: Path, parts: list[Path]) -> None:
 
 
 def as_ros1(message: Any, store: Any) -> Any:
-    """The same message with ROS 1's headers, which count."""
+    """Return the same message with ROS 1's headers, which have a sequence number."""
     kind = getattr(message, "__msgtype__", None)
     if isinstance(message, list):
         return [as_ros1(element, store) for element in message]
@@ -305,7 +305,7 @@ def as_ros1(message: Any, store: Any) -> Any:
 
 
 def with_unknown(flight: Flight) -> list[Message]:
-    """A usual bag with a topic of a type that nobody knows, in nobody's encoding."""
+    """Return a usual bag with an additional topic of an unknown type."""
     TYPES.register(get_types_from_msg("uint32 number", "nobody_msgs/msg/Thing"))
     thing = make("nobody_msgs/msg/Thing", 7)
     return [*usual(flight), ("/thing", "nobody_msgs/msg/Thing", START, thing)]

@@ -20,7 +20,7 @@ for _name, _layouts in DEFINITIONS.items():
 
 
 def px4(flight: Flight, kind: str, boot_ns: int = 0) -> list[Message]:
-    """PX4's messages; their microseconds count from `boot_ns`."""
+    """Return PX4's messages, whose microseconds count from `boot_ns`."""
     kind = f"px4_msgs/msg/{kind}"
     times = flight.imu_ns if kind.endswith("Attitude") else flight.fix_ns
     turns = ENU_FROM_NED.T @ (flight.enu_from_body(times) if kind.endswith("Odometry") else at_place(flight, times))
@@ -52,7 +52,7 @@ def px4(flight: Flight, kind: str, boot_ns: int = 0) -> list[Message]:
 
 
 def px4_of(release: str, messages: list[Message]) -> list[Message]:
-    """PX4's messages in the layout of another release; what that has more is zero."""
+    """Return PX4's messages in the layout of another release; additional fields are zero."""
     kind = messages[0][1]
     store = get_typestore(Stores.EMPTY)
     store.register(get_types_from_msg(DEFINITIONS[kind][release], kind))
@@ -68,7 +68,7 @@ def px4_of(release: str, messages: list[Message]) -> list[Message]:
 
 
 def _px4_value(message: Any, name: str) -> Any:
-    """The field of another layout, None if this one has nothing of the kind."""
+    """Return the value of a field of another layout, None if the message has no such value."""
     if name in ("lat_lon_valid", "alt_valid"):
         return True
     if hasattr(message, name):

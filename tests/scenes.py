@@ -30,7 +30,7 @@ Layout = Literal["orbit", "grid", "line"]
 
 @dataclass(frozen=True)
 class Noise:
-    """Standard deviations of what is measured."""
+    """Standard deviations of the measurements."""
 
     fix_m: tuple[float, float, float] = (0.02, 0.02, 0.03)
     attitude_deg: float = 0.5
@@ -49,7 +49,7 @@ NOISELESS = Noise(pixel_px=0.2, mark_px=1e-9, gcp_m=1e-9, fix_m=(1e-9, 1e-9, 1e-
 
 @dataclass(frozen=True)
 class Scene:
-    """True cameras and points in geo, and which camera sees which point."""
+    """True cameras and points in geo, with their observations."""
 
     center_in_geo: np.ndarray  # (n, 3)
     geo_from_cam: np.ndarray  # (n, 3, 3)
@@ -135,7 +135,7 @@ def sparse_model(scene: Scene, noise: Noise, rng: np.random.Generator) -> Sparse
 
 @dataclass(frozen=True)
 class Measured:
-    """Which measurements a survey carries."""
+    """Choice of the measurements that a survey carries."""
 
     fixes: bool = True
     attitudes: bool = True

@@ -61,7 +61,7 @@ class Matcher:
         return np.asarray(self._smooth.filter(self._top_scores.mean()), dtype=np.float32)
 
 
-# Some hundred thousand images go through the next two classes. They write into arrays of their own: allocating
+# Several hundred thousand images go through the next two classes. They write into arrays of their own: allocating
 # fresh memory takes longer than filling it.
 class _TopScores:
     """Largest values of a sequence of images (H, W) at each pixel, `count` of them."""

@@ -88,7 +88,7 @@ def test_files_alone_put_the_gaussians_on_earth(stage: StageRun) -> None:
     ply, sidecar = stage.out / "splat.ply", read_sidecar(stage.out / "splat.ply")
     positions = sidecar.ecef_from_file().apply(read_gaussians(ply).means.numpy())
     expected = ecef_from_enu(GEO_FROM_MODEL.apply(gaussians().means.numpy()), survey().origin)
-    # Some 10 m from the origin float32 resolves 1e-6 m.
+    # About 10 m from the origin, float32 resolves 1e-6 m.
     np.testing.assert_allclose(positions, expected, rtol=0, atol=2e-6)
     assert summary.values["gaussians"] == 40
     assert sorted(file.name for file in stage.out.iterdir()) == ["splat.ply", "splat.ply.georef.json"]

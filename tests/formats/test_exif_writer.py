@@ -1,4 +1,4 @@
-"""What is written into a photograph is read back by ExifRead and by an XML parser."""
+"""ExifRead and an XML parser read back the tags that are written into a photograph."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ def block(language: str) -> str:
 
 @pytest.fixture
 def result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
-    """What the snippet computes from the example, in a folder that holds nothing else."""
+    """Return the variables that the snippet computes from the example, in a folder without other files."""
     (tmp_path / "splat.ply.georef.json").write_text(block("json"), encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {}

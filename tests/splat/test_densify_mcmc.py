@@ -18,7 +18,7 @@ SETTINGS = McmcSettings(start=0, stop=100, every=10, growth=0.05, noise=0.0, max
 
 
 def row(opacities: list[float], sigma_m: float = 0.2) -> Gaussians:
-    """Gaussians 1 m apart, 5 m ahead; the first harmonic says which is which."""
+    """Return Gaussians 1 m apart, 5 m ahead; the first harmonic identifies each."""
     count = len(opacities)
     place = torch.arange(count, dtype=torch.float32) - (count - 1) / 2
     return Gaussians(
@@ -92,7 +92,7 @@ def test_noise_has_the_shape_of_the_gaussian() -> None:
     strategy.observe(stats(list(range(400))), tiny.PINHOLE)
     strategy.update(1, adam)
     sigma = (adam.gaussians.means.detach() - start.means).std(dim=0)
-    # It goes with the variance: (0.2 / 0.002)² = 10⁴ between the axes.
+    # The noise goes with the variance: (0.2 / 0.002)² = 10⁴ between the axes.
     assert float(sigma[0] / sigma[1]) == pytest.approx(1e4, rel=0.3)
 
 

@@ -85,7 +85,7 @@ def test_a_guess_out_of_reach_has_no_score(fine: list[StereoView]) -> None:
 def test_the_ground_beside_a_roof_is_not_taken_for_roof(
     fine: list[StereoView], coarse: list[DepthEstimate]
 ) -> None:
-    """As a sweep of planes does on the same fine pixels."""
+    """A sweep of planes on the same fine pixels takes the ground for roof."""
     camera = fine[2].camera
     depth = true_depth(camera)
     height = level_normals(FINE).offset(camera, depth.astype(np.float32))
@@ -121,7 +121,7 @@ def _foot_of_a_wall(azimuth_deg: float) -> tuple[StereoView, np.ndarray, np.ndar
 
 
 def test_small_windows_leave_the_foot_of_a_wall_where_it_is() -> None:
-    """A wide one lays the surface across the corner, within a reach of some pixels."""
+    """A wide window lays the surface across the corner, within a reach of a few pixels."""
     (view, depth, upright), *others = [_foot_of_a_wall(azimuth) for azimuth in (0, -24, -12, 12, 24)]
     normals = NormalMap(np.stack([LEVEL.normal_in_world, WALL]), upright.astype(np.uint8))
     offset = normals.offset(view.camera, (depth + 0.3).astype(np.float32)).astype(np.float32)

@@ -13,7 +13,7 @@ HEIGHT, WIDTH, FOCAL = 30, 40, 50.0
 
 
 def plane(tilt_x: float, tilt_y: float, distance_m: float = 100.0) -> np.ndarray:
-    """Depth along z of the plane z + tilt · (x, y) = distance."""
+    """Return the depth along z of the plane z + tilt · (x, y) = distance."""
     v, u = np.mgrid[0:HEIGHT, 0:WIDTH] + 0.5
     x, y = (u - WIDTH / 2) / FOCAL, (v - HEIGHT / 2) / FOCAL
     return (distance_m / (1 + tilt_x * x + tilt_y * y)).astype(np.float32)

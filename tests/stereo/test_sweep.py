@@ -48,7 +48,7 @@ def test_views_that_agree_leave_few_errors(ring: list[StereoView]) -> None:
     alone = np.abs(surfaces[2].depth() - true_depth(ring[2].camera)) > 0.5
     assert known.mean() > 0.7
     assert (np.abs(height_error[known]) < 0.5).mean() > 0.97
-    # What one view gets wrong, others see differently.
+    # Other views see the errors of one view differently.
     assert (np.abs(height_error[known]) >= 0.5).mean() < 0.5 * alone.mean()
 
 
@@ -165,7 +165,7 @@ def upright(view: StereoView, height_m: tuple[float, float] = (-np.inf, np.inf))
 
 
 def test_walls_are_found_on_upright_planes(wall: tuple[StereoView, list[StereoView], np.ndarray]) -> None:
-    """Level planes cut it, and see other texture."""
+    """Level planes cut the wall, and see other texture."""
     reference, others, truth = wall
     flat = Planes(LEVEL.normal_in_world, np.arange(-12.0, 12.0, 0.5))
     inner = np.s_[10:-10, 10:-10]

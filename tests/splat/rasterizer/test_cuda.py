@@ -1,7 +1,7 @@
 """The gsplat backend without a GPU: what it says when it cannot run, and what it makes of gsplat's results.
 
 A stand-in plays gsplat on the CPU: it projects by the reference, and blends and lists intersections by brute force,
-in the shapes and the order of gsplat 1.5.3. What the real kernels return is for a machine that has a GPU.
+in the shapes and the order of gsplat 1.5.3. Tests of the real kernels need a machine with a GPU.
 """
 
 from __future__ import annotations

@@ -93,7 +93,7 @@ def test_depth_stays_in_front_of_the_camera(render):
     view = render(gaussians, torch.eye(4, dtype=torch.float64), CAMERA, SETTINGS)
     seen = view.alpha > 0
     assert (view.expected_depth[seen] - 2.0).abs().max() <= 2.0 * DEPTH_REACH
-    # It uses most of that reach, down to where α is 1/255.
+    # The needle uses most of that reach, down to α = 1/255.
     assert (view.expected_depth[seen] - 2.0).abs().max() > 0.8 * 2.0 * DEPTH_REACH
     assert view.alpha[seen].min() >= ALPHA_MIN
     assert (view.median_depth[view.alpha > 0.5] > 0).all()
