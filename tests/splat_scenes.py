@@ -151,7 +151,7 @@ def write_rendered(root: Path, rendered: Rendered, initial: InitialSimilarity) -
 
 
 @dataclass(frozen=True)
-class Flight:
+class RenderedFlight:
     """Rendered survey and the folder of its photographs."""
 
     rendered: Rendered
