@@ -48,7 +48,7 @@ NOISELESS = Noise(pixel_px=0.2, mark_px=1e-9, gcp_m=1e-9, fix_m=(1e-9, 1e-9, 1e-
 
 
 @dataclass(frozen=True)
-class Scene:
+class TrueScene:
     """True cameras and points in geo, with their observations."""
 
     center_in_geo: np.ndarray  # (n, 3)
@@ -90,7 +90,7 @@ def looking_at(center: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 def make_scene(
     layout: Layout = "orbit", images: int = 24, points: int = 300, gcps: int = 6, seed: int = 0
-) -> Scene:
+) -> TrueScene:
     """Return a built-up area 100 m wide, seen from an orbit at two heights, a nadir grid, or one straight line."""
     rng = np.random.default_rng(seed)
     cloud = np.column_stack([rng.uniform(-50, 50, (points, 2)), rng.uniform(0, 20, points)])
@@ -106,10 +106,10 @@ def make_scene(
         east, north = np.meshgrid(np.linspace(-60, 60, side), np.linspace(-60, 60, rows) if rows > 1 else [0.0])
         center = np.column_stack([east.ravel(), north.ravel(), np.full(east.size, 80.0)])[:images]
         target = center - np.array([0.0, 1e-3, 80.0])
-    return Scene(center, looking_at(center, target), cloud, control)
+    return TrueScene(center, looking_at(center, target), cloud, control)
 
 
-def sparse_model(scene: Scene, noise: Noise, rng: np.random.Generator) -> SparseModel:
+def sparse_model(scene: TrueScene, noise: Noise, rng: np.random.Generator) -> SparseModel:
     """Return the model of an SfM with perfect cameras: the scene in `local`, with noisy pixels."""
     local_from_geo = scene.geo_from_local.inverse()
     owner, image, xy = scene.pixels(scene.point_in_geo)
@@ -145,7 +145,7 @@ class Measured:
 WITH_GCPS = Measured(gcps=True)
 
 
-def survey_of(scene: Scene, noise: Noise, measured: Measured, rng: np.random.Generator) -> Survey:
+def survey_of(scene: TrueScene, noise: Noise, measured: Measured, rng: np.random.Generator) -> Survey:
     """Return the measurements, with noise of exactly the σ that they state (but for outliers and bias)."""
     fixes = scene.center_in_geo + rng.normal(size=scene.center_in_geo.shape) * noise.fix_m + noise.bias_m
     for index in noise.outliers:
@@ -183,7 +183,7 @@ def survey_of(scene: Scene, noise: Noise, measured: Measured, rng: np.random.Gen
     )
 
 
-def _control(scene: Scene, noise: Noise, rng: np.random.Generator) -> tuple[SurveyedPoint, ...]:
+def _control(scene: TrueScene, noise: Noise, rng: np.random.Generator) -> tuple[SurveyedPoint, ...]:
     owner, image, xy = scene.pixels(scene.gcp_in_geo)
     xy = xy + rng.normal(0, noise.mark_px, xy.shape)
     surveyed = scene.gcp_in_geo + rng.normal(0, noise.gcp_m, scene.gcp_in_geo.shape)
@@ -203,7 +203,7 @@ def _control(scene: Scene, noise: Noise, rng: np.random.Generator) -> tuple[Surv
 
 def material(
     noise: Noise = STATED, measured: Measured = WITH_GCPS, images: int = 8, points: int = 60
-) -> tuple[Scene, SparseModel, Survey]:
+) -> tuple[TrueScene, SparseModel, Survey]:
     """Return an orbit, its SfM model and its survey."""
     scene, rng = make_scene(images=images, points=points), np.random.default_rng(0)
     survey = survey_of(scene, noise, measured, rng)
@@ -266,7 +266,7 @@ def without_fixes(survey: Survey, names: tuple[str, ...]) -> Survey:
     return survey.model_copy(update={"images": images})
 
 
-def moved(scene: Scene, geo_from_local: Similarity) -> Scene:
+def moved(scene: TrueScene, geo_from_local: Similarity) -> TrueScene:
     """Return the scene with another SfM frame."""
     return replace(scene, geo_from_local=geo_from_local)
 

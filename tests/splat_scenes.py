@@ -28,7 +28,7 @@ from tests.scenes import (
     GEO_FROM_LOCAL,
     Measured,
     Noise,
-    Scene,
+    TrueScene,
     initial_product,
     looking_at,
     sparse_model,
@@ -51,7 +51,7 @@ START_COVARIANCE = np.diag([5e-3, 5e-3, 5e-3, 5e-3, 0.3, 0.3, 0.3]) ** 2
 class Rendered:
     """True scene, its Gaussians in `geo`, and the measurements of it."""
 
-    scene: Scene
+    scene: TrueScene
     gaussians: Gaussians
     survey: Survey
     sparse: SparseModel
@@ -79,14 +79,14 @@ def true_gaussians(rng: np.random.Generator) -> Gaussians:
     )
 
 
-def true_scene(rng: np.random.Generator, images: int = 14, points: int = 500) -> Scene:
+def true_scene(rng: np.random.Generator, images: int = 14, points: int = 500) -> TrueScene:
     """Return two rings of cameras that look down on the hill, with points, control and check places on it."""
     angle = np.linspace(0, 2 * np.pi, images, endpoint=False)
     height = np.where(np.arange(images) % 2, 30.0, 38.0)
     center = np.column_stack([32 * np.cos(angle), 32 * np.sin(angle), height])
     place = rng.uniform(-26, 26, (points, 2))
     marked = np.array([[-10.0, -8], [9, -11], [12, 8], [-7, 11], [1, 2], [-14, 2]])
-    return Scene(
+    return TrueScene(
         center,
         looking_at(center, rng.normal(0, 2, center.shape) * [1, 1, 0]),
         np.column_stack([place, ground_height(*place.T)]),
