@@ -131,7 +131,7 @@ def _exif(data: bytes, problems: list[str]) -> Mapping[str, Any]:
         return {}
     try:
         tags: Mapping[str, Any] = exifread.process_file(io.BytesIO(data), details=False)
-    except Exception as error:  # the parser raises whatever its arithmetic on broken bytes raises
+    except Exception as error:  # the parser's arithmetic on broken bytes may raise any error
         problems.append(f"the EXIF data cannot be read ({type(error).__name__})")
         return {}
     return tags

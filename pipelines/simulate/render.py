@@ -74,7 +74,7 @@ class Renderer:
         across, down = np.linspace(-1, 1, width), np.linspace(-1, 1, height)
         falloff = (1 - sensor.vignetting / 2 * (across**2 + down[:, None] ** 2)).astype(np.float32)
         exposed = light * (falloff[..., None] * np.float32(sensor.gain)) * np.array(sensor.tint, dtype=np.float32)
-        # Photon noise grows with the root of the signal; the rest is read-out noise.
+        # Photon noise grows with the root of the signal; the constant term is read-out noise.
         spread = np.float32(sensor.noise) * np.sqrt(np.float32(6e-5) * np.maximum(exposed, 0) + np.float32(2.5e-6))
         exposed += spread * rng.standard_normal(exposed.shape, dtype=np.float32)
         return np.round(255 * _encode(exposed)).astype(np.uint8)

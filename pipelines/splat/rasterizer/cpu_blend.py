@@ -42,7 +42,7 @@ from pipelines.splat.rasterizer.cpu_tiles import TILE_HEIGHT, TILE_WIDTH, unpack
 
 TILE_PIXELS = TILE_WIDTH * TILE_HEIGHT
 # Hits between two checks which rows of the tile are not done yet.
-HITS_PER_LOOK = 16
+HITS_PER_CHECK = 16
 
 # Planes of a tile's scratch memory.
 T, R, G, B, D, D2, MEDIAN = range(7)
@@ -105,7 +105,7 @@ def _blend_tile(table: Any, hits: Any, first: int, last: int, tile_x: int, tile_
     pixel_x = load(lane_x, 0) + splat(number(tile_x))
     top, bottom = 0, TILE_HEIGHT - 1
     for place in range(first, last):
-        if (place - first) % HITS_PER_LOOK == 0:
+        if (place - first) % HITS_PER_CHECK == 0:
             top, bottom = alive_rows(scratch, top, bottom)
             if top > bottom:
                 return place

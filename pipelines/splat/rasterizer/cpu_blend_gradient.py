@@ -12,7 +12,7 @@ from numba import prange
 
 from pipelines.splat.rasterizer.api import ALPHA_MAX, TRANSMITTANCE_MIN
 from pipelines.splat.rasterizer.cpu_blend import (
-    HITS_PER_LOOK,
+    HITS_PER_CHECK,
     TILE_PIXELS,
     T,
     alive_rows,
@@ -88,7 +88,7 @@ def _blend_tile_gradient(table: Any, hits: Any, first: int, last: int, tile_x: i
     pixel_x = load(lane_x, 0) + splat(number(tile_x))
     top, bottom = 0, TILE_HEIGHT - 1
     for place in range(first, last):
-        if (place - first) % HITS_PER_LOOK == 0:
+        if (place - first) % HITS_PER_CHECK == 0:
             top, bottom = alive_rows(scratch, top, bottom)
         index, first_row, last_row = unpack_hit(hits[place])
         red, green, blue = splat(table[index, RED]), splat(table[index, GREEN]), splat(table[index, BLUE])

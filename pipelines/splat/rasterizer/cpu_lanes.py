@@ -19,7 +19,7 @@ from numba.extending import models, overload, register_model
 
 LANES = 16
 
-# Typed for what kernels see: the typing context that numba passes first is no argument to them.
+# Any, because numba adds the typing context as a first argument, which kernels do not pass.
 intrinsic: Any = numba.extending.intrinsic
 
 _INDEX = ir.IntType(32)
