@@ -47,7 +47,7 @@ class AgreementSettings:
 def agreed_depth(
     reference: DepthEstimate, others: list[DepthEstimate], settings: AgreementSettings
 ) -> Float32Array:
-    """Return depths (H, W) along the optical axis of `reference`, the mean of the views that agree; 0 elsewhere.
+    """Return depths (H, W) along the optical axis of `reference`, the mean of the views that agree; 0 if few do.
 
     1. Each point of the reference is reprojected into each other view. The residual is the distance to the surface
        of that view along its normal: on a plane, pixels need not coincide.
