@@ -23,13 +23,13 @@ from pipelines.geodesy.enu import Origin, ecef_from_enu, ecef_from_enu_rotation,
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.scene.scene import photographs
 from pipelines.scene.survey import Fix, SurveyImage
-from pipelines.scene.trained import Trained, load_trained, trained_pinholes
+from pipelines.scene.trained_survey import TrainedSurvey, load_trained, trained_pinholes
 from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.splat.storage import read_gaussians
 
 
-def geo_from_cam(image: SurveyImage, trained: Trained, recorded: bool) -> FloatArray:
+def geo_from_cam(image: SurveyImage, trained: TrainedSurvey, recorded: bool) -> FloatArray:
     """Rotation (3, 3) of a photograph's camera, measured or trained."""
     if recorded:
         if image.attitude is None:

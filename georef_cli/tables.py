@@ -1,22 +1,23 @@
-"""What people see of products: documents in, rich renderables out."""
+"""Products as people see them: typed products in, rich renderables out."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Group
 from rich.markup import escape
 from rich.table import Table
 
 from pipelines.compare.table import Comparison, cells, remarks_on
-from pipelines.core.errors import InputError
 from pipelines.core.runner import Outcome
 from pipelines.core.stages import REPORT
 from pipelines.core.staleness import StageState
 from pipelines.core.workspace import Workspace
+
+if TYPE_CHECKING:  # with its statistics it would load SciPy for every command
+    from pipelines.scene.report import CheckPointErrors, EvaluationReport
 
 STATE_STYLE = {
     "current": "green",
@@ -40,19 +41,7 @@ POINT_COLUMNS = {
     "rmse_3d_m": "RMSE 3D",
     "max_3d_m": "max 3D",
 }
-# Column: where its figure is in a row of `checkpoints`.
-ACCURACY_COLUMNS = {
-    "RMSE H": ("with_survey", "rmse_h_m"),
-    "RMSE V": ("with_survey", "rmse_v_m"),
-    "class H": ("asprs", "horizontal_class"),
-    "class V": ("asprs", "vertical_class"),
-    "predicted H": ("predicted", "rms_h_m"),
-    "predicted V": ("predicted", "rms_v_m"),
-    "bound H": ("cramer_rao", "rms_h_m"),
-    "bound V": ("cramer_rao", "rms_v_m"),
-}
 IMAGE_COLUMNS = {"views": "views", "psnr": "PSNR dB", "ssim": "SSIM", "lpips": "LPIPS"}
-SECTIONS = ("photometric", "checkpoints", "fit")
 Renderable = Group | Table | str
 
 
@@ -76,8 +65,8 @@ def states(rows: Iterable[StageState]) -> Table:
 def outcome(workspace: Workspace, result: Outcome) -> list[Renderable]:
     """The result of one stage: headline, figures, and what was warned of when it ran earlier."""
     manifest = result.manifest
-    how = duration(manifest.duration_s) if result.ran else "current, nothing to do"
-    parts: list[Renderable] = [f"[bold]{result.stage}[/]: {escape(manifest.key_figure)} ({how})"]
+    effort = duration(manifest.duration_s) if result.ran else "current, nothing to do"
+    parts: list[Renderable] = [f"[bold]{result.stage}[/]: {escape(manifest.key_figure)} ({effort})"]
     if result.stage == "evaluate":
         parts += report_of(workspace)
     elif manifest.values:
@@ -110,9 +99,9 @@ def calibration(document: Mapping[str, Any]) -> list[Renderable]:
         for axis, value, sigma, start, seen in zip(
             axes, row["value"], row["sigma"], row["start"], row["observable"], strict=True
         ):
-            told = "" if seen else "[yellow]not observable in this flight[/]"
+            remark = "" if seen else "[yellow]not observable in this flight[/]"
             name = f"{row['name']} {axis}".strip()
-            table.add_row(name, f"{value:.4f}", f"{sigma:.4f}", f"{start:.4f}", row["unit"], told)
+            table.add_row(name, f"{value:.4f}", f"{sigma:.4f}", f"{start:.4f}", row["unit"], remark)
     left = f"left over: {document['rms_position_m']:.3f} m an axis"
     if document["rms_attitude_deg"] is not None:
         left += f", {document['rms_attitude_deg']:.2f}°"
@@ -123,14 +112,14 @@ def comparison(table: Comparison) -> list[Renderable]:
     """`georef compare`: a line a configuration, and what sets it apart below."""
     heads = [f"{way}\n{name}" for way in ("camera", "model") for name in ("mean H", "median H", "RMSE H", "RMSE V")]
     del heads[1]  # by camera, mean and median hardly differ
-    shown = _table("", "test\nPSNR", "\nSSIM", *heads, "check\npoints", "\ntraining")
-    for column in shown.columns[1:]:
+    figures = _table("", "test\nPSNR", "\nSSIM", *heads, "check\npoints", "\ntraining")
+    for column in figures.columns[1:]:
         column.justify, column.no_wrap = "right", True
     for row in table.rows:
-        shown.add_row(row.configuration, *cells(row))
+        figures.add_row(row.configuration, *cells(row))
     notes = [f"[bold]{row.configuration}[/] {escape(f'{row.title}: {row.note}')}" for row in table.rows]
     remarks = [f"[yellow]{row.configuration}:[/] {escape(text)}" for row in table.rows for text in remarks_on(row)]
-    return ["[bold]Test views in dB, check points in metres[/]", shown, "", *notes, *remarks]
+    return ["[bold]Test views in dB, check points in metres[/]", figures, "", *notes, *remarks]
 
 
 def topics(rows: Iterable[Mapping[str, Any]]) -> Table:
@@ -161,32 +150,35 @@ def topics(rows: Iterable[Mapping[str, Any]]) -> Table:
 
 
 def report_of(workspace: Workspace) -> list[Renderable]:
-    """The tables of a workspace's evaluation.
+    """Return the tables of a workspace's evaluation.
 
     Raises:
         InputError: the report was replaced by something else.
     """
-    path = workspace.path(REPORT)
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"not valid JSON: {error}", path=path) from error
-    if not isinstance(document, dict) or not all(isinstance(document.get(name, {}), dict) for name in SECTIONS):
-        raise InputError("not a report: make it again with `georef evaluate --force`", path=path)
-    return report(document)
+    from pipelines.scene.report import read_report
+
+    return report(read_report(workspace.path(REPORT)))
 
 
-def report(document: Mapping[str, Any]) -> list[Renderable]:
-    """The tables of `evaluate/report.json`: test views, check points, cross-validation, residuals of the fit.
+def report(document: EvaluationReport) -> list[Renderable]:
+    """Return the tables of a report: test views, check points, cross-validation, residuals of the fit.
 
     A fit residual is not an accuracy, and a control point no check point: they never share a table.
     """
-    views = _rows("Test views", document.get("photometric", {}), IMAGE_COLUMNS)
-    check = _rows("Check points, metres", document.get("checkpoints", {}), POINT_COLUMNS)
-    crossed = {"left out": document.get("cross_validation")}
-    cross = _rows("Control points, each left out in turn (cross-validation), metres", crossed, POINT_COLUMNS)
-    fit = _rows("Residuals of the fit (not an accuracy), metres", document.get("fit", {}), POINT_COLUMNS)
-    tables = (views, check, _accuracy(document.get("checkpoints", {})), cross, fit)
+    ways = {"camera": document.checkpoints.camera, "model": document.checkpoints.model}
+    crossed = document.cross_validation
+    fit = {"gnss": dict(document.fit.gnss), "gcp": dict(document.fit.gcp)}
+    tables = (
+        _rows("Test views", {"test": dict(document.photometric.test)}, IMAGE_COLUMNS),
+        _rows("Check points, metres", {way: dict(errors) for way, errors in ways.items()}, POINT_COLUMNS),
+        _accuracy(ways),
+        _rows(
+            "Control points, each left out in turn (cross-validation), metres",
+            {} if crossed is None else {"left out": dict(crossed)},
+            POINT_COLUMNS,
+        ),
+        _rows("Residuals of the fit (not an accuracy), metres", fit, POINT_COLUMNS),
+    )
     return [table for table in tables if table is not None]
 
 
@@ -202,30 +194,39 @@ def duration(seconds: float | None) -> str:
     return f"{minutes // 60} h {minutes % 60:02d} min"
 
 
-def _rows(title: str, section: Mapping[str, Any], columns: Mapping[str, str]) -> Group | None:
-    """One table under its title, a row a member of `section`, with those columns that any row has."""
-    rows = {name: row for name, row in section.items() if isinstance(row, Mapping)}
-    shown = {key: head for key, head in columns.items() if any(key in row for row in rows.values())}
-    if not shown:
+def _rows(title: str, rows: Mapping[str, Mapping[str, Any]], columns: Mapping[str, str]) -> Group | None:
+    """One table under its title, a line a row, with those columns that any row has."""
+    heads = {key: head for key, head in columns.items() if any(key in row for row in rows.values())}
+    if not heads:
         return None
-    table = _table("", *shown.values())
+    table = _table("", *heads.values())
     for column in table.columns[1:]:
         column.justify = "right"
     for name, row in rows.items():
-        table.add_row(name, *(_number(row.get(key)) for key in shown))
+        table.add_row(name, *(_number(row.get(key)) for key in heads))
     return Group(f"\n[bold]{title}[/]", table)
 
 
-def _accuracy(checkpoints: Mapping[str, Any]) -> Group | None:
-    """What the check points say after the standard, beside what was predicted and what is possible."""
-    rows = {
-        way: {head: (found.get(part) or {}).get(key) for head, (part, key) in ACCURACY_COLUMNS.items()}
-        for way, found in checkpoints.items()
-        if isinstance(found, Mapping) and found.get("with_survey")
-    }
-    columns = {head: head for head in ACCURACY_COLUMNS}
+def _accuracy(ways: Mapping[str, CheckPointErrors]) -> Group | None:
+    """The check points after the standard, beside the prediction and the bound."""
+    rows = {way: _accuracy_row(errors) for way, errors in ways.items() if errors.with_survey is not None}
+    columns = {head: head for row in rows.values() for head in row}
     title = "Accuracy with the check points' own survey (ASPRS, 2nd ed.), prediction and Cramér–Rao bound, metres"
     return _rows(title, rows, columns)
+
+
+def _accuracy_row(errors: CheckPointErrors) -> dict[str, float | str | None]:
+    total, predicted, bound = errors.with_survey, errors.predicted, errors.cramer_rao
+    return {
+        "RMSE H": None if total is None else total.rmse_h_m,
+        "RMSE V": None if total is None else total.rmse_v_m,
+        "class H": errors.asprs.horizontal_class,
+        "class V": errors.asprs.vertical_class,
+        "predicted H": None if predicted is None else predicted.rms_h_m,
+        "predicted V": None if predicted is None else predicted.rms_v_m,
+        "bound H": None if bound is None else bound.rms_h_m,
+        "bound V": None if bound is None else bound.rms_v_m,
+    }
 
 
 def _figures(values: Mapping[str, Any]) -> Table:

@@ -1,6 +1,7 @@
 """A pipeline without photographs: stages that write small files, to test what surrounds the stages.
 
 Every product of a fake stage holds one text, in JSON: the stage's name, its options, and a digest of what it read.
+The report of `evaluate`, which the command line reads back, has that text among its cautions.
 A workspace is consistent when each stage's products hold the text that its manifest tells.
 """
 
@@ -14,6 +15,7 @@ from pathlib import Path
 from types import ModuleType
 
 from pipelines.core.options import StageOptions
+from pipelines.core.products import dump_json
 from pipelines.core.stages import PIPELINE, STAGES, StageSpec, products_of
 from pipelines.core.workspace import StageRun, Summary, Workspace
 
@@ -44,7 +46,7 @@ def fake_run(spec: StageSpec) -> Run:
     def run(stage: StageRun, config: StageOptions) -> Summary:
         read = "".join(read_products(stage.workspace, s)[0] for s in PIPELINE if _reads(spec, s))
         told = {"stage": spec.name, "options": config.model_dump(mode="json"), "read": _digest(read)}
-        text = json.dumps(told, separators=(",", ":"))
+        text = _in_form(spec, json.dumps(told, separators=(",", ":")))
         with stage.progress.task(spec.name, 2) as task:
             task.advance(note="half")
             task.advance()
@@ -68,6 +70,15 @@ def photographs(folder: Path) -> Path:
     for name in ("a.jpg", "b.jpg"):
         (folder / name).write_bytes(name.encode())
     return folder
+
+
+def _in_form(spec: StageSpec, text: str) -> str:
+    """The text of a fake stage, in the form of its product where somebody reads that."""
+    if spec.name != "evaluate":
+        return text
+    from tests.reports import report_with
+
+    return dump_json(report_with(cautions=(text,)).model_dump(mode="json"))
 
 
 def _digest(text: str) -> str:

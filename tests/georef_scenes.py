@@ -11,11 +11,10 @@ from pipelines.geometry.bundle import similarity_modes
 from pipelines.geometry.rotations import exp_so3, log_so3
 from pipelines.geometry.similarity import Similarity
 from pipelines.georef.cameras import CameraCorrections, CameraPoses
-from pipelines.georef.losses import Weighting
-from pipelines.georef.measured import Attitudes, ControlMarks, Fixes, Measured, Pairs
 from pipelines.georef.problem import GeoProblem
 from pipelines.georef.similarity import LearnableSimilarity
 from pipelines.georef.systematic import SystematicErrors
+from pipelines.georef.terms import AttitudeTerm, ControlTerm, DistanceTerm, FixTerm, Term, Weighting
 from tests.scenes import looking_at
 
 SHIFT = np.array([100.0, 50.0, 20.0])
@@ -66,24 +65,24 @@ def pivot(block: Block) -> np.ndarray:
     return block.poses.cam_center_in_model.mean(axis=0) + SHIFT
 
 
-def fixes_of(truth: Truth, sigma_m: np.ndarray, rng: np.random.Generator) -> Fixes:
+def fixes_of(truth: Truth, sigma_m: np.ndarray, rng: np.random.Generator) -> FixTerm:
     """All cameras' fixes, with noise of the σ (3,) that they state."""
     position = truth.geo_from_model.apply(truth.poses.cam_center_in_model)
-    return Fixes(
+    return FixTerm(
         torch.arange(len(position)),
         torch.from_numpy(position + sigma_m * rng.normal(size=position.shape)),
         torch.from_numpy(np.tile(np.diag(1 / sigma_m), (len(position), 1, 1))),
     )
 
 
-def marks_of(truth: Truth, points_in_model: np.ndarray, sigma_m: float, rng: np.random.Generator) -> ControlMarks:
+def marks_of(truth: Truth, points_in_model: np.ndarray, sigma_m: float, rng: np.random.Generator) -> ControlTerm:
     """Control points (J, 3) seen by all cameras with exact bearings, surveyed with σ `sigma_m`."""
     count, images = len(points_in_model), len(truth.poses.cam_center_in_model)
     point, camera = np.repeat(np.arange(count), images), np.tile(np.arange(images), count)
     ray = points_in_model[point] - truth.poses.cam_center_in_model[camera]
     bearing = np.einsum("kij,kj->ki", truth.poses.cam_from_model[camera], ray)
     surveyed = truth.geo_from_model.apply(points_in_model) + sigma_m * rng.normal(size=(count, 3))
-    return ControlMarks(
+    return ControlTerm(
         torch.from_numpy(point),
         torch.from_numpy(camera),
         torch.from_numpy(bearing / np.linalg.norm(bearing, axis=1, keepdims=True)),
@@ -95,41 +94,46 @@ def marks_of(truth: Truth, points_in_model: np.ndarray, sigma_m: float, rng: np.
 
 def attitudes_of(
     truth: Truth, sigma_rad: float, rng: np.random.Generator, nominal_from_true: np.ndarray | None = None
-) -> Attitudes:
+) -> AttitudeTerm:
     """Recorded rotations of all cameras, with white noise, in axes from which the cameras' are turned."""
     true = truth.geo_from_model.rotation @ np.swapaxes(truth.poses.cam_from_model, 1, 2)
     recorded = true if nominal_from_true is None else true @ nominal_from_true.T
     noise = exp_so3(sigma_rad * rng.normal(size=(len(recorded), 3)))
-    return Attitudes(
+    return AttitudeTerm(
         torch.arange(len(recorded)),
         torch.from_numpy(recorded @ noise),
-        torch.full((len(recorded),), 1 / sigma_rad, dtype=torch.float64),
+        torch.eye(3, dtype=torch.float64).repeat(len(recorded), 1, 1) / sigma_rad,
     )
 
 
-def pairs_of(truth: Truth, points_in_model: np.ndarray, sigma_m: float, rng: np.random.Generator) -> Pairs:
+def pairs_of(truth: Truth, points_in_model: np.ndarray, sigma_m: float, rng: np.random.Generator) -> DistanceTerm:
     """All distances between points (J, 3), each point located on Earth with σ `sigma_m`."""
     located = truth.geo_from_model.apply(points_in_model) + sigma_m * rng.normal(size=points_in_model.shape)
     i, j = np.triu_indices(len(located), 1)
-    return Pairs(
+    return DistanceTerm(
         torch.from_numpy(np.linalg.norm(points_in_model[i] - points_in_model[j], axis=1)),
         None,
         torch.from_numpy(np.linalg.norm(located[i] - located[j], axis=1)),
-        torch.full((len(i),), 1 / (np.sqrt(2) * sigma_m), dtype=torch.float64),
+        torch.full((len(i), 1, 1), 1 / (np.sqrt(2) * sigma_m), dtype=torch.float64),
         1.0,
     )
 
 
+def terms(*every: Term | None) -> tuple[Term, ...]:
+    """Those that there are."""
+    return tuple(term for term in every if term is not None)
+
+
 def problem_of(
-    block: Block, fixes: Fixes | None, marks: ControlMarks | None = None, weighting: Weighting = "whitened"
+    block: Block, fixes: FixTerm | None, marks: ControlTerm | None = None, weighting: Weighting = "whitened"
 ) -> GeoProblem:
     """From the block as SfM left it and an initial similarity that is a guess."""
-    return problem_with(block, Measured(fixes, marks), weighting=weighting)
+    return problem_with(block, terms(fixes, marks), weighting=weighting)
 
 
 def problem_with(
     block: Block,
-    measured: Measured,
+    measured: tuple[Term, ...],
     errors: SystematicErrors | None = None,
     *,
     weighting: Weighting = "whitened",

@@ -88,12 +88,18 @@ def test_image_names_of_a_survey_stay_inside(workspace: Workspace, name: str) ->
         load_json(Survey, path)
 
 
+MARK = {"image": "a.jpg", "x_px": 1.0, "y_px": 1.0, "sigma_px": 1.0}
+POINT = {"name": "P1", "position_in_geo": [0, 0, 0], "cov_in_geo": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}
+
+
 @pytest.mark.parametrize(
     ("keys", "value", "message"),
     [
         (("image_dir",), "../elsewhere", r"\[image_dir\].*leaves the workspace: give an absolute path"),
         (("images", 1, "camera_id"), 7, "which is not among the cameras"),
-        (("images", 1, "name"), "DUPLICATE", "two have the same name"),
+        (("images", 1, "name"), "DUPLICATE", "images: two have the same name"),
+        (("control_points",), [{**POINT, "marks": []}] * 2, "control_points: two have the same name"),
+        (("check_points",), [{**POINT, "marks": [MARK, MARK]}], r"check_points\.0\].*two are in one image"),
         (("images", 0, "fix", "cov_in_geo"), [[0.0] * 3] * 3, r"cov_in_geo\].*positive definite"),
         (
             ("images", 0, "fix", "cov_in_geo"),

@@ -12,7 +12,6 @@ import torch
 from pipelines.geometry.cameras import Camera
 from pipelines.geometry.similarity import Similarity
 from pipelines.georef.cameras import CameraCorrections, CameraPoses
-from pipelines.georef.measured import Measured
 from pipelines.georef.problem import GeoProblem
 from pipelines.georef.similarity import LearnableSimilarity
 from pipelines.scene.photographs import ImageCache, Photograph
@@ -22,7 +21,8 @@ from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.optimizer import GaussianAdam
 from pipelines.splat.rasterizer.api import Pinhole, RasterSettings
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
-from pipelines.train.trainer import JointOptions, JointTrainer, Views
+from pipelines.train.schedule import JointOptions
+from pipelines.train.trainer import JointTrainer, TrainingViews
 
 CAMERA = Camera("PINHOLE", 64, 48, np.array([60.0, 60.0, 32.0, 24.0]))
 PINHOLE = Pinhole(64, 48, 60.0, 60.0, 32.0, 24.0)
@@ -80,8 +80,8 @@ def trainer(
     return JointTrainer(
         GaussianAdam(start, EXTENT_M, options.iterations),
         strategy or DefaultStrategy(SETTINGS, EXTENT_M, len(start)),
-        GeoProblem(similarity, cameras, Measured()),
-        Views(train, images),
+        GeoProblem(similarity, cameras, ()),
+        TrainingViews(train, images),
         rasterizer=CpuRasterizer(),
         options=options,
         exposures=exposures if with_exposures else None,

@@ -22,77 +22,80 @@ from pipelines.core.products import load_json
 from pipelines.core.stages import SIM3
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import Workspace
-from pipelines.evaluate.following import Following
-from pipelines.evaluate.points import Sights, points_by_camera, sights
-from pipelines.evaluate.prediction import control_sights, cramer_rao, following, trained_lens
+from pipelines.evaluate.cramer_rao import cramer_rao_bound
+from pipelines.evaluate.intersection_jacobian import IntersectionJacobian
+from pipelines.evaluate.networks import control_rays
+from pipelines.evaluate.points_by_camera import points_by_camera
+from pipelines.evaluate.prediction import jacobian_of_points
 from pipelines.georef.adjustment import Correspondences
 from pipelines.georef.alignment import align
 from pipelines.georef.cameras import CameraCorrections
-from pipelines.georef.measured import ControlMarks, Fixes, Measured
 from pipelines.georef.posterior import minimise
 from pipelines.georef.problem import GeoProblem
 from pipelines.georef.similarity import LearnableSimilarity
+from pipelines.georef.terms import ControlTerm, FixTerm
 from pipelines.scene.initial_similarity import InitialSimilarity
-from pipelines.scene.restored import Restored, geographic_options_of, restore
-from pipelines.scene.trained import load_trained
+from pipelines.scene.marks import MarkRays, mark_rays
+from pipelines.scene.solved_survey import SolvedSurvey, geographic_options_of, solve_survey
+from pipelines.scene.trained_survey import load_trained
 
 
 @dataclass(frozen=True)
-class Marked:
-    """Points (J, 3) in `model` where their marks show them, and how they follow the cameras."""
+class MarkedPoints:
+    """Points (J, 3) in `model` where their marks show them, and their derivatives by the cameras."""
 
     position: FloatArray
-    follow: Following
+    jacobian: IntersectionJacobian
 
     @classmethod
-    def of(cls, restored: Restored, seen: Sights, count: int) -> Marked:
+    def of(cls, solved: SolvedSurvey, rays: MarkRays) -> MarkedPoints:
         """J points from their marks."""
-        in_geo = points_by_camera(restored.trained, seen, count)
-        in_model = restored.trained.geo_from_model.inverse().apply(in_geo)
-        return cls(in_model, following(restored, in_geo, seen))
+        in_geo = points_by_camera(solved.trained, rays)
+        in_model = solved.trained.geo_from_model.inverse().apply(in_geo)
+        return cls(in_model, jacobian_of_points(solved, in_geo, rays.point, rays.camera, rays.sigma_px))
 
 
 @dataclass(frozen=True)
 class Truth:
     """A trained survey that is taken for the truth."""
 
-    restored: Restored
-    control: Marked | None
-    check: Marked
+    solved: SolvedSurvey
+    control: MarkedPoints | None
+    check: MarkedPoints
 
 
 @dataclass(frozen=True)
 class Drawn:
     """One run's measurements, and where the check points (J, 3) truly are in `geo`."""
 
-    fixes: Fixes | None
-    marks: ControlMarks | None
+    fixes: FixTerm | None
+    marks: ControlTerm | None
     check_in_geo: FloatArray
 
 
 def draw(truth: Truth, rng: np.random.Generator, *, images: bool) -> Drawn:
     """Draw the measurements; without `images`, image observations and the check points' marks are exact."""
-    problem, found = truth.restored.problem, truth.restored.scene.correction_basis
-    geo_from_model, basis = truth.restored.trained.geo_from_model, problem.cameras.basis.numpy()
+    problem, found = truth.solved.problem, truth.solved.scene.correction_basis
+    geo_from_model, basis = truth.solved.trained.geo_from_model, problem.cameras.basis.numpy()
     follows = problem.cameras.lens_basis.numpy()
     z = rng.normal(size=basis.shape[2]) * images
-    lens = np.zeros(truth.check.follow.by_lens.shape[2])
+    lens = np.zeros(truth.check.jacobian.by_lens.shape[2])
     if images and found is not None and len(follows):
         lens = follows @ z + _noise(found.lens_cov[None], rng)[0]
 
-    def true(marked: Marked) -> FloatArray:
-        return marked.position + marked.follow.by(basis) @ z + marked.follow.by_lens @ lens
+    def true(marked: MarkedPoints) -> FloatArray:
+        return marked.position + marked.jacobian.by_corrections(basis) @ z + marked.jacobian.by_lens @ lens
 
-    fixes, marks = problem.fixes, problem.marks
+    fixes, marks = problem.fixes, problem.control
     if fixes is not None:
-        moved = truth.restored.trained.poses.cam_center_in_model + basis[:, 3:] @ z
+        moved = truth.solved.trained.poses.cam_center_in_model + basis[:, 3:] @ z
         position = geo_from_model.apply(moved[fixes.camera.numpy()])
         position = position + _noise(_covariance(fixes.root_information), rng)
         fixes = replace(fixes, position_in_geo=torch.from_numpy(position))
     if marks is not None and truth.control is not None:
         position = geo_from_model.apply(true(truth.control)) + _noise(_covariance(marks.root_information), rng)
         marks = replace(marks, position_in_geo=torch.from_numpy(position))
-    check = true(truth.check) + images * _noise(truth.check.follow.cov_of_marks, rng)
+    check = true(truth.check) + images * _noise(truth.check.jacobian.cov_of_marks, rng)
     return Drawn(fixes, marks, geo_from_model.apply(check))
 
 
@@ -109,33 +112,41 @@ def _noise(cov: FloatArray, rng: np.random.Generator) -> FloatArray:
 
 def estimate(truth: Truth, drawn: Drawn, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
     """The check points (J, 3) in `geo`: by the similarity of `init-sim3`, and by similarity and cameras."""
-    poses, cameras = truth.restored.trained.poses, truth.restored.problem.cameras
+    poses, cameras = truth.solved.trained.poses, truth.solved.problem.cameras
     basis, follows = cameras.basis.numpy(), cameras.lens_basis.numpy()
     solution = align(_correspondences(truth, drawn), rng).solution
     start = solution.state.geo_from_local
     problem = GeoProblem(
         LearnableSimilarity(start, solution.covariance, solution.pivot),
         CameraCorrections(poses, basis, follows),
-        Measured(drawn.fixes, _through_trained_lens(truth, drawn.marks)),
+        [term for term in (drawn.fixes, _through_trained_lens(truth, drawn.marks)) if term is not None],
     )
     minimise(problem)
-    by_lens = truth.check.follow.by_lens[:, :, : len(follows)] @ follows
-    followed = truth.check.position + (truth.check.follow.by(basis) + by_lens) @ problem.cameras.z.detach().numpy()
+    by_lens = truth.check.jacobian.by_lens[:, :, : len(follows)] @ follows
+    followed = (
+        truth.check.position
+        + (truth.check.jacobian.by_corrections(basis) + by_lens) @ problem.cameras.z.detach().numpy()
+    )
     return start.apply(truth.check.position), problem.similarity.current().apply(followed)
 
 
-def _through_trained_lens(truth: Truth, marks: ControlMarks | None) -> ControlMarks | None:
+def _through_trained_lens(truth: Truth, marks: ControlTerm | None) -> ControlTerm | None:
     """The marks as the cameras see them from which the estimate starts."""
     if marks is None:
         return None
-    return replace(marks, bearing_in_cam=marks.bearings(trained_lens(truth.restored)))
+    return replace(marks, bearing_in_cam=marks.bearings(_trained_lens(truth.solved)))
+
+
+def _trained_lens(solved: SolvedSurvey) -> torch.Tensor:
+    """Change (L,) of the lens parameters that training made, in the order of `geometry.lens.Lenses`."""
+    return torch.from_numpy(solved.trained.sfm.lenses.change_to(solved.trained.sparse.lenses))
 
 
 def _correspondences(truth: Truth, drawn: Drawn) -> Correspondences:
     """What `init-sim3` would be given, the frame `model` standing for `local`."""
     local, geo, cov, control = [np.empty((0, 3))], [np.empty((0, 3))], [], []
     if drawn.fixes is not None:
-        local.append(truth.restored.trained.poses.cam_center_in_model[drawn.fixes.camera.numpy()])
+        local.append(truth.solved.trained.poses.cam_center_in_model[drawn.fixes.camera.numpy()])
         geo.append(drawn.fixes.position_in_geo.numpy())
         cov.append(_covariance(drawn.fixes.root_information))
         control += [False] * len(geo[-1])
@@ -171,15 +182,12 @@ def main() -> None:
     workspace = Workspace(options.workspace)
     trained = load_trained(workspace)
     initial = load_json(InitialSimilarity, workspace.path(SIM3))
-    restored = restore(trained, initial, geographic_options_of(workspace))
-    seen, points = sights(trained, trained.survey.check_points), trained.survey.check_points
-    control, marks = control_sights(restored), restored.problem.marks
-    truth = Truth(
-        restored,
-        None if marks is None else Marked.of(restored, control, len(marks.position_in_geo)),
-        Marked.of(restored, seen, len(points)),
-    )
-    bound = np.sqrt(np.diagonal(cramer_rao(restored, seen), axis1=1, axis2=2))
+    solved = solve_survey(trained, initial, geographic_options_of(workspace))
+    points = trained.survey.check_points
+    rays = mark_rays(points, trained.sparse)
+    control = None if solved.problem.control is None else MarkedPoints.of(solved, control_rays(solved))
+    truth = Truth(solved, control, MarkedPoints.of(solved, rays))
+    bound = np.sqrt(np.diagonal(cramer_rao_bound(solved, rays), axis1=1, axis2=2))
     clock, errors = time.perf_counter(), []
     for run in range(options.runs):
         rng = np.random.default_rng([options.seed, run])

@@ -39,10 +39,10 @@ from pipelines.splat.metrics import psnr
 from pipelines.splat.optimizer import GaussianAdam
 from pipelines.splat.rasterizer.api import Pinhole, RasterSettings
 from pipelines.splat.rasterizer.backends import rasterizer
+from pipelines.train.assembly import make_trainer
 from pipelines.train.depth_maps import DepthMaps
-from pipelines.train.material import Material
+from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.options import TrainOptions
-from pipelines.train.stage import make_trainer
 from pipelines.train.surface import SceneSurface
 from pipelines.train.trainer import JointTrainer
 
@@ -109,7 +109,7 @@ def curve(arguments: argparse.Namespace) -> None:
         maps = DepthMaps(workspace.cache / "surface", scene, images)
         maps.build()
         trainer = make_trainer(
-            Material(scene, images, SceneSurface(maps)),
+            TrainingScene(scene, images, SceneSurface(maps)),
             geo_problem(scene, survey, initial, config),
             rasterizer(config.backend),
             config,

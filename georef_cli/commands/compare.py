@@ -10,23 +10,25 @@ import click
 from georef_cli import boundary, options, tables
 from georef_cli.display import progress_for
 from georef_cli.output import document_of, print_json, print_rich
-from pipelines.compare.stage import NAMES, TRAIN_OPTIONS, chosen, compare
+from pipelines.compare.configurations import BY_CONFIGURATION, COMMON_TRAIN_OPTIONS, select_configurations
 from pipelines.train.options import TrainOptions
 
 
 def _compare(ctx: click.Context, **values: Any) -> None:
-    configurations = chosen(values["configs"])
+    from pipelines.compare.stage import compare
+
+    configurations = select_configurations(values["configs"])
     workspace = values["workspace"]
-    table, ran = compare(
+    table, finished = compare(
         workspace,
         configurations,
-        options.given(ctx, TRAIN_OPTIONS),
+        options.given(ctx, COMMON_TRAIN_OPTIONS),
         force=values["force"],
         progress=progress_for(ctx.obj),
         around=lambda variant, spec: boundary.written(variant.log_file(spec)),
     )
     if values["as_json"]:
-        stages = [{"configuration": each.configuration, **document_of(each.outcome)} for each in ran]
+        stages = [{"configuration": stage.configuration, **document_of(stage.outcome)} for stage in finished]
         print_json({"workspace": str(workspace.root), **table.model_dump(mode="json"), "stages": stages})
     else:
         print_rich(*tables.comparison(table))
@@ -38,10 +40,10 @@ command = click.Command(
         options.workspace_argument(),
         click.Option(
             ["--configs"],
-            default=",".join(NAMES),
-            help=f"Configurations to compare, with commas. [default: {','.join(NAMES)}]",
+            default=",".join(BY_CONFIGURATION),
+            help=f"Configurations to compare, with commas. [default: {','.join(BY_CONFIGURATION)}]",
         ),
-        *options.stage_options(TrainOptions, TRAIN_OPTIONS),
+        *options.stage_options(TrainOptions, COMMON_TRAIN_OPTIONS),
         options.force_option("Run the stages of the configurations even if their products are current."),
         options.json_option(),
     ],

@@ -18,29 +18,28 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import BoolArray, FloatArray
-from pipelines.geometry.rotations import exp_so3, log_so3
-from pipelines.geometry.similarity import Similarity, umeyama
+from pipelines.geometry.rotations import exp_so3, log_so3, right_jacobian_inverse_so3
+from pipelines.geometry.similarity import Similarity, jacobian_at, perturbation, umeyama
 from pipelines.geometry.trajectory import covered, places_at, turns_at
-from pipelines.robust.kernels import cauchy_weight
-from pipelines.robust.statistics import mad_sigma
+from pipelines.georef.normal_equations import NormalEquations, Observations, robust_weights
+from pipelines.robust.statistics import mad_sigma, median_chi2, squared_mahalanobis
 from pipelines.scene.navigation import NavigationTrack
 
 # A parameter counts as observed if its σ is below this: seconds, degrees, metres.
 LIMIT_OFFSET_S, LIMIT_BORESIGHT_DEG, LIMIT_ARM_M = 0.05, 0.5, 0.1
 _PRIOR_BORESIGHT_RAD, _PRIOR_ARM_M = np.radians(10.0), 2.0
-_SIMILARITY, _OFFSET, _BORESIGHT, _ARM = slice(0, 7), slice(7, 8), slice(8, 11), slice(11, 14)
+_SIMILARITY, _ROTATION = slice(0, 7), slice(1, 4)
+_OFFSET, _BORESIGHT, _ARM = slice(7, 8), slice(8, 11), slice(11, 14)
 _ROUNDS, _STEPS = 4, 12
 _SCAN_STEP_S = 0.1
 # Velocities are taken over this long: between neighbouring fixes noise would drown them.
 _DIFFERENCE_S = 0.5
 _SMOOTHING_S = 0.1
 _LEAST_IMAGES = 6
-_MEDIAN_CHI2_3 = 2.366
 _LEAST_SIGMA_M, _LEAST_SIGMA_RAD = 1e-3, 1e-5
 
 
@@ -134,10 +133,9 @@ def fit_rig(data: RigData, start_offset_s: float, start_boresight: FloatArray, o
     sigma_m, sigma_rad = 1.0, np.radians(2.0)
     for _ in range(_ROUNDS):
         for _ in range(_STEPS):
-            normal, gradient = _normal(data, state, (sigma_m, sigma_rad), start, options)
-            step = np.zeros(14)
-            step[free] = np.linalg.solve(normal[np.ix_(free, free)], gradient[free])
-            state = _moved(state, step)
+            equations, pivot = _equations(data, state, (sigma_m, sigma_rad), start, options)
+            step = equations.solve(robust_weights(equations.residuals()), free)
+            state = _moved(state, step, pivot)
             if np.abs(step[7:]).max() < 1e-7:
                 break
         position, attitude = _residuals(data, state, _usable(data, state.offset_s))
@@ -146,9 +144,9 @@ def fit_rig(data: RigData, start_offset_s: float, start_boresight: FloatArray, o
         sigma_m = max(mad_sigma(np.concatenate([position, -position]).ravel()), _LEAST_SIGMA_M)
         if len(attitude):
             sigma_rad = max(mad_sigma(np.concatenate([attitude, -attitude]).ravel()), _LEAST_SIGMA_RAD)
-    normal, _ = _normal(data, state, (sigma_m, sigma_rad), start, options)
-    sigma = np.full(14, np.inf)
-    sigma[free] = np.sqrt(np.diag(np.linalg.solve(normal[np.ix_(free, free)], np.eye(len(free)))))
+    equations, _ = _equations(data, state, (sigma_m, sigma_rad), start, options)
+    covariance = equations.covariance(robust_weights(equations.residuals()), free)
+    sigma = np.where(free, np.sqrt(np.diag(covariance)), np.inf)
     if options.offset:
         # Noise of the fixes passes for motion, and motion for information: what noise would give is taken off.
         known = sigma[_OFFSET] ** -2 - 3 * (len(position) + len(attitude)) / (2 * _DIFFERENCE_S**2)
@@ -159,13 +157,11 @@ def fit_rig(data: RigData, start_offset_s: float, start_boresight: FloatArray, o
     return RigFit(state, sigma, len(position), sigma_m, left)
 
 
-def _free(data: RigData, options: FitOptions) -> NDArray[np.intp]:
+def _free(data: RigData, options: FitOptions) -> BoolArray:
     free = np.ones(14, dtype=bool)
     free[_OFFSET], free[_ARM] = options.offset, options.arm
-    free[_BORESIGHT] = bool(np.isfinite(data.cam_from_body).all(axis=(1, 2)).any()) and len(
-        data.track.attitude_time_s
-    )
-    return np.flatnonzero(free)
+    free[_BORESIGHT] = _mounted(data, np.ones(len(data.time_s), dtype=bool)).any() and _has_attitudes(data.track)
+    return free
 
 
 def _scan(data: RigData, offsets: FloatArray, boresight: FloatArray) -> RigState:
@@ -228,88 +224,99 @@ def _residuals(data: RigData, state: RigState, used: BoolArray) -> tuple[FloatAr
     position = place - state.geo_from_local.apply(data.center_in_local[used])
     if not len(bodies):
         return position, np.empty((0, 3))
-    mount = data.cam_from_body[used]
-    known = np.isfinite(mount).all(axis=(1, 2))
-    by_navigation = bodies[known] @ np.swapaxes(mount[known], 1, 2) @ state.boresight
+    known = _mounted(data, used)
+    by_navigation = _by_navigation(data, state, bodies, used)
     by_sfm = state.geo_from_local.rotation @ np.swapaxes(data.cam_from_local[used][known], 1, 2)
     return position, log_so3(np.swapaxes(by_sfm, 1, 2) @ by_navigation)
 
 
-def _normal(
+def _mounted(data: RigData, used: BoolArray) -> BoolArray:
+    """Which of the used images (k,) have a camera whose mount is known."""
+    return np.asarray(np.isfinite(data.cam_from_body[used]).all(axis=(1, 2)))
+
+
+def _by_navigation(data: RigData, state: RigState, bodies: FloatArray, used: BoolArray) -> FloatArray:
+    """Camera rotations geo ← cam (j, 3, 3) that the navigation says of the used images with a mount."""
+    known = _mounted(data, used)
+    return np.asarray(bodies[known] @ np.swapaxes(data.cam_from_body[used][known], 1, 2) @ state.boresight)
+
+
+def _equations(
     data: RigData, state: RigState, sigmas: tuple[float, float], start: RigState, options: FitOptions
-) -> tuple[FloatArray, FloatArray]:
-    """Normal matrix (14, 14) and right-hand side (14,) of one step."""
+) -> tuple[NormalEquations, FloatArray]:
+    """The adjustment near a state, in 14 parameters about a pivot (3,) in geo."""
     used = _usable(data, state.offset_s)
+    mapped = state.geo_from_local.apply(data.center_in_local[used])
+    pivot = mapped.mean(axis=0)
     position, attitude = _residuals(data, state, used)
-    jacobian_p, jacobian_a = np.zeros((*position.shape, 14)), np.zeros((*attitude.shape, 14))
-    size = np.full(14, 1e-4)
-    size[4:7], size[_OFFSET], size[_ARM] = 1e-2, _DIFFERENCE_S, 1e-2
-    for i in range(14):
-        step = np.where(np.arange(14) == i, size, 0.0)
-        ahead, behind = (_residuals(data, _moved(state, each), used) for each in (step, -step))
-        jacobian_p[..., i] = (ahead[0] - behind[0]) / (2 * size[i])
-        jacobian_a[..., i] = (ahead[1] - behind[1]) / (2 * size[i])
-    normal, gradient = _prior(state, start, options)
-    for residual, jacobian, sigma in ((position, jacobian_p, sigmas[0]), (attitude, jacobian_a, sigmas[1])):
-        weight = cauchy_weight((residual**2).sum(axis=1) / sigma**2) / sigma**2
-        normal += np.einsum("n,nia,nib->ab", weight, jacobian, jacobian)
-        gradient -= np.einsum("n,nia,ni->a", weight, jacobian, residual)
+    by_position, by_attitude = _derivatives(data, state, used, pivot)
+    observations = {
+        "positions": Observations(position / sigmas[0], by_position / sigmas[0]),
+        "attitudes": Observations(attitude / sigmas[1], by_attitude / sigmas[1]),
+    }
     if len(data.control_in_local):
-        jacobian = -_similarity_jacobian(state, data.control_in_local)
-        missed, inverse = _control(data, state)
-        weight = cauchy_weight(np.einsum("ni,nij,nj->n", missed, inverse, missed))
-        normal[:7, :7] += np.einsum("n,nia,nij,njb->ab", weight, jacobian, inverse, jacobian)
-        gradient[:7] -= np.einsum("n,nia,nij,nj->a", weight, jacobian, inverse, missed)
-    return normal, gradient
+        missed, whitener = _control(data, state)
+        by_control = np.zeros((len(missed), 3, 14))
+        by_control[:, :, _SIMILARITY] = -jacobian_at(state.geo_from_local.apply(data.control_in_local), pivot)
+        observations["control"] = Observations((whitener @ missed[..., None])[..., 0], whitener @ by_control)
+    precision, offset = _prior(state, start, options)
+    return NormalEquations(observations, precision, offset, advice=_UNSEEN), pivot
+
+
+def _derivatives(
+    data: RigData, state: RigState, used: BoolArray, pivot: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Derivatives (k, 3, 14) of the positions' misses and (j, 3, 14) of the attitudes' by the parameters.
+
+    All but those by the time offset are analytic. A velocity is measured over `_DIFFERENCE_S` on either side.
+    """
+    mapped = state.geo_from_local.apply(data.center_in_local[used])
+    _, bodies = _navigation(data, state.offset_s, state.arm, used)
+    ahead, behind = (
+        _residuals(data, replace(state, offset_s=state.offset_s + shift), used)
+        for shift in (_DIFFERENCE_S, -_DIFFERENCE_S)
+    )
+    by_position = np.zeros((len(mapped), 3, 14))
+    by_position[:, :, _SIMILARITY] = -jacobian_at(mapped, pivot)
+    by_position[:, :, _OFFSET] = ((ahead[0] - behind[0]) / (2 * _DIFFERENCE_S))[..., None]
+    if not len(bodies):
+        return by_position, np.zeros((0, 3, 14))
+    by_position[:, :, _ARM] = -bodies
+    _, attitude = _residuals(data, state, used)
+    turned = right_jacobian_inverse_so3(attitude)
+    by_attitude = np.zeros((len(attitude), 3, 14))
+    by_attitude[:, :, _ROTATION] = -turned @ np.swapaxes(_by_navigation(data, state, bodies, used), 1, 2)
+    by_attitude[:, :, _BORESIGHT] = turned
+    by_attitude[:, :, _OFFSET] = ((ahead[1] - behind[1]) / (2 * _DIFFERENCE_S))[..., None]
+    return by_position, by_attitude
 
 
 def _control(data: RigData, state: RigState) -> tuple[FloatArray, FloatArray]:
-    """Misses of the control points (c, 3) and their weights (c, 3, 3).
+    """Misses of the control points (c, 3) in metres and their whiteners (c, 3, 3).
 
     The SfM model bends: where the control points scatter more than marks and survey allow, all count for less.
     """
     model = state.geo_from_local
     missed = data.control_in_geo - model.apply(data.control_in_local)
     cov = data.control_cov_in_geo + model.scale**2 * model.rotation @ data.control_cov_in_local @ model.rotation.T
-    inverse = np.linalg.solve(cov, np.tile(np.eye(3), (len(missed), 1, 1)))
-    usual = float(np.median(np.einsum("ni,nij,nj->n", missed, inverse, missed)))
-    return missed, np.asarray(inverse / max(1.0, usual / _MEDIAN_CHI2_3), dtype=np.float64)
-
-
-def _similarity_jacobian(state: RigState, points: FloatArray) -> FloatArray:
-    """∂(s R p + t) (n, 3, 7) by the similarity's part of a step."""
-    size = 1e-4
-    columns = []
-    for i in range(7):
-        step = np.zeros(14)
-        step[i] = size
-        ahead, behind = _moved(state, step).geo_from_local, _moved(state, -step).geo_from_local
-        columns.append((ahead.apply(points) - behind.apply(points)) / (2 * size))
-    return np.stack(columns, axis=-1)
+    excess = max(1.0, float(np.median(squared_mahalanobis(missed, cov))) / median_chi2(3))
+    return missed, np.asarray(np.linalg.inv(np.linalg.cholesky(excess * cov)))
 
 
 def _prior(state: RigState, start: RigState, options: FitOptions) -> tuple[FloatArray, FloatArray]:
-    sigma = np.full(14, np.inf)
+    """Precision (14,) of what is known beforehand, and the state's distance (14,) from it."""
+    sigma, missed = np.full(14, np.inf), np.zeros(14)
     sigma[_OFFSET], sigma[_BORESIGHT], sigma[_ARM] = options.max_offset_s, _PRIOR_BORESIGHT_RAD, _PRIOR_ARM_M
-    missed = np.zeros(14)
     missed[_OFFSET] = state.offset_s - start.offset_s
     missed[_BORESIGHT] = log_so3(start.boresight.T @ state.boresight)
     missed[_ARM] = state.arm - start.arm
-    weight = 1.0 / sigma**2
-    # The similarity is free, up to what arithmetic needs.
-    weight[_SIMILARITY] = 1e-12
-    return np.diag(weight), -weight * missed
+    return sigma**-2, missed
 
 
-def _moved(state: RigState, step: FloatArray) -> RigState:
-    model = state.geo_from_local
-    turn = exp_so3(step[1:4])
-    similarity = Similarity(
-        model.scale * float(np.exp(step[0])), turn @ model.rotation, turn @ model.translation + step[4:7]
-    )
+def _moved(state: RigState, step: FloatArray, pivot: FloatArray) -> RigState:
     return RigState(
-        similarity,
-        state.offset_s + float(step[7]),
+        perturbation(step[_SIMILARITY], pivot) @ state.geo_from_local,
+        state.offset_s + float(step[_OFFSET][0]),
         state.boresight @ exp_so3(step[_BORESIGHT]),
         state.arm + step[_ARM],
     )

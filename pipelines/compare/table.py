@@ -1,18 +1,19 @@
-"""The table of `georef compare`: what each configuration reached, as JSON, as Markdown and as a plot."""
+"""The table of `georef compare`: the figures of each configuration, as JSON, as Markdown and as a plot."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Literal
 
-import numpy as np
-
-from pipelines.core.errors import InputError
 from pipelines.core.products import Product
 from pipelines.core.workspace import replace_text
 from pipelines.plots.bars import Panel, write_bars
+
+if TYPE_CHECKING:  # with its statistics it would load SciPy to print a table
+    from pipelines.scene.report import CheckPointErrors
+
+JsonScalar = bool | int | float | str
 
 
 class PointAccuracy(Product):
@@ -26,9 +27,9 @@ class PointAccuracy(Product):
 
 
 class ComparedRow(Product):
-    """What one configuration reached.
+    """The figures of one configuration.
 
-    `failure` tells why it reached nothing; `training_s` is None where the training is another configuration's.
+    `failure` tells why there are none; `training_s` is None where the training is another configuration's.
     """
 
     configuration: str
@@ -49,74 +50,57 @@ class Comparison(Product):
     """The table: options that all trainings share, and a row a configuration."""
 
     format_version: Literal[1] = 1
-    options: dict[str, Any]
+    options: dict[str, JsonScalar]
     rows: tuple[ComparedRow, ...]
 
 
-def figures_of(report: Path) -> dict[str, Any]:
-    """The fields of a `ComparedRow` that `evaluate/report.json` holds.
-
-    Raises:
-        InputError: not a report.
-    """
-    try:
-        document = json.loads(report.read_text(encoding="utf-8"))
-        test, check = document["photometric"]["test"], document["checkpoints"]
-        return {
-            "test_psnr": test["psnr"],
-            "test_ssim": test["ssim"],
-            "camera": _accuracy(check["camera"]),
-            "model": _accuracy(check["model"]),
-        }
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise InputError(f"not a report of `georef evaluate`: {error!r}", path=report) from error
-
-
-def _accuracy(section: Mapping[str, Any]) -> PointAccuracy:
-    rows = [row for row in section["points"] if row["de_m"] is not None]
-    distance = np.hypot([row["de_m"] for row in rows], [row["dn_m"] for row in rows])
+def point_accuracy(errors: CheckPointErrors) -> PointAccuracy:
+    """Return the figures of check points for the table."""
     return PointAccuracy(
-        count=section["count"],
-        mean_h_m=section["mean_h_m"],
-        median_h_m=float(np.median(distance)) if rows else None,
-        rmse_h_m=section["rmse_h_m"],
-        rmse_v_m=section["rmse_v_m"],
+        count=errors.count,
+        mean_h_m=errors.mean_h_m,
+        median_h_m=errors.median_h_m,
+        rmse_h_m=errors.rmse_h_m,
+        rmse_v_m=errors.rmse_v_m,
     )
 
 
 def write_comparison(folder: Path, table: Comparison) -> None:
     """Write `table.json`, `table.md` and `plot.png`; nothing if they say this already."""
-    document, notes, plot = (folder / name for name in ("table.json", "table.md", "plot.png"))
-    text, told = table.model_dump_json(indent=1) + "\n", markdown(table)
-    if plot.exists() and _says(document, text) and _says(notes, told):
+    json_path, markdown_path, plot_path = (folder / name for name in ("table.json", "table.md", "plot.png"))
+    json_text, markdown_text = table.model_dump_json(indent=1) + "\n", markdown(table)
+    if plot_path.exists() and _holds(json_path, json_text) and _holds(markdown_path, markdown_text):
         return
-    write_bars(plot, _panels(table.rows))
-    replace_text(notes, told)
-    replace_text(document, text)
+    write_bars(plot_path, _panels(table.rows))
+    replace_text(markdown_path, markdown_text)
+    replace_text(json_path, json_text)
 
 
-def _says(path: Path, text: str) -> bool:
+def _holds(path: Path, text: str) -> bool:
     return path.exists() and path.read_text(encoding="utf-8") == text
 
 
 def _panels(rows: Sequence[ComparedRow]) -> tuple[Panel, ...]:
     members = tuple(row.configuration for row in rows)
-    points = {"camera": [row.camera for row in rows], "model": [row.model for row in rows]}
+    ways = {"camera": [row.camera for row in rows], "model": [row.model for row in rows]}
     geometry = (
         Panel(
             f"Check points by {way}",
-            "RMSE in metres",
+            "RMSE in m",
             members,
-            {"horizontal": [one.rmse_h_m for one in found], "vertical": [one.rmse_v_m for one in found]},
+            {
+                "horizontal": [accuracy.rmse_h_m for accuracy in accuracies],
+                "vertical": [accuracy.rmse_v_m for accuracy in accuracies],
+            },
         )
-        for way, found in points.items()
+        for way, accuracies in ways.items()
     )
     images = Panel("Test views", "PSNR in dB", members, {"PSNR": [row.test_psnr for row in rows]}, digits=2)
     return (*geometry, images)
 
 
 def markdown(table: Comparison) -> str:
-    """The table for people, with the notes below it."""
+    """Return the table for people, with the notes below it."""
     heads = (
         *("", "test PSNR dB", "SSIM", "camera mean H", "camera RMSE H", "camera RMSE V"),
         *("model mean H", "model median H", "model RMSE H", "model RMSE V", "check points", "training"),
@@ -134,12 +118,12 @@ def markdown(table: Comparison) -> str:
     remarks = [(row.configuration, text) for row in table.rows for text in remarks_on(row)]
     if remarks:
         lines += ["", "Remarks:", "", *(f"- {name}: {text}" for name, text in remarks)]
-    told = ", ".join(f"{name} {value}" for name, value in table.options.items())
-    return "\n".join([*lines, "", f"All trained with: {told or 'the default options'}."]) + "\n"
+    options = ", ".join(f"{name} {value}" for name, value in table.options.items())
+    return "\n".join([*lines, "", f"All trained with: {options or 'the default options'}."]) + "\n"
 
 
 def cells(row: ComparedRow) -> tuple[str, ...]:
-    """The figures of a row as text: images, check points by camera and by model, their number, time."""
+    """Return the figures of a row as text: images, check points by camera and by model, their number, time."""
     camera, model = row.camera, row.model
     counts = str(camera.count) if camera.count == model.count else f"{camera.count}, {model.count}"
     return (
@@ -153,11 +137,11 @@ def cells(row: ComparedRow) -> tuple[str, ...]:
 
 
 def remarks_on(row: ComparedRow) -> tuple[str, ...]:
-    """Why a row is empty, and what its stages warned of."""
+    """Return why a row is empty, and the warnings of its stages."""
     return (*(() if row.failure is None else (f"failed: {row.failure}",)), *row.warnings)
 
 
-def _line(parts: Any) -> str:
+def _line(parts: Iterable[str]) -> str:
     return "| " + " | ".join(parts) + " |"
 
 

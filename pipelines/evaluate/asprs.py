@@ -8,13 +8,13 @@ measured one in quadrature, and asks for at least 30 check points.
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from pipelines.core.types import BoolArray, FloatArray
+from pipelines.scene.report import AsprsStatement, ErrorStats, Rmse, TotalRmse
 
 LEAST_POINTS = 30
 BLUNDER_FACTOR = 3.0
@@ -24,111 +24,48 @@ _MOST_ROUNDS = 20
 
 
 @dataclass(frozen=True)
-class ErrorStats:
-    """Figures of errors (measured in the model minus surveyed) in metres; None where there are none.
-
-    `mean_e_m`, `mean_n_m`, `mean_u_m` are signed (the bias), all others are lengths.
-    """
-
-    count: int
-    mean_e_m: float | None = None
-    mean_n_m: float | None = None
-    mean_u_m: float | None = None
-    mean_h_m: float | None = None
-    median_h_m: float | None = None
-    rmse_e_m: float | None = None
-    rmse_n_m: float | None = None
-    rmse_h_m: float | None = None
-    rmse_v_m: float | None = None
-    rmse_3d_m: float | None = None
-    max_h_m: float | None = None
-    max_v_m: float | None = None
-    max_3d_m: float | None = None
-
-
-@dataclass(frozen=True)
-class Rmse:
-    """Horizontal (east and north together) and vertical root mean square in metres."""
-
-    rmse_h_m: float
-    rmse_v_m: float
-
-    @property
-    def rmse_3d_m(self) -> float:
-        """Both together."""
-        return math.hypot(self.rmse_h_m, self.rmse_v_m)
-
-    @property
-    def classes_cm(self) -> tuple[int, int]:
-        """The smallest horizontal and vertical class in whole centimetres; the standard allows any number."""
-        return _class_cm(self.rmse_h_m), _class_cm(self.rmse_v_m)
-
-
-@dataclass(frozen=True)
 class Assessment:
-    """What N check points say of a product.
+    """Accuracy of a product after N check points.
 
     Attributes:
         stats: of the errors as they are, blunders included.
         survey: of the check points' own survey (RMSE_H2, RMSE_V2 of the standard); None without points.
         with_survey: errors and survey in quadrature: the accuracy that the standard states.
+        asprs: the classes that `with_survey` meets.
         blunder: (N,) errors beyond three times the class that the other points meet.
-        without_blunders: figures of the others.
+        without_blunders: figures of the others; None where there are no blunders.
     """
 
     stats: ErrorStats
     survey: Rmse | None
-    with_survey: Rmse | None
+    with_survey: TotalRmse | None
+    asprs: AsprsStatement
     blunder: BoolArray
-    without_blunders: ErrorStats
-
-    @property
-    def statement(self) -> str | None:
-        """The result in a sentence, with the count against the minimum; None without check points."""
-        tested = self.with_survey
-        if tested is None:
-            return None
-        count, (horizontal, vertical) = self.stats.count, tested.classes_cm
-        on = f"tested on {count} check points: " if count >= LEAST_POINTS else f"{few_points(count)}. "
-        return (
-            f"{on}RMSE_H {100 * tested.rmse_h_m:.1f} cm, "
-            f"RMSE_V {100 * tested.rmse_v_m:.1f} cm, the check points' survey included: horizontal accuracy class "
-            f"{horizontal} cm, vertical accuracy class {vertical} cm (ASPRS, 2nd ed.)"
-        )
-
-    def document(self) -> dict[str, Any]:
-        """As plain values; docs/formats.md has their meaning."""
-        tested = self.with_survey
-        horizontal, vertical = (None, None) if tested is None else tested.classes_cm
-        return {
-            **asdict(self.stats),
-            "survey": None if self.survey is None else asdict(self.survey),
-            "with_survey": None if tested is None else {**asdict(tested), "rmse_3d_m": tested.rmse_3d_m},
-            "asprs": {
-                "horizontal_class": None if horizontal is None else f"{horizontal} cm",
-                "vertical_class": None if vertical is None else f"{vertical} cm",
-                "least_points": LEAST_POINTS,
-                "enough_points": self.stats.count >= LEAST_POINTS,
-                "statement": self.statement,
-            },
-            "without_blunders": asdict(self.without_blunders) if self.blunder.any() else None,
-        }
+    without_blunders: ErrorStats | None
 
 
-def few_points(count: int) -> str:
-    """What to say of fewer check points than the standard asks for."""
-    return f"{count} check points; ASPRS 2nd ed. asks for at least {LEAST_POINTS}: the class is indicative"
+def assess(error_in_geo: ArrayLike, cov_survey: ArrayLike) -> Assessment:
+    """Assess errors (N, 3) at check points that were surveyed with covariances (N, 3, 3), both in metres.
 
-
-def _class_cm(rmse_m: float) -> int:
-    return max(math.ceil(100 * rmse_m - 1e-9), 1)
+    The errors are distances from the surveyed positions; the standard adds how far these may be from the datum.
+    """
+    error = np.asarray(error_in_geo, dtype=np.float64).reshape(-1, 3)
+    variance = np.diagonal(np.asarray(cov_survey, dtype=np.float64).reshape(-1, 3, 3), axis1=1, axis2=2)
+    stats = error_stats(error)
+    if len(error) == 0:
+        return Assessment(stats, None, None, _statement(0, None), np.zeros(0, dtype=bool), None)
+    total, blunder = _rmse(error**2 + variance), _blunders(error, variance)
+    with_survey = TotalRmse(**total.model_dump(), rmse_3d_m=math.hypot(total.rmse_h_m, total.rmse_v_m))
+    without_blunders = error_stats(error[~blunder]) if blunder.any() else None
+    statement = _statement(len(error), with_survey)
+    return Assessment(stats, _rmse(variance), with_survey, statement, blunder, without_blunders)
 
 
 def error_stats(error_in_geo: ArrayLike) -> ErrorStats:
-    """Figures of errors (N, 3), east, north, up in metres."""
+    """Return the figures of errors (N, 3), east, north, up in metres."""
     error = np.asarray(error_in_geo, dtype=np.float64).reshape(-1, 3)
     if len(error) == 0:
-        return ErrorStats(0)
+        return ErrorStats(count=0, **dict.fromkeys(name for name in ErrorStats.model_fields if name != "count"))
     mean, square = error.mean(axis=0).tolist(), (error**2).mean(axis=0)
     horizontal, vertical = np.hypot(error[:, 0], error[:, 1]), np.abs(error[:, 2])
     return ErrorStats(
@@ -149,25 +86,45 @@ def error_stats(error_in_geo: ArrayLike) -> ErrorStats:
     )
 
 
-def assess(error_in_geo: ArrayLike, cov_survey: ArrayLike) -> Assessment:
-    """Assess errors (N, 3) at check points that were surveyed with covariances (N, 3, 3), both in metres.
+def classes_cm(rmse: Rmse) -> tuple[int, int]:
+    """Return the smallest horizontal and vertical class in whole centimetres; the standard allows any number."""
+    horizontal, vertical = (max(math.ceil(100 * rmse_m - 1e-9), 1) for rmse_m in (rmse.rmse_h_m, rmse.rmse_v_m))
+    return horizontal, vertical
 
-    The errors are distances from the surveyed positions; the standard adds how far these may be from the datum.
-    """
-    error = np.asarray(error_in_geo, dtype=np.float64).reshape(-1, 3)
-    variance = np.diagonal(np.asarray(cov_survey, dtype=np.float64).reshape(-1, 3, 3), axis1=1, axis2=2)
-    if len(error) == 0:
-        return Assessment(ErrorStats(0), None, None, np.zeros(0, dtype=bool), ErrorStats(0))
-    blunder = _blunders(error, variance)
-    return Assessment(
-        error_stats(error), _rmse(variance), _rmse(error**2 + variance), blunder, error_stats(error[~blunder])
+
+def few_points(count: int) -> str:
+    """Return the remark on fewer check points than the standard asks for."""
+    return f"{count} check points; ASPRS 2nd ed. asks for at least {LEAST_POINTS}: the class is indicative"
+
+
+def _statement(count: int, tested: Rmse | None) -> AsprsStatement:
+    """The classes that check points meet, and the sentence that gives their count against the minimum."""
+    enough = count >= LEAST_POINTS
+    if tested is None:
+        return AsprsStatement(
+            horizontal_class=None,
+            vertical_class=None,
+            least_points=LEAST_POINTS,
+            enough_points=enough,
+            statement=None,
+        )
+    horizontal, vertical = (f"{class_cm} cm" for class_cm in classes_cm(tested))
+    sample = f"tested on {count} check points: " if enough else f"{few_points(count)}. "
+    return AsprsStatement(
+        horizontal_class=horizontal,
+        vertical_class=vertical,
+        least_points=LEAST_POINTS,
+        enough_points=enough,
+        statement=f"{sample}RMSE_H {100 * tested.rmse_h_m:.1f} cm, RMSE_V {100 * tested.rmse_v_m:.1f} cm, "
+        f"the check points' survey included: horizontal accuracy class {horizontal}, "
+        f"vertical accuracy class {vertical} (ASPRS, 2nd ed.)",
     )
 
 
 def _rmse(square: FloatArray) -> Rmse:
     """Of squares (N, 3), east, north and up."""
     east, north, up = square.mean(axis=0).tolist()
-    return Rmse(math.sqrt(east + north), math.sqrt(up))
+    return Rmse(rmse_h_m=math.sqrt(east + north), rmse_v_m=math.sqrt(up))
 
 
 def _blunders(error: FloatArray, variance: FloatArray) -> BoolArray:
@@ -178,18 +135,19 @@ def _blunders(error: FloatArray, variance: FloatArray) -> BoolArray:
     """
     size = np.column_stack([np.hypot(error[:, 0], error[:, 1]), np.abs(error[:, 2])])
     horizontal, vertical = (np.median(size, axis=0) * _RMSE_OF_MEDIAN).tolist()
-    own = _rmse(variance)
-    start = Rmse(math.hypot(horizontal, own.rmse_h_m), math.hypot(vertical, own.rmse_v_m))
-    first = found = _beyond(size, start)
+    survey = _rmse(variance)
+    robust = Rmse(rmse_h_m=math.hypot(horizontal, survey.rmse_h_m), rmse_v_m=math.hypot(vertical, survey.rmse_v_m))
+    first = blunder = _beyond(size, robust)
     for _ in range(_MOST_ROUNDS):
-        if found.all():
+        if blunder.all():
             break
-        before, found = found, _beyond(size, _rmse((error**2 + variance)[~found]))
-        if np.array_equal(before, found):
-            return found
+        previous, blunder = blunder, _beyond(size, _rmse((error**2 + variance)[~blunder]))
+        if np.array_equal(previous, blunder):
+            return blunder
     return first
 
 
 def _beyond(size: FloatArray, others: Rmse) -> BoolArray:
-    allowed_m = BLUNDER_FACTOR * np.array(others.classes_cm) / 100
+    """Which errors (N, 2), horizontal and vertical, exceed three times the class that `others` meet."""
+    allowed_m = BLUNDER_FACTOR * np.array(classes_cm(others)) / 100
     return np.asarray((size > allowed_m).any(axis=1))

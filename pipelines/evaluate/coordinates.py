@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from pipelines.core.types import FloatArray
+from pipelines.core.types import FloatArray, Vector3
 from pipelines.geodesy.crs import PointCrs, parse_crs
 from pipelines.geodesy.enu import ecef_from_enu, lla_from_ecef, lla_of
+from pipelines.scene.report import CheckPointErrors, CheckPoints, Coordinates, PointCoordinates
 from pipelines.scene.survey import Survey
-
-_WAYS = ("camera", "model")
 
 
 def target_crs(text: str, survey: Survey) -> PointCrs:
-    """The CRS in which to list positions of a survey.
+    """Return the CRS in which to list positions of a survey.
 
     Raises:
         InputError: not a CRS, one that is not for this place, or one that needs a grid that is not installed.
@@ -25,47 +22,53 @@ def target_crs(text: str, survey: Survey) -> PointCrs:
     return crs
 
 
-def in_crs(checkpoints: dict[str, Any], survey: Survey, crs: PointCrs) -> dict[str, Any]:
-    """Each check point as surveyed and as measured, and the origin of `geo`, as easting, northing, height of `crs`.
+def coordinates_in(crs: PointCrs, checkpoints: CheckPoints, survey: Survey) -> Coordinates:
+    """Return each check point as surveyed and as measured, and the origin of `geo`, in a CRS.
 
     Args:
-        checkpoints: of the report: `de_m`, `dn_m`, `du_m` of each point by camera and by model, null where it was
-            not measured.
-        survey: whose check points they are.
         crs: from `target_crs`.
+        checkpoints: of the report.
+        survey: whose check points they are.
 
     Raises:
         InputError: a point outside the CRS's domain.
     """
     surveyed = np.array([point.position_in_geo for point in survey.check_points]).reshape(-1, 3)
-    found = {way: surveyed + _errors(checkpoints[way]["points"]) for way in _WAYS}
+    by_camera, by_model = (surveyed + _errors(way) for way in (checkpoints.camera, checkpoints.model))
     # One call for all: one operation serves them all.
-    in_geo = np.concatenate([np.zeros((1, 3)), surveyed, *found.values()])
+    in_geo = np.concatenate([np.zeros((1, 3)), surveyed, by_camera, by_model])
     known = np.isfinite(in_geo).all(axis=1)
     lla = lla_from_ecef(ecef_from_enu(in_geo[known], survey.origin))
     xyz = np.full(in_geo.shape, np.nan)
     xyz[known] = crs.xyz_from_lla(lla)
     operation = crs.operation(lla)
-    rows = dict(zip(("surveyed", *_WAYS), xyz[1:].reshape(-1, len(surveyed), 3), strict=True))
-    return {
-        "crs": crs.name,
-        "units": list(crs.units),
-        "heights": crs.vertical.name,
-        "operation": operation.name,
-        "operation_accuracy_m": operation.accuracy_m,
-        "origin": _listed(xyz[0]),
-        "points": [
-            {"name": point.name, **{kind: _listed(rows[kind][j]) for kind in rows}}
-            for j, point in enumerate(survey.check_points)
-        ],
-    }
+    by_point = np.swapaxes(xyz[1:].reshape(3, len(surveyed), 3), 0, 1)
+    return Coordinates(
+        crs=crs.name,
+        units=crs.units,
+        heights=crs.vertical.name,
+        operation=operation.name,
+        operation_accuracy_m=operation.accuracy_m,
+        origin=_vector(xyz[0]),
+        points=tuple(
+            PointCoordinates(
+                name=point.name, surveyed=_vector(there), camera=_measured(camera), model=_measured(model)
+            )
+            for point, (there, camera, model) in zip(survey.check_points, by_point, strict=True)
+        ),
+    )
 
 
-def _errors(rows: list[dict[str, Any]]) -> FloatArray:
+def _errors(checkpoints: CheckPointErrors) -> FloatArray:
     """(J, 3) measured minus surveyed in metres; NaN where not measured."""
-    values = [[np.nan if row[key] is None else row[key] for key in ("de_m", "dn_m", "du_m")] for row in rows]
-    return np.array(values, dtype=np.float64).reshape(-1, 3)
+    errors = [(row.de_m, row.dn_m, row.du_m) for row in checkpoints.points]
+    return np.array(errors, dtype=np.float64).reshape(-1, 3)  # None becomes NaN
 
 
-def _listed(xyz: FloatArray) -> list[float] | None:
-    return xyz.tolist() if np.isfinite(xyz).all() else None
+def _measured(xyz: FloatArray) -> Vector3 | None:
+    return _vector(xyz) if np.isfinite(xyz).all() else None
+
+
+def _vector(xyz: FloatArray) -> Vector3:
+    x, y, z = xyz.tolist()
+    return x, y, z

@@ -17,6 +17,7 @@ from scipy.sparse import csr_matrix, hstack
 
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import BoolArray, FloatArray, IntArray
+from pipelines.evaluate.networks import control_points, control_rays, in_geo, network_of_points
 from pipelines.geometry.bundle import (
     Network,
     has_positive_depth,
@@ -25,6 +26,8 @@ from pipelines.geometry.bundle import (
     sparse_jacobian,
     with_positive_depths,
 )
+from pipelines.scene.marks import MarkRays
+from pipelines.scene.solved_survey import SolvedSurvey
 
 _WORST_SCALED = 1e-10  # pivot of the scaled normal matrix below which a direction is open
 _RIDGE = 1e-12  # for a point that its rays leave open
@@ -154,3 +157,42 @@ def _eliminated(network: Network, sigma_px: FloatArray, cov_known: FloatArray | 
     point = sparse_jacobian(rows.by_point @ root[network.obs_point], network.obs_point, count)
     cross = rows.by_cameras.T @ point
     return np.asarray((rows.by_cameras.T @ rows.by_cameras - cross @ cross.T).toarray())
+
+
+def cramer_rao_bound(solved: SolvedSurvey, rays: MarkRays) -> FloatArray:
+    """Return the least covariance (J, 3, 3) in m² of the check points, from all measurements with the σ they state.
+
+    Args:
+        solved: the survey.
+        rays: of the marks of all J check points.
+
+    Raises:
+        DegenerateGeometryError: there is none: too many cameras, or too little measured.
+    """
+    scene, trained = solved.scene, solved.trained
+    if scene.correction_basis is None:
+        raise DegenerateGeometryError(f"{len(scene.sparse.image_name)} cameras are too many for the bound")
+    network = in_geo(scene.network, trained.geo_from_model)
+    information = CameraInformation(network, scene.correction_basis.sigma_px, _anchors(solved, network))
+    position = np.array([point.position_in_geo for point in trained.survey.check_points]).reshape(-1, 3)
+    return information.bound(network_of_points(network, position, rays.point, rays.camera), rays.sigma_px)
+
+
+def _anchors(solved: SolvedSurvey, network: Network) -> Anchors:
+    """Fixes and control points as the training used them."""
+    fixes = solved.problem.fixes
+    camera, cov_fix = np.empty(0, dtype=np.int64), np.empty((0, 3, 3))
+    if fixes is not None:
+        root = fixes.root_information.cpu().numpy()
+        camera, cov_fix = fixes.camera.cpu().numpy(), np.linalg.inv(np.swapaxes(root, 1, 2) @ root)
+    points = control_points(solved)
+    if not points:
+        return Anchors(camera, cov_fix)
+    rays, position = control_rays(solved), np.array([point.position_in_geo for point in points])
+    return Anchors(
+        camera,
+        cov_fix,
+        control=network_of_points(network, position, rays.point, rays.camera),
+        control_sigma_px=rays.sigma_px,
+        cov_control=np.array([point.cov_in_geo for point in points]),
+    )

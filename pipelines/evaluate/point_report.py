@@ -1,87 +1,160 @@
-"""What is reported of surveyed points: errors, accuracy after ASPRS, and what was predicted of them."""
+"""The report's sections on surveyed points: errors, accuracy after ASPRS, and the accuracy that was predicted."""
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.core.types import FloatArray, IntArray
-from pipelines.evaluate.asprs import assess
-from pipelines.evaluate.points import Sights
+from pipelines.core.types import BoolArray, FloatArray, IntArray
+from pipelines.evaluate.asprs import Assessment, assess
+from pipelines.scene.report import (
+    ByAxis,
+    CheckPointErrors,
+    CrossValidation,
+    PointError,
+    PointResidual,
+    PointRows,
+    PredictedPointError,
+    PredictedSigma,
+    RmsSigma,
+)
 from pipelines.scene.survey import SurveyedPoint
 
 
-def point_report(
-    error_in_geo: FloatArray,
-    points: tuple[SurveyedPoint, ...],
-    *,
-    rays: IntArray,
-    predicted: FloatArray | None = None,
-    bound: FloatArray | None = None,
-) -> dict[str, Any]:
-    """Statistics and rows of errors (J, 3), measured minus surveyed in metres, NaN for what was not measured.
+@dataclass(frozen=True)
+class MeasuredPoints:
+    """J surveyed points, measured in the model.
+
+    Attributes:
+        points: as surveyed.
+        error_in_geo: (J, 3) m, measured minus surveyed; NaN for a point that was not measured.
+        rays: (J,) marks in registered images.
+        cov_in_geo: (J, 3, 3) m², predicted of the measured positions; None where it is not known.
+    """
+
+    points: tuple[SurveyedPoint, ...]
+    error_in_geo: FloatArray
+    rays: IntArray
+    cov_in_geo: FloatArray | None = None
+
+    @property
+    def is_measured(self) -> BoolArray:
+        """Which points (J,) were measured."""
+        return np.asarray(np.isfinite(self.error_in_geo).all(axis=1))
+
+    @property
+    def cov_survey(self) -> FloatArray:
+        """Covariance (J, 3, 3) of the surveyed positions in m²."""
+        return np.array([point.cov_in_geo for point in self.points]).reshape(-1, 3, 3)
+
+
+def check_point_errors(measured: MeasuredPoints, bound: FloatArray | None = None) -> CheckPointErrors:
+    """Return the section on check points.
 
     Args:
-        points: J surveyed points.
-        rays: (J,) marks in registered images.
-        predicted: (J, 3, 3) m², expected of the measured positions; None where it is not known.
-        bound: (J, 3, 3) m², the least that is possible.
+        measured: J check points.
+        bound: (J, 3, 3) m², the least covariance that is possible; None where it is not known.
     """
-    error = error_in_geo.reshape(-1, 3)
-    measured = np.isfinite(error).all(axis=1)
-    survey = np.array([point.cov_in_geo for point in points]).reshape(-1, 3, 3)
-    found = assess(error[measured], survey[measured])
-    blunder = np.zeros(len(points), dtype=bool)
-    blunder[measured] = found.blunder
-    rows = point_rows(error, points, rays)
-    for row, bad in zip(rows, blunder.tolist(), strict=True):
-        row["blunder"] = bad
-    if predicted is not None:
-        sigma = np.sqrt(np.diagonal(predicted, axis1=1, axis2=2))
-        for row, axes in zip(rows, sigma, strict=True):
-            row.update(_axes(("sigma_e_m", "sigma_n_m", "sigma_u_m"), axes))
-    return {
-        **found.document(),
-        "blunders": [point.name for point, bad in zip(points, blunder, strict=True) if bad],
-        "predicted": None if predicted is None else _predicted(error, predicted, survey),
-        "cramer_rao": None if bound is None else _rms(bound),
-        "points": rows,
-    }
+    assessment = _assess(measured)
+    blunder = _among_all(assessment, measured)
+    return CheckPointErrors(
+        **assessment.stats.model_dump(),
+        survey=assessment.survey,
+        with_survey=assessment.with_survey,
+        asprs=assessment.asprs,
+        without_blunders=assessment.without_blunders,
+        blunders=_names(measured, blunder),
+        predicted=_predicted_sigma(measured),
+        cramer_rao=None if bound is None else _rms_sigma(bound),
+        points=_rows(measured, blunder),
+    )
 
 
-def point_rows(error_in_geo: FloatArray, points: tuple[SurveyedPoint, ...], rays: IntArray) -> list[dict[str, Any]]:
-    """A row for each point: name, marks, error (3,) in metres or null."""
-    return [
-        {"name": point.name, "rays": int(count), **_axes(("de_m", "dn_m", "du_m"), error)}
-        for point, count, error in zip(points, rays, error_in_geo, strict=True)
+def cross_validation_errors(measured: MeasuredPoints) -> CrossValidation:
+    """Return the section on control points that were each measured by a solution without it.
+
+    They get neither class nor bound: they are not check points.
+    """
+    assessment = _assess(measured)
+    blunder = _among_all(assessment, measured)
+    impossible = "no control point can be spared, or none entered the training"
+    return CrossValidation(
+        **assessment.stats.model_dump(),
+        survey=assessment.survey,
+        with_survey=assessment.with_survey,
+        without_blunders=assessment.without_blunders,
+        blunders=_names(measured, blunder),
+        predicted=_predicted_sigma(measured),
+        points=_rows(measured, blunder),
+        reason=None if assessment.stats.count else impossible,
+    )
+
+
+def point_residuals(measured: MeasuredPoints) -> tuple[PointResidual, ...]:
+    """Return a row for each point that entered the solution."""
+    residual = _by_axis(measured.error_in_geo)
+    return tuple(
+        PointResidual(name=point.name, rays=rays, de_m=east, dn_m=north, du_m=up)
+        for point, rays, (east, north, up) in zip(measured.points, measured.rays.tolist(), residual, strict=True)
+    )
+
+
+def _assess(measured: MeasuredPoints) -> Assessment:
+    known = measured.is_measured
+    return assess(measured.error_in_geo[known], measured.cov_survey[known])
+
+
+def _among_all(assessment: Assessment, measured: MeasuredPoints) -> list[bool]:
+    """Which of all J points are blunders."""
+    blunder = np.zeros(len(measured.points), dtype=bool)
+    blunder[measured.is_measured] = assessment.blunder
+    return [bool(is_blunder) for is_blunder in blunder]
+
+
+def _names(measured: MeasuredPoints, chosen: list[bool]) -> tuple[str, ...]:
+    return tuple(point.name for point, is_chosen in zip(measured.points, chosen, strict=True) if is_chosen)
+
+
+def _rows(measured: MeasuredPoints, blunder: list[bool]) -> PointRows:
+    """A row for each point, with its predicted σ where there is a prediction."""
+    rows = [
+        PointError(**residual.model_dump(), blunder=is_blunder)
+        for residual, is_blunder in zip(point_residuals(measured), blunder, strict=True)
     ]
+    if measured.cov_in_geo is None:
+        return tuple(rows)
+    sigma = _by_axis(np.sqrt(np.diagonal(measured.cov_in_geo, axis1=1, axis2=2)))
+    return tuple(
+        PredictedPointError(**row.model_dump(), sigma_e_m=east, sigma_n_m=north, sigma_u_m=up)
+        for row, (east, north, up) in zip(rows, sigma, strict=True)
+    )
 
 
-def ray_counts(seen: Sights, count: int) -> IntArray:
-    """Marks (J,) of each of `count` points."""
-    return np.bincount(seen.point, minlength=count).astype(np.int64)
+def _by_axis(values: FloatArray) -> list[tuple[float, float, float] | tuple[None, None, None]]:
+    """Rows (J, 3) as numbers; None for a row that is not known in all axes."""
+    rows = ((float(east), float(north), float(up)) for east, north, up in values)
+    return [row if np.isfinite(row).all() else (None, None, None) for row in rows]
 
 
-def _axes(names: tuple[str, str, str], values: FloatArray) -> dict[str, float | None]:
-    known = bool(np.isfinite(values).all())
-    return {name: float(value) if known else None for name, value in zip(names, values, strict=True)}
-
-
-def _rms(cov: FloatArray) -> dict[str, Any]:
+def _rms_sigma(cov: FloatArray) -> RmsSigma:
     """Root mean square of the standard deviations of points (J, 3, 3), as far as they are known."""
     known = cov[np.isfinite(cov).all(axis=(1, 2))]
     if not len(known):
-        return {"count": 0, "rms_h_m": None, "rms_v_m": None}
+        return RmsSigma(count=0, rms_h_m=None, rms_v_m=None)
     east, north, up = np.diagonal(known, axis1=1, axis2=2).mean(axis=0).tolist()
-    return {"count": len(known), "rms_h_m": float(np.sqrt(east + north)), "rms_v_m": float(np.sqrt(up))}
+    return RmsSigma(count=len(known), rms_h_m=float(np.sqrt(east + north)), rms_v_m=float(np.sqrt(up)))
 
 
-def _predicted(error: FloatArray, predicted: FloatArray, survey: FloatArray) -> dict[str, Any]:
-    """What was predicted, and errors squared over their variances (survey included): 1 on the average if true."""
-    variance = np.diagonal(predicted + survey, axis1=1, axis2=2)
-    known = np.isfinite(error).all(axis=1) & np.isfinite(variance).all(axis=1)
-    normalised: dict[str, float | None] = dict.fromkeys("enu")
+def _predicted_sigma(measured: MeasuredPoints) -> PredictedSigma | None:
+    """Predicted σ, and errors squared over their variances (survey included): 1 on the average if both are true."""
+    if measured.cov_in_geo is None:
+        return None
+    variance = np.diagonal(measured.cov_in_geo + measured.cov_survey, axis1=1, axis2=2)
+    known = measured.is_measured & np.isfinite(variance).all(axis=1)
+    normalised = ByAxis(e=None, n=None, u=None)
     if known.any():
-        normalised = dict(zip("enu", (error[known] ** 2 / variance[known]).mean(axis=0).tolist(), strict=True))
-    return {**_rms(predicted[known]), "normalised_error_squared": normalised}
+        east, north, up = (measured.error_in_geo[known] ** 2 / variance[known]).mean(axis=0).tolist()
+        normalised = ByAxis(e=east, n=north, u=up)
+    sigma = _rms_sigma(measured.cov_in_geo[known])
+    return PredictedSigma(**sigma.model_dump(), normalised_error_squared=normalised)

@@ -1,4 +1,4 @@
-"""Stage `geolocate`: every SfM point intersected on Earth from the measured positions and attitudes.
+"""Stage `geolocate`: every SfM point intersected on Earth from the observed positions and attitudes.
 
 Reads `ingest/survey.json` and `sfm/sparse`; writes `geolocate/points.npz` (`GeolocatedPoints`) and `points.ply`.
 GeoRefGS section 2.3, eqs 4–15 (doi 10.3390/drones10030195). Control and check points are not used.
@@ -48,7 +48,7 @@ _ALIGNMENT_SEED = 0
 
 @dataclass(frozen=True)
 class Geolocation:
-    """Result of `geolocate`: the points and what to say about them."""
+    """Result of `geolocate`: the points, their σ, and the remarks of the summary."""
 
     points: GeolocatedPoints
     sigma_m: FloatArray  # (N,) along the worst axis; NaN without a position
@@ -57,8 +57,8 @@ class Geolocation:
 
 
 @dataclass(frozen=True)
-class _Measured:
-    """What was measured of a model, and how the fixes agree with its cameras."""
+class _Observed:
+    """Fixes and attitudes of a model's cameras, and how they agree with its layout."""
 
     model: SparseModel
     fixes: Correspondences
@@ -68,7 +68,7 @@ class _Measured:
     problem: str  # why there is no alignment
 
 
-def run(stage: StageRun, config: GeolocateOptions) -> Summary:
+def run(stage: StageRun, options: GeolocateOptions) -> Summary:
     """Intersect the points of the workspace's model and write them.
 
     Raises:
@@ -81,40 +81,42 @@ def run(stage: StageRun, config: GeolocateOptions) -> Summary:
             ", ".join(survey.estimate),
         )
     model = read_sparse(stage.workspace.path(SPARSE))
-    found = geolocate(survey, model, config)
-    points = found.points
+    geolocation = geolocate(survey, model, options)
+    points = geolocation.points
     points.save(stage.out / "points.npz")
-    write_point_ply(stage.out / "points.ply", points.position_in_geo, model.point_rgb, found.sigma_m, points.inlier)
-    return Summary(found.key_figure, _values(found), found.warnings)
+    write_point_ply(
+        stage.out / "points.ply", points.position_in_geo, model.point_rgb, geolocation.sigma_m, points.inlier
+    )
+    return Summary(geolocation.key_figure, _values(points), geolocation.warnings)
 
 
-def geolocate(survey: Survey, model: SparseModel, config: GeolocateOptions) -> Geolocation:
+def geolocate(survey: Survey, model: SparseModel, options: GeolocateOptions) -> Geolocation:
     """Intersect the points of a model.
 
     Raises:
         InputError: `recorded` attitudes are asked for and fewer than two images have them.
         DegenerateGeometryError: SfM's rotations are needed and the fixes do not fix their direction.
     """
-    measured = _measured(survey, model)
-    if len(measured.fixes) == 0:
+    observed = _observed(survey, model)
+    if len(observed.fixes) == 0:
         return _nothing(model, _NO_FIXES)
-    source = _rotation_source(measured, config)
-    if source == "sfm" and measured.alignment is None:
+    source = _rotation_source(observed, options)
+    if source == "sfm" and observed.alignment is None:
         if len(survey.control_points) >= 3:
-            return _nothing(model, f"no directions: positions come from control points ({measured.problem})")
-        raise DegenerateGeometryError(f"SfM's rotations cannot be turned to the Earth: {measured.problem}")
-    warnings = _warnings(measured, source)
-    views, usable = _views(measured, source, config.sigma_px)
+            return _nothing(model, f"no directions: positions come from control points ({observed.problem})")
+        raise DegenerateGeometryError(f"SfM's rotations cannot be turned to the Earth: {observed.problem}")
+    warnings = _warnings(observed, source)
+    views, usable = _views(observed, source, options.sigma_px)
     rays = _rays(model, usable)
-    found = intersect_rays(rays, views, len(model.point_id))
-    sigma, inlier = _judge(found, rays, views, config)
+    intersections = intersect_rays(rays, views, len(model.point_id))
+    sigma, inlier = _judge(intersections, rays, views, options)
     points = GeolocatedPoints(
         point_id=model.point_id,
-        position_in_geo=found.position_in_geo,
-        cov_in_geo=found.cov_in_geo,
-        ray_count=found.ray_count,
-        max_angle_deg=found.max_angle_deg,
-        condition=found.condition,
+        position_in_geo=intersections.position_in_geo,
+        cov_in_geo=intersections.cov_in_geo,
+        ray_count=intersections.ray_count,
+        max_angle_deg=intersections.max_angle_deg,
+        condition=intersections.condition,
         inlier=inlier,
         rotation_source=source,
     )
@@ -141,7 +143,7 @@ def _nothing(model: SparseModel, why: str) -> Geolocation:
     return Geolocation(points, np.full(count, np.nan), why, (why,))
 
 
-def _measured(survey: Survey, model: SparseModel) -> _Measured:
+def _observed(survey: Survey, model: SparseModel) -> _Observed:
     fixes, prior = fix_correspondences(survey, model), attitude_prior(survey, model)
     alignment, problem = None, ""
     try:
@@ -149,29 +151,29 @@ def _measured(survey: Survey, model: SparseModel) -> _Measured:
     except DegenerateGeometryError as error:
         problem = str(error)
         log.info("fixes cannot be compared with the SfM model: %s", error)
-    return _Measured(model, fixes, recorded_rotations(survey, model), prior, alignment, problem)
+    return _Observed(model, fixes, recorded_rotations(survey, model), prior, alignment, problem)
 
 
-def _rotation_source(measured: _Measured, config: GeolocateOptions) -> Literal["recorded", "sfm"]:
-    with_fix = measured.model.image_index()
-    both = int(np.isin([with_fix[name] for name in measured.fixes.name], measured.recorded.image).sum())
-    if config.attitude == "recorded" and both < 2:
+def _rotation_source(observed: _Observed, options: GeolocateOptions) -> Literal["recorded", "sfm"]:
+    with_fix = observed.model.image_index()
+    both = int(np.isin([with_fix[name] for name in observed.fixes.name], observed.recorded.image).sum())
+    if options.attitude == "recorded" and both < 2:
         raise InputError(
             f"{both} images have a fix and an attitude, 2 are needed: use auto or sfm", field="--attitude"
         )
-    complete = both == len(measured.fixes) or (measured.alignment is None and both >= 2)
-    return "recorded" if config.attitude == "recorded" or (config.attitude == "auto" and complete) else "sfm"
+    complete = both == len(observed.fixes) or (observed.alignment is None and both >= 2)
+    return "recorded" if options.attitude == "recorded" or (options.attitude == "auto" and complete) else "sfm"
 
 
-def _warnings(measured: _Measured, source: str) -> list[str]:
+def _warnings(observed: _Observed, source: str) -> list[str]:
     warnings = []
-    turned = measured.recorded.contradicting
+    turned = observed.recorded.contradicting
     if turned:
         warnings.append(
             f"{len(turned)} attitudes contradict the SfM model and are not used: {', '.join(sorted(turned)[:8])}"
             f"{' …' if len(turned) > 8 else ''}. Were these photographs turned in an image viewer?"
         )
-    total, fixes, alignment = len(measured.model.image_name), measured.fixes, measured.alignment
+    total, fixes, alignment = len(observed.model.image_name), observed.fixes, observed.alignment
     if len(fixes) < total:
         warnings.append(f"{total - len(fixes)} of {total} registered images have no fix and give no rays")
     if alignment is None:
@@ -183,7 +185,7 @@ def _warnings(measured: _Measured, source: str) -> list[str]:
             + ", ".join(sorted(rejected)[:8])
             + (" …" if len(rejected) > 8 else "")
         )
-    prior = measured.prior
+    prior = observed.prior
     if source == "recorded" and prior is not None and not alignment.attitude_used:
         turn = float(np.linalg.norm(log_so3(prior.rotation @ alignment.geo_from_local.rotation.T)))
         sigma = np.hypot(np.sqrt(prior.cov_rad2[0, 0]), alignment.solution.rotation_sigma_rad)
@@ -195,9 +197,9 @@ def _warnings(measured: _Measured, source: str) -> list[str]:
     return warnings
 
 
-def _views(measured: _Measured, source: str, sigma_px: float) -> tuple[UncertainCameras, BoolArray]:
+def _views(observed: _Observed, source: str, sigma_px: float) -> tuple[UncertainCameras, BoolArray]:
     """All images as views (those without a fix are placeholders), and which give rays (n,)."""
-    model, fixes, alignment = measured.model, measured.fixes, measured.alignment
+    model, fixes, alignment = observed.model, observed.fixes, observed.alignment
     count, index = len(model.image_name), model.image_index()
     place = np.array([index[name] for name in fixes.name])
     center, cov = np.zeros((count, 3)), np.tile(np.eye(3), (count, 1, 1))
@@ -207,7 +209,7 @@ def _views(measured: _Measured, source: str, sigma_px: float) -> tuple[Uncertain
     sigma_ray = sigma_px / np.array([model.camera_of(image).mean_focal_px for image in range(count)])
     rotation, sigma, common = np.tile(np.eye(3), (count, 1, 1)), np.ones(count), None
     if source == "recorded" or alignment is None:
-        recorded = measured.recorded
+        recorded = observed.recorded
         rotation[recorded.image], sigma[recorded.image] = recorded.geo_from_cam, recorded.sigma_rad
         usable &= np.isin(np.arange(count), recorded.image)
     else:
@@ -230,24 +232,23 @@ def _rays(model: SparseModel, usable: BoolArray) -> Rays:
 
 
 def _judge(
-    found: Intersections, rays: Rays, views: UncertainCameras, config: GeolocateOptions
+    intersections: Intersections, rays: Rays, views: UncertainCameras, options: GeolocateOptions
 ) -> tuple[FloatArray, BoolArray]:
     """σ along the worst axis (N,), and which points (N,) can be relied on."""
-    located: BoolArray = ~np.isnan(found.position_in_geo[:, 0])
+    located: BoolArray = ~np.isnan(intersections.position_in_geo[:, 0])
     sigma = np.full(len(located), np.nan)
-    sigma[located] = np.sqrt(np.linalg.eigvalsh(found.cov_in_geo[located])[:, 2])
-    away = np.linalg.norm(found.position_in_geo[rays.point] - views.center_in_geo[rays.view], axis=1)
+    sigma[located] = np.sqrt(np.linalg.eigvalsh(intersections.cov_in_geo[located])[:, 2])
+    away = np.linalg.norm(intersections.position_in_geo[rays.point] - views.center_in_geo[rays.view], axis=1)
     count = np.bincount(rays.point, minlength=len(located))
     distance = np.bincount(rays.point, away, minlength=len(located)) / np.maximum(count, 1)
     limit = _LARGEST_RELATIVE_SIGMA * distance
-    if config.max_sigma is not None:
-        limit = np.minimum(limit, config.max_sigma)
-    wide = found.max_angle_deg >= config.min_angle
-    return sigma, found.consistent & wide & (np.nan_to_num(sigma, nan=np.inf) <= limit)
+    if options.max_sigma is not None:
+        limit = np.minimum(limit, options.max_sigma)
+    wide = intersections.max_angle_deg >= options.min_angle
+    return sigma, intersections.consistent & wide & (np.nan_to_num(sigma, nan=np.inf) <= limit)
 
 
-def _values(found: Geolocation) -> dict[str, Any]:
-    points = found.points
+def _values(points: GeolocatedPoints) -> dict[str, Any]:
     good = points.inlier
     values: dict[str, Any] = {
         "points": len(good),

@@ -23,7 +23,7 @@ from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.geometry.cameras import Camera, project, project_each
 from pipelines.geometry.lens import parameter_derivative
 from pipelines.geometry.rotations import skew
-from pipelines.robust.kernels import CAUCHY_95, cauchy_weight
+from pipelines.robust.kernels import CAUCHY_SCALE2, cauchy_weight
 from pipelines.robust.statistics import rayleigh_sigma
 
 # A camera with few observations is held to a tenth of its distance from the scene.
@@ -31,7 +31,7 @@ _LOOSEST_RELATIVE_SIGMA = 0.1
 _STEP = 1e-6
 # Means of the weight w and of w r²/2 under Gaussian noise of σ = 1, where r²/2 is exponentially distributed. Robust
 # weights lower the sum of squares of pure noise: without these means the stated σ would be a fifth too small.
-_HALF_SCALE2 = CAUCHY_95**2 / 2
+_HALF_SCALE2 = CAUCHY_SCALE2[2] / 2
 _MEAN_WEIGHT = float(_HALF_SCALE2 * np.exp(_HALF_SCALE2) * exp1(_HALF_SCALE2))
 _MEAN_WEIGHTED_SQUARE = _HALF_SCALE2 * (1 - _MEAN_WEIGHT)
 
@@ -195,7 +195,7 @@ def _central_differences(function: Callable[[FloatArray], FloatArray], points: F
 def _robust_weights(residual: FloatArray) -> FloatArray:
     length = np.linalg.norm(residual, axis=1)
     scale = max(rayleigh_sigma(length), 1e-9)
-    return cauchy_weight((length / scale) ** 2)
+    return cauchy_weight((length / scale) ** 2, 2)
 
 
 @dataclass(frozen=True)

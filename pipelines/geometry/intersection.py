@@ -185,7 +185,7 @@ def _fit_robust(bundle: _RayBundle, cameras: UncertainCameras, start: _RayFit) -
     No outlier can mask the single minimum of the first. The last gives full weight, as the covariance assumes.
     """
     position, whitener, information = start.position, start.whitener, start.information
-    for steps, weigh in ((_CONVEX_STEPS, _near_median_weight), (_REDESCENDING_STEPS, cauchy_weight)):
+    for steps, weigh in ((_CONVEX_STEPS, _near_median_weight), (_REDESCENDING_STEPS, _redescending_weight)):
         pull = (information @ bundle.center[..., None])[..., 0]
         for _ in range(steps):
             weight = weigh(_squared_residuals(whitener, position[bundle.owner] - bundle.center))
@@ -197,6 +197,10 @@ def _fit_robust(bundle: _RayBundle, cameras: UncertainCameras, start: _RayFit) -
         used = _squared_residuals(whitener, position[bundle.owner] - bundle.center) <= _RAY_GATE
         position = _solve_points(bundle, information * used[:, None, None])
     return _RayFit(position, whitener, information, used)
+
+
+def _redescending_weight(squared: FloatArray) -> FloatArray:
+    return cauchy_weight(squared, 2)
 
 
 def _near_median_weight(squared: FloatArray) -> FloatArray:

@@ -44,6 +44,20 @@ def log_so3(rotation: ArrayLike) -> FloatArray:
     return np.asarray(Rotation.from_matrix(matrix.reshape(-1, 3, 3)).as_rotvec()).reshape(matrix.shape[:-1])
 
 
+def right_jacobian_inverse_so3(rotation_vector: ArrayLike) -> FloatArray:
+    """Return the derivatives (…, 3, 3) of log(exp(φ) exp(δ)) by δ at zero, of rotation vectors φ (…, 3), |φ| < π.
+
+    I + ½ [φ]× + (1/θ² − (1 + cos θ) / (2 θ sin θ)) [φ]×² (Chirikjian, Stochastic Models II, 2012, eq. 10.86).
+    """
+    vector = np.asarray(rotation_vector, dtype=np.float64)
+    angle = np.linalg.norm(vector, axis=-1)[..., None, None]
+    safe = np.where(angle < 1e-4, 1.0, angle)
+    quadratic = 1.0 / safe**2 - (1.0 + np.cos(safe)) / (2.0 * safe * np.sin(safe))
+    cross = skew(vector)
+    # Its Taylor series at zero begins with 1/12.
+    return np.eye(3) + 0.5 * cross + np.where(angle < 1e-4, 1.0 / 12.0, quadratic) * (cross @ cross)
+
+
 def skew(vector: ArrayLike) -> FloatArray:
     """Return cross-product matrices (…, 3, 3): `skew(a) @ b = a × b`."""
     v = np.asarray(vector, dtype=np.float64)

@@ -12,7 +12,7 @@ from pydantic import Field
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.products import Product, Rotation
 from pipelines.core.types import FloatArray, Row7, Vector3
-from pipelines.geometry.rotations import matrix_from_quat_xyzw, quat_xyzw_from_matrix, skew
+from pipelines.geometry.rotations import exp_so3, matrix_from_quat_xyzw, quat_xyzw_from_matrix, skew
 
 
 @dataclass(frozen=True)
@@ -67,6 +67,12 @@ class Similarity:
             pivot=_tuple(np.asarray(pivot)),
             covariance=tuple(_tuple(row) for row in cov),
         )
+
+
+def perturbation(delta: FloatArray, pivot: FloatArray) -> Similarity:
+    """Return p' = pivot + δt + e^{δ ln s} Exp(δω) (p − pivot) of delta (δ ln s, δω, δt) (7,) and pivot (3,)."""
+    scale, turn = float(np.exp(delta[0])), exp_so3(delta[1:4])
+    return Similarity(scale, turn, pivot + delta[4:7] - scale * turn @ pivot)
 
 
 def jacobian_at(points: ArrayLike, pivot: ArrayLike) -> FloatArray:

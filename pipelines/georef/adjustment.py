@@ -11,14 +11,17 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pipelines.core.types import BoolArray, FloatArray
-from pipelines.geometry.rotations import exp_so3, log_so3
-from pipelines.geometry.similarity import Similarity, jacobian_at
-from pipelines.robust.statistics import chi2_quantile, squared_mahalanobis
+from pipelines.geometry.rotations import log_so3
+from pipelines.geometry.similarity import Similarity, jacobian_at, perturbation
+from pipelines.georef.normal_equations import NormalEquations, Observations, Weights
+from pipelines.robust.statistics import median_chi2, outlier_gate, squared_mahalanobis
 
-OUTLIER_GATE = float(chi2_quantile(0.999, 3))
-_MEDIAN_CHI2 = float(chi2_quantile(0.5, 3))
+OUTLIER_GATE = outlier_gate(3)
+# What a bias of all fixes must save in −2 ln likelihood to be believed: as much as an outlier costs.
+BIAS_COST = OUTLIER_GATE - 1.0
 _LEAST_FOR_EXCESS = 5  # with fewer points of a kind their scatter says too little
 _STEPS = 12
+_POSITIONS, _ATTITUDE = "positions", "attitude"
 
 
 @dataclass(frozen=True)
@@ -45,7 +48,7 @@ class Correspondences:
         return len(self.name)
 
     def part(self, chosen: BoolArray) -> Correspondences:
-        """Some of them."""
+        """Return some of them."""
         return Correspondences(
             name=tuple(name for name, take in zip(self.name, chosen, strict=True) if take),
             control=self.control[chosen],
@@ -56,7 +59,7 @@ class Correspondences:
         )
 
     def joined(self, other: Correspondences) -> Correspondences:
-        """These, then the others."""
+        """Return these, then the others."""
         return Correspondences(
             name=self.name + other.name,
             control=np.concatenate([self.control, other.control]),
@@ -76,14 +79,14 @@ class RotationPrior:
 
 
 @dataclass(frozen=True)
-class State:
-    """What is adjusted, and how far the scatter exceeds the stated σ.
+class SimilarityState:
+    """Unknowns of the adjustment, and how far the scatter exceeds the stated σ.
 
     Attributes:
         geo_from_local: the similarity.
+        inlier: (n,) the correspondences in use.
         fix_bias_in_geo: (3,) metres, or None where it is not estimated.
         excess_m: σ beyond the stated one, of fixes and of control points.
-        inlier: (n,) the correspondences in use.
     """
 
     geo_from_local: Similarity
@@ -93,7 +96,7 @@ class State:
 
 
 @dataclass(frozen=True)
-class Adjusted:
+class AdjustedSimilarity:
     """A state with what follows from it.
 
     Attributes:
@@ -108,7 +111,7 @@ class Adjusted:
         condition_number: of the normal matrix, with angles and ln s scaled by the size of the layout.
     """
 
-    state: State
+    state: SimilarityState
     covariance: FloatArray
     pivot: FloatArray
     bias_cov: FloatArray
@@ -124,7 +127,7 @@ class Adjusted:
         return float(np.sqrt(np.linalg.eigvalsh(self.covariance[1:4, 1:4])[-1]))
 
 
-def adjust(data: Correspondences, start: State, prior: RotationPrior | None) -> Adjusted:
+def adjust(data: Correspondences, start: SimilarityState, prior: RotationPrior | None) -> AdjustedSimilarity:
     """Adjust robustly from a start that is nearly right.
 
     Each round solves for the parameters, measures the excess scatter (what SfM's own errors and optimistic σ add,
@@ -141,23 +144,23 @@ def adjust(data: Correspondences, start: State, prior: RotationPrior | None) -> 
     return _solve(data, state, prior)
 
 
-def residuals(data: Correspondences, state: State) -> FloatArray:
-    """Measured position, less the bias of the fixes, minus the mapped one (n, 3)."""
+def residuals(data: Correspondences, state: SimilarityState) -> FloatArray:
+    """Return the measured position, less the bias of the fixes, minus the mapped one (n, 3)."""
     missed = data.in_geo - state.geo_from_local.apply(data.in_local)
     if state.fix_bias_in_geo is not None:
         missed = missed - np.where(data.control[:, None], 0.0, state.fix_bias_in_geo)
     return np.asarray(missed)
 
 
-def covariances(data: Correspondences, state: State) -> FloatArray:
-    """Covariances (n, 3, 3) of the residuals: measured, of the point in local, and the excess."""
+def covariances(data: Correspondences, state: SimilarityState) -> FloatArray:
+    """Return the covariances (n, 3, 3) of the residuals: measured, of the point in local, and the excess."""
     turn = state.geo_from_local.scale * state.geo_from_local.rotation
     excess = np.where(data.control, state.excess_m[1], state.excess_m[0])
     cov = data.cov_in_geo + turn @ data.cov_in_local @ turn.T
     return np.asarray(cov + excess[:, None, None] ** 2 * np.eye(3))
 
 
-def _gated(data: Correspondences, state: State) -> State:
+def _gated(data: Correspondences, state: SimilarityState) -> SimilarityState:
     squared = squared_mahalanobis(residuals(data, state), covariances(data, state))
     inlier = squared <= OUTLIER_GATE
     if inlier.sum() < 3:  # never fewer than determine a similarity
@@ -165,82 +168,87 @@ def _gated(data: Correspondences, state: State) -> State:
     return replace(state, inlier=inlier)
 
 
-def _solve(data: Correspondences, state: State, prior: RotationPrior | None) -> Adjusted:
+def _solve(data: Correspondences, state: SimilarityState, prior: RotationPrior | None) -> AdjustedSimilarity:
     """Gauss–Newton over the inliers, with weights, excess and inliers held."""
     for _ in range(_STEPS):
-        step = _normal_step(data, state, prior)
-        state = _moved(state, step.delta, step.pivot)
-        if np.abs(step.delta * step.scale).max() < 1e-9:
+        equations = _equations(data, state, prior)
+        step = equations.normal.solve(equations.weights)
+        state = _moved(state, step, equations.pivot)
+        if np.abs(step * equations.unit_m).max() < 1e-9:
             break
-    step = _normal_step(data, state, prior)
+    equations = _equations(data, state, prior)
+    normal, weights = equations.normal, equations.weights
+    covariance = normal.covariance(weights)
     missed, cov = residuals(data, state), covariances(data, state)
     squared = squared_mahalanobis(missed, cov)
     stretch = np.linalg.slogdet(cov)[1] - np.linalg.slogdet(data.cov_in_geo)[1]
-    return Adjusted(
+    pull = np.swapaxes(-normal.observations[_POSITIONS].jacobian, 1, 2) @ equations.whitener
+    return AdjustedSimilarity(
         state=state,
-        covariance=step.covariance[:7, :7],
-        pivot=step.pivot,
-        bias_cov=step.covariance[7:, 7:] if state.fix_bias_in_geo is not None else np.zeros((3, 3)),
-        response=(step.covariance @ step.pull)[:, :7] * state.inlier[:, None, None],
+        covariance=covariance[:7, :7],
+        pivot=equations.pivot,
+        bias_cov=covariance[7:, 7:] if state.fix_bias_in_geo is not None else np.zeros((3, 3)),
+        response=(covariance @ pull)[:, :7] * state.inlier[:, None, None],
         residual=missed,
         squared=squared,
         cost=float(np.where(state.inlier, squared + stretch, OUTLIER_GATE).sum()),
-        condition_number=step.condition_number,
+        condition_number=normal.condition_number(weights),
     )
 
 
 @dataclass(frozen=True)
-class _Step:
-    delta: FloatArray  # (k,), k = 7 or 10
-    covariance: FloatArray  # (k, k)
-    pull: FloatArray  # (n, k, 3), Jᵀ Σ⁻¹
+class _Equations:
+    normal: NormalEquations  # P = 7, or 10 with a bias
+    weights: Weights
+    whitener: FloatArray  # (n, 3, 3), W with WᵀW = Σ⁻¹
     pivot: FloatArray  # (3,)
-    scale: FloatArray  # (k,), metres per unit of each parameter
-    condition_number: float
+    unit_m: FloatArray  # (P,), metres per unit of each parameter
 
 
-def _normal_step(data: Correspondences, state: State, prior: RotationPrior | None) -> _Step:
+def _equations(data: Correspondences, state: SimilarityState, prior: RotationPrior | None) -> _Equations:
     mapped = state.geo_from_local.apply(data.in_local)
-    information = np.linalg.solve(covariances(data, state), np.eye(3)) * state.inlier[:, None, None]
-    weight = np.trace(information, axis1=1, axis2=2)
+    whitener = np.linalg.inv(np.linalg.cholesky(covariances(data, state)))
+    weight = (whitener**2).sum(axis=(1, 2)) * state.inlier
     pivot = weight @ mapped / weight.sum()
     jacobian = jacobian_at(mapped, pivot)
     if state.fix_bias_in_geo is not None:
         shared = np.where(data.control[:, None, None], 0.0, np.eye(3))
         jacobian = np.concatenate([jacobian, shared], axis=2)
-    pull = np.swapaxes(jacobian, 1, 2) @ information
-    normal = (pull @ jacobian).sum(axis=0)
-    right = (pull @ residuals(data, state)[..., None])[..., 0].sum(axis=0)
+    white = (whitener @ residuals(data, state)[..., None])[..., 0]
+    observations = {_POSITIONS: Observations(white, -whitener @ jacobian)}
+    weights = {_POSITIONS: state.inlier.astype(np.float64)}
+    count = jacobian.shape[2]
     if prior is not None:
-        strength = np.linalg.solve(prior.cov_rad2, np.eye(3))
-        normal[1:4, 1:4] += strength
-        right[1:4] += strength @ log_so3(prior.rotation @ state.geo_from_local.rotation.T)
+        observations[_ATTITUDE] = _attitude(prior, state, count)
+        weights[_ATTITUDE] = np.ones(1)
     size = np.sqrt(weight @ ((mapped - pivot) ** 2).sum(axis=1) / weight.sum())
-    scale = np.ones(len(normal))
-    scale[:4] = max(size, 1e-9)
-    covariance, condition = _inverse(normal / np.outer(scale, scale))
-    covariance = covariance / np.outer(scale, scale)
-    return _Step(covariance @ right, covariance, pull, pivot, scale, condition)
+    unit_m = np.ones(count)
+    unit_m[:4] = max(size, 1e-9)
+    normal = NormalEquations(
+        observations, np.zeros(count), np.zeros(count), unit=1.0 / unit_m, open_directions="wide"
+    )
+    return _Equations(normal, weights, whitener, pivot, unit_m)
 
 
-def _inverse(normal: FloatArray) -> tuple[FloatArray, float]:
-    """Covariance of a normal matrix and its condition number.
-
-    A direction that nothing determines gets an enormous variance instead of failing: the caller judges by it.
-    """
-    values, vectors = np.linalg.eigh(normal)
-    values = np.maximum(values, 1e-12 * values[-1])
-    return (vectors / values) @ vectors.T, float(values[-1] / values[0])
-
-
-def _moved(state: State, delta: FloatArray, pivot: FloatArray) -> State:
-    scale, turn = float(np.exp(np.clip(delta[0], -1.0, 1.0))), exp_so3(delta[1:4])
-    about_pivot = Similarity(scale, turn, pivot + delta[4:7] - scale * turn @ pivot)
-    bias = None if state.fix_bias_in_geo is None else state.fix_bias_in_geo + delta[7:10]
-    return replace(state, geo_from_local=about_pivot @ state.geo_from_local, fix_bias_in_geo=bias)
+def _attitude(prior: RotationPrior, state: SimilarityState, count: int) -> Observations:
+    """The rotation as it was measured: one observation of three angles."""
+    whitener = np.linalg.inv(np.linalg.cholesky(prior.cov_rad2))
+    jacobian = np.zeros((1, 3, count))
+    jacobian[0, :, 1:4] = -whitener
+    missed = log_so3(prior.rotation @ state.geo_from_local.rotation.T)
+    return Observations((whitener @ missed)[None], jacobian)
 
 
-def _rescaled(data: Correspondences, state: State, *, robust: bool, leverage: Adjusted | None = None) -> State:
+def _moved(state: SimilarityState, step: FloatArray, pivot: FloatArray) -> SimilarityState:
+    bounded = np.concatenate([np.clip(step[:1], -1.0, 1.0), step[1:7]])
+    bias = None if state.fix_bias_in_geo is None else state.fix_bias_in_geo + step[7:10]
+    moved = perturbation(bounded, pivot) @ state.geo_from_local
+    return replace(state, geo_from_local=moved, fix_bias_in_geo=bias)
+
+
+def _rescaled(
+    data: Correspondences, state: SimilarityState, *, robust: bool, leverage: AdjustedSimilarity | None = None
+) -> SimilarityState:
     """The state with the excess scatter of each kind measured anew."""
     excess = []
     for kind in (False, True):
@@ -250,7 +258,11 @@ def _rescaled(data: Correspondences, state: State, *, robust: bool, leverage: Ad
 
 
 def _excess(
-    data: Correspondences, state: State, members: BoolArray, robust: bool, leverage: Adjusted | None
+    data: Correspondences,
+    state: SimilarityState,
+    members: BoolArray,
+    robust: bool,
+    leverage: AdjustedSimilarity | None,
 ) -> float:
     """σ to add to each axis so that the scatter of the members is what their covariances say; at least 0."""
     count = int(members.sum())
@@ -266,7 +278,7 @@ def _excess(
 
     def surplus(sigma: float) -> float:
         squared = (along / (variances + sigma**2)).sum(axis=1)
-        return float(np.median(squared) / _MEDIAN_CHI2 if robust else squared.mean() / 3) - free
+        return float(np.median(squared) / median_chi2(3) if robust else squared.mean() / 3) - free
 
     if surplus(0.0) <= 0:
         return 0.0
@@ -279,7 +291,7 @@ def _excess(
     return high
 
 
-def _redundancy(data: Correspondences, solution: Adjusted, members: BoolArray) -> float:
+def _redundancy(data: Correspondences, solution: AdjustedSimilarity, members: BoolArray) -> float:
     """Mean redundancy of the members: 1 less the part of an error that the adjustment absorbs."""
     mapped = solution.state.geo_from_local.apply(data.in_local[members])
     absorbed = jacobian_at(mapped, solution.pivot) @ solution.response[members]

@@ -30,21 +30,21 @@ from pipelines.core.types import FloatArray
 from pipelines.geometry.rotations import exp_so3, log_so3
 from pipelines.geometry.similarity import Similarity, umeyama
 from pipelines.georef.adjustment import (
+    BIAS_COST,
     OUTLIER_GATE,
-    Adjusted,
+    AdjustedSimilarity,
     Correspondences,
     RotationPrior,
-    State,
+    SimilarityState,
     adjust,
     covariances,
     residuals,
 )
 from pipelines.robust.kernels import cauchy_weight
 from pipelines.robust.ransac import RansacOptions, ransac
-from pipelines.robust.statistics import squared_mahalanobis
+from pipelines.robust.statistics import median_chi2, squared_mahalanobis
 
 _WORST_ROTATION_RAD = np.radians(5.0)  # beyond, the linear covariance says nothing
-_BIAS_COST = OUTLIER_GATE - 1.0
 _LONE_BIAS_SIGMAS = 5.0
 _FLAT = 0.02  # third extent of the layout over the first
 _LOOSER = (1.0, 3.0, 10.0, 30.0, 100.0)
@@ -65,7 +65,7 @@ class Alignment:
         attitude: the recorded attitudes, where they resolved the rotation.
     """
 
-    solution: Adjusted
+    solution: AdjustedSimilarity
     layout: Literal["volume", "plane", "line"]
     attitude: RotationPrior | None
 
@@ -103,11 +103,11 @@ def align(
             f"model lies; 3 are needed: {ADVICE}"
         )
     candidates = _candidates(data, _starts(data, rng, guesses), None)
-    firm = [found for found in candidates if found.rotation_sigma_rad <= _WORST_ROTATION_RAD]
+    firm = [candidate for candidate in candidates if candidate.rotation_sigma_rad <= _WORST_ROTATION_RAD]
     if firm:
         best = _choose(firm, data)
         return Alignment(best, layout_of(data.in_local[best.state.inlier]), None)
-    worst = min((np.degrees(found.rotation_sigma_rad) for found in candidates), default=np.inf)
+    worst = min((np.degrees(candidate.rotation_sigma_rad) for candidate in candidates), default=np.inf)
     if attitude is None:
         size = f"is known to {worst:.0f}° only" if worst < 90 else "is not determined"
         raise DegenerateGeometryError(f"the positions lie on one line: the rotation about it {size}; {ADVICE}")
@@ -131,12 +131,12 @@ def mean_rotation(rotations: FloatArray, sigma_rad: FloatArray) -> RotationPrior
     weight = np.ones(len(rotations))
     for _ in range(20):
         error = log_so3(rotations @ mean.T)
-        weight = cauchy_weight((error**2).sum(axis=1) / (3 * sigma_rad**2)) / sigma_rad**2
+        weight = cauchy_weight((error**2).sum(axis=1) / sigma_rad**2, 3) / sigma_rad**2
         step = weight @ error / weight.sum()
         mean = exp_so3(step) @ mean
         if np.linalg.norm(step) < 1e-12:
             break
-    scatter = float(np.median(np.linalg.norm(log_so3(rotations @ mean.T), axis=1)) / np.sqrt(2.366))
+    scatter = float(np.median(np.linalg.norm(log_so3(rotations @ mean.T), axis=1)) / np.sqrt(median_chi2(3)))
     return RotationPrior(mean, max(float(np.median(sigma_rad)), scatter) ** 2 * np.eye(3))
 
 
@@ -162,7 +162,7 @@ def _ransac_start(data: Correspondences, rng: np.random.Generator) -> list[Simil
     def fit(chosen: np.ndarray) -> Similarity:
         return umeyama(data.in_local[chosen], data.in_geo[chosen])
 
-    found = []
+    starts = []
     for looser in _LOOSER:
         # The excess scatter of SfM is not known yet: stated σ may be far too tight.
         options = RansacOptions(3, OUTLIER_GATE * looser**2, max_draws=300)
@@ -170,12 +170,12 @@ def _ransac_start(data: Correspondences, rng: np.random.Generator) -> list[Simil
             result = ransac(len(data), fit, lambda model: _squared(data, model), options, rng)
         except DegenerateGeometryError:
             return []
-        found = [result.model]
+        starts = [result.model]
         if result.inlier.mean() > 0.5:
             with suppress(DegenerateGeometryError):
-                found = [umeyama(data.in_local[result.inlier], data.in_geo[result.inlier])]
+                starts = [umeyama(data.in_local[result.inlier], data.in_geo[result.inlier])]
             break
-    return found
+    return starts
 
 
 def _start_with_rotation(data: Correspondences, rotation: FloatArray, rng: np.random.Generator) -> Similarity:
@@ -194,19 +194,21 @@ def _start_with_rotation(data: Correspondences, rotation: FloatArray, rng: np.ra
 
 
 def _squared(data: Correspondences, model: Similarity) -> FloatArray:
-    state = State(model, np.ones(len(data), dtype=bool))
+    state = SimilarityState(model, np.ones(len(data), dtype=bool))
     return squared_mahalanobis(residuals(data, state), covariances(data, state))
 
 
-def _candidates(data: Correspondences, starts: list[Similarity], prior: RotationPrior | None) -> list[Adjusted]:
+def _candidates(
+    data: Correspondences, starts: list[Similarity], prior: RotationPrior | None
+) -> list[AdjustedSimilarity]:
     everything = np.ones(len(data), dtype=bool)
-    states = [State(start, everything) for start in starts]
+    states = [SimilarityState(start, everything) for start in starts]
     if data.control.any() and not data.control.all():
         states += [_with_bias(data, state) for state in list(states)]
     return [adjust(data, state, prior) for state in states]
 
 
-def _with_bias(data: Correspondences, state: State) -> State:
+def _with_bias(data: Correspondences, state: SimilarityState) -> SimilarityState:
     """The state moved onto the control points, the fixes' offset from it taken as their bias."""
     missed = residuals(data, state)
     shift = np.median(missed[data.control], axis=0)
@@ -215,17 +217,17 @@ def _with_bias(data: Correspondences, state: State) -> State:
     return replace(state, geo_from_local=onto, fix_bias_in_geo=np.median(missed[~data.control], axis=0) - shift)
 
 
-def _choose(candidates: list[Adjusted], data: Correspondences) -> Adjusted:
+def _choose(candidates: list[AdjustedSimilarity], data: Correspondences) -> AdjustedSimilarity:
     """The likeliest candidate, a bias of the fixes costing as much as an outlier."""
 
-    def cost(found: Adjusted) -> float:
-        bias = found.state.fix_bias_in_geo
+    def cost(candidate: AdjustedSimilarity) -> float:
+        bias = candidate.state.fix_bias_in_geo
         if bias is None:
-            return found.cost
-        lone = int((data.control & found.state.inlier).sum()) <= 1
+            return candidate.cost
+        lone = int((data.control & candidate.state.inlier).sum()) <= 1
         allowed = data.cov_in_geo[~data.control].mean(axis=0)
         if lone and squared_mahalanobis(bias[None], allowed)[0] > _LONE_BIAS_SIGMAS**2:
             return np.inf
-        return found.cost + _BIAS_COST
+        return candidate.cost + BIAS_COST
 
     return min(candidates, key=cost)

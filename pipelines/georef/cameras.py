@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from pipelines.core.types import FloatArray
-from pipelines.georef.similarity import exp_so3
+from pipelines.georef.so3 import exp_so3
 
 
 @dataclass(frozen=True)

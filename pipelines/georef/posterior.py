@@ -1,7 +1,8 @@
-"""What the measurements say of similarity and cameras together: their minimum, joint covariance, and leave-one-out.
+"""The geographic half linearised: its minimum, the joint covariance of all unknowns, and leave-one-out.
 
-All from the Gauss–Newton normal matrix of the whitened residuals of `GeoProblem.forward`, over all its parameters,
-constant errors among them, with the weights that the Cauchy kernel gives at the state at hand.
+All three are answers of the same normal equations (`georef.normal_equations`) over the similarity's coordinates y,
+the constant errors v, and the cameras' corrections z, which bundle adjustment knows as N(0, I). Weights are those
+that Cauchy's kernel gives at the state at hand.
 """
 
 from __future__ import annotations
@@ -10,47 +11,140 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.linalg import block_diag, cho_factor, cho_solve
 from torch import Tensor
 
-from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import FloatArray
 from pipelines.geometry.similarity import jacobian_at
-from pipelines.georef.linear import WEIGHT_OF_NOISE
-from pipelines.georef.losses import CAUCHY_SCALE2
+from pipelines.georef.normal_equations import (
+    NormalEquations,
+    Observations,
+    Weights,
+    posterior_weights,
+    robust_weights,
+)
 from pipelines.georef.problem import GeoProblem
-from pipelines.robust.kernels import cauchy_weight
+from pipelines.georef.terms import ControlTerm
 
-_SIMILARITY, _CAMERAS, _ERRORS = "similarity.y", "cameras.z", "errors.x"
-_STEPS = 10  # new derivatives
-_ROUNDS = 20  # new weights with the same derivatives
-_TOLERANCE = 1e-4  # of a σ
+_STEPS = 20  # new derivatives
+_NEAR = 1e-4  # of a σ: a shorter step ends the descent
+_CHUNK = 64
 _OPEN = 1e-9  # redundancy below which the other observations leave a direction open
+_ADVICE = "fixes and control points leave the similarity open: add control points, at least 3"
 
 
 @dataclass(frozen=True)
-class _Linear:
-    """The problem near its present state, in P parameters, R residuals of three components."""
+class GeoEquations:
+    """Normal equations of a problem about its present state, in the parameters (y, v, w), float64.
 
-    jacobian: FloatArray  # (3 R, P), whitened
-    prior: FloatArray  # (P, P) information
-    place: dict[str, slice]
+    The w are coordinates of those camera corrections that a measurement sees, z = `seen` w. The others keep what
+    bundle adjustment knows of them, and need not be solved for.
 
-    def factor(self, weight: FloatArray) -> tuple[FloatArray, bool]:
-        """Cholesky factor of the normal matrix with weights (R,)."""
-        weighted = self.jacobian * np.repeat(weight, 3)[:, None]
-        try:
-            factor: tuple[FloatArray, bool] = cho_factor(weighted.T @ self.jacobian + self.prior)
-        except np.linalg.LinAlgError as error:
-            raise DegenerateGeometryError(
-                "fixes and control points leave the similarity open: add control points, at least 3"
-            ) from error
-        return factor
+    Attributes:
+        normal: P = 7 + p + r parameters.
+        errors: p, constant errors.
+        seen: (k, r), orthonormal columns; None: all k corrections.
+    """
+
+    normal: NormalEquations
+    errors: int
+    seen: FloatArray | None
+
+    @property
+    def similarity(self) -> slice:
+        """Place of y."""
+        return slice(0, 7)
+
+    @property
+    def constant(self) -> slice:
+        """Place of v."""
+        return slice(7, 7 + self.errors)
+
+    @property
+    def cameras(self) -> slice:
+        """Place of w."""
+        return slice(7 + self.errors, len(self.normal.precision))
+
+
+def equations_of(problem: GeoProblem) -> GeoEquations:
+    """Linearise the measurements of a problem about its present state."""
+    cameras, errors = problem.cameras, len(problem.errors)
+    turns = 6 * len(cameras.center)
+
+    def residuals(y: Tensor, moved: Tensor, v: Tensor) -> dict[str, Tensor]:
+        return problem.whitened(problem.estimate_at(y, moved[:turns].view(-1, 6), moved[turns:], v))
+
+    with torch.no_grad():
+        basis = torch.cat([cameras.basis.flatten(0, 1), cameras.lens_basis])
+        y, v, z = problem.similarity.y.detach(), problem.errors.vector(), cameras.z.detach()
+        moved = torch.cat([cameras.corrections().flatten(), cameras.lens()])
+        white = residuals(y, moved, v)
+    by_z, by_x = {}, {}
+    if white:
+        slopes = torch.func.jacrev(residuals, argnums=(0, 1, 2), chunk_size=_CHUNK)(y, moved, v)
+        for kind, (by_y, by_moved, by_v) in slopes.items():
+            by_x[kind] = _numpy(torch.cat([by_y, by_v], dim=2))
+            by_z[kind] = _numpy(by_moved @ basis)
+    seen = _seen(list(by_z.values()), basis.shape[1])
+    observations = {
+        kind: Observations(
+            _numpy(white[kind]),
+            np.concatenate([by_x[kind], by_z[kind] if seen is None else by_z[kind] @ seen], axis=2),
+        )
+        for kind in white
+    }
+    held = float(problem.hold_prior) * _numpy(problem.similarity.held)
+    corrections = _numpy(z) if seen is None else seen.T @ _numpy(z)
+    precision = np.concatenate([held, _numpy(problem.errors.sigma) ** -2, np.ones(len(corrections))])
+    offset = np.concatenate([_numpy(y), _numpy(v), corrections])
+    return GeoEquations(NormalEquations(observations, precision, offset, advice=_ADVICE), errors, seen)
+
+
+def minimise(problem: GeoProblem) -> None:
+    """Bring the whitened loss of the geographic half to its minimum, from where it is, by Gauss–Newton.
+
+    Raises:
+        DegenerateGeometryError: the measurements leave the similarity open.
+    """
+    for _ in range(_STEPS):
+        equations = equations_of(problem)
+        step = equations.normal.minimum().step
+        move(problem, equations, step)
+        if np.linalg.norm(step) < _NEAR:
+            return
+
+
+@torch.no_grad()
+def move(problem: GeoProblem, equations: GeoEquations, step: FloatArray) -> None:
+    """Move the state of a problem by a step (P,) of its equations."""
+    device = problem.similarity.y.device
+    z = problem.cameras.z
+    corrections = _numpy(z) if equations.seen is None else equations.seen.T @ _numpy(z)
+    corrections = corrections + step[equations.cameras]
+    # What no measurement sees goes back to where bundle adjustment has it.
+    z.copy_(torch.from_numpy(corrections if equations.seen is None else equations.seen @ corrections))
+    problem.similarity.y.add_(torch.from_numpy(step[equations.similarity]).to(device))
+    problem.errors.set_vector(problem.errors.vector() + torch.from_numpy(step[equations.constant]).to(device))
+
+
+def covariances(problem: GeoProblem) -> tuple[FloatArray, FloatArray]:
+    """Return the covariance (7, 7) of the similarity about its pivot, and that (p, p) of the constant errors.
+
+    All else is marginalised out. The first has the form of `geometry.similarity.SimilarityRecord`.
+
+    Raises:
+        DegenerateGeometryError: the measurements leave the similarity open.
+    """
+    equations = equations_of(problem)
+    normal, known = equations.normal, 7 + equations.errors
+    columns = np.eye(len(normal.precision), known)
+    marginal = normal.inverse_times(posterior_weights(normal.residuals()), columns)[:known]
+    root = _numpy(problem.similarity.root)
+    return root @ marginal[:7, :7] @ root.T, marginal[7:, 7:]
 
 
 @dataclass(frozen=True)
-class LensDoubt:
-    """What is not known of the L parameters of the lens when it has followed the cameras.
+class FreeLens:
+    """The part of the L lens parameters that stays unknown when the lens has followed the cameras.
 
     Attributes:
         cov: (L, L), `CorrectionBasis.lens_cov`.
@@ -76,7 +170,7 @@ class Posterior:
     pivot: FloatArray
 
     def at(self, point_in_geo: FloatArray, by_cameras: FloatArray, by_lens: FloatArray) -> FloatArray:
-        """Covariance (J, 3, 3) in m² of points (J, 3).
+        """Return the covariance (J, 3, 3) in m² of points (J, 3).
 
         Args:
             point_in_geo: (J, 3).
@@ -88,45 +182,8 @@ class Posterior:
         return np.asarray(jacobian @ self.covariance @ np.swapaxes(jacobian, 1, 2))
 
 
-@dataclass(frozen=True)
-class LeftOut:
-    """J control points, each measured by a solution that does not know it.
-
-    Attributes:
-        error_in_geo: (J, 3) found by camera minus surveyed, metres; NaN where the others leave it open.
-        cov_in_geo: (J, 3, 3) m² that is expected of it: solution, marks and survey; NaN likewise.
-    """
-
-    error_in_geo: FloatArray
-    cov_in_geo: FloatArray
-
-
-def minimise(problem: GeoProblem) -> None:
-    """Bring the whitened loss of the geographic half to its minimum, from where it is.
-
-    Iteratively reweighted Gauss–Newton. Near the solution the problem is almost linear: the derivatives are
-    renewed only when the weights have settled.
-
-    Raises:
-        DegenerateGeometryError: the measurements leave the similarity open.
-    """
-    for _ in range(_STEPS):
-        linear, moved = _linearised(problem), 0.0
-        for _ in range(_ROUNDS):
-            white = _white(problem)
-            factor = linear.factor(_weights(white))
-            pull = linear.jacobian.T @ (white * _weights(white)[:, None]).ravel() + _prior_pull(problem)
-            step = -cho_solve(factor, pull)
-            _move(problem, linear, step)
-            moved = max(moved, float(np.linalg.norm(step)))
-            if np.linalg.norm(step) < _TOLERANCE:
-                break
-        if moved < 100 * _TOLERANCE:  # what a change of the derivatives by so small a step does is nothing
-            return
-
-
-def posterior(problem: GeoProblem, lens: LensDoubt | None = None) -> Posterior:
-    """The joint covariance at the present state.
+def posterior(problem: GeoProblem, lens: FreeLens | None = None) -> Posterior:
+    """Return the joint covariance at the present state.
 
     Of the lens, only what follows the cameras is estimated here. The rest d, which is independent of the estimate's
     own error e₁, shifts the intersections of the control points, and so pulls the estimate by −G d, with G the
@@ -138,31 +195,56 @@ def posterior(problem: GeoProblem, lens: LensDoubt | None = None) -> Posterior:
     Raises:
         DegenerateGeometryError: the measurements leave the similarity open.
     """
-    linear, white = _linearised(problem), _white(problem)
-    weight = _weights(white) / WEIGHT_OF_NOISE
-    factor = linear.factor(weight)
-    covariance = cho_solve(factor, np.eye(len(linear.prior)))
-    similarity, cameras = linear.place[_SIMILARITY], linear.place[_CAMERAS]
-    kept = np.r_[similarity, cameras]
-    of_lens = np.zeros((0, 0)) if lens is None else lens.cov
-    shared = np.zeros((len(covariance), len(of_lens)))
-    if lens is not None and problem.marks is not None:
-        rows = _control_rows(problem)
-        root = problem.marks.root_information.cpu().numpy()
-        moved = (weight[rows, None, None] * (root @ lens.by_control)).reshape(-1, len(of_lens))
-        pulled = cho_solve(
-            factor, linear.jacobian.reshape(len(white), 3, -1)[rows].reshape(len(moved), -1).T @ moved
-        )
-        shared = -pulled @ of_lens
+    equations = equations_of(problem)
+    normal = equations.normal
+    weights = posterior_weights(normal.residuals())
+    covariance = normal.covariance(weights)
+    cov_lens = np.zeros((0, 0)) if lens is None else lens.cov
+    shared = np.zeros((len(covariance), len(cov_lens)))
+    if lens is not None and problem.control is not None:
+        pulled = _pull_of_lens(problem.control, lens, normal, weights)
+        shared = -pulled @ cov_lens
         covariance = covariance - shared @ pulled.T
-    joint = np.block([[covariance[np.ix_(kept, kept)], shared[kept]], [shared[kept].T, of_lens]])
-    unit = np.eye(len(joint))
-    unit[:7, :7] = problem.similarity.root.cpu().numpy()
-    return Posterior(unit @ joint @ unit.T, problem.similarity.pivot_in_geo)
+    turn = _joint_from_parameters(problem, equations)
+    of_all, with_lens = turn @ covariance @ turn.T, turn @ shared
+    if equations.seen is not None:  # corrections that no measurement sees keep the σ = 1 of bundle adjustment
+        of_all[7:, 7:] += np.eye(len(equations.seen)) - equations.seen @ equations.seen.T
+    joint = np.block([[of_all, with_lens], [with_lens.T, cov_lens]])
+    return Posterior(joint, problem.similarity.pivot_in_geo)
+
+
+def _pull_of_lens(control: ControlTerm, lens: FreeLens, normal: NormalEquations, weights: Weights) -> FloatArray:
+    """G (P, L): by what another lens, of the intersections alone, pulls the parameters."""
+    moved = weights[control.kind][:, None, None] * (_numpy(control.root_information) @ lens.by_control)
+    jacobian = normal.observations[control.kind].jacobian
+    return normal.inverse_times(weights, np.einsum("jdp,jdl->pl", jacobian, moved))
+
+
+def _joint_from_parameters(problem: GeoProblem, equations: GeoEquations) -> FloatArray:
+    """(7 + k, P): similarity about its pivot and camera corrections z of the parameters (y, v, w)."""
+    count = len(equations.normal.precision)
+    corrections = np.eye(count - 7 - equations.errors) if equations.seen is None else equations.seen
+    turn = np.zeros((7 + len(corrections), count))
+    turn[:7, equations.similarity] = _numpy(problem.similarity.root)
+    turn[7:, equations.cameras] = corrections
+    return turn
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """J control points, each measured by a solution that does not know it.
+
+    Attributes:
+        error_in_geo: (J, 3) intersected minus surveyed, metres; NaN where the others leave it open.
+        cov_in_geo: (J, 3, 3) m² that is expected of it: solution, marks and survey; NaN likewise.
+    """
+
+    error_in_geo: FloatArray
+    cov_in_geo: FloatArray
 
 
 def leave_one_out(problem: GeoProblem) -> LeftOut:
-    """Each control point against the solution of all other observations, at a minimum of the problem.
+    """Return the error of each control point against the solution of all other observations, at a minimum.
 
     Linear and without a second solution: of the normal matrix N of all observations, a point with Jacobian A and
     weight w has the leverage H = w A N⁻¹ Aᵀ, and its residual without it is (I − H)⁻¹ r (Cook and Weisberg 1982,
@@ -171,90 +253,33 @@ def leave_one_out(problem: GeoProblem) -> LeftOut:
     Raises:
         DegenerateGeometryError: the measurements leave the similarity open.
     """
-    if problem.marks is None:
+    control = problem.control
+    if control is None:
         return LeftOut(np.empty((0, 3)), np.empty((0, 3, 3)))
-    linear, white = _linearised(problem), _white(problem)
-    weight, rows = _weights(white), _control_rows(problem)
-    jacobian = linear.jacobian.reshape(len(white), 3, -1)[rows]
-    leverage = _spread(linear, weight, jacobian) * weight[rows, None, None]
-    spread = _spread(linear, weight / WEIGHT_OF_NOISE, jacobian)
-    expected = spread * weight[rows, None, None] / WEIGHT_OF_NOISE
-    count = len(jacobian)
-    error, cov = np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan)
+    normal = equations_of(problem).normal
+    residuals = normal.residuals()
+    points, white = normal.observations[control.kind], residuals[control.kind]
+    weights, expected_weights = robust_weights(residuals), posterior_weights(residuals)
+    leverage = normal.spread(weights, points.jacobian) * weights[control.kind][:, None, None]
+    spread = normal.spread(expected_weights, points.jacobian)
+    expected = spread * expected_weights[control.kind][:, None, None]
+    error, cov = np.full((len(white), 3), np.nan), np.full((len(white), 3, 3), np.nan)
     free = np.eye(3) - leverage
     known = np.linalg.eigvalsh(free)[:, 0] > _OPEN
-    unwhiten = np.linalg.inv(problem.marks.root_information.cpu().numpy()[known])
-    error[known] = (unwhiten @ np.linalg.solve(free[known], white[rows][known][..., None]))[..., 0]
+    unwhiten = np.linalg.inv(_numpy(control.root_information)[known])
+    error[known] = (unwhiten @ np.linalg.solve(free[known], white[known][..., None]))[..., 0]
     others = np.linalg.solve(np.eye(3) - expected[known], spread[known])
     cov[known] = unwhiten @ (np.eye(3) + (others + np.swapaxes(others, 1, 2)) / 2) @ np.swapaxes(unwhiten, 1, 2)
     return LeftOut(error, cov)
 
 
-def _spread(linear: _Linear, weight: FloatArray, jacobian: FloatArray) -> FloatArray:
-    """A N⁻¹ Aᵀ (J, 3, 3) of Jacobians (J, 3, P), N with weights (R,)."""
-    flat = jacobian.reshape(-1, jacobian.shape[2])
-    solved = cho_solve(linear.factor(weight), flat.T).T.reshape(jacobian.shape)
-    return np.asarray(solved @ np.swapaxes(jacobian, 1, 2))
+def _seen(by_z: list[FloatArray], count: int) -> FloatArray | None:
+    """Orthonormal directions (k, r) of the corrections that the residuals see; None where that saves nothing."""
+    if sum(rows.shape[0] * rows.shape[1] for rows in by_z) >= count:
+        return None
+    stacked = np.concatenate([np.zeros((0, count)), *(rows.reshape(-1, count) for rows in by_z)])
+    return np.asarray(np.linalg.qr(stacked.T)[0])
 
 
-def _control_rows(problem: GeoProblem) -> slice:
-    assert problem.marks is not None
-    first = 0 if problem.fixes is None else len(problem.fixes.camera)
-    return slice(first, first + len(problem.marks.position_in_geo))
-
-
-def _parameters(problem: GeoProblem) -> dict[str, torch.nn.Parameter]:
-    """What is estimated: the learned weights of the terms stay as they are."""
-    return {name: problem.get_parameter(name) for name in (_SIMILARITY, _CAMERAS, _ERRORS)}
-
-
-def _linearised(problem: GeoProblem) -> _Linear:
-    state = {name: parameter.detach() for name, parameter in _parameters(problem).items()}
-    sizes = [len(value) for value in state.values()]
-    ends = np.cumsum(sizes)
-    place = {name: slice(end - size, end) for name, end, size in zip(state, ends, sizes, strict=True)}
-    if problem.fixes is None and problem.marks is None:
-        return _Linear(np.empty((0, int(ends[-1]))), _prior_information(problem), place)
-
-    def residuals(state: dict[str, Tensor]) -> Tensor:
-        found: Tensor = torch.func.functional_call(problem, state, ())
-        return found
-
-    derivatives = torch.func.jacrev(residuals, chunk_size=64)(state)
-    jacobian = torch.cat([derivatives[name] for name in state], dim=2).flatten(0, 1)
-    return _Linear(jacobian.cpu().numpy(), _prior_information(problem), place)
-
-
-def _prior_information(problem: GeoProblem) -> FloatArray:
-    """Half the second derivative (P, P) of what is known beforehand."""
-    errors = problem.errors
-    root = (errors.unit / errors.sigma[:, None]).cpu().numpy()
-    held = float(problem.hold_prior) * problem.similarity.held.cpu().numpy()
-    return np.asarray(block_diag(np.diag(held), np.eye(len(problem.cameras.z)), root.T @ root))
-
-
-def _prior_pull(problem: GeoProblem) -> FloatArray:
-    """Half its first derivative (P,) at the present state."""
-    errors, similarity = problem.errors, problem.similarity
-    with torch.no_grad():
-        held = float(problem.hold_prior) * similarity.held * similarity.y
-        known = errors.unit.T @ (errors.vector() / errors.sigma**2)
-        return np.asarray(torch.cat([held, problem.cameras.z, known]).cpu().numpy())
-
-
-def _white(problem: GeoProblem) -> FloatArray:
-    """Whitened residuals (R, 3)."""
-    if problem.fixes is None and problem.marks is None:
-        return np.empty((0, 3))
-    with torch.no_grad():
-        return np.asarray(problem().cpu().numpy())
-
-
-def _weights(white: FloatArray) -> FloatArray:
-    return cauchy_weight((white**2).sum(axis=1), CAUCHY_SCALE2**0.5)
-
-
-def _move(problem: GeoProblem, linear: _Linear, step: FloatArray) -> None:
-    with torch.no_grad():
-        for name, parameter in _parameters(problem).items():
-            parameter.add_(torch.from_numpy(step[linear.place[name]]).to(parameter.device))
+def _numpy(tensor: Tensor) -> FloatArray:
+    return np.asarray(tensor.detach().cpu().numpy(), dtype=np.float64)

@@ -1,166 +1,131 @@
-"""The geographic half of the joint optimisation: similarity, cameras and what was measured on Earth."""
+"""The geographic half of the joint optimisation: similarity, cameras, constant errors, and their terms."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Sequence
+from typing import TypeVar
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from pipelines.core.types import FloatArray
 from pipelines.geometry.cameras import Pinhole
 from pipelines.georef.cameras import CameraCorrections
-from pipelines.georef.linear import Linearised, linearise, posterior
-from pipelines.georef.losses import (
-    CAUCHY_SCALE2,
-    CAUCHY_SCALE2_OF_ONE,
-    Estimate,
-    Weighting,
-    attitude_residuals,
-    cauchy,
-    control_residuals,
-    depth_residuals,
-    fix_residuals,
-    pair_residuals,
-)
-from pipelines.georef.measured import ControlMarks, Fixes, Measured
+from pipelines.georef.control_by_depth import ControlByDepth, depth_residuals
+from pipelines.georef.estimate import Estimate
 from pipelines.georef.similarity import LearnableSimilarity
 from pipelines.georef.systematic import SystematicErrors
+from pipelines.georef.terms import ControlTerm, FixTerm, Term, Weighting, cauchy, moved_tensors
 from pipelines.georef.weights import TermWeights
+from pipelines.robust.statistics import outlier_gate
 from pipelines.splat.depth import depth_at
 
-# A measurement further out than this (99.9 % of χ² with 3 degrees of freedom) is called an outlier.
-_OUTLIER_CHI2 = 16.27
-
-
-@dataclass(frozen=True)
-class GeoTerms:
-    """Values of the geographic terms at one iteration; None where there is no such observation.
-
-    Attributes:
-        absolute, control, relative, attitude: means of ρ; `control` is by intersection, also where training uses
-            the depth.
-        cameras: what the corrections cost the image observations.
-        errors: what the constant errors cost their priors.
-    """
-
-    absolute: Tensor | None
-    control: Tensor | None
-    relative: Tensor | None
-    attitude: Tensor | None
-    cameras: Tensor
-    errors: Tensor | None
-
-    def present(self) -> dict[str, Tensor]:
-        """Those that there are, by name."""
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
-        return {name: value for name, value in values.items() if value is not None}
+TermT = TypeVar("TermT", bound=Term)
 
 
 class GeoProblem(torch.nn.Module):
-    """L_abs, L_gcp, L_rel, L_att, and what bundle adjustment says against moving the cameras.
+    """The geographic losses, and what bundle adjustment says against moving the cameras.
 
     Args:
         similarity: `geo_from_model`.
         cameras: poses in `model`.
-        measured: the observations.
+        terms: the observations, at most one of a kind.
         weighting: "whitened" (maximum a posteriori) or "paper" (plain mean squares).
         hold_prior: keep what was known of the similarity beforehand as an observation. Only for layouts that the
             fixes do not determine; for a line only the attitude, since the rest came from the same fixes.
         errors: constant errors to estimate; None: none.
         learned_weights: learn a variance factor of each term.
+        control_by_depth: given where training finds control points through the rendered depth; the term of the
+            control points then has no part in the loss, only in the posterior.
     """
 
     def __init__(
         self,
         similarity: LearnableSimilarity,
         cameras: CameraCorrections,
-        measured: Measured,
+        terms: Sequence[Term],
         *,
         weighting: Weighting = "whitened",
         hold_prior: bool = False,
         errors: SystematicErrors | None = None,
         learned_weights: bool = False,
+        control_by_depth: ControlByDepth | None = None,
     ) -> None:
         super().__init__()
         self.similarity, self.cameras = similarity, cameras
-        self.measured = measured
+        self.terms, self.control_by_depth = tuple(terms), control_by_depth
         self.weighting, self.hold_prior = weighting, hold_prior
         self.errors = SystematicErrors() if errors is None else errors
-        self.weights = TermWeights(weighting, learned_weights)
+        self.weights = TermWeights({term.kind: term.dimension for term in terms}, weighting, learned_weights)
 
     @property
-    def fixes(self) -> Fixes | None:
-        """Of the training cameras."""
-        return self.measured.fixes
+    def fixes(self) -> FixTerm | None:
+        """Fixes of the training cameras."""
+        return self.term(FixTerm)
 
     @property
-    def marks(self) -> ControlMarks | None:
-        """Of the control points."""
-        return self.measured.marks
+    def control(self) -> ControlTerm | None:
+        """Control points."""
+        return self.term(ControlTerm)
+
+    def term(self, kind: type[TermT]) -> TermT | None:
+        """Return the term of a kind, or None."""
+        return next((term for term in self.terms if isinstance(term, kind)), None)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> GeoProblem:
         """Move the observations with the parameters, from device to device."""
         super()._apply(fn, recurse)
-        self.measured = self.measured.moved(fn)
+        self.terms = tuple(moved_tensors(term, fn) for term in self.terms)
+        if self.control_by_depth is not None:
+            self.control_by_depth = moved_tensors(self.control_by_depth, fn)
         return self
 
     def learned(self) -> dict[str, torch.nn.Parameter]:
-        """Everything that is learned here: similarity, cameras, and errors and weights where there are any."""
+        """Return all that is learned: similarity y, cameras z, errors x and weights u where there are any."""
         more = {"x": self.errors.x, "u": self.weights.u}
-        return {"y": self.similarity.y, "z": self.cameras.z} | {k: each for k, each in more.items() if len(each)}
+        return {"y": self.similarity.y, "z": self.cameras.z} | {k: p for k, p in more.items() if len(p)}
 
     def estimate(self) -> Estimate:
-        """The present estimate, differentiable in all of `learned`."""
+        """Return the present estimate, differentiable in all of `learned`."""
         cameras = self.cameras
-        return self._estimate(self.similarity.y, cameras.corrections(), cameras.lens(), self.errors.vector())
+        return self.estimate_at(self.similarity.y, cameras.corrections(), cameras.lens(), self.errors.vector())
 
-    def _estimate(self, y: Tensor, correction: Tensor, lens: Tensor, vector: Tensor) -> Estimate:
+    def estimate_at(self, y: Tensor, correction: Tensor, lens: Tensor, errors: Tensor) -> Estimate:
+        """Return the estimate of other values: y (7,), camera corrections (n, 6), lens (L,), errors (p,)."""
         rotation, center = self.cameras.moved(correction)
-        return Estimate(rotation, center, self.similarity.at(y), self.errors.split(vector), lens)
+        return Estimate(rotation, center, self.similarity.at(y), self.errors.split(errors), lens)
 
-    def terms(self) -> GeoTerms:
-        """The losses, each a mean, as the method states them."""
-        at, measured = self.estimate(), self.measured
-        absolute = control = relative = attitude = None
-        if (fixes := measured.fixes) is not None:
-            absolute = self._mean("absolute", self._white(fix_residuals(at, fixes), fixes.root_information))
-        if (marks := measured.marks) is not None:
-            control = self._mean("control", self._white(control_residuals(at, marks), marks.root_information))
-        if (pairs := measured.pairs) is not None:
-            relative = self._mean("relative", self._white(pair_residuals(at, pairs), pairs.root_information))
-        if (attitudes := measured.attitudes) is not None:
-            turned = attitude_residuals(at, attitudes) * attitudes.root_information[:, None]
-            attitude = self._mean("attitude", turned)
-        errors = self.errors.prior(self.errors.vector()) / self._normaliser() if len(self.errors) else None
-        return GeoTerms(absolute, control, relative, attitude, self._prior() / self._normaliser(), errors)
+    def losses(self) -> dict[str, Tensor]:
+        """Return the value of each term, a mean of ρ, by its kind; those of cameras and constant errors as well."""
+        at = self.estimate()
+        values = {term.kind: self._rho(term, self._squared_as(term, at)).mean() for term in self.terms}
+        values["cameras"] = self._prior() / self._normaliser()
+        if len(self.errors):
+            values["errors"] = self.errors.prior(self.errors.vector()) / self._normaliser()
+        return values
 
     def loss(self) -> Tensor:
-        """L_abs + λ_gcp L_gcp + λ_rel L_rel + λ_att L_att + the terms of cameras and errors; scalar.
+        """Return L_abs + λ_gcp L_gcp + λ_rel L_rel + λ_att L_att + the terms of cameras and errors; scalar.
 
         Whitened: every χ² counts alike, so λ is the ratio of the observations of a term to the fixes, and for L_rel
-        that of what its pairs are worth (`measured.scale_share`). Paper: every λ = 1, and no term of the cameras'.
+        that of what its pairs are worth (`Term.share`). Paper: every λ = 1, and no term of the cameras'.
         Control points that are found by depth come with `depth_loss`.
         """
-        terms = self.terms()
+        values = self.losses()
         whitened = self.weighting == "whitened"
-        total = terms.cameras if whitened else 0.0 * terms.cameras
-        if whitened and terms.errors is not None:
-            total = total + terms.errors
-        for name in ("absolute", "control", "relative", "attitude"):
-            value = getattr(terms, name)
-            if value is not None and not (name == "control" and self.measured.depth_marks is not None):
-                total = total + self._share(name) * self._priced(name, value)
+        total = values["cameras"] if whitened else 0.0 * values["cameras"]
+        if whitened and "errors" in values:
+            total = total + values["errors"]
+        for term in self.terms:
+            if self.control_by_depth is None or not isinstance(term, ControlTerm):
+                total = total + self._factor(term) * self._priced(term, values[term.kind])
         return total + self.weights.prior() / self._normaliser() if self.weights.learned else total
 
     def sees_by_depth(self, camera: int) -> bool:
-        """Whether a view needs a rendered depth for `depth_loss`."""
-        return self.measured.depth_marks is not None and camera in self.measured.depth_marks.rows
+        """Return whether a view needs a rendered depth for `depth_loss`."""
+        return self.control_by_depth is not None and camera in self.control_by_depth.rows
 
     def depth_loss(self, camera: int, depth_m: Tensor, alpha: Tensor, pinhole: Pinhole) -> Tensor | None:
-        """λ_gcp L_gcp of one view, control points being found through the rendered depth at their marks; scalar.
+        """Return λ_gcp L_gcp of one view, control points being found through the rendered depth; scalar.
 
         The gradient reaches similarity, camera and Gaussians. Each point counts as one, whatever the number of its
         marks, and each view for all of them, so that the mean over the views is the loss of the whole. None: the
@@ -172,86 +137,35 @@ class GeoProblem(torch.nn.Module):
             alpha: (H, W).
             pinhole: of these pixels, with the lens as it is now.
         """
-        marks = self.measured.depth_marks
-        if marks is None or not self.sees_by_depth(camera):
+        marks, control = self.control_by_depth, self.control
+        if marks is None or control is None or not self.sees_by_depth(camera):
             return None
         rows = marks.rows[camera]
         xy = marks.rays(rows, self.cameras.lens())
         depth, seen = depth_at(depth_m, alpha, xy, pinhole)
         mapping, surveyed = self.similarity.at(self.similarity.y), marks.position_in_geo[rows]
         missed = depth_residuals(self.cameras.pose(camera), mapping, surveyed, xy, depth)
-        rho = self._rho("control", self._white(missed, marks.root_information[rows]))
-        points = 1 if self.marks is None else len(self.marks.position_in_geo)
+        if self.weighting == "whitened":
+            missed = (marks.root_information[rows] @ missed[:, :, None])[:, :, 0]
         share = marks.share[rows] * seen
-        return self._share("control") * marks.views / points * (share * self._priced("control", rho)).sum()
+        rho = self._priced(control, self._rho(control, missed))
+        return self._factor(control) * marks.views / len(control) * (share * rho).sum()
 
-    def whitened(self, at: Estimate) -> Tensor:
-        """Whitened residuals (F + J + A, 3) of the fixes, the control points, then the attitudes.
-
-        The pairs of L_rel are none of these: they repeat what the fixes say. Learned variances count.
-        """
-        rows, measured = [], self.measured
-        if (fixes := measured.fixes) is not None:
-            rows.append(("absolute", _times(fixes.root_information, fix_residuals(at, fixes))))
-        if (marks := measured.marks) is not None:
-            rows.append(("control", _times(marks.root_information, control_residuals(at, marks))))
-        if (attitudes := measured.attitudes) is not None:
-            rows.append(("attitude", attitude_residuals(at, attitudes) * attitudes.root_information[:, None]))
-        if not rows:
-            return at.center.new_zeros((0, 3))
+    def whitened(self, at: Estimate) -> dict[str, Tensor]:
+        """Return the whitened residuals (M, d) of the terms that measure, by kind; learned variances count."""
+        measuring = [term for term in self.terms if term.measures]
         if self.weighting == "paper":  # what is learned there are variances in m², not factors of the stated ones
-            return torch.cat([white for _, white in rows])
-        return torch.cat([self._scaled(name, white) for name, white in rows])
+            return {term.kind: term.whitened(at) for term in measuring}
+        return {term.kind: self._scaled(term, term.whitened(at)) for term in measuring}
 
-    def forward(self) -> Tensor:
-        """`whitened` at the present estimate."""
-        return self.whitened(self.estimate())
-
-    def linearised(self) -> Linearised:
-        """The problem about the present estimate."""
-        cameras, turns = self.cameras, 6 * len(self.cameras.center)
-
-        def residuals(y: Tensor, moved: Tensor, vector: Tensor) -> Tensor:
-            return self.whitened(self._estimate(y, moved[:turns].view(-1, 6), moved[turns:], vector))
-
-        held = float(self.hold_prior) * self.similarity.held
-        precision = torch.cat([held, self.errors.sigma**-2])
-        with torch.no_grad():
-            moved = torch.cat([cameras.corrections().flatten(), cameras.lens()])
-            at = (self.similarity.y, moved, self.errors.vector(), cameras.z)
-        return linearise(residuals, at, torch.cat([cameras.basis.flatten(0, 1), cameras.lens_basis]), precision)
-
-    def covariance(self) -> FloatArray:
-        """Covariance (7, 7) of the similarity about its pivot, cameras and constant errors marginalised out.
-
-        From the Gauss–Newton normal matrix of the whitened residuals at the present estimate, with the weights
-        that the Cauchy kernel gave, in the form of `products.SimilarityRecord`.
-        """
-        return self.covariances()[0]
-
-    def covariances(self) -> tuple[FloatArray, FloatArray]:
-        """`covariance`, and that of the constant errors (p, p), all else marginalised out."""
-        model = self.linearised()
-        found = posterior(model, model.white).numpy()
-        root = self.similarity.root.cpu().numpy()
-        return np.asarray(root @ found[:7, :7] @ root.T), found[7:, 7:]
-
-    def outliers(self) -> list[int]:
-        """Cameras whose fix contradicts the whole at the 99.9 % level."""
-        if self.fixes is None:
+    @torch.no_grad()
+    def contradicting(self, kind: type[Term]) -> list[int]:
+        """Return the rows of a term's observations that contradict the whole at the 99.9 % level."""
+        term = self.term(kind)
+        if term is None:
             return []
-        return [int(self.fixes.camera[row]) for row in self._far(0, len(self.fixes.camera))]
-
-    def control_outliers(self) -> list[int]:
-        """Control points that contradict the whole at the 99.9 % level, as rows of `marks`."""
-        if self.marks is None:
-            return []
-        return self._far(0 if self.fixes is None else len(self.fixes.camera), len(self.marks.position_in_geo))
-
-    def _far(self, first: int, count: int) -> list[int]:
-        with torch.no_grad():
-            chi2 = self()[first : first + count].square().sum(dim=1)
-        return [int(row) for row in torch.nonzero(chi2 > _OUTLIER_CHI2)[:, 0]]
+        chi2 = self.whitened(self.estimate())[term.kind].square().sum(dim=1)
+        return [int(row) for row in torch.nonzero(chi2 > outlier_gate(term.dimension))[:, 0]]
 
     def _prior(self) -> Tensor:
         prior = self.cameras.z.square().sum()
@@ -259,48 +173,28 @@ class GeoProblem(torch.nn.Module):
 
     def _normaliser(self) -> int:
         """N of the means: the fixes, or the cameras where there is none."""
-        return len(self.cameras.center) if self.fixes is None else len(self.fixes.camera)
+        return len(self.cameras.center) if self.fixes is None else len(self.fixes)
 
-    def _share(self, term: str) -> float:
+    def _factor(self, term: Term) -> float:
         """λ of a term."""
-        if self.weighting == "paper" or term == "absolute":
-            return 1.0
-        measured, count = self.measured, 0.0
-        if term == "control" and measured.marks is not None:
-            count = len(measured.marks.position_in_geo)
-        elif term == "relative" and measured.pairs is not None:
-            count = measured.pairs.share * len(measured.pairs.distance_in_geo)
-        elif term == "attitude" and measured.attitudes is not None:
-            count = len(measured.attitudes.camera)
-        return count / self._normaliser()
+        return 1.0 if self.weighting == "paper" else term.share * len(term) / self._normaliser()
 
-    def _white(self, residual: Tensor, root_information: Tensor) -> Tensor:
-        """Residuals (M, 3) or (M,) as they are squared: whitened, or in metres."""
-        if self.weighting == "paper":
-            return residual
-        return residual * root_information if residual.dim() == 1 else _times(root_information, residual)
+    def _squared_as(self, term: Term, at: Estimate) -> Tensor:
+        """Residuals (M, d) as they are squared: whitened, or in metres; those of angles always whitened."""
+        in_metres = self.weighting == "paper" and term.in_metres
+        return term.residuals(at) if in_metres else term.whitened(at)
 
-    def _rho(self, term: str, white: Tensor) -> Tensor:
-        """ρ (M,) of residuals (M, 3) or (M,)."""
-        white = self._scaled(term, white)
-        squared = white.square() if white.dim() == 1 else white.square().sum(dim=1)
-        if self.weighting == "paper":
-            return squared
-        return cauchy(squared, CAUCHY_SCALE2_OF_ONE if white.dim() == 1 else CAUCHY_SCALE2)
+    def _rho(self, term: Term, residual: Tensor) -> Tensor:
+        """ρ (M,) of residuals (M, d)."""
+        chi2 = self._scaled(term, residual).square().sum(dim=1)
+        return chi2 if self.weighting == "paper" else cauchy(chi2, term.dimension)
 
-    def _mean(self, term: str, white: Tensor) -> Tensor:
-        return self._rho(term, white).mean()
-
-    def _scaled(self, term: str, white: Tensor) -> Tensor:
+    def _scaled(self, term: Term, white: Tensor) -> Tensor:
         """Residuals divided by the learned σ of their term."""
-        s = self.weights.log_variance(term)
+        s = self.weights.log_variance(term.kind)
         return white if s is None else torch.exp(-0.5 * s) * white
 
-    def _priced(self, term: str, value: Tensor) -> Tensor:
+    def _priced(self, term: Term, value: Tensor) -> Tensor:
         """A term's ρ with the price of its learned variance."""
-        s = self.weights.log_variance(term)
-        return value if s is None else value + self.weights.price(term) * s
-
-
-def _times(matrix: Tensor, vector: Tensor) -> Tensor:
-    return (matrix @ vector[:, :, None])[:, :, 0]
+        s = self.weights.log_variance(term.kind)
+        return value if s is None else value + self.weights.price(term.kind) * s

@@ -2,60 +2,16 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from torch import Tensor
 
 from pipelines.core.types import FloatArray
 from pipelines.geometry import rotations
-from pipelines.geometry.similarity import Similarity
+from pipelines.geometry.similarity import Similarity, perturbation
 from pipelines.georef.adjustment import RotationPrior
-
-
-def cross_matrix(vector: Tensor) -> Tensor:
-    """Cross-product matrices (…, 3, 3) of vectors (…, 3)."""
-    x, y, z = vector.unbind(-1)
-    zero = torch.zeros_like(x)
-    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).reshape(*vector.shape[:-1], 3, 3)
-
-
-def exp_so3(rotation_vector: Tensor) -> Tensor:
-    """Rotation matrices (…, 3, 3) of rotation vectors (…, 3), differentiable also at zero.
-
-    Rodrigues' formula: `torch.linalg.matrix_exp` would wait for the device.
-    """
-    squared = rotation_vector.square().sum(dim=-1, keepdim=True)[..., None]
-    angle = (squared + torch.finfo(squared.dtype).tiny).sqrt()  # the root has no derivative at zero
-    cross = cross_matrix(rotation_vector)
-    identity = torch.eye(3, dtype=cross.dtype, device=cross.device)
-    linear, quadratic = torch.sinc(angle / math.pi), 0.5 * torch.sinc(0.5 * angle / math.pi).square()
-    return identity + linear * cross + quadratic * (cross @ cross)
-
-
-def log_so3(rotation: Tensor) -> Tensor:
-    """Rotation vectors (…, 3) of rotations (…, 3, 3) by less than π, differentiable also at zero."""
-    skewed = rotation - rotation.transpose(-1, -2)
-    sine_axis = 0.5 * torch.stack([skewed[..., 2, 1], skewed[..., 0, 2], skewed[..., 1, 0]], dim=-1)
-    # The root has no derivative at zero: 1e-12 rad stand for none.
-    sine = (sine_axis.square().sum(dim=-1, keepdim=True) + 1e-24).sqrt()
-    cosine = 0.5 * (rotation.diagonal(dim1=-2, dim2=-1).sum(dim=-1, keepdim=True) - 1.0)
-    return sine_axis * (torch.atan2(sine, cosine) / sine)
-
-
-@dataclass(frozen=True)
-class Mapping:
-    """geo ← model: p_geo = scale · rotation p_model + shift; scale (), rotation (3, 3), shift (3,), float64."""
-
-    scale: Tensor
-    rotation: Tensor
-    shift: Tensor
-
-    def apply(self, points: Tensor) -> Tensor:
-        """Map points (N, 3)."""
-        return self.scale * points @ self.rotation.T + self.shift
+from pipelines.georef.estimate import TensorSimilarity
+from pipelines.georef.so3 import exp_so3
 
 
 class LearnableSimilarity(torch.nn.Module):
@@ -84,7 +40,7 @@ class LearnableSimilarity(torch.nn.Module):
         root, held, start = _root(covariance), np.ones(7), np.zeros(7)
         if attitude is not None:
             root, held, start = _about_attitude(root, initial.rotation, attitude)
-        self.base = base = _perturbation(root @ start, self.pivot_in_geo).inverse() @ initial
+        self.base = base = perturbation(root @ start, self.pivot_in_geo).inverse() @ initial
         self.y = torch.nn.Parameter(torch.from_numpy(start))
         self.root: Tensor
         self.held: Tensor
@@ -101,20 +57,28 @@ class LearnableSimilarity(torch.nn.Module):
         """Map points (N, 3) float64 of `model` to `geo`."""
         return self.at(self.y).apply(points)
 
-    def at(self, y: Tensor) -> Mapping:
+    def at(self, y: Tensor) -> TensorSimilarity:
         """The similarity of coordinates (7,), differentiable in them."""
         delta = self.root @ y
         turn, grow = exp_so3(delta[1:4]), torch.exp(delta[0])
-        return Mapping(
+        return TensorSimilarity(
             grow * self.base.scale,
             turn @ self.base_rotation,
             self.pivot + delta[4:] + grow * (turn @ (self.base_shift - self.pivot)),
         )
 
+    def place(self, value: Similarity) -> None:
+        """Set the present estimate."""
+        away = value @ self.base.inverse()
+        shift = away.apply(self.pivot_in_geo) - self.pivot_in_geo
+        delta = np.array([np.log(away.scale), *rotations.log_so3(away.rotation), *shift])
+        with torch.no_grad():
+            self.y.copy_(torch.from_numpy(np.linalg.solve(self.root.cpu().numpy(), delta)))
+
     def current(self) -> Similarity:
-        """The present estimate."""
+        """Return the present estimate."""
         delta = (self.root @ self.y).detach().cpu().numpy()
-        return _perturbation(delta, self.pivot_in_geo) @ self.base
+        return perturbation(delta, self.pivot_in_geo) @ self.base
 
     def prior(self) -> Tensor:
         """Twice the negative logarithm of the density of y a priori, but for a constant; scalar."""
@@ -124,12 +88,6 @@ class LearnableSimilarity(torch.nn.Module):
         """Covariance (7, 7) of the initial estimate."""
         root = self.root.cpu().numpy()
         return np.asarray(root @ root.T)
-
-
-def _perturbation(delta: FloatArray, pivot: FloatArray) -> Similarity:
-    """p' = pivot + δt + e^{δ ln s} Exp(δω) (p − pivot)."""
-    grow, turn = float(np.exp(delta[0])), rotations.exp_so3(delta[1:4])
-    return Similarity(grow, turn, pivot + delta[4:] - grow * turn @ pivot)
 
 
 def _about_attitude(

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
-from torch import Tensor
 
-from pipelines.georef.adjustment import OUTLIER_GATE
-from pipelines.georef.linear import Linearised, Solution, posterior, solve
-from pipelines.georef.losses import control_residuals, fix_residuals
+from pipelines.core.types import BoolArray, FloatArray
+from pipelines.georef.adjustment import BIAS_COST
+from pipelines.georef.normal_equations import RobustMinimum, posterior_weights
+from pipelines.georef.posterior import GeoEquations, equations_of
 from pipelines.georef.problem import GeoProblem
 
-# What the bias of a flight must save in −2 ln likelihood: as much as the initial similarity asks of it.
-_BIAS_COST = OUTLIER_GATE - 1.0
 # The similarity turns, and so may a boresight: as many linearisations are enough from 20°.
 _ROUNDS, _NEAR = 4, 0.1  # or until a step is a tenth of a σ
 
@@ -28,51 +27,59 @@ def begin(problem: GeoProblem) -> float:
     y, errors = problem.similarity.y, problem.errors
     before = y.detach().clone()
     for _ in range(_ROUNDS):
-        model = problem.linearised()
-        best = _best(problem, model, with_errors=True)
-        covariance = posterior(model, best.white)
-        moved = best.x - model.x
-        errors.begin(best.x[7:].numpy(), torch.linalg.cholesky(covariance[7:, 7:]).numpy())
+        equations = equations_of(problem)
+        with_errors = _best(problem, equations, with_errors=True)
+        covariance = equations.normal.covariance(posterior_weights(with_errors.residuals))
+        solved = slice(0, equations.constant.stop)
+        constant = equations.constant
+        values = equations.normal.offset[constant] + with_errors.step[constant]
+        errors.begin(values, np.asarray(np.linalg.cholesky(covariance[constant, constant])))
         with torch.no_grad():
-            y.copy_(best.x[:7])
-        if float((moved @ torch.linalg.solve(covariance, moved)).sqrt()) < _NEAR:
+            y.add_(torch.from_numpy(with_errors.step[equations.similarity]).to(y.device))
+        step = with_errors.step[solved]
+        if step @ np.linalg.solve(covariance[solved, solved], step) < _NEAR**2:
             break
-    without = _best(problem, model, with_errors=False)
+    without = _best(problem, equations, with_errors=False)
     with torch.no_grad():
         y.copy_(before)
-    return without.cost - best.cost
+    return without.cost - with_errors.cost
 
 
 def bias_pays(problem: GeoProblem, saved: float) -> bool:
-    """Whether biases that save so much of −2 ln likelihood are to be believed.
+    """Return whether biases that save so much of −2 ln likelihood are to be believed.
 
     A bias that is not there costs accuracy, since the fixes then say nothing of the position: with RTK and a few
     control points, twice the σ and more. So it has to be evident, as for the initial similarity.
     """
-    return saved > _BIAS_COST * problem.errors.flights
+    return saved > BIAS_COST * problem.errors.flights
 
 
-def _best(problem: GeoProblem, model: Linearised, with_errors: bool) -> Solution:
-    free = torch.ones(len(model.x), dtype=torch.bool)
-    free[7:] = with_errors
-    starts = (model.x, _from_control(problem, model.x, with_errors))
-    return min((solve(model, start, free) for start in starts), key=lambda solution: solution.cost)
+def _best(problem: GeoProblem, equations: GeoEquations, *, with_errors: bool) -> RobustMinimum:
+    """The likelier of the minima from two starts, with the constant errors free or held at zero."""
+    free: BoolArray = np.ones(len(equations.normal.precision), dtype=bool)
+    free[equations.constant] = with_errors
+    here = np.zeros(len(free))
+    starts = [here, _step_to_control(problem, equations)]
+    if not with_errors:
+        for start in starts:
+            start[equations.constant] = -equations.normal.offset[equations.constant]
+    return min((equations.normal.minimum(start, free) for start in starts), key=lambda solution: solution.cost)
 
 
 @torch.no_grad()
-def _from_control(problem: GeoProblem, x: Tensor, with_errors: bool) -> Tensor:
-    """x (7 + p,) with the similarity moved onto the control points, and the biases taken from the fixes there."""
-    start, at = x.clone(), problem.estimate()
-    fixes, marks = problem.measured.fixes, problem.measured.marks
-    if fixes is None or marks is None:
-        return start
-    shift = -control_residuals(at, marks).median(dim=0).values
+def _step_to_control(problem: GeoProblem, equations: GeoEquations) -> FloatArray:
+    """Step (P,) that moves the similarity onto the control points, and takes the biases from the fixes there."""
+    step, at = np.zeros(len(equations.normal.precision)), problem.estimate()
+    fixes, control, errors = problem.fixes, problem.control, problem.errors
+    if fixes is None or control is None:
+        return step
+    shift = -control.residuals(at).median(dim=0).values
     root = problem.similarity.root
-    start[:7] += torch.linalg.solve(root, torch.cat([root.new_zeros(4), shift])).cpu()
-    if with_errors and problem.errors.flights:
-        missed = fix_residuals(at, fixes) + shift
+    step[equations.similarity] = torch.linalg.solve(root, torch.cat([root.new_zeros(4), shift])).cpu().numpy()
+    if errors.flights:
+        missed = fixes.residuals(at) + shift
         flight = torch.zeros_like(fixes.camera) if fixes.flight is None else fixes.flight
-        for index in range(problem.errors.flights):
-            middle = missed[flight == index].median(dim=0).values
-            start[7 + 3 * index : 10 + 3 * index] -= middle.cpu()
-    return start
+        middle = torch.stack([missed[flight == index].median(dim=0).values for index in range(errors.flights)])
+        biases = equations.constant.start + np.arange(3 * errors.flights)
+        step[biases] = -middle.cpu().numpy().ravel()
+    return step

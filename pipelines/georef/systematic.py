@@ -69,7 +69,7 @@ class ErrorEstimate:
 class SystematicErrors(torch.nn.Module):
     """The vector v = start + unit · x of all errors (p,), in metres and radians, with v ~ N(0, diag σ²) a priori.
 
-    `start` and `unit` (the root of v's covariance once the data are known, see `georef.linear.begin`) only make the
+    `start` and `unit` (the root of v's covariance once the data are known, see `georef.start.begin`) only make the
     learned x of size one.
 
     Args:
@@ -107,6 +107,11 @@ class SystematicErrors(torch.nn.Module):
             self.unit.copy_(torch.from_numpy(unit))
             self.x.zero_()
 
+    def set_vector(self, vector: Tensor) -> None:
+        """Set the present values (p,)."""
+        with torch.no_grad():
+            self.x.copy_(torch.linalg.solve(self.unit, vector - self.start))
+
     def vector(self) -> Tensor:
         """Present values v (p,)."""
         return self.start + self.unit @ self.x
@@ -126,7 +131,7 @@ class SystematicErrors(torch.nn.Module):
             found.get("common"),
         )
 
-    def found(self, covariance: FloatArray) -> tuple[ErrorEstimate, ...]:
+    def estimates(self, covariance: FloatArray) -> tuple[ErrorEstimate, ...]:
         """The present values with the σ of their covariance (p, p); what all attitudes share is not told."""
         value, prior = self.vector().detach().cpu().numpy(), self.sigma.cpu().numpy()
         sigma = np.sqrt(np.diag(covariance))

@@ -21,7 +21,7 @@ from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
 from pipelines.geometry.similarity import Similarity, jacobian_at, spread_ratio_similarity, umeyama
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.georef.adjustment import OUTLIER_GATE, Adjusted, Correspondences, RotationPrior
+from pipelines.georef.adjustment import OUTLIER_GATE, AdjustedSimilarity, Correspondences, RotationPrior
 from pipelines.georef.alignment import Alignment, align, layout_of
 from pipelines.init_sim3.options import InitSim3Options
 from pipelines.robust.ransac import RansacOptions, ransac
@@ -35,7 +35,7 @@ _GUESS_POINTS = 1000
 _LOUD_EXCESS = 2.0  # times the stated σ
 
 
-def run(stage: StageRun, config: InitSim3Options) -> Summary:
+def run(stage: StageRun, options: InitSim3Options) -> Summary:
     """Estimate the similarity of the workspace and write it.
 
     Raises:
@@ -44,42 +44,42 @@ def run(stage: StageRun, config: InitSim3Options) -> Summary:
     survey = load_json(Survey, stage.workspace.path(SURVEY))
     model = read_sparse(stage.workspace.path(SPARSE))
     points = GeolocatedPoints.load(stage.workspace.path(POINTS))
-    found, warnings = estimate_similarity(survey, model, points, config)
-    save_json(found, stage.out / "geo_from_local.json")
-    return _summary(found, warnings)
+    initial, warnings = estimate_similarity(survey, model, points, options)
+    save_json(initial, stage.out / "geo_from_local.json")
+    return _summary(initial, warnings)
 
 
 def estimate_similarity(
-    survey: Survey, model: SparseModel, points: GeolocatedPoints, config: InitSim3Options
+    survey: Survey, model: SparseModel, points: GeolocatedPoints, options: InitSim3Options
 ) -> tuple[InitialSimilarity, tuple[str, ...]]:
     """The similarity and what to warn of.
 
     Raises:
         DegenerateGeometryError: the measurements leave the similarity open; says what to add.
-        ConvergenceError: the residual is larger than `config.max_residual`.
+        ConvergenceError: the residual is larger than `options.max_residual`.
         InputError: `points` does not belong to `model`.
     """
     if not np.array_equal(points.point_id, model.point_id):
         raise InputError("the geolocated points are of another model: run `georef geolocate` again")
     fixes = fix_correspondences(survey, model)
-    if not config.control_points:
+    if not options.control_points:
         survey = survey.model_copy(update={"control_points": ()})
     control, warnings = control_correspondences(survey, model)
     data = fixes.joined(control)
-    if config.method == "paper":
-        found = _by_paper(model, points, data)
+    if options.method == "paper":
+        initial = _by_paper(model, points, data)
     else:
-        guess = _guess(model, points, np.random.default_rng(config.seed))
+        guess = _guess(model, points, np.random.default_rng(options.seed))
         alignment = align(
             data,
-            np.random.default_rng(config.seed),
+            np.random.default_rng(options.seed),
             attitude=attitude_prior(survey, model),
             guesses=(guess,) if guess else (),
         )
-        found = _robust_product(model, points, data, alignment)
+        initial = _robust_product(model, points, data, alignment)
         warnings += _warnings(data, alignment.solution)
-    _check_residual(found, config.max_residual)
-    return found, warnings
+    _check_residual(initial, options.max_residual)
+    return initial, warnings
 
 
 def _guess(model: SparseModel, points: GeolocatedPoints, rng: np.random.Generator) -> Similarity | None:
@@ -92,7 +92,7 @@ def _guess(model: SparseModel, points: GeolocatedPoints, rng: np.random.Generato
         result = ransac(
             len(best),
             lambda chosen: umeyama(local[chosen], geo[chosen]),
-            lambda found: squared_mahalanobis(geo - found.apply(local), cov),
+            lambda similarity: squared_mahalanobis(geo - similarity.apply(local), cov),
             RansacOptions(3, OUTLIER_GATE, max_draws=200),
             rng,
         )
@@ -143,8 +143,8 @@ def _by_paper(model: SparseModel, points: GeolocatedPoints, data: Correspondence
             f"--method paper needs 3 geolocated points, there are {good.sum()}: use --method robust"
         )
     local, geo = model.point_in_local[good], points.position_in_geo[good]
-    found = spread_ratio_similarity(local, geo)
-    mapped = found.apply(local)
+    similarity = spread_ratio_similarity(local, geo)
+    mapped = similarity.apply(local)
     pivot = mapped.mean(axis=0)
     jacobian = jacobian_at(mapped, pivot)
     normal = np.einsum("nia,nib->ab", jacobian, jacobian)
@@ -152,13 +152,13 @@ def _by_paper(model: SparseModel, points: GeolocatedPoints, data: Correspondence
     size = np.ones(7)
     size[:4] = np.sqrt(((mapped - pivot) ** 2).sum(axis=1).mean())
     return InitialSimilarity(
-        geo_from_local=found.to_record(
+        geo_from_local=similarity.to_record(
             "local", "geo", covariance=variance * np.linalg.solve(normal, np.eye(7)), pivot=pivot
         ),
         method="paper",
         correspondences=_counts(data.control[:0], good),
         inliers=_counts(data.control[:0], good),
-        residuals=_residuals(model, points, found, data, data.in_geo - found.apply(data.in_local)),
+        residuals=_residuals(model, points, similarity, data, data.in_geo - similarity.apply(data.in_local)),
         condition_number=float(np.linalg.cond(normal / np.outer(size, size))),
         layout=layout_of(local),
         attitude_used=points.rotation_source == "recorded",
@@ -169,28 +169,28 @@ def _counts(control: np.ndarray, points: np.ndarray) -> dict[str, int]:
     return {"gnss": int((~control).sum()), "gcp": int(control.sum()), "points": int(points.sum())}
 
 
-def _agreeing(model: SparseModel, points: GeolocatedPoints, found: Similarity) -> np.ndarray:
+def _agreeing(model: SparseModel, points: GeolocatedPoints, similarity: Similarity) -> np.ndarray:
     """Which geolocated points lie where the similarity puts them, within their covariance."""
     good = points.inlier.copy()
-    missed = points.position_in_geo[good] - found.apply(model.point_in_local[good])
+    missed = points.position_in_geo[good] - similarity.apply(model.point_in_local[good])
     good[good] = squared_mahalanobis(missed, points.cov_in_geo[good]) <= OUTLIER_GATE
     return good
 
 
 def _residuals(
-    model: SparseModel, points: GeolocatedPoints, found: Similarity, data: Correspondences, missed: FloatArray
+    model: SparseModel, points: GeolocatedPoints, similarity: Similarity, data: Correspondences, missed: FloatArray
 ) -> dict[str, ResidualStats]:
     good = points.inlier
     return {
         "gnss": residual_stats(missed[~data.control]),
         "gcp": residual_stats(missed[data.control]),
-        "points": residual_stats(points.position_in_geo[good] - found.apply(model.point_in_local[good])),
+        "points": residual_stats(points.position_in_geo[good] - similarity.apply(model.point_in_local[good])),
     }
 
 
-def _check_residual(found: InitialSimilarity, limit_m: float | None) -> None:
-    kind: Literal["gnss", "gcp"] = "gnss" if found.residuals["gnss"].count else "gcp"
-    stats = found.residuals[kind]
+def _check_residual(initial: InitialSimilarity, limit_m: float | None) -> None:
+    kind: Literal["gnss", "gcp"] = "gnss" if initial.residuals["gnss"].count else "gcp"
+    stats = initial.residuals[kind]
     if limit_m is None or stats.rmse_3d_m is None or stats.rmse_3d_m <= limit_m:
         return
     what = "camera centres" if kind == "gnss" else "control points"
@@ -201,7 +201,7 @@ def _check_residual(found: InitialSimilarity, limit_m: float | None) -> None:
     )
 
 
-def _warnings(data: Correspondences, solution: Adjusted) -> tuple[str, ...]:
+def _warnings(data: Correspondences, solution: AdjustedSimilarity) -> tuple[str, ...]:
     state, warnings = solution.state, []
     if state.fix_bias_in_geo is not None:
         sigma = np.sqrt(np.diag(solution.bias_cov))
@@ -231,24 +231,24 @@ def _warnings(data: Correspondences, solution: Adjusted) -> tuple[str, ...]:
     return tuple(warnings)
 
 
-def _summary(found: InitialSimilarity, warnings: tuple[str, ...]) -> Summary:
-    sigma = np.sqrt(np.diag(np.array(found.geo_from_local.covariance)))
+def _summary(initial: InitialSimilarity, warnings: tuple[str, ...]) -> Summary:
+    sigma = np.sqrt(np.diag(np.array(initial.geo_from_local.covariance)))
     parts = [
         f"{kind} {stats.rmse_3d_m:.3f} m RMS of {stats.count}"
-        for kind, stats in found.residuals.items()
+        for kind, stats in initial.residuals.items()
         if stats.rmse_3d_m is not None and kind != "points"
     ]
     position = float(np.linalg.norm(sigma[4:]))
     values: dict[str, Any] = {
-        "scale": found.geo_from_local.scale,
-        "sigma_scale": float(sigma[0] * found.geo_from_local.scale),
+        "scale": initial.geo_from_local.scale,
+        "sigma_scale": float(sigma[0] * initial.geo_from_local.scale),
         "sigma_rotation_deg": float(np.degrees(sigma[1:4].max())),
         "sigma_position_m": position,
-        "layout": found.layout,
-        "attitude_used": found.attitude_used,
-        "condition_number": found.condition_number,
-        "inliers": found.inliers,
-        "gnss_outliers": list(found.gnss_outliers),
-        "residuals": {kind: stats.model_dump() for kind, stats in found.residuals.items()},
+        "layout": initial.layout,
+        "attitude_used": initial.attitude_used,
+        "condition_number": initial.condition_number,
+        "inliers": initial.inliers,
+        "gnss_outliers": list(initial.gnss_outliers),
+        "residuals": {kind: stats.model_dump() for kind, stats in initial.residuals.items()},
     }
     return Summary(f"σ of position {position:.3f} m; residuals {', '.join(parts)}", values, warnings)

@@ -1,4 +1,4 @@
-"""Bar charts as PNG files, drawn without a display."""
+"""Bar charts as PNG files."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pipelines.plots.style import FIGURE_POINTS, SERIES_COLOURS, TICK_POINTS, label, new_figure, write_png
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_COLOURS = ("#2b6cb0", "#dd8a3b", "#4f9d69")
 _PANEL_INCHES = (4.6, 4.2)
-_DOTS_PER_INCH = 130
 _WIDE_RANGE = 20.0  # between the largest and the smallest bar: beyond, only a logarithmic axis shows both
 
 
@@ -39,21 +39,36 @@ class Panel:
 
 def write_bars(path: Path, panels: Sequence[Panel]) -> None:
     """Draw the panels side by side; a file that is there is replaced when the new one is complete."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(_PANEL_INCHES[0] * len(panels), _PANEL_INCHES[1]), layout="constrained")
-    axes = figure.subplots(1, len(panels), squeeze=False)[0]
-    for place, panel in zip(axes, panels, strict=True):
-        _draw(place, panel)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_suffix(".tmp")
-    with draft.open("wb") as handle:
-        FigureCanvasAgg(figure).print_png(handle, metadata={"Software": None})
-    draft.rename(path)
+    width, height = _PANEL_INCHES
+    figure = new_figure((width * len(panels), height), "constrained")
+    for axes, panel in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
+        _draw(axes, panel)
+    write_png(figure, path)
 
 
 def _draw(axes: Axes, panel: Panel) -> None:
+    _scale(axes, panel)
+    width = 0.8 / len(panel.series)
+    for position, (name, values) in enumerate(panel.series.items()):
+        heights = {index: value for index, value in enumerate(values) if value is not None}
+        left = [index + (position - (len(panel.series) - 1) / 2) * width for index in heights]
+        colour = SERIES_COLOURS[position]
+        bars = axes.bar(left, list(heights.values()), 0.94 * width, color=colour, label=name)
+        figures = [f"{value:.{panel.digits}f}" for value in heights.values()]
+        turn = 90 if len(panel.series) > 1 else 0
+        axes.bar_label(bars, figures, padding=2, fontsize=FIGURE_POINTS, rotation=turn)
+    label(axes, panel.title, y=panel.axis)
+    axes.set_xticks(range(len(panel.members)), panel.members)
+    axes.spines[["top", "right"]].set_visible(False)
+    if len(panel.series) > 1:
+        below = (0.5, -0.08)
+        axes.legend(
+            frameon=False, fontsize=TICK_POINTS, loc="upper center", bbox_to_anchor=below, ncols=len(panel.series)
+        )
+
+
+def _scale(axes: Axes, panel: Panel) -> None:
+    """A logarithmic axis where bars of unlike size would vanish on a linear one."""
     heights = [value for values in panel.series.values() for value in values if value is not None]
     if heights and min(heights) > 0 and max(heights) > _WIDE_RANGE * min(heights):
         axes.set_yscale("log")
@@ -61,17 +76,3 @@ def _draw(axes: Axes, panel: Panel) -> None:
         axes.set_ylim(min(heights) / 2, max(heights) * 3)
     elif heights:
         axes.set_ylim(panel.least, panel.least + 1.18 * max(max(heights) - panel.least, 1e-9))
-    width = 0.8 / len(panel.series)
-    for place, (name, values) in enumerate(panel.series.items()):
-        shown = [(index, value) for index, value in enumerate(values) if value is not None]
-        left = [index + (place - (len(panel.series) - 1) / 2) * width for index, _ in shown]
-        bars = axes.bar(left, [value for _, value in shown], 0.94 * width, color=_COLOURS[place], label=name)
-        labels = [f"{value:.{panel.digits}f}" for _, value in shown]
-        axes.bar_label(bars, labels, padding=2, fontsize=7, rotation=90 if len(panel.series) > 1 else 0)
-    axes.set_xticks(range(len(panel.members)), panel.members)
-    axes.set_title(panel.title, fontsize=11)
-    axes.set_ylabel(panel.axis)
-    axes.spines[["top", "right"]].set_visible(False)
-    if len(panel.series) > 1:
-        below = (0.5, -0.08)
-        axes.legend(frameon=False, fontsize=8, loc="upper center", bbox_to_anchor=below, ncols=len(panel.series))

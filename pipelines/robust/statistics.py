@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import chi2
@@ -21,6 +23,18 @@ def chi2_quantile(probability: float, degrees: ArrayLike) -> FloatArray:
     distinct, place = np.unique(dof, return_inverse=True)
     values = np.where(distinct > 0, chi2.ppf(probability, np.maximum(distinct, 1)), 0.0)
     return np.asarray(values[place].reshape(dof.shape), dtype=np.float64)
+
+
+@cache
+def outlier_gate(dimension: int) -> float:
+    """Return the χ² beyond which a residual of a dimension is an outlier: plain noise is within in 99.9 %."""
+    return float(chi2_quantile(0.999, dimension))
+
+
+@cache
+def median_chi2(dimension: int) -> float:
+    """Return the median of χ²: what half of the squared residuals of plain noise stay below."""
+    return float(chi2_quantile(0.5, dimension))
 
 
 def mad_sigma(values: ArrayLike) -> float:

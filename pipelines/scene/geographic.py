@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,15 +12,16 @@ from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.similarity import moved_pivot
 from pipelines.georef.adjustment import RotationPrior
 from pipelines.georef.cameras import CameraCorrections
-from pipelines.georef.measured import ControlMarks, Measured
+from pipelines.georef.control_by_depth import ControlByDepth
 from pipelines.georef.problem import GeoProblem
 from pipelines.georef.similarity import LearnableSimilarity
 from pipelines.georef.start import begin, bias_pays
 from pipelines.georef.systematic import SystematicErrors
+from pipelines.georef.terms import AttitudeTerm, ControlTerm, DistanceTerm, FixTerm, Term
 from pipelines.scene.geographic_options import GeographicOptions
 from pipelines.scene.geolocated import GeolocatedPoints
 from pipelines.scene.initial_similarity import InitialSimilarity
-from pipelines.scene.measurements import attitudes_of, control_marks, depth_marks, fixes_of, pairs_of
+from pipelines.scene.measurements import attitude_term, control_by_depth, control_term, distance_term, fix_term
 from pipelines.scene.scene import Scene
 from pipelines.scene.survey import Survey
 
@@ -49,15 +50,16 @@ def geo_problem(
     record = initial.geo_from_local
     pivot = scene.geo_from_model.apply(scene.poses.cam_center_in_model[scene.train]).mean(axis=0)
     covariance = moved_pivot(np.array(record.covariance), record.pivot, pivot)
-    measured = _measured(scene, survey, options, points, seed) if options.geo_loss else Measured()
+    observed = _observed(scene, survey, options, points, seed) if options.geo_loss else Observed()
     problem = GeoProblem(
         LearnableSimilarity(scene.geo_from_model, covariance, pivot, _attitude(scene, initial)),
         _corrections(scene, options),
-        measured,
+        observed.terms,
         weighting=options.weighting,
-        hold_prior=_leaves_open(measured, initial),
-        errors=_errors(measured, options) if options.geo_loss else None,
+        hold_prior=_leaves_open(observed, initial),
+        errors=_errors(observed, options) if options.geo_loss else None,
         learned_weights=options.loss_weights == "learned",
+        control_by_depth=observed.control_by_depth,
     )
     if len(problem.errors):
         saved = begin(problem)
@@ -88,38 +90,53 @@ def _attitude(scene: Scene, initial: InitialSimilarity) -> RotationPrior | None:
     return RotationPrior(geo_from_local @ scene.model_from_local.rotation.T, np.array(initial.attitude.cov_rad2))
 
 
-def _leaves_open(measured: Measured, initial: InitialSimilarity) -> bool:
+@dataclass(frozen=True)
+class Observed:
+    """The terms of a survey; None where there is nothing of a kind, or it is not to be used."""
+
+    fixes: FixTerm | None = None
+    control: ControlTerm | None = None
+    distances: DistanceTerm | None = None
+    attitudes: AttitudeTerm | None = None
+    control_by_depth: ControlByDepth | None = None
+
+    @property
+    def terms(self) -> tuple[Term, ...]:
+        """Those that there are."""
+        every = (self.fixes, self.control, self.distances, self.attitudes)
+        return tuple(term for term in every if term is not None)
+
+
+def _leaves_open(observed: Observed, initial: InitialSimilarity) -> bool:
     """Whether the observations leave some of the similarity to what was known of it beforehand."""
     if initial.layout == "line":
-        return measured.attitudes is None
-    return measured.fixes is None and not _determined_by(measured.marks)
+        return observed.attitudes is None
+    return observed.fixes is None and not _determined_by(observed.control)
 
 
-def _determined_by(marks: ControlMarks | None) -> bool:
+def _determined_by(control: ControlTerm | None) -> bool:
     """Whether control points alone fix all seven unknowns of the similarity."""
-    return marks is not None and len(marks.position_in_geo) >= _LEAST_CONTROL
+    return control is not None and len(control) >= _LEAST_CONTROL
 
 
-def _measured(
+def _observed(
     scene: Scene, survey: Survey, options: GeographicOptions, points: GeolocatedPoints | None, seed: int
-) -> Measured:
-    fixes = fixes_of(scene, survey)
-    measured = Measured(fixes, control_marks(scene, survey) if options.gcp_loss else None)
-    if measured.marks is not None and options.gcp_mode == "depth":
-        by_depth, marks = depth_marks(scene, survey, measured.marks)
-        measured = replace(measured, marks=marks, depth_marks=by_depth)
-    if fixes is not None and options.rel_loss:
-        measured = replace(measured, pairs=pairs_of(scene, fixes, points, seed))
-    if "boresight" in options.estimated:
-        measured = replace(measured, attitudes=attitudes_of(scene, survey))
-    return measured
+) -> Observed:
+    fixes = fix_term(scene, survey)
+    control = control_term(scene, survey) if options.gcp_loss else None
+    by_depth = None
+    if control is not None and options.gcp_mode == "depth":
+        by_depth, control = control_by_depth(scene, survey, control)
+    distances = distance_term(scene, fixes, points, seed) if fixes is not None and options.rel_loss else None
+    attitudes = attitude_term(scene, survey) if "boresight" in options.estimated else None
+    return Observed(fixes, control, distances, attitudes, by_depth)
 
 
-def _errors(measured: Measured, options: GeographicOptions) -> SystematicErrors:
+def _errors(observed: Observed, options: GeographicOptions) -> SystematicErrors:
     """The constant errors that are asked for; with `auto` the bias, wherever control points could show it."""
-    fixes, attitudes, wanted = measured.fixes, measured.attitudes, options.estimated
+    fixes, attitudes, wanted = observed.fixes, observed.attitudes, options.estimated
     if options.estimate == AUTO:
-        possible = options.weighting == "whitened" and fixes is not None and _determined_by(measured.marks)
+        possible = options.weighting == "whitened" and fixes is not None and _determined_by(observed.control)
         wanted = ("bias",) if possible else ()
     for name, source, what in (
         ("bias", fixes, "positions"),
@@ -132,5 +149,7 @@ def _errors(measured: Measured, options: GeographicOptions) -> SystematicErrors:
     return SystematicErrors(
         flights if "bias" in wanted else 0,
         arm="lever-arm" in wanted,
-        attitude_sigma_rad=None if attitudes is None else float((1.0 / attitudes.root_information).median()),
+        attitude_sigma_rad=None
+        if attitudes is None
+        else float((1.0 / attitudes.root_information[:, 0, 0]).median()),
     )

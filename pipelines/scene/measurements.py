@@ -10,30 +10,32 @@ from torch import Tensor
 
 from pipelines.core.errors import InputError
 from pipelines.core.types import FloatArray
-from pipelines.geometry.lens import bearings
-from pipelines.georef.measured import Attitudes, ControlMarks, DepthMarks, Fixes, Pairs, scale_share
+from pipelines.georef.control_by_depth import ControlByDepth
+from pipelines.georef.terms import AttitudeTerm, ControlTerm, DistanceTerm, FixTerm
 from pipelines.scene.geolocated import GeolocatedPoints
+from pipelines.scene.marks import mark_rays
 from pipelines.scene.observations import recorded_rotations
 from pipelines.scene.scene import Scene
-from pipelines.scene.survey import Survey, SurveyedPoint
+from pipelines.scene.survey import Survey
 
 # Between the times of two consecutive fixes: longer, and the receiver may have started anew.
 FLIGHT_GAP_S = 600.0
 # Of the rendered surface at a mark, as a part of its distance: 12 cm at 60 m.
 SURFACE_SIGMA = 2e-3
+_WORTH = 0.1  # of the fixes' information on the scale, that distances between points repeat
 _PAIRS = 300
 # Candidates for each pair that is taken: the longest are, since short ones say little of the scale.
 _DRAWN = 3
 
 
-def fixes_of(scene: Scene, survey: Survey) -> Fixes | None:
+def fix_term(scene: Scene, survey: Survey) -> FixTerm | None:
     """Fixes of the training cameras; those of test cameras stay unused, as their photographs do."""
     found = [(int(i), survey.image(scene.sparse.image_name[i])) for i in scene.train]
     fixed = [(index, image, image.fix) for index, image in found if image is not None and image.fix is not None]
     if len(fixed) < 3:
         return None
     covariance = np.array([fix.cov_in_geo for _, _, fix in fixed])
-    return Fixes(
+    return FixTerm(
         torch.tensor([index for index, _, _ in fixed]),
         torch.tensor([fix.position_in_geo for _, _, fix in fixed], dtype=torch.float64),
         torch.from_numpy(root_information(covariance)),
@@ -52,29 +54,29 @@ def flights(times_s: list[float | None]) -> np.ndarray:
     return flight
 
 
-def control_marks(scene: Scene, survey: Survey) -> ControlMarks | None:
+def control_term(scene: Scene, survey: Survey) -> ControlTerm | None:
     """Marks of the control points in training images, where a point is seen in two or more of them."""
-    rays = [(point, _rays(scene, point)) for point in survey.control_points]
-    kept = [(point, found) for point, found in rays if len({ray[0] for ray in found}) >= 2]
-    if not kept:
+    rays = mark_rays(survey.control_points, scene.sparse, scene.train)
+    kept = rays.marks_of_point >= 2
+    if not kept.any():
         return None
-    flat = [(j, *ray) for j, (_, found) in enumerate(kept) for ray in found]
-    bearing, pixel = (np.array([row[column] for row in flat]) for column in (2, 4))
-    camera = np.array([row[1] for row in flat])
-    marks = ControlMarks(
-        point=torch.tensor([row[0] for row in flat]),
-        camera=torch.from_numpy(camera),
-        bearing_in_cam=torch.from_numpy(bearing),
-        sigma_rad=torch.tensor([row[3] for row in flat], dtype=torch.float64),
-        position_in_geo=torch.tensor([point.position_in_geo for point, _ in kept], dtype=torch.float64),
-        root_information=torch.eye(3, dtype=torch.float64).repeat(len(kept), 1, 1),
-        name=tuple(point.name for point, _ in kept),
-        bearing_by_lens=torch.from_numpy(scene.sparse.lenses.bearing_jacobian(camera, pixel)),
+    rays = rays.of_points(kept)
+    surveyed = [point for point, keep in zip(survey.control_points, kept, strict=True) if keep]
+    control = ControlTerm(
+        point=torch.from_numpy(rays.point),
+        camera=torch.from_numpy(rays.camera),
+        bearing_in_cam=torch.from_numpy(rays.bearing_in_cam),
+        sigma_rad=torch.from_numpy(rays.sigma_rad),
+        position_in_geo=torch.tensor([point.position_in_geo for point in surveyed], dtype=torch.float64),
+        root_information=torch.eye(3, dtype=torch.float64).repeat(len(surveyed), 1, 1),
+        point_id=rays.point_id,
+        bearing_by_lens=torch.from_numpy(scene.sparse.lenses.bearing_jacobian(rays.camera, rays.xy_px)),
     )
-    return _with_covariance(marks, _survey_covariance(kept) + _mark_covariance(scene, marks))
+    of_survey = np.array([point.cov_in_geo for point in surveyed])
+    return _with_covariance(control, of_survey + _mark_covariance(scene, control))
 
 
-def depth_marks(scene: Scene, survey: Survey, marks: ControlMarks) -> tuple[DepthMarks, ControlMarks]:
+def control_by_depth(scene: Scene, survey: Survey, marks: ControlTerm) -> tuple[ControlByDepth, ControlTerm]:
     """The marks for projection onto the rendered surface, and the control points with the surface's σ added.
 
     The surface is taken to be off by `SURFACE_SIGMA` of the distance, in any direction, the same for all marks of a
@@ -85,14 +87,14 @@ def depth_marks(scene: Scene, survey: Survey, marks: ControlMarks) -> tuple[Dept
     center = torch.from_numpy(scene.geo_from_model.apply(scene.poses.cam_center_in_model))[camera]
     distance = (marks.position_in_geo[point] - center).norm(dim=1)
     surveyed = {each.name: np.array(each.cov_in_geo) for each in survey.control_points}
-    covariance = torch.from_numpy(np.array([surveyed[name] for name in marks.name]))
+    covariance = torch.from_numpy(np.array([surveyed[name] for name in marks.point_id]))
     identity = torch.eye(3, dtype=torch.float64)
     lateral, surface = marks.sigma_rad[order] * distance, SURFACE_SIGMA * distance
     of_mark = covariance[point] + (lateral.square() + surface.square())[:, None, None] * identity
     bearing = marks.bearing_in_cam[order]
     count = torch.bincount(point, minlength=len(marks.position_in_geo))
     starts = {int(index): int(torch.searchsorted(camera, index)) for index in torch.unique(camera)}
-    found = DepthMarks(
+    found = ControlByDepth(
         camera=camera,
         xy=bearing[:, :2] / bearing[:, 2:],
         position_in_geo=marks.position_in_geo[point],
@@ -115,35 +117,50 @@ def _slopes(bearing: Tensor, by_lens: Tensor | None, order: Tensor) -> Tensor | 
     return by_lens[:, :2] / z - bearing[:, :2, None] * by_lens[:, 2:] / z**2
 
 
-def attitudes_of(scene: Scene, survey: Survey) -> Attitudes | None:
+def attitude_term(scene: Scene, survey: Survey) -> AttitudeTerm | None:
     """Recorded rotations of the training cameras, as far as the SfM model bears them out."""
     recorded = recorded_rotations(survey, scene.sparse)
     mine = np.isin(recorded.image, scene.train)
     if not mine.any():
         return None
-    return Attitudes(
+    return AttitudeTerm(
         torch.from_numpy(recorded.image[mine]),
         torch.from_numpy(recorded.geo_from_cam[mine]),
-        torch.from_numpy(1.0 / recorded.sigma_rad[mine]),
+        torch.from_numpy(np.eye(3) / recorded.sigma_rad[mine, None, None]),
     )
 
 
-def pairs_of(scene: Scene, fixes: Fixes, points: GeolocatedPoints | None, seed: int) -> Pairs | None:
+def distance_term(scene: Scene, fixes: FixTerm, points: GeolocatedPoints | None, seed: int) -> DistanceTerm | None:
     """Some hundred long distances across the scene: between located points, else between cameras with fixes.
 
-    What they are worth is limited to a tenth of what the fixes say of the scale (`georef.measured.scale_share`).
+    What they are worth is limited to a tenth of what the fixes say of the scale (`scale_share`).
 
     Raises:
         InputError: `points` does not belong to the scene.
     """
     found = _pairs_of_points(scene, points, seed) if points is not None else None
     found = _pairs_of_cameras(scene, fixes, seed) if found is None else found
-    weight = (found.distance_in_geo * found.root_information).square().sum()
+    weight = (found.distance_in_geo * found.root_information[:, 0, 0]).square().sum()
     share = scale_share(_scale_information(fixes), float(weight))
     return replace(found, share=share) if share > 0 else None
 
 
-def _pairs_of_points(scene: Scene, points: GeolocatedPoints, seed: int) -> Pairs | None:
+def scale_share(information_of_fixes: float, information_of_pairs: float) -> float:
+    """Return the share of each pair, so that all together say at most a tenth of what the fixes do of the scale.
+
+    Located points are functions of the same few fixes (`georef.alignment`), and carry the lens's errors besides:
+    counted as independent, some hundred of them would claim to know the scale many times better than the fixes from
+    which they were made. Being nothing new, they shall steady the scale and not decide it.
+
+    Args:
+        information_of_fixes: Σ |W (C_i − C̄)|², of ln s.
+        information_of_pairs: Σ (distance/σ)², of ln s.
+    """
+    most = _WORTH * information_of_fixes
+    return min(1.0, most / information_of_pairs) if information_of_pairs > 0 else 0.0
+
+
+def _pairs_of_points(scene: Scene, points: GeolocatedPoints, seed: int) -> DistanceTerm | None:
     if not np.array_equal(points.point_id, scene.sparse.point_id):
         raise InputError("the geolocated points are of another model: run `georef geolocate` again")
     good = np.flatnonzero(points.inlier)
@@ -153,18 +170,18 @@ def _pairs_of_points(scene: Scene, points: GeolocatedPoints, seed: int) -> Pairs
     i, j = good[first], good[second]
     apart = points.position_in_geo[i] - points.position_in_geo[j]
     inside = np.linalg.norm(scene.point_in_model[i] - scene.point_in_model[j], axis=1)
-    return Pairs(
+    return DistanceTerm(
         torch.from_numpy(inside), None, *_measured_distance(apart, points.cov_in_geo[i] + points.cov_in_geo[j]), 1.0
     )
 
 
-def _pairs_of_cameras(scene: Scene, fixes: Fixes, seed: int) -> Pairs:
+def _pairs_of_cameras(scene: Scene, fixes: FixTerm, seed: int) -> DistanceTerm:
     camera, place = fixes.camera.numpy(), fixes.position_in_geo.numpy()
     i, j = _long_pairs(scene.poses.cam_center_in_model[camera], seed)
     root = fixes.root_information.numpy()
     covariance = np.linalg.inv(np.swapaxes(root, 1, 2) @ root)
     chosen = torch.from_numpy(np.column_stack([camera[i], camera[j]]))
-    return Pairs(None, chosen, *_measured_distance(place[i] - place[j], covariance[i] + covariance[j]), 1.0)
+    return DistanceTerm(None, chosen, *_measured_distance(place[i] - place[j], covariance[i] + covariance[j]), 1.0)
 
 
 def _long_pairs(place: FloatArray, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -178,14 +195,14 @@ def _long_pairs(place: FloatArray, seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _measured_distance(apart: FloatArray, covariance: FloatArray) -> tuple[Tensor, Tensor]:
-    """Lengths (P,) of differences (P, 3), and 1/σ (P,) of them."""
+    """Lengths (P,) of differences (P, 3), and 1/σ (P, 1, 1) of them."""
     distance = np.linalg.norm(apart, axis=1)
     along = apart / distance[:, None]
     variance = np.einsum("pi,pij,pj->p", along, covariance, along)
-    return torch.from_numpy(distance), torch.from_numpy(variance**-0.5)
+    return torch.from_numpy(distance), torch.from_numpy(variance**-0.5)[:, None, None]
 
 
-def _scale_information(fixes: Fixes) -> float:
+def _scale_information(fixes: FixTerm) -> float:
     """What the fixes say of ln s: Σ |W (C − C̄)|² about their weighted mean."""
     root = fixes.root_information
     information = root.transpose(1, 2) @ root
@@ -194,34 +211,11 @@ def _scale_information(fixes: Fixes) -> float:
     return float((root @ arm[:, :, None]).square().sum())
 
 
-_Ray = tuple[int, FloatArray, float, tuple[float, float]]
-
-
-def _rays(scene: Scene, point: SurveyedPoint) -> list[_Ray]:
-    """Of each mark in a training image: camera index, bearing (3,) in the camera, angular σ, pixel."""
-    index, trained = scene.sparse.image_index(), set(map(int, scene.train))
-    rays = []
-    for mark in point.marks:
-        camera_index = index.get(mark.image)
-        if camera_index is None or camera_index not in trained:
-            continue
-        camera = scene.sparse.camera_of(camera_index)
-        bearing = bearings(camera, np.array([[mark.x_px, mark.y_px]]))[0]
-        if not np.isfinite(bearing).all():  # a mark where the lens model maps no ray
-            continue
-        rays.append((camera_index, bearing, mark.sigma_px / float(camera.params[0]), (mark.x_px, mark.y_px)))
-    return rays
-
-
-def _survey_covariance(kept: list[tuple[SurveyedPoint, list[_Ray]]]) -> FloatArray:
-    return np.array([point.cov_in_geo for point, _ in kept])
-
-
-def _with_covariance(marks: ControlMarks, covariance: FloatArray) -> ControlMarks:
+def _with_covariance(marks: ControlTerm, covariance: FloatArray) -> ControlTerm:
     return replace(marks, root_information=torch.from_numpy(root_information(covariance)))
 
 
-def _mark_covariance(scene: Scene, marks: ControlMarks) -> FloatArray:
+def _mark_covariance(scene: Scene, marks: ControlTerm) -> FloatArray:
     """Covariance (J, 3, 3) that the marks' own σ leaves in each intersected point."""
     poses, position = scene.poses, marks.position_in_geo.numpy()
     camera, point = marks.camera.numpy(), marks.point.numpy()

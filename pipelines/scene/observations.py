@@ -6,15 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.core.types import FloatArray, IntArray
+from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.geometry.cameras import undistort
-from pipelines.geometry.intersection import intersect_rays
-from pipelines.geometry.rays import Rays, UncertainCameras
 from pipelines.geometry.rotations import log_so3, matrix_from_quat_xyzw
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.georef.adjustment import Correspondences, RotationPrior
 from pipelines.georef.alignment import mean_rotation
-from pipelines.scene.survey import Mark, Survey, SurveyedPoint
+from pipelines.scene.marks import MarkRays, RayErrors, intersect_marks, mark_rays
+from pipelines.scene.survey import Survey
 
 _CONTRADICTION_SIGMAS = 6.0
 _CONTRADICTION_RAD = np.radians(15.0)  # never less: σ of an attitude are often optimistic
@@ -61,62 +60,45 @@ def control_correspondences(survey: Survey, model: SparseModel) -> tuple[Corresp
     Points that their marks do not determine are left out, with a warning each. The covariance is that of the marks
     alone: the model's own error is not known here, the adjustment measures it as excess scatter.
     """
-    index = model.image_index()
-    points, warnings = [], []
-    for point in survey.control_points:
-        marks = [mark for mark in point.marks if mark.image in index]
-        if len({mark.image for mark in marks}) < 2:
-            warnings.append(f"control point {point.name}: marked in fewer than 2 registered images, not used")
-        else:
-            points.append((point, marks))
-    position, cov, good = _intersect_marks(model, [marks for _, marks in points])
-    kept: list[SurveyedPoint] = []
-    for (point, marks), fine in zip(points, good, strict=True):
-        if fine:
-            kept.append(point)
-        else:
-            warnings.append(
-                f"control point {point.name}: its {len(marks)} marks do not meet in one point, not used; "
-                "check the marks"
+    points = survey.control_points
+    rays = mark_rays(points, model)
+    marked = rays.marks_of_point >= 2
+    warnings = {
+        point.name: f"control point {point.name}: marked in fewer than 2 registered images, not used"
+        for point, enough in zip(points, marked, strict=True)
+        if not enough
+    }
+    rays = rays.of_points(marked)
+    position, cov, meets = _intersect_in_local(model, rays)
+    for name, count, good in zip(rays.point_id, rays.marks_of_point, meets, strict=True):
+        if not good:
+            warnings[name] = (
+                f"control point {name}: its {count} marks do not meet in one point, not used; check the marks"
             )
+    kept = [point for point in points if point.name not in warnings]
     return Correspondences(
         name=tuple(point.name for point in kept),
         control=np.ones(len(kept), dtype=bool),
-        in_local=position[good],
-        cov_in_local=cov[good],
+        in_local=position[meets],
+        cov_in_local=cov[meets],
         in_geo=np.array([point.position_in_geo for point in kept]).reshape(-1, 3),
         cov_in_geo=np.array([point.cov_in_geo for point in kept]).reshape(-1, 3, 3),
-    ), tuple(warnings)
+    ), tuple(warnings.values())
 
 
-def _intersect_marks(model: SparseModel, marks: list[list[Mark]]) -> tuple[FloatArray, FloatArray, np.ndarray]:
-    """Position (K, 3), covariance (K, 3, 3) and success (K,) of points in local from their marks."""
-    if not marks:
-        return np.empty((0, 3)), np.empty((0, 3, 3)), np.empty(0, dtype=bool)
-    index = model.image_index()
-    owner = np.repeat(np.arange(len(marks)), [len(each) for each in marks])
-    flat = [mark for each in marks for mark in each]
-    image = np.array([index[mark.image] for mark in flat])
-    cameras = [model.camera_of(each) for each in image]
-    xy = np.array([undistort(camera, (mark.x_px, mark.y_px)) for camera, mark in zip(cameras, flat, strict=True)])
-    sigma_px = np.array([mark.sigma_px for mark in flat])
+def _intersect_in_local(model: SparseModel, rays: MarkRays) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Position (J, 3), covariance (J, 3, 3) and success (J,) of points in local from their marks."""
     # Whether marks agree is judged with the model's own error added, as a lens is never modelled to 0.1 px.
     own_px = float(np.nanmedian(model.point_error_px)) if np.isfinite(model.point_error_px).any() else 0.0
-    focal = np.array([camera.mean_focal_px for camera in cameras])
+    own_rad = own_px * rays.sigma_rad / rays.sigma_px
     center = model.cam_center_in_local
-    extent = float(np.ptp(center, axis=0).max())
-    # One view for each mark, since marks of one image may have different σ.
-    views = UncertainCameras(
-        center_in_geo=center[image],
-        rotation_geo_from_cam=np.swapaxes(model.rotation_cam_from_local[image], 1, 2),
-        cov_center_in_geo=np.tile(np.eye(3) * (_TINY * extent) ** 2, (len(flat), 1, 1)),
-        sigma_attitude_rad=np.full(len(flat), _TINY),
-        sigma_ray=np.hypot(sigma_px, own_px) / focal,
+    errors = RayErrors(_TINY * float(np.ptp(center, axis=0).max()), _TINY, own_rad)
+    solved = intersect_marks(rays, model.rotation_cam_from_local, center, errors)
+    count = len(rays.point_id)
+    of_marks = np.bincount(rays.point, rays.sigma_rad**2, count) / np.bincount(
+        rays.point, rays.sigma_rad**2 + own_rad**2, count
     )
-    seen = np.isfinite(xy).all(axis=1)
-    found = intersect_rays(Rays(owner[seen], np.flatnonzero(seen), xy[seen]), views, len(marks))
-    of_marks = np.bincount(owner, sigma_px**2) / np.bincount(owner, sigma_px**2 + own_px**2)
-    return found.position_in_geo, found.cov_in_geo * of_marks[:, None, None], found.consistent
+    return solved.position_in_geo, solved.cov_in_geo * of_marks[:, None, None], solved.consistent
 
 
 def recorded_rotations(survey: Survey, model: SparseModel) -> RecordedRotations:

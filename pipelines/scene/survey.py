@@ -79,6 +79,13 @@ class SurveyedPoint(Product):
     cov_in_geo: Covariance3
     marks: tuple[Mark, ...]
 
+    @model_validator(mode="after")
+    def _is_marked_once_an_image(self) -> SurveyedPoint:
+        images = [mark.image for mark in self.marks]
+        if len(set(images)) != len(images):
+            raise ValueError("marks: two are in one image")
+        return self
+
 
 class Survey(Product):
     """Product of `ingest`: everything that was measured, in one frame.
@@ -102,9 +109,14 @@ class Survey(Product):
 
     @model_validator(mode="after")
     def _belongs_together(self) -> Survey:
-        names = [image.name for image in self.images]
-        if len(set(names)) != len(names):
-            raise ValueError("images: two have the same name")
+        names = {
+            "images": [image.name for image in self.images],
+            "control_points": [point.name for point in self.control_points],
+            "check_points": [point.name for point in self.check_points],
+        }
+        for field, of_field in names.items():
+            if len(set(of_field)) != len(of_field):
+                raise ValueError(f"{field}: two have the same name")
         cameras = {camera.camera_id for camera in self.cameras}
         lost = next((image for image in self.images if image.camera_id not in cameras), None)
         if lost is not None:

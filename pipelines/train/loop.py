@@ -44,8 +44,8 @@ class LoopOptions:
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """What a training took.
+class TrainingRecord:
+    """Time and incidents of a training.
 
     Attributes:
         seconds: of all runs together, if it was interrupted.
@@ -56,7 +56,7 @@ class Outcome:
     recovery: str | None
 
 
-def optimise(trainer: JointTrainer, options: LoopOptions, progress: Progress) -> Outcome:
+def optimise(trainer: JointTrainer, options: LoopOptions, progress: Progress) -> TrainingRecord:
     """Iterate to the end.
 
     Raises:
@@ -87,7 +87,7 @@ def optimise(trainer: JointTrainer, options: LoopOptions, progress: Progress) ->
             except NonFiniteError as error:
                 loop.recover(error)
         loop.save()
-    return Outcome(loop.seconds(), loop.recovery)
+    return TrainingRecord(loop.seconds(), loop.recovery)
 
 
 class _Loop:
@@ -166,7 +166,7 @@ class _Loop:
 def _metrics_row(trainer: JointTrainer, report: StepReport, seconds: float) -> dict[str, float]:
     problem = trainer.problem
     with torch.no_grad():
-        terms, factors = problem.terms().present(), problem.weights.variance_factors()
+        losses, factors = problem.losses(), problem.weights.variance_factors()
     row = {
         "iteration": trainer.iteration,
         "seconds": round(seconds, 2),
@@ -175,7 +175,7 @@ def _metrics_row(trainer: JointTrainer, report: StepReport, seconds: float) -> d
         "gaussians": len(trainer.optimizer.gaussians),
         "geo_weight": report.weight,
     }
-    row |= {name: float(value) for name, value in terms.items()}
+    row |= {name: float(value) for name, value in losses.items()}
     if report.by_depth is not None:
         row["control_by_depth"] = float(report.by_depth)
-    return row | {f"variance_{name}": factors[name] for name in factors if name in terms}
+    return row | {f"variance_{name}": factors[name] for name in factors}

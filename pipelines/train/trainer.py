@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pipelines.core.types import IntArray
 from pipelines.geometry.lens import Lenses
-from pipelines.georef.losses import Schedule, rising_weight
 from pipelines.georef.problem import GeoProblem
 from pipelines.scene.photographs import ImageCache
 from pipelines.scene.pinholes import Pinholes
@@ -22,55 +22,24 @@ from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.losses import photometric_loss
 from pipelines.splat.optimizer import GaussianAdam
 from pipelines.splat.rasterizer.api import Pinhole, Rasterizer, RasterSettings, Render
-from pipelines.splat.surface import SurfaceSettings, compactness_loss, depth_loss, flatness_loss, normal_loss
+from pipelines.splat.surface import compactness_loss, depth_loss, flatness_loss, normal_loss
 from pipelines.train.checkpoint import prefixed, unprefixed
-from pipelines.train.targets import Target, Targets
+from pipelines.train.schedule import JointOptions, TrainingSchedule
+from pipelines.train.target_images import TargetImage, TargetImages
 
-_FINAL_RATE = 0.05  # of the geographic learning rates, relative to the first
-_TOLD = {"y": "the similarity", "z": "the cameras", "x": "the constant errors", "u": "the weights of the losses"}
+_UNKNOWNS = {
+    "y": "the similarity",
+    "z": "the cameras",
+    "x": "the constant errors",
+    "u": "the weights of the losses",
+}
 _LENS_EVERY = 100  # iterations: to look where the lens has come to waits for the device
 # A gradient that is not finite shows in one of these: colours pass theirs on to the opacities.
 _WATCHED = ("means", "quats_wxyz", "log_scales", "logit_opacities")
 
 
 @dataclass(frozen=True)
-class JointOptions:
-    """Schedule of the joint optimisation.
-
-    Attributes:
-        iterations: length of the training.
-        sh_degree: degree that the spherical harmonics reach.
-        geo_weight: w_max of eq. 27.
-        geo_rise: τ of eq. 27, as a fraction of the iterations.
-        geo_schedule: "rising" as in eq. 27, or "constant": w_max from the first iteration.
-        similarity_rate: first learning rate of the similarity and of constant errors of the measurements, in
-            standard deviations an iteration.
-        camera_rate: first learning rate of the camera corrections, likewise.
-        variance_rate: first learning rate of the log-variances of the geographic terms.
-        background: colour behind the scene.
-        seed: of the order of views.
-        coarse: (shrink, fraction) pairs: photographs are shrunken so much up to this fraction of the training.
-        coarse_least_px: but never to a longest side of less than this.
-        surface: weights of the surface losses; None: the photographs alone decide.
-    """
-
-    iterations: int
-    sh_degree: int = 3
-    geo_weight: float = 0.05
-    geo_rise: float = 0.1
-    geo_schedule: Schedule = "rising"
-    similarity_rate: float = 0.1
-    camera_rate: float = 0.01
-    variance_rate: float = 0.01
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    seed: int = 0
-    coarse: tuple[tuple[int, float], ...] = ()
-    coarse_least_px: int = 160
-    surface: SurfaceSettings | None = None
-
-
-@dataclass(frozen=True)
-class Views:
+class TrainingViews:
     """Training views.
 
     Attributes:
@@ -80,7 +49,7 @@ class Views:
         lenses: that the images were undistorted with; None: they stay.
     """
 
-    camera: np.ndarray
+    camera: IntArray
     images: ImageCache
     surface: Callable[[int], Tensor] | None = None
     lenses: Lenses | None = None
@@ -118,7 +87,7 @@ class JointTrainer:
         optimizer: GaussianAdam,
         strategy: Strategy,
         problem: GeoProblem,
-        views: Views,
+        views: TrainingViews,
         *,
         rasterizer: Rasterizer,
         options: JointOptions,
@@ -128,10 +97,11 @@ class JointTrainer:
         self.views, self.rasterizer, self.options = views, rasterizer, options
         self.exposures = exposures
         self.iteration = 0
+        self._schedule = TrainingSchedule(options, views.camera)
         self.device = optimizer.gaussians.means.device
         self._pinholes = Pinholes(views.images, views.lenses)
         self._lens = np.zeros(len(problem.cameras.lens_basis))
-        self._targets = Targets(views.images, self._pinholes, self.device)
+        self._targets = TargetImages(views.images, self._pinholes, self.device)
         names = ("photometric loss", "geographic loss", *(f"gradient of {name}" for name in self._watched()))
         self._watch = FinitenessMonitor(names, self.device)
         rates = {
@@ -149,13 +119,13 @@ class JointTrainer:
         self.iteration += 1
         if self.iteration % _LENS_EVERY == 1:
             self._look_through(self.problem.cameras.lens().detach().cpu().numpy())
-        index = self._view_of(self.iteration)
-        target = self._targets.get(index, self._shrink(index), self._view_of(self.iteration + 1))
+        index = self._schedule.view(self.iteration)
+        target = self._targets.get(index, self._shrink(index), self._schedule.view(self.iteration + 1))
         pose = self.problem.cameras.cam_from_model(index)
         render = self._render(pose, target.camera, depth=self.problem.sees_by_depth(index))
         colour = render.colour if self.exposures is None else self.exposures.apply(index, render.colour)
         photometric = photometric_loss(colour, target.colour, target.mask)
-        weight, by_depth = self._geo_weight(), self._by_depth(index, render, target)
+        weight, by_depth = self._schedule.geographic_weight(self.iteration), self._by_depth(index, render, target)
         geographic = self.problem.loss() if by_depth is None else self.problem.loss() + by_depth
         self.optimizer.zero_grad()
         self._geo_adam.zero_grad()
@@ -178,8 +148,8 @@ class JointTrainer:
 
     @torch.no_grad()
     def sample_contributions(self, count: int, generator: torch.Generator) -> list[ViewContributions]:
-        """Return the contributions to `count` different training views; see `splat.contributions.Probe`."""
-        found = []
+        """What `count` different training views say of the Gaussians; see `splat.contributions.Probe`."""
+        contributions = []
         for place in torch.randperm(len(self.views.camera), generator=generator)[:count].tolist():
             index = int(self.views.camera[place])
             shrink, pose = self._shrink(index), self.problem.cameras.cam_from_model(index)
@@ -191,8 +161,8 @@ class JointTrainer:
             error = error if target.mask is None else error * target.mask
             seen = view_contributions(self.optimizer.gaussians, pose, target.camera, error, self.rasterizer)
             # Strategies count pixels of the photographs, whatever the schedule makes of them.
-            found.append(ViewContributions(shrink**2 * seen.weight_px, shrink**2 * seen.high_error_px))
-        return found
+            contributions.append(ViewContributions(shrink**2 * seen.weight_px, shrink**2 * seen.high_error_px))
+        return contributions
 
     def pinhole(self, index: int) -> Pinhole:
         """Camera of an undistorted photograph, with the lens in use."""
@@ -217,13 +187,7 @@ class JointTrainer:
         if self.views.lenses is not None and len(lens):
             self._pinholes.renew(self.views.lenses.moved(self._lens))
 
-    def _geo_weight(self) -> float:
-        options = self.options
-        if options.geo_schedule == "constant":
-            return options.geo_weight
-        return rising_weight(self.iteration, options.geo_weight, options.geo_rise * options.iterations)
-
-    def _by_depth(self, index: int, render: Render, target: Target) -> Tensor | None:
+    def _by_depth(self, index: int, render: Render, target: TargetImage) -> Tensor | None:
         """The control points of this view, where they are found through the rendered depth."""
         if render.expected_depth is None:
             return None
@@ -231,10 +195,12 @@ class JointTrainer:
 
     def _render(self, pose: Tensor, camera: Pinhole, *, depth: bool = False) -> Render:
         depth = depth or self.options.surface is not None
-        settings = RasterSettings(sh_degree=self._sh_degree(), background=self.options.background, depth=depth)
+        settings = RasterSettings(
+            sh_degree=self._schedule.sh_degree(self.iteration), background=self.options.background, depth=depth
+        )
         return self.rasterizer.render(self.optimizer.gaussians, pose, camera, settings)
 
-    def _surface(self, render: Render, pose: Tensor, target: Target, index: int) -> Tensor | None:
+    def _surface(self, render: Render, pose: Tensor, target: TargetImage, index: int) -> Tensor | None:
         """The surface losses, where they are wanted."""
         wanted, gaussians = self.options.surface, self.optimizer.gaussians
         if wanted is None:
@@ -255,7 +221,7 @@ class JointTrainer:
 
     def _watched(self) -> dict[str, Tensor]:
         tensors = self.optimizer.gaussians.tensors()
-        geo = {_TOLD[name]: parameter for name, parameter in self.problem.learned().items()}
+        geo = {_UNKNOWNS[name]: parameter for name, parameter in self.problem.learned().items()}
         return {name: tensors[name] for name in _WATCHED} | geo
 
     def _note(self, photometric: Tensor, geographic: Tensor) -> None:
@@ -267,32 +233,18 @@ class JointTrainer:
         self._watch.note(self.iteration, losses | gradients)
 
     def _apply(self, visible: Tensor) -> None:
-        progress = self.iteration / self.options.iterations
+        rate = self._schedule.geographic_rate(self.iteration)
         for group in self._geo_adam.param_groups:
-            group["lr"] = self.optimizer.rate_factor * group["rate"] * _FINAL_RATE**progress
+            group["lr"] = self.optimizer.rate_factor * group["rate"] * rate
         self._geo_adam.step()
         self.optimizer.step(self.iteration, visible)
         if self.exposures is not None:
             self.exposures.step(self.iteration)
 
     def _shrink(self, index: int) -> int:
-        """How much the photographs are shrunken at this iteration."""
+        """How much a photograph is shrunken at this iteration."""
         camera = self.views.images.pinhole(index)
-        most = max(max(camera.width, camera.height) // self.options.coarse_least_px, 1)
-        progress = self.iteration / self.options.iterations
-        return min(next((shrink for shrink, until in self.options.coarse if progress <= until), 1), most)
-
-    def _view_of(self, iteration: int) -> int:
-        """Every view once an epoch, in an order that only depends on the seed and the epoch."""
-        count = len(self.views.camera)
-        epoch, place = divmod(iteration - 1, count)
-        order = np.random.default_rng([self.options.seed, epoch]).permutation(count)
-        return int(self.views.camera[order[place]])
-
-    def _sh_degree(self) -> int:
-        """One degree more each sixth of the training, up to half of it (3DGS: each 1 000 of 30 000)."""
-        every = max(self.options.iterations // 6, 1)
-        return min(self.options.sh_degree, self.iteration // every)
+        return self._schedule.shrink(self.iteration, max(camera.width, camera.height))
 
     def state(self) -> dict[str, Tensor]:
         """Everything that the next iteration depends on."""
@@ -341,7 +293,7 @@ class JointTrainer:
 
 
 @torch.no_grad()
-def _mean_square(colour: Tensor, target: Target) -> Tensor:
+def _mean_square(colour: Tensor, target: TargetImage) -> Tensor:
     """Mean square error over the pixels that count, without waiting for the device to count them."""
     error = (colour - target.colour).square()
     if target.mask is None:

@@ -7,7 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.calibrate.rig_fit import LIMIT_ARM_M, LIMIT_OFFSET_S, FitOptions, RigData, fit_rig
+from pipelines.calibrate.rig_fit import (
+    LIMIT_ARM_M,
+    LIMIT_OFFSET_S,
+    FitOptions,
+    RigData,
+    RigState,
+    _derivatives,
+    _moved,
+    _residuals,
+    _usable,
+    fit_rig,
+)
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import FloatArray
 from pipelines.geometry.rig import boresight
@@ -68,6 +79,24 @@ def _data(track: TrueTrajectory, seed: int = 1, control: int = 0) -> RigData:
         pixel_rad=PIXEL_RAD,
         footprint_in_local=100.0 * PIXEL_RAD / GEO_FROM_LOCAL.scale,
     )
+
+
+def test_derivatives_agree_with_differences() -> None:
+    data = _data(_flight("orbit", images=12))
+    turn = exp_so3([0.02, -0.01, 0.03])
+    state = RigState(
+        Similarity(16.8, turn @ GEO_FROM_LOCAL.rotation, np.ones(3)), 0.1, boresight([3.0, -2.0, 4.0]), ARM_M
+    )
+    used = _usable(data, state.offset_s)
+    pivot = state.geo_from_local.apply(data.center_in_local[used]).mean(axis=0)
+    analytic = _derivatives(data, state, used, pivot)
+    for place in range(14):
+        # The offset has no smaller step: its derivative is a velocity over half a second on either side.
+        size = 0.5 if place == 7 else 1e-5
+        step = np.where(np.arange(14) == place, size, 0.0)
+        ahead, behind = (_residuals(data, _moved(state, each, pivot), used) for each in (step, -step))
+        for rows, first, second in zip(analytic, ahead, behind, strict=True):
+            np.testing.assert_allclose(rows[:, :, place], (first - second) / (2 * size), atol=1e-6)
 
 
 @pytest.mark.parametrize("kind", ["orbit", "grid"])

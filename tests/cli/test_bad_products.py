@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from pipelines.core.products import load_json, save_json
-from pipelines.core.stages import BY_NAME, GAUSSIANS, MODEL, POINTS, SIM3, SPARSE, SURVEY
+from pipelines.core.stages import BY_NAME, GAUSSIANS, MODEL, POINTS, REPORT, SIM3, SPARSE, SURVEY
 from pipelines.geometry.similarity import Similarity
 from pipelines.scene.geolocated import GeolocatedPoints
 from pipelines.scene.survey import Survey
@@ -89,6 +89,18 @@ def test_damaged_gaussians(real_georef: Georef, made: Path, data: bytes, told: s
     assert (result.code, result.out) == (1, "")
     assert told in result.err.splitlines()[-1]
     assert not (made / "export").exists()
+
+
+@pytest.mark.parametrize("content", [b"nonsense", b"[]", b'{"photometric": {}}'])
+def test_report_that_was_replaced(real_georef: Georef, made: Path, content: bytes) -> None:
+    """Put there by hand, it is kept; but it cannot be shown."""
+    absent = [read for read in BY_NAME["evaluate"].reads if not (made / read).exists()]
+    write_files(made, dict.fromkeys(absent, b"") | {REPORT: content})
+    result = real_georef("evaluate", made)
+    assert (result.code, result.out) == (1, "")
+    assert f"error: {made / REPORT}" in result.err
+    assert "not a report: make it again with `georef evaluate --force`" in result.err.splitlines()[-1]
+    assert (made / REPORT).read_bytes() == content
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")

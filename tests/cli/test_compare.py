@@ -9,14 +9,17 @@ from typing import Any
 
 import pytest
 
-from pipelines.compare.stage import NAMES
+from pipelines.compare.configurations import BY_CONFIGURATION
 from pipelines.core.errors import ConvergenceError, InputError
 from pipelines.core.options import StageOptions
+from pipelines.core.products import dump_json
 from pipelines.core.stages import BY_NAME, PIPELINE
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from tests import fakes
 from tests.cli_runs import Georef, Result
+from tests.reports import check_points_with, report_with
 
+NAMES = tuple(BY_CONFIGURATION)
 SHARED = ["ingest", "sfm", "geolocate"]
 OWN = ["init-sim3", "train", "evaluate"]
 
@@ -31,13 +34,10 @@ def reporting(stage: StageRun, config: StageOptions) -> Summary:
     spec = BY_NAME["evaluate"]
     text = fakes.fake_run(spec)(stage, config).values["text"]
     error = error_of(text)
-    points = {
-        "count": 2, "mean_h_m": error, "rmse_h_m": error, "rmse_v_m": 2 * error,
-        "points": [{"de_m": error, "dn_m": 0.0}, {"de_m": 0.0, "dn_m": error}, {"de_m": None, "dn_m": None}],
-    }  # fmt: skip
-    test = {"psnr": 20.0 + error, "ssim": 0.5}
-    report = {**json.loads(text), "photometric": {"test": test}, "checkpoints": {"camera": points, "model": points}}
-    fakes.write_products(stage, spec, json.dumps(report))
+    # Two points, as far off.
+    points = check_points_with(count=2, mean_h_m=error, median_h_m=error, rmse_h_m=error, rmse_v_m=2 * error)
+    report = report_with(test={"psnr": 20.0 + error, "ssim": 0.5}, camera=points, model=points, cautions=(text,))
+    fakes.write_products(stage, spec, dump_json(report.model_dump(mode="json")))
     return Summary("evaluated", {}, ("few check points",))
 
 

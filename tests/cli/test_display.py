@@ -12,15 +12,15 @@ from rich.console import Console
 from georef_cli import display, tables
 from georef_cli.verbosity import Verbosity
 from pipelines.core.progress import SILENT
+from pipelines.scene.report import AsprsStatement, ByAxis, NoCrossValidation, PredictedSigma, TotalRmse
+from tests.reports import check_points_with, cross_validation_with, report_with
 
-REPORT: dict[str, Any] = {
-    "photometric": {"test": {"views": 6, "psnr": 24.31, "ssim": 0.812, "lpips": None}},
-    "checkpoints": {
-        "camera": {"count": 30, "mean_h_m": 0.014, "rmse_h_m": 0.016, "rmse_v_m": 0.021, "rmse_3d_m": 0.0264},
-        "model": {"count": 28, "mean_h_m": 0.035, "rmse_h_m": 0.041, "rmse_v_m": 0.05, "rmse_3d_m": 0.065},
-    },
-    "fit": {"gnss": {"count": 42, "rmse_h_m": 1.5, "rmse_v_m": 3.1}, "gcp": None},
-}
+REPORT = report_with(
+    test={"views": 6, "psnr": 24.31, "ssim": 0.812},
+    camera=check_points_with(count=30, mean_h_m=0.014, rmse_h_m=0.016, rmse_v_m=0.021, rmse_3d_m=0.0264),
+    model=check_points_with(count=28, mean_h_m=0.035, rmse_h_m=0.041, rmse_v_m=0.05, rmse_3d_m=0.065),
+    gnss={"count": 42, "rmse_h_m": 1.5, "rmse_v_m": 3.1},
+)
 
 
 def text_of(*parts: Any) -> str:
@@ -47,15 +47,24 @@ class TestReport:
         assert "not an accuracy" in fit
 
     def test_accuracy_has_class_prediction_and_bound(self) -> None:
-        camera = {
-            **REPORT["checkpoints"]["camera"],
-            "with_survey": {"rmse_h_m": 0.018, "rmse_v_m": 0.023},
-            "asprs": {"horizontal_class": "2 cm", "vertical_class": "3 cm"},
-            "predicted": {"rms_h_m": 0.017, "rms_v_m": 0.022},
-            "cramer_rao": None,
-        }
-        document = {"checkpoints": {"camera": camera}, "cross_validation": {"count": 8, "rmse_h_m": 0.044}}
-        check, accuracy, cross = [text_of(part) for part in tables.report(document)]
+        camera = check_points_with(
+            count=30,
+            rmse_h_m=0.016,
+            with_survey=TotalRmse(rmse_h_m=0.018, rmse_v_m=0.023, rmse_3d_m=0.0292),
+            asprs=AsprsStatement(
+                horizontal_class="2 cm",
+                vertical_class="3 cm",
+                least_points=30,
+                enough_points=True,
+                statement="tested on 30 check points",
+            ),
+            predicted=PredictedSigma(
+                count=30, rms_h_m=0.017, rms_v_m=0.022, normalised_error_squared=ByAxis(e=1.0, n=1.0, u=1.0)
+            ),
+        )
+        crossed = cross_validation_with(count=8, rmse_h_m=0.044)
+        parts = tables.report(report_with(camera=camera, crossed=crossed))
+        check, accuracy, cross = [text_of(part) for part in parts[1:4]]
         line = next(line for line in accuracy.splitlines() if line.startswith("camera"))
         assert line.split() == ["camera", "0.018", "0.023", "2", "cm", "3", "cm", "0.017", "0.022", "–", "–"]
         assert "0.044" in cross
@@ -64,9 +73,16 @@ class TestReport:
     def test_unknown_is_a_dash(self) -> None:
         assert "–" in text_of(*tables.report(REPORT)[:1])
 
-    @pytest.mark.parametrize("document", [{}, {"checkpoints": {"camera": None, "model": None}}, {"fit": {}}])
-    def test_what_is_not_there_has_no_table(self, document: dict[str, Any]) -> None:
-        assert tables.report(document) == []
+    def test_parts_that_are_not_there_have_no_table(self) -> None:
+        """No statement without check points, no cross-validation unless asked for."""
+        titles = [text_of(part).splitlines()[1] for part in tables.report(report_with())]
+        assert titles == ["Test views", "Check points, metres", "Residuals of the fit (not an accuracy), metres"]
+
+    def test_impossible_cross_validation_counts_no_points(self) -> None:
+        crossed = NoCrossValidation(count=0, reason="the measurements leave the similarity open")
+        document = report_with().model_copy(update={"cross_validation": crossed})
+        lines = text_of(tables.report(document)[2]).splitlines()
+        assert lines[-1].split() == ["left", "out", "0"]
 
 
 @pytest.mark.parametrize(

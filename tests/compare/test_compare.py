@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipelines.compare.stage import CONFIGURATIONS, Ran, chosen, compare
+from pipelines.compare.configurations import CONFIGURATIONS, select_configurations
+from pipelines.compare.stage import ComparedStage, compare
 from pipelines.compare.table import ComparedRow, Comparison
 from pipelines.core.products import load_json, save_json
 from pipelines.core.stages import GAUSSIANS, REPORT, SIM3, SURVEY
@@ -20,12 +21,12 @@ from pipelines.core.workspace import Workspace
 from pipelines.geometry.similarity import Similarity, SimilarityRecord
 from pipelines.scene.initial_similarity import InitialSimilarity
 from pipelines.scene.survey import Survey
-from pipelines.scene.trained import load_trained
+from pipelines.scene.trained_survey import load_trained
 from tests.splat_scenes import RenderedFlight
 
 pytest.importorskip("pycolmap")
 pytestmark = pytest.mark.usefixtures("one_thread")
-Compared = tuple[Workspace, Comparison, list[Ran]]
+Compared = tuple[Workspace, Comparison, list[ComparedStage]]
 SHORT = {"iterations": 60, "dense": False, "sh_degree": 0, "log_every": 5, "checkpoint_every": 10}
 # Marks of 0.1 px are 5 cm from 45 m, over 14 rays 1.5 cm; the similarity of 14 fixes adds 1.5 cm and 2.4 cm up.
 BY_CAMERA_M = 0.08
@@ -84,13 +85,13 @@ def test_table_holds_what_the_reports_say(compared: Compared) -> None:
         report = report_of(workspace, row.configuration)
         assert row.test_psnr == report["photometric"]["test"]["psnr"]
         assert row.test_ssim == report["photometric"]["test"]["ssim"]
-        for way, found in (("camera", row.camera), ("model", row.model)):
+        for way, accuracy in (("camera", row.camera), ("model", row.model)):
             points = report["checkpoints"][way]["points"]
             distance = np.hypot([point["de_m"] for point in points], [point["dn_m"] for point in points])
-            assert found.mean_h_m == pytest.approx(distance.mean())
-            assert found.median_h_m == pytest.approx(np.median(distance))
-            assert found.rmse_h_m == pytest.approx(np.sqrt((distance**2).mean()))
-            assert found.rmse_v_m == report["checkpoints"][way]["rmse_v_m"]
+            assert accuracy.mean_h_m == pytest.approx(distance.mean())
+            assert accuracy.median_h_m == pytest.approx(np.median(distance))
+            assert accuracy.rmse_h_m == pytest.approx(np.sqrt((distance**2).mean()))
+            assert accuracy.rmse_v_m == report["checkpoints"][way]["rmse_v_m"]
 
 
 def test_with_good_fixes_all_but_the_papers_start_are_right(
@@ -134,16 +135,16 @@ def test_what_is_shared_is_not_copied(compared: Compared) -> None:
 
 def test_second_comparison_does_nothing(compared: Compared) -> None:
     workspace, table, _ = compared
-    again, ran = compare(workspace, CONFIGURATIONS, {})
-    assert not [each for each in ran if each.outcome.ran]
+    again, stages = compare(workspace, CONFIGURATIONS, {})
+    assert not [stage for stage in stages if stage.outcome.ran]
     assert again == table
 
 
 def test_moved_workspace_is_still_current(compared: Compared, tmp_path: Path) -> None:
     moved = tmp_path / "moved"
     shutil.copytree(compared[0].root, moved, symlinks=True)
-    _, ran = compare(Workspace(moved), CONFIGURATIONS, {})
-    assert not [each for each in ran if each.outcome.ran]
+    _, stages = compare(Workspace(moved), CONFIGURATIONS, {})
+    assert not [stage for stage in stages if stage.outcome.ran]
 
 
 class Interrupting:
@@ -168,11 +169,11 @@ def test_interrupted_training_goes_on_from_its_checkpoint(
 ) -> None:
     workspace = prepare(flights[0], "interrupted")
     with pytest.raises(KeyboardInterrupt):
-        compare(workspace, chosen("A"), SHORT, progress=Interrupting(35))
+        compare(workspace, select_configurations("A"), SHORT, progress=Interrupting(35))
     partial = workspace.root / "compare/A/train.partial"
     assert len((partial / "metrics.jsonl").read_text(encoding="utf-8").splitlines()) == 7
     resumed = Interrupting(10_000)
-    compare(workspace, chosen("A"), {}, progress=resumed)
+    compare(workspace, select_configurations("A"), {}, progress=resumed)
     whole = compared[0].root / "compare/A" / GAUSSIANS
     assert (workspace.root / "compare/A" / GAUSSIANS).read_bytes() == whole.read_bytes()
 
@@ -182,7 +183,7 @@ def test_without_check_points_there_are_images_only(flights: list[RenderedFlight
     workspace = prepare(flight, "no_check_points")
     survey = load_json(Survey, workspace.path(SURVEY))
     save_json(survey.model_copy(update={"check_points": ()}), workspace.root / SURVEY)
-    table, _ = compare(workspace, chosen("A"), {**SHORT, "iterations": 5})
+    table, _ = compare(workspace, select_configurations("A"), {**SHORT, "iterations": 5})
     (row,) = table.rows
     assert row.test_psnr is not None
     assert (row.camera.count, row.camera.mean_h_m, row.model.median_h_m) == (0, None, None)

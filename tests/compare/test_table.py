@@ -1,23 +1,20 @@
-"""The table of `georef compare`: what is read from reports, and how figures are told."""
+"""The table of `georef compare`: figures of reports, and their text."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-
-import pytest
 
 from pipelines.compare.table import (
     ComparedRow,
     Comparison,
     PointAccuracy,
     cells,
-    figures_of,
     markdown,
+    point_accuracy,
     remarks_on,
     write_comparison,
 )
-from pipelines.core.errors import InputError
+from tests.reports import check_points_with
 
 GOOD = PointAccuracy(count=3, mean_h_m=0.0123, median_h_m=0.01, rmse_h_m=0.015, rmse_v_m=25.128)
 ROW = ComparedRow(
@@ -65,21 +62,11 @@ def test_files_are_written_when_they_say_something_new(tmp_path: Path) -> None:
     assert "it diverged" in (tmp_path / "table.md").read_text("utf-8")
 
 
-@pytest.mark.parametrize(
-    "document",
-    ["", "[]", "{}", '{"photometric": {"test": {}}}', '{"photometric": {"test": null}, "checkpoints": {}}'],
-)
-def test_what_is_no_report_is_refused(document: str, tmp_path: Path) -> None:
-    path = tmp_path / "report.json"
-    path.write_text(document, encoding="utf-8")
-    with pytest.raises(InputError, match="not a report"):
-        figures_of(path)
-
-
-def test_figures_of_the_wrong_kind_are_refused(tmp_path: Path) -> None:
-    points = {"count": 1, "mean_h_m": "far", "rmse_h_m": 1, "rmse_v_m": 1, "points": []}
-    report = {"photometric": {"test": {"psnr": 1, "ssim": 1}}, "checkpoints": {"camera": points, "model": points}}
-    path = tmp_path / "report.json"
-    path.write_text(json.dumps(report), encoding="utf-8")
-    with pytest.raises(InputError, match="not a report"):
-        figures_of(path)
+def test_figures_are_those_of_the_report() -> None:
+    assert (
+        point_accuracy(
+            check_points_with(count=3, mean_h_m=0.0123, median_h_m=0.01, rmse_h_m=0.015, rmse_v_m=25.128)
+        )
+        == GOOD
+    )
+    assert point_accuracy(check_points_with()) == PointAccuracy()

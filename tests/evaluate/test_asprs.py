@@ -5,53 +5,55 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipelines.evaluate.asprs import assess, error_stats
+from pipelines.evaluate.asprs import assess, classes_cm, error_stats
 
 EXACT = np.zeros((3, 3))
 
 
 def test_figures_by_hand() -> None:
-    found = error_stats([[0.03, 0.04, -0.01], [0.0, 0.0, 0.02], [-0.06, 0.08, 0.02]])
-    assert found.count == 3
-    assert (found.mean_e_m, found.mean_n_m, found.mean_u_m) == pytest.approx((-0.01, 0.04, 0.01))
-    assert found.mean_h_m == pytest.approx(0.05)  # of 5, 0 and 10 cm
-    assert found.median_h_m == pytest.approx(0.05)
-    assert found.rmse_h_m == pytest.approx(np.sqrt(0.0125 / 3))
-    assert found.rmse_v_m == pytest.approx(np.sqrt(0.0009 / 3))
-    assert found.rmse_3d_m == pytest.approx(np.sqrt(0.0134 / 3))
-    assert (found.max_h_m, found.max_v_m, found.max_3d_m) == pytest.approx((0.1, 0.02, np.sqrt(0.0104)))
+    stats = error_stats([[0.03, 0.04, -0.01], [0.0, 0.0, 0.02], [-0.06, 0.08, 0.02]])
+    assert stats.count == 3
+    assert (stats.mean_e_m, stats.mean_n_m, stats.mean_u_m) == pytest.approx((-0.01, 0.04, 0.01))
+    assert stats.mean_h_m == pytest.approx(0.05)  # of 5, 0 and 10 cm
+    assert stats.median_h_m == pytest.approx(0.05)
+    assert stats.rmse_h_m == pytest.approx(np.sqrt(0.0125 / 3))
+    assert stats.rmse_v_m == pytest.approx(np.sqrt(0.0009 / 3))
+    assert stats.rmse_3d_m == pytest.approx(np.sqrt(0.0134 / 3))
+    assert (stats.max_h_m, stats.max_v_m, stats.max_3d_m) == pytest.approx((0.1, 0.02, np.sqrt(0.0104)))
 
 
 def test_survey_is_added_in_quadrature() -> None:
     # Every error 3 cm east and 5 cm up; surveyed to √(4² + 0²) cm in the plane and 12 cm in height.
-    found = assess(np.tile([0.03, 0.0, -0.05], (30, 1)), np.tile(np.diag([0.04, 0.0, 0.12]) ** 2, (30, 1, 1)))
-    assert found.survey is not None
-    assert found.with_survey is not None
-    assert (found.survey.rmse_h_m, found.survey.rmse_v_m) == pytest.approx((0.04, 0.12))
-    assert (found.with_survey.rmse_h_m, found.with_survey.rmse_v_m) == pytest.approx((0.05, 0.13))
-    assert found.with_survey.classes_cm == (5, 13)
-    document = found.document()
-    assert document["rmse_h_m"] == pytest.approx(0.03)  # the raw one stays beside it
-    assert document["asprs"]["horizontal_class"] == "5 cm"
-    assert document["asprs"]["enough_points"] is True
-    assert document["without_blunders"] is None
+    assessment = assess(np.tile([0.03, 0.0, -0.05], (30, 1)), np.tile(np.diag([0.04, 0.0, 0.12]) ** 2, (30, 1, 1)))
+    assert assessment.survey is not None
+    assert assessment.with_survey is not None
+    assert (assessment.survey.rmse_h_m, assessment.survey.rmse_v_m) == pytest.approx((0.04, 0.12))
+    assert (assessment.with_survey.rmse_h_m, assessment.with_survey.rmse_v_m) == pytest.approx((0.05, 0.13))
+    assert assessment.with_survey.rmse_3d_m == pytest.approx(np.hypot(0.05, 0.13))
+    assert classes_cm(assessment.with_survey) == (5, 13)
+    assert assessment.stats.rmse_h_m == pytest.approx(0.03)  # the raw one stays beside it
+    assert assessment.asprs.horizontal_class == "5 cm"
+    assert assessment.asprs.enough_points is True
+    assert assessment.without_blunders is None
 
 
 @pytest.mark.parametrize(("error_m", "class_cm"), [(0.0101, 2), (0.01, 1), (0.0499, 5), (1.234, 124), (1e-4, 1)])
 def test_class_is_the_smallest_that_is_met(error_m: float, class_cm: int) -> None:
-    found = assess(np.tile([error_m, 0, error_m], (30, 1)), np.tile(EXACT, (30, 1, 1)))
-    assert found.with_survey is not None
-    assert found.with_survey.classes_cm == (class_cm, class_cm)
+    assessment = assess(np.tile([error_m, 0, error_m], (30, 1)), np.tile(EXACT, (30, 1, 1)))
+    assert assessment.with_survey is not None
+    assert classes_cm(assessment.with_survey) == (class_cm, class_cm)
 
 
 def test_too_few_points_are_told_plainly() -> None:
     few = assess(np.full((12, 3), 0.01), np.tile(EXACT, (12, 1, 1)))
-    assert few.statement is not None
-    assert few.statement.startswith("12 check points; ASPRS 2nd ed. asks for at least 30: the class is indicative")
-    assert few.document()["asprs"]["enough_points"] is False
+    assert few.asprs.statement is not None
+    assert few.asprs.statement.startswith(
+        "12 check points; ASPRS 2nd ed. asks for at least 30: the class is indicative"
+    )
+    assert few.asprs.enough_points is False
     many = assess(np.full((30, 3), 0.01), np.tile(EXACT, (30, 1, 1)))
-    assert many.statement is not None
-    assert "indicative" not in many.statement
+    assert many.asprs.statement is not None
+    assert "indicative" not in many.asprs.statement
 
 
 @pytest.mark.parametrize("count", [5, 9, 40])
@@ -59,11 +61,12 @@ def test_too_few_points_are_told_plainly() -> None:
 def test_blunder_cannot_hide_among_few(count: int, axis: int) -> None:
     error = np.random.default_rng(0).normal(0, 0.02, (count, 3))
     error[1, axis] = 0.6
-    found = assess(error, np.tile(EXACT, (count, 1, 1)))
-    assert np.flatnonzero(found.blunder).tolist() == [1]
-    assert found.stats.count == count  # it stays in the statistics
-    assert found.without_blunders == error_stats(np.delete(error, 1, axis=0))
-    assert found.document()["without_blunders"]["count"] == count - 1
+    assessment = assess(error, np.tile(EXACT, (count, 1, 1)))
+    assert np.flatnonzero(assessment.blunder).tolist() == [1]
+    assert assessment.stats.count == count  # it stays in the statistics
+    assert assessment.without_blunders == error_stats(np.delete(error, 1, axis=0))
+    assert assessment.without_blunders is not None
+    assert assessment.without_blunders.count == count - 1
 
 
 def test_honest_errors_are_not_blunders() -> None:
@@ -85,14 +88,14 @@ def test_survey_that_is_poor_makes_no_blunders() -> None:
 def test_half_in_plan_and_half_in_height_leave_no_others() -> None:
     error = np.zeros((4, 3))
     error[:2, 0] = error[2:, 2] = 1.0
-    found = assess(error, np.tile(EXACT, (4, 1, 1)))
-    assert found.stats.count == 4
-    assert found.stats.rmse_h_m == pytest.approx(np.sqrt(0.5))
+    assessment = assess(error, np.tile(EXACT, (4, 1, 1)))
+    assert assessment.stats.count == 4
+    assert assessment.stats.rmse_h_m == pytest.approx(np.sqrt(0.5))
 
 
 def test_nothing_measured_is_nothing_stated() -> None:
-    document = assess(np.empty((0, 3)), np.empty((0, 3, 3))).document()
-    assert document["count"] == 0
-    assert document["rmse_h_m"] is None
-    assert document["with_survey"] is None
-    assert document["asprs"]["statement"] is None
+    assessment = assess(np.empty((0, 3)), np.empty((0, 3, 3)))
+    assert assessment.stats.count == 0
+    assert assessment.stats.rmse_h_m is None
+    assert assessment.with_survey is None
+    assert assessment.asprs.statement is None

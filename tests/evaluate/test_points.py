@@ -5,13 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipelines.evaluate.points import points_by_camera, points_by_model, sights
+from pipelines.evaluate.points_by_camera import points_by_camera
+from pipelines.evaluate.points_by_model import points_by_model
 from pipelines.geometry.cameras import Pinhole
 from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.similarity import Similarity
 from pipelines.georef.cameras import CameraPoses
+from pipelines.scene.marks import mark_rays
 from pipelines.scene.survey import SurveyedPoint
-from pipelines.scene.trained import Trained
+from pipelines.scene.trained_survey import TrainedSurvey
 from pipelines.splat.initialise import gaussians_of_size
 from tests.scenes import GEO_FROM_LOCAL, Measured, Noise, make_scene, sparse_model, survey_of, trained_model
 
@@ -23,12 +25,12 @@ PINHOLE = Pinhole(320, 240, 270.0, 270.0, 160.0, 120.0)
 
 
 @pytest.fixture
-def trained() -> Trained:
+def trained() -> TrainedSurvey:
     """Exact cameras in a frame `model` that is turned against `geo`."""
     truth, rng = make_scene(images=8, points=20), np.random.default_rng(0)
     geo_from_model = MODEL_FROM_GEO.inverse()
     rotation = np.swapaxes(truth.geo_from_cam, 1, 2) @ geo_from_model.rotation
-    return Trained(
+    return TrainedSurvey(
         survey=survey_of(truth, EXACT, Measured(gcps=True), rng),
         sfm=sparse_model(truth, EXACT, rng),
         model=trained_model(geo_from_model, MODEL_FROM_GEO @ GEO_FROM_LOCAL),
@@ -41,7 +43,7 @@ def surveyed(points: tuple[SurveyedPoint, ...]) -> np.ndarray:
     return np.array([point.position_in_geo for point in points])
 
 
-def planes(trained: Trained, height_m: float) -> dict[int, np.ndarray]:
+def planes(trained: TrainedSurvey, height_m: float) -> dict[int, np.ndarray]:
     """Depth maps (along z) of a level plane in geo, by camera."""
     v, u = np.mgrid[0 : PINHOLE.height, 0 : PINHOLE.width] + 0.5
     ray = np.stack([(u - PINHOLE.cx) / PINHOLE.fx, (v - PINHOLE.cy) / PINHOLE.fy, np.ones_like(u)], axis=-1)
@@ -54,72 +56,72 @@ def planes(trained: Trained, height_m: float) -> dict[int, np.ndarray]:
     return depth
 
 
-def test_rays_meet_in_the_surveyed_point(trained: Trained) -> None:
+def test_rays_meet_in_the_surveyed_point(trained: TrainedSurvey) -> None:
     points = trained.survey.control_points
-    found = points_by_camera(trained, sights(trained, points), len(points))
+    found = points_by_camera(trained, mark_rays(points, trained.sparse))
     np.testing.assert_allclose(found, surveyed(points), atol=1e-6)
 
 
-def test_depth_gives_the_surveyed_point(trained: Trained) -> None:
+def test_depth_gives_the_surveyed_point(trained: TrainedSurvey) -> None:
     # The surface is a plane at the point's height: inverse depth is linear, so that interpolation is exact.
     points = trained.survey.control_points[:1]
-    seen = sights(trained, points)
+    rays = mark_rays(points, trained.sparse)
     depth = planes(trained, points[0].position_in_geo[2])
-    found = points_by_model(trained, seen, depth, dict.fromkeys(depth, PINHOLE), 1)
+    found = points_by_model(trained, rays, depth, dict.fromkeys(depth, PINHOLE))
     np.testing.assert_allclose(found, surveyed(points), atol=1e-5)
 
 
-def test_surface_at_another_height_is_measured_as_such(trained: Trained) -> None:
+def test_surface_at_another_height_is_measured_as_such(trained: TrainedSurvey) -> None:
     points = trained.survey.control_points[:1]
     depth = planes(trained, points[0].position_in_geo[2] - 1.0)
-    found = points_by_model(trained, sights(trained, points), depth, dict.fromkeys(depth, PINHOLE), 1)
+    found = points_by_model(trained, mark_rays(points, trained.sparse), depth, dict.fromkeys(depth, PINHOLE))
     assert found[0, 2] - points[0].position_in_geo[2] == pytest.approx(-1.0, abs=0.05)
 
 
-def test_roughness_of_the_surface_is_evened_out(trained: Trained) -> None:
+def test_roughness_of_the_surface_is_evened_out(trained: TrainedSurvey) -> None:
     # 25 pixels of independent noise leave a fifth of it in the middle of their plane.
     points, rng = trained.survey.control_points[:1], np.random.default_rng(5)
-    seen = sights(trained, points)
+    rays = mark_rays(points, trained.sparse)
     depth = planes(trained, points[0].position_in_geo[2])
     roughness = 0.002
     rough = {i: each * (1 + roughness * rng.standard_normal(each.shape)) for i, each in depth.items()}
-    found = points_by_model(trained, seen, rough, dict.fromkeys(depth, PINHOLE), 1)
-    centers = trained.geo_from_model.apply(trained.poses.cam_center_in_model[seen.camera])
+    found = points_by_model(trained, rays, rough, dict.fromkeys(depth, PINHOLE))
+    centers = trained.geo_from_model.apply(trained.poses.cam_center_in_model[rays.camera])
     distance = float(np.linalg.norm(centers - surveyed(points), axis=1).max())
     sigma_of_view = roughness * distance / 5
-    assert np.linalg.norm(found - surveyed(points)) < 3 * sigma_of_view * 1.25 / np.sqrt(len(seen.point))
+    assert np.linalg.norm(found - surveyed(points)) < 3 * sigma_of_view * 1.25 / np.sqrt(len(rays.point))
 
 
-def test_wrong_surface_in_few_views_is_outvoted(trained: Trained) -> None:
+def test_wrong_surface_in_few_views_is_outvoted(trained: TrainedSurvey) -> None:
     points = trained.survey.control_points[:1]
-    seen = sights(trained, points)
+    rays = mark_rays(points, trained.sparse)
     depth = planes(trained, points[0].position_in_geo[2])
-    views = sorted({int(i) for i in seen.camera})
+    views = sorted({int(i) for i in rays.camera})
     depth[views[0]] = depth[views[0]] * 0.3  # a floater before the camera
     depth[views[1]] = depth[views[1]] * 0.0  # nothing there
-    found = points_by_model(trained, seen, depth, dict.fromkeys(depth, PINHOLE), 1)
+    found = points_by_model(trained, rays, depth, dict.fromkeys(depth, PINHOLE))
     assert np.linalg.norm(found - surveyed(points)) < 0.01
 
 
-def test_points_with_too_few_views_are_not_measured(trained: Trained) -> None:
+def test_points_with_too_few_views_are_not_measured(trained: TrainedSurvey) -> None:
     first = trained.survey.control_points[0]
     lonely = (first.model_copy(update={"marks": first.marks[:1]}), first.model_copy(update={"marks": ()}))
-    seen = sights(trained, lonely)
+    rays = mark_rays(lonely, trained.sparse)
     depth = planes(trained, 0.0)
-    assert np.isnan(points_by_camera(trained, seen, 2)).all()
-    assert np.isnan(points_by_model(trained, seen, depth, dict.fromkeys(depth, PINHOLE), 2)).all()
+    assert np.isnan(points_by_camera(trained, rays)).all()
+    assert np.isnan(points_by_model(trained, rays, depth, dict.fromkeys(depth, PINHOLE))).all()
 
 
-def test_marks_outside_of_the_map_or_lens_are_no_hits(trained: Trained) -> None:
+def test_marks_outside_of_the_map_or_lens_are_no_hits(trained: TrainedSurvey) -> None:
     first = trained.survey.control_points[0]
     away = first.model_copy(update={"marks": tuple(m.model_copy(update={"x_px": -500.0}) for m in first.marks)})
     depth = planes(trained, 0.0)
-    found = points_by_model(trained, sights(trained, (away,)), depth, dict.fromkeys(depth, PINHOLE), 1)
+    found = points_by_model(trained, mark_rays((away,), trained.sparse), depth, dict.fromkeys(depth, PINHOLE))
     assert np.isnan(found).all()
 
 
-def test_no_points_at_all(trained: Trained) -> None:
-    seen = sights(trained, ())
-    assert seen.xy.shape == (0, 2)
-    assert points_by_camera(trained, seen, 0).shape == (0, 3)
-    assert points_by_model(trained, seen, {}, {}, 0).shape == (0, 3)
+def test_no_points_at_all(trained: TrainedSurvey) -> None:
+    rays = mark_rays((), trained.sparse)
+    assert rays.xy.shape == (0, 2)
+    assert points_by_camera(trained, rays).shape == (0, 3)
+    assert points_by_model(trained, rays, {}, {}).shape == (0, 3)

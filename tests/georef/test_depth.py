@@ -11,9 +11,10 @@ import torch
 from pipelines.geometry.cameras import Pinhole
 from pipelines.geometry.similarity import Similarity
 from pipelines.georef.cameras import CameraCorrections, CameraPoses
-from pipelines.georef.measured import ControlMarks, DepthMarks, Measured
+from pipelines.georef.control_by_depth import ControlByDepth
 from pipelines.georef.problem import GeoProblem
 from pipelines.georef.similarity import LearnableSimilarity
+from pipelines.georef.terms import ControlTerm
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.reference import render_reference
@@ -51,7 +52,7 @@ def problem(truth: Similarity, basis: np.ndarray) -> GeoProblem:
     surveyed = torch.from_numpy(truth.apply(CONTROL))
     variance = SURVEY_M**2 + (MARK_RAD * DEPTH_M) ** 2 + SURFACE_M**2
     root = torch.eye(3, dtype=torch.float64) / variance**0.5
-    marks = ControlMarks(
+    marks = ControlTerm(
         torch.from_numpy(point),
         torch.from_numpy(camera),
         torch.from_numpy(ray / np.linalg.norm(ray, axis=1, keepdims=True)),
@@ -59,7 +60,7 @@ def problem(truth: Similarity, basis: np.ndarray) -> GeoProblem:
         surveyed,
         root.repeat(3, 1, 1),
     )
-    by_depth = DepthMarks(
+    by_depth = ControlByDepth(
         torch.from_numpy(camera),
         torch.from_numpy(ray[:, :2] / ray[:, 2:]),
         surveyed[point],
@@ -70,7 +71,7 @@ def problem(truth: Similarity, basis: np.ndarray) -> GeoProblem:
     )
     pivot = np.array([0.0, 0.0, DEPTH_M]) + SHIFT
     similarity = LearnableSimilarity(Similarity(translation=SHIFT), np.diag([0.02] * 4 + [0.5] * 3) ** 2, pivot)
-    return GeoProblem(similarity, CameraCorrections(POSES, basis), Measured(marks=marks, depth_marks=by_depth))
+    return GeoProblem(similarity, CameraCorrections(POSES, basis), (marks,), control_by_depth=by_depth)
 
 
 def loss_of_view(problem: GeoProblem, gaussians: Gaussians, index: int) -> torch.Tensor:
@@ -162,7 +163,7 @@ def test_views_add_up_to_the_loss_by_intersection() -> None:
     views = [whole.depth_loss(index, flat, solid, PINHOLE) for index in range(3)]
     mean = sum(float(view.detach()) for view in views if view is not None) / 3
     # λ_gcp = 3 control points over N = 3 cameras, as there are no fixes.
-    control = whole.terms().control
+    control = whole.losses()["control"]
     assert control is not None
     assert mean == pytest.approx(float(control.detach()), rel=1e-9)
     # In the sum that is optimised the views stand in for the intersection.

@@ -10,11 +10,11 @@ import torch
 
 from pipelines.geometry.similarity import Similarity
 from pipelines.georef.cameras import CameraCorrections
-from pipelines.georef.losses import intersect
-from pipelines.georef.measured import ControlMarks, Measured
+from pipelines.georef.posterior import equations_of
 from pipelines.georef.problem import GeoProblem
 from pipelines.georef.similarity import LearnableSimilarity
-from tests.georef_scenes import LOOSE, SHIFT, draw_truth, fixes_of, make_block, marks_of, pivot
+from pipelines.georef.terms import ControlTerm
+from tests.georef_scenes import LOOSE, SHIFT, draw_truth, fixes_of, make_block, marks_of, pivot, terms
 
 BLOCK = make_block(images=4)
 SIGMA_M = np.array([0.5, 0.4, 0.8])
@@ -24,7 +24,7 @@ DIRECTIONS = BLOCK.basis.shape[2]
 LENS = 1e-3 * np.random.default_rng(1).normal(size=(3, DIRECTIONS))
 
 
-def by_lens(marks: ControlMarks) -> torch.Tensor:
+def by_lens(marks: ControlTerm) -> torch.Tensor:
     """Of bearings by ln f, cx / f, cy / f of one camera for all: rays are (x, y, 1) → (x − cx, y − cy, 1) / f."""
     ray = marks.bearing_in_cam / marks.bearing_in_cam[:, 2:]
     moved = torch.zeros((len(ray), 3, 3), dtype=torch.float64)
@@ -43,7 +43,7 @@ def problem() -> GeoProblem:
     problem = GeoProblem(
         LearnableSimilarity(Similarity(translation=SHIFT), LOOSE, pivot(BLOCK)),
         CameraCorrections(BLOCK.poses, BLOCK.basis, LENS),
-        Measured(fixes_of(truth, SIGMA_M, rng), marks),
+        terms(fixes_of(truth, SIGMA_M, rng), marks),
     )
     with torch.no_grad():
         problem.cameras.z.copy_(torch.from_numpy(0.5 * rng.normal(size=DIRECTIONS)))
@@ -51,7 +51,7 @@ def problem() -> GeoProblem:
 
 
 def test_rays_spread_with_a_shorter_lens_and_turn_with_the_principal_point(problem: GeoProblem) -> None:
-    marks = problem.marks
+    marks = problem.control
     assert marks is not None
     change = torch.tensor([-0.01, 0.002, -0.003], dtype=torch.float64)
     told, before = marks.bearings(change), marks.bearing_in_cam
@@ -60,7 +60,7 @@ def test_rays_spread_with_a_shorter_lens_and_turn_with_the_principal_point(probl
     np.testing.assert_allclose(told[:, :2] / told[:, 2:], wanted, atol=2e-4)
     np.testing.assert_allclose(told.norm(dim=1), 1.0, rtol=1e-12)
     held = replace(problem.estimate(), lens=change[:0])
-    away = intersect(replace(held, lens=change), marks) - intersect(held, marks)
+    away = marks.intersected(replace(held, lens=change)) - marks.intersected(held)
     # Some thousandths of 50 m.
     assert 0.05 < float(away.norm(dim=1).mean().detach()) < 0.5
 
@@ -86,22 +86,25 @@ class _Control(torch.nn.Module):
         self.problem = problem
 
     def forward(self) -> torch.Tensor:
-        control = self.problem.terms().control
+        control = self.problem.losses()["control"]
         assert control is not None
         return control
 
 
-def test_linear_problem_counts_the_path_through_the_lens(problem: GeoProblem) -> None:
-    found, columns = problem.linearised().gram, []
+def test_equations_count_the_path_through_the_lens(problem: GeoProblem) -> None:
+    equations, columns = equations_of(problem), []
+    assert equations.seen is None  # 21 residuals, 17 corrections
     z = problem.cameras.z
     for direction in torch.eye(DIRECTIONS, dtype=torch.float64):
         moved = []
         for sign in (1, -1):
             with torch.no_grad():
                 z.add_(sign * 1e-4 * direction)
-                moved.append(problem().flatten())
+                moved.append(problem.whitened(problem.estimate()))
                 z.sub_(sign * 1e-4 * direction)
-        columns.append((moved[0] - moved[1]) / 2e-4)
-    numeric = torch.stack(columns, dim=1)
-    # Second order in steps of 1e-4 σ.
-    np.testing.assert_allclose(found, numeric @ numeric.T, rtol=1e-6, atol=1e-7 * float(found.abs().max()))
+        columns.append({kind: (moved[0][kind] - moved[1][kind]) / 2e-4 for kind in moved[0]})
+    for kind, rows in equations.normal.observations.items():
+        numeric = torch.stack([column[kind] for column in columns], dim=2).numpy()
+        # Second order in steps of 1e-4 σ.
+        analytic = rows.jacobian[:, :, equations.cameras]
+        np.testing.assert_allclose(analytic, numeric, rtol=1e-6, atol=1e-7 * np.abs(numeric).max())

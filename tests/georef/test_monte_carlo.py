@@ -16,17 +16,17 @@ import pytest
 import torch
 
 from pipelines.evaluate.cramer_rao import Anchors, CameraInformation
-from pipelines.evaluate.following import follow
+from pipelines.evaluate.intersection_jacobian import intersection_jacobian
 from pipelines.geometry.bundle import Network, correction_basis
 from pipelines.geometry.lens import Lenses, bearings
 from pipelines.geometry.similarity import Similarity
 from pipelines.georef.cameras import CameraCorrections, CameraPoses
-from pipelines.georef.losses import ControlMarks, Fixes, intersect
-from pipelines.georef.measured import Measured
-from pipelines.georef.posterior import LensDoubt, minimise, posterior
+from pipelines.georef.posterior import FreeLens, minimise, posterior
 from pipelines.georef.problem import GeoProblem
 from pipelines.georef.similarity import LearnableSimilarity
+from pipelines.georef.terms import ControlTerm, FixTerm
 from tests.bundle_scenes import LENS, SIGMA_PX, adjuster, exact_network, noisy, pixels, readjusted, size
+from tests.georef_scenes import terms
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 IMAGES, MARK_PX, SURVEY_M = 8, 0.3, 0.02
@@ -63,12 +63,12 @@ def marked(points: np.ndarray, truth: Network, network: Network | None = None) -
     return replace(seen, obs_xy_px=xy, cameras=at.cameras, **poses)
 
 
-def marks_of(seen: Network, cov_survey: np.ndarray, rng: np.random.Generator) -> ControlMarks:
+def marks_of(seen: Network, cov_survey: np.ndarray, rng: np.random.Generator) -> ControlTerm:
     """Noisy marks, read through the adjusted lens, and a noisy survey."""
     xy_px = seen.obs_xy_px + rng.normal(0, MARK_PX, seen.obs_xy_px.shape)
-    cov = follow(seen, np.full(len(xy_px), MARK_PX)).cov_of_marks + cov_survey
+    cov = intersection_jacobian(seen, np.full(len(xy_px), MARK_PX)).cov_of_marks + cov_survey
     surveyed = seen.point_in_world + rng.multivariate_normal(np.zeros(3), cov_survey, len(cov))
-    return ControlMarks(
+    return ControlTerm(
         torch.from_numpy(seen.obs_point),
         torch.from_numpy(seen.obs_image),
         torch.from_numpy(bearings(seen.cameras[1], xy_px)),
@@ -96,7 +96,7 @@ def one_run(seed: int, setting: Setting, solve: np.ndarray) -> Run:
     drawn = noisy(truth, rng)
     network = readjusted(drawn, solve @ (drawn.obs_xy_px - truth.obs_xy_px).ravel())
     found, center = correction_basis(network, lens_follows=setting.follows), truth.cam_center_in_world
-    fixes = Fixes(
+    fixes = FixTerm(
         torch.arange(IMAGES),
         torch.from_numpy(center + sigma_m * rng.normal(size=center.shape)),
         torch.from_numpy(np.tile(np.diag(1 / sigma_m), (IMAGES, 1, 1))),
@@ -109,16 +109,16 @@ def one_run(seed: int, setting: Setting, solve: np.ndarray) -> Run:
             found.matrix,
             found.lens_matrix if setting.follows else None,
         ),
-        Measured(fixes, marks_of(at_control, SURVEY_M**2 * np.eye(3), rng) if setting.control else None),
+        terms(fixes, marks_of(at_control, SURVEY_M**2 * np.eye(3), rng) if setting.control else None),
     )
     minimise(problem)
-    by_control = follow(at_control, np.full(len(at_control.obs_point), MARK_PX)).by_lens
-    joint = posterior(problem, LensDoubt(found.lens_cov, by_control))
+    by_control = intersection_jacobian(at_control, np.full(len(at_control.obs_point), MARK_PX)).by_lens
+    joint = posterior(problem, FreeLens(found.lens_cov, by_control))
     at_check = marked(CHECK, truth, network)
     with torch.no_grad():
-        measured = problem.similarity(intersect(problem.estimate(), marks_of(at_check, np.zeros((3, 3)), rng)))
-    moved = follow(at_check, np.full(len(at_check.obs_point), MARK_PX))
-    by_cameras = moved.by(found.matrix) + moved.by_lens @ found.lens_matrix
+        measured = problem.similarity(marks_of(at_check, np.zeros((3, 3)), rng).intersected(problem.estimate()))
+    moved = intersection_jacobian(at_check, np.full(len(at_check.obs_point), MARK_PX))
+    by_cameras = moved.by_corrections(found.matrix) + moved.by_lens @ found.lens_matrix
     predicted = joint.at(measured.numpy(), by_cameras, moved.by_lens) + moved.cov_of_marks
     return Run(measured.numpy() - CHECK, predicted)
 

@@ -9,11 +9,11 @@ import pytest
 import torch
 
 from pipelines.core.errors import DegenerateGeometryError
-from pipelines.georef.losses import ControlMarks, intersect
-from pipelines.georef.measured import Measured
-from pipelines.georef.posterior import leave_one_out, minimise, posterior
+from pipelines.georef.posterior import covariances, equations_of, leave_one_out, minimise, posterior
 from pipelines.georef.problem import GeoProblem
 from pipelines.georef.systematic import SystematicErrors
+from pipelines.georef.terms import ControlTerm
+from pipelines.robust.kernels import CAUCHY_SCALE2, NOISE_WEIGHT
 from tests.georef_scenes import (
     Block,
     Truth,
@@ -24,6 +24,7 @@ from tests.georef_scenes import (
     pivot,
     problem_of,
     problem_with,
+    terms,
 )
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -43,7 +44,7 @@ def solved(
     return truth, problem
 
 
-def without(marks: ControlMarks, left_out: int) -> ControlMarks:
+def without(marks: ControlTerm, left_out: int) -> ControlTerm:
     """The marks of all points but one."""
     keep = marks.point != left_out
     others = torch.arange(len(marks.position_in_geo)) != left_out
@@ -59,11 +60,42 @@ def without(marks: ControlMarks, left_out: int) -> ControlMarks:
     )
 
 
+def by_differences(problem: GeoProblem) -> np.ndarray:
+    """Covariance of (y, z) from a normal matrix by central differences: slow, and with nothing left out."""
+    y, z = problem.similarity.y, problem.cameras.z
+    columns = []
+    for parameter in (y, z):
+        for direction in torch.eye(len(parameter), dtype=torch.float64):
+            rows = []
+            for sign in (1, -1):
+                with torch.no_grad():
+                    parameter.add_(sign * 1e-4 * direction)
+                    white = problem.whitened(problem.estimate())
+                    parameter.sub_(sign * 1e-4 * direction)
+                rows.append(torch.cat(list(white.values())))
+            columns.append((rows[0] - rows[1]) / 2e-4)
+    jacobian = torch.stack(columns, dim=2).numpy()
+    chi2 = torch.cat(list(problem.whitened(problem.estimate()).values())).square().sum(dim=1).detach().numpy()
+    weight = 1 / (1 + chi2 / CAUCHY_SCALE2[3]) / NOISE_WEIGHT[3]
+    prior = np.diag([0.0] * 7 + [1.0] * len(z))
+    return np.linalg.inv(np.einsum("m,mip,miq->pq", weight, jacobian, jacobian) + prior)
+
+
+@pytest.mark.parametrize("control", [CONTROL, np.tile(CONTROL, (8, 1))], ids=["seen", "all"])
 @pytest.mark.parametrize("sigma_m", [RTK, CONSUMER], ids=["rtk", "consumer"])
-def test_marginal_is_what_training_states(sigma_m: np.ndarray) -> None:
-    _, problem = solved(0, sigma_m, CONTROL)
-    joint = posterior(problem)
-    np.testing.assert_allclose(joint.covariance[:7, :7], problem.covariance(), rtol=1e-6, atol=1e-12)
+def test_posterior_is_that_of_the_whole_normal_matrix(sigma_m: np.ndarray, control: np.ndarray) -> None:
+    """With fewer residuals than camera corrections, those that no measurement sees are left out of the solution."""
+    _, problem = solved(0, sigma_m, control)
+    assert (equations_of(problem).seen is None) is (len(control) > 6)
+    joint, unit = posterior(problem), np.eye(7 + len(problem.cameras.z))
+    unit[:7, :7] = problem.similarity.root.numpy()
+    expected = unit @ by_differences(problem) @ unit.T
+    scale = np.sqrt(np.diag(expected))
+    # Differences of 1e-4 σ are good to eight digits of a correlation.
+    np.testing.assert_allclose(
+        joint.covariance / np.outer(scale, scale), expected / np.outer(scale, scale), atol=1e-6
+    )
+    np.testing.assert_allclose(covariances(problem)[0], joint.covariance[:7, :7], rtol=1e-9, atol=1e-15)
     assert np.linalg.eigvalsh(joint.covariance)[0] > 0
     # The image observations alone know the corrections to one σ: measurements on Earth only add to that.
     assert np.diag(joint.covariance)[7:].max() <= 1 + 1e-9
@@ -86,13 +118,13 @@ def test_measurements_on_earth_that_leave_the_similarity_open_are_refused() -> N
 def test_leaving_out_is_what_solving_again_would_give(sigma_m: np.ndarray | None, count: int) -> None:
     _, problem = solved(1, sigma_m, CONTROL[:count])
     found = leave_one_out(problem)
-    assert problem.marks is not None
+    assert problem.control is not None
     for j in range(count):
-        again = problem_of(BLOCK, problem.fixes, without(problem.marks, j))
+        again = problem_of(BLOCK, problem.fixes, without(problem.control, j))
         minimise(again)
         with torch.no_grad():
-            measured = again.similarity(intersect(again.estimate(), problem.marks))[j]
-        error = (measured - problem.marks.position_in_geo[j]).numpy()
+            measured = again.similarity(problem.control.intersected(again.estimate()))[j]
+        error = (measured - problem.control.position_in_geo[j]).numpy()
         # The weights of the others change a little when it is gone: a fifth of what is expected of the error.
         sigma = np.sqrt(np.diag(found.cov_in_geo[j]))
         np.testing.assert_allclose(found.error_in_geo[j], error, atol=0.2 * sigma.max())
@@ -137,7 +169,7 @@ def test_cameras_that_are_held_leave_the_similarity() -> None:
     _, problem = solved(0, RTK, CONTROL, block)
     joint = posterior(problem)
     assert joint.covariance.shape == (7, 7)
-    np.testing.assert_allclose(joint.covariance, problem.covariance(), rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(joint.covariance, covariances(problem)[0], rtol=1e-6, atol=1e-12)
     found = joint.at(np.zeros((2, 3)), np.zeros((2, 3, 0)), np.zeros((2, 3, 0)))
     assert found.shape == (2, 3, 3)
 
@@ -152,12 +184,12 @@ def test_a_bias_that_is_estimated_is_marginalised_out() -> None:
     truth = draw_truth(BLOCK, rng)
     fixes = fixes_of(truth, RTK, rng)
     shifted = replace(fixes, position_in_geo=fixes.position_in_geo + torch.tensor([2.0, -1.0, 3.0]))
-    measured = Measured(shifted, marks_of(truth, CONTROL, 0.02, rng))
+    measured = terms(shifted, marks_of(truth, CONTROL, 0.02, rng))
     problem = problem_with(BLOCK, measured, SystematicErrors(1))
     minimise(problem)
     np.testing.assert_allclose(problem.errors.vector().detach(), [2.0, -1.0, 3.0], atol=0.05)
     # The position then is the control points' alone: worse than with fixes that are believed.
-    believed = problem_of(BLOCK, fixes, problem.marks)
+    believed = problem_of(BLOCK, fixes, problem.control)
     minimise(believed)
     assert (np.diag(posterior(problem).covariance)[4:7] > np.diag(posterior(believed).covariance)[4:7]).all()
     assert posterior(problem).covariance.shape == posterior(believed).covariance.shape

@@ -8,7 +8,8 @@ import torch
 
 from pipelines.geometry.rotations import exp_so3 as exp_so3_numpy
 from pipelines.geometry.similarity import Similarity, jacobian_at
-from pipelines.georef.similarity import LearnableSimilarity, exp_so3
+from pipelines.georef.similarity import LearnableSimilarity
+from pipelines.georef.so3 import exp_so3
 
 PIVOT = np.array([2500.0, -1800.0, 40.0])
 BASE = Similarity(1.3, exp_so3_numpy([0.4, -1.1, 2.0]), PIVOT + np.array([3.0, -2.0, 1.0]))

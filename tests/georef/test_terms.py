@@ -11,13 +11,12 @@ import torch
 from pipelines.geometry.rotations import exp_so3, log_so3
 from pipelines.geometry.similarity import Similarity
 from pipelines.georef.cameras import CameraPoses
-from pipelines.georef.losses import control_residuals
-from pipelines.georef.measured import ControlMarks, Fixes, Measured
-from pipelines.georef.posterior import minimise
+from pipelines.georef.posterior import covariances, minimise
 from pipelines.georef.problem import GeoProblem
-from pipelines.georef.similarity import log_so3 as torch_log
+from pipelines.georef.so3 import log_so3 as torch_log
 from pipelines.georef.start import begin
 from pipelines.georef.systematic import SystematicErrors
+from pipelines.georef.terms import ControlTerm, FixTerm
 from tests.georef_scenes import (
     SHIFT,
     Block,
@@ -30,6 +29,7 @@ from tests.georef_scenes import (
     marks_of,
     pairs_of,
     problem_with,
+    terms,
 )
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -41,7 +41,7 @@ OFF = Similarity(1.005, exp_so3([0.004, -0.006, 0.008]), SHIFT + np.array([1.0, 
 STIFF = replace(BLOCK, basis=np.zeros((10, 6, 0)))
 
 
-def moved(fixes: Fixes, offset_m: np.ndarray) -> Fixes:
+def moved(fixes: FixTerm, offset_m: np.ndarray) -> FixTerm:
     return replace(fixes, position_in_geo=fixes.position_in_geo + torch.from_numpy(offset_m))
 
 
@@ -52,7 +52,7 @@ def error_m(problem: GeoProblem, truth: Truth, points: np.ndarray) -> float:
 
 def test_absolute_loss_brings_a_shifted_and_turned_flight_home() -> None:
     truth = Truth(OFF, BLOCK.poses)
-    problem = problem_with(STIFF, Measured(fixes_of(truth, RTK, np.random.default_rng(0))))
+    problem = problem_with(STIFF, terms(fixes_of(truth, RTK, np.random.default_rng(0))))
     assert error_m(problem, truth, CONTROL) > 1.0
     descend(problem)
     assert error_m(problem, truth, CONTROL) < 0.03  # 2 to 3 cm over √10, and 40 m of arm
@@ -81,13 +81,13 @@ def test_control_points_straighten_a_bowed_block() -> None:
     given = np.array([[x, y, 0.0] for x in (-38.0, 0.0, 38.0) for y in (-38.0, 0.0, 38.0)])
     checked = np.array([[x, y, 0.0] for x in (-20.0, 20.0) for y in (-20.0, 20.0)] + [[30.0, -5, 0], [-5, 30, 0]])
     rng = np.random.default_rng(0)
-    problem = problem_with(block, Measured(marks=near(marks_of(truth, given, 0.005, rng), given, center)))
+    problem = problem_with(block, terms(near(marks_of(truth, given, 0.005, rng), given, center)))
     check = near(marks_of(truth, checked, 1e-6, rng), checked, center)
 
     def height_error() -> float:
-        return float(control_residuals(problem.estimate(), check).detach()[:, 2].square().mean().sqrt())
+        return float(check.residuals(problem.estimate()).detach()[:, 2].square().mean().sqrt())
 
-    level = problem_with(replace(block, basis=np.zeros((25, 6, 0))), problem.measured)
+    level = problem_with(replace(block, basis=np.zeros((25, 6, 0))), problem.terms)
     for each in (problem, level):
         descend(each, 600)
     assert height_error() < 0.02
@@ -95,7 +95,7 @@ def test_control_points_straighten_a_bowed_block() -> None:
     assert height_error() > 0.06
 
 
-def near(marks: ControlMarks, points: np.ndarray, center: np.ndarray) -> ControlMarks:
+def near(marks: ControlTerm, points: np.ndarray, center: np.ndarray) -> ControlTerm:
     """Only the marks in cameras nearly above the points."""
     away = np.linalg.norm((points[marks.point] - center[marks.camera])[:, :2], axis=1)
     kept = torch.from_numpy(away < 25.0)
@@ -111,8 +111,8 @@ def near(marks: ControlMarks, points: np.ndarray, center: np.ndarray) -> Control
 def test_control_points_outvote_biased_positions() -> None:
     truth, rng = Truth(OFF, BLOCK.poses), np.random.default_rng(1)
     fixes = moved(fixes_of(truth, CONSUMER, rng), np.array([4.0, -3.0, 8.0]))
-    without = problem_with(STIFF, Measured(fixes))
-    with_control = problem_with(STIFF, Measured(fixes, marks_of(truth, CONTROL, 0.02, rng)))
+    without = problem_with(STIFF, terms(fixes))
+    with_control = problem_with(STIFF, terms(fixes, marks_of(truth, CONTROL, 0.02, rng)))
     for problem in (without, with_control):
         minimise(problem)
     assert error_m(without, truth, CONTROL) > 3.0
@@ -122,7 +122,7 @@ def test_control_points_outvote_biased_positions() -> None:
 def test_relative_loss_mends_the_scale_and_nothing_else() -> None:
     truth = Truth(Similarity(1.01, np.eye(3), SHIFT), BLOCK.poses)
     points = np.random.default_rng(2).uniform(-20, 20, (12, 3))
-    problem = problem_with(STIFF, Measured(pairs=pairs_of(truth, points, 0.005, np.random.default_rng(3))))
+    problem = problem_with(STIFF, terms(pairs_of(truth, points, 0.005, np.random.default_rng(3))))
     descend(problem)
     found = problem.similarity.current()
     # 5 mm over pairs of some 20 m, 66 of them that hang on 12 points.
@@ -134,13 +134,13 @@ def test_relative_loss_mends_the_scale_and_nothing_else() -> None:
 
 def estimated(problem: GeoProblem, name: str) -> tuple[np.ndarray, np.ndarray, tuple[bool, bool, bool]]:
     """Value, σ and whether it was observed."""
-    (found,) = [each for each in problem.errors.found(problem.covariances()[1]) if each.name == name]
+    (found,) = [each for each in problem.errors.estimates(covariances(problem)[1]) if each.name == name]
     return np.array(found.value), np.array(found.sigma), found.observed
 
 
 def test_bias_of_a_flight_is_told_by_control_points() -> None:
     truth, rng, bias = Truth(OFF, BLOCK.poses), np.random.default_rng(4), np.array([0.5, -0.3, 1.2])
-    measured = Measured(moved(fixes_of(truth, RTK, rng), bias), marks_of(truth, CONTROL, 0.02, rng))
+    measured = terms(moved(fixes_of(truth, RTK, rng), bias), marks_of(truth, CONTROL, 0.02, rng))
     blind, problem = problem_with(STIFF, measured), problem_with(STIFF, measured, SystematicErrors(1))
     assert begin(problem) > 100.0
     for each in (blind, problem):
@@ -151,7 +151,7 @@ def test_bias_of_a_flight_is_told_by_control_points() -> None:
     assert (np.abs(value - bias) < 4 * sigma).all()
     assert sigma.max() < 0.02  # 2 cm over √5, 3 cm over √10
     assert observed == (True, True, True)
-    assert problem.control_outliers() == problem.outliers() == []
+    assert problem.contradicting(ControlTerm) == problem.contradicting(FixTerm) == []
 
 
 def test_two_flights_have_a_bias_each() -> None:
@@ -160,10 +160,10 @@ def test_two_flights_have_a_bias_each() -> None:
     biases = np.array([[0.4, 0.0, -0.6], [-0.4, 0.1, 0.6]])  # no offset on the average
     fixes = fixes_of(truth, RTK, rng)
     fixes = replace(moved(fixes, biases[flight.numpy()]), flight=flight)
-    problem = problem_with(STIFF, Measured(fixes, marks_of(truth, CONTROL, 0.02, rng)), SystematicErrors(2))
+    problem = problem_with(STIFF, terms(fixes, marks_of(truth, CONTROL, 0.02, rng)), SystematicErrors(2))
     begin(problem)
     minimise(problem)
-    found = problem.errors.found(problem.covariances()[1])
+    found = problem.errors.estimates(covariances(problem)[1])
     assert [each.flight for each in found] == [0, 1]
     np.testing.assert_allclose([each.value for each in found], biases, atol=0.06)
     assert error_m(problem, truth, CONTROL) < 0.04
@@ -171,17 +171,17 @@ def test_two_flights_have_a_bias_each() -> None:
 
 def test_bias_without_control_points_is_not_observed() -> None:
     truth = Truth(OFF, BLOCK.poses)
-    problem = problem_with(STIFF, Measured(fixes_of(truth, RTK, np.random.default_rng(0))), SystematicErrors(1))
+    problem = problem_with(STIFF, terms(fixes_of(truth, RTK, np.random.default_rng(0))), SystematicErrors(1))
     begin(problem)
     assert estimated(problem, "bias")[2] == (False, False, False)
     # Nobody then knows the position better than the prior of the bias.
-    assert np.sqrt(np.diag(problem.covariance())[4:]) == pytest.approx([5.0, 5.0, 10.0], rel=0.01)
+    assert np.sqrt(np.diag(covariances(problem)[0])[4:]) == pytest.approx([5.0, 5.0, 10.0], rel=0.01)
 
 
 def test_lever_arm_is_found_and_taken_out() -> None:
     truth, rng, arm = Truth(OFF, BLOCK.poses), np.random.default_rng(6), np.array([0.1, -0.4, 0.25])
     offset = (OFF.rotation @ np.swapaxes(BLOCK.poses.cam_from_model, 1, 2)) @ arm
-    measured = Measured(moved(fixes_of(truth, RTK, rng), offset), marks_of(truth, CONTROL, 0.02, rng))
+    measured = terms(moved(fixes_of(truth, RTK, rng), offset), marks_of(truth, CONTROL, 0.02, rng))
     problem = problem_with(STIFF, measured, SystematicErrors(arm=True))
     begin(problem)
     minimise(problem)
@@ -195,9 +195,7 @@ def test_lever_arm_is_found_and_taken_out() -> None:
 def test_lever_arm_passes_for_a_similarity_without_control_points() -> None:
     # All cameras look at the middle: an antenna further out is a larger ring, one to the right a turned one.
     truth = Truth(OFF, BLOCK.poses)
-    problem = problem_with(
-        STIFF, Measured(fixes_of(truth, RTK, np.random.default_rng(0))), SystematicErrors(arm=True)
-    )
+    problem = problem_with(STIFF, terms(fixes_of(truth, RTK, np.random.default_rng(0))), SystematicErrors(arm=True))
     begin(problem)
     observed = estimated(problem, "lever-arm")[2]
     assert not observed[0]
@@ -208,7 +206,7 @@ def test_boresight_is_found() -> None:
     truth, rng = Truth(OFF, BLOCK.poses), np.random.default_rng(7)
     boresight_rad, sigma_rad = np.radians([2.0, -3.0, 8.0]), np.radians(0.5)
     attitudes = attitudes_of(truth, sigma_rad, rng, exp_so3(boresight_rad))
-    measured = Measured(fixes_of(truth, RTK, rng), attitudes=attitudes)
+    measured = terms(fixes_of(truth, RTK, rng), attitudes)
     problem = problem_with(STIFF, measured, SystematicErrors(attitude_sigma_rad=sigma_rad))
     begin(problem)
     minimise(problem)
@@ -225,12 +223,12 @@ def test_attitudes_claim_no_more_of_the_rotation_than_one_of_them() -> None:
     truth, rng = Truth(OFF, BLOCK.poses), np.random.default_rng(8)
     attitudes = attitudes_of(truth, np.radians(0.5), rng)
     turned = torch.from_numpy(exp_so3([0.0, 0.0, np.radians(3.0)])) @ attitudes.geo_from_cam
-    measured = Measured(fixes_of(truth, CONSUMER, rng), attitudes=replace(attitudes, geo_from_cam=turned))
-    alone = problem_with(STIFF, replace(measured, attitudes=None))
+    measured = terms(fixes_of(truth, CONSUMER, rng), replace(attitudes, geo_from_cam=turned))
+    alone = problem_with(STIFF, measured[:1])
     problem = problem_with(STIFF, measured, SystematicErrors(attitude_sigma_rad=np.radians(0.5)))
     begin(problem)
-    assert np.sqrt(problem.covariance()[3, 3]) > np.radians(0.4)
-    assert np.sqrt(problem.covariance()[3, 3]) < np.sqrt(alone.covariance()[3, 3])
+    assert np.sqrt(covariances(problem)[0][3, 3]) > np.radians(0.4)
+    assert np.sqrt(covariances(problem)[0][3, 3]) < np.sqrt(covariances(alone)[0][3, 3])
 
 
 def test_a_moved_control_point_is_named() -> None:
@@ -238,19 +236,19 @@ def test_a_moved_control_point_is_named() -> None:
     marks = marks_of(truth, CONTROL, 0.02, rng)
     position = marks.position_in_geo.clone()
     position[2] += torch.tensor([0.5, 0.0, -0.4])
-    problem = problem_with(STIFF, Measured(fixes_of(truth, RTK, rng), replace(marks, position_in_geo=position)))
+    problem = problem_with(STIFF, terms(fixes_of(truth, RTK, rng), replace(marks, position_in_geo=position)))
     minimise(problem)
-    assert problem.control_outliers() == [2]
-    assert problem.outliers() == []
+    assert problem.contradicting(ControlTerm) == [2]
+    assert problem.contradicting(FixTerm) == []
 
 
 def test_observations_move_with_the_parameters() -> None:
     truth, rng = draw_truth(BLOCK, np.random.default_rng(0)), np.random.default_rng(0)
-    measured = Measured(
+    measured = terms(
         replace(fixes_of(truth, RTK, rng), flight=torch.zeros(10, dtype=torch.int64)),
         marks_of(truth, CONTROL, 0.02, rng),
-        attitudes=attitudes_of(truth, 0.01, rng),
-        pairs=pairs_of(truth, CONTROL, 0.1, rng),
+        attitudes_of(truth, 0.01, rng),
+        pairs_of(truth, CONTROL, 0.1, rng),
     )
     errors = SystematicErrors(1, arm=True, attitude_sigma_rad=0.01)
     loss = problem_with(BLOCK, measured, errors, learned_weights=True).to("meta").loss()

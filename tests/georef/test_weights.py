@@ -8,24 +8,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from scipy.integrate import quad
-from scipy.stats import chi2
 
-from pipelines.georef.losses import CAUCHY_SCALE2, CAUCHY_SCALE2_OF_ONE
-from pipelines.georef.measured import Measured
+from pipelines.georef.posterior import covariances
 from pipelines.georef.similarity import LearnableSimilarity
-from pipelines.georef.weights import MEAN_WEIGHTED_CHI2, TermWeights
-from tests.georef_scenes import descend, draw_truth, fixes_of, make_block, marks_of, pivot, problem_with
+from pipelines.georef.weights import TermWeights
+from tests.georef_scenes import descend, draw_truth, fixes_of, make_block, marks_of, pivot, problem_with, terms
 
 pytestmark = pytest.mark.usefixtures("one_thread")
+DIMENSIONS = {"absolute": 3, "control": 3, "relative": 1}
 BLOCK = replace(make_block(images=16), basis=np.zeros((16, 6, 0)))
 CONTROL = np.array([[-15.0, -15, 0], [15, -12, 1], [12, 15, 2], [-14, 13, 0.5], [0, 0, 3], [5, -9, 0]])
-
-
-@pytest.mark.parametrize(("dimensions", "scale2"), [(1, CAUCHY_SCALE2_OF_ONE), (3, CAUCHY_SCALE2)])
-def test_price_is_what_the_kernel_leaves_of_noise(dimensions: int, scale2: float) -> None:
-    expected = quad(lambda x: x / (1 + x / scale2) * chi2(dimensions).pdf(x), 0, 300)[0]
-    assert expected == pytest.approx(MEAN_WEIGHTED_CHI2[dimensions], abs=1e-4)
 
 
 def learned(true_sigma_m: float, stated_m: float, outliers: int = 0) -> dict[str, float]:
@@ -36,7 +28,7 @@ def learned(true_sigma_m: float, stated_m: float, outliers: int = 0) -> dict[str
     position = fixes.position_in_geo.clone()
     position[:outliers] += 20.0
     root = torch.eye(3, dtype=torch.float64).repeat(16, 1, 1) / stated_m
-    measured = Measured(
+    measured = terms(
         replace(fixes, position_in_geo=position, root_information=root), marks_of(truth, CONTROL, 0.02, rng)
     )
     problem = problem_with(BLOCK, measured, learned_weights=True)
@@ -59,7 +51,7 @@ def test_right_sigma_is_left_alone_also_among_outliers() -> None:
 
 @pytest.mark.parametrize("weighting", ["whitened", "paper"])
 def test_bounds_hold_whatever_is_learned(weighting: str) -> None:
-    weights = TermWeights(weighting, learned=True)  # type: ignore[arg-type]
+    weights = TermWeights(DIMENSIONS, weighting, learned=True)  # type: ignore[arg-type]
     factor = 100.0 if weighting == "whitened" else 1e4
     for far in (-1e6, 1e6):
         with torch.no_grad():
@@ -69,7 +61,7 @@ def test_bounds_hold_whatever_is_learned(weighting: str) -> None:
 
 
 def test_fixed_weights_learn_nothing() -> None:
-    weights = TermWeights("whitened", learned=False)
+    weights = TermWeights(DIMENSIONS, "whitened", learned=False)
     assert weights.variance_factors() == {}
     assert len(weights.u) == 0
     assert float(weights.prior()) == 0.0
@@ -78,14 +70,14 @@ def test_fixed_weights_learn_nothing() -> None:
 def test_variance_enters_the_covariance() -> None:
     truth = draw_truth(BLOCK, np.random.default_rng(0))
     fixes = fixes_of(truth, np.array([0.02, 0.02, 0.03]), np.random.default_rng(0))
-    problem = problem_with(replace(BLOCK, poses=truth.poses), Measured(fixes), learned_weights=True)
+    problem = problem_with(replace(BLOCK, poses=truth.poses), terms(fixes), learned_weights=True)
     descend(problem, 300)
-    before, s = problem.covariance(), problem.weights.log_variance("absolute")
+    before, s = covariances(problem)[0], problem.weights.log_variance("absolute")
     assert s is not None
     with torch.no_grad():
         problem.weights.u += 0.01
     after = problem.weights.log_variance("absolute")
     assert after is not None
     # Cauchy's weights rise a little as residuals shrink.
-    ratio = np.trace(problem.covariance()[4:, 4:]) / np.trace(before[4:, 4:])
+    ratio = np.trace(covariances(problem)[0][4:, 4:]) / np.trace(before[4:, 4:])
     assert 1.0 < ratio <= math.exp(float((after - s).detach())) + 1e-9

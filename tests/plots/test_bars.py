@@ -33,14 +33,14 @@ def panel(*heights: float | None) -> Panel:
 
 
 def test_bars_are_as_high_as_their_figures(tmp_path: Path) -> None:
-    found = columns(picture(tmp_path / "bars.png", panel(0.1, 0.2, 0.4)), BLUE)
-    np.testing.assert_allclose(found, np.array([0.25, 0.5, 1.0]) * found[2], atol=4)
+    heights = columns(picture(tmp_path / "bars.png", panel(0.1, 0.2, 0.4)), BLUE)
+    np.testing.assert_allclose(heights, np.array([0.25, 0.5, 1.0]) * heights[2], atol=4)
 
 
 def test_figures_of_other_orders_of_magnitude_show_too(tmp_path: Path) -> None:
-    found = columns(picture(tmp_path / "bars.png", panel(0.01, 0.1, 25.0)), BLUE)
-    assert len(found) == 3
-    assert found[0] > 0.04 * found[2]  # a linear axis would leave a fraction of a pixel
+    heights = columns(picture(tmp_path / "bars.png", panel(0.01, 0.1, 25.0)), BLUE)
+    assert len(heights) == 3
+    assert heights[0] > 0.04 * heights[2]  # a linear axis would leave a fraction of a pixel
 
 
 def test_series_stand_side_by_side_and_gaps_stay_gaps(tmp_path: Path) -> None:

@@ -12,8 +12,10 @@ from pipelines.core.errors import InputError
 from pipelines.geometry.cameras import Camera
 from pipelines.geometry.lens import bearings
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.georef.losses import depth_residuals
+from pipelines.georef.control_by_depth import depth_residuals
+from pipelines.georef.posterior import covariances
 from pipelines.georef.problem import GeoProblem
+from pipelines.georef.terms import AttitudeTerm
 from pipelines.scene.geographic import geo_problem
 from pipelines.scene.initial_similarity import AttitudeRecord
 from pipelines.scene.measurements import SURFACE_SIGMA
@@ -32,16 +34,14 @@ def test_truth_fits_exact_measurements() -> None:
     _, sparse, survey = material(NOISELESS)
     problem = geo_problem(initial_scene(sparse, survey, initial()), survey, initial(), CONFIG)
     assert problem.fixes is not None
-    assert problem.marks is not None
+    assert problem.control is not None
     assert len(problem.fixes.camera) == 8
-    assert len(problem.marks.position_in_geo) == 6
-    terms = problem.terms()
-    assert terms.absolute is not None
-    assert terms.control is not None
+    assert len(problem.control.position_in_geo) == 6
+    losses = problem.losses()
     # 1e-9 m and 1e-9 px of noise, whitened by as much, and rounding of 1e-13 of 100 m.
-    assert float(terms.absolute.detach()) < 10.0
-    assert float(terms.control.detach()) < 10.0
-    assert float(terms.cameras.detach()) == 0.0
+    assert float(losses["absolute"].detach()) < 10.0
+    assert float(losses["control"].detach()) < 10.0
+    assert float(losses["cameras"].detach()) == 0.0
 
 
 def test_test_cameras_measure_nothing() -> None:
@@ -52,26 +52,26 @@ def test_test_cameras_measure_nothing() -> None:
     split = survey.model_copy(update={"images": images})
     problem = geo_problem(initial_scene(sparse, split, initial()), split, initial(), CONFIG)
     assert problem.fixes is not None
-    assert problem.marks is not None
+    assert problem.control is not None
     assert problem.fixes.camera.tolist() == [3, 4, 5, 6, 7]
-    assert set(problem.marks.camera.tolist()) <= {3, 4, 5, 6, 7}
+    assert set(problem.control.camera.tolist()) <= {3, 4, 5, 6, 7}
 
 
 def test_unusable_marks_are_left_out() -> None:
     _, sparse, survey = material()
     first, second, *rest = survey.control_points
-    twice = first.model_copy(update={"marks": (first.marks[0], first.marks[0])})  # two marks, one photograph
+    alone = first.model_copy(update={"marks": first.marks[:1]})
     # 3 000 px from the centre the lens has long turned back: no ray leads there.
     outside = Mark(image=second.marks[0].image, x_px=-3000.0, y_px=447.0, sigma_px=0.3)
     partly = second.model_copy(update={"marks": (outside, *second.marks[1:])})
-    spoilt = survey.model_copy(update={"control_points": (twice, partly, *rest)})
+    spoilt = survey.model_copy(update={"control_points": (alone, partly, *rest)})
     folding = Camera("OPENCV", 1200, 900, np.array([1020.0, 1018.0, 603.0, 447.0, -0.2, 0.0, 3e-4, -2e-4]))
     problem = geo_problem(
         initial_scene(replace(sparse, cameras={1: folding}), spoilt, initial()), spoilt, initial(), CONFIG
     )
-    assert problem.marks is not None
-    assert len(problem.marks.position_in_geo) == 5
-    assert (problem.marks.point == 0).sum() == len(second.marks) - 1
+    assert problem.control is not None
+    assert len(problem.control.position_in_geo) == 5
+    assert (problem.control.point == 0).sum() == len(second.marks) - 1
     assert np.isfinite(float(problem.loss().detach()))
 
 
@@ -83,7 +83,7 @@ def test_start_is_held_where_the_measurements_leave_it_open(points: int, held: b
     assert problem.fixes is None
     assert problem.hold_prior is held
     if points:
-        assert np.linalg.eigvalsh(problem.covariance()).min() > 0
+        assert np.linalg.eigvalsh(covariances(problem)[0]).min() > 0
 
 
 def test_line_holds_its_start() -> None:
@@ -126,7 +126,7 @@ def test_nothing_to_optimise_when_switched_off() -> None:
     config = TrainOptions(geo_loss=False, optimize_cameras=False)
     problem = geo_problem(initial_scene(sparse, survey, initial()), survey, initial(), config)
     assert problem.fixes is None
-    assert problem.marks is None
+    assert problem.control is None
     assert len(problem.cameras.z) == 0
 
 
@@ -164,9 +164,10 @@ def test_errors_that_are_asked_for_are_there() -> None:
     _, sparse, survey = material()
     found = problem_of(survey, sparse, estimate="boresight,bias,lever-arm")
     assert [part.name for part in found.errors.parts] == ["bias", "lever-arm", "boresight", "common"]
-    assert found.measured.attitudes is not None
-    assert len(found.measured.attitudes.camera) == 8
-    assert problem_of(survey, sparse).measured.attitudes is None
+    attitudes = found.term(AttitudeTerm)
+    assert attitudes is not None
+    assert len(attitudes) == 8
+    assert problem_of(survey, sparse).term(AttitudeTerm) is None
     value = found.errors.vector().detach().numpy()
     # None of them is there: noise of centimetres, and of half a degree over √8.
     assert np.abs(value[:6]).max() < 0.5
@@ -184,23 +185,23 @@ def test_errors_of_nothing_are_refused(what: str) -> None:
 @pytest.mark.parametrize(
     ("options", "gone"),
     [
-        ({"gcp_loss": False}, {"marks"}),
-        ({"rel_loss": False}, {"pairs"}),
-        ({"geo_loss": False}, {"fixes", "marks", "pairs"}),
+        ({"gcp_loss": False}, {"control"}),
+        ({"rel_loss": False}, {"relative"}),
+        ({"geo_loss": False}, {"absolute", "control", "relative"}),
         ({}, set()),
     ],
 )
 def test_terms_can_be_switched_off(options: dict[str, bool], gone: set[str]) -> None:
     _, sparse, survey = material()
-    measured = problem_of(survey, sparse, **options).measured
-    assert {name for name in ("fixes", "marks", "pairs") if getattr(measured, name) is None} == gone
-    assert measured.depth_marks is None
+    problem = problem_of(survey, sparse, **options)
+    assert {"absolute", "control", "relative"} - {term.kind for term in problem.terms} == gone
+    assert problem.control_by_depth is None
 
 
 def test_depth_mode_finds_control_points_by_the_surface() -> None:
     truth, sparse, survey = material(NOISELESS)
     found = problem_of(survey, sparse, gcp_mode="depth")
-    marks, control = found.measured.depth_marks, found.marks
+    marks, control = found.control_by_depth, found.control
     assert marks is not None
     assert control is not None
     assert marks.views == 8
@@ -225,7 +226,7 @@ def test_depth_mode_finds_control_points_by_the_surface() -> None:
 def test_marks_follow_the_lens_as_the_lens_itself_would_have_them() -> None:
     _, sparse, survey = material(NOISELESS)
     found = problem_of(survey, sparse, gcp_mode="depth")
-    marks, by_depth = found.marks, found.measured.depth_marks
+    marks, by_depth = found.control, found.control_by_depth
     lenses = sparse.lenses
     assert marks is not None
     assert by_depth is not None

@@ -11,10 +11,10 @@ import torch
 from pipelines.core.errors import InputError
 from pipelines.geolocate.options import GeolocateOptions
 from pipelines.geolocate.stage import geolocate
-from pipelines.georef.losses import pair_residuals
+from pipelines.georef.terms import DistanceTerm
 from pipelines.scene.geographic import geo_problem
 from pipelines.scene.geolocated import GeolocatedPoints
-from pipelines.scene.measurements import fixes_of, flights, pairs_of, root_information
+from pipelines.scene.measurements import distance_term, fix_term, flights, root_information
 from pipelines.scene.scene import Scene as InModel
 from pipelines.scene.scene import initial_scene
 from pipelines.scene.survey import Survey
@@ -44,7 +44,7 @@ def test_times_of_the_images_make_the_flights() -> None:
         image.model_copy(update={"timestamp_s": 1e9 + 3.0 * index + 1200.0 * (index >= 7)})
         for index, image in enumerate(survey.images)
     )
-    fixes = fixes_of(scene, survey.model_copy(update={"images": images}))
+    fixes = fix_term(scene, survey.model_copy(update={"images": images}))
     assert fixes is not None
     assert fixes.flight is not None
     assert fixes.flight.tolist() == [0] * 7 + [1] * 5
@@ -52,16 +52,16 @@ def test_times_of_the_images_make_the_flights() -> None:
 
 def test_distances_agree_with_the_truth_within_their_sigma() -> None:
     _, scene, survey, points = located(Noise())
-    fixes = fixes_of(scene, survey)
+    fixes = fix_term(scene, survey)
     assert fixes is not None
-    pairs = pairs_of(scene, fixes, points, 0)
+    pairs = distance_term(scene, fixes, points, 0)
     assert pairs is not None
     assert len(pairs.distance_in_geo) == 300
     assert pairs.camera is None
     assert pairs.distance_in_model is not None
     # The scene is in true metres: what remains is the error of geolocation. What both points of a pair share of it
     # cancels, which their two covariances do not know.
-    white = (pairs.distance_in_model - pairs.distance_in_geo) * pairs.root_information
+    white = (pairs.distance_in_model - pairs.distance_in_geo) * pairs.root_information[:, 0, 0]
     assert 0.1 < float(white.square().mean()) < 1.5
     # Across the scene: the longest third of random pairs in 100 m.
     assert float(pairs.distance_in_geo.min()) > 50.0
@@ -70,11 +70,11 @@ def test_distances_agree_with_the_truth_within_their_sigma() -> None:
 def test_distances_say_of_the_scale_a_tenth_of_what_the_fixes_say() -> None:
     for noise in (Noise(), Noise(fix_m=(1.5, 1.5, 3.0), attitude_deg=0.01)):
         _, scene, survey, points = located(noise)
-        fixes = fixes_of(scene, survey)
+        fixes = fix_term(scene, survey)
         assert fixes is not None
-        pairs = pairs_of(scene, fixes, points, 0)
+        pairs = distance_term(scene, fixes, points, 0)
         assert pairs is not None
-        of_pairs = pairs.share * float((pairs.distance_in_geo * pairs.root_information).square().sum())
+        of_pairs = pairs.share * float((pairs.distance_in_geo * pairs.root_information[:, 0, 0]).square().sum())
         arm = fixes.position_in_geo - fixes.position_in_geo.mean(dim=0)
         of_fixes = float((fixes.root_information @ arm[..., None]).square().sum())
         assert 0 < of_pairs <= 0.1 * of_fixes * (1 + 1e-3)
@@ -82,28 +82,29 @@ def test_distances_say_of_the_scale_a_tenth_of_what_the_fixes_say() -> None:
 
 def test_without_located_points_the_cameras_serve() -> None:
     _, scene, survey, points = located(Noise())
-    fixes = fixes_of(scene, survey)
+    fixes = fix_term(scene, survey)
     assert fixes is not None
     lost = replace(points, inlier=np.zeros_like(points.inlier))
     for given in (None, lost):
-        pairs = pairs_of(scene, fixes, given, 0)
+        pairs = distance_term(scene, fixes, given, 0)
         assert pairs is not None
         assert pairs.distance_in_model is None
         assert pairs.camera is not None
         assert (pairs.camera[:, 0] != pairs.camera[:, 1]).all()
     problem = geo_problem(scene, survey, initial(), TrainOptions())
-    assert problem.measured.pairs is not None
-    missed = pair_residuals(problem.estimate(), problem.measured.pairs).detach()
+    pairs = problem.term(DistanceTerm)
+    assert pairs is not None
+    missed = pairs.residuals(problem.estimate()).detach()
     # Fixes of 2 to 3 cm at either end.
     assert 0.01 < float(missed.square().mean().sqrt()) < 0.06
 
 
 def test_points_of_another_model_are_refused() -> None:
     _, scene, survey, points = located(Noise())
-    fixes = fixes_of(scene, survey)
+    fixes = fix_term(scene, survey)
     assert fixes is not None
     with pytest.raises(InputError, match="another model"):
-        pairs_of(scene, fixes, replace(points, point_id=points.point_id + 1), 0)
+        distance_term(scene, fixes, replace(points, point_id=points.point_id + 1), 0)
 
 
 def test_distances_do_not_overrule_the_fixes() -> None:

@@ -13,8 +13,8 @@ from pipelines.core.stages import GAUSSIANS, MODEL
 from pipelines.core.workspace import Workspace
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
 from pipelines.geometry.similarity import Similarity
-from pipelines.scene.trained import load_trained
 from pipelines.scene.trained_model import TrainedCamera, TrainedLens, TrainedModel
+from pipelines.scene.trained_survey import load_trained
 from pipelines.splat.initialise import gaussians_of_size
 from pipelines.splat.storage import write_gaussians
 from tests.scenes import (

@@ -17,7 +17,8 @@ from pipelines.splat.densify_fast import FastSettings, FastStrategy
 from pipelines.splat.densify_mcmc import McmcSettings, McmcStrategy
 from pipelines.splat.surface import SurfaceSettings
 from pipelines.train.loop import LoopOptions, optimise
-from pipelines.train.trainer import JointOptions, JointTrainer
+from pipelines.train.schedule import JointOptions
+from pipelines.train.trainer import JointTrainer
 from tests import tiny_training as tiny
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -14,7 +14,7 @@ from pipelines.scene.photographs import ImageCache, save_array
 from pipelines.scene.scene import Scene, make_scene, photographs
 from pipelines.splat.initialise import InitialisationOptions
 from pipelines.train.depth_maps import DepthMaps
-from pipelines.train.material import Material, initial_gaussians, points_to_hold
+from pipelines.train.initial_gaussians import TrainingScene, initial_gaussians, points_to_hold
 from pipelines.train.surface import SceneSurface, spread_evenly
 from tests.scenes import write_workspace
 from tests.splat_scenes import CAMERA, GEO_FROM_LOCAL, Rendered, ground_height, make_rendered
@@ -137,8 +137,8 @@ def test_gaussians_start_on_the_surface(
 ) -> None:
     _, scene, images = material
     options = InitialisationOptions(sh_degree=0)
-    without = initial_gaussians(Material(scene, images), options, 3000, 0)
-    start = initial_gaussians(Material(scene, images, surface), options, 3000, 0)
+    without = initial_gaussians(TrainingScene(scene, images), options, 3000, 0)
+    start = initial_gaussians(TrainingScene(scene, images, surface), options, 3000, 0)
     assert len(without) < len(start) <= 3000
     place = start.means.numpy()
     near = place[(np.abs(place[:, :2]) < 26).all(axis=1)]
@@ -150,7 +150,7 @@ def test_gaussians_start_as_discs_however_many_sfm_points_there_are(
 ) -> None:
     _, scene, images = material
     most = len(scene.point_in_model)  # as many as there may be: balls at all of them would leave no room for discs
-    start = initial_gaussians(Material(scene, images, surface), InitialisationOptions(sh_degree=0), most, 0)
+    start = initial_gaussians(TrainingScene(scene, images, surface), InitialisationOptions(sh_degree=0), most, 0)
     scale = start.log_scales.exp()
     discs = int((scale.amin(dim=1) < 0.2 * scale.amax(dim=1)).sum())
     sfm = torch.from_numpy(scene.point_in_model).float()
@@ -172,7 +172,7 @@ def test_fewer_start_on_a_surface_of_which_less_is_known(
     most, options = 3000, InitialisationOptions(sh_degree=0)
 
     def discs(found: SceneSurface) -> int:
-        scale = initial_gaussians(Material(scene, images, found), options, most, 0).log_scales.exp()
+        scale = initial_gaussians(TrainingScene(scene, images, found), options, most, 0).log_scales.exp()
         return int((scale.amin(dim=1) < 0.2 * scale.amax(dim=1)).sum())
 
     quarter = SceneSurface(part)
@@ -185,7 +185,7 @@ def test_points_to_hold_are_those_of_the_view(
     surface: SceneSurface, material: tuple[Rendered, Scene, ImageCache]
 ) -> None:
     _, scene, images = material
-    hold = points_to_hold(Material(scene, images, surface), torch.device("cpu"))
+    hold = points_to_hold(TrainingScene(scene, images, surface), torch.device("cpu"))
     train, test = int(scene.train[0]), int(scene.test[0])
     seen = len(np.unique(scene.sparse.obs_point[scene.sparse.obs_image == train]))
     assert len(hold(train)) > seen

@@ -30,7 +30,7 @@ from pipelines.splat.rasterizer.api import Pinhole, RasterSettings
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
 from pipelines.splat.storage import read_gaussians
 from pipelines.train.options import TrainOptions
-from pipelines.train.stage import PRESETS, Preset, effort
+from pipelines.train.presets import PRESETS, Preset, effort
 from tests.georef_scenes import squared_error
 from tests.scenes import GEO_FROM_LOCAL, without_fixes
 from tests.splat_scenes import TRAINING, RenderedFlight

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +12,10 @@ from pipelines.core.workspace import Workspace
 from pipelines.scene.geographic import geo_problem
 from pipelines.scene.scene import initial_scene, photographs
 from pipelines.splat.rasterizer.backends import rasterizer
+from pipelines.train.assembly import make_trainer
 from pipelines.train.checkpoint import load_checkpoint, save_checkpoint
-from pipelines.train.material import Material
+from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.options import TrainOptions
-from pipelines.train.stage import make_trainer
 from pipelines.train.trainer import JointTrainer
 from tests.splat_scenes import (
     START_COVARIANCE,
@@ -26,8 +25,6 @@ from tests.splat_scenes import (
     write_photographs,
     write_rendered,
 )
-
-pytestmark = pytest.mark.usefixtures("one_thread")
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 CONFIG = TrainOptions(iterations=60, sh_degree=2, max_gaussians=1000)
@@ -55,27 +52,7 @@ def trainer_of(rendered: Rendered, workspace: Workspace, config: TrainOptions = 
     scene = initial_scene(rendered.sparse, rendered.survey, initial)  # type: ignore[arg-type]
     images = photographs(scene.sparse, rendered.survey, workspace, 640)
     problem = geo_problem(scene, rendered.survey, initial, config)  # type: ignore[arg-type]
-    return make_trainer(Material(scene, images), problem, rasterizer("cpu"), config)
-
-
-def test_every_view_is_seen_once_an_epoch_and_no_test_view_ever(rendered: Rendered, workspace: Workspace) -> None:
-    trainer = trainer_of(rendered, workspace)
-    seen = [trainer._view_of(iteration) for iteration in range(1, 37)]
-    assert Counter(seen) == dict.fromkeys((0, 1, 2, 4, 5, 6, 7, 8, 10, 11, 12, 13), 3)
-    for epoch in range(3):
-        assert len(set(seen[12 * epoch : 12 * epoch + 12])) == 12
-    assert seen[:12] != seen[12:24]
-    other = trainer_of(rendered, workspace, CONFIG.model_copy(update={"seed": 1}))
-    assert seen != [other._view_of(iteration) for iteration in range(1, 37)]
-
-
-def test_harmonics_grow_up_to_half_of_the_training(rendered: Rendered, workspace: Workspace) -> None:
-    trainer = trainer_of(rendered, workspace)
-    degrees = []
-    for iteration in range(1, 61):
-        trainer.iteration = iteration
-        degrees.append(trainer._sh_degree())
-    assert degrees == [0] * 9 + [1] * 10 + [2] * 41
+    return make_trainer(TrainingScene(scene, images), problem, rasterizer("cpu"), config)
 
 
 def test_a_step_moves_everything_but_test_cameras_by_themselves(rendered: Rendered, workspace: Workspace) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Literal
 
+import torch
+
 from pipelines.core.errors import BackendUnavailableError
 from pipelines.splat.rasterizer.api import Rasterizer
 
@@ -23,3 +25,8 @@ def rasterizer(name: Literal["auto", "cpu", "cuda"]) -> Rasterizer:
     from pipelines.splat.rasterizer.cpu import CpuRasterizer
 
     return CpuRasterizer()
+
+
+def device_of(backend: Rasterizer) -> torch.device:
+    """Return where the tensors of a backend live."""
+    return torch.device("cuda" if backend.name == "cuda" else "cpu")

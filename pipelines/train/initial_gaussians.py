@@ -1,4 +1,4 @@
-"""What there is to train from, and the Gaussians that training starts with."""
+"""The scene that training starts from, and its first Gaussians."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _OFF_SURFACE = 3.0  # gaps between points of the surface: an SfM point so near t
 
 
 @dataclass(frozen=True)
-class Material:
+class TrainingScene:
     """Cameras and SfM points, photographs, and the surface, if it was looked for."""
 
     scene: Scene
@@ -35,14 +35,14 @@ class Material:
     surface: SceneSurface | None = None
 
 
-def initial_gaussians(material: Material, options: InitialisationOptions, most: int, seed: int) -> Gaussians:
+def initial_gaussians(training: TrainingScene, options: InitialisationOptions, most: int, seed: int) -> Gaussians:
     """On the surface as densely as photographs show it, at SfM points where none is known, and in the background.
 
     Where the surface is known its discs are the better start: an SfM point says nothing of where it faces, and a
     ball reaches as far behind a wall as the wall's next point is away.
 
     Args:
-        material: what there is.
+        training: cameras, photographs and surface.
         options: how each of them starts.
         most: how many there may be.
         seed: of the choice of points.
@@ -50,14 +50,14 @@ def initial_gaussians(material: Material, options: InitialisationOptions, most: 
     Raises:
         DegenerateGeometryError: too few points.
     """
-    scene = material.scene
-    found = SurfacePoints(scene.point_in_model, scene.sparse.point_rgb, np.full_like(scene.point_in_model, np.nan))
-    if material.surface is not None:
-        share = _SURFACE_SHARE * min(1.0, material.surface.known() / _MOSTLY_KNOWN)
-        surface = material.surface.sample(int(share * most), seed)
-        found = SurfacePoints.concatenate([found.part(_off_surface(found, surface)), surface])
-    near = gaussians_from_points(found.point_in_model, found.rgb, options, found.normal_in_model)
-    behind = background(scene, material.images, found.point_in_model)
+    scene = training.scene
+    start = SurfacePoints(scene.point_in_model, scene.sparse.point_rgb, np.full_like(scene.point_in_model, np.nan))
+    if training.surface is not None:
+        share = _SURFACE_SHARE * min(1.0, training.surface.known() / _MOSTLY_KNOWN)
+        surface = training.surface.sample(int(share * most), seed)
+        start = SurfacePoints.concatenate([start.part(_off_surface(start, surface)), surface])
+    near = gaussians_from_points(start.point_in_model, start.rgb, options, start.normal_in_model)
+    behind = background(scene, training.images, start.point_in_model)
     far = gaussians_of_size(behind.point_in_model, behind.rgb, behind.sigma_m, options)
     room = max(most - len(near), 0)
     keep = torch.linspace(0, max(len(far) - 1, 0), min(room, len(far))).long()
@@ -74,16 +74,16 @@ def _off_surface(points: SurfacePoints, surface: SurfacePoints) -> IntArray:
     return np.flatnonzero(distance > _OFF_SURFACE * gap[nearest, 1])
 
 
-def points_to_hold(material: Material, device: torch.device) -> Callable[[int], Tensor]:
+def points_to_hold(training: TrainingScene, device: torch.device) -> Callable[[int], Tensor]:
     """By image, the points (K, 3) in `model`, float32, of SfM and of the surface that it shows."""
-    scene = material.scene
+    scene = training.scene
     shown = set(map(int, scene.train))
 
     @lru_cache(maxsize=_KEPT_VIEWS)
     def points(index: int) -> Tensor:
-        found = scene.point_in_model[scene.sparse.points_in(index)]
-        if material.surface is not None and index in shown:
-            found = np.concatenate([found, material.surface.points(index, _STRIDE)])
-        return torch.from_numpy(found).float().to(device)
+        shown_points = scene.point_in_model[scene.sparse.points_in(index)]
+        if training.surface is not None and index in shown:
+            shown_points = np.concatenate([shown_points, training.surface.points(index, _STRIDE)])
+        return torch.from_numpy(shown_points).float().to(device)
 
     return points

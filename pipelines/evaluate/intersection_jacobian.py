@@ -1,4 +1,4 @@
-"""How intersected points follow the cameras that see them and their lens: the derivative of an intersection."""
+"""Derivatives of intersected points by the poses and the lens of the cameras that see them."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from pipelines.geometry.bundle import (
 
 
 @dataclass(frozen=True)
-class Following:
-    """What moves N intersected points, to first order.
+class IntersectionJacobian:
+    """What poses, lens and marks do to N intersected points, to first order.
 
     Attributes:
         by_poses: (3 N, 6 n) sparse, metres by (δω, δc) of each camera as in `geometry.bundle.CorrectionBasis`.
@@ -31,15 +31,15 @@ class Following:
     by_lens: FloatArray
     cov_of_marks: FloatArray
 
-    def by(self, basis: FloatArray) -> FloatArray:
+    def by_corrections(self, basis: FloatArray) -> FloatArray:
         """Metres (N, 3, k) per unit of each of the k corrections of a basis (n, 6, k)."""
         n, rows, width = basis.shape
         moved = np.asarray(self.by_poses @ basis.reshape(rows * n, width))
         return moved.reshape(len(moved) // 3, 3, width)
 
 
-def follow(marks: Network, sigma_px: FloatArray) -> Following:
-    """How the points of a network follow, each intersected from its own marks, the lens and the poses held.
+def intersection_jacobian(marks: Network, sigma_px: FloatArray) -> IntersectionJacobian:
+    """Return how the points of a network, each intersected from its own marks, depend on poses and lens.
 
     Where the marks are does not enter, but the places where the points appear do.
 
@@ -59,7 +59,7 @@ def follow(marks: Network, sigma_px: FloatArray) -> Following:
     longest = lin.jacobian_intrinsics.shape[2]
     lens = _blocks(marks, response @ lin.jacobian_intrinsics, lens_slots(marks), longest * len(marks.cameras))
     poses = _blocks(marks, response @ lin.jacobian_pose, marks.obs_image, 6 * len(marks.camera_id))
-    return Following(poses, lens.toarray().reshape(count, 3, -1), cov)
+    return IntersectionJacobian(poses, lens.toarray().reshape(count, 3, -1), cov)
 
 
 def _blocks(marks: Network, blocks: FloatArray, column_block: IntArray, width: int) -> csr_matrix:

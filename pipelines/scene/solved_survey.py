@@ -1,28 +1,23 @@
-"""The geographic half of a training, restored from its products and brought to its minimum."""
+"""The geographic half of a training: set up again from its products, and brought to its minimum."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-import torch
-
 from pipelines.core.stages import BY_NAME
 from pipelines.core.workspace import Workspace
-from pipelines.geometry.rotations import log_so3
 from pipelines.geometry.similarity import Similarity
 from pipelines.georef.posterior import minimise
 from pipelines.georef.problem import GeoProblem
-from pipelines.georef.similarity import LearnableSimilarity
 from pipelines.scene.geographic import geo_problem
 from pipelines.scene.geographic_options import GeographicOptions
 from pipelines.scene.initial_similarity import InitialSimilarity
 from pipelines.scene.scene import Scene, make_scene
-from pipelines.scene.trained import Trained
+from pipelines.scene.trained_survey import TrainedSurvey
 
 
 @dataclass(frozen=True)
-class Restored:
+class SolvedSurvey:
     """A trained survey with what was measured of it.
 
     Attributes:
@@ -32,7 +27,7 @@ class Restored:
         options: what it was trained with.
     """
 
-    trained: Trained
+    trained: TrainedSurvey
     scene: Scene
     problem: GeoProblem
     options: GeographicOptions
@@ -41,13 +36,13 @@ class Restored:
 def geographic_options_of(workspace: Workspace) -> GeographicOptions:
     """What a workspace's model was trained with; the defaults for one that was put there by hand."""
     manifest = workspace.manifest(BY_NAME["train"])
-    known = {} if manifest is None else manifest.config
+    recorded = {} if manifest is None else manifest.config
     return GeographicOptions.model_validate(
-        {key: known[key] for key in GeographicOptions.model_fields if key in known}
+        {name: recorded[name] for name in GeographicOptions.model_fields if name in recorded}
     )
 
 
-def restore(trained: Trained, initial: InitialSimilarity, options: GeographicOptions) -> Restored:
+def solve_survey(trained: TrainedSurvey, initial: InitialSimilarity, options: GeographicOptions) -> SolvedSurvey:
     """Set up the measurements as for the training, and solve them without the photographs, from its result.
 
     Raises:
@@ -61,16 +56,6 @@ def restore(trained: Trained, initial: InitialSimilarity, options: GeographicOpt
     if options.weighting != "whitened":  # which estimates no constant errors
         changed |= {"weighting": "whitened", "estimate": "none"}
     problem = geo_problem(scene, trained.survey, initial, options.model_copy(update=changed))
-    _place(problem.similarity, trained.geo_from_model)
+    problem.similarity.place(trained.geo_from_model)
     minimise(problem)
-    return Restored(trained, scene, problem, options)
-
-
-def _place(similarity: LearnableSimilarity, at: Similarity) -> None:
-    """Give a similarity its value."""
-    away = at @ similarity.base.inverse()
-    shift = away.apply(similarity.pivot_in_geo) - similarity.pivot_in_geo
-    delta = np.array([np.log(away.scale), *log_so3(away.rotation), *shift])
-    y = np.linalg.solve(similarity.root.numpy(), delta)
-    with torch.no_grad():
-        similarity.y.copy_(torch.from_numpy(y))
+    return SolvedSurvey(trained, scene, problem, options)

@@ -19,8 +19,8 @@ _MASKS = 64  # on the device; one serves all photographs of a camera
 
 
 @dataclass(frozen=True)
-class Target:
-    """What a render is compared with.
+class TargetImage:
+    """A photograph as a render is compared with it.
 
     Attributes:
         colour: (H, W, 3) float32 from 0 to 1.
@@ -33,7 +33,7 @@ class Target:
     camera: Pinhole
 
 
-class Targets:
+class TargetImages:
     """Training photographs on `device`.
 
     On a GPU the next photograph is read from disk into pinned memory while this one is trained on, so that no
@@ -46,7 +46,7 @@ class Targets:
         self._reader = ThreadPoolExecutor(1, "photographs") if device.type == "cuda" else None
         self._next: tuple[int, Future[Tensor]] | None = None
 
-    def get(self, index: int, shrink: int = 1, upcoming: int | None = None) -> Target:
+    def get(self, index: int, shrink: int = 1, upcoming: int | None = None) -> TargetImage:
         """One photograph at 1/`shrink` of its size.
 
         Args:
@@ -62,7 +62,7 @@ class Targets:
         if shrink > 1:
             colour = functional.avg_pool2d(colour.permute(2, 0, 1), shrink).permute(1, 2, 0).contiguous()
             camera = shrunken(camera, shrink)
-        return Target(colour, self._mask(index, shrink), camera)
+        return TargetImage(colour, self._mask(index, shrink), camera)
 
     def _pixels(self, index: int) -> Tensor:
         if self._next is not None and self._next[0] == index:

@@ -27,7 +27,7 @@ from pipelines.splat.storage import read_gaussians
 
 
 @dataclass(frozen=True)
-class Trained:
+class TrainedSurvey:
     """What training left.
 
     Attributes:
@@ -63,7 +63,7 @@ class Trained:
         return [index for index, camera in enumerate(self.model.cameras) if camera.split == split]
 
 
-def load_trained(workspace: Workspace, similarity: Literal["trained", "initial"] = "trained") -> Trained:
+def load_trained(workspace: Workspace, similarity: Literal["trained", "initial"] = "trained") -> TrainedSurvey:
     """Read the products of ingest, sfm and train.
 
     Args:
@@ -89,7 +89,7 @@ def load_trained(workspace: Workspace, similarity: Literal["trained", "initial"]
         model = model.model_copy(update={"geo_from_model": record})
     rotation = matrix_from_quat_xyzw([camera.quat_xyzw for camera in model.cameras])
     translation = np.array([camera.translation for camera in model.cameras])
-    return Trained(
+    return TrainedSurvey(
         survey=load_json(Survey, workspace.path(SURVEY)),
         sfm=sparse,
         model=model,
@@ -98,7 +98,7 @@ def load_trained(workspace: Workspace, similarity: Literal["trained", "initial"]
     )
 
 
-def trained_pinholes(trained: Trained, images: ImageCache) -> Pinholes:
+def trained_pinholes(trained: TrainedSurvey, images: ImageCache) -> Pinholes:
     """Cameras of the photographs that were undistorted with SfM's lenses, as the trained ones have them."""
     found = Pinholes(images, trained.sfm.lenses)
     found.renew(trained.sparse.lenses)

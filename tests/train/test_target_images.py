@@ -13,7 +13,7 @@ from pipelines.geometry.cameras import Camera
 from pipelines.scene.photographs import ImageCache, Photograph
 from pipelines.scene.pinholes import Pinholes
 from pipelines.splat.rasterizer.api import Pinhole
-from pipelines.train.targets import Targets, shrunken
+from pipelines.train.target_images import TargetImages, shrunken
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -33,7 +33,7 @@ def cache(folder: Path, camera: Camera, count: int = 1) -> ImageCache:
 
 def test_a_shrunken_photograph_is_the_mean_of_its_blocks(tmp_path: Path) -> None:
     images = cache(tmp_path, PINHOLE)
-    target = Targets(images, Pinholes(images), torch.device("cpu")).get(0, shrink=4)
+    target = TargetImages(images, Pinholes(images), torch.device("cpu")).get(0, shrink=4)
     full = images.image(0)[:28, :40].astype(np.float64) / 255
     blocks = full.reshape(7, 4, 10, 4, 3).mean(axis=(1, 3))
     assert np.abs(target.colour.numpy() - blocks).max() < 1e-6
@@ -53,7 +53,7 @@ def test_a_block_counts_only_where_all_of_its_pixels_do(tmp_path: Path) -> None:
     images = cache(tmp_path, BARREL)
     covered = np.array(images.mask(0))
     assert covered.any() and not covered.all()
-    targets = Targets(images, Pinholes(images), torch.device("cpu"))
+    targets = TargetImages(images, Pinholes(images), torch.device("cpu"))
     mask = targets.get(0, shrink=2).mask
     assert mask is not None
     assert np.array_equal(mask.numpy(), covered.reshape(15, 2, 21, 2).all(axis=(1, 3)))
@@ -68,5 +68,5 @@ def test_images_of_one_camera_share_a_mask_and_only_one_map_is_kept(tmp_path: Pa
     for index in range(3):
         images.mask(index)
     assert len(list((tmp_path / "cache").glob("*.mask.npy"))) == 1
-    targets = Targets(images, Pinholes(images), torch.device("cpu"))
+    targets = TargetImages(images, Pinholes(images), torch.device("cpu"))
     assert targets.get(0).mask is targets.get(2).mask

@@ -1,0 +1,92 @@
+"""The configurations of the ablation (method, section 4): a table, light enough for the command line."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from pipelines.core.errors import InputError
+from pipelines.core.stages import BY_NAME
+from pipelines.core.staleness import Flags
+
+_FIXED: Flags = {
+    "optimize_cameras": False,
+    "geo_loss": False,
+    "gcp_loss": False,
+    "rel_loss": False,
+    "geo_schedule": "constant",
+}
+_JOINT: Flags = {**_FIXED, "optimize_cameras": True, "geo_loss": True}
+
+
+@dataclass(frozen=True)
+class Configuration:
+    """One row of the ablation.
+
+    Attributes:
+        name: as in `--configs`.
+        title: the method in a few words.
+        note: the difference from the other configurations, in a line.
+        sim3: options of `init-sim3` that make it; None: a bundle adjustment with the fixes places the model.
+        train: options of `train` that make it; those of A where `trained_by` says A.
+        trained_by: the configuration whose training it takes, itself if None.
+    """
+
+    name: str
+    title: str
+    note: str
+    sim3: Flags | None
+    train: Flags = field(default_factory=dict)
+    trained_by: str | None = None
+
+
+CONFIGURATIONS: tuple[Configuration, ...] = (
+    Configuration(
+        "baseline", "SfM-BBA + 3DGS",
+        "bundle adjustment with the fixes as priors, then cameras fixed and no geographic loss; no control points",
+        None, _FIXED,
+    ),
+    Configuration(
+        "A", "3DGS, aligned afterwards",
+        "SfM's cameras fixed, no geographic loss; similarity robustly from camera centres and fixes",
+        {"method": "robust", "control_points": False}, _FIXED,
+    ),
+    Configuration(
+        "B", "geolocation + initial similarity",
+        "the Gaussians of A, placed by the paper's similarity of the geolocated points",
+        {"method": "paper", "control_points": False}, trained_by="A",
+    ),
+    Configuration(
+        "C", "B + joint T and cameras, L_abs",
+        "similarity and cameras trained with L_abs alone, from a robust start; no control points",
+        {"method": "robust", "control_points": False}, _JOINT,
+    ),
+    Configuration(
+        "D", "C + L_gcp + L_rel",
+        "control points and relative distances too, at constant weight",
+        {"method": "robust", "control_points": True}, {**_JOINT, "gcp_loss": True, "rel_loss": True},
+    ),
+    Configuration(
+        "E", "D + adaptive weight, the full method",
+        "the weight of the geographic losses rises while training",
+        {"method": "robust", "control_points": True},
+        {**_JOINT, "gcp_loss": True, "rel_loss": True, "geo_schedule": "rising"},
+    ),
+)  # fmt: skip
+BY_CONFIGURATION = {configuration.name: configuration for configuration in CONFIGURATIONS}
+# The options that make the configurations are not for the user to set; all others of `train` are, for all alike.
+COMMON_TRAIN_OPTIONS = tuple(name for name in BY_NAME["train"].options.model_fields if name not in _FIXED)
+
+
+def select_configurations(text: str) -> tuple[Configuration, ...]:
+    """Return the configurations that are named in a text, with commas, each once.
+
+    Raises:
+        InputError: an unknown name, or none.
+    """
+    names = [name.strip() for name in text.split(",") if name.strip()]
+    unknown = [name for name in names if name not in BY_CONFIGURATION]
+    if unknown or not names:
+        known = ", ".join(BY_CONFIGURATION)
+        message = f"{unknown[0]!r} is none of {known}" if unknown else f"choose from {known}"
+        raise InputError(message, field="--configs")
+    return tuple(BY_CONFIGURATION[name] for name in dict.fromkeys(names))

@@ -1,0 +1,152 @@
+"""Surveyed points measured in the trained survey: check points, cross-validation, and residuals of the fit."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+
+from pipelines.core.errors import DegenerateGeometryError
+from pipelines.core.progress import Progress
+from pipelines.core.types import FloatArray
+from pipelines.evaluate.cramer_rao import cramer_rao_bound
+from pipelines.evaluate.error_propagation import ErrorPropagation, NoErrorPropagation
+from pipelines.evaluate.point_report import (
+    MeasuredPoints,
+    check_point_errors,
+    cross_validation_errors,
+    point_residuals,
+)
+from pipelines.evaluate.points_by_camera import points_by_camera
+from pipelines.evaluate.points_by_model import points_by_model
+from pipelines.georef.posterior import LeftOut, leave_one_out
+from pipelines.robust.statistics import residual_stats
+from pipelines.scene.marks import MarkRays, mark_rays
+from pipelines.scene.renderer import ModelRenderer
+from pipelines.scene.report import (
+    CheckPointErrors,
+    CheckPoints,
+    ControlResiduals,
+    CrossValidation,
+    Fit,
+    FixResiduals,
+    NoCrossValidation,
+)
+from pipelines.scene.solved_survey import SolvedSurvey
+from pipelines.scene.survey import SurveyedPoint
+from pipelines.scene.trained_survey import TrainedSurvey
+
+log = logging.getLogger(__name__)
+
+
+def measure_check_points(
+    renderer: ModelRenderer, propagation: ErrorPropagation | NoErrorPropagation, progress: Progress
+) -> CheckPoints:
+    """Measure the check points by camera and by model."""
+    trained = renderer.trained
+    rays = mark_rays(trained.survey.check_points, trained.sparse)
+    return CheckPoints(camera=_by_camera(trained, rays, propagation), model=_by_model(renderer, rays, progress))
+
+
+def cross_validate(
+    trained: TrainedSurvey, propagation: ErrorPropagation | NoErrorPropagation
+) -> CrossValidation | NoCrossValidation:
+    """Measure each control point by a solution without it."""
+    if isinstance(propagation, NoErrorPropagation):
+        return NoCrossValidation(count=0, reason=propagation.reason)
+    points = trained.survey.control_points
+    independent = _left_out(propagation.solved)
+    rays = mark_rays(points, trained.sparse).marks_of_point
+    return cross_validation_errors(MeasuredPoints(points, independent.error_in_geo, rays, independent.cov_in_geo))
+
+
+def fit_residuals(trained: TrainedSurvey) -> Fit:
+    """Return the residuals of fixes and control points: how the solution fits, not how accurate it is."""
+    return Fit(gnss=_fix_residuals(trained), gcp=_control_residuals(trained))
+
+
+def _by_camera(
+    trained: TrainedSurvey, rays: MarkRays, propagation: ErrorPropagation | NoErrorPropagation
+) -> CheckPointErrors:
+    """Where the rays of the marks meet, with prediction and bound."""
+    points = trained.survey.check_points
+    position = points_by_camera(trained, rays)
+    measured = _compared(points, position, rays)
+    if isinstance(propagation, NoErrorPropagation) or not points:
+        return check_point_errors(measured)
+    measured = replace(measured, cov_in_geo=propagation.prediction.of_marked_points(position, rays))
+    try:
+        bound = cramer_rao_bound(propagation.solved, rays)
+    except DegenerateGeometryError as error:
+        log.info("no Cramér–Rao bound: %s", error)
+        bound = None
+    return check_point_errors(measured, bound)
+
+
+def _by_model(renderer: ModelRenderer, rays: MarkRays, progress: Progress) -> CheckPointErrors:
+    """Where the surface of the Gaussians lies behind the marks."""
+    points, depth_m = renderer.trained.survey.check_points, _depth_maps(renderer, rays, progress)
+    pinholes = {index: renderer.pinhole(index) for index in depth_m}
+    position = points_by_model(renderer.trained, rays, depth_m, pinholes)
+    return check_point_errors(_compared(points, position, rays))
+
+
+def _depth_maps(renderer: ModelRenderer, rays: MarkRays, progress: Progress) -> dict[int, FloatArray]:
+    """Depth of the surface by camera, of those that show a mark."""
+    depth_m = {}
+    cameras = sorted({int(index) for index in rays.camera})
+    with progress.task("depth maps", len(cameras)) as task:
+        for index in cameras:
+            depth_m[index] = renderer.depth_m(index)
+            task.advance()
+    return depth_m
+
+
+def _compared(points: tuple[SurveyedPoint, ...], position_in_geo: FloatArray, rays: MarkRays) -> MeasuredPoints:
+    """Positions (J, 3) of surveyed points against their survey."""
+    surveyed = np.array([point.position_in_geo for point in points]).reshape(-1, 3)
+    return MeasuredPoints(points, position_in_geo - surveyed, rays.marks_of_point)
+
+
+def _left_out(solved: SolvedSurvey) -> LeftOut:
+    """Each control point of the survey (J) measured without it; NaN for one that entered no solution.
+
+    The covariance is that of the solution and the marks: the survey's own is taken off again.
+    """
+    points, control = solved.trained.survey.control_points, solved.problem.control
+    error, cov = np.full((len(points), 3), np.nan), np.full((len(points), 3, 3), np.nan)
+    if control is None:
+        return LeftOut(error, cov)
+    independent = leave_one_out(solved.problem)
+    used = {name: row for row, name in enumerate(control.point_id)}
+    for index, point in enumerate(points):
+        if (row := used.get(point.name)) is not None:
+            error[index] = independent.error_in_geo[row]
+            cov[index] = independent.cov_in_geo[row] - np.array(point.cov_in_geo)
+    return LeftOut(error, cov)
+
+
+def _control_residuals(trained: TrainedSurvey) -> ControlResiduals:
+    points = trained.survey.control_points
+    rays = mark_rays(points, trained.sparse)
+    measured = _compared(points, points_by_camera(trained, rays), rays)
+    stats = residual_stats(measured.error_in_geo[measured.is_measured])
+    return ControlResiduals(**stats.model_dump(), points=point_residuals(measured))
+
+
+def _fix_residuals(trained: TrainedSurvey) -> FixResiduals:
+    """Of the training cameras, outliers left out."""
+    center_in_geo = trained.geo_from_model.apply(trained.poses.cam_center_in_model)
+    outliers = set(trained.model.gnss_outliers)
+    residuals, left_out_count = [], 0
+    for index in trained.indices("train"):
+        image = trained.survey.image(trained.sparse.image_name[index])
+        if image is None or image.fix is None:
+            continue
+        if image.name in outliers:
+            left_out_count += 1
+            continue
+        residuals.append(center_in_geo[index] - np.array(image.fix.position_in_geo))
+    stats = residual_stats(np.array(residuals).reshape(-1, 3))
+    return FixResiduals(**stats.model_dump(), outliers=left_out_count)

@@ -1,0 +1,71 @@
+"""The measurements' errors, propagated to the trained survey: the basis of every predicted accuracy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pipelines.core.errors import DegenerateGeometryError
+from pipelines.evaluate.accuracy_map import AccuracyGrid, accuracy_grid
+from pipelines.evaluate.prediction import AccuracyPrediction
+from pipelines.scene.geographic_options import GeographicOptions
+from pipelines.scene.initial_similarity import InitialSimilarity
+from pipelines.scene.report import AccuracySummary
+from pipelines.scene.solved_survey import SolvedSurvey, solve_survey
+from pipelines.scene.trained_survey import TrainedSurvey
+
+
+@dataclass(frozen=True)
+class ErrorPropagation:
+    """Covariances of a trained survey that follow from its measurements.
+
+    Attributes:
+        solved: the geographic half of the training, solved.
+        prediction: covariance of any point.
+        grid: σ over the scene; None for a scene of too few points.
+    """
+
+    solved: SolvedSurvey
+    prediction: AccuracyPrediction
+    grid: AccuracyGrid | None
+
+
+@dataclass(frozen=True)
+class NoErrorPropagation:
+    """The reason why the measurements do not determine the trained survey."""
+
+    reason: str
+
+
+def propagate_errors(
+    trained: TrainedSurvey, initial: InitialSimilarity, options: GeographicOptions
+) -> ErrorPropagation | NoErrorPropagation:
+    """Return the covariances of a trained survey, or why there are none.
+
+    Args:
+        trained: the model.
+        initial: the similarity with which the training began.
+        options: those of the training.
+    """
+    try:
+        solved = solve_survey(trained, initial, options)
+        prediction = AccuracyPrediction(solved)
+        return ErrorPropagation(solved, prediction, accuracy_grid(solved, prediction))
+    except DegenerateGeometryError as error:
+        return NoErrorPropagation(str(error))
+
+
+def accuracy_summary(propagation: ErrorPropagation | NoErrorPropagation, *, of_initial: bool) -> AccuracySummary:
+    """Return the predicted accuracy over the scene in short.
+
+    Args:
+        propagation: of the trained survey.
+        of_initial: whether the points are measured with the initial similarity.
+    """
+    if isinstance(propagation, NoErrorPropagation):
+        return AccuracySummary(cells=0, reason=propagation.reason, cautions=())
+    cautions = propagation.prediction.cautions
+    if of_initial:
+        cautions += ("measured with the initial similarity: the prediction is that of the trained one",)
+    if propagation.grid is None:
+        return AccuracySummary(cells=0, reason="the scene has too few points", cautions=cautions)
+    return propagation.grid.summary(cautions)

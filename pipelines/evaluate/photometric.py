@@ -1,0 +1,100 @@
+"""The test views against their photographs; their cameras were never fitted to them (method, section 4)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from pipelines.core.progress import Progress
+from pipelines.core.types import ByteArray
+from pipelines.scene.renderer import ModelRenderer
+from pipelines.scene.report import PhotometricFigures, ViewFigures
+from pipelines.splat.exposure import fitted_affine, with_affine
+from pipelines.splat.lpips import Lpips
+from pipelines.splat.metrics import lpips, psnr, ssim
+
+# Takes the name of a photograph, and (H, 3 W, 3) RGB: the photograph, its render, their difference.
+SaveRender = Callable[[str, ByteArray], None]
+
+_DIFFERENCE_GAIN = 3
+
+
+def compare_test_views(
+    renderer: ModelRenderer,
+    lpips_weights: Path | None,
+    save_render: SaveRender,
+    progress: Progress,
+    *,
+    saved: int,
+) -> PhotometricFigures:
+    """Measure PSNR, SSIM and LPIPS of the test views.
+
+    `psnr` compares the render as it is. `psnr_compensated` first gives it the photograph's own exposure, an affine
+    change of colour fitted to that very photograph: what is left then is not a matter of exposure.
+
+    Args:
+        renderer: of the trained model.
+        lpips_weights: NPZ file; None: no LPIPS.
+        save_render: gets the first views side by side with their photographs.
+        progress: whom to tell of progress.
+        saved: number of views for `save_render`.
+    """
+    indices, views = renderer.trained.indices("test"), []
+    distance = lpips(lpips_weights)
+    with progress.task("test views", len(indices)) as task:
+        for place, index in enumerate(indices):
+            name = renderer.trained.sparse.image_name[index]
+            render = renderer.render(index).colour.clamp(0, 1).cpu()
+            photo = torch.from_numpy(np.array(renderer.images.image(index))).float() / 255.0
+            mask = torch.from_numpy(np.array(renderer.images.mask(index)))
+            views.append(_figures(name, render, photo, mask, distance if callable(distance) else None))
+            if place < saved:
+                save_render(name, _side_by_side(photo, render))
+            task.advance()
+    return PhotometricFigures(
+        views=len(views),
+        psnr=_mean(view.psnr for view in views),
+        psnr_compensated=_mean(view.psnr_compensated for view in views),
+        ssim=_mean(view.ssim for view in views),
+        lpips=_mean(view.lpips for view in views),
+        lpips_reason=None if callable(distance) else distance,
+        per_view=tuple(views),
+    )
+
+
+def write_render(folder: Path, image: str, strip: ByteArray) -> None:
+    """Write a photograph and its render, side by side (H, 3 W, 3) RGB, as PNG."""
+    cv2.imwrite(str(folder / render_name(image)), np.ascontiguousarray(strip[..., ::-1]))
+
+
+def render_name(image: str) -> str:
+    """Return the file name of an image's render, folders included: images in two folders may share their names."""
+    return Path(image).with_suffix(".png").as_posix().replace("/", "_")
+
+
+def _figures(name: str, render: Tensor, photo: Tensor, mask: Tensor, distance: Lpips | None) -> ViewFigures:
+    """Of a render (H, W, 3) against its photograph, colours from 0 to 1, where the mask (H, W) is true."""
+    return ViewFigures(
+        image=name,
+        psnr=psnr(render, photo, mask),
+        psnr_compensated=psnr(with_affine(render, fitted_affine(render, photo, mask)), photo, mask),
+        ssim=ssim(render, photo, mask),
+        lpips=None if distance is None else distance(render, photo, mask),
+    )
+
+
+def _mean(values: Iterable[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return float(np.mean(np.array(known, dtype=np.float64))) if known else None
+
+
+def _side_by_side(photo: Tensor, render: Tensor) -> ByteArray:
+    """Photograph, render, and their difference (× 3): (H, 3 W, 3)."""
+    difference = (_DIFFERENCE_GAIN * (photo - render).abs()).clamp(0, 1)
+    strip = torch.cat([photo, render, difference], dim=1).mul(255).round().byte()
+    return np.asarray(strip.numpy())

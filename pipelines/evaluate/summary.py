@@ -1,0 +1,55 @@
+"""The headline, figures and warnings of an evaluation."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pipelines.core.workspace import Summary
+from pipelines.evaluate.asprs import LEAST_POINTS, few_points
+from pipelines.scene.report import CheckPointErrors, CheckPoints, EvaluationReport
+
+_NAMES_SHOWN = 8
+
+
+def summarise(report: EvaluationReport) -> Summary:
+    """Return what the command line says of a report."""
+    test, ways = report.photometric.test, _by_way(report.checkpoints)
+    parts = [f"test PSNR {test.psnr:.2f} dB" if test.psnr is not None else "no test views"]
+    parts += [f"check points by {way} {errors.mean_h_m:.3f} m H" for way, errors in ways.items() if errors.count]
+    values: dict[str, Any] = {
+        "views": test.views,
+        "psnr": test.psnr,
+        "psnr_compensated": test.psnr_compensated,
+        "ssim": test.ssim,
+    }
+    for way, errors in ways.items():
+        values |= {
+            f"{way}_count": errors.count,
+            f"{way}_mean_h_m": errors.mean_h_m,
+            f"{way}_rmse_h_m": errors.rmse_h_m,
+            f"{way}_rmse_v_m": errors.rmse_v_m,
+            f"{way}_rmse_3d_m": errors.rmse_3d_m,
+        }
+    return Summary(", ".join(parts), values, _warnings(report))
+
+
+def _by_way(checkpoints: CheckPoints) -> dict[str, CheckPointErrors]:
+    return {"camera": checkpoints.camera, "model": checkpoints.model}
+
+
+def _warnings(report: EvaluationReport) -> tuple[str, ...]:
+    warnings = list(report.accuracy.cautions)
+    count = report.checkpoints.camera.count
+    if 0 < count < LEAST_POINTS:
+        warnings.append(few_points(count))
+    for way, errors in _by_way(report.checkpoints).items():
+        if errors.blunders:
+            more = " …" if len(errors.blunders) > _NAMES_SHOWN else ""
+            warnings.append(
+                f"by {way}, {len(errors.blunders)} of {errors.count} check points are off by more than three times "
+                f"the class that the others meet: {', '.join(errors.blunders[:_NAMES_SHOWN])}{more}"
+            )
+    crossed = report.cross_validation
+    if crossed is not None and crossed.reason is not None:
+        warnings.append(f"no cross-validation: {crossed.reason}")
+    return tuple(warnings)

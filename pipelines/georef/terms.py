@@ -1,0 +1,230 @@
+"""The terms of the adjustment (GeoRefGS section 2.4, doi 10.3390/drones10030195), in float64.
+
+A term is the observations of one kind: residuals against an estimate, their root information, and their share in
+the loss. A new measurement is one subclass of `Term`; nothing else knows which terms there are. Residuals are
+whitened by their covariance: each term is half of a χ² and the whole a maximum a posteriori estimate; `paper`
+takes plain mean squares in metres instead. A Cauchy kernel bounds the effect of one bad fix.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from typing import ClassVar, Literal, TypeVar
+
+import torch
+from torch import Tensor
+
+from pipelines.georef.estimate import Estimate
+from pipelines.georef.so3 import exp_so3, log_so3
+from pipelines.robust.kernels import CAUCHY_SCALE2
+
+RecordT = TypeVar("RecordT")
+Weighting = Literal["whitened", "paper"]
+
+
+def cauchy(chi2: Tensor, dimension: int) -> Tensor:
+    """Return Cauchy's ρ of squared whitened residuals (N,) of a dimension: c² ln(1 + χ²/c²)."""
+    scale2 = CAUCHY_SCALE2[dimension]
+    return scale2 * torch.log1p(chi2 / scale2)
+
+
+def moved_tensors(record: RecordT, move: Callable[[Tensor], Tensor]) -> RecordT:
+    """Return a dataclass with every tensor replaced by `move` of it: to another device, say."""
+    tensors = {
+        field.name: move(getattr(record, field.name))
+        for field in fields(record)  # type: ignore[arg-type]
+        if isinstance(getattr(record, field.name), Tensor)
+    }
+    return replace(record, **tensors)  # type: ignore[type-var]
+
+
+class Term(ABC):
+    """M observations of one kind.
+
+    Attributes:
+        kind: name in losses, metrics and normal equations.
+        dimension: d, of a residual.
+        measures: whether the observations are measurements of their own. A term that repeats what others say
+            steadies the training and has no part in the posterior.
+        in_metres: whether the residuals are lengths, which plain mean squares take as they are.
+        root_information: (M, d, d) float64, W with WᵀW = Σ⁻¹.
+        share: what each observation counts for in the loss, 0 to 1.
+    """
+
+    kind: ClassVar[str]
+    dimension: ClassVar[int] = 3
+    measures: ClassVar[bool] = True
+    in_metres: ClassVar[bool] = True
+
+    root_information: Tensor
+    share: float = 1.0
+
+    @abstractmethod
+    def residuals(self, at: Estimate) -> Tensor:
+        """Return the residuals (M, d), predicted minus measured, in metres or radians."""
+
+    def __len__(self) -> int:
+        return len(self.root_information)
+
+    def whitened(self, at: Estimate) -> Tensor:
+        """Return the residuals (M, d) in units of their σ."""
+        return (self.root_information @ self.residuals(at)[:, :, None])[:, :, 0]
+
+
+@dataclass(frozen=True)
+class FixTerm(Term):
+    """Measured centres of F training cameras: the term L_abs.
+
+    Attributes:
+        camera: (F,) int64 index into the cameras.
+        position_in_geo: (F, 3) float64 metres.
+        root_information: (F, 3, 3) float64.
+        flight: (F,) int64, the flight that each was measured in; None: all in one.
+    """
+
+    kind: ClassVar[str] = "absolute"
+
+    camera: Tensor
+    position_in_geo: Tensor
+    root_information: Tensor
+    flight: Tensor | None = None
+
+    def residuals(self, at: Estimate) -> Tensor:
+        """Return T(c_i) + lever arm + bias − C_i (F, 3) in metres."""
+        predicted = at.geo_from_model.apply(at.center[self.camera])
+        if at.errors.arm_m is not None:
+            predicted = predicted + at.geo_from_cam(self.camera) @ at.errors.arm_m
+        if at.errors.bias_m is not None:
+            predicted = predicted + (at.errors.bias_m[0] if self.flight is None else at.errors.bias_m[self.flight])
+        return predicted - self.position_in_geo
+
+
+@dataclass(frozen=True)
+class ControlTerm(Term):
+    """Control points against the intersection of their image marks: the term L_gcp; J points, K marks in all.
+
+    Attributes:
+        point: (K,) int64 index into the points.
+        camera: (K,) int64 index into the cameras.
+        bearing_in_cam: (K, 3) float64 unit vectors.
+        sigma_rad: (K,) float64 angular σ of a mark.
+        position_in_geo: (J, 3) float64 metres, surveyed.
+        root_information: (J, 3, 3) float64 of survey and intersection together, and of the surface where the points
+            are found by depth.
+        point_id: of the points (J), as in the survey.
+        bearing_by_lens: (K, 3, L) float64, derivative of the bearings by the lens parameters, in the order of
+            `geometry.lens.Lenses`; None: the lens that they were read through is taken for exact.
+    """
+
+    kind: ClassVar[str] = "control"
+
+    point: Tensor
+    camera: Tensor
+    bearing_in_cam: Tensor
+    sigma_rad: Tensor
+    position_in_geo: Tensor
+    root_information: Tensor
+    point_id: tuple[str, ...] = ()
+    bearing_by_lens: Tensor | None = None
+
+    def residuals(self, at: Estimate) -> Tensor:
+        """Return T(x_j) − X_j (J, 3) in metres, x_j intersected from its marks and the cameras."""
+        return at.geo_from_model.apply(self.intersected(at)) - self.position_in_geo
+
+    def bearings(self, lens: Tensor) -> Tensor:
+        """Return unit vectors (K, 3) with the lens changed by (L,), to first order; L = 0: as it was."""
+        if self.bearing_by_lens is None or not len(lens):
+            return self.bearing_in_cam
+        return torch.nn.functional.normalize(self.bearing_in_cam + self.bearing_by_lens @ lens, dim=1)
+
+    def intersected(self, at: Estimate) -> Tensor:
+        """Return points (J, 3) in `model` nearest to the rays of their marks, differentiable in cameras and lens.
+
+        Rays are weighted by the inverse of their lateral σ at the point (angular σ × distance); GeoRefGS eqs 4–8.
+        """
+        rotation, center = at.rotation[self.camera], at.center[self.camera]
+        direction = (rotation.transpose(1, 2) @ self.bearings(at.lens)[:, :, None])[:, :, 0]
+        projector = torch.eye(3, dtype=direction.dtype, device=direction.device) - (
+            direction[:, :, None] * direction[:, None, :]
+        )
+        weight = 1.0 / self.sigma_rad**2
+        point = torch.zeros(0)
+        for _ in range(2):  # the second pass knows the distances
+            normal = self._sum_by_point(weight[:, None, None] * projector)
+            right = self._sum_by_point(weight[:, None, None] * (projector @ center[:, :, None]))
+            point = torch.linalg.solve_ex(normal, right).result[:, :, 0]  # `solve` would wait for the device
+            distance = (point[self.point] - center).norm(dim=1)
+            weight = 1.0 / (self.sigma_rad * distance) ** 2
+        return point
+
+    def _sum_by_point(self, values: Tensor) -> Tensor:
+        total = torch.zeros((len(self), *values.shape[1:]), dtype=values.dtype, device=values.device)
+        return total.index_add(0, self.point, values)
+
+
+@dataclass(frozen=True)
+class AttitudeTerm(Term):
+    """Recorded rotations of A training cameras: the term L_att.
+
+    Attributes:
+        camera: (A,) int64 index into the cameras.
+        geo_from_cam: (A, 3, 3) float64, of the nominal camera axes.
+        root_information: (A, 3, 3) float64, in 1/rad.
+    """
+
+    kind: ClassVar[str] = "attitude"
+    in_metres: ClassVar[bool] = False
+
+    camera: Tensor
+    geo_from_cam: Tensor
+    root_information: Tensor
+
+    def residuals(self, at: Estimate) -> Tensor:
+        """Return Log(R_iᵀ G_i B) (A, 3) in radians, from a camera to its recorded axes less the boresight B."""
+        turned = at.geo_from_cam(self.camera)
+        recorded = self.geo_from_cam
+        if at.errors.common_rad is not None:
+            turned = exp_so3(at.errors.common_rad) @ turned
+        if at.errors.boresight_rad is not None:
+            recorded = recorded @ exp_so3(at.errors.boresight_rad)
+        return log_so3(turned.transpose(1, 2) @ recorded)
+
+
+@dataclass(frozen=True)
+class DistanceTerm(Term):
+    """Distances between P pairs of points that were located on Earth, or of cameras with fixes: the term L_rel.
+
+    The distances are functions of the fixes, not measurements of their own.
+
+    Points stay where SfM put them. They would follow the cameras' corrections; but these are such that the points
+    keep their mean place, turn and size (`geometry.bundle.correction_basis`), so that fixed ones are right to first
+    order for what the pairs can say: the scale.
+
+    Attributes:
+        distance_in_model: (P,) float64; None: of the cameras below.
+        camera: (P, 2) int64 indices into the cameras; None: fixed points of the scene.
+        distance_in_geo: (P,) float64 metres.
+        root_information: (P, 1, 1) float64, 1/σ of the measured distance in 1/m.
+        share: see `scale_share`.
+    """
+
+    kind: ClassVar[str] = "relative"
+    dimension: ClassVar[int] = 1
+    measures: ClassVar[bool] = False
+
+    distance_in_model: Tensor | None
+    camera: Tensor | None
+    distance_in_geo: Tensor
+    root_information: Tensor
+    share: float = 1.0
+
+    def residuals(self, at: Estimate) -> Tensor:
+        """Return s |x_i − x_j| − |X_i − X_j| (P, 1) in metres."""
+        if self.camera is None:
+            assert self.distance_in_model is not None
+            distance = self.distance_in_model
+        else:
+            distance = (at.center[self.camera[:, 0]] - at.center[self.camera[:, 1]]).norm(dim=1)
+        return (at.geo_from_model.scale * distance - self.distance_in_geo)[:, None]

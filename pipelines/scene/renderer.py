@@ -1,0 +1,53 @@
+"""Renders of the trained model from its own cameras."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from pipelines.core.types import FloatArray
+from pipelines.geometry.cameras import Pinhole
+from pipelines.scene.photographs import ImageCache
+from pipelines.scene.trained_survey import TrainedSurvey, trained_pinholes
+from pipelines.splat.depth import measured_depth
+from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings, Render
+
+
+class ModelRenderer:
+    """Renders the trained model from its own cameras, at the size of the training photographs.
+
+    Args:
+        trained: the model.
+        images: its undistorted photographs.
+        backend: the rasteriser.
+    """
+
+    def __init__(self, trained: TrainedSurvey, images: ImageCache, backend: Rasterizer) -> None:
+        self.trained, self.images = trained, images
+        self._backend = backend
+        self._pinholes = trained_pinholes(trained, images)
+        device = torch.device("cuda" if backend.name == "cuda" else "cpu")
+        self._gaussians = trained.gaussians.to(device)
+
+    def pinhole(self, index: int) -> Pinhole:
+        """Return camera `index` at the size of its render."""
+        return self._pinholes.of(index)
+
+    def render(self, index: int, *, depth: bool = False) -> Render:
+        """Render the view of camera `index` without gradients."""
+        model, poses = self.trained.model, self.trained.poses
+        matrix = np.eye(4)
+        matrix[:3, :3] = poses.cam_from_model[index]
+        matrix[:3, 3] = -poses.cam_from_model[index] @ poses.cam_center_in_model[index]
+        settings = RasterSettings(sh_degree=model.sh_degree, background=model.background, depth=depth)
+        cam_from_model = torch.as_tensor(matrix, dtype=torch.float32, device=self._gaussians.means.device)
+        with torch.no_grad():
+            return self._backend.render(self._gaussians, cam_from_model, self.pinhole(index), settings)
+
+    def depth_m(self, index: int) -> FloatArray:
+        """Return the depth (H, W) of the surface along the z axis of camera `index`; 0 where there is none."""
+        view = self.render(index, depth=True)
+        assert view.median_depth is not None and view.expected_depth is not None
+        assert view.depth_variance is not None  # of every render with depth
+        depth = measured_depth(view.median_depth, view.expected_depth, view.depth_variance)
+        return np.asarray(depth.cpu().numpy())

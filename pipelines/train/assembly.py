@@ -1,0 +1,81 @@
+"""The trainer, put together from scene, measurements and options."""
+
+from __future__ import annotations
+
+import torch
+
+from pipelines.georef.problem import GeoProblem
+from pipelines.scene.photographs import ImageCache
+from pipelines.scene.scene import Scene
+from pipelines.splat.densify import DefaultSettings, DefaultStrategy, Strategy
+from pipelines.splat.densify_fast import FastSettings, FastStrategy
+from pipelines.splat.densify_mcmc import McmcSettings, McmcStrategy
+from pipelines.splat.exposure import Exposures
+from pipelines.splat.initialise import InitialisationOptions, scene_extent
+from pipelines.splat.memory import TrainingSize
+from pipelines.splat.optimizer import GaussianAdam
+from pipelines.splat.rasterizer.api import Rasterizer
+from pipelines.splat.rasterizer.backends import device_of
+from pipelines.splat.surface import SurfaceSettings
+from pipelines.train.initial_gaussians import TrainingScene, initial_gaussians, points_to_hold
+from pipelines.train.options import TrainOptions
+from pipelines.train.presets import effort
+from pipelines.train.schedule import JointOptions
+from pipelines.train.trainer import JointTrainer, TrainingViews
+
+# Shrunken so much, up to this fraction of the training. More would push Gaussians, which are then smaller than a
+# pixel, off the surface that they start on.
+_COARSE = ((2, 0.3),)
+
+
+def training_size(scene: Scene, images: ImageCache, options: TrainOptions) -> TrainingSize:
+    """Return what the memory of a training depends on."""
+    cameras = [images.pinhole(index) for index in map(int, scene.train)]
+    largest = max(cameras, key=lambda camera: camera.width * camera.height)
+    corrected = len(images) if options.optimize_cameras else 0
+    return TrainingSize(effort(options).max_gaussians, largest, options.sh_degree, corrected)
+
+
+def make_trainer(
+    training: TrainingScene, problem: GeoProblem, backend: Rasterizer, options: TrainOptions
+) -> JointTrainer:
+    """Return Gaussians on the surface, and everything that moves them.
+
+    Raises:
+        DegenerateGeometryError: too few SfM points.
+    """
+    preset, device = effort(options), device_of(backend)
+    scene, images = training.scene, training.images
+    start = InitialisationOptions(sh_degree=options.sh_degree, max_gaussians=preset.max_gaussians)
+    gaussians = initial_gaussians(training, start, preset.max_gaussians, options.seed).to(device)
+    extent_m = scene_extent(scene.poses.cam_center_in_model)
+    train = torch.from_numpy(scene.train)
+    hold = points_to_hold(training, device) if options.faithful_surface else None
+    return JointTrainer(
+        GaussianAdam(gaussians, extent_m, preset.iterations),
+        _strategy(options, extent_m, len(gaussians)),
+        problem.to(device),
+        TrainingViews(scene.train, images, hold, scene.sparse.lenses),
+        rasterizer=backend,
+        options=JointOptions(
+            preset.iterations,
+            options.sh_degree,
+            geo_weight=options.geo_weight,
+            geo_schedule=options.geo_schedule,
+            seed=options.seed,
+            coarse=_COARSE if options.coarse_to_fine else (),
+            surface=SurfaceSettings() if options.faithful_surface else None,
+        ),
+        exposures=Exposures(len(images), train, preset.iterations, device) if options.exposure else None,
+    )
+
+
+def _strategy(options: TrainOptions, extent_m: float, count: int) -> Strategy:
+    iterations, most = effort(options).iterations, effort(options).max_gaussians
+    if options.strategy == "mcmc":
+        return McmcStrategy(McmcSettings.for_iterations(iterations, count, most), extent_m, options.seed)
+    settings = DefaultSettings.for_iterations(iterations, most)
+    if options.strategy == "fast":
+        fast = FastSettings.for_iterations(iterations)
+        return FastStrategy(settings, fast, extent_m, count, options.seed)
+    return DefaultStrategy(settings, extent_m, count, options.seed)

@@ -1,0 +1,143 @@
+"""The product of a training, and the summary and warnings that go with it."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from pipelines.core.workspace import Summary
+from pipelines.geometry.rotations import quat_xyzw_from_matrix
+from pipelines.georef.posterior import covariances
+from pipelines.georef.problem import GeoProblem
+from pipelines.georef.terms import ControlTerm, FixTerm
+from pipelines.scene.scene import Scene
+from pipelines.scene.trained_model import EstimatedError, TrainedCamera, TrainedLens, TrainedModel
+from pipelines.train.loop import TrainingRecord
+from pipelines.train.trainer import JointTrainer
+
+_EVIDENT_SIGMAS = 3.0
+_CAUSES = {
+    "bias": "Check the base station, the vertical datum and the antenna offset",
+    "lever-arm": "`georef ingest --lever-arm` can apply it, in the axes of the body",
+    "boresight": "`georef ingest --boresight` can apply it",
+}
+
+
+def trained_model(trainer: JointTrainer, scene: Scene) -> TrainedModel:
+    """Return the product of `train` beside the Gaussians."""
+    problem, gaussians = trainer.problem, trainer.optimizer.gaussians
+    similarity, control = problem.similarity, problem.control
+    measured = problem.fixes is not None or control is not None
+    covariance, of_errors = covariances(problem) if measured else (similarity.prior_covariance(), None)
+    estimates = () if of_errors is None else problem.errors.estimates(of_errors)
+    return TrainedModel(
+        geo_from_model=similarity.current().to_record(
+            "model", "geo", covariance=covariance, pivot=similarity.pivot_in_geo
+        ),
+        model_from_local=scene.model_from_local.to_record("local", "model"),
+        max_image_size=trainer.views.images.max_size_px,
+        cameras=_cameras(trainer, scene),
+        lenses=_lenses(trainer, scene),
+        background=trainer.options.background,
+        sh_degree=gaussians.sh_degree,
+        iterations=trainer.iteration,
+        gaussians=len(gaussians),
+        backend=trainer.rasterizer.name,
+        gnss_outliers=_contradicting_fixes(problem, scene),
+        control_outliers=()
+        if control is None
+        else tuple(control.point_id[row] for row in problem.contradicting(ControlTerm)),
+        estimated_errors=tuple(EstimatedError.model_validate(asdict(estimate)) for estimate in estimates),
+    )
+
+
+def summary_of(model: TrainedModel, metrics: list[dict[str, Any]], record: TrainingRecord) -> Summary:
+    """Return headline, values and warnings of a training.
+
+    Args:
+        model: its product.
+        metrics: rows of `metrics.jsonl`.
+        record: time and incidents.
+    """
+    psnr = float(np.mean([row["psnr"] for row in metrics[-20:]]))
+    sigma = np.sqrt(np.diag(np.array(model.geo_from_model.covariance)))
+    values = {
+        "iterations": model.iterations,
+        "gaussians": model.gaussians,
+        "train_psnr": round(psnr, 3),
+        "seconds": round(record.seconds, 1),
+        "seconds_per_iteration": round(record.seconds / model.iterations, 4),
+        "similarity_sigma_m": [round(float(value), 5) for value in sigma[4:]],
+        "gnss_outliers": list(model.gnss_outliers),
+        "control_outliers": list(model.control_outliers),
+        "estimated_errors": [error.model_dump() for error in model.estimated_errors],
+    }
+    return Summary(
+        f"{model.gaussians} gaussians, train PSNR {psnr:.2f} dB", values, tuple(_warnings(model, record))
+    )
+
+
+def _warnings(model: TrainedModel, record: TrainingRecord) -> list[str]:
+    warnings = []
+    for names, kind in ((model.gnss_outliers, "fixes"), (model.control_outliers, "control points")):
+        if names:
+            warnings.append(f"{len(names)} {kind} contradict the cameras: {', '.join(names[:5])}")
+    warnings += [text for error in model.estimated_errors if (text := _warning_of(error)) is not None]
+    return warnings if record.recovery is None else [*warnings, record.recovery]
+
+
+def _warning_of(error: EstimatedError) -> str | None:
+    """A warning of an error beyond 3 σ, or of one that could not be observed."""
+    axes = "east, north, up" if error.name == "bias" else "right, down, forward"
+    flight = "" if error.flight is None else f" of flight {error.flight + 1}"
+    subject = f"{error.name}{flight}"
+    values = ", ".join(f"{value:+.3f} ± {sigma:.3f}" for value, sigma in zip(error.value, error.sigma, strict=True))
+    evident = [
+        abs(value) > _EVIDENT_SIGMAS * sigma and observed
+        for value, sigma, observed in zip(error.value, error.sigma, error.observed, strict=True)
+    ]
+    if any(evident):
+        return (
+            f"{subject} of ({values}) {error.unit} {axes}, beyond 3 σ: it is taken out here. {_CAUSES[error.name]}"
+        )
+    if not all(error.observed):
+        return f"{subject} is not observable along every axis: ({values}) {error.unit} {axes}"
+    return None
+
+
+def _contradicting_fixes(problem: GeoProblem, scene: Scene) -> tuple[str, ...]:
+    fixes = problem.fixes
+    if fixes is None:
+        return ()
+    rows = problem.contradicting(FixTerm)
+    return tuple(sorted(scene.sparse.image_name[int(fixes.camera[row])] for row in rows))
+
+
+def _cameras(trainer: JointTrainer, scene: Scene) -> tuple[TrainedCamera, ...]:
+    poses, train = trainer.problem.cameras.current(), set(map(int, scene.train))
+    exposure = None if trainer.exposures is None else trainer.exposures.affine.cpu().numpy().astype(float)
+    quats = quat_xyzw_from_matrix(poses.cam_from_model)
+    translations = -np.einsum("nij,nj->ni", poses.cam_from_model, poses.cam_center_in_model)
+    return tuple(
+        TrainedCamera(
+            name=name,
+            split="train" if index in train else "test",
+            quat_xyzw=tuple(quats[index]),
+            translation=tuple(translations[index]),
+            exposure=None if exposure is None or index not in train else tuple(map(tuple, exposure[index])),
+        )
+        for index, name in enumerate(scene.sparse.image_name)
+    )
+
+
+def _lenses(trainer: JointTrainer, scene: Scene) -> tuple[TrainedLens, ...]:
+    """The lenses that have followed the cameras; none where they stayed."""
+    change = trainer.problem.cameras.lens().detach().cpu().numpy()
+    if not len(change):
+        return ()
+    return tuple(
+        TrainedLens(camera_id=key, model=camera.model, params=tuple(camera.params.tolist()))
+        for key, camera in scene.sparse.lenses.moved(change).cameras.items()
+    )

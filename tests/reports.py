@@ -1,0 +1,87 @@
+"""Reports of `evaluate`: made up for tests of those who read them, and as scripts read them."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from pipelines.core.stages import REPORT
+from pipelines.core.workspace import Workspace
+from pipelines.robust.statistics import ResidualStats
+from pipelines.scene.report import (
+    AccuracySummary,
+    AsprsStatement,
+    CheckPointErrors,
+    CheckPoints,
+    ControlResiduals,
+    CrossValidation,
+    ErrorStats,
+    EvaluationReport,
+    Fit,
+    FixResiduals,
+    Photometric,
+    PhotometricFigures,
+    SimilaritySigma,
+    read_report,
+    write_report,
+)
+
+_NO_STATEMENT = AsprsStatement(
+    horizontal_class=None, vertical_class=None, least_points=30, enough_points=False, statement=None
+)
+
+
+def check_points_with(**figures: Any) -> CheckPointErrors:
+    """Check points with the given figures and no others; none were measured if there are no figures."""
+    unknown = {"survey": None, "with_survey": None, "predicted": None, "cramer_rao": None, "without_blunders": None}
+    nothing = {**dict.fromkeys(ErrorStats.model_fields), **unknown, "count": 0, "blunders": (), "points": ()}
+    return CheckPointErrors(**{**nothing, "asprs": _NO_STATEMENT, **figures})
+
+
+def cross_validation_with(**figures: Any) -> CrossValidation:
+    """Control points left out, with the given figures and no others."""
+    stated = check_points_with(**figures).model_dump(exclude={"asprs", "cramer_rao"})
+    return CrossValidation(**stated, reason=None)
+
+
+def report_with(
+    *,
+    test: dict[str, Any] | None = None,
+    camera: CheckPointErrors | None = None,
+    model: CheckPointErrors | None = None,
+    crossed: CrossValidation | None = None,
+    gnss: dict[str, Any] | None = None,
+    cautions: tuple[str, ...] = (),
+) -> EvaluationReport:
+    """A report with the given parts; nothing was measured of the others.
+
+    Args:
+        test: photometric figures.
+        gnss: figures of the residuals of the fixes.
+    """
+    no_views = dict.fromkeys(("psnr", "psnr_compensated", "ssim", "lpips"))
+    no_residuals = {**dict.fromkeys(ResidualStats.model_fields), "count": 0}
+    return EvaluationReport(
+        photometric=Photometric(
+            test=PhotometricFigures(**{"views": 0, **no_views, "per_view": (), **(test or {})})
+        ),
+        checkpoints=CheckPoints(camera=camera or check_points_with(), model=model or check_points_with()),
+        cross_validation=crossed,
+        accuracy=AccuracySummary(cells=0, reason="the scene has too few points", cautions=cautions),
+        fit=Fit(
+            gnss=FixResiduals(**{**no_residuals, "outliers": 0, **(gnss or {})}),
+            gcp=ControlResiduals(**no_residuals, points=()),
+        ),
+        similarity=SimilaritySigma(sigma_ln_scale=1e-4, sigma_translation_m=(0.01, 0.01, 0.02)),
+    )
+
+
+def report_of(workspace: Workspace) -> dict[str, Any]:
+    """The report as scripts read it; every one must survive reading and writing to the last character."""
+    path = workspace.path(REPORT)
+    text = path.read_text(encoding="utf-8")
+    copy = workspace.root / "report_copy.json"
+    write_report(read_report(path), copy)
+    assert copy.read_text(encoding="utf-8") == text
+    document: dict[str, Any] = json.loads(text)
+    return document
