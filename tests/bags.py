@@ -1,4 +1,4 @@
-"""Tiny bags by rosbags' writer: one and the same flight, told by every message type and in every convention."""
+"""Tiny bags by rosbags' writer: the same flight in every message type and in every convention."""
 
 from __future__ import annotations
 
@@ -48,12 +48,12 @@ class Flight:
         return START + 20_000_000 * np.arange(-25, 50 * self.count)
 
     def camera(self, time_ns: np.ndarray) -> np.ndarray:
-        """Camera centres (N, 3) in the frame at ORIGIN; exactly linear, so that interpolation adds nothing."""
+        """Return camera centres (N, 3) in the frame at ORIGIN, exactly linear: interpolation adds no error."""
         t = (time_ns - START) / 1e9
         return np.stack([5.0 * t, 20.0 - 3.0 * t, 60.0 + 0.5 * t], axis=1)
 
     def enu_from_body(self, time_ns: np.ndarray) -> np.ndarray:
-        """Attitudes (N, 3, 3) of the body, forward-right-down, in the frame at ORIGIN."""
+        """Return attitudes (N, 3, 3) of the body, forward-right-down, in the frame at ORIGIN."""
         t = (time_ns - START) / 1e9
         angles = np.stack([40.0 + 7.0 * t, 3.0 * np.sin(t), 4.0 * np.cos(t)], axis=1)
         return ENU_FROM_NED @ Rotation.from_euler("ZYX", angles, degrees=True).as_matrix()
@@ -123,14 +123,14 @@ def transforms(flight: Flight, base: str = "base_link", topic: str = "/tf_static
         ("gnss", from_frd @ flight.arm, np.eye(3)),
     ]
     kind = "tf2_msgs/msg/TFMessage"
-    made = [
+    stamped = [
         make(
             "geometry_msgs/msg/TransformStamped", header(START, base), child,
             make("geometry_msgs/msg/Transform", vector(shift), quaternion(turn)),
         )
         for child, shift, turn in links
     ]  # fmt: skip
-    return topic, kind, START - 500_000_000, make(kind, made)
+    return topic, kind, START - 500_000_000, make(kind, stamped)
 
 
 def fix(ns: int, lla: Iterable[float], status: int = 2, covariance_type: int = 2, sigma: float = 0.02) -> Any:
@@ -149,7 +149,7 @@ def fixes(flight: Flight, topic: str = "/gnss/fix") -> list[Message]:
 
 
 def at_place(flight: Flight, ns: np.ndarray) -> np.ndarray:
-    """Attitudes against north and up where they are measured, as instruments tell them."""
+    """Return attitudes against north and up at their own places, as instruments measure them."""
     place = lla_from_enu(flight.camera(ns), ORIGIN)
     return np.swapaxes(geo_from_enu_at(place, ORIGIN), -1, -2) @ flight.enu_from_body(ns)
 
@@ -158,21 +158,21 @@ def imu(flight: Flight, frame: str = "base_link", topic: str = "/imu/data") -> l
     ned = frame.endswith("_ned")
     kind = "sensor_msgs/msg/Imu"
     covariance = np.eye(3).ravel() * np.radians(0.4) ** 2
-    found = []
+    messages = []
     for ns, enu_from_frd in zip(flight.imu_ns, at_place(flight, flight.imu_ns), strict=True):
         turn = ENU_FROM_NED.T @ enu_from_frd if ned else enu_from_frd @ FLU
         message = make(
             kind, header(ns, frame), quaternion(turn), covariance, vector(np.zeros(3)), np.zeros(9),
             vector(np.zeros(3)), np.zeros(9),
         )  # fmt: skip
-        found.append((topic, kind, int(ns), message))
-    return found
+        messages.append((topic, kind, int(ns), message))
+    return messages
 
 
 def poses(flight: Flight, kind: str, world: str = "map", body: str = "base_link") -> list[Message]:
-    """Camera positions and body attitudes in a local frame, as Odometry or either kind of pose."""
+    """Return camera positions and body attitudes in a local frame, as Odometry or either kind of pose."""
     times = flight.fix_ns
-    found = []
+    messages = []
     for ns, place, enu_from_frd in zip(times, flight.camera(times), flight.enu_from_body(times), strict=True):
         from_enu = ENU_FROM_NED.T if world.endswith("_ned") else np.eye(3)
         frd_from_body = {"base_link": FLU, "base_link_frd": np.eye(3), "camera_optical": flight.cam_from_body.T}[
@@ -192,18 +192,18 @@ def poses(flight: Flight, kind: str, world: str = "map", body: str = "base_link"
             message = make(kind, header(ns, world), pose)
         else:
             message = make(kind, header(ns, world), make("geometry_msgs/msg/PoseWithCovariance", pose, covariance))
-        found.append(("/localization", kind, int(ns), message))
-    return found
+        messages.append(("/localization", kind, int(ns), message))
+    return messages
 
 
 def usual(flight: Flight) -> list[Message]:
-    """NavSatFix, Imu, CameraInfo and /tf_static beside the photographs."""
+    """Return NavSatFix, Imu, CameraInfo and /tf_static beside the photographs."""
     return [transforms(flight), info(flight), *fixes(flight), *imu(flight), *images(flight)]
 
 
 @dataclass(frozen=True)
 class Form:
-    """How a bag is stored."""
+    """Storage of a bag."""
 
     storage: StoragePlugin = StoragePlugin.MCAP
     compression: CompressionMode | None = None
@@ -217,7 +217,7 @@ def write(path: Path, messages: list[Message], form: Form = Form()) -> Path:
         writer.set_compression(form.compression, CompressionFormat.ZSTD)
     with writer:
         links: dict[str, Any] = {}
-        for topic, kind, ns, message in sorted(messages, key=lambda one: one[2]):
+        for topic, kind, ns, message in sorted(messages, key=lambda message: message[2]):
             if topic not in links:
                 stated = {"msgdef": form.definitions[kind], "rihs01": "-"} if kind in form.definitions else {}
                 links[topic] = writer.add_connection(topic, kind, typestore=TYPES, **stated)
@@ -227,16 +227,16 @@ def write(path: Path, messages: list[Message], form: Form = Form()) -> Path:
 
 
 def expected(flight: Flight, origin: Origin) -> tuple[np.ndarray, np.ndarray]:
-    """Camera centres (N, 3) and rotations geo ← camera (N, 3, 3) in the frame at another origin."""
+    """Return camera centres (N, 3) and rotations geo ← camera (N, 3, 3) in the frame at another origin."""
     lla = lla_from_enu(flight.camera(flight.image_ns), ORIGIN)
     turn = geo_from_enu_at(lla_from_enu(np.zeros(3), ORIGIN), origin)
     return enu_from_lla(lla, origin), turn @ flight.enu_from_body(flight.image_ns) @ flight.cam_from_body.T
 
 
 def raw_images(flight: Flight, encoding: str, coded_of: Callable[[np.ndarray], np.ndarray]) -> list[Message]:
-    """Photographs as `sensor_msgs/Image` with seven bytes of padding a row."""
+    """Return photographs as `sensor_msgs/Image` with seven bytes of padding a row."""
     kind = "sensor_msgs/msg/Image"
-    found: list[Message] = []
+    messages: list[Message] = []
     for i, ns in enumerate(flight.image_ns):
         rows = np.ascontiguousarray(coded_of(picture(i))).view(np.uint8).reshape(48, -1)
         padded = np.pad(rows, ((0, 0), (0, 7)))
@@ -244,12 +244,12 @@ def raw_images(flight: Flight, encoding: str, coded_of: Callable[[np.ndarray], n
         message = make(
             kind, header(ns, "camera_optical"), 48, 64, encoding, 0, step, padded.ravel()
         )  # fmt: skip
-        found.append(("/camera/image_raw", kind, int(ns), message))
-    return found
+        messages.append(("/camera/image_raw", kind, int(ns), message))
+    return messages
 
 
 def coded(bgr: np.ndarray, encoding: str) -> np.ndarray:
-    """A picture (48, 64) of one colour as a mosaic or as YUV 4:2:2 (BT.601, studio range)."""
+    """Return a picture (48, 64) of one colour as a mosaic or as YUV 4:2:2 (BT.601, studio range)."""
     blue, green, red = (float(value) for value in bgr)
     if encoding.startswith("bayer"):
         values = {"r": red, "g": green, "b": blue}
@@ -263,7 +263,7 @@ def coded(bgr: np.ndarray, encoding: str) -> np.ndarray:
 
 
 def join(path: Path, parts: list[Path]) -> None:
-    """One bag of several files, as a recorder splits it."""
+    """Make one bag of several files, as a recorder splits it."""
     path.mkdir()
     yaml = YAML(typ="safe")
     documents = [yaml.load((part / "metadata.yaml").read_text()) for part in parts]
@@ -272,11 +272,11 @@ def join(path: Path, parts: list[Path]) -> None:
     merged["relative_file_paths"] = []
     counts: dict[str, dict] = {}
     for number, (part, document) in enumerate(zip(parts, documents, strict=True)):
-        one = document["rosbag2_bagfile_information"]
+        information = document["rosbag2_bagfile_information"]
         name = f"bag_{number}.mcap"
         (part / files[number]).rename(path / name)
         merged["relative_file_paths"].append(name)
-        for topic in one["topics_with_message_count"]:
+        for topic in information["topics_with_message_count"]:
             key = topic["topic_metadata"]["name"]
             if key in counts:
                 counts[key]["message_count"] += topic["message_count"]
@@ -289,10 +289,10 @@ def join(path: Path, parts: list[Path]) -> None:
 
 
 def as_ros1(message: Any, store: Any) -> Any:
-    """The same message with ROS 1's headers, which count."""
+    """Return the same message with ROS 1's headers, which have a sequence number."""
     kind = getattr(message, "__msgtype__", None)
     if isinstance(message, list):
-        return [as_ros1(one, store) for one in message]
+        return [as_ros1(element, store) for element in message]
     if kind is None:
         return message
     values = {
@@ -305,7 +305,7 @@ def as_ros1(message: Any, store: Any) -> Any:
 
 
 def with_unknown(flight: Flight) -> list[Message]:
-    """A usual bag with a topic of a type that nobody knows, in nobody's encoding."""
+    """Return a usual bag with an additional topic of an unknown type."""
     TYPES.register(get_types_from_msg("uint32 number", "nobody_msgs/msg/Thing"))
     thing = make("nobody_msgs/msg/Thing", 7)
     return [*usual(flight), ("/thing", "nobody_msgs/msg/Thing", START, thing)]

@@ -1,4 +1,4 @@
-"""A bundle with known truth: its pixels, their derivatives, and what adjustment makes of their noise."""
+"""A bundle with known truth: its pixels, their derivatives, and the effect of their noise after adjustment."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SIGMA_PX = 0.5
 
 
 def adjuster(network: Network) -> np.ndarray:
-    """Change of all unknowns (U, 2 M) that a free least-squares adjustment makes of a change of the pixels."""
+    """Return the matrix (U, 2 M) of a free least-squares adjustment: unknowns by a change of the pixels."""
     design = jacobian(network)
     scale = 1.0 / np.linalg.norm(design, axis=0)
     value, vector = np.linalg.eigh((design * scale).T @ (design * scale))
@@ -25,10 +25,10 @@ def adjuster(network: Network) -> np.ndarray:
 
 
 def exact_network(images: int = 6, points: int = 60, seed: int = 0, *, rolled: bool = True) -> Network:
-    """Two rings of cameras about points that all of them see, with exact pixels.
+    """Return two rings of cameras about points that all of them see, with exact pixels.
 
-    Every other camera stands on its side: only then is the principal point well determined. Unless `rolled`, all
-    are held level.
+    Every other camera stands on its side, because only then is the principal point well determined. With `rolled`
+    false, all cameras are level.
     """
     rng = np.random.default_rng(seed)
     angle = np.linspace(0, 2 * np.pi, images, endpoint=False)
@@ -51,13 +51,13 @@ def exact_network(images: int = 6, points: int = 60, seed: int = 0, *, rolled: b
 
 
 def size(network: Network) -> int:
-    """Unknowns: six for a camera, three for a point, and the lens."""
+    """Return the number of unknowns: six for a camera, three for a point, and the lens."""
     lens = len(network.cameras[1].params)
     return 6 * len(network.camera_id) + 3 * len(network.point_in_world) + lens
 
 
 def pixels(network: Network, change: np.ndarray) -> np.ndarray:
-    """Pixels (M, 2) after a change of all unknowns: poses as documented, then points, then the lens."""
+    """Return pixels (M, 2) after a change of all unknowns: poses as documented, then points, then the lens."""
     n, points = len(network.camera_id), len(network.point_in_world)
     pose = change[: 6 * n].reshape(n, 6)
     cloud = network.point_in_world + change[6 * n : 6 * n + 3 * points].reshape(-1, 3)
@@ -69,7 +69,7 @@ def pixels(network: Network, change: np.ndarray) -> np.ndarray:
 
 
 def jacobian(network: Network) -> np.ndarray:
-    """∂pixels/∂unknowns (2 M, U) by central differences, one unknown at a time."""
+    """Return ∂pixels/∂unknowns (2 M, U) by central differences, one unknown at a time."""
     steps = np.full(size(network), 1e-5)
     steps[-len(network.cameras[1].params) :] = 1e-5 * np.maximum(1.0, np.abs(network.cameras[1].params))
     columns = []
@@ -81,18 +81,18 @@ def jacobian(network: Network) -> np.ndarray:
 
 
 def units(network: Network) -> np.ndarray:
-    """Units (6 n,) in which rotations count as metres at the scene: 1 / median distance, and 1."""
+    """Return units (6 n,) in which rotations count as metres at the scene: 1 / median distance, and 1."""
     ray = network.point_in_world[network.obs_point] - network.cam_center_in_world[network.obs_image]
     return np.tile([1 / np.median(np.linalg.norm(ray, axis=1))] * 3 + [1.0] * 3, len(network.camera_id))
 
 
 def noisy(network: Network, rng: np.random.Generator) -> Network:
-    """The network with pixel noise of `SIGMA_PX`."""
+    """Return the network with pixel noise of `SIGMA_PX`."""
     return replace(network, obs_xy_px=network.obs_xy_px + rng.normal(0, SIGMA_PX, network.obs_xy_px.shape))
 
 
 def readjusted(network: Network, change: np.ndarray) -> Network:
-    """The network after adjustment: everything moved, pixels as observed."""
+    """Return the network after adjustment: unknowns changed, pixels as observed."""
     n, points = len(network.camera_id), len(network.point_in_world)
     pose = change[: 6 * n].reshape(n, 6)
     lens = network.cameras[1]

@@ -15,7 +15,7 @@ from pipelines.core.workspace import Workspace
 from tests import fakes
 
 if TYPE_CHECKING:
-    from tests.splat_scenes import Flight
+    from tests.splat_scenes import RenderedFlight
 
 SEEDS = 3
 
@@ -53,9 +53,9 @@ def one_thread() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
-def flights(tmp_path_factory: pytest.TempPathFactory) -> list[Flight]:
+def flights(tmp_path_factory: pytest.TempPathFactory) -> list[RenderedFlight]:
     """Rendered surveys that differ in everything random, made once for the tests of training and evaluation."""
-    from tests.splat_scenes import Flight, make_rendered, write_photographs
+    from tests.splat_scenes import RenderedFlight, make_rendered, write_photographs
     from tests.threads import single_thread
 
     made = []
@@ -63,12 +63,12 @@ def flights(tmp_path_factory: pytest.TempPathFactory) -> list[Flight]:
         rendered, root = make_rendered(seed), tmp_path_factory.mktemp(f"rendered{seed}")
         with single_thread():
             write_photographs(rendered, root / "photos")
-        made.append(Flight(rendered, root, seed))
+        made.append(RenderedFlight(rendered, root, seed))
     return made
 
 
 @pytest.fixture(scope="session")
-def trained(flights: list[Flight]) -> list[tuple[Workspace, Workspace]]:
+def trained(flights: list[RenderedFlight]) -> list[tuple[Workspace, Workspace]]:
     """Each survey trained with the geographic losses and without."""
     from pipelines.core.runner import run_stage
     from tests.splat_scenes import TRAINING

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pipelines.geometry.rays import Views
+from pipelines.geometry.rays import UncertainCameras
 
 
-def intersect_one(xy: np.ndarray, views: list[int], of: Views) -> tuple[np.ndarray, np.ndarray]:
+def intersect_one(xy: np.ndarray, views: list[int], of: UncertainCameras) -> tuple[np.ndarray, np.ndarray]:
     """Position (3,) and covariance (3, 3) of one point from its rays, without outliers.
 
     Each ray's error across itself comes from numerical derivatives of its direction by attitude and pixel.
@@ -33,7 +33,7 @@ def _direction(ray: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     return direction / np.linalg.norm(direction)
 
 
-def _direction_cov(ray: np.ndarray, view: int, of: Views) -> np.ndarray:
+def _direction_cov(ray: np.ndarray, view: int, of: UncertainCameras) -> np.ndarray:
     rotation, step = of.rotation_geo_from_cam[view], 1e-6
     columns = []
     for axis in np.eye(3):

@@ -27,7 +27,7 @@ class Exif:
     gps: list[Entry] = field(default_factory=list)
 
     def tiff(self) -> bytes:
-        """As a little-endian TIFF structure."""
+        """Return the block as a little-endian TIFF structure."""
         image = [*self.image, (0x8769, LONG, 0), (0x8825, LONG, 0)]
         photo_at = 8 + len(_directory(image, 8))
         gps_at = photo_at + len(_directory(self.photo, photo_at))
@@ -37,12 +37,12 @@ class Exif:
 
 
 def rational(value: float, denominator: int = 1_000_000) -> tuple[int, int]:
-    """A number as EXIF's fraction."""
+    """Return a number as EXIF's fraction."""
     return round(Fraction(value) * denominator), denominator
 
 
 def gps_entries(lat: float, lon: float, alt: float | None = 100.0) -> list[Entry]:
-    """GPS tags of a position: degrees, minutes, seconds to 1e-7 arc seconds."""
+    """Return GPS tags of a position: degrees, minutes, seconds to 1e-7 arc seconds."""
     entries: list[Entry] = [
         (1, ASCII, "N" if lat >= 0 else "S"),
         (2, RATIONAL, _dms(abs(lat))),
@@ -55,7 +55,7 @@ def gps_entries(lat: float, lon: float, alt: float | None = 100.0) -> list[Entry
 
 
 def dji_xmp(**values: object) -> bytes:
-    """DJI's packet in attribute form."""
+    """Return DJI's packet in attribute form."""
     attributes = " ".join(f'drone-dji:{key}="{value}"' for key, value in values.items())
     return (
         '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
@@ -66,7 +66,7 @@ def dji_xmp(**values: object) -> bytes:
 def jpeg(
     seed: int = 0, size: tuple[int, int] = (64, 48), exif: Exif | None = None, xmp: bytes | None = None
 ) -> bytes:
-    """A JPEG of random pixels, `size` = (width, height)."""
+    """Return a JPEG of random pixels, `size` = (width, height)."""
     pixels = np.random.default_rng(seed).integers(0, 255, (size[1], size[0], 3), dtype=np.uint8)
     plain = cv2.imencode(".jpg", pixels)[1].tobytes()
     segments = b""
@@ -80,7 +80,7 @@ def jpeg(
 def write_flight(
     folder: Path, count: int, *, lat: float = 46.02, lon: float = 7.75, alt: float = 120.0, positions: bool = True
 ) -> list[str]:
-    """`count` different JPEGs, 1e-4 degrees apart in longitude, one second apart; their names."""
+    """Write `count` different JPEGs, 1e-4 degrees of longitude and one second apart; return their names."""
     folder.mkdir(parents=True, exist_ok=True)
     names = []
     for index in range(count):
@@ -107,7 +107,7 @@ def _app1(payload: bytes) -> bytes:
 
 
 def _directory(entries: list[Entry], at: int) -> bytes:
-    """An image file directory at offset `at`, with its long values behind it."""
+    """Return an image file directory for offset `at`, followed by its long values."""
     after = at + 2 + 12 * len(entries) + 4
     table, heap = b"", b""
     for tag, kind, value in sorted(entries, key=lambda entry: entry[0]):

@@ -20,13 +20,13 @@ for _name, _layouts in DEFINITIONS.items():
 
 
 def px4(flight: Flight, kind: str, boot_ns: int = 0) -> list[Message]:
-    """PX4's messages; their microseconds count from `boot_ns`."""
+    """Return PX4's messages, whose microseconds count from `boot_ns`."""
     kind = f"px4_msgs/msg/{kind}"
     times = flight.imu_ns if kind.endswith("Attitude") else flight.fix_ns
     turns = ENU_FROM_NED.T @ (flight.enu_from_body(times) if kind.endswith("Odometry") else at_place(flight, times))
     quats = quat_xyzw_from_matrix(turns)[:, [3, 0, 1, 2]].astype(np.float32, order="C")
     zero = np.zeros(3, np.float32)
-    found = []
+    messages = []
     for i, ns in enumerate(times):
         stamp = int(ns - boot_ns) // 1000
         camera, antenna = flight.camera(times[i : i + 1])[0], flight.antenna(times[i : i + 1])[0]
@@ -47,28 +47,28 @@ def px4(flight: Flight, kind: str, boot_ns: int = 0) -> list[Message]:
                 0.02, 0.03, 0.7, 1.0, 0, 0, 0, 0, 0, 0.0, 0.0, 0.0, 0.0, 0.0, True, 0, 0, 20, 0.0, 0.0, 0.0, 1.0, 0,
                 False, 0,
             )  # fmt: skip
-        found.append((f"/fmu/out/{kind.rpartition('/')[2]}", kind, int(ns), message))
-    return found
+        messages.append((f"/fmu/out/{kind.rpartition('/')[2]}", kind, int(ns), message))
+    return messages
 
 
 def px4_of(release: str, messages: list[Message]) -> list[Message]:
-    """PX4's messages in the layout of another release; what that has more is zero."""
+    """Return PX4's messages in the layout of another release; additional fields are zero."""
     kind = messages[0][1]
     store = get_typestore(Stores.EMPTY)
     store.register(get_types_from_msg(DEFINITIONS[kind][release], kind))
-    found: list[Message] = []
+    converted: list[Message] = []
     for topic, _, ns, message in messages:
         values = []
         for name, (node, detail) in store.fielddefs[kind][1]:
             value = _px4_value(message, name)
             zero = np.zeros(detail[1], np.float32) if node == Nodetype.ARRAY else 0
             values.append(zero if value is None else value)
-        found.append((topic, kind, ns, bytes(store.serialize_cdr(store.types[kind](*values), kind))))
-    return found
+        converted.append((topic, kind, ns, bytes(store.serialize_cdr(store.types[kind](*values), kind))))
+    return converted
 
 
 def _px4_value(message: Any, name: str) -> Any:
-    """The field of another layout, None if this one has nothing of the kind."""
+    """Return the value of a field of another layout, None if the message has no such value."""
     if name in ("lat_lon_valid", "alt_valid"):
         return True
     if hasattr(message, name):

@@ -30,7 +30,7 @@ Layout = Literal["orbit", "grid", "line"]
 
 @dataclass(frozen=True)
 class Noise:
-    """Standard deviations of what is measured."""
+    """Standard deviations of the measurements."""
 
     fix_m: tuple[float, float, float] = (0.02, 0.02, 0.03)
     attitude_deg: float = 0.5
@@ -48,8 +48,8 @@ NOISELESS = Noise(pixel_px=0.2, mark_px=1e-9, gcp_m=1e-9, fix_m=(1e-9, 1e-9, 1e-
 
 
 @dataclass(frozen=True)
-class Scene:
-    """True cameras and points in geo, and which camera sees which point."""
+class TrueScene:
+    """True cameras and points in geo, with their observations."""
 
     center_in_geo: np.ndarray  # (n, 3)
     geo_from_cam: np.ndarray  # (n, 3, 3)
@@ -64,8 +64,8 @@ class Scene:
         return tuple(f"image_{index:03d}.jpg" for index in range(len(self.center_in_geo)))
 
     def pixels(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Where points (N, 3) in geo appear: point and image of each observation, exact pixels; by point."""
-        found = []
+        """Return the observations of points (N, 3) in geo, by point: indices of point and image, exact pixels."""
+        observations = []
         for image, (center, rotation) in enumerate(zip(self.center_in_geo, self.geo_from_cam, strict=True)):
             in_cam = (points - center) @ rotation
             ahead = np.flatnonzero(in_cam[:, 2] > 0.5)
@@ -73,14 +73,14 @@ class Scene:
             ahead = ahead[(np.abs(in_cam[ahead, :2]) < 0.8 * in_cam[ahead, 2:]).all(axis=1)]
             xy = project(self.camera, in_cam[ahead])
             inside = ((xy > 0) & (xy < [self.camera.width, self.camera.height])).all(axis=1)
-            found.append(np.column_stack([ahead[inside], np.full(inside.sum(), image), xy[inside]]))
-        rows = np.concatenate(found)
+            observations.append(np.column_stack([ahead[inside], np.full(inside.sum(), image), xy[inside]]))
+        rows = np.concatenate(observations)
         rows = rows[np.lexsort((rows[:, 1], rows[:, 0]))]
         return rows[:, 0].astype(np.int64), rows[:, 1].astype(np.int64), rows[:, 2:]
 
 
 def looking_at(center: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Rotations geo ← camera (n, 3, 3) of level cameras at centres (n, 3) that look at targets (n, 3)."""
+    """Return rotations geo ← camera (n, 3, 3) of level cameras at centres (n, 3) that look at targets (n, 3)."""
     forward = target - center
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
     right = np.cross(forward, [1e-9, 0.0, 1.0])
@@ -90,8 +90,8 @@ def looking_at(center: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 def make_scene(
     layout: Layout = "orbit", images: int = 24, points: int = 300, gcps: int = 6, seed: int = 0
-) -> Scene:
-    """A built-up area 100 m wide, seen from an orbit at two heights, a nadir grid, or one straight line."""
+) -> TrueScene:
+    """Return a built-up area 100 m wide, seen from an orbit at two heights, a nadir grid, or one straight line."""
     rng = np.random.default_rng(seed)
     cloud = np.column_stack([rng.uniform(-50, 50, (points, 2)), rng.uniform(0, 20, points)])
     control = np.column_stack([rng.uniform(-45, 45, (gcps, 2)), rng.uniform(0, 5, gcps)])
@@ -106,11 +106,11 @@ def make_scene(
         east, north = np.meshgrid(np.linspace(-60, 60, side), np.linspace(-60, 60, rows) if rows > 1 else [0.0])
         center = np.column_stack([east.ravel(), north.ravel(), np.full(east.size, 80.0)])[:images]
         target = center - np.array([0.0, 1e-3, 80.0])
-    return Scene(center, looking_at(center, target), cloud, control)
+    return TrueScene(center, looking_at(center, target), cloud, control)
 
 
-def sparse_model(scene: Scene, noise: Noise, rng: np.random.Generator) -> SparseModel:
-    """What an SfM with perfect cameras would give: the scene in `local`, with noisy pixels."""
+def sparse_model(scene: TrueScene, noise: Noise, rng: np.random.Generator) -> SparseModel:
+    """Return the model of an SfM with perfect cameras: the scene in `local`, with noisy pixels."""
     local_from_geo = scene.geo_from_local.inverse()
     owner, image, xy = scene.pixels(scene.point_in_geo)
     rotation = np.swapaxes(scene.geo_from_cam, 1, 2) @ scene.geo_from_local.rotation
@@ -135,7 +135,7 @@ def sparse_model(scene: Scene, noise: Noise, rng: np.random.Generator) -> Sparse
 
 @dataclass(frozen=True)
 class Measured:
-    """Which measurements a survey carries."""
+    """Choice of the measurements that a survey carries."""
 
     fixes: bool = True
     attitudes: bool = True
@@ -145,8 +145,8 @@ class Measured:
 WITH_GCPS = Measured(gcps=True)
 
 
-def survey_of(scene: Scene, noise: Noise, measured: Measured, rng: np.random.Generator) -> Survey:
-    """The measurements, with noise of exactly the σ that they state (but for outliers and bias)."""
+def survey_of(scene: TrueScene, noise: Noise, measured: Measured, rng: np.random.Generator) -> Survey:
+    """Return the measurements, with noise of exactly the σ that they state (but for outliers and bias)."""
     fixes = scene.center_in_geo + rng.normal(size=scene.center_in_geo.shape) * noise.fix_m + noise.bias_m
     for index in noise.outliers:
         direction = rng.normal(size=3)
@@ -183,7 +183,7 @@ def survey_of(scene: Scene, noise: Noise, measured: Measured, rng: np.random.Gen
     )
 
 
-def _control(scene: Scene, noise: Noise, rng: np.random.Generator) -> tuple[SurveyedPoint, ...]:
+def _control(scene: TrueScene, noise: Noise, rng: np.random.Generator) -> tuple[SurveyedPoint, ...]:
     owner, image, xy = scene.pixels(scene.gcp_in_geo)
     xy = xy + rng.normal(0, noise.mark_px, xy.shape)
     surveyed = scene.gcp_in_geo + rng.normal(0, noise.gcp_m, scene.gcp_in_geo.shape)
@@ -203,21 +203,21 @@ def _control(scene: Scene, noise: Noise, rng: np.random.Generator) -> tuple[Surv
 
 def material(
     noise: Noise = STATED, measured: Measured = WITH_GCPS, images: int = 8, points: int = 60
-) -> tuple[Scene, SparseModel, Survey]:
-    """An orbit, its SfM model and its survey."""
+) -> tuple[TrueScene, SparseModel, Survey]:
+    """Return an orbit, its SfM model and its survey."""
     scene, rng = make_scene(images=images, points=points), np.random.default_rng(0)
     survey = survey_of(scene, noise, measured, rng)
     return scene, sparse_model(scene, noise, rng), survey
 
 
 def initial(layout: str = "volume") -> InitialSimilarity:
-    """The true similarity, with σ of 1 % of scale, 0.01 rad and 1 cm about a place in the scene."""
+    """Return the true similarity, with σ of 1 % of scale, 0.01 rad and 1 cm about a place in the scene."""
     covariance, pivot = np.eye(7) * 1e-4, (5.0, -3.0, 60.0)
     return initial_product(GEO_FROM_LOCAL.to_record("local", "geo", covariance=covariance, pivot=pivot), layout)
 
 
 def initial_product(geo_from_local: SimilarityRecord, layout: str = "volume") -> InitialSimilarity:
-    """What `init-sim3` writes of a similarity, but for what it counts on the way."""
+    """Return the product of `init-sim3` for a similarity, without counts of correspondences and residuals."""
     return InitialSimilarity(
         geo_from_local=geo_from_local,
         method="robust",
@@ -237,7 +237,7 @@ def trained_model(
     max_image_size: int = 320,
     cameras: tuple[TrainedCamera, ...] = (),
 ) -> TrainedModel:
-    """What `train` writes beside a single Gaussian without bands."""
+    """Return the product that `train` writes beside a single Gaussian without bands."""
     return TrainedModel(
         geo_from_model=geo_from_model.to_record("model", "geo"),
         model_from_local=model_from_local.to_record("local", "model"),
@@ -252,22 +252,22 @@ def trained_model(
 
 
 def write_workspace(root: Path, survey: Survey, model: SparseModel) -> Workspace:
-    """A workspace as `ingest` and `sfm` leave it."""
+    """Return a workspace as `ingest` and `sfm` leave it."""
     save_json(survey, root / SURVEY)
     write_sparse(model, root / SPARSE)
     return Workspace(root)
 
 
 def without_fixes(survey: Survey, names: tuple[str, ...]) -> Survey:
-    """The survey with the fixes of some images taken away."""
+    """Return the survey without the fixes of the named images."""
     images = tuple(
         image.model_copy(update={"fix": None}) if image.name in names else image for image in survey.images
     )
     return survey.model_copy(update={"images": images})
 
 
-def moved(scene: Scene, geo_from_local: Similarity) -> Scene:
-    """The scene with another SfM frame."""
+def moved(scene: TrueScene, geo_from_local: Similarity) -> TrueScene:
+    """Return the scene with another SfM frame."""
     return replace(scene, geo_from_local=geo_from_local)
 
 

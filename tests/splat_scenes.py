@@ -1,4 +1,4 @@
-"""A survey whose photographs are renders of known Gaussians: what training should find again."""
+"""A survey whose photographs are renders of known Gaussians, which training should recover."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from tests.scenes import (
     GEO_FROM_LOCAL,
     Measured,
     Noise,
-    Scene,
+    TrueScene,
     initial_product,
     looking_at,
     sparse_model,
@@ -49,21 +49,21 @@ START_COVARIANCE = np.diag([5e-3, 5e-3, 5e-3, 5e-3, 0.3, 0.3, 0.3]) ** 2
 
 @dataclass(frozen=True)
 class Rendered:
-    """True scene, its Gaussians in `geo`, and what was measured of it."""
+    """True scene, its Gaussians in `geo`, and the measurements of it."""
 
-    scene: Scene
+    scene: TrueScene
     gaussians: Gaussians
     survey: Survey
     sparse: SparseModel
 
 
 def ground_height(east: np.ndarray, north: np.ndarray) -> np.ndarray:
-    """A smooth hill, in metres."""
+    """Return the height of a smooth hill, in metres."""
     return 6.0 * np.exp(-(east**2 + north**2) / 300.0)
 
 
 def true_gaussians(rng: np.random.Generator) -> Gaussians:
-    """Opaque, flat, randomly coloured Gaussians on the hill, out to 36 m."""
+    """Return opaque, flat, randomly coloured Gaussians on the hill, out to 36 m."""
     grid = np.arange(-36.0, 36.1, SPACING_M)
     east, north = (axis.ravel() for axis in np.meshgrid(grid, grid))
     count = len(east)
@@ -79,14 +79,14 @@ def true_gaussians(rng: np.random.Generator) -> Gaussians:
     )
 
 
-def true_scene(rng: np.random.Generator, images: int = 14, points: int = 500) -> Scene:
-    """Two rings of cameras around the hill that look down on it; points, control and check places on it."""
+def true_scene(rng: np.random.Generator, images: int = 14, points: int = 500) -> TrueScene:
+    """Return two rings of cameras that look down on the hill, with points, control and check places on it."""
     angle = np.linspace(0, 2 * np.pi, images, endpoint=False)
     height = np.where(np.arange(images) % 2, 30.0, 38.0)
     center = np.column_stack([32 * np.cos(angle), 32 * np.sin(angle), height])
     place = rng.uniform(-26, 26, (points, 2))
     marked = np.array([[-10.0, -8], [9, -11], [12, 8], [-7, 11], [1, 2], [-14, 2]])
-    return Scene(
+    return TrueScene(
         center,
         looking_at(center, rng.normal(0, 2, center.shape) * [1, 1, 0]),
         np.column_stack([place, ground_height(*place.T)]),
@@ -96,7 +96,7 @@ def true_scene(rng: np.random.Generator, images: int = 14, points: int = 500) ->
 
 
 def make_rendered(seed: int = 0) -> Rendered:
-    """The survey with the scene's six surveyed places as check points, two views held out, and its SfM model."""
+    """Return the survey with six check points and two test views, and its SfM model."""
     rng = np.random.default_rng(seed)
     scene, gaussians = true_scene(rng), true_gaussians(rng)
     survey = survey_of(scene, NOISE, Measured(gcps=True), rng)
@@ -135,7 +135,7 @@ def write_photographs(rendered: Rendered, folder: Path) -> None:
 def initial_similarity(
     rng: np.random.Generator, covariance: np.ndarray, pivot: np.ndarray, truth: Similarity = GEO_FROM_LOCAL
 ) -> InitialSimilarity:
-    """The truth, off by one draw from `covariance` (7, 7) about `pivot`."""
+    """Return the truth, changed by one draw from `covariance` (7, 7) about `pivot`."""
     delta = np.linalg.cholesky(covariance) @ rng.normal(size=7)
     turn, grow = exp_so3(delta[1:4]), float(np.exp(delta[0]))
     off = Similarity(grow, turn, pivot + delta[4:] - grow * turn @ pivot)
@@ -143,7 +143,7 @@ def initial_similarity(
 
 
 def write_rendered(root: Path, rendered: Rendered, initial: InitialSimilarity) -> Workspace:
-    """A workspace as the stages before training leave it; the photographs must be in `root/photos`."""
+    """Return a workspace as the stages before training leave it; the photographs must be in `root/photos`."""
     workspace = write_workspace(root, rendered.survey, rendered.sparse)
     save_json(initial, root / SIM3)
     geolocate(rendered.survey, rendered.sparse, GeolocateOptions()).points.save(root / POINTS)
@@ -151,15 +151,15 @@ def write_rendered(root: Path, rendered: Rendered, initial: InitialSimilarity) -
 
 
 @dataclass(frozen=True)
-class Flight:
-    """A rendered survey and the folder of its photographs."""
+class RenderedFlight:
+    """Rendered survey and the folder of its photographs."""
 
     rendered: Rendered
     root: Path
     seed: int
 
     def workspace(self, name: str) -> Workspace:
-        """A new workspace of that name, ready to train."""
+        """Return a new workspace of that name, ready to train."""
         root = self.root / name
         root.mkdir()
         (root / "photos").symlink_to(self.root / "photos")

@@ -1,4 +1,4 @@
-"""A step in level ground, seen from a ring: a scene for stereo that is known exactly."""
+"""A scene for stereo that is known exactly: a step in level ground, seen from a ring."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 
 from pipelines.geometry.cameras import Pinhole
-from pipelines.stereo.agreement import Surface
+from pipelines.stereo.agreement import DepthEstimate
 from pipelines.stereo.matching import MatchSettings
-from pipelines.stereo.sweep import Facing, Planes, StereoCamera, StereoView, plane_sweep
+from pipelines.stereo.sweep import NormalMap, Planes, StereoCamera, StereoView, plane_sweep
 
 CAMERA = Pinhole(120, 90, 110.0, 110.0, 60.0, 45.0)
 GROUND_M, ROOF_M, ROOF_SIDE_M = 0.0, 6.0, 8.0
@@ -33,18 +33,18 @@ def texture(seed: int) -> np.ndarray:
 
 
 def painted(seed: int, right_m: np.ndarray, up_m: np.ndarray) -> np.ndarray:
-    """The texture at places on a plane."""
+    """Return the texture at places on a plane."""
     column, row = ((along / TEXEL_M + 400).astype(np.float32) for along in (right_m, up_m))
     return np.asarray(cv2.remap(texture(seed), column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP))
 
 
 def photographed(camera: StereoCamera, grey: np.ndarray) -> StereoView:
-    """A view of grey levels (H, W), cut off where they leave 0 … 255."""
+    """Return a view of grey levels (H, W), clipped to 0 … 255."""
     return StereoView(camera, np.clip(grey + 1, 1, 256).astype(np.float32))
 
 
 def true_depth(camera: StereoCamera) -> np.ndarray:
-    """First surface along each ray: the square roof, or the ground."""
+    """Return the depth (H, W) of the first surface along each ray: the square roof, or the ground."""
     rays, center = camera.rays(), camera.center_in_world
     roof = (ROOF_M - center[2]) / rays[..., 2]
     on_roof = center + roof[..., None] * rays
@@ -60,21 +60,23 @@ def shot(azimuth_deg: float, brightness: float = 1.0, pinhole: Pinhole = CAMERA)
     return photographed(camera, brightness * np.where(place[..., 2] > 0.5 * ROOF_M, roof, ground))
 
 
-def facing_up(pinhole: Pinhole = CAMERA) -> Facing:
-    """All pixels on level planes."""
-    return Facing(LEVEL.normal_in_world[None], np.zeros((pinhole.height, pinhole.width), np.uint8))
+def level_normals(pinhole: Pinhole = CAMERA) -> NormalMap:
+    """Return the normal map of level planes at all pixels."""
+    return NormalMap(LEVEL.normal_in_world[None], np.zeros((pinhole.height, pinhole.width), np.uint8))
 
 
 def ring_of_views(pinhole: Pinhole = CAMERA) -> list[StereoView]:
-    """Views of different brightness, as the exposure of a flight varies."""
+    """Return views of different brightness, as the exposure of a flight varies."""
     return [shot(azimuth, 1 + 0.1 * (index % 3), pinhole) for index, azimuth in enumerate(range(0, 120, 20))]
 
 
-def around(ring: list[StereoView], index: int) -> list[StereoView]:
-    """The four views next to one."""
+def neighbours_of(ring: list[StereoView], index: int) -> list[StereoView]:
+    """Return the four views next to one."""
     return [view for place, view in enumerate(ring) if 0 < abs(place - index) <= 2]
 
 
-def swept(ring: list[StereoView], index: int) -> Surface:
-    """What planes find in a view."""
-    return Surface(ring[index].camera, plane_sweep(ring[index], around(ring, index), [LEVEL], MatchSettings()))
+def depth_estimate(ring: list[StereoView], index: int) -> DepthEstimate:
+    """Return the depths that a sweep of level planes gives a view of the ring."""
+    return DepthEstimate(
+        ring[index].camera, plane_sweep(ring[index], neighbours_of(ring, index), [LEVEL], MatchSettings())
+    )

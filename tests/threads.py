@@ -1,4 +1,4 @@
-"""How many threads tests compute with."""
+"""Number of threads that tests compute with."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import torch
 
 @contextmanager
 def single_thread() -> Iterator[None]:
-    """Compute with one thread: work as small as that of tests loses time to more. No result depends on it."""
+    """Compute with one thread: more threads slow work as small as that of tests. No result depends on it."""
     before = numba.get_num_threads(), torch.get_num_threads()
     numba.set_num_threads(1)
     torch.set_num_threads(1)

@@ -31,7 +31,7 @@ SETTINGS = DefaultSettings(start=4, stop=60, every=8, reset_every=0, max_gaussia
 
 
 def true_gaussians(count: int = 200, seed: int = 0) -> Gaussians:
-    """Coloured blobs on a wall 4 m away."""
+    """Return coloured blobs on a wall 4 m away."""
     random = torch.Generator().manual_seed(seed)
     place = torch.rand(count, 2, generator=random) * torch.tensor([5.0, 4.0]) - torch.tensor([2.5, 2.0])
     return Gaussians(
@@ -44,13 +44,13 @@ def true_gaussians(count: int = 200, seed: int = 0) -> Gaussians:
 
 
 def poses(count: int = 6) -> CameraPoses:
-    """Cameras beside each other that look along z."""
+    """Return cameras beside each other that look along z."""
     center = np.column_stack([np.linspace(-1, 1, count), np.zeros(count), np.zeros(count)])
     return CameraPoses(np.tile(np.eye(3), (count, 1, 1)), center)
 
 
 def photographs(folder: Path, scene: Gaussians, gains: tuple[float, ...] = (1.0,) * 6) -> ImageCache:
-    """Renders of the scene as PNG files, each times its gain, and the cache over them."""
+    """Write renders of the scene as PNG files, each times its gain, and return the cache over them."""
     shots = []
     for index, gain in enumerate(gains):
         pose = torch.eye(4)
@@ -70,7 +70,7 @@ def trainer(
     with_exposures: bool = False,
     count: int = 200,
 ) -> JointTrainer:
-    """A trainer that starts from the true places, grey and small."""
+    """Return a trainer that starts from the true places, grey and small."""
     start = true_gaussians(count)
     start = replace(start, log_scales=start.log_scales - 0.5, sh=torch.zeros_like(start.sh))
     train = np.arange(len(images))

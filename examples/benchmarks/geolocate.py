@@ -8,13 +8,14 @@ import time
 
 import numpy as np
 
-from pipelines.geometry.rays import Rays, Views, intersect
+from pipelines.geometry.intersection import intersect_rays
+from pipelines.geometry.rays import Rays, UncertainCameras
 from pipelines.geometry.rotations import exp_so3, geo_from_cam
 
 
 def survey(
     points: int, rays_each: int, outliers: float, rng: np.random.Generator
-) -> tuple[np.ndarray, Rays, Views]:
+) -> tuple[np.ndarray, Rays, UncertainCameras]:
     """A grid flight of 400 nadir views 80 m above `points` points, with consumer errors."""
     grid = np.stack(np.meshgrid(np.arange(20), np.arange(20)), axis=-1).reshape(-1, 2) * 15.0
     center = np.column_stack([grid, np.full(len(grid), 80.0)])
@@ -29,7 +30,7 @@ def survey(
     fixes = center + rng.normal(size=center.shape) * sigma_position
     bad = rng.random(len(center)) < outliers
     fixes[bad] += 15.0
-    views = Views(
+    views = UncertainCameras(
         center_in_geo=fixes,
         rotation_geo_from_cam=exp_so3(rng.normal(0, sigma_attitude, center.shape)) @ rotation,
         cov_center_in_geo=np.tile(np.diag(sigma_position**2), (len(center), 1, 1)),
@@ -50,7 +51,7 @@ def main() -> None:
     for outliers in (0.0, 0.05, 0.15):
         truth, rays, views = survey(options.points, options.rays, outliers, np.random.default_rng(0))
         clock = time.perf_counter()
-        found = intersect(rays, views, options.points)
+        found = intersect_rays(rays, views, options.points)
         seconds = time.perf_counter() - clock
         good = found.consistent
         error = np.linalg.norm(found.position_in_geo - truth, axis=1)

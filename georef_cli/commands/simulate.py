@@ -20,9 +20,11 @@ from pipelines.simulate.options import SimulateOptions
 def _simulate(ctx: click.Context, **values: Any) -> None:
     from pipelines.simulate.stage import simulate
 
-    config = resolve(SimulateOptions, {}, options.given(ctx, SimulateOptions.model_fields), Path(CONFIG_FILE))
+    survey_options = resolve(
+        SimulateOptions, {}, options.given(ctx, SimulateOptions.model_fields), Path(CONFIG_FILE)
+    )
     started = time.monotonic()
-    summary = simulate(config, values["directory"], progress_for(ctx.obj), overwrite=values["force"])
+    summary = simulate(survey_options, values["directory"], progress_for(ctx.obj), overwrite=values["force"])
     if values["as_json"]:
         print_json({**dataclasses.asdict(summary), "directory": str(summary.directory)})
         return
@@ -44,8 +46,8 @@ command = click.Command(
     help=inspect.cleandoc(
         """Simulate a survey whose truth is known exactly.
 
-        DIR gets photographs, a trajectory, raw navigation, control and check points as a surveyor would hand them
-        over, and truth.json with everything that they hide. The same options give the same bytes.
+        DIR gets photographs, a trajectory, raw navigation, control and check points in the form of a surveyor's
+        files, and truth.json with the truth behind them. The same options give the same bytes.
 
         \b
         Examples:

@@ -1,1 +1,1 @@
-"""What a surveyor takes away: one module a deliverable."""
+"""Deliverables of a survey, one module each."""

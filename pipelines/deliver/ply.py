@@ -1,10 +1,10 @@
-"""Export of the splat as a 3DGS PLY in real-world metres, with a sidecar that says where on Earth it lies.
+"""Export of the splat as a 3DGS PLY in real-world metres, with a sidecar that states its place on Earth.
 
 Reads `ingest/survey.json`, `train/model.json` and `train/gaussians.ply`; writes `export/splat.ply` and
 `export/splat.ply.georef.json` (docs/formats.md). GeoRefGS section 2.4: the similarity carries the model to Earth.
 
-The PLY's frame is East-North-Up at its own origin, which lies in the middle of the scene: float32 coordinates
-stay small there, and "up" is up where the splat is, not where the survey began.
+The PLY's frame is East-North-Up at its own origin in the middle of the scene. There float32 coordinates stay small,
+and "up" is the vertical at the splat, not at the start of the survey.
 """
 
 from __future__ import annotations
@@ -39,18 +39,18 @@ from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.storage import read_gaussians, write_gaussians
 from pipelines.splat.transform import transformed
 
-_ORIGIN_DECIMALS_DEG = 6  # 0.1 m: short numbers that a person can pass on without loss
+_ORIGIN_DECIMALS_DEG = 6  # 0.1 m: short numbers that people can copy without loss
 _ORIGIN_DECIMALS_M = 1
 
 
 @dataclass(frozen=True)
-class Export:
-    """A splat for the world outside.
+class ExportedSplat:
+    """Splat in the frame of its PLY, with its sidecar.
 
     Attributes:
         gaussians: in the PLY's frame, metres.
-        sidecar: where that frame is.
-        left_out: how many Gaussians were too transparent.
+        sidecar: place of that frame on Earth.
+        left_out: number of Gaussians that were too transparent.
     """
 
     gaussians: Gaussians
@@ -58,18 +58,18 @@ class Export:
     left_out: int
 
 
-def run(stage: StageRun, config: ExportPlyOptions) -> Summary:
+def run(stage: StageRun, options: ExportPlyOptions) -> Summary:
     """Write the PLY and its sidecar.
 
     Raises:
         MissingProductError: ingest or train has not been run.
-        InputError: a product that is not of its form.
+        InputError: a product does not have its form.
         DegenerateGeometryError: no Gaussian is opaque enough.
     """
     survey = load_survey(stage.workspace)
     model = load_json(TrainedModel, stage.workspace.path(MODEL))
     gaussians = read_gaussians(stage.workspace.path(GAUSSIANS))
-    export = exported(gaussians, model, survey, config)
+    export = export_splat(gaussians, model, survey, options)
     path = stage.out / SPLAT.rpartition("/")[2]
     write_gaussians(path, export.gaussians)
     write_sidecar(export.sidecar, path)
@@ -85,16 +85,18 @@ def run(stage: StageRun, config: ExportPlyOptions) -> Summary:
     return Summary(f"{len(export.gaussians)} Gaussians{sigma}", values)
 
 
-def exported(gaussians: Gaussians, model: TrainedModel, survey: Survey, config: ExportPlyOptions) -> Export:
-    """Gaussians of the model in an East-North-Up frame at the scene, and what places that frame on Earth.
+def export_splat(
+    gaussians: Gaussians, model: TrainedModel, survey: Survey, options: ExportPlyOptions
+) -> ExportedSplat:
+    """Return the Gaussians of a model in an East-North-Up frame at the scene, with the sidecar of that frame.
 
     Raises:
         DegenerateGeometryError: no Gaussian is opaque enough.
     """
-    kept = gaussians.select(torch.sigmoid(gaussians.logit_opacities) >= config.min_opacity)
+    kept = gaussians.select(torch.sigmoid(gaussians.logit_opacities) >= options.min_opacity)
     if len(kept) == 0:
         raise DegenerateGeometryError(
-            f"none of {len(gaussians)} Gaussians has an opacity of {config.min_opacity} or more: "
+            f"none of {len(gaussians)} Gaussians has an opacity of {options.min_opacity} or more: "
             "lower --min-opacity"
         )
     geo_from_model = Similarity.from_record(model.geo_from_model)
@@ -103,22 +105,22 @@ def exported(gaussians: Gaussians, model: TrainedModel, survey: Survey, config: 
     ply_from_geo = _enu_at(origin_lla).inverse() @ _enu_at(lla_of(survey.origin))
     in_ply = transformed(kept, ply_from_geo @ geo_from_model)
     sidecar = _sidecar(origin_lla, _covariance_in_ply(model.geo_from_model, ply_from_geo), survey)
-    return Export(in_ply, sidecar, len(gaussians) - len(kept))
+    return ExportedSplat(in_ply, sidecar, len(gaussians) - len(kept))
 
 
 def _rounded_origin(point_in_geo: FloatArray, origin: Origin) -> FloatArray:
-    """Latitude, longitude, height of a point, rounded: from these numbers alone a reader has the exact frame."""
+    """Return latitude, longitude and height of a point, rounded: these short numbers define the frame exactly."""
     lla = lla_from_ecef(ecef_from_enu(point_in_geo, origin))
     return np.array([*np.round(lla[:2], _ORIGIN_DECIMALS_DEG), np.round(lla[2], _ORIGIN_DECIMALS_M)])
 
 
 def _enu_at(lla: FloatArray) -> Similarity:
-    """`ecef_from_enu` of the frame at a place."""
+    """Return ecef_from_enu of the frame at a place."""
     return Similarity(1.0, ecef_from_enu_rotation(lla), ecef_from_lla(lla))
 
 
 def _covariance_in_ply(geo_from_model: SimilarityRecord, ply_from_geo: Similarity) -> FloatArray | None:
-    """The similarity's covariance (7, 7) about the PLY's origin, along its axes; None where none was estimated."""
+    """Return the similarity's covariance (7, 7) about the PLY's origin, along its axes; None if unknown."""
     covariance = np.array(geo_from_model.covariance)
     if not covariance.any():
         return None

@@ -18,7 +18,14 @@ from scipy.sparse import csr_matrix, hstack
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.evaluate.networks import control_points, control_rays, in_geo, network_of_points
-from pipelines.geometry.bundle import Network, in_front, is_ahead, lens_slots, linearise, scatter
+from pipelines.geometry.bundle import (
+    Network,
+    has_positive_depth,
+    lens_slots,
+    linearise_bundle,
+    sparse_jacobian,
+    with_positive_depths,
+)
 from pipelines.scene.marks import MarkRays
 from pipelines.scene.solved_survey import SolvedSurvey
 
@@ -93,7 +100,7 @@ class CameraInformation:
             wanted: the points and their K marks; its cameras are those of the bundle.
             sigma_px: (K,) of the marks.
         """
-        sigma_px, wanted = sigma_px[is_ahead(wanted)], in_front(wanted)
+        sigma_px, wanted = sigma_px[has_positive_depth(wanted)], with_positive_depths(wanted)
         found = np.full((len(wanted.point_in_world), 3, 3), np.nan)
         for j in np.unique(wanted.obs_point):
             mine = wanted.obs_point == j
@@ -130,16 +137,16 @@ def _only(network: Network, mine: BoolArray) -> Network:
 
 
 def _rows(network: Network, sigma_px: FloatArray) -> _Rows:
-    lin = linearise(network)
+    lin = linearise_bundle(network)
     whiten = 1.0 / sigma_px[:, None, None]
-    poses = scatter(lin.by_pose * whiten, network.obs_image, len(network.camera_id))
-    lens = scatter(lin.by_intrinsics * whiten, lens_slots(network), len(network.cameras))
-    return _Rows(hstack([poses, lens], format="csr"), lin.by_point * whiten)
+    poses = sparse_jacobian(lin.jacobian_pose * whiten, network.obs_image, len(network.camera_id))
+    lens = sparse_jacobian(lin.jacobian_intrinsics * whiten, lens_slots(network), len(network.cameras))
+    return _Rows(hstack([poses, lens], format="csr"), lin.jacobian_point * whiten)
 
 
 def _eliminated(network: Network, sigma_px: FloatArray, cov_known: FloatArray | None) -> FloatArray:
     """Information of cameras and lens (6 n + L, 6 n + L), the points eliminated, which may be known beforehand."""
-    sigma_px, network = sigma_px[is_ahead(network)], in_front(network)
+    sigma_px, network = sigma_px[has_positive_depth(network)], with_positive_depths(network)
     rows, count = _rows(network, sigma_px), len(network.point_in_world)
     normal = np.zeros((count, 3, 3))
     np.add.at(normal, network.obs_point, np.swapaxes(rows.by_point, 1, 2) @ rows.by_point)
@@ -147,7 +154,7 @@ def _eliminated(network: Network, sigma_px: FloatArray, cov_known: FloatArray | 
         normal += np.linalg.inv(cov_known)
     normal += (_RIDGE * np.trace(normal, axis1=1, axis2=2) + _RIDGE)[:, None, None] * np.eye(3)
     root = np.swapaxes(np.linalg.inv(np.linalg.cholesky(normal)), 1, 2)
-    point = scatter(rows.by_point @ root[network.obs_point], network.obs_point, count)
+    point = sparse_jacobian(rows.by_point @ root[network.obs_point], network.obs_point, count)
     cross = rows.by_cameras.T @ point
     return np.asarray((rows.by_cameras.T @ rows.by_cameras - cross @ cross.T).toarray())
 

@@ -8,7 +8,13 @@ import numpy as np
 from scipy.sparse import csr_matrix
 
 from pipelines.core.types import FloatArray, IntArray
-from pipelines.geometry.bundle import Network, in_front, is_ahead, lens_slots, linearise
+from pipelines.geometry.bundle import (
+    Network,
+    has_positive_depth,
+    lens_slots,
+    linearise_bundle,
+    with_positive_depths,
+)
 
 
 @dataclass(frozen=True)
@@ -41,18 +47,18 @@ def intersection_jacobian(marks: Network, sigma_px: FloatArray) -> IntersectionJ
         marks: N points, M marks.
         sigma_px: (M,) of the marks. Those of points behind their camera do not count.
     """
-    sigma_px, marks = sigma_px[is_ahead(marks)], in_front(marks)
-    lin, count = linearise(marks), len(marks.point_in_world)
-    pull = np.swapaxes(lin.by_point, 1, 2) / (sigma_px**2)[:, None, None]
+    sigma_px, marks = sigma_px[has_positive_depth(marks)], with_positive_depths(marks)
+    lin, count = linearise_bundle(marks), len(marks.point_in_world)
+    pull = np.swapaxes(lin.jacobian_point, 1, 2) / (sigma_px**2)[:, None, None]
     normal = np.zeros((count, 3, 3))
-    np.add.at(normal, marks.obs_point, pull @ lin.by_point)
+    np.add.at(normal, marks.obs_point, pull @ lin.jacobian_point)
     value, vector = np.linalg.eigh(normal)
     value[value[:, 0] <= 1e-9 * value[:, 2]] = np.nan
     cov = (vector / value[:, None, :]) @ np.swapaxes(vector, 1, 2)
     response = -cov[marks.obs_point] @ pull  # (M, 3, 2) metres per pixel
-    longest = lin.by_intrinsics.shape[2]
-    lens = _blocks(marks, response @ lin.by_intrinsics, lens_slots(marks), longest * len(marks.cameras))
-    poses = _blocks(marks, response @ lin.by_pose, marks.obs_image, 6 * len(marks.camera_id))
+    longest = lin.jacobian_intrinsics.shape[2]
+    lens = _blocks(marks, response @ lin.jacobian_intrinsics, lens_slots(marks), longest * len(marks.cameras))
+    poses = _blocks(marks, response @ lin.jacobian_pose, marks.obs_image, 6 * len(marks.camera_id))
     return IntersectionJacobian(poses, lens.toarray().reshape(count, 3, -1), cov)
 
 

@@ -22,20 +22,20 @@ from pipelines.geometry.sparse_model import SparseModel
 log = logging.getLogger(__name__)
 
 
-# COLMAP writes one line a step; only its errors are of use here.
+# COLMAP logs a line for each step; only its errors are of use here.
 _COLMAP_ERRORS_ONLY = 2
 
 _INVALID_POINT = np.uint64(2**64 - 1)
 
-# Least bytes of one record of each binary file. COLMAP believes the record count at the head of the file, and
-# reads on for ever past the end of a truncated or forged one.
+# Least bytes of one record of each binary file. COLMAP trusts the record count at the head of the file, and reads
+# without end past the end of a truncated or forged file.
 _LEAST_RECORD_BYTES = {"cameras.bin": 48, "images.bin": 73, "points3D.bin": 51, "frames.bin": 8, "rigs.bin": 8}
 
 
 def read_sparse(path: Path) -> SparseModel:
     """Read the COLMAP model (cameras, images, points3D as .bin or .txt) in a folder.
 
-    Images without a pose are left out, and so are observations that belong to no point.
+    Images without a pose and observations without a point are left out.
 
     Raises:
         InputError: unreadable, inconsistent, or with values that are not finite.
@@ -47,7 +47,7 @@ def read_sparse(path: Path) -> SparseModel:
 
 
 def flatten(reconstruction: Any) -> SparseModel:
-    """A `pycolmap.Reconstruction` as arrays; what `read_sparse` leaves out is left out here."""
+    """Return a `pycolmap.Reconstruction` as arrays; images without a pose and stray observations are left out."""
     cameras = {
         int(camera_id): Camera(
             camera.model_name, int(camera.width), int(camera.height), np.array(camera.params, dtype=np.float64)
@@ -78,9 +78,9 @@ def flatten(reconstruction: Any) -> SparseModel:
 
 
 def write_sparse(model: SparseModel, path: Path) -> None:
-    """Write a model in COLMAP's binary form, so that `read_sparse` returns it again and COLMAP opens it.
+    """Write a model in COLMAP's binary form; `read_sparse` returns the same model, and COLMAP opens it.
 
-    Every image gets its own frame and every camera a trivial rig. The folder is made if needed.
+    Every image gets its own frame and every camera a trivial rig. The folder is made if missing.
 
     Raises:
         BackendUnavailableError: pycolmap is not installed.
@@ -104,7 +104,7 @@ def write_sparse(model: SparseModel, path: Path) -> None:
 
 
 def _add_images(reconstruction: Any, model: SparseModel) -> IntArray:
-    """Add the images with their pixels; returns the place of each observation in its image's list."""
+    """Add the images with their pixels; return the place of each observation in its image's list."""
     pycolmap = pycolmap_module()
     by_image = np.argsort(model.obs_image, kind="stable")
     bounds = np.searchsorted(model.obs_image[by_image], np.arange(len(model.image_name) + 1))
@@ -137,9 +137,10 @@ def _add_points(reconstruction: Any, model: SparseModel, rank: IntArray) -> None
 
 
 def pycolmap_module() -> Any:
-    """pycolmap, imported so that it leaves the process's signals alone.
+    """Return pycolmap, imported so that the process's signals stay as they are.
 
-    On import it takes SIGTERM to print a stack trace and die, which would cost an interrupted stage its clean end.
+    On import, pycolmap handles SIGTERM by a stack trace and the end of the process: an interrupted stage would not
+    end cleanly.
 
     Raises:
         BackendUnavailableError: pycolmap is not installed.
@@ -156,7 +157,7 @@ def pycolmap_module() -> Any:
 
 @contextmanager
 def quiet_colmap() -> Iterator[Any]:
-    """pycolmap, with its log reduced to errors while in use."""
+    """Yield pycolmap, with its log reduced to errors while in use."""
     pycolmap = pycolmap_module()
     level = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = _COLMAP_ERRORS_ONLY
@@ -167,7 +168,7 @@ def quiet_colmap() -> Iterator[Any]:
 
 
 def load_reconstruction(path: Path) -> Any:
-    """The COLMAP model in a folder as a `pycolmap.Reconstruction`.
+    """Return the COLMAP model in a folder as a `pycolmap.Reconstruction`.
 
     Raises:
         InputError: no such folder, or not a readable model.
@@ -195,7 +196,7 @@ def _check_count(file: Path, least_record_bytes: int) -> None:
 
 
 def _observations(images: list[Any], point_ids: IntArray) -> tuple[IntArray, IntArray, FloatArray]:
-    """Flat arrays over all observations that belong to a point, sorted by point."""
+    """Return flat arrays over all observations that belong to a point, sorted by point."""
     pycolmap = pycolmap_module()
     # A pinhole of unit focal length at the origin turns a list of pixels into an array in one call.
     unit = pycolmap.Camera(model="SIMPLE_PINHOLE", width=1, height=1, params=[1.0, 0.0, 0.0])

@@ -1,7 +1,7 @@
-"""EXIF of a photograph: where, when, with which lens. DJI's XMP comes along.
+"""EXIF of a photograph: position, time and lens, together with DJI's XMP.
 
-EXIF is written by thousands of programs. A tag that cannot be trusted (a zero denominator, a latitude without its
-hemisphere, 0° 0°) is as good as absent, and the reason is kept for the log.
+Thousands of programs write EXIF. A tag that cannot be trusted (a zero denominator, a latitude without its
+hemisphere, 0° 0°) counts as absent, and the reason is kept for the log.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from pipelines.formats.xmp import DjiTags, XmpError, read_dji
 
 _JPEG = b"\xff\xd8"
 _TIFF = (b"II*\x00", b"MM\x00*")
-# A JPEG's EXIF lies in its first 64 KiB segment; the rest is none of the parser's business.
+# A JPEG's EXIF lies in one of its first segments of 64 KiB. The parser gets no more than this head.
 _JPEG_HEAD = 1024 * 1024
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
-_BELOW_ZERO = frozenset({1, 3})  # EXIF 3.0 added 2 and 3: above and below the sea, said outright
+_BELOW_ZERO = frozenset({1, 3})  # EXIF 3.0 added 2 and 3: above and below sea level, stated explicitly
 _WGS84_NAMES = frozenset({"", "WGS84"})
 _GPS_H_ERROR = ("GPS GPSHPositioningError", "GPS Tag 0x001F")
 TimeSource = Literal["offset", "gps", "assumed UTC"]
@@ -28,7 +28,14 @@ TimeSource = Literal["offset", "gps", "assumed UTC"]
 
 @dataclass(frozen=True)
 class GpsTag:
-    """A position: WGS84 degrees, metres (None where only the altitude is missing), σ horizontal if given."""
+    """Position of a photograph.
+
+    Attributes:
+        lat_deg, lon_deg: degrees.
+        alt_m: metres; None if only the altitude is missing.
+        sigma_h_m: horizontal σ, if stated.
+        datum: name of the map datum; empty for WGS84.
+    """
 
     lat_deg: float
     lon_deg: float
@@ -39,14 +46,14 @@ class GpsTag:
 
 @dataclass(frozen=True)
 class LensTags:
-    """What EXIF says of the lens; None where absent.
+    """Tags of the lens; None if absent.
 
     Attributes:
         focal_mm: real focal length.
-        focal_35mm_mm: of the same angle of view on 35 mm film.
-        px_per_mm: of the image as it was taken.
-        taken_width_px: longer side of the image as it was taken, which may have been scaled since.
-        zoom: digital zoom, 1 if none.
+        focal_35mm_mm: focal length of the same angle of view on 35 mm film.
+        px_per_mm: resolution of the original image.
+        taken_width_px: longer side of the original image, which may have been scaled since.
+        zoom: digital zoom, 1 without zoom.
     """
 
     focal_mm: float | None = None
@@ -58,15 +65,15 @@ class LensTags:
 
 @dataclass(frozen=True)
 class PhotoTags:
-    """What a photograph says of itself.
+    """Metadata of a photograph.
 
     Attributes:
         make: manufacturer.
         model: camera.
         orientation: EXIF orientation, 1 for upright.
-        lens: focal length and what scales it.
+        lens: focal length and the tags that scale it.
         timestamp_s: seconds since 1970 UTC.
-        time_source: how the time zone was known.
+        time_source: source of the time zone.
         gps: position.
         dji: DJI's XMP.
         problems: why tags were not used, one phrase each.
@@ -84,12 +91,12 @@ class PhotoTags:
 
     @property
     def make_model(self) -> str:
-        """Make and model, the make once."""
+        """Make and model, without a repetition of the make."""
         return self.model if self.model.startswith(self.make) else f"{self.make} {self.model}"
 
 
 def read_tags(data: bytes) -> PhotoTags:
-    """EXIF and DJI XMP of a photograph. Never fails: what cannot be read is in `problems`.
+    """Return EXIF and DJI XMP of a photograph; tags that cannot be read become `problems`, never an error.
 
     Args:
         data: the file.
@@ -123,11 +130,11 @@ def _exif(data: bytes, problems: list[str]) -> Mapping[str, Any]:
     elif data[:4] not in _TIFF:
         return {}
     try:
-        found: Mapping[str, Any] = exifread.process_file(io.BytesIO(data), details=False)
-    except Exception as error:  # the parser raises whatever its arithmetic on broken bytes raises
+        tags: Mapping[str, Any] = exifread.process_file(io.BytesIO(data), details=False)
+    except Exception as error:  # the parser's arithmetic on broken bytes may raise any error
         problems.append(f"the EXIF data cannot be read ({type(error).__name__})")
         return {}
-    return found
+    return tags
 
 
 def _gps(tags: Mapping[str, Any], problems: list[str]) -> GpsTag | None:
@@ -176,7 +183,7 @@ def _lens(tags: Mapping[str, Any]) -> LensTags:
 
 
 def _time(tags: Mapping[str, Any]) -> tuple[float | None, TimeSource | None]:
-    """Seconds since 1970 UTC: by the clock's own zone, else from GPS, else the clock taken for UTC."""
+    """Return seconds since 1970 UTC: by the clock's own zone, else from GPS, else with the clock taken for UTC."""
     local = _datetime(_text(tags, "EXIF DateTimeOriginal") or _text(tags, "Image DateTime"))
     fraction = _text(tags, "EXIF SubSecTimeOriginal") or _text(tags, "EXIF SubSecTime")
     seconds = float(f"0.{fraction}") if fraction.isascii() and fraction.isdigit() else 0.0
@@ -214,19 +221,19 @@ def _text(tags: Mapping[str, Any], key: str) -> str:
 
 
 def _numbers(tags: Mapping[str, Any], key: str) -> list[float]:
-    """All values of a tag, or none if one of them is no number."""
+    """Return all values of a tag, or none if one of them is not a number."""
     values = getattr(tags.get(key), "values", None)
     if values is None or isinstance(values, str):
         return []
-    found = []
+    numbers = []
     for value in values if isinstance(values, (list, tuple)) else [values]:
         if hasattr(value, "den") and value.den == 0:
             return []
         try:
-            found.append(float(value))
+            numbers.append(float(value))
         except (TypeError, ValueError, OverflowError):
             return []
-    return found if all(math.isfinite(value) for value in found) else []
+    return numbers if all(math.isfinite(value) for value in numbers) else []
 
 
 def _number(tags: Mapping[str, Any], key: str) -> float | None:
@@ -243,7 +250,7 @@ def _positive(value: float | None) -> float | None:
 
 
 def _degrees(tags: Mapping[str, Any], key: str) -> float | None:
-    """Degrees, minutes, seconds; some writers give degrees alone, or degrees and minutes."""
+    """Return degrees from degrees, minutes and seconds; some writers omit seconds, or minutes too."""
     values = _numbers(tags, key)
     if not 1 <= len(values) <= 3 or min(values) < 0.0:
         return None

@@ -1,8 +1,8 @@
-"""Writes EXIF and DJI-like XMP into a JPEG: position, attitude, time, lens.
+"""Writing of EXIF and DJI-like XMP into a JPEG: position, attitude, time, lens.
 
-EXIF is a TIFF of a few directories in an APP1 segment, and XMP is an XML packet in another, so that they are
-written here: the libraries that do it are unmaintained or bring a whole image library.
-Sources: CIPA DC-008 (EXIF 2.32); the DJI tags as found in photographs of M300 and Phantom 4 RTK.
+EXIF is a TIFF of a few directories in an APP1 segment, and XMP an XML packet in another. This file writes both,
+because libraries for them are unmaintained or bring a whole image library.
+Sources: CIPA DC-008 (EXIF 2.32); DJI tags of photographs of M300 and Phantom 4 RTK.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ _SEGMENT_LIMIT = 65533
 
 
 @dataclass(frozen=True)
-class PhotoTags:
-    """What a drone writes into a photograph.
+class DroneTags:
+    """Tags that a drone writes into a photograph.
 
     Attributes:
         width, height: pixels.
@@ -34,7 +34,7 @@ class PhotoTags:
         relative_alt_m: above the place of take-off.
         yaw_pitch_roll_deg: the gimbal's.
         body_yaw_pitch_roll_deg: the aircraft's.
-        sigma_enu_m: σ that the receiver states, or None for a plain receiver, which states none.
+        sigma_enu_m: σ that the receiver states; None: a plain receiver, which states no σ.
     """
 
     width: int
@@ -50,8 +50,8 @@ class PhotoTags:
     sigma_enu_m: tuple[float, float, float] | None
 
 
-def with_tags(jpeg: bytes, tags: PhotoTags) -> bytes:
-    """The JPEG with an EXIF and an XMP segment at its start.
+def with_tags(jpeg: bytes, tags: DroneTags) -> bytes:
+    """Return the JPEG with an EXIF and an XMP segment at its start.
 
     Raises:
         InputError: not a JPEG.
@@ -91,15 +91,15 @@ def _rationals(*values: float, denominator: int) -> Entry:
 
 
 def _degrees(value: float) -> Entry:
-    """Degrees, minutes and seconds, the seconds to a micro-second of arc (0.03 mm)."""
+    """Return degrees, minutes and seconds, the seconds to a microsecond of arc (0.03 mm)."""
     micro = round(abs(value) * 3600e6)
-    degrees, rest = divmod(micro, 3600_000_000)
-    minutes, seconds = divmod(rest, 60_000_000)
+    degrees, arc = divmod(micro, 3600_000_000)
+    minutes, seconds = divmod(arc, 60_000_000)
     return _RATIONAL, struct.pack("<6L", degrees, 1, minutes, 1, seconds, 1_000_000), 3
 
 
-def _tiff(tags: PhotoTags) -> bytes:
-    """A little-endian TIFF: the main directory, then the EXIF and the GPS directory."""
+def _tiff(tags: DroneTags) -> bytes:
+    """Return a little-endian TIFF: the main directory, then the EXIF and the GPS directory."""
     time = datetime.fromtimestamp(tags.stamp_ns // 1_000_000_000, UTC)
     fraction = f"{tags.stamp_ns % 1_000_000_000:09d}"
     day = time.strftime("%Y:%m:%d")
@@ -150,7 +150,7 @@ def _tiff(tags: PhotoTags) -> bytes:
 
 
 def _directory(entries: Mapping[int, Entry], offset: int) -> bytes:
-    """One directory with the values that do not fit into it, to stand at `offset`."""
+    """Return a directory for the place `offset`, followed by the values that do not fit into its entries."""
     rows, values = b"", b""
     values_at = offset + 2 + 12 * len(entries) + 4
     for tag, (kind, value, count) in sorted(entries.items()):
@@ -163,7 +163,7 @@ def _directory(entries: Mapping[int, Entry], offset: int) -> bytes:
     return struct.pack("<H", len(entries)) + rows + struct.pack("<L", 0) + values
 
 
-def _xmp(tags: PhotoTags) -> str:
+def _xmp(tags: DroneTags) -> str:
     yaw, pitch, roll = tags.yaw_pitch_roll_deg
     body_yaw, body_pitch, body_roll = tags.body_yaw_pitch_roll_deg
     values = {

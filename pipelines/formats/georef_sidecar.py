@@ -1,8 +1,8 @@
-"""The sidecar of an exported artefact: where on Earth it lies, and how well that is known.
+"""Sidecar of an exported artefact: its place on Earth, with the uncertainty of that place.
 
-JSON beside the file (`splat.ply.georef.json`), because PLY comments are lost by popular tools. It mirrors
-SPZ_NIANTIC_georeference: p_ecef = scale · R(rotation) · p_file + origin, in float64. docs/formats.md has every
-field and a worked example.
+The sidecar is JSON beside the file (`splat.ply.georef.json`), because popular tools lose PLY comments. Its content
+mirrors SPZ_NIANTIC_georeference: p_ecef = scale · R(rotation) · p_file + origin, in float64. docs/formats.md has
+every field and a worked example.
 """
 
 from __future__ import annotations
@@ -34,7 +34,8 @@ class _CamelCase(Product):
 class PredictedAccuracy(Product):
     """Standard deviations in metres that the covariance predicts at `at`, a point of the file's frame.
 
-    It is the uncertainty of the georeference alone, not of the model's shape, and not measured on check points.
+    They state the uncertainty of the georeference alone, without that of the model's shape, and are no measurement
+    on check points.
     """
 
     kind: Literal["predicted"] = "predicted"
@@ -71,13 +72,13 @@ class GeorefSidecar(_CamelCase):
         return rotation
 
     def ecef_from_file(self) -> Similarity:
-        """p_ecef = s R p_file + origin."""
+        """Return the similarity p_ecef = s R p_file + origin."""
         return Similarity(self.scale, matrix_from_quat_xyzw(self.rotation), np.array(self.origin))
 
     def covariance_at(self, point_in_file: ArrayLike) -> FloatArray | None:
-        """Covariance (N, 3, 3) in m² along the file's axes at points (N, 3) of it; None where none was estimated.
+        """Return covariances (N, 3, 3) in m² along the file's axes at points (N, 3) of the file; None if unknown.
 
-        J C Jᵀ with J = [p, −[p]×, I]: what the georeference leaves open, not the splat's own shape.
+        The covariance is J C Jᵀ with J = [p, −[p]×, I]: that of the georeference, without the splat's own shape.
         """
         if self.covariance is None:
             return None
@@ -85,7 +86,7 @@ class GeorefSidecar(_CamelCase):
 
 
 def predicted_accuracy(covariance: ArrayLike, point_in_file: ArrayLike) -> PredictedAccuracy:
-    """What the sidecar's covariance (7, 7) predicts at a point (3,) of the file's frame."""
+    """Return the accuracy that the sidecar's covariance (7, 7) predicts at a point (3,) of the file's frame."""
     at = np.asarray(point_in_file, dtype=np.float64)
     east, north, up = np.diagonal(covariance_at(at[None], covariance, np.zeros(3))[0]).tolist()
     x, y, z = at.tolist()
@@ -101,12 +102,12 @@ def predicted_accuracy(covariance: ArrayLike, point_in_file: ArrayLike) -> Predi
 
 
 def sidecar_path(artefact: Path) -> Path:
-    """Where the sidecar of a file lies: its name with `.georef.json` added."""
+    """Return the path of a file's sidecar: the file's name with `.georef.json` added."""
     return artefact.with_name(artefact.name + SUFFIX)
 
 
 def write_sidecar(sidecar: GeorefSidecar, artefact: Path) -> None:
-    """Write the sidecar beside its file; it appears whole or not at all."""
+    """Write the sidecar beside its file; the sidecar appears whole or not at all."""
     path = sidecar_path(artefact)
     draft = path.with_name(path.name + ".tmp")
     draft.write_text(sidecar.model_dump_json(by_alias=True, indent=1) + "\n", encoding="utf-8")
@@ -117,6 +118,6 @@ def read_sidecar(artefact: Path) -> GeorefSidecar:
     """Read the sidecar of a file.
 
     Raises:
-        InputError: there is none, or it is not of this form; names the field.
+        InputError: no sidecar, or not of this form; names the field.
     """
     return load_json(GeorefSidecar, sidecar_path(artefact))

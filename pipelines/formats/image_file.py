@@ -1,6 +1,6 @@
-"""Photographs as files: their size from the header, whether they decode, and their hash.
+"""Photographs as files: size from the header, a check that they decode, and their hash.
 
-The header is read before anything is allocated, so that a file that claims a billion pixels is refused.
+The header is read before memory is allocated, so that a file that claims a billion pixels is refused.
 """
 
 from __future__ import annotations
@@ -23,11 +23,10 @@ _TIFF_WIDTH, _TIFF_HEIGHT = 256, 257
 
 @dataclass(frozen=True)
 class ImageFile:
-    """A photograph that decodes.
+    """Photograph that decodes.
 
     Attributes:
-        width: pixels as stored, before any EXIF orientation.
-        height: the same.
+        width, height: pixels as stored, before any EXIF orientation.
         sha256: of the whole file, hexadecimal.
     """
 
@@ -37,7 +36,7 @@ class ImageFile:
 
 
 def read_bytes(path: Path) -> bytes:
-    """The whole file.
+    """Return the bytes of the whole file.
 
     Raises:
         InputError: unreadable, empty, or larger than 512 MiB.
@@ -54,7 +53,7 @@ def read_bytes(path: Path) -> bytes:
 
 
 def inspect_image(data: bytes, path: Path) -> ImageFile:
-    """Size and hash of a JPEG, PNG or TIFF file, after decoding it to its end.
+    """Return size and hash of a JPEG, PNG or TIFF file, after decoding it to its end.
 
     Args:
         data: the file.
@@ -75,7 +74,7 @@ def inspect_image(data: bytes, path: Path) -> ImageFile:
 
 
 def header_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height that a JPEG, PNG or TIFF header states, or None."""
+    """Return width and height that a JPEG, PNG or TIFF header states, or None."""
     try:
         if data[:2] == b"\xff\xd8":
             return _jpeg_size(data)
@@ -109,21 +108,21 @@ def _tiff_size(data: bytes) -> tuple[int, int] | None:
     order = "<" if data[:2] == b"II" else ">"
     (directory,) = struct.unpack_from(order + "I", data, 4)
     (count,) = struct.unpack_from(order + "H", data, directory)
-    found: dict[int, int] = {}
+    sizes: dict[int, int] = {}
     for entry in range(count):
         at = directory + 2 + 12 * entry
         tag, kind = struct.unpack_from(order + "HH", data, at)
         if tag in (_TIFF_WIDTH, _TIFF_HEIGHT):
-            (found[tag],) = struct.unpack_from(order + ("H" if kind == 3 else "I"), data, at + 8)
-    if len(found) < 2:
+            (sizes[tag],) = struct.unpack_from(order + ("H" if kind == 3 else "I"), data, at + 8)
+    if len(sizes) < 2:
         return None
-    return found[_TIFF_WIDTH], found[_TIFF_HEIGHT]
+    return sizes[_TIFF_WIDTH], sizes[_TIFF_HEIGHT]
 
 
 def _decodes(data: bytes) -> bool:
     import cv2
 
-    # An eighth of the size still reads the entropy-coded stream to its end, which is where truncation shows.
+    # Decoding at an eighth of the size still reads the entropy-coded stream to its end, where truncation shows.
     flags = cv2.IMREAD_REDUCED_GRAYSCALE_8 | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         return cv2.imdecode(np.frombuffer(data, np.uint8), flags) is not None

@@ -1,4 +1,4 @@
-"""A PLY of points with their uncertainty, for viewers."""
+"""PLY of points with their uncertainty, for viewers."""
 
 from __future__ import annotations
 
@@ -19,9 +19,16 @@ _VERTEX = [
 def write_point_ply(
     path: Path, position: FloatArray, rgb: ByteArray, sigma_m: FloatArray, inlier: BoolArray
 ) -> None:
-    """Write points (N, 3) with colour (N, 3), σ along their worst axis (N,) and an inlier flag (N,), in binary.
+    """Write points with their colour and uncertainty, in binary.
 
-    Points without a position (NaN) are left out, since viewers stumble over them.
+    Points without a position (NaN) are left out, because viewers fail on them.
+
+    Args:
+        path: of the file.
+        position: (N, 3).
+        rgb: (N, 3).
+        sigma_m: (N,) σ along the worst axis.
+        inlier: (N,).
     """
     finite = np.isfinite(position).all(axis=1)
     vertex = np.empty(int(finite.sum()), dtype=_VERTEX)

@@ -1,7 +1,7 @@
-"""The PLY of 3D Gaussian Splatting: binary little-endian float32, as viewers and trainers exchange it.
+"""PLY of 3D Gaussian Splatting: binary little-endian float32, as viewers and trainers exchange it.
 
 Properties: `x y z nx ny nz f_dc_0..2 f_rest_0.. opacity scale_0..2 rot_0..3`. Opacity is a logit, scales are
-natural logarithms, the rotation is wxyz, `f_rest` goes channel by channel, the normals are zero.
+natural logarithms, the rotation is wxyz, `f_rest` is ordered by channel, the normals are zero.
 """
 
 from __future__ import annotations
@@ -16,8 +16,6 @@ from plyfile import PlyData, PlyElement, PlyParseError
 
 from pipelines.core.errors import InputError
 from pipelines.core.types import Float32Array
-
-FloatRows = Float32Array
 
 _HEADER_LIMIT = 64 * 1024
 _POSITION = ("x", "y", "z")
@@ -40,11 +38,11 @@ class SplatArrays:
         sh: (N, K, 3), K = (degree + 1)².
     """
 
-    means: FloatRows
-    quats_wxyz: FloatRows
-    log_scales: FloatRows
-    logit_opacities: FloatRows
-    sh: FloatRows
+    means: Float32Array
+    quats_wxyz: Float32Array
+    log_scales: Float32Array
+    logit_opacities: Float32Array
+    sh: Float32Array
 
     def __len__(self) -> int:
         return len(self.means)
@@ -54,19 +52,19 @@ def write_splat_ply(path: Path, splat: SplatArrays) -> None:
     """Write Gaussians; the file appears whole or not at all.
 
     Raises:
-        ValueError: shapes do not belong together.
+        ValueError: shapes do not agree.
         OSError: the file cannot be written.
     """
     count, coefficients = len(splat), splat.sh.shape[1]
-    rest = 3 * (coefficients - 1)
-    if rest not in _REST_COUNTS or splat.sh.shape != (count, coefficients, 3):
+    rest_count = 3 * (coefficients - 1)
+    if rest_count not in _REST_COUNTS or splat.sh.shape != (count, coefficients, 3):
         raise ValueError(f"expected spherical harmonics (N, 1 | 4 | 9 | 16, 3), got {splat.sh.shape}")
-    names = _property_names(rest)
+    names = _property_names(rest_count)
     rows = np.empty((count, len(names)), dtype="<f4")
     rows[:, :3], rows[:, 3:6], rows[:, 6:9] = splat.means, 0.0, splat.sh[:, 0]
-    rows[:, 9 : 9 + rest] = splat.sh[:, 1:].transpose(0, 2, 1).reshape(count, rest)
-    rows[:, 9 + rest] = splat.logit_opacities
-    rows[:, 10 + rest : 13 + rest], rows[:, 13 + rest :] = splat.log_scales, splat.quats_wxyz
+    rows[:, 9 : 9 + rest_count] = splat.sh[:, 1:].transpose(0, 2, 1).reshape(count, rest_count)
+    rows[:, 9 + rest_count] = splat.logit_opacities
+    rows[:, 10 + rest_count : 13 + rest_count], rows[:, 13 + rest_count :] = splat.log_scales, splat.quats_wxyz
     vertices = rows.view([(name, "<f4") for name in names]).reshape(count)
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_name(path.name + ".tmp")
@@ -86,14 +84,15 @@ def read_splat_ply(path: Path) -> SplatArrays:
     except (PlyParseError, ValueError, OverflowError, KeyError) as error:
         raise InputError(f"damaged PLY file: {error}", path=path) from error
     table = _Table(path, tuple(vertices.dtype.names), vertices)
-    rest = sum(name.startswith("f_rest_") for name in table.names)
-    if rest not in _REST_COUNTS:
+    rest_count = sum(name.startswith("f_rest_") for name in table.names)
+    if rest_count not in _REST_COUNTS:
         raise InputError(
-            f"{rest} coefficients; degree 0 to 3 has {', '.join(map(str, _REST_COUNTS))}",
+            f"{rest_count} coefficients; degree 0 to 3 has {', '.join(map(str, _REST_COUNTS))}",
             path=path,
             field="f_rest",
         )
-    higher = table.columns(tuple(f"f_rest_{i}" for i in range(rest))).reshape(len(vertices), 3, rest // 3)
+    higher = table.columns(tuple(f"f_rest_{i}" for i in range(rest_count)))
+    higher = higher.reshape(len(vertices), 3, rest_count // 3)
     dc = table.columns(_DC)[:, None, :]
     return SplatArrays(
         means=table.columns(_POSITION),
@@ -104,20 +103,20 @@ def read_splat_ply(path: Path) -> SplatArrays:
     )
 
 
-def _property_names(rest: int) -> list[str]:
-    return [*_POSITION, *_NORMAL, *_DC, *(f"f_rest_{i}" for i in range(rest)), "opacity", *_SCALE, *_ROTATION]
+def _property_names(rest_count: int) -> list[str]:
+    return [*_POSITION, *_NORMAL, *_DC, *(f"f_rest_{i}" for i in range(rest_count)), "opacity", *_SCALE, *_ROTATION]
 
 
 class _Table:
-    """The rows of the file and what their columns are called."""
+    """Rows of the file and the names of their columns."""
 
     def __init__(self, path: Path, names: tuple[str, ...], vertices: NDArray[np.void]) -> None:
         self.path = path
         self.names = names
-        # One type for all columns, as the format has it, makes this a view; a file of mixed types is converted.
+        # With one type for all columns, as the format demands, this is a view; a file of mixed types is converted.
         self._rows = recfunctions.structured_to_unstructured(vertices, dtype=np.float32)
 
-    def columns(self, names: tuple[str, ...]) -> FloatRows:
+    def columns(self, names: tuple[str, ...]) -> Float32Array:
         missing = [name for name in names if name not in self.names]
         if missing:
             raise InputError(
@@ -142,16 +141,16 @@ class _Table:
 
 
 def _check_header(path: Path) -> None:
-    """Refuse, before anything is allocated, a file whose size is not what its header promises."""
+    """Refuse, before memory is allocated, a file whose size differs from the promise of its header."""
     try:
         with path.open("rb") as stream:
             start = stream.read(_HEADER_LIMIT)
         size = path.stat().st_size
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}", path=path) from error
-    head, found, _ = start.partition(b"end_header")
+    head, end_marker, _ = start.partition(b"end_header")
     lines = [line.split() for line in head.decode("ascii", errors="replace").splitlines()]
-    if not found or lines[:1] != [["ply"]]:
+    if not end_marker or lines[:1] != [["ply"]]:
         raise InputError("not a PLY file", path=path)
     if ["format", "binary_little_endian", "1.0"] not in lines:
         raise InputError("expected a PLY of format binary_little_endian 1.0", path=path)
@@ -163,7 +162,7 @@ def _check_header(path: Path) -> None:
     if not widths or 0 in widths:
         raise InputError("expected properties of fixed size only", path=path)
     promised = int(elements[0][2]) if elements[0][2].isdecimal() and len(elements[0][2]) < 16 else -1
-    body = size - len(head) - len(found) - (2 if start[len(head) + len(found) :][:1] == b"\r" else 1)
+    body = size - len(head) - len(end_marker) - (2 if start[len(head) + len(end_marker) :][:1] == b"\r" else 1)
     if promised < 1 or promised * sum(widths) != body:
         raise InputError(
             f"the header promises {elements[0][2][:20]} Gaussians of {sum(widths)} bytes, the file holds "

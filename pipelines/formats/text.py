@@ -1,4 +1,4 @@
-"""Reading text that people and spreadsheets wrote: marks of byte order, line ends, decimal commas, limits."""
+"""Reading of text from people and spreadsheets: byte order marks, line ends, decimal commas, limits."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ MAX_BYTES = 128 * 1024 * 1024
 
 
 def read_lines(path: Path) -> list[str]:
-    """Lines of a UTF-8 text file without their ends; a byte order mark and CRLF or CR are taken off.
+    """Return the lines of a UTF-8 text file, without byte order mark and line ends (LF, CRLF or CR).
 
     Raises:
         InputError: missing, a folder, larger than 128 MiB, empty, or not UTF-8.
@@ -36,14 +36,14 @@ def read_lines(path: Path) -> list[str]:
 
 
 def number(text: str, *, path: Path, line: int, field: str, decimal_comma: bool = False) -> float:
-    """A number as a person writes it; `nan`, `inf` and an empty cell are NaN.
+    """Return a number as a person writes it; `nan`, `inf` and an empty cell are NaN.
 
     Args:
         text: the cell.
         path: for errors.
         line: for errors.
         field: for errors.
-        decimal_comma: whether `46,02` is a number here (where commas do not separate).
+        decimal_comma: whether `46,02` is a number, because commas do not separate cells.
 
     Raises:
         InputError: not a number.
@@ -54,7 +54,7 @@ def number(text: str, *, path: Path, line: int, field: str, decimal_comma: bool 
     if decimal_comma and "." not in cell:
         cell = cell.replace(",", ".", 1)
     try:
-        if "_" in cell:  # Python's own digit grouping, which no table means
+        if "_" in cell:  # Python's own digit grouping, which tables do not have
             raise ValueError(cell)
         value = float(cell)
     except ValueError:

@@ -1,7 +1,7 @@
-"""DJI's XMP: gimbal angles, RTK state and σ, altitudes. Attribute and element form.
+"""DJI's XMP in attribute and element form: gimbal angles, RTK state and σ, altitudes.
 
-The packet is looked for in the first and last mebibyte of a file only and must be short; entities and document
-types are refused by defusedxml.
+The packet must be short and lie in the first or last mebibyte of a file. defusedxml refuses entities and document
+types.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ RTK_FLOAT = 34
 
 @dataclass(frozen=True)
 class DjiTags:
-    """What DJI wrote; None where it is absent.
+    """DJI's tags; None if absent.
 
     Attributes:
         gimbal_yaw_pitch_roll_deg: Z-Y-X from North-East-Down.
         rtk_flag: 50 fixed, 34 float, 16 single point, 0 none.
         rtk_sigma_enu_m: σ east, north, up.
-        absolute_altitude_m: above whatever `GPSAltitude` is above.
+        absolute_altitude_m: above the same reference as `GPSAltitude`.
         relative_altitude_m: above take-off.
     """
 
@@ -40,11 +40,11 @@ class DjiTags:
 
 
 class XmpError(ValueError):
-    """There is a packet, but it cannot be read."""
+    """A packet exists, but cannot be read."""
 
 
 def read_dji(data: bytes) -> DjiTags | None:
-    """DJI's tags of a photograph, or None if it has no XMP packet.
+    """Return DJI's tags of a photograph, or None without an XMP packet.
 
     Args:
         data: the file.
@@ -66,10 +66,10 @@ def read_dji(data: bytes) -> DjiTags | None:
 
 
 def find_packet(data: bytes) -> bytes | None:
-    """The XMP packet in the first or last mebibyte of a file, or None.
+    """Return the XMP packet in the first or last mebibyte of a file, or None.
 
     Raises:
-        XmpError: it is longer than 256 KiB or has no end.
+        XmpError: the packet is longer than 256 KiB or has no end.
     """
     for part in (data[:_SEARCHED], data[max(_SEARCHED, len(data) - _SEARCHED) :]):
         begin = part.find(_OPEN)
@@ -83,7 +83,7 @@ def find_packet(data: bytes) -> bytes | None:
 
 
 def _values(packet: bytes) -> dict[str, str]:
-    """Simple properties by local name, whichever form they have; the first of a name counts."""
+    """Return simple properties of either form by local name; the first of a name counts."""
     from defusedxml.common import DefusedXmlException
     from defusedxml.ElementTree import fromstring
 
@@ -91,13 +91,13 @@ def _values(packet: bytes) -> dict[str, str]:
         root: Element = fromstring(packet, forbid_dtd=True)
     except (ParseError, DefusedXmlException, ValueError) as error:
         raise XmpError(f"the XMP packet is not well formed: {error}") from error
-    found: dict[str, str] = {}
+    properties: dict[str, str] = {}
     for element in root.iter():
         for key, text in element.attrib.items():
-            found.setdefault(_local(key), text)
+            properties.setdefault(_local(key), text)
         if element.text and not len(element):
-            found.setdefault(_local(element.tag), element.text)
-    return found
+            properties.setdefault(_local(element.tag), element.text)
+    return properties
 
 
 def _local(name: str) -> str:
@@ -120,5 +120,5 @@ def _triple(values: dict[str, str], *keys: str) -> Vector3 | None:
 
 
 def _positive(values: Vector3 | None) -> Vector3 | None:
-    """σ of zero is what DJI writes when it has none."""
+    """Return σ, or None for zeros: DJI writes zero for an unknown σ."""
     return values if values is not None and min(values) > 0.0 else None

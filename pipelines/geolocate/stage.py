@@ -22,7 +22,8 @@ from pipelines.core.workspace import StageRun, Summary
 from pipelines.formats.colmap import read_sparse
 from pipelines.formats.point_ply import write_point_ply
 from pipelines.geolocate.options import GeolocateOptions
-from pipelines.geometry.rays import CommonRotation, Intersections, Rays, Views, intersect
+from pipelines.geometry.intersection import intersect_rays
+from pipelines.geometry.rays import CommonRotation, Intersections, Rays, UncertainCameras
 from pipelines.geometry.rotations import log_so3
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.georef.adjustment import Correspondences, RotationPrior
@@ -102,7 +103,7 @@ def geolocate(survey: Survey, model: SparseModel, options: GeolocateOptions) -> 
     warnings = _warnings(observed, source)
     views, usable = _views(observed, source, options.sigma_px)
     rays = _rays(model, usable)
-    intersections = intersect(rays, views, len(model.point_id))
+    intersections = intersect_rays(rays, views, len(model.point_id))
     sigma, inlier = _judge(intersections, rays, views, options)
     points = GeolocatedPoints(
         point_id=model.point_id,
@@ -191,7 +192,7 @@ def _warnings(observed: _Observed, source: str) -> list[str]:
     return warnings
 
 
-def _views(observed: _Observed, source: str, sigma_px: float) -> tuple[Views, BoolArray]:
+def _views(observed: _Observed, source: str, sigma_px: float) -> tuple[UncertainCameras, BoolArray]:
     """All images as views (those without a fix are placeholders), and which give rays (n,)."""
     model, fixes, alignment = observed.model, observed.fixes, observed.alignment
     count, index = len(model.image_name), model.image_index()
@@ -213,7 +214,7 @@ def _views(observed: _Observed, source: str, sigma_px: float) -> tuple[Views, Bo
         gain = np.zeros((count, 3, 3))
         gain[place] = alignment.solution.response[:, 1:4]
         common = CommonRotation(alignment.solution.covariance[1:4, 1:4], gain)
-    return Views(center, rotation, cov, sigma, sigma_ray, common), usable
+    return UncertainCameras(center, rotation, cov, sigma, sigma_ray, common), usable
 
 
 def _rays(model: SparseModel, usable: BoolArray) -> Rays:
@@ -226,7 +227,7 @@ def _rays(model: SparseModel, usable: BoolArray) -> Rays:
 
 
 def _judge(
-    intersections: Intersections, rays: Rays, views: Views, options: GeolocateOptions
+    intersections: Intersections, rays: Rays, views: UncertainCameras, options: GeolocateOptions
 ) -> tuple[FloatArray, BoolArray]:
     """σ along the worst axis (N,), and which points (N,) can be relied on."""
     located: BoolArray = ~np.isnan(intersections.position_in_geo[:, 0])

@@ -1,9 +1,10 @@
-"""What bundle adjustment knows of its cameras: the information that the image observations leave in the poses.
+"""Information that bundle adjustment leaves in the camera poses, as whitened corrections of them.
 
-The reduced normal matrix of the bundle (points and intrinsics eliminated) says which corrections of the cameras
-the observations would resist, and how much. Its square root gives coordinates in which every correction that
-costs the observations χ² = 1 has length one, and in which the seven movements that no observation can see, those
-of a similarity of the whole, do not exist.
+The reduced normal matrix of the bundle (points and intrinsics eliminated) states how strongly the observations
+resist each correction of the cameras. Its inverse square root gives coordinates with two properties:
+
+1. A correction that costs the observations χ² = 1 has length one.
+2. The seven movements that no observation resists, those of a similarity of the whole, do not exist.
 """
 
 from __future__ import annotations
@@ -20,16 +21,16 @@ from scipy.special import exp1
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.geometry.cameras import Camera, project, project_each
-from pipelines.geometry.lens import by_parameter
+from pipelines.geometry.lens import parameter_derivative
 from pipelines.geometry.rotations import skew
 from pipelines.robust.kernels import CAUCHY_SCALE2, cauchy_weight
 from pipelines.robust.statistics import rayleigh_sigma
 
-# A camera that hangs on few observations is held to a tenth of its distance from the scene.
+# A camera with few observations is held to a tenth of its distance from the scene.
 _LOOSEST_RELATIVE_SIGMA = 0.1
 _STEP = 1e-6
-# Means of the weight w and of w r²/2 under Gaussian noise of σ = 1, where r²/2 is exponentially distributed:
-# without them the weights would take noise for outliers, and state a σ that is a fifth too small.
+# Means of the weight w and of w r²/2 under Gaussian noise of σ = 1, where r²/2 is exponentially distributed. Robust
+# weights lower the sum of squares of pure noise: without these means the stated σ would be a fifth too small.
 _HALF_SCALE2 = CAUCHY_SCALE2[2] / 2
 _MEAN_WEIGHT = float(_HALF_SCALE2 * np.exp(_HALF_SCALE2) * exp1(_HALF_SCALE2))
 _MEAN_WEIGHTED_SQUARE = _HALF_SCALE2 * (1 - _MEAN_WEIGHT)
@@ -37,7 +38,7 @@ _MEAN_WEIGHTED_SQUARE = _HALF_SCALE2 * (1 - _MEAN_WEIGHT)
 
 @dataclass(frozen=True)
 class Network:
-    """A bundle of n cameras, N points, M observations, in any metric frame `world`.
+    """Bundle of n cameras, N points and M observations in a metric frame `world`.
 
     Attributes:
         cameras: intrinsics by camera id.
@@ -65,8 +66,8 @@ class CorrectionBasis:
 
     `δω` [rad] turns a camera about its centre, axes of the world: `R' = R Exp(−δω)`; `δc` [m] moves the centre.
 
-    The lens goes with them: how far it is from the true one, (L,) in the order of `geometry.lens.Lenses`, is
-    lens_matrix @ z + a rest with covariance `lens_cov`, which is independent of z.
+    The lens parameters correlate with the poses. Their error, (L,) in the order of `geometry.lens.Lenses`, is
+    lens_matrix @ z plus an error with covariance `lens_cov` that is independent of z.
 
     Attributes:
         matrix: (n, 6, k), rows (δω, δc), k = 6 n − 7.
@@ -82,52 +83,54 @@ class CorrectionBasis:
 
 
 @dataclass(frozen=True)
-class Linearised:
-    """Residuals of M observations in pixels (projected minus observed), and their derivatives.
+class LinearisedBundle:
+    """Residuals of M observations in pixels (projected minus observed), and their Jacobians.
 
     Attributes:
         residual: (M, 2).
-        by_pose: (M, 2, 6), by (δω, δc) of the camera, as in `CorrectionBasis`.
-        by_point: (M, 2, 3).
-        by_intrinsics: (M, 2, P), P the longest parameter list; zero beyond a shorter one.
+        jacobian_pose: (M, 2, 6), by (δω, δc) of the camera, as in `CorrectionBasis`.
+        jacobian_point: (M, 2, 3).
+        jacobian_intrinsics: (M, 2, P), P the longest parameter list; zero beyond a shorter one.
     """
 
     residual: FloatArray
-    by_pose: FloatArray
-    by_point: FloatArray
-    by_intrinsics: FloatArray
+    jacobian_pose: FloatArray
+    jacobian_point: FloatArray
+    jacobian_intrinsics: FloatArray
 
 
 def correction_basis(network: Network, *, lens_follows: bool = True) -> CorrectionBasis:
-    """Whitened, gauge-free coordinates of the camera corrections.
+    """Return whitened, gauge-free coordinates of the camera corrections.
 
-    Robust: observations are weighted by Cauchy's kernel. The lens is uncertain, hence eliminated from the
-    information. The gauge is held at the points: each correction, with the points following the cameras and the
-    lens that goes with these, leaves them in place on the average (mean similarity zero, weighted by how well each
-    is seen). So the uncertainty of the similarity is that of the scene, not that of the cameras' mean; and a wrong
-    focal length or principal point shows as a common shift of the cameras against a scene that stays, which costs
-    the images little, and fixes can tell. Cost O((6 n)³).
+    1. Cauchy's kernel weights the observations.
+    2. The lens is uncertain: its parameters are eliminated from the information, like the points.
+    3. The points hold the gauge. Under each correction the points follow the cameras and their lens; the mean
+       similarity of this movement, weighted by the information of each point, is zero.
+
+    The uncertainty of the similarity is therefore that of the scene, not that of the cameras' mean. A wrong focal
+    length or principal point shows as a common shift of the cameras against a scene that stays. That shift costs
+    the images little, and fixes reveal it. Cost O((6 n)³).
 
     Args:
         network: the bundle at its minimum.
-        lens_follows: whether whoever moves the cameras moves the lens by `lens_matrix` with them. Where it is held,
-            the points follow through the lens as it is.
+        lens_follows: whether the caller moves the lens by `lens_matrix` with the cameras. Otherwise the lens is
+            held, and the points follow through it as it is.
 
     Raises:
         DegenerateGeometryError: fewer observations than unknowns.
     """
-    network = in_front(network)
-    lin = linearise(network)
+    network = with_positive_depths(network)
+    linearised = linearise_bundle(network)
     n, points = len(network.camera_id), len(network.point_in_world)
-    redundancy = 2 * len(lin.residual) - 6 * n - 3 * points
+    redundancy = 2 * len(linearised.residual) - 6 * n - 3 * points
     if redundancy <= 0:
         raise DegenerateGeometryError(
-            f"{len(lin.residual)} observations do not determine {n} cameras and {points} points"
+            f"{len(linearised.residual)} observations do not determine {n} cameras and {points} points"
         )
-    weight = _robust_weights(lin.residual)
-    variance = (weight[:, None] * lin.residual**2).sum() / (_MEAN_WEIGHTED_SQUARE * redundancy)
-    reduced = _reduced(network, lin, np.sqrt(weight / (_MEAN_WEIGHT * variance)), lens_follows)
-    basis = _whitened(network, reduced.information)
+    weight = _robust_weights(linearised.residual)
+    variance = (weight[:, None] * linearised.residual**2).sum() / (_MEAN_WEIGHTED_SQUARE * redundancy)
+    reduced = _schur_complement(network, linearised, np.sqrt(weight / (_MEAN_WEIGHT * variance)), lens_follows)
+    basis = _whitened_basis(network, reduced.information)
     flat = basis.reshape(-1, basis.shape[2])
     modes = similarity_modes(network.cam_center_in_world).reshape(-1, 7)
     held = flat - modes @ (reduced.points_follow @ flat)
@@ -136,27 +139,27 @@ def correction_basis(network: Network, *, lens_follows: bool = True) -> Correcti
     )
 
 
-def in_front(network: Network) -> Network:
-    """Without the observations of points behind their camera, which an imported model may hold."""
-    ahead = is_ahead(network)
-    if ahead.all():
+def with_positive_depths(network: Network) -> Network:
+    """Return the network without observations of points behind their camera, which an imported model may hold."""
+    positive = has_positive_depth(network)
+    if positive.all():
         return network
     return replace(
         network,
-        obs_point=network.obs_point[ahead],
-        obs_image=network.obs_image[ahead],
-        obs_xy_px=network.obs_xy_px[ahead],
+        obs_point=network.obs_point[positive],
+        obs_image=network.obs_image[positive],
+        obs_xy_px=network.obs_xy_px[positive],
     )
 
 
-def is_ahead(network: Network) -> BoolArray:
-    """Which observations (M,) are of points in front of their camera."""
+def has_positive_depth(network: Network) -> BoolArray:
+    """Return the mask (M,) of the observations whose points lie in front of their camera."""
     ray = network.point_in_world[network.obs_point] - network.cam_center_in_world[network.obs_image]
     return np.asarray(np.einsum("mj,mj->m", network.cam_from_world[network.obs_image, 2], ray) > 0)
 
 
-def linearise(network: Network) -> Linearised:
-    """The observations of a network, all points in front of their cameras, as linear functions of its unknowns."""
+def linearise_bundle(network: Network) -> LinearisedBundle:
+    """Return the observations as linear functions of the unknowns; all points lie in front of their cameras."""
     ray = network.point_in_world[network.obs_point] - network.cam_center_in_world[network.obs_image]
     rotation = network.cam_from_world[network.obs_image]
     in_cam = np.einsum("mij,mj->mi", rotation, ray)
@@ -164,20 +167,22 @@ def linearise(network: Network) -> Linearised:
     longest = max(len(camera.params) for camera in network.cameras.values())
     camera_of = network.camera_id[network.obs_image]
     residual = project_each(network.cameras, camera_of, in_cam) - network.obs_xy_px
-    by_cam, by_intrinsics = np.zeros((count, 2, 3)), np.zeros((count, 2, longest))
+    jacobian_cam, jacobian_intrinsics = np.zeros((count, 2, 3)), np.zeros((count, 2, longest))
     for key, camera in network.cameras.items():
         rows = np.flatnonzero(camera_of == key)
         local = in_cam[rows]
-        by_cam[rows] = _differences(partial(project, camera), local)
+        jacobian_cam[rows] = _central_differences(partial(project, camera), local)
         for index in range(len(camera.params)):
-            by_intrinsics[rows, :, index] = by_parameter(partial(project, point_in_cam=local), camera, index, _STEP)
-    by_point = by_cam @ rotation
-    by_pose = np.concatenate([by_point @ skew(ray), -by_point], axis=2)
-    return Linearised(residual, by_pose, by_point, by_intrinsics)
+            jacobian_intrinsics[rows, :, index] = parameter_derivative(
+                partial(project, point_in_cam=local), camera, index, _STEP
+            )
+    jacobian_point = jacobian_cam @ rotation
+    jacobian_pose = np.concatenate([jacobian_point @ skew(ray), -jacobian_point], axis=2)
+    return LinearisedBundle(residual, jacobian_pose, jacobian_point, jacobian_intrinsics)
 
 
-def _differences(function: Callable[[FloatArray], FloatArray], points: FloatArray) -> FloatArray:
-    """Central differences of (M, 2) by (M, 3), with steps relative to each point's depth."""
+def _central_differences(function: Callable[[FloatArray], FloatArray], points: FloatArray) -> FloatArray:
+    """Return central differences (M, 2, 3) of a function of points (M, 3), with steps relative to their depths."""
     step = _STEP * points[:, 2:3]
     columns = []
     for axis in range(3):
@@ -194,27 +199,29 @@ def _robust_weights(residual: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class _Reduced:
+class _ReducedSystem:
     information: FloatArray  # (6 n, 6 n) of the poses, points and intrinsics eliminated
-    points_follow: FloatArray  # (7, 6 n) mean similarity of the points when the cameras (and their lens) move
-    lens_follows: FloatArray  # (L, 6 n) expected lens parameters when the cameras move
-    lens_cov: FloatArray  # (L, L) about that
+    points_follow: FloatArray  # (7, 6 n) mean similarity of the points, by the poses (the lens following)
+    lens_follows: FloatArray  # (L, 6 n) expected lens parameters, by the poses
+    lens_cov: FloatArray  # (L, L) about that expectation
 
 
-def _reduced(network: Network, lin: Linearised, root_weight: FloatArray, lens_follows: bool) -> _Reduced:
-    """Schur complement of points and intrinsics, and how points and lens follow the poses."""
+def _schur_complement(
+    network: Network, linearised: LinearisedBundle, root_weight: FloatArray, lens_follows: bool
+) -> _ReducedSystem:
+    """Eliminate points and intrinsics (Schur complement); return how points and lens follow the poses, too."""
     n, points = len(network.camera_id), len(network.point_in_world)
     scaled = root_weight[:, None, None]
     slot = lens_slots(network)
-    pose = scatter(lin.by_pose * scaled, network.obs_image, n)
-    intrinsics = scatter(lin.by_intrinsics * scaled, slot, len(network.cameras))
-    by_point = lin.by_point * scaled
+    pose = sparse_jacobian(linearised.jacobian_pose * scaled, network.obs_image, n)
+    intrinsics = sparse_jacobian(linearised.jacobian_intrinsics * scaled, slot, len(network.cameras))
+    jacobian_point = linearised.jacobian_point * scaled
     normal = np.zeros((points, 3, 3))
-    np.add.at(normal, network.obs_point, np.swapaxes(by_point, 1, 2) @ by_point)
+    np.add.at(normal, network.obs_point, np.swapaxes(jacobian_point, 1, 2) @ jacobian_point)
     normal += 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3) + 1e-12 * np.eye(3)
     root = np.linalg.cholesky(normal)
     inverse_root = np.swapaxes(np.linalg.inv(root), 1, 2)
-    point = scatter(by_point @ inverse_root[network.obs_point], network.obs_point, points)
+    point = sparse_jacobian(jacobian_point @ inverse_root[network.obs_point], network.obs_point, points)
     pose_point, intrinsics_point = pose.T @ point, intrinsics.T @ point
     cc = (pose.T @ pose - pose_point @ pose_point.T).toarray()
     ci = (pose.T @ intrinsics - pose_point @ intrinsics_point.T).toarray()
@@ -227,28 +234,34 @@ def _reduced(network: Network, lin: Linearised, root_weight: FloatArray, lens_fo
     follows[used] = -scale[:, None] * np.linalg.solve(block, cross.T)
     cov[np.ix_(used, used)] = scale[:, None] * np.linalg.solve(block, np.eye(len(used))) * scale
     cc += ci @ follows
-    moved = (np.swapaxes(root, 1, 2) @ _displacements(network)).reshape(3 * points, 7)
+    moved = (np.swapaxes(root, 1, 2) @ _point_similarity_modes(network)).reshape(3 * points, 7)
     pull = pose_point @ moved
     if lens_follows:
         pull = pull + follows.T @ (intrinsics_point @ moved)
     points_follow = -np.linalg.solve(moved.T @ moved, pull.T)
-    return _Reduced((cc + cc.T) / 2, points_follow, follows, cov)
+    return _ReducedSystem((cc + cc.T) / 2, points_follow, follows, cov)
 
 
 def lens_slots(network: Network) -> IntArray:
-    """Place of each observation's camera (M,) among `network.cameras`."""
+    """Return the place (M,) of each observation's camera among `network.cameras`."""
     keys = list(network.cameras)
     return np.array([keys.index(int(key)) for key in network.camera_id], dtype=np.int64)[network.obs_image]
 
 
-def _displacements(network: Network) -> FloatArray:
-    """How an infinitesimal similarity about the mean camera centre moves each point: (N, 3, 7)."""
+def _point_similarity_modes(network: Network) -> FloatArray:
+    """Return the movements (N, 3, 7) of points under an infinitesimal similarity about the mean camera centre."""
     arm = network.point_in_world - network.cam_center_in_world.mean(axis=0)
     return np.concatenate([arm[:, :, None], -skew(arm), np.tile(np.eye(3), (len(arm), 1, 1))], axis=2)
 
 
-def scatter(blocks: FloatArray, column_block: IntArray, count: int) -> csr_matrix:
-    """Sparse matrix with one (2, w) block a row pair, in the block column that is given: (2 M, w · count)."""
+def sparse_jacobian(blocks: FloatArray, column_block: IntArray, count: int) -> csr_matrix:
+    """Return the sparse matrix (2 M, w · count) with one block (2, w) for each observation.
+
+    Args:
+        blocks: (M, 2, w).
+        column_block: (M,) block column of each.
+        count: number of block columns.
+    """
     rows, height, width = blocks.shape
     columns = column_block[:, None, None] * width + np.arange(width)[None, None, :]
     columns = np.broadcast_to(columns, blocks.shape)
@@ -256,7 +269,7 @@ def scatter(blocks: FloatArray, column_block: IntArray, count: int) -> csr_matri
     return csr_matrix((blocks.ravel(), columns.ravel(), pointer), shape=(rows * height, width * count))
 
 
-def _whitened(network: Network, information: FloatArray) -> FloatArray:
+def _whitened_basis(network: Network, information: FloatArray) -> FloatArray:
     center = network.cam_center_in_world
     n = len(center)
     distance = np.linalg.norm(network.point_in_world[network.obs_point] - center[network.obs_image], axis=1)
@@ -273,7 +286,7 @@ def _whitened(network: Network, information: FloatArray) -> FloatArray:
 
 
 def similarity_modes(cam_center_in_world: FloatArray) -> FloatArray:
-    """How an infinitesimal similarity about the mean centre moves each camera: (n, 6, 7).
+    """Return the movements (n, 6, 7) of the cameras under an infinitesimal similarity about their mean centre.
 
     Rows (δω, δc) as in `CorrectionBasis`, columns (ln s, rotation, translation).
     """

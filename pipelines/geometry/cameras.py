@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from pipelines.core.errors import InputError
 from pipelines.core.types import FloatArray, IntArray
 
-# Where each of COLMAP's parameters goes: fx fy cx cy | k1 k2 p1 p2 k3 k4 k5 k6 (fisheye: k1 k2 k3 k4).
+# Slots of each of COLMAP's parameters: fx fy cx cy | k1 k2 p1 p2 k3 k4 k5 k6 (fisheye: k1 k2 k3 k4).
 _LAYOUT: dict[str, tuple[tuple[int, ...], ...]] = {
     "SIMPLE_PINHOLE": ((0, 1), (2,), (3,)),
     "PINHOLE": ((0,), (1,), (2,), (3,)),
@@ -43,14 +43,14 @@ class Pinhole:
     cy: float
 
     def limited(self, max_size_px: int) -> Pinhole:
-        """The same view at a size of at most `max_size_px` along the longer side."""
+        """Return the camera of the same view, scaled down to `max_size_px` along the longer side at most."""
         scale = min(1.0, max_size_px / max(self.width, self.height))
         width, height = max(1, round(self.width * scale)), max(1, round(self.height * scale))
         sx, sy = width / self.width, height / self.height
         return Pinhole(width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy)
 
     def rays(self, xy_px: ArrayLike) -> FloatArray:
-        """Viewing rays (…, 3) of pixels (…, 2) in the camera's frame, of length one along the optical axis."""
+        """Return viewing rays (…, 3) of pixels (…, 2) in the camera frame, of length one along the optical axis."""
         slope = (np.asarray(xy_px, dtype=np.float64) - [self.cx, self.cy]) / [self.fx, self.fy]
         return np.concatenate([slope, np.ones((*slope.shape[:-1], 1))], axis=-1)
 
@@ -73,20 +73,20 @@ class Camera:
     @property
     def mean_focal_px(self) -> float:
         """Mean of the two focal lengths in pixels."""
-        focal, _, _ = _lens(self)
+        focal, _, _ = _split_params(self)
         return float(focal.mean())
 
 
 def undistort(camera: Camera, xy_px: ArrayLike) -> FloatArray:
-    """Rays (…, 2) as (x/z, y/z) of pixels (…, 2); NaN where the lens model maps no ray to the pixel.
+    """Return rays (…, 2) as (x/z, y/z) of pixels (…, 2); NaN where the lens model maps no ray to the pixel.
 
-    Newton's method on the distortion, with its analytic derivative; a solution beyond the fold of the radial
-    polynomial (where it stops being one to one) is refused.
+    Newton's method inverts the distortion, with its analytic derivative. A solution beyond the fold of the radial
+    polynomial (where the polynomial stops being one to one) is refused.
 
     Raises:
         InputError: unknown camera model, or a wrong number of parameters.
     """
-    focal, center, distortion = _lens(camera)
+    focal, center, distortion = _split_params(camera)
     target = (np.asarray(xy_px, dtype=np.float64) - center) / focal
     if not distortion.any() and camera.model != "OPENCV_FISHEYE":
         return target
@@ -96,7 +96,7 @@ def undistort(camera: Camera, xy_px: ArrayLike) -> FloatArray:
 
 
 def project(camera: Camera, point_in_cam: ArrayLike) -> FloatArray:
-    """Pixels (…, 2) of points (…, 3) in the camera frame; NaN behind the camera.
+    """Return pixels (…, 2) of points (…, 3) in the camera frame; NaN behind the camera.
 
     Raises:
         InputError: as `undistort`.
@@ -107,24 +107,27 @@ def project(camera: Camera, point_in_cam: ArrayLike) -> FloatArray:
 
 
 def project_each(cameras: dict[int, Camera], camera_of: IntArray, points_in_cam: FloatArray) -> FloatArray:
-    """Pixels (M, 2) of points (M, 3), each in the frame of its own camera, whose key among `cameras` is given (M,).
+    """Return pixels (M, 2) of points that have a camera each; NaN as in `project`.
 
-    NaN as in `project`.
+    Args:
+        cameras: by key.
+        camera_of: (M,) key of each point's camera.
+        points_in_cam: (M, 3) in the frame of that camera.
     """
-    found = np.empty((len(points_in_cam), 2))
+    pixels = np.empty((len(points_in_cam), 2))
     for key, camera in cameras.items():
         rows = np.flatnonzero(camera_of == key)
-        found[rows] = project(camera, points_in_cam[rows])
-    return found
+        pixels[rows] = project(camera, points_in_cam[rows])
+    return pixels
 
 
 def distort(camera: Camera, ray: ArrayLike) -> FloatArray:
-    """Pixels (…, 2) of rays (…, 2) given as (x/z, y/z).
+    """Return pixels (…, 2) of rays (…, 2) given as (x/z, y/z).
 
     Raises:
         InputError: as `undistort`.
     """
-    focal, center, distortion = _lens(camera)
+    focal, center, distortion = _split_params(camera)
     normalised = np.asarray(ray, dtype=np.float64)
     flat = normalised.reshape(-1, 2)
     bent = _distort_fisheye(flat, distortion) if _is_fisheye(camera) else _distort_rational(flat, distortion)[0]
@@ -135,8 +138,8 @@ def _is_fisheye(camera: Camera) -> bool:
     return camera.model == "OPENCV_FISHEYE"
 
 
-def _lens(camera: Camera) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Focal lengths (2,), principal point (2,) and distortion (8,), zero where the model has no such term."""
+def _split_params(camera: Camera) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return focal lengths (2,), principal point (2,) and distortion (8,), zero for terms that the model lacks."""
     layout = _LAYOUT.get(camera.model)
     if layout is None:
         raise InputError(f"camera model {camera.model} is not supported; use one of {', '.join(MODELS)}")
@@ -151,7 +154,7 @@ def _lens(camera: Camera) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def _distort_rational(ray: FloatArray, lens: FloatArray) -> tuple[FloatArray, tuple[FloatArray, ...]]:
-    """Distorted rays (N, 2) and the derivative's entries (du/dx, du/dy = dv/dx, dv/dy), each (N,)."""
+    """Return distorted rays (N, 2) and the derivative's entries (du/dx, du/dy = dv/dx, dv/dy), each (N,)."""
     k1, k2, p1, p2, k3, k4, k5, k6 = lens
     x, y = ray[:, 0], ray[:, 1]
     r2 = x * x + y * y
@@ -172,19 +175,19 @@ def _undistort_rational(target: FloatArray, lens: FloatArray) -> FloatArray:
     with np.errstate(all="ignore"):
         for _ in range(_MAX_NEWTON_STEPS):
             bent, (a, b, c) = _distort_rational(ray, lens)
-            miss = target - bent
-            if not (np.abs(miss) > _TOLERANCE).any():
+            residual = target - bent
+            if not (np.abs(residual) > _TOLERANCE).any():
                 break
             determinant = a * c - b * b
-            ray[:, 0] += (c * miss[:, 0] - b * miss[:, 1]) / determinant
-            ray[:, 1] += (a * miss[:, 1] - b * miss[:, 0]) / determinant
+            ray[:, 0] += (c * residual[:, 0] - b * residual[:, 1]) / determinant
+            ray[:, 1] += (a * residual[:, 1] - b * residual[:, 0]) / determinant
         bent, (a, b, c) = _distort_rational(ray, lens)
         solved = (np.abs(target - bent) <= 10 * _TOLERANCE).all(axis=1) & (a * c - b * b > 0) & (a + c > 0)
     return np.where(solved[:, None], ray, np.nan)
 
 
 def _fisheye_angle(theta: FloatArray, lens: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Distorted angle and its derivative; `lens` holds k1 … k4."""
+    """Return the distorted angle and its derivative; `lens` holds k1 … k4."""
     t2 = theta * theta
     k1, k2, k3, k4 = lens[:4]
     bent = theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))

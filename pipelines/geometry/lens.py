@@ -1,4 +1,4 @@
-"""Lenses whose parameters change: as one vector, what that does to rays, and to undistorted images."""
+"""Lenses whose parameters change: their parameter vector, its effect on bearings and on undistorted images."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ _LEAST_RAYS = 8
 
 @dataclass(frozen=True)
 class Lenses:
-    """The cameras of n images.
+    """Cameras of n images.
 
-    Changes of their parameters make one vector (L,): a list for each of `cameras`, in their order, and each as long
-    as the longest, zero beyond a shorter one.
+    Changes of their parameters form one vector (L,): a parameter list for each of `cameras`, in their order. All
+    lists have the length of the longest, with zeros beyond a shorter one.
 
     Attributes:
         cameras: by camera id.
@@ -33,15 +33,15 @@ class Lenses:
 
     @property
     def longest(self) -> int:
-        """Parameters of the camera that has most."""
+        """Number of parameters of the camera that has most."""
         return max((len(camera.params) for camera in self.cameras.values()), default=0)
 
     def of(self, image: int) -> Camera:
-        """The camera of an image."""
+        """Return the camera of an image."""
         return self.cameras[int(self.camera_id[image])]
 
     def moved(self, change: FloatArray) -> Lenses:
-        """With parameters changed by (L,)."""
+        """Return the lenses with parameters changed by (L,)."""
         rows = np.asarray(change, dtype=np.float64).reshape(len(self.cameras), self.longest)
         cameras = {
             key: replace(camera, params=camera.params + row[: len(camera.params)])
@@ -50,29 +50,34 @@ class Lenses:
         return Lenses(cameras, self.camera_id)
 
     def change_to(self, other: Lenses) -> FloatArray:
-        """What `moved` would have to be given (L,) to make the parameters those of another state of the same."""
+        """Return the change (L,) by which `moved` reaches the parameters of another state of the same cameras."""
         change = np.zeros((len(self.cameras), self.longest))
         for row, (key, camera) in zip(change, self.cameras.items(), strict=True):
             row[: len(camera.params)] = other.cameras[key].params - camera.params
         return change.ravel()
 
-    def bearings_by_parameters(self, image: IntArray, xy_px: FloatArray) -> FloatArray:
-        """Derivatives (K, 3, L) of `bearings` of pixels (K, 2) in images (K,) by all parameters."""
+    def bearing_jacobian(self, image: IntArray, xy_px: FloatArray) -> FloatArray:
+        """Return the derivatives (K, 3, L) of `bearings` of pixels (K, 2) in images (K,) by all parameters."""
         image, longest = np.asarray(image, dtype=np.int64), self.longest
-        found = np.zeros((len(image), 3, len(self.cameras), longest))
+        jacobian = np.zeros((len(image), 3, len(self.cameras), longest))
         for slot, (key, camera) in enumerate(self.cameras.items()):
             rows = np.flatnonzero(self.camera_id[image] == key)
             for index in range(len(camera.params)):
-                towards = partial(bearings, xy_px=xy_px[rows])
-                found[rows, :, slot, index] = by_parameter(towards, camera, index, _STEP)
-        return found.reshape(len(image), 3, -1)
+                bearings_of = partial(bearings, xy_px=xy_px[rows])
+                jacobian[rows, :, slot, index] = parameter_derivative(bearings_of, camera, index, _STEP)
+        return jacobian.reshape(len(image), 3, -1)
 
 
-def by_parameter(function: Callable[[Camera], FloatArray], camera: Camera, index: int, step: float) -> FloatArray:
-    """Central difference of a function of a camera by one of its parameters.
+def parameter_derivative(
+    function: Callable[[Camera], FloatArray], camera: Camera, index: int, step: float
+) -> FloatArray:
+    """Return the central difference of a function of a camera by one of its parameters.
 
     Args:
-        step: of the parameter, as a part of it, or of 1 where that is more.
+        function: of the camera.
+        camera: where to differentiate.
+        index: of the parameter.
+        step: of the parameter, relative to the larger of its magnitude and 1.
     """
     shift = np.zeros(len(camera.params))
     shift[index] = step * max(1.0, abs(float(camera.params[index])))
@@ -81,18 +86,18 @@ def by_parameter(function: Callable[[Camera], FloatArray], camera: Camera, index
 
 
 def bearings(camera: Camera, xy_px: FloatArray) -> FloatArray:
-    """Unit vectors (K, 3) in the camera towards pixels (K, 2); NaN as in `undistort`."""
+    """Return unit vectors (K, 3) in the camera's frame towards pixels (K, 2); NaN as in `undistort`."""
     ray = undistort(camera, xy_px)
     ray = np.concatenate([ray, np.ones((len(ray), 1))], axis=1)
     return np.asarray(ray / np.linalg.norm(ray, axis=1, keepdims=True))
 
 
-def pinhole_through(pinhole: Pinhole, before: Camera, after: Camera) -> Pinhole:
-    """Camera of an image that was undistorted to `pinhole` with the lens `before`, if the lens is `after`.
+def refit_pinhole(pinhole: Pinhole, before: Camera, after: Camera) -> Pinhole:
+    """Return the camera of an image that the lens `before` undistorted to `pinhole`, if the lens is `after`.
 
-    The rays that the pixels then truly have are fitted, over the part of the image that the photograph covers, by
-    least squares in pixels along each axis. Exact for another focal length or principal point; what another
-    distortion adds beyond the linear stays in the image.
+    The lens `after` gives each pixel another ray. Least squares in pixels along each axis fits a pinhole to these
+    rays, over the part of the image that the photograph covers. The fit is exact for another focal length or
+    principal point. Of another distortion, the part beyond the linear stays in the image.
     """
     if before.model == after.model and np.array_equal(before.params, after.params):
         return pinhole

@@ -20,26 +20,26 @@ ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 
 def matrix_from_quat_xyzw(quat_xyzw: ArrayLike) -> FloatArray:
-    """Rotation matrices (…, 3, 3) of quaternions (…, 4); they need not be of unit length."""
+    """Return rotation matrices (…, 3, 3) of quaternions (…, 4), which need not be of unit length."""
     quat = np.asarray(quat_xyzw, dtype=np.float64)
     return np.asarray(Rotation.from_quat(quat.reshape(-1, 4)).as_matrix()).reshape(*quat.shape[:-1], 3, 3)
 
 
 def quat_xyzw_from_matrix(rotation: ArrayLike) -> FloatArray:
-    """Unit quaternions (…, 4) with w ≥ 0 of rotation matrices (…, 3, 3)."""
+    """Return unit quaternions (…, 4) with w ≥ 0 of rotation matrices (…, 3, 3)."""
     matrix = np.asarray(rotation, dtype=np.float64)
     quat = Rotation.from_matrix(matrix.reshape(-1, 3, 3)).as_quat(canonical=True)
     return np.asarray(quat).reshape(*matrix.shape[:-2], 4)
 
 
 def exp_so3(rotation_vector: ArrayLike) -> FloatArray:
-    """Rotation matrices (…, 3, 3) of rotation vectors (…, 3) in radians."""
+    """Return rotation matrices (…, 3, 3) of rotation vectors (…, 3) in radians."""
     vector = np.asarray(rotation_vector, dtype=np.float64)
     return np.asarray(Rotation.from_rotvec(vector.reshape(-1, 3)).as_matrix()).reshape(*vector.shape[:-1], 3, 3)
 
 
 def log_so3(rotation: ArrayLike) -> FloatArray:
-    """Rotation vectors (…, 3) in radians, of length ≤ π, of rotation matrices (…, 3, 3)."""
+    """Return rotation vectors (…, 3) in radians, of length ≤ π, of rotation matrices (…, 3, 3)."""
     matrix = np.asarray(rotation, dtype=np.float64)
     return np.asarray(Rotation.from_matrix(matrix.reshape(-1, 3, 3)).as_rotvec()).reshape(matrix.shape[:-1])
 
@@ -59,7 +59,7 @@ def right_jacobian_inverse_so3(rotation_vector: ArrayLike) -> FloatArray:
 
 
 def skew(vector: ArrayLike) -> FloatArray:
-    """Cross-product matrices (…, 3, 3): `skew(a) @ b = a × b`."""
+    """Return cross-product matrices (…, 3, 3): `skew(a) @ b = a × b`."""
     v = np.asarray(vector, dtype=np.float64)
     matrix = np.zeros((*v.shape[:-1], 3, 3))
     matrix[..., 0, 1], matrix[..., 0, 2] = -v[..., 2], v[..., 1]
@@ -69,7 +69,7 @@ def skew(vector: ArrayLike) -> FloatArray:
 
 
 def geo_from_cam(yaw_pitch_roll_deg: ArrayLike) -> FloatArray:
-    """Rotation camera → East-North-Up of gimbal angles (…, 3) in degrees.
+    """Return rotations (…, 3, 3) camera → East-North-Up of gimbal angles (…, 3) in degrees.
 
     The angles turn North-East-Down into the gimbal's forward-right-down axes, in the order Z-Y-X (yaw, pitch,
     roll). Pitch −90 looks straight down; the camera looks along the gimbal's forward axis.
@@ -81,9 +81,9 @@ def geo_from_cam(yaw_pitch_roll_deg: ArrayLike) -> FloatArray:
 
 
 def yaw_pitch_roll_deg(geo_from_cam_rotation: ArrayLike) -> FloatArray:
-    """Gimbal angles (…, 3) in degrees of rotations camera → East-North-Up (…, 3, 3): undoes `geo_from_cam`.
+    """Return gimbal angles (…, 3) in degrees of rotations (…, 3, 3) camera → East-North-Up: inverts `geo_from_cam`.
 
-    Straight down or up, yaw and roll turn about the same axis: roll is then zero.
+    For a camera that looks straight down or up, yaw and roll turn about the same axis: roll is then zero.
     """
     matrix = np.asarray(geo_from_cam_rotation, dtype=np.float64)
     ned_from_gimbal = ENU_FROM_NED.T @ matrix @ _CAM_FROM_GIMBAL

@@ -13,7 +13,7 @@ from pipelines.geometry.lens import Lenses
 
 @dataclass(frozen=True)
 class SparseModel:
-    """An SfM model in its own frame `local`: n registered images, N points, M observations.
+    """SfM model in its own frame `local`: n registered images, N points, M observations.
 
     Observations are sorted by point, then by image, so that the track of a point is one contiguous run.
 
@@ -53,18 +53,18 @@ class SparseModel:
         return -np.einsum("nji,nj->ni", self.rotation_cam_from_local, self.translation_cam_from_local)
 
     def image_index(self) -> dict[str, int]:
-        """Index of each image by its name."""
+        """Return the index of each image by its name."""
         return {name: index for index, name in enumerate(self.image_name)}
 
     def camera_of(self, image: int) -> Camera:
-        """Intrinsics of the image with that index."""
+        """Return the intrinsics of the image with that index."""
         return self.cameras[int(self.image_camera_id[image])]
 
     @property
     def lenses(self) -> Lenses:
-        """The cameras of the images, whose parameters may change."""
+        """Cameras of the images, whose parameters may change."""
         return Lenses(self.cameras, self.image_camera_id)
 
     def points_in(self, image: int) -> IntArray:
-        """Indices (K,), ascending, of the points that are observed in the image with that index."""
+        """Return ascending indices (K,) of the points that are observed in the image with that index."""
         return np.unique(self.obs_point[self.obs_image == image])

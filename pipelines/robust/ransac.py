@@ -17,7 +17,7 @@ ModelT = TypeVar("ModelT")
 
 @dataclass(frozen=True)
 class RansacOptions:
-    """How hard to look.
+    """Sample size, gate and number of draws.
 
     Attributes:
         sample_size: observations that determine a model.
@@ -34,7 +34,7 @@ class RansacOptions:
 
 @dataclass(frozen=True)
 class RansacResult(Generic[ModelT]):
-    """The best model, its inliers (N,) and its truncated cost."""
+    """Best model, its inliers (N,) and its truncated cost."""
 
     model: ModelT
     inlier: BoolArray
@@ -48,11 +48,14 @@ def ransac(
     options: RansacOptions,
     rng: np.random.Generator,
 ) -> RansacResult[ModelT]:
-    """Find the model that the largest consistent part of `count` observations agrees with.
+    """Return the model with the smallest truncated cost over `count` observations.
 
     Args:
+        count: number of observations.
         fit: makes a model from the chosen indices; may raise `DegenerateGeometryError`.
         squared_residuals: whitened squared residuals (count,) of a model.
+        options: sample size, gate and number of draws.
+        rng: draws the samples.
 
     Raises:
         DegenerateGeometryError: too few observations, or no draw gave a model.
@@ -79,7 +82,7 @@ def ransac(
 
 
 def draws_needed(inlier_share: float, options: RansacOptions) -> float:
-    """Draws after which one without outliers has been seen with the wanted confidence."""
+    """Return the number of draws that contain one without outliers at the wanted confidence."""
     clean = inlier_share**options.sample_size
     if clean >= 1.0:
         return 1.0

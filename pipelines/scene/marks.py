@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipelines.core.types import BoolArray, FloatArray, IntArray
+from pipelines.geometry.intersection import intersect_rays
 from pipelines.geometry.lens import bearings
-from pipelines.geometry.rays import Intersections, Rays, Views, intersect
+from pipelines.geometry.rays import Intersections, Rays, UncertainCameras
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.scene.survey import SurveyedPoint
 
@@ -144,11 +145,11 @@ def intersect_marks(
     """
     count = len(rays)
     # A view for each mark: marks of one image may have different σ.
-    views = Views(
+    views = UncertainCameras(
         center_in_geo=center_in_frame[rays.camera],
         rotation_geo_from_cam=np.swapaxes(cam_from_frame[rays.camera], 1, 2),
         cov_center_in_geo=np.tile(np.eye(3) * errors.sigma_center**2, (count, 1, 1)),
         sigma_attitude_rad=np.full(count, errors.sigma_attitude_rad),
         sigma_ray=np.hypot(rays.sigma_rad, errors.sigma_lens_rad),
     )
-    return intersect(Rays(rays.point, np.arange(count), rays.xy), views, len(rays.point_id))
+    return intersect_rays(Rays(rays.point, np.arange(count), rays.xy), views, len(rays.point_id))

@@ -70,7 +70,7 @@ def control_term(scene: Scene, survey: Survey) -> ControlTerm | None:
         position_in_geo=torch.tensor([point.position_in_geo for point in surveyed], dtype=torch.float64),
         root_information=torch.eye(3, dtype=torch.float64).repeat(len(surveyed), 1, 1),
         point_id=rays.point_id,
-        bearing_by_lens=torch.from_numpy(scene.sparse.lenses.bearings_by_parameters(rays.camera, rays.xy_px)),
+        bearing_by_lens=torch.from_numpy(scene.sparse.lenses.bearing_jacobian(rays.camera, rays.xy_px)),
     )
     of_survey = np.array([point.cov_in_geo for point in surveyed])
     return _with_covariance(control, of_survey + _mark_covariance(scene, control))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pipelines.geometry.cameras import Pinhole
-from pipelines.geometry.lens import Lenses, pinhole_through
+from pipelines.geometry.lens import Lenses, refit_pinhole
 from pipelines.scene.photographs import ImageCache
 
 
@@ -33,5 +33,5 @@ class Pinholes:
         key = int(self._sfm.camera_id[index])  # photographs of one camera have one pinhole
         if key not in self._fitted:
             before, after = self._sfm.of(index), self._now.of(index)
-            self._fitted[key] = pinhole_through(self._images.pinhole(index), before, after)
+            self._fitted[key] = refit_pinhole(self._images.pinhole(index), before, after)
         return self._fitted[key]

@@ -1,1 +1,1 @@
-"""A survey whose truth is known exactly: scene, flight, sensors and photographs."""
+"""Simulation of a survey whose truth is known exactly: scene, flight, sensors and photographs."""

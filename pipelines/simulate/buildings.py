@@ -1,4 +1,4 @@
-"""Houses, trees and cars as triangles."""
+"""Buildings, trees and cars as triangles."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.core.types import FloatArray
-from pipelines.simulate.mesh import Color, Finish, Material, MeshBuilder
+from pipelines.simulate.mesh import Color, Material, MeshBuilder, TextureParameters
 
 Roof = Literal["flat", "gable", "hip"]
-SpotKind = Literal["ground", "roof", "wall"]
+SiteKind = Literal["ground", "roof", "wall"]
 _TARGET_LIFT_M = 0.03
-_FOOT_M = 2.5  # walls go on below the ground, which is not level
+_FOOT_M = 2.5  # walls continue below the ground, which is not level
 
 PLASTERS: tuple[Color, ...] = (
     (0.62, 0.55, 0.42), (0.70, 0.66, 0.58), (0.55, 0.36, 0.24), (0.48, 0.50, 0.46), (0.60, 0.44, 0.30),
@@ -33,22 +33,22 @@ CROWNS: tuple[Color, ...] = ((0.09, 0.16, 0.04), (0.13, 0.19, 0.05), (0.06, 0.12
 
 
 @dataclass(frozen=True)
-class Spot:
-    """A place for a survey target: position (3,) and outward unit normal (3,) in geo."""
+class TargetSite:
+    """Place for a survey target: position (3,) and outward unit normal (3,) in geo."""
 
     position: FloatArray
     normal: FloatArray
-    kind: SpotKind
+    kind: SiteKind
 
     @property
     def target_position(self) -> FloatArray:
-        """Centre (3,) of a target's face: the board stands a little off the surface that it is fixed to."""
+        """Centre (3,) of the target's face: its board stands a little off the surface behind it."""
         return np.asarray(self.position + _TARGET_LIFT_M * self.normal)
 
 
 @dataclass(frozen=True)
-class House:
-    """A block with one roof.
+class Building:
+    """Rectangular building with one roof.
 
     Attributes:
         center: (3,) geo, at ground level.
@@ -72,126 +72,136 @@ class House:
         return self.storeys * self.floor_m + 0.3
 
     def at(self, x: float, y: float, z: float) -> FloatArray:
-        """Geo position (3,) of a place in the house's own axes."""
+        """Return the geo position (3,) of a place in the building's own axes."""
         return np.asarray(self.center + np.array([x, y, z]) @ self.axes)
 
 
-def pick(rng: np.random.Generator, colors: tuple[Color, ...]) -> Color:
-    """One of the colours, varied a little."""
+def varied_color(rng: np.random.Generator, colors: tuple[Color, ...]) -> Color:
+    """Return one of the colours, varied a little."""
     chosen = np.array(colors[rng.integers(len(colors))])
     varied = np.clip(chosen * rng.uniform(0.85, 1.15) * rng.uniform(0.93, 1.07, 3), 0.02, 0.9)
     return (float(varied[0]), float(varied[1]), float(varied[2]))
 
 
-def shift(rng: np.random.Generator) -> tuple[float, float]:
-    """A random place in the noise."""
+def random_shift(rng: np.random.Generator) -> tuple[float, float]:
+    """Return a random shift (2,) of a texture in the noise, in metres."""
     return (float(rng.uniform(0, 400)), float(rng.uniform(0, 400)))
 
 
-def add_house(builder: MeshBuilder, house: House, rng: np.random.Generator) -> list[Spot]:
-    """Add a house; returns places on its walls and flat roof where a target can be fixed."""
+def add_building(builder: MeshBuilder, building: Building, rng: np.random.Generator) -> list[TargetSite]:
+    """Add a building, and return sites for targets on its walls and flat roof."""
     style = int(rng.integers(3))
-    wall = Finish(
-        base=pick(rng, STONES if style == 1 else PLASTERS),
-        accent=pick(rng, FRAMES),
+    wall = TextureParameters(
+        base=varied_color(rng, STONES if style == 1 else PLASTERS),
+        accent=varied_color(rng, FRAMES),
         style=style,
-        floor_m=house.floor_m,
+        floor_m=building.floor_m,
         pitch_m=float(rng.uniform(2.3, 3.6)),
         window_m=(float(rng.uniform(0.9, 1.7)), float(rng.uniform(1.2, 1.7))),
         sill_m=float(rng.uniform(0.7, 1.0)),
-        top_m=house.storeys * house.floor_m,
+        top_m=building.storeys * building.floor_m,
         shop=bool(rng.random() < 0.35),
     )
-    spots = _add_walls(builder, house, wall, rng)
-    if house.roof == "flat":
-        return spots + _add_flat_roof(builder, house, rng)
-    _add_pitched_roof(builder, house, wall, rng)
-    return spots
+    sites = _add_walls(builder, building, wall, rng)
+    if building.roof == "flat":
+        return sites + _add_flat_roof(builder, building, rng)
+    _add_pitched_roof(builder, building, wall, rng)
+    return sites
 
 
-def _add_walls(builder: MeshBuilder, house: House, wall: Finish, rng: np.random.Generator) -> list[Spot]:
-    half_l, half_w = house.length_m / 2, house.width_m / 2
-    top = house.height_m + (0.8 if house.roof == "flat" else 0.0)
+def _add_walls(
+    builder: MeshBuilder, building: Building, wall: TextureParameters, rng: np.random.Generator
+) -> list[TargetSite]:
+    half_l, half_w = building.length_m / 2, building.width_m / 2
+    top = building.height_m + (0.8 if building.roof == "flat" else 0.0)
     ring = [(-half_l, -half_w), (half_l, -half_w), (half_l, half_w), (-half_l, half_w), (-half_l, -half_w)]
-    spots = []
+    sites = []
     for (x0, y0), (x1, y1) in pairwise(ring):
-        start, end = house.at(x0, y0, 0.0), house.at(x1, y1, 0.0)
+        start, end = building.at(x0, y0, 0.0), building.at(x1, y1, 0.0)
         length = float(np.linalg.norm(end - start))
         along = (end - start) / length
         up = np.array([0.0, 0.0, 1.0])
         count = max(1, round(length / wall.pitch_m))
-        finish = builder.finish(Finish(**{**vars(wall), "pitch_m": length / count, "shift_m": shift(rng)}))
+        texture = builder.add_texture(
+            TextureParameters(**{**vars(wall), "pitch_m": length / count, "shift_m": random_shift(rng)})
+        )
         a, b, c, d = start - _FOOT_M * up, end - _FOOT_M * up, end + top * up, start + top * up
-        builder.triangles(np.array([[a, b, c], [a, c, d]]), Material.WALL, finish, (start, along, up))
+        builder.triangles(np.array([[a, b, c], [a, c, d]]), Material.WALL, texture, (start, along, up))
         normal = np.cross(along, up)
         for share in np.arange(1.2, length - 1.0, 1.9):
-            height = float(rng.uniform(1.5, max(1.6, house.height_m - 1.0)))
-            spots.append(Spot(start + along * share + up * height, normal, "wall"))
-    return spots
+            height = float(rng.uniform(1.5, max(1.6, building.height_m - 1.0)))
+            sites.append(TargetSite(start + along * share + up * height, normal, "wall"))
+    return sites
 
 
-def _add_flat_roof(builder: MeshBuilder, house: House, rng: np.random.Generator) -> list[Spot]:
-    half_l, half_w, top = house.length_m / 2, house.width_m / 2, house.height_m
+def _add_flat_roof(builder: MeshBuilder, building: Building, rng: np.random.Generator) -> list[TargetSite]:
+    half_l, half_w, top = building.length_m / 2, building.width_m / 2, building.height_m
     ring = [(-half_l, -half_w), (half_l, -half_w), (half_l, half_w), (-half_l, half_w)]
-    sheet = builder.finish(Finish(pick(rng, SHEETS), pick(rng, SHEETS), shift_m=shift(rng)))
-    builder.quad([house.at(x, y, top) for x, y in ring], Material.FLAT_ROOF, sheet)
-    metal = builder.finish(Finish((0.45, 0.46, 0.47), shift_m=shift(rng)))
+    sheet = builder.add_texture(
+        TextureParameters(varied_color(rng, SHEETS), varied_color(rng, SHEETS), shift_m=random_shift(rng))
+    )
+    builder.quad([building.at(x, y, top) for x, y in ring], Material.FLAT_ROOF, sheet)
+    metal = builder.add_texture(TextureParameters((0.45, 0.46, 0.47), shift_m=random_shift(rng)))
     free = [(x, y) for x in (-0.6, 0.0, 0.6) for y in (-0.5, 0.5)]
     rng.shuffle(free)
     for x, y in free[: int(rng.integers(1, 4))]:
         size = rng.uniform([1.2, 1.0, 0.8], [3.4, 2.4, 2.2])
-        builder.box(house.at(x * half_l, y * half_w, top), size, house.axes, Material.PLAIN, metal)
+        builder.box(building.at(x * half_l, y * half_w, top), size, building.axes, Material.PLAIN, metal)
     if rng.random() < 0.5 and half_l > 5:
-        _add_solar(builder, house, free[4], rng)
-        return [_roof_spot(house, free[3]), _roof_spot(house, free[5])]
-    return [_roof_spot(house, place) for place in free[3:]]
+        _add_solar(builder, building, free[4], rng)
+        return [_roof_site(building, free[3]), _roof_site(building, free[5])]
+    return [_roof_site(building, place) for place in free[3:]]
 
 
-def _roof_spot(house: House, place: tuple[float, float]) -> Spot:
-    position = house.at(place[0] * house.length_m / 2, place[1] * house.width_m / 2, house.height_m)
-    return Spot(position, np.array([0.0, 0.0, 1.0]), "roof")
+def _roof_site(building: Building, place: tuple[float, float]) -> TargetSite:
+    position = building.at(place[0] * building.length_m / 2, place[1] * building.width_m / 2, building.height_m)
+    return TargetSite(position, np.array([0.0, 0.0, 1.0]), "roof")
 
 
-def _add_solar(builder: MeshBuilder, house: House, place: tuple[float, float], rng: np.random.Generator) -> None:
-    x, y, top = place[0] * house.length_m / 2, place[1] * house.width_m / 2, house.height_m
-    finish = builder.finish(Finish((0.02, 0.03, 0.07), shift_m=shift(rng)))
-    low, high, reach = top + 0.2, top + 0.9, min(2.5, house.length_m / 8)
+def _add_solar(
+    builder: MeshBuilder, building: Building, place: tuple[float, float], rng: np.random.Generator
+) -> None:
+    x, y, top = place[0] * building.length_m / 2, place[1] * building.width_m / 2, building.height_m
+    texture = builder.add_texture(TextureParameters((0.02, 0.03, 0.07), shift_m=random_shift(rng)))
+    low, high, reach = top + 0.2, top + 0.9, min(2.5, building.length_m / 8)
     corners = [
         (x - reach, y - 0.8, low),
         (x + reach, y - 0.8, low),
         (x + reach, y + 0.8, high),
         (x - reach, y + 0.8, high),
     ]
-    builder.quad([house.at(*corner) for corner in corners], Material.SOLAR, finish)
+    builder.quad([building.at(*corner) for corner in corners], Material.SOLAR, texture)
 
 
-def _add_pitched_roof(builder: MeshBuilder, house: House, wall: Finish, rng: np.random.Generator) -> None:
-    half_l, half_w, top, over = house.length_m / 2, house.width_m / 2, house.height_m, 0.45
+def _add_pitched_roof(
+    builder: MeshBuilder, building: Building, wall: TextureParameters, rng: np.random.Generator
+) -> None:
+    half_l, half_w, top, over = building.length_m / 2, building.width_m / 2, building.height_m, 0.45
     slope = float(rng.uniform(0.55, 0.95))
     ridge, eave = top + half_w * slope, top - over * slope
-    back = half_w if house.roof == "hip" else -over
-    tile = builder.finish(Finish(pick(rng, TILES), shift_m=shift(rng)))
-    ends = [house.at(-half_l + back, 0.0, ridge), house.at(half_l - back, 0.0, ridge)]
+    back = half_w if building.roof == "hip" else -over
+    tile = builder.add_texture(TextureParameters(varied_color(rng, TILES), shift_m=random_shift(rng)))
+    ends = [building.at(-half_l + back, 0.0, ridge), building.at(half_l - back, 0.0, ridge)]
     out_l, out_w = half_l + over, half_w + over
     corners = [
-        house.at(x, y, eave) for x, y in [(-out_l, -out_w), (out_l, -out_w), (out_l, out_w), (-out_l, out_w)]
+        building.at(x, y, eave) for x, y in [(-out_l, -out_w), (out_l, -out_w), (out_l, out_w), (-out_l, out_w)]
     ]
     builder.quad([corners[0], corners[1], ends[1], ends[0]], Material.TILES, tile)
     builder.quad([corners[2], corners[3], ends[0], ends[1]], Material.TILES, tile)
-    if house.roof == "hip":
+    if building.roof == "hip":
         _add_hip(builder, (corners[1], corners[2], ends[1]), tile)
         _add_hip(builder, (corners[3], corners[0], ends[0]), tile)
     else:
-        gable = builder.finish(Finish(**{**vars(wall), "shift_m": shift(rng)}))
+        gable = builder.add_texture(TextureParameters(**{**vars(wall), "shift_m": random_shift(rng)}))
         for sign in (-1.0, 1.0):
-            low = house.at(sign * half_l, -sign * half_w, top), house.at(sign * half_l, sign * half_w, top)
-            peak = house.at(sign * half_l, 0.0, ridge)
-            frame = (house.at(sign * half_l, -sign * half_w, 0.0), sign * house.axes[1], house.axes[2])
+            low = building.at(sign * half_l, -sign * half_w, top), building.at(sign * half_l, sign * half_w, top)
+            peak = building.at(sign * half_l, 0.0, ridge)
+            frame = (building.at(sign * half_l, -sign * half_w, 0.0), sign * building.axes[1], building.axes[2])
             builder.triangles(np.array([[*low, peak]]), Material.WALL, gable, frame)
-    brick = builder.finish(Finish(pick(rng, STONES), shift_m=shift(rng)))
+    brick = builder.add_texture(TextureParameters(varied_color(rng, STONES), shift_m=random_shift(rng)))
     x, y = rng.uniform(-0.5, 0.5) * (half_l - 1), rng.uniform(-0.5, 0.5) * half_w
     foot = top + (half_w - abs(y)) * slope - 0.8
-    builder.box(house.at(x, y, foot), (0.9, 0.7, 2.2), house.axes, Material.PLAIN, brick)
+    builder.box(building.at(x, y, foot), (0.9, 0.7, 2.2), building.axes, Material.PLAIN, brick)
 
 
 def _add_hip(builder: MeshBuilder, corners: tuple[FloatArray, FloatArray, FloatArray], tile: int) -> None:
@@ -202,7 +212,7 @@ def _add_hip(builder: MeshBuilder, corners: tuple[FloatArray, FloatArray, FloatA
 
 
 def _ball() -> tuple[FloatArray, NDArray[np.intp]]:
-    """A sphere of 80 triangles: an octahedron's cousin, the icosahedron, divided once."""
+    """Return vertices (42, 3) and faces (80, 3) of a unit sphere: an icosahedron, divided once."""
     golden = (1 + 5**0.5) / 2
     vertices = np.array(
         [[-1, golden, 0], [1, golden, 0], [-1, -golden, 0], [1, -golden, 0], [0, -1, golden], [0, 1, golden],
@@ -226,10 +236,11 @@ _BALL_VERTICES, _BALL_FACES = _ball()
 
 def add_tree(builder: MeshBuilder, foot: FloatArray, height_m: float, rng: np.random.Generator) -> None:
     """Add a tree of a trunk and three lumpy crowns; `foot` (3,) in geo."""
-    bark = builder.finish(Finish((0.13, 0.10, 0.07), shift_m=shift(rng)))
+    bark = builder.add_texture(TextureParameters((0.13, 0.10, 0.07), shift_m=random_shift(rng)))
     builder.box(foot - [0, 0, 0.5], (0.35, 0.35, 0.6 * height_m), np.eye(3), Material.PLAIN, bark)
-    color = pick(rng, CROWNS)
-    leaf = builder.finish(Finish(color, tuple(2.1 * part for part in color), shift_m=shift(rng)))  # type: ignore[arg-type]
+    red, green, blue = varied_color(rng, CROWNS)
+    light = (2.1 * red, 2.1 * green, 2.1 * blue)
+    leaf = builder.add_texture(TextureParameters((red, green, blue), light, shift_m=random_shift(rng)))
     for _ in range(3):
         radius = height_m * rng.uniform(0.2, 0.3)
         aside, above = rng.normal(0, 0.12 * height_m, 2), height_m * rng.uniform(0.55, 0.78)
@@ -242,8 +253,8 @@ def add_tree(builder: MeshBuilder, foot: FloatArray, height_m: float, rng: np.ra
 
 def add_car(builder: MeshBuilder, foot: FloatArray, axes: FloatArray, rng: np.random.Generator) -> None:
     """Add a parked car; `foot` (3,) in geo, `axes` (3, 3) rows along, across, up."""
-    color = pick(rng, CARS)
-    body = builder.finish(Finish(color, shift_m=shift(rng)))
-    cabin = builder.finish(Finish(color, top_m=1.0, shift_m=shift(rng)))
+    color = varied_color(rng, CARS)
+    body = builder.add_texture(TextureParameters(color, shift_m=random_shift(rng)))
+    cabin = builder.add_texture(TextureParameters(color, top_m=1.0, shift_m=random_shift(rng)))
     builder.box(foot + 0.25 * axes[2], (4.3, 1.8, 0.7), axes, Material.CAR, body)
     builder.box(foot + 0.95 * axes[2] - 0.2 * axes[0], (2.4, 1.6, 0.55), axes, Material.CAR, cabin)

@@ -1,4 +1,4 @@
-"""Flights: where the camera is and how it points, at any time."""
+"""Flights: position and attitude of the camera at any time."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from scipy.interpolate import CubicSpline, PchipInterpolator
 from pipelines.core.types import FloatArray
 from pipelines.geometry.rotations import ENU_FROM_NED, geo_from_cam
 
-LEAD_S = 1.0  # the sensors run this long before the first and after the last photograph
+LEAD_S = 1.0  # time that the sensors run before the first and after the last photograph
 _LOOK_AT_M = 6.0
 _SPEED_M_S = 8.0
 DEFAULT_HEIGHTS_M = {"orbit": (60.0,), "grid": (70.0,), "facade": (7.0, 15.0)}
@@ -20,11 +20,11 @@ DEFAULT_RADIUS_M = {"orbit": 85.0, "grid": 60.0, "facade": 19.0}
 
 @dataclass(frozen=True)
 class FlightPlan:
-    """What to fly.
+    """Plan of a flight.
 
     Attributes:
         kind: "orbit", "grid" or "facade".
-        images: photographs.
+        images: number of photographs.
         interval_s: time between them; None for 2 s, or more where the aircraft would be faster than 8 m/s.
         heights_m: above the origin, one round each.
         radius_m: radius, half side, or distance from the facade.
@@ -38,8 +38,8 @@ class FlightPlan:
 
 
 @dataclass(frozen=True)
-class Track:
-    """The true motion. Times are seconds of the camera's clock since the first photograph.
+class TrueTrajectory:
+    """True motion of the camera. Times are seconds of the camera's clock since the first photograph.
 
     Attributes:
         photo_s: (N,) times of the photographs.
@@ -52,28 +52,32 @@ class Track:
     _angles: PchipInterpolator
 
     def position(self, time_s: ArrayLike) -> FloatArray:
-        """Camera centres (N, 3) in geo."""
+        """Return camera centres (N, 3) in geo."""
         return np.asarray(self._position(time_s))
 
     def acceleration(self, time_s: ArrayLike) -> FloatArray:
-        """Acceleration (N, 3) in geo, m/s²."""
+        """Return accelerations (N, 3) in geo, m/s²."""
         return np.asarray(self._position(time_s, 2))
 
     def geo_from_nominal_cam(self, time_s: ArrayLike) -> FloatArray:
-        """Rotations (N, 3, 3) of a camera that is mounted exactly as planned."""
+        """Return rotations (N, 3, 3) camera → geo of a camera that is mounted exactly as planned."""
         return geo_from_cam(self._angles(time_s))
 
     def geo_from_body(self, time_s: ArrayLike) -> FloatArray:
-        """Rotations (N, 3, 3) of the body (forward, right, down)."""
+        """Return rotations (N, 3, 3) body → geo of the body (forward, right, down)."""
         return np.asarray(self.geo_from_nominal_cam(time_s) @ self.cam_from_body)
 
 
-def fly(plan: FlightPlan, complex_m: tuple[float, float], axes: FloatArray, rng: np.random.Generator) -> Track:
-    """Plan a flight over a scene.
+def make_trajectory(
+    plan: FlightPlan, complex_m: tuple[float, float], axes: FloatArray, rng: np.random.Generator
+) -> TrueTrajectory:
+    """Return the motion of a flight over a scene, with the wobble of an aircraft.
 
     Args:
+        plan: of the flight.
         complex_m: half lengths of the complex in the middle.
         axes: (3, 3) rows: the town's axes in geo.
+        rng: of the wobble.
     """
     index = np.arange(-1.0, plan.images + 1)
     if plan.kind == "orbit":
@@ -88,7 +92,7 @@ def fly(plan: FlightPlan, complex_m: tuple[float, float], axes: FloatArray, rng:
     angles = angles + wobble
     angles[:, 0] = np.degrees(np.unwrap(np.radians(angles[:, 0])))
     times = index * (plan.interval_s or _unhurried_s(positions))
-    return Track(
+    return TrueTrajectory(
         times[1:-1].astype(np.float64),
         # The mount tilts the camera as the flight needs, so that the body itself flies level.
         geo_from_cam([0.0, pitch, 0.0]).T @ ENU_FROM_NED,
@@ -98,13 +102,13 @@ def fly(plan: FlightPlan, complex_m: tuple[float, float], axes: FloatArray, rng:
 
 
 def _unhurried_s(positions: FloatArray) -> float:
-    """Interval in half seconds, so that photographs and fixes coincide: 2 s, or what the distances need."""
+    """Return the interval for at most 8 m/s, 2 s or more, in half seconds: photographs coincide with fixes."""
     step_m = float(np.median(np.linalg.norm(np.diff(positions, axis=0), axis=1)))
     return max(2.0, float(np.ceil(2 * step_m / _SPEED_M_S)) / 2)
 
 
 def _rounds(plan: FlightPlan, index: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
-    """Which round each index belongs to, and its fraction of that round."""
+    """Return the number of the round of each index, and the index as a fraction of that round."""
     rounds = len(plan.heights_m)
     per_round = -(-plan.images // rounds)
     number = np.clip(index // per_round, 0, rounds - 1).astype(np.intp)
@@ -121,7 +125,7 @@ def _orbit(plan: FlightPlan, index: FloatArray) -> tuple[FloatArray, FloatArray]
 
 
 def _looking(direction: FloatArray) -> FloatArray:
-    """Yaw, pitch, roll (N, 3) in degrees of cameras that look along `direction` (N, 3) in geo."""
+    """Return yaw, pitch, roll (N, 3) in degrees of cameras that look along `direction` (N, 3) in geo."""
     yaw = np.degrees(np.arctan2(direction[:, 0], direction[:, 1]))
     pitch = np.degrees(np.arctan2(direction[:, 2], np.hypot(direction[:, 0], direction[:, 1])))
     return np.stack([yaw, pitch, np.zeros_like(yaw)], axis=1)
@@ -130,7 +134,7 @@ def _looking(direction: FloatArray) -> FloatArray:
 def _grid(plan: FlightPlan, index: FloatArray, axes: FloatArray) -> tuple[FloatArray, FloatArray]:
     number, share = _rounds(plan, index)
     per_round = -(-plan.images // len(plan.heights_m))
-    # A photograph covers more across the line than along it, so that lines can be further apart.
+    # A photograph covers more across the line than along it: lines can be further apart than photographs.
     lines = max(1, round((0.75 * per_round) ** 0.5))
     per_line = -(-per_round // lines)
     step = np.clip(np.round(share * per_round), 0, per_round - 1).astype(int)
@@ -139,7 +143,7 @@ def _grid(plan: FlightPlan, index: FloatArray, axes: FloatArray) -> tuple[FloatA
     place = np.where(forward, along, per_line - 1 - along) / max(per_line - 1, 1)
     x = plan.radius_m * (2 * place - 1)
     y = plan.radius_m * (2 * line / max(lines - 1, 1) - 1)
-    # The lead-in and lead-out go on straight for a moment.
+    # Lead-in and lead-out continue the line for a moment.
     x = x + np.where((index < 0) | (index >= plan.images), np.where(forward, 1, -1) * np.sign(index) * 5.0, 0.0)
     positions = np.stack([x, y, np.array(plan.heights_m)[number]], axis=1) @ axes
     positions[:, 2] = np.array(plan.heights_m)[number]
@@ -162,9 +166,9 @@ def _facade(
     turn = np.radians(-90 + 90 * (part // 2 + np.where(part % 2 == 1, done, 0.0)))
     outward = np.stack([np.cos(turn), np.sin(turn)], axis=1)
     starts = np.array([[-half_x, -half_y], [half_x, -half_y], [half_x, half_y], [-half_x, half_y]])
-    here, following = starts[part // 2], starts[(part // 2 + 1) % 4]
+    corner_xy, next_corner_xy = starts[part // 2], starts[(part // 2 + 1) % 4]
     on_side = np.where(part % 2 == 1, 1.0, done)[:, None]
-    place = here + (following - here) * on_side + plan.radius_m * outward
+    place = corner_xy + (next_corner_xy - corner_xy) * on_side + plan.radius_m * outward
     height = np.array(plan.heights_m)[number]
     positions = np.concatenate([place, np.zeros((len(index), 1))], axis=1) @ axes
     positions[:, 2] = height

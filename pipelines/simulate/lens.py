@@ -1,7 +1,7 @@
-"""The simulated lens: exact projection, and rays by Newton's method.
+"""Simulated lens: exact projection, and rays by Newton's method.
 
-Written apart from the pipeline's own camera models on purpose: a mistake that both sides shared would cancel and
-never show in a check point.
+The code is separate from the pipeline's own camera models on purpose. A mistake in code that both sides shared
+would cancel, and never show at a check point.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ _TOLERANCE = 1e-12
 
 @dataclass(frozen=True)
 class Lens:
-    """A lens of COLMAP's RADIAL or OPENCV kind, with one focal length.
+    """Lens of COLMAP's RADIAL or OPENCV kind, with one focal length.
 
     Attributes:
-        model: which coefficients are in use.
+        model: determines the coefficients in use.
         width, height: image size in pixels.
         focal_px: focal length in pixels.
         center_px: principal point; the centre of the top-left pixel is (0.5, 0.5).
@@ -58,9 +58,9 @@ class Lens:
         return (self.focal_px, self.focal_px, cx, cy, self.k1, self.k2, self.p1, self.p2)
 
     def project(self, points_in_cam: ArrayLike) -> FloatArray:
-        """Pixels (N, 2) of points (N, 3) in the camera frame; NaN where the lens cannot see a point.
+        """Return pixels (N, 2) of points (N, 3) in the camera frame; NaN if the lens cannot see the point.
 
-        A polynomial folds back at large angles: a point from beyond the fold has no true image, although the
+        The polynomial folds back at large angles. A point from beyond the fold has no true image, although the
         polynomial gives one.
         """
         points = np.asarray(points_in_cam, dtype=np.float64)
@@ -73,7 +73,7 @@ class Lens:
         return pixels
 
     def directions(self, pixels: ArrayLike) -> FloatArray:
-        """Directions (N, 3) with z = 1 of pixels (N, 2), exact to 1e-12.
+        """Return directions (N, 3) with z = 1 of pixels (N, 2), exact to 1e-12.
 
         Raises:
             InputError: the distortion folds inside the image, so that a pixel has no ray.
@@ -103,7 +103,7 @@ class Lens:
         )
 
     def _solve(self, xy: FloatArray, residual: FloatArray) -> FloatArray:
-        """Newton step (N, 2): the 2×2 Jacobian of `_distort` solved by Cramer's rule."""
+        """Return the Newton step (N, 2): the 2×2 Jacobian of `_distort` solved by Cramer's rule."""
         x, y = xy[:, 0], xy[:, 1]
         r2 = x * x + y * y
         radial, slope = 1 + r2 * (self.k1 + r2 * self.k2), 2 * (self.k1 + 2 * r2 * self.k2)
@@ -114,7 +114,7 @@ class Lens:
         return np.asarray(np.stack([yy * u - xy_ * v, xx * v - xy_ * u], axis=1) / (xx * yy - xy_ * xy_)[:, None])
 
     def _fold_radius(self) -> float:
-        """Radius (tangent of the angle) at which r (1 + k1 r² + k2 r⁴) stops growing."""
+        """Return the radius (tangent of the angle) at which r (1 + k1 r² + k2 r⁴) stops growing."""
         roots = np.roots([5 * self.k2, 0.0, 3 * self.k1, 0.0, 1.0])
         real = roots[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)].real
         return float(real.min()) if len(real) else float("inf")

@@ -1,4 +1,4 @@
-"""The options of `georef simulate`: of a survey that is made up, not of a stage in a workspace."""
+"""Options of `georef simulate`, which belongs to no stage in a workspace."""
 
 from __future__ import annotations
 
@@ -10,17 +10,19 @@ from pipelines.core.options import PlaceOnEarth, StageOptions, Triple
 
 
 class SimulateOptions(StageOptions):
-    """A survey to simulate. Triples are written with commas: `46.02,7.75,1620`."""
+    """Options of a simulated survey. Triples are written with commas: `46.02,7.75,1620`."""
 
-    scene: Literal["city", "village"] = Field("city", description="What stands there.")
+    scene: Literal["city", "village"] = Field("city", description="Type of town.")
     flight: Literal["orbit", "grid", "facade"] = Field(
         "orbit", description="Circles around the complex, nadir lines, or along its facades."
     )
-    images: int = Field(48, ge=3, le=5000, description="Photographs.")
-    size: str = Field("640x480", pattern=r"^\d{2,5}x\d{2,5}$", description="Their size in pixels, WxH.")
+    images: int = Field(48, ge=3, le=5000, description="Number of photographs.")
+    size: str = Field(
+        "640x480", pattern=r"^\d{2,5}x\d{2,5}$", description="Size of the photographs in pixels, WxH."
+    )
     seed: int = Field(0, ge=0, description="Seed of everything: scene, flight and noise.")
     origin: PlaceOnEarth = Field(
-        (46.02, 7.75, 1620.0), description="Where on Earth: latitude,longitude,ellipsoidal height."
+        (46.02, 7.75, 1620.0), description="Place on Earth: latitude,longitude,ellipsoidal height."
     )
     heights: tuple[float, ...] = Field(
         (),
@@ -39,14 +41,14 @@ class SimulateOptions(StageOptions):
         description="Seconds between photographs (default: 2, more above 8 m/s).",
     )
     gnss: Literal["rtk", "ppk", "consumer", "outliers"] = Field(
-        "rtk", description="Receiver: sets σ, slow bias and outliers, each of which can be set by itself."
+        "rtk", description="Receiver: sets σ, slow bias and outliers; further options set each by itself."
     )
     sigma_h: float | None = Field(None, ge=0, description="White noise of the fixes, horizontal σ in metres.")
     sigma_v: float | None = Field(None, ge=0, description="White noise of the fixes, vertical σ in metres.")
     bias: float | None = Field(None, ge=0, description="RMS of the slow bias of the fixes per axis in metres.")
     bias_period: float = Field(60.0, gt=0, description="Period of the slow bias in seconds.")
     outlier_share: float | None = Field(None, ge=0, le=1, description="Share of photographs whose fixes are wrong.")
-    outlier_size: float = Field(15.0, gt=0, description="How far a wrong fix is off, in metres.")
+    outlier_size: float = Field(15.0, gt=0, description="Error of a wrong fix in metres.")
     sigma_attitude: float = Field(0.5, ge=0, description="White noise of the attitude per axis in degrees.")
     lever_arm: Triple = Field(
         (0.0, 0.0, 0.0),

@@ -1,4 +1,4 @@
-"""Rays against a mesh with Embree (the sole home of embreex)."""
+"""Ray casting against a mesh with Embree (the sole home of embreex)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Hits:
 
     Attributes:
         triangle: (N,) int32, or `MISS`.
-        distance: (N,) float32, in lengths of the ray's direction.
+        distance: (N,) float32, in units of the direction's length.
         barycentric: (N, 2) float32, weights of the triangle's corners 1 and 2.
     """
 
@@ -30,7 +30,7 @@ class Hits:
 
 
 class Raycaster:
-    """A mesh that answers rays.
+    """Ray caster of a mesh.
 
     Raises:
         BackendUnavailableError: embreex is not installed (it has no wheel for this platform).
@@ -51,19 +51,19 @@ class Raycaster:
         self._geometry = TriangleMesh(self._scene, corners, np.arange(len(corners), dtype=np.int32).reshape(-1, 3))
 
     def first_hits(self, origins: ArrayLike, directions: ArrayLike) -> Hits:
-        """First hit of rays from origins (N, 3) along directions (N, 3)."""
-        found = self._scene.run(*_rays(origins, directions), output=1)
-        return Hits(found["primID"], found["tfar"], np.stack([found["u"], found["v"]], axis=1))
+        """Return the first hits of rays from origins (N, 3) along directions (N, 3)."""
+        hits = self._scene.run(*_rays(origins, directions), output=1)
+        return Hits(hits["primID"], hits["tfar"], np.stack([hits["u"], hits["v"]], axis=1))
 
     def blocked(self, origins: ArrayLike, directions: ArrayLike) -> BoolArray:
-        """Whether rays hit anything at all: (N,)."""
+        """Return whether rays hit any triangle: (N,)."""
         hit: BoolArray = self._scene.run(*_rays(origins, directions), query="OCCLUDED") != MISS
         return hit
 
     def exact_distance(self, origin: FloatArray, directions: FloatArray, hits: Hits) -> FloatArray:
-        """Distances (N,) in float64 to the planes of the triangles that were hit; NaN for a miss.
+        """Return distances (N,) in float64 to the planes of the triangles that rays hit; NaN for a miss.
 
-        Embree answers in single precision, which is centimetres at the horizon.
+        Embree's own distances are single precision, which means centimetres at the horizon.
         """
         corners = self._mesh.corners[hits.triangle]
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

@@ -1,4 +1,4 @@
-"""What the instruments and the surveyor recorded of a flight, and the truth behind it."""
+"""Records of the instruments and the surveyor for a flight, and the truth behind them."""
 
 from __future__ import annotations
 
@@ -17,31 +17,31 @@ from pipelines.simulate.sensors import (
     GnssLog,
     ImuLog,
     Receiver,
-    against_local_north,
     attitudes_at,
     fixes_at,
+    in_local_enu,
     photo_stamps,
     record_gnss,
     record_imu,
 )
-from pipelines.simulate.targets import LEAST_RAYS, choose_control, sightings
+from pipelines.simulate.targets import LEAST_RAYS, choose_control, project_targets
 from pipelines.simulate.truth import TrueLens, TrueMark, TrueNavigation, TrueTarget, Truth
 from pipelines.simulate.world import World
 from pipelines.simulate.write import PhotoRecords, SurveyedTarget
 
-_LEAST_SIGMA_M = 0.001  # no receiver claims less
+_LEAST_SIGMA_M = 0.001  # no receiver states less
 
 
 @dataclass(frozen=True)
 class Recording:
-    """Everything that was recorded.
+    """All records of a flight.
 
     Attributes:
         photos: position and attitude of the photographs.
         body_yaw_pitch_roll_deg: (N, 3) attitude of the aircraft at the photographs.
-        gnss, imu: the logs; gnss_lla (M, 3) degrees and metres; imu_in_geo (K, 3) where the attitudes were taken.
+        gnss, imu: the logs; gnss_lla (M, 3) degrees and metres; imu_in_geo (K, 3) places of the attitudes.
         control, check: surveyed targets.
-        truth: of it all.
+        truth: of the whole survey.
     """
 
     photos: PhotoRecords
@@ -55,29 +55,29 @@ class Recording:
     truth: Truth
 
 
-def receiver_of(config: SimulateOptions) -> Receiver:
-    """The receiver's profile with what the options change in it."""
+def receiver_of(options: SimulateOptions) -> Receiver:
+    """Return the receiver's profile, with the changes that the options make."""
     asked = {
-        "sigma_h_m": config.sigma_h,
-        "sigma_v_m": config.sigma_v,
-        "bias_m": config.bias,
-        "bias_period_s": config.bias_period,
-        "outlier_share": config.outlier_share,
-        "outlier_m": config.outlier_size,
+        "sigma_h_m": options.sigma_h,
+        "sigma_v_m": options.sigma_v,
+        "bias_m": options.bias,
+        "bias_period_s": options.bias_period,
+        "outlier_share": options.outlier_share,
+        "outlier_m": options.outlier_size,
     }
     given = {name: value for name, value in asked.items() if value is not None}
-    return replace(RECEIVERS[config.gnss], **given)
+    return replace(RECEIVERS[options.gnss], **given)
 
 
-def record(config: SimulateOptions, world: World, raycaster: Raycaster, seed: np.random.SeedSequence) -> Recording:
-    """Run the sensors over the flight and mark the targets in the photographs."""
+def record(options: SimulateOptions, world: World, raycaster: Raycaster, seed: np.random.SeedSequence) -> Recording:
+    """Run the sensors over the flight, and mark the targets in the photographs."""
     gnss_seed, imu_seed, mark_seed = seed.spawn(3)
-    receiver = receiver_of(config)
-    gnss = record_gnss(world.track, world.mounting, receiver, np.random.default_rng(gnss_seed))
-    imu = record_imu(world.track, world.mounting, config.sigma_attitude, np.random.default_rng(imu_seed))
+    receiver = receiver_of(options)
+    gnss = record_gnss(world.trajectory, world.mounting, receiver, np.random.default_rng(gnss_seed))
+    imu = record_imu(world.trajectory, world.mounting, options.sigma_attitude, np.random.default_rng(imu_seed))
     photos, body_angles = _photo_records(world, receiver, gnss, imu)
-    targets = _mark(config, world, photos.names, raycaster, np.random.default_rng(mark_seed))
-    truth = _truth(config, world, gnss, photos)
+    targets = _mark(options, world, photos.names, raycaster, np.random.default_rng(mark_seed))
+    truth = _truth(options, world, gnss, photos)
     imu_time_s = (imu.stamp_ns - photos.stamp_ns[0]) / 1e9 - world.mounting.clock_offset_s
     return Recording(
         photos=photos,
@@ -85,7 +85,7 @@ def record(config: SimulateOptions, world: World, raycaster: Raycaster, seed: np
         gnss=gnss,
         gnss_lla=lla_from_enu(gnss.position_in_geo, world.origin),
         imu=imu,
-        imu_in_geo=world.track.position(imu_time_s),
+        imu_in_geo=world.trajectory.position(imu_time_s),
         control=tuple(surveyed for true, surveyed in targets if true.role == "control"),
         check=tuple(surveyed for true, surveyed in targets if true.role == "check"),
         truth=truth.model_copy(update={"targets": tuple(true for true, _ in targets)}),
@@ -93,58 +93,58 @@ def record(config: SimulateOptions, world: World, raycaster: Raycaster, seed: np
 
 
 def _photo_records(world: World, receiver: Receiver, gnss: GnssLog, imu: ImuLog) -> tuple[PhotoRecords, FloatArray]:
-    """Fix and attitude at each photograph's stamp, as a user reads them off the logs."""
-    stamps = photo_stamps(world.track)
+    """Return fix and attitude at each photograph's stamp, as a user reads them off the logs."""
+    stamps = photo_stamps(world.trajectory)
     fixes = fixes_at(gnss, stamps)
-    enu_from_body = against_local_north(attitudes_at(imu, stamps), fixes, world.origin)
-    angles = yaw_pitch_roll_deg(enu_from_body @ world.track.cam_from_body.T)
-    # The aircraft's angles are those of a camera that looks along its nose.
+    enu_from_body = in_local_enu(attitudes_at(imu, stamps), fixes, world.origin)
+    angles = yaw_pitch_roll_deg(enu_from_body @ world.trajectory.cam_from_body.T)
+    # The aircraft's angles are those of a camera that looks along the nose.
     level_cam_from_body = geo_from_cam([0.0, 0.0, 0.0]).T @ ENU_FROM_NED
     body_angles = yaw_pitch_roll_deg(enu_from_body @ level_cam_from_body.T)
-    # As the frames of a bag are named, so that the marks in one gcp_list.txt fit the photographs and the bag.
+    # These are the names of the frames of a bag, so that the marks in one gcp_list.txt fit photographs and bag.
     names = tuple(f"frame_{i:06d}.jpg" for i in range(len(stamps)))
     stated = np.maximum([receiver.sigma_h_m, receiver.sigma_h_m, receiver.sigma_v_m], _LEAST_SIGMA_M)
     return PhotoRecords(names, stamps, lla_from_enu(fixes, world.origin), angles, stated), body_angles
 
 
 def _mark(
-    config: SimulateOptions, world: World, names: tuple[str, ...], raycaster: Raycaster, rng: np.random.Generator
+    options: SimulateOptions, world: World, names: tuple[str, ...], raycaster: Raycaster, rng: np.random.Generator
 ) -> list[tuple[TrueTarget, SurveyedTarget]]:
-    """The targets that at least two photographs see: truth, and what the surveyor hands over."""
-    found = sightings(world.spots, world.poses, world.lens, raycaster, world.target_m)
-    rays = found.seen.sum(axis=1)
-    control = set(choose_control(world.spots, rays, config.control))
+    """Return the targets that at least two photographs see: the truth, and the surveyor's records."""
+    projections = project_targets(world.sites, world.poses, world.lens, raycaster, world.target_m)
+    rays = projections.seen.sum(axis=1)
+    control = set(choose_control(world.sites, rays, options.control))
     targets = []
     for i in np.nonzero(rays >= LEAST_RAYS)[0]:
         role: Literal["control", "check"] = "control" if i in control else "check"
         name = f"{'G' if role == 'control' else 'C'}{i:02d}"
         marks = []
-        for j in np.nonzero(found.seen[i])[0]:
-            x, y = found.pixels[i, j]
-            dx, dy = rng.normal(0, config.sigma_mark, 2)
-            # Three decimals are what the files hold.
+        for j in np.nonzero(projections.seen[i])[0]:
+            x, y = projections.pixels[i, j]
+            dx, dy = rng.normal(0, options.sigma_mark, 2)
+            # The files hold three decimals.
             marks.append(TrueMark(
                 image=names[j], x_px=x, y_px=y, written_x_px=round(x + dx, 3), written_y_px=round(y + dy, 3)
             ))  # fmt: skip
-        position = world.spots[i].target_position
-        measured = position + rng.normal(0, config.sigma_survey, 3)
+        position = world.sites[i].target_position
+        measured = position + rng.normal(0, options.sigma_survey, 3)
         true = TrueTarget(
-            name=name, role=role, surface=world.spots[i].kind, position_in_geo=_vector(position), marks=tuple(marks)
+            name=name, role=role, surface=world.sites[i].kind, position_in_geo=_vector(position), marks=tuple(marks)
         )
         written = tuple((mark.image, mark.written_x_px, mark.written_y_px) for mark in marks)
         targets.append((true, SurveyedTarget(name, measured, written)))
     return targets
 
 
-def _truth(config: SimulateOptions, world: World, gnss: GnssLog, photos: PhotoRecords) -> Truth:
-    """The truth, without the targets."""
+def _truth(options: SimulateOptions, world: World, gnss: GnssLog, photos: PhotoRecords) -> Truth:
+    """Return the truth, without the targets."""
     lens = world.lens
     true_fixes = fixes_at(replace(gnss, position_in_geo=gnss.true_in_geo), photos.stamp_ns)
     errors = fixes_at(gnss, photos.stamp_ns) - true_fixes
     return Truth(
-        scene=config.scene,
-        flight=config.flight,
-        seed=config.seed,
+        scene=options.scene,
+        flight=options.flight,
+        seed=options.seed,
         origin=world.origin,
         lens=TrueLens(model=lens.colmap_model, width=lens.width, height=lens.height, params=lens.colmap_params),
         images=photos.names,
@@ -152,18 +152,18 @@ def _truth(config: SimulateOptions, world: World, gnss: GnssLog, photos: PhotoRe
         centers=tuple(_vector(pose.center) for pose in world.poses),
         cam_from_enu=tuple(_matrix(pose.geo_from_cam.T) for pose in world.poses),
         fix_errors=tuple(_vector(error) for error in errors),
-        navigation=_navigation(config, world, gnss, photos),
+        navigation=_navigation(options, world, gnss, photos),
         targets=(),
-        sigma_mark_px=config.sigma_mark,
-        sigma_survey_m=config.sigma_survey,
+        sigma_mark_px=options.sigma_mark,
+        sigma_survey_m=options.sigma_survey,
         sun_in_geo=_vector(world.scene.sun),
     )
 
 
-def _navigation(config: SimulateOptions, world: World, gnss: GnssLog, photos: PhotoRecords) -> TrueNavigation:
-    mounting, receiver = world.mounting, receiver_of(config)
+def _navigation(options: SimulateOptions, world: World, gnss: GnssLog, photos: PhotoRecords) -> TrueNavigation:
+    mounting, receiver = world.mounting, receiver_of(options)
     return TrueNavigation(
-        receiver=config.gnss,
+        receiver=options.gnss,
         sigma_h_m=receiver.sigma_h_m,
         sigma_v_m=receiver.sigma_v_m,
         bias_amplitude_m=_vector(gnss.bias_amplitude_m),
@@ -171,10 +171,10 @@ def _navigation(config: SimulateOptions, world: World, gnss: GnssLog, photos: Ph
         bias_period_s=receiver.bias_period_s,
         outlier_m=receiver.outlier_m,
         wrong_images=tuple(photos.names[i] for i in gnss.wrong_photos),
-        sigma_attitude_deg=config.sigma_attitude,
+        sigma_attitude_deg=options.sigma_attitude,
         antenna_in_body_m=_vector(mounting.antenna_in_body),
         nominal_from_cam=_matrix(mounting.nominal_from_cam),
-        cam_from_body=_matrix(world.track.cam_from_body),
+        cam_from_body=_matrix(world.trajectory.cam_from_body),
         clock_offset_s=mounting.clock_offset_s,
     )
 

@@ -1,4 +1,4 @@
-"""Photographs: rays through the lens, sun and sky, then exposure, vignetting and sensor noise."""
+"""Rendering of photographs: rays through the lens, sun and sky, then exposure, vignetting and sensor noise."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from pipelines.core.types import ByteArray, Float32Array, FloatArray
 from pipelines.simulate.lens import Lens
 from pipelines.simulate.patterns import mix
 from pipelines.simulate.raycast import MISS, Hits, Raycaster
-from pipelines.simulate.scene import Scene
-from pipelines.simulate.textures import Surface, albedo
+from pipelines.simulate.scene import SimulatedScene
+from pipelines.simulate.textures import TextureSamples, albedo
 
-# Rays at a time: larger arrays leave the cache, smaller ones cost more calls than work (measured: +50 %, +10 %).
+# Rays at a time: larger arrays leave the cache, smaller arrays cost more calls than work (measured: +50 %, +10 %).
 _CHUNK = 1 << 15
 _RAYS_KEPT = 1 << 24
 _SUN = np.array([3.0, 2.78, 2.45], dtype=np.float32)
@@ -27,7 +27,7 @@ _SHADOW_LIFT_M = 0.02
 
 @dataclass(frozen=True)
 class Pose:
-    """A camera: centre (3,) in geo and rotation (3, 3) camera → geo."""
+    """Camera pose: centre (3,) in geo and rotation (3, 3) camera → geo."""
 
     center: FloatArray
     geo_from_cam: FloatArray
@@ -35,12 +35,12 @@ class Pose:
 
 @dataclass(frozen=True)
 class Sensor:
-    """What the sensor does to the light.
+    """Response of the sensor to light.
 
     Attributes:
         gain: exposure of this photograph, 1 for a grey of 18 % under the sun at about mid-scale.
         tint: (3,) white balance.
-        noise: factor of the noise; 1 is a small sensor at base sensitivity (0.4 % of full scale in the middle).
+        noise: factor of the noise; 1 is a small sensor at base sensitivity (0.4 % of full scale at mid-scale).
         vignetting: loss of light in the corners.
     """
 
@@ -57,43 +57,43 @@ class Renderer:
         samples: rays for a pixel; a square number.
     """
 
-    def __init__(self, scene: Scene, lens: Lens, samples: int) -> None:
+    def __init__(self, scene: SimulatedScene, lens: Lens, samples: int) -> None:
         self._scene, self._lens = scene, lens
         self.raycaster = Raycaster(scene.mesh)
         self._samples = samples
         rows = max(1, _CHUNK // (lens.width * samples))
         self._bands = [(top, min(top + rows, lens.height)) for top in range(0, lens.height, rows)]
-        # Kept for all photographs while they fit; the rays of a large one are made anew for each.
+        # Rays are kept for all photographs if they fit; rays of large photographs are made anew for each.
         keep = lens.width * lens.height * samples <= _RAYS_KEPT
         self._kept = [self._rays(band) for band in self._bands] if keep else []
 
     def photograph(self, pose: Pose, sensor: Sensor, rng: np.random.Generator) -> ByteArray:
-        """The photograph (H, W, 3), RGB."""
+        """Return the photograph (H, W, 3), RGB."""
         light = self.radiance(pose)
         height, width = light.shape[:2]
         across, down = np.linspace(-1, 1, width), np.linspace(-1, 1, height)
         falloff = (1 - sensor.vignetting / 2 * (across**2 + down[:, None] ** 2)).astype(np.float32)
         exposed = light * (falloff[..., None] * np.float32(sensor.gain)) * np.array(sensor.tint, dtype=np.float32)
-        # Photon noise grows with the root of the signal; the rest is read-out noise.
+        # Photon noise grows with the root of the signal; the constant term is read-out noise.
         spread = np.float32(sensor.noise) * np.sqrt(np.float32(6e-5) * np.maximum(exposed, 0) + np.float32(2.5e-6))
         exposed += spread * rng.standard_normal(exposed.shape, dtype=np.float32)
         return np.round(255 * _encode(exposed)).astype(np.uint8)
 
     def radiance(self, pose: Pose) -> Float32Array:
-        """Linear light (H, W, 3), about 0…1, before exposure."""
+        """Return linear light (H, W, 3), about 0…1, before exposure."""
         rotation = pose.geo_from_cam.astype(np.float32)
         parts = []
         for k, band in enumerate(self._bands):
             rays = self._kept[k] if self._kept else self._rays(band)
             light = self._shade(pose, rays @ rotation.T, rotation)
-            # Clipped first: a highlight inside a pixel must not outshine the rest of it.
+            # Samples are clipped before the mean: a highlight inside a pixel must not outshine its other samples.
             light = np.minimum(light, np.float32(1.5)).reshape(-1, self._lens.width, self._samples, 3)
-            # Slice by slice: numpy's mean over so short an axis takes four times as long.
+            # The sum is taken slice by slice: numpy's mean over such a short axis takes four times as long.
             parts.append(sum(light[:, :, k] for k in range(self._samples)) / np.float32(self._samples))
         return np.concatenate(parts)
 
     def depth(self, pose: Pose) -> Float32Array:
-        """Depth (H, W) along the camera's z axis at the centre of every pixel, in metres; 0 is the sky."""
+        """Return depth (H, W) in metres along the camera's z axis at the pixel centres; 0 for the sky."""
         parts = []
         for band in self._bands:
             directions = self._lens.directions(_sample_pixels(self._lens, band, 1)) @ pose.geo_from_cam.T
@@ -104,20 +104,20 @@ class Renderer:
         return np.concatenate(parts)
 
     def _rays(self, band: tuple[int, int]) -> Float32Array:
-        """Directions (rows · W · samples, 3) of depth 1 in the camera."""
+        """Return directions (rows · W · samples, 3) of depth 1 in the camera."""
         return self._lens.directions(_sample_pixels(self._lens, band, self._samples)).astype(np.float32)
 
     def _shade(self, pose: Pose, rays: Float32Array, rotation: Float32Array) -> Float32Array:
-        """Linear light (N, 3) that comes along rays (N, 3) whose depth is 1."""
+        """Return the linear light (N, 3) that comes along rays (N, 3) of depth 1."""
         hits = self.raycaster.first_hits(pose.center, rays)
         hit = hits.triangle != MISS
         light = np.empty_like(rays)
         free, seen = np.nonzero(~hit)[0], np.nonzero(hit)[0]
         light[free] = _sky(rays[free], self._scene.sun.astype(np.float32))
         if len(seen):
-            found = Hits(hits.triangle[seen], hits.distance[seen], hits.barycentric[seen])
-            color = self._surface_light(pose, rays[seen], found, rotation)
-            haze = 1 - np.exp(-np.square(found.distance / np.float32(_HAZE_M)))
+            surface_hits = Hits(hits.triangle[seen], hits.distance[seen], hits.barycentric[seen])
+            color = self._surface_light(pose, rays[seen], surface_hits, rotation)
+            haze = 1 - np.exp(-np.square(surface_hits.distance / np.float32(_HAZE_M)))
             light[seen] = mix(color, _HORIZON, haze)
         return light
 
@@ -125,8 +125,8 @@ class Renderer:
         mesh = self._scene.mesh
         points = pose.center.astype(np.float32) + rays * hits.distance[:, None]
         normals = _normals(mesh.normals[hits.triangle], hits.barycentric, rays)
-        surface = self._surface(points, rays, hits, normals, rotation)
-        color = albedo(surface, mesh.material[hits.triangle], self._scene.plan)
+        samples = self._texture_samples(points, rays, hits, normals, rotation)
+        color = albedo(samples, mesh.material[hits.triangle], self._scene.plan)
         sun = self._scene.sun.astype(np.float32)
         facing = normals @ sun
         lit = np.nonzero(facing > 0)[0]
@@ -138,10 +138,10 @@ class Renderer:
         incoming = facing[:, None] * _SUN + sky[:, None] * _SKY + (1 - sky)[:, None] * _BOUNCE
         return np.asarray(color * incoming * np.float32(1 / 2.6))
 
-    def _surface(
+    def _texture_samples(
         self, points: Float32Array, rays: Float32Array, hits: Hits, normals: Float32Array, rotation: Float32Array
-    ) -> Surface:
-        """Texture coordinates, and how wide a pixel is along them."""
+    ) -> TextureSamples:
+        """Return texture coordinates, and the width of a pixel along them."""
         mesh, index = self._scene.mesh, hits.triangle
         u_axis, v_axis = mesh.u_axis[index], mesh.v_axis[index]
         uv_shift = mesh.uv_shift[index]
@@ -151,21 +151,21 @@ class Renderer:
         ray_u, ray_v = _dot(rays, u_axis), _dot(rays, v_axis)
         du = dv = np.zeros_like(pixel)
         for axis in (rotation[:, 0], rotation[:, 1]):
-            # The step of one pixel, slid along the ray onto the surface.
+            # The step of one pixel slides along the ray onto the surface.
             slide = (normals @ axis) / along
             du = du + np.abs(u_axis @ axis - slide * ray_u)
             dv = dv + np.abs(v_axis @ axis - slide * ray_v)
-        return Surface(
+        return TextureSamples(
             _dot(points, u_axis) + uv_shift[:, 0],
             _dot(points, v_axis) + uv_shift[:, 1],
             pixel * du,
             pixel * dv,
-            mesh.finishes[mesh.finish[index]],
+            mesh.texture_params[mesh.texture[index]],
         )
 
 
 def _sample_pixels(lens: Lens, band: tuple[int, int], samples: int) -> FloatArray:
-    """Pixel coordinates (rows · W · samples, 2): a turned grid inside each pixel, its own centre for one."""
+    """Return pixel coordinates (rows · W · samples, 2): a turned grid in each pixel, its centre for one sample."""
     side = round(samples**0.5)
     grid = (np.arange(side) + 0.5) / side - 0.5
     dx, dy = (part.ravel() for part in np.meshgrid(grid, grid))
@@ -181,7 +181,7 @@ def _dot(a: Float32Array, b: Float32Array) -> Float32Array:
 
 
 def _normals(corners: Float32Array, weights: Float32Array, rays: Float32Array) -> Float32Array:
-    """Interpolated unit normals (N, 3), turned towards the camera."""
+    """Return interpolated unit normals (N, 3), turned towards the camera."""
     first = (1 - weights[:, 0] - weights[:, 1])[:, None]
     normal = first * corners[:, 0] + weights[:, :1] * corners[:, 1] + weights[:, 1:] * corners[:, 2]
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -197,7 +197,7 @@ def _sky(rays: Float32Array, sun: Float32Array) -> Float32Array:
 
 
 def _encode(linear: Float32Array) -> Float32Array:
-    """sRGB's curve, after a soft shoulder that keeps highlights from clipping."""
+    """Return values on sRGB's curve, after a soft shoulder that keeps highlights from clipping."""
     clean = np.maximum(linear, 0)
     rolled = np.where(clean < 0.7, clean, 0.7 + 0.3 * np.tanh((clean - 0.7) / 0.3))
     return np.asarray(np.where(rolled < 0.0031308, 12.92 * rolled, 1.055 * rolled ** (1 / 2.4) - 0.055))

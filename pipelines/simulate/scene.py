@@ -1,4 +1,4 @@
-"""The scene as a whole: mesh, painted ground, sun, and places for survey targets."""
+"""Simulated scene: mesh, painted ground, sun, and sites for survey targets."""
 
 from __future__ import annotations
 
@@ -7,23 +7,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipelines.core.types import FloatArray
-from pipelines.simulate.buildings import House, Spot, add_car, add_house, add_tree
-from pipelines.simulate.layout import STYLES, Layout, Plot, make_layout
-from pipelines.simulate.mesh import Finish, Material, Mesh, MeshBuilder
+from pipelines.simulate.buildings import Building, TargetSite, add_building, add_car, add_tree
+from pipelines.simulate.layout import STYLES, BuildingPlan, TownLayout, make_town_layout
+from pipelines.simulate.mesh import Material, Mesh, MeshBuilder, TextureParameters
 from pipelines.simulate.terrain import Terrain, add_terrain, make_terrain
 from pipelines.simulate.textures import GroundPlan
 
 
 @dataclass(frozen=True)
-class Scene:
-    """A town to photograph.
+class SimulatedScene:
+    """Town to photograph.
 
     Attributes:
         mesh: its triangles, metres in geo.
-        plan: what is painted on the ground.
+        plan: paint of the ground.
         axes: (3, 3) rows: the town's east, north and up in geo.
         sun: (3,) unit vector towards the sun.
-        spots: places where a survey target can be fixed.
+        sites: places where a survey target can be fixed.
         complex_m: half lengths, along the town's axes, of the complex in the middle.
     """
 
@@ -31,27 +31,27 @@ class Scene:
     plan: GroundPlan
     axes: FloatArray
     sun: FloatArray
-    spots: tuple[Spot, ...]
+    sites: tuple[TargetSite, ...]
     complex_m: tuple[float, float]
 
 
-def make_scene(name: str, seed: np.random.SeedSequence) -> Scene:
+def build_scene(name: str, seed: np.random.SeedSequence) -> SimulatedScene:
     """Build a town of one of the `STYLES`."""
     style = STYLES[name]
     rng = np.random.default_rng(seed)
     turn = rng.uniform(0.15, 0.45)
     axes = np.array([[np.cos(turn), np.sin(turn), 0.0], [-np.sin(turn), np.cos(turn), 0.0], [0.0, 0.0, 1.0]])
     terrain = make_terrain(style.relief_m, rng)
-    layout = make_layout(style, rng)
+    layout = make_town_layout(style, rng)
     builder = MeshBuilder()
-    add_terrain(builder, terrain, axes, Finish((0.1, 0.15, 0.05)))
-    spots = _ground_spots(terrain, rng)
-    for plot in layout.plots:
-        spots += add_house(builder, _house(plot, terrain, axes), rng)
+    add_terrain(builder, terrain, axes, TextureParameters((0.1, 0.15, 0.05)))
+    sites = _ground_sites(terrain, rng)
+    for plan in layout.buildings:
+        sites += add_building(builder, _building(plan, terrain, axes), rng)
     _add_furniture(builder, layout, terrain, axes, rng)
     azimuth, elevation = rng.uniform(2.2, 4.1), np.radians(rng.uniform(42, 56))
     sun = np.array([np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation), np.sin(elevation)])
-    return Scene(builder.build(), layout.plan, axes, sun, tuple(spots), (17.5, 18.5))
+    return SimulatedScene(builder.build(), layout.plan, axes, sun, tuple(sites), (17.5, 18.5))
 
 
 def _on_ground(xy: tuple[float, float], terrain: Terrain, axes: FloatArray) -> FloatArray:
@@ -60,14 +60,22 @@ def _on_ground(xy: tuple[float, float], terrain: Terrain, axes: FloatArray) -> F
     return np.asarray(place)
 
 
-def _house(plot: Plot, terrain: Terrain, axes: FloatArray) -> House:
-    own = np.stack([axes[1], -axes[0], axes[2]]) if plot.turned else axes
-    center = _on_ground(plot.center, terrain, axes)
-    return House(center, own, plot.length_m, plot.width_m, plot.storeys, plot.floor_m, plot.roof)
+def _building(plan: BuildingPlan, terrain: Terrain, axes: FloatArray) -> Building:
+    own = np.stack([axes[1], -axes[0], axes[2]]) if plan.turned else axes
+    center = _on_ground(plan.center, terrain, axes)
+    return Building(
+        center,
+        own,
+        plan.length_m,
+        plan.width_m,
+        plan.storeys,
+        plan.floor_m,
+        plan.roof,
+    )
 
 
 def _add_furniture(
-    builder: MeshBuilder, layout: Layout, terrain: Terrain, axes: FloatArray, rng: np.random.Generator
+    builder: MeshBuilder, layout: TownLayout, terrain: Terrain, axes: FloatArray, rng: np.random.Generator
 ) -> None:
     for x, y, height in layout.trees:
         add_tree(builder, _on_ground((x, y), terrain, axes), height, rng)
@@ -80,32 +88,32 @@ def _add_furniture(
         add_car(builder, foot, np.stack([along, np.cross(up, along), up]), rng)
 
 
-def _ground_spots(terrain: Terrain, rng: np.random.Generator) -> list[Spot]:
+def _ground_sites(terrain: Terrain, rng: np.random.Generator) -> list[TargetSite]:
     places = rng.uniform(-95, 95, (260, 2))
     normals = terrain.normal(places)
     positions = np.concatenate([places, terrain.height(places)[:, None]], axis=1)
-    return [Spot(position, normal, "ground") for position, normal in zip(positions, normals, strict=True)]
+    return [TargetSite(position, normal, "ground") for position, normal in zip(positions, normals, strict=True)]
 
 
-def with_targets(scene: Scene, spots: list[Spot], width_m: float) -> Scene:
-    """The scene with a black and white board of `width_m` at every spot."""
-    if not spots:
+def with_targets(scene: SimulatedScene, sites: list[TargetSite], width_m: float) -> SimulatedScene:
+    """Return the scene with a black and white board of `width_m` at every site."""
+    if not sites:
         return scene
     builder = MeshBuilder()
-    finish = builder.finish(Finish((0.5, 0.5, 0.5), pitch_m=width_m))
-    for spot in spots:
-        side = np.array([0.0, 0.0, 1.0]) if spot.kind == "wall" else scene.axes[1]
-        u_axis = np.cross(side, spot.normal)
+    texture = builder.add_texture(TextureParameters((0.5, 0.5, 0.5), pitch_m=width_m))
+    for site in sites:
+        side = np.array([0.0, 0.0, 1.0]) if site.kind == "wall" else scene.axes[1]
+        u_axis = np.cross(side, site.normal)
         u_axis /= np.linalg.norm(u_axis)
-        v_axis = np.cross(spot.normal, u_axis)
-        middle, half = spot.target_position, width_m / 2
+        v_axis = np.cross(site.normal, u_axis)
+        middle, half = site.target_position, width_m / 2
         a, b, c, d = (middle + half * (i * u_axis + j * v_axis) for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1)))
-        builder.triangles(np.array([[a, b, c], [a, c, d]]), Material.TARGET, finish, (middle, u_axis, v_axis))
+        builder.triangles(np.array([[a, b, c], [a, c, d]]), Material.TARGET, texture, (middle, u_axis, v_axis))
     boards = builder.build()
     return replace(scene, mesh=_join(scene.mesh, boards))
 
 
 def _join(first: Mesh, second: Mesh) -> Mesh:
-    shifted = replace(second, finish=second.finish + np.int32(len(first.finishes)))
+    shifted = replace(second, texture=second.texture + np.int32(len(first.texture_params)))
     names = vars(first)
     return Mesh(**{name: np.concatenate([getattr(first, name), getattr(shifted, name)]) for name in names})

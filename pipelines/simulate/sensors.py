@@ -1,4 +1,4 @@
-"""GNSS at 10 Hz and attitude at 100 Hz, with the errors that real ones have, each known."""
+"""Sensors: GNSS at 10 Hz and attitude at 100 Hz, with realistic errors, each of them known."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.geodesy.enu import Origin, geo_from_enu_at, lla_from_enu
 from pipelines.geometry.rotations import exp_so3
-from pipelines.simulate.flight import LEAD_S, Track
+from pipelines.simulate.flight import LEAD_S, TrueTrajectory
 
 START_NS = 1_700_000_000_000_000_000  # 2023-11-14 22:13:20 UTC
 GNSS_STEP_NS, IMU_STEP_NS = 100_000_000, 10_000_000
@@ -22,11 +22,11 @@ class Receiver:
     """Errors of a GNSS receiver.
 
     Attributes:
-        sigma_h_m, sigma_v_m: white noise, also what the receiver states.
-        bias_m: RMS of a slow bias per axis, of which the receiver says nothing.
-        bias_period_s: its period.
+        sigma_h_m, sigma_v_m: white noise, also the σ that the receiver states.
+        bias_m: RMS of a slow bias per axis, which the receiver does not state.
+        bias_period_s: period of the bias.
         outlier_share: share of photographs around which the fixes are wrong.
-        outlier_m: by how much.
+        outlier_m: size of these errors.
     """
 
     sigma_h_m: float
@@ -47,11 +47,11 @@ RECEIVERS = {
 
 @dataclass(frozen=True)
 class Mounting:
-    """How camera, antenna and clocks are really put together.
+    """True arrangement of camera, antenna and clocks.
 
     Attributes:
         antenna_in_body: (3,) metres from the camera's centre, forward-right-down.
-        nominal_from_cam: (3, 3) boresight: true camera axes → the axes that the mounting plan says.
+        nominal_from_cam: (3, 3) boresight: true camera axes → nominal axes of the mounting plan.
         clock_offset_s: navigation clock minus camera clock.
     """
 
@@ -62,14 +62,14 @@ class Mounting:
 
 @dataclass(frozen=True)
 class GnssLog:
-    """What the receiver recorded, and the truth behind it.
+    """Records of the receiver, and the truth behind them.
 
     Attributes:
         stamp_ns: (N,) navigation clock.
         position_in_geo: (N, 3) measured antenna.
         true_in_geo: (N, 3) true antenna.
-        bias: (N, 3) slow bias in it, metres in geo.
-        outlier: (N, 3) what was added to wrong fixes, metres in geo; zero for the others.
+        bias: (N, 3) slow bias of the positions, metres in geo.
+        outlier: (N, 3) errors of wrong fixes, metres in geo; zero for the others.
         bias_amplitude_m, bias_phase_rad: (3,) bias(t) = amplitude · sin(2πt/period + phase), t from the first
             photograph on the camera's clock.
         wrong_photos: (M,) indices of the photographs with wrong fixes.
@@ -87,7 +87,7 @@ class GnssLog:
 
 @dataclass(frozen=True)
 class ImuLog:
-    """What the attitude sensor recorded; the body is forward-right-down.
+    """Records of the attitude sensor; the body is forward-right-down.
 
     Attributes:
         stamp_ns: (N,) navigation clock.
@@ -101,57 +101,61 @@ class ImuLog:
     specific_force_in_body: FloatArray
 
 
-def photo_stamps(track: Track) -> IntArray:
-    """Stamps (N,) of the photographs on the camera's clock."""
-    return np.asarray(START_NS + np.round(track.photo_s * 1e9).astype(np.int64))
+def photo_stamps(trajectory: TrueTrajectory) -> IntArray:
+    """Return the stamps (N,) of the photographs on the camera's clock."""
+    return np.asarray(START_NS + np.round(trajectory.photo_s * 1e9).astype(np.int64))
 
 
-def record_gnss(track: Track, mounting: Mounting, receiver: Receiver, rng: np.random.Generator) -> GnssLog:
-    """Fixes at 10 Hz of the antenna's true time and place, with the receiver's errors."""
-    since_ns = _epochs(track, mounting, GNSS_STEP_NS)
+def record_gnss(
+    trajectory: TrueTrajectory, mounting: Mounting, receiver: Receiver, rng: np.random.Generator
+) -> GnssLog:
+    """Return fixes at 10 Hz of the antenna's true position, with the receiver's errors."""
+    since_ns = _epochs(trajectory, mounting, GNSS_STEP_NS)
     time_s = since_ns / 1e9
-    arm = track.geo_from_body(time_s) @ mounting.antenna_in_body
-    true = track.position(time_s) + arm
+    arm = trajectory.geo_from_body(time_s) @ mounting.antenna_in_body
+    true = trajectory.position(time_s) + arm
     amplitude = np.full(3, np.sqrt(2.0) * receiver.bias_m)
     phase = rng.uniform(0, 2 * np.pi, 3)
     bias = amplitude * np.sin(2 * np.pi * time_s[:, None] / receiver.bias_period_s + phase)
     white = rng.normal(size=true.shape) * [receiver.sigma_h_m, receiver.sigma_h_m, receiver.sigma_v_m]
-    count = len(track.photo_s)
+    count = len(trajectory.photo_s)
     wrong = np.sort(rng.permutation(count)[: round(receiver.outlier_share * count)])
     jumps = np.zeros((count, 3))
     jumps[wrong] = _jumps(len(wrong), receiver.outlier_m, rng)
-    # A reflected signal is wrong for a while: from halfway before the photograph to halfway after it. The
-    # photograph is matched by the navigation clock's stamp, as a user would who knows nothing of the offset.
+    # A reflected signal lasts a while: from halfway before the photograph to halfway after it. Photographs are
+    # matched by the navigation clock's stamp, as a user does who does not know the clock offset.
     stamped_s = time_s + mounting.clock_offset_s
-    nearest = np.searchsorted((track.photo_s[1:] + track.photo_s[:-1]) / 2, stamped_s)
+    nearest = np.searchsorted((trajectory.photo_s[1:] + trajectory.photo_s[:-1]) / 2, stamped_s)
     outlier = jumps[nearest]
     stamp_ns = START_NS + since_ns + round(mounting.clock_offset_s * 1e9)
     return GnssLog(stamp_ns, true + bias + white + outlier, true, bias, outlier, amplitude, phase, wrong)
 
 
-def _epochs(track: Track, mounting: Mounting, step_ns: int) -> IntArray:
-    """Epochs (N,) in camera-clock nanoseconds since the first photograph, that cover all photographs."""
+def _epochs(trajectory: TrueTrajectory, mounting: Mounting, step_ns: int) -> IntArray:
+    """Return epochs (N,) that cover all photographs, in camera-clock nanoseconds since the first."""
     lead_ns = round((LEAD_S + abs(mounting.clock_offset_s)) * 1e9)
-    last_ns = round(float(track.photo_s[-1]) * 1e9) + lead_ns
+    last_ns = round(float(trajectory.photo_s[-1]) * 1e9) + lead_ns
     return np.arange(-(-lead_ns // step_ns) * -step_ns, last_ns + step_ns, step_ns, dtype=np.int64)
 
 
 def _jumps(count: int, size_m: float, rng: np.random.Generator) -> FloatArray:
-    """Errors (N, 3) of 0.7 to 1.3 times `size_m`, flatter than a sphere as multipath is."""
+    """Return errors (N, 3) of 0.7 to 1.3 times `size_m`, flatter than a sphere like multipath."""
     direction = rng.normal(size=(count, 3)) * [1.0, 1.0, 0.6]
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     return np.asarray(direction * size_m * rng.uniform(0.7, 1.3, (count, 1)))
 
 
-def record_imu(track: Track, mounting: Mounting, sigma_deg: float, rng: np.random.Generator) -> ImuLog:
-    """Attitude, rate and specific force at 100 Hz, with white noise on the attitude."""
-    since_ns = _epochs(track, mounting, IMU_STEP_NS)
+def record_imu(
+    trajectory: TrueTrajectory, mounting: Mounting, sigma_deg: float, rng: np.random.Generator
+) -> ImuLog:
+    """Return attitude, rate and specific force at 100 Hz, with white noise on the attitude."""
+    since_ns = _epochs(trajectory, mounting, IMU_STEP_NS)
     time_s = since_ns / 1e9
-    true = track.geo_from_body(time_s)
+    true = trajectory.geo_from_body(time_s)
     half_s = 1e-3
-    ahead, behind = track.geo_from_body(time_s + half_s), track.geo_from_body(time_s - half_s)
+    ahead, behind = trajectory.geo_from_body(time_s + half_s), trajectory.geo_from_body(time_s - half_s)
     rate = Rotation.from_matrix(np.swapaxes(behind, 1, 2) @ ahead).as_rotvec() / (2 * half_s)
-    force = track.acceleration(time_s) + np.array([0.0, 0.0, GRAVITY_M_S2])
+    force = trajectory.acceleration(time_s) + np.array([0.0, 0.0, GRAVITY_M_S2])
     noise = exp_so3(np.radians(rng.normal(0, sigma_deg, (len(time_s), 3))))
     return ImuLog(
         START_NS + since_ns + round(mounting.clock_offset_s * 1e9),
@@ -162,20 +166,20 @@ def record_imu(track: Track, mounting: Mounting, sigma_deg: float, rng: np.rando
 
 
 def fixes_at(log: GnssLog, stamp_ns: IntArray) -> FloatArray:
-    """Fixes (M, 3) in geo at stamps (M,), linear between the two nearest."""
+    """Return fixes (M, 3) in geo at stamps (M,), linear between the two nearest."""
     since = (log.stamp_ns - log.stamp_ns[0]).astype(np.float64)
     at = (stamp_ns - log.stamp_ns[0]).astype(np.float64)
     return np.stack([np.interp(at, since, log.position_in_geo[:, i]) for i in range(3)], axis=1)
 
 
 def attitudes_at(log: ImuLog, stamp_ns: IntArray) -> FloatArray:
-    """Attitudes geo ← body (M, 3, 3) at stamps (M,), slerp between the two nearest."""
+    """Return attitudes geo ← body (M, 3, 3) at stamps (M,), by slerp between the two nearest."""
     since = (log.stamp_ns - log.stamp_ns[0]).astype(np.float64)
     at = (stamp_ns - log.stamp_ns[0]).astype(np.float64)
     return np.asarray(Slerp(since, Rotation.from_matrix(log.geo_from_body))(at).as_matrix())
 
 
-def against_local_north(rotations: FloatArray, positions_in_geo: FloatArray, origin: Origin) -> FloatArray:
-    """Rotations (N, 3, 3) into geo, turned into East-North-Up at each place (N, 3), as an instrument says."""
+def in_local_enu(rotations: FloatArray, positions_in_geo: FloatArray, origin: Origin) -> FloatArray:
+    """Return rotations (N, 3, 3) into geo as rotations into East-North-Up at each place (N, 3)."""
     geo_from_enu = geo_from_enu_at(lla_from_enu(positions_in_geo, origin), origin)
     return np.asarray(np.swapaxes(geo_from_enu, -1, -2) @ rotations)

@@ -1,7 +1,7 @@
 """Simulate a survey whose truth is known exactly.
 
 Reads: nothing. Writes a survey folder, not a workspace: `images/`, `trajectory.csv`, `gnss.csv`, `imu.csv`,
-`gcp_list.txt`, `checkpoints.txt`, `truth.json`; on request `depth/` and `bag/`. docs/simulator.md tells of each.
+`gcp_list.txt`, `checkpoints.txt`, `truth.json`; on request `depth/` and `bag/` (docs/simulator.md).
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from pipelines.core.errors import InputError
 from pipelines.core.products import save_json
 from pipelines.core.progress import SILENT, Progress
 from pipelines.formats.bag.writer import BagCamera, BagFlight, write_bag
-from pipelines.formats.exif_writer import PhotoTags, with_tags
+from pipelines.formats.exif_writer import DroneTags, with_tags
 from pipelines.simulate.options import SimulateOptions
 from pipelines.simulate.recording import Recording, record
 from pipelines.simulate.render import Renderer, Sensor
-from pipelines.simulate.sensors import against_local_north
+from pipelines.simulate.sensors import in_local_enu
 from pipelines.simulate.targets import WANTED_RAYS
 from pipelines.simulate.world import World, check_clearance, make_world
 from pipelines.simulate.write import write_gnss, write_imu, write_points, write_trajectory
@@ -39,14 +39,14 @@ WANTED_CHECKS = 30
 
 @dataclass(frozen=True)
 class SimulationSummary:
-    """What was made.
+    """Summary of a simulation.
 
     Attributes:
         directory: the survey folder.
-        images, control_points, check_points: how many.
-        well_seen: check points with at least 6 marks.
-        bag_messages: messages in the bag; 0 without one.
-        warnings: what the user should know.
+        images, control_points, check_points: their numbers.
+        well_seen: number of check points with at least 6 marks.
+        bag_messages: number of messages in the bag; 0 without a bag.
+        warnings: for the user.
     """
 
     directory: Path
@@ -59,17 +59,17 @@ class SimulationSummary:
 
     @property
     def key_figure(self) -> str:
-        """The headline."""
+        """Headline of the summary."""
         return f"{self.images} photographs, {self.control_points} control and {self.check_points} check points"
 
 
 @dataclass(frozen=True)
-class Flown:
-    """A flight over a world, and all that was recorded on it but the photographs.
+class RecordedFlight:
+    """Flight over a world with all records, without the photographs.
 
     Attributes:
-        world: everything that is true.
-        renderer: what takes photographs of it.
+        world: scene, lens, motion and mounting.
+        renderer: of the photographs.
         recording: of the instruments and the surveyor.
         photo_seed: of the photographs' noise.
     """
@@ -80,48 +80,48 @@ class Flown:
     photo_seed: np.random.SeedSequence
 
 
-def fly_survey(config: SimulateOptions) -> Flown:
-    """Make the world of these options, fly over it and record, without taking the photographs.
+def fly_survey(options: SimulateOptions) -> RecordedFlight:
+    """Make the world of these options, fly over it and record, without photographs.
 
-    World, flight and photographs' noise are drawn apart from what is recorded: options that differ in the receiver
-    alone give the same flight.
+    World, flight and noise of the photographs have random numbers apart from those of the records: options that
+    differ in the receiver alone give the same flight.
 
     Raises:
         InputError: the options cannot be flown or photographed.
         BackendUnavailableError: the ray caster is not installed.
     """
-    world_seed, record_seed, photo_seed = np.random.SeedSequence(config.seed).spawn(3)
-    world = make_world(config, world_seed)
-    renderer = Renderer(world.scene, world.lens, int(config.samples))
+    world_seed, record_seed, photo_seed = np.random.SeedSequence(options.seed).spawn(3)
+    world = make_world(options, world_seed)
+    renderer = Renderer(world.scene, world.lens, int(options.samples))
     check_clearance(world, renderer.raycaster)
-    return Flown(world, renderer, record(config, world, renderer.raycaster, record_seed), photo_seed)
+    return RecordedFlight(world, renderer, record(options, world, renderer.raycaster, record_seed), photo_seed)
 
 
 def simulate(
-    config: SimulateOptions, directory: Path, progress: Progress = SILENT, *, overwrite: bool = False
+    options: SimulateOptions, directory: Path, progress: Progress = SILENT, *, overwrite: bool = False
 ) -> SimulationSummary:
     """Simulate a survey into `directory`, which appears when complete.
 
-    The same options give the same bytes. `overwrite` allows to replace an earlier simulation, nothing else.
+    The same options give the same bytes. `overwrite` allows replacing an earlier simulation, and no other folder.
 
     Raises:
         InputError: the folder is in use, or the options cannot be flown or photographed.
         BackendUnavailableError: the ray caster is not installed.
     """
-    check_target(directory, overwrite=overwrite)
-    flown = fly_survey(config)
-    recording = flown.recording
+    check_folder(directory, overwrite=overwrite)
+    flight = fly_survey(options)
+    recording = flight.recording
     with _draft(directory) as draft:
-        _Shoot(config, flown, draft).run(progress)
-        messages = _write_records(config, flown.world, recording, draft)
+        _PhotoWriter(options, flight, draft).run(progress)
+        messages = _write_records(options, flight.world, recording, draft)
     summary = SimulationSummary(
         directory,
-        config.images,
+        options.images,
         len(recording.control),
         len(recording.check),
         sum(len(target.marks) >= WANTED_RAYS for target in recording.check),
         messages,
-        _warnings(config, recording),
+        _warnings(options, recording),
     )
     for warning in summary.warnings:
         log.warning("simulate: %s", warning)
@@ -129,11 +129,11 @@ def simulate(
     return summary
 
 
-def check_target(directory: Path, *, overwrite: bool) -> None:
-    """See before the work begins that a survey can be put at `directory`.
+def check_folder(directory: Path, *, overwrite: bool) -> None:
+    """Check before the work begins that a survey can be written to `directory`.
 
     Raises:
-        InputError: something is there that may not be replaced.
+        InputError: the folder exists and may not be replaced.
     """
     if not directory.exists():
         return
@@ -148,7 +148,7 @@ def check_target(directory: Path, *, overwrite: bool) -> None:
 
 @contextmanager
 def _draft(directory: Path) -> Iterator[Path]:
-    """A folder to write into that becomes `directory` when all is well, and vanishes otherwise."""
+    """Yield a folder that becomes `directory` on success, and vanishes otherwise."""
     draft = directory.with_name(f".{directory.name}.partial")
     old = directory.with_name(f".{directory.name}.old")
     for left in (draft, old):
@@ -169,24 +169,24 @@ def _draft(directory: Path) -> Iterator[Path]:
 
 
 @dataclass(frozen=True)
-class _Shoot:
-    """Renders and writes the photographs, and depth maps where asked, into `folder`."""
+class _PhotoWriter:
+    """Renders and writes the photographs, and depth maps on request, into `folder`."""
 
-    config: SimulateOptions
-    flown: Flown
+    options: SimulateOptions
+    flight: RecordedFlight
     folder: Path
 
     def run(self, progress: Progress) -> None:
-        """All photographs, several at a time; each has its own stream of noise, whatever the order."""
-        count, rng = self.config.images, np.random.default_rng(self.flown.photo_seed)
+        """Write all photographs, several at a time; each has its own stream of noise, whatever the order."""
+        count, rng = self.options.images, np.random.default_rng(self.flight.photo_seed)
         (self.folder / "images").mkdir()
-        if self.config.depth:
+        if self.options.depth:
             (self.folder / "depth").mkdir()
-        sensors = _sensors(self.config, rng)
+        sensors = _sensors(self.options, rng)
         streams = rng.spawn(count)
-        threads = self.config.threads if self.config.threads > 0 else os.cpu_count() or 1
+        threads = self.options.threads if self.options.threads > 0 else os.cpu_count() or 1
         with progress.task("photographs", count) as task, ThreadPoolExecutor(max(1, threads)) as pool:
-            jobs = [pool.submit(self._one, i, sensors[i], streams[i]) for i in range(count)]
+            jobs = [pool.submit(self._write, i, sensors[i], streams[i]) for i in range(count)]
             try:
                 for job in jobs:
                     job.result()
@@ -195,35 +195,35 @@ class _Shoot:
                 pool.shutdown(cancel_futures=True)
                 raise
 
-    def _one(self, i: int, sensor: Sensor, rng: np.random.Generator) -> None:
-        world, recording = self.flown.world, self.flown.recording
+    def _write(self, i: int, sensor: Sensor, rng: np.random.Generator) -> None:
+        world, recording = self.flight.world, self.flight.recording
         pose, name = world.poses[i], recording.photos.names[i]
-        rgb = self.flown.renderer.photograph(pose, sensor, rng)
-        _, encoded = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, self.config.quality])
+        rgb = self.flight.renderer.photograph(pose, sensor, rng)
+        _, encoded = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, self.options.quality])
         jpeg = encoded.tobytes()
-        if self.config.exif:
-            jpeg = with_tags(jpeg, _tags(self.config, world, recording, i))
+        if self.options.exif:
+            jpeg = with_tags(jpeg, _tags(self.options, world, recording, i))
         (self.folder / "images" / name).write_bytes(jpeg)
-        if self.config.depth:
-            np.save(self.folder / "depth" / f"{Path(name).stem}.npy", self.flown.renderer.depth(pose))
+        if self.options.depth:
+            np.save(self.folder / "depth" / f"{Path(name).stem}.npy", self.flight.renderer.depth(pose))
 
 
-def _sensors(config: SimulateOptions, rng: np.random.Generator) -> list[Sensor]:
-    """Exposure and white balance of each photograph."""
-    gains = 1.1 * np.exp(rng.normal(0, config.exposure, config.images))
-    tints = np.exp(rng.normal(0, 0.15 * config.exposure, (config.images, 3)))
+def _sensors(options: SimulateOptions, rng: np.random.Generator) -> list[Sensor]:
+    """Return exposure and white balance of each photograph."""
+    gains = 1.1 * np.exp(rng.normal(0, options.exposure, options.images))
+    tints = np.exp(rng.normal(0, 0.15 * options.exposure, (options.images, 3)))
     return [
-        Sensor(float(gain), (float(red), float(green), float(blue)), config.noise)
+        Sensor(float(gain), (float(red), float(green), float(blue)), options.noise)
         for gain, (red, green, blue) in zip(gains, tints, strict=True)
     ]
 
 
-def _tags(config: SimulateOptions, world: World, recording: Recording, i: int) -> PhotoTags:
+def _tags(options: SimulateOptions, world: World, recording: Recording, i: int) -> DroneTags:
     lat, lon, alt = (float(value) for value in recording.photos.lla[i])
     yaw, pitch, roll = (float(value) for value in recording.photos.yaw_pitch_roll_deg[i])
     body_yaw, body_pitch, body_roll = (float(value) for value in recording.body_yaw_pitch_roll_deg[i])
     east, north, up = (float(value) for value in recording.photos.sigma_enu_m)
-    return PhotoTags(
+    return DroneTags(
         width=world.lens.width,
         height=world.lens.height,
         focal_px=world.lens.focal_px,
@@ -234,25 +234,25 @@ def _tags(config: SimulateOptions, world: World, recording: Recording, i: int) -
         relative_alt_m=alt - world.origin.alt_m,
         yaw_pitch_roll_deg=(yaw, pitch, roll),
         body_yaw_pitch_roll_deg=(body_yaw, body_pitch, body_roll),
-        sigma_enu_m=None if config.gnss == "consumer" else (east, north, up),
+        sigma_enu_m=None if options.gnss == "consumer" else (east, north, up),
     )
 
 
-def _write_records(config: SimulateOptions, world: World, recording: Recording, folder: Path) -> int:
-    """Write tables, truth and bag; returns the number of messages in the bag."""
-    enu_from_body = against_local_north(recording.imu.geo_from_body, recording.imu_in_geo, world.origin)
+def _write_records(options: SimulateOptions, world: World, recording: Recording, folder: Path) -> int:
+    """Write tables, truth and bag; return the number of messages in the bag."""
+    enu_from_body = in_local_enu(recording.imu.geo_from_body, recording.imu_in_geo, world.origin)
     write_trajectory(folder / "trajectory.csv", recording.photos)
     write_gnss(folder / "gnss.csv", recording.gnss, recording.photos.sigma_enu_m, world.origin)
     write_imu(folder / "imu.csv", recording.imu, enu_from_body)
     write_points(folder / "gcp_list.txt", recording.control, world.origin)
     write_points(folder / "checkpoints.txt", recording.check, world.origin)
     save_json(recording.truth, folder / TRUTH)
-    if config.bag == "none":
+    if options.bag == "none":
         return 0
     lens = world.lens
     camera = BagCamera(
         lens.width, lens.height, lens.focal_px, lens.center_px, (lens.k1, lens.k2, lens.p1, lens.p2, 0.0),
-        world.track.cam_from_body,
+        world.trajectory.cam_from_body,
     )  # fmt: skip
     flight = BagFlight(
         camera=camera,
@@ -261,25 +261,25 @@ def _write_records(config: SimulateOptions, world: World, recording: Recording, 
         fix_stamp_ns=recording.gnss.stamp_ns,
         fix_lla=recording.gnss_lla,
         fix_sigma_enu_m=recording.photos.sigma_enu_m,
-        fix_status=0 if config.gnss == "consumer" else 2,
+        fix_status=0 if options.gnss == "consumer" else 2,
         antenna_in_body=world.mounting.antenna_in_body,
         imu_stamp_ns=recording.imu.stamp_ns,
         imu_enu_from_body=enu_from_body,
         imu_rate=recording.imu.rate_in_body,
         imu_force=recording.imu.specific_force_in_body,
-        imu_sigma_deg=config.sigma_attitude,
+        imu_sigma_deg=options.sigma_attitude,
     )
-    return write_bag(folder / "bag", config.bag, flight)
+    return write_bag(folder / "bag", options.bag, flight)
 
 
-def _warnings(config: SimulateOptions, recording: Recording) -> tuple[str, ...]:
-    found = []
+def _warnings(options: SimulateOptions, recording: Recording) -> tuple[str, ...]:
+    messages = []
     good = sum(len(target.marks) >= WANTED_RAYS for target in recording.check)
-    if config.targets and good < WANTED_CHECKS:
-        found.append(
+    if options.targets and good < WANTED_CHECKS:
+        messages.append(
             f"only {good} check points are seen in {WANTED_RAYS} photographs or more: "
             "take more --images, larger ones (--size), or more --targets"
         )
-    if len(recording.control) < config.control:
-        found.append(f"only {len(recording.control)} of {config.control} control points found a place")
-    return tuple(found)
+    if len(recording.control) < options.control:
+        messages.append(f"only {len(recording.control)} of {options.control} control points found a place")
+    return tuple(messages)

@@ -1,4 +1,4 @@
-"""Terrain: gentle relief where the town stands, hills towards the horizon."""
+"""Terrain: gentle relief in the town, hills towards the horizon."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pipelines.core.types import FloatArray
-from pipelines.simulate.mesh import Finish, Material, MeshBuilder
+from pipelines.simulate.mesh import Material, MeshBuilder, TextureParameters
 
 HORIZON_M = 1600.0
 _INNER_M, _CELL_M = 150.0, 2.5
@@ -16,7 +16,7 @@ _INNER_M, _CELL_M = 150.0, 2.5
 
 @dataclass(frozen=True)
 class Terrain:
-    """Height as a sum of waves: `height(x, y)`, zero at the origin.
+    """Terrain whose height is a sum of waves, zero at the origin.
 
     Attributes:
         waves: (W, 2) radians per metre, east and north.
@@ -30,7 +30,7 @@ class Terrain:
     far_m: FloatArray
 
     def height(self, xy: ArrayLike) -> FloatArray:
-        """Heights (…,) in metres of places (…, 2)."""
+        """Return heights (…,) in metres of places (…, 2)."""
         place = np.asarray(xy, dtype=np.float64)
         raised = np.sin(place @ self.waves.T + self.phases) - np.sin(self.phases)
         distance = np.linalg.norm(place, axis=-1)
@@ -38,7 +38,7 @@ class Terrain:
         return np.asarray((raised * (self.near_m + hills * self.far_m)).sum(axis=-1))
 
     def normal(self, xy: FloatArray) -> FloatArray:
-        """Upward unit normals (N, 3) at places (N, 2)."""
+        """Return upward unit normals (N, 3) at places (N, 2)."""
         step = 0.5 * np.eye(2)
         east, north = (self.height(xy + aside) - self.height(xy - aside) for aside in step)
         normal = np.stack([-east, -north, np.ones(len(xy))], axis=1)
@@ -46,7 +46,7 @@ class Terrain:
 
 
 def make_terrain(relief_m: float, rng: np.random.Generator) -> Terrain:
-    """Terrain whose height in the town varies by about ± `relief_m`."""
+    """Return terrain whose height in the town varies by about ± `relief_m`."""
     lengths = np.array([420.0, 260.0, 150.0, 90.0])
     bearing = rng.uniform(0, 2 * np.pi, len(lengths))
     waves = 2 * np.pi / lengths[:, None] * np.stack([np.sin(bearing), np.cos(bearing)], axis=1)
@@ -56,7 +56,7 @@ def make_terrain(relief_m: float, rng: np.random.Generator) -> Terrain:
     )
 
 
-def add_terrain(builder: MeshBuilder, terrain: Terrain, axes: FloatArray, finish: Finish) -> None:
+def add_terrain(builder: MeshBuilder, terrain: Terrain, axes: FloatArray, texture: TextureParameters) -> None:
     """Add the terrain as a grid, fine in the town and coarse beyond; `axes` (3, 3) are the town's."""
     inner = np.arange(0.0, _INNER_M + _CELL_M / 2, _CELL_M)
     outer = np.geomspace(_INNER_M, HORIZON_M, 40)[1:]
@@ -71,7 +71,7 @@ def add_terrain(builder: MeshBuilder, terrain: Terrain, axes: FloatArray, finish
     builder.triangles(
         vertices[faces],
         Material.TERRAIN,
-        builder.finish(finish),
+        builder.add_texture(texture),
         (np.zeros(3), axes[0], axes[1]),
         terrain.normal(places)[faces],
     )

@@ -1,4 +1,4 @@
-"""Albedo of every material at points on it: walls with windows, roofs, ground, leaves, cars, targets."""
+"""Textures: albedo of every material, such as walls with windows, roofs, ground, leaves, cars, targets."""
 
 from __future__ import annotations
 
@@ -16,34 +16,34 @@ STYLE, FLOOR, PITCH, WINDOW_W, WINDOW_H, SILL, TOP, SHOP, SHIFT_U, SHIFT_V = ran
 
 
 @dataclass(frozen=True)
-class Surface:
-    """N points on surfaces of one material.
+class TextureSamples:
+    """N points on surfaces of one material, at which its texture is sampled.
 
     Attributes:
         u, v: (N,) texture coordinates in metres.
         du, dv: (N,) width of a pixel along them, in metres.
-        finish: (N, 16) rows of the finish table.
+        params: (N, 16) rows of `Mesh.texture_params`.
     """
 
     u: Float32Array
     v: Float32Array
     du: Float32Array
     dv: Float32Array
-    finish: Float32Array
+    params: Float32Array
 
     @property
     def pixel(self) -> Float32Array:
-        """Width of a pixel for patterns without direction; a bit sharp, for the image is supersampled."""
+        """Width of a pixel for patterns without direction; slightly small, because images are supersampled."""
         return np.asarray(np.float32(0.75) * np.maximum(self.du, self.dv))
 
-    def select(self, chosen: np.ndarray) -> Surface:
-        """The chosen points only."""
-        return Surface(*(getattr(self, field.name)[chosen] for field in fields(self)))
+    def select(self, chosen: np.ndarray) -> TextureSamples:
+        """Return the chosen points only."""
+        return TextureSamples(*(getattr(self, field.name)[chosen] for field in fields(self)))
 
 
 @dataclass(frozen=True)
 class GroundPlan:
-    """What is painted on the ground: colour (square root of albedo), and shares of grass, paving, asphalt."""
+    """Paint of the ground: colour (square root of albedo), and shares of grass, paving, asphalt."""
 
     color: Pyramid
     kind: Pyramid
@@ -54,18 +54,18 @@ def _tinted(base: Float32Array, amount: Float32Array) -> Float32Array:
     return np.asarray(base * np.clip(1 + amount, 0.15, 2.5)[:, None])
 
 
-def _grime(s: Surface) -> Float32Array:
-    """Weathering: blotches, and streaks that run down the wall."""
-    u, v = s.u + s.finish[:, SHIFT_U], s.v + s.finish[:, SHIFT_V]
+def _grime(s: TextureSamples) -> Float32Array:
+    """Return weathering: blotches, and streaks that run down the wall."""
+    u, v = s.u + s.params[:, SHIFT_U], s.v + s.params[:, SHIFT_V]
     blotches = fbm(u, v, (3.1, 1.3, 0.55, 0.24, 0.1), s.pixel)
     streaks = noise(u, v * np.float32(0.12), 0.45, s.pixel)
     return np.asarray(np.float32(0.42) * blotches + np.float32(0.22) * streaks)
 
 
 def _masonry(
-    s: Surface, stone_m: tuple[float, float], joint: float, salt: int
+    s: TextureSamples, stone_m: tuple[float, float], joint: float, salt: int
 ) -> tuple[Float32Array, Float32Array]:
-    """Tone of each stone, and the share of joints."""
+    """Return the tone of each stone, and the share of joints."""
     length, height = stone_m
     row = np.floor(s.v / np.float32(height))
     along = s.u + np.float32(0.5 * length) * np.mod(row, 2)
@@ -74,116 +74,116 @@ def _masonry(
     return tone * visible(height, s.pixel), joints
 
 
-def wall(s: Surface) -> Float32Array:
-    """A facade: plaster, masonry or panels, with plinth, windows, frames, sills, curtains and shops."""
-    color = _tinted(s.finish[:, BASE], _grime(s))
+def wall(s: TextureSamples) -> Float32Array:
+    """Return a facade: plaster, masonry or panels, with plinth, windows, frames, sills, curtains and shops."""
+    color = _tinted(s.params[:, BASE], _grime(s))
     for style, stone_m, joint, contrast in ((1, (0.8, 0.4), 0.035, 0.75), (2, (3.0, 1.5), 0.05, 0.3)):
-        own = np.nonzero(s.finish[:, STYLE] == style)[0]
+        own = np.nonzero(s.params[:, STYLE] == style)[0]
         if len(own):
             tone, joints = _masonry(s.select(own), stone_m, joint, style)
             color[own] = mix(_tinted(color[own], contrast * tone), color[own] * np.float32(0.5), joints)
     plinth = band(s.v, -50.0, 0.7, s.dv)
-    color = mix(color, s.finish[:, BASE] * np.float32(0.35) + np.float32(0.05), plinth * np.float32(0.8))
-    cornice = band(s.v, s.finish[:, TOP] + 0.05, s.finish[:, TOP] + 0.3, s.dv)
-    color = mix(color, s.finish[:, ACCENT], cornice)
+    color = mix(color, s.params[:, BASE] * np.float32(0.35) + np.float32(0.05), plinth * np.float32(0.8))
+    cornice = band(s.v, s.params[:, TOP] + 0.05, s.params[:, TOP] + 0.3, s.dv)
+    color = mix(color, s.params[:, ACCENT], cornice)
     return _add_windows(s, color)
 
 
-def _add_windows(s: Surface, color: Float32Array) -> Float32Array:
-    floor, pitch = s.finish[:, FLOOR], s.finish[:, PITCH]
+def _add_windows(s: TextureSamples, color: Float32Array) -> Float32Array:
+    floor, pitch = s.params[:, FLOOR], s.params[:, PITCH]
     storey, column = np.floor(s.v / floor), np.floor(s.u / pitch)
     x, y = s.u - (column + np.float32(0.5)) * pitch, s.v - storey * floor
-    salt_u, salt_v = s.finish[:, SHIFT_U], s.finish[:, SHIFT_V]
+    salt_u, salt_v = s.params[:, SHIFT_U], s.params[:, SHIFT_V]
     luck, mood = (cell_random(column + salt_u, storey + salt_v, salt) for salt in (3, 4))
     ground = storey < 1
-    shop = ground & (s.finish[:, SHOP] > 0)
-    half = np.where(shop, np.float32(0.42) * pitch, s.finish[:, WINDOW_W] / 2)
-    low = np.where(shop, np.float32(0.35), s.finish[:, SILL])
-    high = np.where(shop, np.float32(2.5), s.finish[:, SILL] + s.finish[:, WINDOW_H])
+    shop = ground & (s.params[:, SHOP] > 0)
+    half = np.where(shop, np.float32(0.42) * pitch, s.params[:, WINDOW_W] / 2)
+    low = np.where(shop, np.float32(0.35), s.params[:, SILL])
+    high = np.where(shop, np.float32(2.5), s.params[:, SILL] + s.params[:, WINDOW_H])
     door = ground & ~shop & (luck < 0.2)
     low, high = np.where(door, 0.0, low), np.where(door, 2.2, high)
-    exists = ((s.v > 0) & ((storey + 1) * floor <= s.finish[:, TOP] + 0.05) & (luck < 0.93)).astype(np.float32)
+    exists = ((s.v > 0) & ((storey + 1) * floor <= s.params[:, TOP] + 0.05) & (luck < 0.93)).astype(np.float32)
     frame_m = np.float32(0.14)
     hole = band(x, -half - frame_m, half + frame_m, s.du) * band(y, low - frame_m, high + frame_m, s.dv) * exists
     pane = band(x, -half, half, s.du) * band(y, low, high, s.dv) * exists
     pane *= 1 - band(x, -0.05, 0.05, s.du) * (~door)
     sill = band(x, -half - 0.25, half + 0.25, s.du) * band(y, low - 0.32, low - frame_m, s.dv) * exists * (~door)
     color = mix(color, np.array([0.5, 0.48, 0.44], dtype=np.float32), sill)
-    color = mix(color, s.finish[:, ACCENT], hole)
+    color = mix(color, s.params[:, ACCENT], hole)
     glass = np.array([0.035, 0.05, 0.065], dtype=np.float32) * (np.float32(0.5) + 2 * mood)[:, None]
     curtain_low = low + (high - low) * np.where(luck > 0.45, np.float32(0.25) + mood, 2.0)
     curtain = band(y, curtain_low, high, s.dv)
     tint = np.array([0.42, 0.38, 0.32], dtype=np.float32) * (np.float32(0.4) + luck)[:, None]
-    glass = np.where(door[:, None], s.finish[:, ACCENT] * np.float32(0.35), mix(glass, tint, curtain * (~door)))
+    glass = np.where(door[:, None], s.params[:, ACCENT] * np.float32(0.35), mix(glass, tint, curtain * (~door)))
     return mix(color, glass, pane)
 
 
-def tiles(s: Surface) -> Float32Array:
-    """A pitched roof: rows of tiles, each of its own tone, with moss and darker patches."""
+def tiles(s: TextureSamples) -> Float32Array:
+    """Return a pitched roof: rows of tiles, each of its own tone, with moss and darker patches."""
     row = np.floor(s.v / np.float32(0.4))
     along = s.u + np.float32(0.15) * np.mod(row, 2)
     tone = (cell_random(np.floor(along / np.float32(0.3)), row, 5) - np.float32(0.5)) * visible(0.3, s.pixel)
     patch = cell_random(np.floor(s.u / np.float32(1.7)), np.floor(s.v / np.float32(1.2)), 6) - np.float32(0.5)
-    color = _tinted(s.finish[:, BASE], 0.8 * tone + 0.35 * patch * visible(1.2, s.pixel) + _grime(s))
+    color = _tinted(s.params[:, BASE], 0.8 * tone + 0.35 * patch * visible(1.2, s.pixel) + _grime(s))
     lap = stripes(s.v, 0.4, 0.07, s.dv)
     color = mix(color, color * np.float32(0.45), lap)
-    u, v = s.u + s.finish[:, SHIFT_U], s.v + s.finish[:, SHIFT_V]
+    u, v = s.u + s.params[:, SHIFT_U], s.v + s.params[:, SHIFT_V]
     moss = np.clip(3 * fbm(u, v, (2.3, 0.9, 0.35), s.pixel) - np.float32(0.9), 0, 0.7)
     return mix(color, np.array([0.09, 0.11, 0.04], dtype=np.float32), moss)
 
 
-def flat_roof(s: Surface) -> Float32Array:
-    """Bitumen sheets or gravel, with repairs, puddle stains and seams."""
-    u, v = s.u + s.finish[:, SHIFT_U], s.v + s.finish[:, SHIFT_V]
-    color = _tinted(s.finish[:, BASE], 0.7 * fbm(u, v, (2.9, 1.2, 0.5, 0.22, 0.1), s.pixel, 0.85))
+def flat_roof(s: TextureSamples) -> Float32Array:
+    """Return bitumen sheets or gravel, with repairs, puddle stains and seams."""
+    u, v = s.u + s.params[:, SHIFT_U], s.v + s.params[:, SHIFT_V]
+    color = _tinted(s.params[:, BASE], 0.7 * fbm(u, v, (2.9, 1.2, 0.5, 0.22, 0.1), s.pixel, 0.85))
     repair = cell_random(np.floor(u / np.float32(2.2)), np.floor(v / np.float32(1.3)), 7)
     inset = stripes(u, 2.2, 1.7, s.du) * stripes(v, 1.3, 1.05, s.dv)
-    color = mix(color, s.finish[:, ACCENT], inset * (repair > 0.82) * np.float32(0.8))
+    color = mix(color, s.params[:, ACCENT], inset * (repair > 0.82) * np.float32(0.8))
     stain = np.clip(4 * noise(u + 31, v, 1.9, s.pixel) - np.float32(0.9), 0, 0.55)
     color = mix(color, color * np.float32(0.35), stain)
     return mix(color, color * np.float32(0.5), stripes(s.v, 1.0, 0.05, s.dv))
 
 
-def plain(s: Surface) -> Float32Array:
-    """Concrete, painted metal, bark: weathered, with louvres that show up close."""
+def plain(s: TextureSamples) -> Float32Array:
+    """Return weathered concrete, painted metal or bark, with louvres that show up close."""
     louvre = stripes(s.v, 0.25, 0.07, s.dv)
-    return mix(_tinted(s.finish[:, BASE], _grime(s)), s.finish[:, BASE] * np.float32(0.5), louvre * np.float32(0.5))
+    return mix(_tinted(s.params[:, BASE], _grime(s)), s.params[:, BASE] * np.float32(0.5), louvre * np.float32(0.5))
 
 
-def leaves(s: Surface) -> Float32Array:
-    """Foliage: clumps of light and dark."""
-    u, v = s.u + s.finish[:, SHIFT_U], s.v + s.finish[:, SHIFT_V]
+def leaves(s: TextureSamples) -> Float32Array:
+    """Return foliage: clumps of light and dark."""
+    u, v = s.u + s.params[:, SHIFT_U], s.v + s.params[:, SHIFT_V]
     clumps = fbm(u, v, (1.1, 0.5, 0.24, 0.12), s.pixel, 0.9)
-    color = _tinted(s.finish[:, BASE], 1.5 * clumps)
-    return mix(color, s.finish[:, ACCENT], np.clip(2 * clumps, 0, 0.6))
+    color = _tinted(s.params[:, BASE], 1.5 * clumps)
+    return mix(color, s.params[:, ACCENT], np.clip(2 * clumps, 0, 0.6))
 
 
-def car(s: Surface) -> Float32Array:
-    """Painted body; the cabin, marked by `TOP`, has dark windows."""
-    windows = band(s.v, 0.08, 0.47, s.dv) * stripes(s.u - np.float32(0.1), 1.15, 1.0, s.du) * (s.finish[:, TOP] > 0)
-    return mix(_tinted(s.finish[:, BASE], 0.15 * _grime(s)), np.float32(0.03) + 0 * s.finish[:, BASE], windows)
+def car(s: TextureSamples) -> Float32Array:
+    """Return a painted body; the cabin, marked by `TOP`, has dark windows."""
+    windows = band(s.v, 0.08, 0.47, s.dv) * stripes(s.u - np.float32(0.1), 1.15, 1.0, s.du) * (s.params[:, TOP] > 0)
+    return mix(_tinted(s.params[:, BASE], 0.15 * _grime(s)), np.float32(0.03) + 0 * s.params[:, BASE], windows)
 
 
-def solar(s: Surface) -> Float32Array:
-    """Solar modules: dark cells in a bright grid."""
+def solar(s: TextureSamples) -> Float32Array:
+    """Return solar modules: dark cells in a bright grid."""
     frame = np.maximum(stripes(s.u, 1.0, 0.06, s.du), stripes(s.v, 1.65, 0.06, s.dv))
     cells = np.maximum(stripes(s.u, 0.166, 0.012, s.du), stripes(s.v, 0.166, 0.012, s.dv))
-    color = mix(_tinted(s.finish[:, BASE], 0.25 * _grime(s)), s.finish[:, BASE] * 3, cells)
+    color = mix(_tinted(s.params[:, BASE], 0.25 * _grime(s)), s.params[:, BASE] * 3, cells)
     return mix(color, np.array([0.45, 0.46, 0.48], dtype=np.float32), frame)
 
 
-def target(s: Surface) -> Float32Array:
-    """A survey target: black and white quarters about the origin of the coordinates; `PITCH` is its width."""
-    half = s.finish[:, PITCH] / 2
+def target(s: TextureSamples) -> Float32Array:
+    """Return a survey target: black and white quarters about the origin of the coordinates, `PITCH` wide."""
+    half = s.params[:, PITCH] / 2
     right, upper = band(s.u, 0.0, half, s.du), band(s.v, 0.0, half, s.dv)
     left, lower = band(s.u, -half, 0.0, s.du), band(s.v, -half, 0.0, s.dv)
     white = right * upper + left * lower
     return np.repeat((np.float32(0.03) + np.float32(0.75) * white)[:, None], 3, axis=1)
 
 
-def ground(s: Surface, plan: GroundPlan) -> Float32Array:
-    """The painted plan with the grain of grass, paving and asphalt; fields beyond it."""
-    # The plan is sampled sharper than the pixel: supersampling filters the rest.
+def ground(s: TextureSamples, plan: GroundPlan) -> Float32Array:
+    """Return the painted plan with the grain of grass, paving and asphalt, and fields beyond."""
+    # The plan is sampled sharper than the pixel: supersampling completes the filter.
     fine = np.sqrt(s.du * s.dv) * np.float32(0.6)
     color = np.square(plan.color.sample(s.u, s.v, fine))
     kind = plan.kind.sample(s.u, s.v, fine)
@@ -200,16 +200,16 @@ def ground(s: Surface, plan: GroundPlan) -> Float32Array:
     return color
 
 
-def _meadow(s: Surface, color: Float32Array, grass: Float32Array) -> Float32Array:
-    """Blades and dry patches, as far as there is grass."""
+def _meadow(s: TextureSamples, color: Float32Array, grass: Float32Array) -> Float32Array:
+    """Add blades and dry patches, by the share of grass."""
     grain = fbm(s.u, s.v, (7.0, 3.0, 1.3, 0.6, 0.28, 0.13), s.pixel, 0.85)
     color = _tinted(color, grass * np.float32(0.85) * grain)
     dry = grass * np.clip(np.float32(1.6) * grain, 0, 0.5)
     return mix(color, np.array([0.26, 0.23, 0.1], dtype=np.float32), dry)
 
 
-def _pavement(s: Surface, color: Float32Array, kind: Float32Array) -> Float32Array:
-    """Slabs and joints of paving; grit and cracks of asphalt."""
+def _pavement(s: TextureSamples, color: Float32Array, kind: Float32Array) -> Float32Array:
+    """Add slabs and joints of paving, grit and cracks of asphalt."""
     paving, asphalt = kind[:, 1], kind[:, 2]
     grit = fbm(s.u + np.float32(50), s.v, (2.6, 1.1, 0.45, 0.2, 0.09), s.pixel, 0.9)
     slab, joints = _masonry(s, (1.6, 0.8), 0.05, 8)
@@ -223,8 +223,8 @@ def _pavement(s: Surface, color: Float32Array, kind: Float32Array) -> Float32Arr
     return mix(color, color * np.float32(0.5), paving * joints)
 
 
-def _fields(s: Surface) -> Float32Array:
-    """A quilt of fields with furrows."""
+def _fields(s: TextureSamples) -> Float32Array:
+    """Return a quilt of fields with furrows."""
     i, j = np.floor((s.u + np.float32(20)) / 90), np.floor((s.v - np.float32(35)) / 60)
     hue, tone = cell_random(i, j, 9), cell_random(i, j, 10)
     green, straw = np.array([[0.10, 0.17, 0.05], [0.33, 0.27, 0.12]], dtype=np.float32)
@@ -234,7 +234,7 @@ def _fields(s: Surface) -> Float32Array:
     return mix(mix(color, color * np.float32(0.75), furrow), green * np.float32(0.5), edge)
 
 
-_TEXTURES: dict[Material, Callable[[Surface], Float32Array]] = {
+_TEXTURES: dict[Material, Callable[[TextureSamples], Float32Array]] = {
     Material.WALL: wall,
     Material.TILES: tiles,
     Material.FLAT_ROOF: flat_roof,
@@ -246,11 +246,11 @@ _TEXTURES: dict[Material, Callable[[Surface], Float32Array]] = {
 }
 
 
-def albedo(surface: Surface, material: np.ndarray, plan: GroundPlan) -> Float32Array:
-    """Linear albedo (N, 3) at N points of the given materials (N,)."""
+def albedo(samples: TextureSamples, material: np.ndarray, plan: GroundPlan) -> Float32Array:
+    """Return the linear albedo (N, 3) at N points of the given materials (N,)."""
     color = np.zeros((len(material), 3), dtype=np.float32)
     for kind in np.unique(material):
         chosen = np.nonzero(material == kind)[0]
-        part = surface.select(chosen)
+        part = samples.select(chosen)
         color[chosen] = ground(part, plan) if kind == Material.TERRAIN else _TEXTURES[Material(kind)](part)
     return color

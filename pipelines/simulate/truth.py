@@ -1,4 +1,4 @@
-"""`truth.json`: everything that a simulated survey hides from the pipeline."""
+"""`truth.json`: the truth that a simulated survey hides from the pipeline."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pipelines.geodesy.enu import Origin
 
 
 class TrueLens(Product):
-    """The lens as a COLMAP camera; the centre of the top-left pixel is (0.5, 0.5)."""
+    """Lens as a COLMAP camera; the centre of the top-left pixel is (0.5, 0.5)."""
 
     model: str
     width: int
@@ -19,7 +19,7 @@ class TrueLens(Product):
 
 
 class TrueMark(Product):
-    """Exact projection of a target, and what was written with noise."""
+    """Exact projection of a target, and the mark with noise in the files."""
 
     image: str
     x_px: float
@@ -29,7 +29,7 @@ class TrueMark(Product):
 
 
 class TrueTarget(Product):
-    """A survey target: exact centre in geo."""
+    """Survey target with its exact centre in geo."""
 
     name: str
     role: Literal["control", "check"]
@@ -42,9 +42,13 @@ class TrueNavigation(Product):
     """Errors of the navigation.
 
     The bias is amplitude · sin(2π t / period + phase), t in seconds of the camera's clock since the first
-    photograph. `wrong_images` are photographs around which the fixes are off. The boresight maps the true camera
-    axes into those that mounting and attitude suggest. `clock_offset_s` is navigation clock minus camera clock.
-    `cam_from_body` is the nominal mounting, the body forward-right-down.
+    photograph.
+
+    Attributes:
+        wrong_images: photographs around which the fixes are wrong.
+        nominal_from_cam: boresight: true camera axes → axes that mounting and attitude suggest.
+        cam_from_body: nominal mounting, the body forward-right-down.
+        clock_offset_s: navigation clock minus camera clock.
     """
 
     receiver: str
@@ -63,7 +67,7 @@ class TrueNavigation(Product):
 
 
 class Truth(Product):
-    """The whole truth. Lists run parallel to `images`; the geo frame is East-North-Up at `origin`.
+    """Truth of a survey. Lists run parallel to `images`; the geo frame is East-North-Up at `origin`.
 
     Attributes:
         centers: camera centres in geo.

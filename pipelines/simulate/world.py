@@ -1,4 +1,4 @@
-"""What is simulated: scene, lens, true motion, and how the sensors are put together."""
+"""Simulated world: scene, lens, true motion, and the arrangement of the sensors."""
 
 from __future__ import annotations
 
@@ -9,16 +9,22 @@ import numpy as np
 from pipelines.core.errors import InputError
 from pipelines.geodesy.enu import Origin
 from pipelines.geometry.rotations import exp_so3
-from pipelines.simulate.buildings import Spot
-from pipelines.simulate.flight import DEFAULT_HEIGHTS_M, DEFAULT_RADIUS_M, FlightPlan, Track, fly
+from pipelines.simulate.buildings import TargetSite
+from pipelines.simulate.flight import (
+    DEFAULT_HEIGHTS_M,
+    DEFAULT_RADIUS_M,
+    FlightPlan,
+    TrueTrajectory,
+    make_trajectory,
+)
 from pipelines.simulate.lens import Lens
 from pipelines.simulate.mesh import Material
 from pipelines.simulate.options import SimulateOptions
 from pipelines.simulate.raycast import MISS, Raycaster
 from pipelines.simulate.render import Pose
-from pipelines.simulate.scene import Scene, make_scene, with_targets
+from pipelines.simulate.scene import SimulatedScene, build_scene, with_targets
 from pipelines.simulate.sensors import Mounting
-from pipelines.simulate.targets import choose, sightings
+from pipelines.simulate.targets import choose_sites, project_targets
 
 _CLEARANCE_M = 2.0
 _TARGET_PX = 5.0
@@ -26,85 +32,91 @@ _TARGET_PX = 5.0
 
 @dataclass(frozen=True)
 class World:
-    """Everything that is true.
+    """Truth from which records and photographs are made.
 
     Attributes:
-        scene: with its targets; spots: where those are; target_m: how wide.
-        track: true motion; poses: of the photographs.
+        origin: of geo, on Earth.
+        scene: with its targets.
+        sites: of the targets.
+        target_m: width of a target.
+        lens: of the camera.
+        trajectory: true motion of the camera.
+        poses: of the photographs.
+        mounting: arrangement of camera, antenna and clocks.
     """
 
     origin: Origin
-    scene: Scene
-    spots: tuple[Spot, ...]
+    scene: SimulatedScene
+    sites: tuple[TargetSite, ...]
     target_m: float
     lens: Lens
-    track: Track
+    trajectory: TrueTrajectory
     poses: tuple[Pose, ...]
     mounting: Mounting
 
 
-def make_world(config: SimulateOptions, seed: np.random.SeedSequence) -> World:
-    """Build the scene, fly over it, and lay out the targets where the flight sees them.
+def make_world(options: SimulateOptions, seed: np.random.SeedSequence) -> World:
+    """Build the scene, fly over it, and lay out targets at sites that the flight sees.
 
     Raises:
         InputError: the lens folds inside the image.
     """
     scene_seed, flight_seed, target_seed = seed.spawn(3)
-    lat, lon, alt = config.origin
-    lens = _lens(config)
+    lat, lon, alt = options.origin
+    lens = _lens(options)
     mounting = Mounting(
-        antenna_in_body=np.array(config.lever_arm),
-        nominal_from_cam=exp_so3(np.radians(config.boresight)),
-        clock_offset_s=config.clock_offset,
+        antenna_in_body=np.array(options.lever_arm),
+        nominal_from_cam=exp_so3(np.radians(options.boresight)),
+        clock_offset_s=options.clock_offset,
     )
-    bare = make_scene(config.scene, scene_seed)
+    bare = build_scene(options.scene, scene_seed)
     plan = FlightPlan(
-        config.flight,
-        config.images,
-        config.interval,
-        config.heights or DEFAULT_HEIGHTS_M[config.flight],
-        config.radius or DEFAULT_RADIUS_M[config.flight],
+        options.flight,
+        options.images,
+        options.interval,
+        options.heights or DEFAULT_HEIGHTS_M[options.flight],
+        options.radius or DEFAULT_RADIUS_M[options.flight],
     )
-    track = fly(plan, bare.complex_m, bare.axes, np.random.default_rng(flight_seed))
-    centers = track.position(track.photo_s)
-    rotations = track.geo_from_nominal_cam(track.photo_s) @ mounting.nominal_from_cam
+    trajectory = make_trajectory(plan, bare.complex_m, bare.axes, np.random.default_rng(flight_seed))
+    centers = trajectory.position(trajectory.photo_s)
+    rotations = trajectory.geo_from_nominal_cam(trajectory.photo_s) @ mounting.nominal_from_cam
     poses = tuple(Pose(center, rotation) for center, rotation in zip(centers, rotations, strict=True))
     distance_m = float(np.median(np.linalg.norm(centers, axis=1)))
-    width_m = config.target_size or max(0.3, _TARGET_PX * distance_m / lens.focal_px)
-    spots: list[Spot] = []
-    if config.targets:
-        found = sightings(bare.spots, poses, lens, Raycaster(bare.mesh), width_m)
-        spots = choose(bare.spots, found.seen, config.targets, np.random.default_rng(target_seed))
-    scene = with_targets(bare, spots, width_m)
+    width_m = options.target_size or max(0.3, _TARGET_PX * distance_m / lens.focal_px)
+    sites: list[TargetSite] = []
+    if options.targets:
+        projections = project_targets(bare.sites, poses, lens, Raycaster(bare.mesh), width_m)
+        sites = choose_sites(bare.sites, projections.seen, options.targets, np.random.default_rng(target_seed))
+    scene = with_targets(bare, sites, width_m)
     origin = Origin(lat_deg=lat, lon_deg=lon, alt_m=alt)
-    return World(origin, scene, tuple(spots), width_m, lens, track, poses, mounting)
+    return World(origin, scene, tuple(sites), width_m, lens, trajectory, poses, mounting)
 
 
-def _lens(config: SimulateOptions) -> Lens:
-    width, height = config.size_px
-    # The principal point of a real camera is never quite in the middle.
-    center = (0.504 * width, 0.497 * height) if config.lens != "pinhole" else (0.5 * width, 0.5 * height)
-    bent, skewed = config.lens != "pinhole", config.lens == "opencv"
+def _lens(options: SimulateOptions) -> Lens:
+    width, height = options.size_px
+    # The principal point of a real camera is never exactly in the middle.
+    center = (0.504 * width, 0.497 * height) if options.lens != "pinhole" else (0.5 * width, 0.5 * height)
+    bent, skewed = options.lens != "pinhole", options.lens == "opencv"
     lens = Lens(
-        config.lens,
+        options.lens,
         width,
         height,
-        config.focal * width,
+        options.focal * width,
         center,
-        config.k1 * bent,
-        config.k2 * bent,
-        config.p1 * skewed,
-        config.p2 * skewed,
+        options.k1 * bent,
+        options.k2 * bent,
+        options.p1 * skewed,
+        options.p2 * skewed,
     )
     lens.directions([(x, y) for x in (0, width / 2, width) for y in (0, height / 2, height)])
     return lens
 
 
 def check_clearance(world: World, raycaster: Raycaster) -> None:
-    """See that no photograph is taken inside of something.
+    """Check that no photograph is taken inside terrain or a building.
 
     Raises:
-        InputError: a camera is in the ground, in a house, or almost.
+        InputError: a camera is in the ground, or within 2 m of a surface.
     """
     golden = np.pi * (3 - 5**0.5)
     step = np.arange(400)

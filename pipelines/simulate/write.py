@@ -1,4 +1,4 @@
-"""Writes a survey's tables: trajectory, raw navigation, control and check points."""
+"""Writing of a survey's tables: trajectory, raw navigation, control and check points."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ POINTS_CRS = "EPSG:4979"
 
 @dataclass(frozen=True)
 class SurveyedTarget:
-    """A target as the surveyor hands it over: measured position (3,) in geo, and (image, x, y) of its marks."""
+    """Target as the surveyor measured it: position (3,) in geo, and (image, x, y) of its marks."""
 
     name: str
     position_in_geo: FloatArray
@@ -27,7 +27,7 @@ class SurveyedTarget:
 
 @dataclass(frozen=True)
 class PhotoRecords:
-    """What was recorded for N photographs.
+    """Records of N photographs.
 
     Attributes:
         names: file names.
@@ -45,7 +45,7 @@ class PhotoRecords:
 
 
 def write_trajectory(path: Path, photos: PhotoRecords) -> None:
-    """One line for each photograph: position and attitude at its stamp."""
+    """Write a line for each photograph: position and attitude at its stamp."""
     rows = ["image,timestamp,latitude,longitude,altitude,yaw,pitch,roll,sigma_e,sigma_n,sigma_u"]
     sigma = ",".join(f"{value:.4g}" for value in photos.sigma_enu_m)
     for name, stamp, lla, angles in zip(
@@ -57,7 +57,7 @@ def write_trajectory(path: Path, photos: PhotoRecords) -> None:
 
 
 def write_gnss(path: Path, log: GnssLog, sigma_enu_m: FloatArray, origin: Origin) -> None:
-    """Every fix, on the navigation clock."""
+    """Write every fix, on the navigation clock."""
     rows = ["timestamp,latitude,longitude,altitude,sigma_e,sigma_n,sigma_u"]
     sigma = ",".join(f"{value:.4g}" for value in sigma_enu_m)
     places = lla_from_enu(log.position_in_geo, origin)
@@ -66,7 +66,7 @@ def write_gnss(path: Path, log: GnssLog, sigma_enu_m: FloatArray, origin: Origin
 
 
 def write_imu(path: Path, log: ImuLog, enu_from_body: FloatArray) -> None:
-    """Every attitude (N, 3, 3), on the navigation clock: East-North-Up from the body, forward-right-down."""
+    """Write every attitude (N, 3, 3), on the navigation clock: East-North-Up from the body, forward-right-down."""
     rows = ["timestamp,qx,qy,qz,qw"]
     for stamp, quat in zip(log.stamp_ns, quat_xyzw_from_matrix(enu_from_body), strict=True):
         rows.append(f"{_seconds(stamp)}," + ",".join(f"{part:.9f}" for part in quat))
@@ -74,7 +74,7 @@ def write_imu(path: Path, log: ImuLog, enu_from_body: FloatArray) -> None:
 
 
 def write_points(path: Path, targets: Sequence[SurveyedTarget], origin: Origin) -> None:
-    """Control or check points in the form of ODM's gcp_list.txt: x is the longitude."""
+    """Write control or check points in the form of ODM's gcp_list.txt: x is the longitude."""
     rows = [POINTS_CRS]
     for target in targets:
         lat, lon, alt = lla_from_enu(target.position_in_geo, origin)

@@ -1,1 +1,1 @@
-"""The Gaussians: model, spherical harmonics, losses, densification, metrics."""
+"""Gaussians: model, spherical harmonics, losses, density control, metrics."""

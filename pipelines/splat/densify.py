@@ -1,8 +1,8 @@
-"""Where Gaussians are added and removed while training: strategies behind one small interface.
+"""Density control: strategies that add and remove Gaussians while training, behind one small interface.
 
-A strategy is told of every render after its backward pass, and may then edit the Gaussians through the optimiser,
-which keeps the moments of those that stay. Settings are apart from running state; the state can be saved, and
-everything random comes from the strategy's own generator.
+A strategy observes every render after its backward pass. Then it may edit the Gaussians through the optimiser,
+which keeps the moments of the rows that stay. Settings are apart from running state. The state can be saved, and
+all random numbers come from the strategy's own generator.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from pipelines.splat.evidence import Probe
+from pipelines.splat.contributions import Probe
 from pipelines.splat.gaussians import Gaussians, rotation_matrices
 from pipelines.splat.morton import morton_order
 from pipelines.splat.optimizer import GaussianAdam
@@ -25,8 +25,8 @@ _SHRINK = 0.8 * _CHILDREN  # 3DGS: a child of a split has 1/1.6 of its parent's 
 
 
 @dataclass(frozen=True)
-class Change:
-    """What a strategy did to the Gaussians in one iteration."""
+class DensityEdit:
+    """Numbers of Gaussians that a strategy edited in one iteration."""
 
     cloned: int = 0
     split: int = 0
@@ -36,28 +36,28 @@ class Change:
 
 
 class Strategy(Protocol):
-    """A way to add and remove Gaussians."""
+    """Interface of density control."""
 
     def penalty(self, gaussians: Gaussians, stats: ScreenStats) -> Tensor | None:
-        """A term to add to the loss of a render, if the strategy has one; scalar."""
+        """Return a scalar term to add to the loss of a render, or None."""
 
     def observe(self, stats: ScreenStats, camera: Pinhole) -> None:
-        """Take note of a render, after its backward pass."""
+        """Record a render, after its backward pass."""
 
-    def update(self, iteration: int, optimizer: GaussianAdam, probe: Probe | None = None) -> Change:
-        """Edit the Gaussians, if it is time; called after the optimiser's step of every iteration (from 1).
+    def update(self, iteration: int, optimizer: GaussianAdam, probe: Probe | None = None) -> DensityEdit:
+        """Edit the Gaussians if the schedule says so; called after the optimiser's step of every iteration.
 
         Args:
             iteration: from 1.
             optimizer: holds the Gaussians and their moments.
-            probe: shows what training views say of the Gaussians, to strategies that ask.
+            probe: returns contributions of the Gaussians to sampled training views, for strategies that need them.
         """
 
     def state(self) -> dict[str, Tensor]:
-        """Copies of the running state, for a checkpoint."""
+        """Return copies of the running state, for a checkpoint."""
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Take over a state."""
+        """Restore a state."""
 
 
 @dataclass(frozen=True)
@@ -65,18 +65,18 @@ class DefaultSettings:
     """Settings of `DefaultStrategy`; iterations count from 1.
 
     Attributes:
-        start: add Gaussians after this iteration,
-        stop: and up to this one,
-        every: after each so many iterations.
+        start: Gaussians are added after this iteration,
+        stop: and up to this iteration,
+        every: at every such number of iterations.
         reset_every: iterations between opacity resets, before `stop` (0: none).
         gradient_threshold: mean length of ∂L/∂(centre in normalised device coordinates) from which a Gaussian
             is cloned or split.
-        split_scale: clone up to this standard deviation, split above; in scene extents.
-        prune_opacity: remove what is less opaque.
-        prune_scale: remove what has a larger standard deviation, in scene extents,
+        split_scale: largest standard deviation to clone, in scene extents; larger Gaussians are split.
+        prune_opacity: Gaussians below this opacity are removed.
+        prune_scale: Gaussians above this standard deviation in scene extents are removed,
         prune_scale_from: after this iteration.
-        reset_opacity: opacity that a reset leaves at the most.
-        max_gaussians: never more than so many.
+        reset_opacity: largest opacity after a reset.
+        max_gaussians: limit of their number.
     """
 
     start: int = 500
@@ -93,11 +93,11 @@ class DefaultSettings:
 
     @classmethod
     def for_iterations(cls, iterations: int, max_gaussians: int) -> DefaultSettings:
-        """The schedule of 3DGS, made for 30 000 iterations, fitted to a training of another length.
+        """Return the schedule of 3DGS, made for 30 000 iterations, adapted to a training of another length.
 
-        Fewer iterations mean more frequent, not only fewer, additions, as long as every Gaussian is seen some
-        times in between. A reset of the opacities costs several hundred iterations to recover from: short runs
-        have none.
+        Fewer iterations mean more frequent, not only fewer, additions; between two of them every Gaussian must
+        still be seen a few times. Recovery from a reset of the opacities takes several hundred iterations: short
+        trainings have none.
         """
         stop, reset_every = iterations // 2, max(iterations // 10, 1_500)
         return cls(
@@ -113,13 +113,15 @@ class DefaultSettings:
 class DefaultStrategy:
     """Adaptive density control of 3D Gaussian Splatting (doi 10.1145/3592433, section 5.2).
 
-    Gaussians whose projected centre is pulled hard are cloned where small and split where large; transparent and
-    oversized ones are removed; opacities are reset now and then. Where the limit leaves no room for all, those
-    with the largest gradients come first. Edited Gaussians are put back into spatial order.
+    1. Gaussians with a large gradient of the projected centre are cloned if small, and split if large. If the limit
+       leaves no room for all, those with the largest gradients come first.
+    2. Transparent and oversized Gaussians are removed.
+    3. Opacities are reset at intervals.
+    4. Edited Gaussians are put back into spatial order.
     """
 
     def __init__(self, settings: DefaultSettings, extent_m: float, count: int, seed: int = 0) -> None:
-        """Start with nothing observed of `count` Gaussians in a scene of size `extent_m`."""
+        """Start without observations of `count` Gaussians in a scene of size `extent_m`."""
         self.settings = settings
         self.extent_m = extent_m
         self._generator = torch.Generator().manual_seed(seed)
@@ -127,7 +129,7 @@ class DefaultStrategy:
         self._observations = torch.zeros(count)
 
     def penalty(self, gaussians: Gaussians, stats: ScreenStats) -> Tensor | None:
-        """None: the photographs alone decide."""
+        """Return None: the photographs alone decide."""
         return None
 
     def observe(self, stats: ScreenStats, camera: Pinhole) -> None:
@@ -146,19 +148,19 @@ class DefaultStrategy:
         self._gradient_sum.index_add_(0, stats.visible, length)
         self._observations.index_add_(0, stats.visible, torch.ones_like(length))
 
-    def update(self, iteration: int, optimizer: GaussianAdam, probe: Probe | None = None) -> Change:
+    def update(self, iteration: int, optimizer: GaussianAdam, probe: Probe | None = None) -> DensityEdit:
         """See `Strategy.update`."""
-        settings, change = self.settings, Change()
+        settings, edit = self.settings, DensityEdit()
         if settings.start < iteration <= settings.stop and iteration % settings.every == 0:
             gaussians = optimizer.gaussians.detached()
             alive = self._alive(gaussians, iteration)
-            change = self._edit(optimizer, alive, self._chosen(alive))
+            edit = self._edit(optimizer, alive, self._chosen(alive))
         if settings.reset_every and iteration < settings.stop and iteration % settings.reset_every == 0:
             ceiling = math.log(settings.reset_opacity / (1 - settings.reset_opacity))
             capped = optimizer.gaussians.logit_opacities.detach().clamp_max(ceiling)
             optimizer.overwrite("logit_opacities", capped)
-            change = replace(change, opacity_reset=True)
-        return change
+            edit = replace(edit, opacity_reset=True)
+        return edit
 
     def state(self) -> dict[str, Tensor]:
         """See `Strategy.state`."""
@@ -174,8 +176,8 @@ class DefaultStrategy:
         self._observations = state["observations"].clone()
         self._generator.set_state(state["generator"])
 
-    def _edit(self, optimizer: GaussianAdam, alive: Tensor, chosen: Tensor) -> Change:
-        """Keep those of the mask `alive`, and add one for each of the mask `chosen`."""
+    def _edit(self, optimizer: GaussianAdam, alive: Tensor, chosen: Tensor) -> DensityEdit:
+        """Keep the Gaussians of the mask `alive`, and add one for each of the mask `chosen`."""
         gaussians = optimizer.gaussians.detached()
         large = gaussians.log_scales.amax(dim=1).exp() > self.settings.split_scale * self.extent_m
         cloned, parents = chosen & ~large, chosen & large
@@ -188,7 +190,7 @@ class DefaultStrategy:
         optimizer.rearrange(edited.select(order), source[order])
         self._gradient_sum = torch.zeros(len(edited))
         self._observations = torch.zeros(len(edited))
-        return Change(int(cloned.sum()), int(parents.sum()), int((~alive).sum()))
+        return DensityEdit(int(cloned.sum()), int(parents.sum()), int((~alive).sum()))
 
     def _alive(self, gaussians: Gaussians, iteration: int) -> Tensor:
         alive = torch.sigmoid(gaussians.logit_opacities) >= self.settings.prune_opacity
@@ -198,7 +200,7 @@ class DefaultStrategy:
         return alive
 
     def _chosen(self, alive: Tensor) -> Tensor:
-        """Mask of the Gaussians to clone or split: each adds one, and there is room for so many."""
+        """Return the mask of the Gaussians to clone or split: each adds one, within the limit."""
         gradient = self._mean_gradient(alive.device)
         chosen = alive & (gradient >= self.settings.gradient_threshold)
         return self._within_room(alive, chosen, gradient)
@@ -207,7 +209,7 @@ class DefaultStrategy:
         return (self._gradient_sum / self._observations.clamp_min(1)).to(device)
 
     def _within_room(self, alive: Tensor, chosen: Tensor, score: Tensor) -> Tensor:
-        """Of the mask `chosen`, as many as the limit leaves room for, those with the highest scores."""
+        """Reduce the mask `chosen` to the highest scores that the limit leaves room for."""
         room = max(self.settings.max_gaussians - int(alive.sum()), 0)
         if int(chosen.sum()) > room:
             strongest = torch.argsort(score * chosen, descending=True, stable=True)[:room]
@@ -216,7 +218,7 @@ class DefaultStrategy:
         return chosen
 
     def _children(self, parents: Gaussians) -> Gaussians:
-        """Two smaller Gaussians a parent, at random places within it."""
+        """Return two smaller Gaussians for each parent, at random places within it."""
         children = Gaussians.concatenate([parents] * _CHILDREN)
         noise = torch.randn(len(children), 3, generator=self._generator).to(children.means)
         offset = rotation_matrices(children.quats_wxyz) @ (children.log_scales.exp() * noise)[..., None]

@@ -1,8 +1,12 @@
 """3D Gaussian Splatting as Markov chain Monte Carlo (doi 10.48550/arXiv.2404.09591).
 
-The Gaussians are samples of what the scene looks like. Transparent ones are moved to where opaque ones are, in such
-a way that the image stays the same (section 3.4, eq. 9); noise lets them explore (eq. 8); two penalties let those
-disappear that are not needed (eq. 10). The number grows by a fixed share up to a fixed limit: no thresholds.
+The Gaussians are samples of a distribution that represents the scene.
+
+1. Transparent Gaussians move to places of opaque ones, in such a way that the image stays the same (section 3.4,
+   eq. 9).
+2. Noise lets Gaussians explore (eq. 8).
+3. Two penalties make superfluous Gaussians disappear (eq. 10).
+4. The number grows by a fixed share up to a fixed limit, without thresholds.
 """
 
 from __future__ import annotations
@@ -13,8 +17,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pipelines.splat.densify import Change
-from pipelines.splat.evidence import Probe
+from pipelines.splat.contributions import Probe
+from pipelines.splat.densify import DensityEdit
 from pipelines.splat.gaussians import Gaussians, rotation_matrices
 from pipelines.splat.morton import morton_order
 from pipelines.splat.optimizer import GaussianAdam
@@ -29,16 +33,16 @@ class McmcSettings:
     """Settings of `McmcStrategy`; iterations count from 1.
 
     Attributes:
-        start: move and add Gaussians after this iteration,
-        stop: and up to this one,
-        every: after each so many iterations.
+        start: Gaussians are moved and added after this iteration,
+        stop: and up to this iteration,
+        every: at every such number of iterations.
         growth: share of Gaussians to add at each edit.
-        dead_opacity: what is less opaque is moved.
+        dead_opacity: Gaussians up to this opacity are moved.
         noise: standard deviation of the noise, in learning rates of the centres times covariance, all in scene
             extents. The paper's 5e5 is for scenes whose extent is about 5 units, hence the factor 5².
         opacity_penalty: weight of the mean opacity,
         scale_penalty: and of the mean standard deviation, in scene extents.
-        max_gaussians: never more than so many.
+        max_gaussians: limit of their number.
     """
 
     start: int = 500
@@ -53,9 +57,9 @@ class McmcSettings:
 
     @classmethod
     def for_iterations(cls, iterations: int, count: int, max_gaussians: int) -> McmcSettings:
-        """The schedule of the paper, made for 30 000 iterations, fitted to another length.
+        """Return the schedule of the paper, made for 30 000 iterations, adapted to another length.
 
-        The limit is to be reached at half of the training: shorter ones grow by more at each edit.
+        The number reaches its limit at half of the training: shorter trainings grow by more at each edit.
         """
         start, stop = min(max(iterations // 20, 50), 500), iterations * 5 // 6
         every = min(max(iterations // 40, 50), 100)
@@ -74,9 +78,9 @@ class McmcStrategy:
         self._visible: Tensor | None = None
 
     def penalty(self, gaussians: Gaussians, stats: ScreenStats) -> Tensor | None:
-        """Mean opacity and mean standard deviation of what is visible, weighted.
+        """Return the weighted sum of mean opacity and mean standard deviation of the visible Gaussians.
 
-        Only visible rows are updated; a Gaussian that is not shall not shrink either.
+        Only visible rows are updated. Invisible Gaussians must not shrink either.
         """
         rows = stats.visible
         share = len(rows) / max(len(gaussians), 1)
@@ -85,18 +89,18 @@ class McmcStrategy:
         return share * (self.settings.opacity_penalty * opacity + self.settings.scale_penalty * scale)
 
     def observe(self, stats: ScreenStats, camera: Pinhole) -> None:
-        """Remember which Gaussians this iteration moves."""
+        """Record the Gaussians that this iteration moves."""
         self._visible = stats.visible
 
-    def update(self, iteration: int, optimizer: GaussianAdam, probe: Probe | None = None) -> Change:
-        """See `Strategy.update`; the noise of this iteration is added, too."""
-        settings, change = self.settings, Change()
+    def update(self, iteration: int, optimizer: GaussianAdam, probe: Probe | None = None) -> DensityEdit:
+        """See `Strategy.update`; also adds the noise of this iteration."""
+        settings, edit = self.settings, DensityEdit()
         if settings.start < iteration <= settings.stop and iteration % settings.every == 0:
-            change = self._edit(optimizer)
+            edit = self._edit(optimizer)
             self._visible = None
         if self._visible is not None and len(self._visible):
             self._shake(iteration, optimizer, self._visible)
-        return change
+        return edit
 
     def state(self) -> dict[str, Tensor]:
         """See `Strategy.state`."""
@@ -108,7 +112,7 @@ class McmcStrategy:
 
     @torch.no_grad()
     def _shake(self, iteration: int, optimizer: GaussianAdam, rows: Tensor) -> None:
-        """Eq. 8: noise shaped like the Gaussian, on transparent ones, that fades with the learning rate."""
+        """Add the noise of eq. 8: shaped like the Gaussian, on transparent ones, fading with the learning rate."""
         moved = optimizer.gaussians
         opacity = torch.sigmoid(moved.logit_opacities[rows])
         free = torch.sigmoid(_SIGMOID_STEEPNESS * (1 - opacity - _SIGMOID_CENTRE))
@@ -120,8 +124,8 @@ class McmcStrategy:
         moved.means[rows] += length * free[:, None] * shaped
 
     @torch.no_grad()
-    def _edit(self, optimizer: GaussianAdam) -> Change:
-        """Move the dead, add new ones, and put all into spatial order."""
+    def _edit(self, optimizer: GaussianAdam) -> DensityEdit:
+        """Move dead Gaussians, add new ones, and put all into spatial order."""
         gaussians, settings = optimizer.gaussians.detached(), self.settings
         opacity = torch.sigmoid(gaussians.logit_opacities)
         dead = (opacity <= settings.dead_opacity).nonzero()[:, 0]
@@ -130,23 +134,23 @@ class McmcStrategy:
         added = max(target - count, 0) if len(dead) < count else 0
         relocated = len(dead) if len(dead) < count else 0
         if relocated + added == 0:
-            return Change()
+            return DensityEdit()
         parent = self._drawn(opacity, dead, relocated + added)
         source = torch.arange(count, device=opacity.device)
         source[dead[:relocated]] = -1
         copies = torch.bincount(parent, minlength=count)
         shared = _shared_among(gaussians, copies + 1)
-        source[copies > 0] = -1  # their moments belong to what they were
+        source[copies > 0] = -1  # their moments belong to their former opacities and scales
         edited = Gaussians.concatenate([shared, shared.select(parent[relocated:])])
         for name, tensor in edited.tensors().items():
             tensor[dead[:relocated]] = shared.tensors()[name][parent[:relocated]]
         source = torch.cat([source, source.new_full((added,), -1)])
         order = morton_order(edited.means)
         optimizer.rearrange(edited.select(order), source[order])
-        return Change(cloned=added, relocated=relocated)
+        return DensityEdit(cloned=added, relocated=relocated)
 
     def _drawn(self, opacity: Tensor, dead: Tensor, count: int) -> Tensor:
-        """Parents (count,), drawn by opacity from those that live."""
+        """Return parents (count,), drawn by opacity from the living Gaussians."""
         chance = opacity.double().cpu().clone()
         chance[dead.cpu()] = 0
         # Inverse of the cumulative distribution: `multinomial` takes no more than 2²⁴ categories.
@@ -157,24 +161,24 @@ class McmcStrategy:
 
 
 def _shared_among(gaussians: Gaussians, copies: Tensor) -> Gaussians:
-    """The Gaussians with opacity and scale such that `copies` (N,) of each look like one did (eq. 9)."""
+    """Return Gaussians whose `copies` (N,) together look like each original did (eq. 9: opacity and scale)."""
     shared = Gaussians(**{name: tensor.clone() for name, tensor in gaussians.tensors().items()})
     rows = (copies > 1).nonzero()[:, 0]
     n = copies[rows].clamp_max(_MOST_COPIES)
     opacity = torch.sigmoid(gaussians.logit_opacities[rows].double())
-    each = 1 - (1 - opacity) ** (1 / n)
-    # A logit of 1 is infinite, and a copy below the dead ones' opacity would be moved at once.
-    shared.logit_opacities[rows] = torch.logit(each.clamp(0.005, 1 - 1e-6)).to(shared.logit_opacities)
-    shared.log_scales[rows] += (opacity / _overlap(each, n)).log().to(shared.log_scales)[:, None]
+    shared_opacity = 1 - (1 - opacity) ** (1 / n)
+    # A logit of 1 is infinite, and a copy below the opacity of dead Gaussians would be moved at once.
+    shared.logit_opacities[rows] = torch.logit(shared_opacity.clamp(0.005, 1 - 1e-6)).to(shared.logit_opacities)
+    shared.log_scales[rows] += (opacity / _overlap(shared_opacity, n)).log().to(shared.log_scales)[:, None]
     return shared
 
 
 def _overlap(opacity: Tensor, n: Tensor) -> Tensor:
-    """Σ_{i=1..n} Σ_{k=0..i−1} C(i−1, k) (−1)^k o^(k+1) / √(k+1) for opacities (N,) and numbers n (N,).
+    """Return Σ_{i=1..n} Σ_{k=0..i−1} C(i−1, k) (−1)^k o^(k+1) / √(k+1) for opacities (N,) and numbers n (N,).
 
-    The alternating sum loses its digits in the binomials. With 1/√(k+1) = 2/√π ∫₀^∞ exp(−(k+1) t²) dt both sums
-    can be carried out: it is 2/√π ∫₀^∞ 1 − (1 − o exp(−t²))^n dt, whose integrand is even and smooth, so that the
-    trapezoidal rule is exact to many digits.
+    The binomials cost the alternating sum its digits. With 1/√(k+1) = 2/√π ∫₀^∞ exp(−(k+1) t²) dt both sums have a
+    closed form, 2/√π ∫₀^∞ 1 − (1 − o exp(−t²))^n dt. The integrand is even and smooth: the trapezoidal rule is
+    exact to many digits.
     """
     step, total = 0.1, (1 - (1 - opacity) ** n) / 2
     for node in range(1, 61):

@@ -1,8 +1,8 @@
-"""Exposure of each photograph: an affine change of colour that training fits beside the Gaussians.
+"""Exposure of each photograph: an affine change of colour that training fits together with the Gaussians.
 
-Photographs of one flight differ in exposure and white balance. A model that cannot say so bakes the differences
-into the colours of Gaussians that only some views see. What the images leave open, a change of all exposures
-together with all Gaussians, is held: the mean over the training photographs is the identity.
+Photographs of one flight differ in exposure and white balance. Without exposures, a model bakes these differences
+into the colours of Gaussians that few views see. The images cannot tell a change of all exposures from a change of
+all Gaussians: the mean over the training photographs is therefore held at the identity.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ class Exposures:
     """Affine colour corrections of all images, and the Adam that moves those of the training images.
 
     Attributes:
-        affine: (V, 3, 4) gain matrix and offset of each image; the identity where nothing was fitted.
+        affine: (V, 3, 4) gain matrix and offset of each image; the identity for images without a fit.
 
     Args:
         count: V.
@@ -35,13 +35,13 @@ class Exposures:
         self._used: tuple[int, Tensor] | None = None
 
     def apply(self, index: int, colour: Tensor) -> Tensor:
-        """The render (H, W, 3) as photograph `index` would show it; differentiable, for `step`."""
+        """Return the render (H, W, 3) with the exposure of photograph `index`; differentiable, for `step`."""
         leaf = self.affine[index].clone().requires_grad_()
         self._used = (index, leaf)
         return with_affine(colour, leaf)
 
     def step(self, iteration: int) -> None:
-        """Move the image that `apply` was last used for, by its gradient, and restore the mean."""
+        """Move the exposure that `apply` used last by its gradient, and restore the mean."""
         if self._used is None or self._used[1].grad is None:
             return
         index, leaf = self._used
@@ -59,7 +59,7 @@ class Exposures:
         self._used = None
 
     def state(self) -> dict[str, Tensor]:
-        """Copies of everything, for a checkpoint."""
+        """Return copies of exposures and moments, for a checkpoint."""
         return {
             "affine": self.affine.clone(),
             "moments": self._moments.clone(),
@@ -67,19 +67,19 @@ class Exposures:
         }
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Take over a state."""
+        """Restore a state."""
         self.affine.copy_(state["affine"])
         self._moments.copy_(state["moments"])
         self._steps = [int(count) for count in state["steps"]]
 
 
 def with_affine(colour: Tensor, affine: Tensor) -> Tensor:
-    """A c + b of every colour c in (…, 3), for (A | b) in `affine` (3, 4)."""
+    """Return A c + b of every colour c in (…, 3), for (A | b) in `affine` (3, 4)."""
     return colour @ affine[:, :3].T + affine[:, 3]
 
 
 def fitted_affine(rendered: Tensor, photograph: Tensor, mask: Tensor | None = None) -> Tensor:
-    """The affine change of colour (3, 4) that brings a render nearest to a photograph, by least squares.
+    """Return the affine change of colour (3, 4) that maps a render to a photograph best, by least squares.
 
     Args:
         rendered: (H, W, 3).
@@ -90,6 +90,6 @@ def fitted_affine(rendered: Tensor, photograph: Tensor, mask: Tensor | None = No
     if mask is not None:
         x, y = x[mask.reshape(-1)], y[mask.reshape(-1)]
     design = torch.cat([x, torch.ones_like(x[:, :1])], dim=1)
-    # gelsd: the smallest solution where a render has too few colours to tell all twelve numbers.
+    # gelsd: the smallest solution if a render has too few colours to determine all twelve numbers.
     solution = torch.linalg.lstsq(design.cpu(), y.cpu(), driver="gelsd").solution
     return solution.T.to(rendered)

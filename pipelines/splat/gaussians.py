@@ -1,4 +1,4 @@
-"""The Gaussians as tensors: one row a Gaussian, in the form in which they are optimised and stored."""
+"""Gaussians as tensors, a row for each Gaussian, in the form in which they are optimised and stored."""
 
 from __future__ import annotations
 
@@ -38,40 +38,40 @@ class Gaussians:
         return round(self.sh.shape[1] ** 0.5) - 1
 
     def tensors(self) -> dict[str, Tensor]:
-        """The tensors by name, in order."""
+        """Return the tensors by name, in order."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def detached(self) -> Gaussians:
-        """The same values without gradient history."""
+        """Return the same values without gradient history."""
         return Gaussians(**{name: tensor.detach() for name, tensor in self.tensors().items()})
 
     def arrays(self) -> dict[str, Float32Array]:
-        """The values as numpy arrays by name, for files."""
+        """Return the values as numpy arrays by name, for files."""
         return {name: tensor.detach().cpu().numpy() for name, tensor in self.tensors().items()}
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Float32Array]) -> Gaussians:
-        """From arrays by the names of the attributes; copied."""
+        """Make Gaussians from arrays by the names of the attributes; copied."""
         return cls(**{field.name: torch.tensor(arrays[field.name]) for field in fields(cls)})
 
     def select(self, index: Tensor) -> Gaussians:
-        """The rows that `index` (bool mask or integer) picks."""
+        """Return the rows that `index` (bool mask or integer) picks."""
         return Gaussians(**{name: tensor[index] for name, tensor in self.tensors().items()})
 
     def to(self, device: torch.device) -> Gaussians:
-        """The same Gaussians on a device."""
+        """Return the same Gaussians on a device."""
         return Gaussians(**{name: tensor.to(device) for name, tensor in self.tensors().items()})
 
     @staticmethod
     def concatenate(parts: list[Gaussians]) -> Gaussians:
-        """All rows of `parts`, in order."""
+        """Return all rows of `parts`, in order."""
         return Gaussians(
             **{name: torch.cat([part.tensors()[name] for part in parts]) for name in parts[0].tensors()}
         )
 
 
 def rotation_matrices(quats_wxyz: Tensor) -> Tensor:
-    """Rotation matrices (N, 3, 3) of quaternions (N, 4) of any length but zero."""
+    """Return rotation matrices (N, 3, 3) of quaternions (N, 4) of any length but zero."""
     w, x, y, z = torch.nn.functional.normalize(quats_wxyz, dim=1).unbind(1)
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),

@@ -1,4 +1,4 @@
-"""Gaussians to start from: one at each SfM point, as large as the gaps between the points."""
+"""Initial Gaussians: one at each SfM point, as large as the gaps between the points."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ from pipelines.splat.sh import coefficient_count, sh_from_rgb
 log = logging.getLogger(__name__)
 
 _NEIGHBOURS = 3
-# A lone pair of points has no gap to measure, and a lone point in the sky no size: both take their scale from
-# the cloud. Its spread of scales is some two orders of magnitude.
+# Two points at almost one place have no gap, and a lone point in the sky has no size. The scales of both are
+# clipped to those of the cloud, which spread over some two orders of magnitude.
 _SCALE_SPREAD = 10.0
 
 
 @dataclass(frozen=True)
 class InitialisationOptions:
-    """How to start.
+    """Settings of the initial Gaussians.
 
     Attributes:
         sh_degree: degree of the spherical harmonics; all but the constant start at zero.
-        opacity: opacity of every Gaussian without a normal.
-        disc_opacity: of one with a normal: its place is known, and it need not make room for others.
-        thickness: of one with a normal, as a part of its standard deviation across that.
-        far: points farther from the cloud's median centre than this many median distances are left out: they
-            are mismatches, or the sky.
-        max_gaussians: thin a larger cloud evenly down to this number.
+        opacity: of Gaussians without a normal.
+        disc_opacity: of Gaussians with a normal: their place is known, and they need not make room for others.
+        thickness: of Gaussians with a normal, relative to their standard deviation across it.
+        far: points farther from the cloud's median centre than this many median distances are left out, as
+            mismatches or sky.
+        max_gaussians: number to which a larger cloud is thinned evenly; None: no limit.
     """
 
     sh_degree: int = 3
@@ -53,17 +53,17 @@ def gaussians_from_points(
     options: InitialisationOptions | None = None,
     normals_in_model: ArrayLike | None = None,
 ) -> Gaussians:
-    """Gaussians at points, as 3D Gaussian Splatting starts (doi 10.1145/3592433, section 5.1).
+    """Return Gaussians at points, as 3D Gaussian Splatting starts (doi 10.1145/3592433, section 5.1).
 
     A Gaussian's standard deviation is the mean distance to the three nearest other points. Points that are not
-    finite, repeated or far out are left out. They are isotropic, but for points with a known normal, which become
-    discs: a ball as wide as the gaps between the points reaches as far before the surface, and behind it.
+    finite, repeated or far out are left out. Without a normal, Gaussians are isotropic; with a normal, they are
+    discs: a ball as wide as the gaps between the points would reach as far before the surface, and behind it.
 
     Args:
         points_in_model: (N, 3) metres in the model frame.
         colours: (N, 3) uint8, or floats from 0 to 1.
-        options: how to start.
-        normals_in_model: (N, 3) unit vectors, NaN where unknown; None: of none.
+        options: settings of the Gaussians.
+        normals_in_model: (N, 3) unit vectors, NaN if unknown; None: all are unknown.
 
     Returns:
         At most N Gaussians, float32, in spatial order.
@@ -90,7 +90,7 @@ def gaussians_from_points(
 
 
 def scene_extent(camera_centers: ArrayLike) -> float:
-    """Size of a scene in metres: 1.1 times the largest distance of a camera from their mean (as 3DGS has it).
+    """Return the size of a scene in metres: 1.1 times the largest distance of a camera from their mean, as in 3DGS.
 
     Args:
         camera_centers: (N, 3) metres.
@@ -108,7 +108,7 @@ def scene_extent(camera_centers: ArrayLike) -> float:
 def gaussians_of_size(
     points_in_model: ArrayLike, colours: ArrayLike, sigma_m: ArrayLike, options: InitialisationOptions | None = None
 ) -> Gaussians:
-    """Isotropic Gaussians of given standard deviations (N,) in metres; otherwise as `gaussians_from_points`."""
+    """Return isotropic Gaussians of given standard deviations (N,) in metres, else as `gaussians_from_points`."""
     options = options or InitialisationOptions()
     points, rgb = _checked(points_in_model, colours)
     count = len(points)
@@ -124,10 +124,10 @@ def gaussians_of_size(
 
 
 def _make_discs(gaussians: Gaussians, normals: FloatArray, options: InitialisationOptions) -> None:
-    """Turn the third axis of Gaussians into their normals (N, 3), where these are known, and shorten it."""
+    """Turn the third axis of Gaussians to their normals (N, 3), if known, and shorten that axis."""
     rows = np.flatnonzero(np.isfinite(normals).all(axis=1))
     normal = torch.as_tensor(normals[rows] * np.where(normals[rows, 2:] < 0, -1.0, 1.0)).float()
-    # The shortest turn from z to n is about z × n; upward normals keep clear of the opposite of z.
+    # The shortest turn from z to n is about z × n. The sign that makes n point upwards avoids the opposite of z.
     quats = torch.stack([1 + normal[:, 2], -normal[:, 1], normal[:, 0], torch.zeros(len(rows))], dim=1)
     gaussians.quats_wxyz[rows] = torch.nn.functional.normalize(quats, dim=1)
     gaussians.log_scales[rows, 2] += math.log(options.thickness)
@@ -135,7 +135,7 @@ def _make_discs(gaussians: Gaussians, normals: FloatArray, options: Initialisati
 
 
 def _gap(points: FloatArray) -> FloatArray:
-    """Mean distance to the nearest other points (N,), held near the cloud's median."""
+    """Return the mean distance (N,) to the nearest other points, clipped to the cloud's median."""
     neighbours = min(_NEIGHBOURS, len(points) - 1)
     distance, _ = cKDTree(points).query(points, k=neighbours + 1)
     gap = np.asarray(distance)[:, 1:].mean(axis=1)
@@ -144,7 +144,7 @@ def _gap(points: FloatArray) -> FloatArray:
 
 
 def _usable(points: FloatArray, far: float) -> IntArray:
-    """Rows of points that are finite, the first of their kind (in float32, as they will be kept), and not far."""
+    """Return rows of points that are finite, not far, and no repetition (in float32, as Gaussians are kept)."""
     rows = np.flatnonzero(np.isfinite(points).all(axis=1))
     if len(rows) == 0:
         return rows

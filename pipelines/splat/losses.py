@@ -3,8 +3,8 @@
 SSIM (doi 10.1109/TIP.2003.819861) has the 11×11 Gaussian window, σ = 1.5 px, zeros around the image. On a CPU
 value and gradient come from one pass of fused kernels: torch's convolutions cost more than the rasteriser.
 
-A mask says which pixels count. The others are zero in both images, like everything outside: they add neither to
-L1 nor to SSIM's mean, and a window that reaches over them sees what it sees at the image's edge.
+A mask selects the pixels that count. The others are zero in both images, like pixels outside the image: they add
+neither to L1 nor to SSIM's mean, and a window that reaches over them sees the same zeros as at the image's edge.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class ImageSimilarity:
 def photometric_loss(
     rendered: Tensor, target: Tensor, mask: Tensor | None = None, *, ssim_weight: float = SSIM_WEIGHT
 ) -> Tensor:
-    """(1 − w) · mean|rendered − target| + w · (1 − mean SSIM), differentiable in `rendered`.
+    """Return (1 − w) · mean|rendered − target| + w · (1 − mean SSIM), differentiable in `rendered`.
 
     Args:
         rendered: (H, W, 3) float32 or float64.
@@ -57,7 +57,7 @@ def photometric_loss(
 
 
 def image_similarity(image: Tensor, target: Tensor, mask: Tensor | None = None) -> ImageSimilarity:
-    """L1 and SSIM of two images (H, W, 3), without gradient; see `photometric_loss`.
+    """Return L1 and SSIM of two images (H, W, 3), without gradient; see `photometric_loss`.
 
     Raises:
         ValueError: shapes, types or devices do not agree.
@@ -72,7 +72,7 @@ def image_similarity(image: Tensor, target: Tensor, mask: Tensor | None = None) 
 
 
 class _Photometric(torch.autograd.Function):
-    """Value and gradient in one go: the gradient is only scaled afterwards."""
+    """Value and gradient in one pass: backward only scales the gradient."""
 
     @staticmethod
     def forward(ctx: Any, rendered: Tensor, target: Tensor, mask: Tensor | None, ssim_weight: float) -> Tensor:
@@ -92,7 +92,7 @@ class _Photometric(torch.autograd.Function):
 def _forward(
     rendered: Tensor, target: Tensor, mask: Tensor | None
 ) -> tuple[tuple[float, float], int, np.ndarray[Any, Any]]:
-    """Σ|x − y| and Σ SSIM, how many values they are sums of, and SSIM's derivatives for `_gradient`."""
+    """Return Σ|x − y| and Σ SSIM, the number of values in these sums, and SSIM's derivatives for `_gradient`."""
     x, y, valid = _rows(rendered), _rows(target), _valid(mask)
     partials = np.empty((3, *x.shape), dtype=x.dtype)
     sums = np.empty((len(x), 2))
@@ -100,7 +100,7 @@ def _forward(
     kernels.ssim_forward(x, y, valid, taps, c1, c2, _bands(len(x)), partials, sums)
     count = x.size if mask is None else 3 * int(valid.sum())
     l1, ssim = sums.sum(axis=0)
-    # Nothing to compare is no difference: SSIM counts as 1.
+    # Without pixels that count, there is no difference: SSIM is 1.
     return ((float(l1), float(ssim)), count, partials) if count else ((0.0, 1.0), 1, partials)
 
 
@@ -111,7 +111,7 @@ def _gradient(
     partials: np.ndarray[Any, Any],
     scales: tuple[float, float],
 ) -> Tensor:
-    """∂(scales[0] · Σ|x − y| − scales[1] · Σ SSIM)/∂rendered."""
+    """Return ∂(scales[0] · Σ|x − y| − scales[1] · Σ SSIM)/∂rendered."""
     x, y = _rows(rendered), _rows(target)
     gradient = torch.empty_like(rendered, memory_format=torch.contiguous_format)
     kind = x.dtype.type
@@ -131,12 +131,12 @@ def _valid(mask: Tensor | None) -> np.ndarray[Any, Any]:
 
 
 def _bands(height: int) -> int:
-    # A band blurs ten rows that its neighbours blur too: no more bands than threads, and none of a few rows.
+    # A band blurs ten rows that its neighbours blur, too: no more bands than threads, and none of a few rows.
     return max(1, min(numba.get_num_threads(), height // kernels.WINDOW))
 
 
 def _terms_by_convolution(image: Tensor, target: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
-    """L1 and SSIM in torch operations, for devices that the kernels do not run on."""
+    """Return L1 and SSIM by torch operations, for devices that the kernels do not run on."""
     weight = torch.ones_like(image[..., 0]) if mask is None else mask.to(image.dtype)
     x, y = (value * weight[..., None] for value in (image, target))
     half = torch.as_tensor(kernels.gaussian_taps(np.float64), dtype=image.dtype, device=image.device)

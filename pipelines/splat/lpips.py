@@ -1,8 +1,8 @@
 """LPIPS (doi 10.1109/CVPR.2018.00068) with VGG-16 features, as the splatting literature reports it.
 
-The weights are not part of the package. They are read from an NPZ file: a TorchScript or `.pth` file would carry
-code or pickles, and these are numbers. The arrays are called as in the published network's state; where the
-`lpips` package and its weights are installed, this writes the file:
+The weights are not part of the package. An NPZ file holds them: a TorchScript or `.pth` file would carry code or
+pickles. The arrays have the names of the published network's state. With the `lpips` package and its weights
+installed, these lines write the file:
 
     import lpips, numpy
     numpy.savez("lpips_vgg.npz", **{k: v.numpy() for k, v in lpips.LPIPS(net="vgg").state_dict().items()})
@@ -29,7 +29,7 @@ _SMALLEST_PX = 16  # four poolings
 
 
 class Lpips:
-    """The perceptual distance; weights are loaded once."""
+    """Perceptual distance of images; weights are loaded once."""
 
     def __init__(self, weights: Path) -> None:
         """Read the weights.
@@ -44,10 +44,10 @@ class Lpips:
         self._weights = {name: torch.as_tensor(array, dtype=torch.float32) for name, array in arrays.items()}
 
     def __call__(self, image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
-        """Distance of two images (H, W, 3) with values from 0 to 1.
+        """Return the distance of two images (H, W, 3) with values from 0 to 1.
 
-        The features see neighbourhoods, so pixels cannot be left out: where the `mask` (H, W) is False, the image
-        is given the target's pixels, and the two are equal there.
+        Features see neighbourhoods, so that pixels cannot be left out. Where the `mask` (H, W) is False, the image
+        takes the target's pixels instead.
 
         Raises:
             ValueError: other shapes, or smaller than 16 px.
@@ -65,7 +65,7 @@ class Lpips:
         return float(torch.stack(distances).sum())
 
     def _features(self, image: Tensor) -> list[Tensor]:
-        """Unit-length features of the five slices."""
+        """Return unit-length features of the five slices."""
         planes = 2 * image.detach().cpu().float().clamp(0, 1).permute(2, 0, 1)[None] - 1
         x = (planes - torch.tensor(_SHIFT).view(1, 3, 1, 1)) / torch.tensor(_SCALE).view(1, 3, 1, 1)
         features = []

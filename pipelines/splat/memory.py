@@ -1,4 +1,4 @@
-"""Peak memory of a training, predicted before it starts, against what the machine has left."""
+"""Peak memory of a training, predicted before it starts, and compared with the free memory of the machine."""
 
 from __future__ import annotations
 
@@ -15,25 +15,26 @@ from pipelines.splat.rasterizer.api import Pinhole
 from pipelines.splat.sh import coefficient_count
 
 _FLOAT = 4
-# Copies of all parameters that exist at once while density control rearranges them: the old ones, their gradients,
-# two moments and their successors (two more), and the new ones in parts, joined, in spatial order, and as leaves.
+# Copies of all parameters that exist at once while density control rearranges them: the old parameters, their
+# gradients, two moments and their successors (two more), and the new parameters in parts, joined, in spatial order,
+# and as leaves.
 _COPIES = 10
 # Photograph, mask, render, loss, their gradients and the exposure's: floats a pixel.
 _IMAGE_FLOATS = 45
 _ROW_BYTES = 40  # counters, keys of the spatial order
-_FIXED_BYTES = 150 * 2**20  # compiled kernels and what the allocators keep
-_USABLE = 0.9  # of what is free: other programs live too
+_FIXED_BYTES = 150 * 2**20  # compiled kernels and reserves of the allocators
+_USABLE = 0.9  # of the free memory: other programs grow, too
 
 
 @dataclass(frozen=True)
 class TrainingSize:
-    """What memory depends on.
+    """Sizes on which the memory of a training depends.
 
     Attributes:
-        gaussians: most Gaussians.
-        camera: the largest image.
+        gaussians: largest number of Gaussians.
+        camera: of the largest image.
         sh_degree: of the stored spherical harmonics.
-        cameras: those whose poses are corrected together (0: none).
+        cameras: number of cameras whose poses are corrected together.
     """
 
     gaussians: int
@@ -43,7 +44,7 @@ class TrainingSize:
 
 
 def predicted_peak_bytes(size: TrainingSize) -> int:
-    """Bytes that training adds to the process at its peak; all Gaussians are taken to be in view."""
+    """Return the bytes that training adds to the process at its peak, assuming that a view sees all Gaussians."""
     width = 11 + 3 * coefficient_count(size.sh_degree)
     # The dense normal matrix of the cameras, its factor, the basis, and a Jacobian of the same size.
     poses = 4 * 8 * (6 * size.cameras) ** 2
@@ -57,17 +58,17 @@ def require_memory(size: TrainingSize, free_bytes: int | None) -> None:
 
     Args:
         size: of the training.
-        free_bytes: from `free_memory_bytes`; None: unknown, nothing is refused.
+        free_bytes: from `free_memory_bytes`; None: unknown, no training is refused.
 
     Raises:
-        ResourceError: says how much is missing, and with how many Gaussians it would fit.
+        ResourceError: states the memory needed, and a number of Gaussians that would fit.
     """
     needed = predicted_peak_bytes(size)
     if free_bytes is None or needed <= _USABLE * free_bytes:
         return
-    none = predicted_peak_bytes(TrainingSize(0, size.camera, size.sh_degree, size.cameras))
-    each = (needed - none) / max(size.gaussians, 1)
-    fitting = int((_USABLE * free_bytes - none) / each) // 1000 * 1000
+    without_gaussians = predicted_peak_bytes(TrainingSize(0, size.camera, size.sh_degree, size.cameras))
+    per_gaussian = (needed - without_gaussians) / max(size.gaussians, 1)
+    fitting = int((_USABLE * free_bytes - without_gaussians) / per_gaussian) // 1000 * 1000
     advice = (
         f"--max-gaussians {fitting}"
         if fitting >= 1000
@@ -81,7 +82,7 @@ def require_memory(size: TrainingSize, free_bytes: int | None) -> None:
 
 
 def free_memory_bytes(device: torch.device) -> int | None:
-    """Memory that a training on `device` may still take; None where the system does not tell."""
+    """Return the memory that a training on `device` may still take; None if the system does not state it."""
     if device.type == "cuda":
         return int(torch.cuda.mem_get_info(device)[0])
     known = [free for free in (_free_in_system(), _free_in_group(Path("/sys/fs/cgroup"))) if free is not None]
@@ -89,11 +90,11 @@ def free_memory_bytes(device: torch.device) -> int | None:
 
 
 def _raster_bytes() -> int:
-    """Of the CPU rasteriser, for one visible Gaussian on six tiles; the GPU's needs less."""
+    """Return the bytes of the CPU rasteriser for one visible Gaussian on six tiles; the GPU's needs less."""
     from pipelines.splat.rasterizer.cpu import predicted_bytes
 
-    nothing = Pinhole(1, 1, 1.0, 1.0, 0.5, 0.5)
-    return predicted_bytes(1000, nothing, 0) // 1000
+    single_pixel = Pinhole(1, 1, 1.0, 1.0, 0.5, 0.5)
+    return predicted_bytes(1000, single_pixel, 0) // 1000
 
 
 def _free_in_system() -> int | None:
@@ -129,7 +130,7 @@ class _WindowsMemory(ctypes.Structure):
 
 
 def _free_in_group(root: Path) -> int | None:
-    """What the control group (version 2) of a container leaves; file cache that can be dropped counts as free."""
+    """Return the memory that a container's control group (v2) leaves; droppable file cache counts as free."""
     try:
         limit = (root / "memory.max").read_text(encoding="ascii").strip()
         if limit == "max":

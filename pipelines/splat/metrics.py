@@ -10,15 +10,15 @@ from torch import Tensor
 from pipelines.splat.losses import image_similarity
 from pipelines.splat.lpips import Lpips
 
-# What equal images get: a report has no infinity. Rounding to 8 bits alone is 59 dB.
+# PSNR of equal images: a report has no infinity. Rounding to 8 bits alone gives 59 dB.
 MAX_PSNR_DB = 100.0
 
 
 def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
-    """Peak signal-to-noise ratio in dB, of values from 0 to 1 over all channels; at most 100 dB.
+    """Return the peak signal-to-noise ratio in dB, of values from 0 to 1 over all channels; at most 100 dB.
 
     Args:
-        image: (H, W, 3); clamped to 0 … 1, as it would be shown.
+        image: (H, W, 3); clamped to 0 … 1, as on a display.
         target: (H, W, 3).
         mask: (H, W) bool, True where a pixel counts; None: all do.
 
@@ -34,10 +34,10 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
 
 
 def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
-    """Mean SSIM with the 11×11 Gaussian window of the loss (`pipelines.splat.losses`), 1 for equal images.
+    """Return the mean SSIM with the 11×11 Gaussian window of `pipelines.splat.losses`, 1 for equal images.
 
     Args:
-        image: (H, W, 3); clamped to 0 … 1, as it would be shown.
+        image: (H, W, 3); clamped to 0 … 1, as on a display.
         target: (H, W, 3).
         mask: (H, W) bool, True where a pixel counts; None: all do.
 
@@ -49,7 +49,7 @@ def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
 
 
 def lpips(weights: Path | None) -> Lpips | str:
-    """The perceptual distance, or the reason why there is none.
+    """Return the perceptual distance, or the reason why there is none.
 
     Raises:
         InputError: `weights` is not an NPZ file of LPIPS weights.

@@ -1,6 +1,7 @@
 """Order of the Gaussians in memory: neighbours in space are neighbours in memory.
 
-What one view sees is then a few long runs of rows, and gathering it costs a third of what it costs at random.
+The Gaussians of one view are then a few long runs of rows. Gathering them takes a third of the time of rows in
+random order.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ _BITS = 21  # three coordinates of 21 bits fill the 63 bits of a positive int64
 
 
 def morton_order(means: Tensor) -> Tensor:
-    """Permutation (N,) int64 that sorts points (N, 3) along a Z-order curve through their bounding box."""
+    """Return the permutation (N,) int64 that sorts points (N, 3) along a Z-order curve in their bounding box."""
     if len(means) == 0:
         return torch.zeros(0, dtype=torch.int64, device=means.device)
     low, high = means.amin(dim=0), means.amax(dim=0)

@@ -1,8 +1,8 @@
-"""Adam over the Gaussians: one learning rate a quantity, updates of visible rows only, editable rows.
+"""Adam over the Gaussians: a learning rate for each quantity, updates of visible rows only, editable rows.
 
 Rates are those of 3D Gaussian Splatting (doi 10.1145/3592433); the rate of the centres is in scene extents and
-falls exponentially over the training. Every row counts its own updates, for rows are born, and seen, at different
-times: so each gets the bias correction that its own moments need. With all rows in every step this is plain Adam.
+falls exponentially over the training. Rows are added, and seen, at different times. Every row therefore counts its
+own updates, for the bias correction that its moments need. With all rows in every step the result is plain Adam.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class LearningRates:
         sh_rest: rate of the direction-dependent colour.
         beta1: decay of the first moment.
         beta2: decay of the second moment.
-        eps: added to the denominator; tiny, for these gradients are tiny.
+        eps: added to the denominator; tiny, because these gradients are tiny.
     """
 
     means: float = 1.6e-4
@@ -51,23 +51,23 @@ class LearningRates:
 
     @classmethod
     def for_iterations(cls, iterations: int) -> LearningRates:
-        """The rates of 3DGS, made for 30 000 iterations, raised for shorter trainings.
+        """Return the rates of 3DGS, made for 30 000 iterations, raised for shorter trainings.
 
-        A Gaussian can only change so much in so many steps: at the rates of 3DGS, 600 iterations of a 48-image
-        orbit (240 px, 20 000 Gaussians) leave holes between Gaussians that had no time to grow, and 18.1 dB on
-        the test views. Raised 2, 4 and 8 times they give 22.3, 26.8 and 23.7 dB.
+        The rate limits the change of a Gaussian per step. At the rates of 3DGS, 600 iterations of a 48-image orbit
+        (240 px, 20 000 Gaussians) leave holes between Gaussians that had no time to grow, and 18.1 dB on the test
+        views. Rates raised 2, 4 and 8 times give 22.3, 26.8 and 23.7 dB.
         """
         factor = min(max((_REFERENCE_ITERATIONS / iterations) ** (1 / 3), 1.0), _MOST_RAISED)
         rates = ("means", "means_final", "quats_wxyz", "log_scales", "logit_opacities", "sh_dc", "sh_rest")
         return cls(**{name: factor * getattr(cls(), name) for name in rates})
 
     def means_at(self, progress: float) -> float:
-        """Rate of the centres, in scene extents, after the fraction `progress` (0 to 1) of the training."""
+        """Return the rate of the centres, in scene extents, after the fraction `progress` of the training."""
         return float(self.means ** (1 - progress) * self.means_final**progress)
 
 
 class GaussianAdam:
-    """The Gaussians being trained and their moments.
+    """Gaussians under training and their moments.
 
     Attributes:
         gaussians: leaf tensors that require gradients; replaced by `rearrange`.
@@ -77,7 +77,7 @@ class GaussianAdam:
     def __init__(
         self, gaussians: Gaussians, extent_m: float, iterations: int, rates: LearningRates | None = None
     ) -> None:
-        """Start with no moments.
+        """Start without moments.
 
         Args:
             gaussians: N Gaussians, float32; copied.
@@ -102,7 +102,7 @@ class GaussianAdam:
             tensor.grad = None
 
     def step(self, iteration: int, rows: Tensor | None = None) -> None:
-        """Update from the tensors' `.grad`.
+        """Update the Gaussians by the tensors' `.grad`.
 
         Args:
             iteration: of the training, for the falling rate.
@@ -124,16 +124,16 @@ class GaussianAdam:
                 self._step_by_tensors(iteration, rows)
 
     def means_rate(self, iteration: int) -> float:
-        """Learning rate of the centres, in metres."""
+        """Return the learning rate of the centres, in metres."""
         progress = min(max(iteration / max(self.iterations, 1), 0.0), 1.0)
         return self.rate_factor * self.rates.means_at(progress) * self.extent_m
 
     def rearrange(self, gaussians: Gaussians, source: Tensor) -> None:
-        """Replace all rows: survivors keep their moments, new ones start without.
+        """Replace all rows: surviving rows keep their moments, new rows start without.
 
         Args:
             gaussians: N' Gaussians; copied.
-            source: (N',) int64, the row that each was before, or −1 for a new one.
+            source: (N',) int64, the former row of each, or −1 for a new row.
         """
         old = source >= 0
         index = source.clamp_min(0)
@@ -151,11 +151,11 @@ class GaussianAdam:
         self._exp_avg_sq[:, columns] = 0
 
     def state(self) -> dict[str, Tensor]:
-        """Copies of the moments, for a checkpoint; the Gaussians themselves are saved by who owns them."""
+        """Return copies of the moments, for a checkpoint; their owner saves the Gaussians themselves."""
         return {name: tensor.clone() for name, tensor in self._moments().items()}
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Take over the moments of `state`.
+        """Restore the moments of `state`.
 
         Raises:
             ValueError: they belong to Gaussians of another number or degree.
@@ -206,7 +206,7 @@ class GaussianAdam:
         )
 
     def _step_by_tensors(self, iteration: int, rows: Tensor) -> None:
-        """The same in torch operations, for devices that the kernel does not run on."""
+        """Take the same step by torch operations, for devices that the kernel does not run on."""
         self._steps[rows] += 1
         unbias = self._corrections[self._steps[rows].long().clamp_max(len(self._corrections) - 1)]
         rates, columns = self._column_rates(iteration), self._columns()

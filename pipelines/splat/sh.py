@@ -29,7 +29,7 @@ _C3 = (
 
 
 def coefficient_count(degree: int) -> int:
-    """Number of coefficients up to a degree.
+    """Return the number of coefficients up to a degree.
 
     Raises:
         ValueError: not a degree from 0 to 3.
@@ -40,17 +40,17 @@ def coefficient_count(degree: int) -> int:
 
 
 def sh_from_rgb(rgb: Tensor) -> Tensor:
-    """Constant coefficient of a colour."""
+    """Return the constant coefficient of a colour."""
     return (rgb - 0.5) / C0
 
 
 def rgb_from_sh(sh_dc: Tensor) -> Tensor:
-    """Colour of a constant coefficient, not clamped."""
+    """Return the colour of a constant coefficient, not clamped."""
     return sh_dc * C0 + 0.5
 
 
 def basis(directions: Tensor, degree: int) -> Tensor:
-    """Values Y_k (…, K) of the harmonics up to `degree` at unit vectors (…, 3)."""
+    """Return values Y_k (…, K) of the harmonics up to `degree` at unit vectors (…, 3)."""
     x, y, z = directions.unbind(-1)
     values = [torch.full_like(x, C0)]
     if degree >= 1:
@@ -77,16 +77,13 @@ def basis(directions: Tensor, degree: int) -> Tensor:
     return torch.stack(values, dim=-1)
 
 
-def evaluate(sh: Tensor, directions: Tensor, degree: int | None = None) -> Tensor:
-    """Σ c_k Y_k(d), without the 0.5 and the clamp that make it a colour.
+def evaluate_sh(sh: Tensor, directions: Tensor, degree: int | None = None) -> Tensor:
+    """Return Σ c_k Y_k(d) (…, 3), without the 0.5 and the clamp of a colour.
 
     Args:
         sh: (…, K, 3) coefficients.
         directions: (…, 3) vectors, not necessarily of unit length.
-        degree: use the bands up to here only (default: all).
-
-    Returns:
-        (…, 3).
+        degree: highest band to use (default: all).
     """
     used = round(sh.shape[-2] ** 0.5) - 1 if degree is None else degree
     count = coefficient_count(used)
@@ -94,8 +91,8 @@ def evaluate(sh: Tensor, directions: Tensor, degree: int | None = None) -> Tenso
     return (basis(unit, used)[..., None] * sh[..., :count, :]).sum(dim=-2)
 
 
-def rotate(sh: Tensor, rotation: ArrayLike | Tensor) -> Tensor:
-    """Coefficients of the turned functions: evaluate(rotate(sh, R), R d) = evaluate(sh, d).
+def rotate_sh(sh: Tensor, rotation: ArrayLike | Tensor) -> Tensor:
+    """Return coefficients of the turned functions: evaluate_sh(rotate_sh(sh, R), R d) = evaluate_sh(sh, d).
 
     Args:
         sh: (…, K, 3) coefficients.
@@ -116,10 +113,11 @@ def rotate(sh: Tensor, rotation: ArrayLike | Tensor) -> Tensor:
 
 
 def _band_rotation(band: int, rotation: Tensor) -> Tensor:
-    """Matrix (2l + 1, 2l + 1) that turns the coefficients of band l.
+    """Return the matrix (2l + 1, 2l + 1) that turns the coefficients of band l.
 
-    A rotation maps a band into itself (Ivanic and Ruedenberg, doi 10.1021/jp953350u), so that its matrix follows
-    from the values at directions enough: Y(R d_i) c' = Y(d_i) c for all i. Exact, and small: solved once a call.
+    A rotation maps a band into itself (Ivanic and Ruedenberg, doi 10.1021/jp953350u). Its matrix therefore follows
+    from the values at enough directions: Y(R d_i) c' = Y(d_i) c for all i. The solution is exact, and the system
+    small: it is solved once a call.
     """
     directions = _sample_directions()
     columns = slice(band**2, (band + 1) ** 2)
@@ -130,7 +128,7 @@ def _band_rotation(band: int, rotation: Tensor) -> Tensor:
 
 @cache
 def _sample_directions() -> Tensor:
-    """Even directions (64, 3): a Fibonacci sphere."""
+    """Return evenly spread directions (64, 3): a Fibonacci sphere."""
     index = torch.arange(64, dtype=torch.float64) + 0.5
     polar, azimuth = torch.acos(1 - 2 * index / 64), torch.pi * (1 + 5**0.5) * index
     return torch.stack([azimuth.cos() * polar.sin(), azimuth.sin() * polar.sin(), polar.cos()], dim=1)

@@ -1,10 +1,10 @@
 """Numba kernels of the photometric loss: L1 and SSIM of two images, value and gradient, rows over threads.
 
-An image is (H, W·3), a row its interleaved channels: a blur along the row is then one loop with taps three
-elements apart, the same for every channel, and vectorises. A row is blurred along x once, kept in a ring of the
-last eleven, and blurred along y from there. A pixel's result depends neither on the bands nor on the threads.
+An image is (H, W·3), a row its interleaved channels. A blur along the row is then one loop with taps three elements
+apart, the same for every channel, and vectorises. Each row is blurred along x once, kept in a ring of the last
+eleven rows, and blurred along y from there. A pixel's result depends neither on the bands nor on the threads.
 
-Float32 or float64, by the images; sums over pixels are float64.
+Numbers are float32 or float64, like the images; sums over pixels are float64.
 """
 
 # ruff: noqa: PLR0917  (kernels take arrays, not objects)
@@ -27,7 +27,7 @@ _FAST = {"contract", "reassoc", "nsz"}
 
 
 def gaussian_taps(dtype: Any) -> np.ndarray:
-    """Half of the window's weights, centre first: (6,)."""
+    """Return half of the window's weights (6,), centre first."""
     offset = np.arange(-RADIUS, RADIUS + 1)
     window = np.exp(-(offset**2) / (2 * SIGMA_PX**2))
     return (window / window.sum())[RADIUS:].astype(dtype)
@@ -49,7 +49,7 @@ def _blur_along_row(padded: Any, taps: Any, out: Any) -> None:
 
 @njit(fastmath=_FAST)
 def _blur_across_rows(ring: Any, row: int, taps: Any, out: Any) -> None:
-    """Blur at `row` from a ring (11, n) in which row r lies at r mod 11."""
+    """Blur `row` across rows, from a ring (11, n) in which row r lies at r mod 11."""
     centre = ring[row % WINDOW]
     for j in range(out.shape[0]):
         out[j] = taps[0] * centre[j]
@@ -62,7 +62,7 @@ def _blur_across_rows(ring: Any, row: int, taps: Any, out: Any) -> None:
 
 @njit(fastmath=_FAST)
 def _load_masked(image: Any, valid: Any, row: int, padded: Any) -> None:
-    """A row between its zero margins; pixels that do not count are zero, like everything outside the image."""
+    """Load a row between its zero margins; pixels that do not count are zero, like those outside the image."""
     source = image[row]
     for j in range(source.shape[0]):
         padded[PAD + j] = source[j]
@@ -75,7 +75,7 @@ def _load_masked(image: Any, valid: Any, row: int, padded: Any) -> None:
 
 @njit(fastmath=_FAST)
 def _push_moments(rendered: Any, target: Any, valid: Any, row: int, taps: Any, padded: Any, ring: Any) -> None:
-    """Blur x, y, x², y², xy of one row along it, into the five rings (5, 11, n)."""
+    """Blur x, y, x², y², xy of a row along the row, into the five rings (5, 11, n)."""
     slot, n = row % WINDOW, rendered.shape[1]
     if row >= rendered.shape[0]:
         ring[:, slot] = 0
@@ -98,7 +98,7 @@ def _push_moments(rendered: Any, target: Any, valid: Any, row: int, taps: Any, p
 
 @njit(fastmath=_FAST)
 def _ssim_row(moments: Any, c1: Any, c2: Any, partials: Any, row: int) -> None:
-    """SSIM of a row into moments[0]; its derivatives by the blurred x, x² and xy into partials (3, H, n)."""
+    """Write SSIM of a row into moments[0], its derivatives by the blurred x, x² and xy into partials (3, H, n)."""
     mu_x, mu_y, xx, yy, xy = moments[0], moments[1], moments[2], moments[3], moments[4]
     one = c1 / c1  # of the images' type: a literal would turn the loop to float64
     d_mu, d_xx, d_xy = partials[0, row], partials[1, row], partials[2, row]
@@ -118,7 +118,7 @@ def _ssim_row(moments: Any, c1: Any, c2: Any, partials: Any, row: int) -> None:
 
 @njit(fastmath=_FAST)
 def _sum_row(x: Any, y: Any, ssim: Any) -> tuple[float, float]:
-    """Σ|x − y| and Σ SSIM of a row, in float64."""
+    """Return Σ|x − y| and Σ SSIM of a row, in float64."""
     absolute, similarity = 0.0, 0.0
     for j in range(x.shape[0]):
         absolute += abs(np.float64(x[j] - y[j]))
@@ -141,7 +141,7 @@ def _clear_invalid(valid: Any, row: int, ssim: Any, partials: Any) -> None:
 def ssim_forward(
     rendered: Any, target: Any, valid: Any, taps: Any, c1: Any, c2: Any, bands: int, partials: Any, sums: Any
 ) -> None:
-    """Σ|x − y| and Σ SSIM of each row into sums (H, 2); SSIM's derivatives into partials (3, H, n).
+    """Write Σ|x − y| and Σ SSIM of each row into sums (H, 2), and SSIM's derivatives into partials (3, H, n).
 
     Args:
         rendered: (H, n) with n = 3 W.
@@ -150,7 +150,7 @@ def ssim_forward(
         taps: (6,) from `gaussian_taps`.
         c1: SSIM's constant, of the images' type.
         c2: likewise.
-        bands: in how many blocks of rows to share the work out.
+        bands: number of blocks of rows that share the work.
         partials: (3, H, n) output: ∂SSIM by the blurred x, x² and xy.
         sums: (H, 2) float64 output.
     """
@@ -209,9 +209,9 @@ def ssim_backward(
     bands: int,
     gradient: Any,
 ) -> None:
-    """∂(l1_weight · Σ|x − y| − ssim_weight · Σ SSIM)/∂x into gradient (H, n).
+    """Write ∂(l1_weight · Σ|x − y| − ssim_weight · Σ SSIM)/∂x into gradient (H, n).
 
-    The window is symmetric and the margins are zero, so that the blur is its own adjoint.
+    The window is symmetric and the margins are zero: the blur is its own adjoint.
     """
     height, n = rendered.shape
     for band in prange(bands):

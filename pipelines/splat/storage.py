@@ -1,4 +1,4 @@
-"""Gaussians in files."""
+"""Reading and writing of Gaussians as files."""
 
 from __future__ import annotations
 

@@ -1,9 +1,10 @@
-"""Losses that make the Gaussians lie on surfaces, so that the depth of a render can be measured in.
+"""Surface losses: they make Gaussians lie on surfaces, so that renders have a depth to measure in.
 
-The rendered depth is held to that of the SfM points that a view observes (as in DS-NeRF,
-doi 10.1109/CVPR52688.2022.01254), each Gaussian is flattened towards a disc (as in PGSR,
-doi 10.1109/TVCG.2024.3494046, eq. 1), and the normals of the discs are held to those of the rendered depth (2D
-Gaussian Splatting, doi 10.1145/3641519.3657428, eq. 14).
+1. The rendered depth is pulled to the depth of the points that a view observes (as in DS-NeRF,
+   doi 10.1109/CVPR52688.2022.01254).
+2. Each Gaussian is flattened towards a disc (as in PGSR, doi 10.1109/TVCG.2024.3494046, eq. 1).
+3. The normals of the discs are pulled to the normals of the rendered depth (2D Gaussian Splatting,
+   doi 10.1145/3641519.3657428, eq. 14).
 """
 
 from __future__ import annotations
@@ -19,9 +20,9 @@ from pipelines.splat.gaussians import Gaussians, rotation_matrices
 from pipelines.splat.rasterizer.api import Pinhole, Rasterizer, RasterSettings
 from pipelines.splat.sh import sh_from_rgb
 
-_SPREAD = 0.005  # of the depth: what less of it costs grows with its square
+_SPREAD = 0.005  # of the depth: the loss of a smaller spread grows with its square
 _NEAR = 0.002  # of the depth
-_FIRMNESS = 9.0  # how much more a depth so near to a point is drawn to it
+_FIRMNESS = 9.0  # additional pull on depths that near to their point
 
 
 @dataclass(frozen=True)
@@ -30,13 +31,13 @@ class SurfaceSettings:
 
     Attributes:
         depth: of the mean relative difference of depth at the points of the surface, see `depth_loss`.
-        compactness: of the logarithm that bounds what haze before and behind a surface costs.
+        compactness: of the logarithm that bounds the loss of haze before and behind a surface.
         flatness: of the mean smallest standard deviation, in scene extents.
         normals: of the depth–normal consistency,
-        normals_from: from this fraction of the training,
-        normals_every: at every so many iterations, since it takes a render of its own; with as much more weight.
-        edge: depth steps larger than this fraction of the depth between neighbouring pixels are edges, where
-            the depth has no normal.
+        normals_from: fraction of the training from which it counts,
+        normals_every: and iterations between two of its renders, by which its weight is multiplied.
+        edge: depth steps between neighbouring pixels that are larger than this fraction of the depth are edges,
+            where the depth has no normal.
     """
 
     depth: float = 1.0
@@ -51,37 +52,38 @@ class SurfaceSettings:
 def depth_loss(
     depth_m: Tensor, alpha: Tensor, point_in_model: Tensor, cam_from_model: Tensor, camera: Pinhole
 ) -> Tensor:
-    """Mean of r + F s (1 − exp(−r/s)), r = |z_rendered / z − 1|, of points (K, 3) that the view observes; scalar.
+    """Return the mean of r + F s (1 − exp(−r/s)), r = |z_rendered / z − 1|, over points that the view observes.
 
-    Gaussians are blended in the order of their centres: on a surface that is seen at a slant the nearer ones hide
-    the others, and the photographs are met best by a surface behind the true one, by a part of the Gaussians' size.
-    Within s of a point its pull is 1 + F times as strong as further away, and withstands that; further away it is
-    rather the point that is wrong, and photographs may have their way.
+    1. Gaussians are blended in the order of their centres. On a slanted surface the nearer Gaussians hide the
+       others. A surface behind the true one, by a part of the Gaussians' size, then matches the photographs best.
+    2. Within s of a point its pull is 1 + F times as strong as further away, and withstands that bias.
+    3. Further away the point is more likely to be wrong, and the photographs prevail.
 
-    Points that fall outside, or where the render is nearly transparent, do not count: there is no surface yet.
+    Points outside the image do not count, nor do points where the render is nearly transparent: there is no surface
+    yet.
 
     Args:
         depth_m: (H, W) expected depth.
         alpha: (H, W).
         point_in_model: (K, 3) metres.
-        cam_from_model: (4, 4) pose; no gradient reaches it, for cameras shall not follow the surface.
+        cam_from_model: (4, 4) pose; without gradient, because cameras must not follow the surface.
         camera: of H × W pixels.
     """
     pose = cam_from_model.detach()
     in_cam = point_in_model @ pose[:3, :3].T + pose[:3, 3]
     z = in_cam[:, 2].clamp_min(1e-3)
-    found, seen = depth_at(depth_m, alpha, in_cam[:, :2] / z[:, None], camera)
+    rendered_m, seen = depth_at(depth_m, alpha, in_cam[:, :2] / z[:, None], camera)
     counts = seen * (in_cam[:, 2] > 1e-3)
-    off = (found / z - 1).abs()
+    off = (rendered_m / z - 1).abs()
     pull = off + _FIRMNESS * _NEAR * (1 - torch.exp(-off / _NEAR))
     return (pull * counts).sum() / counts.sum().clamp_min(1)
 
 
 def compactness_loss(depth_m: Tensor, variance_m2: Tensor, alpha: Tensor) -> Tensor:
-    """Mean of α ln(1 + σ²/s²), σ the spread of depth in a pixel, and s a two-hundredth of the depth; scalar.
+    """Return the mean of α ln(1 + σ²/s²), σ the spread of depth in a pixel, and s a two-hundredth of the depth.
 
-    The mean depth can be right in a haze that no surface is in. The logarithm, because a pixel at an edge shows
-    what is before and behind it, and rightly so.
+    The mean depth can be right in a haze without any surface: the spread cannot. The logarithm bounds the loss of
+    pixels at edges, which rightly show surfaces before and behind the edge.
 
     Args:
         depth_m: (H, W) expected depth.
@@ -93,12 +95,12 @@ def compactness_loss(depth_m: Tensor, variance_m2: Tensor, alpha: Tensor) -> Ten
 
 
 def flatness_loss(gaussians: Gaussians, visible: Tensor, extent_m: float) -> Tensor:
-    """Mean smallest standard deviation of the visible Gaussians, in scene extents; scalar."""
+    """Return the mean smallest standard deviation of the visible Gaussians, in scene extents."""
     return gaussians.log_scales[visible].amin(dim=1).exp().mean() / extent_m
 
 
 def disc_normals(gaussians: Gaussians, center_in_model: Tensor) -> Tensor:
-    """Normals (N, 3) in `model`: the shortest principal axes, on the side of a camera centre (3,)."""
+    """Return normals (N, 3) in `model`: the shortest principal axes, on the side of a camera centre (3,)."""
     axis = gaussians.log_scales.argmin(dim=1)
     rotation = rotation_matrices(gaussians.quats_wxyz)
     normal = rotation.gather(2, axis[:, None, None].expand(-1, 3, 1))[:, :, 0]
@@ -107,7 +109,7 @@ def disc_normals(gaussians: Gaussians, center_in_model: Tensor) -> Tensor:
 
 
 def depth_normals(depth_m: Tensor, camera: Pinhole) -> Tensor:
-    """Normals (H − 1, W − 1, 3) in `cam`, towards the camera, of a depth map (H, W) along z."""
+    """Return normals (H − 1, W − 1, 3) in `cam`, towards the camera, of a depth map (H, W) along z."""
     v, u = torch.meshgrid(
         torch.arange(camera.height, device=depth_m.device) + 0.5,
         torch.arange(camera.width, device=depth_m.device) + 0.5,
@@ -122,14 +124,14 @@ def depth_normals(depth_m: Tensor, camera: Pinhole) -> Tensor:
 def normal_loss(
     gaussians: Gaussians, cam_from_model: Tensor, camera: Pinhole, rasterizer: Rasterizer, edge: float
 ) -> Tensor:
-    """Mean of α · (1 − n · n_depth) over the pixels that are not at a depth edge; scalar.
+    """Return the mean of α · (1 − n · n_depth) over the pixels that are not at a depth edge.
 
-    One further render, whose colours are the normals of the discs, with expected depth.
+    The loss takes a render of its own, whose colours are the normals of the discs, with expected depth.
     """
     rotation = cam_from_model[:3, :3]
     center = (-rotation.T @ cam_from_model[:3, 3]).detach()
     normal = disc_normals(gaussians, center) @ rotation.detach().T
-    # Colours are clamped at zero: a normal's components are moved to 0 … 1, and back after blending.
+    # Colours are clamped at zero: the components of a normal are moved to 0 … 1, and back after blending.
     painted = Gaussians(
         gaussians.means,
         gaussians.quats_wxyz,
@@ -147,8 +149,8 @@ def normal_loss(
 
 
 def _smooth(depth: Tensor, alpha: Tensor, edge: float) -> Tensor:
-    """1 where a pixel and its neighbours to the right and below lie on one surface, else 0."""
-    here = depth[:-1, :-1]
-    step = torch.maximum((depth[:-1, 1:] - here).abs(), (depth[1:, :-1] - here).abs())
+    """Return 1 for pixels that lie on one surface with their neighbours to the right and below, else 0."""
+    center = depth[:-1, :-1]
+    step = torch.maximum((depth[:-1, 1:] - center).abs(), (depth[1:, :-1] - center).abs())
     solid = (alpha[:-1, :-1] > 0.5) & (alpha[:-1, 1:] > 0.5) & (alpha[1:, :-1] > 0.5)
-    return ((step < edge * here) & solid).to(depth.dtype)
+    return ((step < edge * center) & solid).to(depth.dtype)

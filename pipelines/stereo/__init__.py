@@ -1,1 +1,1 @@
-"""Multi-view stereo: a depth for every pixel, from photographs whose cameras are known."""
+"""Multi-view stereo: depth maps from photographs whose cameras are known."""

@@ -1,4 +1,4 @@
-"""Which views to compare with which, and on which planes, from the SfM points that they share."""
+"""Choice of the views and planes to compare a view with, from the SfM points that views share."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import numpy as np
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.stereo.sweep import Planes, StereoCamera
 
-# Smaller angles give no depth, larger ones another picture of the same place (after Yao et al.,
-# doi 10.1007/978-3-030-01237-3_47, section 4.1, for the wider angles of flights).
+# Smaller angles give no depth, larger angles another picture of the same place. After Yao et al.,
+# doi 10.1007/978-3-030-01237-3_47, section 4.1, adapted to the wider angles of flights.
 _BEST_ANGLE_DEG, _SIGMA_BELOW_DEG, _SIGMA_ABOVE_DEG = 12.0, 4.0, 10.0
-_MOST_POINTS = 400  # of a view, to judge by
+_MOST_POINTS = 400  # of a view
 _LEAST_SHARED = 5
 
 _UP = np.array([0.0, 0.0, 1.0])
-_LEVEL = np.sin(np.radians(15.0))  # a view that looks down less than this sees walls rather than ground
+_LEVEL = np.sin(np.radians(15.0))  # a view that looks down by less sees walls rather than ground
 _NEAREST = 0.3  # of the distance of most points
 _RANGE = (0.5, 99.5)  # percentiles of the points
 _MARGIN = 0.25  # of their range, on either side: ground without texture has no points
@@ -25,8 +25,8 @@ _LEAST_PLANES, _MOST_PLANES = 16, 256
 
 
 @dataclass(frozen=True)
-class Sightings:
-    """Which of N points is seen in which of n views.
+class PointVisibility:
+    """Observations of N points in n views.
 
     Attributes:
         point_in_world: (N, 3) metres.
@@ -39,35 +39,42 @@ class Sightings:
     obs_point: IntArray
     obs_view: IntArray
 
-    def seen_by(self, view: int) -> IntArray:
-        """Points that a view sees."""
+    def points_in_view(self, view: int) -> IntArray:
+        """Return ascending indices of the points that a view sees."""
         return np.unique(self.obs_point[self.obs_view == view])
 
 
-def best_neighbours(sightings: Sightings, view: int, among: IntArray, count: int) -> list[int]:
-    """The views that share most points with `view` under good angles, best first; at most `count`."""
-    seen = sightings.seen_by(view)
+def best_neighbours(visibility: PointVisibility, view: int, among: IntArray, count: int) -> list[int]:
+    """Return at most `count` views that share most points with `view` under good angles, best first.
+
+    Args:
+        visibility: of the SfM points.
+        view: index of the view.
+        among: indices of the views to choose from.
+        count: most views.
+    """
+    seen = visibility.points_in_view(view)
     seen = seen[np.linspace(0, len(seen) - 1, min(len(seen), _MOST_POINTS)).astype(np.int64)]
-    rows = np.isin(sightings.obs_point, seen) & np.isin(sightings.obs_view, among) & (sightings.obs_view != view)
-    point, other = sightings.obs_point[rows], sightings.obs_view[rows]
-    here = sightings.point_in_world[point] - sightings.center_in_world[view]
-    there = sightings.point_in_world[point] - sightings.center_in_world[other]
-    cosine = (here * there).sum(axis=1) / np.maximum(
-        np.linalg.norm(here, axis=1) * np.linalg.norm(there, axis=1), 1e-12
+    rows = np.isin(visibility.obs_point, seen) & np.isin(visibility.obs_view, among) & (visibility.obs_view != view)
+    point, other = visibility.obs_point[rows], visibility.obs_view[rows]
+    from_view = visibility.point_in_world[point] - visibility.center_in_world[view]
+    from_other = visibility.point_in_world[point] - visibility.center_in_world[other]
+    cosine = (from_view * from_other).sum(axis=1) / np.maximum(
+        np.linalg.norm(from_view, axis=1) * np.linalg.norm(from_other, axis=1), 1e-12
     )
     away = np.degrees(np.arccos(np.clip(cosine, -1, 1))) - _BEST_ANGLE_DEG
     sigma = np.where(away < 0, _SIGMA_BELOW_DEG, _SIGMA_ABOVE_DEG)
-    worth = np.bincount(other, np.exp(-0.5 * (away / sigma) ** 2), minlength=len(sightings.center_in_world))
+    worth = np.bincount(other, np.exp(-0.5 * (away / sigma) ** 2), minlength=len(visibility.center_in_world))
     worth[np.bincount(other, minlength=len(worth)) < _LEAST_SHARED] = 0
     order = np.argsort(-worth, kind="stable")[:count]
     return [int(index) for index in order if worth[index] > 0]
 
 
 def planes_for(view: StereoCamera, neighbours: list[StereoCamera], points: FloatArray) -> list[Planes]:
-    """Planes through points (P, 3) that the view sees, by direction; none where the points are too few.
+    """Return planes through points (P, 3) that the view sees, by direction; none if the points are too few.
 
-    Level ones suit ground and roofs, upright ones across the view the walls. A view that hardly looks down needs
-    planes across its axis alone.
+    Level planes suit ground and roofs; upright planes across the view suit walls. A view that hardly looks down
+    needs planes across its axis alone.
     """
     if len(points) < _LEAST_SHARED:
         return []
@@ -75,15 +82,15 @@ def planes_for(view: StereoCamera, neighbours: list[StereoCamera], points: Float
     ahead = axis * [1.0, 1.0, 0.0]
     forward = float(np.linalg.norm(ahead))
     if -axis[2] <= _LEVEL:
-        found = [_planes_across(view, neighbours, points, axis)]
+        candidates = [_planes_across(view, neighbours, points, axis)]
     elif forward <= _LEVEL:  # from straight above walls are not seen
-        found = [_level_planes(view, neighbours, points)]
+        candidates = [_level_planes(view, neighbours, points)]
     else:
-        found = [
+        candidates = [
             _level_planes(view, neighbours, points),
             _planes_across(view, neighbours, points, ahead / forward, height_m=_range(points @ _UP)),
         ]
-    return [planes for planes in found if planes is not None]
+    return [planes for planes in candidates if planes is not None]
 
 
 def _level_planes(view: StereoCamera, neighbours: list[StereoCamera], points: FloatArray) -> Planes | None:
@@ -100,7 +107,7 @@ def _planes_across(
     normal: FloatArray,
     height_m: tuple[float, float] = (-np.inf, np.inf),
 ) -> Planes | None:
-    """Planes at distances whose inverses are evenly spaced, as pixels have it."""
+    """Return planes at distances with evenly spaced inverses, which are evenly spaced in pixels."""
     away = points @ normal - normal @ view.center_in_world
     low, high = _range(away)
     low = max(low, _NEAREST * float(np.median(away)))
@@ -120,7 +127,7 @@ def _range(along: FloatArray) -> tuple[float, float]:
 def _count(
     view: StereoCamera, neighbours: list[StereoCamera], points: FloatArray, normal: FloatArray, range_m: float
 ) -> int:
-    """How many planes are a step apart in the neighbours."""
+    """Return the number of planes that lie `_STEP_PX` apart in the neighbours."""
     middle = points[np.argsort(points @ normal)[len(points) // 2]]
     step = _STEP_PX / max(_pixels_a_metre(view, neighbours, middle, normal), 1e-9)
     return int(np.clip(np.ceil(range_m / step), _LEAST_PLANES, _MOST_PLANES))
@@ -129,7 +136,7 @@ def _count(
 def _pixels_a_metre(
     view: StereoCamera, neighbours: list[StereoCamera], point: FloatArray, normal: FloatArray
 ) -> float:
-    """How fast the neighbours see a point move that moves along the ray of `view`, by a metre of its plane."""
+    """Return the pixels by which a point moves in the neighbours (median) if its plane moves by a metre."""
     ray = point - view.center_in_world
     ray = ray / max(abs(float(normal @ ray)), 1e-9)
     speeds = []

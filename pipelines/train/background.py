@@ -13,7 +13,7 @@ import numpy as np
 
 from pipelines.core.types import ByteArray, FloatArray
 from pipelines.geometry.cameras import Pinhole
-from pipelines.geometry.thinning import one_a_cube
+from pipelines.geometry.thinning import thin_to_voxels
 from pipelines.scene.photographs import ImageCache
 from pipelines.scene.scene import Scene
 
@@ -123,5 +123,5 @@ def _thinned(all_points: Background) -> Background:
     """One point a cube of its own size: neighbouring views see the same places."""
     if not len(all_points.sigma_m):
         return all_points
-    first = one_a_cube(all_points.point_in_model, 2 * all_points.sigma_m)
+    first = thin_to_voxels(all_points.point_in_model, 2 * all_points.sigma_m)
     return Background(all_points.point_in_model[first], all_points.rgb[first], all_points.sigma_m[first])

@@ -14,15 +14,15 @@ import cv2
 import numpy as np
 
 from pipelines.core.progress import SILENT, Progress
-from pipelines.core.types import ByteArray
+from pipelines.core.types import ByteArray, Float32Array
 from pipelines.geometry.cameras import Pinhole
 from pipelines.scene.photographs import ImageCache, save_array
 from pipelines.scene.scene import Scene
-from pipelines.stereo.agreement import AgreementSettings, Surface, agreed_depth, without_rims
-from pipelines.stereo.matching import UNSEEN, Float32Array, MatchSettings
-from pipelines.stereo.neighbours import Sightings, best_neighbours, planes_for
-from pipelines.stereo.refinement import guess_from, refine
-from pipelines.stereo.sweep import Facing, Planes, StereoCamera, StereoView, Swept, plane_sweep
+from pipelines.stereo.agreement import AgreementSettings, DepthEstimate, agreed_depth, without_rims
+from pipelines.stereo.matching import UNSEEN, MatchSettings
+from pipelines.stereo.neighbours import PointVisibility, best_neighbours, planes_for
+from pipelines.stereo.refinement import refine, surface_prior
+from pipelines.stereo.sweep import NormalMap, Planes, StereoCamera, StereoView, SweepResult, plane_sweep
 
 # Of what is kept: other forms have other folders.
 _FORM = b"coarse, fine: direction, offset, score, step, sharpness"
@@ -68,7 +68,7 @@ class DepthMaps:
         self.scene, self.images = scene, images
         self._options = options or StereoOptions()
         sparse = scene.sparse
-        self._sightings = Sightings(
+        self._visibility = PointVisibility(
             scene.point_in_model, scene.poses.cam_center_in_model, sparse.obs_point, sparse.obs_image
         )
         # Asked for again by each of a view's neighbours, and the same each time.
@@ -116,9 +116,9 @@ class DepthMaps:
         if own is None:
             return _empty_maps(self.camera(index))
         reference = self._view(self.camera(index), index)
-        guess = guess_from(own, self._agreed(own, index, "coarse"), reference.camera)
+        prior = surface_prior(own, self._agreed(own, index, "coarse"), reference.camera)
         views = [self._view(self.camera(j), j) for j in self._neighbours(index)]
-        return _packed(refine(reference, views, guess, self._options.refining))
+        return _packed(refine(reference, views, prior, self._options.refining))
 
     def _agree(self, index: int) -> Float32Array:
         own = self._surface(index, "fine")
@@ -126,7 +126,7 @@ class DepthMaps:
             return np.zeros((self.camera(index).height, self.camera(index).width), dtype=np.float32)
         return self._agreed(own, index, "fine")
 
-    def _agreed(self, own: Surface, index: int, kind: str) -> Float32Array:
+    def _agreed(self, own: DepthEstimate, index: int, kind: str) -> Float32Array:
         """Depths (H, W) that views agree on, 0 elsewhere."""
         others, options = [self._surface(j, kind) for j in self._neighbours(index)], self._options
         depth = agreed_depth(own, [other for other in others if other is not None], options.agreement)
@@ -134,25 +134,25 @@ class DepthMaps:
         window_px = options.matching.window_px * own.camera.pinhole.width / self._coarse(index).width
         return without_rims(depth, int(window_px / 2), options.agreement.rim)
 
-    def _surface(self, index: int, kind: str) -> Surface | None:
+    def _surface(self, index: int, kind: str) -> DepthEstimate | None:
         sweeps = self._planes(index)
         if not sweeps:
             return None
         pinhole = self._coarse(index) if kind == "coarse" else self.camera(index)
         which, *rest = np.load(self._path(index, kind), mmap_mode="r", allow_pickle=False)
-        facing = Facing(np.stack([planes.normal_in_world for planes in sweeps]), which.astype(np.uint8))
-        return Surface(self._camera(pinhole, index), Swept(facing, *rest))
+        normals = NormalMap(np.stack([planes.normal_in_world for planes in sweeps]), which.astype(np.uint8))
+        return DepthEstimate(self._camera(pinhole, index), SweepResult(normals, *rest))
 
     def _find_planes(self, index: int) -> list[Planes]:
         others = self._neighbours(index)
         if not others:
             return []
-        points = self.scene.point_in_model[self._sightings.seen_by(index)]
+        points = self.scene.point_in_model[self._visibility.points_in_view(index)]
         cameras = [self._camera(self._coarse(j), j) for j in others]
         return planes_for(self._camera(self._coarse(index), index), cameras, points)
 
     def _find_neighbours(self, index: int) -> list[int]:
-        return best_neighbours(self._sightings, index, self.scene.train, self._options.neighbours)
+        return best_neighbours(self._visibility, index, self.scene.train, self._options.neighbours)
 
     def _coarse(self, index: int) -> Pinhole:
         return self.images.pinhole(index).limited(self._options.coarse_px)
@@ -191,10 +191,10 @@ class DepthMaps:
         return digest.hexdigest()[:32]
 
 
-def _packed(swept: Swept) -> Float32Array:
+def _packed(sweep: SweepResult) -> Float32Array:
     """(5, H, W): direction, offset, score, step and sharpness of each pixel."""
-    which = swept.facing.which.astype(np.float32)
-    return np.stack([which, swept.offset_m, swept.score, swept.step_m, swept.sharpness])
+    which = sweep.normals.index.astype(np.float32)
+    return np.stack([which, sweep.offset_m, sweep.score, sweep.step_m, sweep.sharpness])
 
 
 def _empty_maps(pinhole: Pinhole) -> Float32Array:

@@ -15,7 +15,7 @@ import torch
 from pipelines.core.errors import ConvergenceError
 from pipelines.core.interrupts import deferred_interrupts
 from pipelines.core.progress import Progress
-from pipelines.splat.watch import NonFiniteError
+from pipelines.splat.finiteness import NonFiniteError
 from pipelines.train.checkpoint import load_checkpoint, save_checkpoint
 from pipelines.train.trainer import JointTrainer, StepReport
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipelines.core.types import ByteArray, FloatArray, IntArray
-from pipelines.geometry.thinning import one_a_cube
+from pipelines.geometry.thinning import thin_to_voxels
 from pipelines.train.depth_maps import DepthMaps
 
 _NORMAL_REACH_PX = 3
@@ -119,7 +119,7 @@ def spread_evenly(points: FloatArray, size_m: FloatArray, count: int) -> IntArra
     low, kept = points.min(axis=0), np.arange(1)
     for _ in range(16):
         middle = float(np.sqrt(fine * coarse))
-        first = one_a_cube(points - low, middle * size_m)
+        first = thin_to_voxels(points - low, middle * size_m)
         if len(first) > count:
             fine = middle
         else:

@@ -14,15 +14,15 @@ from pipelines.geometry.lens import Lenses
 from pipelines.georef.problem import GeoProblem
 from pipelines.scene.photographs import ImageCache
 from pipelines.scene.pinholes import Pinholes
+from pipelines.splat.contributions import ViewContributions, view_contributions
 from pipelines.splat.densify import Strategy
-from pipelines.splat.evidence import Evidence, evidence
 from pipelines.splat.exposure import Exposures
+from pipelines.splat.finiteness import FinitenessMonitor
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.losses import photometric_loss
 from pipelines.splat.optimizer import GaussianAdam
 from pipelines.splat.rasterizer.api import Pinhole, Rasterizer, RasterSettings, Render
 from pipelines.splat.surface import compactness_loss, depth_loss, flatness_loss, normal_loss
-from pipelines.splat.watch import FiniteWatch
 from pipelines.train.checkpoint import prefixed, unprefixed
 from pipelines.train.schedule import JointOptions, TrainingSchedule
 from pipelines.train.target_images import TargetImage, TargetImages
@@ -103,7 +103,7 @@ class JointTrainer:
         self._lens = np.zeros(len(problem.cameras.lens_basis))
         self._targets = TargetImages(views.images, self._pinholes, self.device)
         names = ("photometric loss", "geographic loss", *(f"gradient of {name}" for name in self._watched()))
-        self._watch = FiniteWatch(names, self.device)
+        self._watch = FinitenessMonitor(names, self.device)
         rates = {
             "y": options.similarity_rate,
             "z": options.camera_rate,
@@ -137,7 +137,7 @@ class JointTrainer:
         self._note(photometric, geographic)
         self._apply(render.stats.visible)
         self.strategy.observe(render.stats, target.camera)
-        self.strategy.update(self.iteration, self.optimizer, self.evidence)
+        self.strategy.update(self.iteration, self.optimizer, self.sample_contributions)
         return StepReport(
             photometric.detach(),
             _mean_square(colour, target),
@@ -147,8 +147,8 @@ class JointTrainer:
         )
 
     @torch.no_grad()
-    def evidence(self, count: int, generator: torch.Generator) -> list[Evidence]:
-        """What `count` different training views say of the Gaussians; see `splat.evidence.Probe`."""
+    def sample_contributions(self, count: int, generator: torch.Generator) -> list[ViewContributions]:
+        """What `count` different training views say of the Gaussians; see `splat.contributions.Probe`."""
         contributions = []
         for place in torch.randperm(len(self.views.camera), generator=generator)[:count].tolist():
             index = int(self.views.camera[place])
@@ -159,9 +159,9 @@ class JointTrainer:
                 colour = self.exposures.apply(index, colour)
             error = (colour - target.colour).abs().mean(dim=-1)
             error = error if target.mask is None else error * target.mask
-            seen = evidence(self.optimizer.gaussians, pose, target.camera, error, self.rasterizer)
+            seen = view_contributions(self.optimizer.gaussians, pose, target.camera, error, self.rasterizer)
             # Strategies count pixels of the photographs, whatever the schedule makes of them.
-            contributions.append(Evidence(shrink**2 * seen.weight_px, shrink**2 * seen.high_error_px))
+            contributions.append(ViewContributions(shrink**2 * seen.weight_px, shrink**2 * seen.high_error_px))
         return contributions
 
     def pinhole(self, index: int) -> Pinhole:

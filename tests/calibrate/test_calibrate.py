@@ -29,7 +29,7 @@ from pipelines.simulate.options import SimulateOptions
 from pipelines.simulate.stage import simulate
 from pipelines.simulate.truth import Truth
 from tests import bags
-from tests.scenes import Noise, Scene, sparse_model
+from tests.scenes import Noise, TrueScene, sparse_model
 
 OFFSET_S, BORESIGHT_DEG = 0.2, np.array([0.7, -0.5, 0.4])
 EXACT = Noise(pixel_px=0.05)
@@ -61,7 +61,7 @@ def write_model(path: Path, names: list[str], centers: np.ndarray, geo_from_cam:
     """What SfM would make of cameras (n, 3) and (n, 3, 3) above a landscape, in a frame of its own."""
     rng = np.random.default_rng(0)
     land = np.column_stack([rng.uniform(-150, 150, (1500, 2)), rng.uniform(0, 15, 1500)])
-    scene = Scene(centers, geo_from_cam, land, np.empty((0, 3)))
+    scene = TrueScene(centers, geo_from_cam, land, np.empty((0, 3)))
     model = sparse_model(scene, EXACT, rng)
     seen = np.bincount(model.obs_point, minlength=len(land)) > 2
     keep = seen[model.obs_point]

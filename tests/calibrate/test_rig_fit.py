@@ -25,7 +25,7 @@ from pipelines.geometry.rig import boresight
 from pipelines.geometry.rotations import exp_so3, log_so3
 from pipelines.geometry.similarity import Similarity
 from pipelines.scene.navigation import NavigationTrack
-from pipelines.simulate.flight import FlightPlan, Track, fly
+from pipelines.simulate.flight import FlightPlan, TrueTrajectory, make_trajectory
 from pipelines.simulate.sensors import RECEIVERS, Mounting, record_gnss, record_imu
 
 OFFSET_S, BORESIGHT_DEG, ARM_M = 0.2, np.array([0.6, -0.5, 0.62]), np.array([0.25, -0.1, -0.15])
@@ -33,13 +33,13 @@ PIXEL_RAD = 1 / 3000  # 3 cm at 100 m
 GEO_FROM_LOCAL = Similarity(17.0, exp_so3([0.3, 0.6, 0.7]), np.array([5.0, -40.0, 12.0]))
 
 
-def _flight(kind: str, images: int = 48, seed: int = 0) -> Track:
+def _flight(kind: str, images: int = 48, seed: int = 0) -> TrueTrajectory:
     heights = {"orbit": (50.0, 70.0), "grid": (70.0,)}[kind]
     plan = FlightPlan(kind, images, None, heights, {"orbit": 85.0, "grid": 60.0}[kind])
-    return fly(plan, (20.0, 15.0), np.eye(3), np.random.default_rng(seed))
+    return make_trajectory(plan, (20.0, 15.0), np.eye(3), np.random.default_rng(seed))
 
 
-def _data(track: Track, seed: int = 1, control: int = 0) -> RigData:
+def _data(track: TrueTrajectory, seed: int = 1, control: int = 0) -> RigData:
     """Navigation of an RTK receiver and an attitude of 0.5°, SfM cameras with errors of 5 mm and 0.02°."""
     rng = np.random.default_rng(seed)
     mounting = Mounting(ARM_M, boresight(BORESIGHT_DEG), OFFSET_S)

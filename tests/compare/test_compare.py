@@ -22,7 +22,7 @@ from pipelines.geometry.similarity import Similarity, SimilarityRecord
 from pipelines.scene.initial_similarity import InitialSimilarity
 from pipelines.scene.survey import Survey
 from pipelines.scene.trained_survey import load_trained
-from tests.splat_scenes import Flight
+from tests.splat_scenes import RenderedFlight
 
 pytest.importorskip("pycolmap")
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -32,7 +32,7 @@ SHORT = {"iterations": 60, "dense": False, "sh_degree": 0, "log_every": 5, "chec
 BY_CAMERA_M = 0.08
 
 
-def prepare(flight: Flight, name: str) -> Workspace:
+def prepare(flight: RenderedFlight, name: str) -> Workspace:
     """A new workspace whose survey and SfM model were put there by hand, with two points of the six as control."""
     workspace = flight.workspace(name)
     shutil.rmtree(workspace.root / "sim3")
@@ -44,7 +44,7 @@ def prepare(flight: Flight, name: str) -> Workspace:
 
 
 @pytest.fixture(scope="module")
-def compared(flights: list[Flight]) -> Compared:
+def compared(flights: list[RenderedFlight]) -> Compared:
     """All configurations of the first survey."""
     workspace = prepare(flights[0], "compared")
     return workspace, *compare(workspace, CONFIGURATIONS, SHORT)
@@ -164,7 +164,9 @@ class Interrupting:
             raise KeyboardInterrupt
 
 
-def test_interrupted_training_goes_on_from_its_checkpoint(compared: Compared, flights: list[Flight]) -> None:
+def test_interrupted_training_goes_on_from_its_checkpoint(
+    compared: Compared, flights: list[RenderedFlight]
+) -> None:
     workspace = prepare(flights[0], "interrupted")
     with pytest.raises(KeyboardInterrupt):
         compare(workspace, select_configurations("A"), SHORT, progress=Interrupting(35))
@@ -176,7 +178,7 @@ def test_interrupted_training_goes_on_from_its_checkpoint(compared: Compared, fl
     assert (workspace.root / "compare/A" / GAUSSIANS).read_bytes() == whole.read_bytes()
 
 
-def test_without_check_points_there_are_images_only(flights: list[Flight]) -> None:
+def test_without_check_points_there_are_images_only(flights: list[RenderedFlight]) -> None:
     flight = flights[1]
     workspace = prepare(flight, "no_check_points")
     survey = load_json(Survey, workspace.path(SURVEY))

@@ -14,7 +14,7 @@ from pipelines.core.products import save_json
 from pipelines.core.stages import GAUSSIANS, MODEL, SURVEY
 from pipelines.core.workspace import StageRun, Workspace
 from pipelines.deliver.options import ExportPlyOptions
-from pipelines.deliver.ply import exported, run
+from pipelines.deliver.ply import export_splat, run
 from pipelines.formats.georef_sidecar import read_sidecar, sidecar_path
 from pipelines.geodesy.enu import Origin, ecef_from_enu, ecef_from_lla, enu_from_ecef
 from pipelines.geodesy.vertical import VerticalDatum
@@ -27,7 +27,7 @@ from pipelines.splat.rasterizer.api import Pinhole, RasterSettings
 from pipelines.splat.rasterizer.reference import render_reference
 from pipelines.splat.storage import read_gaussians, write_gaussians
 
-CONFIG = ExportPlyOptions()
+OPTIONS = ExportPlyOptions()
 # The scene lies 3 km from the survey's origin, where vertical and north have visibly turned.
 GEO_FROM_MODEL = Similarity(1.3, exp_so3(np.array([0.4, -1.1, 2.0])), np.array([2500.0, -1800.0, 40.0]))
 PIVOT_IN_GEO = np.array([2000.0, -2000.0, 0.0])
@@ -84,18 +84,18 @@ def stage(tmp_path: Path) -> StageRun:
 
 
 def test_files_alone_put_the_gaussians_on_earth(stage: StageRun) -> None:
-    summary = run(stage, CONFIG)
+    summary = run(stage, OPTIONS)
     ply, sidecar = stage.out / "splat.ply", read_sidecar(stage.out / "splat.ply")
-    found = sidecar.ecef_from_file().apply(read_gaussians(ply).means.numpy())
+    positions = sidecar.ecef_from_file().apply(read_gaussians(ply).means.numpy())
     expected = ecef_from_enu(GEO_FROM_MODEL.apply(gaussians().means.numpy()), survey().origin)
-    # Some 10 m from the origin float32 resolves 1e-6 m.
-    np.testing.assert_allclose(found, expected, rtol=0, atol=2e-6)
+    # About 10 m from the origin, float32 resolves 1e-6 m.
+    np.testing.assert_allclose(positions, expected, rtol=0, atol=2e-6)
     assert summary.values["gaussians"] == 40
     assert sorted(file.name for file in stage.out.iterdir()) == ["splat.ply", "splat.ply.georef.json"]
 
 
 def test_frame_is_east_north_up_at_its_own_rounded_origin(stage: StageRun) -> None:
-    run(stage, CONFIG)
+    run(stage, OPTIONS)
     sidecar = read_sidecar(stage.out / "splat.ply")
     lat, lon, alt = sidecar.origin_lla
     assert (round(lat, 6), round(lon, 6), round(alt, 1)) == (lat, lon, alt)
@@ -108,7 +108,7 @@ def test_frame_is_east_north_up_at_its_own_rounded_origin(stage: StageRun) -> No
 
 
 def test_rendered_image_is_the_same_from_the_same_place(stage: StageRun) -> None:
-    run(stage, CONFIG)
+    run(stage, OPTIONS)
     camera = Pinhole(32, 24, 30.0, 30.0, 16.0, 12.0)
     settings = RasterSettings(sh_degree=3, background=(0.2, 0.3, 0.4), near_m=0.01)
     cam_from_model = np.eye(4)
@@ -134,7 +134,7 @@ def _axes(origin: Origin) -> np.ndarray:
 
 
 def test_covariance_predicts_the_same_uncertainty_in_the_new_frame() -> None:
-    export = exported(gaussians(), model(covariance()), survey(), CONFIG)
+    export = export_splat(gaussians(), model(covariance()), survey(), OPTIONS)
     points_in_model = np.array([[0.0, 0, 0], [30, -20, 5]])
     in_geo = covariance_at(GEO_FROM_MODEL.apply(points_in_model), covariance(), PIVOT_IN_GEO)
     to_ecef, turn = export.sidecar.ecef_from_file(), _axes(survey().origin)
@@ -145,9 +145,9 @@ def test_covariance_predicts_the_same_uncertainty_in_the_new_frame() -> None:
 
 
 def test_predicted_accuracy_is_that_of_the_covariance_at_the_origin() -> None:
-    accuracy = exported(gaussians(), model(covariance()), survey(), CONFIG).sidecar.accuracy
+    accuracy = export_splat(gaussians(), model(covariance()), survey(), OPTIONS).sidecar.accuracy
     assert accuracy is not None
-    cov = np.array(exported(gaussians(), model(covariance()), survey(), CONFIG).sidecar.covariance)
+    cov = np.array(export_splat(gaussians(), model(covariance()), survey(), OPTIONS).sidecar.covariance)
     east, north, up = np.sqrt(np.diagonal(cov)[4:])
     assert (accuracy.sigma_e_m, accuracy.sigma_n_m, accuracy.sigma_u_m) == pytest.approx((east, north, up))
     assert accuracy.sigma_h_m == pytest.approx(np.hypot(east, north))
@@ -155,7 +155,7 @@ def test_predicted_accuracy_is_that_of_the_covariance_at_the_origin() -> None:
 
 
 def test_unknown_uncertainty_is_null_and_not_zero() -> None:
-    sidecar = exported(gaussians(), model(), survey(), CONFIG).sidecar
+    sidecar = export_splat(gaussians(), model(), survey(), OPTIONS).sidecar
     assert sidecar.covariance is None
     assert sidecar.accuracy is None
 
@@ -163,15 +163,15 @@ def test_unknown_uncertainty_is_null_and_not_zero() -> None:
 def test_transparent_gaussians_are_left_out() -> None:
     start = gaussians()
     start.logit_opacities[:5] = -8.0
-    export = exported(start, model(), survey(), CONFIG)
+    export = export_splat(start, model(), survey(), OPTIONS)
     assert (len(export.gaussians), export.left_out) == (35, 5)
     start.logit_opacities[:] = -8.0
     with pytest.raises(DegenerateGeometryError, match="--min-opacity"):
-        exported(start, model(), survey(), CONFIG)
+        export_splat(start, model(), survey(), OPTIONS)
 
 
 def test_sidecar_has_the_fields_that_were_promised(stage: StageRun) -> None:
-    run(stage, CONFIG)
+    run(stage, OPTIONS)
     document = json.loads(sidecar_path(stage.out / "splat.ply").read_text(encoding="utf-8"))
     fields = "format version crsId origin rotation scale epoch originLla verticalDatum crsWkt covariance accuracy"
     assert list(document) == fields.split()
@@ -182,7 +182,7 @@ def test_sidecar_has_the_fields_that_were_promised(stage: StageRun) -> None:
 
 
 def test_damaged_sidecar_is_refused(stage: StageRun) -> None:
-    run(stage, CONFIG)
+    run(stage, OPTIONS)
     path = sidecar_path(stage.out / "splat.ply")
     text = path.read_text(encoding="utf-8")
     path.write_text(text.replace('"scale": 1.0', '"scale": -1.0'), encoding="utf-8")

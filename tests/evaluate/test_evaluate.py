@@ -23,7 +23,7 @@ from pipelines.scene.survey import Mark, Survey
 from pipelines.scene.trained_model import TrainedModel
 from pipelines.scene.trained_survey import load_trained
 from tests.reports import report_of
-from tests.splat_scenes import NOISE, SIGMA_M, Flight, ground_height
+from tests.splat_scenes import NOISE, SIGMA_M, RenderedFlight, ground_height
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 EVALUATE = BY_NAME["evaluate"]
@@ -99,7 +99,7 @@ def test_few_check_points_are_remarked_on(evaluated: tuple[Workspace, Outcome]) 
     assert evaluated[1].manifest.warnings == [few_points(6)]
 
 
-def test_control_points_are_a_fit_and_not_an_accuracy(altered: Workspace, flights: list[Flight]) -> None:
+def test_control_points_are_a_fit_and_not_an_accuracy(altered: Workspace, flights: list[RenderedFlight]) -> None:
     survey = flights[0].rendered.survey
     change_survey(altered, control_points=survey.check_points, check_points=())
     run_stage(altered, EVALUATE, {"renders": 0})
@@ -110,7 +110,9 @@ def test_control_points_are_a_fit_and_not_an_accuracy(altered: Workspace, flight
     assert report["cross_validation"] is None  # nobody asked
 
 
-def test_cross_validation_is_of_control_points_and_stands_alone(altered: Workspace, flights: list[Flight]) -> None:
+def test_cross_validation_is_of_control_points_and_stands_alone(
+    altered: Workspace, flights: list[RenderedFlight]
+) -> None:
     survey = flights[0].rendered.survey
     change_survey(altered, control_points=survey.check_points[:5], check_points=survey.check_points[5:])
     run_stage(altered, EVALUATE, {"renders": 0, "cross_validate": True})
@@ -233,7 +235,7 @@ def test_predicted_accuracy_is_mapped(evaluated: tuple[Workspace, Outcome]) -> N
     assert min(picture.shape[:2]) > 400
 
 
-def test_every_field_of_the_report_is_described(altered: Workspace, flights: list[Flight]) -> None:
+def test_every_field_of_the_report_is_described(altered: Workspace, flights: list[RenderedFlight]) -> None:
     survey = flights[0].rendered.survey
     far = survey.check_points[0].model_copy(update={"position_in_geo": (9.0, 9.0, 9.0)})
     change_survey(altered, control_points=survey.check_points[1:4], check_points=(far, *survey.check_points[1:]))

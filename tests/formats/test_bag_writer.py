@@ -44,13 +44,13 @@ def flight(folder: Path) -> BagFlight:
 
 
 def read(path: Path) -> tuple[dict[str, list[Any]], list[int]]:
-    found: dict[str, list[Any]] = {}
+    messages: dict[str, list[Any]] = {}
     times = []
     with AnyReader([path]) as reader:
         for connection, time, raw in reader.messages():
-            found.setdefault(connection.topic, []).append(reader.deserialize(raw, connection.msgtype))
+            messages.setdefault(connection.topic, []).append(reader.deserialize(raw, connection.msgtype))
             times.append(time)
-    return found, times
+    return messages, times
 
 
 def stamps(messages: list[Any]) -> list[int]:
@@ -65,11 +65,11 @@ def rotation(quaternion: Any) -> np.ndarray:
 def test_bag_says_what_was_written(tmp_path: Path, storage: Literal["mcap", "sqlite3"]) -> None:
     given = flight(tmp_path)
     count = write_bag(tmp_path / "bag", storage, given)
-    found, times = read(tmp_path / "bag")
+    messages, times = read(tmp_path / "bag")
     assert count == len(times) == 1 + 24 + 240 + 2 + 2
     assert times == sorted(times)
     fixes, imu, images = (
-        found[topic] for topic in (bag_writer.FIX_TOPIC, bag_writer.IMU_TOPIC, bag_writer.IMAGE_TOPIC)
+        messages[topic] for topic in (bag_writer.FIX_TOPIC, bag_writer.IMU_TOPIC, bag_writer.IMAGE_TOPIC)
     )
     assert stamps(fixes) == given.fix_stamp_ns.tolist()
     np.testing.assert_array_equal([[m.latitude, m.longitude, m.altitude] for m in fixes], given.fix_lla)

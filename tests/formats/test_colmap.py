@@ -55,8 +55,8 @@ def test_text_model_from_pycolmap_gives_its_tracks_and_centres(tmp_path: Path) -
             for element in point.track.elements
         )
         mine = model.obs_point == index
-        found = np.column_stack([model.image_id[model.obs_image[mine]], model.obs_xy_px[mine]])
-        np.testing.assert_allclose(found, expected)
+        observations = np.column_stack([model.image_id[model.obs_image[mine]], model.obs_xy_px[mine]])
+        np.testing.assert_allclose(observations, expected)
 
 
 def test_unregistered_images_are_left_out(model: SparseModel, tmp_path: Path) -> None:

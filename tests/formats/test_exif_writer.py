@@ -1,4 +1,4 @@
-"""What is written into a photograph is read back by ExifRead and by an XML parser."""
+"""ExifRead and an XML parser read back the tags that are written into a photograph."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipelines.core.errors import InputError
-from pipelines.formats.exif_writer import PhotoTags, with_tags
+from pipelines.formats.exif_writer import DroneTags, with_tags
 
-TAGS = PhotoTags(
+TAGS = DroneTags(
     width=64, height=48, focal_px=54.4, stamp_ns=1_700_000_002_250_000_000,
     lat_deg=-33.856784321, lon_deg=151.215296789, alt_m=-12.3456, relative_alt_m=61.5,
     yaw_pitch_roll_deg=(-91.25, -35.5, 1.75), body_yaw_pitch_roll_deg=(-91.0, 0.5, 1.5),
@@ -71,12 +71,12 @@ def test_focal_length_gives_back_the_pixels() -> None:
 
 
 def test_xmp_is_what_dji_writes() -> None:
-    found = xmp(with_tags(JPEG, TAGS))
-    assert [float(found[f"Gimbal{axis}Degree"]) for axis in ("Yaw", "Pitch", "Roll")] == [-91.25, -35.5, 1.75]
-    assert float(found["GpsLatitude"]) == pytest.approx(TAGS.lat_deg, abs=1e-9)
-    assert float(found["GpsLongitude"]) == pytest.approx(TAGS.lon_deg, abs=1e-9)
-    assert float(found["AbsoluteAltitude"]) == pytest.approx(TAGS.alt_m, abs=1e-4)
-    assert (found["RtkFlag"], found["RtkStdLon"], found["RtkStdLat"], found["RtkStdHgt"]) == (
+    tags = xmp(with_tags(JPEG, TAGS))
+    assert [float(tags[f"Gimbal{axis}Degree"]) for axis in ("Yaw", "Pitch", "Roll")] == [-91.25, -35.5, 1.75]
+    assert float(tags["GpsLatitude"]) == pytest.approx(TAGS.lat_deg, abs=1e-9)
+    assert float(tags["GpsLongitude"]) == pytest.approx(TAGS.lon_deg, abs=1e-9)
+    assert float(tags["AbsoluteAltitude"]) == pytest.approx(TAGS.alt_m, abs=1e-4)
+    assert (tags["RtkFlag"], tags["RtkStdLon"], tags["RtkStdLat"], tags["RtkStdHgt"]) == (
         "50", "0.02000", "0.02100", "0.03000",
     )  # fmt: skip
 

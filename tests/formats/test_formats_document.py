@@ -17,14 +17,14 @@ DOCUMENT = (Path(__file__).parents[2] / "docs" / "formats.md").read_text(encodin
 
 
 def block(language: str) -> str:
-    found = re.search(rf"```{language}\n(.*?)```", DOCUMENT, re.DOTALL)
-    assert found is not None
-    return found[1]
+    block = re.search(rf"```{language}\n(.*?)```", DOCUMENT, re.DOTALL)
+    assert block is not None
+    return block[1]
 
 
 @pytest.fixture
 def result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
-    """What the snippet computes from the example, in a folder that holds nothing else."""
+    """Return the variables that the snippet computes from the example, in a folder without other files."""
     (tmp_path / "splat.ply.georef.json").write_text(block("json"), encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {}
@@ -61,8 +61,8 @@ def test_snippet_agrees_with_the_package(result: dict[str, Any]) -> None:
     assert cov is not None
     np.testing.assert_allclose(result["sigma_enu_m"], np.sqrt(np.diagonal(cov[0])), rtol=1e-12)
     assert sidecar.covariance is not None
-    there = predicted_accuracy(sidecar.covariance, result["p_ply"])
-    assert there.sigma_h_m == pytest.approx(np.hypot(*result["sigma_enu_m"][:2]))
+    accuracy = predicted_accuracy(sidecar.covariance, result["p_ply"])
+    assert accuracy.sigma_h_m == pytest.approx(np.hypot(*result["sigma_enu_m"][:2]))
     assert predicted_accuracy(sidecar.covariance, np.zeros(3)) == sidecar.accuracy
     assert sidecar.model_copy(update={"covariance": None}).covariance_at(result["p_ply"][None]) is None
 

@@ -25,14 +25,14 @@ def _encoded(suffix: str) -> bytes:
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif"])
 def test_size_and_hash(suffix: str) -> None:
     data = _encoded(suffix)
-    found = inspect_image(data, PATH)
-    assert (found.width, found.height) == (70, 30)
-    assert found.sha256 == hashlib.sha256(data).hexdigest()
+    image = inspect_image(data, PATH)
+    assert (image.width, image.height) == (70, 30)
+    assert image.sha256 == hashlib.sha256(data).hexdigest()
 
 
 def test_orientation_does_not_turn_the_size() -> None:
-    found = inspect_image(jpeg(size=(64, 48), exif=Exif(image=[(0x0112, 3, 6)])), PATH)
-    assert (found.width, found.height) == (64, 48)
+    image = inspect_image(jpeg(size=(64, 48), exif=Exif(image=[(0x0112, 3, 6)])), PATH)
+    assert (image.width, image.height) == (64, 48)
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif"])

@@ -26,9 +26,9 @@ def test_properties_are_in_the_standard_order(tmp_path: Path) -> None:
     write_splat_ply(tmp_path / "s.ply", splat())
     data = PlyData.read(tmp_path / "s.ply")
     names = [prop.name for prop in data["vertex"].properties]
-    rest = " ".join(f"f_rest_{i}" for i in range(45))
+    rest_names = " ".join(f"f_rest_{i}" for i in range(45))
     last = "opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3"
-    assert " ".join(names) == f"x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 {rest} {last}"
+    assert " ".join(names) == f"x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 {rest_names} {last}"
     assert data.byte_order == "<"
     assert {prop.val_dtype for prop in data["vertex"].properties} == {"f4"}
 

@@ -17,13 +17,22 @@ from pipelines.geolocate.stage import geolocate
 from pipelines.geometry.rotations import exp_so3, matrix_from_quat_xyzw, quat_xyzw_from_matrix
 from pipelines.scene.geolocated import GeolocatedPoints
 from pipelines.scene.survey import Survey
-from tests.scenes import Measured, Noise, Scene, make_scene, sparse_model, survey_of, without_fixes, write_workspace
+from tests.scenes import (
+    Measured,
+    Noise,
+    TrueScene,
+    make_scene,
+    sparse_model,
+    survey_of,
+    without_fixes,
+    write_workspace,
+)
 
 CONFIG = GeolocateOptions()
 CONSUMER = Noise(fix_m=(1.5, 1.5, 3.0))
 
 
-def squared_errors(points: GeolocatedPoints, scene: Scene) -> np.ndarray:
+def squared_errors(points: GeolocatedPoints, scene: TrueScene) -> np.ndarray:
     good = points.inlier
     error = (points.position_in_geo - scene.point_in_geo)[good]
     return (error * np.linalg.solve(points.cov_in_geo[good], error[..., None])[..., 0]).sum(axis=1)
@@ -31,7 +40,7 @@ def squared_errors(points: GeolocatedPoints, scene: Scene) -> np.ndarray:
 
 def located(
     noise: Noise, measured: Measured, config: GeolocateOptions = CONFIG, seed: int = 0
-) -> tuple[GeolocatedPoints, Scene, tuple[str, ...]]:
+) -> tuple[GeolocatedPoints, TrueScene, tuple[str, ...]]:
     scene, rng = make_scene(points=100), np.random.default_rng(seed)
     found = geolocate(survey_of(scene, noise, measured, rng), sparse_model(scene, noise, rng), config)
     return found.points, scene, found.warnings

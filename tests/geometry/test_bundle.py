@@ -1,4 +1,4 @@
-"""What bundle adjustment knows of its cameras, against the full normal matrix and against real readjustments."""
+"""Whitened camera corrections of a bundle, against the full normal matrix and against real readjustments."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from tests.bundle_scenes import SIGMA_PX, adjuster, exact_network, jacobian, noi
 
 
 def free_covariance(network: Network) -> np.ndarray:
-    """Covariance (6 n, 6 n) of the poses for unit pixel noise, with the points held on the average.
+    """Return the covariance (6 n, 6 n) of the poses for unit pixel noise, with the points held on the average.
 
-    The normal matrix of everything is bordered by Meissl's constraints on the cameras; then the gauge is moved.
+    Meissl's constraints on the cameras border the full normal matrix. Then the gauge moves to the points.
     """
     n, unknowns = len(network.camera_id), size(network)
     design = jacobian(network)
@@ -34,18 +34,18 @@ def free_covariance(network: Network) -> np.ndarray:
 
 
 def points_follow(network: Network, corrections: np.ndarray, *, lens_follows: bool = True) -> np.ndarray:
-    """Mean similarity (7, c) of the points when they, and the lens or not, follow corrections (6 n, c)."""
+    """Return the mean similarity (7, c) of points that follow corrections (6 n, c), with or without the lens."""
     n, points = len(network.camera_id), len(network.point_in_world)
     design, modes = jacobian(network), point_modes(network)
-    rest = design[:, 6 * n :] if lens_follows else design[:, 6 * n : 6 * n + 3 * points]
-    follow = np.linalg.lstsq(rest, -design[:, : 6 * n] @ corrections, rcond=None)[0][: 3 * points]
+    following = design[:, 6 * n :] if lens_follows else design[:, 6 * n : 6 * n + 3 * points]
+    follow = np.linalg.lstsq(following, -design[:, : 6 * n] @ corrections, rcond=None)[0][: 3 * points]
     own = [design[:, 6 * n + 3 * j : 6 * n + 3 * j + 3] for j in range(points)]
     pull = sum(m.T @ d.T @ d @ follow[3 * j : 3 * j + 3] for j, (m, d) in enumerate(zip(modes, own, strict=True)))
     return np.linalg.solve(sum(m.T @ d.T @ d @ m for m, d in zip(modes, own, strict=True)), pull)
 
 
 def point_modes(network: Network) -> np.ndarray:
-    """∂(point)/∂(ln s, rotation, translation) of a similarity about the mean camera centre: (N, 3, 7)."""
+    """Return ∂(point)/∂(ln s, rotation, translation) of a similarity about the mean camera centre: (N, 3, 7)."""
     arm = network.point_in_world - network.cam_center_in_world.mean(axis=0)
     turns = [np.cross(axis, arm) for axis in np.eye(3)]
     shifts = [np.tile(axis, (len(arm), 1)) for axis in np.eye(3)]
@@ -56,10 +56,10 @@ def test_basis_is_the_root_of_the_full_bundles_covariance() -> None:
     network = exact_network(images=5, points=40)
     # Equal residuals everywhere: the robust weights are all the same, and the two agree but for the hold.
     shifted = replace(network, obs_xy_px=network.obs_xy_px + SIGMA_PX)
-    found = correction_basis(shifted)
-    basis = found.matrix.reshape(30, -1) / units(network)[:, None]
+    basis = correction_basis(shifted)
+    whitened = basis.matrix.reshape(30, -1) / units(network)[:, None]
     expected = free_covariance(network) / units(network)[:, None] / units(network)
-    shape = basis @ basis.T
+    shape = whitened @ whitened.T
     shape *= np.trace(expected) / np.trace(shape)
     # The hold of 0.1 distances takes (σ / hold)² from what is worst known: at 1 px (0.4 m / 3.8 m)² = 1 %.
     np.testing.assert_allclose(shape, expected, atol=0.01 * np.abs(expected).max())
@@ -82,23 +82,23 @@ def test_no_correction_moves_the_points_by_a_similarity(lens_follows: bool) -> N
 
 def test_lens_follows_as_a_readjustment_with_held_cameras_would_have_it() -> None:
     network = exact_network()
-    found = correction_basis(replace(network, obs_xy_px=network.obs_xy_px + SIGMA_PX))
-    design, flat = jacobian(network), found.matrix.reshape(36, -1)
+    basis = correction_basis(replace(network, obs_xy_px=network.obs_xy_px + SIGMA_PX))
+    design, flat = jacobian(network), basis.matrix.reshape(36, -1)
     unit = np.linalg.norm(design[:, 36:], axis=0)
     wanted = np.linalg.lstsq(design[:, 36:] / unit, -design[:, :36] @ flat, rcond=None)[0] / unit[:, None]
     # Both derivatives are numerical, with steps of 1e-6.
-    np.testing.assert_allclose(found.lens_matrix, wanted[-4:], atol=1e-4 * np.abs(wanted[-4:]).max(axis=1).min())
+    np.testing.assert_allclose(basis.lens_matrix, wanted[-4:], atol=1e-4 * np.abs(wanted[-4:]).max(axis=1).min())
 
 
 def test_a_wrong_focal_length_moves_the_cameras_and_not_the_points() -> None:
     network = exact_network()
-    found = correction_basis(replace(network, obs_xy_px=network.obs_xy_px + SIGMA_PX))
+    basis = correction_basis(replace(network, obs_xy_px=network.obs_xy_px + SIGMA_PX))
     # The correction that is expected of a focal length one σ off.
-    focal = found.lens_matrix[0] / np.linalg.norm(found.lens_matrix[0])
-    moved = (found.matrix @ focal)[:, 3:]
+    focal = basis.lens_matrix[0] / np.linalg.norm(basis.lens_matrix[0])
+    moved = (basis.matrix @ focal)[:, 3:]
     along = network.cam_center_in_world - network.point_in_world.mean(axis=0)
     farther = (moved * along).sum(axis=1) / np.linalg.norm(along, axis=1)
-    relative = np.linalg.norm(found.lens_matrix[0]) / network.cameras[1].params[0]
+    relative = np.linalg.norm(basis.lens_matrix[0]) / network.cameras[1].params[0]
     # A longer lens sees the same from farther away, in proportion; less what the perspective of the scene forbids.
     assert (farther > 0).all()
     assert farther.mean() == pytest.approx(relative * np.linalg.norm(along, axis=1).mean(), rel=0.5)
@@ -126,17 +126,17 @@ def test_readjusted_cameras_differ_by_unit_variance() -> None:
     for seed in range(30):
         network = noisy(exact, np.random.default_rng(seed))
         change = solve @ (network.obs_xy_px - exact.obs_xy_px).ravel()
-        found = correction_basis(readjusted(network, change))
-        white = np.linalg.lstsq(complete(found.matrix, exact), change[:36] / units(exact), rcond=None)[0][:29]
+        basis = correction_basis(readjusted(network, change))
+        white = np.linalg.lstsq(complete(basis.matrix, exact), change[:36] / units(exact), rcond=None)[0][:29]
         squared.append(white @ white)
-        sigmas.append(found.sigma_px)
+        sigmas.append(basis.sigma_px)
     # 720 coordinates and 220 unknowns: σ̂ is good to 3 % a run, the mean of 30 χ²₂₉ / 29 to 5 %.
     assert np.mean(sigmas) == pytest.approx(SIGMA_PX, rel=0.03)
     assert np.mean(squared) / 29 == pytest.approx(1.0, rel=0.12)
 
 
 def complete(matrix: np.ndarray, network: Network) -> np.ndarray:
-    """Basis and gauge together (6 n, 6 n), in metres: any change of the cameras is one combination of them."""
+    """Return basis and gauge together (6 n, 6 n), in metres: they span all changes of the cameras."""
     unit = units(network)[:, None]
     modes = similarity_modes(network.cam_center_in_world).reshape(-1, 7)
     return np.hstack([matrix.reshape(len(modes), -1) / unit, modes / unit])

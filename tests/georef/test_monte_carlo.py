@@ -76,7 +76,7 @@ def marks_of(seen: Network, cov_survey: np.ndarray, rng: np.random.Generator) ->
         torch.from_numpy(surveyed),
         torch.from_numpy(np.linalg.inv(np.linalg.cholesky(cov))),
         bearing_by_lens=torch.from_numpy(
-            Lenses(seen.cameras, seen.camera_id).bearings_by_parameters(seen.obs_image, xy_px)
+            Lenses(seen.cameras, seen.camera_id).bearing_jacobian(seen.obs_image, xy_px)
         ),
     )
 

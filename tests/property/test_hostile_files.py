@@ -59,8 +59,8 @@ def test_photographs_with_flipped_bytes(at: list[tuple[float, int]]) -> None:
     assert read_tags(bytes(data)).orientation is not None
     size = header_size(bytes(data))
     with contextlib.suppress(InputError):
-        found = inspect_image(bytes(data), Path("a.jpg"))
-        assert size == (found.width, found.height)
+        image = inspect_image(bytes(data), Path("a.jpg"))
+        assert size == (image.width, image.height)
 
 
 @settings(deadline=None, max_examples=5)  # PROJ searches all its names for each, a quarter of a second

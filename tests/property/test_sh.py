@@ -30,9 +30,9 @@ def coefficients(degree: int, count: int = 3) -> Tensor:
 @settings(max_examples=60, deadline=None)
 def test_rotated_function_at_the_rotated_place_is_the_function(rotation: np.ndarray, degree: int) -> None:
     values, places = coefficients(degree), directions()
-    turned = sh.rotate(values, rotation)
-    before = sh.evaluate(values[:, None], places)
-    after = sh.evaluate(turned[:, None], places @ torch.from_numpy(rotation).T)
+    turned = sh.rotate_sh(values, rotation)
+    before = sh.evaluate_sh(values[:, None], places)
+    after = sh.evaluate_sh(turned[:, None], places @ torch.from_numpy(rotation).T)
     torch.testing.assert_close(after, before, rtol=0, atol=1e-12)
 
 
@@ -40,8 +40,8 @@ def test_rotated_function_at_the_rotated_place_is_the_function(rotation: np.ndar
 @settings(max_examples=20, deadline=None)
 def test_rotations_compose(first: np.ndarray, second: np.ndarray) -> None:
     values = coefficients(3)
-    one_by_one = sh.rotate(sh.rotate(values, first), second)
-    torch.testing.assert_close(one_by_one, sh.rotate(values, second @ first), rtol=0, atol=1e-12)
+    one_by_one = sh.rotate_sh(sh.rotate_sh(values, first), second)
+    torch.testing.assert_close(one_by_one, sh.rotate_sh(values, second @ first), rtol=0, atol=1e-12)
 
 
 def test_the_basis_is_orthonormal() -> None:
@@ -66,21 +66,21 @@ def test_signs_of_the_first_band_are_those_of_3dgs() -> None:
 
 def test_single_precision_in_single_precision_out() -> None:
     values = coefficients(3).float()
-    turned = sh.rotate(values, exp_so3(np.array([0.3, -1.0, 2.0])))
+    turned = sh.rotate_sh(values, exp_so3(np.array([0.3, -1.0, 2.0])))
     assert turned.dtype == torch.float32
     assert torch.equal(turned[:, 0], values[:, 0])
 
 
 def test_bands_above_the_degree_are_ignored() -> None:
     values, place = coefficients(3), directions(1)
-    torch.testing.assert_close(sh.evaluate(values, place, degree=1), sh.evaluate(values[:, :4], place))
+    torch.testing.assert_close(sh.evaluate_sh(values, place, degree=1), sh.evaluate_sh(values[:, :4], place))
 
 
 def test_constant_is_the_colour() -> None:
     rgb = torch.rand(4, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     constant = sh.sh_from_rgb(rgb)
     torch.testing.assert_close(sh.rgb_from_sh(constant), rgb)
-    torch.testing.assert_close(sh.evaluate(constant[:, None], directions(4)) + 0.5, rgb)
+    torch.testing.assert_close(sh.evaluate_sh(constant[:, None], directions(4)) + 0.5, rgb)
 
 
 def test_unknown_degrees_are_refused() -> None:

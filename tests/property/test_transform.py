@@ -49,8 +49,8 @@ def test_centres_covariances_and_colours_move_together(similarity: Similarity) -
     expected = similarity.scale**2 * turn @ covariances(before) @ turn.T
     torch.testing.assert_close(covariances(after), expected, rtol=1e-9, atol=1e-9 * similarity.scale**2)
     directions = gaussians().means
-    colour = sh.evaluate(before.sh, directions)
-    torch.testing.assert_close(sh.evaluate(after.sh, directions @ turn.T), colour, rtol=0, atol=1e-11)
+    colour = sh.evaluate_sh(before.sh, directions)
+    torch.testing.assert_close(sh.evaluate_sh(after.sh, directions @ turn.T), colour, rtol=0, atol=1e-11)
     assert torch.equal(after.logit_opacities, before.logit_opacities)
 
 

@@ -19,14 +19,14 @@ from pipelines.scene.scene import Scene as InModel
 from pipelines.scene.scene import initial_scene
 from pipelines.scene.survey import Survey
 from pipelines.train.options import TrainOptions
-from tests.scenes import Measured, Noise, Scene, initial, material
+from tests.scenes import Measured, Noise, TrueScene, initial, material
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-def located(noise: Noise) -> tuple[Scene, InModel, Survey, GeolocatedPoints]:
+def located(noise: Noise) -> tuple[TrueScene, InModel, Survey, GeolocatedPoints]:
     truth, sparse, survey = material(noise, Measured(), images=12, points=200)
     points = geolocate(survey, sparse, GeolocateOptions()).points
     return truth, initial_scene(sparse, survey, initial()), survey, points

@@ -12,13 +12,13 @@ from pipelines.scene.scene import photographs
 from pipelines.scene.trained_survey import TrainedSurvey
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
 from tests.scenes import trained_model
-from tests.splat_scenes import CAMERA, SPACING_M, Flight, ground_height
+from tests.splat_scenes import CAMERA, SPACING_M, RenderedFlight, ground_height
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture(scope="module")
-def renderer(flights: list[Flight]) -> ModelRenderer:
+def renderer(flights: list[RenderedFlight]) -> ModelRenderer:
     """Of the true Gaussians in true cameras; the frame `model` is `geo`."""
     rendered, scene = flights[0].rendered, flights[0].rendered.scene
     model = trained_model(Similarity(), max_image_size=CAMERA.width).model_copy(update={"sh_degree": 0})

@@ -18,7 +18,16 @@ from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.scene.initial_similarity import InitialSimilarity
-from tests.scenes import Measured, Noise, Scene, make_scene, sparse_model, survey_of, without_fixes, write_workspace
+from tests.scenes import (
+    Measured,
+    Noise,
+    TrueScene,
+    make_scene,
+    sparse_model,
+    survey_of,
+    without_fixes,
+    write_workspace,
+)
 
 pytest.importorskip("pycolmap")
 RTK = Noise(fix_m=(0.02, 0.02, 0.03), pixel_px=0.5)
@@ -43,7 +52,7 @@ def disturbed(model: SparseModel, rng: np.random.Generator) -> SparseModel:
     )
 
 
-def adjusted(root: Path, noise: Noise, seed: int = 0, scene: Scene = SCENE) -> tuple[Workspace, Outcome]:
+def adjusted(root: Path, noise: Noise, seed: int = 0, scene: TrueScene = SCENE) -> tuple[Workspace, Outcome]:
     """A workspace whose disturbed model was adjusted."""
     rng = np.random.default_rng(seed)
     survey = survey_of(scene, noise, Measured(attitudes=False), rng)

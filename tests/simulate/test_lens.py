@@ -1,4 +1,4 @@
-"""The simulated lens against COLMAP's own camera models, which share no line with it."""
+"""The simulated lens against COLMAP's own camera models, which share no code with it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Textures must not alias: stripes are box-filtered exactly, and what is too fine is faded out."""
+"""Textures must not alias: stripes are box-filtered exactly, and patterns that are too fine fade out."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ def test_stripes_are_the_mean_over_the_pixel(pixel: float) -> None:
     # 20 001 points across the pixel: their mean is off by no more than an edge's share of 1/20 000 an edge.
     inside = x[:, None].astype(np.float64) + pixel * np.linspace(-0.5, 0.5, 20_001)
     expected = averaged(np.mod(inside, 0.7) < 0.2)
-    found = stripes(x, 0.7, 0.2, np.full(101, pixel, dtype=np.float32))
-    np.testing.assert_allclose(found, expected, atol=2e-3)
+    filtered = stripes(x, 0.7, 0.2, np.full(101, pixel, dtype=np.float32))
+    np.testing.assert_allclose(filtered, expected, atol=2e-3)
 
 
 @pytest.mark.parametrize("pixel", [0.01, 0.4, 3.0])
@@ -27,8 +27,8 @@ def test_band_is_the_mean_over_the_pixel(pixel: float) -> None:
     x = np.linspace(-2, 2, 101, dtype=np.float32)
     inside = x[:, None].astype(np.float64) + pixel * np.linspace(-0.5, 0.5, 20_001)
     expected = averaged((inside > -0.3) & (inside < 0.8))
-    found = band(x, -0.3, 0.8, np.full(101, pixel, dtype=np.float32))
-    np.testing.assert_allclose(found, expected, atol=2e-3)
+    filtered = band(x, -0.3, 0.8, np.full(101, pixel, dtype=np.float32))
+    np.testing.assert_allclose(filtered, expected, atol=2e-3)
 
 
 def test_noise_fades_before_it_aliases() -> None:
@@ -50,9 +50,9 @@ def test_noise_does_not_repeat_within_a_town() -> None:
     u, v = np.random.default_rng(0).uniform(0, 100, (2, 4000)).astype(np.float32)
     pixel = np.full(4000, 0.05, dtype=np.float32)
     sizes = (7.0, 3.0, 1.3)
-    here, there = fbm(u, v, sizes, pixel), fbm(u + np.float32(128 * 0.7), v, sizes, pixel)
+    first, second = fbm(u, v, sizes, pixel), fbm(u + np.float32(128 * 0.7), v, sizes, pixel)
     # Two independent patches of 4000 samples correlate by about 1/√(some hundred blobs).
-    assert abs(np.corrcoef(here, there)[0, 1]) < 0.15
+    assert abs(np.corrcoef(first, second)[0, 1]) < 0.15
 
 
 def test_cells_are_uniform_and_their_own() -> None:

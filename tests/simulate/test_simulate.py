@@ -34,13 +34,13 @@ ORIGIN = "-33.86,151.21,-20"  # south, east, below the ellipsoid
 SMALL: dict[str, Any] = {"size": "160x120", "samples": "1", "images": 4, "targets": 30}
 
 
-class Made:
-    """A survey that was simulated, as its files tell."""
+class SimulatedSurvey:
+    """Simulated survey, read from its files."""
 
     def __init__(self, folder: Path, **options: Any) -> None:
-        self.config = SimulateOptions(**{**SMALL, **options})
+        self.options = SimulateOptions(**{**SMALL, **options})
         self.folder = folder
-        self.summary: SimulationSummary = simulate(self.config, folder)
+        self.summary: SimulationSummary = simulate(self.options, folder)
         self.truth = load_json(Truth, folder / "truth.json")
         self.centers = np.array(self.truth.centers)
         self.cam_from_enu = np.array(self.truth.cam_from_enu)
@@ -71,20 +71,20 @@ class Made:
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
-    """Five photographs of one side, with everything that can be written."""
-    return Made(
+def survey(tmp_path_factory: pytest.TempPathFactory) -> SimulatedSurvey:
+    """Return a survey of eight photographs with every file that can be written."""
+    return SimulatedSurvey(
         tmp_path_factory.mktemp("simulated") / "survey", images=8, origin=ORIGIN, bag="mcap", depth=True,
         gnss="outliers", lever_arm="0.1,-0.2,-0.3", sigma_mark=0.3,
     )  # fmt: skip
 
 
-def test_marks_are_the_projections_of_the_targets(made: Made) -> None:
+def test_marks_are_the_projections_of_the_targets(survey: SimulatedSurvey) -> None:
     exact, written = [], []
-    for target in made.truth.targets:
+    for target in survey.truth.targets:
         for mark in target.marks:
-            i = made.truth.images.index(mark.image)
-            (pixel,) = made.project(i, np.array([target.position_in_geo]))
+            i = survey.truth.images.index(mark.image)
+            (pixel,) = survey.project(i, np.array([target.position_in_geo]))
             exact.append(pixel - [mark.x_px, mark.y_px])
             written.append([mark.written_x_px - mark.x_px, mark.written_y_px - mark.y_px])
     assert np.abs(exact).max() < 1e-8
@@ -92,84 +92,84 @@ def test_marks_are_the_projections_of_the_targets(made: Made) -> None:
     assert abs(np.std(written) - 0.3) < 5 * 0.3 / np.sqrt(2 * np.size(written))
 
 
-def test_point_files_hold_the_targets(made: Made) -> None:
+def test_point_files_hold_the_targets(survey: SimulatedSurvey) -> None:
     for name, role in (("gcp_list.txt", "control"), ("checkpoints.txt", "check")):
-        assert (made.folder / name).read_text("utf-8").splitlines()[0] == "EPSG:4979"
-        rows = made.points(name)
+        assert (survey.folder / name).read_text("utf-8").splitlines()[0] == "EPSG:4979"
+        rows = survey.points(name)
         expected = [
             (target.name, mark.image, mark.written_x_px, mark.written_y_px)
-            for target in made.truth.targets if target.role == role for mark in target.marks
+            for target in survey.truth.targets if target.role == role for mark in target.marks
         ]  # fmt: skip
         assert [(row[6], row[5], float(row[3]), float(row[4])) for row in rows] == expected
-        places = {target.name: target.position_in_geo for target in made.truth.targets}
+        places = {target.name: target.position_in_geo for target in survey.truth.targets}
         lla = np.array([[float(row[1]), float(row[0]), float(row[2])] for row in rows])
-        found = enu_from_lla(lla, made.truth.origin)
+        positions = enu_from_lla(lla, survey.truth.origin)
         # Ten decimals of a degree and five of a metre: below 0.02 mm.
-        np.testing.assert_allclose(found, [places[row[6]] for row in rows], atol=2e-5)
+        np.testing.assert_allclose(positions, [places[row[6]] for row in rows], atol=2e-5)
 
 
 def test_targets_are_in_the_photographs(tmp_path: Path) -> None:
-    """The boards that were painted lie where the marks say: two white quarters across from each other."""
-    made = Made(tmp_path / "survey", size="320x240", samples="4", images=3, target_size=4.0, noise=0.0)
-    east, north, _ = fly_survey(made.config).world.scene.axes
+    """Boards in the photographs lie at their marks: two white quarters across from each other."""
+    survey = SimulatedSurvey(tmp_path / "survey", size="320x240", samples="4", images=3, target_size=4.0, noise=0.0)
+    east, north, _ = fly_survey(survey.options).world.scene.axes
     contrasts = []
-    for target in made.truth.targets:
+    for target in survey.truth.targets:
         if target.surface == "wall":  # those boards stand; the others lie, along the axes of the town
             continue
         quarters = np.array(target.position_in_geo) + np.array(
             [east + north, -east - north, east - north, north - east]
         )
         for mark in target.marks:
-            i = made.truth.images.index(mark.image)
-            pixels = made.project(i, quarters).astype(np.float32) - np.float32(0.5)
-            found = cv2.remap(made.image(i), pixels[:, :1], pixels[:, 1:], cv2.INTER_LINEAR).ravel().astype(float)
-            contrasts.append(found[:2].min() - found[2:].max())
+            i = survey.truth.images.index(mark.image)
+            pixels = survey.project(i, quarters).astype(np.float32) - np.float32(0.5)
+            grey = cv2.remap(survey.image(i), pixels[:, :1], pixels[:, 1:], cv2.INTER_LINEAR).ravel().astype(float)
+            contrasts.append(grey[:2].min() - grey[2:].max())
     assert len(contrasts) > 10
     assert np.median(contrasts) > 40
 
 
-def test_trajectory_is_truth_and_errors(made: Made) -> None:
-    found = enu_from_lla(made.recorded_positions(), made.truth.origin)
-    rows = made.table("trajectory.csv")
+def test_trajectory_is_truth_and_errors(survey: SimulatedSurvey) -> None:
+    positions = enu_from_lla(survey.recorded_positions(), survey.truth.origin)
+    rows = survey.table("trajectory.csv")
     assert list(rows[0]) == [
         "image", "timestamp", "latitude", "longitude", "altitude", "yaw", "pitch", "roll",
         "sigma_e", "sigma_n", "sigma_u",
     ]  # fmt: skip
-    navigation = made.truth.navigation
+    navigation = survey.truth.navigation
     body_from_cam = np.array(navigation.cam_from_body).T
-    geo_from_body = np.swapaxes(made.cam_from_enu, 1, 2) @ body_from_cam.T
-    antenna = made.centers + geo_from_body @ np.array(navigation.antenna_in_body_m)
-    np.testing.assert_allclose(found - made.truth.fix_errors, antenna, atol=2e-4)
-    size = np.linalg.norm(made.truth.fix_errors, axis=1)
-    wrong = [name in navigation.wrong_images for name in made.truth.images]
+    geo_from_body = np.swapaxes(survey.cam_from_enu, 1, 2) @ body_from_cam.T
+    antenna = survey.centers + geo_from_body @ np.array(navigation.antenna_in_body_m)
+    np.testing.assert_allclose(positions - survey.truth.fix_errors, antenna, atol=2e-4)
+    size = np.linalg.norm(survey.truth.fix_errors, axis=1)
+    wrong = [name in navigation.wrong_images for name in survey.truth.images]
     assert sum(wrong) == round(0.15 * 8)
     assert (size[wrong] > 9).all()
     assert (size[~np.array(wrong)] < 6 * 0.08).all()
     angles = np.array([[float(row[key]) for key in ("yaw", "pitch", "roll")] for row in rows])
-    error = log_so3(made.cam_from_enu @ geo_from_cam(angles))
+    error = log_so3(survey.cam_from_enu @ geo_from_cam(angles))
     assert np.degrees(np.abs(error)).max() < 5 * 0.5
 
 
-def test_photographs_carry_the_same_position(made: Made) -> None:
-    recorded = made.recorded_positions()
-    for name, (lat, lon, alt) in zip(made.truth.images, recorded, strict=True):
-        data = (made.folder / "images" / name).read_bytes()
+def test_photographs_carry_the_same_position(survey: SimulatedSurvey) -> None:
+    recorded = survey.recorded_positions()
+    for name, (lat, lon, alt) in zip(survey.truth.images, recorded, strict=True):
+        data = (survey.folder / "images" / name).read_bytes()
         tags = exifread.process_file(io.BytesIO(data), details=False)
-        found = []
+        degrees = []
         for key, sign in (("Latitude", "S"), ("Longitude", "W")):
             whole, minutes, seconds = (float(part) for part in tags[f"GPS GPS{key}"].values)
             negative = str(tags[f"GPS GPS{key}Ref"]) == sign
-            found.append((whole + minutes / 60 + seconds / 3600) * (-1 if negative else 1))
-        np.testing.assert_allclose(found, [lat, lon], atol=1e-9)
+            degrees.append((whole + minutes / 60 + seconds / 3600) * (-1 if negative else 1))
+        np.testing.assert_allclose(degrees, [lat, lon], atol=1e-9)
         assert f'GpsLatitude="{lat:.9f}"'.encode() in data
         assert f'GpsLongitude="{lon:.9f}"'.encode() in data
         height = float(tags["GPS GPSAltitude"].values[0]) * (-1 if tags["GPS GPSAltitudeRef"].values[0] else 1)
         assert height == pytest.approx(alt, abs=2e-4)
 
 
-def test_bag_says_the_same_as_the_tables(made: Made) -> None:
+def test_bag_says_the_same_as_the_tables(survey: SimulatedSurvey) -> None:
     fixes, images, count = {}, {}, 0
-    with AnyReader([made.folder / "bag"]) as reader:
+    with AnyReader([survey.folder / "bag"]) as reader:
         for connection, _, raw in reader.messages():
             message = reader.deserialize(raw, connection.msgtype)
             count += 1
@@ -179,81 +179,81 @@ def test_bag_says_the_same_as_the_tables(made: Made) -> None:
                     fixes[stamp] = (message.latitude, message.longitude, message.altitude)
                 else:
                     images[stamp] = bytes(message.data)
-    assert count == made.summary.bag_messages
-    assert list(images) == list(made.truth.stamp_ns)
+    assert count == survey.summary.bag_messages
+    assert list(images) == list(survey.truth.stamp_ns)
     for stamp, name, recorded in zip(
-        made.truth.stamp_ns, made.truth.images, made.recorded_positions(), strict=True
+        survey.truth.stamp_ns, survey.truth.images, survey.recorded_positions(), strict=True
     ):
-        assert images[stamp] == (made.folder / "images" / name).read_bytes()
+        assert images[stamp] == (survey.folder / "images" / name).read_bytes()
         # Both clocks agree and photographs fall on whole fixes: no interpolation comes between. 9 decimals: 0.1 mm.
         np.testing.assert_allclose(fixes[stamp][:2], recorded[:2], atol=1e-9)
         assert fixes[stamp][2] == pytest.approx(recorded[2], abs=1e-4)
-    rows = made.table("gnss.csv")
+    rows = survey.table("gnss.csv")
     assert len(rows) == len(fixes)
     assert [round(float(row["timestamp"]) * 10) for row in rows] == [stamp // 100_000_000 for stamp in fixes]
 
 
-def test_marks_fit_the_photographs_and_the_bag(made: Made, tmp_path: Path) -> None:
+def test_marks_fit_the_photographs_and_the_bag(survey: SimulatedSurvey, tmp_path: Path) -> None:
     """One gcp_list.txt serves both: the photographs are named as a bag's frames."""
-    points = {"gcp": made.folder / "gcp_list.txt", "checkpoints": made.folder / "checkpoints.txt"}
-    from_bag, _ = survey_and_track(IngestOptions(bag=made.folder / "bag", **points), tmp_path / "frames")
-    from_folder = build_survey(IngestOptions(images=made.folder / "images", **points))
+    points = {"gcp": survey.folder / "gcp_list.txt", "checkpoints": survey.folder / "checkpoints.txt"}
+    from_bag, _ = survey_and_track(IngestOptions(bag=survey.folder / "bag", **points), tmp_path / "frames")
+    from_folder = build_survey(IngestOptions(images=survey.folder / "images", **points))
     assert [image.name for image in from_bag.images] == [image.name for image in from_folder.images]
     marks = [
-        {point.name: point.marks for point in (*one.control_points, *one.check_points)}
-        for one in (from_bag, from_folder)
+        {point.name: point.marks for point in (*ingested.control_points, *ingested.check_points)}
+        for ingested in (from_bag, from_folder)
     ]
     assert marks[0] == marks[1]
-    assert len(marks[0]) == sum(len(target.marks) > 1 for target in made.truth.targets) > 5
+    assert len(marks[0]) == sum(len(target.marks) > 1 for target in survey.truth.targets) > 5
 
 
-def test_depth_lies_on_the_surface(made: Made) -> None:
+def test_depth_lies_on_the_surface(survey: SimulatedSurvey) -> None:
     """Targets seen in a photograph have the depth of its depth map, and two maps agree on the ground."""
     gaps = []
-    for target in made.truth.targets:
+    for target in survey.truth.targets:
         for mark in target.marks:
-            i = made.truth.images.index(mark.image)
-            depth = np.load(made.folder / "depth" / f"{Path(mark.image).stem}.npy", allow_pickle=False)
+            i = survey.truth.images.index(mark.image)
+            depth = np.load(survey.folder / "depth" / f"{Path(mark.image).stem}.npy", allow_pickle=False)
             assert depth.dtype == np.float32
             row, column = int(mark.y_px), int(mark.x_px)
-            ray = ray_of(made, column + 0.5, row + 0.5)
-            point = made.centers[i] + made.cam_from_enu[i].T @ (ray * float(depth[row, column]))
+            ray = ray_of(survey, column + 0.5, row + 0.5)
+            point = survey.centers[i] + survey.cam_from_enu[i].T @ (ray * float(depth[row, column]))
             gaps.append(np.linalg.norm(point - np.array(target.position_in_geo)))
     # A pixel is about 0.8 m wide here, and slanted surfaces stretch it; a wrong surface would be many metres off.
     assert np.median(gaps) < 0.7
     assert np.mean(np.array(gaps) > 4) < 0.05
 
 
-def ray_of(made: Made, x: float, y: float) -> np.ndarray:
-    xy = made.camera.cam_from_img(np.array([x, y]))
+def ray_of(survey: SimulatedSurvey, x: float, y: float) -> np.ndarray:
+    xy = survey.camera.cam_from_img(np.array([x, y]))
     assert xy is not None
     return np.array([xy[0], xy[1], 1.0])
 
 
 def test_same_seed_same_bytes_other_seed_other_survey(tmp_path: Path) -> None:
     options: dict[str, Any] = {"images": 3, "bag": "mcap", "depth": True, "flight": "grid"}
-    Made(tmp_path / "a", **options)
-    Made(tmp_path / "b", **options, threads=1)
+    SimulatedSurvey(tmp_path / "a", **options)
+    SimulatedSurvey(tmp_path / "b", **options, threads=1)
     names = sorted(str(path.relative_to(tmp_path / "a")) for path in (tmp_path / "a").rglob("*") if path.is_file())
     assert len(names) == 3 + 3 + 2 + 6
     same, different, missing = filecmp.cmpfiles(tmp_path / "a", tmp_path / "b", names, shallow=False)
     assert (sorted(same), different, missing) == (names, [], [])
-    Made(tmp_path / "c", **options, seed=1)
+    SimulatedSurvey(tmp_path / "c", **options, seed=1)
     names = [name for name in names if not name.endswith((".txt", ".yaml"))]
     same, _, _ = filecmp.cmpfiles(tmp_path / "a", tmp_path / "c", names, shallow=False)
     assert same == []
 
 
-def test_flight_without_photographs_is_that_of_the_survey(made: Made, tmp_path: Path) -> None:
-    write_trajectory(tmp_path / "trajectory.csv", fly_survey(made.config).recording.photos)
-    assert (tmp_path / "trajectory.csv").read_bytes() == (made.folder / "trajectory.csv").read_bytes()
+def test_flight_without_photographs_is_that_of_the_survey(survey: SimulatedSurvey, tmp_path: Path) -> None:
+    write_trajectory(tmp_path / "trajectory.csv", fly_survey(survey.options).recording.photos)
+    assert (tmp_path / "trajectory.csv").read_bytes() == (survey.folder / "trajectory.csv").read_bytes()
 
 
-def test_receivers_record_the_same_flight(made: Made) -> None:
-    other = fly_survey(made.config.model_copy(update={"gnss": "consumer"})).recording
-    assert other.truth.centers == made.truth.centers
-    assert other.truth.targets == made.truth.targets
-    assert other.truth.fix_errors != made.truth.fix_errors
+def test_receivers_record_the_same_flight(survey: SimulatedSurvey) -> None:
+    other = fly_survey(survey.options.model_copy(update={"gnss": "consumer"})).recording
+    assert other.truth.centers == survey.truth.centers
+    assert other.truth.targets == survey.truth.targets
+    assert other.truth.fix_errors != survey.truth.fix_errors
 
 
 def test_neighbours_match_by_sift() -> None:
@@ -262,69 +262,71 @@ def test_neighbours_match_by_sift() -> None:
     renderer = Renderer(world.scene, world.lens, 4)
     poses, gains = world.poses[4:6], (1.0, 1.15)
     sift = cv2.SIFT_create(3000)
-    found = []
+    features = []
     for pose, gain in zip(poses, gains, strict=True):
         rgb = renderer.photograph(pose, Sensor(gain, (1.0, 1.0, 1.0), 1.0), np.random.default_rng(int(100 * gain)))
         keys, descriptors = sift.detectAndCompute(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), None)
-        found.append((np.array([key.pt for key in keys]) + 0.5, descriptors))
-    nearest = cv2.BFMatcher().knnMatch(found[0][1], found[1][1], k=2)
+        features.append((np.array([key.pt for key in keys]) + 0.5, descriptors))
+    nearest = cv2.BFMatcher().knnMatch(features[0][1], features[1][1], k=2)
     good = np.array([(m.queryIdx, m.trainIdx) for m, n in nearest if m.distance < 0.8 * n.distance])
     rays = [
         world.lens.directions(keys[good[:, k]]) @ pose.geo_from_cam.T
-        for k, ((keys, _), pose) in enumerate(zip(found, poses, strict=True))
+        for k, ((keys, _), pose) in enumerate(zip(features, poses, strict=True))
     ]
     baseline = poses[1].center - poses[0].center
     normals = np.cross(baseline, rays[0])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     off_plane = np.einsum("ni,ni->n", rays[1], normals) / np.linalg.norm(rays[1], axis=1)
     inliers = np.abs(off_plane) * world.lens.focal_px < 1.5
-    assert len(found[0][0]) > 1000
+    assert len(features[0][0]) > 1000
     assert inliers.sum() > 200
     assert inliers.mean() > 0.6
 
 
 @pytest.mark.parametrize("origin", ["89.99,10,5", "-90,0,2800", "0,180,0", "12.5,-179.9999,-400"])
 def test_anywhere_on_earth(tmp_path: Path, origin: str) -> None:
-    made = Made(tmp_path / "survey", origin=origin, images=3, targets=0, sigma_attitude=0.0, gnss="rtk")
+    survey = SimulatedSurvey(
+        tmp_path / "survey", origin=origin, images=3, targets=0, sigma_attitude=0.0, gnss="rtk"
+    )
     lat, lon, alt = (float(part) for part in origin.split(","))
-    found = enu_from_lla(made.recorded_positions(), Origin(lat_deg=lat, lon_deg=lon, alt_m=alt))
-    np.testing.assert_allclose(found, made.centers, atol=0.15)
+    positions = enu_from_lla(survey.recorded_positions(), Origin(lat_deg=lat, lon_deg=lon, alt_m=alt))
+    np.testing.assert_allclose(positions, survey.centers, atol=0.15)
     # Yaw is against the north of the place, which differs from the origin's near a pole.
-    rows = made.table("trajectory.csv")
-    for row, rotation, place in zip(rows, made.cam_from_enu, found, strict=True):
+    rows = survey.table("trajectory.csv")
+    for row, rotation, place in zip(rows, survey.cam_from_enu, positions, strict=True):
         angles = [float(row[key]) for key in ("yaw", "pitch", "roll")]
         look = geo_from_cam(angles)[:, 2]
-        ahead = lla_from_enu(place + 5 * rotation[2], made.truth.origin)
-        here = Origin(
-            **dict(zip(("lat_deg", "lon_deg", "alt_m"), lla_from_enu(place, made.truth.origin), strict=True))
+        ahead = lla_from_enu(place + 5 * rotation[2], survey.truth.origin)
+        place_origin = Origin(
+            **dict(zip(("lat_deg", "lon_deg", "alt_m"), lla_from_enu(place, survey.truth.origin), strict=True))
         )
-        np.testing.assert_allclose(enu_from_lla(ahead, here), 5 * look, atol=1e-4)
+        np.testing.assert_allclose(enu_from_lla(ahead, place_origin), 5 * look, atol=1e-4)
 
 
 def test_without_exif_and_targets(tmp_path: Path) -> None:
-    made = Made(tmp_path / "survey", exif=False, targets=0, images=3, lens="pinhole", gnss="consumer")
-    for name in made.truth.images:
-        data = (made.folder / "images" / name).read_bytes()
+    survey = SimulatedSurvey(tmp_path / "survey", exif=False, targets=0, images=3, lens="pinhole", gnss="consumer")
+    for name in survey.truth.images:
+        data = (survey.folder / "images" / name).read_bytes()
         assert b"Exif" not in data
         assert b"drone-dji" not in data
-    assert made.points("gcp_list.txt") == made.points("checkpoints.txt") == []
-    assert not (made.folder / "bag").exists()
-    assert made.truth.lens.model == "SIMPLE_PINHOLE"
+    assert survey.points("gcp_list.txt") == survey.points("checkpoints.txt") == []
+    assert not (survey.folder / "bag").exists()
+    assert survey.truth.lens.model == "SIMPLE_PINHOLE"
 
 
 def test_only_a_simulation_is_replaced(tmp_path: Path) -> None:
     folder = tmp_path / "survey"
     folder.mkdir()
-    config = SimulateOptions(**{**SMALL, "images": 3, "targets": 0})
-    simulate(config, folder)  # an empty folder may be used
+    options = SimulateOptions(**{**SMALL, "images": 3, "targets": 0})
+    simulate(options, folder)  # an empty folder may be used
     with pytest.raises(InputError, match="--force"):
-        simulate(config, folder)
-    simulate(config, folder, overwrite=True)
+        simulate(options, folder)
+    simulate(options, folder, overwrite=True)
     other = tmp_path / "thesis"
     other.mkdir()
     (other / "chapter.txt").write_text("years of work", encoding="utf-8")
     with pytest.raises(InputError, match="something other"):
-        simulate(config, other, overwrite=True)
+        simulate(options, other, overwrite=True)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["survey", "thesis"]
 
 
@@ -354,8 +356,8 @@ def test_bad_options_are_named(options: dict[str, Any], field: str) -> None:
         resolve(SimulateOptions, {}, options, Path("georef.toml"))
 
 
-def test_truth_is_plain_json(made: Made) -> None:
-    document = json.loads((made.folder / "truth.json").read_text("utf-8"))
+def test_truth_is_plain_json(survey: SimulatedSurvey) -> None:
+    document = json.loads((survey.folder / "truth.json").read_text("utf-8"))
     assert len(document["centers"]) == len(document["cam_from_enu"]) == len(document["images"]) == 8
     rotations = np.array(document["cam_from_enu"])
     np.testing.assert_allclose(rotations @ np.swapaxes(rotations, 1, 2), [np.eye(3)] * 8, atol=1e-12)

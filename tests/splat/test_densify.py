@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from pipelines.splat.densify import Change, DefaultSettings, DefaultStrategy
+from pipelines.splat.densify import DefaultSettings, DefaultStrategy, DensityEdit
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.optimizer import GaussianAdam
 from pipelines.splat.rasterizer.api import Pinhole, ScreenStats
@@ -54,7 +54,7 @@ def test_threshold_is_in_normalised_device_coordinates() -> None:
     gradient = torch.tensor([[2.1e-6, 0], [1.9e-6, 0], [0, 4.1e-6], [0, 3.9e-6]])
     adam, strategy = setup(gaussians([SMALL_M] * 4))
     strategy.observe(pull(gradient), CAMERA)
-    assert strategy.update(10, adam) == Change(cloned=2)
+    assert strategy.update(10, adam) == DensityEdit(cloned=2)
 
 
 def test_gradient_is_the_mean_over_the_views_that_saw_it() -> None:
@@ -62,14 +62,14 @@ def test_gradient_is_the_mean_over_the_views_that_saw_it() -> None:
     strategy.observe(pull(torch.tensor([[3e-6, 0], [3e-6, 0]])), CAMERA)
     strategy.observe(pull(torch.tensor([[0.5e-6, 0]]), rows=torch.tensor([1])), CAMERA)
     # Row 0 has a mean of 3e-6, row 1 of 1.75e-6.
-    assert strategy.update(10, adam) == Change(cloned=1)
+    assert strategy.update(10, adam) == DensityEdit(cloned=1)
     assert sorted(adam.gaussians.sh[:, 0, 0].tolist()) == [0, 0, 1]
 
 
 def test_small_ones_are_cloned_and_large_ones_split() -> None:
     adam, strategy = setup(gaussians([SMALL_M, LARGE_M, SMALL_M]))
     strategy.observe(pull(hot(3, [0, 1])), CAMERA)
-    assert strategy.update(10, adam) == Change(cloned=1, split=1)
+    assert strategy.update(10, adam) == DensityEdit(cloned=1, split=1)
     after = adam.gaussians
     label, sigma = after.sh[:, 0, 0], after.log_scales[:, 0].exp()
     assert sorted(label.tolist()) == [0, 0, 1, 1, 2]
@@ -99,8 +99,8 @@ def test_transparent_and_oversized_ones_are_removed() -> None:
     start = gaussians([SMALL_M, SMALL_M, 1.1])
     start.logit_opacities[1] = math.log(0.004 / 0.996)
     adam, strategy = setup(start, replace(SETTINGS, prune_scale_from=10))
-    assert strategy.update(10, adam) == Change(pruned=1)  # the size counts later
-    assert strategy.update(20, adam) == Change(pruned=1)
+    assert strategy.update(10, adam) == DensityEdit(pruned=1)  # the size counts later
+    assert strategy.update(20, adam) == DensityEdit(pruned=1)
     assert adam.gaussians.sh[:, 0, 0].tolist() == [0]
 
 
@@ -108,10 +108,10 @@ def test_limit_takes_the_largest_gradients_first() -> None:
     adam, strategy = setup(gaussians([SMALL_M] * 4), replace(SETTINGS, max_gaussians=6))
     gradient = torch.tensor([[3e-6, 0], [9e-6, 0], [5e-6, 0], [7e-6, 0]])
     strategy.observe(pull(gradient), CAMERA)
-    assert strategy.update(10, adam) == Change(cloned=2)
+    assert strategy.update(10, adam) == DensityEdit(cloned=2)
     assert sorted(adam.gaussians.sh[:, 0, 0].tolist()) == [0, 1, 1, 2, 3, 3]
     strategy.observe(pull(hot(6, [0, 1, 2])), CAMERA)
-    assert strategy.update(20, adam) == Change()
+    assert strategy.update(20, adam) == DensityEdit()
 
 
 def test_moments_follow_their_gaussians() -> None:
@@ -134,7 +134,7 @@ def test_reset_caps_the_opacities() -> None:
     adam, strategy = setup(gaussians([SMALL_M] * 3, opacity=0.5), replace(SETTINGS, every=7, reset_every=10))
     with torch.no_grad():
         adam.gaussians.logit_opacities[1] = -6.0
-    assert strategy.update(10, adam) == Change(opacity_reset=True)
+    assert strategy.update(10, adam) == DensityEdit(opacity_reset=True)
     opacity = torch.sigmoid(adam.gaussians.logit_opacities)
     torch.testing.assert_close(opacity, torch.tensor([0.01, 1 / (1 + math.exp(6)), 0.01]))
 
@@ -143,8 +143,8 @@ def test_nothing_happens_outside_the_schedule() -> None:
     settings = replace(SETTINGS, start=20, stop=50, reset_every=30)
     adam, strategy = setup(gaussians([SMALL_M] * 3), settings)
     strategy.observe(pull(hot(3, [0, 1, 2])), CAMERA)
-    assert [strategy.update(iteration, adam) for iteration in (10, 20, 25, 55, 60)] == [Change()] * 5
-    assert strategy.update(40, adam) == Change(cloned=3)
+    assert [strategy.update(iteration, adam) for iteration in (10, 20, 25, 55, 60)] == [DensityEdit()] * 5
+    assert strategy.update(40, adam) == DensityEdit(cloned=3)
 
 
 def test_same_seed_same_gaussians_and_restored_state_continues_exactly() -> None:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from pipelines.splat.densify import Change, DefaultSettings
+from pipelines.splat.contributions import Probe, ViewContributions, view_contributions
+from pipelines.splat.densify import DefaultSettings, DensityEdit
 from pipelines.splat.densify_fast import FastSettings, FastStrategy
-from pipelines.splat.evidence import Evidence, Probe, evidence
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.optimizer import GaussianAdam
 from pipelines.splat.rasterizer.api import RasterSettings, ScreenStats
@@ -28,9 +28,9 @@ def setup(count: int = 4) -> tuple[GaussianAdam, FastStrategy]:
 
 
 def probe(*views: tuple[list[float], list[float]]) -> Probe:
-    def look(count: int, generator: torch.Generator) -> list[Evidence]:
+    def look(count: int, generator: torch.Generator) -> list[ViewContributions]:
         assert count == FAST.views
-        return [Evidence(torch.tensor(weight), torch.tensor(error)) for weight, error in views]
+        return [ViewContributions(torch.tensor(weight), torch.tensor(error)) for weight, error in views]
 
     return look
 
@@ -43,7 +43,7 @@ def test_only_what_views_agree_to_be_wrong_is_added_to() -> None:
     adam, strategy = setup()
     # All four are pulled. 0 is wrong in both views, 1 in one of two, 2 in the only one that sees it, 3 in none.
     seen = probe(([9.0, 9.0, 0.0, 9.0], [1.2, 1.8, 0.0, 0.1]), ([9.0, 9.0, 9.0, 9.0], [1.2, 0.0, 1.1, 0.1]))
-    assert strategy.update(10, adam, seen) == Change(cloned=2)
+    assert strategy.update(10, adam, seen) == DensityEdit(cloned=2)
     assert labels(adam) == [0, 0, 1, 2, 2, 3]
 
 
@@ -51,16 +51,16 @@ def test_what_no_view_would_miss_goes_if_enough_views_saw_it() -> None:
     adam, strategy = setup()
     # 0 is needed by one view, 1 by none of two, 2 was hardly seen by one alone, 3 was not seen.
     seen = probe(([0.1, 0.4, 0.2, 0.0], [0.0] * 4), ([2.0, 0.4, 0.0, 0.0], [0.0] * 4))
-    assert strategy.update(10, adam, seen) == Change(pruned=1)
+    assert strategy.update(10, adam, seen) == DensityEdit(pruned=1)
     assert labels(adam) == [0, 2, 3]
 
 
 def test_after_the_last_addition_it_only_removes() -> None:
     adam, strategy = setup()
     seen = probe(([9.0, 0.1, 9.0, 9.0], [9.0] * 4), ([9.0, 0.1, 9.0, 9.0], [9.0] * 4))
-    assert strategy.update(70, adam, seen) == Change()
-    assert strategy.update(80, adam, seen) == Change(pruned=1)
-    assert strategy.update(120, adam, seen) == Change()
+    assert strategy.update(70, adam, seen) == DensityEdit()
+    assert strategy.update(80, adam, seen) == DensityEdit(pruned=1)
+    assert strategy.update(120, adam, seen) == DensityEdit()
 
 
 def test_it_cannot_work_without_views() -> None:
@@ -69,20 +69,20 @@ def test_it_cannot_work_without_views() -> None:
         strategy.update(10, adam)
 
 
-def test_evidence_is_what_each_gaussian_adds_to_the_pixels() -> None:
+def test_contributions_are_what_each_gaussian_adds_to_the_pixels() -> None:
     gaussians = tiny.true_gaussians(12)
     error = torch.zeros(48, 64)
     error[:, :32] = 0.5
     error[:, 32:] = 0.02  # below a tenth of the largest
-    found = evidence(gaussians, POSE, tiny.PINHOLE, error, CpuRasterizer())
+    contributions = view_contributions(gaussians, POSE, tiny.PINHOLE, error, CpuRasterizer())
 
     def alpha(part: Gaussians) -> torch.Tensor:
         return CpuRasterizer().render(part, POSE, tiny.PINHOLE, RasterSettings(sh_degree=0)).alpha
 
     # Σ over Gaussians of w is the image's alpha, and a lone Gaussian's weight is its own alpha.
     whole = alpha(gaussians)
-    assert float(found.weight_px.sum()) == pytest.approx(float(whole.sum()), rel=1e-4)
-    assert float(found.high_error_px.sum()) == pytest.approx(float(whole[:, :32].sum()), rel=1e-4)
+    assert float(contributions.weight_px.sum()) == pytest.approx(float(whole.sum()), rel=1e-4)
+    assert float(contributions.high_error_px.sum()) == pytest.approx(float(whole[:, :32].sum()), rel=1e-4)
     lone = gaussians.select(torch.tensor([3]))
-    single = evidence(lone, POSE, tiny.PINHOLE, error, CpuRasterizer())
+    single = view_contributions(lone, POSE, tiny.PINHOLE, error, CpuRasterizer())
     assert float(single.weight_px[0]) == pytest.approx(float(alpha(lone).sum()), rel=1e-4)

@@ -18,7 +18,7 @@ SETTINGS = McmcSettings(start=0, stop=100, every=10, growth=0.05, noise=0.0, max
 
 
 def row(opacities: list[float], sigma_m: float = 0.2) -> Gaussians:
-    """Gaussians 1 m apart, 5 m ahead; the first harmonic says which is which."""
+    """Return Gaussians 1 m apart, 5 m ahead; the first harmonic identifies each."""
     count = len(opacities)
     place = torch.arange(count, dtype=torch.float32) - (count - 1) / 2
     return Gaussians(
@@ -42,16 +42,16 @@ def exact_overlap(opacity: float, n: int) -> float:
 
 @pytest.mark.parametrize(("opacity", "n"), [(0.3, 1), (0.9, 2), (0.05, 7), (0.5, 12), (0.01, 20)])
 def test_the_sum_of_eq_9_is_the_integral(opacity: float, n: int) -> None:
-    found = float(_overlap(torch.tensor([opacity], dtype=torch.float64), torch.tensor([n])))
-    assert found == pytest.approx(exact_overlap(opacity, n), rel=1e-9)
+    overlap = float(_overlap(torch.tensor([opacity], dtype=torch.float64), torch.tensor([n])))
+    assert overlap == pytest.approx(exact_overlap(opacity, n), rel=1e-9)
 
 
 def test_dead_ones_move_to_living_ones_and_the_image_stays_nearly_the_same() -> None:
     start = row([0.9, 0.002, 0.6])
     adam, strategy = GaussianAdam(start, 1.0, 100), McmcStrategy(SETTINGS, 1.0, seed=1)
     before = CpuRasterizer().render(start, torch.eye(4), tiny.PINHOLE, RasterSettings(sh_degree=0)).alpha
-    change = strategy.update(10, adam)
-    assert (change.relocated, change.cloned) == (1, 1)
+    edit = strategy.update(10, adam)
+    assert (edit.relocated, edit.cloned) == (1, 1)
     after = adam.gaussians.detached()
     assert len(after) == 4
     assert not (after.means[:, 0] == 0).any()  # the dead one is gone from its place
@@ -92,7 +92,7 @@ def test_noise_has_the_shape_of_the_gaussian() -> None:
     strategy.observe(stats(list(range(400))), tiny.PINHOLE)
     strategy.update(1, adam)
     sigma = (adam.gaussians.means.detach() - start.means).std(dim=0)
-    # It goes with the variance: (0.2 / 0.002)² = 10⁴ between the axes.
+    # The noise goes with the variance: (0.2 / 0.002)² = 10⁴ between the axes.
     assert float(sigma[0] / sigma[1]) == pytest.approx(1e4, rel=0.3)
 
 

@@ -14,9 +14,9 @@ PINHOLE = Pinhole(24, 18, 20.0, 20.0, 12.0, 9.0)
 def test_depth_is_bilinear_between_pixel_centres() -> None:
     depth = torch.arange(24.0)[None] + 100 * torch.arange(18.0)[:, None]
     xy = torch.tensor([[0.0, 0.0], [0.025, -0.05], [0.7, 0.0]], dtype=torch.float64)
-    found, seen = depth_at(depth, torch.ones(18, 24), xy, PINHOLE)
+    sampled, seen = depth_at(depth, torch.ones(18, 24), xy, PINHOLE)
     # The principal point is the corner between pixels 11 and 12, rows 8 and 9; half a pixel right, one up.
-    np.testing.assert_allclose(found[:2], [11.5 + 850, 12.0 + 750], rtol=1e-6)
+    np.testing.assert_allclose(sampled[:2], [11.5 + 850, 12.0 + 750], rtol=1e-6)
     assert seen.tolist() == [1.0, 1.0, 0.0]
     assert depth_at(depth, torch.full((18, 24), 0.3), xy, PINHOLE)[1].tolist() == [0.0, 0.0, 0.0]
 
@@ -26,5 +26,5 @@ def test_measured_depth_is_the_mean_where_there_is_but_one_surface() -> None:
     # On one surface; one with haze behind it; haze before it, far off; haze alone.
     expected = torch.tensor([[10.01, 10.05, 7.0, 3.0]])
     sigma = torch.tensor([[0.02, 0.2, 4.0, 2.0]])
-    found = measured_depth(median, expected, sigma.square())
-    torch.testing.assert_close(found, torch.tensor([[10.01, 10.0, 10.0, 0.0]]))
+    measured = measured_depth(median, expected, sigma.square())
+    torch.testing.assert_close(measured, torch.tensor([[10.01, 10.0, 10.0, 0.0]]))

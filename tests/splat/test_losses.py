@@ -12,7 +12,7 @@ from pipelines.splat.losses import image_similarity, photometric_loss
 
 
 def reference_terms(x: Tensor, y: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """L1 and SSIM as 3DGS writes them: one full 11×11 convolution per moment."""
+    """Return L1 and SSIM in the form of 3DGS: a full 11×11 convolution for each moment."""
     weight = torch.ones(x.shape[:2], dtype=x.dtype) if mask is None else mask.to(x.dtype)
     x, y = x * weight[..., None], y * weight[..., None]
     offset = torch.arange(11, dtype=x.dtype) - 5

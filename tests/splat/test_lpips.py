@@ -30,7 +30,7 @@ def vgg_layers() -> nn.Sequential:
 
 
 def distance(layers: nn.Sequential, lins: list[Tensor], image: Tensor, target: Tensor) -> Tensor:
-    """The definition: Σ over layers of the mean over pixels of w · (x̂ − ŷ)²."""
+    """Return the distance by its definition: Σ over layers of the mean over pixels of w · (x̂ − ŷ)²."""
     shift, scale = torch.tensor([-0.030, -0.088, -0.188]), torch.tensor([0.458, 0.448, 0.450])
     x, y = (((2 * value - 1 - shift) / scale).permute(2, 0, 1)[None] for value in (image, target))
     total = torch.zeros(())

@@ -34,20 +34,23 @@ def test_all_rows_is_plain_adam() -> None:
     rates = LearningRates()
     ours = GaussianAdam(start, extent_m=5.0, iterations=ITERATIONS, rates=rates)
     theirs = {name: tensor.clone().requires_grad_() for name, tensor in start.tensors().items()}
-    rest = theirs.pop("sh")
-    dc, rest = rest[:, :1].detach().clone().requires_grad_(), rest[:, 1:].detach().clone().requires_grad_()
+    sh_rest = theirs.pop("sh")
+    sh_dc, sh_rest = (
+        sh_rest[:, :1].detach().clone().requires_grad_(),
+        sh_rest[:, 1:].detach().clone().requires_grad_(),
+    )
     groups = [{"params": [tensor], "lr": getattr(rates, name)} for name, tensor in theirs.items()]
-    groups += [{"params": [dc], "lr": rates.sh_dc}, {"params": [rest], "lr": rates.sh_rest}]
+    groups += [{"params": [sh_dc], "lr": rates.sh_dc}, {"params": [sh_rest], "lr": rates.sh_rest}]
     adam = torch.optim.Adam(groups, eps=rates.eps)
     for iteration in range(ITERATIONS):
         fill_gradients(ours.gaussians, iteration)
         for name, tensor in theirs.items():
             tensor.grad = ours.gaussians.tensors()[name].grad.clone()
-        dc.grad, rest.grad = ours.gaussians.sh.grad[:, :1].clone(), ours.gaussians.sh.grad[:, 1:].clone()
+        sh_dc.grad, sh_rest.grad = ours.gaussians.sh.grad[:, :1].clone(), ours.gaussians.sh.grad[:, 1:].clone()
         adam.param_groups[0]["lr"] = 5.0 * 1.6e-4 * 0.01 ** (iteration / ITERATIONS)
         ours.step(iteration)
         adam.step()
-    expected = {**theirs, "sh": torch.cat([dc, rest], dim=1)}
+    expected = {**theirs, "sh": torch.cat([sh_dc, sh_rest], dim=1)}
     for name, tensor in ours.gaussians.tensors().items():
         # Fifty float32 steps of about the learning rate, rounded at the magnitude of the parameter.
         torch.testing.assert_close(tensor, expected[name], rtol=2e-6, atol=2e-6)

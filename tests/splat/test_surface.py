@@ -24,7 +24,7 @@ POSE = torch.eye(4)
 
 
 def wall(tilt_rad: float, thickness_m: float = 0.01, disc_tilt_rad: float | None = None) -> Gaussians:
-    """Opaque discs on a plane 5 m ahead that is turned about the vertical; the discs may be turned otherwise."""
+    """Return opaque discs on a plane 5 m ahead, turned about the vertical; the discs may have another turn."""
     grid = torch.linspace(-4, 4, 33)
     u, v = (axis.reshape(-1) for axis in torch.meshgrid(grid, grid, indexing="ij"))
     turned = tilt_rad if disc_tilt_rad is None else disc_tilt_rad
@@ -128,11 +128,11 @@ def test_depth_is_held_firmly_where_it_is_nearly_right() -> None:
 
 
 def haze(apart_m: float) -> Gaussians:
-    """Two walls that half hide what is behind them, and an opaque third, about 5 m ahead."""
+    """Return two translucent walls before an opaque third, about 5 m ahead."""
     walls = [wall(0.0) for _ in range(3)]
-    for place, each in enumerate(walls):
-        each.means[:, 2] += (place - 1) * apart_m
-        each.logit_opacities[:] = -1.5 if place < 2 else 3.0
+    for place, layer in enumerate(walls):
+        layer.means[:, 2] += (place - 1) * apart_m
+        layer.logit_opacities[:] = -1.5 if place < 2 else 3.0
     return Gaussians.concatenate(walls)
 
 

@@ -1,4 +1,4 @@
-"""Refinement on finer pixels of what a sweep found on coarse ones."""
+"""Refinement on finer pixels of the surface that a sweep gives on coarse ones."""
 
 from __future__ import annotations
 
@@ -6,24 +6,25 @@ import cv2
 import numpy as np
 import pytest
 
+from pipelines.core.types import Float32Array
 from pipelines.geometry.cameras import Pinhole
-from pipelines.stereo.agreement import AgreementSettings, Surface, agreed_depth
-from pipelines.stereo.matching import UNSEEN, Float32Array, MatchSettings
-from pipelines.stereo.refinement import Guess, guess_from, refine
-from pipelines.stereo.sweep import Facing, StereoCamera, StereoView, plane_sweep
+from pipelines.stereo.agreement import AgreementSettings, DepthEstimate, agreed_depth
+from pipelines.stereo.matching import UNSEEN, MatchSettings
+from pipelines.stereo.refinement import SurfacePrior, refine, surface_prior
+from pipelines.stereo.sweep import NormalMap, StereoCamera, StereoView, plane_sweep
 from pipelines.train.depth_maps import StereoOptions
 from tests.stereo_scenes import (
     CAMERA,
     GROUND_M,
     LEVEL,
     TENTH_PX_M,
-    around,
-    facing_up,
+    depth_estimate,
+    level_normals,
     looking_at_origin,
+    neighbours_of,
     painted,
     photographed,
     ring_of_views,
-    swept,
     true_depth,
 )
 
@@ -38,63 +39,65 @@ def fine() -> list[StereoView]:
 
 
 @pytest.fixture(scope="module")
-def coarse() -> list[Surface]:
+def coarse() -> list[DepthEstimate]:
     ring = ring_of_views()
-    return [swept(ring, index) for index in range(5)]
+    return [depth_estimate(ring, index) for index in range(5)]
 
 
 def height_error(camera: StereoCamera, offset_m: Float32Array) -> np.ndarray:
-    return np.asarray(offset_m - facing_up(FINE).offset(camera, true_depth(camera).astype(np.float32)))
+    return np.asarray(offset_m - level_normals(FINE).offset(camera, true_depth(camera).astype(np.float32)))
 
 
-def guessed(camera: StereoCamera, off_m: float) -> Guess:
-    """The truth, but so much higher."""
-    offset = facing_up(FINE).offset(camera, true_depth(camera).astype(np.float32)) + off_m
-    return Guess(facing_up(FINE), offset.astype(np.float32), np.full(offset.shape, STEP_M, np.float32))
+def shifted_truth(camera: StereoCamera, off_m: float) -> SurfacePrior:
+    """Return the true surface, raised by `off_m`."""
+    offset = level_normals(FINE).offset(camera, true_depth(camera).astype(np.float32)) + off_m
+    return SurfacePrior(level_normals(FINE), offset.astype(np.float32), np.full(offset.shape, STEP_M, np.float32))
 
 
 def test_offsets_are_the_inverse_of_depths(fine: list[StereoView]) -> None:
     camera = fine[1].camera
     offset = np.random.default_rng(0).uniform(-3, 9, (FINE.height, FINE.width)).astype(np.float32)
-    which = np.random.default_rng(1).integers(0, 2, offset.shape).astype(np.uint8)
-    facing = Facing(np.array([[0.0, 0.0, 1.0], [0.6, 0.8, 0.0]]), which)
-    depth = facing.depth(camera, offset).astype(np.float32)
-    steep = np.abs(facing.along(camera)) > 0.1
+    index = np.random.default_rng(1).integers(0, 2, offset.shape).astype(np.uint8)
+    normals = NormalMap(np.array([[0.0, 0.0, 1.0], [0.6, 0.8, 0.0]]), index)
+    depth = normals.depth(camera, offset).astype(np.float32)
+    steep = np.abs(normals.offset_per_metre(camera)) > 0.1
     # Depths of 30 m and, of rays along the planes, hundreds, in single precision.
-    np.testing.assert_allclose(facing.offset(camera, depth)[steep], offset[steep], atol=1e-4)
+    np.testing.assert_allclose(normals.offset(camera, depth)[steep], offset[steep], atol=1e-4)
 
 
 @pytest.mark.parametrize("off_m", [0.0, 0.6, -0.6])
 def test_a_guess_within_reach_is_corrected(fine: list[StereoView], off_m: float) -> None:
-    found = refine(fine[2], around(fine, 2), guessed(fine[2].camera, off_m), MatchSettings())
-    error = height_error(fine[2].camera, found.offset_m)[INNER]
-    trusted = found.score[INNER] > AgreementSettings().least_score
+    refined = refine(fine[2], neighbours_of(fine, 2), shifted_truth(fine[2].camera, off_m), MatchSettings())
+    error = height_error(fine[2].camera, refined.offset_m)[INNER]
+    trusted = refined.score[INNER] > AgreementSettings().least_score
     assert trusted.mean() > 0.9
     assert np.median(np.abs(error[trusted])) < TENTH_PX_M / 2  # pixels are half as wide
-    np.testing.assert_array_equal(found.step_m, STEP_M)
+    np.testing.assert_array_equal(refined.step_m, STEP_M)
 
 
 def test_a_guess_out_of_reach_has_no_score(fine: list[StereoView]) -> None:
-    found = refine(fine[2], around(fine, 2), guessed(fine[2].camera, 3.0), MatchSettings())
+    refined = refine(fine[2], neighbours_of(fine, 2), shifted_truth(fine[2].camera, 3.0), MatchSettings())
     # By chance some texture fits itself elsewhere: less than half, and not well.
-    assert (found.score[INNER] > AgreementSettings().least_score).mean() < 0.25
-    assert (found.score[INNER] == UNSEEN).any()
+    assert (refined.score[INNER] > AgreementSettings().least_score).mean() < 0.25
+    assert (refined.score[INNER] == UNSEEN).any()
 
 
-def test_the_ground_beside_a_roof_is_not_taken_for_roof(fine: list[StereoView], coarse: list[Surface]) -> None:
-    """As a sweep of planes does on the same fine pixels."""
+def test_the_ground_beside_a_roof_is_not_taken_for_roof(
+    fine: list[StereoView], coarse: list[DepthEstimate]
+) -> None:
+    """A sweep of planes on the same fine pixels takes the ground for roof."""
     camera = fine[2].camera
     depth = true_depth(camera)
-    height = facing_up(FINE).offset(camera, depth.astype(np.float32))
+    height = level_normals(FINE).offset(camera, depth.astype(np.float32))
     roof = (height > GROUND_M + 3).astype(np.uint8)
     beside = (cv2.dilate(roof, np.ones((9, 9), np.uint8)) > roof)[INNER]
     agreed = agreed_depth(coarse[2], [coarse[index] for index in (0, 1, 3, 4)], AgreementSettings())
-    refined = refine(fine[2], around(fine, 2), guess_from(coarse[2], agreed, camera), MatchSettings())
-    planes = plane_sweep(fine[2], around(fine, 2), [LEVEL], MatchSettings())
+    refined = refine(fine[2], neighbours_of(fine, 2), surface_prior(coarse[2], agreed, camera), MatchSettings())
+    planes = plane_sweep(fine[2], neighbours_of(fine, 2), [LEVEL], MatchSettings())
     trusted = AgreementSettings().least_score
     wrong = [
-        ((np.abs(height_error(camera, found.offset_m)) > 0.5) & (found.score > trusted))[INNER]
-        for found in (refined, planes)
+        ((np.abs(height_error(camera, result.offset_m)) > 0.5) & (result.score > trusted))[INNER]
+        for result in (refined, planes)
     ]
     assert wrong[0][beside].mean() < 0.5 * wrong[1][beside].mean()
     assert wrong[0].mean() < 0.1
@@ -104,7 +107,7 @@ WALL = np.array([np.cos(np.radians(20)), np.sin(np.radians(20)), 0.0])  # throug
 
 
 def _foot_of_a_wall(azimuth_deg: float) -> tuple[StereoView, np.ndarray, np.ndarray]:
-    """A view, its true depth, and where it shows the wall, below which the ground begins."""
+    """Return a view, its true depth, and the mask of the wall, below which the ground begins."""
     rotation, center = looking_at_origin(azimuth_deg, 22.0, 30.0)
     camera = StereoCamera(FINE, rotation, center)
     rays = camera.rays()
@@ -118,42 +121,42 @@ def _foot_of_a_wall(azimuth_deg: float) -> tuple[StereoView, np.ndarray, np.ndar
 
 
 def test_small_windows_leave_the_foot_of_a_wall_where_it_is() -> None:
-    """A wide one lays the surface across the corner, within a reach of some pixels."""
+    """A wide window lays the surface across the corner, within a reach of a few pixels."""
     (view, depth, upright), *others = [_foot_of_a_wall(azimuth) for azimuth in (0, -24, -12, 12, 24)]
-    facing = Facing(np.stack([LEVEL.normal_in_world, WALL]), upright.astype(np.uint8))
-    offset = facing.offset(view.camera, (depth + 0.3).astype(np.float32)).astype(np.float32)
-    guess = Guess(facing, offset, np.full(offset.shape, STEP_M, np.float32))
+    normals = NormalMap(np.stack([LEVEL.normal_in_world, WALL]), upright.astype(np.uint8))
+    offset = normals.offset(view.camera, (depth + 0.3).astype(np.float32)).astype(np.float32)
+    prior = SurfacePrior(normals, offset, np.full(offset.shape, STEP_M, np.float32))
     edge = cv2.morphologyEx(upright.astype(np.uint8), cv2.MORPH_GRADIENT, np.ones((9, 9), np.uint8)) > 0
     wrong = []
     for settings in (StereoOptions().refining, StereoOptions().matching):
-        found = refine(view, [other[0] for other in others], guess, settings)
-        error = np.abs(facing.depth(view.camera, found.offset_m) - depth)
+        refined = refine(view, [other[0] for other in others], prior, settings)
+        error = np.abs(normals.depth(view.camera, refined.offset_m) - depth)
         wrong.append(np.median(error[INNER][edge[INNER]]))
     assert wrong[0] < TENTH_PX_M
     assert wrong[0] < 0.8 * wrong[1]
 
 
-def test_guesses_are_what_views_agree_on(fine: list[StereoView], coarse: list[Surface]) -> None:
+def test_guesses_are_what_views_agree_on(fine: list[StereoView], coarse: list[DepthEstimate]) -> None:
     own = coarse[2]
     agreed = np.zeros((CAMERA.height, CAMERA.width), np.float32)
-    agreed[10:20, 10:20] = facing_up().depth(own.camera, np.full(agreed.shape, 7.0, np.float32))[10:20, 10:20]
-    found = guess_from(own, agreed, fine[2].camera)
-    assert found.offset_m.shape == (FINE.height, FINE.width)
-    np.testing.assert_allclose(found.offset_m[20:40, 20:40], 7.0, atol=1e-4)
+    agreed[10:20, 10:20] = level_normals().depth(own.camera, np.full(agreed.shape, 7.0, np.float32))[10:20, 10:20]
+    prior = surface_prior(own, agreed, fine[2].camera)
+    assert prior.offset_m.shape == (FINE.height, FINE.width)
+    np.testing.assert_allclose(prior.offset_m[20:40, 20:40], 7.0, atol=1e-4)
     # Elsewhere it is the view's own.
     elsewhere = np.s_[60:120, 60:180]
-    own_error = height_error(fine[2].camera, found.offset_m)[elsewhere]
+    own_error = height_error(fine[2].camera, prior.offset_m)[elsewhere]
     assert np.median(np.abs(own_error)) < 2 * TENTH_PX_M  # and half a coarse pixel of slope
-    np.testing.assert_allclose(found.step_m, 0.5 / 3, rtol=1e-6)  # a third of that of the sweep
+    np.testing.assert_allclose(prior.step_m, 0.5 / 3, rtol=1e-6)  # a third of that of the sweep
 
 
-def test_pixels_that_nothing_fits_find_nothing(fine: list[StereoView], coarse: list[Surface]) -> None:
-    empty = Surface(coarse[2].camera, plane_sweep(*_nothing_to_see(), [LEVEL], MatchSettings()))
-    assert np.isnan(empty.swept.offset_m).all()
-    guess = guess_from(empty, np.zeros((CAMERA.height, CAMERA.width), np.float32), fine[2].camera)
-    assert np.isfinite(guess.offset_m).all()
-    found = refine(fine[2], around(fine, 2), guess, MatchSettings())
-    assert (found.score[INNER] > AgreementSettings().least_score).mean() < 0.05
+def test_pixels_that_nothing_fits_find_nothing(fine: list[StereoView], coarse: list[DepthEstimate]) -> None:
+    empty = DepthEstimate(coarse[2].camera, plane_sweep(*_nothing_to_see(), [LEVEL], MatchSettings()))
+    assert np.isnan(empty.sweep.offset_m).all()
+    prior = surface_prior(empty, np.zeros((CAMERA.height, CAMERA.width), np.float32), fine[2].camera)
+    assert np.isfinite(prior.offset_m).all()
+    refined = refine(fine[2], neighbours_of(fine, 2), prior, MatchSettings())
+    assert (refined.score[INNER] > AgreementSettings().least_score).mean() < 0.05
 
 
 def _nothing_to_see() -> tuple[StereoView, list[StereoView]]:
@@ -163,4 +166,4 @@ def _nothing_to_see() -> tuple[StereoView, list[StereoView]]:
 
 def test_refinement_needs_neighbours(fine: list[StereoView]) -> None:
     with pytest.raises(ValueError, match="no neighbours"):
-        refine(fine[2], [], guessed(fine[2].camera, 0.0), MatchSettings())
+        refine(fine[2], [], shifted_truth(fine[2].camera, 0.0), MatchSettings())

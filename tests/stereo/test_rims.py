@@ -13,7 +13,7 @@ HEIGHT, WIDTH, FOCAL = 30, 40, 50.0
 
 
 def plane(tilt_x: float, tilt_y: float, distance_m: float = 100.0) -> np.ndarray:
-    """Depth along z of the plane z + tilt · (x, y) = distance."""
+    """Return the depth along z of the plane z + tilt · (x, y) = distance."""
     v, u = np.mgrid[0:HEIGHT, 0:WIDTH] + 0.5
     x, y = (u - WIDTH / 2) / FOCAL, (v - HEIGHT / 2) / FOCAL
     return (distance_m / (1 + tilt_x * x + tilt_y * y)).astype(np.float32)
@@ -29,10 +29,10 @@ def test_a_plane_has_no_rims_however_steep(tilt: tuple[float, float], reach: int
 def test_the_near_side_of_a_step_is_given_up(reach: int) -> None:
     depth = plane(0.3, 0.5)
     depth[:, :20] *= 0.95  # a roof 5 m before the ground
-    found = without_rims(depth, reach, 0.01)
-    assert (found[:, 20 - reach : 20] == 0).all()
-    np.testing.assert_array_equal(found[:, : 20 - reach], depth[:, : 20 - reach])
-    np.testing.assert_array_equal(found[:, 20:], depth[:, 20:])  # what lies behind is seen beside the edge, too
+    trimmed = without_rims(depth, reach, 0.01)
+    assert (trimmed[:, 20 - reach : 20] == 0).all()
+    np.testing.assert_array_equal(trimmed[:, : 20 - reach], depth[:, : 20 - reach])
+    np.testing.assert_array_equal(trimmed[:, 20:], depth[:, 20:])  # what lies behind is seen beside the edge, too
 
 
 def test_steps_below_the_noise_and_unknown_places_are_no_rims() -> None:

@@ -5,22 +5,22 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipelines.stereo.agreement import AgreementSettings, Surface, agreed_depth
+from pipelines.stereo.agreement import AgreementSettings, DepthEstimate, agreed_depth
 from pipelines.stereo.matching import MatchSettings
-from pipelines.stereo.neighbours import Sightings, best_neighbours, planes_for
-from pipelines.stereo.sweep import Planes, StereoCamera, StereoView, Swept, plane_sweep
+from pipelines.stereo.neighbours import PointVisibility, best_neighbours, planes_for
+from pipelines.stereo.sweep import Planes, StereoCamera, StereoView, SweepResult, plane_sweep
 from tests.stereo_scenes import (
     CAMERA,
     GROUND_M,
     LEVEL,
     ROOF_M,
     TENTH_PX_M,
-    facing_up,
+    depth_estimate,
+    level_normals,
     looking_at_origin,
     painted,
     photographed,
     ring_of_views,
-    swept,
     true_depth,
 )
 
@@ -31,8 +31,8 @@ def ring() -> list[StereoView]:
 
 
 def test_sweep_finds_ground_and_roof(ring: list[StereoView]) -> None:
-    found = swept(ring, 2)
-    depth = found.depth()
+    estimate = depth_estimate(ring, 2)
+    depth = estimate.depth()
     error = (depth - true_depth(ring[2].camera)) * np.abs(ring[2].camera.rays()[..., 2])
     inner = np.s_[8:-8, 8:-8]
     assert np.median(np.abs(error[inner])) < TENTH_PX_M
@@ -41,19 +41,19 @@ def test_sweep_finds_ground_and_roof(ring: list[StereoView]) -> None:
 
 
 def test_views_that_agree_leave_few_errors(ring: list[StereoView]) -> None:
-    surfaces = [swept(ring, index) for index in range(len(ring))]
+    surfaces = [depth_estimate(ring, index) for index in range(len(ring))]
     depth = agreed_depth(surfaces[2], [surfaces[index] for index in (0, 1, 3, 4)], AgreementSettings())
     known = depth > 0
     height_error = (depth - true_depth(ring[2].camera)) * np.abs(ring[2].camera.rays()[..., 2])
     alone = np.abs(surfaces[2].depth() - true_depth(ring[2].camera)) > 0.5
     assert known.mean() > 0.7
     assert (np.abs(height_error[known]) < 0.5).mean() > 0.97
-    # What one view gets wrong, others see differently.
+    # Other views see the errors of one view differently.
     assert (np.abs(height_error[known]) >= 0.5).mean() < 0.5 * alone.mean()
 
 
 def test_what_no_other_view_confirms_is_left_out(ring: list[StereoView]) -> None:
-    own = swept(ring, 2)
+    own = depth_estimate(ring, 2)
     assert not agreed_depth(own, [], AgreementSettings()).any()
 
 
@@ -61,12 +61,12 @@ def test_a_place_that_views_look_through_is_no_surface(ring: list[StereoView]) -
     """Two views that err alike, as beside a roof, against two that see the ground behind."""
     raised = (slice(20, 40), slice(20, 40))
 
-    def flat(index: int, height_m: float) -> Surface:
+    def flat(index: int, height_m: float) -> DepthEstimate:
         camera = ring[index].camera
         offset = np.zeros((CAMERA.height, CAMERA.width), np.float32)
         offset[raised] = height_m
-        one = np.ones_like(offset)
-        return Surface(camera, Swept(facing_up(), offset, one, 0.5 * one, one))
+        ones = np.ones_like(offset)
+        return DepthEstimate(camera, SweepResult(level_normals(), offset, ones, 0.5 * ones, ones))
 
     own, alike, clear = flat(2, 4.0), [flat(2, 4.0), flat(2, 4.0)], [flat(2, 0.0), flat(2, 0.0)]
     assert (agreed_depth(own, alike, AgreementSettings())[raised] > 0).all()
@@ -80,8 +80,8 @@ def test_a_place_that_views_look_through_is_no_surface(ring: list[StereoView]) -
 
 def test_planes_behind_the_camera_are_never_chosen(ring: list[StereoView]) -> None:
     above = Planes(np.array([0.0, 0.0, 1.0]), np.array([31.0, 32.0, 33.0, 0.0]))
-    found = plane_sweep(ring[2], ring[3:5], [above], MatchSettings())
-    assert np.nanmin(np.abs(found.offset_m - 33.0)) > 1  # all on the only plane in front, or none at all
+    sweep = plane_sweep(ring[2], ring[3:5], [above], MatchSettings())
+    assert np.nanmin(np.abs(sweep.offset_m - 33.0)) > 1  # all on the only plane in front, or none at all
 
 
 def test_a_sweep_needs_neighbours_and_planes(ring: list[StereoView]) -> None:
@@ -100,15 +100,15 @@ def grid_points() -> np.ndarray:
 def test_neighbours_are_those_under_good_angles(ring: list[StereoView]) -> None:
     points = grid_points()
     count = len(points)
-    sightings = Sightings(
+    visibility = PointVisibility(
         points,
         np.array([view.camera.center_in_world for view in ring]),
         np.tile(np.arange(count), len(ring)),
         np.repeat(np.arange(len(ring)), count),
     )
-    found = best_neighbours(sightings, 2, np.arange(len(ring)), 2)
-    assert set(found) == {1, 3}  # 13° and less from the scene; the next ones are at 26°
-    assert 5 not in best_neighbours(sightings, 2, np.array([0, 1, 3, 4]), 9)
+    neighbours = best_neighbours(visibility, 2, np.arange(len(ring)), 2)
+    assert set(neighbours) == {1, 3}  # 13° and less from the scene; the next ones are at 26°
+    assert 5 not in best_neighbours(visibility, 2, np.array([0, 1, 3, 4]), 9)
 
 
 def test_planes_follow_the_view(ring: list[StereoView]) -> None:
@@ -139,13 +139,13 @@ def test_from_straight_above_there_are_level_planes_alone() -> None:
     rotation = np.diag([1.0, -1.0, -1.0])
     above = StereoCamera(CAMERA, rotation, np.array([0.0, 0.0, 40.0]))
     side = StereoCamera(CAMERA, rotation, np.array([8.0, 0.0, 40.0]))
-    (found,) = planes_for(above, [side], grid_points())
-    np.testing.assert_allclose(found.normal_in_world, [0, 0, 1])
+    (planes,) = planes_for(above, [side], grid_points())
+    np.testing.assert_allclose(planes.normal_in_world, [0, 0, 1])
 
 
 @pytest.fixture(scope="module")
 def wall() -> tuple[StereoView, list[StereoView], np.ndarray]:
-    """A view down on a wall that is turned by 30°, its neighbours, and the true depth (H, W)."""
+    """Return a view down on a wall that is turned by 30°, its neighbours, and the true depth (H, W)."""
     normal = np.array([np.cos(np.radians(30)), np.sin(np.radians(30)), 0.0])
     side = np.cross([0.0, 0.0, 1.0], normal)
     views, depths = [], []
@@ -159,20 +159,20 @@ def wall() -> tuple[StereoView, list[StereoView], np.ndarray]:
 
 
 def upright(view: StereoView, height_m: tuple[float, float] = (-np.inf, np.inf)) -> Planes:
-    """Planes across a view."""
+    """Return upright planes across a view."""
     ahead = view.camera.cam_from_world[2] * [1, 1, 0]
     return Planes(ahead / np.linalg.norm(ahead), np.arange(-10.0, 10.0, 0.5), height_m)
 
 
 def test_walls_are_found_on_upright_planes(wall: tuple[StereoView, list[StereoView], np.ndarray]) -> None:
-    """Level planes cut it, and see other texture."""
+    """Level planes cut the wall, and see other texture."""
     reference, others, truth = wall
     flat = Planes(LEVEL.normal_in_world, np.arange(-12.0, 12.0, 0.5))
     inner = np.s_[10:-10, 10:-10]
     wrong = []
     for sweeps in ([flat], [flat, upright(reference)]):
-        found = Surface(reference.camera, plane_sweep(reference, others, sweeps, MatchSettings()))
-        wrong.append((np.abs(found.depth() - truth)[inner] > 0.5).mean())
+        estimate = DepthEstimate(reference.camera, plane_sweep(reference, others, sweeps, MatchSettings()))
+        wrong.append((np.abs(estimate.depth() - truth)[inner] > 0.5).mean())
     assert wrong[1] < 0.5 * wrong[0]
     assert wrong[1] < 0.15
 
@@ -183,23 +183,23 @@ def test_only_the_rows_that_may_show_the_scene_are_compared(
     reference, others, truth = wall
     heights = (-4.0, 3.0)
     whole, part = (
-        Surface(reference.camera, plane_sweep(reference, others, [planes], MatchSettings()))
+        DepthEstimate(reference.camera, plane_sweep(reference, others, [planes], MatchSettings()))
         for planes in (upright(reference), upright(reference, heights))
     )
 
     def height(depth: np.ndarray) -> np.ndarray:
         return reference.camera.center_in_world[2] + depth * reference.camera.rays()[..., 2]
 
-    found = height(part.depth())
+    height_m = height(part.depth())
     # Nothing beyond; a parabola goes half a step of 0.5 m from a plane, on rays that fall by 18 m in 34 m.
-    assert np.nanmin(found) > heights[0] - 0.2
-    assert np.nanmax(found) < heights[1] + 0.2
+    assert np.nanmin(height_m) > heights[0] - 0.2
+    assert np.nanmax(height_m) < heights[1] + 0.2
     # Within, planes before and after it are compared as well, and it is what a sweep of all rows finds.
     inner = (height(truth) > heights[0] + 1) & (height(truth) < heights[1] - 1)
     inner &= np.abs(whole.depth() - truth) < 0.3
     assert inner.mean() > 0.05
-    np.testing.assert_allclose(part.swept.offset_m[inner], whole.swept.offset_m[inner], atol=1e-3)
-    np.testing.assert_allclose(part.swept.score[inner], whole.swept.score[inner], atol=1e-3)
+    np.testing.assert_allclose(part.sweep.offset_m[inner], whole.sweep.offset_m[inner], atol=1e-3)
+    np.testing.assert_allclose(part.sweep.score[inner], whole.sweep.score[inner], atol=1e-3)
 
 
 def test_too_few_points_give_no_planes(ring: list[StereoView]) -> None:

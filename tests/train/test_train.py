@@ -32,7 +32,7 @@ from pipelines.train.options import TrainOptions
 from pipelines.train.presets import PRESETS, Preset, effort
 from tests.georef_scenes import squared_error
 from tests.scenes import GEO_FROM_LOCAL, without_fixes
-from tests.splat_scenes import TRAINING, Flight
+from tests.splat_scenes import TRAINING, RenderedFlight
 from tests.threads import single_thread
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -47,7 +47,7 @@ def metrics(workspace: Workspace, folder: str = "train") -> list[dict]:
     return [json.loads(line) for line in lines]
 
 
-def view_psnr(workspace: Workspace, flight: Flight, split: str) -> float:
+def view_psnr(workspace: Workspace, flight: RenderedFlight, split: str) -> float:
     """Mean PSNR of the views of a split, as the trained cameras see them, against renders of the true scene."""
     model, gaussians = load_json(TrainedModel, workspace.path(MODEL)), read_gaussians(workspace.path(GAUSSIANS))
     scene = flight.rendered.scene
@@ -80,7 +80,7 @@ def error_of(workspace: Workspace) -> float:
     return squared_error(truth, found, np.array(record.covariance), np.array(record.pivot))
 
 
-def test_photographs_are_learned(trained: Pairs, flights: list[Flight]) -> None:
+def test_photographs_are_learned(trained: Pairs, flights: list[RenderedFlight]) -> None:
     rows = metrics(trained[0][0])
     assert [row["iteration"] for row in rows] == list(range(5, 151, 5))
     start, end = (np.mean([row["psnr"] for row in part]) for part in (rows[:2], rows[-4:]))
@@ -93,7 +93,7 @@ def test_photographs_are_learned(trained: Pairs, flights: list[Flight]) -> None:
     assert rows[-1]["absolute"] < 3.0  # χ² of three coordinates, less what the fit takes
 
 
-def test_geographic_losses_cost_no_photometric_quality(trained: Pairs, flights: list[Flight]) -> None:
+def test_geographic_losses_cost_no_photometric_quality(trained: Pairs, flights: list[RenderedFlight]) -> None:
     lost = [
         view_psnr(without, flight, "test") - view_psnr(with_geo, flight, "test")
         for (with_geo, without), flight in zip(trained, flights, strict=True)
@@ -158,7 +158,7 @@ def interrupt() -> None:
 
 
 @pytest.fixture(scope="module")
-def uninterrupted(flights: list[Flight]) -> Workspace:
+def uninterrupted(flights: list[RenderedFlight]) -> Workspace:
     workspace = flights[0].workspace("uninterrupted")
     with single_thread():  # as the runs that it is compared with: sums of many threads differ in the last bit
         run_stage(workspace, TRAIN, SHORT)
@@ -191,7 +191,7 @@ def test_resumed_run_ends_as_an_uninterrupted_one(
     assert [row["seconds"] for row in rows] == sorted(row["seconds"] for row in rows)
 
 
-def test_damaged_checkpoint_is_told(flights: list[Flight]) -> None:
+def test_damaged_checkpoint_is_told(flights: list[RenderedFlight]) -> None:
     workspace = flights[0].workspace("damaged")
     with pytest.raises(KilledError):
         run_stage(workspace, TRAIN, SHORT, progress=Signalling(10, kill))
@@ -202,12 +202,12 @@ def test_damaged_checkpoint_is_told(flights: list[Flight]) -> None:
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
-def test_cuda_without_gpu_is_refused(flights: list[Flight]) -> None:
+def test_cuda_without_gpu_is_refused(flights: list[RenderedFlight]) -> None:
     with pytest.raises(BackendUnavailableError, match=r"cuda|CUDA|GPU"):
         run_stage(flights[0].workspace("cuda"), TRAIN, {**SHORT, "backend": "cuda"})
 
 
-def test_wrong_fix_is_named_and_moves_nothing(flights: list[Flight]) -> None:
+def test_wrong_fix_is_named_and_moves_nothing(flights: list[RenderedFlight]) -> None:
     workspace = flights[0].workspace("outlier")
     survey = load_json(Survey, workspace.path(SURVEY))
     images = list(survey.images)
@@ -223,7 +223,7 @@ def test_wrong_fix_is_named_and_moves_nothing(flights: list[Flight]) -> None:
     assert error_of(workspace) < FAR
 
 
-def test_cameras_can_be_held(flights: list[Flight]) -> None:
+def test_cameras_can_be_held(flights: list[RenderedFlight]) -> None:
     workspace = flights[0].workspace("held")
     run_stage(workspace, TRAIN, {**SHORT, "optimize_cameras": False})
     model = load_json(TrainedModel, workspace.path(MODEL))
@@ -235,7 +235,7 @@ def test_cameras_can_be_held(flights: list[Flight]) -> None:
     assert np.linalg.eigvalsh(np.array(model.geo_from_model.covariance)).min() > 0
 
 
-def test_without_any_measurement_the_start_is_kept(flights: list[Flight]) -> None:
+def test_without_any_measurement_the_start_is_kept(flights: list[RenderedFlight]) -> None:
     workspace = flights[0].workspace("blind")
     survey = load_json(Survey, workspace.path(SURVEY))
     names = tuple(image.name for image in survey.images)
@@ -250,7 +250,7 @@ def test_without_any_measurement_the_start_is_kept(flights: list[Flight]) -> Non
     np.testing.assert_allclose(found.translation, initial.geo_from_local.translation, atol=1e-9)
 
 
-def test_lens_follows_the_cameras_and_is_told(trained: Pairs, flights: list[Flight]) -> None:
+def test_lens_follows_the_cameras_and_is_told(trained: Pairs, flights: list[RenderedFlight]) -> None:
     model = load_json(TrainedModel, trained[0][0].path(MODEL))
     (lens,) = model.lenses
     camera = flights[0].rendered.sparse.cameras[lens.camera_id]
@@ -260,7 +260,7 @@ def test_lens_follows_the_cameras_and_is_told(trained: Pairs, flights: list[Flig
     assert 1e-6 < np.abs(moved).max() < 1.0
 
 
-def test_two_cameras_are_needed(flights: list[Flight]) -> None:
+def test_two_cameras_are_needed(flights: list[RenderedFlight]) -> None:
     workspace = flights[0].workspace("test_only")
     survey = load_json(Survey, workspace.path(SURVEY))
     images = tuple(image.model_copy(update={"split": "test"}) for image in survey.images)
@@ -285,7 +285,7 @@ def with_control(workspace: Workspace, offset_m: tuple[float, float, float] = BI
     return workspace
 
 
-def test_evident_bias_is_estimated_and_told(flights: list[Flight]) -> None:
+def test_evident_bias_is_estimated_and_told(flights: list[RenderedFlight]) -> None:
     workspace = with_control(flights[0].workspace("biased"))
     outcome = run_stage(workspace, TRAIN, {**TRAINING, "iterations": 120})
     model = load_json(TrainedModel, workspace.path(MODEL))
@@ -299,7 +299,7 @@ def test_evident_bias_is_estimated_and_told(flights: list[Flight]) -> None:
     assert outcome.manifest.values["control_outliers"] == []
 
 
-def test_every_option_together_trains_and_resumes(flights: list[Flight]) -> None:
+def test_every_option_together_trains_and_resumes(flights: list[RenderedFlight]) -> None:
     whole, broken = (with_control(flights[0].workspace(name)) for name in ("whole", "broken"))
     outcome = run_stage(whole, TRAIN, EVERYTHING)
     with pytest.raises(KilledError):
@@ -317,7 +317,7 @@ def test_every_option_together_trains_and_resumes(flights: list[Flight]) -> None
     assert any("control_by_depth" in row for row in metrics(whole))
 
 
-def test_constant_schedule_starts_at_the_full_weight(flights: list[Flight]) -> None:
+def test_constant_schedule_starts_at_the_full_weight(flights: list[RenderedFlight]) -> None:
     workspace = flights[0].workspace("constant")
     run_stage(workspace, TRAIN, {**SHORT, "iterations": 4, "geo_schedule": "constant"})
     assert [row["geo_weight"] for row in metrics(workspace)] == [0.05, 0.05]

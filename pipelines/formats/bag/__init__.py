@@ -1,1 +1,1 @@
-"""ROS 1 and ROS 2 bags: messages in and out, image decoding."""
+"""ROS 1 and ROS 2 bags: reading and writing of messages, decoding of images."""

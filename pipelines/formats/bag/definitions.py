@@ -1,7 +1,7 @@
 """Layouts of PX4's messages for bags that do not carry their own definitions (sqlite3 bags up to ROS 2 Humble).
 
-After `msg/*.msg` of PX4-Autopilot and px4_msgs. Fields came and went between releases; a message tells by its
-length, and by whether `timestamp_sample` lies close to `timestamp`, which layout it was written by.
+After `msg/*.msg` of PX4-Autopilot and px4_msgs. Fields changed between releases. The length of a message reveals
+its layout, together with the distance of `timestamp_sample` from `timestamp`.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ float32 heading_offset
 float32 heading_accuracy
 float32 rtcm_injection_rate
 uint8 selected_rtcm_instance
-{rest}
+{tail}
 """
 
 _WHOLE = "int32 lat\nint32 lon\nint32 alt\nint32 alt_ellipsoid"
@@ -155,14 +155,14 @@ int8 quality
 
 _SAMPLE = "uint64 timestamp_sample"
 
-# The layouts of each message from the newest, each with the release that it is of, or was first seen in.
+# Layouts of each message from the newest to the oldest, by the release in which the layout first appeared.
 DEFINITIONS: dict[str, dict[str, str]] = {
     "px4_msgs/msg/SensorGps": {
-        "1.17": _GPS.format(**_SINCE_1_16, rest=f"{_RTCM}\n{_ANTENNA}"),
-        "1.16 with quality": _GPS.format(**_SINCE_1_16, rest=f"{_RTCM}\n{_QUALITY}"),
-        "1.16": _GPS.format(**_SINCE_1_16, rest=_RTCM),
-        "1.15": _GPS.format(place=_DEGREES, authentication="", error="", rest=_RTCM),
-        "1.14": _GPS.format(place=_WHOLE, authentication="", error="", rest=""),
+        "1.17": _GPS.format(**_SINCE_1_16, tail=f"{_RTCM}\n{_ANTENNA}"),
+        "1.16 with quality": _GPS.format(**_SINCE_1_16, tail=f"{_RTCM}\n{_QUALITY}"),
+        "1.16": _GPS.format(**_SINCE_1_16, tail=_RTCM),
+        "1.15": _GPS.format(place=_DEGREES, authentication="", error="", tail=_RTCM),
+        "1.14": _GPS.format(place=_WHOLE, authentication="", error="", tail=""),
     },
     "px4_msgs/msg/VehicleAttitude": {
         "1.14": _ATTITUDE.format(sample=_SAMPLE),

@@ -1,4 +1,4 @@
-"""Photographs and calibrations out of ROS messages."""
+"""Decoding of photographs from ROS messages."""
 
 from __future__ import annotations
 
@@ -24,24 +24,27 @@ ENCODINGS = tuple(_PIXEL_BYTES)
 
 
 class BadImageError(ValueError):
-    """An image message that cannot become a photograph; the text says why."""
+    """An image message that cannot become a photograph; the text states the reason."""
 
 
 @dataclass
 class ImageWriter:
-    """Turns image messages into the bytes of a JPEG or PNG file.
+    """Converts image messages to the bytes of a JPEG or PNG file.
 
-    JPEG and PNG in a `CompressedImage` stay as they are; a raw `Image` becomes a PNG without loss, with 16 bits
-    brought to 8 by the same factor for the whole bag: its first image decides how many bits are in use.
+    JPEG and PNG in a `CompressedImage` stay as they are. A raw `Image` becomes a PNG without loss, but for 16 bits,
+    which become 8 by the same factor for the whole bag: the first image decides how many bits are in use.
+
+    Attributes:
+        bits: bits in use of 16-bit images; None before the first.
     """
 
     bits: int | None = None
 
     def encoded(self, kind: str, message: Any) -> tuple[bytes, str]:
-        """The file's bytes and its suffix.
+        """Return the file's bytes and its suffix.
 
         Raises:
-            BadImageError: an encoding that is not known, too few bytes, too many pixels.
+            BadImageError: unknown encoding, too few bytes, or too many pixels.
         """
         if kind == COMPRESSED:
             return _compressed(message)
@@ -53,7 +56,7 @@ class ImageWriter:
         return data.tobytes(), ".png"
 
     def _pixels(self, message: Any) -> ByteArray:
-        """BGR or grey pixels of a raw image."""
+        """Return BGR or grey pixels of a raw image."""
         encoding = str(message.encoding).strip().lower()
         if encoding not in _PIXEL_BYTES:
             raise BadImageError(f"encoding {message.encoding!r} is none of {', '.join(ENCODINGS)}")
@@ -72,7 +75,7 @@ class ImageWriter:
 
 
 def sharpness(data: bytes) -> float:
-    """Variance of the Laplacian of an encoded image at a quarter of its size: low for blurred ones."""
+    """Return the variance of the Laplacian of an encoded image at a quarter of its size: low for blurred images."""
     import cv2
 
     grey = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_REDUCED_GRAYSCALE_4)
@@ -96,7 +99,7 @@ def _compressed(message: Any) -> tuple[bytes, str]:
 
 
 def _rows(message: Any, pixel_bytes: int) -> ByteArray:
-    """Bytes (height, width · pixel_bytes) of a raw image without the padding of its rows."""
+    """Return the bytes (height, width · pixel_bytes) of a raw image without the padding of its rows."""
     width, height, step = int(message.width), int(message.height), int(message.step)
     data = np.asarray(message.data, dtype=np.uint8)
     if not 0 < width * height <= MAX_PIXELS:
@@ -108,7 +111,7 @@ def _rows(message: Any, pixel_bytes: int) -> ByteArray:
 
 
 def _to_bgr(raw: ByteArray, encoding: str) -> ByteArray:
-    """BGR (height, width, 3) or grey (height, width) of rows of bytes."""
+    """Return BGR (height, width, 3) or grey (height, width) of rows of bytes."""
     import cv2
 
     height = len(raw)

@@ -1,8 +1,8 @@
-"""ROS bags, read one message at a time: rosbag2 folders and bare files (mcap, sqlite3), and ROS 1 bags.
+"""Reading of ROS bags, one message at a time: rosbag2 folders and bare files (mcap, sqlite3), and ROS 1 bags.
 
-Every message type is decoded by its own definition: the bag's, else the distribution's, or (PX4, whose messages no
-distribution has) that of `bag_definitions` which fits the message. A damaged definition harms its own
-topic only.
+Definitions of message types come from the bag, else from the ROS distribution. PX4's messages are in no
+distribution: for them the layout of `bag.definitions` counts that fits the message. A damaged definition harms its
+own topic only.
 """
 
 from __future__ import annotations
@@ -18,22 +18,22 @@ from typing import Any
 from pipelines.core.errors import InputError
 from pipelines.formats.bag.definitions import DEFINITIONS
 
-# A chunk is unpacked in one piece, and held up to three times; ROS writes 0.8 to 4 MiB.
+# A chunk is unpacked in one piece, with up to three copies in memory; ROS writes 0.8 to 4 MiB.
 _MAX_CHUNK_BYTES = 200 * 1024 * 1024
-# Schemas of mcap that have no place in a ROS bag, and with which the reader cannot open it.
+# Schemas of mcap that do not belong in a ROS bag; the reader cannot open a bag with them.
 _FOREIGN_SCHEMAS = ("jsonschema", "protobuf", "flatbuffer", "ros1msg")
-# PX4 sends a message within milliseconds of the sample that it is made from.
+# PX4 sends a message within milliseconds of its sample.
 _SAMPLE_LAG_US = 60_000_000
 _REPAIR = "repair it with `mcap recover` (mcap) or `ros2 bag reindex` (sqlite3, or metadata.yaml missing)"
 
 
 class UndecodableError(ValueError):
-    """A message that does not fit its definition, or whose definition is not known."""
+    """A message that does not fit its definition, or whose definition is unknown."""
 
 
 @dataclass(frozen=True)
 class BagTopic:
-    """A topic: its name, message type (`sensor_msgs/msg/Imu`) and how many messages it has."""
+    """Topic: name, message type (`sensor_msgs/msg/Imu`) and number of messages."""
 
     name: str
     type: str
@@ -42,7 +42,7 @@ class BagTopic:
 
 @dataclass(frozen=True)
 class RawMessage:
-    """A message as stored; `bag_ns` is when it was recorded, nanoseconds since 1970."""
+    """Message as stored; `bag_ns` is the time of recording, nanoseconds since 1970."""
 
     topic: str
     type: str
@@ -51,19 +51,19 @@ class RawMessage:
 
 
 class Bag:
-    """An open bag; see `open_bag`.
+    """Open bag; see `open_bag`.
 
     Attributes:
         path: file or folder.
         topics: by name.
-        damage: why reading ended before its end, once it did.
-        fallback_types: types decoded by a definition that the bag does not have itself.
+        damage: reason why reading ended before the end of the bag; None if it did not.
+        fallback_types: types decoded by a definition that the bag itself does not have.
     """
 
     def __init__(self, path: Path, reader: Any, ros2: bool) -> None:
         self.path, self._reader, self._ros2 = path, reader, ros2
         self._connections = list(reader.connections)
-        # Of a split bag, any file may be the one that has a definition.
+        # Any file of a split bag may have the definition.
         links = [link for part in _parts(reader) for link in part.connections] + self._connections
         self._definitions = {link.msgtype: link.msgdef for link in links if link.msgdef.data}
         self._stores: dict[str, Any] = {}
@@ -79,13 +79,13 @@ class Bag:
 
     @property
     def message_count(self) -> int:
-        """Messages of all topics, as the bag's index has it."""
+        """Number of messages of all topics, by the bag's index."""
         return sum(topic.count for topic in self.topics.values())
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
-        """Messages of these topics by time of recording, one at a time.
+        """Yield the messages of these topics by time of recording.
 
-        Reading ends early where the bag is damaged; `damage` then tells.
+        Reading ends early where the bag is damaged; `damage` then states the reason.
         """
         wanted = {name: self.topics[name].type for name in topics}
         links = [link for link in self._connections if wanted.get(link.topic) == link.msgtype]
@@ -97,37 +97,37 @@ class Bag:
                 link, bag_ns, data = next(stream)
             except StopIteration:
                 return
-            except Exception as error:  # the library lets out whatever its parsers meet
+            except Exception as error:  # the library raises any error of its parsers
                 self.damage = f"{type(error).__name__}: {error}"
                 return
             yield RawMessage(link.topic, link.msgtype, int(bag_ns), bytes(data))
 
     def decode(self, message: RawMessage) -> Any:
-        """The message as an object with the fields of its definition.
+        """Return the message as an object with the fields of its definition.
 
         Raises:
-            UndecodableError: it does not fit, or no definition is known.
+            UndecodableError: the message does not fit, or has no known definition.
         """
         store = self._store(message)
         try:
             if self._ros2:
                 return store.deserialize_cdr(message.data, message.type)
             return store.deserialize_ros1(message.data, message.type)
-        except Exception as error:  # as above: hostile bytes meet generated code
+        except Exception as error:  # hostile bytes make generated code raise any error
             raise UndecodableError(f"{type(error).__name__}: {error}") from error
 
     def first(self, topic: str) -> Any | None:
-        """The first message of a topic that decodes, or None."""
-        for tried, message in enumerate(self.messages([topic])):
+        """Return the first message of a topic that decodes, or None."""
+        for attempt, message in enumerate(self.messages([topic])):
             try:
                 return self.decode(message)
             except UndecodableError:
-                if tried >= 9:
+                if attempt >= 9:
                     break
         return None
 
     def header_stamp_ns(self, message: RawMessage) -> int | None:
-        """Stamp of a message that begins with a `std_msgs/Header`, read without decoding the rest; None if zero."""
+        """Return the stamp of a message that begins with a `std_msgs/Header`, without decoding it; None if zero."""
         try:
             if not self._ros2:
                 sec, nanosec = struct.unpack_from("<II", message.data, 4)
@@ -139,7 +139,7 @@ class Bag:
         return sec * 1_000_000_000 + nanosec or None
 
     def _store(self, message: RawMessage) -> Any:
-        """A typestore that knows the type of `message`."""
+        """Return a typestore that has the type of `message`."""
         kind = message.type
         if kind not in self._stores:
             stated = self._definitions.get(kind)
@@ -153,7 +153,7 @@ class Bag:
         return store
 
     def _make_store(self, kind: str, stated: Any | None) -> Any:
-        """A typestore that knows `kind` as the bag defines it, or by default, or why there is none."""
+        """Return a typestore that has `kind` by the bag's or a default definition, or the reason why none has."""
         from rosbags.typesys import Stores, get_typestore
 
         if stated is not None:
@@ -161,14 +161,14 @@ class Bag:
             try:
                 store.register(_parsed(stated, kind))
                 return store
-            except Exception as error:  # a grammar error, an unknown word, a name twice …
+            except Exception as error:  # a grammar error, an unknown word, a repeated name …
                 return f"its definition of {kind} cannot be read: {type(error).__name__}: {error}"
         self.fallback_types.add(kind)
         common = get_typestore(Stores.ROS2_JAZZY if self._ros2 else Stores.ROS1_NOETIC)
         return common if kind in common.types else f"it has no definition of {kind}"
 
     def _store_that_fits(self, message: RawMessage) -> Any:
-        """A typestore with that layout of `DEFINITIONS` which fits `message`."""
+        """Return a typestore with the layout of `DEFINITIONS` that fits `message`."""
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
         for release, text in DEFINITIONS[message.type].items():
@@ -183,7 +183,7 @@ class Bag:
                 continue
             self.fallback_types.add(f"{message.type} (as of PX4 {release})")
             return store
-        # Not remembered: the next message may be whole.
+        # The failure is not stored: the next message may be whole.
         raise UndecodableError(
             f"{len(message.data)} bytes are none of the layouts of {message.type} that are known here"
         )
@@ -194,7 +194,7 @@ def open_bag(path: Path) -> Iterator[Bag]:
     """Open a bag for reading.
 
     Raises:
-        InputError: no bag, damaged so that it cannot be opened, or packed in pieces too large for memory.
+        InputError: no bag, damaged beyond opening, or with chunks too large for memory.
     """
     ros2 = path.suffix != ".bag"
     reader = _reader(path, ros2)
@@ -204,12 +204,12 @@ def open_bag(path: Path) -> Iterator[Bag]:
         raise
     except KeyError as error:
         if error.args[0] not in _FOREIGN_SCHEMAS:
-            raise InputError(f"is no bag, or is damaged ({_told(error)}): {_REPAIR}", path=path) from error
+            raise InputError(f"is no bag, or is damaged ({_describe(error)}): {_REPAIR}", path=path) from error
         raise InputError(
             f"has a topic in {error.args[0]!r}, which is not ROS 2's: leave it out with `mcap filter`", path=path
         ) from error
-    except Exception as error:  # truncated and forged files raise whatever the parser trips over
-        raise InputError(f"is no bag, or is damaged ({_told(error)}): {_REPAIR}", path=path) from error
+    except Exception as error:  # truncated and forged files make the parser raise any error
+        raise InputError(f"is no bag, or is damaged ({_describe(error)}): {_REPAIR}", path=path) from error
     try:
         _check_chunks(reader, path)
         yield Bag(path, reader, ros2)
@@ -235,7 +235,7 @@ def _reader(path: Path, ros2: bool) -> Any:
     try:
         return rosbag2.Reader(path) if ros2 else rosbag1.Reader(path)
     except Exception as error:
-        raise InputError(f"is no bag, or is damaged ({_told(error)}): {_REPAIR}", path=path) from error
+        raise InputError(f"is no bag, or is damaged ({_describe(error)}): {_REPAIR}", path=path) from error
 
 
 def _check_chunks(reader: Any, path: Path) -> None:
@@ -250,20 +250,20 @@ def _check_chunks(reader: Any, path: Path) -> None:
 
 
 def _parts(reader: Any) -> list[Any]:
-    """The files of a rosbag2."""
+    """Return the files of a rosbag2."""
     outer = getattr(reader, "storage", None)
     return list(getattr(outer, "storages", [] if outer is None else [outer]))
 
 
 def _parsed(definition: Any, kind: str) -> Any:
-    """Types of a definition, in ROS's message language or in IDL."""
+    """Return the types of a definition, in ROS's message language or in IDL."""
     from rosbags.interfaces import MessageDefinitionFormat
     from rosbags.typesys import get_types_from_idl, get_types_from_msg
 
     if definition.format == MessageDefinitionFormat.MSG:
         return get_types_from_msg(definition.data, kind)
     rule = "=" * 80 + "\n"
-    # rosbags' parser takes no directives; what they include stands below.
+    # rosbags' parser takes no directives; the definitions that they include follow below.
     text = re.sub(r"^[ \t]*#.*$", "", definition.data, flags=re.MULTILINE)
     if not text.startswith(f"{rule}IDL: "):
         return get_types_from_idl(text)
@@ -273,5 +273,5 @@ def _parsed(definition: Any, kind: str) -> Any:
     return types
 
 
-def _told(error: Exception) -> str:
+def _describe(error: Exception) -> str:
     return f"{type(error).__name__}: {error}".rstrip(": ").rstrip(".")

@@ -1,4 +1,4 @@
-"""Writes a flight as a rosbag2, the way a ROS 2 drone would record it (REP-103, REP-105, REP-145).
+"""Writing of a flight as a rosbag2, in the form of a ROS 2 drone (REP-103, REP-105, REP-145).
 
 The world is East-North-Up, `base_link` Forward-Left-Up, the camera `_optical` (x right, y down, z forward).
 """
@@ -33,7 +33,7 @@ _TYPES = {
 
 @dataclass(frozen=True)
 class BagCamera:
-    """The camera as `CameraInfo` tells it.
+    """Camera in the terms of `CameraInfo`.
 
     Attributes:
         width, height: pixels.
@@ -52,15 +52,19 @@ class BagCamera:
 
 @dataclass(frozen=True)
 class BagFlight:
-    """What to record. Stamps are nanoseconds since 1970, each sensor's on its own clock.
+    """Records of a flight. Stamps are nanoseconds since 1970, each sensor's on its own clock.
 
     Attributes:
-        camera: its calibration.
-        image_stamp_ns: (N,) and image_paths: the photographs.
-        fix_stamp_ns: (M,) fix_lla: (M, 3) degrees and ellipsoidal metres.
-        fix_sigma_enu_m: (3,) σ that the receiver states; fix_status: of `NavSatStatus`.
+        camera: calibration.
+        image_stamp_ns: (N,) of the photographs.
+        image_paths: N JPEG files.
+        fix_stamp_ns: (M,) of the fixes.
+        fix_lla: (M, 3) degrees and ellipsoidal metres.
+        fix_sigma_enu_m: (3,) σ that the receiver states.
+        fix_status: of `NavSatStatus`.
         antenna_in_body: (3,) metres, forward-right-down.
-        imu_stamp_ns: (K,) imu_enu_from_body: (K, 3, 3), body forward-right-down.
+        imu_stamp_ns: (K,) of the attitudes.
+        imu_enu_from_body: (K, 3, 3), body forward-right-down.
         imu_rate, imu_force: (K, 3) rad/s and m/s², forward-right-down.
         imu_sigma_deg: σ of the attitude per axis.
     """
@@ -81,7 +85,7 @@ class BagFlight:
 
 
 def write_bag(path: Path, storage: Literal["mcap", "sqlite3"], flight: BagFlight) -> int:
-    """Write a bag folder in order of time; returns the number of messages."""
+    """Write a bag folder in order of time; return the number of messages."""
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
 
@@ -101,7 +105,7 @@ def write_bag(path: Path, storage: Literal["mcap", "sqlite3"], flight: BagFlight
 
 
 def _qos(topic: str) -> list[Any]:
-    """Static transforms must reach a listener that comes late; the rest takes the default."""
+    """Return the quality of service: static transforms must reach late listeners; other topics take the default."""
     if topic != TF_TOPIC:
         return []
     from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
@@ -116,13 +120,13 @@ def _qos(topic: str) -> list[Any]:
 
 
 class _Messages:
-    """Makes the messages of a flight from a typestore's classes."""
+    """Messages of a flight, made of a typestore's classes."""
 
     def __init__(self, flight: BagFlight, types: Any) -> None:
         self._flight, self._types = flight, types
 
     def in_order(self) -> Iterator[tuple[str, int, Any]]:
-        """(topic, stamp, message) by time, made one at a time: photographs are read when their turn comes."""
+        """Yield (topic, stamp, message) by time; a photograph is read only when its message is due."""
         flight = self._flight
         streams = [(FIX_TOPIC, flight.fix_stamp_ns), (IMU_TOPIC, flight.imu_stamp_ns)]
         streams += [(INFO_TOPIC, flight.image_stamp_ns), (IMAGE_TOPIC, flight.image_stamp_ns)]
@@ -189,11 +193,11 @@ class _Messages:
             (ANTENNA, _FLU_FROM_FRD @ flight.antenna_in_body, np.eye(3)),
             (IMU, np.zeros(3), np.eye(3)),
         )
-        made = [
+        transforms = [
             self._new(
                 "geometry_msgs/msg/TransformStamped", self._header(stamp_ns, BODY), child,
                 self._new("geometry_msgs/msg/Transform", self._vector(shift), self._quaternion(rotation)),
             )
             for child, shift, rotation in links
         ]  # fmt: skip
-        return self._new("tf2_msgs/msg/TFMessage", made)
+        return self._new("tf2_msgs/msg/TFMessage", transforms)

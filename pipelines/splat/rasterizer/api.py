@@ -1,15 +1,20 @@
-"""One interface to every rasteriser: Gaussians and a camera in, colour, alpha and depth out, all differentiable.
+"""Interface of every rasteriser: Gaussians and a camera in; colour, alpha and depth out, all differentiable.
 
-The blending is that of 3D Gaussian Splatting (doi 10.1145/3592433), with gsplat's conventions: pixel centres at
-(0.5, 0.5), screen covariance dilated by `dilation_px2`, contributions below alpha 1/255 left out, alpha at most
-0.999, a pixel is done when its transmittance would fall to 1e-4.
+The blending is that of 3D Gaussian Splatting (doi 10.1145/3592433), with gsplat's conventions:
 
-The depth of a Gaussian is that of its plane at the pixel, not of its centre: the conditional mean of z given the
-pixel, z + q · (p − µ) with q = C⁻¹ c, where C is the screen covariance and c the covariance of the screen position
-with z (RaDe-GS, doi 10.48550/arXiv.2406.01467, in the local affine approximation of the perspective). Where α
-reaches 1/255 this departs from the centre by at most 3.33 standard deviations along z; q is shortened where even
-that were more than `DEPTH_REACH` of the centre's depth, so that z stays positive. Gaussians are ordered by their
-centres.
+1. Pixel centres lie at (0.5, 0.5).
+2. The screen covariance is dilated by `dilation_px2`.
+3. Contributions below alpha 1/255 are left out, and alpha is at most 0.999.
+4. A pixel is done when its transmittance would fall to 1e-4.
+5. Gaussians are ordered by the depth of their centres.
+
+The depth of a Gaussian is the depth of its plane at the pixel, not of its centre:
+
+1. The depth is the conditional mean of z given the pixel, z + q · (p − µ) with q = C⁻¹ c. C is the screen
+   covariance, and c the covariance of the screen position with z (RaDe-GS, doi 10.48550/arXiv.2406.01467, in the
+   local affine approximation of the perspective).
+2. Down to α = 1/255 this depth departs from that of the centre by at most 3.33 standard deviations along z.
+3. If that were more than `DEPTH_REACH` of the centre's depth, q is shortened, so that z stays positive.
 """
 
 from __future__ import annotations
@@ -32,12 +37,12 @@ BackendName = Literal["cpu", "cuda"]
 
 @dataclass(frozen=True)
 class RasterSettings:
-    """How to render.
+    """Settings of a render.
 
     Attributes:
-        sh_degree: degree of the spherical harmonics in use (≤ the stored one).
+        sh_degree: degree of the spherical harmonics in use (≤ the stored degree).
         background: colour behind everything.
-        near_m: Gaussians whose centre is nearer are left out.
+        near_m: Gaussians with a nearer centre are left out.
         dilation_px2: added to the diagonal of the screen covariance, in px².
         depth: whether to compute depths (colour and alpha always are).
     """
@@ -51,7 +56,7 @@ class RasterSettings:
 
 @dataclass
 class ScreenStats:
-    """What densification needs to know of one render.
+    """Statistics of one render for density control.
 
     Attributes:
         visible: (M,) int64 rows of the Gaussians that touched the image.
@@ -66,18 +71,18 @@ class ScreenStats:
 
 @dataclass
 class Render:
-    """One rendered view of H × W pixels.
+    """Rendered view of H × W pixels.
 
     Attributes:
         colour: (H, W, 3), linear in the Gaussians' colours, background blended in.
         alpha: (H, W), 1 − final transmittance.
         stats: for densification.
-        expected_depth: (H, W), Σ w z / Σ w along the camera's z axis in metres, each Gaussian's z at the pixel,
-            0 where alpha is 0; or None.
-        depth_variance: (H, W), Σ w z² / Σ w − expected_depth² in m²: 0 where all that is seen lies on one surface;
-            or None.
-        median_depth: (H, W), z at the pixel of the Gaussian at which the transmittance falls to one half, 0
-            where it never does; not differentiable; or None.
+        expected_depth: (H, W), Σ w z / Σ w along the camera's z axis in metres, with each Gaussian's z at the
+            pixel; 0 where alpha is 0; or None.
+        depth_variance: (H, W), Σ w z² / Σ w − expected_depth² in m²: 0 if all Gaussians of a pixel lie on one
+            surface; or None.
+        median_depth: (H, W), z at the pixel of the Gaussian at which the transmittance falls to one half, 0 if the
+            transmittance stays higher; not differentiable; or None.
     """
 
     colour: Tensor
@@ -89,7 +94,7 @@ class Render:
 
 
 class Rasterizer(Protocol):
-    """A backend."""
+    """Rasteriser backend."""
 
     name: BackendName
 

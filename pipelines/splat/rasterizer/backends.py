@@ -1,4 +1,4 @@
-"""The rasteriser backends by name."""
+"""Rasteriser backends by name."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pipelines.splat.rasterizer.api import Rasterizer
 
 
 def rasterizer(name: Literal["auto", "cpu", "cuda"]) -> Rasterizer:
-    """The backend of that name; `auto` takes cuda where a device and gsplat are present.
+    """Return the backend of that name; `auto` takes cuda if a device and gsplat are present.
 
     Raises:
         BackendUnavailableError: `cuda` without a device or without gsplat.

@@ -1,7 +1,7 @@
-"""The rasteriser on a CPU: numba kernels behind a `torch.autograd.Function`.
+"""Rasteriser on a CPU: numba kernels behind a `torch.autograd.Function`.
 
-Gaussians are projected, sorted by depth, listed by tile, and blended tile by tile; the backward pass walks the
-same lists. The kernels are in `cpu_project`, `cpu_tiles`, `cpu_blend` and `cpu_gradients`.
+Forward: `cpu_project` projects the Gaussians, `cpu_tiles` lists them by tile in order of depth, `cpu_blend` blends
+tile by tile. Backward: `cpu_blend_gradient` walks the same lists, `cpu_gradients` sums up by Gaussian.
 """
 
 from __future__ import annotations
@@ -19,19 +19,26 @@ from torch.autograd.function import once_differentiable
 
 from pipelines.core.errors import InputError
 from pipelines.splat.gaussians import Gaussians
-from pipelines.splat.rasterizer import cpu_blend, cpu_gradients, cpu_project, cpu_tiles, cpu_view
+from pipelines.splat.rasterizer import (
+    cpu_blend,
+    cpu_blend_gradient,
+    cpu_gradients,
+    cpu_project,
+    cpu_tiles,
+    cpu_view,
+)
 from pipelines.splat.rasterizer.api import BackendName, Pinhole, RasterSettings, Render, ScreenStats
 
 _Array = NDArray[Any]
 
-# Kernels use all cores; and numba's fallback threading layer crashes when two threads launch at once.
-_ONE_AT_A_TIME = threading.Lock()
+# Kernels use all cores, and numba's fallback threading layer crashes if two threads launch kernels at once.
+_KERNEL_LOCK = threading.Lock()
 
 
 class CpuRasterizer:
-    """The CPU backend. Exact gradients; the same result on every run, whatever the number of threads.
+    """CPU backend, with exact gradients, and the same result on every run for any number of threads.
 
-    Works in the dtype of the Gaussians: float32 to train, float64 to check. The number of threads is numba's
+    Its dtype is that of the Gaussians: float32 to train, float64 to check. The number of threads is numba's
     (`numba.set_num_threads`, `NUMBA_NUM_THREADS`).
     """
 
@@ -48,53 +55,53 @@ class CpuRasterizer:
         _validate(gaussians, cam_from_model, camera, settings)
         pose = cam_from_model[:3].to(torch.float64)
         center_in_model = -torch.linalg.solve(pose[:, :3], pose[:, 3])
-        frame = _Frame(camera, settings)
+        context = _RenderContext(camera, settings)
         colour, alpha, depth_sum, square_sum, median = _Rasterize.apply(
-            *gaussians.tensors().values(), pose, center_in_model, frame
+            *gaussians.tensors().values(), pose, center_in_model, context
         )
         if not settings.depth:
-            return Render(colour, alpha, frame.stats)
+            return Render(colour, alpha, context.stats)
         opaque = alpha > 0
         total = torch.where(opaque, alpha, 1.0)
         expected = torch.where(opaque, depth_sum / total, 0.0)
         variance = (square_sum / total - expected.square()).clamp_min(0.0)
-        return Render(colour, alpha, frame.stats, expected, variance, median)
+        return Render(colour, alpha, context.stats, expected, variance, median)
 
 
 def predicted_bytes(
     count: int, camera: Pinhole, sh_degree: int, *, visible: int | None = None, hits_per_visible: float = 6.0
 ) -> int:
-    """Peak memory in bytes of one render and its backward pass, gradients included, parameters excluded.
+    """Return the peak memory in bytes of one render and its backward pass, with gradients, without parameters.
 
     Args:
         count: number of Gaussians.
         camera: the image.
         sh_degree: degree of the stored spherical harmonics.
-        visible: how many of them are in the image; all, if None.
-        hits_per_visible: tiles (16 × 32 px) that one of them touches on average: 3 to 6 in trained models, and as
-            many as there are tiles if all are huge.
+        visible: number of Gaussians in the image; None: all.
+        hits_per_visible: tiles (16 × 32 px) that a visible Gaussian touches on average: 3 to 6 in trained models,
+            and all tiles of the image if Gaussians are huge.
     """
     gradients = count * (11 + 3 * (sh_degree + 1) ** 2) * 4 + count * 5
     splats = cpu_project.SPLAT_WIDTH + cpu_project.ELLIPSE_WIDTH
     in_view = count if visible is None else visible
-    hits = in_view * hits_per_visible * (16 + 4 * cpu_blend.HIT_GRADIENT_WIDTH)
-    # Colour, alpha, mean, mean square and median depth, and the gradients of all but the last.
+    hits = in_view * hits_per_visible * (16 + 4 * cpu_blend_gradient.HIT_GRADIENT_WIDTH)
+    # Colour, alpha, Σ w z, Σ w z² and median depth, and the gradients of all but the median.
     images = camera.width * camera.height * 13 * 4
     return int(gradients + in_view * (4 * splats + 48) + hits + images)
 
 
 @dataclass
-class _Frame:
-    """One render: what was asked, and what the forward pass leaves for the backward pass.
+class _RenderContext:
+    """State of one render that the forward pass leaves for the backward pass.
 
     Attributes:
-        camera, settings: what was asked.
+        camera, settings: of the render.
         workers: number of threads.
         stats: handed out with the render.
         visible: (M,) rows of the visible Gaussians, ascending.
-        rank: (M,) their places in the order of depth.
+        rank: (M,) places of the visible Gaussians in the order of depth.
         table: (M, SPLAT_WIDTH) splats in the order of depth.
-        lists: their hits on tiles.
+        lists: hits of the splats on tiles.
     """
 
     camera: Pinhole
@@ -108,11 +115,11 @@ class _Frame:
 
     @property
     def background(self) -> _Array:
-        """(3,) float64."""
+        """Background colour (3,) float64."""
         return np.array(self.settings.background, dtype=np.float64)
 
     def view(self, pose: _Array) -> cpu_view.View:
-        """The camera as kernels want it."""
+        """Return the camera in the form of the kernels."""
         return cpu_view.make_view(self.camera, self.settings, pose)
 
 
@@ -123,7 +130,7 @@ class _TileLists:
     Attributes:
         hits: (H,) packed, by tile, nearest first.
         tile_start: (tiles + 1,) into `hits`.
-        tile_end: (tiles,) where blending stopped because all pixels were done.
+        tile_end: (tiles,) hit at which blending stopped because all pixels were done.
         splat_start: (M + 1,) into `places`.
         places: (H,) into `hits`, by splat.
     """
@@ -140,13 +147,13 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, ...]:
-        *tensors, frame = inputs
+        *tensors, context = inputs
         *parameters, pose, center = (_array(tensor) for tensor in tensors)
-        with _ONE_AT_A_TIME:
-            _project(frame, parameters, pose, center)
-            images = _blend(frame)
+        with _KERNEL_LOCK:
+            _project(context, parameters, pose, center)
+            images = _blend(context)
         outputs = tuple(torch.from_numpy(image) for image in images)
-        ctx.frame = frame
+        ctx.context = context
         ctx.save_for_backward(*tensors, *outputs)
         ctx.mark_non_differentiable(outputs[4])
         return outputs
@@ -154,14 +161,14 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
-        frame: _Frame = ctx.frame
+        context: _RenderContext = ctx.context
         saved = [_array(tensor) for tensor in ctx.saved_tensors]
         *parameters, pose, center = saved[:7]
         grads = tuple(_array(grad) for grad in grad_outputs[:4])
         outputs = [np.empty_like(parameter) for parameter in parameters]
-        with _ONE_AT_A_TIME:
-            hit_gradient = _hit_gradient(frame, tuple(saved[7:]), grads)
-            camera = _gaussian_gradients(frame, [*parameters, pose, center], hit_gradient, outputs)
+        with _KERNEL_LOCK:
+            hit_gradient = _hit_gradient(context, tuple(saved[7:]), grads)
+            camera = _gaussian_gradients(context, [*parameters, pose, center], hit_gradient, outputs)
         gradients = [*outputs, camera[:12].reshape(3, 4), camera[12:]]
         return (*(torch.from_numpy(gradient) for gradient in gradients), None)
 
@@ -171,27 +178,27 @@ def _array(tensor: Tensor) -> _Array:
     return array
 
 
-def _project(frame: _Frame, parameters: list[_Array], pose: _Array, center: _Array) -> None:
-    """Project what is visible, order it by depth and list it by tile."""
-    view, dtype = frame.view(pose), parameters[0].dtype
+def _project(context: _RenderContext, parameters: list[_Array], pose: _Array, center: _Array) -> None:
+    """Project the visible Gaussians, order them by depth and list them by tile."""
+    view, dtype = context.view(pose), parameters[0].dtype
     is_visible, depth = np.empty(len(parameters[0]), dtype=np.bool_), np.empty(len(parameters[0]), dtype=dtype)
-    cpu_project.find_visible(*parameters[:4], pose, view, is_visible, depth, frame.workers)
-    frame.visible = np.flatnonzero(is_visible)
-    frame.rank = _depth_rank(depth[frame.visible])
-    count = len(frame.visible)
-    frame.table = np.empty((count, cpu_project.SPLAT_WIDTH), dtype=dtype)
+    cpu_project.find_visible(*parameters[:4], pose, view, is_visible, depth, context.workers)
+    context.visible = np.flatnonzero(is_visible)
+    context.rank = _depth_rank(depth[context.visible])
+    count = len(context.visible)
+    context.table = np.empty((count, cpu_project.SPLAT_WIDTH), dtype=dtype)
     ellipses = np.empty((count, cpu_project.ELLIPSE_WIDTH), dtype=dtype)
     radius = np.empty(count, dtype=np.float32)
     cpu_project.project_visible(
-        *(*parameters, pose, center, view, frame.settings.sh_degree),
-        *(frame.visible, frame.rank, frame.table, ellipses, radius, frame.workers),
+        *(*parameters, pose, center, view, context.settings.sh_degree),
+        *(context.visible, context.rank, context.table, ellipses, radius, context.workers),
     )
-    frame.lists = _list_tiles(ellipses, frame.camera)
-    frame.stats = ScreenStats(visible=torch.from_numpy(frame.visible), radius_px=torch.from_numpy(radius))
+    context.lists = _list_tiles(ellipses, context.camera)
+    context.stats = ScreenStats(visible=torch.from_numpy(context.visible), radius_px=torch.from_numpy(radius))
 
 
 def _depth_rank(depth: _Array) -> _Array:
-    """Place of each Gaussian in the order of depth; equal depths keep their order."""
+    """Return the place of each Gaussian in the order of depth; equal depths keep their order."""
     if depth.dtype == np.float32:
         # Positive floats sort like their bits. One sort of whole keys is several times faster than an argsort.
         keys = depth.view(np.uint32).astype(np.uint64) << np.uint64(32) | np.arange(len(depth), dtype=np.uint64)
@@ -219,43 +226,45 @@ def _list_tiles(ellipses: _Array, camera: Pinhole) -> _TileLists:
     return _TileLists(hits, tile_start, np.empty(tiles, dtype=np.int64), splat_start, places)
 
 
-def _blend(frame: _Frame) -> tuple[_Array, ...]:
-    """Colour, alpha, Σ w z, Σ w z² and median depth, the last three of size (0, 0) if they are not wanted."""
-    size = (frame.camera.height, frame.camera.width)
-    depth_size = size if frame.settings.depth else (0, 0)
+def _blend(context: _RenderContext) -> tuple[_Array, ...]:
+    """Return colour, alpha, Σ w z, Σ w z² and median depth, the last three of size (0, 0) if not wanted."""
+    size = (context.camera.height, context.camera.width)
+    depth_size = size if context.settings.depth else (0, 0)
     shapes: tuple[tuple[int, ...], ...] = ((*size, 3), size, *3 * (depth_size,))
-    images = tuple(np.empty(shape, dtype=frame.table.dtype) for shape in shapes)
-    lists = frame.lists
+    images = tuple(np.empty(shape, dtype=context.table.dtype) for shape in shapes)
+    lists = context.lists
     cpu_blend.blend(
-        *(frame.table, lists.hits, lists.tile_start),
-        *(frame.background, images, lists.tile_end, frame.workers),
+        *(context.table, lists.hits, lists.tile_start),
+        *(context.background, images, lists.tile_end, context.workers),
     )
     return images
 
 
-def _hit_gradient(frame: _Frame, images: tuple[_Array, ...], grads: tuple[_Array, ...]) -> _Array:
-    lists = frame.lists
-    gradient = np.empty(len(lists.hits) * cpu_blend.HIT_GRADIENT_WIDTH, dtype=frame.table.dtype)
-    cpu_blend.blend_gradient(
-        *(frame.table, lists.hits, lists.tile_start, lists.tile_end),
-        *(frame.background, images, grads, gradient, frame.workers),
+def _hit_gradient(context: _RenderContext, images: tuple[_Array, ...], grads: tuple[_Array, ...]) -> _Array:
+    lists = context.lists
+    gradient = np.empty(len(lists.hits) * cpu_blend_gradient.HIT_GRADIENT_WIDTH, dtype=context.table.dtype)
+    cpu_blend_gradient.blend_gradient(
+        *(context.table, lists.hits, lists.tile_start, lists.tile_end),
+        *(context.background, images, grads, gradient, context.workers),
     )
     return gradient
 
 
-def _gaussian_gradients(frame: _Frame, inputs: list[_Array], hit_gradient: _Array, outputs: list[_Array]) -> _Array:
-    """Fill `outputs`; returns the gradient (15,) of pose and centre."""
+def _gaussian_gradients(
+    context: _RenderContext, inputs: list[_Array], hit_gradient: _Array, outputs: list[_Array]
+) -> _Array:
+    """Fill `outputs`, and return the gradient (15,) of pose and centre."""
     *parameters, pose, center = inputs
     blocks = -(-len(parameters[0]) // cpu_project.BLOCK)
-    block_start = np.searchsorted(frame.visible, np.arange(blocks + 1) * cpu_project.BLOCK)
+    block_start = np.searchsorted(context.visible, np.arange(blocks + 1) * cpu_project.BLOCK)
     camera = np.empty((blocks, cpu_gradients.CAMERA_WIDTH), dtype=np.float64)
-    g_screen = np.empty((len(frame.visible), 2), dtype=np.float32)
+    g_screen = np.empty((len(context.visible), 2), dtype=np.float32)
     cpu_gradients.gaussian_gradients(
-        *(*parameters, pose, center, frame.view(pose), frame.settings.sh_degree, frame.visible, frame.rank),
-        *(hit_gradient, frame.lists.splat_start, frame.lists.places, block_start),
-        *(*outputs, camera, g_screen, frame.workers),
+        *(*parameters, pose, center, context.view(pose), context.settings.sh_degree, context.visible, context.rank),
+        *(hit_gradient, context.lists.splat_start, context.lists.places, block_start),
+        *(*outputs, camera, g_screen, context.workers),
     )
-    frame.stats.mean_gradient = torch.from_numpy(g_screen)
+    context.stats.mean_gradient = torch.from_numpy(g_screen)
     total: _Array = camera.sum(axis=0)
     return total
 

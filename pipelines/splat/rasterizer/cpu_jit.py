@@ -1,11 +1,12 @@
-"""How the kernels are compiled.
+"""Compilation of the kernels.
 
-A kernel is a short parallel loop over workers (`parallel_jit`), each of which runs one serial function
-(`worker_jit`: the parallel compiler is slow on long bodies) made of small ones (`jit`, always inlined: the
-reference counts of arrays passed between threads would cost more than the work). Only what Python calls is
-kept in numba's cache; it contains the rest.
+1. A kernel is a short parallel loop over workers (`parallel_jit`).
+2. Each worker runs one serial function (`worker_jit`), because the parallel compiler is slow on long bodies.
+3. The serial function is made of small functions (`jit`). These are always inlined: the reference counts of arrays
+   passed between threads would cost more than the work.
+4. Numba's cache keeps only the functions that Python calls. They contain the others.
 
-No flag lets the compiler reorder or assume anything, but for fused multiply-add: results are reproducible.
+Of all flags that allow the compiler to reorder or assume, only fused multiply-add is set: results are reproducible.
 """
 
 from __future__ import annotations

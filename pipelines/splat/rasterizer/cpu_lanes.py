@@ -1,8 +1,8 @@
-"""A vector of `LANES` numbers for numba kernels: one row of a tile at a time, in registers.
+"""Vector of `LANES` numbers for numba kernels: one row of a tile at a time, in registers.
 
-numba leaves vectorising to LLVM, which gives up on loops with calls, selections or state that outlives the
-loop. Here each operation is emitted as one LLVM vector instruction instead, which LLVM then maps to whatever
-the processor has: AVX-512, AVX2, SSE or NEON. Works for float32 and float64.
+numba leaves vectorising to LLVM, which gives up on loops with calls, selections or state that outlives the loop.
+Here each operation is emitted as one LLVM vector instruction instead. LLVM maps it to the instructions of the
+processor: AVX-512, AVX2, SSE or NEON. Elements are float32 or float64.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from numba.extending import models, overload, register_model
 
 LANES = 16
 
-# Typed for what kernels see: the typing context that numba passes first is no argument to them.
+# Any, because numba adds the typing context as a first argument, which kernels do not pass.
 intrinsic: Any = numba.extending.intrinsic
 
 _INDEX = ir.IntType(32)
 
 
 class LanesType(types.Type):
-    """numba type of a vector of `LANES` elements."""
+    """Numba type of a vector of `LANES` elements."""
 
     def __init__(self, element: types.Float) -> None:
         self.element = element
@@ -48,7 +48,7 @@ def _row_pointer(context: Any, builder: Any, array_type: Any, array: Any, index:
 
 @intrinsic
 def load(typing_context: Any, array: Any, index: Any) -> Any:
-    """`array[index : index + LANES]` of a contiguous 1-D array; not checked."""
+    """Load `array[index : index + LANES]` of a contiguous 1-D array; not checked."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         pointer = _row_pointer(context, builder, array, args[0], args[1])
@@ -59,7 +59,7 @@ def load(typing_context: Any, array: Any, index: Any) -> Any:
 
 @intrinsic
 def store(typing_context: Any, array: Any, index: Any, lanes: Any) -> Any:
-    """`array[index : index + LANES] = lanes` in a contiguous 1-D array; not checked."""
+    """Store `array[index : index + LANES] = lanes` in a contiguous 1-D array; not checked."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         pointer = _row_pointer(context, builder, array, args[0], args[1])
@@ -71,7 +71,7 @@ def store(typing_context: Any, array: Any, index: Any, lanes: Any) -> Any:
 
 @intrinsic
 def splat(typing_context: Any, number: Any) -> Any:
-    """The same number in every lane."""
+    """Return the same number in every lane."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         vector = context.get_value_type(signature.return_type)
@@ -84,7 +84,7 @@ def splat(typing_context: Any, number: Any) -> Any:
 
 @intrinsic
 def where_greater(typing_context: Any, a: Any, b: Any, chosen: Any, otherwise: Any) -> Any:
-    """`chosen` in the lanes where a > b, `otherwise` in the others."""
+    """Return `chosen` in the lanes where a > b, `otherwise` in the others."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return builder.select(builder.fcmp_ordered(">", args[0], args[1]), args[2], args[3])
@@ -94,7 +94,7 @@ def where_greater(typing_context: Any, a: Any, b: Any, chosen: Any, otherwise: A
 
 @intrinsic
 def any_positive(typing_context: Any, lanes: Any) -> Any:
-    """Whether any lane is above zero."""
+    """Return whether any lane is above zero."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         positive = builder.fcmp_ordered(">", args[0], ir.Constant(args[0].type, None))
@@ -105,7 +105,7 @@ def any_positive(typing_context: Any, lanes: Any) -> Any:
 
 
 def _fold(builder: Any, a: Any, b: Any, low: list[int], high: list[int]) -> Any:
-    """The sum of two shuffles of the vectors a and b."""
+    """Return the sum of two shuffles of the vectors a and b."""
     halves = (
         builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(_INDEX, len(mask)), mask)) for mask in (low, high)
     )
@@ -114,7 +114,7 @@ def _fold(builder: Any, a: Any, b: Any, low: list[int], high: list[int]) -> Any:
 
 @intrinsic
 def store_totals(typing_context: Any, array: Any, index: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
-    """`array[index : index + 4] = a.sum(), b.sum(), c.sum(), d.sum()`, always added in the same order.
+    """Store `array[index : index + 4] = a.sum(), b.sum(), c.sum(), d.sum()`, always added in the same order.
 
     The four sums share their shuffles: within each group of four lanes first, then across the groups.
     """
@@ -171,7 +171,7 @@ def _libm_exp(typing_context: Any, lanes: Any) -> Any:
 
 
 def exp(x: Any) -> Any:
-    """e^x in kernels: in float32 to 3e-6 relative for −5.56 ≤ x ≤ 0 and anything, NaN too, elsewhere."""
+    """Return e^x in kernels: in float32 to 3e-6 relative for −5.56 ≤ x ≤ 0, and anything, even NaN, elsewhere."""
     raise NotImplementedError("only inside numba kernels")
 
 
@@ -181,7 +181,7 @@ def _resolve_exp(x: Any) -> Any:
         return _libm_exp(x)
 
     def polynomial(x: Any) -> Any:
-        # The minimax polynomial of e^(x/8), to the eighth power: neither bits nor tables are needed.
+        # The minimax polynomial of e^(x/8), to the eighth power, needs neither bit operations nor tables.
         y = splat(types.float32(1.788867319255094e-07))
         y = y * x + splat(types.float32(9.716052147757105e-06))
         y = y * x + splat(types.float32(0.00032419492951124107))

@@ -1,8 +1,4 @@
-"""Projection of Gaussians to the screen and its derivative, one Gaussian at a time, as numba kernels.
-
-Arithmetic is float64 whatever the arrays hold: it is scalar code, where float32 is no faster. Small matrices
-are flat tuples, row by row, so that they stay in registers.
-"""
+"""Numba kernels that find the visible Gaussians and fill the tables for binning and blending."""
 
 from __future__ import annotations
 
@@ -13,6 +9,20 @@ import numpy as np
 from numba import prange
 
 from pipelines.splat.rasterizer.api import ALPHA_MIN
+from pipelines.splat.rasterizer.cpu_gaussian import (
+    jacobian,
+    log_sigmoid,
+    point_in_cam,
+    rotation,
+    row3,
+    screen_covariance,
+    screen_from_model,
+    sh_colour,
+    times_rotation,
+    unit_direction,
+    unit_quat,
+    variances,
+)
 from pipelines.splat.rasterizer.cpu_jit import jit, parallel_jit, worker_jit
 from pipelines.splat.rasterizer.cpu_sh import MAX_COEFFICIENTS, sh_basis
 from pipelines.splat.rasterizer.cpu_slope import WIDEST, depth_slope
@@ -20,10 +30,11 @@ from pipelines.splat.rasterizer.cpu_view import View
 
 LOG_ALPHA_MIN = math.log(ALPHA_MIN)
 LOGIT_ALPHA_MIN = math.log(ALPHA_MIN / (1 - ALPHA_MIN))
-# Gaussians that one worker takes at a time: dealt out in turn, because the visible ones come in clusters.
+# Gaussians that one worker takes at a time. Blocks are dealt out in turn, because visible Gaussians come in
+# clusters.
 BLOCK = 256
 
-# Columns of the table of splats that blending reads: centre, factor of the conic (see `write_splat`),
+# Columns of the table of splats that blending reads: centre, factor of the conic (see `_write_splat`),
 # logarithm of the opacity, colour, depth of the centre, slope of the depth in metres per pixel.
 X, Y, FACTOR_XX, FACTOR_XY, FACTOR_YY, LOG_OPACITY, RED, GREEN, BLUE, DEPTH, SLOPE_X, SLOPE_Y = range(12)
 SPLAT_WIDTH = 12
@@ -33,108 +44,8 @@ ELLIPSE_WIDTH = 6
 
 
 @jit
-def row3(array: Any, i: int) -> Any:
-    """Row i of an (N, 3) array."""
-    return float(array[i, 0]), float(array[i, 1]), float(array[i, 2])
-
-
-@jit
-def point_in_cam(pose: Any, mean: Any) -> Any:
-    """(x, y, z) of a point under the rigid transformation `pose` (3, 4)."""
-    x, y, z = mean
-    return (
-        pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3],
-        pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3],
-        pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3],
-    )
-
-
-@jit
-def unit_quat(quats: Any, i: int) -> Any:
-    """Row i of (N, 4) quaternions at unit length, and the reciprocal of the length."""
-    w, x, y, z = float(quats[i, 0]), float(quats[i, 1]), float(quats[i, 2]), float(quats[i, 3])
-    scale = 1.0 / max(math.sqrt(w * w + x * x + y * y + z * z), 1e-12)
-    return (w * scale, x * scale, y * scale, z * scale), scale
-
-
-@jit
-def rotation(quat: Any) -> Any:
-    """Rotation matrix (9) of a unit quaternion (w, x, y, z)."""
-    w, x, y, z = quat
-    return (
-        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-
-
-@jit
-def variances(log_scales: Any, i: int) -> Any:
-    """Variances along the principal axes of Gaussian i."""
-    a, b, c = row3(log_scales, i)
-    return math.exp(2 * a), math.exp(2 * b), math.exp(2 * c)
-
-
-@jit
-def jacobian(view: View, point: Any) -> Any:
-    """Entries 00, 02, 11, 12 of ∂(u, v)/∂(x, y, z); the others are zero."""
-    x, y, z = point
-    slope_x = min(max(x / z, view.slope_x_min), view.slope_x_max)
-    slope_y = min(max(y / z, view.slope_y_min), view.slope_y_max)
-    return view.fx / z, -view.fx * slope_x / z, view.fy / z, -view.fy * slope_y / z
-
-
-@jit
-def screen_from_model(jac: Any, pose: Any) -> Any:
-    """W (9): the linearised map from the model's frame to (u, v, z)."""
-    j00, j02, j11, j12 = jac
-    return (
-        j00 * pose[0, 0] + j02 * pose[2, 0],
-        j00 * pose[0, 1] + j02 * pose[2, 1],
-        j00 * pose[0, 2] + j02 * pose[2, 2],
-        j11 * pose[1, 0] + j12 * pose[2, 0],
-        j11 * pose[1, 1] + j12 * pose[2, 1],
-        j11 * pose[1, 2] + j12 * pose[2, 2],
-        *(pose[2, 0], pose[2, 1], pose[2, 2]),
-    )
-
-
-@jit
-def times_rotation(w: Any, r: Any) -> Any:
-    """V = W R (9): the principal axes along (u, v, z)."""
-    return (
-        w[0] * r[0] + w[1] * r[3] + w[2] * r[6],
-        w[0] * r[1] + w[1] * r[4] + w[2] * r[7],
-        w[0] * r[2] + w[1] * r[5] + w[2] * r[8],
-        w[3] * r[0] + w[4] * r[3] + w[5] * r[6],
-        w[3] * r[1] + w[4] * r[4] + w[5] * r[7],
-        w[3] * r[2] + w[4] * r[5] + w[5] * r[8],
-        w[6] * r[0] + w[7] * r[3] + w[8] * r[6],
-        w[6] * r[1] + w[7] * r[4] + w[8] * r[7],
-        w[6] * r[2] + w[7] * r[5] + w[8] * r[8],
-    )
-
-
-@jit
-def screen_covariance(axes: Any, variance: Any, dilation: float) -> Any:
-    """xx, xy, yy of V diag(σ²) Vᵀ, of the rows u and v of V, + dilation · I."""
-    a, b, c = variance
-    return (
-        axes[0] * axes[0] * a + axes[1] * axes[1] * b + axes[2] * axes[2] * c + dilation,
-        axes[0] * axes[3] * a + axes[1] * axes[4] * b + axes[2] * axes[5] * c,
-        axes[3] * axes[3] * a + axes[4] * axes[4] * b + axes[5] * axes[5] * c + dilation,
-    )
-
-
-@jit
-def log_sigmoid(logit: float) -> float:
-    """ln of the opacity; only called where logit ≥ LOGIT_ALPHA_MIN."""
-    return -math.log1p(math.exp(-logit))
-
-
-@jit
 def _ellipse(means: Any, quats: Any, log_scales: Any, pose: Any, view: View, i: int) -> Any:
-    """Point in the camera's frame, screen covariance and slope of the depth of Gaussian i."""
+    """Return the point in the camera's frame, screen covariance and slope of the depth of Gaussian i."""
     point = point_in_cam(pose, row3(means, i))
     quat, _ = unit_quat(quats, i)
     axes = times_rotation(screen_from_model(jacobian(view, point), pose), rotation(quat))
@@ -145,7 +56,7 @@ def _ellipse(means: Any, quats: Any, log_scales: Any, pose: Any, view: View, i: 
 
 @jit
 def _holds_pixel(center: float, extent: float, size: float) -> bool:
-    """Whether a pixel centre 0.5, 1.5 … size − 0.5 lies within `extent` of `center`."""
+    """Return whether a pixel centre 0.5, 1.5 … size − 0.5 lies within `extent` of `center`."""
     first = max(math.ceil(center - extent - 0.5), 0.0)
     last = min(math.floor(center + extent - 0.5), size - 1.0)
     return first <= last
@@ -153,7 +64,7 @@ def _holds_pixel(center: float, extent: float, size: float) -> bool:
 
 @jit
 def _may_reach_image(point: Any, largest_log_scale: float, view: View) -> bool:
-    """False only if a sphere around the Gaussian is sure to project outside the image: cheap, for most of them."""
+    """Return False only if a sphere around the Gaussian surely projects outside the image: a cheap first test."""
     x, y, z = point
     sigma = math.exp(largest_log_scale) / z
     reach_x = WIDEST * math.sqrt(view.stretch_x * view.stretch_x * sigma * sigma + view.dilation)
@@ -164,9 +75,9 @@ def _may_reach_image(point: Any, largest_log_scale: float, view: View) -> bool:
 
 @jit
 def _is_visible(means: Any, quats: Any, log_scales: Any, logit: float, pose: Any, view: View, i: int) -> bool:
-    """Whether the ellipse in which Gaussian i reaches ALPHA_MIN has a pixel in its bounding box.
+    """Return whether the ellipse in which Gaussian i reaches ALPHA_MIN has a pixel in its bounding box.
 
-    Written so that NaN anywhere makes it invisible.
+    Comparisons are written so that NaN anywhere makes the Gaussian invisible.
     """
     point, (xx, xy, yy), _ = _ellipse(means, quats, log_scales, pose, view, i)
     if not (xx * yy - xy * xy > 0.0 and xx < math.inf and yy < math.inf):
@@ -202,7 +113,7 @@ def find_visible(
     means: Any, quats: Any, log_scales: Any, logit_opacities: Any, pose: Any, view: View, visible: Any, depth: Any,
     workers: int,
 ) -> None:  # fmt: skip
-    """Write, for N Gaussians, whether each is visible (N,) and its depth (N,) if it is; on `workers` threads."""
+    """Write the visibility (N,) of N Gaussians, and the depth (N,) of the visible, on `workers` threads."""
     for worker in prange(workers):
         _find_visible(
             means, quats, log_scales, logit_opacities, pose, view, visible, depth, np.int64(worker), workers
@@ -211,10 +122,10 @@ def find_visible(
 
 @jit
 def _write_splat(splats: Any, ellipses: Any, row: int, center: Any, cov: Any, log_opacity: float) -> None:
-    """Fill the row that blending and the one that binning reads, but for colour, depth and slope.
+    """Fill the rows for blending (without colour, depth and slope) and for binning.
 
-    The conic is kept as the factor of ½ Σ⁻¹: the exponent is −(f_xx dx + f_xy dy)² − (f_yy dy)², which does not
-    cancel catastrophically for long thin Gaussians as the polynomial does.
+    The conic is kept as the factor of ½ Σ⁻¹: the exponent is −(f_xx dx + f_xy dy)² − (f_yy dy)². This form does not
+    cancel catastrophically for long thin Gaussians, as the polynomial does.
     """
     xx, xy, yy = cov
     determinant = xx * yy - xy * xy
@@ -231,29 +142,10 @@ def _write_splat(splats: Any, ellipses: Any, row: int, center: Any, cov: Any, lo
 
 @jit
 def _longer_radius(cov: Any) -> float:
-    """Three standard deviations along the longer axis of a covariance xx, xy, yy."""
+    """Return three standard deviations along the longer axis of a covariance xx, xy, yy."""
     xx, xy, yy = cov
     half_difference = 0.5 * (xx - yy)
     return 3.0 * math.sqrt(0.5 * (xx + yy) + math.sqrt(half_difference * half_difference + xy * xy))
-
-
-@jit
-def unit_direction(mean: Any, center: Any) -> Any:
-    """Unit vector from the camera's centre to a Gaussian, and the reciprocal of their distance."""
-    x, y, z = mean[0] - center[0], mean[1] - center[1], mean[2] - center[2]
-    scale = 1.0 / max(math.sqrt(x * x + y * y + z * z), 1e-12)
-    return (x * scale, y * scale, z * scale), scale
-
-
-@jit
-def sh_colour(sh: Any, i: int, basis: Any, terms: int) -> Any:
-    """Red, green, blue of Gaussian i before they are clamped at zero."""
-    red, green, blue = 0.5, 0.5, 0.5
-    for k in range(terms):
-        red += basis[k] * sh[i, k, 0]
-        green += basis[k] * sh[i, k, 1]
-        blue += basis[k] * sh[i, k, 2]
-    return red, green, blue
 
 
 @worker_jit
@@ -293,7 +185,7 @@ def project_visible(
         view: camera.
         degree: of the spherical harmonics in use.
         visible: (M,) rows of the Gaussians, ascending.
-        rank: (M,) place of each in the order of depth.
+        rank: (M,) places of the visible Gaussians in the order of depth.
         splats: (M, SPLAT_WIDTH) by rank, written.
         ellipses: (M, ELLIPSE_WIDTH) by rank, written.
         radius: (M,) three standard deviations along the longer axis in px, in the order of `visible`, written.

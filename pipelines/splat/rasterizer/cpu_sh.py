@@ -10,7 +10,7 @@ from typing import Any
 
 from pipelines.splat.rasterizer.cpu_jit import jit
 
-# N_lm of the real spherical harmonics; the rest of each is a polynomial of the direction.
+# N_lm of the real spherical harmonics; the other factor of each is a polynomial of the direction.
 _C0 = math.sqrt(1 / (4 * math.pi))
 _C1 = math.sqrt(3 / (4 * math.pi))
 _C2 = math.sqrt(15 / (4 * math.pi))
@@ -52,7 +52,7 @@ def sh_basis(direction: Any, degree: int, basis: Any) -> None:
 
 @jit
 def sh_direction_gradient(direction: Any, degree: int, weight: Any) -> Any:
-    """Σ_k weight[k] · ∂basis[k]/∂(x, y, z), the polynomials taken as functions of all space."""
+    """Return Σ_k weight[k] · ∂basis[k]/∂(x, y, z), with the polynomials as functions of all space."""
     x, y, z = direction
     gx, gy, gz = 0.0, 0.0, 0.0
     if degree >= 1:

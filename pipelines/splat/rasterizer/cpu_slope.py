@@ -1,7 +1,7 @@
-"""How the depth of a Gaussian changes across the screen, and the derivative of that, as numba kernels.
+"""Slope of the depth of a Gaussian across the screen, and its derivative, as numba functions.
 
 With V the principal axes along (u, v, z), in rows, D their variances and C the dilated screen covariance, the
-slope is q = s C⁻¹ c, c = (V D Vᵀ)_uz,vz. The factor s ≤ 1 keeps z near that of the centre, see `api`.
+slope is q = s C⁻¹ c, c = (V D Vᵀ)_uz,vz. The factor s ≤ 1 keeps z near the depth of the centre, see `api`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _SPREAD_MAX = DEPTH_REACH / WIDEST
 
 @jit
 def _free_slope(axes: Any, variance: Any, cov: Any) -> Any:
-    """c (2), C⁻¹ (xx, xy, yy) and C⁻¹ c (2)."""
+    """Return c (2), C⁻¹ (xx, xy, yy) and C⁻¹ c (2)."""
     a, b, c = variance
     xz = axes[0] * axes[6] * a + axes[1] * axes[7] * b + axes[2] * axes[8] * c
     yz = axes[3] * axes[6] * a + axes[4] * axes[7] * b + axes[5] * axes[8] * c
@@ -39,14 +39,14 @@ def _times(symmetric: Any, vector: Any) -> Any:
 
 @jit
 def _shrinkage(spread2: float, depth: float) -> float:
-    """s, given c · C⁻¹ c, the variance of the depth over the screen."""
+    """Return s, given c · C⁻¹ c, the variance of the depth over the screen."""
     most = _SPREAD_MAX * depth
     return most / math.sqrt(spread2) if spread2 > most * most else 1.0
 
 
 @jit
 def depth_slope(axes: Any, variance: Any, cov: Any, depth: float) -> Any:
-    """∂z/∂u, ∂z/∂v of a Gaussian in metres per pixel, given V (9), D (3), C (xx, xy, yy) and z of the centre."""
+    """Return ∂z/∂u, ∂z/∂v of a Gaussian in m/px, given V (9), D (3), C (xx, xy, yy) and z of the centre."""
     (xz, yz), _, (qx, qy) = _free_slope(axes, variance, cov)
     s = _shrinkage(xz * qx + yz * qy, depth)
     return s * qx, s * qy
@@ -54,7 +54,7 @@ def depth_slope(axes: Any, variance: Any, cov: Any, depth: float) -> Any:
 
 @jit
 def depth_slope_gradient(axes: Any, variance: Any, cov: Any, depth: float, g_slope: Any) -> Any:
-    """The slope, and given ∂L/∂ slope: ∂L/∂c (2), the symmetric ∂L/∂C (xx, xy, yy) and ∂L/∂z."""
+    """Return the slope and, given ∂L/∂ slope, ∂L/∂c (2), the symmetric ∂L/∂C (xx, xy, yy) and ∂L/∂z."""
     (xz, yz), inverse, (qx, qy) = _free_slope(axes, variance, cov)
     spread2 = xz * qx + yz * qy
     s = _shrinkage(spread2, depth)

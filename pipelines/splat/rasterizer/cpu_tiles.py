@@ -1,8 +1,8 @@
-"""Which splats touch which tiles, nearest first: a parallel counting sort, as numba kernels.
+"""Lists of the splats of each tile, nearest first: a parallel counting sort, as numba kernels.
 
-An ellipse is cut into the columns of tiles that it crosses. Within a column its extreme rows are known in
-closed form, so that a tile is listed only if the ellipse enters it, with exactly the rows that it enters
-(the idea of AccuTile, doi 10.48550/arXiv.2412.00578).
+An ellipse is cut into the columns of tiles that it crosses. Its extreme rows within a column have a closed form. A
+tile is therefore listed only if the ellipse enters it, with exactly the rows that the ellipse enters (the idea of
+AccuTile, doi 10.48550/arXiv.2412.00578).
 """
 
 from __future__ import annotations
@@ -19,24 +19,24 @@ from pipelines.splat.rasterizer.cpu_project import E_LEVEL, E_X, E_XX, E_XY, E_Y
 
 TILE_WIDTH = LANES
 TILE_HEIGHT = 32
-# The splats are counted and written in this many runs of the depth order, whatever the number of threads.
+# Number of runs of the depth order in which splats are counted and written, whatever the number of threads.
 RUNS = 32
 
 
 def tile_grid(width: int, height: int) -> tuple[int, int]:
-    """Columns and rows of tiles over an image."""
+    """Return the columns and rows of tiles over an image."""
     return -(-width // TILE_WIDTH), -(-height // TILE_HEIGHT)
 
 
 @jit
 def pack_hit(splat: int, first_row: int, last_row: int) -> int:
-    """A splat in a tile, and the first and last of the tile's rows that it touches."""
+    """Pack a splat in a tile with the first and last of the tile's rows that it touches."""
     return (splat << 16) | (first_row << 8) | last_row
 
 
 @jit
 def unpack_hit(hit: int) -> Any:
-    """The inverse of `pack_hit`."""
+    """Unpack a hit: inverts `pack_hit`."""
     return hit >> 16, (hit >> 8) & 255, hit & 255
 
 
@@ -47,7 +47,7 @@ def _clamp_to_int(value: float, low: int, high: int) -> int:
 
 @jit
 def _column_span(ellipses: Any, splat: int, width: int) -> Any:
-    """First and last column of tiles; first > last if there is none."""
+    """Return the first and last column of tiles; first > last if there is none."""
     x = float(ellipses[splat, E_X])
     extent = math.sqrt(float(ellipses[splat, E_LEVEL]) * float(ellipses[splat, E_XX]))
     first = _clamp_to_int(math.ceil(x - extent - 0.5), 0, width)
@@ -59,10 +59,10 @@ def _column_span(ellipses: Any, splat: int, width: int) -> Any:
 
 @jit
 def _row_span(ellipses: Any, splat: int, column: int, height: int) -> Any:
-    """First and last row of pixels that the ellipse touches within a column of tiles.
+    """Return the first and last row of pixels that the ellipse touches within a column of tiles.
 
-    At a distance dx from the centre the ellipse spans dx · xy/xx ± sqrt((level − dx²/xx) · det/xx); the upper
-    branch is concave, so its maximum over an interval is at its own, clamped to the interval.
+    At a distance dx from the centre the ellipse spans dx · xy/xx ± sqrt((level − dx²/xx) · det/xx). The upper
+    branch is concave: its maximum over an interval lies at its global maximum, clamped to the interval.
     """
     x, y = float(ellipses[splat, E_X]), float(ellipses[splat, E_Y])
     xx, xy, yy = float(ellipses[splat, E_XX]), float(ellipses[splat, E_XY]), float(ellipses[splat, E_YY])
@@ -116,7 +116,7 @@ def count_hits(ellipses: Any, width: int, height: int, per_tile: Any, per_splat:
 
 @kernel_jit
 def starts_from_counts(per_tile: Any, tile_start: Any) -> None:
-    """Turn `per_tile` (RUNS, tiles) into the place of each run's first hit, and fill `tile_start` (tiles + 1,)."""
+    """Turn `per_tile` (RUNS, tiles) into the place of each run's first hit; fill `tile_start` (tiles + 1,)."""
     place = 0
     for tile in range(per_tile.shape[1]):
         tile_start[tile] = place
@@ -153,12 +153,12 @@ def _list_hits(
 def list_hits(
     ellipses: Any, width: int, height: int, next_place: Any, splat_start: Any, hits: Any, places: Any
 ) -> None:
-    """List the splats of each tile, nearest first, and for each splat where it stands in those lists.
+    """List the splats of each tile, nearest first, and the places of each splat in those lists.
 
     Args:
         ellipses: (M, ELLIPSE_WIDTH), nearest first.
         width, height: of the image in px.
-        next_place: (RUNS, tiles) from `starts_from_counts`, used up.
+        next_place: (RUNS, tiles) from `starts_from_counts`, overwritten.
         splat_start: (M + 1,) start of each splat in `places`.
         hits: (H,) packed hits by tile, written.
         places: (H,) places in `hits` by splat, written.

@@ -1,4 +1,4 @@
-"""The camera as the kernels want it."""
+"""Camera in the form of the kernels."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pipelines.splat.rasterizer.reference import FRUSTUM_MARGIN
 
 
 class View(NamedTuple):
-    """The camera as kernels want it: lengths in pixels, slopes x/z and y/z, near plane in metres.
+    """Camera of the kernels: lengths in pixels, slopes x/z and y/z, near plane in metres.
 
     A standard deviation of 1 m at a depth of 1 m is at most `stretch_x` px wide and `stretch_y` px high.
     """
@@ -35,12 +35,12 @@ class View(NamedTuple):
 
 
 def make_view(camera: Pinhole, settings: RasterSettings, pose: FloatArray) -> View:
-    """The kernels' view of `camera`; the Jacobian is taken no further out than these slopes, as in gsplat."""
+    """Return the kernels' form of `camera`; the Jacobian is taken no further out than its slopes, as in gsplat."""
     margin_x = FRUSTUM_MARGIN * 0.5 * camera.width / camera.fx
     margin_y = FRUSTUM_MARGIN * 0.5 * camera.height / camera.fy
     slope_x_min, slope_x_max = -camera.cx / camera.fx - margin_x, (camera.width - camera.cx) / camera.fx + margin_x
     slope_y_min, slope_y_max = -camera.cy / camera.fy - margin_y, (camera.height - camera.cy) / camera.fy + margin_y
-    # 1 for a rotation, which is what it should be; but the derivative is taken in all of its entries.
+    # The norm of a rotation is 1. Derivatives vary all entries of the pose, however, and leave the rotations.
     norm = float(np.linalg.norm(pose[:, :3], 2))
     return View(
         width=float(camera.width),

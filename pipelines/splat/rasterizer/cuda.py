@@ -1,7 +1,7 @@
-"""The rasteriser on a GPU: gsplat behind the common interface.
+"""Rasteriser on a GPU: gsplat behind the common interface.
 
-gsplat (doi 10.48550/arXiv.2409.06765) blends by the rules of `api`; what it lacks, depth at the pixel, is made
-here: the expected one by blending the Gaussians' planes, the median one from its pixel–Gaussian intersections.
+gsplat (doi 10.48550/arXiv.2409.06765) blends by the rules of `api`, but has no depth at the pixel. The expected
+depth comes from blending the Gaussians' planes, the median depth from gsplat's pixel–Gaussian intersections.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ _EVERY_BATCH = 2**31 - 1
 
 
 def cuda_available() -> bool:
-    """Whether a CUDA device and gsplat are both present."""
+    """Return whether a CUDA device and gsplat are both present."""
     return torch.cuda.is_available() and importlib.util.find_spec("gsplat") is not None
 
 
 class CudaRasterizer:
-    """gsplat ≥ 1.5.3. The tensors must be on the CUDA device.
+    """Backend of gsplat ≥ 1.5.3. The tensors must be on the CUDA device.
 
     Raises:
         BackendUnavailableError: no CUDA device, no gsplat, or no kernels for it.
@@ -44,7 +44,7 @@ class CudaRasterizer:
     def render(
         self, gaussians: Gaussians, cam_from_model: Tensor, camera: Pinhole, settings: RasterSettings
     ) -> Render:
-        """See `Rasterizer.render`; the view and its statistics stay on the device."""
+        """See `Rasterizer.render`; the render and its statistics stay on the device."""
         device = gaussians.means.device
         image, alpha, meta = self._gsplat.rasterization(
             gaussians.means,
@@ -62,20 +62,20 @@ class CudaRasterizer:
             packed=True,
             backgrounds=_row(settings.background, device),
         )
-        found = Render(image[0], alpha[0, ..., 0], _screen_stats(meta))
+        view = Render(image[0], alpha[0, ..., 0], _screen_stats(meta))
         if settings.depth:
             slope = _depth_slope(gaussians, cam_from_model, camera, meta)
-            found.expected_depth, found.depth_variance = self._depth_moments(meta, slope, camera, found.alpha)
-            found.median_depth = self._median_depth(meta, slope, camera)
-        return found
+            view.expected_depth, view.depth_variance = self._depth_moments(meta, slope, camera, view.alpha)
+            view.median_depth = self._median_depth(meta, slope, camera)
+        return view
 
     def _depth_moments(
         self, meta: dict[str, Any], slope: Tensor, camera: Pinhole, alpha: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Mean and variance (H, W) of z = z₀ + q · (p − middle of the image), with the weights of blending.
+        """Return mean and variance (H, W) of z = z₀ + q · (p − middle of the image), with the weights of blending.
 
-        The three numbers of each Gaussian are blended, and the six products of them that make z². About the middle,
-        because a plane's depth at (0, 0) can be far from those that it is seen at.
+        The three numbers of each Gaussian are blended, and their six products that make z². Planes are stated about
+        the middle of the image: their depths at (0, 0) can be far from those in their pixels.
         """
         middle = 0.5 * _row((float(camera.width), float(camera.height)), slope.device)
         z = meta["depths"] + (slope * (middle - meta["means2d"])).sum(dim=-1)
@@ -103,7 +103,7 @@ class CudaRasterizer:
 
     @torch.no_grad()
     def _median_depth(self, meta: dict[str, Any], slope: Tensor, camera: Pinhole) -> Tensor:
-        """(H, W) z of the Gaussian at which the transmittance falls to one half, 0 where it never does."""
+        """Return z (H, W) of the Gaussian at which the transmittance falls to one half, 0 if it stays higher."""
         means_px, conics, opacities = meta["means2d"], meta["conics"], meta["opacities"]
         median = torch.zeros(camera.height * camera.width, device=means_px.device)
         if len(means_px) == 0:
@@ -147,7 +147,7 @@ def _import_gsplat() -> ModuleType:
             "no CUDA device found: install a driver and a CUDA build of torch, or use the cpu backend"
         )
     try:
-        # Its first import may compile for minutes, and says so on stdout, which belongs to results.
+        # The first import may compile for minutes. Its messages go to stdout, which belongs to results.
         with contextlib.redirect_stdout(sys.stderr):
             import gsplat
             from gsplat.cuda import _backend
@@ -164,7 +164,7 @@ def _import_gsplat() -> ModuleType:
     return module
 
 
-# Small constants are made once: every copy to the device waits for all that was asked of it before.
+# Small constants are made once: every copy to the device waits for all work that is queued there.
 @lru_cache(maxsize=64)
 def _row(values: tuple[float, ...], device: torch.device) -> Tensor:
     return torch.tensor([values], device=device)
@@ -176,9 +176,10 @@ def _intrinsics(camera: Pinhole, device: torch.device) -> Tensor:
 
 
 def _depth_slope(gaussians: Gaussians, cam_from_model: Tensor, camera: Pinhole, meta: dict[str, Any]) -> Tensor:
-    """∂z/∂(u, v) of the M visible Gaussians (M, 2), in m/px.
+    """Return ∂z/∂(u, v) of the M visible Gaussians (M, 2), in m/px.
 
-    By gsplat's own conics: they decide how far from its centre a Gaussian is seen, hence how far its plane reaches.
+    The conics are gsplat's own: they limit how far from its centre a Gaussian is seen, hence the reach of its
+    plane.
     """
     rows, pose = meta["gaussian_ids"].long(), cam_from_model.to(gaussians.means.dtype)
     mean_in_cam = gaussians.means[rows] @ pose[:3, :3].T + pose[:3, 3]

@@ -1,7 +1,7 @@
-"""The rasteriser in plain torch, as close to the equations as it gets: the oracle of the fast ones.
+"""Rasteriser in plain torch, as close to the equations as possible: the oracle of the fast backends.
 
-Dense (every Gaussian at every pixel), in the dtype of its inputs, differentiated by autograd. For tests and
-small images only: memory grows as Gaussians × pixels.
+Every Gaussian is evaluated at every pixel, in the dtype of the inputs, and differentiated by autograd. Use it for
+tests and small images only: memory grows as Gaussians × pixels.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from pipelines.splat.rasterizer.api import (
     ScreenStats,
 )
 
-# How far outside the image, in half widths, the projection is still linearised at the point itself.
+# Margin around the image, in half widths, within which the projection is linearised at the point itself.
 FRUSTUM_MARGIN = 0.3
 
 
@@ -49,7 +49,7 @@ def render_reference(
     front = front[torch.argsort(mean_in_cam[front, 2].detach(), stable=True)]
     sorted_gaussians, mean_in_cam = gaussians.select(front), mean_in_cam[front]
 
-    mean_px, cov_px2 = project(sorted_gaussians, mean_in_cam, pose, camera, settings.dilation_px2)
+    mean_px, cov_px2 = project_gaussians(sorted_gaussians, mean_in_cam, pose, camera, settings.dilation_px2)
     colours = view_colours(sorted_gaussians, pose, settings.sh_degree)
     offset_px = _offsets(mean_px, camera)
     alpha = _alpha(offset_px, cov_px2, torch.sigmoid(sorted_gaussians.logit_opacities))
@@ -79,10 +79,10 @@ def render_reference(
     return Render(colour.view(*size, 3), (1 - final).view(size), stats, expected, variance, median)
 
 
-def project(
+def project_gaussians(
     gaussians: Gaussians, mean_in_cam: Tensor, cam_from_model: Tensor, camera: Pinhole, dilation_px2: float
 ) -> tuple[Tensor, Tensor]:
-    """Screen means (N, 2) in px and dilated screen covariances (N, 2, 2) in px²."""
+    """Return screen means (N, 2) in px and dilated screen covariances (N, 2, 2) in px²."""
     x, y, z = mean_in_cam.unbind(-1)
     screen_axes = _projected_axes(gaussians.quats_wxyz, gaussians.log_scales, mean_in_cam, cam_from_model, camera)[
         :, :2
@@ -95,13 +95,13 @@ def project(
 def screen_depth_covariance(
     quats_wxyz: Tensor, log_scales: Tensor, mean_in_cam: Tensor, cam_from_model: Tensor, camera: Pinhole
 ) -> Tensor:
-    """Covariances (N, 2) of the screen position (u, v) with z, in px · m, of Gaussians at (N, 3)."""
+    """Return covariances (N, 2) of the screen position (u, v) with z, in px · m, of Gaussians at (N, 3)."""
     axes = _projected_axes(quats_wxyz, log_scales, mean_in_cam, cam_from_model, camera)
     return (axes[:, :2] @ axes[:, 2, :, None])[..., 0]
 
 
 def bounded_slope(slope: Tensor, cov_px_m: Tensor, depth: Tensor) -> Tensor:
-    """∂z/∂(u, v) of the Gaussians (N, 2) in m/px, shortened where z would leave `DEPTH_REACH` of the centre's.
+    """Return ∂z/∂(u, v) of Gaussians (N, 2) in m/px, shortened if z would leave `DEPTH_REACH` of the centre's.
 
     Args:
         slope: (N, 2) q = C⁻¹ c.
@@ -116,7 +116,7 @@ def bounded_slope(slope: Tensor, cov_px_m: Tensor, depth: Tensor) -> Tensor:
 def _projected_axes(
     quats_wxyz: Tensor, log_scales: Tensor, mean_in_cam: Tensor, cam_from_model: Tensor, camera: Pinhole
 ) -> Tensor:
-    """The principal axes, a standard deviation long, along (u, v, z): (N, 3, 3), one axis a column, px, px and m.
+    """Return principal axes (N, 3, 3), a standard deviation long, along (u, v, z): an axis a column; px, px and m.
 
     The perspective is linearised at the centre (EWA, doi 10.1109/TVCG.2002.1021576), but no further out than
     `FRUSTUM_MARGIN` beyond the image, as in gsplat.
@@ -138,13 +138,13 @@ def _projected_axes(
 
 
 def view_colours(gaussians: Gaussians, cam_from_model: Tensor, sh_degree: int) -> Tensor:
-    """(N, 3) colours of the Gaussians seen from the camera's centre, not negative."""
+    """Return colours (N, 3) of the Gaussians seen from the camera's centre, not negative."""
     center_in_model = -torch.linalg.solve(cam_from_model[:3, :3], cam_from_model[:3, 3])
-    return (sh.evaluate(gaussians.sh, gaussians.means - center_in_model, sh_degree) + 0.5).clamp_min(0.0)
+    return (sh.evaluate_sh(gaussians.sh, gaussians.means - center_in_model, sh_degree) + 0.5).clamp_min(0.0)
 
 
 def _offsets(mean_px: Tensor, camera: Pinhole) -> Tensor:
-    """(N, H·W, 2) from the screen means to the pixel centres."""
+    """Return offsets (N, H·W, 2) from the screen means to the pixel centres."""
     v, u = torch.meshgrid(
         torch.arange(camera.height, dtype=mean_px.dtype) + 0.5,
         torch.arange(camera.width, dtype=mean_px.dtype) + 0.5,
@@ -154,7 +154,7 @@ def _offsets(mean_px: Tensor, camera: Pinhole) -> Tensor:
 
 
 def _alpha(offset_px: Tensor, cov_px2: Tensor, opacity: Tensor) -> Tensor:
-    """(N, H·W) opacity of each Gaussian at each pixel centre, cut off below ALPHA_MIN and above ALPHA_MAX."""
+    """Return opacities (N, H·W) at each pixel centre, cut off below ALPHA_MIN and above ALPHA_MAX."""
     dx, dy = offset_px.unbind(-1)
     xx, xy, yy = cov_px2[:, 0, 0, None], cov_px2[:, 0, 1, None], cov_px2[:, 1, 1, None]
     sigma = 0.5 * (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / (xx * yy - xy * xy)
@@ -163,7 +163,7 @@ def _alpha(offset_px: Tensor, cov_px2: Tensor, opacity: Tensor) -> Tensor:
 
 
 def _median_depth(depth: Tensor, before: Tensor, after: Tensor, counted: Tensor) -> Tensor:
-    """(P,) z, of (N, P), of the Gaussian at which the transmittance of each pixel falls to one half, else 0."""
+    """Return z (P,), of (N, P), of the Gaussian at which a pixel's transmittance falls to one half, else 0."""
     crossing = counted & (before > 0.5) & (after <= 0.5)
     return torch.where(crossing, depth.detach(), 0.0).sum(dim=0)
 

@@ -15,7 +15,7 @@ Scene = tuple[Gaussians, Tensor]
 
 
 def random_scene(count: int, *, seed: int = 0, degree: int = 3, log_scale: float = -2.0) -> Scene:
-    """Gaussians (float64) at depths 2 to 8 m, some of them outside the image, and a camera off the origin."""
+    """Return Gaussians (float64) at depths 2 to 8 m, some outside the image, and a camera off the origin."""
     random = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> Tensor:
@@ -38,14 +38,14 @@ def random_scene(count: int, *, seed: int = 0, degree: int = 3, log_scale: float
 
 
 def as_leaves(scene: Scene, dtype: torch.dtype) -> Scene:
-    """A copy in `dtype` that collects gradients; the pose stays float64, as in training."""
+    """Return a copy in `dtype` that collects gradients; the pose stays float64, as in training."""
     gaussians, pose = scene
     tensors = [tensor.detach().to(dtype).requires_grad_() for tensor in gaussians.tensors().values()]
     return Gaussians(*tensors), pose.detach().clone().requires_grad_()
 
 
 def weighted_loss(render: Render, *, seed: int = 0) -> Tensor:
-    """A loss to which every pixel of every differentiable image contributes with its own random weight."""
+    """Return a loss to which every pixel of every differentiable image contributes with its own random weight."""
     random = torch.Generator().manual_seed(seed)
     loss = torch.zeros((), dtype=torch.float64)
     for image in (render.colour, render.alpha, render.expected_depth, render.depth_variance):
@@ -56,7 +56,7 @@ def weighted_loss(render: Render, *, seed: int = 0) -> Tensor:
 
 @pytest.fixture
 def camera() -> Pinhole:
-    """Not a multiple of the tile in either direction, and off centre."""
+    """Return a camera off centre, whose image is no multiple of the tile in either direction."""
     return Pinhole(width=70, height=45, fx=60.0, fy=58.0, cx=36.0, cy=21.0)
 
 

@@ -21,7 +21,7 @@ PLAIN = RasterSettings(sh_degree=0, depth=True)
 
 
 def stack(depths, logits, colours, *, sigma=500.0):
-    """Round Gaussians one behind the other, wide enough to be constant over the image."""
+    """Return round Gaussians behind each other, wide enough to be constant over the image."""
     count = len(depths)
     means = torch.zeros(count, 3)
     means[:, 2] = torch.tensor(depths)
@@ -132,8 +132,8 @@ def test_extreme_parameters_keep_gradients_finite(make_scene, leaves, loss_of, c
         gaussians.logit_opacities[5:7] = torch.tensor([60.0, -60.0])
         gaussians.means[7] = torch.linalg.inv(pose)[:3, 3] + 0.0501 * pose[2, :3]
         gaussians.sh[8] = 1e6
-    found = gradients(gaussians, pose, camera, RasterSettings(depth=True), loss_of)
-    assert all(torch.isfinite(gradient).all() for gradient in found)
+    grads = gradients(gaussians, pose, camera, RasterSettings(depth=True), loss_of)
+    assert all(torch.isfinite(gradient).all() for gradient in grads)
 
 
 @pytest.mark.parametrize("name", ["means", "quats_wxyz", "log_scales", "logit_opacities"])

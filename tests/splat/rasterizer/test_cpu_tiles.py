@@ -20,7 +20,7 @@ def frame(make_scene, camera, monkeypatch):
     monkeypatch.setattr(
         cpu, "_list_tiles", lambda ellipses, size: tables.update(e=ellipses) or listing(ellipses, size)
     )
-    frame = cpu._Frame(camera, RasterSettings())
+    frame = cpu._RenderContext(camera, RasterSettings())
     center = -torch.linalg.solve(pose[:3, :3], pose[:3, 3])
     parameters = [tensor.numpy() for tensor in gaussians.tensors().values()]
     cpu._project(frame, parameters, pose[:3].numpy(), center.numpy())
@@ -28,7 +28,7 @@ def frame(make_scene, camera, monkeypatch):
 
 
 def inside(ellipse, camera):
-    """(H, W) whether each pixel centre lies in an ellipse."""
+    """Return the mask (H, W) of the pixel centres that lie in an ellipse."""
     determinant = ellipse[E_XX] * ellipse[E_YY] - ellipse[E_XY] ** 2
     dx = np.arange(camera.width) + 0.5 - ellipse[E_X]
     dy = (np.arange(camera.height) + 0.5 - ellipse[E_Y])[:, None]
@@ -51,9 +51,9 @@ def test_lists_are_complete_tight_and_sorted(frame, camera):
     for splat, ellipse in enumerate(ellipses):
         pixels = np.pad(inside(ellipse, camera), ((0, 0), (0, columns * TILE_WIDTH - camera.width)))
         touched = pixels.reshape(camera.height, columns, TILE_WIDTH).any(axis=2)
-        found = listed[splat, : camera.height]
-        assert not (touched & ~found).any()
-        wasted += (found & ~touched).sum()
+        rows_listed = listed[splat, : camera.height]
+        assert not (touched & ~rows_listed).any()
+        wasted += (rows_listed & ~touched).sum()
     # An ellipse may pass between pixel centres, or beside the last column of the image; else rows are exact.
     assert wasted < 0.1 * listed.sum()
 

@@ -1,7 +1,7 @@
 """The gsplat backend without a GPU: what it says when it cannot run, and what it makes of gsplat's results.
 
 A stand-in plays gsplat on the CPU: it projects by the reference, and blends and lists intersections by brute force,
-in the shapes and the order of gsplat 1.5.3. What the real kernels return is for a machine that has a GPU.
+in the shapes and the order of gsplat 1.5.3. Tests of the real kernels need a machine with a GPU.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.rasterizer import cuda
 from pipelines.splat.rasterizer.api import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, RasterSettings
 from pipelines.splat.rasterizer.backends import rasterizer
-from pipelines.splat.rasterizer.reference import project, render_reference, view_colours
+from pipelines.splat.rasterizer.reference import project_gaussians, render_reference, view_colours
 
 BACKGROUND = (0.1, 0.7, 0.4)
 
@@ -36,7 +36,7 @@ class StandIn:
             rows = render_reference(gaussians, viewmats[0], camera, settings).stats.visible
         seen, pose = gaussians.select(rows), viewmats[0]
         in_cam = seen.means @ pose[:3, :3].T + pose[:3, 3]
-        means2d, cov = project(seen, in_cam, pose, camera, options["eps2d"])
+        means2d, cov = project_gaussians(seen, in_cam, pose, camera, options["eps2d"])
         inverse = torch.linalg.inv(cov)
         conics = torch.stack([inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 1, 1]], dim=-1)
         meta = {"means2d": means2d, "conics": conics, "opacities": opacities[rows], "depths": in_cam[:, 2]}
@@ -66,9 +66,9 @@ class StandIn:
         self, start, end, transmittances, means2d, conics, opacities, width, height, tile_size, offsets, order
     ):
         assert start == 0 and end > 1_000_000 and transmittances.shape == (1, height, width)
-        found = []
+        intersections = []
         for pixel in range(width * height):
-            left = 1.0
+            transmittance = 1.0
             for index in order.tolist():
                 dx, dy = means2d[0, index] - torch.tensor([pixel % width + 0.5, pixel // width + 0.5])
                 a, b, c = conics[0, index]
@@ -78,11 +78,11 @@ class StandIn:
                 )
                 if alpha < ALPHA_MIN:
                     continue
-                left *= 1 - alpha
-                if left <= TRANSMITTANCE_MIN:
+                transmittance *= 1 - alpha
+                if transmittance <= TRANSMITTANCE_MIN:
                     break
-                found.append((index, pixel))
-        gaussian, pixel = torch.tensor(found).T
+                intersections.append((index, pixel))
+        gaussian, pixel = torch.tensor(intersections).T
         return gaussian, pixel, torch.zeros_like(pixel)
 
 

@@ -18,7 +18,7 @@ RENDERERS = pytest.mark.parametrize("render", [CpuRasterizer().render, render_re
 
 
 def disc(center, tilt_rad, sigma_m, *, opacity=0.95):
-    """One flat Gaussian, turned by `tilt_rad` about the camera's x axis from facing it."""
+    """Return a flat Gaussian that faces the camera, turned by `tilt_rad` about the camera's x axis."""
     quat = [math.cos(tilt_rad / 2), math.sin(tilt_rad / 2), 0.0, 0.0]
     return Gaussians(
         means=torch.tensor([center], dtype=torch.float64),
@@ -30,7 +30,7 @@ def disc(center, tilt_rad, sigma_m, *, opacity=0.95):
 
 
 def rays():
-    """(H, W, 3) directions through the pixel centres, z = 1."""
+    """Return directions (H, W, 3) through the pixel centres, z = 1."""
     v, u = torch.meshgrid(
         torch.arange(CAMERA.height, dtype=torch.float64) + 0.5,
         torch.arange(CAMERA.width, dtype=torch.float64) + 0.5,
@@ -93,7 +93,7 @@ def test_depth_stays_in_front_of_the_camera(render):
     view = render(gaussians, torch.eye(4, dtype=torch.float64), CAMERA, SETTINGS)
     seen = view.alpha > 0
     assert (view.expected_depth[seen] - 2.0).abs().max() <= 2.0 * DEPTH_REACH
-    # It uses most of that reach, down to where α is 1/255.
+    # The needle uses most of that reach, down to α = 1/255.
     assert (view.expected_depth[seen] - 2.0).abs().max() > 0.8 * 2.0 * DEPTH_REACH
     assert view.alpha[seen].min() >= ALPHA_MIN
     assert (view.median_depth[view.alpha > 0.5] > 0).all()

@@ -10,7 +10,7 @@ import torch
 from pipelines.splat import sh
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.rasterizer.api import ALPHA_MIN, Pinhole, RasterSettings
-from pipelines.splat.rasterizer.reference import project, render_reference
+from pipelines.splat.rasterizer.reference import project_gaussians, render_reference
 
 
 def test_single_round_gaussian_has_its_closed_form(camera):
@@ -61,12 +61,12 @@ def test_projection_and_harmonics_agree_with_gsplat(make_scene, camera):
     intrinsics = torch.tensor([[60.0, 0, 36], [0, 58, 21], [0, 0, 1]], dtype=torch.float64)
     mean_in_cam, covar_in_cam = theirs._world_to_cam(gaussians.means, covars, pose[None])
     mean_px, cov_px2 = theirs._persp_proj(mean_in_cam, covar_in_cam, intrinsics[None], camera.width, camera.height)
-    ours_mean, ours_cov = project(gaussians, mean_in_cam[0], pose, camera, 0.0)
+    ours_mean, ours_cov = project_gaussians(gaussians, mean_in_cam[0], pose, camera, 0.0)
     torch.testing.assert_close(ours_mean, mean_px[0], rtol=1e-10, atol=1e-10)
     torch.testing.assert_close(ours_cov, cov_px2[0], rtol=1e-10, atol=1e-10)
     direction = torch.nn.functional.normalize(gaussians.means, dim=-1)
     torch.testing.assert_close(
-        sh.evaluate(gaussians.sh, direction, 3),
+        sh.evaluate_sh(gaussians.sh, direction, 3),
         theirs._spherical_harmonics(3, direction, gaussians.sh),
         rtol=1e-6,  # their constants have seven digits or more
         atol=1e-9,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from pipelines.splat.watch import FiniteWatch, NonFiniteError
+from pipelines.splat.finiteness import FinitenessMonitor, NonFiniteError
 
 CPU = torch.device("cpu")
 
@@ -15,18 +15,18 @@ def scalars(a: float, b: float) -> dict[str, torch.Tensor]:
 
 
 def test_the_first_iteration_and_term_are_named_however_late_one_looks() -> None:
-    watch = FiniteWatch(("a", "b"), CPU)
+    monitor = FinitenessMonitor(("a", "b"), CPU)
     for iteration, (a, b) in enumerate([(1, 2), (1, float("inf")), (float("nan"), 2), (1, 1)], start=1):
-        watch.note(iteration, scalars(a, b))
+        monitor.note(iteration, scalars(a, b))
     with pytest.raises(NonFiniteError, match="b is not finite at iteration 2") as caught:
-        watch.check()
+        monitor.check()
     assert (caught.value.name, caught.value.iteration) == ("b", 2)
 
 
 def test_finite_values_pass_and_a_reset_forgets() -> None:
-    watch = FiniteWatch(("a", "b"), CPU)
-    watch.note(1, scalars(1e30, -1e300))
-    watch.check()
-    watch.note(2, scalars(float("nan"), 0))
-    watch.reset()
-    watch.check()
+    monitor = FinitenessMonitor(("a", "b"), CPU)
+    monitor.note(1, scalars(1e30, -1e300))
+    monitor.check()
+    monitor.note(2, scalars(float("nan"), 0))
+    monitor.reset()
+    monitor.check()

@@ -1,4 +1,4 @@
-"""Watches a training for values that are not finite, without waiting for the device at every iteration."""
+"""Detection of values that are not finite, without waiting for the device at every iteration."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class NonFiniteError(ConvergenceError):
 
     Args:
         name: of the loss or gradient.
-        iteration: at which it was first so.
+        iteration: the first with a value that is not finite.
     """
 
     def __init__(self, name: str, iteration: int) -> None:
@@ -25,23 +25,23 @@ class NonFiniteError(ConvergenceError):
         super().__init__(f"the {name} is not finite at iteration {iteration}")
 
 
-class FiniteWatch:
-    """Remembers, on the device, the iteration at which each of some scalars was first not finite."""
+class FinitenessMonitor:
+    """Records on the device, for each of several scalars, the first iteration at which it was not finite."""
 
     def __init__(self, names: tuple[str, ...], device: torch.device) -> None:
         self._names = names
         self._first = torch.full((len(names),), _NEVER, dtype=torch.int64, device=device)
 
     def note(self, iteration: int, values: Mapping[str, Tensor]) -> None:
-        """Look at this iteration's scalars, by name; a sum over a tensor stands for all of it."""
+        """Record this iteration's scalars, by name; a sum over a tensor stands for all of its values."""
         row = torch.stack([values[name].detach().double() for name in self._names])
         self._first = torch.where(torch.isfinite(row), self._first, self._first.clamp_max(iteration))
 
     def check(self) -> None:
-        """Wait for the device and say what was wrong first.
+        """Wait for the device and report the first value that was not finite.
 
         Raises:
-            NonFiniteError: the earliest; of several at once, the first by order of names.
+            NonFiniteError: of the earliest iteration; of several scalars at once, the first by order of names.
         """
         first = self._first.cpu()
         place = int(first.argmin())
@@ -49,5 +49,5 @@ class FiniteWatch:
             raise NonFiniteError(self._names[place], int(first[place]))
 
     def reset(self) -> None:
-        """Forget what was seen."""
+        """Forget all records."""
         self._first.fill_(_NEVER)

@@ -7,14 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.geometry.rays import CommonRotation, Rays, Views, intersect
+from pipelines.geometry.intersection import intersect_rays
+from pipelines.geometry.rays import CommonRotation, Rays, UncertainCameras
 from pipelines.geometry.rotations import exp_so3
 from tests.oracles import intersect_one
 from tests.scenes import make_scene
 
 
-def true_views(sigma_m: float, attitude_deg: float, ray: float, images: int = 24) -> tuple[Views, Rays, np.ndarray]:
-    """Error-free views, rays and points of an orbit, with the σ that noise will be drawn from."""
+def true_cameras(
+    sigma_m: float, attitude_deg: float, ray: float, images: int = 24
+) -> tuple[UncertainCameras, Rays, np.ndarray]:
+    """Return error-free cameras, rays and points of an orbit, with the σ that noise will be drawn from."""
     scene = make_scene(images=images, points=150)
     owner, image, _ = scene.pixels(scene.point_in_geo)
     in_cam = np.einsum(
@@ -23,30 +26,30 @@ def true_views(sigma_m: float, attitude_deg: float, ray: float, images: int = 24
     count = len(scene.center_in_geo)
     cov = np.diag([sigma_m, sigma_m, 2 * sigma_m]) ** 2
     cov[0, 1] = cov[1, 0] = 0.4 * sigma_m**2
-    views = Views(
+    cameras = UncertainCameras(
         center_in_geo=scene.center_in_geo,
         rotation_geo_from_cam=scene.geo_from_cam,
         cov_center_in_geo=np.tile(cov, (count, 1, 1)),
         sigma_attitude_rad=np.full(count, np.radians(attitude_deg)),
         sigma_ray=np.full(count, ray),
     )
-    return views, Rays(owner, image, in_cam[:, :2] / in_cam[:, 2:]), scene.point_in_geo
+    return cameras, Rays(owner, image, in_cam[:, :2] / in_cam[:, 2:]), scene.point_in_geo
 
 
-def noisy(views: Views, rays: Rays, rng: np.random.Generator) -> tuple[Views, Rays]:
-    root = np.linalg.cholesky(views.cov_center_in_geo[0])
-    count = len(views.center_in_geo)
+def noisy(cameras: UncertainCameras, rays: Rays, rng: np.random.Generator) -> tuple[UncertainCameras, Rays]:
+    root = np.linalg.cholesky(cameras.cov_center_in_geo[0])
+    count = len(cameras.center_in_geo)
     shaken = replace(
-        views,
-        center_in_geo=views.center_in_geo + rng.normal(size=(count, 3)) @ root.T,
-        rotation_geo_from_cam=exp_so3(rng.normal(size=(count, 3)) * views.sigma_attitude_rad[:, None])
-        @ views.rotation_geo_from_cam,
+        cameras,
+        center_in_geo=cameras.center_in_geo + rng.normal(size=(count, 3)) @ root.T,
+        rotation_geo_from_cam=exp_so3(rng.normal(size=(count, 3)) * cameras.sigma_attitude_rad[:, None])
+        @ cameras.rotation_geo_from_cam,
     )
-    return shaken, replace(rays, xy=rays.xy + rng.normal(0, views.sigma_ray[0], rays.xy.shape))
+    return shaken, replace(rays, xy=rays.xy + rng.normal(0, cameras.sigma_ray[0], rays.xy.shape))
 
 
 def few_rays(rays: Rays, most: int, rng: np.random.Generator) -> Rays:
-    """At most so many rays of each point, chosen at random."""
+    """Return at most `most` rays of each point, chosen at random."""
     order = rng.permutation(len(rays.point))
     order = order[np.argsort(rays.point[order], kind="stable")]
     rank = np.arange(len(order)) - np.searchsorted(rays.point[order], rays.point[order])
@@ -54,35 +57,35 @@ def few_rays(rays: Rays, most: int, rng: np.random.Generator) -> Rays:
     return Rays(rays.point[keep], rays.view[keep], rays.xy[keep])
 
 
-def squared_errors(found_position: np.ndarray, cov: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    error = found_position - truth
+def squared_errors(position: np.ndarray, cov: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    error = position - truth
     return (error * np.linalg.solve(cov, error[..., None])[..., 0]).sum(axis=-1)
 
 
 def test_exact_rays_meet_in_the_point() -> None:
-    views, rays, truth = true_views(0.02, 0.1, 1e-4)
-    found = intersect(rays, views, len(truth))
-    np.testing.assert_allclose(found.position_in_geo, truth, atol=1e-8)
-    assert found.consistent.all()
-    assert found.used.all()
-    np.testing.assert_array_equal(found.ray_count, np.bincount(rays.point))
+    cameras, rays, truth = true_cameras(0.02, 0.1, 1e-4)
+    intersections = intersect_rays(rays, cameras, len(truth))
+    np.testing.assert_allclose(intersections.position_in_geo, truth, atol=1e-8)
+    assert intersections.consistent.all()
+    assert intersections.used.all()
+    np.testing.assert_array_equal(intersections.ray_count, np.bincount(rays.point))
 
 
 def test_agrees_with_the_plain_reference() -> None:
     rng = np.random.default_rng(1)
-    views, rays, truth = true_views(0.5, 0.3, 1e-3)
-    views, rays = noisy(views, few_rays(rays, 6, rng), rng)
-    found = intersect(rays, views, len(truth))
+    cameras, rays, truth = true_cameras(0.5, 0.3, 1e-3)
+    cameras, rays = noisy(cameras, few_rays(rays, 6, rng), rng)
+    intersections = intersect_rays(rays, cameras, len(truth))
     compared = 0
     for point in range(0, len(truth), 5):
         mine = rays.point == point
-        if not found.used[mine].all():
+        if not intersections.used[mine].all():
             continue  # the reference knows no outliers
-        position, cov = intersect_one(rays.xy[mine], rays.view[mine].tolist(), views)
+        position, cov = intersect_one(rays.xy[mine], rays.view[mine].tolist(), cameras)
         # The two take the distances, on which the weights depend, from different iterates.
         sigma = np.sqrt(np.diag(cov))
-        assert (np.abs(found.position_in_geo[point] - position) < 0.05 * sigma).all()
-        np.testing.assert_allclose(np.diag(found.cov_in_geo[point]), np.diag(cov), rtol=0.05)
+        assert (np.abs(intersections.position_in_geo[point] - position) < 0.05 * sigma).all()
+        np.testing.assert_allclose(np.diag(intersections.cov_in_geo[point]), np.diag(cov), rtol=0.05)
         compared += 1
     assert compared > 20
 
@@ -95,36 +98,38 @@ def test_agrees_with_the_plain_reference() -> None:
 @pytest.mark.parametrize("most", [3, 8])
 def test_covariance_is_calibrated(sigma_m: float, attitude_deg: float, ray: float, most: int) -> None:
     rng = np.random.default_rng(7)
-    views, rays, truth = true_views(sigma_m, attitude_deg, ray)
+    cameras, rays, truth = true_cameras(sigma_m, attitude_deg, ray)
     squared = []
     for _ in range(60):
-        measured, seen = noisy(views, few_rays(rays, most, rng), rng)
-        found = intersect(seen, measured, len(truth))
-        good = found.consistent & (found.max_angle_deg > 10)
-        squared.append(squared_errors(found.position_in_geo, found.cov_in_geo, truth)[good])
+        measured, seen = noisy(cameras, few_rays(rays, most, rng), rng)
+        intersections = intersect_rays(seen, measured, len(truth))
+        good = intersections.consistent & (intersections.max_angle_deg > 10)
+        squared.append(squared_errors(intersections.position_in_geo, intersections.cov_in_geo, truth)[good])
     # 60 redraws of 150 points; what points share in one redraw leaves about 3 % of scatter in the mean.
     assert np.concatenate(squared).mean() == pytest.approx(3.0, rel=0.1)
 
 
 def test_shared_rotation_error_is_calibrated() -> None:
     rng = np.random.default_rng(3)
-    views, rays, truth = true_views(0.5, 0.001, 1e-4)
-    count = len(views.center_in_geo)
+    cameras, rays, truth = true_cameras(0.5, 0.001, 1e-4)
+    count = len(cameras.center_in_geo)
     # As an alignment would: the rotation is a linear function of the errors of all centres.
     gain = rng.normal(size=(count, 3, 3)) * 0.004
-    cov = np.einsum("nij,njk,nlk->il", gain, views.cov_center_in_geo, gain)
+    cov = np.einsum("nij,njk,nlk->il", gain, cameras.cov_center_in_geo, gain)
     squared = []
     for _ in range(120):
-        measured, seen = noisy(views, few_rays(rays, 6, rng), rng)
-        error = measured.center_in_geo - views.center_in_geo
+        measured, seen = noisy(cameras, few_rays(rays, 6, rng), rng)
+        error = measured.center_in_geo - cameras.center_in_geo
         turn = exp_so3(np.einsum("nij,nj->i", gain, error))
         measured = replace(
             measured,
             rotation_geo_from_cam=turn @ measured.rotation_geo_from_cam,
             common=CommonRotation(cov, gain),
         )
-        found = intersect(seen, measured, len(truth))
-        squared.append(squared_errors(found.position_in_geo, found.cov_in_geo, truth)[found.consistent])
+        intersections = intersect_rays(seen, measured, len(truth))
+        squared.append(
+            squared_errors(intersections.position_in_geo, intersections.cov_in_geo, truth)[intersections.consistent]
+        )
     # All points share one rotation in a redraw, so 120 redraws of three numbers scatter by about 7 %.
     assert np.concatenate(squared).mean() == pytest.approx(3.0, rel=0.2)
 
@@ -133,42 +138,42 @@ def test_shared_rotation_error_is_calibrated() -> None:
 @pytest.mark.parametrize("sigma_m", [0.05, 0.5])
 def test_one_bad_fix_does_not_move_points_by_metres(most: int, sigma_m: float) -> None:
     rng = np.random.default_rng(11)
-    views, rays, truth = true_views(sigma_m, 0.1, 3e-4)
-    measured, seen = noisy(views, few_rays(rays, most, rng), rng)
-    clean = intersect(seen, measured, len(truth))
+    cameras, rays, truth = true_cameras(sigma_m, 0.1, 3e-4)
+    measured, seen = noisy(cameras, few_rays(rays, most, rng), rng)
+    clean = intersect_rays(seen, measured, len(truth))
     direction = rng.normal(size=3)
     center = measured.center_in_geo.copy()
     center[5] += 15 * direction / np.linalg.norm(direction)
-    found = intersect(seen, replace(measured, center_in_geo=center), len(truth))
+    intersections = intersect_rays(seen, replace(measured, center_in_geo=center), len(truth))
     touched = np.unique(seen.point[seen.view == 5])
-    error = np.linalg.norm(found.position_in_geo - truth, axis=1)[touched]
+    error = np.linalg.norm(intersections.position_in_geo - truth, axis=1)[touched]
     before = np.linalg.norm(clean.position_in_geo - truth, axis=1)[touched]
-    trusted = found.consistent[touched]
+    trusted = intersections.consistent[touched]
     assert trusted.mean() > 0.9
     # Losing one ray of five costs some accuracy, not metres.
     assert np.median(error[trusted]) < 1.5 * np.median(before)
     assert error[trusted].max() < 3 * before.max() + 0.5
-    assert found.used[seen.view == 5].mean() < 0.1
+    assert intersections.used[seen.view == 5].mean() < 0.1
 
 
 def test_one_false_match_among_five_is_left_out() -> None:
     rng = np.random.default_rng(5)
-    views, rays, truth = true_views(0.03, 0.05, 3e-4)
-    measured, seen = noisy(views, few_rays(rays, 5, rng), rng)
+    cameras, rays, truth = true_cameras(0.03, 0.05, 3e-4)
+    measured, seen = noisy(cameras, few_rays(rays, 5, rng), rng)
     counts = np.bincount(seen.point, minlength=len(truth))
     last = np.cumsum(counts) - 1
     wrong = last[counts == 5]
     xy = seen.xy.copy()
     xy[wrong] += rng.choice([-0.2, 0.2], (len(wrong), 2))
-    found = intersect(replace(seen, xy=xy), measured, len(truth))
+    intersections = intersect_rays(replace(seen, xy=xy), measured, len(truth))
     hit = counts == 5
-    assert found.used[wrong].mean() < 0.03
-    assert np.linalg.norm(found.position_in_geo - truth, axis=1)[hit & found.consistent].max() < 1.0
-    assert (found.consistent[hit]).mean() > 0.95
+    assert intersections.used[wrong].mean() < 0.03
+    assert np.linalg.norm(intersections.position_in_geo - truth, axis=1)[hit & intersections.consistent].max() < 1.0
+    assert (intersections.consistent[hit]).mean() > 0.95
 
 
 def test_parallel_single_and_missing_rays_give_no_position() -> None:
-    views = Views(
+    cameras = UncertainCameras(
         center_in_geo=np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]),
         rotation_geo_from_cam=np.tile(np.eye(3), (2, 1, 1)),
         cov_center_in_geo=np.tile(np.eye(3) * 1e-4, (2, 1, 1)),
@@ -177,33 +182,33 @@ def test_parallel_single_and_missing_rays_give_no_position() -> None:
     )
     rays = Rays(np.array([0, 0, 1, 3, 3]), np.array([0, 1, 0, 0, 1]), np.zeros((5, 2)))
     rays.xy[3], rays.xy[4] = [0.05, 0.0], [-0.05, 0.0]
-    found = intersect(rays, views, 4)
-    assert np.isnan(found.position_in_geo[:3]).all()
-    assert not found.consistent[:3].any()
-    assert np.isinf(found.condition[:3]).all()
-    np.testing.assert_allclose(found.position_in_geo[3], [0.5, 0.0, 10.0], atol=1e-9)
-    assert found.max_angle_deg[3] == pytest.approx(np.degrees(2 * np.arctan(0.05)))
+    intersections = intersect_rays(rays, cameras, 4)
+    assert np.isnan(intersections.position_in_geo[:3]).all()
+    assert not intersections.consistent[:3].any()
+    assert np.isinf(intersections.condition[:3]).all()
+    np.testing.assert_allclose(intersections.position_in_geo[3], [0.5, 0.0, 10.0], atol=1e-9)
+    assert intersections.max_angle_deg[3] == pytest.approx(np.degrees(2 * np.arctan(0.05)))
 
 
 def test_point_behind_a_camera_is_not_trusted() -> None:
-    views, rays, truth = true_views(0.02, 0.05, 1e-4)
-    views = replace(views, rotation_geo_from_cam=views.rotation_geo_from_cam * [1.0, 1.0, -1.0])
-    found = intersect(replace(rays, xy=-rays.xy), views, len(truth))
-    assert not found.consistent.any()
+    cameras, rays, truth = true_cameras(0.02, 0.05, 1e-4)
+    cameras = replace(cameras, rotation_geo_from_cam=cameras.rotation_geo_from_cam * [1.0, 1.0, -1.0])
+    intersections = intersect_rays(replace(rays, xy=-rays.xy), cameras, len(truth))
+    assert not intersections.consistent.any()
 
 
 def test_unsorted_rays_are_refused() -> None:
-    views, rays, truth = true_views(0.02, 0.05, 1e-4)
+    cameras, rays, truth = true_cameras(0.02, 0.05, 1e-4)
     with pytest.raises(ValueError, match="sorted"):
-        intersect(Rays(rays.point[::-1], rays.view, rays.xy), views, len(truth))
+        intersect_rays(Rays(rays.point[::-1], rays.view, rays.xy), cameras, len(truth))
 
 
 def test_result_does_not_depend_on_where_chunks_are_cut(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(2)
-    views, rays, truth = true_views(0.5, 0.3, 1e-3)
-    views, rays = noisy(views, rays, rng)
-    whole = intersect(rays, views, len(truth))
-    monkeypatch.setattr("pipelines.geometry.rays._CHUNK_RAYS", 37)
-    parts = intersect(rays, views, len(truth))
+    cameras, rays, truth = true_cameras(0.5, 0.3, 1e-3)
+    cameras, rays = noisy(cameras, rays, rng)
+    whole = intersect_rays(rays, cameras, len(truth))
+    monkeypatch.setattr("pipelines.geometry.intersection._CHUNK_RAYS", 37)
+    parts = intersect_rays(rays, cameras, len(truth))
     np.testing.assert_allclose(parts.position_in_geo, whole.position_in_geo, atol=1e-9)
     np.testing.assert_array_equal(parts.used, whole.used)

@@ -1,8 +1,8 @@
-"""What single views say of every Gaussian: how much of the image it makes up, and how much of the error.
+"""Contribution of every Gaussian to a view: the pixels that it makes up, and those of them with a high error.
 
-The weight of Gaussian k at pixel p is w_k(p) = α_k(p) T_k(p), and Σ_p w_k(p) e(p) is the derivative of the image
-Σ_p e(p) c(p) by the Gaussian's colour: one render of grey Gaussians and its backward pass give the sums of all
-Gaussians at once, on every backend (the auxiliary gradient of doi 10.48550/arXiv.2404.06109, section 3.1).
+The blending weight of Gaussian k at pixel p is w_k(p) = α_k(p) T_k(p), and Σ_p w_k(p) e(p) is the derivative of
+Σ_p e(p) c(p) by the Gaussian's colour. One render of grey Gaussians and its backward pass therefore give the sums
+of all Gaussians at once, on every backend (the auxiliary gradient of doi 10.48550/arXiv.2404.06109, section 3.1).
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ _HIGH_ERROR = 0.1
 
 
 @dataclass(frozen=True)
-class Evidence:
-    """One view's say.
+class ViewContributions:
+    """Contributions of N Gaussians to one view.
 
     Attributes:
         weight_px: (N,) pixels that each Gaussian makes up, Σ w.
@@ -34,14 +34,14 @@ class Evidence:
     high_error_px: Tensor
 
 
-# Asks for the evidence of so many different training views, drawn with the generator.
-Probe = Callable[[int, torch.Generator], list[Evidence]]
+# Returns the contributions to a number of different training views, drawn with the generator.
+Probe = Callable[[int, torch.Generator], list[ViewContributions]]
 
 
-def evidence(
+def view_contributions(
     gaussians: Gaussians, cam_from_model: Tensor, camera: Pinhole, error: Tensor, rasterizer: Rasterizer
-) -> Evidence:
-    """Weigh all Gaussians against one view's error.
+) -> ViewContributions:
+    """Return the contributions of all Gaussians to one view.
 
     Args:
         gaussians: N of them.
@@ -58,4 +58,4 @@ def evidence(
         render = rasterizer.render(grey, cam_from_model.detach(), camera, RasterSettings(sh_degree=0))
         (gradient,) = torch.autograd.grad((render.colour * maps).sum(), grey.sh)
     sums = gradient[:, 0] / C0
-    return Evidence(sums[:, 0], sums[:, 1])
+    return ViewContributions(sums[:, 0], sums[:, 1])

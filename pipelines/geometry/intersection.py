@@ -1,0 +1,291 @@
+"""Intersection of rays from uncertain cameras: many points at once, robust, with covariance.
+
+GeoRefGS section 2.3, eqs 4–15 (doi 10.3390/drones10030195). The paper minimises Σ |(X − Cᵢ) × dᵢ|² with equal
+weights and propagates Σ_X = J Σ_obs Jᵀ. Here every ray is whitened first:
+
+1. (X − Cᵢ) has two components across the ray. Three errors cause their covariance: the camera's position, its
+   attitude (times distance) and the pixel (times depth).
+2. Whitening divides the two components by that covariance. J Σ_obs Jᵀ is then the inverse of the normal matrix, and
+   no linear estimate is better.
+3. A convex robust fit reveals one bad fix among several rays. The ray of that fix is left out.
+
+Rays are flat arrays sorted by point. The rays of a point are a run (a segment) of the arrays.
+"""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipelines.core.types import BoolArray, FloatArray, IntArray
+from pipelines.geometry.rays import CommonRotation, Intersections, Rays, UncertainCameras
+from pipelines.geometry.rotations import skew
+from pipelines.robust.kernels import cauchy_weight, huber_weight
+from pipelines.robust.statistics import chi2_quantile
+
+_CHUNK_RAYS = 60_000  # working arrays of a chunk stay in the processor's cache
+_CONVEX_SCALE = 0.5  # near enough to a sum of distances that the fit is a median
+_CONVEX_STEPS, _REDESCENDING_STEPS = 6, 4
+_RAY_GATE = float(chi2_quantile(0.999, 2))
+_RAY_ALARM = float(chi2_quantile(0.99, 2))
+_WORST_CONDITION = 1e10
+
+
+@dataclass(frozen=True)
+class _RayBundle:
+    """The rays of one chunk of p points with at least two rays each."""
+
+    start: IntArray  # (p,) first ray of each point
+    owner: IntArray  # (m,) point of each ray
+    view: IntArray  # (m,)
+    center: FloatArray  # (m, 3), from `shift`
+    direction: FloatArray  # (m, 3) unit
+    axis: FloatArray  # (m, 3) optical axis of its camera
+    shift: FloatArray  # (3,) subtracted, so that large coordinates cost no digits
+
+    def select(self, points: BoolArray) -> tuple[_RayBundle, BoolArray]:
+        """Return the bundle of the chosen points (p,), and the mask of their rays (m,)."""
+        rays = points[self.owner]
+        renumber = np.cumsum(points) - 1
+        owner = renumber[self.owner[rays]]
+        start = np.searchsorted(owner, np.arange(int(points.sum())))
+        fields = (self.view[rays], self.center[rays], self.direction[rays], self.axis[rays])
+        return _RayBundle(start, owner, *fields, self.shift), rays
+
+    def sum_by_point(self, values: FloatArray) -> FloatArray:
+        """Return the sums (p, …) of values (m, …) over the rays of each point."""
+        return np.asarray(np.add.reduceat(values, self.start, axis=0))
+
+
+def intersect_rays(rays: Rays, cameras: UncertainCameras, point_count: int) -> Intersections:
+    """Intersect the rays of each point.
+
+    Args:
+        rays: of all points, sorted by point.
+        cameras: their poses and errors.
+        point_count: N.
+
+    Raises:
+        ValueError: `rays.point` is not ascending.
+    """
+    if len(rays.point) and (np.diff(rays.point) < 0).any():
+        raise ValueError("rays must be sorted by point")
+    intersections = Intersections(
+        position_in_geo=np.full((point_count, 3), np.nan),
+        cov_in_geo=np.full((point_count, 3, 3), np.nan),
+        ray_count=np.zeros(point_count, dtype=np.int32),
+        max_angle_deg=np.zeros(point_count),
+        condition=np.full(point_count, np.inf),
+        consistent=np.zeros(point_count, dtype=bool),
+        used=np.zeros(len(rays.point), dtype=bool),
+    )
+    counts = np.bincount(rays.point, minlength=point_count)
+    usable = np.flatnonzero(counts[rays.point] >= 2)
+    cuts = _chunk_cuts(rays.point[usable])
+
+    def work(chunk: int) -> None:
+        _intersect_chunk(rays, cameras, usable[cuts[chunk] : cuts[chunk + 1]], intersections)
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:  # numpy lets go of the interpreter in these sizes
+        list(pool.map(work, range(len(cuts) - 1)))
+    return intersections
+
+
+def _chunk_cuts(point: IntArray) -> IntArray:
+    """Cut sorted rays into chunks of about `_CHUNK_RAYS`, never within a point."""
+    wanted = np.arange(_CHUNK_RAYS, len(point), _CHUNK_RAYS)
+    cuts = np.searchsorted(point, point[wanted]) if len(wanted) else wanted
+    return np.unique(np.concatenate([[0], cuts, [len(point)]])).astype(np.int64)
+
+
+def _intersect_chunk(rays: Rays, cameras: UncertainCameras, chosen: IntArray, intersections: Intersections) -> None:
+    """Intersect the chosen rays, and write their points into `intersections`."""
+    if len(chosen) == 0:
+        return
+    bundle, ids = _ray_bundle(rays, cameras, chosen)
+    fit = _fit_rays(bundle, cameras)
+    position, used = fit.position, fit.used
+    information = fit.information * used[:, None, None]
+    normal = bundle.sum_by_point(information)
+    eigenvalues = np.linalg.eigvalsh(normal)
+    solved = eigenvalues[:, 0] * _WORST_CONDITION > eigenvalues[:, 2]
+    condition = np.where(solved, eigenvalues[:, 2] / np.where(solved, eigenvalues[:, 0], 1.0), np.inf)
+    offset = position[bundle.owner] - bundle.center
+    squared = _squared_residuals(fit.whitener, offset)
+    ahead = (offset * bundle.direction).sum(axis=1) > 0
+    count = bundle.sum_by_point(used.astype(np.float64))
+    agrees = bundle.sum_by_point(used * squared) <= chi2_quantile(0.9999, np.maximum(2 * count - 3, 1))
+    behind = bundle.sum_by_point((used & ~ahead).astype(np.float64)) > 0
+    most = 2 * count > bundle.sum_by_point(np.ones(len(used)))
+    cov = np.full((len(ids), 3, 3), np.nan)
+    cov[solved] = np.linalg.solve(normal[solved], np.eye(3))
+    if cameras.common is not None:
+        cov += _common_covariance(bundle, cameras, cameras.common, cov[bundle.owner] @ information, offset)
+    intersections.position_in_geo[ids] = np.where(solved[:, None], position + bundle.shift, np.nan)
+    intersections.cov_in_geo[ids] = (cov + np.swapaxes(cov, 1, 2)) / 2
+    intersections.ray_count[ids] = np.where(solved, count, 0)
+    intersections.max_angle_deg[ids] = _largest_angle_deg(bundle, used)
+    intersections.condition[ids] = condition
+    intersections.consistent[ids] = solved & agrees & most & ~behind & (count >= 2)
+    intersections.used[chosen] = used & solved[bundle.owner]
+
+
+def _ray_bundle(rays: Rays, cameras: UncertainCameras, chosen: IntArray) -> tuple[_RayBundle, IntArray]:
+    """Return the chosen rays in geo, and the ids (p,) of their points."""
+    point, view, xy = rays.point[chosen], rays.view[chosen], rays.xy[chosen]
+    start = np.flatnonzero(np.diff(point, prepend=point[0] - 1))
+    owner = np.repeat(np.arange(len(start)), np.diff(np.append(start, len(point))))
+    rotation = cameras.rotation_geo_from_cam[view]
+    in_cam = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
+    direction = (rotation @ in_cam[..., None])[..., 0]
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    shift = cameras.center_in_geo[view[0]]
+    center = cameras.center_in_geo[view] - shift
+    return _RayBundle(start, owner, view, center, direction, rotation[:, :, 2], shift), point[start]
+
+
+@dataclass
+class _RayFit:
+    """State of a chunk's solution."""
+
+    position: FloatArray  # (p, 3), from the bundle's shift
+    whitener: FloatArray  # (m, 2, 3)
+    information: FloatArray  # (m, 3, 3), W = Gᵀ G
+    used: BoolArray  # (m,)
+
+
+def _fit_rays(bundle: _RayBundle, cameras: UncertainCameras) -> _RayFit:
+    """Fit points by least squares, and robustly where a ray is out of its σ."""
+    across = np.eye(3) - bundle.direction[:, :, None] * bundle.direction[:, None, :]  # A = I − d dᵀ
+    position = _solve_points(bundle, across)  # eq. 9 with equal weights: near enough for the distances
+    whitener = _whitener(bundle, cameras, position)
+    information = _information(whitener)
+    fit = _RayFit(_solve_points(bundle, information), whitener, information, np.ones(len(bundle.owner), dtype=bool))
+    squared = _squared_residuals(whitener, fit.position[bundle.owner] - bundle.center)
+    degrees = 2 * np.diff(np.append(bundle.start, len(bundle.owner))) - 3
+    alarm = (bundle.sum_by_point(squared) > chi2_quantile(0.99, degrees)) | (
+        np.maximum.reduceat(squared, bundle.start) > _RAY_ALARM
+    )
+    if alarm.any():
+        suspect, rays = bundle.select(alarm)
+        robust = _fit_robust(
+            suspect, cameras, _RayFit(fit.position[alarm], whitener[rays], information[rays], rays[rays])
+        )
+        fit.position[alarm], fit.whitener[rays] = robust.position, robust.whitener
+        fit.information[rays], fit.used[rays] = robust.information, robust.used
+    return fit
+
+
+def _fit_robust(bundle: _RayBundle, cameras: UncertainCameras, start: _RayFit) -> _RayFit:
+    """Fit points by a nearly convex loss, then by a redescending loss, then by least squares within the gate.
+
+    No outlier can mask the single minimum of the first. The last gives full weight, as the covariance assumes.
+    """
+    position, whitener, information = start.position, start.whitener, start.information
+    for steps, weigh in ((_CONVEX_STEPS, _near_median_weight), (_REDESCENDING_STEPS, _redescending_weight)):
+        pull = (information @ bundle.center[..., None])[..., 0]
+        for _ in range(steps):
+            weight = weigh(_squared_residuals(whitener, position[bundle.owner] - bundle.center))
+            position = _solve_points(bundle, information * weight[:, None, None], pull * weight[:, None])
+        whitener = _whitener(bundle, cameras, position)  # the distances have changed
+        information = _information(whitener)
+    used = np.ones(len(bundle.owner), dtype=bool)
+    for _ in range(2):
+        used = _squared_residuals(whitener, position[bundle.owner] - bundle.center) <= _RAY_GATE
+        position = _solve_points(bundle, information * used[:, None, None])
+    return _RayFit(position, whitener, information, used)
+
+
+def _redescending_weight(squared: FloatArray) -> FloatArray:
+    return cauchy_weight(squared, 2)
+
+
+def _near_median_weight(squared: FloatArray) -> FloatArray:
+    return huber_weight(squared, _CONVEX_SCALE)
+
+
+def _whitener(bundle: _RayBundle, cameras: UncertainCameras, position: FloatArray) -> FloatArray:
+    """Return G (m, 2, 3) such that G (X − C) has unit covariance, for the three error sources of eqs 10–12."""
+    basis = _axes_across(bundle.direction)
+    offset = position[bundle.owner] - bundle.center
+    distance = (offset * bundle.direction).sum(axis=1)
+    cosine = (bundle.direction * bundle.axis).sum(axis=1)
+    cov = basis @ cameras.cov_center_in_geo[bundle.view] @ np.swapaxes(basis, 1, 2)
+    # A pixel's σ moves the ray by depth · σ in the image plane, which is foreshortened along the axis.
+    slant = (basis @ bundle.axis[..., None])[..., 0]
+    pixel = (distance * cosine * cameras.sigma_ray[bundle.view]) ** 2
+    cov -= pixel[:, None, None] * slant[:, :, None] * slant[:, None, :]
+    isotropic = pixel + (distance * cameras.sigma_attitude_rad[bundle.view]) ** 2
+    cov[:, 0, 0] += isotropic
+    cov[:, 1, 1] += isotropic
+    first = 1.0 / np.sqrt(cov[:, 0, 0])  # rows of the inverse Cholesky factor of the 2×2 covariance
+    ratio = cov[:, 0, 1] / cov[:, 0, 0]
+    second = 1.0 / np.sqrt(cov[:, 1, 1] - ratio * cov[:, 0, 1])
+    rows = np.empty_like(basis)
+    rows[:, 0] = first[:, None] * basis[:, 0]
+    rows[:, 1] = second[:, None] * (basis[:, 1] - ratio[:, None] * basis[:, 0])
+    return rows
+
+
+def _axes_across(direction: FloatArray) -> FloatArray:
+    """Return two unit vectors (m, 2, 3) across each direction and each other (Duff et al., JCGT 6(1), 2017)."""
+    x, y, z = direction.T
+    sign = np.copysign(1.0, z)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    basis = np.empty((len(direction), 2, 3))
+    basis[:, 0, 0], basis[:, 0, 1], basis[:, 0, 2] = 1.0 + sign * x * x * a, sign * b, -sign * x
+    basis[:, 1, 0], basis[:, 1, 1], basis[:, 1, 2] = b, sign + y * y * a, -y
+    return basis
+
+
+def _information(whitener: FloatArray) -> FloatArray:
+    return np.asarray(np.swapaxes(whitener, 1, 2) @ whitener)
+
+
+def _squared_residuals(whitener: FloatArray, offset: FloatArray) -> FloatArray:
+    whitened = (whitener @ offset[..., None])[..., 0]
+    return np.asarray((whitened**2).sum(axis=1))
+
+
+def _solve_points(bundle: _RayBundle, information: FloatArray, pull: FloatArray | None = None) -> FloatArray:
+    """Solve (Σ W) X = Σ W C for each point (eq. 9); `pull` (m, 3) is W C where it is known."""
+    normal = bundle.sum_by_point(information)
+    right = bundle.sum_by_point((information @ bundle.center[..., None])[..., 0] if pull is None else pull)
+    # Without the ridge, parallel rays would stop the whole batch. The condition number reveals them afterwards.
+    ridge = 1e-14 * np.trace(normal, axis1=1, axis2=2) + np.finfo(float).tiny
+    normal[:, [0, 1, 2], [0, 1, 2]] += ridge[:, None]
+    return np.asarray(np.linalg.solve(normal, right[..., None])[..., 0])
+
+
+def _common_covariance(
+    bundle: _RayBundle, cameras: UncertainCameras, common: CommonRotation, response: FloatArray, offset: FloatArray
+) -> FloatArray:
+    """Return the covariance (p, 3, 3) that the common rotation adds: its own, and that with the centres.
+
+    `response` (m, 3, 3) is ∂X/∂C of each ray, `offset` (m, 3) is X − C.
+    """
+    by_rotation = bundle.sum_by_point(response @ -skew(offset))
+    shared = cameras.cov_center_in_geo @ np.swapaxes(common.gain, 1, 2)
+    by_center = bundle.sum_by_point(response @ shared[bundle.view])
+    cross = by_center @ np.swapaxes(by_rotation, 1, 2)
+    own = by_rotation @ common.cov_rad2 @ np.swapaxes(by_rotation, 1, 2)
+    return np.asarray(own + cross + np.swapaxes(cross, 1, 2))
+
+
+def _largest_angle_deg(bundle: _RayBundle, used: BoolArray) -> FloatArray:
+    """Return the largest angle (p,) between two used rays; 0 with fewer than two."""
+    direction, owner = bundle.direction[used], bundle.owner[used]
+    count = np.bincount(owner, minlength=len(bundle.start))
+    first = np.cumsum(count) - count
+    angle = np.zeros(len(count))
+    for size in np.unique(count[count >= 2]):
+        points = np.flatnonzero(count == size)
+        for part in np.array_split(points, 1 + len(points) * size**2 // 4_000_000):
+            run = direction[first[part][:, None] + np.arange(size)]
+            cosine = (run @ np.swapaxes(run, 1, 2)).min(axis=(1, 2))
+            angle[part] = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    return angle
