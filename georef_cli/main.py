@@ -28,7 +28,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 
 @dataclass(frozen=True)
-class Entry:
+class HelpLine:
     """One line of `georef --help`: the module that holds `command`, the section and one line of help."""
 
     module: str
@@ -36,20 +36,22 @@ class Entry:
     help: str
 
 
-COMMANDS: dict[str, Entry] = {
-    "simulate": Entry("simulate", "Surveys", "Simulate a survey whose truth is known exactly."),
-    "inspect": Entry("inspect", "Surveys", "Show what a ROS bag holds, what ingest would choose, what is missing."),
-    "run": Entry("run", "Pipeline", "Run all stages, or some, skipping what is current."),
-    "status": Entry("status", "Pipeline", "Show the state of every stage."),
-    "ingest": Entry("ingest", "Stages", "Read photographs, positions and control points into one survey."),
-    "sfm": Entry("sfm", "Stages", "Reconstruct cameras and points with COLMAP."),
-    "calibrate": Entry("calibrate", "Stages", "Estimate time offset, boresight and lever arm after sfm."),
-    "compare": Entry("compare", "Pipeline", "Run the ablation and put its figures into one table."),
-    "geolocate": Entry("geolocate", "Stages", "Intersect every SfM point on Earth."),
-    "init-sim3": Entry("init_sim3", "Stages", "Estimate the similarity from the SfM model to the Earth."),
-    "train": Entry("train", "Stages", "Train the Gaussians with the similarity and the cameras."),
-    "evaluate": Entry("evaluate", "Stages", "Measure test views and check points."),
-    "export-ply": Entry("export_ply", "Stages", "Write the splat as a PLY that knows where it is."),
+COMMANDS: dict[str, HelpLine] = {
+    "simulate": HelpLine("simulate", "Surveys", "Simulate a survey whose truth is known exactly."),
+    "inspect": HelpLine(
+        "inspect", "Surveys", "Show what a ROS bag holds, what ingest would choose, what is missing."
+    ),
+    "run": HelpLine("run", "Pipeline", "Run all stages, or some, skipping what is current."),
+    "status": HelpLine("status", "Pipeline", "Show the state of every stage."),
+    "ingest": HelpLine("ingest", "Stages", "Read photographs, positions and control points into one survey."),
+    "sfm": HelpLine("sfm", "Stages", "Reconstruct cameras and points with COLMAP."),
+    "calibrate": HelpLine("calibrate", "Stages", "Estimate time offset, boresight and lever arm after sfm."),
+    "compare": HelpLine("compare", "Pipeline", "Run the ablation and put its figures into one table."),
+    "geolocate": HelpLine("geolocate", "Stages", "Intersect every SfM point on Earth."),
+    "init-sim3": HelpLine("init_sim3", "Stages", "Estimate the similarity from the SfM model to the Earth."),
+    "train": HelpLine("train", "Stages", "Train the Gaussians with the similarity and the cameras."),
+    "evaluate": HelpLine("evaluate", "Stages", "Measure test views and check points."),
+    "export-ply": HelpLine("export_ply", "Stages", "Write the splat as a PLY that knows where it is."),
 }
 
 
@@ -116,5 +118,5 @@ def cli(**_verbosity: bool) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point of `georef`: run the command line and exit with its code."""
+    """HelpLine point of `georef`: run the command line and exit with its code."""
     sys.exit(boundary.guarded(cli, arguments))

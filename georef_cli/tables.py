@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rich.console import Group
 from rich.markup import escape
@@ -15,9 +15,7 @@ from pipelines.core.runner import Outcome
 from pipelines.core.stages import REPORT
 from pipelines.core.staleness import StageState
 from pipelines.core.workspace import Workspace
-
-if TYPE_CHECKING:  # with its statistics it would load SciPy for every command
-    from pipelines.scene.report import CheckPointErrors, EvaluationReport
+from pipelines.scene.report import CheckPointErrors, EvaluationReport, read_report
 
 STATE_STYLE = {
     "current": "green",
@@ -136,8 +134,6 @@ def report_of(workspace: Workspace) -> list[Renderable]:
     Raises:
         InputError: the report was replaced by something else.
     """
-    from pipelines.scene.report import read_report
-
     return report(read_report(workspace.path(REPORT)))
 
 

@@ -173,14 +173,14 @@ def _scan(data: RigData, offsets: FloatArray, boresight: FloatArray) -> RigState
             continue
         place, _ = _navigation(data, float(offset), np.zeros(3), inside)
         try:
-            found = umeyama(data.center_in_local[inside], place)
+            model = umeyama(data.center_in_local[inside], place)
         except DegenerateGeometryError:
             continue
-        missed = np.linalg.norm(place - found.apply(data.center_in_local[inside]), axis=1)
+        missed = np.linalg.norm(place - model.apply(data.center_in_local[inside]), axis=1)
         # Few images agree easily: each that the offset loses counts like a large miss.
         cost = float(np.median(missed)) * (1.0 + 10.0 * (1.0 - inside.mean()))
         if best is None or cost < best[0]:
-            best = cost, RigState(found, float(offset), boresight, np.zeros(3))
+            best = cost, RigState(model, float(offset), boresight, np.zeros(3))
     if best is None:
         raise DegenerateGeometryError(_UNSEEN)
     state = best[1]

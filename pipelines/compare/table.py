@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from pipelines.core.products import Product
 from pipelines.core.workspace import replace_text
 from pipelines.plots.bars import Panel, write_bars
-
-if TYPE_CHECKING:  # with its statistics it would load SciPy to print a table
-    from pipelines.scene.report import CheckPointErrors
+from pipelines.scene.report import CheckPointErrors
 
 JsonScalar = bool | int | float | str
 

@@ -101,12 +101,12 @@ class CameraInformation:
             sigma_px: (K,) of the marks.
         """
         sigma_px, wanted = sigma_px[has_positive_depth(wanted)], with_positive_depths(wanted)
-        found = np.full((len(wanted.point_in_world), 3, 3), np.nan)
+        bounds = np.full((len(wanted.point_in_world), 3, 3), np.nan)
         for j in np.unique(wanted.obs_point):
             mine = wanted.obs_point == j
             if mine.sum() >= 2:
-                found[j] = self._bound_of(_only(wanted, mine), sigma_px[mine])
-        return found
+                bounds[j] = self._bound_of(_only(wanted, mine), sigma_px[mine])
+        return bounds
 
     def _bound_of(self, marks: Network, sigma_px: FloatArray) -> FloatArray:
         rows = _rows(marks, sigma_px)

@@ -16,12 +16,13 @@ from pipelines.scene.renderer import ModelRenderer
 from pipelines.scene.report import PhotometricFigures, ViewFigures
 from pipelines.splat.exposure import fitted_affine, with_affine
 from pipelines.splat.lpips import Lpips
-from pipelines.splat.metrics import lpips, psnr, ssim
+from pipelines.splat.metrics import psnr, ssim
 
 # Takes the name of a photograph, and (H, 3 W, 3) RGB: the photograph, its render, their difference.
 SaveRender = Callable[[str, ByteArray], None]
 
 _DIFFERENCE_GAIN = 3
+_NO_WEIGHTS = "no weights were given: they are not part of the package (--lpips-weights FILE.npz)"
 
 
 def compare_test_views(
@@ -45,14 +46,14 @@ def compare_test_views(
         saved: number of views for `save_render`.
     """
     indices, views = renderer.trained.indices("test"), []
-    distance = lpips(lpips_weights)
+    distance = None if lpips_weights is None else Lpips(lpips_weights)
     with progress.task("test views", len(indices)) as task:
         for place, index in enumerate(indices):
             name = renderer.trained.sparse.image_name[index]
             render = renderer.render(index).colour.clamp(0, 1).cpu()
             photo = torch.from_numpy(np.array(renderer.images.image(index))).float() / 255.0
             mask = torch.from_numpy(np.array(renderer.images.mask(index)))
-            views.append(_figures(name, render, photo, mask, distance if callable(distance) else None))
+            views.append(_figures(name, render, photo, mask, distance))
             if place < saved:
                 save_render(name, _side_by_side(photo, render))
             task.advance()
@@ -62,7 +63,7 @@ def compare_test_views(
         psnr_compensated=_mean(view.psnr_compensated for view in views),
         ssim=_mean(view.ssim for view in views),
         lpips=_mean(view.lpips for view in views),
-        lpips_reason=None if callable(distance) else distance,
+        lpips_reason=_NO_WEIGHTS if distance is None else None,
         per_view=tuple(views),
     )
 

@@ -23,8 +23,8 @@ from pyproj.exceptions import CRSError
 
 from pipelines.core.errors import InputError
 from pipelines.core.types import FloatArray
-from pipelines.geodesy.operations import Operation, Way, best_operation
-from pipelines.geodesy.plausible import Rows, check_area, horizontal_of, rough_lon_lat
+from pipelines.geodesy.operations import Operation, OperationRequest, best_operation
+from pipelines.geodesy.plausible import ListedPoints, check_area, horizontal_of, rough_lon_lat
 from pipelines.geodesy.vertical import ELLIPSOIDAL, VerticalChoice, VerticalDatum, assumed_ellipsoidal, name_of
 
 ECEF = "EPSG:4978"
@@ -84,14 +84,14 @@ class PointCrs:
         points = np.asarray(xyz, dtype=np.float64).reshape(-1, 3)
         if not len(points):
             return points
-        rows = Rows(points, self.name, path, lines)
-        lon, lat = rough_lon_lat(self._crs, rows)
-        transformer, _ = best_operation(self._way(path), lon, lat)
+        listed = ListedPoints(points, self.name, path, lines)
+        lon, lat = rough_lon_lat(self._crs, listed)
+        transformer, _ = best_operation(self._request(path), lon, lat)
         height = points[:, 2] * (1.0 if self._three_dimensional else self._height_unit_m)
         x, y, z = transformer.transform(points[:, 0], points[:, 1], height)
         lla = np.stack([y, x, z if self._three_dimensional else height], axis=-1)
         lla[:, 1] -= 360.0 * np.round(lla[:, 1] / 360.0)
-        rows.require(np.isfinite(lla).all(axis=1), f"outside the domain of {self.name}")
+        listed.require(np.isfinite(lla).all(axis=1), f"outside the domain of {self.name}")
         return lla
 
     def xyz_from_lla(self, lla: ArrayLike) -> FloatArray:
@@ -103,10 +103,10 @@ class PointCrs:
         points = np.asarray(lla, dtype=np.float64).reshape(-1, 3)
         if not len(points):
             return points
-        rows = Rows(points, self.name)
-        rows.require(np.isfinite(points).all(axis=1), "not a number")
-        check_area(self._crs, points[:, 1], points[:, 0], rows)
-        transformer, _ = best_operation(self._way(), points[:, 1], points[:, 0])
+        listed = ListedPoints(points, self.name)
+        listed.require(np.isfinite(points).all(axis=1), "not a number")
+        check_area(self._crs, points[:, 1], points[:, 0], listed)
+        transformer, _ = best_operation(self._request(), points[:, 1], points[:, 0])
         x, y, z = _inverse(transformer, points[:, 1], points[:, 0], points[:, 2])
         if not self._three_dimensional:
             # PROJ's flat datum shifts take a height for one above their own ellipsoid, on the way there and on the
@@ -117,7 +117,7 @@ class PointCrs:
             x, y, _ = _inverse(transformer, points[:, 1] + off, 2 * points[:, 0] - lat, points[:, 2])
             z = points[:, 2] / self._height_unit_m
         xyz = np.stack([x, y, z], axis=-1)
-        rows.require(np.isfinite(xyz).all(axis=1), f"outside the domain of {self.name}")
+        listed.require(np.isfinite(xyz).all(axis=1), f"outside the domain of {self.name}")
         return xyz
 
     def operation(self, lla: ArrayLike) -> Operation:
@@ -127,10 +127,10 @@ class PointCrs:
             InputError: as `lla_from_xyz`.
         """
         points = np.asarray(lla, dtype=np.float64).reshape(-1, 3)
-        return best_operation(self._way(), points[:, 1], points[:, 0])[1]
+        return best_operation(self._request(), points[:, 1], points[:, 0])[1]
 
-    def _way(self, path: Path | str | None = None) -> Way:
-        return Way(self._crs, self.name, self._three_dimensional, path)
+    def _request(self, path: Path | str | None = None) -> OperationRequest:
+        return OperationRequest(self._crs, self.name, self._three_dimensional, path)
 
 
 def _inverse(

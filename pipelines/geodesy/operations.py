@@ -44,7 +44,7 @@ class Operation:
 
 
 @dataclass(frozen=True)
-class Way:
+class OperationRequest:
     """A CRS, its name in errors, whether its heights are transformed too, and the file of the points."""
 
     crs: CRS
@@ -53,15 +53,15 @@ class Way:
     path: Path | str | None = None
 
 
-def best_operation(way: Way, lon: FloatArray, lat: FloatArray) -> tuple[Transformer, Operation]:
+def best_operation(request: OperationRequest, lon: FloatArray, lat: FloatArray) -> tuple[Transformer, Operation]:
     """Return the best transformation for points at `lon`, `lat` (N,) in degrees: one for all of them.
 
     Raises:
         InputError: a missing grid, or no transformation.
     """
-    group = _group(way.crs, _WGS84_3D if way.three_dimensional else WGS84, _area(lon, lat))
+    group = _group(request.crs, _WGS84_3D if request.three_dimensional else WGS84, _area(lon, lat))
     if group is None:
-        raise _no_way(way)
+        raise _no_operation(request)
     real = [transformer for transformer in group.transformers if not _does_nothing(transformer)]
     if real:
         best = real[0]
@@ -71,9 +71,9 @@ def best_operation(way: Way, lon: FloatArray, lat: FloatArray) -> tuple[Transfor
     lacking = [grids for operation in group.unavailable_operations if (grids := _missing([operation]))]
     lacking += [_missing(transformer.operations or ()) for transformer in group.transformers]
     if lacking:
-        datum = way.crs.sub_crs_list[1].name if way.crs.is_compound else None
-        raise missing_grid_error(datum, way.name, min(lacking, key=len), get_user_data_dir(), way.path)
-    raise _no_way(way)
+        datum = request.crs.sub_crs_list[1].name if request.crs.is_compound else None
+        raise missing_grid_error(datum, request.name, min(lacking, key=len), get_user_data_dir(), request.path)
+    raise _no_operation(request)
 
 
 def _group(crs: CRS, target: str, area: AreaOfInterest | None) -> TransformerGroup | None:
@@ -102,19 +102,19 @@ def _missing(operations: Iterable[CoordinateOperation]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(names))
 
 
-def _no_way(way: Way) -> InputError:
+def _no_operation(request: OperationRequest) -> InputError:
     """Return the error for a CRS that PROJ's database does not connect with WGS84."""
-    horizontal = way.crs.sub_crs_list[0] if way.crs.is_compound else way.crs
-    flat = _group(horizontal, WGS84, None) if way.crs.is_compound else None
+    horizontal = request.crs.sub_crs_list[0] if request.crs.is_compound else request.crs
+    flat = _group(horizontal, WGS84, None) if request.crs.is_compound else None
     if flat is not None and (flat.transformers or flat.unavailable_operations):
         message = (
-            f"heights above {way.crs.sub_crs_list[1].name} cannot be made ellipsoidal: PROJ knows no geoid for "
+            f"heights above {request.crs.sub_crs_list[1].name} cannot be made ellipsoidal: PROJ knows no geoid for "
             "them. Give ellipsoidal heights, the horizontal CRS alone and `--vertical ellipsoidal`"
         )
-        return InputError(message, path=way.path)
+        return InputError(message, path=request.path)
     message = (
-        f"no transformation from {way.name} to WGS84 is known here: name its datum (+datum=… or +towgs84=… in a "
-        "PROJ string), or give another CRS"
+        f"no transformation from {request.name} to WGS84 is known here: name its datum (+datum=… or +towgs84=… in "
+        "a PROJ string), or give another CRS"
     )
     ellipsoid = horizontal.ellipsoid
     if ellipsoid is not None and _is_modern(ellipsoid.semi_major_metre, ellipsoid.inverse_flattening):
@@ -122,7 +122,7 @@ def _no_way(way: Way) -> InputError:
             warnings.simplefilter("ignore", UserWarning)  # "you will lose information": the datum, which is stated
             projection = horizontal.to_proj4().replace(" +no_defs", "").replace(" +type=crs", "")
         message += f". If its datum is WGS84 as closely as you need: {projection} +towgs84=0,0,0"
-    return InputError(message, path=way.path)
+    return InputError(message, path=request.path)
 
 
 def _is_modern(axis_m: float, inverse_flattening: float) -> bool:

@@ -21,7 +21,7 @@ _FALSE_ORIGIN_M = 100_000.0
 
 
 @dataclass(frozen=True)
-class Rows:
+class ListedPoints:
     """Points (N, 3) of a CRS and where they stand, to blame the right one."""
 
     points: FloatArray
@@ -47,37 +47,37 @@ def horizontal_of(crs: CRS) -> CRS:
     return crs.sub_crs_list[0] if crs.is_compound else crs
 
 
-def rough_lon_lat(crs: CRS, rows: Rows) -> tuple[FloatArray, FloatArray]:
+def rough_lon_lat(crs: CRS, listed: ListedPoints) -> tuple[FloatArray, FloatArray]:
     """Return longitude and latitude (N,) from Greenwich in the CRS's own datum, within a kilometre of WGS84.
 
     Raises:
         InputError: a point that is not finite, out of range, in degrees where metres are due, or far outside the
             CRS's area.
     """
-    points, name = rows.points, rows.crs_name
-    rows.require(np.isfinite(points).all(axis=1), "not a number")
+    points, name = listed.points, listed.crs_name
+    listed.require(np.isfinite(points).all(axis=1), "not a number")
     if crs.is_geocentric:
         lla = lla_from_ecef(points)
-        rows.require(np.abs(lla[:, 2]) < 1e5, f"not near the Earth's surface in {name}")
+        listed.require(np.abs(lla[:, 2]) < 1e5, f"not near the Earth's surface in {name}")
         return lla[:, 1], lla[:, 0]
     horizontal = horizontal_of(crs)
     geodetic = horizontal.geodetic_crs or horizontal
     if horizontal.is_geographic:
         lon, lat = _from_greenwich(geodetic, points[:, 0], points[:, 1])
         order = f"(in {name} x is the longitude, y the latitude)"
-        rows.require(np.abs(lat) <= 90.0, f"latitude out of range −90 … 90 {order}", "latitude")
-        rows.require(np.abs(lon) <= 360.0, "longitude out of range −180 … 180", "longitude")
+        listed.require(np.abs(lat) <= 90.0, f"latitude out of range −90 … 90 {order}", "latitude")
+        listed.require(np.abs(lon) <= 360.0, "longitude out of range −180 … 180", "longitude")
     else:
         to_degrees = Transformer.from_crs(horizontal, geodetic, always_xy=True)
         lon, lat = _from_greenwich(geodetic, *to_degrees.transform(points[:, 0], points[:, 1]))
-        rows.require(np.isfinite(lon + lat), f"outside the domain of {name}")
+        listed.require(np.isfinite(lon + lat), f"outside the domain of {name}")
         degrees = _look_like_degrees(horizontal, points, lon, lat)
-        rows.require(~degrees, f"degrees? {name} has eastings and northings: wrong CRS")
-    check_area(crs, lon, lat, rows)
+        listed.require(~degrees, f"degrees? {name} has eastings and northings: wrong CRS")
+    check_area(crs, lon, lat, listed)
     return lon, lat
 
 
-def check_area(crs: CRS, lon: FloatArray, lat: FloatArray, rows: Rows) -> None:
+def check_area(crs: CRS, lon: FloatArray, lat: FloatArray, listed: ListedPoints) -> None:
     """Refuse points at `lon`, `lat` (N,) more than 3° outside the CRS's area of use, if it has one.
 
     Raises:
@@ -86,8 +86,8 @@ def check_area(crs: CRS, lon: FloatArray, lat: FloatArray, rows: Rows) -> None:
     area = horizontal_of(crs).area_of_use
     if area is not None:
         bounds = f"{area.south:g} … {area.north:g}° N, {area.west:g} … {area.east:g}° E"
-        message = f"far outside the area of {rows.crs_name} ({bounds}): wrong CRS, or x and y swapped?"
-        rows.require(_within(horizontal_of(crs), lon, lat, _AREA_MARGIN_DEG), message)
+        message = f"far outside the area of {listed.crs_name} ({bounds}): wrong CRS, or x and y swapped?"
+        listed.require(_within(horizontal_of(crs), lon, lat, _AREA_MARGIN_DEG), message)
 
 
 def _from_greenwich(geodetic: CRS, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -57,7 +57,7 @@ class Geolocation:
 
 
 @dataclass(frozen=True)
-class _Observed:
+class _CameraObservations:
     """Fixes and attitudes of a model's cameras, and how they agree with its layout."""
 
     model: SparseModel
@@ -138,7 +138,7 @@ def _nothing(model: SparseModel, why: str) -> Geolocation:
     return Geolocation(points, np.full(count, np.nan), why, (why,))
 
 
-def _observed(survey: Survey, model: SparseModel) -> _Observed:
+def _observed(survey: Survey, model: SparseModel) -> _CameraObservations:
     fixes, prior = fix_correspondences(survey, model), attitude_prior(survey, model)
     alignment, problem = None, ""
     try:
@@ -146,10 +146,10 @@ def _observed(survey: Survey, model: SparseModel) -> _Observed:
     except DegenerateGeometryError as error:
         problem = str(error)
         log.info("fixes cannot be compared with the SfM model: %s", error)
-    return _Observed(model, fixes, recorded_rotations(survey, model), prior, alignment, problem)
+    return _CameraObservations(model, fixes, recorded_rotations(survey, model), prior, alignment, problem)
 
 
-def _rotation_source(observed: _Observed, options: GeolocateOptions) -> Literal["recorded", "sfm"]:
+def _rotation_source(observed: _CameraObservations, options: GeolocateOptions) -> Literal["recorded", "sfm"]:
     with_fix = observed.model.image_index()
     both = int(np.isin([with_fix[name] for name in observed.fixes.name], observed.recorded.image).sum())
     if options.attitude == "recorded" and both < 2:
@@ -160,7 +160,7 @@ def _rotation_source(observed: _Observed, options: GeolocateOptions) -> Literal[
     return "recorded" if options.attitude == "recorded" or (options.attitude == "auto" and complete) else "sfm"
 
 
-def _warnings(observed: _Observed, source: str) -> list[str]:
+def _warnings(observed: _CameraObservations, source: str) -> list[str]:
     warnings = []
     turned = observed.recorded.contradicting
     if turned:
@@ -192,7 +192,7 @@ def _warnings(observed: _Observed, source: str) -> list[str]:
     return warnings
 
 
-def _views(observed: _Observed, source: str, sigma_px: float) -> tuple[UncertainCameras, BoolArray]:
+def _views(observed: _CameraObservations, source: str, sigma_px: float) -> tuple[UncertainCameras, BoolArray]:
     """All images as views (those without a fix are placeholders), and which give rays (n,)."""
     model, fixes, alignment = observed.model, observed.fixes, observed.alignment
     count, index = len(model.image_name), model.image_index()

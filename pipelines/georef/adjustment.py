@@ -152,7 +152,7 @@ def residuals(data: Correspondences, state: SimilarityState) -> FloatArray:
     return np.asarray(missed)
 
 
-def covariances(data: Correspondences, state: SimilarityState) -> FloatArray:
+def residual_covariances(data: Correspondences, state: SimilarityState) -> FloatArray:
     """Return the covariances (n, 3, 3) of the residuals: measured, of the point in local, and the excess."""
     turn = state.geo_from_local.scale * state.geo_from_local.rotation
     excess = np.where(data.control, state.excess_m[1], state.excess_m[0])
@@ -161,7 +161,7 @@ def covariances(data: Correspondences, state: SimilarityState) -> FloatArray:
 
 
 def _gated(data: Correspondences, state: SimilarityState) -> SimilarityState:
-    squared = squared_mahalanobis(residuals(data, state), covariances(data, state))
+    squared = squared_mahalanobis(residuals(data, state), residual_covariances(data, state))
     inlier = squared <= OUTLIER_GATE
     if inlier.sum() < 3:  # never fewer than determine a similarity
         inlier = squared <= np.sort(squared)[min(2, len(squared) - 1)]
@@ -179,7 +179,7 @@ def _solve(data: Correspondences, state: SimilarityState, prior: RotationPrior |
     equations = _equations(data, state, prior)
     normal, weights = equations.normal, equations.weights
     covariance = normal.covariance(weights)
-    missed, cov = residuals(data, state), covariances(data, state)
+    missed, cov = residuals(data, state), residual_covariances(data, state)
     squared = squared_mahalanobis(missed, cov)
     stretch = np.linalg.slogdet(cov)[1] - np.linalg.slogdet(data.cov_in_geo)[1]
     pull = np.swapaxes(-normal.observations[_POSITIONS].jacobian, 1, 2) @ equations.whitener
@@ -207,7 +207,7 @@ class _Equations:
 
 def _equations(data: Correspondences, state: SimilarityState, prior: RotationPrior | None) -> _Equations:
     mapped = state.geo_from_local.apply(data.in_local)
-    whitener = np.linalg.inv(np.linalg.cholesky(covariances(data, state)))
+    whitener = np.linalg.inv(np.linalg.cholesky(residual_covariances(data, state)))
     weight = (whitener**2).sum(axis=(1, 2)) * state.inlier
     pivot = weight @ mapped / weight.sum()
     jacobian = jacobian_at(mapped, pivot)
@@ -268,7 +268,7 @@ def _excess(
     count = int(members.sum())
     if count < _LEAST_FOR_EXCESS:
         return 0.0
-    missed, cov = residuals(data, state)[members], covariances(data, state)[members]
+    missed, cov = residuals(data, state)[members], residual_covariances(data, state)[members]
     variances, axes = np.linalg.eigh(cov)
     along = (np.swapaxes(axes, 1, 2) @ missed[..., None])[..., 0] ** 2
     # The share of the scatter that the parameters have taken up.

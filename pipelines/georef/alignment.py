@@ -37,7 +37,7 @@ from pipelines.georef.adjustment import (
     RotationPrior,
     SimilarityState,
     adjust,
-    covariances,
+    residual_covariances,
     residuals,
 )
 from pipelines.robust.kernels import cauchy_weight
@@ -195,7 +195,7 @@ def _start_with_rotation(data: Correspondences, rotation: FloatArray, rng: np.ra
 
 def _squared(data: Correspondences, model: Similarity) -> FloatArray:
     state = SimilarityState(model, np.ones(len(data), dtype=bool))
-    return squared_mahalanobis(residuals(data, state), covariances(data, state))
+    return squared_mahalanobis(residuals(data, state), residual_covariances(data, state))
 
 
 def _candidates(

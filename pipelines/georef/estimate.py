@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from pipelines.georef.systematic import Errors
+from pipelines.georef.systematic import SystematicErrorValues
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Estimate:
     rotation: Tensor
     center: Tensor
     geo_from_model: TensorSimilarity
-    errors: Errors
+    errors: SystematicErrorValues
     lens: Tensor
 
     def geo_from_cam(self, camera: Tensor) -> Tensor:

@@ -126,7 +126,7 @@ def move(problem: GeoProblem, equations: GeoEquations, step: FloatArray) -> None
     problem.errors.set_vector(problem.errors.vector() + torch.from_numpy(step[equations.constant]).to(device))
 
 
-def covariances(problem: GeoProblem) -> tuple[FloatArray, FloatArray]:
+def solution_covariances(problem: GeoProblem) -> tuple[FloatArray, FloatArray]:
     """Return the covariance (7, 7) of the similarity about its pivot, and that (p, p) of the constant errors.
 
     All else is marginalised out. The first has the form of `geometry.similarity.SimilarityRecord`.

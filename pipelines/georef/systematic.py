@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from pipelines.core.types import FloatArray
+from pipelines.georef.estimated_error import EstimatedError
 
 # Weak priors: wide enough for whatever a flight brings, finite so that what is not observable is recognised.
 SIGMA_BIAS_M = (5.0, 5.0, 10.0)
@@ -29,7 +30,7 @@ OBSERVED_PART = 0.5
 
 
 @dataclass(frozen=True)
-class Errors:
+class SystematicErrorValues:
     """Values of the errors; None where one is not estimated.
 
     Attributes:
@@ -46,24 +47,12 @@ class Errors:
 
 
 @dataclass(frozen=True)
-class Part:
+class ErrorBlock:
     """One error in the vector of all: `name` as in `TrainOptions.estimate` or "common", flight counted from 0."""
 
     name: Literal["bias", "lever-arm", "boresight", "common"]
     flight: int | None
     sigma: tuple[float, float, float]
-
-
-@dataclass(frozen=True)
-class ErrorEstimate:
-    """One error as it was estimated: value and σ (3,) in `unit`, and which components were observed."""
-
-    name: Literal["bias", "lever-arm", "boresight"]
-    flight: int | None
-    unit: Literal["m", "deg"]
-    value: tuple[float, float, float]
-    sigma: tuple[float, float, float]
-    observed: tuple[bool, bool, bool]
 
 
 class SystematicErrors(torch.nn.Module):
@@ -80,15 +69,15 @@ class SystematicErrors(torch.nn.Module):
 
     def __init__(self, flights: int = 0, *, arm: bool = False, attitude_sigma_rad: float | None = None) -> None:
         super().__init__()
-        parts = [Part("bias", flight, SIGMA_BIAS_M) for flight in range(flights)]
+        blocks = [ErrorBlock("bias", flight, SIGMA_BIAS_M) for flight in range(flights)]
         if arm:
-            parts.append(Part("lever-arm", None, (SIGMA_ARM_M,) * 3))
+            blocks.append(ErrorBlock("lever-arm", None, (SIGMA_ARM_M,) * 3))
         if attitude_sigma_rad is not None:
-            parts.append(Part("boresight", None, (SIGMA_BORESIGHT_RAD,) * 3))
-            parts.append(Part("common", None, (attitude_sigma_rad,) * 3))
-        self.parts = tuple(parts)
+            blocks.append(ErrorBlock("boresight", None, (SIGMA_BORESIGHT_RAD,) * 3))
+            blocks.append(ErrorBlock("common", None, (attitude_sigma_rad,) * 3))
+        self.blocks = tuple(blocks)
         self.flights = flights
-        prior = np.array([part.sigma for part in self.parts]).reshape(-1)
+        prior = np.array([block.sigma for block in self.blocks]).reshape(-1)
         self.x = torch.nn.Parameter(torch.zeros(len(prior), dtype=torch.float64))
         self.sigma: Tensor
         self.start: Tensor
@@ -120,31 +109,31 @@ class SystematicErrors(torch.nn.Module):
         """Σ (v/σ)²; scalar."""
         return (vector / self.sigma).square().sum()
 
-    def split(self, vector: Tensor) -> Errors:
+    def split(self, vector: Tensor) -> SystematicErrorValues:
         """The errors of a vector (p,)."""
         rows = vector.view(-1, 3)
-        common = {part.name: row for part, row in zip(self.parts, rows, strict=True) if part.flight is None}
-        return Errors(
+        common = {block.name: row for block, row in zip(self.blocks, rows, strict=True) if block.flight is None}
+        return SystematicErrorValues(
             rows[: self.flights] if self.flights else None,
             common.get("lever-arm"),
             common.get("boresight"),
             common.get("common"),
         )
 
-    def estimates(self, covariance: FloatArray) -> tuple[ErrorEstimate, ...]:
+    def estimates(self, covariance: FloatArray) -> tuple[EstimatedError, ...]:
         """The present values with the σ of their covariance (p, p); what all attitudes share is not among them."""
         value, prior = self.vector().detach().cpu().numpy(), self.sigma.cpu().numpy()
         sigma = np.sqrt(np.diag(covariance))
         estimates = []
-        for index, part in enumerate(self.parts):
-            if part.name == "common":
+        for index, block in enumerate(self.blocks):
+            if block.name == "common":
                 continue
-            here, turned = slice(3 * index, 3 * index + 3), part.name == "boresight"
+            here, turned = slice(3 * index, 3 * index + 3), block.name == "boresight"
             unit = math.degrees(1.0) if turned else 1.0
             estimates.append(
-                ErrorEstimate(
-                    name=part.name,
-                    flight=part.flight,
+                EstimatedError(
+                    name=block.name,
+                    flight=block.flight,
                     unit="deg" if turned else "m",
                     value=tuple(unit * value[here]),
                     sigma=tuple(unit * sigma[here]),

@@ -6,7 +6,6 @@ from functools import cache
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import chi2
 
 from pipelines.core.products import Product
 from pipelines.core.types import FloatArray
@@ -19,6 +18,8 @@ _WEISZFELD_NEAR = 1e-6  # a point that is met weighs no more than this distance
 
 def chi2_quantile(probability: float, degrees: ArrayLike) -> FloatArray:
     """Quantile of χ² with `degrees` (…) of freedom; 0 where there are none."""
+    from scipy.stats import chi2  # takes a second to load, which the types below need not cost
+
     dof = np.asarray(degrees)
     distinct, place = np.unique(dof, return_inverse=True)
     values = np.where(distinct > 0, chi2.ppf(probability, np.maximum(distinct, 1)), 0.0)

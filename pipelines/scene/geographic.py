@@ -49,16 +49,16 @@ def geo_problem(
     record = initial.geo_from_local
     pivot = scene.geo_from_model.apply(scene.poses.cam_center_in_model[scene.train]).mean(axis=0)
     covariance = moved_pivot(np.array(record.covariance), record.pivot, pivot)
-    observed = _observed(scene, survey, options, points, seed) if options.geo_loss else Observed()
+    terms = _terms_of(scene, survey, options, points, seed) if options.geo_loss else SurveyTerms()
     problem = GeoProblem(
         LearnableSimilarity(scene.geo_from_model, covariance, pivot, _attitude(scene, initial)),
         _corrections(scene, options),
-        observed.terms,
+        terms.present,
         weighting=options.weighting,
-        hold_prior=_leaves_open(observed, initial),
-        errors=_errors(observed, options) if options.geo_loss else None,
+        hold_prior=_leaves_open(terms, initial),
+        errors=_errors(terms, options) if options.geo_loss else None,
         learned_weights=options.loss_weights == "learned",
-        control_by_depth=observed.control_by_depth,
+        control_by_depth=terms.control_by_depth,
     )
     if len(problem.errors):
         saved = begin(problem)
@@ -90,7 +90,7 @@ def _attitude(scene: Scene, initial: InitialSimilarity) -> RotationPrior | None:
 
 
 @dataclass(frozen=True)
-class Observed:
+class SurveyTerms:
     """The terms of a survey; None where there is nothing of a kind, or it is not to be used."""
 
     fixes: FixTerm | None = None
@@ -100,17 +100,17 @@ class Observed:
     control_by_depth: ControlByDepth | None = None
 
     @property
-    def terms(self) -> tuple[Term, ...]:
+    def present(self) -> tuple[Term, ...]:
         """Those that there are."""
         every = (self.fixes, self.control, self.distances, self.attitudes)
         return tuple(term for term in every if term is not None)
 
 
-def _leaves_open(observed: Observed, initial: InitialSimilarity) -> bool:
+def _leaves_open(terms: SurveyTerms, initial: InitialSimilarity) -> bool:
     """Whether the observations leave some of the similarity to what was known of it beforehand."""
     if initial.layout == "line":
-        return observed.attitudes is None
-    return observed.fixes is None and not _determined_by(observed.control)
+        return terms.attitudes is None
+    return terms.fixes is None and not _determined_by(terms.control)
 
 
 def _determined_by(control: ControlTerm | None) -> bool:
@@ -118,9 +118,9 @@ def _determined_by(control: ControlTerm | None) -> bool:
     return control is not None and len(control) >= _LEAST_CONTROL
 
 
-def _observed(
+def _terms_of(
     scene: Scene, survey: Survey, options: GeographicOptions, points: GeolocatedPoints | None, seed: int
-) -> Observed:
+) -> SurveyTerms:
     fixes = fix_term(scene, survey)
     control = control_term(scene, survey) if options.gcp_loss else None
     by_depth = None
@@ -128,14 +128,14 @@ def _observed(
         by_depth, control = control_by_depth(scene, survey, control)
     distances = distance_term(scene, fixes, points, seed) if fixes is not None and options.rel_loss else None
     attitudes = attitude_term(scene, survey) if "boresight" in options.estimated else None
-    return Observed(fixes, control, distances, attitudes, by_depth)
+    return SurveyTerms(fixes, control, distances, attitudes, by_depth)
 
 
-def _errors(observed: Observed, options: GeographicOptions) -> SystematicErrors:
+def _errors(terms: SurveyTerms, options: GeographicOptions) -> SystematicErrors:
     """The constant errors that are asked for; with `auto` the bias, wherever control points could show it."""
-    fixes, attitudes, wanted = observed.fixes, observed.attitudes, options.estimated
+    fixes, attitudes, wanted = terms.fixes, terms.attitudes, options.estimated
     if options.estimate == "auto":
-        possible = options.weighting == "whitened" and fixes is not None and _determined_by(observed.control)
+        possible = options.weighting == "whitened" and fixes is not None and _determined_by(terms.control)
         wanted = ("bias",) if possible else ()
     for name, source, what in (
         ("bias", fixes, "positions"),

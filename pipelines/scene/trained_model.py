@@ -9,6 +9,7 @@ from pydantic import Field
 from pipelines.core.products import ImageName, Product, Rotation
 from pipelines.core.types import Matrix34, Vector3
 from pipelines.geometry.similarity import SimilarityRecord
+from pipelines.georef.estimated_error import EstimatedError
 
 
 class TrainedCamera(Product):
@@ -30,22 +31,6 @@ class TrainedLens(Product):
     camera_id: int
     model: str
     params: tuple[float, ...]
-
-
-class EstimatedError(Product):
-    """A constant error of the measurements that training estimated, with its σ, by axis.
-
-    `bias`: fix minus truth, east, north, up, in m; `flight` counts from 0 in the order of time. `lever-arm`:
-    antenna seen from the camera beyond what the survey has applied, camera axes, in m. `boresight`: rotation vector
-    from the true to the nominal camera axes, in degrees. `observed`: σ is at most half of that of the prior.
-    """
-
-    name: Literal["bias", "lever-arm", "boresight"]
-    flight: int | None = None
-    unit: Literal["m", "deg"]
-    value: Vector3
-    sigma: Vector3
-    observed: tuple[bool, bool, bool]
 
 
 class TrainedModel(Product):

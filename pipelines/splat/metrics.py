@@ -1,14 +1,12 @@
-"""Image quality as the splatting literature reports it: PSNR, SSIM and LPIPS of images as they are shown."""
+"""Image quality as the splatting literature reports it: PSNR and SSIM of images as they are shown."""
 
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 from torch import Tensor
 
 from pipelines.splat.losses import image_similarity
-from pipelines.splat.lpips import Lpips
 
 # PSNR of equal images: a report has no infinity. Rounding to 8 bits alone gives 59 dB.
 MAX_PSNR_DB = 100.0
@@ -46,17 +44,6 @@ def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
     """
     _check(image, target, mask)
     return image_similarity(image.detach().clamp(0, 1), target, mask).ssim
-
-
-def lpips(weights: Path | None) -> Lpips | str:
-    """Return the perceptual distance, or the reason why there is none.
-
-    Raises:
-        InputError: `weights` is not an NPZ file of LPIPS weights.
-    """
-    if weights is None:
-        return "no weights were given: they are not part of the package (--lpips-weights FILE.npz)"
-    return Lpips(weights)
 
 
 def _check(image: Tensor, target: Tensor, mask: Tensor | None) -> None:

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
 from pipelines.core.workspace import Summary
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
-from pipelines.georef.posterior import covariances
+from pipelines.georef.estimated_error import EstimatedError
+from pipelines.georef.posterior import solution_covariances
 from pipelines.georef.problem import GeoProblem
 from pipelines.georef.terms import ControlTerm, FixTerm
 from pipelines.scene.scene import Scene
-from pipelines.scene.trained_model import EstimatedError, TrainedCamera, TrainedLens, TrainedModel
+from pipelines.scene.trained_model import TrainedCamera, TrainedLens, TrainedModel
 from pipelines.train.loop import TrainingRecord
 from pipelines.train.trainer import JointTrainer
 
@@ -30,7 +30,7 @@ def trained_model(trainer: JointTrainer, scene: Scene) -> TrainedModel:
     problem, gaussians = trainer.problem, trainer.optimizer.gaussians
     similarity, control = problem.similarity, problem.control
     measured = problem.fixes is not None or control is not None
-    covariance, of_errors = covariances(problem) if measured else (similarity.prior_covariance(), None)
+    covariance, of_errors = solution_covariances(problem) if measured else (similarity.prior_covariance(), None)
     estimates = () if of_errors is None else problem.errors.estimates(of_errors)
     return TrainedModel(
         geo_from_model=similarity.current().to_record(
@@ -49,7 +49,7 @@ def trained_model(trainer: JointTrainer, scene: Scene) -> TrainedModel:
         control_outliers=()
         if control is None
         else tuple(control.point_id[row] for row in problem.contradicting(ControlTerm)),
-        estimated_errors=tuple(EstimatedError.model_validate(asdict(estimate)) for estimate in estimates),
+        estimated_errors=estimates,
     )
 
 

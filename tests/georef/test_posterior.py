@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from pipelines.core.errors import DegenerateGeometryError
-from pipelines.georef.posterior import covariances, equations_of, leave_one_out, minimise, posterior
+from pipelines.georef.posterior import equations_of, leave_one_out, minimise, posterior, solution_covariances
 from pipelines.georef.problem import GeoProblem
 from pipelines.georef.systematic import SystematicErrors
 from pipelines.georef.terms import ControlTerm
@@ -95,7 +95,7 @@ def test_posterior_is_that_of_the_whole_normal_matrix(sigma_m: np.ndarray, contr
     np.testing.assert_allclose(
         joint.covariance / np.outer(scale, scale), expected / np.outer(scale, scale), atol=1e-6
     )
-    np.testing.assert_allclose(covariances(problem)[0], joint.covariance[:7, :7], rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(solution_covariances(problem)[0], joint.covariance[:7, :7], rtol=1e-9, atol=1e-15)
     assert np.linalg.eigvalsh(joint.covariance)[0] > 0
     # The image observations alone know the corrections to one σ: measurements on Earth only add to that.
     assert np.diag(joint.covariance)[7:].max() <= 1 + 1e-9
@@ -169,7 +169,7 @@ def test_cameras_that_are_held_leave_the_similarity() -> None:
     _, problem = solved(0, RTK, CONTROL, block)
     joint = posterior(problem)
     assert joint.covariance.shape == (7, 7)
-    np.testing.assert_allclose(joint.covariance, covariances(problem)[0], rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(joint.covariance, solution_covariances(problem)[0], rtol=1e-6, atol=1e-12)
     found = joint.at(np.zeros((2, 3)), np.zeros((2, 3, 0)), np.zeros((2, 3, 0)))
     assert found.shape == (2, 3, 3)
 

@@ -14,7 +14,7 @@ from pipelines.geometry.similarity import Similarity, jacobian_at, umeyama
 from pipelines.georef.adjustment import Correspondences, RotationPrior
 from pipelines.georef.alignment import align
 from pipelines.georef.cameras import CameraCorrections, CameraPoses
-from pipelines.georef.posterior import covariances, minimise
+from pipelines.georef.posterior import minimise, solution_covariances
 from pipelines.georef.problem import GeoProblem
 from pipelines.georef.similarity import LearnableSimilarity
 from pipelines.georef.start import begin, bias_pays
@@ -60,7 +60,7 @@ def test_covariance_is_calibrated(sigma_m: np.ndarray, control: bool, biased: bo
         if biased:
             begin(problem)
         minimise(problem)
-        covariance, of_errors = covariances(problem)
+        covariance, of_errors = solution_covariances(problem)
         found = problem.similarity.current()
         squared.append(squared_error(truth.geo_from_model, found, covariance, pivot(BLOCK)))
         if biased:
@@ -134,7 +134,10 @@ def test_one_outlier_moves_nothing() -> None:
     assert np.abs(moved).max() < 0.02
     assert hit.contradicting(FixTerm) == [3]
     assert clean.contradicting(FixTerm) == []
-    assert squared_error(truth.geo_from_model, hit.similarity.current(), covariances(hit)[0], pivot(BLOCK)) < FAR
+    assert (
+        squared_error(truth.geo_from_model, hit.similarity.current(), solution_covariances(hit)[0], pivot(BLOCK))
+        < FAR
+    )
 
 
 def test_bowed_block_is_straightened_by_its_fixes() -> None:
@@ -221,7 +224,9 @@ def test_covariance_of_a_line_counts_its_fixes_once(sigma_m: np.ndarray, sigma_r
                 similarity, CameraCorrections(block.poses, block.basis), terms(fixes, None), hold_prior=True
             )
             minimise(problem)
-            found.append(squared_error(truth.geo_from_model, similarity.current(), covariances(problem)[0], about))
+            found.append(
+                squared_error(truth.geo_from_model, similarity.current(), solution_covariances(problem)[0], about)
+            )
     # The mean of 30 χ²₇ has σ 0.68, 10 % of 7.
     assert np.mean(squared) == pytest.approx(7.0, rel=0.25)
     # All of the start held: six of the seven unknowns, those that the fixes know, look twice as certain.
@@ -248,7 +253,7 @@ def test_prior_is_held_where_asked() -> None:
     problem = problem_of(block, fixes_of(truth, RTK, rng))
     problem.hold_prior = True
     minimise(problem)
-    covariance = covariances(problem)[0]
+    covariance = solution_covariances(problem)[0]
     # A priori 0.02 rad about every axis; the fixes say nothing of the one along the line (east).
     assert np.sqrt(covariance[1, 1]) == pytest.approx(0.02, rel=0.02)
     assert np.sqrt(covariance[2, 2]) < 1e-3
@@ -260,7 +265,9 @@ def test_cameras_that_are_held_leave_a_covariance() -> None:
     problem = problem_of(replace(BLOCK, basis=np.zeros((12, 6, 0))), fixes_of(truth, RTK, rng))
     minimise(problem)
     assert (
-        squared_error(truth.geo_from_model, problem.similarity.current(), covariances(problem)[0], pivot(BLOCK))
+        squared_error(
+            truth.geo_from_model, problem.similarity.current(), solution_covariances(problem)[0], pivot(BLOCK)
+        )
         < FAR
     )
 

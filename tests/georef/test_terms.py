@@ -11,7 +11,7 @@ import torch
 from pipelines.geometry.rotations import exp_so3, log_so3
 from pipelines.geometry.similarity import Similarity
 from pipelines.georef.cameras import CameraPoses
-from pipelines.georef.posterior import covariances, minimise
+from pipelines.georef.posterior import minimise, solution_covariances
 from pipelines.georef.problem import GeoProblem
 from pipelines.georef.so3 import log_so3 as torch_log
 from pipelines.georef.start import begin
@@ -134,7 +134,7 @@ def test_relative_loss_mends_the_scale_and_nothing_else() -> None:
 
 def estimated(problem: GeoProblem, name: str) -> tuple[np.ndarray, np.ndarray, tuple[bool, bool, bool]]:
     """Value, σ and whether it was observed."""
-    (found,) = [each for each in problem.errors.estimates(covariances(problem)[1]) if each.name == name]
+    (found,) = [each for each in problem.errors.estimates(solution_covariances(problem)[1]) if each.name == name]
     return np.array(found.value), np.array(found.sigma), found.observed
 
 
@@ -163,7 +163,7 @@ def test_two_flights_have_a_bias_each() -> None:
     problem = problem_with(STIFF, terms(fixes, marks_of(truth, CONTROL, 0.02, rng)), SystematicErrors(2))
     begin(problem)
     minimise(problem)
-    found = problem.errors.estimates(covariances(problem)[1])
+    found = problem.errors.estimates(solution_covariances(problem)[1])
     assert [each.flight for each in found] == [0, 1]
     np.testing.assert_allclose([each.value for each in found], biases, atol=0.06)
     assert error_m(problem, truth, CONTROL) < 0.04
@@ -175,7 +175,7 @@ def test_bias_without_control_points_is_not_observed() -> None:
     begin(problem)
     assert estimated(problem, "bias")[2] == (False, False, False)
     # Nobody then knows the position better than the prior of the bias.
-    assert np.sqrt(np.diag(covariances(problem)[0])[4:]) == pytest.approx([5.0, 5.0, 10.0], rel=0.01)
+    assert np.sqrt(np.diag(solution_covariances(problem)[0])[4:]) == pytest.approx([5.0, 5.0, 10.0], rel=0.01)
 
 
 def test_lever_arm_is_found_and_taken_out() -> None:
@@ -227,8 +227,8 @@ def test_attitudes_claim_no_more_of_the_rotation_than_one_of_them() -> None:
     alone = problem_with(STIFF, measured[:1])
     problem = problem_with(STIFF, measured, SystematicErrors(attitude_sigma_rad=np.radians(0.5)))
     begin(problem)
-    assert np.sqrt(covariances(problem)[0][3, 3]) > np.radians(0.4)
-    assert np.sqrt(covariances(problem)[0][3, 3]) < np.sqrt(covariances(alone)[0][3, 3])
+    assert np.sqrt(solution_covariances(problem)[0][3, 3]) > np.radians(0.4)
+    assert np.sqrt(solution_covariances(problem)[0][3, 3]) < np.sqrt(solution_covariances(alone)[0][3, 3])
 
 
 def test_a_moved_control_point_is_named() -> None:

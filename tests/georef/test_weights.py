@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from pipelines.georef.posterior import covariances
+from pipelines.georef.posterior import solution_covariances
 from pipelines.georef.similarity import LearnableSimilarity
 from pipelines.georef.weights import TermWeights
 from tests.georef_scenes import descend, draw_truth, fixes_of, make_block, marks_of, pivot, problem_with, terms
@@ -72,12 +72,12 @@ def test_variance_enters_the_covariance() -> None:
     fixes = fixes_of(truth, np.array([0.02, 0.02, 0.03]), np.random.default_rng(0))
     problem = problem_with(replace(BLOCK, poses=truth.poses), terms(fixes), learned_weights=True)
     descend(problem, 300)
-    before, s = covariances(problem)[0], problem.weights.log_variance("absolute")
+    before, s = solution_covariances(problem)[0], problem.weights.log_variance("absolute")
     assert s is not None
     with torch.no_grad():
         problem.weights.u += 0.01
     after = problem.weights.log_variance("absolute")
     assert after is not None
     # Cauchy's weights rise a little as residuals shrink.
-    ratio = np.trace(covariances(problem)[0][4:, 4:]) / np.trace(before[4:, 4:])
+    ratio = np.trace(solution_covariances(problem)[0][4:, 4:]) / np.trace(before[4:, 4:])
     assert 1.0 < ratio <= math.exp(float((after - s).detach())) + 1e-9

@@ -13,7 +13,7 @@ from pipelines.geometry.cameras import Camera
 from pipelines.geometry.lens import bearings
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.georef.control_by_depth import depth_residuals
-from pipelines.georef.posterior import covariances
+from pipelines.georef.posterior import solution_covariances
 from pipelines.georef.problem import GeoProblem
 from pipelines.georef.terms import AttitudeTerm
 from pipelines.scene.geographic import geo_problem
@@ -83,7 +83,7 @@ def test_start_is_held_where_the_measurements_leave_it_open(points: int, held: b
     assert problem.fixes is None
     assert problem.hold_prior is held
     if points:
-        assert np.linalg.eigvalsh(covariances(problem)[0]).min() > 0
+        assert np.linalg.eigvalsh(solution_covariances(problem)[0]).min() > 0
 
 
 def test_line_holds_its_start() -> None:
@@ -150,7 +150,7 @@ def test_bias_is_freed_where_control_points_show_it() -> None:
     offset = (0.8, -0.5, 1.5)
     assert len(problem_of(survey, sparse).errors) == 0
     found = problem_of(biased(survey, offset), sparse)
-    assert [part.name for part in found.errors.parts] == ["bias"]
+    assert [part.name for part in found.errors.blocks] == ["bias"]
     # 2 to 3 cm over √8 fixes, 2 cm over √6 control points, and what 60 SfM points leave of the cameras.
     np.testing.assert_allclose(found.errors.vector().detach(), offset, atol=0.15)
     few = biased(survey, offset).model_copy(update={"control_points": survey.control_points[:2]})
@@ -163,7 +163,7 @@ def test_bias_is_freed_where_control_points_show_it() -> None:
 def test_errors_that_are_asked_for_are_there() -> None:
     _, sparse, survey = material()
     found = problem_of(survey, sparse, estimate="boresight,bias,lever-arm")
-    assert [part.name for part in found.errors.parts] == ["bias", "lever-arm", "boresight", "common"]
+    assert [part.name for part in found.errors.blocks] == ["bias", "lever-arm", "boresight", "common"]
     attitudes = found.term(AttitudeTerm)
     assert attitudes is not None
     assert len(attitudes) == 8

@@ -11,7 +11,6 @@ from torch import Tensor, nn
 
 from pipelines.core.errors import InputError
 from pipelines.splat.lpips import Lpips
-from pipelines.splat.metrics import lpips as lpips_or_reason
 
 VGG16 = (64, 64, "M", 128, 128, "M", 256, 256, 256, "M", 512, 512, 512, "M", 512, 512, 512)
 TAKEN = (3, 8, 15, 22, 29)  # the last ReLU before each pooling
@@ -83,12 +82,6 @@ def test_pixels_outside_the_mask_are_equal(network: tuple[nn.Sequential, list[Te
     assert lpips(spoilt, target, mask) == lpips(image, target, mask)
     assert 0 < lpips(image, target, mask) < lpips(image, target)
     assert lpips(image, target, ~torch.ones_like(mask)) == 0
-
-
-def test_without_weights_there_is_a_reason() -> None:
-    reason = lpips_or_reason(None)
-    assert isinstance(reason, str)
-    assert "--lpips-weights" in reason
 
 
 def test_files_that_are_no_weights_are_refused(tmp_path: Path) -> None:

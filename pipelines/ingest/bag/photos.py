@@ -15,7 +15,7 @@ from pipelines.formats.bag.images import BadImageError, ImageWriter, sharpness
 from pipelines.formats.bag.reader import Bag, UndecodableError
 from pipelines.formats.exif import PhotoTags
 from pipelines.formats.image_file import inspect_image
-from pipelines.ingest.bag.streams import Clock
+from pipelines.ingest.bag.streams import SampleTimes
 from pipelines.ingest.notes import Notes
 from pipelines.ingest.options import Every, IngestOptions
 from pipelines.ingest.photo_folder import Photo
@@ -61,7 +61,7 @@ class _BlurDetector:
 def write_photos(
     bag: Bag,
     topic: str,
-    clock: Clock,
+    clock: SampleTimes,
     place: FloatArray,
     *,
     options: IngestOptions,

@@ -29,7 +29,7 @@ _JUMP_NS = 60_000_000_000
 
 
 @dataclass
-class Series:
+class TopicSamples:
     """Samples of one topic in the order of recording.
 
     Attributes:
@@ -68,7 +68,7 @@ class Series:
 
 
 @dataclass(frozen=True)
-class Clock:
+class SampleTimes:
     """When the samples of a topic were taken: seconds (N,), and which of them are usable (N,)."""
 
     time_s: FloatArray
@@ -90,13 +90,13 @@ class BagStreams:
     """
 
     path: Path
-    images: Series
+    images: TopicSamples
     image_frame: str
-    positions: Series | None
-    attitudes: Series | None
+    positions: TopicSamples | None
+    attitudes: TopicSamples | None
     transforms: Transforms
     info: Any | None
-    clocks: Mapping[str, Clock]
+    clocks: Mapping[str, SampleTimes]
 
 
 def read_streams(bag: Bag, topics: SelectedTopics, notes: Notes, progress: Progress = SILENT) -> BagStreams:
@@ -132,12 +132,12 @@ def read_streams(bag: Bag, topics: SelectedTopics, notes: Notes, progress: Progr
     return BagStreams(bag.path, images, image_frame, positions, attitudes, transforms, info, clocks)
 
 
-def _series(bag: Bag, topic: str, width: int) -> Series:
-    return Series(topic, bag.topics[topic].type, width)
+def _series(bag: Bag, topic: str, width: int) -> TopicSamples:
+    return TopicSamples(topic, bag.topics[topic].type, width)
 
 
 def _note_losses(
-    bag: Bag, series: list[Series], undecodable: dict[str, list[str]], refused: int, notes: Notes
+    bag: Bag, series: list[TopicSamples], undecodable: dict[str, list[str]], refused: int, notes: Notes
 ) -> None:
     for topic, errors in undecodable.items():
         notes.warn(f"{len(errors)} messages of {topic} do not decode and were left out: {errors[0]}")
@@ -163,11 +163,13 @@ def _frame(bag: Bag, message: RawMessage) -> str:
         return ""
 
 
-def _count(series: Series) -> int:
+def _count(series: TopicSamples) -> int:
     return len(series.stamps) + sum(series.problems.values())
 
 
-def _navigation(bag: Bag, message: RawMessage, positions: Series | None, attitudes: Series | None) -> None:
+def _navigation(
+    bag: Bag, message: RawMessage, positions: TopicSamples | None, attitudes: TopicSamples | None
+) -> None:
     decoded = bag.decode(message)
     if positions is not None and message.topic == positions.topic:
         position = POSITIONS[message.type].read(decoded)
@@ -188,7 +190,7 @@ def _navigation(bag: Bag, message: RawMessage, positions: Series | None, attitud
             attitudes.add(stamp_ns(decoded), message.bag_ns, (*attitude.quat_xyzw, attitude.sigma_deg))
 
 
-def settle_clocks(series: list[Series], notes: Notes) -> dict[str, Clock]:
+def settle_clocks(series: list[TopicSamples], notes: Notes) -> dict[str, SampleTimes]:
     """Return times on one clock for all topics, in seconds: the messages' own stamps, where they have any.
 
     Messages without a stamp get the time of recording. Topics that count from another epoch than the rest (since
@@ -223,7 +225,7 @@ def settle_clocks(series: list[Series], notes: Notes) -> dict[str, Clock]:
         latest = np.maximum.accumulate(np.where(usable, time, np.iinfo(np.int64).min))
         backwards = usable & np.concatenate([[False], time[1:] <= latest[:-1]])
         _note_left_out(notes, backwards, topic, "have a stamp that is not later than one before")
-        clocks[topic] = Clock(time / 1e9, usable & ~backwards)
+        clocks[topic] = SampleTimes(time / 1e9, usable & ~backwards)
     return clocks
 
 

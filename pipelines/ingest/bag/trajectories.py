@@ -16,7 +16,7 @@ from pipelines.geometry.rig import frame_from_frd
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.trajectory import Trajectory
 from pipelines.ingest.bag.messages import POSITIONS, Axes
-from pipelines.ingest.bag.streams import BagStreams, Series
+from pipelines.ingest.bag.streams import BagStreams, TopicSamples
 from pipelines.ingest.notes import Notes
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.position_sigma import RECEIVERS
@@ -85,7 +85,7 @@ def _positions(streams: BagStreams, options: IngestOptions, notes: Notes) -> tup
     return positions, vertical
 
 
-def _geodetic(series: Series, options: IngestOptions, notes: Notes) -> tuple[FloatArray, VerticalDatum]:
+def _geodetic(series: TopicSamples, options: IngestOptions, notes: Notes) -> tuple[FloatArray, VerticalDatum]:
     """Return positions in ECEF (K, 3) of latitudes, longitudes and heights, and what the heights counted from."""
     crs, kind = parse_crs(WGS84, vertical=options.vertical), POSITIONS[series.type]
     if options.vertical is None:
@@ -95,7 +95,7 @@ def _geodetic(series: Series, options: IngestOptions, notes: Notes) -> tuple[Flo
     return ecef_from_lla(lla), crs.vertical if crs.vertical.stated else by_definition
 
 
-def _zero_of(series: Series, streams: BagStreams, options: IngestOptions) -> Origin:
+def _zero_of(series: TopicSamples, streams: BagStreams, options: IngestOptions) -> Origin:
     if options.origin is None:
         raise InputError(
             f"{series.topic} has positions in the local frame {series.world!r} only: give --origin LAT,LON,HEIGHT "
