@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -43,7 +44,7 @@ def describe(name: str) -> str:
     )
 
 
-def _of(command: click.Command, kind: type) -> list:
+def _of(command: click.Command, kind: type) -> list[Any]:
     return [param for param in command.params if isinstance(param, kind)]
 
 

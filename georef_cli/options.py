@@ -85,12 +85,12 @@ def _bare_type(annotation: Any) -> Any:
     return get_args(annotation)[0] if get_origin(annotation) is Annotated else annotation
 
 
-def _click_type(kind: Any) -> click.ParamType:
+def _click_type(kind: Any) -> click.ParamType[Any]:
     if get_origin(kind) is Literal:
         return click.Choice(get_args(kind))
     if kind is Path:
         return click.Path(resolve_path=True, path_type=Path)
-    known: dict[type, click.ParamType] = {int: click.INT, float: click.FLOAT, str: click.STRING}
+    known: dict[type, click.ParamType[Any]] = {int: click.INT, float: click.FLOAT, str: click.STRING}
     return known[kind]
 
 

@@ -14,14 +14,14 @@ from pipelines.core.stages import POINTS, SIM3
 from pipelines.core.workspace import Workspace
 from pipelines.geolocate.options import GeolocateOptions
 from pipelines.geolocate.stage import geolocate
-from pipelines.geometry.cameras import Camera
+from pipelines.geometry.cameras import Camera, Pinhole
 from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.scene.initial_similarity import InitialSimilarity
 from pipelines.scene.survey import Survey
 from pipelines.splat.gaussians import Gaussians
-from pipelines.splat.rasterizer.api import Pinhole, RasterSettings
+from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
 from pipelines.splat.sh import sh_from_rgb
 from tests.scenes import (

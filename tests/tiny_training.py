@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import torch
 
-from pipelines.geometry.cameras import Camera
+from pipelines.geometry.cameras import Camera, Pinhole
 from pipelines.geometry.similarity import Similarity
 from pipelines.georef.cameras import CameraCorrections, CameraPoses
 from pipelines.georef.problem import GeoProblem
@@ -19,7 +19,7 @@ from pipelines.splat.densify import DefaultSettings, DefaultStrategy, Strategy
 from pipelines.splat.exposure import Exposures
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.optimizer import GaussianAdam
-from pipelines.splat.rasterizer.api import Pinhole, RasterSettings
+from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
 from pipelines.train.schedule import JointOptions
 from pipelines.train.trainer import JointTrainer, TrainingViews

@@ -107,7 +107,7 @@ def _covariance(root_information: torch.Tensor) -> FloatArray:
 def _noise(cov: FloatArray, rng: np.random.Generator) -> FloatArray:
     value, vector = np.linalg.eigh(cov)
     white = rng.normal(size=value.shape) * np.sqrt(np.maximum(value, 0.0))
-    return (vector @ white[..., None])[..., 0]
+    return np.asarray((vector @ white[..., None])[..., 0])
 
 
 def estimate(truth: Truth, drawn: Drawn, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:

@@ -13,8 +13,9 @@ import time
 
 import torch
 
+from pipelines.geometry.cameras import Pinhole
 from pipelines.splat.gaussians import Gaussians
-from pipelines.splat.rasterizer.api import Pinhole, RasterSettings, Render
+from pipelines.splat.rasterizer.api import RasterSettings, Render
 from pipelines.splat.rasterizer.backends import rasterizer
 
 

@@ -27,6 +27,7 @@ from pipelines.core.products import load_json
 from pipelines.core.stages import SIM3, SPARSE
 from pipelines.core.workspace import Workspace
 from pipelines.formats.colmap import read_sparse
+from pipelines.geometry.cameras import Pinhole
 from pipelines.scene.calibrated import load_survey
 from pipelines.scene.geographic import geo_problem
 from pipelines.scene.initial_similarity import InitialSimilarity
@@ -37,7 +38,7 @@ from pipelines.splat.losses import photometric_loss
 from pipelines.splat.memory import TrainingSize, predicted_peak_bytes
 from pipelines.splat.metrics import psnr
 from pipelines.splat.optimizer import GaussianAdam
-from pipelines.splat.rasterizer.api import Pinhole, RasterSettings
+from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.train.assembly import make_trainer
 from pipelines.train.depth_maps import DepthMaps

@@ -282,7 +282,7 @@ def _whitened_basis(network: Network, information: FloatArray) -> FloatArray:
     reduced += np.eye(len(reduced)) / (_LOOSEST_RELATIVE_SIGMA * typical) ** 2
     root = np.linalg.cholesky(reduced)
     basis = solve_triangular(root, complement.T, lower=True).T
-    return (basis * unit[:, None]).reshape(n, 6, -1)
+    return np.asarray((basis * unit[:, None]).reshape(n, 6, -1))
 
 
 def similarity_modes(cam_center_in_world: FloatArray) -> FloatArray:

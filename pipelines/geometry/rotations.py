@@ -77,7 +77,7 @@ def geo_from_cam(yaw_pitch_roll_deg: ArrayLike) -> FloatArray:
     angles = np.asarray(yaw_pitch_roll_deg, dtype=np.float64)
     ned_from_gimbal = Rotation.from_euler("ZYX", angles.reshape(-1, 3), degrees=True).as_matrix()
     rotation = ENU_FROM_NED @ np.asarray(ned_from_gimbal) @ _CAM_FROM_GIMBAL.T
-    return rotation.reshape(*angles.shape[:-1], 3, 3)
+    return np.asarray(rotation.reshape(*angles.shape[:-1], 3, 3))
 
 
 def yaw_pitch_roll_deg(geo_from_cam_rotation: ArrayLike) -> FloatArray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -142,7 +142,7 @@ def _checked(
     return p, q, w / w.sum()
 
 
-def _tuple(values: ArrayLike) -> tuple:
+def _tuple(values: ArrayLike) -> tuple[Any, ...]:
     return tuple(float(value) for value in np.asarray(values))
 
 

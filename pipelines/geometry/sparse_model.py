@@ -50,7 +50,7 @@ class SparseModel:
     @property
     def cam_center_in_local(self) -> FloatArray:
         """Projection centres (n, 3): −Rᵀ t."""
-        return -np.einsum("nji,nj->ni", self.rotation_cam_from_local, self.translation_cam_from_local)
+        return np.asarray(-np.einsum("nji,nj->ni", self.rotation_cam_from_local, self.translation_cam_from_local))
 
     def image_index(self) -> dict[str, int]:
         """Return the index of each image by its name."""

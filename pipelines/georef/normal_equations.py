@@ -161,7 +161,8 @@ class NormalEquations:
         unit = self._units()[free].reshape(-1, *[1] * (right.ndim - 1))
         if self.open_directions == "wide":
             values, vectors = np.linalg.eigh(self._scaled(weights, free))
-            return (vectors / np.maximum(values, _FLOOR * values[-1])) @ (vectors.T @ (right * unit)) * unit
+            inverse = vectors / np.maximum(values, _FLOOR * values[-1])
+            return np.asarray(inverse @ (vectors.T @ (right * unit)) * unit)
         return np.asarray(cho_solve((self._root(weights, free), False), right * unit) * unit)
 
     def _scaled(self, weights: Weights, free: BoolArray) -> FloatArray:

@@ -73,7 +73,7 @@ class GeoProblem(torch.nn.Module):
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> GeoProblem:
         """Move the observations with the parameters, from device to device."""
-        super()._apply(fn, recurse)
+        super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
         self.terms = tuple(moved_tensors(term, fn) for term in self.terms)
         if self.control_by_depth is not None:
             self.control_by_depth = moved_tensors(self.control_by_depth, fn)

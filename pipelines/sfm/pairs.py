@@ -59,7 +59,7 @@ def select_pairs(cameras: CameraDirections, max_neighbors: int) -> IntArray:
 
 def _look_alike(axis: FloatArray, i: int, others: IntArray) -> BoolArray:
     cosine = axis[others] @ axis[i]
-    return ~(cosine < np.cos(np.radians(_MAX_ANGLE_DEG)))  # unknown (NaN) passes
+    return np.asarray(~(cosine < np.cos(np.radians(_MAX_ANGLE_DEG))))  # unknown (NaN) passes
 
 
 def _spread(offset: FloatArray, limit: int) -> list[int]:

@@ -73,7 +73,7 @@ class GroundPainter:
 
 def _pixels(corners: ArrayLike) -> NDArray[np.int32]:
     scaled = (np.asarray(corners, dtype=np.float64) + REACH_M) / _PIXEL_M - 0.5
-    return np.round(scaled * 2**_SUBPIXEL).astype(np.int32)
+    return np.asarray(np.round(scaled * 2**_SUBPIXEL).astype(np.int32))
 
 
 def paint_meadows(painter: GroundPainter, rng: np.random.Generator) -> None:

@@ -70,7 +70,7 @@ class Lens:
         pixels = self.focal_px * distorted + np.array(self.center_px)
         seen = (points[:, 2] > 0) & (np.square(normalised).sum(axis=1) < self._fold_radius() ** 2)
         pixels[~seen] = np.nan
-        return pixels
+        return np.asarray(pixels)
 
     def directions(self, pixels: ArrayLike) -> FloatArray:
         """Return directions (N, 3) with z = 1 of pixels (N, 2), exact to 1e-12.

@@ -107,7 +107,7 @@ def stripes(x: Float32Array, period: ArrayLike, width: ArrayLike, pixel: Float32
         return np.asarray(whole * wide + np.minimum(end - whole * every, wide))
 
     low, high = covered(x - reach / np.float32(2)), covered(x + reach / np.float32(2))
-    return np.clip((high - low) / reach, 0.0, 1.0).astype(np.float32)
+    return np.asarray(np.clip((high - low) / reach, 0.0, 1.0).astype(np.float32))
 
 
 def band(x: Float32Array, low: ArrayLike, high: ArrayLike, pixel: Float32Array) -> Float32Array:
@@ -116,7 +116,7 @@ def band(x: Float32Array, low: ArrayLike, high: ArrayLike, pixel: Float32Array) 
     half = reach / np.float32(2)
     low, high = np.asarray(low, dtype=np.float32), np.asarray(high, dtype=np.float32)
     inside = np.minimum(x + half, high) - np.maximum(x - half, low)
-    return np.clip(inside / reach, 0.0, 1.0).astype(np.float32)
+    return np.asarray(np.clip(inside / reach, 0.0, 1.0).astype(np.float32))
 
 
 def mix(a: Float32Array, b: Float32Array, share: Float32Array) -> Float32Array:

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from pipelines.geometry.cameras import Pinhole
 from pipelines.splat.gaussians import Gaussians
-from pipelines.splat.rasterizer.api import Pinhole, Rasterizer, RasterSettings
+from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings
 from pipelines.splat.sh import C0
 
 # An error counts as high from this fraction of the view's largest (FastGS takes maps normalised to 0 … 1).

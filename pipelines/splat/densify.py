@@ -14,11 +14,12 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from pipelines.geometry.cameras import Pinhole
 from pipelines.splat.contributions import Probe
 from pipelines.splat.gaussians import Gaussians, rotation_matrices
 from pipelines.splat.morton import morton_order
 from pipelines.splat.optimizer import GaussianAdam
-from pipelines.splat.rasterizer.api import Pinhole, ScreenStats
+from pipelines.splat.rasterizer.api import ScreenStats
 
 _CHILDREN = 2
 _SHRINK = 0.8 * _CHILDREN  # 3DGS: a child of a split has 1/1.6 of its parent's standard deviations

@@ -17,12 +17,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from pipelines.geometry.cameras import Pinhole
 from pipelines.splat.contributions import Probe
 from pipelines.splat.densify import DensityEdit
 from pipelines.splat.gaussians import Gaussians, rotation_matrices
 from pipelines.splat.morton import morton_order
 from pipelines.splat.optimizer import GaussianAdam
-from pipelines.splat.rasterizer.api import Pinhole, ScreenStats
+from pipelines.splat.rasterizer.api import ScreenStats
 
 _MOST_COPIES = 51  # of one Gaussian in one edit: the binomials of eq. 9 are tabulated
 _SIGMOID_STEEPNESS, _SIGMOID_CENTRE = 100.0, 0.995

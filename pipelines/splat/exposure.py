@@ -91,5 +91,5 @@ def fitted_affine(rendered: Tensor, photograph: Tensor, mask: Tensor | None = No
         x, y = x[mask.reshape(-1)], y[mask.reshape(-1)]
     design = torch.cat([x, torch.ones_like(x[:, :1])], dim=1)
     # gelsd: the smallest solution if a render has too few colours to determine all twelve numbers.
-    solution = torch.linalg.lstsq(design.cpu(), y.cpu(), driver="gelsd").solution
+    solution: Tensor = torch.linalg.lstsq(design.cpu(), y.cpu(), driver="gelsd").solution
     return solution.T.to(rendered)

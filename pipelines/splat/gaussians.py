@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 
@@ -35,7 +36,7 @@ class Gaussians:
     @property
     def sh_degree(self) -> int:
         """Degree of the stored spherical harmonics."""
-        return round(self.sh.shape[1] ** 0.5) - 1
+        return math.isqrt(self.sh.shape[1]) - 1
 
     def tensors(self) -> dict[str, Tensor]:
         """Return the tensors by name, in order."""

@@ -140,7 +140,7 @@ def _gap(points: FloatArray) -> FloatArray:
     distance, _ = cKDTree(points).query(points, k=neighbours + 1)
     gap = np.asarray(distance)[:, 1:].mean(axis=1)
     median = float(np.median(gap))
-    return np.clip(gap, median / _SCALE_SPREAD, median * _SCALE_SPREAD)
+    return np.asarray(np.clip(gap, median / _SCALE_SPREAD, median * _SCALE_SPREAD))
 
 
 def _usable(points: FloatArray, far: float) -> IntArray:
@@ -151,7 +151,7 @@ def _usable(points: FloatArray, far: float) -> IntArray:
     _, first = np.unique(points[rows].astype(np.float32), axis=0, return_index=True)
     rows = rows[np.sort(first)]
     distance = np.linalg.norm(points[rows] - np.median(points[rows], axis=0), axis=1)
-    return rows[distance <= far * np.median(distance)]
+    return np.asarray(rows[distance <= far * np.median(distance)])
 
 
 def _checked(points_in_model: ArrayLike, colours: ArrayLike) -> tuple[FloatArray, FloatArray]:

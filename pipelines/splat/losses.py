@@ -50,7 +50,7 @@ def photometric_loss(
     """
     _check(rendered, target, mask)
     if rendered.device.type == "cpu":
-        loss: Tensor = _Photometric.apply(rendered, target, mask, ssim_weight)
+        loss: Tensor = _Photometric.apply(rendered, target, mask, ssim_weight)  # type: ignore[no-untyped-call]
         return loss
     l1, ssim = _terms_by_convolution(rendered, target, mask)
     return (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim)

@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 
 from pipelines.core.errors import ResourceError
-from pipelines.splat.rasterizer.api import Pinhole
+from pipelines.geometry.cameras import Pinhole
 from pipelines.splat.sh import coefficient_count
 
 _FLOAT = 4

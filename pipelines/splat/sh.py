@@ -123,7 +123,8 @@ def _band_rotation(band: int, rotation: Tensor) -> Tensor:
     columns = slice(band**2, (band + 1) ** 2)
     before = basis(directions, band)[:, columns]
     after = basis(directions @ rotation.T, band)[:, columns]
-    return torch.linalg.lstsq(after, before).solution
+    solution: Tensor = torch.linalg.lstsq(after, before).solution
+    return solution
 
 
 @cache

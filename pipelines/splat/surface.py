@@ -15,9 +15,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from pipelines.geometry.cameras import Pinhole
 from pipelines.splat.depth import depth_at
 from pipelines.splat.gaussians import Gaussians, rotation_matrices
-from pipelines.splat.rasterizer.api import Pinhole, Rasterizer, RasterSettings
+from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings
 from pipelines.splat.sh import sh_from_rgb
 
 _SPREAD = 0.005  # of the depth: the loss of a smaller spread grows with its square

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from pipelines.geometry.cameras import Pinhole
 from pipelines.scene.photographs import ImageCache
 from pipelines.scene.pinholes import Pinholes
-from pipelines.splat.rasterizer.api import Pinhole
 
 _MASKS = 64  # on the device; one serves all photographs of a camera
 

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from pipelines.core.types import IntArray
+from pipelines.geometry.cameras import Pinhole
 from pipelines.geometry.lens import Lenses
 from pipelines.georef.problem import GeoProblem
 from pipelines.scene.photographs import ImageCache
@@ -21,7 +22,7 @@ from pipelines.splat.finiteness import FinitenessMonitor
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.losses import photometric_loss
 from pipelines.splat.optimizer import GaussianAdam
-from pipelines.splat.rasterizer.api import Pinhole, Rasterizer, RasterSettings, Render
+from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings, Render
 from pipelines.splat.surface import compactness_loss, depth_loss, flatness_loss, normal_loss
 from pipelines.train.checkpoint import prefixed, unprefixed
 from pipelines.train.schedule import JointOptions, TrainingSchedule

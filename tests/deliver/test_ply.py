@@ -18,12 +18,13 @@ from pipelines.deliver.ply import export_splat, run
 from pipelines.formats.georef_sidecar import read_sidecar, sidecar_path
 from pipelines.geodesy.enu import Origin, ecef_from_enu, ecef_from_lla, enu_from_ecef
 from pipelines.geodesy.vertical import VerticalDatum
+from pipelines.geometry.cameras import Pinhole
 from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.similarity import Similarity, covariance_at
 from pipelines.scene.survey import Survey
 from pipelines.scene.trained_model import TrainedModel
 from pipelines.splat.gaussians import Gaussians
-from pipelines.splat.rasterizer.api import Pinhole, RasterSettings
+from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.reference import render_reference
 from pipelines.splat.storage import read_gaussians, write_gaussians
 

@@ -9,10 +9,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from pipelines.geometry.cameras import Pinhole
 from pipelines.splat.densify import DefaultSettings, DefaultStrategy, DensityEdit
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.optimizer import GaussianAdam
-from pipelines.splat.rasterizer.api import Pinhole, ScreenStats
+from pipelines.splat.rasterizer.api import ScreenStats
 
 CAMERA = Pinhole(200, 100, 100.0, 100.0, 100.0, 50.0)
 SETTINGS = DefaultSettings(start=0, stop=1000, every=10, reset_every=0, prune_scale_from=1000, max_gaussians=100)

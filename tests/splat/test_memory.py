@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from pipelines.core.errors import ResourceError
+from pipelines.geometry.cameras import Pinhole
 from pipelines.splat.memory import (
     TrainingSize,
     _free_in_group,
@@ -17,7 +18,6 @@ from pipelines.splat.memory import (
     predicted_peak_bytes,
     require_memory,
 )
-from pipelines.splat.rasterizer.api import Pinhole
 
 CAMERA = Pinhole(320, 240, 300.0, 300.0, 160.0, 120.0)
 SIZE = TrainingSize(300_000, CAMERA, 3, 0)
@@ -30,7 +30,7 @@ from pipelines.splat.densify import DefaultSettings, DefaultStrategy
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.losses import photometric_loss
 from pipelines.splat.optimizer import GaussianAdam
-from pipelines.geometry.cameras import Pinhole
+from pipelines.geometry.cameras import Pinhole, Pinhole, Pinhole
 from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.backends import rasterizer
 def peak():

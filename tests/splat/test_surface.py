@@ -7,8 +7,9 @@ import math
 import pytest
 import torch
 
+from pipelines.geometry.cameras import Pinhole
 from pipelines.splat.gaussians import Gaussians
-from pipelines.splat.rasterizer.api import Pinhole, RasterSettings, Render
+from pipelines.splat.rasterizer.api import RasterSettings, Render
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
 from pipelines.splat.surface import (
     compactness_loss,

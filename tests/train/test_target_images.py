@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from pipelines.geometry.cameras import Camera
+from pipelines.geometry.cameras import Camera, Pinhole
 from pipelines.scene.photographs import ImageCache, Photograph
 from pipelines.scene.pinholes import Pinholes
-from pipelines.splat.rasterizer.api import Pinhole
 from pipelines.train.target_images import TargetImages, shrunken
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -18,6 +18,7 @@ from pipelines.core.products import load_json, save_json
 from pipelines.core.runner import run_stage
 from pipelines.core.stages import BY_NAME, GAUSSIANS, MODEL, SIM3, SURVEY
 from pipelines.core.workspace import Workspace
+from pipelines.geometry.cameras import Pinhole
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.similarity import Similarity
 from pipelines.scene.initial_similarity import InitialSimilarity
@@ -25,7 +26,7 @@ from pipelines.scene.survey import Survey
 from pipelines.scene.trained_model import TrainedModel
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.metrics import psnr
-from pipelines.splat.rasterizer.api import Pinhole, RasterSettings
+from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
 from pipelines.splat.storage import read_gaussians
 from pipelines.train.options import TrainOptions

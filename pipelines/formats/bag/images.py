@@ -71,7 +71,7 @@ class ImageWriter:
         if self.bits is None:
             used = int(pixels.max(initial=1)).bit_length()
             self.bits = next(bits for bits in (8, 10, 12, 14, 16) if used <= bits)
-        return np.minimum(pixels >> (self.bits - 8), 255).astype(np.uint8)
+        return np.asarray(np.minimum(pixels >> (self.bits - 8), 255).astype(np.uint8))
 
 
 def sharpness(data: bytes) -> float:

@@ -71,7 +71,7 @@ class BagReport:
 class _Tally:
     """Counts of one pass over a topic."""
 
-    times: array = field(default_factory=lambda: array("q"))
+    times: array[int] = field(default_factory=lambda: array("q"))
     stamped: bool = False
     frame: str = ""
     child: str = ""

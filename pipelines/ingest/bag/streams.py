@@ -46,9 +46,9 @@ class TopicSamples:
     topic: str
     type: str
     width: int = 0
-    stamps: array = field(default_factory=lambda: array("q"))
-    bag_times: array = field(default_factory=lambda: array("q"))
-    values: array = field(default_factory=lambda: array("d"))
+    stamps: array[int] = field(default_factory=lambda: array("q"))
+    bag_times: array[int] = field(default_factory=lambda: array("q"))
+    values: array[float] = field(default_factory=lambda: array("d"))
     receivers: list[str] = field(default_factory=list)
     frame: str = ""
     world: str = ""

@@ -24,7 +24,7 @@ class _Link:
 
     parent: str
     static: bool
-    samples: array = field(default_factory=lambda: array("d"))
+    samples: array[float] = field(default_factory=lambda: array("d"))
 
 
 class Transforms:

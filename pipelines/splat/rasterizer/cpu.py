@@ -18,6 +18,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from pipelines.core.errors import InputError
+from pipelines.geometry.cameras import Pinhole
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.rasterizer import (
     cpu_blend,
@@ -27,7 +28,7 @@ from pipelines.splat.rasterizer import (
     cpu_tiles,
     cpu_view,
 )
-from pipelines.splat.rasterizer.api import BackendName, Pinhole, RasterSettings, Render, ScreenStats
+from pipelines.splat.rasterizer.api import BackendName, RasterSettings, Render, ScreenStats
 
 _Array = NDArray[Any]
 

@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from pipelines.core.types import FloatArray
-from pipelines.splat.rasterizer.api import Pinhole, RasterSettings
+from pipelines.geometry.cameras import Pinhole
+from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.reference import FRUSTUM_MARGIN
 
 

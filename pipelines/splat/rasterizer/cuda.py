@@ -17,8 +17,9 @@ import torch
 from torch import Tensor
 
 from pipelines.core.errors import BackendUnavailableError
+from pipelines.geometry.cameras import Pinhole
 from pipelines.splat.gaussians import Gaussians
-from pipelines.splat.rasterizer.api import ALPHA_MAX, BackendName, Pinhole, RasterSettings, Render, ScreenStats
+from pipelines.splat.rasterizer.api import ALPHA_MAX, BackendName, RasterSettings, Render, ScreenStats
 from pipelines.splat.rasterizer.reference import bounded_slope, screen_depth_covariance
 
 _EVERY_BATCH = 2**31 - 1

@@ -11,6 +11,7 @@ import math
 import torch
 from torch import Tensor
 
+from pipelines.geometry.cameras import Pinhole
 from pipelines.splat import sh
 from pipelines.splat.gaussians import Gaussians, rotation_matrices
 from pipelines.splat.rasterizer.api import (
@@ -18,7 +19,6 @@ from pipelines.splat.rasterizer.api import (
     ALPHA_MIN,
     DEPTH_REACH,
     TRANSMITTANCE_MIN,
-    Pinhole,
     RasterSettings,
     Render,
     ScreenStats,

@@ -8,8 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from pipelines.geometry.cameras import Pinhole
 from pipelines.splat.gaussians import Gaussians
-from pipelines.splat.rasterizer.api import Pinhole, Render
+from pipelines.splat.rasterizer.api import Render
 
 Scene = tuple[Gaussians, Tensor]
 

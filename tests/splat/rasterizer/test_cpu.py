@@ -10,8 +10,9 @@ import pytest
 import torch
 
 from pipelines.core.errors import InputError
+from pipelines.geometry.cameras import Pinhole
 from pipelines.splat.gaussians import Gaussians
-from pipelines.splat.rasterizer.api import ALPHA_MAX, Pinhole, RasterSettings
+from pipelines.splat.rasterizer.api import ALPHA_MAX, RasterSettings
 from pipelines.splat.rasterizer.cpu import CpuRasterizer, predicted_bytes
 from pipelines.splat.rasterizer.reference import render_reference
 

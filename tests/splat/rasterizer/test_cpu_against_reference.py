@@ -5,8 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
+from pipelines.geometry.cameras import Pinhole
 from pipelines.splat.gaussians import Gaussians
-from pipelines.splat.rasterizer.api import Pinhole, RasterSettings
+from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
 from pipelines.splat.rasterizer.reference import render_reference
 

@@ -7,8 +7,9 @@ import math
 import pytest
 import torch
 
+from pipelines.geometry.cameras import Pinhole
 from pipelines.splat.gaussians import Gaussians
-from pipelines.splat.rasterizer.api import ALPHA_MIN, DEPTH_REACH, Pinhole, RasterSettings
+from pipelines.splat.rasterizer.api import ALPHA_MIN, DEPTH_REACH, RasterSettings
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
 from pipelines.splat.rasterizer.reference import render_reference
 

@@ -7,9 +7,10 @@ import math
 import pytest
 import torch
 
+from pipelines.geometry.cameras import Pinhole
 from pipelines.splat import sh
 from pipelines.splat.gaussians import Gaussians
-from pipelines.splat.rasterizer.api import ALPHA_MIN, Pinhole, RasterSettings
+from pipelines.splat.rasterizer.api import ALPHA_MIN, RasterSettings
 from pipelines.splat.rasterizer.reference import project_gaussians, render_reference
 
 
