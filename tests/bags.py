@@ -14,9 +14,10 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from ruamel.yaml import YAML
 from scipy.spatial.transform import Rotation
 
-from pipelines.geodesy.enu import Origin, enu_from_lla, geo_from_enu_at, lla_from_enu
+from pipelines.geodesy.enu import Origin, geo_from_enu_at, lla_from_enu
 from pipelines.geometry.rig import mount
 from pipelines.geometry.rotations import ENU_FROM_NED, quat_xyzw_from_matrix
+from tests.earth import enu_from_lla
 
 START = 1_700_000_000_000_000_000
 ORIGIN = Origin(lat_deg=46.02, lon_deg=7.75, alt_m=1620.0)

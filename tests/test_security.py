@@ -17,12 +17,13 @@ from pipelines.core.errors import InputError
 from pipelines.core.products import load_json
 from pipelines.core.stages import POINTS, SPARSE, SURVEY
 from pipelines.core.workspace import Workspace
-from pipelines.formats.colmap import read_sparse, write_sparse
+from pipelines.formats.colmap import read_sparse
 from pipelines.ingest.options import IngestOptions
-from pipelines.ingest.stage import build_survey
+from pipelines.ingest.stage import survey_and_track
 from pipelines.scene.geolocated import GeolocatedPoints
 from pipelines.scene.scene import photographs
 from pipelines.scene.survey import Survey
+from tests.colmap_writer import write_sparse
 from tests.photos import Exif, gps_entries, jpeg, write_flight
 from tests.scenes import Measured, Noise, make_scene, sparse_model, survey_of, write_workspace
 
@@ -201,7 +202,7 @@ def test_names_that_are_no_text_are_left_out_of_a_survey(tmp_path: Path) -> None
     photograph = jpeg(9, exif=Exif(gps=gps_entries(46.02, 7.75)))
     (tmp_path / "new\nline.jpg").write_bytes(photograph)
     Path(os.fsdecode(os.fsencode(tmp_path) + b"/\xff.jpg")).write_bytes(photograph)
-    survey = build_survey(IngestOptions(images=tmp_path))
+    survey = survey_and_track(IngestOptions(images=tmp_path), None)[0]
     assert len(survey.images) == 3
     assert any(
         text.startswith("2 images have names that are no text and were left out") for text in survey.warnings
@@ -212,5 +213,5 @@ def test_links_that_leave_the_folder_are_left_out(tmp_path: Path) -> None:
     write_flight(tmp_path / "photos", 3)
     (tmp_path / "private.jpg").write_bytes(jpeg(9))
     (tmp_path / "photos/link.jpg").symlink_to(tmp_path / "private.jpg")
-    survey = build_survey(IngestOptions(images=tmp_path / "photos"))
+    survey = survey_and_track(IngestOptions(images=tmp_path / "photos"), None)[0]
     assert "1 image is a link that leaves the folder and was left out: link.jpg" in survey.warnings

@@ -92,11 +92,6 @@ def enu_from_ecef(ecef: ArrayLike, origin: Origin) -> FloatArray:
     return (_checked(ecef) - ecef_of(origin)) @ ecef_from_enu_rotation(lla_of(origin))
 
 
-def enu_from_lla(lla: ArrayLike, origin: Origin) -> FloatArray:
-    """Return tangent-plane points (…, 3) in metres at `origin` of geodetic points (…, 3)."""
-    return enu_from_ecef(ecef_from_lla(lla), origin)
-
-
 def lla_from_enu(enu: ArrayLike, origin: Origin) -> FloatArray:
     """Return geodetic points (…, 3) of tangent-plane points (…, 3) in metres at `origin`."""
     return lla_from_ecef(ecef_from_enu(enu, origin))

@@ -51,15 +51,6 @@ def run(stage: StageRun, options: IngestOptions) -> Summary:
     return _summary(survey)
 
 
-def build_survey(options: IngestOptions, progress: Progress = SILENT) -> Survey:
-    """Return everything that was measured, in one East-North-Up frame. Reads files and writes none: not for bags.
-
-    Raises:
-        InputError: as `run`.
-    """
-    return survey_and_track(options, None, progress)[0]
-
-
 def survey_and_track(
     options: IngestOptions, frames: Path | None, progress: Progress = SILENT
 ) -> tuple[Survey, NavigationTrack | None]:

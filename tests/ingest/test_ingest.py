@@ -17,15 +17,16 @@ from pipelines.geodesy import enu
 from pipelines.geodesy.crs import parse_crs
 from pipelines.geometry.rotations import geo_from_cam, matrix_from_quat_xyzw
 from pipelines.ingest.options import IngestOptions
-from pipelines.ingest.stage import build_survey
+from pipelines.ingest.stage import survey_and_track
 from pipelines.scene.survey import Survey
+from tests.earth import enu_from_lla
 from tests.photos import FLIGHT_START_S, Exif, dji_xmp, gps_entries, jpeg, write_flight
 
 LAT, LON = 46.02, 7.75
 
 
 def _build(images: Path, **options: Any) -> Survey:
-    return build_survey(IngestOptions(images=images, **options))
+    return survey_and_track(IngestOptions(images=images, **options), None)[0]
 
 
 def _positions(survey: Survey) -> np.ndarray:
@@ -48,7 +49,7 @@ def test_exif_alone(tmp_path: Path) -> None:
     survey = _build(tmp_path / "images")
     assert survey.names("test") == ("IMG_0000.JPG", "IMG_0008.JPG")
     assert (survey.origin.lat_deg, survey.origin.lon_deg, survey.origin.alt_m) == (46.02, 7.7504, 120.0)
-    truth = enu.enu_from_lla([[LAT, LON + 1e-4 * index, 120.0] for index in range(9)], survey.origin)
+    truth = enu_from_lla([[LAT, LON + 1e-4 * index, 120.0] for index in range(9)], survey.origin)
     np.testing.assert_allclose(_positions(survey), truth, rtol=0, atol=1e-4)  # EXIF's last digit
     fix = survey.images[0].fix
     assert fix is not None and (fix.source, fix.sigma_source) == ("exif", "default")
@@ -108,7 +109,7 @@ def test_trajectory_in_utm_with_attitude_and_sigma(tmp_path: Path) -> None:
     path = tmp_path / "t.csv"
     path.write_text("image,x,y,z,yaw,pitch,roll,sigma_e,sigma_n,sigma_u\n" + "\n".join(rows))
     survey = _build(tmp_path / "images", trajectory=path, crs="EPSG:32632", vertical="ellipsoidal", test_every=0)
-    np.testing.assert_allclose(_positions(survey), enu.enu_from_lla(truth, survey.origin), rtol=0, atol=2e-4)
+    np.testing.assert_allclose(_positions(survey), enu_from_lla(truth, survey.origin), rtol=0, atol=2e-4)
     image = survey.images[2]
     assert image.fix is not None and image.attitude is not None and image.fix.sigma_source == "file"
     np.testing.assert_allclose(image.fix.cov_in_geo, np.diag([0.01, 0.04, 0.09]), rtol=0, atol=1e-5)
@@ -135,7 +136,7 @@ def test_geo_txt_control_and_check_points(tmp_path: Path) -> None:
     assert [point.name for point in survey.control_points] == ["P0", "P2"]
     assert [point.name for point in survey.check_points] == ["C0", "P1"]
     for point, place in zip(survey.control_points, lla[[0, 2]], strict=True):
-        np.testing.assert_allclose(point.position_in_geo, enu.enu_from_lla(place, survey.origin), rtol=0, atol=2e-4)
+        np.testing.assert_allclose(point.position_in_geo, enu_from_lla(place, survey.origin), rtol=0, atol=2e-4)
         np.testing.assert_allclose(point.cov_in_geo, np.diag([4e-4, 4e-4, 9e-4]), rtol=0, atol=1e-7)
     assert survey.control_points[0].marks[1].sigma_px == 0.3
     assert any("is stated" in text and "only assumed" in text for text in survey.warnings)
@@ -156,7 +157,7 @@ def test_time_matched_trajectory(tmp_path: Path) -> None:
     rows = [f"{FLIGHT_START_S - 0.5 + index};46,02;{7.75 + 1e-4 * index:.6f};500" for index in range(6)]
     (tmp_path / "t.csv").write_text("timestamp;lat;lon;alt\r\n" + "\r\n".join(rows).replace(".", ","))
     survey = _build(tmp_path / "images", trajectory=tmp_path / "t.csv", max_gap=1.5)
-    truth = enu.enu_from_lla([[LAT, LON + 1e-4 * (index + 0.5), 500.0] for index in range(4)], survey.origin)
+    truth = enu_from_lla([[LAT, LON + 1e-4 * (index + 0.5), 500.0] for index in range(4)], survey.origin)
     np.testing.assert_allclose(_positions(survey), truth, rtol=0, atol=1e-3)
 
 
@@ -211,7 +212,7 @@ def test_sigma_and_focal_options(tmp_path: Path) -> None:
 def test_options_that_cannot_be(tmp_path: Path, options: dict[str, Any], message: str) -> None:
     write_flight(tmp_path / "images", 3)
     with pytest.raises(InputError, match=message):
-        build_survey(IngestOptions(**{"images": tmp_path / "images", **options}))
+        survey_and_track(IngestOptions(**{"images": tmp_path / "images", **options}), None)[0]
 
 
 def test_too_few_usable_images_say_why(tmp_path: Path) -> None:

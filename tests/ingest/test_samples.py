@@ -16,7 +16,7 @@ from pipelines.geodesy import enu
 from pipelines.geodesy.enu import Origin
 from pipelines.geometry.rotations import log_so3, matrix_from_quat_xyzw
 from pipelines.ingest.options import IngestOptions
-from pipelines.ingest.stage import build_survey, survey_and_track
+from pipelines.ingest.stage import survey_and_track
 from pipelines.scene.survey import Survey
 
 DATA = Path(os.environ.get("GEOREF_DATA", "no-samples"))
@@ -27,14 +27,13 @@ needs_beach = pytest.mark.skipif(not BEACH.is_dir(), reason="the sample survey b
 
 def _orbit(trajectory: str) -> tuple[Survey, FloatArray, FloatArray]:
     """The survey, its positions in the truth's frame, and the true ones."""
-    survey = build_survey(
-        IngestOptions(
-            images=ORBIT / "images",
-            trajectory=ORBIT / trajectory,
-            gcp=ORBIT / "gcp_list.txt",
-            checkpoints=ORBIT / "checkpoints.txt",
-        )
+    options = IngestOptions(
+        images=ORBIT / "images",
+        trajectory=ORBIT / trajectory,
+        gcp=ORBIT / "gcp_list.txt",
+        checkpoints=ORBIT / "checkpoints.txt",
     )
+    survey = survey_and_track(options, None)[0]
     document = json.loads((ORBIT / "truth.json").read_text())
     origin = Origin(lat_deg=document["lat"], lon_deg=document["lon"], alt_m=document["alt"])
     in_geo = np.array([image.fix.position_in_geo for image in survey.images if image.fix is not None])
@@ -94,7 +93,7 @@ def test_orbit_bag_says_what_it_lacks_and_takes_it(tmp_path: Path, capsys: pytes
 
 @needs_beach
 def test_brighton_beach() -> None:
-    survey = build_survey(IngestOptions(images=BEACH / "images"))
+    survey = survey_and_track(IngestOptions(images=BEACH / "images"), None)[0]
     assert len(survey.images) == 18 and len(survey.cameras) == 1
     assert all(image.fix is not None and image.attitude is not None for image in survey.images)
     assert survey.cameras[0].make_model == "DJI FC300S"

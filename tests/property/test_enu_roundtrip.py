@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from pipelines.geodesy import enu
 from pipelines.geodesy.enu import Origin
+from tests.earth import enu_from_lla
 
 LATITUDES = st.floats(-90.0, 90.0)
 LONGITUDES = st.floats(-180.0, 180.0)
@@ -27,7 +28,7 @@ def test_lla_and_ecef(lat: float, lon: float, alt: float) -> None:
 @given(LATITUDES, LONGITUDES, HEIGHTS, st.tuples(OFFSETS, OFFSETS, OFFSETS))
 def test_enu_and_lla(lat: float, lon: float, alt: float, offset: tuple[float, float, float]) -> None:
     origin = Origin(lat_deg=lat, lon_deg=lon, alt_m=alt)
-    back = enu.enu_from_lla(enu.lla_from_enu(offset, origin), origin)
+    back = enu_from_lla(enu.lla_from_enu(offset, origin), origin)
     np.testing.assert_allclose(back, offset, rtol=0, atol=2e-8)
 
 

@@ -19,16 +19,17 @@ from rosbags.highlevel import AnyReader
 from pipelines.core.errors import InputError
 from pipelines.core.options import resolve
 from pipelines.core.products import load_json
-from pipelines.geodesy.enu import Origin, enu_from_lla, lla_from_enu
+from pipelines.geodesy.enu import Origin, lla_from_enu
 from pipelines.geometry.rotations import geo_from_cam, log_so3
 from pipelines.ingest.options import IngestOptions
-from pipelines.ingest.stage import build_survey, survey_and_track
+from pipelines.ingest.stage import survey_and_track
 from pipelines.simulate.options import SimulateOptions
 from pipelines.simulate.render import Renderer, Sensor
 from pipelines.simulate.stage import SimulationSummary, fly_survey, simulate
 from pipelines.simulate.truth import Truth
 from pipelines.simulate.world import make_world
 from pipelines.simulate.write import write_trajectory
+from tests.earth import enu_from_lla
 
 ORIGIN = "-33.86,151.21,-20"  # south, east, below the ellipsoid
 SMALL: dict[str, Any] = {"size": "160x120", "samples": "1", "images": 4, "targets": 30}
@@ -197,7 +198,7 @@ def test_marks_fit_the_photographs_and_the_bag(survey: SimulatedSurvey, tmp_path
     """One gcp_list.txt serves both: the photographs are named as a bag's frames."""
     points = {"gcp": survey.folder / "gcp_list.txt", "checkpoints": survey.folder / "checkpoints.txt"}
     from_bag, _ = survey_and_track(IngestOptions(bag=survey.folder / "bag", **points), tmp_path / "frames")
-    from_folder = build_survey(IngestOptions(images=survey.folder / "images", **points))
+    from_folder = survey_and_track(IngestOptions(images=survey.folder / "images", **points), None)[0]
     assert [image.name for image in from_bag.images] == [image.name for image in from_folder.images]
     marks = [
         {point.name: point.marks for point in (*ingested.control_points, *ingested.check_points)}

@@ -9,7 +9,7 @@ import torch
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.splat.gaussians import rotation_matrices
 from pipelines.splat.initialise import InitialisationOptions, gaussians_from_points, scene_extent
-from pipelines.splat.sh import rgb_from_sh
+from pipelines.splat.sh import C0
 
 
 def grid(side: int = 6, spacing_m: float = 0.5) -> np.ndarray:
@@ -28,7 +28,7 @@ def test_a_grid_gives_gaussians_of_its_spacing() -> None:
     assert (gaussians.sh[:, 1:] == 0).all()
     same = gaussians.means.numpy()[:, None] == points.astype(np.float32)
     rows = same.all(axis=2).argmax(axis=1)
-    np.testing.assert_allclose(rgb_from_sh(gaussians.sh[:, 0]).numpy(), colours[rows] / 255, atol=1e-6)
+    np.testing.assert_allclose((C0 * gaussians.sh[:, 0] + 0.5).numpy(), colours[rows] / 255, atol=1e-6)
     assert all(tensor.dtype == torch.float32 for tensor in gaussians.tensors().values())
 
 
@@ -53,7 +53,7 @@ def test_known_normals_make_discs() -> None:
 
 def test_float_colours_are_taken_as_they_are() -> None:
     gaussians = gaussians_from_points(grid(2), np.full((8, 3), 0.25), InitialisationOptions(sh_degree=0))
-    torch.testing.assert_close(rgb_from_sh(gaussians.sh[:, 0]), torch.full((8, 3), 0.25))
+    torch.testing.assert_close(C0 * gaussians.sh[:, 0] + 0.5, torch.full((8, 3), 0.25))
 
 
 def test_repeated_and_unusable_points_are_left_out() -> None:
