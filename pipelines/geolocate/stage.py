@@ -94,18 +94,39 @@ def geolocate(survey: Survey, model: SparseModel, options: GeolocateOptions) -> 
     """
     observed = _observed(survey, model)
     if len(observed.fixes) == 0:
-        return _nothing(model, _NO_FIXES)
+        return _without_positions(model, _NO_FIXES)
     source = _rotation_source(observed, options)
     if source == "sfm" and observed.alignment is None:
         if len(survey.control_points) >= 3:
-            return _nothing(model, f"no directions: positions come from control points ({observed.problem})")
+            return _without_positions(
+                model, f"no directions: positions come from control points ({observed.problem})"
+            )
         raise DegenerateGeometryError(f"SfM's rotations cannot be turned to the Earth: {observed.problem}")
     warnings = _warnings(observed, source)
     views, usable = _views(observed, source, options.sigma_px)
     rays = _rays(model, usable)
     intersections = intersect_rays(rays, views, len(model.point_id))
     sigma, inlier = _judge(intersections, rays, views, options)
-    points = GeolocatedPoints(
+    points = _points(model, intersections, inlier, source)
+    if inlier.sum() < 0.5 * len(inlier):
+        warnings.append(f"only {inlier.sum()} of {len(inlier)} points have rays that agree: check σ and attitudes")
+    middle = f", median σ {np.median(sigma[inlier]):.3g} m" if inlier.any() else ""
+    figure = f"{inlier.sum()} of {len(inlier)} points{middle} ({source} rotations)"
+    return Geolocation(points, sigma, figure, tuple(warnings))
+
+
+def _without_positions(model: SparseModel, why: str) -> Geolocation:
+    """A product without positions, so that control points can carry the survey alone."""
+    count = len(model.point_id)
+    points = _points(model, Intersections.none(count), np.zeros(count, dtype=bool), "sfm")
+    return Geolocation(points, np.full(count, np.nan), why, (why,))
+
+
+def _points(
+    model: SparseModel, intersections: Intersections, inlier: BoolArray, source: Literal["recorded", "sfm"]
+) -> GeolocatedPoints:
+    """The product, of the intersections of a model's points."""
+    return GeolocatedPoints(
         point_id=model.point_id,
         position_in_geo=intersections.position_in_geo,
         cov_in_geo=intersections.cov_in_geo,
@@ -115,27 +136,6 @@ def geolocate(survey: Survey, model: SparseModel, options: GeolocateOptions) -> 
         inlier=inlier,
         rotation_source=source,
     )
-    if inlier.sum() < 0.5 * len(inlier):
-        warnings.append(f"only {inlier.sum()} of {len(inlier)} points have rays that agree: check σ and attitudes")
-    middle = f", median σ {np.median(sigma[inlier]):.3g} m" if inlier.any() else ""
-    figure = f"{inlier.sum()} of {len(inlier)} points{middle} ({source} rotations)"
-    return Geolocation(points, sigma, figure, tuple(warnings))
-
-
-def _nothing(model: SparseModel, why: str) -> Geolocation:
-    """A product without positions, so that control points can carry the survey alone."""
-    count = len(model.point_id)
-    points = GeolocatedPoints(
-        point_id=model.point_id,
-        position_in_geo=np.full((count, 3), np.nan),
-        cov_in_geo=np.full((count, 3, 3), np.nan),
-        ray_count=np.zeros(count, dtype=np.int32),
-        max_angle_deg=np.zeros(count),
-        condition=np.full(count, np.inf),
-        inlier=np.zeros(count, dtype=bool),
-        rotation_source="sfm",
-    )
-    return Geolocation(points, np.full(count, np.nan), why, (why,))
 
 
 def _observed(survey: Survey, model: SparseModel) -> _CameraObservations:

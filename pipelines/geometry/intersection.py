@@ -73,15 +73,7 @@ def intersect_rays(rays: Rays, cameras: UncertainCameras, point_count: int) -> I
     """
     if len(rays.point) and (np.diff(rays.point) < 0).any():
         raise ValueError("rays must be sorted by point")
-    intersections = Intersections(
-        position_in_geo=np.full((point_count, 3), np.nan),
-        cov_in_geo=np.full((point_count, 3, 3), np.nan),
-        ray_count=np.zeros(point_count, dtype=np.int32),
-        max_angle_deg=np.zeros(point_count),
-        condition=np.full(point_count, np.inf),
-        consistent=np.zeros(point_count, dtype=bool),
-        used=np.zeros(len(rays.point), dtype=bool),
-    )
+    intersections = Intersections.none(point_count, len(rays.point))
     counts = np.bincount(rays.point, minlength=point_count)
     usable = np.flatnonzero(counts[rays.point] >= 2)
     cuts = _chunk_cuts(rays.point[usable])

@@ -74,3 +74,16 @@ class Intersections:
     condition: FloatArray
     consistent: BoolArray
     used: BoolArray
+
+    @classmethod
+    def none(cls, point_count: int, ray_count: int = 0) -> Intersections:
+        """Return the intersections of points none of which has a position."""
+        return cls(
+            position_in_geo=np.full((point_count, 3), np.nan),
+            cov_in_geo=np.full((point_count, 3, 3), np.nan),
+            ray_count=np.zeros(point_count, dtype=np.int32),
+            max_angle_deg=np.zeros(point_count),
+            condition=np.full(point_count, np.inf),
+            consistent=np.zeros(point_count, dtype=bool),
+            used=np.zeros(ray_count, dtype=bool),
+        )
