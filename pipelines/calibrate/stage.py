@@ -18,10 +18,10 @@ from pipelines.calibrate.rig_fit import (
     LIMIT_BORESIGHT_DEG,
     LIMIT_OFFSET_S,
     FitOptions,
-    RigData,
     RigFit,
     fit_rig,
 )
+from pipelines.calibrate.rig_model import RigData
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.products import load_json, save_json
 from pipelines.core.stages import SPARSE, SURVEY
@@ -161,7 +161,8 @@ def _data(survey: Survey, model: SparseModel, track: NavigationTrack) -> RigData
     control, _ = control_correspondences(survey, model)
     pixel_rad, footprint = _pixel(model)
     return RigData(
-        track=track,
+        positions=track.positions,
+        attitudes=track.attitudes,
         time_s=track.image_time_s[rows],
         center_in_local=model.cam_center_in_local[registered],
         cam_from_local=model.rotation_cam_from_local[registered],

@@ -68,6 +68,10 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.time_s)
 
+    def covers(self, time_s: FloatArray) -> BoolArray:
+        """Return for which times (n,) there is a value, by rules 1 and 2."""
+        return _bracket(self.time_s, time_s, self.max_gap_s).covered
+
     def at(self, time_s: FloatArray) -> Trajectory:
         """Return the motion at times (n,), after the rules above; NaN where they give nothing."""
         bracket = _bracket(self.time_s, time_s, self.max_gap_s)
@@ -79,21 +83,6 @@ class Trajectory:
             _linear(self.sigma_deg[:, None], bracket)[:, 0],
             self.max_gap_s,
         )
-
-
-def covered(clock_s: FloatArray, time_s: FloatArray, max_gap_s: float) -> BoolArray:
-    """Return which of the times (n,) samples at `clock_s` (K,) give a value for."""
-    return _bracket(clock_s, time_s, max_gap_s).covered
-
-
-def places_at(clock_s: FloatArray, places: FloatArray, time_s: FloatArray) -> FloatArray:
-    """Return places (n, 3) at covered times (n,) between samples (K, 3)."""
-    return _linear(places, _bracket(clock_s, time_s, np.inf))
-
-
-def turns_at(clock_s: FloatArray, rotations: FloatArray, time_s: FloatArray) -> FloatArray:
-    """Return rotations (n, 3, 3) at covered times (n,) between samples (K, 3, 3)."""
-    return _shortest_arc(rotations, _bracket(clock_s, time_s, np.inf))
 
 
 @dataclass(frozen=True)

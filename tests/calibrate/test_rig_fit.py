@@ -11,20 +11,16 @@ from pipelines.calibrate.rig_fit import (
     LIMIT_ARM_M,
     LIMIT_OFFSET_S,
     FitOptions,
-    RigData,
-    RigState,
-    _derivatives,
     _moved,
-    _residuals,
-    _usable,
     fit_rig,
 )
+from pipelines.calibrate.rig_model import RigData, RigState, derivatives_of, residuals_of, usable_images
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import FloatArray
 from pipelines.geometry.rig import boresight
 from pipelines.geometry.rotations import exp_so3, log_so3
 from pipelines.geometry.similarity import Similarity
-from pipelines.scene.navigation import NavigationTrack
+from pipelines.geometry.trajectory import Trajectory
 from pipelines.simulate.flight import FlightPlan, TrueTrajectory, make_trajectory
 from pipelines.simulate.sensors import RECEIVERS, Mounting, record_gnss, record_imu
 
@@ -50,27 +46,13 @@ def _data(track: TrueTrajectory, seed: int = 1, control: int = 0) -> RigData:
     noise = boresight(rng.normal(0, 0.02, (count, 3)))
     start = 1_700_000_000
     points = rng.uniform(-40, 40, (control, 3))
-    navigation = NavigationTrack(
-        position_time_s=gnss.stamp_ns / 1e9,
-        antenna_in_geo=gnss.position_in_geo,
-        sigma_m=np.full((len(gnss.stamp_ns), 3), 0.02),
-        attitude_time_s=imu.stamp_ns / 1e9,
-        geo_from_body=imu.geo_from_body,
-        image=np.array([str(i) for i in range(count)]),
-        image_time_s=start + track.photo_s,
-        cam_from_body=np.tile(track.cam_from_body, (count, 1, 1)),
-        antenna_in_body=np.zeros((count, 3)),
-        nominal_from_cam=np.eye(3),
-        time_offset_s=np.array(0.0),
-        max_gap_s=np.array(1.0),
-        body_known=np.array(True),
-    )
     return RigData(
-        track=navigation,
-        time_s=navigation.image_time_s,
+        positions=Trajectory.from_samples(gnss.stamp_ns / 1e9, position=gnss.position_in_geo, max_gap_s=1.0),
+        attitudes=Trajectory.from_samples(imu.stamp_ns / 1e9, rotation=imu.geo_from_body, max_gap_s=1.0),
+        time_s=start + track.photo_s,
         center_in_local=local_from_geo.apply(track.position(track.photo_s) + rng.normal(0, 0.005, (count, 3))),
         cam_from_local=noise @ np.swapaxes(true_geo_from_cam, 1, 2) @ GEO_FROM_LOCAL.rotation,
-        cam_from_body=navigation.cam_from_body,
+        cam_from_body=np.tile(track.cam_from_body, (count, 1, 1)),
         antenna_in_body=np.tile(ARM_M, (count, 1)),
         control_in_local=local_from_geo.apply(points),
         control_in_geo=points,
@@ -87,14 +69,14 @@ def test_derivatives_agree_with_differences() -> None:
     state = RigState(
         Similarity(16.8, turn @ GEO_FROM_LOCAL.rotation, np.ones(3)), 0.1, boresight([3.0, -2.0, 4.0]), ARM_M
     )
-    used = _usable(data, state.offset_s)
+    used = usable_images(data, state.offset_s)
     pivot = state.geo_from_local.apply(data.center_in_local[used]).mean(axis=0)
-    analytic = _derivatives(data, state, used, pivot)
+    analytic = derivatives_of(data, state, used, pivot)
     for place in range(14):
         # The offset has no smaller step: its derivative is a velocity over half a second on either side.
         size = 0.5 if place == 7 else 1e-5
         step = np.where(np.arange(14) == place, size, 0.0)
-        ahead, behind = (_residuals(data, _moved(state, each, pivot), used) for each in (step, -step))
+        ahead, behind = (residuals_of(data, _moved(state, each, pivot), used) for each in (step, -step))
         for rows, first, second in zip(analytic, ahead, behind, strict=True):
             np.testing.assert_allclose(rows[:, :, place], (first - second) / (2 * size), atol=1e-6)
 
@@ -171,7 +153,7 @@ def test_downward_lever_arm_of_a_level_flight_is_not_observable() -> None:
 def _circle(speed_wobble: float) -> RigData:
     """A circle that looks inwards, at constant speed but for a share `speed_wobble`."""
     data = _data(_flight("orbit"))
-    clock = data.track.position_time_s
+    clock = data.positions.time_s
 
     def angle(time_s: FloatArray) -> FloatArray:
         t = time_s - data.time_s[0]
@@ -183,13 +165,14 @@ def _circle(speed_wobble: float) -> RigData:
         )
 
     rng = np.random.default_rng(0)
-    track = replace(
-        data.track,
-        antenna_in_geo=place(clock - OFFSET_S) + rng.normal(0, 0.02, (len(clock), 3)),
-        attitude_time_s=np.empty(0),
-        geo_from_body=np.empty((0, 3, 3)),
+    fixes = place(clock - OFFSET_S) + rng.normal(0, 0.02, (len(clock), 3))
+    positions, none = replace(data.positions, position=fixes), Trajectory.from_samples(np.empty(0))
+    return replace(
+        data,
+        positions=positions,
+        attitudes=none,
+        center_in_local=GEO_FROM_LOCAL.inverse().apply(place(data.time_s)),
     )
-    return replace(data, track=track, center_in_local=GEO_FROM_LOCAL.inverse().apply(place(data.time_s)))
 
 
 def test_offset_of_a_circle_at_constant_speed_is_not_observable() -> None:
@@ -209,7 +192,7 @@ def test_hover_and_straight_line_are_refused(speed_m_s: float) -> None:
     def place(time_s: FloatArray) -> FloatArray:
         return np.outer(time_s - start, [speed_m_s, 0, 0]) + rng.normal(0, 0.02, (len(time_s), 3))
 
-    track = replace(data.track, antenna_in_geo=place(data.track.position_time_s))
-    data = replace(data, track=track, center_in_local=GEO_FROM_LOCAL.inverse().apply(place(data.time_s)))
+    positions = replace(data.positions, position=place(data.positions.time_s))
+    data = replace(data, positions=positions, center_in_local=GEO_FROM_LOCAL.inverse().apply(place(data.time_s)))
     with pytest.raises(DegenerateGeometryError, match="nothing of the rig is observable"):
         fit_rig(data, 0.0, np.eye(3), FitOptions())
