@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 from pathlib import Path
 
@@ -51,3 +52,16 @@ def test_links_lead_somewhere(document: Path) -> None:
 def test_there_are_documents_with_links() -> None:
     assert {"README.md", "CONTRIBUTING.md", "inputs.md"} <= {path.name for path in DOCUMENTS}
     assert sum(len(LINK.findall(text_of(path))) for path in DOCUMENTS) > 10
+
+
+def test_code_named_by_the_conventions_exists() -> None:
+    """The table from the paper to the code names modules, and what stands in them."""
+    text = (REPOSITORY / "docs/conventions.md").read_text(encoding="utf-8")
+    rooms = "|".join(path.parent.name for path in (REPOSITORY / "pipelines").glob("*/__init__.py"))
+    names = sorted(set(re.findall(rf"`((?:{rooms})\.[\w.]+)`", text)))
+    assert len(names) > 20
+    for name in names:
+        room, module, *attributes = name.split(".")
+        thing: object = importlib.import_module(f"pipelines.{room}.{module}")
+        for attribute in attributes:
+            thing = getattr(thing, attribute)
