@@ -1,1 +1,1 @@
-"""What every stage stands on: errors, types, options, products, the table of stages, workspace, runner."""
+"""Foundation of every stage: errors, types, options, products, the table of stages, workspace, runner."""

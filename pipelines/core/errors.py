@@ -1,7 +1,7 @@
-"""Known failures. Each message says what happened, where, and what to do next.
+"""Known failures; each message states the fault, its place and the remedy.
 
-The command line prints any `GeorefError` as one message and exits with 1; every other exception is a
-defect and keeps its traceback.
+The command line prints a `GeorefError` as one message and exits with 1. Every other exception is a defect and keeps
+its traceback.
 """
 
 from __future__ import annotations
@@ -10,14 +10,14 @@ from pathlib import Path
 
 
 class GeorefError(Exception):
-    """A failure that the user can understand and act on."""
+    """Failure that the user can understand and act on."""
 
 
 class InputError(GeorefError):
     """Bad input: a file, a line or field of it, or an option.
 
     Args:
-        message: what is wrong and what to do.
+        message: the fault and its remedy.
         path: the file at fault.
         line: 1-based line number in `path`.
         field: column, tag or option at fault.
@@ -41,7 +41,7 @@ class InputError(GeorefError):
 
 
 class MissingProductError(GeorefError):
-    """A stage needs a product that is not there yet.
+    """Missing product of another stage.
 
     Args:
         product: workspace-relative path of the product.
@@ -55,20 +55,20 @@ class MissingProductError(GeorefError):
 
 
 class WorkspaceBusyError(GeorefError):
-    """Another process is writing to the workspace."""
+    """Workspace that another process is writing to."""
 
 
 class DegenerateGeometryError(GeorefError):
-    """The observations do not determine the unknowns (parallel rays, collinear cameras …)."""
+    """Observations that do not determine the unknowns (parallel rays, collinear cameras …)."""
 
 
 class ConvergenceError(GeorefError):
-    """An optimisation diverged, or ended outside the bound that the user set."""
+    """Optimisation that diverged, or ended outside the bound that the user set."""
 
 
 class ResourceError(GeorefError):
-    """The machine is too small for what was asked; the message says what to ask for instead."""
+    """Machine too small for the options; the message names options that need less."""
 
 
 class BackendUnavailableError(GeorefError):
-    """An optional library or device is missing; the message names the extra to install."""
+    """Missing optional library or device; the message names the extra to install."""

@@ -1,4 +1,4 @@
-"""What decides a stage's result, as hashes: equal hashes and equal options mean an equal product."""
+"""Hashes of the inputs of a stage: equal hashes and equal options mean an equal product."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ _WHOLE_BYTES = 256 * 1024 * 1024
 
 
 def fingerprints(workspace: Workspace, spec: StageSpec, options: StageOptions, memo: Memo) -> dict[str, str]:
-    """Return hashes of everything that decides a stage's result, by product or flag.
+    """Return the hashes of all inputs that decide a stage's result, by product or flag.
 
-    Workspace products, or parts of them, by content; files that the options name by content, those beyond 256 MiB
-    (bags) and folders by the name, size and modification time of each file (reading gigabytes at each look would be
-    too slow).
+    - Products of the workspace, or parts of them, count by content.
+    - Files that the options name count by content. Those beyond 256 MiB (bags) and folders count by the name, size
+      and modification time of each file: reading gigabytes for each `georef status` would be too slow.
 
     Args:
-        workspace: where the products are.
+        workspace: holds the products.
         spec: the stage.
-        options: its options.
-        memo: hashes of whole products; one that several stages read is hashed once.
+        options: the stage's options.
+        memo: hashes of whole products by path, extended here: a product that several stages read is hashed once.
 
     Raises:
-        MissingProductError: a product is not there.
-        InputError: a path that an option names does not exist, or something cannot be read.
+        MissingProductError: a product does not exist.
+        InputError: a path that an option names does not exist, or a file cannot be read.
     """
     hashes: dict[str, str] = {}
     try:
@@ -49,7 +49,7 @@ def fingerprints(workspace: Workspace, spec: StageSpec, options: StageOptions, m
 
 
 def _hash_part(workspace: Workspace, part: ProductPart, memo: Memo) -> dict[str, str]:
-    """Return the hash of a part and of the products that it brings; nothing where the stage does without it."""
+    """Return the hash of a part and of the products that it brings; none for a missing or empty optional part."""
     try:
         path = workspace.path(part.product)
     except MissingProductError:
@@ -58,7 +58,7 @@ def _hash_part(workspace: Workspace, part: ProductPart, memo: Memo) -> dict[str,
         raise
     try:
         values = _values(path, part.fields)
-    except ValueError:  # no such document: the stage that reads it will tell
+    except ValueError:  # not JSON: the stage that reads the product raises the error
         values = None
     if values is None or (_is_empty(values) and not part.optional):
         return {part.product: _hash_product(path, memo)}
@@ -72,7 +72,7 @@ def _hash_part(workspace: Workspace, part: ProductPart, memo: Memo) -> dict[str,
 
 
 def _values(path: Path, fields: Sequence[str]) -> list[Any] | None:
-    """Return the values of a JSON document's fields; None where no fields are asked for."""
+    """Return the values of a JSON document's fields; None if `fields` is empty."""
     if not fields:
         return None
     try:
@@ -83,7 +83,7 @@ def _values(path: Path, fields: Sequence[str]) -> list[Any] | None:
 
 
 def _value(document: Any, keys: Sequence[str]) -> Any:
-    """Return the value at a path of keys, of every item of a list; None where there is none."""
+    """Return the value at a path of keys, through every item of a list; None where a key is missing."""
     if not keys or document is None:
         return document
     if isinstance(document, list):
@@ -123,7 +123,7 @@ def _hash_folder(path: Path) -> str:
 
 
 def _hash_listing(path: Path, workspace_root: Path) -> str:
-    """Return the hash of the visible files' names, sizes and times, but for a workspace inside the folder."""
+    """Return the hash of the names, sizes and times of visible files; a workspace inside the folder is left out."""
     digest = hashlib.sha256()
     for file in _files(path):
         hidden = any(part.startswith(".") for part in file.relative_to(path).parts)

@@ -1,5 +1,4 @@
-"""Interrupts at a time of one's own choosing: a loop ends its step and saves before it stops; a library that never
-looks up is left to itself."""
+"""Delayed interrupts: a loop ends its step and saves first; a library that ignores signals runs in a thread."""
 
 from __future__ import annotations
 
@@ -14,24 +13,27 @@ from typing import TypeVar
 
 ResultT = TypeVar("ResultT")
 SIGNALS = [signal.SIGINT, signal.SIGTERM]
-if sys.platform == "win32":  # where SIGTERM ends a process unheard, Ctrl-Break is what another process can send
+if sys.platform == "win32":  # There SIGTERM kills without a handler; another process can send Ctrl-Break instead.
     SIGNALS.append(signal.SIGBREAK)
 _LOOK_UP_S = 0.2
 
 
 @dataclass
 class StopRequest:
-    """Whether the user has asked to stop."""
+    """Flag that a signal sets: whether the user has requested a stop."""
 
     requested: bool = False
 
 
 @contextmanager
 def deferred_interrupts() -> Iterator[StopRequest]:
-    """Hold back `SIGNALS` while the context lasts: the first sets `requested`, a second one interrupts.
+    """Hold back `SIGNALS` while the context lasts: the first signal sets `requested`, the second interrupts.
 
-    The loop inside looks at `requested` after each step, saves, and raises `KeyboardInterrupt` itself. Only the
-    main thread receives signals; in any other the request stays unset.
+    The loop inside reads `requested` after each step, saves, and raises `KeyboardInterrupt` itself. Only the main
+    thread receives signals; in other threads `requested` stays false.
+
+    Raises:
+        KeyboardInterrupt: a second signal.
     """
     stop = StopRequest()
     if threading.current_thread() is not threading.main_thread():
@@ -53,10 +55,13 @@ def deferred_interrupts() -> Iterator[StopRequest]:
 
 
 def interruptible(work: Callable[[], ResultT]) -> ResultT:
-    """The result of long work in a library that lets go of Python but hears no signals.
+    """Return the result of long work in a library that releases Python's lock but handles no signals.
 
-    It runs in a thread of its own, so that `SIGNALS` interrupt the wait for it; the thread then goes on until the
-    process ends, which it does not hold up.
+    The work runs in a thread of its own, and `SIGNALS` interrupt the wait for its result. After an interrupt the
+    thread runs on until the process ends; the process does not wait for the thread.
+
+    Raises:
+        BaseException: the exception of the work.
     """
     results: list[ResultT] = []
     errors: list[BaseException] = []
@@ -64,7 +69,7 @@ def interruptible(work: Callable[[], ResultT]) -> ResultT:
     def run() -> None:
         try:
             results.append(work())
-        except BaseException as error:  # raised again where it is awaited
+        except BaseException as error:  # raised again in the waiting thread
             errors.append(error)
 
     thread = threading.Thread(target=run, daemon=True)

@@ -1,7 +1,7 @@
-"""One writer at a time in a folder.
+"""Lock that admits one writer at a time to a folder.
 
-The operating system holds the lock and drops it when its holder dies: no stale lock is left to be removed. The
-holder's name stands in a file of its own, because Windows lets no other process read a locked file.
+The operating system holds the lock and drops it when its holder dies: no stale lock remains. The holder's name has
+a file of its own, because on Windows no other process can read a locked file.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from pipelines.core.errors import InputError, WorkspaceBusyError
 
 LOCK = ".lock"
 HOLDER = ".lock.holder"
-# Asking who writes takes the lock for an instant, which must neither turn a writer away nor look like one.
+# `activity` takes the lock for an instant. That must neither refuse a writer nor be reported as a writer.
 _ATTEMPTS, _PAUSE_S = 3, 0.05
 _IN_PROCESS = " in process "
 
 
 @dataclass(frozen=True)
 class WriteLock:
-    """The right to write in a folder, which one process has at a time.
+    """Right to write in a folder, held by at most one process.
 
     Attributes:
         folder: the folder; made when the lock is first held.
@@ -40,10 +40,10 @@ class WriteLock:
         """Hold the lock while the context lasts.
 
         Args:
-            activity: the command that writes, for those who find the folder busy.
+            activity: the command that writes, for the error message of other processes.
 
         Raises:
-            WorkspaceBusyError: another process holds it; names that process and its activity.
+            WorkspaceBusyError: another process holds the lock; names that process and its activity.
             InputError: the folder cannot be made, written or locked.
         """
         try:
@@ -72,17 +72,17 @@ class WriteLock:
         try:
             # A network file system locks only a file that is open for writing.
             with path.open("r+b" if os.access(path, os.W_OK) else "rb") as handle:
-                # A stage under way asks as well, and need not wait for itself.
+                # A running stage asks as well, and must not wait for its own lock.
                 own = self._holder().endswith(f"{_IN_PROCESS}{os.getpid()}")
                 if not _lock(handle, attempts=1 if own else _ATTEMPTS):
                     return self._holder().partition(_IN_PROCESS)[0]
                 unlock_descriptor(handle.fileno())
         except OSError:
-            pass  # no lock file, or none that can be opened: nobody writes
+            pass  # The lock file does not exist or cannot be opened: no process writes.
         return None
 
     def _holder(self) -> str:
-        """Return the holder's activity and process: true only while the lock is held."""
+        """Return the holder's activity and process; valid only while the lock is held."""
         try:
             text = (self.folder / HOLDER).read_text(encoding="utf-8").strip()
         except (OSError, UnicodeDecodeError):
@@ -91,7 +91,7 @@ class WriteLock:
 
 
 def _lock(handle: BinaryIO, attempts: int) -> bool:
-    """Return whether the lock of an open file was had within the attempts."""
+    """Return whether one of the attempts locked the open file."""
     for attempt in range(attempts):
         if attempt:
             time.sleep(_PAUSE_S)

@@ -1,12 +1,12 @@
-"""Options, each with its default, range and meaning in one place, and how they are given.
+"""Options of the stages, each with its default, range and meaning in one place.
 
 Precedence: default < the workspace's `georef.toml` (one table a stage) < command-line flag. The command line
 derives its flags from these classes, so that a default exists once. Unknown keys and values out of range are
-errors that name the key. The options of a stage stand in `options.py` of its room.
+errors that name the key. The options of a stage are defined in `options.py` of its room.
 
-Options hold parsed values. An option that users write as text (`0.1,0,-0.3`, `2s`, `auto`) has a type with
-`from_text`, which reads the text of a flag, of `georef.toml` and of an earlier version's manifest once, and with
-`WRITTEN`, which tells the command line that it takes text.
+Options hold parsed values. An option that users write as text (`0.1,0,-0.3`, `2s`, `auto`) has a type with two
+annotations: `from_text` parses the text of a flag, of `georef.toml` and of an earlier version's manifest; `WRITTEN`
+marks the flag as text for the command line.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ CONFIG_FILE = "georef.toml"
 
 
 class InputMarker:
-    """Marks a path whose content decides the stage's result: its fingerprint enters the manifest."""
+    """Mark of a path whose content decides the stage's result: its fingerprint enters the manifest."""
 
 
 class WrittenMarker:
-    """Marks an option that users write as text; `notation` writes its value as they do."""
+    """Mark of an option that users write as text; `notation` gives the text of its value."""
 
 
 InputPath = Annotated[Path, InputMarker()]
@@ -44,20 +44,20 @@ class StageOptions(BaseModel):
 
 
 def from_text(parse: Callable[[str], object]) -> BeforeValidator:
-    """Return the validator that parses a text; other values (a TOML array, a manifest's JSON) pass unparsed."""
+    """Return a validator that parses texts; other values (a TOML array, a manifest's JSON) pass unparsed."""
     return BeforeValidator(lambda value: parse(value) if isinstance(value, str) else value)
 
 
 def listed_names(text: str, known: Collection[str], otherwise: str = "") -> tuple[str, ...]:
-    """Return the names in a text with commas.
+    """Return the names in a text, where commas separate them.
 
     Args:
         text: e.g. `boresight,lever-arm`.
-        known: the names there are.
-        otherwise: what else may be given, for the error.
+        known: the valid names.
+        otherwise: ending of the error message, which names further valid texts.
 
     Raises:
-        ValueError: a name that is not known.
+        ValueError: an unknown name.
     """
     names = tuple(text.split(","))
     unknown = [name for name in names if name not in known]
@@ -101,7 +101,7 @@ OptionsT = TypeVar("OptionsT", bound=StageOptions)
 
 
 def flag_name(options_type: type[StageOptions], name: str) -> str:
-    """Return the command-line flag of a field: its name with dashes, or what the field says."""
+    """Return the command-line flag of a field: its name with dashes, or the flag that the field states."""
     info = options_type.model_fields.get(name)
     extra = info.json_schema_extra if info is not None else None
     stated = extra.get("flag") if isinstance(extra, dict) else None
@@ -126,9 +126,13 @@ def is_written(info: FieldInfo) -> bool:
 def resolve(
     options_type: type[OptionsT], table: Mapping[str, Any], flags: Mapping[str, Any], toml: Path
 ) -> OptionsT:
-    """Merge default < `table` of `toml` < `flags` into validated options.
+    """Return validated options: default < `table` < `flags`.
 
-    Relative paths in the table are relative to the folder of `toml`.
+    Args:
+        options_type: class of the options.
+        table: the stage's table in `georef.toml`; its relative paths are relative to the folder of that file.
+        flags: options that the user gave as flags, by field.
+        toml: path of `georef.toml`.
 
     Raises:
         InputError: an unknown key or a value out of range; names the file (or flag) and the key.
@@ -147,10 +151,10 @@ def resolve(
 
 
 def load_toml(path: Path, stages: Collection[str]) -> dict[str, dict[str, Any]]:
-    """Read `georef.toml` into a table for each stage; a missing file is an empty one.
+    """Read `georef.toml` and return its tables by stage; a missing file has none.
 
     Raises:
-        InputError: not TOML, or a table that names no stage.
+        InputError: the file cannot be read or is not TOML, or a table names no stage.
     """
     if not path.exists():
         return {}
@@ -173,7 +177,7 @@ def _is_input(info: FieldInfo) -> bool:
 
 
 def _marks(info: FieldInfo) -> list[object]:
-    """Return a field's marks, also those that `… | None` hides in a union's member."""
+    """Return a field's marks, with those that `… | None` hides in a member of the union."""
     members = getattr(info.annotation, "__args__", ())
     return [*info.metadata, *(mark for member in members for mark in getattr(member, "__metadata__", ()))]
 

@@ -1,8 +1,9 @@
-"""Typed products: what the stages hand to each other, and how each is stored. What `ingest` makes: `survey.py`.
+"""Typed products of the stages: base class, reading and writing. The products themselves are types in `scene/`.
 
-JSON products are pydantic models (validated on load: a product can be replaced by hand), arrays are NPZ
-without pickle. Frames and units are those of docs/conventions.md: `geo` is East-North-Up metres at the survey's
-origin, `local` the SfM model's frame, `model` the metric, origin-shifted frame in which the Gaussians live.
+JSON products are pydantic models. They are validated when loaded, because users can replace a product by hand.
+Arrays are stored as NPZ without pickle. Frames and units are those of docs/conventions.md: `geo` is East-North-Up
+metres at the survey's origin, `local` the SfM model's frame, `model` the metric, origin-shifted frame of the
+Gaussians.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from pipelines.core.errors import InputError
 from pipelines.core.types import Matrix3, Quaternion
 from pipelines.core.validators import covariance, image_name, unit_quaternion
 
-# Products may be written by hand: larger than any survey's, and they are not even read.
+# Users may write products by hand: a file larger than any survey's is refused before it is read.
 _MAX_JSON_BYTES = 1 << 30
 
 ImageName = Annotated[str, AfterValidator(image_name)]
@@ -48,7 +49,7 @@ def load_json(product_type: type[ProductT], path: Path) -> ProductT:
     """Read and validate a JSON product.
 
     Raises:
-        InputError: unreadable, not JSON, or not of that form; names file and field.
+        InputError: the file is unreadable, too large, not JSON, or not of that type; names file and field.
     """
     try:
         if path.stat().st_size > _MAX_JSON_BYTES:
@@ -65,7 +66,11 @@ def load_json(product_type: type[ProductT], path: Path) -> ProductT:
 
 
 def dump_json(document: Any) -> str:
-    """JSON text of a plain document: no NaN, stable order."""
+    """Return the JSON text of a plain document: no NaN, stable order.
+
+    Raises:
+        ValueError: the document holds NaN or an infinity.
+    """
     return json.dumps(document, indent=1, allow_nan=False)
 
 
@@ -79,7 +84,7 @@ def load_npz(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
     """Read the named arrays of an NPZ file, without pickle.
 
     Raises:
-        InputError: unreadable, or an array is missing.
+        InputError: the file is unreadable, or lacks one of the arrays.
     """
     try:
         with np.load(path, allow_pickle=False) as archive:

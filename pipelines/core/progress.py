@@ -1,7 +1,7 @@
-"""How long work tells its progress, without knowing who listens.
+"""Progress of long work.
 
-Library code opens a task and advances it; the command line supplies a `Progress` that draws a bar or
-prints lines. The default says nothing.
+Library code opens a task and advances it. The command line supplies a `Progress` that draws a bar or prints lines.
+The default is silent.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from typing import Protocol
 
 
 class ProgressTask(Protocol):
-    """One bar: so many steps of a known (or unknown) total."""
+    """Task that counts its steps; their total may be unknown."""
 
     def advance(self, steps: int = 1, note: str = "") -> None:
-        """Count `steps` more; `note` is shown behind the bar (`psnr 23.1 dB`)."""
+        """Add `steps` to the count; `note` is shown behind the bar (`psnr 23.1 dB`)."""
 
 
 class Progress(Protocol):
-    """A place to open tasks."""
+    """Display of tasks."""
 
     def task(self, name: str, total: int | None = None) -> AbstractContextManager[ProgressTask]:
         """Open a task that is closed when the context ends."""
@@ -27,15 +27,15 @@ class Progress(Protocol):
 
 class _SilentTask:
     def advance(self, steps: int = 1, note: str = "") -> None:
-        """Say nothing."""
+        """Do nothing."""
 
 
 class SilentProgress:
-    """Progress for library use and tests: says nothing."""
+    """Progress without output, for library use and tests."""
 
     @contextmanager
     def task(self, name: str, total: int | None = None) -> Iterator[ProgressTask]:
-        """Open a task that nobody watches."""
+        """Open a task that shows nothing."""
         yield _SilentTask()
 
 

@@ -1,4 +1,4 @@
-"""The conductor: runs stages in a workspace and skips what is current."""
+"""Runner of the stages in a workspace; stages whose product is current are skipped."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ LIBRARIES = ("numpy", "pycolmap", "torch", "numba", "pyproj")
 
 @dataclass(frozen=True)
 class Outcome:
-    """Result of asking for a stage: its manifest, and whether it was run or skipped as current."""
+    """Result of a requested stage: its manifest, and whether the stage ran or was skipped as current."""
 
     stage: str
     ran: bool
@@ -49,12 +49,15 @@ def run_stage(
     The flags are remembered for `run_pipeline`, unless the stage refuses its input.
 
     Args:
-        flags: options given by the user (only those given).
-        force: run even if current, and start afresh.
+        workspace: holds the products that the stage reads, and receives its product.
+        spec: the stage.
+        flags: only the options that the user gave, by field.
+        force: run even if the product is current, and start afresh.
         resume: whether to continue an interrupted run; see `Workspace.begin`.
+        progress: shows the stage's tasks.
 
     Raises:
-        GeorefError: any known failure; the previous product is left whole.
+        GeorefError: any known failure; the previous product stays whole.
     """
     if spec.reads:
         must_exist(workspace)
@@ -84,14 +87,18 @@ def run_pipeline(
     progress: Progress = SILENT,
     around: Callable[[StageSpec], AbstractContextManager[None]] = lambda _: nullcontext(),
 ) -> list[Outcome]:
-    """Run stages in order, skipping what is current and resuming what was interrupted.
+    """Run stages in order; current stages are skipped, and interrupted ones are resumed.
 
-    All options are checked and remembered before the first stage begins: a bad option of a late stage costs no
-    hours, and a run that is killed early is completed as it was asked for.
+    All options are checked and remembered before the first stage begins, for two reasons: a bad option of a late
+    stage costs no hours, and a run that is killed early is later completed with the same options.
 
     Args:
-        flags: options by stage; they come on top of those that the stage was last asked for with.
-        around: a context to run each stage in.
+        workspace: holds the products of all stages.
+        stages: the stages, in the order of the pipeline.
+        flags: options by stage; they override the remembered options of the stage.
+        force: run also the stages whose product is current, and start all afresh.
+        progress: shows the tasks of the stages.
+        around: makes the context in which a stage runs.
 
     Raises:
         GeorefError: the first failure.
@@ -122,7 +129,7 @@ def run_pipeline(
 
 
 def remembered(workspace: Workspace, spec: StageSpec, flags: Flags) -> dict[str, Any]:
-    """Return the options that a stage was last asked for with, and `flags` on top of them."""
+    """Return the options that a stage was last requested with, overridden by `flags`."""
     return {**workspace.requests().get(spec.name, {}), **flags}
 
 
@@ -190,7 +197,7 @@ def _current(workspace: Workspace, asked: Request) -> Manifest | None:
 
 
 def _warn_of_stale_inputs(workspace: Workspace, spec: StageSpec, memo: Memo) -> None:
-    """Say so when a stage is about to build on a product whose own inputs have changed."""
+    """Log a warning for each stale stage whose product `spec` reads."""
     producers = {producer_of(part.product).name for part in spec.reads}
     for row in status(workspace, memo, before=spec):
         if row.stage in producers and row.state == "stale":

@@ -1,6 +1,6 @@
-"""The pipeline at a glance: every stage, what it reads, and which module does it.
+"""Table of the stages: their modules, options, inputs and products.
 
-Light on purpose: `georef status` and `--help` read this table without importing a stage.
+`georef status` and `--help` read this table without importing a stage.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from pipelines.core.errors import GeorefError
 from pipelines.core.options import StageOptions
 
 SURVEY = "ingest/survey.json"
-TRACK = "ingest/track.npz"  # not always there
+TRACK = "ingest/track.npz"  # only for surveys with a trajectory
 SPARSE = "sfm/sparse"
 RIG = "calibrate/rig.json"
 POINTS = "geolocate/points.npz"
@@ -25,14 +25,14 @@ SPLAT = "export/splat.ply"
 
 @dataclass(frozen=True)
 class ProductPart:
-    """A product of another stage, or the part of it that decides a stage's result.
+    """Product of another stage, or the part of it that decides a stage's result.
 
     Attributes:
-        product: its workspace path, a file or a folder.
-        fields: paths of keys in its JSON document, through every item of a list: `images.fix.position_in_geo`.
-            Nothing else in the document makes the stage stale. Without fields, the whole product counts.
-        optional: whether the stage does without it. A part without any value then counts as not there.
-        brings: further products that count where this part has a value, if they are there.
+        product: workspace path of a file or a folder.
+        fields: paths of keys in the JSON document, through every item of a list: `images.fix.position_in_geo`.
+            No other field of the document makes the stage stale. Without fields, the whole product counts.
+        optional: whether the stage runs without this product. A part without any value then counts as missing.
+        brings: further products that count if they exist and this part has a value.
     """
 
     product: str
@@ -42,7 +42,7 @@ class ProductPart:
 
 
 def whole(*products: str) -> tuple[ProductPart, ...]:
-    """Return products that count as a whole."""
+    """Return the parts that are whole products."""
     return tuple(ProductPart(product) for product in products)
 
 
@@ -60,7 +60,7 @@ PHOTOGRAPHS = ProductPart(
         "images.attitude.quat_xyzw",
     ),
 )
-# The estimates that are applied to the survey when it is read, with the navigation that they are applied to.
+# The estimates that are applied to the survey when the survey is read, and the navigation that they are applied to.
 APPLIED_RIG = ProductPart(
     RIG, fields=("applied.name", "applied.value", "applied.start"), optional=True, brings=(TRACK,)
 )
@@ -68,18 +68,18 @@ APPLIED_RIG = ProductPart(
 
 @dataclass(frozen=True)
 class StageSpec:
-    """One stage.
+    """Row of the table: one stage.
 
     Attributes:
         name: the subcommand.
-        module: where `run(stage, options) -> Summary` lives.
-        options_place: where the class of its options lives, `module:class`.
+        module: module that defines `run(stage, options) -> Summary`.
+        options_place: `module:class` of its options.
         folder: its folder in the workspace.
         reads: products, or parts of them, that decide its result.
-        product: the path that later stages and people look for.
+        product: workspace path of its main product.
         title: one line of help.
         resumable: whether a partial product can be continued.
-        also: further paths in its folder that others look for, besides what the stages of the pipeline read.
+        also: further products in its folder, besides those that the stages of the pipeline read.
     """
 
     name: str
@@ -94,7 +94,7 @@ class StageSpec:
 
     @property
     def options(self) -> type[StageOptions]:
-        """The class of its options, imported when it is asked for."""
+        """Class of its options; the module is imported on access."""
         module, _, name = self.options_place.partition(":")
         options: type[StageOptions] = getattr(importlib.import_module(module), name)
         return options
@@ -177,8 +177,8 @@ PIPELINE: tuple[StageSpec, ...] = (
     ),
 )
 
-# Not part of the line: `georef compare` runs it for the baseline, whose later stages find in its folder what they
-# otherwise read from those of sfm and init-sim3.
+# No part of the pipeline: `georef compare` runs this stage for the baseline. There it replaces sfm and init-sim3:
+# the later stages of the baseline read its folder instead of theirs.
 ADJUST = StageSpec(
     name="adjust",
     module="pipelines.sfm.pose_prior",
@@ -201,7 +201,7 @@ def producer_of(path: str) -> StageSpec:
 
 
 def products_of(spec: StageSpec) -> tuple[str, ...]:
-    """Return everything in a stage's folder that people or later stages look for."""
+    """Return the products of a stage: its main product, its further ones, and those that other stages require."""
     needed = (part.product for other in PIPELINE for part in other.reads if not part.optional)
     own = (product for product in needed if producer_of(product) is spec)
     return tuple(dict.fromkeys((spec.product, *spec.also, *own)))

@@ -1,4 +1,4 @@
-"""The state of every stage: is its product there, and is it what its inputs and options would make now?"""
+"""State of every stage: a product is current if its inputs and options are those of now."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Flags = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class StageState:
-    """One row of `georef status`."""
+    """Row of `georef status`."""
 
     stage: str
     state: State
@@ -32,7 +32,7 @@ class StageState:
 
 @dataclass(frozen=True)
 class Request:
-    """A stage as it is asked for now: its options, and the fingerprints of what it reads."""
+    """Stage with its present options and the fingerprints of its present inputs."""
 
     spec: StageSpec
     options: StageOptions
@@ -40,10 +40,10 @@ class Request:
 
 
 def request(workspace: Workspace, spec: StageSpec, flags: Flags, memo: Memo) -> Request:
-    """Return options (default < `georef.toml` < flags) and inputs of a stage.
+    """Return the options (default < `georef.toml` < flags) and the inputs of a stage.
 
     Raises:
-        MissingProductError: a product that it reads is not there.
+        MissingProductError: a product that the stage reads does not exist.
         InputError: an unknown or invalid option, or a missing file.
     """
     options = stage_config(workspace, spec, flags)
@@ -54,14 +54,14 @@ def stage_config(workspace: Workspace, spec: StageSpec, flags: Flags) -> StageOp
     """Return the options of a stage: default < `georef.toml` < flags.
 
     Raises:
-        InputError: unknown or invalid option.
+        InputError: an unknown or invalid option.
     """
     tables = load_toml(workspace.config_file, BY_NAME)
     return resolve(spec.options, tables.get(spec.name, {}), flags, workspace.config_file)
 
 
 def why_stale(workspace: Workspace, asked: Request, manifest: Manifest) -> str:
-    """Return why a product is not what its inputs and options would make now; empty if it is."""
+    """Return the reason why a product is stale; empty if its inputs and options are unchanged."""
     options = asked.options
     try:
         made_with = type(options).model_validate(manifest.config)
@@ -79,10 +79,15 @@ def why_stale(workspace: Workspace, asked: Request, manifest: Manifest) -> str:
 
 
 def status(workspace: Workspace, memo: Memo | None = None, before: StageSpec | None = None) -> list[StageState]:
-    """Return the state of every stage, in order; of those ahead of `before`, if given.
+    """Return the state of every stage, in order.
+
+    Args:
+        workspace: an existing workspace.
+        memo: hashes of whole products by path, extended here.
+        before: stage of the pipeline; only the stages ahead of it are returned.
 
     Raises:
-        InputError: there is no such directory, or its `georef.toml` or `requests.json` is not valid.
+        InputError: the directory does not exist, or its `georef.toml` or `requests.json` is not valid.
     """
     must_exist(workspace)
     look = _Look(workspace, {} if memo is None else memo, workspace.requests())
@@ -95,14 +100,18 @@ def status(workspace: Workspace, memo: Memo | None = None, before: StageSpec | N
 
 
 def must_exist(workspace: Workspace) -> None:
-    """Raise InputError where there is no workspace."""
+    """Refuse a workspace that does not exist.
+
+    Raises:
+        InputError: the directory does not exist.
+    """
     if not workspace.root.is_dir():
         raise InputError("no such workspace: `georef ingest` makes one", path=workspace.root)
 
 
 @dataclass
 class _Look:
-    """One look along the pipeline, which carries staleness downstream."""
+    """Pass along the pipeline that carries staleness downstream."""
 
     workspace: Workspace
     memo: Memo
@@ -117,7 +126,7 @@ class _Look:
         return row
 
     def _state(self, spec: StageSpec) -> StageState:
-        if spec.folder in self.workspace.lent:  # who lends it has seen to it
+        if spec.folder in self.workspace.lent:  # The runs of the lending workspace keep it current.
             return StageState(spec.name, "current", "")
         if self.workspace.placed_by_hand(spec):
             return StageState(spec.name, "current", BY_HAND)
@@ -143,7 +152,7 @@ class _Look:
         )
 
     def _reason(self, spec: StageSpec, manifest: Manifest) -> str:
-        """Return why a product is stale, by itself or because one that it builds on is."""
+        """Return the reason why a product is stale: its own inputs and options, or a stale stage upstream."""
         flags = self.requests.get(spec.name, {})
         stage_config(self.workspace, spec, flags)  # a bad georef.toml is an error, not a state
         try:

@@ -1,6 +1,6 @@
-"""Array and tuple types that the whole house shares.
+"""Array and tuple types that all rooms share.
 
-Arrays are numpy's; shapes, units and frames stand in the docstrings of whoever uses them.
+Arrays are numpy's. Their shapes, units and frames are stated in the docstrings of the functions and classes.
 """
 
 from __future__ import annotations

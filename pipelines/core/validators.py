@@ -1,6 +1,6 @@
-"""What a product written by hand is checked for, beyond the types of its fields.
+"""Checks of products that users may write by hand, beyond the types of the fields.
 
-Each function returns its argument, or raises ValueError with what is wrong; pydantic adds file and field.
+A validator returns its argument, or raises a ValueError that names the fault; `load_json` adds file and field.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ _LEAST_EIGENVALUE_RATIO = 1e-12
 
 
 def stays_inside(path: str) -> bool:
-    """Whether a relative path cannot lead out of the folder that it is relative to (but for links in it).
+    """Return whether a relative path stays inside its folder; symbolic links are not followed.
 
-    Control characters and bytes that are no text have no place in it either: lists of names are split at them.
+    Paths with control characters or undecodable bytes do not count as inside: lists of names are split at them.
     """
     pure = PurePosixPath(path)
     is_text = not any(unicodedata.category(character) in ("Cc", "Cs") for character in path)
@@ -27,14 +27,22 @@ def stays_inside(path: str) -> bool:
 
 
 def image_name(name: str) -> str:
-    """A name relative to the folder of photographs."""
+    """Return an image name that is relative to the folder of photographs and stays inside.
+
+    Raises:
+        ValueError: the name leaves the folder.
+    """
     if not stays_inside(name):
         raise ValueError(f"{name!r} leaves the folder of photographs: names are relative to it")
     return name
 
 
 def image_dir(path: str) -> str:
-    """A folder of photographs: anywhere by its absolute path, or inside the workspace."""
+    """Return the path of a folder of photographs: absolute, or relative and inside the workspace.
+
+    Raises:
+        ValueError: a relative path leaves the workspace.
+    """
     pure = PurePosixPath(path)
     if not pure.is_absolute() and pure.parts and not stays_inside(path):
         raise ValueError(f"{path!r} leaves the workspace: give an absolute path")
@@ -42,7 +50,11 @@ def image_dir(path: str) -> str:
 
 
 def unit_quaternion(quat: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
-    """A rotation."""
+    """Return a quaternion of length 1, in either order.
+
+    Raises:
+        ValueError: the length differs from 1 by more than 1e-3.
+    """
     length = float(np.linalg.norm(quat))
     if abs(length - 1) > _UNIT_TOLERANCE:
         raise ValueError(f"a rotation is a quaternion of length 1, this has {length:g}")
@@ -50,7 +62,11 @@ def unit_quaternion(quat: tuple[float, float, float, float]) -> tuple[float, flo
 
 
 def covariance(rows: tuple[Vector3, Vector3, Vector3]) -> tuple[Vector3, Vector3, Vector3]:
-    """A covariance that can be divided by."""
+    """Return a covariance (3, 3) that is symmetric and positive definite, and therefore invertible.
+
+    Raises:
+        ValueError: the matrix is not symmetric, or its least eigenvalue is not above 1e-12 of its greatest.
+    """
     matrix = np.array(rows)
     values = np.linalg.eigvalsh(matrix)
     if not np.allclose(matrix, matrix.T, rtol=1e-6) or values[0] <= _LEAST_EIGENVALUE_RATIO * values[-1]:

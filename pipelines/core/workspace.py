@@ -1,8 +1,8 @@
-"""The workspace directory: the contract between the stages.
+"""Workspace directory: the contract between the stages.
 
-Every stage owns one folder with a `manifest.json`. A stage writes into `<folder>.partial` and the folder is
-renamed when complete, so that a killed stage leaves the previous product whole; the next writer finishes or undoes
-a rename that was cut off. One writer at a time holds the workspace's lock.
+Every stage owns one folder with a `manifest.json`. A stage writes into `<folder>.partial`, and the complete folder
+is renamed: a killed stage leaves the previous product whole. The next writer completes or undoes an interrupted
+rename. One writer at a time holds the workspace's lock.
 """
 
 from __future__ import annotations
@@ -34,7 +34,20 @@ Resume = Literal["never", "if-same", "always"]
 
 
 class Manifest(BaseModel):
-    """What made a stage's product: inputs, resolved options, versions, time, and its headline."""
+    """Record of how a product was made: inputs, resolved options, versions, time, and key figure.
+
+    Attributes:
+        format_version: version of the manifest's format.
+        stage: the subcommand.
+        config: resolved options by field.
+        inputs: SHA-256 by product or flag, from `fingerprints`.
+        versions: versions of this package and its libraries.
+        started: UTC.
+        duration_s: wall-clock time.
+        key_figure: one line for tables.
+        values: plain numbers and strings for `--json`.
+        warnings: messages that the user should read.
+    """
 
     model_config = ConfigDict(extra="forbid")
 
@@ -52,12 +65,12 @@ class Manifest(BaseModel):
 
 @dataclass(frozen=True)
 class Summary:
-    """What a stage says of its result.
+    """Summary of a stage's result, for tables, `--json` and the log.
 
     Attributes:
-        key_figure: the headline for tables, e.g. "48 of 48 registered".
+        key_figure: one line for tables, e.g. "48 of 48 registered".
         values: plain numbers and strings for `--json`.
-        warnings: what the user should look at.
+        warnings: messages that the user should read.
     """
 
     key_figure: str
@@ -67,12 +80,12 @@ class Summary:
 
 @dataclass(frozen=True)
 class StageRun:
-    """What a stage is handed: where to read, where to write, whom to tell.
+    """Run of one stage: the argument of its `run`, beside the options.
 
     Attributes:
-        workspace: read finished products of other stages through `workspace.path`.
-        out: the folder to write into; becomes the stage's folder when complete.
-        progress: whom to tell of progress.
+        workspace: finished products of other stages, to be read through `workspace.path`.
+        out: folder to write into; it becomes the stage's folder when complete.
+        progress: shows the stage's tasks.
         resumed: whether `out` holds the partial product of an interrupted run with the same inputs and options.
     """
 
@@ -84,13 +97,13 @@ class StageRun:
 
 @dataclass(frozen=True)
 class Workspace:
-    """A workspace directory.
+    """Workspace directory, or a variant of one that shares some of its products.
 
     Attributes:
         root: the directory.
-        base: of a variant, the workspace that it is a variant of: it has the photographs, the cache and
+        base: for a variant, the workspace that it varies; that one holds the photographs, the cache and
             `georef.toml`.
-        lent: stage folders that a variant reads elsewhere, by name. It writes none of them.
+        lent: for a variant, stage folders outside it, by name. The variant reads them and never writes them.
     """
 
     root: Path
@@ -98,18 +111,19 @@ class Workspace:
     lent: Mapping[str, Path] = field(default_factory=dict, hash=False)
 
     def variant(self, place: str, lent: Mapping[str, Path]) -> Workspace:
-        """A workspace at `place` inside this one, in which some stages are run otherwise.
+        """Return a variant in the folder `place` of this workspace; some stages run in it with other options.
 
         Args:
-            lent: the folders of all stages that are not run in it but read by it.
+            place: path relative to `root`.
+            lent: by name, the folders of all stages that the variant reads but does not run.
         """
         return Workspace(self.root / place, self, lent)
 
     def path(self, product: str) -> Path:
-        """Absolute path of a finished product.
+        """Return the path of a finished product.
 
         Raises:
-            MissingProductError: it is not there; names the command that makes it.
+            MissingProductError: the product does not exist; names the command that makes it.
         """
         folder, _, inside = product.partition("/")
         path = self._folder(folder) / inside
@@ -122,44 +136,44 @@ class Workspace:
         return self.lent.get(name, self.root / name)
 
     def photographs(self, image_dir: str) -> Path:
-        """The folder of photographs that a survey names."""
+        """Return the path of the folder of photographs that a survey names."""
         return (self.base or self).root / image_dir
 
     @property
     def cache(self) -> Path:
-        """Folder of things that can be made again (undistorted images)."""
+        """Folder of files that can be made again (undistorted images)."""
         return (self.base or self).root / "cache"
 
     @property
     def config_file(self) -> Path:
-        """The workspace's `georef.toml`."""
+        """Path of the workspace's `georef.toml`."""
         return (self.base or self).root / CONFIG_FILE
 
     def log_file(self, spec: StageSpec) -> Path:
-        """Where the log of a stage is kept."""
+        """Return the path of a stage's log."""
         return self.root / "logs" / f"{spec.name}.log"
 
     def manifest(self, spec: StageSpec) -> Manifest | None:
-        """The manifest of a finished stage, or None.
+        """Return the manifest of a finished stage, or None.
 
         Raises:
-            InputError: it is damaged.
+            InputError: the manifest is damaged.
         """
         path = self._folder(spec.folder) / MANIFEST
         return load_json(Manifest, path) if path.exists() else None
 
     def placed_by_hand(self, spec: StageSpec) -> bool:
-        """Whether all products of a stage are there, but no stage has made them."""
+        """Return whether all products of a stage exist without a manifest."""
         folder = self.root / spec.folder
         return not (folder / MANIFEST).exists() and all((self.root / p).exists() for p in products_of(spec))
 
     def failure(self, spec: StageSpec) -> str | None:
-        """The message with which the latest run of a stage failed, or None."""
+        """Return the message with which the latest run of a stage failed, or None."""
         path = self.partial(spec) / FAILURE
         return path.read_text(encoding="utf-8") if path.exists() else None
 
     def partial(self, spec: StageSpec) -> Path:
-        """Where a stage writes before it is complete."""
+        """Return the folder that a stage writes into until it is complete."""
         return self.root / f"{spec.folder}.partial"
 
     def _old(self, spec: StageSpec) -> Path:
@@ -167,13 +181,13 @@ class Workspace:
 
     @contextmanager
     def lock(self, activity: str) -> Iterator[None]:
-        """Hold the workspace for writing, and repair what a killed writer left.
+        """Hold the lock of the workspace, and complete or undo the renames of a killed writer.
 
         Args:
-            activity: the command that writes, for those who find the workspace busy.
+            activity: the command that writes, for the error message of other processes.
 
         Raises:
-            WorkspaceBusyError: another process holds it.
+            WorkspaceBusyError: another process holds the lock.
             InputError: the directory cannot be made or written.
         """
         with WriteLock(self.root).hold(activity):
@@ -182,7 +196,7 @@ class Workspace:
             yield
 
     def writer(self) -> str | None:
-        """The activity of the process that is writing now (`train`), or None."""
+        """Return the activity of the process that is writing now (`train`), or None."""
         return WriteLock(self.root).activity()
 
     def _recover(self, spec: StageSpec) -> None:
@@ -209,15 +223,16 @@ class Workspace:
         """Open the partial folder of a stage: as an interrupted run left it, or empty.
 
         Args:
-            token: stands for the inputs and options of the run.
-            resume: continue an interrupted run never; if it had the same token, or else begin afresh; always, and
-                refuse to begin afresh where one with another token is.
+            spec: the stage; only a resumable one can be continued.
+            token: hash of the inputs and options of the run.
+            resume: `never` begins afresh; `if-same` continues an interrupted run with the same token, and otherwise
+                begins afresh; `always` does the same, but refuses an interrupted run with another token.
 
         Returns:
-            The folder, and whether it is continued.
+            The folder, and whether it holds a run to be continued.
 
         Raises:
-            InputError: there is an interrupted run that must be, and cannot be, continued.
+            InputError: `resume` is `always`, and the interrupted run has another token.
         """
         partial = self.partial(spec)
         held = partial / TOKEN
@@ -230,7 +245,7 @@ class Workspace:
                     "the interrupted run had other inputs or options: give those, or start afresh without --resume",
                     path=partial,
                 )
-        held.unlink(missing_ok=True)  # first: a half deleted run must not be taken for one to continue
+        held.unlink(missing_ok=True)  # first, so that a half deleted run is never continued
         if partial.exists():
             shutil.rmtree(partial)
         partial.mkdir(parents=True)
@@ -238,22 +253,22 @@ class Workspace:
         return partial, False
 
     def fail(self, spec: StageSpec, message: str) -> None:
-        """Record why a stage could not be completed."""
+        """Record the message with which a stage failed."""
         (self.partial(spec) / FAILURE).write_text(message, encoding="utf-8")
 
     def commit(self, spec: StageSpec, manifest: Manifest) -> None:
-        """Make the partial folder the stage's product."""
+        """Write the manifest, and rename the partial folder to the stage's folder."""
         partial = self.partial(spec)
         draft = partial / f"{MANIFEST}.tmp"
         save_json(manifest, draft)
-        draft.replace(partial / MANIFEST)  # from here on it counts as complete, whatever happens
+        draft.replace(partial / MANIFEST)  # The manifest marks the folder as complete, even if the rename fails.
         self._swap(spec)
 
     def requests(self) -> dict[str, dict[str, Any]]:
-        """The flags that each stage was last asked for with, so that `georef run` can complete them.
+        """Return the flags that stages were last requested with, by stage; `georef run` starts from them.
 
         Raises:
-            InputError: the file is damaged.
+            InputError: `requests.json` is damaged.
         """
         path = self.root / REQUESTS
         if not path.exists():
@@ -267,18 +282,18 @@ class Workspace:
         return document
 
     def remember(self, flags: Mapping[str, Mapping[str, Any]]) -> None:
-        """Record the flags that stages were asked for with, by stage."""
+        """Record the flags that stages were requested with, by stage."""
         document = {**self.requests(), **{stage: dict(given) for stage, given in flags.items()}}
         replace_text(self.root / REQUESTS, json.dumps(document, indent=1, default=str) + "\n")
 
 
 def replace_text(path: Path, text: str) -> None:
-    """Write a file; one that is there is replaced when the new one is complete."""
+    """Write a file; an existing file is replaced when the new one is complete."""
     draft = path.with_suffix(".tmp")
     draft.write_text(text, encoding="utf-8")
     draft.replace(path)
 
 
 def now() -> datetime:
-    """The time for manifests: UTC, seconds."""
+    """Return the present time for manifests: UTC, whole seconds."""
     return datetime.now(UTC).replace(microsecond=0)
