@@ -1,1 +1,1 @@
-"""What stages share about a survey: the products as types, and what several stages make of them."""
+"""Survey and model as the stages share them: products as types, and the computations of several stages on them."""

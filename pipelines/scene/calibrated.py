@@ -1,4 +1,4 @@
-"""The survey with the calibration of its rig: positions and attitudes anew from the navigation."""
+"""Survey with its calibrated rig: positions and attitudes computed anew from the navigation."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from pipelines.scene.survey import Attitude, Fix, Survey, SurveyImage
 
 log = logging.getLogger(__name__)
 
-# A position this far from the middle of all is a blunder.
+# A position farther than this from the median of all is a blunder.
 FIX_RANGE_M = 100_000.0
 ValueT = TypeVar("ValueT")
 
@@ -30,8 +30,8 @@ def load_survey(workspace: Workspace) -> Survey:
     """Return the survey of a workspace, with the calibration of the rig in its positions and attitudes.
 
     Raises:
-        MissingProductError: there is no survey.
-        InputError: a product is damaged, or there is no navigation to apply the calibration to.
+        MissingProductError: the survey does not exist.
+        InputError: a product is damaged, or the calibration has no navigation to be applied to.
     """
     survey = load_json(Survey, workspace.path(SURVEY))
     try:
@@ -49,8 +49,13 @@ def load_survey(workspace: Workspace) -> Survey:
 def apply_calibration(survey: Survey, track: NavigationTrack, calibration: RigCalibration) -> Survey:
     """Return the survey with the applied estimates of a calibration in its positions and attitudes.
 
-    The rest of the rig stays as `ingest` was told. An image that only now lies within the navigation takes σ from
-    the nearest one in time.
+    The other parameters of the rig keep the values of `ingest`. A new time offset can bring further images into the
+    span of the navigation. Their fixes and attitudes take σ from the image nearest in time.
+
+    Args:
+        survey: as recorded.
+        track: its navigation.
+        calibration: estimates of the rig; only `applied` counts.
     """
     values = {estimate.name: np.array(estimate.value) for estimate in calibration.applied}
     starts = {estimate.name: np.array(estimate.start) for estimate in calibration.applied}
@@ -71,7 +76,7 @@ def _bodies(survey: Survey, track: NavigationTrack, time_s: FloatArray) -> Float
     """Return attitudes geo ← body (n, 3, 3) of the track's images at times (n,), NaN where unknown."""
     if len(track.attitude_time_s) > 1:
         return track.attitudes.at(time_s).rotation
-    # Attitudes that came with the photographs, whose boresight nothing has changed.
+    # The attitudes were recorded with the photographs: mount and boresight of `ingest` give those of the body.
     recorded = {image.name: image.attitude.quat_xyzw for image in survey.images if image.attitude}
     unknown = (np.nan,) * 4
     quat = np.array([recorded.get(name, unknown) for name in track.image.tolist()]).reshape(-1, 4)
@@ -82,7 +87,7 @@ def _bodies(survey: Survey, track: NavigationTrack, time_s: FloatArray) -> Float
 
 
 def _far_from_others(center: FloatArray) -> BoolArray:
-    """Return which of the places (n, 3) are blunders; NaN is none."""
+    """Return the mask (n,) of the positions (n, 3) that are blunders; NaN is none."""
     if np.isnan(center).all():
         return np.zeros(len(center), dtype=bool)
     distance_m = np.linalg.norm(center - np.nanmedian(center, axis=0), axis=1)
@@ -111,7 +116,7 @@ def _images(
 
 
 def _filled(values: list[ValueT | None], time_s: FloatArray) -> list[ValueT | None]:
-    """Return the values, with that of the nearest in time where there is none."""
+    """Return the values; None is replaced by the value nearest in time, if there is any."""
     known = np.array([row for row, value in enumerate(values) if value is not None], dtype=np.int64)
     if not len(known):
         return values

@@ -1,4 +1,4 @@
-"""The geographic half of a training, from the products of the stages before it and the options of training."""
+"""Geographic problem of a training, set up from the products of earlier stages and the options of training."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from pipelines.scene.measurements import attitude_term, control_by_depth, contro
 from pipelines.scene.scene import Scene
 from pipelines.scene.survey import Survey
 
-# Fewer control points cannot tell a bias of the fixes from a blunder of their own.
+# With fewer control points, a bias of the fixes cannot be separated from a blunder of a control point.
 _LEAST_CONTROL = 3
 
 
@@ -37,14 +37,19 @@ def geo_problem(
     points: GeolocatedPoints | None = None,
     seed: int = 0,
 ) -> GeoProblem:
-    """The similarity, the cameras and the measurements that hold them, ready to be optimised.
+    """Return the problem of similarity, cameras and constant errors under the survey's measurements.
 
     Args:
-        points: of `geolocate`, for L_rel; None: it takes the cameras and their fixes.
-        seed: of the choice of pairs for L_rel.
+        scene: cameras and points at the start of the training.
+        survey: the measurements.
+        initial: similarity of `init-sim3`.
+        options: which measurements are used, their weights, and the constant errors to estimate.
+        points: of `geolocate`, for L_rel; None: L_rel uses the cameras and their fixes.
+        seed: of the random pairs for L_rel.
 
     Raises:
-        InputError: a constant error is to be estimated of something that was not measured.
+        InputError: a constant error is to be estimated, but its measurements were not recorded; or `points` belongs
+            to another model.
     """
     record = initial.geo_from_local
     pivot = scene.geo_from_model.apply(scene.poses.cam_center_in_model[scene.train]).mean(axis=0)
@@ -68,9 +73,9 @@ def geo_problem(
 
 
 def _corrections(scene: Scene, options: GeographicOptions) -> CameraCorrections:
-    """Cameras and lens that follow the measurements, as far as they may.
+    """Return the corrections that the options allow to cameras and lens.
 
-    Plain mean squares have nothing that holds a lens where the photographs have it: with `paper` it stays.
+    With `paper` the lens stays, because plain mean squares hold no lens to the photographs.
     """
     follows = options.weighting == "whitened"
     basis = None
@@ -82,7 +87,7 @@ def _corrections(scene: Scene, options: GeographicOptions) -> CameraCorrections:
 
 
 def _attitude(scene: Scene, initial: InitialSimilarity) -> RotationPrior | None:
-    """What attitudes said of the rotation geo ← model, where the initial similarity needed them."""
+    """Return the rotation geo ← model of the recorded attitudes, if the initial similarity needed them."""
     if initial.attitude is None:
         return None
     geo_from_local = matrix_from_quat_xyzw(initial.attitude.quat_xyzw)
@@ -91,7 +96,7 @@ def _attitude(scene: Scene, initial: InitialSimilarity) -> RotationPrior | None:
 
 @dataclass(frozen=True)
 class SurveyTerms:
-    """The terms of a survey; None where there is nothing of a kind, or it is not to be used."""
+    """Terms of a survey; None: the survey has no measurement of the kind, or the options exclude it."""
 
     fixes: FixTerm | None = None
     control: ControlTerm | None = None
@@ -101,20 +106,20 @@ class SurveyTerms:
 
     @property
     def present(self) -> tuple[Term, ...]:
-        """Those that there are."""
+        """Terms of the loss and the posterior."""
         every = (self.fixes, self.control, self.distances, self.attitudes)
         return tuple(term for term in every if term is not None)
 
 
 def _leaves_open(terms: SurveyTerms, initial: InitialSimilarity) -> bool:
-    """Whether the observations leave some of the similarity to what was known of it beforehand."""
+    """Return whether the observations leave part of the similarity to its prior."""
     if initial.layout == "line":
         return terms.attitudes is None
     return terms.fixes is None and not _determined_by(terms.control)
 
 
 def _determined_by(control: ControlTerm | None) -> bool:
-    """Whether control points alone fix all seven unknowns of the similarity."""
+    """Return whether the control points alone determine all seven unknowns of the similarity."""
     return control is not None and len(control) >= _LEAST_CONTROL
 
 
@@ -132,7 +137,11 @@ def _terms_of(
 
 
 def _errors(terms: SurveyTerms, options: GeographicOptions) -> SystematicErrors:
-    """The constant errors that are asked for; with `auto` the bias, wherever control points could show it."""
+    """Return the constant errors to estimate; `auto` gives the bias if control points can reveal it.
+
+    Raises:
+        InputError: the measurements that the error belongs to were not recorded.
+    """
     fixes, attitudes, wanted = terms.fixes, terms.attitudes, options.estimated
     if options.estimate == "auto":
         possible = options.weighting == "whitened" and fixes is not None and _determined_by(terms.control)

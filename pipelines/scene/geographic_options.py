@@ -1,4 +1,4 @@
-"""The options of the geographic losses: those of `train`, and of whoever restores what it trained."""
+"""Options of the geographic losses: of `train`, and of the stages that set up its problem again."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ConstantErrors = Annotated[tuple[ConstantError, ...] | Literal["auto"], from_tex
 
 
 class GeographicOptions(StageOptions):
-    """Which measurements hold similarity and cameras, how they are weighted, and what is estimated beside them."""
+    """Options of the geographic losses: measurements in use, their weights, and constant errors to estimate."""
 
     geo_loss: bool = Field(True, description="Use the geographic losses.")
     weighting: Literal["whitened", "paper"] = Field(
@@ -53,7 +53,7 @@ class GeographicOptions(StageOptions):
 
     @property
     def estimated(self) -> tuple[ConstantError, ...]:
-        """The constant errors that are asked for by name."""
+        """Constant errors that `estimate` names; none with `auto`."""
         return tuple(name for name in CONSTANT_ERRORS if self.estimate != "auto" and name in self.estimate)
 
     @field_validator("estimate")

@@ -1,4 +1,4 @@
-"""The product of `geolocate`: SfM points on Earth, each with its covariance."""
+"""Product of `geolocate`: SfM points on Earth, each with its covariance."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ class GeolocatedPoints:
         point_id: (N,) int64, ids in the COLMAP model.
         position_in_geo: (N, 3) float64, metres; NaN where rays did not intersect.
         cov_in_geo: (N, 3, 3) float64, m².
-        ray_count: (N,) int32, rays that were used.
+        ray_count: (N,) int32, rays in use.
         max_angle_deg: (N,) float64, largest angle between two of its rays.
         condition: (N,) float64, condition number of the normal matrix.
         inlier: (N,) bool.
-        rotation_source: where the rays' rotations came from: "recorded" or "sfm".
+        rotation_source: source of the rays' rotations: "recorded" attitudes or "sfm".
     """
 
     point_id: IntArray
@@ -38,15 +38,15 @@ class GeolocatedPoints:
     rotation_source: str
 
     def save(self, path: Path) -> None:
-        """Write as NPZ."""
+        """Write the points as NPZ."""
         save_npz(path, {field.name: getattr(self, field.name) for field in fields(self)})
 
     @classmethod
     def load(cls, path: Path) -> GeolocatedPoints:
-        """Read from NPZ.
+        """Read points from NPZ.
 
         Raises:
-            InputError: not an NPZ file of that form.
+            InputError: the file is no NPZ file with these arrays.
         """
         arrays = load_npz(path, tuple(field.name for field in fields(cls)))
         for name, (kind, shape) in _POINT_ARRAYS.items():

@@ -1,4 +1,4 @@
-"""The product of `init-sim3`: the similarity from the SfM model to the Earth, with its covariance."""
+"""Product of `init-sim3`: the similarity from the SfM model to the Earth, with its covariance."""
 
 from __future__ import annotations
 
@@ -10,14 +10,34 @@ from pipelines.robust.statistics import ResidualStats
 
 
 class AttitudeRecord(Product):
-    """Rotation `to ← from` of a similarity as recorded attitudes have it: covariance in rad² along target axes."""
+    """Rotation geo ← local that the recorded attitudes give.
+
+    Attributes:
+        quat_xyzw: rotation geo ← local.
+        cov_rad2: 3×3 covariance in rad², axes of geo.
+    """
 
     quat_xyzw: Rotation
     cov_rad2: Covariance3
 
 
 class InitialSimilarity(Product):
-    """Product of `init-sim3`: `geo_from_local`, how it was found and how well it is determined."""
+    """Product of `init-sim3`: `geo_from_local`, its estimation and its precision.
+
+    Attributes:
+        format_version: version of the format.
+        geo_from_local: the similarity with its covariance.
+        method: `robust` or `paper`, the option of `init-sim3`; `adjusted` by the bundle adjustment of the baseline.
+        correspondences: number by kind: `gnss` (camera centres with fixes), `gcp` (control points), `points`
+            (geolocated points).
+        inliers: number by kind that agrees with the similarity.
+        gnss_outliers: names of the images whose fixes were rejected.
+        residuals: figures by kind.
+        condition_number: of the normal matrix, with angles and ln s scaled by the size of the layout.
+        layout: extent of the correspondences: they fill a volume, lie in a plane, or on a line.
+        attitude_used: whether recorded attitudes contributed to the rotation.
+        attitude: rotation of the recorded attitudes, if the robust method needed it.
+    """
 
     format_version: Literal[1] = 1
     geo_from_local: SimilarityRecord

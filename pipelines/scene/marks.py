@@ -1,4 +1,4 @@
-"""Image marks of surveyed points as rays: the one place in which a mark becomes a ray, and its σ an angle."""
+"""Image marks of surveyed points as rays. Only here does a mark become a ray, and its σ an angle."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class MarkRays:
         xy_px: (K, 2) pixels of the photograph.
         bearing_in_cam: (K, 3) unit vectors.
         sigma_px: (K,) σ of a mark in pixels.
-        sigma_rad: (K,) the same as an angle: over the mean focal length.
+        sigma_rad: (K,) σ of a mark as an angle: `sigma_px` over the mean focal length.
     """
 
     point_id: tuple[str, ...]
@@ -42,16 +42,20 @@ class MarkRays:
 
     @property
     def xy(self) -> FloatArray:
-        """(K, 2) x/z and y/z in the camera."""
+        """Ratios x/z and y/z (K, 2) of the rays in the camera."""
         return np.asarray(self.bearing_in_cam[:, :2] / self.bearing_in_cam[:, 2:])
 
     @property
     def marks_of_point(self) -> IntArray:
-        """(J,) number of marks of each point, each in another image."""
+        """Number of marks (J,) of each point; no two are in one image."""
         return np.bincount(self.point, minlength=len(self.point_id)).astype(np.int64)
 
     def part(self, chosen: BoolArray | IntArray) -> MarkRays:
-        """Return some of the marks, of the same points."""
+        """Return the chosen marks; the points stay the same.
+
+        Args:
+            chosen: (K,) mask, or indices.
+        """
         return MarkRays(
             self.point_id,
             self.point[chosen],
@@ -63,7 +67,11 @@ class MarkRays:
         )
 
     def of_points(self, chosen: BoolArray) -> MarkRays:
-        """Return the marks of some points (J,), which are numbered anew."""
+        """Return the marks of the chosen points, which are numbered anew.
+
+        Args:
+            chosen: (J,) mask.
+        """
         rays = self.part(chosen[self.point])
         number = np.cumsum(chosen) - 1
         point_id = tuple(name for name, keep in zip(self.point_id, chosen, strict=True) if keep)
@@ -83,12 +91,12 @@ def mark_rays(
 ) -> MarkRays:
     """Return the rays of all marks in registered images.
 
-    Marks where the lens maps no ray to the pixel are left out.
+    A mark is left out if the lens maps no ray to its pixel.
 
     Args:
-        points: J points, whose order is kept.
+        points: J points; their order is kept.
         sparse: cameras and lenses.
-        images: indices of the images to look at; None: all.
+        images: indices of the images in use; None: all.
     """
     index = sparse.image_index()
     wanted = set(range(len(sparse.image_name))) if images is None else set(map(int, images))
@@ -119,12 +127,12 @@ def mark_rays(
 
 @dataclass(frozen=True)
 class RayErrors:
-    """Errors of K rays beside those of their marks.
+    """Errors of K rays, apart from those of their marks.
 
     Attributes:
-        sigma_center: σ of a camera's centre along each axis, in units of its frame.
-        sigma_attitude_rad: σ of its attitude about each axis.
-        sigma_lens_rad: (K,) or one for all, added to the σ of the marks in quadrature.
+        sigma_center: σ of a projection centre along each axis, in units of the cameras' frame.
+        sigma_attitude_rad: σ of a camera's attitude about each axis.
+        sigma_lens_rad: (K,) or scalar; added in quadrature to the σ of the marks.
     """
 
     sigma_center: float
@@ -135,16 +143,16 @@ class RayErrors:
 def intersect_marks(
     rays: MarkRays, cam_from_frame: FloatArray, center_in_frame: FloatArray, errors: RayErrors
 ) -> Intersections:
-    """Intersect the rays of each point (J), in the frame of the cameras.
+    """Intersect the rays of each of the J points, in the frame of the cameras.
 
     Args:
-        rays: of the marks.
+        rays: rays of the marks.
         cam_from_frame: (n, 3, 3) rotations of all images.
         center_in_frame: (n, 3) projection centres of all images.
         errors: of cameras and lenses.
     """
     count = len(rays)
-    # A view for each mark: marks of one image may have different σ.
+    # One view for each mark, because marks of one image may have different σ.
     views = UncertainCameras(
         center_in_geo=center_in_frame[rays.camera],
         rotation_geo_from_cam=np.swapaxes(cam_from_frame[rays.camera], 1, 2),

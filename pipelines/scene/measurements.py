@@ -1,4 +1,4 @@
-"""What a survey measured of a scene, as the geographic losses take it: training images only."""
+"""Terms of the geographic losses, built from the survey's measurements of the training images."""
 
 from __future__ import annotations
 
@@ -18,18 +18,21 @@ from pipelines.scene.observations import recorded_rotations
 from pipelines.scene.scene import Scene
 from pipelines.scene.survey import Survey
 
-# Between the times of two consecutive fixes: longer, and the receiver may have started anew.
+# Gap between two consecutive fixes beyond which the receiver may have restarted.
 FLIGHT_GAP_S = 600.0
-# Of the rendered surface at a mark, as a part of its distance: 12 cm at 60 m.
+# σ of the rendered surface at a mark, as a fraction of its distance: 12 cm at 60 m.
 SURFACE_SIGMA = 2e-3
-_WORTH = 0.1  # of the fixes' information on the scale, that distances between points repeat
+_WORTH = 0.1  # share of the fixes' information on the scale that the distances may repeat
 _PAIRS = 300
-# Candidates for each pair that is taken: the longest are, since short ones say little of the scale.
+# Candidates drawn for each pair in use. The longest are used, because short pairs hardly constrain the scale.
 _DRAWN = 3
 
 
 def fix_term(scene: Scene, survey: Survey) -> FixTerm | None:
-    """Fixes of the training cameras; those of test cameras stay unused, as their photographs do."""
+    """Return the fixes of the training cameras, or None if there are fewer than three.
+
+    The fixes of test cameras stay unused, like their photographs.
+    """
     images = [(int(index), survey.image(scene.sparse.image_name[index])) for index in scene.train]
     fixed = [(index, image, image.fix) for index, image in images if image is not None and image.fix is not None]
     if len(fixed) < 3:
@@ -44,7 +47,10 @@ def fix_term(scene: Scene, survey: Survey) -> FixTerm | None:
 
 
 def flights(times_s: list[float | None]) -> np.ndarray:
-    """The flight (F,) of each fix, from 0 in the order of time; all in one where a time is missing."""
+    """Return the flight (F,) of each fix, counted from 0 in the order of time.
+
+    A gap of more than `FLIGHT_GAP_S` begins a new flight. Without the time of every fix, all belong to one flight.
+    """
     if any(time is None for time in times_s):
         return np.zeros(len(times_s), dtype=np.int64)
     times = np.array(times_s, dtype=np.float64)
@@ -55,7 +61,7 @@ def flights(times_s: list[float | None]) -> np.ndarray:
 
 
 def control_term(scene: Scene, survey: Survey) -> ControlTerm | None:
-    """Marks of the control points in training images, where a point is seen in two or more of them."""
+    """Return the control points with marks in two or more training images, or None if there is none."""
     rays = mark_rays(survey.control_points, scene.sparse, scene.train)
     marked = rays.marks_of_point >= 2
     if not marked.any():
@@ -77,10 +83,15 @@ def control_term(scene: Scene, survey: Survey) -> ControlTerm | None:
 
 
 def control_by_depth(scene: Scene, survey: Survey, marks: ControlTerm) -> tuple[ControlByDepth, ControlTerm]:
-    """The marks for projection onto the rendered surface, and the control points with the surface's σ added.
+    """Return the marks for projection onto the rendered surface, and the control points with the surface's σ added.
 
-    The surface is taken to be off by `SURFACE_SIGMA` of the distance, in any direction, the same for all marks of a
-    point: they look at one piece of it.
+    The surface's error has a σ of `SURFACE_SIGMA` times the distance, along each axis. All marks of a point share
+    this error, because they show one piece of the surface.
+
+    Args:
+        scene: cameras at the start of the training.
+        survey: has the control points.
+        marks: of `control_term`.
     """
     order = torch.argsort(marks.camera, stable=True)
     point, camera = marks.point[order], marks.camera[order]
@@ -110,7 +121,13 @@ def control_by_depth(scene: Scene, survey: Survey, marks: ControlTerm) -> tuple[
 
 
 def _slopes(bearing: Tensor, by_lens: Tensor | None, order: Tensor) -> Tensor | None:
-    """Derivatives (K, 2, L) of x/z and y/z of bearings (K, 3), from those of the bearings in another order."""
+    """Return the derivatives (K, 2, L) of x/z and y/z by the lens.
+
+    Args:
+        bearing: (K, 3), already in `order`.
+        by_lens: (K, 3, L) derivatives of the bearings, not yet in `order`.
+        order: (K,) permutation.
+    """
     if by_lens is None:
         return None
     by_lens, z = by_lens[order], bearing[:, 2:, None]
@@ -118,7 +135,7 @@ def _slopes(bearing: Tensor, by_lens: Tensor | None, order: Tensor) -> Tensor | 
 
 
 def attitude_term(scene: Scene, survey: Survey) -> AttitudeTerm | None:
-    """Recorded rotations of the training cameras, as far as the SfM model bears them out."""
+    """Return the recorded rotations of the training cameras that the SfM model does not contradict, or None."""
     recorded = recorded_rotations(survey, scene.sparse)
     mine = np.isin(recorded.image, scene.train)
     if not mine.any():
@@ -131,12 +148,19 @@ def attitude_term(scene: Scene, survey: Survey) -> AttitudeTerm | None:
 
 
 def distance_term(scene: Scene, fixes: FixTerm, points: GeolocatedPoints | None, seed: int) -> DistanceTerm | None:
-    """Some hundred long distances across the scene: between located points, else between cameras with fixes.
+    """Return 300 long distances across the scene: between located points, else between cameras with fixes.
 
-    What they are worth is limited to a tenth of what the fixes say of the scale (`scale_share`).
+    Their information on the scale is limited to a tenth of that of the fixes (`scale_share`). None: that share is
+    zero.
+
+    Args:
+        scene: cameras and points at the start of the training.
+        fixes: of the training cameras.
+        points: of `geolocate`; None: take the cameras.
+        seed: of the random pairs.
 
     Raises:
-        InputError: `points` does not belong to the scene.
+        InputError: `points` belongs to another model.
     """
     distances = _pairs_of_points(scene, points, seed) if points is not None else None
     distances = _pairs_of_cameras(scene, fixes, seed) if distances is None else distances
@@ -146,11 +170,11 @@ def distance_term(scene: Scene, fixes: FixTerm, points: GeolocatedPoints | None,
 
 
 def scale_share(information_of_fixes: float, information_of_pairs: float) -> float:
-    """Return the share of each pair, so that all together say at most a tenth of what the fixes do of the scale.
+    """Return the share of each pair that limits their information on the scale to a tenth of that of the fixes.
 
-    Located points are functions of the same few fixes (`georef.alignment`), and carry the lens's errors besides:
-    counted as independent, some hundred of them would claim to know the scale many times better than the fixes from
-    which they were made. Being nothing new, they shall steady the scale and not decide it.
+    Located points are functions of the same few fixes (`georef.alignment`), and contain the lens's errors as well.
+    Counted as independent measurements, hundreds of pairs would claim a σ of the scale many times below that of the
+    fixes. They add no information of their own: their purpose is to steady the scale, not to decide it.
 
     Args:
         information_of_fixes: Σ |W (C_i − C̄)|², of ln s.
@@ -185,7 +209,7 @@ def _pairs_of_cameras(scene: Scene, fixes: FixTerm, seed: int) -> DistanceTerm:
 
 
 def _long_pairs(place: FloatArray, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rows (P,), (P,) of points (n, 3): the longest third of randomly drawn pairs."""
+    """Return the row numbers (P,), (P,) of pairs of points (n, 3): the longest third of randomly drawn pairs."""
     rng = np.random.default_rng(seed)
     first = rng.integers(0, len(place), _DRAWN * _PAIRS)
     second = (first + rng.integers(1, len(place), len(first))) % len(place)
@@ -195,7 +219,7 @@ def _long_pairs(place: FloatArray, seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _measured_distance(apart: FloatArray, covariance: FloatArray) -> tuple[Tensor, Tensor]:
-    """Lengths (P,) of differences (P, 3), and 1/σ (P, 1, 1) of them."""
+    """Return the lengths (P,) of differences (P, 3), and their 1/σ (P, 1, 1)."""
     distance = np.linalg.norm(apart, axis=1)
     along = apart / distance[:, None]
     variance = np.einsum("pi,pij,pj->p", along, covariance, along)
@@ -203,7 +227,7 @@ def _measured_distance(apart: FloatArray, covariance: FloatArray) -> tuple[Tenso
 
 
 def _scale_information(fixes: FixTerm) -> float:
-    """What the fixes say of ln s: Σ |W (C − C̄)|² about their weighted mean."""
+    """Return the information of the fixes on ln s: Σ |W (C − C̄)|² about their weighted mean."""
     root = fixes.root_information
     information = root.transpose(1, 2) @ root
     weight = information.diagonal(dim1=1, dim2=2).sum(dim=1)
@@ -216,7 +240,7 @@ def _with_covariance(marks: ControlTerm, covariance: FloatArray) -> ControlTerm:
 
 
 def _mark_covariance(scene: Scene, marks: ControlTerm) -> FloatArray:
-    """Covariance (J, 3, 3) that the marks' own σ leaves in each intersected point."""
+    """Return the covariance (J, 3, 3) of each intersected point that the σ of its marks causes."""
     poses, position = scene.poses, marks.position_in_geo.numpy()
     camera, point = marks.camera.numpy(), marks.point.numpy()
     center = scene.geo_from_model.apply(poses.cam_center_in_model[camera])
@@ -230,5 +254,5 @@ def _mark_covariance(scene: Scene, marks: ControlTerm) -> FloatArray:
 
 
 def root_information(covariance: FloatArray) -> FloatArray:
-    """W (N, 3, 3) with WᵀW = Σ⁻¹."""
+    """Return W (N, 3, 3) with WᵀW = Σ⁻¹, from covariances Σ (N, 3, 3)."""
     return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))

@@ -1,4 +1,4 @@
-"""The navigation as recorded, and how the cameras sit in it."""
+"""Navigation as recorded, with the times and the rig of the photographs."""
 
 from __future__ import annotations
 
@@ -21,10 +21,11 @@ from pipelines.scene.rig import RigParameter
 
 @dataclass(frozen=True)
 class NavigationTrack:
-    """Product of `ingest` beside the survey: the navigation as recorded, and how n cameras sit in it.
+    """Second product of `ingest`: the navigation as recorded, with the times and the rig of n photographs.
 
-    `calibrate` fits the SfM cameras to it. Positions are the antenna's, attitudes the body's (forward-right-down),
-    both on the navigation's clock; nothing of the rig is applied to them. The rig is as `ingest` was told.
+    `calibrate` fits the SfM cameras to this navigation. Positions are those of the antenna, attitudes those of the
+    body (forward-right-down), both on the navigation's clock, without any correction by the rig. The rig is the one
+    given to `ingest`.
 
     Attributes:
         position_time_s: (K,) float64, seconds.
@@ -39,7 +40,7 @@ class NavigationTrack:
         nominal_from_cam: (3, 3) float64, boresight.
         time_offset_s: () float64, navigation clock minus camera clock.
         max_gap_s: () float64, longest gap to interpolate over.
-        body_known: () bool; where not, the camera's nominal axes stand for the body's.
+        body_known: () bool; if false, the body's axes are set to the camera's nominal axes.
     """
 
     position_time_s: FloatArray
@@ -58,7 +59,7 @@ class NavigationTrack:
 
     @property
     def positions(self) -> Trajectory:
-        """The antenna in geo, on the navigation's clock."""
+        """Trajectory of the antenna in geo, on the navigation's clock."""
         return Trajectory.from_samples(
             self.position_time_s,
             position=self.antenna_in_geo,
@@ -68,26 +69,26 @@ class NavigationTrack:
 
     @property
     def attitudes(self) -> Trajectory:
-        """The body in geo, on the navigation's clock."""
+        """Rotations of the body in geo, on the navigation's clock."""
         return Trajectory.from_samples(
             self.attitude_time_s, rotation=self.geo_from_body, max_gap_s=float(self.max_gap_s)
         )
 
     @property
     def rig(self) -> Rig:
-        """The rig of the n images as `ingest` was told."""
+        """Rig of the n images, as given to `ingest`."""
         return Rig(self.cam_from_body, self.antenna_in_body, self.nominal_from_cam)
 
     def save(self, path: Path) -> None:
-        """Write as NPZ."""
+        """Write the navigation as NPZ."""
         save_npz(path, {field.name: getattr(self, field.name) for field in fields(self)})
 
     @classmethod
     def load(cls, path: Path) -> NavigationTrack:
-        """Read from NPZ.
+        """Read the navigation from NPZ.
 
         Raises:
-            InputError: not an NPZ file of that form.
+            InputError: the file is no NPZ file with these arrays.
         """
         return cls(**load_npz(path, tuple(field.name for field in fields(cls))))
 
@@ -96,7 +97,7 @@ def load_track(workspace: Workspace) -> NavigationTrack:
     """Return the navigation of a workspace's survey.
 
     Raises:
-        InputError: it was not recorded by time, or the file is damaged.
+        InputError: the navigation was not recorded by time, or the file is damaged.
     """
     try:
         path = workspace.path(TRACK)
@@ -110,15 +111,16 @@ def load_track(workspace: Workspace) -> NavigationTrack:
 
 
 def require_estimable(track: NavigationTrack | None, wanted: Sequence[RigParameter], field: str) -> None:
-    """Refuse to estimate parameters of the rig without the navigation for it.
+    """Refuse parameters of the rig that the navigation cannot determine.
 
     Args:
-        track: the navigation, None where it was not recorded by time.
-        wanted: the parameters.
-        field: the option that asks for them.
+        track: the navigation; None: not recorded by time.
+        wanted: parameters to be estimated.
+        field: option that names them.
 
     Raises:
-        InputError: navigation that was not recorded by time, no attitudes, no mount.
+        InputError: the navigation was not recorded by time; or attitudes, the body's axes or the mount are needed
+            and unknown.
     """
     if track is None or len(track.position_time_s) < 2:
         raise InputError(

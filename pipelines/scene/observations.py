@@ -1,4 +1,4 @@
-"""What a survey measured of an SfM model, as arrays: fixes, control points, attitudes and rays."""
+"""Observations of an SfM model as arrays: fixes, control points, attitudes and rays."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from pipelines.scene.marks import MarkRays, RayErrors, intersect_marks, mark_ray
 from pipelines.scene.survey import Survey
 
 _CONTRADICTION_SIGMAS = 6.0
-_CONTRADICTION_RAD = np.radians(15.0)  # never less: σ of an attitude are often optimistic
-_TINY = 1e-9  # stands for "exact" where a covariance must be regular
+_CONTRADICTION_RAD = np.radians(15.0)  # lower limit, because the σ of attitudes are often optimistic
+_TINY = 1e-9  # σ of exact values, where a covariance must be regular
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class RecordedRotations:
         image: (k,) index into the model's images.
         geo_from_cam: (k, 3, 3).
         sigma_rad: (k,) per axis.
-        contradicting: names of further images, whose attitudes the SfM model contradicts.
+        contradicting: names of further images whose attitudes contradict the SfM model.
     """
 
     image: IntArray
@@ -38,9 +38,10 @@ class RecordedRotations:
 
 
 def fix_correspondences(survey: Survey, model: SparseModel) -> Correspondences:
-    """Camera centres of registered images against their fixes.
+    """Return the camera centres of registered images with their fixes.
 
-    SfM's own error of a centre is not known here (zero covariance): the adjustment measures it as excess scatter.
+    SfM's own error of a centre is not known at this point (zero covariance). The adjustment measures it as excess
+    scatter.
     """
     fixes = {image.name: image.fix for image in survey.images if image.fix is not None}
     fixed = [(index, name) for index, name in enumerate(model.image_name) if name in fixes]
@@ -55,10 +56,10 @@ def fix_correspondences(survey: Survey, model: SparseModel) -> Correspondences:
 
 
 def control_correspondences(survey: Survey, model: SparseModel) -> tuple[Correspondences, tuple[str, ...]]:
-    """Control points intersected in local from their marks, against their survey; and warnings.
+    """Return the control points, intersected in local from their marks, with their survey; and warnings.
 
-    Points that their marks do not determine are left out, with a warning each. The covariance is that of the marks
-    alone: the model's own error is not known here, the adjustment measures it as excess scatter.
+    A point that its marks do not determine is left out with a warning. The covariance in local is that of the marks
+    alone. The model's own error is not known at this point: the adjustment measures it as excess scatter.
     """
     points = survey.control_points
     rays = mark_rays(points, model)
@@ -87,8 +88,8 @@ def control_correspondences(survey: Survey, model: SparseModel) -> tuple[Corresp
 
 
 def _intersect_in_local(model: SparseModel, rays: MarkRays) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Position (J, 3), covariance (J, 3, 3) and success (J,) of points in local from their marks."""
-    # Whether marks agree is judged with the model's own error added, as a lens is never modelled to 0.1 px.
+    """Return the position (J, 3), covariance (J, 3, 3) and success (J,) of points in local from their marks."""
+    # The test of the marks' agreement includes the model's own error, because no lens is modelled to 0.1 px.
     own_px = float(np.nanmedian(model.point_error_px)) if np.isfinite(model.point_error_px).any() else 0.0
     own_rad = own_px * rays.sigma_rad / rays.sigma_px
     center = model.cam_center_in_local
@@ -102,10 +103,10 @@ def _intersect_in_local(model: SparseModel, rays: MarkRays) -> tuple[FloatArray,
 
 
 def recorded_rotations(survey: Survey, model: SparseModel) -> RecordedRotations:
-    """Attitudes of the registered images that have one, as far as the SfM model bears them out.
+    """Return the recorded attitudes of the registered images, without those that the SfM model contradicts.
 
-    A photograph that was turned in an image viewer keeps the attitude that the drone wrote: it contradicts the
-    others by far more than its σ.
+    For example, a photograph that was turned in an image viewer keeps the attitude that the drone wrote. That
+    attitude differs from the others by far more than its σ.
     """
     attitudes = {image.name: image.attitude for image in survey.images if image.attitude is not None}
     image = np.array([index for index, name in enumerate(model.image_name) if name in attitudes], dtype=np.int64)
@@ -127,7 +128,7 @@ def recorded_rotations(survey: Survey, model: SparseModel) -> RecordedRotations:
 
 
 def attitude_prior(survey: Survey, model: SparseModel) -> RotationPrior | None:
-    """Rotation geo ← local that the recorded attitudes say, or None without any."""
+    """Return the mean rotation geo ← local of the recorded attitudes, or None without any."""
     recorded = recorded_rotations(survey, model)
     if len(recorded.image) == 0:
         return None
@@ -136,7 +137,7 @@ def attitude_prior(survey: Survey, model: SparseModel) -> RotationPrior | None:
 
 
 def observation_rays(model: SparseModel) -> FloatArray:
-    """Undistorted x/z and y/z (M, 2) of all observations; NaN where the lens model maps no ray."""
+    """Return undistorted x/z and y/z (M, 2) of all observations; NaN where the lens model maps no ray."""
     xy = np.empty_like(model.obs_xy_px)
     camera_id = model.image_camera_id[model.obs_image]
     for camera in np.unique(camera_id):

@@ -1,4 +1,4 @@
-"""Undistorted photographs at training size, cached as plain arrays on disk and mapped into memory on use."""
+"""Undistorted photographs at training size, cached as plain arrays on disk and mapped into memory."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from pipelines.geometry.cameras import Camera, Pinhole, distort, undistort
 
 log = logging.getLogger(__name__)
 
-# A pixel that needs light from beyond the photograph's edge is not compared.
+# Width of the edge that the mask leaves out: interpolation there needs pixels from beyond the photograph.
 _EDGE_PX = 0.5
 _SAME_RAY = 1e-6  # of normalised coordinates
 
 
 @dataclass(frozen=True)
 class Photograph:
-    """A photograph to undistort: its name, file, and camera at full size."""
+    """Photograph to undistort: its name, its file, and its camera at full size."""
 
     name: str
     file: Path
@@ -34,9 +34,9 @@ class Photograph:
 
 
 def pinhole_of(camera: Camera, max_size_px: int) -> Pinhole:
-    """The pinhole camera of the same view at a size of at most `max_size_px` along the longer side.
+    """Return the pinhole camera of the same view, its longer side limited to `max_size_px`.
 
-    The focal length is kept; distortion parameters are dropped.
+    The focal length is scaled with the size. Distortion parameters are dropped.
     """
     return Pinhole(camera.width, camera.height, *_focal_and_centre(camera)).limited(max_size_px)
 
@@ -48,15 +48,15 @@ def _focal_and_centre(camera: Camera) -> tuple[float, float, float, float]:
 
 
 class ImageCache:
-    """Undistorted images on disk: uint8 RGB arrays, made once, mapped when asked for.
+    """Undistorted images on disk: uint8 RGB arrays, made once and mapped into memory on access.
 
-    Memory does not grow with their number: of the distortion maps only the last is kept, and masks, one a camera,
-    lie on disk beside the images.
+    Memory does not grow with their number. Only the last distortion map stays in memory; the masks, one for each
+    camera, are stored beside the images.
 
     Args:
-        folder: where the arrays are kept.
-        photographs: what to undistort.
-        max_size_px: longest side.
+        folder: folder of the arrays.
+        photographs: photographs to undistort, in the order of the indices.
+        max_size_px: limit of the longer side.
     """
 
     def __init__(self, folder: Path, photographs: list[Photograph], max_size_px: int) -> None:
@@ -69,11 +69,11 @@ class ImageCache:
         return len(self._photographs)
 
     def pinhole(self, index: int) -> Pinhole:
-        """Camera of an undistorted image."""
+        """Return the camera of an undistorted image."""
         return pinhole_of(self._photographs[index].camera, self.max_size_px)
 
     def build(self, progress: Progress = SILENT) -> None:
-        """Make what is not there yet.
+        """Make all images that are not yet in the cache.
 
         Raises:
             InputError: a photograph cannot be read, or has another size than its camera.
@@ -85,23 +85,23 @@ class ImageCache:
                 task.advance()
 
     def image(self, index: int) -> ByteArray:
-        """RGB of an image: (H, W, 3), mapped from disk; made if it is not there or not whole.
+        """Return the RGB values (H, W, 3) of an image, mapped from disk; a missing or damaged file is made again.
 
         Raises:
-            InputError: as `build`.
+            InputError: the photograph cannot be read, or has another size than its camera.
         """
         path = self._path(index)
         if not path.exists():
             self._write(index)
         try:
             return self._open(path)
-        except (ValueError, EOFError):  # cut off, by a full disk or a power failure
+        except (ValueError, EOFError):  # truncated by a full disk or a power failure
             log.warning("%s is damaged and made again", path)
             self._write(index)
             return self._open(path)
 
     def mask(self, index: int) -> BoolArray:
-        """Pixels that the photograph covers: (H, W), mapped from disk."""
+        """Return the mask (H, W) of the pixels that the photograph covers, mapped from disk."""
         path = self._folder / f"{self.mask_key(index)}.mask.npy"
         if not path.exists():
             save_array(path, self._map(index)[1])
@@ -109,7 +109,7 @@ class ImageCache:
         return array
 
     def mask_key(self, index: int) -> str:
-        """The same for photographs of the same camera, whose masks are the same."""
+        """Return the key of an image's mask, which all photographs of one camera share."""
         camera = self._photographs[index].camera
         key = f"{camera.model}|{camera.width}x{camera.height}|{camera.params.tobytes().hex()}|{self.max_size_px}"
         return hashlib.sha256(key.encode()).hexdigest()[:32]
@@ -123,10 +123,10 @@ class ImageCache:
         return self._folder / f"{self.key(index)}.npy"
 
     def key(self, index: int) -> str:
-        """Changes with all that an undistorted image depends on.
+        """Return the key of an undistorted image: a hash of file name, size and time, camera and limit.
 
         Raises:
-            InputError: the photograph is gone.
+            InputError: the photograph does not exist.
         """
         photograph = self._photographs[index]
         try:
@@ -143,7 +143,7 @@ class ImageCache:
 
     def _write(self, index: int) -> None:
         photograph, pinhole = self._photographs[index], self.pinhole(index)
-        # COLMAP does not turn images by their EXIF orientation, so neither do we.
+        # COLMAP ignores the EXIF orientation of images, and so must this cache.
         full = cv2.imread(str(photograph.file), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
         if full is None:
             raise InputError("the photograph cannot be read", path=photograph.file)
@@ -159,7 +159,7 @@ class ImageCache:
         save_array(self._path(index), np.ascontiguousarray(flat[..., ::-1]))
 
     def _map(self, index: int) -> tuple[Float32Array, BoolArray]:
-        """Where each undistorted pixel lies in the shrunken photograph, and whether it lies inside."""
+        """Return the place (H, W, 2) of each undistorted pixel in the shrunken photograph, and the mask (H, W)."""
         key = self.mask_key(index)
         if self._last_map is None or self._last_map[0] != key:
             self._last_map = (key, *_distortion_map(self._photographs[index].camera, self.pinhole(index)))
@@ -167,7 +167,7 @@ class ImageCache:
 
 
 def save_array(path: Path, array: NDArray[Any]) -> None:
-    """Write an array; it appears whole or not at all."""
+    """Write an array to a temporary file, and rename that: the file at `path` is always complete."""
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_suffix(".tmp")
     with draft.open("wb") as handle:
@@ -179,13 +179,13 @@ def _distortion_map(camera: Camera, pinhole: Pinhole) -> tuple[Float32Array, Boo
     u, v = np.meshgrid(np.arange(pinhole.width) + 0.5, np.arange(pinhole.height) + 0.5)
     ray = np.stack([(u - pinhole.cx) / pinhole.fx, (v - pinhole.cy) / pinhole.fy], axis=-1)
     full = distort(camera, ray)
-    # Beyond its fold a lens polynomial leads back into the picture, to a place that another ray shows.
+    # Beyond its fold a lens polynomial leads back into the picture, to the pixel of another ray.
     with np.errstate(invalid="ignore"):
         own = (np.abs(undistort(camera, full) - ray) < _SAME_RAY).all(axis=-1)
     size = np.array([pinhole.width / camera.width, pinhole.height / camera.height])
     small = full * size
     limit = np.array([pinhole.width, pinhole.height]) - _EDGE_PX
     inside = own & ((small >= _EDGE_PX) & (small <= limit)).all(axis=-1)
-    # cv2 counts from the centre of the first pixel, and takes long to reflect what lies far outside.
+    # cv2 counts from the centre of the first pixel, and is slow to reflect pixels far outside.
     source = np.clip(np.nan_to_num(small - 0.5), -limit, 2 * limit)
     return source.astype(np.float32), inside

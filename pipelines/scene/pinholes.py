@@ -1,4 +1,4 @@
-"""The cameras of the undistorted photographs, with the lens as it has become."""
+"""Cameras of the undistorted photographs under a lens that has changed since."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ from pipelines.scene.photographs import ImageCache
 
 
 class Pinholes:
-    """By image, the pinhole that maps a photograph's true rays to where the undistorted photograph shows them.
+    """Pinhole of each image, which maps the rays of the present lens to pixels of the undistorted photograph.
 
-    Photographs are undistorted once, with SfM's lens. Another lens is another pinhole (`geometry.lens`).
+    Photographs are undistorted once, with SfM's lens. A change of the lens is expressed as another pinhole
+    (`geometry.lens`).
 
     Args:
         images: the undistorted photographs.
-        sfm: the lenses that they were undistorted with; None: these stay.
+        sfm: the lenses with which they were undistorted; None: the lenses never change.
     """
 
     def __init__(self, images: ImageCache, sfm: Lenses | None = None) -> None:
@@ -22,15 +23,15 @@ class Pinholes:
         self._fitted: dict[int, Pinhole] = {}
 
     def renew(self, now: Lenses) -> None:
-        """Take over other lenses of the same images."""
+        """Set the present lenses of the images."""
         self._now = now
         self._fitted.clear()
 
     def of(self, index: int) -> Pinhole:
-        """Camera of an image, at the size of the undistorted photographs."""
+        """Return the camera of an image, at the size of the undistorted photographs."""
         if self._sfm is None or self._now is None:
             return self._images.pinhole(index)
-        key = int(self._sfm.camera_id[index])  # photographs of one camera have one pinhole
+        key = int(self._sfm.camera_id[index])  # Photographs of one camera share a pinhole.
         if key not in self._fitted:
             before, after = self._sfm.of(index), self._now.of(index)
             self._fitted[key] = refit_pinhole(self._images.pinhole(index), before, after)

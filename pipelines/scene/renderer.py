@@ -1,4 +1,4 @@
-"""Renders of the trained model from its own cameras."""
+"""Rendering of the trained model from its own cameras."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings, Render
 
 
 class ModelRenderer:
-    """Renders the trained model from its own cameras, at the size of the training photographs.
+    """Renderer of the trained model from its own cameras, at the size of the training photographs.
 
     Args:
-        trained: the model.
-        images: its undistorted photographs.
+        trained: the trained model.
+        images: undistorted photographs of the same cameras.
         backend: the rasteriser.
     """
 
@@ -30,11 +30,16 @@ class ModelRenderer:
         self._gaussians = trained.gaussians.to(device)
 
     def pinhole(self, index: int) -> Pinhole:
-        """Return camera `index` at the size of its render."""
+        """Return the pinhole of camera `index`, at the size of its render."""
         return self._pinholes.of(index)
 
     def render(self, index: int, *, depth: bool = False) -> Render:
-        """Render the view of camera `index` without gradients."""
+        """Return the render of camera `index`, without gradients.
+
+        Args:
+            index: of the camera.
+            depth: render depths as well.
+        """
         model, poses = self.trained.model, self.trained.poses
         matrix = np.eye(4)
         matrix[:3, :3] = poses.cam_from_model[index]
@@ -45,7 +50,7 @@ class ModelRenderer:
             return self._backend.render(self._gaussians, cam_from_model, self.pinhole(index), settings)
 
     def depth_m(self, index: int) -> FloatArray:
-        """Return the depth (H, W) of the surface along the z axis of camera `index`; 0 where there is none."""
+        """Return the depth (H, W) in metres of the surface along the z axis of camera `index`; 0: no surface."""
         view = self.render(index, depth=True)
         assert view.median_depth is not None and view.expected_depth is not None
         assert view.depth_variance is not None  # of every render with depth

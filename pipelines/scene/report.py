@@ -1,7 +1,7 @@
-"""The product of `evaluate`: how good a trained survey is, as `evaluate/report.json` states it.
+"""Product of `evaluate`: quality and accuracy of a trained survey, stored as `evaluate/report.json`.
 
-Lengths are metres, axes those of `geo` (east, north, up), errors measured minus surveyed. docs/formats.md explains
-the fields to people. None stands for a figure that does not exist, such as a mean over no points.
+Lengths are metres, axes those of `geo` (east, north, up). An error is the measured minus the surveyed position. A
+figure that does not exist, such as a mean over no points, is None. docs/formats.md explains every field.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pipelines.robust.statistics import ResidualStats
 
 
 class _OptionalKeys(Product):
-    """Base of parts with optional keys: a field with the default None is written only where it has a value."""
+    """Base of parts with optional keys: a field with the default None is written only if it has a value."""
 
     @model_serializer(mode="wrap")
     def _existing_keys(self, serialise: SerializerFunctionWrapHandler) -> dict[str, Any]:
@@ -38,10 +38,16 @@ class ViewFigures(Product):
 
 
 class PhotometricFigures(_OptionalKeys):
-    """Means over the test views, and each view.
+    """Photometric figures of all test views: means, and the figures of each view.
 
-    `psnr_compensated` comes after an affine change of colour that is fitted to the photograph itself.
-    `lpips_reason` says why there is no LPIPS.
+    Attributes:
+        views: number of test views.
+        psnr: dB.
+        psnr_compensated: dB, after an affine change of colour that is fitted to each photograph.
+        ssim: structural similarity.
+        lpips: perceptual distance; None without weights of the network.
+        lpips_reason: reason why there is no LPIPS.
+        per_view: figures of each view.
     """
 
     views: int
@@ -60,7 +66,7 @@ class Photometric(Product):
 
 
 class ErrorStats(Product):
-    """Figures of errors. `mean_e_m`, `mean_n_m`, `mean_u_m` are signed (the bias), all others are lengths."""
+    """Figures of errors; `mean_e_m`, `mean_n_m`, `mean_u_m` are signed (the bias), all others are lengths."""
 
     count: int
     mean_e_m: float | None
@@ -86,13 +92,21 @@ class Rmse(Product):
 
 
 class TotalRmse(Rmse):
-    """The same, and both together."""
+    """Horizontal, vertical and three-dimensional root mean square."""
 
     rmse_3d_m: float
 
 
 class AsprsStatement(Product):
-    """The accuracy classes of ASPRS, 2nd edition, and a sentence to quote; None without check points."""
+    """Accuracy classes of the ASPRS standard, 2nd edition.
+
+    Attributes:
+        horizontal_class, vertical_class: smallest classes of whole centimetres that the errors meet ("5 cm"); None
+            without check points.
+        least_points: number of check points that the standard demands.
+        enough_points: whether there are that many.
+        statement: sentence to quote; None without check points.
+    """
 
     horizontal_class: str | None
     vertical_class: str | None
@@ -102,7 +116,7 @@ class AsprsStatement(Product):
 
 
 class ByAxis(Product):
-    """A figure for each axis."""
+    """Figure by axis: east, north, up."""
 
     e: float | None
     n: float | None
@@ -110,7 +124,7 @@ class ByAxis(Product):
 
 
 class RmsSigma(Product):
-    """Root mean square over `count` points of σ, horizontal and vertical."""
+    """Root mean square of σ over `count` points, horizontal and vertical."""
 
     count: int
     rms_h_m: float | None
@@ -118,13 +132,23 @@ class RmsSigma(Product):
 
 
 class PredictedSigma(RmsSigma):
-    """Predicted σ, and the mean of error² / (predicted + survey variance): 1 if both are true."""
+    """Predicted σ, and its test against the errors.
+
+    Attributes:
+        normalised_error_squared: mean of error² / (predicted + survey variance); 1 if both variances are true.
+    """
 
     normalised_error_squared: ByAxis
 
 
 class PointResidual(Product):
-    """A surveyed point: its number of rays, and its error, None where it was not measured."""
+    """Error of a surveyed point.
+
+    Attributes:
+        name: as in the survey.
+        rays: number of marks in registered images.
+        de_m, dn_m, du_m: error; None: not measured.
+    """
 
     name: str
     rays: int
@@ -134,13 +158,21 @@ class PointResidual(Product):
 
 
 class PointError(PointResidual):
-    """A point that entered no solution. `blunder`: beyond three times the class that the other points meet."""
+    """Error of a point that entered no solution.
+
+    Attributes:
+        blunder: whether the error exceeds three times the class that the other points meet.
+    """
 
     blunder: bool
 
 
 class PredictedPointError(PointError):
-    """The same with its predicted σ, None where the rays do not determine the point."""
+    """Error of a point that entered no solution, with its predicted σ.
+
+    Attributes:
+        sigma_e_m, sigma_n_m, sigma_u_m: None: the rays do not determine the point.
+    """
 
     sigma_e_m: float | None
     sigma_n_m: float | None
@@ -151,14 +183,28 @@ PointRows = tuple[PredictedPointError | PointError, ...]
 
 
 class StatedErrors(ErrorStats):
-    """Errors, the points' own survey, and both in quadrature (`with_survey`)."""
+    """Figures of errors, with those of the survey.
+
+    Attributes:
+        survey: σ of the points' own survey.
+        with_survey: errors and survey in quadrature.
+    """
 
     survey: Rmse | None
     with_survey: TotalRmse | None
 
 
 class CheckPointErrors(StatedErrors):
-    """Check points measured in one way: statement, prediction, Cramér–Rao bound, a row a point."""
+    """Errors of the check points, measured in one way.
+
+    Attributes:
+        asprs: accuracy classes.
+        without_blunders: figures without the blunders; None: there are none.
+        blunders: names of the points that are blunders.
+        predicted: predicted σ; None where no prediction exists.
+        cramer_rao: lower bound of σ for any unbiased estimate.
+        points: one row for each point.
+    """
 
     asprs: AsprsStatement
     without_blunders: ErrorStats | None
@@ -169,14 +215,22 @@ class CheckPointErrors(StatedErrors):
 
 
 class CheckPoints(Product):
-    """The check points by camera (rays of their marks) and by model (surface behind their marks)."""
+    """Check points by camera (intersection of their marks) and by model (surface behind their marks)."""
 
     camera: CheckPointErrors
     model: CheckPointErrors
 
 
 class CrossValidation(StatedErrors):
-    """Control points, each measured by a solution without it. `reason`: why there is none."""
+    """Errors of the control points, each measured by a solution without that point.
+
+    Attributes:
+        without_blunders: figures without the blunders; None: there are none.
+        blunders: names of the points that are blunders.
+        predicted: predicted σ.
+        points: one row for each point.
+        reason: reason why there are no errors, else None.
+    """
 
     without_blunders: ErrorStats | None
     blunders: tuple[str, ...]
@@ -186,14 +240,23 @@ class CrossValidation(StatedErrors):
 
 
 class NoCrossValidation(Product):
-    """A cross-validation that was asked for and is not possible."""
+    """Requested cross-validation that is not possible, with the reason."""
 
     count: Literal[0]
     reason: str
 
 
 class AccuracySummary(_OptionalKeys):
-    """Predicted σ over `cells` of the scene; `reason`: why there are none; `cautions`: limits of the prediction."""
+    """Predicted σ over the cells of the scene.
+
+    Attributes:
+        cells: number of cells.
+        cell_m: side of a cell.
+        least_sigma_h_m, median_sigma_h_m, largest_sigma_h_m: horizontal.
+        least_sigma_v_m, median_sigma_v_m, largest_sigma_v_m: vertical.
+        reason: reason why there are no cells, else None.
+        cautions: limits of the prediction.
+    """
 
     cells: int
     cell_m: float | None = None
@@ -208,7 +271,7 @@ class AccuracySummary(_OptionalKeys):
 
 
 class FixResiduals(ResidualStats):
-    """Residuals of the training cameras' fixes; `outliers` of them were left out."""
+    """Residuals of the training cameras' fixes; `outliers` is the number of those left out."""
 
     outliers: int
 
@@ -220,7 +283,7 @@ class ControlResiduals(ResidualStats):
 
 
 class Fit(Product):
-    """Residuals of what entered the solution. Not an accuracy."""
+    """Residuals of the observations that entered the solution. These are no accuracy."""
 
     gnss: FixResiduals
     gcp: ControlResiduals
@@ -234,7 +297,7 @@ class SimilaritySigma(Product):
 
 
 class PointCoordinates(Product):
-    """A check point in a CRS, as surveyed and as measured; None where it was not measured."""
+    """Coordinates of a check point in a CRS, as surveyed and as measured; None: not measured."""
 
     name: str
     surveyed: Vector3
@@ -243,7 +306,17 @@ class PointCoordinates(Product):
 
 
 class Coordinates(Product):
-    """The check points and the origin of `geo` in a CRS: easting or longitude first, height last."""
+    """Check points and origin of `geo` in a CRS: easting or longitude first, height last.
+
+    Attributes:
+        crs: name of the CRS.
+        units: of the three coordinates.
+        heights: surface that the heights count from.
+        operation: published operation between WGS84 and the CRS.
+        operation_accuracy_m: its accuracy; None: not known.
+        origin: origin of `geo`.
+        points: the check points.
+    """
 
     crs: str
     units: tuple[str, str, str]
@@ -255,7 +328,18 @@ class Coordinates(Product):
 
 
 class EvaluationReport(_OptionalKeys):
-    """Product of `evaluate`. `cross_validation` is None and `coordinates` absent unless asked for."""
+    """Product of `evaluate`.
+
+    Attributes:
+        format_version: version of the format.
+        photometric: figures of the test views.
+        checkpoints: errors of the check points.
+        cross_validation: errors of the control points; None without `--cross-validate`.
+        accuracy: predicted σ over the scene.
+        fit: residuals of the solution.
+        similarity: σ of the similarity.
+        coordinates: check points in the CRS of `--crs`; absent without it.
+    """
 
     format_version: Literal[1] = 1
     photometric: Photometric
@@ -276,12 +360,12 @@ def read_report(path: Path) -> EvaluationReport:
     """Return the report at `path`.
 
     Raises:
-        InputError: it cannot be read, or is not a report; names the field at fault.
+        InputError: the file cannot be read or is no report; names the field at fault.
     """
     try:
         return load_json(EvaluationReport, path)
     except InputError as error:
-        if not isinstance(error.__cause__, ValueError):  # the file system refuses, not the content
+        if not isinstance(error.__cause__, ValueError):  # The file cannot be read: its content is not at fault.
             raise
         message = "not a report: make it again with `georef evaluate --force`"
         raise InputError(message, path=path, field=error.field) from error

@@ -1,4 +1,4 @@
-"""The rig as `calibrate` estimates it: time offset, boresight and lever arm with their σ."""
+"""Product of `calibrate`: estimates of time offset, boresight and lever arm with their σ."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ _COMPONENTS: dict[RigParameter, int] = {"time-offset": 1, "boresight": 3, "lever
 
 
 def in_usual_order(names: Container[RigParameter]) -> tuple[RigParameter, ...]:
-    """Return parameters of the rig in their usual order, each once."""
+    """Return the named parameters of the rig in their usual order, without repetition."""
     return tuple(name for name in RIG_PARAMETERS if name in names)
 
 
-# An option: parameters of the rig.
+# Type of an option that names parameters of the rig.
 RigParameters = Annotated[
     tuple[RigParameter, ...],
     from_text(lambda text: listed_names(text, RIG_PARAMETERS)),
@@ -30,10 +30,17 @@ RigParameters = Annotated[
 
 
 class RigEstimate(Product):
-    """A parameter of the rig, estimated from the SfM cameras, in sense and unit of `ingest`'s option of that name.
+    """Parameter of the rig, estimated from the SfM cameras.
 
-    `start` is the value that `ingest` was told, `sigma` of each component; `observable` by component: whether σ is
-    small enough to use it.
+    Sign and unit are those of the option of `ingest` with the same name.
+
+    Attributes:
+        name: the parameter.
+        unit: of value, σ and start.
+        value: estimate, by component.
+        sigma: σ, by component.
+        start: value given to `ingest`, by component.
+        observable: by component, whether σ is small enough for the estimate to be used.
     """
 
     name: RigParameter
@@ -59,10 +66,17 @@ class RigEstimate(Product):
 
 
 class RigCalibration(Product):
-    """Product of `calibrate`: estimates of the rig, and which of them are applied when the survey is read.
+    """Product of `calibrate`: estimates of the rig, divided into those applied to the survey and the others.
 
-    `wanted` names the parameters that were to be estimated, `problem` tells why none could be. `rms_position_m` and
-    `rms_attitude_deg` are the robust σ per axis of what is left over.
+    Attributes:
+        format_version: version of the format.
+        wanted: parameters that were to be estimated.
+        applied: estimates that `load_survey` applies.
+        not_applied: all other estimates.
+        images: number of images in the fit.
+        control_points: number of control points in the fit.
+        rms_position_m, rms_attitude_deg: robust σ of the residuals per axis.
+        problem: reason why nothing was estimated; else empty.
     """
 
     format_version: Literal[1] = 1

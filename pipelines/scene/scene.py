@@ -1,8 +1,8 @@
-"""The scene as training and evaluation see it: cameras, points and photographs in the frame `model`.
+"""Scene of training and evaluation: cameras, points and photographs in the frame `model`.
 
-`model` has the axes and the metre of `geo`, and an origin near the scene, so that float32 holds it to fractions of
-a millimetre. Its relation to the SfM frame, `model_from_local`, is fixed when training starts; its relation to the
-Earth, `geo_from_model`, is what training refines.
+The frame `model` has the axes and the metre of `geo`. Its origin lies near the scene, so that float32 resolves
+fractions of a millimetre. `model_from_local`, its relation to the SfM frame, is fixed when training starts.
+Training refines `geo_from_model`, its relation to the Earth.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from pipelines.scene.initial_similarity import InitialSimilarity
 from pipelines.scene.photographs import ImageCache, Photograph
 from pipelines.scene.survey import Survey
 
-# Beyond this the dense normal matrix of the cameras no longer fits a laptop.
+# Beyond this number the dense normal matrix of the cameras exceeds the memory of a laptop.
 _MOST_CORRECTED_CAMERAS = 1200
 
 
@@ -34,8 +34,8 @@ class Scene:
 
     Attributes:
         sparse: the SfM model (frame `local`).
-        model_from_local: fixed.
-        geo_from_model: initial estimate; a pure shift.
+        model_from_local: similarity that stays fixed.
+        geo_from_model: initial estimate, a pure shift.
         train, test: indices of the cameras in each split.
     """
 
@@ -47,7 +47,7 @@ class Scene:
 
     @cached_property
     def poses(self) -> CameraPoses:
-        """The cameras as SfM left them."""
+        """Cameras of the SfM model, in `model`."""
         turn = self.model_from_local.rotation
         return CameraPoses(
             self.sparse.rotation_cam_from_local @ turn.T,
@@ -56,12 +56,12 @@ class Scene:
 
     @cached_property
     def point_in_model(self) -> FloatArray:
-        """SfM points (N, 3) in metres."""
+        """Points of the SfM model (N, 3), metres in `model`."""
         return self.model_from_local.apply(self.sparse.point_in_local)
 
     @cached_property
     def network(self) -> Network:
-        """Cameras, points and image observations as SfM left them, in `model`."""
+        """Cameras, points and image observations of the SfM model, in `model`."""
         sparse, poses = self.sparse, self.poses
         return Network(
             sparse.cameras,
@@ -76,12 +76,12 @@ class Scene:
 
     @cached_property
     def correction_basis(self) -> CorrectionBasis | None:
-        """What the image observations know of the cameras; None where there are too many of them."""
+        """Whitened corrections of the cameras, which the lens follows; None for more than 1200 cameras."""
         return self._basis(lens_follows=True)
 
     @cached_property
     def correction_basis_through_sfm_lens(self) -> CorrectionBasis | None:
-        """The same for cameras that move while the lens stays."""
+        """Whitened corrections of the cameras under a lens that stays; None for more than 1200 cameras."""
         return self._basis(lens_follows=False)
 
     def _basis(self, lens_follows: bool) -> CorrectionBasis | None:
@@ -91,7 +91,13 @@ class Scene:
 
 
 def make_scene(sparse: SparseModel, survey: Survey, model_from_local: Similarity, shift: FloatArray) -> Scene:
-    """Put a sparse model into the frame `model`, whose origin lies at `shift` (3,) in `geo`.
+    """Return the scene of a sparse model.
+
+    Args:
+        sparse: the SfM model.
+        survey: has the split into training and test images.
+        model_from_local: similarity from the SfM frame.
+        shift: (3,) origin of the frame `model` in `geo`.
 
     Raises:
         DegenerateGeometryError: fewer than two registered training images.
@@ -105,7 +111,11 @@ def make_scene(sparse: SparseModel, survey: Survey, model_from_local: Similarity
 
 
 def initial_scene(sparse: SparseModel, survey: Survey, initial: InitialSimilarity) -> Scene:
-    """The scene at the start of training: origin of `model` at the median SfM point, rounded to a metre."""
+    """Return the scene at the start of training, its origin at the median SfM point, rounded to a metre.
+
+    Raises:
+        DegenerateGeometryError: fewer than two registered training images.
+    """
     geo_from_local = Similarity.from_record(initial.geo_from_local)
     shift = np.round(np.median(geo_from_local.apply(sparse.point_in_local), axis=0))
     model_from_local = replace(geo_from_local, translation=geo_from_local.translation - shift)
@@ -113,7 +123,7 @@ def initial_scene(sparse: SparseModel, survey: Survey, initial: InitialSimilarit
 
 
 def photographs(sparse: SparseModel, survey: Survey, workspace: Workspace, max_size_px: int) -> ImageCache:
-    """The registered photographs, undistorted to a longest side of `max_size_px`, cached in the workspace.
+    """Return the cache of the registered photographs, undistorted with their longer side limited to `max_size_px`.
 
     Raises:
         InputError: an image of the model is not in the survey.

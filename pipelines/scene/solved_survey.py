@@ -1,4 +1,4 @@
-"""The geographic half of a training: set up again from its products, and brought to its minimum."""
+"""Geographic problem of a trained survey: set up again from its products, and solved."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from pipelines.scene.trained_survey import TrainedSurvey
 
 @dataclass(frozen=True)
 class SolvedSurvey:
-    """A trained survey with what was measured of it.
+    """Trained survey with the solved problem of its measurements.
 
     Attributes:
-        trained: the product.
-        scene: as at the start of the training.
+        trained: the trained survey.
+        scene: scene at the start of the training.
         problem: similarity, cameras and measurements, at the minimum of the whitened loss.
-        options: what it was trained with.
+        options: options of the training.
     """
 
     trained: TrainedSurvey
@@ -34,7 +34,7 @@ class SolvedSurvey:
 
 
 def geographic_options_of(workspace: Workspace) -> GeographicOptions:
-    """What a workspace's model was trained with; the defaults for one that was put there by hand."""
+    """Return the options with which a workspace's model was trained; the defaults for a model put there by hand."""
     manifest = workspace.manifest(BY_NAME["train"])
     recorded = {} if manifest is None else manifest.config
     return GeographicOptions.model_validate(
@@ -43,17 +43,27 @@ def geographic_options_of(workspace: Workspace) -> GeographicOptions:
 
 
 def solve_survey(trained: TrainedSurvey, initial: InitialSimilarity, options: GeographicOptions) -> SolvedSurvey:
-    """Set up the measurements as for the training, and solve them without the photographs, from its result.
+    """Return the trained survey with its measurements solved anew, from the result of the training.
+
+    The problem has the measurements of the training, and no photographs. Two things differ from the training: L_rel
+    is left out, because its distances repeat the fixes; and the residuals are whitened also where the training used
+    plain mean squares.
+
+    Args:
+        trained: the trained survey.
+        initial: similarity of `init-sim3`.
+        options: options of the training.
 
     Raises:
         DegenerateGeometryError: the measurements leave the similarity open.
+        InputError: a constant error is to be estimated, but its measurements were not recorded.
     """
     model_from_local = Similarity.from_record(trained.model.model_from_local)
     start = Similarity.from_record(initial.geo_from_local) @ model_from_local.inverse()
     scene = make_scene(trained.sfm, trained.survey, model_from_local, start.translation)
-    # Distances repeat what the fixes say, and have no part in the whitened residuals.
+    # The distances are functions of the fixes and have no part in the posterior.
     changed: dict[str, object] = {"rel_loss": False}
-    if options.weighting != "whitened":  # which estimates no constant errors
+    if options.weighting != "whitened":  # A training with plain mean squares estimates no constant errors.
         changed |= {"weighting": "whitened", "estimate": ()}
     problem = geo_problem(scene, trained.survey, initial, options.model_copy(update=changed))
     problem.similarity.place(trained.geo_from_model)

@@ -1,6 +1,6 @@
-"""The survey's records: what was measured, and with what. The products of `ingest`.
+"""Product of `ingest`: the survey, with its images, cameras, fixes, attitudes and marks.
 
-All places are in the frame `geo`: East-North-Up metres at the survey's origin.
+All positions are in the frame `geo`: East-North-Up metres at the survey's origin.
 """
 
 from __future__ import annotations
@@ -18,7 +18,16 @@ from pipelines.scene.rig import RigParameter
 
 
 class CameraPrior(Product):
-    """Intrinsics before SfM. `params` are COLMAP's for `model`, in pixels of the full image."""
+    """Intrinsics of a camera before SfM.
+
+    Attributes:
+        camera_id: number from 1.
+        model: COLMAP's name of the camera model.
+        width, height: of the full image in pixels.
+        params: COLMAP's parameters of the model, in pixels of the full image.
+        focal_source: source of the focal length.
+        make_model: of the camera, as recorded in the photographs.
+    """
 
     camera_id: int = Field(ge=1)
     model: str
@@ -32,7 +41,11 @@ class CameraPrior(Product):
 class Fix(Product):
     """Measured position of a camera centre.
 
-    `position_in_geo` in metres; `cov_in_geo` 3×3 in m²; `sigma_source` tells who gave σ.
+    Attributes:
+        position_in_geo: metres.
+        cov_in_geo: 3×3, m².
+        source: kind of record that the position comes from.
+        sigma_source: source of σ: the recording, an option, or the default.
     """
 
     position_in_geo: Vector3
@@ -42,7 +55,13 @@ class Fix(Product):
 
 
 class Attitude(Product):
-    """Measured rotation of a camera: `p_geo = R(quat_xyzw) p_cam + centre`, σ per axis in degrees."""
+    """Measured rotation of a camera: `p_geo = R(quat_xyzw) p_cam + centre`.
+
+    Attributes:
+        quat_xyzw: rotation geo ← cam.
+        sigma_deg: σ per axis in degrees.
+        source: kind of record that the rotation comes from.
+    """
 
     quat_xyzw: Rotation
     sigma_deg: float = Field(gt=0)
@@ -50,7 +69,17 @@ class Attitude(Product):
 
 
 class SurveyImage(Product):
-    """One photograph. `name` is relative to the survey's `image_dir`; `sha256` is of the file."""
+    """Photograph of the survey.
+
+    Attributes:
+        name: path relative to the survey's `image_dir`.
+        camera_id: of the survey's `cameras`.
+        sha256: hash of the file.
+        timestamp_s: time of exposure, camera clock.
+        fix: measured position of its centre.
+        attitude: measured rotation.
+        split: use of the photograph, for training or as a test view.
+    """
 
     name: ImageName
     camera_id: int
@@ -62,7 +91,7 @@ class SurveyImage(Product):
 
 
 class Mark(Product):
-    """Where a surveyed point is seen: full-image pixels, centre of the top-left pixel (0.5, 0.5)."""
+    """Image coordinates of a surveyed point: pixels of the full image, centre of the top-left pixel (0.5, 0.5)."""
 
     image: ImageName
     x_px: float
@@ -71,7 +100,7 @@ class Mark(Product):
 
 
 class SurveyedPoint(Product):
-    """A control or check point: position in geo (m), covariance (m²), its marks."""
+    """Control or check point: position in geo (m), 3×3 covariance (m²), and marks."""
 
     name: str
     position_in_geo: Vector3
@@ -87,10 +116,24 @@ class SurveyedPoint(Product):
 
 
 class Survey(Product):
-    """Product of `ingest`: everything that was measured, in one frame.
+    """Product of `ingest`: all measurements of a survey, in one frame.
 
-    Positions and attitudes are as recorded, with the rig that `ingest` was told; `scene.calibrated.load_survey`
-    puts the estimates of `calibrate` in its place. `estimate` names the parameters to be estimated after sfm.
+    Positions and attitudes are as recorded, with the rig that was given to `ingest`. `scene.calibrated.load_survey`
+    replaces that rig by the estimates of `calibrate`.
+
+    Attributes:
+        format_version: version of the format.
+        origin: of the frame `geo`.
+        source_crs: CRS in which the positions were recorded.
+        vertical: vertical datum of the recorded heights.
+        image_dir: folder of photographs, absolute or inside the workspace.
+        cameras: intrinsics before SfM.
+        images: the photographs.
+        control_points: points that enter the solution.
+        check_points: points that enter no solution.
+        assumptions: decisions that `ingest` made where the input states nothing.
+        warnings: messages that the user should read.
+        estimate: parameters of the rig to be estimated after sfm.
     """
 
     format_version: Literal[1] = 1
@@ -109,7 +152,7 @@ class Survey(Product):
     @model_validator(mode="before")
     @classmethod
     def _as_recorded(cls, document: Any) -> Any:
-        """Read surveys of earlier versions, which had a field for the calibration of the rig."""
+        """Return the document without `rig`, a field of earlier versions for the calibration of the rig."""
         if not isinstance(document, dict) or "rig" not in document:
             return document
         if document["rig"] is not None:

@@ -1,4 +1,4 @@
-"""The product of `train` beside the Gaussians: frames, cameras, lenses, constant errors."""
+"""Product of `train` beside the Gaussians: frames, cameras, lenses, constant errors."""
 
 from __future__ import annotations
 
@@ -13,9 +13,14 @@ from pipelines.georef.estimated_error import EstimatedError
 
 
 class TrainedCamera(Product):
-    """A camera after training, as `cam_from_model`. A test camera has moved only with its neighbours.
+    """Pose `cam_from_model` of a camera after training. A test camera has moved only with its neighbours.
 
-    `exposure` is the gain matrix and offset (A | b) with which the photograph shows a colour c: A c + b.
+    Attributes:
+        name: of the image.
+        split: use of the image.
+        quat_xyzw: rotation cam ← model.
+        translation: metres, p_cam = R p_model + translation.
+        exposure: gain matrix and offset (A | b): the photograph shows a colour c as A c + b. None: not estimated.
     """
 
     name: ImageName
@@ -26,7 +31,7 @@ class TrainedCamera(Product):
 
 
 class TrainedLens(Product):
-    """The lens of a camera of the SfM model after training: COLMAP's parameters of COLMAP's camera model."""
+    """Lens of a camera of the SfM model after training: COLMAP's parameters of COLMAP's camera model."""
 
     camera_id: int
     model: str
@@ -34,9 +39,23 @@ class TrainedLens(Product):
 
 
 class TrainedModel(Product):
-    """Product of `train` beside the Gaussians: frames, cameras and what was optimised.
+    """Product of `train` beside the Gaussians: frames, cameras, lenses and constant errors.
 
-    `lenses`: of the cameras of the SfM model; one that is not among them is as SfM found it.
+    Attributes:
+        format_version: version of the format.
+        geo_from_model: trained similarity with its covariance.
+        model_from_local: fixed similarity from the SfM frame.
+        max_image_size: limit of the longer side of the training photographs, in pixels.
+        cameras: trained cameras, in the order of the SfM model's images.
+        lenses: trained lenses; a camera of the SfM model without one keeps SfM's lens.
+        background: colour behind the Gaussians, RGB.
+        sh_degree: degree of the spherical harmonics.
+        iterations: iterations of the training.
+        gaussians: number of Gaussians.
+        backend: rasteriser of the training.
+        gnss_outliers: names of the images whose fixes contradict the solution.
+        control_outliers: names of the control points that contradict the solution.
+        estimated_errors: constant errors of the measurements.
     """
 
     format_version: Literal[1] = 1

@@ -1,4 +1,4 @@
-"""A trained model, read back for evaluation: cameras in `model`, the similarity, and the Gaussians."""
+"""Trained survey, read from the workspace: cameras in `model`, the similarity, and the Gaussians."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ from pipelines.splat.storage import read_gaussians
 
 @dataclass(frozen=True)
 class TrainedSurvey:
-    """What training left.
+    """Survey with its trained model.
 
     Attributes:
-        survey: what was measured.
-        sfm: the SfM model, with SfM's lenses; its images have the order of `poses`.
+        survey: the measurements.
+        sfm: the SfM model with SfM's lenses; its images have the order of `poses`.
         model: similarity, cameras, settings.
-        poses: refined cameras in `model`.
-        gaussians: in `model`.
+        poses: trained cameras in `model`.
+        gaussians: Gaussians in `model`.
     """
 
     survey: Survey
@@ -47,7 +47,7 @@ class TrainedSurvey:
 
     @cached_property
     def sparse(self) -> SparseModel:
-        """The SfM model with the trained lenses."""
+        """SfM model with the trained lenses."""
         trained = {
             lens.camera_id: replace(self.sfm.cameras[lens.camera_id], params=np.array(lens.params))
             for lens in self.model.lenses
@@ -56,11 +56,11 @@ class TrainedSurvey:
 
     @property
     def geo_from_model(self) -> Similarity:
-        """The refined similarity."""
+        """Similarity of `model`."""
         return Similarity.from_record(self.model.geo_from_model)
 
     def indices(self, split: str) -> list[int]:
-        """Indices of the cameras of a split."""
+        """Return the indices of the cameras of a split."""
         return [index for index, camera in enumerate(self.model.cameras) if camera.split == split]
 
 
@@ -68,12 +68,12 @@ def load_trained(workspace: Workspace, similarity: Literal["trained", "initial"]
     """Read the products of ingest, sfm and train.
 
     Args:
-        similarity: what places the model on Earth: `geo_from_model` as training left it, or that which follows
-            from the similarity of init-sim3, whatever training made of its own.
+        workspace: holds the products.
+        similarity: choice of `geo_from_model`: the trained one, or the one that follows from init-sim3.
 
     Raises:
-        MissingProductError: one of them is not there.
-        InputError: they do not belong together.
+        MissingProductError: a product does not exist.
+        InputError: a product is damaged, or the cameras or lenses of `train` are not those of `sfm`.
     """
     model_path = workspace.path(MODEL)
     model = load_json(TrainedModel, model_path)
@@ -100,14 +100,17 @@ def load_trained(workspace: Workspace, similarity: Literal["trained", "initial"]
 
 
 def trained_pinholes(trained: TrainedSurvey, images: ImageCache) -> Pinholes:
-    """Cameras of the photographs that were undistorted with SfM's lenses, as the trained ones have them."""
+    """Return the pinholes of the photographs, undistorted with SfM's lenses, under the trained lenses."""
     pinholes = Pinholes(images, trained.sfm.lenses)
     pinholes.renew(trained.sparse.lenses)
     return pinholes
 
 
 def _initially_placed(model: TrainedModel, initial: InitialSimilarity) -> SimilarityRecord:
-    """`geo_from_model` of a similarity geo ← local; its covariance, of a movement on Earth, stays as it is."""
+    """Return `geo_from_model` of the initial similarity.
+
+    The covariance carries over unchanged, because it describes a perturbation in the target frame `geo`.
+    """
     geo_from_local = Similarity.from_record(initial.geo_from_local)
     geo_from_model = geo_from_local @ Similarity.from_record(model.model_from_local).inverse()
     covariance = np.array(initial.geo_from_local.covariance)
