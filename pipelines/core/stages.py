@@ -177,8 +177,8 @@ PIPELINE: tuple[StageSpec, ...] = (
     ),
 )
 
-# No part of the pipeline: `georef compare` runs this stage for the baseline. There it replaces sfm and init-sim3:
-# the later stages of the baseline read its folder instead of theirs.
+# No part of the pipeline: `georef compare` runs this stage for the baseline, whose later stages read its folder in
+# place of those of sfm and init-sim3.
 ADJUST = StageSpec(
     name="adjust",
     module="pipelines.sfm.pose_prior",

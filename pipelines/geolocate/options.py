@@ -1,4 +1,4 @@
-"""The options of `georef geolocate`."""
+"""Options of `georef geolocate`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pipelines.core.options import StageOptions
 
 
 class GeolocateOptions(StageOptions):
-    """Multi-view intersection of every SfM point in the geo frame."""
+    """Options of the intersection of every SfM point in the frame `geo`."""
 
     attitude: Literal["auto", "recorded", "sfm"] = Field(
         "auto", description="Rotations of the rays: recorded with the images, or SfM's aligned to geo."

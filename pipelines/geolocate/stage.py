@@ -3,8 +3,8 @@
 Reads `ingest/survey.json` and `sfm/sparse`; writes `geolocate/points.npz` (`GeolocatedPoints`) and `points.ply`.
 GeoRefGS section 2.3, eqs 4–15 (doi 10.3390/drones10030195). Control and check points are not used.
 
-Fixes that contradict the layout of the cameras in the SfM model give no rays: in a point seen three times one bad
-fix cannot be told from two good ones, in the layout of all cameras it can.
+Fixes that contradict the layout of the cameras in the SfM model give no rays. The layout of all cameras reveals a
+bad fix. The three rays of a point do not: they cannot tell one bad fix from two good ones.
 """
 
 from __future__ import annotations
@@ -41,38 +41,45 @@ from pipelines.scene.survey import Survey
 
 log = logging.getLogger(__name__)
 
-_LARGEST_RELATIVE_SIGMA = 0.3  # of the distance: beyond, the linear covariance says nothing
+_LARGEST_RELATIVE_SIGMA = 0.3  # of the distance: beyond, the linear covariance is invalid
 _NO_FIXES = "no fixes: positions come from control points"
 _ALIGNMENT_SEED = 0
 
 
 @dataclass(frozen=True)
 class Geolocation:
-    """Result of `geolocate`: the points, their σ, and the remarks of the summary."""
+    """Result of `geolocate`.
+
+    Attributes:
+        points: the points on Earth.
+        sigma_m: (N,) σ along the worst axis in metres; NaN without a position.
+        key_figure: one line for tables.
+        warnings: messages that the user should read.
+    """
 
     points: GeolocatedPoints
-    sigma_m: FloatArray  # (N,) along the worst axis; NaN without a position
+    sigma_m: FloatArray
     key_figure: str
     warnings: tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class _CameraObservations:
-    """Fixes and attitudes of a model's cameras, and how they agree with its layout."""
+    """Fixes and attitudes of a model's cameras, with their alignment to the model."""
 
     model: SparseModel
     fixes: Correspondences
     recorded: RecordedRotations
     prior: RotationPrior | None
     alignment: Alignment | None
-    problem: str  # why there is no alignment
+    problem: str  # reason why there is no alignment
 
 
 def run(stage: StageRun, options: GeolocateOptions) -> Summary:
     """Intersect the points of the workspace's model and write them.
 
     Raises:
-        GeorefError: unreadable products, or attitudes asked for that are not there.
+        GeorefError: unreadable products, or an error of `geolocate`.
     """
     survey = load_survey(stage.workspace)
     model = read_sparse(stage.workspace.path(SPARSE))
@@ -86,11 +93,20 @@ def run(stage: StageRun, options: GeolocateOptions) -> Summary:
 
 
 def geolocate(survey: Survey, model: SparseModel, options: GeolocateOptions) -> Geolocation:
-    """Intersect the points of a model.
+    """Return the points of a model, intersected on Earth.
+
+    Without fixes, or without any rotations, the points have no positions, so that control points alone can
+    georeference the survey.
+
+    Args:
+        survey: has the fixes and attitudes.
+        model: the SfM model.
+        options: of the stage.
 
     Raises:
-        InputError: `recorded` attitudes are asked for and fewer than two images have them.
-        DegenerateGeometryError: SfM's rotations are needed and the fixes do not fix their direction.
+        InputError: the options demand `recorded` attitudes, and fewer than two images have a fix and an attitude.
+        DegenerateGeometryError: SfM's rotations are needed, the fixes do not determine their direction, and there
+            are fewer than three control points.
     """
     observed = _observed(survey, model)
     if len(observed.fixes) == 0:
@@ -116,7 +132,7 @@ def geolocate(survey: Survey, model: SparseModel, options: GeolocateOptions) -> 
 
 
 def _without_positions(model: SparseModel, why: str) -> Geolocation:
-    """A product without positions, so that control points can carry the survey alone."""
+    """Return points without positions."""
     count = len(model.point_id)
     points = _points(model, Intersections.none(count), np.zeros(count, dtype=bool), "sfm")
     return Geolocation(points, np.full(count, np.nan), why, (why,))
@@ -125,7 +141,7 @@ def _without_positions(model: SparseModel, why: str) -> Geolocation:
 def _points(
     model: SparseModel, intersections: Intersections, inlier: BoolArray, source: Literal["recorded", "sfm"]
 ) -> GeolocatedPoints:
-    """The product, of the intersections of a model's points."""
+    """Return the product, made of the intersections of a model's points."""
     return GeolocatedPoints(
         point_id=model.point_id,
         position_in_geo=intersections.position_in_geo,
@@ -193,7 +209,7 @@ def _warnings(observed: _CameraObservations, source: str) -> list[str]:
 
 
 def _views(observed: _CameraObservations, source: str, sigma_px: float) -> tuple[UncertainCameras, BoolArray]:
-    """All images as views (those without a fix are placeholders), and which give rays (n,)."""
+    """Return all images as views, and the mask (n,) of those that give rays; the others are placeholders."""
     model, fixes, alignment = observed.model, observed.fixes, observed.alignment
     count, index = len(model.image_name), model.image_index()
     place = np.array([index[name] for name in fixes.name])
@@ -209,7 +225,7 @@ def _views(observed: _CameraObservations, source: str, sigma_px: float) -> tuple
         usable &= np.isin(np.arange(count), recorded.image)
     else:
         rotation = alignment.geo_from_local.rotation @ np.swapaxes(model.rotation_cam_from_local, 1, 2)
-        # Within the model, bundle adjustment has averaged the pixel errors of a whole image.
+        # Bundle adjustment has averaged the pixel errors of a whole image: rotations in the model have this σ.
         sigma = sigma_ray / np.sqrt(np.maximum(np.bincount(model.obs_image, minlength=count), 1))
         gain = np.zeros((count, 3, 3))
         gain[place] = alignment.solution.response[:, 1:4]
@@ -218,7 +234,10 @@ def _views(observed: _CameraObservations, source: str, sigma_px: float) -> tuple
 
 
 def _rays(model: SparseModel, usable: BoolArray) -> Rays:
-    """Rays of the usable images; a point that an image shows twice counts once, as the errors are the same."""
+    """Return the rays of the usable images.
+
+    A point that an image shows twice counts once, because both rays have the same errors of position and attitude.
+    """
     xy = observation_rays(model)
     again = np.zeros(len(xy), dtype=bool)
     again[1:] = (np.diff(model.obs_point) == 0) & (np.diff(model.obs_image) == 0)
@@ -229,7 +248,7 @@ def _rays(model: SparseModel, usable: BoolArray) -> Rays:
 def _judge(
     intersections: Intersections, rays: Rays, views: UncertainCameras, options: GeolocateOptions
 ) -> tuple[FloatArray, BoolArray]:
-    """σ along the worst axis (N,), and which points (N,) can be relied on."""
+    """Return the σ (N,) along the worst axis in metres, and the mask (N,) of the inliers."""
     located: BoolArray = ~np.isnan(intersections.position_in_geo[:, 0])
     sigma = np.full(len(located), np.nan)
     sigma[located] = np.sqrt(np.linalg.eigvalsh(intersections.cov_in_geo[located])[:, 2])

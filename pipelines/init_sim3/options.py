@@ -1,4 +1,4 @@
-"""The options of `georef init-sim3`."""
+"""Options of `georef init-sim3`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pipelines.core.options import StageOptions
 
 
 class InitSim3Options(StageOptions):
-    """The similarity from the SfM model into the geo frame."""
+    """Options of the similarity from the SfM model into the frame `geo`."""
 
     method: Literal["robust", "paper"] = Field(
         "robust", description="robust: RANSAC and weights from covariances; paper: plain least squares."

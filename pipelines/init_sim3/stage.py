@@ -1,9 +1,9 @@
 """Stage `init-sim3`: the similarity `geo_from_local` from the SfM model to the Earth.
 
 Reads `ingest/survey.json`, `sfm/sparse`, `geolocate/points.npz`; writes `sim3/geo_from_local.json`.
-GeoRefGS section 2.4.1, eqs 16–21 (doi 10.3390/drones10030195), as `--method paper`. The default is a robust
-adjustment over camera centres and control points, started from these and from the geolocated points; why the
-points themselves are not adjusted is told in `pipelines.georef.alignment`.
+GeoRefGS section 2.4.1, eqs 16–21 (doi 10.3390/drones10030195), is `--method paper`. The default is a robust
+adjustment over camera centres and control points. Its starts come from these and from the geolocated points.
+`pipelines.georef.alignment` explains why the geolocated points are no observations.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def run(stage: StageRun, options: InitSim3Options) -> Summary:
     """Estimate the similarity of the workspace and write it.
 
     Raises:
-        GeorefError: unreadable products, or one of `estimate_similarity`.
+        GeorefError: unreadable products, or an error of `estimate_similarity`.
     """
     survey = load_survey(stage.workspace)
     model = read_sparse(stage.workspace.path(SPARSE))
@@ -53,12 +53,18 @@ def run(stage: StageRun, options: InitSim3Options) -> Summary:
 def estimate_similarity(
     survey: Survey, model: SparseModel, points: GeolocatedPoints, options: InitSim3Options
 ) -> tuple[InitialSimilarity, tuple[str, ...]]:
-    """The similarity and what to warn of.
+    """Return the initial similarity, and warnings for the user.
+
+    Args:
+        survey: has the fixes, attitudes and control points.
+        model: the SfM model.
+        points: the model's points on Earth.
+        options: of the stage.
 
     Raises:
-        DegenerateGeometryError: the measurements leave the similarity open; says what to add.
+        DegenerateGeometryError: the measurements leave the similarity open; names further measurements.
         ConvergenceError: the residual is larger than `options.max_residual`.
-        InputError: `points` does not belong to `model`.
+        InputError: `points` belongs to another model.
     """
     if not np.array_equal(points.point_id, model.point_id):
         raise InputError("the geolocated points are of another model: run `georef geolocate` again")
@@ -84,7 +90,7 @@ def estimate_similarity(
 
 
 def _guess(model: SparseModel, points: GeolocatedPoints, rng: np.random.Generator) -> Similarity | None:
-    """The similarity of the best geolocated points: RANSAC, then their covariances as weights."""
+    """Return the similarity of the best geolocated points, by RANSAC, then weighted by covariance; or None."""
     trace = np.trace(points.cov_in_geo, axis1=1, axis2=2)
     best = np.flatnonzero(points.inlier)
     best = best[np.argsort(trace[best], kind="stable")][:_GUESS_POINTS]
@@ -133,10 +139,13 @@ def _attitude(prior: RotationPrior | None) -> AttitudeRecord | None:
 
 
 def _by_paper(model: SparseModel, points: GeolocatedPoints, data: Correspondences) -> InitialSimilarity:
-    """Eqs 16–21 on the geolocated points, all alike.
+    """Return the paper's similarity (eqs 16–21) of the geolocated points, with equal weights.
 
-    The paper gives no covariance. This one takes the scatter of the points, but counts only as many of them as
-    there are images, since all points share the errors of these.
+    The paper gives no covariance. Here the covariance follows from the scatter of the points, counted as only one
+    point for each image, because the points share the errors of the images.
+
+    Raises:
+        DegenerateGeometryError: fewer than three points.
     """
     good = points.inlier
     if good.sum() < 3:
@@ -171,7 +180,7 @@ def _counts(control: np.ndarray, points: np.ndarray) -> dict[str, int]:
 
 
 def _agreeing(model: SparseModel, points: GeolocatedPoints, similarity: Similarity) -> np.ndarray:
-    """Which geolocated points lie where the similarity puts them, within their covariance."""
+    """Return the mask (N,) of the geolocated points that agree with the similarity within their covariance."""
     good = points.inlier.copy()
     missed = points.position_in_geo[good] - similarity.apply(model.point_in_local[good])
     good[good] = squared_mahalanobis(missed, points.cov_in_geo[good]) <= OUTLIER_GATE

@@ -1,1 +1,1 @@
-"""Stage `sfm`: cameras and points with COLMAP; and the adjustment with position priors, `compare`'s baseline."""
+"""Stage `sfm`: cameras and points by COLMAP; and the adjustment with position priors, the baseline of `compare`."""

@@ -1,8 +1,8 @@
-"""The adjustment that ends a reconstruction: the principal point free, image observations weighted robustly.
+"""Last adjustment of a reconstruction: the principal point is free, and image observations are weighted robustly.
 
-COLMAP adjusts by plain least squares. What its filter of 4 px leaves of wrong matches gives the residuals longer
-tails than noise has, and pulls lens and poses further off than the noise would. All that is computed from the model
-later on (`geometry/bundle.py`) takes its observations to have been weighted by Cauchy's kernel, as they are here.
+COLMAP adjusts by plain least squares. Wrong matches that pass its filter of 4 px give the residuals longer tails
+than noise has, and cause larger errors of lens and poses than noise does. This adjustment weights the observations
+by Cauchy's kernel. Later computations from the model (`geometry/bundle.py`) assume these weights.
 """
 
 from __future__ import annotations
@@ -24,24 +24,26 @@ from pipelines.robust.statistics import rayleigh_sigma
 log = logging.getLogger(__name__)
 
 _FEWEST_FOR_PRINCIPAL_POINT = 10
-_FURTHEST_PRINCIPAL_POINT = 0.05  # of the longer side: beyond, it has taken up something else
+_FURTHEST_PRINCIPAL_POINT = 0.05  # of the longer side: beyond, the principal point has absorbed other errors
 _ROBUST_ROUNDS = 3
-_STEPS_A_TIME, _MOST_STEPS = 5, 100  # of a round: the solver lets no signal through while it works
+_STEPS_A_TIME, _MOST_STEPS = 5, 100  # of a round, in short calls: the solver blocks signals while it works
 _SETTLED = 0.01  # relative change of the residuals' scale
-_LEAST_SCALE_PX = 1e-3  # of observations without noise, which have no tails either
-# A step that gains less, of the whole cost and times the number of observations, is the last: a parameter that is
-# one σ off costs 1/2 so measured. COLMAP's own tolerance of zero goes on to the limit of 100 steps.
+_LEAST_SCALE_PX = 1e-3  # for observations without noise, which have no tails either
+# Least gain of a step, as a fraction of the cost and times the number of observations; a smaller gain ends the
+# adjustment. In this unit an error of one σ in one parameter costs 1/2. COLMAP's own tolerance of zero runs to the
+# limit of 100 steps.
 _LEAST_GAIN = 0.2
 _LEAST_GAIN_OF_FEW = 1e-6
-_COARSE = 10.0  # times that, while the scale is still to change
+_COARSE = 10.0  # factor on the least gain while the scale of the kernel still changes
 
 
 @dataclass(frozen=True)
 class LastAdjustment:
-    """How to adjust.
+    """Options of the last adjustment.
 
     Attributes:
-        principal_point: free it, from ten images on, which the mapper holds at the image's centre.
+        principal_point: free the principal point, if there are ten images or more. The mapper holds it at the
+            image's centre.
         threads: of the solver; -1: all cores.
     """
 
@@ -50,17 +52,19 @@ class LastAdjustment:
 
 
 def adjust_finally(colmap: Any, model: Any, options: LastAdjustment, progress: Progress = SILENT) -> None:
-    """Adjust a `pycolmap.Reconstruction` in place, robustly at the end.
+    """Adjust a `pycolmap.Reconstruction` in place.
 
-    A principal point that is off by a few pixels, as those of most lenses are, moves points by decimetres once the
-    cameras are laid on GNSS. Fewer than ten images do not determine it. Where it would leave the middle of the
-    image it is refused, with a warning.
-
-    Then follow up to three adjustments with Cauchy's kernel, its scale that of the residuals that the one before
-    left, until this settles. No observation is left out: those far off have next to no weight.
+    1. The principal point is adjusted with all other parameters. For most lenses it lies a few pixels from the
+       image's centre; without it, points move by decimetres when the cameras are aligned with GNSS. Fewer than ten
+       images do not determine it. A result far from the image's centre is refused with a warning.
+    2. Up to three adjustments with Cauchy's kernel follow. The scale of the kernel comes from the residuals of the
+       adjustment before, until that scale converges. No observation is removed: an outlier has nearly no weight.
 
     Args:
         colmap: the pycolmap module.
+        model: the reconstruction; one without points is left as is.
+        options: of the adjustment.
+        progress: shows the rounds.
 
     Raises:
         ConvergenceError: COLMAP found no solution.
@@ -96,7 +100,10 @@ def _adjust(colmap: Any, model: Any, adjustment: Any) -> None:
 
 
 def _free_principal_point(colmap: Any, model: Any, adjustment: Any) -> bool:
-    """Adjust with the principal point free; whether it was accepted. If not, all is adjusted without it."""
+    """Adjust with the principal point free, and return whether the result was accepted.
+
+    A refused principal point is held where it was, and all other parameters are adjusted anew.
+    """
     adjustment.refine_principal_point = True
     before = {key: camera.params.copy() for key, camera in model.cameras.items()}
     _adjust(colmap, model, adjustment)
@@ -134,7 +141,7 @@ def _adjust_robustly(colmap: Any, model: Any, adjustment: Any, least_gain: float
 
 
 def _residual_px(model: Any) -> FloatArray:
-    """Lengths (M,) of the residuals of all observations in pixels; NaN behind the camera."""
+    """Return the lengths (M,) of the residuals of all observations in pixels; NaN behind the camera."""
     flat = flatten(model)
     rotation = flat.rotation_cam_from_local[flat.obs_image]
     in_cam = np.einsum("mij,mj->mi", rotation, flat.point_in_local[flat.obs_point])

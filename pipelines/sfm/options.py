@@ -1,4 +1,4 @@
-"""The options of `georef sfm`, and of the adjustment with position priors."""
+"""Options of `georef sfm`, and of the adjustment with position priors."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pipelines.core.options import InputPath, StageOptions
 
 
 class SfmOptions(StageOptions):
-    """Structure from motion with COLMAP."""
+    """Options of structure from motion with COLMAP."""
 
     mapper: Literal["incremental", "global"] = Field("incremental", description="Mapper.")
     camera_model: Literal["SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"] = Field(
@@ -33,6 +33,6 @@ class SfmOptions(StageOptions):
 
 
 class AdjustOptions(StageOptions):
-    """Bundle adjustment with the fixes as priors, the baseline of `georef compare`."""
+    """Options of the bundle adjustment with the fixes as priors, the baseline of `georef compare`."""
 
     seed: int = Field(0, ge=0, description="Seed of every random choice.")

@@ -1,4 +1,4 @@
-"""Which images are worth matching, from where they were taken and where they look."""
+"""Choice of the image pairs to match, from camera positions and viewing directions."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from pipelines.core.types import BoolArray, FloatArray, IntArray
 
-# SIFT matches fade out between views that differ by more than this.
+# Between views that differ by a larger angle SIFT finds hardly any matches.
 _MAX_ANGLE_DEG = 60.0
 _SECTORS = 8
 _CANDIDATES_PER_NEIGHBOR = 8
@@ -17,7 +17,7 @@ _CANDIDATES_PER_NEIGHBOR = 8
 
 @dataclass(frozen=True)
 class CameraDirections:
-    """Where N images were taken from, and which way they look.
+    """Positions and viewing directions of N images.
 
     Attributes:
         position_in_geo: (N, 3) metres, NaN where unknown.
@@ -29,16 +29,21 @@ class CameraDirections:
 
 
 def all_pairs(count: int) -> IntArray:
-    """Every pair (i < j) of `count` images: (P, 2)."""
+    """Return every pair (P, 2), i < j, of `count` images."""
     return np.stack(np.triu_indices(count, k=1), axis=1)
 
 
 def select_pairs(cameras: CameraDirections, max_neighbors: int) -> IntArray:
-    """Pairs (i < j) of images that may see the same place: (P, 2), sorted, unique.
+    """Return the pairs (P, 2), i < j, of images that may show the same place; sorted, unique.
 
-    Half of an image's neighbours are the nearest that look the same way; the others are the nearest in each of
-    eight directions, so that flight lines with a dense forward overlap are still tied to the lines beside them.
-    Images without a position are paired with all others, and each image with its successor in the list.
+    1. Half of an image's neighbours are the nearest with a similar viewing direction.
+    2. The others are the nearest in each of eight directions. With a dense forward overlap, these connect a flight
+       line to the lines beside it.
+    3. Images without a position are paired with all others, and each image with its successor in the list.
+
+    Args:
+        cameras: of N images.
+        max_neighbors: limit of the neighbours in steps 1 and 2.
     """
     position = cameras.position_in_geo
     count = len(position)
@@ -63,7 +68,7 @@ def _look_alike(axis: FloatArray, i: int, others: IntArray) -> BoolArray:
 
 
 def _spread(offset: FloatArray, limit: int) -> list[int]:
-    """Of candidates sorted by distance: the nearest half, then round the compass, nearest first."""
+    """Return up to `limit` candidates, sorted by distance: the nearest half, then the nearest of each sector."""
     order = list(range(min(len(offset), limit // 2)))
     sector = (np.arctan2(offset[:, 1], offset[:, 0]) // (2 * np.pi / _SECTORS)).astype(int)
     rank = np.zeros(len(offset), dtype=int)

@@ -1,9 +1,9 @@
 """Bundle adjustment with the fixes as priors of the camera positions: the usual way to a georeferenced model.
 
 Reads `ingest/survey.json` and `sfm/sparse`; writes `adjust/sparse`, the same model adjusted in the frame `geo`, and
-`adjust/geo_from_local.json`, which says so: the identity, with the covariance that the fixes leave it. This is the
-baseline "SfM-BBA" of GeoRefGS (doi 10.3390/drones10030195), and what COLMAP's `pose_prior_mapper` does at its end:
-image observations of σ = 1 px, fixes with their covariances under Cauchy's kernel. Control points do not enter.
+`adjust/geo_from_local.json`, the identity with the covariance that the fixes give. This is the baseline "SfM-BBA"
+of GeoRefGS (doi 10.3390/drones10030195), and the last step of COLMAP's `pose_prior_mapper`: image observations have
+σ = 1 px, and fixes their covariances under Cauchy's kernel. Control points do not enter.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from pipelines.scene.survey import Fix, Survey
 from pipelines.sfm.options import AdjustOptions
 
 _MOST_ITERATIONS = 100
-# COLMAP lays the model on the fixes before it adjusts. It may take for inliers what is so many times further off
-# than the inliers of our own alignment: too tight a limit would leave it with no start.
+# COLMAP aligns the model with the fixes before it adjusts. Its limit of an inlier is this factor times the largest
+# residual of the inliers of `align`: with too tight a limit COLMAP has no start.
 _ALIGNMENT_SLACK = 3.0
 
 
@@ -60,13 +60,16 @@ def run(stage: StageRun, options: AdjustOptions) -> Summary:
 
 
 def adjust_to_fixes(model: Any, survey: Survey, alignment: Alignment, seed: int = 0) -> None:
-    """Adjust a `pycolmap.Reconstruction` in place: cameras, lenses and points, in `geo` from here on.
+    """Adjust cameras, lenses and points of a `pycolmap.Reconstruction` in place; its frame becomes `geo`.
 
     Args:
-        alignment: of the model with the fixes; says how far off fixes may be.
+        model: the reconstruction, in `local`.
+        survey: has the fixes.
+        alignment: of the model with the fixes; its residuals limit those of COLMAP's inliers.
+        seed: of COLMAP's alignment.
 
     Raises:
-        DegenerateGeometryError: fixes on one line, on which positions alone cannot hold a model.
+        DegenerateGeometryError: the fixes lie on one line, and leave the rotation about that line open.
         ConvergenceError: COLMAP found no solution.
     """
     if alignment.layout == "line":
@@ -83,7 +86,7 @@ def adjust_to_fixes(model: Any, survey: Survey, alignment: Alignment, seed: int 
     summary = adjuster.solve()
     if not summary.is_solution_usable():
         raise ConvergenceError(f"the bundle adjustment found no solution: {summary.brief_report()}")
-    # Where COLMAP cannot lay the model on the fixes, it adjusts without them and says so in its log only.
+    # If COLMAP cannot align the model with the fixes, it adjusts without them, and only its log mentions that.
     limit_m = options.alignment_ransac.max_error
     if np.median(np.linalg.norm(_residuals(model, survey), axis=1)) > limit_m:
         raise ConvergenceError(f"the bundle adjustment left most cameras more than {limit_m:.2f} m off their fixes")
@@ -91,16 +94,16 @@ def adjust_to_fixes(model: Any, survey: Survey, alignment: Alignment, seed: int 
 
 
 def _aligned(model: SparseModel, survey: Survey, seed: int) -> Alignment:
-    """The similarity between a model and the fixes."""
+    """Return the alignment of a model with the fixes."""
     data = fix_correspondences(survey, model)
     return align(data, np.random.default_rng(seed), attitude=attitude_prior(survey, model))
 
 
 def _identity(alignment: Alignment, names: tuple[str, ...], residual: FloatArray) -> InitialSimilarity:
-    """The identity: at its minimum the adjustment has no similarity left to gain.
+    """Return the identity as initial similarity: at its minimum the adjustment cannot improve the similarity.
 
     Args:
-        alignment: of the adjusted model; its covariance is that of the identity too.
+        alignment: of the adjusted model with the fixes; has the covariance.
         names: of the F images with a fix.
         residual: (F, 3) of their cameras.
     """
@@ -120,14 +123,14 @@ def _identity(alignment: Alignment, names: tuple[str, ...], residual: FloatArray
 
 
 def _located(model: Any, survey: Survey) -> list[tuple[Any, Fix]]:
-    """Registered images that have a fix."""
+    """Return the registered images that have a fix, with their fixes."""
     fixes = {image.name: image.fix for image in survey.images if image.fix is not None}
     images = (model.images[image_id] for image_id in sorted(model.reg_image_ids()))
     return [(image, fixes[image.name]) for image in images if image.name in fixes]
 
 
 def _residuals(model: Any, survey: Survey) -> FloatArray:
-    """Camera centres less fixes (F, 3), once the model is in `geo`."""
+    """Return camera centres minus fixes (F, 3) of a model in `geo`."""
     rows = [image.projection_center() - np.array(fix.position_in_geo) for image, fix in _located(model, survey)]
     return np.array(rows).reshape(-1, 3)
 

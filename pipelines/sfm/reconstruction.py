@@ -1,4 +1,4 @@
-"""A reconstruction by COLMAP: features, matches, mapping, and a last, robust adjustment."""
+"""Reconstruction by COLMAP: features, matches, mapping, and a last, robust adjustment."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ _PAIRS_PER_CHUNK = 48
 
 @dataclass(frozen=True)
 class SfmJob:
-    """What to reconstruct.
+    """Inputs of a reconstruction.
 
     Attributes:
-        survey: the photographs, what is known of their cameras and places.
-        images: folder that the survey's image names are relative to.
-        database: COLMAP's database; one that is there is continued.
+        survey: photographs with priors of their cameras, positions and attitudes.
+        images: folder of the photographs.
+        database: path of COLMAP's database; an existing one is continued.
         options: of the stage.
     """
 
@@ -48,17 +48,17 @@ class SfmJob:
 
 
 def reconstruct(colmap: Any, job: SfmJob, progress: Progress) -> Any:
-    """Features, matches, mapping and a last, robust adjustment.
+    """Return the largest `pycolmap.Reconstruction` of the photographs, robustly adjusted.
 
     Args:
         colmap: the pycolmap module.
-
-    Returns:
-        The largest `pycolmap.Reconstruction`.
+        job: inputs of the reconstruction.
+        progress: shows features, matches and mapping.
 
     Raises:
-        InputError: a photograph is gone.
-        DegenerateGeometryError: no two images could be tied together.
+        InputError: a photograph does not exist, or a camera prior is none of COLMAP's cameras.
+        DegenerateGeometryError: COLMAP found no model.
+        ConvergenceError: the last adjustment found no solution.
     """
     names = [image.name for image in job.survey.images]
     missing = [name for name in names if not (job.images / name).is_file()]
@@ -67,9 +67,9 @@ def reconstruct(colmap: Any, job: SfmJob, progress: Progress) -> Any:
     colmap.set_random_seed(job.options.seed)
     number_of = {name: f"{number:06d}" for number, name in enumerate(names)}
     name_of = {number: name for name, number in number_of.items()}
-    _rename_images(colmap, job.database, name_of)  # a killed run may leave the numbers
+    _rename_images(colmap, job.database, name_of)  # A killed run may have left the numbers.
     _extract(colmap, job, progress)
-    # COLMAP takes pairs from a text in which a blank ends a name: meanwhile, photographs go by numbers.
+    # COLMAP reads pairs from a text in which a blank ends a name: numbers replace the names while it matches.
     _rename_images(colmap, job.database, number_of)
     pairs = [(number_of[names[i]], number_of[names[j]]) for i, j in candidate_pairs(job.survey, job.options)]
     try:
@@ -92,9 +92,10 @@ def reconstruct(colmap: Any, job: SfmJob, progress: Progress) -> Any:
 
 
 def candidate_pairs(survey: Survey, options: SfmOptions) -> IntArray:
-    """Indices (P, 2) into `survey.images` of the pairs to match.
+    """Return the pairs to match as indices (P, 2) into `survey.images`.
 
-    All pairs for up to 20 images or where no image has a fix; else by position and view direction.
+    All pairs are matched if there are up to 20 images, or if no image has a fix. Otherwise position and viewing
+    direction decide.
     """
     count = len(survey.images)
     located = any(image.fix for image in survey.images)
@@ -112,7 +113,7 @@ def candidate_pairs(survey: Survey, options: SfmOptions) -> IntArray:
 
 
 def _extract(colmap: Any, job: SfmJob, progress: Progress) -> None:
-    """Detect features camera by camera, a few images at a time: what is done survives an interruption."""
+    """Detect features camera by camera, in chunks of images: finished chunks survive an interruption."""
     options = colmap.FeatureExtractionOptions()
     options.max_image_size = job.options.max_image_size
     options.num_threads = job.options.threads
@@ -135,11 +136,11 @@ def _extract(colmap: Any, job: SfmJob, progress: Progress) -> None:
 
 
 def _add_camera(colmap: Any, job: SfmJob, prior: CameraPrior) -> None:
-    """Put the camera into the database unless an interrupted run already did."""
+    """Put the camera into the database, unless an interrupted run has already done so."""
     with colmap.Database.open(job.database) as database:
         if database.exists_camera(prior.camera_id):
             return
-        # A fisheye has no likeness among the perspective models to start from.
+        # No perspective model approximates a fisheye: its own model is kept.
         model = prior.model if prior.model == "OPENCV_FISHEYE" else job.options.camera_model
         camera = colmap.Camera.create_from_model_name(
             prior.camera_id, model, prior.params[0], prior.width, prior.height
@@ -150,7 +151,11 @@ def _add_camera(colmap: Any, job: SfmJob, prior: CameraPrior) -> None:
 
 
 def _copy_shared_params(colmap: Any, prior: CameraPrior, camera: Any) -> None:
-    """Take over the prior's focal length, centre and distortion as far as both models know them."""
+    """Copy the parameters of the prior that both camera models have: focal length, centre, distortion.
+
+    Raises:
+        InputError: COLMAP has no camera of that model with that number of parameters.
+    """
     try:
         original = colmap.Camera(
             model=prior.model, width=prior.width, height=prior.height, params=list(prior.params)
@@ -185,7 +190,7 @@ def _match(colmap: Any, job: SfmJob, pairs: list[tuple[str, str]], progress: Pro
 
 
 def _rename_images(colmap: Any, path: Path, names: dict[str, str]) -> None:
-    """Rename the images of a database, as far as they have one of these names."""
+    """Rename those images of a database whose names are keys of `names`."""
     with colmap.Database.open(path) as database:
         for image in database.read_all_images():
             if image.name in names:
@@ -212,7 +217,10 @@ def _map(colmap: Any, job: SfmJob, progress: Progress) -> list[Any]:
 
 @contextmanager
 def _scratch(folder: Path) -> Iterator[Path]:
-    """An empty folder for COLMAP's own output; its fixed name lets the next run clear what a killed one left."""
+    """Make an empty folder for COLMAP's own output, and remove it at the end.
+
+    The name is fixed, so that the next run removes the folder of a killed one.
+    """
     scratch = folder / "mapping"
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir()

@@ -1,8 +1,8 @@
-"""Structure from motion with COLMAP.
+"""Stage `sfm`: structure from motion with COLMAP.
 
-Reads `ingest/survey.json` and the photographs. Writes `sfm/sparse/` (a COLMAP model that COLMAP itself opens)
-and `sfm/database.db` (features and matches). The model's frame is `local`: similar to the scene, at an arbitrary
-place and scale; what GNSS measured chooses the pairs to match and enters nothing else.
+Reads `ingest/survey.json` and the photographs. Writes `sfm/sparse/` (a COLMAP model that COLMAP itself opens) and
+`sfm/database.db` (features and matches). The model's frame is `local`: similar to the scene, with an arbitrary
+place, rotation and scale. The positions measured by GNSS select the pairs to match, and have no other use here.
 """
 
 from __future__ import annotations
@@ -27,7 +27,12 @@ _FEW_REGISTERED = 0.8
 
 
 def run(stage: StageRun, options: SfmOptions) -> Summary:
-    """Reconstruct, or take over someone else's model, and say how complete it is."""
+    """Reconstruct the cameras and points, or import a model, and write the model.
+
+    Raises:
+        GeorefError: unreadable products, or an error of `reconstruct` or `import_model`.
+        DegenerateGeometryError: fewer than three photographs are registered.
+    """
     survey = load_json(Survey, stage.workspace.path(SURVEY))
     images = stage.workspace.photographs(survey.image_dir)
     sparse = stage.out / "sparse"
@@ -45,10 +50,10 @@ def run(stage: StageRun, options: SfmOptions) -> Summary:
 
 
 def import_model(path: Path, survey: Survey) -> Any:
-    """Someone else's COLMAP model, reduced to the survey's images.
+    """Return the COLMAP model at `path` (a `pycolmap.Reconstruction`), reduced to the survey's images.
 
     Raises:
-        InputError: not a COLMAP model, or fewer than 3 of its images are the survey's.
+        InputError: the folder holds no COLMAP model, or fewer than 3 of its images are in the survey.
     """
     model = load_reconstruction(path)
     names = {image.name for image in survey.images}
