@@ -1,1 +1,1 @@
-"""`georef compare`: the ablation of the method on one survey."""
+"""Ablation of the method on one survey: `georef compare`."""

@@ -1,4 +1,4 @@
-"""The configurations of the ablation (method, section 4): a table, light enough for the command line."""
+"""Table of the ablation's configurations, which the command line reads without loading a stage."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ _JOINT: Flags = {**_FIXED, "optimize_cameras": True, "geo_loss": True}
 
 @dataclass(frozen=True)
 class Configuration:
-    """One row of the ablation.
+    """Configuration of the ablation: options of the stages.
 
     Attributes:
         name: as in `--configs`.
         title: the method in a few words.
-        note: the difference from the other configurations, in a line.
-        sim3: options of `init-sim3` that make it; None: a bundle adjustment with the fixes places the model.
-        train: options of `train` that make it; those of A where `trained_by` says A.
-        trained_by: the configuration whose training it takes, itself if None.
+        note: difference from the other configurations, in one line.
+        sim3: its options of `init-sim3`; None: a bundle adjustment with the fixes places the model.
+        train: its options of `train`; without effect if `trained_by` is set.
+        trained_by: name of the configuration whose training it uses; None: its own.
     """
 
     name: str
@@ -73,15 +73,15 @@ CONFIGURATIONS: tuple[Configuration, ...] = (
     ),
 )  # fmt: skip
 BY_CONFIGURATION = {configuration.name: configuration for configuration in CONFIGURATIONS}
-# The options that make the configurations are not for the user to set; all others of `train` are, for all alike.
+# Users cannot set the options that define the configurations. All other options of `train` hold for all of them.
 COMMON_TRAIN_OPTIONS = tuple(name for name in BY_NAME["train"].options.model_fields if name not in _FIXED)
 
 
 def select_configurations(text: str) -> tuple[Configuration, ...]:
-    """Return the configurations that are named in a text, with commas, each once.
+    """Return the configurations named in a text, where commas separate the names; each only once.
 
     Raises:
-        InputError: an unknown name, or none.
+        InputError: the text has an unknown name, or no name.
     """
     names = [name.strip() for name in text.split(",") if name.strip()]
     unknown = [name for name in names if name not in BY_CONFIGURATION]

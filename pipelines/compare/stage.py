@@ -1,8 +1,8 @@
-"""The ablation: one survey trained and measured in several configurations, in one table.
+"""Ablation: one survey trained and measured in several configurations, compared in one table.
 
-Each configuration is a variant of the workspace at `compare/<name>/`: it runs the stages in which it differs, and
-reads the folders of the others where they are. What is current is skipped, what was interrupted goes on, as in
-`georef run`.
+Each configuration is a variant of the workspace at `compare/<name>/`. The variant runs the stages in which it
+differs, and reads the folders of all other stages. As in `georef run`, current stages are skipped and interrupted
+ones are resumed.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ FOLDER = "compare"
 _SHARED = stage_slice(None, "geolocate")
 _INIT, _TRAIN, _EVALUATE = BY_NAME["init-sim3"], BY_NAME["train"], BY_NAME["evaluate"]
 
-_RESULTS = (DegenerateGeometryError, ConvergenceError)  # errors that say something of a configuration
+_RESULTS = (DegenerateGeometryError, ConvergenceError)  # errors that are the result of a configuration
 
 StageContext = Callable[[Workspace, StageSpec], AbstractContextManager[None]]
 
 
 @dataclass(frozen=True)
 class PlannedStage:
-    """A stage to run in a variant, with its options."""
+    """Stage to run in a variant, with its options."""
 
     variant: Workspace
     spec: StageSpec
@@ -44,7 +44,7 @@ class PlannedStage:
 
 @dataclass(frozen=True)
 class ComparedStage:
-    """The outcome of a stage, and the configuration that asked for it; None: shared by all."""
+    """Outcome of a stage, with the configuration that requested it; None: all share it."""
 
     configuration: str | None
     outcome: Outcome
@@ -59,16 +59,22 @@ def compare(
     progress: Progress = SILENT,
     around: StageContext = lambda _workspace, _spec: nullcontext(),
 ) -> tuple[Comparison, list[ComparedStage]]:
-    """Bring the configurations up to date and write the table of their figures.
+    """Bring the configurations up to date, and write and return the table of their figures.
 
-    Stages up to geolocate are shared, and run first where they are not current. A configuration whose geometry or
-    training fails has a row that says why; the others go on.
+    The stages up to geolocate are shared, and run first if they are not current. A configuration whose geometry or
+    training fails has a row with the reason, and the others continue.
 
     Args:
-        flags: options of `train` for all configurations (`seed` also for the similarity). They come on top of those
-            of the last comparison, these on top of what `train` was last asked for with, and are remembered.
+        workspace: with an ingested survey.
+        configurations: rows of the table.
+        flags: options of `train` for all configurations (`seed` also for the similarity). They override those of
+            the last comparison, which override those that `train` was last requested with. They are remembered.
         force: run the stages of the configurations even if they are current.
-        around: a context to run each stage in.
+        progress: shows the tasks of the stages.
+        around: makes the context in which a stage runs.
+
+    Returns:
+        The table, and the stages in the order of their runs.
 
     Raises:
         GeorefError: the first other failure.
@@ -93,12 +99,12 @@ def compare(
 
 
 def _json_scalars(options: Flags) -> dict[str, JsonScalar]:
-    """Options as JSON holds them."""
+    """Return the options as values of JSON."""
     return {name: value if isinstance(value, bool | int | float) else str(value) for name, value in options.items()}
 
 
 def _plan(workspace: Workspace, configuration: Configuration, asked: Flags) -> Iterator[PlannedStage]:
-    """The stages of a configuration, in order, those of the training that it takes from another included."""
+    """Yield the stages of a configuration in order, with those of the configuration whose training it uses."""
     place, root = f"{FOLDER}/{configuration.name}", workspace.root
     shared = {spec.folder: root / spec.folder for spec in _SHARED}
     seed = {"seed": asked["seed"]} if "seed" in asked else {}
@@ -124,10 +130,10 @@ def _plan(workspace: Workspace, configuration: Configuration, asked: Flags) -> I
 
 @dataclass
 class _PlanRunner:
-    """Runs each planned stage once, whichever configuration asks for it.
+    """Runner that runs each planned stage once, even if several configurations plan it.
 
     Attributes:
-        finished: the stages so far, in the order of their runs.
+        finished: finished stages, in the order of their runs.
     """
 
     finished: list[ComparedStage]
@@ -137,10 +143,10 @@ class _PlanRunner:
     _by_place: dict[tuple[str, str], Outcome | GeorefError] = field(default_factory=dict)
 
     def run(self, configuration: Configuration, planned: PlannedStage) -> Outcome:
-        """Return the outcome of a stage.
+        """Return the outcome of a stage, run now or before.
 
         Raises:
-            GeorefError: it fails, or has failed before.
+            GeorefError: the stage fails, or has failed before.
         """
         key = (str(planned.variant.root), planned.spec.name)
         if key not in self._by_place:
@@ -165,7 +171,7 @@ class _PlanRunner:
 
 
 def _row(configuration: Configuration, plan: Sequence[PlannedStage], runner: _PlanRunner) -> ComparedRow:
-    """Run a configuration and read its figures."""
+    """Run a configuration and return the row of its figures."""
     log.info("configuration %s: %s", configuration.name, configuration.title)
     try:
         # Of two runs of init-sim3 the later is the configuration's own.
@@ -178,7 +184,7 @@ def _row(configuration: Configuration, plan: Sequence[PlannedStage], runner: _Pl
             note=configuration.note,
             failure=str(error),
         )
-    del manifests[_EVALUATE.name]  # it warns of the survey, which is that of all rows
+    del manifests[_EVALUATE.name]  # Its warnings concern the survey, which all rows share.
     training = manifests[_TRAIN.name].values
     report = read_report(plan[-1].variant.path(REPORT))
     return ComparedRow(

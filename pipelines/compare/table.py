@@ -1,4 +1,4 @@
-"""The table of `georef compare`: the figures of each configuration, as JSON, as Markdown and as a plot."""
+"""Table of `georef compare`: the figures of each configuration, as JSON, as Markdown and as a plot."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ JsonScalar = bool | int | float | str
 
 
 class PointAccuracy(Product):
-    """Check points against their survey, in metres; None where none was measured."""
+    """Errors of the check points in metres; None: no point was measured."""
 
     count: int = 0
     mean_h_m: float | None = None
@@ -25,9 +25,16 @@ class PointAccuracy(Product):
 
 
 class ComparedRow(Product):
-    """The figures of one configuration.
+    """Row of the table: the figures of one configuration.
 
-    `failure` tells why there are none; `training_s` is None where the training is another configuration's.
+    Attributes:
+        configuration, title, note: as in `Configuration`.
+        failure: reason why there are no figures.
+        test_psnr, test_ssim: means over the test views, in dB and from 0 to 1.
+        camera, model: errors of the check points by camera and by model.
+        iterations, gaussians: of the training.
+        training_s: duration; None if the training is that of another configuration.
+        warnings: of its stages.
     """
 
     configuration: str
@@ -45,7 +52,13 @@ class ComparedRow(Product):
 
 
 class Comparison(Product):
-    """The table: options that all trainings share, and a row a configuration."""
+    """Table of the configurations.
+
+    Attributes:
+        format_version: version of the format.
+        options: options that all trainings share.
+        rows: one row for each configuration.
+    """
 
     format_version: Literal[1] = 1
     options: dict[str, JsonScalar]
@@ -53,7 +66,7 @@ class Comparison(Product):
 
 
 def point_accuracy(errors: CheckPointErrors) -> PointAccuracy:
-    """Return the figures of check points for the table."""
+    """Return the figures of the check points that the table shows."""
     return PointAccuracy(
         count=errors.count,
         mean_h_m=errors.mean_h_m,
@@ -64,7 +77,7 @@ def point_accuracy(errors: CheckPointErrors) -> PointAccuracy:
 
 
 def write_comparison(folder: Path, table: Comparison) -> None:
-    """Write `table.json`, `table.md` and `plot.png`; nothing if they say this already."""
+    """Write `table.json`, `table.md` and `plot.png`, unless the files already hold this table."""
     json_path, markdown_path, plot_path = (folder / name for name in ("table.json", "table.md", "plot.png"))
     json_text, markdown_text = table.model_dump_json(indent=1) + "\n", markdown(table)
     if plot_path.exists() and _holds(json_path, json_text) and _holds(markdown_path, markdown_text):
@@ -98,7 +111,7 @@ def _panels(rows: Sequence[ComparedRow]) -> tuple[Panel, ...]:
 
 
 def markdown(table: Comparison) -> str:
-    """Return the table for people, with the notes below it."""
+    """Return the table as Markdown, with notes and remarks below."""
     heads = (
         *("", "test PSNR dB", "SSIM", "camera mean H", "camera RMSE H", "camera RMSE V"),
         *("model mean H", "model median H", "model RMSE H", "model RMSE V", "check points", "training"),
@@ -121,7 +134,7 @@ def markdown(table: Comparison) -> str:
 
 
 def cells(row: ComparedRow) -> tuple[str, ...]:
-    """Return the figures of a row as text: images, check points by camera and by model, their number, time."""
+    """Return the figures of a row as text: PSNR, SSIM, check points by camera and by model, their number, time."""
     camera, model = row.camera, row.model
     counts = str(camera.count) if camera.count == model.count else f"{camera.count}, {model.count}"
     return (
@@ -135,7 +148,7 @@ def cells(row: ComparedRow) -> tuple[str, ...]:
 
 
 def remarks_on(row: ComparedRow) -> tuple[str, ...]:
-    """Return why a row is empty, and the warnings of its stages."""
+    """Return the reason why a row is empty, and the warnings of its stages."""
     return (*(() if row.failure is None else (f"failed: {row.failure}",)), *row.warnings)
 
 
@@ -148,5 +161,5 @@ def _number(value: float | None, digits: int) -> str:
 
 
 def _metres(value: float | None) -> str:
-    """Tenths of a millimetre below a metre."""
+    """Return metres as text, with tenths of a millimetre below one metre."""
     return _number(value, 4 if value is not None and value < 1 else 2)

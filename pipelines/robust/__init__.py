@@ -1,1 +1,1 @@
-"""Robust losses, RANSAC and statistics. Plain numpy, float64."""
+"""Robust kernels, RANSAC and statistics (numpy, float64)."""

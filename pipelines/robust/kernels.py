@@ -1,15 +1,15 @@
-"""Robust kernels of a whitened residual: losses, weights, and what they make of plain noise.
+"""Robust kernels of a whitened residual: losses, weights, and their means under plain noise.
 
-All take r² (any shape), the squared length of a residual in units of its σ. A weight ρ'(r²) in (0, 1] is the
+The argument is r² (any shape), the squared length of a residual in units of its σ. A weight ρ'(r²) in (0, 1] is the
 derivative of its loss ρ, which is r² for small residuals.
 
-Tuning constants, one a dimension of the residual:
+Tuning constants by dimension of the residual:
 
 - Huber in one dimension: 95 % efficiency for Gaussian errors (Huber 1964, doi 10.1214/aoms/1177703732).
 - Cauchy in two dimensions (image residuals): 95 % efficiency of one coordinate (Holland and Welsch 1977,
-  doi 10.1080/03610927708827533), as COLMAP's adjustments take it.
-- Cauchy in one and in three dimensions (distances, positions, attitudes): the 95 % quantile of χ², the scale that
-  COLMAP gives position priors.
+  doi 10.1080/03610927708827533), as in COLMAP's adjustments.
+- Cauchy in one and in three dimensions (distances, positions, attitudes): the 95 % quantile of χ², COLMAP's scale
+  for position priors.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ HUBER_95 = 1.345
 CAUCHY_95 = 2.385
 # Cauchy's c² by the dimension of the residual.
 CAUCHY_SCALE2 = {1: 3.841, 2: CAUCHY_95**2, 3: 7.815}
-# E[χ² w] under Gaussian noise of the stated σ: what Cauchy's weight w = 1 / (1 + χ²/c²) leaves of χ².
+# E[w χ²] under Gaussian noise of the stated σ, with Cauchy's weight w = 1 / (1 + χ²/c²).
 MEAN_WEIGHTED_CHI2 = {1: 0.6208, 2: 1.2604, 3: 1.9279}
-# Cauchy's weight also falls on what is only noise. Weights divided by this give the covariance that the estimator
-# has under Gaussian noise of the stated σ: E[w] E[w² χ²/d] / E[∂(w r)/∂r]² for χ² with d degrees of freedom.
+# Cauchy's weight also lowers plain noise. Weights divided by this factor give the covariance that the estimator has
+# under Gaussian noise of the stated σ: E[w] E[w² χ²/d] / E[∂(w r)/∂r]² for χ² with d degrees of freedom.
 NOISE_WEIGHT = {1: 0.9087, 2: 0.8265, 3: 0.7886}
 
 
 def huber_weight(squared: ArrayLike, scale: float = HUBER_95) -> FloatArray:
-    """Return Huber's weight, whose loss is r² up to `scale` σ, then linear in r: 1, then scale / r."""
+    """Return Huber's weight: 1 up to `scale` σ, where the loss is r²; then scale / r, where the loss is linear."""
     r2 = np.asarray(squared, dtype=np.float64)
     return scale / np.sqrt(np.maximum(r2, scale**2))
 
@@ -39,7 +39,7 @@ def huber_weight(squared: ArrayLike, scale: float = HUBER_95) -> FloatArray:
 def cauchy_weight(squared: ArrayLike, dimension: int) -> FloatArray:
     """Return Cauchy's weight 1 / (1 + r²/c²) of residuals of a dimension.
 
-    It redescends: the start has to be nearly right.
+    The weight redescends: the start must be near the solution.
     """
     return np.asarray(1.0 / (1.0 + np.asarray(squared, dtype=np.float64) / CAUCHY_SCALE2[dimension]))
 

@@ -23,7 +23,7 @@ class RansacOptions:
         sample_size: observations that determine a model.
         gate: largest squared whitened residual of an inlier.
         max_draws: limit of draws.
-        confidence: wanted probability of at least one draw without outliers.
+        confidence: required probability of at least one draw without outliers.
     """
 
     sample_size: int
@@ -82,7 +82,7 @@ def ransac(
 
 
 def draws_needed(inlier_share: float, options: RansacOptions) -> float:
-    """Return the number of draws that contain one without outliers at the wanted confidence."""
+    """Return the number of draws that contain one without outliers at the required confidence."""
     clean = inlier_share**options.sample_size
     if clean >= 1.0:
         return 1.0

@@ -1,4 +1,4 @@
-"""Statistics of residuals: robust scale, consistency, and the figures that reports print."""
+"""Statistics of residuals: robust scale, consistency, and the figures of reports."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from pipelines.core.products import Product
 from pipelines.core.types import FloatArray
 
 _NORMAL_MAD = 1.4826  # σ / MAD of a normal distribution
-_RAYLEIGH_MEDIAN = 1.1774  # of the length of a residual, of σ = 1 in either coordinate
+_RAYLEIGH_MEDIAN = 1.1774  # median length of a residual with σ = 1 in either coordinate
 _WEISZFELD_STEPS = 50
-_WEISZFELD_NEAR = 1e-6  # a point that is met weighs no more than this distance
+_WEISZFELD_NEAR = 1e-6  # lower limit of a distance, so that a point at the median keeps a finite weight
 
 
 def chi2_quantile(probability: float, degrees: ArrayLike) -> FloatArray:
-    """Quantile of χ² with `degrees` (…) of freedom; 0 where there are none."""
-    from scipy.stats import chi2  # takes a second to load, which the types below need not cost
+    """Return the quantile of χ² with `degrees` (…) of freedom; 0 for zero degrees."""
+    from scipy.stats import chi2  # loads for a second, which an import of the types below must not cost
 
     dof = np.asarray(degrees)
     distinct, place = np.unique(dof, return_inverse=True)
@@ -28,31 +28,32 @@ def chi2_quantile(probability: float, degrees: ArrayLike) -> FloatArray:
 
 @cache
 def outlier_gate(dimension: int) -> float:
-    """Return the χ² beyond which a residual of a dimension is an outlier: plain noise is within in 99.9 %."""
+    """Return the χ² beyond which a residual of a dimension is an outlier: 99.9 % of plain noise stays below."""
     return float(chi2_quantile(0.999, dimension))
 
 
 @cache
 def median_chi2(dimension: int) -> float:
-    """Return the median of χ²: what half of the squared residuals of plain noise stay below."""
+    """Return the median of χ² for residuals of a dimension: half of plain noise stays below."""
     return float(chi2_quantile(0.5, dimension))
 
 
 def mad_sigma(values: ArrayLike) -> float:
-    """σ of values (N,) from the median absolute deviation: half of them may be outliers."""
+    """Return the σ of values (N,) from their median absolute deviation; up to half may be outliers."""
     array = np.asarray(values, dtype=np.float64)
     return float(_NORMAL_MAD * np.median(np.abs(array - np.median(array))))
 
 
 def rayleigh_sigma(lengths: ArrayLike) -> float:
-    """σ of either coordinate of residuals of lengths (N,), from their median. NaN is left out."""
+    """Return the σ of either coordinate of planar residuals, from the median of their lengths (N,) without NaN."""
     return float(np.nanmedian(np.asarray(lengths, dtype=np.float64))) / _RAYLEIGH_MEDIAN
 
 
 def spatial_median(points: ArrayLike) -> FloatArray:
-    """The place (3,) with the least sum of distances to points (N, 3), N ≥ 1, by Weiszfeld's iteration.
+    """Return the point (3,) with the least sum of distances to points (N, 3), N ≥ 1, by Weiszfeld's iteration.
 
-    Half of the points may be anywhere; and unlike the median of each coordinate it does not depend on the axes.
+    Up to half of the points may be outliers. The result does not depend on the axes, unlike the median of each
+    coordinate.
     """
     array = np.asarray(points, dtype=np.float64)
     place = np.median(array, axis=0)
@@ -63,14 +64,14 @@ def spatial_median(points: ArrayLike) -> FloatArray:
 
 
 def squared_mahalanobis(residuals: ArrayLike, covariances: ArrayLike) -> FloatArray:
-    """rᵀ Σ⁻¹ r (N,) of residuals (N, d) with covariances (N, d, d) or (d, d)."""
+    """Return rᵀ Σ⁻¹ r (N,) of residuals (N, d) with covariances (N, d, d) or (d, d)."""
     r = np.asarray(residuals, dtype=np.float64)
     solved = np.linalg.solve(np.asarray(covariances, dtype=np.float64), r[..., None])[..., 0]
     return np.asarray((r * solved).sum(axis=-1))
 
 
 def residual_stats(residuals_in_geo: ArrayLike) -> ResidualStats:
-    """Figures of residuals (N, 3), East-North-Up in metres; null where N is 0."""
+    """Return the figures of residuals (N, 3), East-North-Up in metres; all but the count are None if N is 0."""
     r = np.asarray(residuals_in_geo, dtype=np.float64).reshape(-1, 3)
     if len(r) == 0:
         empty = dict.fromkeys(name for name in ResidualStats.model_fields if name != "count")
@@ -90,7 +91,7 @@ def residual_stats(residuals_in_geo: ArrayLike) -> ResidualStats:
 
 
 class ResidualStats(Product):
-    """Residuals of a fit in metres. Not an accuracy."""
+    """Figures of the residuals of a fit, in metres. These are no accuracy."""
 
     count: int
     mean_h_m: float | None
