@@ -1,4 +1,4 @@
-"""The options of `georef calibrate`."""
+"""Options of `georef calibrate`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pipelines.scene.rig import RigParameters
 
 
 class CalibrateOptions(StageOptions):
-    """What `georef calibrate` estimates from the SfM cameras and the recorded navigation, and what it applies."""
+    """Options of the calibration of the rig: parameters to estimate, and parameters to apply."""
 
     estimate: RigParameters | None = Field(
         None,

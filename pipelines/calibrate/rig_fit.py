@@ -1,11 +1,12 @@
-"""Time offset, boresight and lever arm from the SfM cameras against the recorded navigation.
+"""Adjustment of time offset, boresight and lever arm: the SfM cameras against the recorded navigation.
 
-The SfM model knows the shape of the camera's track and its turns, the navigation the same on another clock, from
-another place and in other axes. One adjustment finds the similarity geo ← local, the time offset, the boresight and
-the lever arm with which both agree (`rig_model` has the equations): Gauss-Newton, reweighted by Cauchy's kernel.
-The scatter of either kind is measured, not believed. Wide priors keep finite what the flight does not show, so that
-it is recognised by its σ: a hover, a straight line, a circle at constant speed (where an offset looks like a turn
-of the whole).
+The SfM model gives the camera's track and its turns. The navigation gives the same on another clock, from another
+place and in other axes. One adjustment solves for the similarity geo ← local, the time offset, the boresight and
+the lever arm that make both agree (`rig_model` has the equations): Gauss–Newton, reweighted by Cauchy's kernel.
+
+- The σ of positions and of attitudes are estimated from the residuals.
+- Wide priors keep the σ of unobservable parameters finite but large. Examples are a hover, a straight line, and a
+  circle at constant speed, where a time offset is equivalent to a rotation of the whole.
 """
 
 from __future__ import annotations
@@ -45,15 +46,15 @@ _LEAST_SIGMA_M, _LEAST_SIGMA_RAD = 1e-3, 1e-5
 
 @dataclass(frozen=True)
 class RigFit:
-    """The result.
+    """Result of the adjustment.
 
     Attributes:
-        state: the values.
-        sigma: (14,) σ: of the similarity (7), offset in s, boresight in rad (3), lever arm in m (3). A lens that
-            SfM has not quite found tilts all cameras alike, or moves them along their view, with the scene's
-            consent: no scatter shows it, and σ of boresight and lever arm count a pixel of it.
-        images: that took part.
-        rms_position_m, rms_attitude_deg: robust scatter per axis of what is left; attitude NaN without any.
+        state: values of the unknowns.
+        sigma: (14,) σ: of the similarity (7), offset in s, boresight in rad (3), lever arm in m (3). A small error
+            of SfM's lens tilts all cameras alike, or shifts them along their view, without any residual. The σ of
+            boresight and lever arm therefore include one pixel: its angle, and its width at the scene.
+        images: number of images in the adjustment.
+        rms_position_m, rms_attitude_deg: robust σ of the residuals per axis; attitude NaN without any.
     """
 
     state: RigState
@@ -65,7 +66,13 @@ class RigFit:
 
 @dataclass(frozen=True)
 class FitOptions:
-    """Which unknowns are free, and how far an offset is searched on either side of its start."""
+    """Options of the adjustment.
+
+    Attributes:
+        offset: estimate the time offset.
+        arm: estimate the lever arm.
+        max_offset_s: the offset is searched so far on either side of its start.
+    """
 
     offset: bool = True
     arm: bool = False
@@ -73,7 +80,16 @@ class FitOptions:
 
 
 def fit_rig(data: RigData, start_offset_s: float, start_boresight: FloatArray, options: FitOptions) -> RigFit:
-    """Adjust. The boresight is free wherever there are attitudes, so that its error does not reach the rest.
+    """Return the parameters of the rig that make SfM cameras and navigation agree.
+
+    The boresight is free if attitudes and a mount are known, so that its error does not affect the other
+    parameters.
+
+    Args:
+        data: cameras, navigation and control points.
+        start_offset_s: time offset to start from.
+        start_boresight: (3, 3) nominal ← true camera, to start from.
+        options: free parameters.
 
     Raises:
         DegenerateGeometryError: fewer than six images within the track, or all on one line or in one place.
@@ -103,7 +119,8 @@ def fit_rig(data: RigData, start_offset_s: float, start_boresight: FloatArray, o
     covariance = equations.covariance(robust_weights(equations.residuals()), free)
     sigma = np.where(free, np.sqrt(np.diag(covariance)), np.inf)
     if options.offset:
-        # Noise of the fixes passes for motion, and motion for information: what noise would give is taken off.
+        # Noise of the navigation looks like motion, and motion is information on the offset. The information that
+        # plain noise would give is subtracted.
         known = sigma[OFFSET] ** -2 - 3 * (len(position) + len(attitude)) / (2 * DIFFERENCE_S**2)
         sigma[OFFSET] = np.maximum(known, options.max_offset_s**-2) ** -0.5
     sigma[BORESIGHT] = np.hypot(sigma[BORESIGHT], data.pixel_rad)
@@ -122,7 +139,15 @@ def _free(data: RigData, options: FitOptions) -> BoolArray:
 def _equations(
     data: RigData, state: RigState, sigmas: tuple[float, float], start: RigState, options: FitOptions
 ) -> tuple[NormalEquations, FloatArray]:
-    """The adjustment near a state, in 14 parameters about a pivot (3,) in geo."""
+    """Return the normal equations in 14 parameters near a state, and their pivot (3,) in geo.
+
+    Args:
+        data: cameras, navigation and control points.
+        state: values about which to linearise.
+        sigmas: σ of positions in metres and of attitudes in radians.
+        start: middle of the prior.
+        options: free parameters.
+    """
     used = usable_images(data, state.offset_s)
     mapped = state.geo_from_local.apply(data.center_in_local[used])
     pivot = mapped.mean(axis=0)
@@ -142,9 +167,10 @@ def _equations(
 
 
 def _control(data: RigData, state: RigState) -> tuple[FloatArray, FloatArray]:
-    """Misses of the control points (c, 3) in metres and their whiteners (c, 3, 3).
+    """Return the residuals of the control points (c, 3) in metres and their whiteners (c, 3, 3).
 
-    The SfM model bends: where the control points scatter more than marks and survey allow, all count for less.
+    The SfM model bends. If the control points scatter more than the covariances of marks and survey, these
+    covariances are scaled up to the scatter.
     """
     model = state.geo_from_local
     missed = data.control_in_geo - model.apply(data.control_in_local)
@@ -154,7 +180,7 @@ def _control(data: RigData, state: RigState) -> tuple[FloatArray, FloatArray]:
 
 
 def _prior(state: RigState, start: RigState, options: FitOptions) -> tuple[FloatArray, FloatArray]:
-    """Precision (14,) of what is known beforehand, and the state's distance (14,) from it."""
+    """Return the precision (14,) of the prior, and the state's distance (14,) from its middle."""
     sigma, missed = np.full(14, np.inf), np.zeros(14)
     sigma[OFFSET], sigma[BORESIGHT], sigma[ARM] = options.max_offset_s, _PRIOR_BORESIGHT_RAD, _PRIOR_ARM_M
     missed[OFFSET] = state.offset_s - start.offset_s

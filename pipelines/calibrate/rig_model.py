@@ -1,4 +1,4 @@
-"""What navigation and SfM say of the same cameras: the equations of a calibration, and their derivatives.
+"""Equations of a calibration, with their derivatives: cameras by the navigation equal cameras by SfM.
 
 With the antenna p and the body A as recorded, the mount M, camera centres c and rotations C in local, the
 similarity geo ← local (s, R, t), the time offset δ, the boresight B and the lever arm l:
@@ -21,24 +21,28 @@ from pipelines.geometry.trajectory import Trajectory
 # Columns of the parameters: similarity (ln s, rotation, translation), offset in s, boresight in rad, arm in m.
 SIMILARITY, ROTATION = slice(0, 7), slice(1, 4)
 OFFSET, BORESIGHT, ARM = slice(7, 8), slice(8, 11), slice(11, 14)
-# Velocities are taken over this long: between neighbouring fixes noise would drown them.
+# Time on either side of an image over which velocities are measured: between neighbouring fixes noise dominates.
 DIFFERENCE_S = 0.5
 
 
 @dataclass(frozen=True)
 class RigData:
-    """What the adjustment sees of n images and c control points.
+    """Cameras of n images by navigation and by SfM, and c control points.
 
     Attributes:
-        positions: of the antenna in geo, on the navigation's clock.
-        attitudes: of the body in geo, on the same clock; at most one sample if none were recorded.
+        positions: trajectory of the antenna in geo, on the navigation's clock.
+        attitudes: rotations of the body in geo, on the same clock; at most one sample if none were recorded.
         time_s: (n,) camera clock.
-        center_in_local: (n, 3) and cam_from_local: (n, 3, 3), of SfM.
+        center_in_local: (n, 3) projection centres of SfM.
+        cam_from_local: (n, 3, 3) rotations of SfM.
         cam_from_body: (n, 3, 3) mount, NaN where unknown.
-        antenna_in_body: (n, 3) lever arm to start from.
-        control_in_local, control_in_geo: (c, 3).
-        control_cov_in_local, control_cov_in_geo: (c, 3, 3), of their marks and of their survey.
-        pixel_rad: angle of a pixel; footprint_in_local: its width at the distance of the scene.
+        antenna_in_body: (n, 3) lever arm to start from, metres.
+        control_in_local: (c, 3) control points, intersected from their marks.
+        control_in_geo: (c, 3) control points as surveyed, metres.
+        control_cov_in_local: (c, 3, 3) covariances of the intersections.
+        control_cov_in_geo: (c, 3, 3) covariances of the survey, m².
+        pixel_rad: angle of a pixel.
+        footprint_in_local: width of a pixel at the distance of the scene.
     """
 
     positions: Trajectory
@@ -63,7 +67,14 @@ class RigData:
 
 @dataclass(frozen=True)
 class RigState:
-    """Values of the unknowns; `arm` is added to `RigData.antenna_in_body`, boresight is nominal ← true camera."""
+    """Values of the unknowns.
+
+    Attributes:
+        geo_from_local: the similarity.
+        offset_s: navigation clock minus camera clock.
+        boresight: (3, 3) nominal ← true camera.
+        arm: (3,) metres, added to `RigData.antenna_in_body`.
+    """
 
     geo_from_local: Similarity
     offset_s: float
@@ -72,7 +83,7 @@ class RigState:
 
 
 def usable_images(data: RigData, offset_s: float) -> BoolArray:
-    """Return for which images (n,) there is navigation now and where the offset is moved to differentiate."""
+    """Return the mask (n,) of the images that the navigation covers, with a margin for differentiation by time."""
     usable = np.ones(len(data.time_s), dtype=bool)
     for recorded in [data.positions, data.attitudes] if data.has_attitudes else [data.positions]:
         for shift in (-DIFFERENCE_S, 0.0, DIFFERENCE_S):
@@ -83,7 +94,17 @@ def usable_images(data: RigData, offset_s: float) -> BoolArray:
 def cameras_by_navigation(
     data: RigData, offset_s: float, arm: FloatArray, used: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return places (k, 3) of the used cameras by the navigation, and bodies geo ← body (k, 3, 3) or none."""
+    """Return the used cameras by the navigation: centres (k, 3) in geo, and rotations geo ← body (k, 3, 3).
+
+    Args:
+        data: navigation and rig.
+        offset_s: navigation clock minus camera clock.
+        arm: (3,) metres, added to the lever arm of `data`.
+        used: (n,) mask of k images.
+
+    Returns:
+        Without attitudes, the antenna's positions, and no rotations (0, 3, 3).
+    """
     time_s = data.time_s[used] + offset_s
     place = data.positions.at(time_s).position
     if not data.has_attitudes:
@@ -93,7 +114,13 @@ def cameras_by_navigation(
 
 
 def residuals_of(data: RigData, state: RigState, used: BoolArray) -> tuple[FloatArray, FloatArray]:
-    """Return misses of positions (k, 3) in metres and of attitudes (j, 3) in radians, in the camera's axes."""
+    """Return the residuals of positions (k, 3) in metres, and of attitudes (j, 3) in radians, axes of the camera.
+
+    Args:
+        data: cameras and navigation.
+        state: values of the unknowns.
+        used: (n,) mask of k images; j of them have a mount.
+    """
     place, bodies = cameras_by_navigation(data, state.offset_s, state.arm, used)
     position = place - state.geo_from_local.apply(data.center_in_local[used])
     if not len(bodies):
@@ -105,12 +132,19 @@ def residuals_of(data: RigData, state: RigState, used: BoolArray) -> tuple[Float
 
 
 def has_mount(data: RigData, used: BoolArray) -> BoolArray:
-    """Return which of the used images (k,) have a camera whose mount is known."""
+    """Return the mask (k,) of the used images whose mount is known."""
     return np.asarray(np.isfinite(data.cam_from_body[used]).all(axis=(1, 2)))
 
 
 def rotations_by_navigation(data: RigData, state: RigState, bodies: FloatArray, used: BoolArray) -> FloatArray:
-    """Return camera rotations geo ← cam (j, 3, 3) that the navigation says of the used images with a mount."""
+    """Return the rotations geo ← cam (j, 3, 3) by the navigation, of the used images with a mount.
+
+    Args:
+        data: has the mounts.
+        state: has the boresight.
+        bodies: (k, 3, 3) rotations geo ← body of the used images.
+        used: (n,) mask of k images.
+    """
     known = has_mount(data, used)
     return np.asarray(bodies[known] @ np.swapaxes(data.cam_from_body[used][known], 1, 2) @ state.boresight)
 
@@ -118,9 +152,16 @@ def rotations_by_navigation(data: RigData, state: RigState, bodies: FloatArray, 
 def derivatives_of(
     data: RigData, state: RigState, used: BoolArray, pivot: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return derivatives (k, 3, 14) of the positions' misses and (j, 3, 14) of the attitudes' by the parameters.
+    """Return the derivatives of `residuals_of` by the parameters: positions (k, 3, 14) and attitudes (j, 3, 14).
 
-    All but those by the time offset are analytic. A velocity is measured over `DIFFERENCE_S` on either side.
+    The derivatives by the time offset are central differences over `DIFFERENCE_S` on either side. All others are
+    analytic.
+
+    Args:
+        data: cameras and navigation.
+        state: values of the unknowns.
+        used: (n,) mask of k images; j of them have a mount.
+        pivot: (3,) in geo, of the similarity's parameters.
     """
     mapped = state.geo_from_local.apply(data.center_in_local[used])
     _, bodies = cameras_by_navigation(data, state.offset_s, state.arm, used)

@@ -1,4 +1,4 @@
-"""Where a calibration starts: the time offset at which the tracks of cameras and navigation have one shape."""
+"""Start of a calibration: the time offset at which the tracks of cameras and navigation have the same shape."""
 
 from __future__ import annotations
 
@@ -22,7 +22,12 @@ _SMOOTHING_S = 0.1
 
 
 def scan_offsets(data: RigData, offsets: FloatArray, boresight: FloatArray) -> RigState:
-    """Return the offset at which the shapes of the tracks agree best, and the similarity there.
+    """Return the state at the time offset for which the shapes of the tracks agree best.
+
+    Args:
+        data: cameras and navigation.
+        offsets: (m,) candidates in seconds; the first wins a tie.
+        boresight: (3, 3) nominal ← true camera, taken over into the state.
 
     Raises:
         DegenerateGeometryError: fewer than six images within the track, or all on one line or in one place.
@@ -38,7 +43,7 @@ def scan_offsets(data: RigData, offsets: FloatArray, boresight: FloatArray) -> R
         except DegenerateGeometryError:
             continue
         missed = np.linalg.norm(place - model.apply(data.center_in_local[inside]), axis=1)
-        # Few images agree easily: each that the offset loses counts like a large miss.
+        # Few images agree easily: images that an offset moves out of the navigation raise its cost.
         cost = float(np.median(missed)) * (1.0 + 10.0 * (1.0 - inside.mean()))
         if best is None or cost < best[0]:
             best = cost, RigState(model, float(offset), boresight, np.zeros(3))
@@ -56,7 +61,7 @@ def scan_offsets(data: RigData, offsets: FloatArray, boresight: FloatArray) -> R
 
 
 def smoothed(attitudes: Trajectory) -> Trajectory:
-    """Return attitudes averaged over a tenth of a second on either side: white noise shrinks, a turn stays."""
+    """Return attitudes averaged over 0.1 s on either side: white noise shrinks, while turns are kept."""
     clock = attitudes.time_s
     if len(clock) < 3:
         return attitudes

@@ -1,8 +1,8 @@
 """Stage `calibrate`: time offset, boresight and lever arm, from the SfM cameras against the recorded navigation.
 
-Reads: `ingest/survey.json`, and `ingest/track.npz` and `sfm/sparse` where there is anything to estimate.
-Writes: `calibrate/rig.json`. What is applied of it enters positions and attitudes when later stages read the survey
-(`scene.calibrated.load_survey`). What SfM made of the photographs stays as it is.
+Reads `ingest/survey.json`, and if any parameter is to be estimated, `ingest/track.npz` and `sfm/sparse`. Writes
+`calibrate/rig.json`. Its applied estimates change positions and attitudes when later stages read the survey
+(`scene.calibrated.load_survey`). The SfM model stays as it is.
 """
 
 from __future__ import annotations
@@ -44,10 +44,11 @@ _ENDLESS = 1e6
 
 
 def run(stage: StageRun, options: CalibrateOptions) -> Summary:
-    """Estimate the rig of the flight and save the estimates; where nothing is to be estimated, read nothing for it.
+    """Estimate the rig of the flight and write the estimates; without any to estimate, write an empty product.
 
     Raises:
-        InputError: the navigation was not recorded by time, or there are no attitudes for what is to be estimated.
+        MissingProductError: a product does not exist.
+        InputError: a product is damaged, or an error of `calibrate`.
     """
     workspace = stage.workspace
     survey = load_json(Survey, workspace.path(SURVEY))
@@ -61,12 +62,21 @@ def run(stage: StageRun, options: CalibrateOptions) -> Summary:
 def calibrate(
     survey: Survey, model: SparseModel, track: NavigationTrack, options: CalibrateOptions
 ) -> RigCalibration:
-    """Return estimates of the rig, those that ingest was asked for applied unless `--apply` says otherwise.
+    """Return the estimates of the rig.
 
-    A flight that shows nothing of the rig is no failure: the calibration then says so.
+    An observable estimate is applied if the survey names its parameter. `options.apply` overrides the survey: all
+    observable estimates, or none. A flight in which no parameter is observable is no failure: `problem` states the
+    reason.
+
+    Args:
+        survey: has the control points and the option of `ingest`.
+        model: the SfM model.
+        track: the recorded navigation.
+        options: of the stage.
 
     Raises:
-        InputError: as `run`.
+        InputError: the navigation was not recorded by time; or attitudes, the body's axes or the mount are needed
+            and unknown.
     """
     wanted = _wanted(survey, options)
     require_estimable(track, wanted, "--estimate")
@@ -92,7 +102,7 @@ def calibrate(
 
 
 def _wanted(survey: Survey, options: CalibrateOptions) -> tuple[RigParameter, ...]:
-    """Return the parameters to estimate: those of the options, else those that ingest was asked for."""
+    """Return the parameters to estimate: those of the options, else those of the survey."""
     return survey.estimate if options.estimate is None else options.estimate
 
 
@@ -139,7 +149,7 @@ def _key_figure(calibration: RigCalibration) -> str:
 
 
 def _warnings(calibration: RigCalibration, survey: Survey) -> tuple[str, ...]:
-    """Return parameters that stay as `ingest` was told although they were to be estimated."""
+    """Return warnings of parameters that keep the values of `ingest` although they were to be estimated."""
     if calibration.problem:
         return (f"{calibration.problem}; {', '.join(calibration.wanted)} stay as told",)
     warnings = [
@@ -178,7 +188,7 @@ def _data(survey: Survey, model: SparseModel, track: NavigationTrack) -> RigData
 
 
 def _pixel(model: SparseModel) -> tuple[float, float]:
-    """Return a pixel's angle in radians, and its width at the distance of the points in units of local."""
+    """Return the angle of a pixel in radians, and its width at the distance of the points in units of local."""
     arm = model.point_in_local[model.obs_point] - model.cam_center_in_local[model.obs_image]
     focal = np.array([model.camera_of(image).mean_focal_px for image in range(len(model.image_name))])
     footprint = np.median(np.linalg.norm(arm, axis=1) / focal[model.obs_image])
@@ -188,7 +198,7 @@ def _pixel(model: SparseModel) -> tuple[float, float]:
 def _estimate(name: RigParameter, value: ArrayLike, sigma: ArrayLike, start: ArrayLike) -> RigEstimate:
     values, sigmas, starts = (tuple(float(number) for number in np.ravel(row)) for row in (value, sigma, start))
     limit, unit = _LIMITS[name]
-    # A parameter that nothing tells of has an endless σ, which JSON does not have.
+    # A parameter without any information has an infinite σ, which JSON cannot hold.
     sigmas = tuple(min(number, _ENDLESS) for number in sigmas)
     return RigEstimate(
         name=name,
