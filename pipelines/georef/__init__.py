@@ -1,1 +1,1 @@
-"""Geographic losses, their weighting, the learnable similarity and camera corrections."""
+"""Geographic losses and their weights, the learnable similarity, and the corrections of the cameras."""

@@ -1,7 +1,7 @@
 """Least-squares adjustment of the similarity `geo_from_local`, every residual whitened by its covariance.
 
-Observations are camera centres against GNSS fixes, control points against their survey, and, where the layout
-leaves the rotation open, the recorded attitudes. The state may carry one more vector: a bias that all fixes share.
+The observations are camera centres against GNSS fixes, control points against their survey, and, if the layout
+leaves the rotation open, the recorded attitudes. The unknowns may include a bias (3,) that all fixes share.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from pipelines.georef.normal_equations import NormalEquations, Observations, Wei
 from pipelines.robust.statistics import median_chi2, outlier_gate, squared_mahalanobis
 
 OUTLIER_GATE = outlier_gate(3)
-# What a bias of all fixes must save in −2 ln likelihood to be believed: as much as an outlier costs.
+# A bias of all fixes is accepted if it lowers −2 ln likelihood by more than this, the cost of one outlier.
 BIAS_COST = OUTLIER_GATE - 1.0
-_LEAST_FOR_EXCESS = 5  # with fewer points of a kind their scatter says too little
+_LEAST_FOR_EXCESS = 5  # points of a kind; the scatter of fewer is too uncertain
 _STEPS = 12
 _POSITIONS, _ATTITUDE = "positions", "attitude"
 
@@ -29,10 +29,10 @@ class Correspondences:
     """n points known in both frames.
 
     Attributes:
-        name: of the image or the control point.
+        name: (n) names of images and control points.
         control: (n,) control point (True) or camera centre (False).
         in_local: (n, 3), in units of local.
-        cov_in_local: (n, 3, 3).
+        cov_in_local: (n, 3, 3), in squared units of local.
         in_geo: (n, 3) metres, as measured.
         cov_in_geo: (n, 3, 3) m².
     """
@@ -48,7 +48,7 @@ class Correspondences:
         return len(self.name)
 
     def part(self, chosen: BoolArray) -> Correspondences:
-        """Return some of them."""
+        """Return the correspondences that a mask (n,) selects."""
         return Correspondences(
             name=tuple(name for name, take in zip(self.name, chosen, strict=True) if take),
             control=self.control[chosen],
@@ -59,7 +59,7 @@ class Correspondences:
         )
 
     def joined(self, other: Correspondences) -> Correspondences:
-        """Return these, then the others."""
+        """Return these correspondences, followed by those of `other`."""
         return Correspondences(
             name=self.name + other.name,
             control=np.concatenate([self.control, other.control]),
@@ -72,7 +72,12 @@ class Correspondences:
 
 @dataclass(frozen=True)
 class RotationPrior:
-    """A measured rotation geo ← local, and its covariance (3, 3) in rad²."""
+    """Measured rotation geo ← local.
+
+    Attributes:
+        rotation: (3, 3).
+        cov_rad2: (3, 3) covariance in rad², axes of geo.
+    """
 
     rotation: FloatArray
     cov_rad2: FloatArray
@@ -80,13 +85,13 @@ class RotationPrior:
 
 @dataclass(frozen=True)
 class SimilarityState:
-    """Unknowns of the adjustment, and how far the scatter exceeds the stated σ.
+    """Unknowns of the adjustment, with the inliers and the excess scatter.
 
     Attributes:
         geo_from_local: the similarity.
         inlier: (n,) the correspondences in use.
-        fix_bias_in_geo: (3,) metres, or None where it is not estimated.
-        excess_m: σ beyond the stated one, of fixes and of control points.
+        fix_bias_in_geo: (3,) metres, fix minus truth; None if it is not estimated.
+        excess_m: σ per axis beyond the stated one, of fixes and of control points.
     """
 
     geo_from_local: Similarity
@@ -97,17 +102,17 @@ class SimilarityState:
 
 @dataclass(frozen=True)
 class AdjustedSimilarity:
-    """A state with what follows from it.
+    """Solution of the adjustment, with its covariance, residuals and cost.
 
     Attributes:
         state: the solution.
         covariance: (7, 7) about `pivot`, see `SimilarityRecord`.
         pivot: (3,) in geo.
-        bias_cov: (3, 3) m² of the bias; zero where it is not estimated.
+        bias_cov: (3, 3) m² of the bias; zero if it is not estimated.
         response: (n, 7, 3) change of the parameters per metre of error of each measured position.
         residual: (n, 3) metres, measured (less bias) minus mapped.
         squared: (n,) whitened squared residuals.
-        cost: −2 ln likelihood, outliers counted as if at the gate; compares solutions of the same data.
+        cost: −2 ln likelihood, with outliers at the cost of the gate; compares solutions of the same data.
         condition_number: of the normal matrix, with angles and ln s scaled by the size of the layout.
     """
 
@@ -128,10 +133,19 @@ class AdjustedSimilarity:
 
 
 def adjust(data: Correspondences, start: SimilarityState, prior: RotationPrior | None) -> AdjustedSimilarity:
-    """Adjust robustly from a start that is nearly right.
+    """Return the robust solution, from a start near it.
 
-    Each round solves for the parameters, measures the excess scatter (what SfM's own errors and optimistic σ add,
-    after Paule and Mandel, doi 10.6028/jres.087.022), and gates the outliers at 0.1 %.
+    Each round has three steps:
+
+    1. Gate the outliers at 0.1 %.
+    2. Solve for the parameters.
+    3. Estimate the excess scatter of each kind: SfM's own errors, and σ that were stated too small (after Paule
+       and Mandel, doi 10.6028/jres.087.022).
+
+    Args:
+        data: n correspondences.
+        start: start of the similarity, and of the bias if it is to be estimated.
+        prior: measured rotation, if the layout needs it.
     """
     state = _rescaled(data, start, robust=True)
     for _ in range(_STEPS):
@@ -145,15 +159,15 @@ def adjust(data: Correspondences, start: SimilarityState, prior: RotationPrior |
 
 
 def residuals(data: Correspondences, state: SimilarityState) -> FloatArray:
-    """Return the measured position, less the bias of the fixes, minus the mapped one (n, 3)."""
-    missed = data.in_geo - state.geo_from_local.apply(data.in_local)
+    """Return the residuals (n, 3) in metres: measured minus mapped position, the fixes less their bias."""
+    residual = data.in_geo - state.geo_from_local.apply(data.in_local)
     if state.fix_bias_in_geo is not None:
-        missed = missed - np.where(data.control[:, None], 0.0, state.fix_bias_in_geo)
-    return np.asarray(missed)
+        residual = residual - np.where(data.control[:, None], 0.0, state.fix_bias_in_geo)
+    return np.asarray(residual)
 
 
 def residual_covariances(data: Correspondences, state: SimilarityState) -> FloatArray:
-    """Return the covariances (n, 3, 3) of the residuals: measured, of the point in local, and the excess."""
+    """Return the covariances (n, 3, 3) of the residuals in m²: measurement, mapped point of local, and excess."""
     turn = state.geo_from_local.scale * state.geo_from_local.rotation
     excess = np.where(data.control, state.excess_m[1], state.excess_m[0])
     cov = data.cov_in_geo + turn @ data.cov_in_local @ turn.T
@@ -163,13 +177,13 @@ def residual_covariances(data: Correspondences, state: SimilarityState) -> Float
 def _gated(data: Correspondences, state: SimilarityState) -> SimilarityState:
     squared = squared_mahalanobis(residuals(data, state), residual_covariances(data, state))
     inlier = squared <= OUTLIER_GATE
-    if inlier.sum() < 3:  # never fewer than determine a similarity
+    if inlier.sum() < 3:  # a similarity needs three
         inlier = squared <= np.sort(squared)[min(2, len(squared) - 1)]
     return replace(state, inlier=inlier)
 
 
 def _solve(data: Correspondences, state: SimilarityState, prior: RotationPrior | None) -> AdjustedSimilarity:
-    """Gauss–Newton over the inliers, with weights, excess and inliers held."""
+    """Return the Gauss–Newton solution of the inliers, with excess and inliers held."""
     for _ in range(_STEPS):
         equations = _equations(data, state, prior)
         step = equations.normal.solve(equations.weights)
@@ -179,8 +193,8 @@ def _solve(data: Correspondences, state: SimilarityState, prior: RotationPrior |
     equations = _equations(data, state, prior)
     normal, weights = equations.normal, equations.weights
     covariance = normal.covariance(weights)
-    missed, cov = residuals(data, state), residual_covariances(data, state)
-    squared = squared_mahalanobis(missed, cov)
+    residual, cov = residuals(data, state), residual_covariances(data, state)
+    squared = squared_mahalanobis(residual, cov)
     stretch = np.linalg.slogdet(cov)[1] - np.linalg.slogdet(data.cov_in_geo)[1]
     pull = np.swapaxes(-normal.observations[_POSITIONS].jacobian, 1, 2) @ equations.whitener
     return AdjustedSimilarity(
@@ -189,7 +203,7 @@ def _solve(data: Correspondences, state: SimilarityState, prior: RotationPrior |
         pivot=equations.pivot,
         bias_cov=covariance[7:, 7:] if state.fix_bias_in_geo is not None else np.zeros((3, 3)),
         response=(covariance @ pull)[:, :7] * state.inlier[:, None, None],
-        residual=missed,
+        residual=residual,
         squared=squared,
         cost=float(np.where(state.inlier, squared + stretch, OUTLIER_GATE).sum()),
         condition_number=normal.condition_number(weights),
@@ -231,12 +245,12 @@ def _equations(data: Correspondences, state: SimilarityState, prior: RotationPri
 
 
 def _attitude(prior: RotationPrior, state: SimilarityState, count: int) -> Observations:
-    """The rotation as it was measured: one observation of three angles."""
+    """Return the measured rotation as one observation of three angles."""
     whitener = np.linalg.inv(np.linalg.cholesky(prior.cov_rad2))
     jacobian = np.zeros((1, 3, count))
     jacobian[0, :, 1:4] = -whitener
-    missed = log_so3(prior.rotation @ state.geo_from_local.rotation.T)
-    return Observations((whitener @ missed)[None], jacobian)
+    residual = log_so3(prior.rotation @ state.geo_from_local.rotation.T)
+    return Observations((whitener @ residual)[None], jacobian)
 
 
 def _moved(state: SimilarityState, step: FloatArray, pivot: FloatArray) -> SimilarityState:
@@ -249,7 +263,7 @@ def _moved(state: SimilarityState, step: FloatArray, pivot: FloatArray) -> Simil
 def _rescaled(
     data: Correspondences, state: SimilarityState, *, robust: bool, leverage: AdjustedSimilarity | None = None
 ) -> SimilarityState:
-    """The state with the excess scatter of each kind measured anew."""
+    """Return the state with the excess scatter of each kind estimated anew."""
     excess = []
     for kind in (False, True):
         members = (data.control == kind) & (state.inlier | robust)
@@ -264,14 +278,14 @@ def _excess(
     robust: bool,
     leverage: AdjustedSimilarity | None,
 ) -> float:
-    """σ to add to each axis so that the scatter of the members is what their covariances say; at least 0."""
+    """Return the σ per axis that makes the scatter of the members agree with their covariances; at least 0."""
     count = int(members.sum())
     if count < _LEAST_FOR_EXCESS:
         return 0.0
-    missed, cov = residuals(data, state)[members], residual_covariances(data, state)[members]
+    residual, cov = residuals(data, state)[members], residual_covariances(data, state)[members]
     variances, axes = np.linalg.eigh(cov)
-    along = (np.swapaxes(axes, 1, 2) @ missed[..., None])[..., 0] ** 2
-    # The share of the scatter that the parameters have taken up.
+    along = (np.swapaxes(axes, 1, 2) @ residual[..., None])[..., 0] ** 2
+    # The parameters absorb a part of the scatter: their redundancy is left.
     free = (
         1 - 7 / (3 * max(int(state.inlier.sum()), 3)) if leverage is None else _redundancy(data, leverage, members)
     )
@@ -282,7 +296,7 @@ def _excess(
 
     if surplus(0.0) <= 0:
         return 0.0
-    low, high = 0.0, float(np.linalg.norm(missed, axis=1).max()) + 1e-9
+    low, high = 0.0, float(np.linalg.norm(residual, axis=1).max()) + 1e-9
     while surplus(high) > 0:
         high *= 2
     for _ in range(40):
@@ -292,7 +306,7 @@ def _excess(
 
 
 def _redundancy(data: Correspondences, solution: AdjustedSimilarity, members: BoolArray) -> float:
-    """Mean redundancy of the members: 1 less the part of an error that the adjustment absorbs."""
+    """Return the mean redundancy of the members: 1 less the part of an error that the adjustment absorbs."""
     mapped = solution.state.geo_from_local.apply(data.in_local[members])
     absorbed = jacobian_at(mapped, solution.pivot) @ solution.response[members]
     absorbed_part = float(np.trace(absorbed, axis1=1, axis2=2).sum())

@@ -1,20 +1,24 @@
-"""The similarity `geo_from_local` from scratch: starts, robust adjustment, choice, and refusal.
+"""Similarity `geo_from_local` without an initial value: starts, robust adjustment, and choice of the solution.
 
-What carries the information
-    Camera centres against GNSS fixes, and control points against their survey: their errors are independent.
-    The geolocated points are *not* a third source. Each is a function of the same few fixes and attitudes, so a
-    hundred thousand of them know no more than the cameras do; counted as independent they would claim millimetres
-    and let a compass error outweigh RTK. They serve as one start of the search and as a check.
-    Attitudes enter only where centres and control points leave the rotation open (a single straight flight line).
-    Their errors (boresight, compass) are mostly common to a flight and do not average out, so the mean of all is
-    given the σ of one.
+Sources of information:
 
-Fixes against control points
-    Fixes of a flight often share an offset (base station, datum, antenna height). A solution in which the fixes
-    have a common bias competes with one in which they have none, by likelihood, the bias costing as much as one
-    outlier. So control points that agree with each other decide the position when the fixes contradict them by
-    more than σ allow, and the fixes still give scale and rotation. A *single* contradicting control point is
-    believed only while the bias stays within 5 σ of one fix; beyond that it is taken for a blunder.
+1. Camera centres against GNSS fixes, and control points against their survey. Their errors are independent.
+2. Attitudes, only if centres and control points leave the rotation open (a single straight flight line). Their
+   errors (boresight, compass) are mostly common to a flight and do not average out. The mean of all attitudes
+   therefore has the σ of one.
+
+The geolocated points are *not* a third source. Each is a function of the same few fixes and attitudes: a hundred
+thousand points have no more information than the cameras. Counted as independent, they would claim σ of
+millimetres, and an error of the compass would outweigh RTK. They serve as one start of the search and as a check.
+
+Fixes against control points:
+
+1. Fixes of a flight often share an offset (base station, datum, antenna height). A solution with a common bias of
+   the fixes therefore competes by likelihood with one without. The bias costs as much as one outlier.
+2. If the fixes contradict control points that agree with each other by more than σ allow, the control points
+   determine the position. The fixes still determine scale and rotation.
+3. A *single* contradicting control point is accepted only while the bias is within 5 σ of one fix. Beyond that,
+   the control point counts as a blunder.
 """
 
 from __future__ import annotations
@@ -44,10 +48,10 @@ from pipelines.robust.kernels import cauchy_weight
 from pipelines.robust.ransac import RansacOptions, ransac
 from pipelines.robust.statistics import median_chi2, squared_mahalanobis
 
-_WORST_ROTATION_RAD = np.radians(5.0)  # beyond, the linear covariance says nothing
+_WORST_ROTATION_RAD = np.radians(5.0)  # beyond, the linear covariance is not valid
 _LONE_BIAS_SIGMAS = 5.0
 _FLAT = 0.02  # third extent of the layout over the first
-_LOOSER = (1.0, 3.0, 10.0, 30.0, 100.0)
+_GATE_FACTORS = (1.0, 3.0, 10.0, 30.0, 100.0)  # of the stated σ
 
 ADVICE = (
     "add control points that do not lie on that line (`georef ingest --gcp FILE`, at least 3), or attitudes "
@@ -57,12 +61,12 @@ ADVICE = (
 
 @dataclass(frozen=True)
 class Alignment:
-    """The similarity, how it was found, and what contradicts it.
+    """Similarity, with the layout that determines it and the attitude in use.
 
     Attributes:
         solution: parameters, covariance and residuals.
         layout: extent of the correspondences used: "volume", "plane", or "line" if attitude was needed.
-        attitude: the recorded attitudes, where they resolved the rotation.
+        attitude: mean of the recorded attitudes, if it resolved the rotation.
     """
 
     solution: AdjustedSimilarity
@@ -87,15 +91,17 @@ def align(
     attitude: RotationPrior | None = None,
     guesses: tuple[Similarity, ...] = (),
 ) -> Alignment:
-    """Find the similarity that maps local onto geo.
+    """Return the similarity that maps local onto geo.
 
     Args:
-        data: camera centres with fixes and control points.
+        data: camera centres with fixes, and control points.
+        rng: draws the samples of RANSAC.
         attitude: rotation geo ← local from recorded attitudes, for layouts that need it.
         guesses: further starts, e.g. from geolocated points.
 
     Raises:
-        DegenerateGeometryError: the correspondences leave the similarity open; says what to add.
+        DegenerateGeometryError: the correspondences leave the similarity open; the message advises measurements to
+            add.
     """
     if len(data) < 2 or (len(data) < 3 and attitude is None):
         raise DegenerateGeometryError(
@@ -116,16 +122,20 @@ def align(
 
 
 def layout_of(positions: FloatArray) -> Literal["volume", "plane"]:
-    """Whether positions (n, 3) fill a volume or lie in one plane."""
+    """Return whether positions (n, 3) fill a volume or lie in one plane."""
     extent = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False)
     return "plane" if len(extent) < 3 or extent[2] < _FLAT * extent[0] else "volume"
 
 
 def mean_rotation(rotations: FloatArray, sigma_rad: FloatArray) -> RotationPrior:
-    """Robust mean of rotations (k, 3, 3) that each estimate geo ← local with σ (k,), from recorded attitudes.
+    """Return the robust mean of rotations geo ← local, estimated from recorded attitudes.
 
-    The covariance is that of one of them (or their scatter, if larger), since attitude errors of a flight are
-    mostly common to all its images.
+    Attitude errors of a flight are mostly common to all its images. The covariance is therefore that of one
+    rotation, or the scatter if it is larger.
+
+    Args:
+        rotations: (k, 3, 3).
+        sigma_rad: (k,) σ of each rotation per axis, radians.
     """
     mean = rotations[int(np.argmin(_spread(rotations)))]
     weight = np.ones(len(rotations))
@@ -141,14 +151,17 @@ def mean_rotation(rotations: FloatArray, sigma_rad: FloatArray) -> RotationPrior
 
 
 def _spread(rotations: FloatArray) -> FloatArray:
-    """Median angle of each rotation to all others, over at most 200 of them."""
+    """Return the median angle (k,) of each rotation to a sample of all rotations."""
     others = rotations[:: max(1, len(rotations) // 200)]
     cosine = (np.einsum("aij,bij->ab", rotations, others) - 1) / 2
     return np.asarray(np.median(np.arccos(np.clip(cosine, -1, 1)), axis=1))
 
 
 def _starts(data: Correspondences, rng: np.random.Generator, guesses: tuple[Similarity, ...]) -> list[Similarity]:
-    """Similarities to start from: of the fixes, of the control points, of both where neither suffices."""
+    """Return the similarities to start from: the guesses, those of the fixes, and those of the control points.
+
+    Without any of these, fixes and control points together give one start.
+    """
     starts = list(guesses)
     for members in (~data.control, data.control):
         if members.sum() >= 3:
@@ -157,15 +170,15 @@ def _starts(data: Correspondences, rng: np.random.Generator, guesses: tuple[Simi
 
 
 def _ransac_start(data: Correspondences, rng: np.random.Generator) -> list[Similarity]:
-    """The similarity most agree with, at the tightest gate that half of them pass; none if degenerate."""
+    """Return the similarity of RANSAC at the tightest gate that half of the points pass; none if degenerate."""
 
     def fit(chosen: np.ndarray) -> Similarity:
         return umeyama(data.in_local[chosen], data.in_geo[chosen])
 
     starts = []
-    for looser in _LOOSER:
-        # The excess scatter of SfM is not known yet: stated σ may be far too tight.
-        options = RansacOptions(3, OUTLIER_GATE * looser**2, max_draws=300)
+    for factor in _GATE_FACTORS:
+        # The excess scatter of SfM is not known yet: the stated σ may be far too small.
+        options = RansacOptions(3, OUTLIER_GATE * factor**2, max_draws=300)
         try:
             result = ransac(len(data), fit, lambda model: _squared(data, model), options, rng)
         except DegenerateGeometryError:
@@ -179,7 +192,7 @@ def _ransac_start(data: Correspondences, rng: np.random.Generator) -> list[Simil
 
 
 def _start_with_rotation(data: Correspondences, rotation: FloatArray, rng: np.random.Generator) -> Similarity:
-    """Scale and translation, robustly, with the rotation given."""
+    """Return the similarity of a given rotation, with robust scale and translation."""
     turned = data.in_local @ rotation.T
 
     def fit(chosen: np.ndarray) -> Similarity:
@@ -189,7 +202,7 @@ def _start_with_rotation(data: Correspondences, rotation: FloatArray, rng: np.ra
             raise DegenerateGeometryError("the two positions run against each other")
         return Similarity(scale, rotation, (p + q - scale * (a + b)) / 2)
 
-    options = RansacOptions(2, OUTLIER_GATE * _LOOSER[-1] ** 2, max_draws=300)
+    options = RansacOptions(2, OUTLIER_GATE * _GATE_FACTORS[-1] ** 2, max_draws=300)
     return ransac(len(data), fit, lambda model: _squared(data, model), options, rng).model
 
 
@@ -209,16 +222,16 @@ def _candidates(
 
 
 def _with_bias(data: Correspondences, state: SimilarityState) -> SimilarityState:
-    """The state moved onto the control points, the fixes' offset from it taken as their bias."""
-    missed = residuals(data, state)
-    shift = np.median(missed[data.control], axis=0)
+    """Return the state shifted onto the control points, with the remaining offset of the fixes as bias."""
+    residual = residuals(data, state)
+    shift = np.median(residual[data.control], axis=0)
     model = state.geo_from_local
     onto = Similarity(model.scale, model.rotation, model.translation + shift)
-    return replace(state, geo_from_local=onto, fix_bias_in_geo=np.median(missed[~data.control], axis=0) - shift)
+    return replace(state, geo_from_local=onto, fix_bias_in_geo=np.median(residual[~data.control], axis=0) - shift)
 
 
 def _choose(candidates: list[AdjustedSimilarity], data: Correspondences) -> AdjustedSimilarity:
-    """The likeliest candidate, a bias of the fixes costing as much as an outlier."""
+    """Return the likeliest candidate; a bias of the fixes costs as much as an outlier."""
 
     def cost(candidate: AdjustedSimilarity) -> float:
         bias = candidate.state.fix_bias_in_geo

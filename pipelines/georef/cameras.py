@@ -1,4 +1,4 @@
-"""Cameras and lens that may move while training: corrections in the coordinates that bundle adjustment left."""
+"""Cameras and lens that training corrects, in the whitened coordinates of bundle adjustment."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pipelines.georef.so3 import exp_so3
 
 @dataclass(frozen=True)
 class CameraPoses:
-    """n cameras in the frame `model`.
+    """Poses of n cameras in the frame `model`.
 
     Attributes:
         cam_from_model: (n, 3, 3) rotations.
@@ -28,15 +28,17 @@ class CameraPoses:
 class CameraCorrections(torch.nn.Module):
     """Poses = base corrected by (δω, δc) = basis · z, in float64.
 
-    With the basis of `geometry.bundle.correction_basis`, |z|² is what the correction costs the image
-    observations, and no z moves all cameras by a similarity: the gauge is held by construction. A test camera
-    gives no gradient; it is carried along by its ties to the others, as it would be in the bundle. The lens, which
-    the observations tell together with the poses, is carried along likewise.
+    The basis of `geometry.bundle.correction_basis` has these properties:
+
+    - |z|² is the χ² that the correction costs the image observations.
+    - No z moves all cameras by a similarity: the basis holds the gauge.
+    - A test camera gives no gradient. Its correction follows from its correlation with the other cameras, as in
+      the bundle. The lens parameters correlate with the poses and follow likewise.
 
     Args:
         base: poses before training.
-        basis: (n, 6, k); k = 0 holds the cameras fixed.
-        lens_basis: (L, k), how the lens parameters follow: `CorrectionBasis.lens_matrix`. None: the lens stays.
+        basis: (n, 6, k) rows (δω, δc), rad and m; k = 0 holds the cameras fixed.
+        lens_basis: (L, k) response of the lens parameters: `CorrectionBasis.lens_matrix`. None: the lens stays.
     """
 
     def __init__(self, base: CameraPoses, basis: FloatArray, lens_basis: FloatArray | None = None) -> None:
@@ -53,38 +55,42 @@ class CameraCorrections(torch.nn.Module):
         self.register_buffer("center", torch.from_numpy(np.ascontiguousarray(base.cam_center_in_model)))
 
     def corrections(self) -> Tensor:
-        """(δω, δc) of all cameras (n, 6)."""
+        """Return the corrections (δω, δc) of all cameras (n, 6), rad and m."""
         return (self.basis.flatten(0, 1) @ self.z).view(-1, 6)
 
     def lens(self) -> Tensor:
-        """Change (L,) of the lens parameters, in the order of `geometry.lens.Lenses`; L = 0: it stays."""
+        """Return the change (L,) of the lens parameters, in the order of `geometry.lens.Lenses`; L = 0: none."""
         return self.lens_basis @ self.z
 
     def centers(self) -> Tensor:
-        """Corrected projection centres (n, 3) in `model`."""
+        """Return the corrected projection centres (n, 3) in `model`, metres."""
         return self.moved(self.corrections())[1]
 
     def rotations(self) -> Tensor:
-        """Corrected rotations cam ← model (n, 3, 3)."""
+        """Return the corrected rotations cam ← model (n, 3, 3)."""
         return self.moved(self.corrections())[0]
 
     def moved(self, correction: Tensor) -> tuple[Tensor, Tensor]:
-        """Rotations cam ← model (n, 3, 3) and centres (n, 3) under corrections (n, 6), differentiable in them."""
+        """Return the poses under other corrections (n, 6), differentiable in them.
+
+        Returns:
+            Rotations cam ← model (n, 3, 3) and centres (n, 3) in `model`.
+        """
         return self.rotation @ exp_so3(-correction[:, :3]), self.center + correction[:, 3:]
 
     def pose(self, index: int) -> tuple[Tensor, Tensor]:
-        """Corrected rotation cam ← model (3, 3) and centre (3,) of one camera."""
+        """Return the corrected rotation cam ← model (3, 3) and centre (3,) of one camera."""
         correction = self.basis[index] @ self.z
         return self.rotation[index] @ exp_so3(-correction[:3]), self.center[index] + correction[3:]
 
     def cam_from_model(self, index: int) -> Tensor:
-        """Corrected pose of one camera, (4, 4) float32, differentiable in z."""
+        """Return the corrected pose of one camera, (4, 4) float32, differentiable in z."""
         rotation, center = self.pose(index)
         translation = -rotation @ center
         bottom = torch.eye(4, dtype=torch.float64, device=rotation.device)[3:]
         return torch.cat([torch.cat([rotation, translation[:, None]], dim=1), bottom]).float()
 
     def current(self) -> CameraPoses:
-        """The present poses."""
+        """Return the present poses."""
         with torch.no_grad():
             return CameraPoses(self.rotations().cpu().numpy(), self.centers().cpu().numpy())

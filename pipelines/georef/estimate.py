@@ -1,4 +1,4 @@
-"""The state that measurements are compared with: cameras, similarity, constant errors and lens, as tensors."""
+"""Estimate that the measurements are compared with: cameras, similarity, constant errors and lens, as tensors."""
 
 from __future__ import annotations
 
@@ -11,27 +11,33 @@ from pipelines.georef.systematic import SystematicErrorValues
 
 @dataclass(frozen=True)
 class TensorSimilarity:
-    """geo ← model: p_geo = scale · rotation p_model + translation; scale (), rotation (3, 3), float64."""
+    """Similarity geo ← model: p_geo = scale · rotation p_model + translation, in float64.
+
+    Attributes:
+        scale: scalar ().
+        rotation: (3, 3).
+        translation: (3,) metres.
+    """
 
     scale: Tensor
     rotation: Tensor
     translation: Tensor
 
     def apply(self, points: Tensor) -> Tensor:
-        """Map points (N, 3)."""
+        """Return the mapped points (N, 3)."""
         return self.scale * points @ self.rotation.T + self.translation
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Everything that the measurements are compared with.
+    """Values of all unknowns that the measurements depend on.
 
     Attributes:
         rotation: (n, 3, 3) cam ← model.
-        center: (n, 3) projection centres in `model`.
+        center: (n, 3) projection centres in `model`, metres.
         geo_from_model: the similarity.
         errors: constant errors of the measurements.
-        lens: (L,) change of the lens parameters; L = 0 where the lens stays.
+        lens: (L,) change of the lens parameters; L = 0: none.
     """
 
     rotation: Tensor
@@ -41,5 +47,5 @@ class Estimate:
     lens: Tensor
 
     def geo_from_cam(self, camera: Tensor) -> Tensor:
-        """Return rotations (K, 3, 3) of cameras (K,)."""
+        """Return the rotations geo ← cam (K, 3, 3) of cameras with indices (K,)."""
         return self.geo_from_model.rotation @ self.rotation[camera].transpose(1, 2)

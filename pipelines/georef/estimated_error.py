@@ -1,4 +1,4 @@
-"""A constant error of the measurements, as it was estimated: part of the trained model."""
+"""Estimated constant error of the measurements: part of the trained model."""
 
 from __future__ import annotations
 
@@ -9,11 +9,17 @@ from pipelines.core.types import Vector3
 
 
 class EstimatedError(Product):
-    """A constant error of the measurements that training estimated, with its σ, by axis.
+    """Constant error of the measurements that training estimated, with its σ, by axis.
 
-    `bias`: fix minus truth, east, north, up, in m; `flight` counts from 0 in the order of time. `lever-arm`:
-    antenna seen from the camera beyond what the survey has applied, camera axes, in m. `boresight`: rotation vector
-    from the true to the nominal camera axes, in degrees. `observed`: σ is at most half of that of the prior.
+    Attributes:
+        name: `bias`: fix minus truth, east, north, up, in m. `lever-arm`: antenna seen from the camera beyond the
+            arm that the survey has applied, camera axes, in m. `boresight`: rotation vector from the true to the
+            nominal camera axes, in degrees.
+        flight: of a bias, counted from 0 in the order of time.
+        unit: of `value` and `sigma`.
+        value: the estimate.
+        sigma: its σ.
+        observed: σ is at most half of that of the prior.
     """
 
     name: Literal["bias", "lever-arm", "boresight"]

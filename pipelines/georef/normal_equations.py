@@ -1,12 +1,13 @@
-"""Normal equations of weighted, whitened observations: one solve and one posterior for every adjustment.
+"""Normal equations of weighted, whitened observations: one solver and one posterior for every adjustment.
 
-Near a state, the residuals of each kind of observation are e + J δ with a step δ (P,). The prior of the parameters
-is N(−o, Λ⁻¹) of δ, o being where they stand. The minimum of
+Near a state, the residuals of each kind of observation are e + J δ with a step δ (P,). The prior of δ is N(−o,
+Λ⁻¹), with o the distance of the state from the mean of the prior. Iteratively reweighted least squares finds the
+minimum of
 
-    Σ_kinds Σ_m ρ(|e_m + J_m δ|²) + (δ + o)ᵀ Λ (δ + o)
+    Σ_kinds Σ_m ρ(|e_m + J_m δ|²) + (δ + o)ᵀ Λ (δ + o).
 
-is found by iteratively reweighted least squares; its curvature is the posterior. ρ is Cauchy's kernel, unless the
-caller brings weights of its own, such as a gate.
+The curvature there gives the posterior. ρ is Cauchy's kernel, unless the caller passes weights of its own, such as
+a gate.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import BoolArray, FloatArray
 from pipelines.robust.kernels import NOISE_WEIGHT, cauchy_loss, cauchy_weight
 
-_ROUNDS, _STILL = 50, 1e-6  # of reweighting, and the change of a whitened residual at which it ends
+_ROUNDS, _STILL = 50, 1e-6  # of reweighting; the change of a whitened residual that ends it
 _FLOOR = 1e-12  # eigenvalue over the largest one, below which a direction counts as open
 
 # By kind of observation: weights (M,), residuals (M, d).
@@ -49,7 +50,13 @@ class Observations:
 
 @dataclass(frozen=True)
 class RobustMinimum:
-    """Minimum of the robust cost: the step (P,) to it, the residuals there, and the cost, a −2 ln likelihood."""
+    """Minimum of the robust cost.
+
+    Attributes:
+        step: (P,) from the state to the minimum.
+        residuals: at the minimum.
+        cost: −2 ln likelihood.
+    """
 
     step: FloatArray
     residuals: Residuals
@@ -58,14 +65,15 @@ class RobustMinimum:
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """Observations by kind, and what is known of the P parameters beforehand.
+    """Observations by kind, with the prior of the P parameters.
 
     Attributes:
         observations: by the name of their kind.
-        precision: (P,) diagonal Λ of the prior; zero where nothing is known.
-        offset: (P,) o, the parameters' present distance from the middle of the prior.
+        precision: (P,) diagonal Λ of the prior; zero: no prior.
+        offset: (P,) o, distance of the state from the mean of the prior.
         unit: (P,) size of a step of each parameter in common units; scales the decompositions.
-        open_directions: of parameters that nothing determines: "refuse", or give them a "wide" but finite variance.
+        open_directions: treatment of parameters that nothing determines: "refuse", or a "wide" but finite
+            variance.
         advice: message of the error with "refuse".
     """
 
@@ -77,7 +85,7 @@ class NormalEquations:
     advice: str = "the observations do not determine all unknowns"
 
     def residuals(self, step: FloatArray | None = None) -> Residuals:
-        """Return the residuals at the state, or after a step."""
+        """Return the residuals at the state, or to first order after a step (P,)."""
         if step is None:
             return {name: rows.residual for name, rows in self.observations.items()}
         return {name: rows.after(step) for name, rows in self.observations.items()}
@@ -95,10 +103,10 @@ class NormalEquations:
 
         Args:
             weights: of the observations.
-            free: (P,) parameters to adjust; the others stay.
+            free: (P,) mask of the parameters to adjust; the others stay. None: all.
 
         Raises:
-            DegenerateGeometryError: a direction is open, and these are refused.
+            DegenerateGeometryError: a direction is open, with `open_directions` "refuse".
         """
         return self._solve(weights, np.zeros(len(self.precision)), self._all() if free is None else free)
 
@@ -106,25 +114,29 @@ class NormalEquations:
         """Return the minimum of the robust cost.
 
         Args:
-            start: (P,) step at which the first weights are taken; none: the state itself.
-            free: (P,) parameters to adjust; the others stay where `start` has them.
+            start: (P,) step at which the first weights are taken; None: the state itself.
+            free: (P,) mask of the parameters to adjust; the others keep the value of `start`. None: all.
 
         Raises:
             DegenerateGeometryError: as `solve`.
         """
         step = np.zeros(len(self.precision)) if start is None else start
         free = self._all() if free is None else free
-        left = self.residuals(step)
+        residuals = self.residuals(step)
         for _ in range(_ROUNDS):
-            step = self._solve(robust_weights(left), step, free)
-            before, left = left, self.residuals(step)
-            if all(np.abs(left[name] - before[name]).max(initial=0.0) < _STILL for name in left):
+            step = self._solve(robust_weights(residuals), step, free)
+            before, residuals = residuals, self.residuals(step)
+            if all(np.abs(residuals[name] - before[name]).max(initial=0.0) < _STILL for name in residuals):
                 break
-        known = step + self.offset
-        return RobustMinimum(step, left, robust_cost(left) + float(self.precision @ known**2))
+        from_prior = step + self.offset
+        return RobustMinimum(step, residuals, robust_cost(residuals) + float(self.precision @ from_prior**2))
 
     def covariance(self, weights: Weights, free: BoolArray | None = None) -> FloatArray:
-        """Return the covariance (P, P) of the parameters, the inverse normal matrix; zero where they are held.
+        """Return the covariance (P, P) of the parameters, the inverse normal matrix; zero for held ones.
+
+        Args:
+            weights: of the observations.
+            free: (P,) mask of the parameters that are not held. None: all.
 
         Raises:
             DegenerateGeometryError: as `solve`.
@@ -135,21 +147,29 @@ class NormalEquations:
         return covariance
 
     def inverse_times(self, weights: Weights, right: FloatArray) -> FloatArray:
-        """Return N⁻¹ times vectors (P, m)."""
+        """Return the product (P, m) of the inverse normal matrix N⁻¹ and vectors (P, m).
+
+        Raises:
+            DegenerateGeometryError: as `solve`.
+        """
         return self._inverse_times(weights, self._all(), right)
 
     def spread(self, weights: Weights, jacobian: FloatArray) -> FloatArray:
-        """Return A N⁻¹ Aᵀ (J, d, d) of derivatives A (J, d, P): the covariance that the parameters cause."""
+        """Return A N⁻¹ Aᵀ (J, d, d) of derivatives A (J, d, P): the covariance that the parameters cause.
+
+        Raises:
+            DegenerateGeometryError: as `solve`.
+        """
         solved = self.inverse_times(weights, _flat(jacobian).T).T.reshape(jacobian.shape)
         return np.asarray(solved @ np.swapaxes(jacobian, 1, 2))
 
     def condition_number(self, weights: Weights) -> float:
-        """Return the condition number of the scaled normal matrix; an open direction counts 1e12."""
+        """Return the condition number of the scaled normal matrix, at most 1e12."""
         values = np.linalg.eigvalsh(self._scaled(weights, self._all()))
         return float(values[-1] / max(values[0], _FLOOR * values[-1]))
 
     def _solve(self, weights: Weights, held: FloatArray, free: BoolArray) -> FloatArray:
-        """The step of the free parameters (P,), the others held where they are."""
+        """Return the step (P,) that minimises over the free parameters, the others held at `held`."""
         step = np.where(free, 0.0, held)
         slope = self.precision * (self.offset + step)
         for name, rows in self.observations.items():
@@ -166,15 +186,15 @@ class NormalEquations:
         return np.asarray(cho_solve((self._root(weights, free), False), right * unit) * unit)
 
     def _scaled(self, weights: Weights, free: BoolArray) -> FloatArray:
-        """The normal matrix of the free parameters in their units."""
+        """Return the normal matrix of the free parameters in their units."""
         unit = self._units()[free]
         return np.asarray(self.matrix(weights)[np.ix_(free, free)] * unit[:, None] * unit)
 
     def _root(self, weights: Weights, free: BoolArray) -> FloatArray:
-        """Upper triangle U with UᵀU = the scaled normal matrix.
+        """Return the upper triangle U with UᵀU = the scaled normal matrix.
 
-        Cholesky's method loses half of the digits. Where too few are left, U comes from the residuals' rows
-        themselves, at a higher price.
+        Cholesky's method loses half of the digits. If too few are left, a QR decomposition of the weighted
+        Jacobian gives U, at a higher cost.
         """
         try:
             return np.asarray(cholesky(self._scaled(weights, free)))
@@ -198,21 +218,21 @@ class NormalEquations:
 
 
 def robust_weights(residuals: Residuals) -> Weights:
-    """Return Cauchy's weights of whitened residuals, by kind."""
+    """Return Cauchy's weights (M,) of whitened residuals (M, d), by kind."""
     return {name: cauchy_weight(_chi2(rows), rows.shape[1]) for name, rows in residuals.items()}
 
 
 def posterior_weights(residuals: Residuals) -> Weights:
-    """Return the weights whose normal matrix is that of the estimate's covariance.
+    """Return the weights (M,), by kind, whose normal matrix is the inverse covariance of the estimate.
 
-    Cauchy's weight also falls on what is only noise: see `robust.kernels.NOISE_WEIGHT`.
+    Cauchy's weight is also below 1 under pure noise: see `robust.kernels.NOISE_WEIGHT`.
     """
     weights = robust_weights(residuals)
     return {name: weights[name] / NOISE_WEIGHT[rows.shape[1]] for name, rows in residuals.items()}
 
 
 def robust_cost(residuals: Residuals) -> float:
-    """Return Σ ρ of whitened residuals."""
+    """Return Σ ρ of whitened residuals of all kinds."""
     return sum(float(cauchy_loss(_chi2(rows), rows.shape[1]).sum()) for rows in residuals.values())
 
 

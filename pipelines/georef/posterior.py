@@ -1,8 +1,8 @@
-"""The geographic half linearised: its minimum, the joint covariance of all unknowns, and leave-one-out.
+"""Linearised geographic half: its minimum, the joint covariance of all unknowns, and leave-one-out.
 
-All three are answers of the same normal equations (`georef.normal_equations`) over the similarity's coordinates y,
-the constant errors v, and the cameras' corrections z, which bundle adjustment knows as N(0, I). Weights are those
-that Cauchy's kernel gives at the state at hand.
+All three come from the same normal equations (`georef.normal_equations`). Their unknowns are the similarity's
+coordinates y, the constant errors v, and the cameras' corrections z, whose prior of bundle adjustment is N(0, I).
+The weights are those of Cauchy's kernel at the present state.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from pipelines.georef.normal_equations import (
 from pipelines.georef.problem import GeoProblem
 from pipelines.georef.terms import ControlTerm
 
-_STEPS = 20  # new derivatives
-_NEAR = 1e-4  # of a σ: a shorter step ends the descent
+_STEPS = 20  # linearisations
+_NEAR = 1e-4  # length of the step, in σ, that ends the descent
 _CHUNK = 64
 _OPEN = 1e-9  # redundancy below which the other observations leave a direction open
 _ADVICE = "fixes and control points leave the similarity open: add control points, at least 3"
@@ -36,12 +36,12 @@ _ADVICE = "fixes and control points leave the similarity open: add control point
 class GeoEquations:
     """Normal equations of a problem about its present state, in the parameters (y, v, w), float64.
 
-    The w are coordinates of those camera corrections that a measurement sees, z = `seen` w. The others keep what
-    bundle adjustment knows of them, and need not be solved for.
+    w are coordinates of the camera corrections that affect a measurement: z = `seen` w. All other corrections keep
+    their prior of bundle adjustment, and are not among the unknowns.
 
     Attributes:
-        normal: P = 7 + p + r parameters.
-        errors: p, constant errors.
+        normal: the equations, of P = 7 + p + r parameters.
+        errors: p, number of constant errors.
         seen: (k, r), orthonormal columns; None: all k corrections.
     """
 
@@ -51,22 +51,22 @@ class GeoEquations:
 
     @property
     def similarity(self) -> slice:
-        """Place of y."""
+        """Columns of y."""
         return slice(0, 7)
 
     @property
     def constant(self) -> slice:
-        """Place of v."""
+        """Columns of v."""
         return slice(7, 7 + self.errors)
 
     @property
     def cameras(self) -> slice:
-        """Place of w."""
+        """Columns of w."""
         return slice(7 + self.errors, len(self.normal.precision))
 
 
 def equations_of(problem: GeoProblem) -> GeoEquations:
-    """Linearise the measurements of a problem about its present state."""
+    """Return the normal equations of a problem, linearised about its present state."""
     cameras, errors = problem.cameras, len(problem.errors)
     turns = 6 * len(cameras.center)
 
@@ -100,7 +100,7 @@ def equations_of(problem: GeoProblem) -> GeoEquations:
 
 
 def minimise(problem: GeoProblem) -> None:
-    """Bring the whitened loss of the geographic half to its minimum, from where it is, by Gauss–Newton.
+    """Move a problem to the minimum of its whitened loss by Gauss–Newton, from its present state.
 
     Raises:
         DegenerateGeometryError: the measurements leave the similarity open.
@@ -120,16 +120,17 @@ def move(problem: GeoProblem, equations: GeoEquations, step: FloatArray) -> None
     z = problem.cameras.z
     corrections = _numpy(z) if equations.seen is None else equations.seen.T @ _numpy(z)
     corrections = corrections + step[equations.cameras]
-    # What no measurement sees goes back to where bundle adjustment has it.
+    # Corrections that affect no measurement return to zero, the mean of their prior.
     z.copy_(torch.from_numpy(corrections if equations.seen is None else equations.seen @ corrections))
     problem.similarity.y.add_(torch.from_numpy(step[equations.similarity]).to(device))
     problem.errors.set_vector(problem.errors.vector() + torch.from_numpy(step[equations.constant]).to(device))
 
 
 def solution_covariances(problem: GeoProblem) -> tuple[FloatArray, FloatArray]:
-    """Return the covariance (7, 7) of the similarity about its pivot, and that (p, p) of the constant errors.
+    """Return the covariances of the similarity (7, 7) about its pivot, and of the constant errors (p, p).
 
-    All else is marginalised out. The first has the form of `geometry.similarity.SimilarityRecord`.
+    All other unknowns are marginalised out. The first covariance has the form of
+    `geometry.similarity.SimilarityRecord`, the second is in m and rad.
 
     Raises:
         DegenerateGeometryError: the measurements leave the similarity open.
@@ -144,11 +145,11 @@ def solution_covariances(problem: GeoProblem) -> tuple[FloatArray, FloatArray]:
 
 @dataclass(frozen=True)
 class FreeLens:
-    """The part of the L lens parameters that stays unknown when the lens has followed the cameras.
+    """Part of the L lens parameters that stays unknown after the lens has followed the cameras.
 
     Attributes:
         cov: (L, L), `CorrectionBasis.lens_cov`.
-        by_control: (J, 3, L) metres by which each control point in geo is found elsewhere with another lens.
+        by_control: (J, 3, L) derivative of the intersected control points in geo by the lens parameters, metres.
     """
 
     cov: FloatArray
@@ -157,12 +158,12 @@ class FreeLens:
 
 @dataclass(frozen=True)
 class Posterior:
-    """Joint covariance of the errors of the similarity, of k camera corrections, and of the lens beyond these.
+    """Joint covariance of the similarity, of k camera corrections, and of the rest of the L lens parameters.
 
     Attributes:
-        covariance: (7 + k + L, 7 + k + L) of (δ ln s, δω, δt) about `pivot`, as in `SimilarityRecord`, of
-            `CameraCorrections.z`, and of what the lens parameters differ by from those that follow z; whatever else
-            was estimated is marginalised out.
+        covariance: (7 + k + L, 7 + k + L) of (δ ln s, δω, δt) about `pivot`, as in `SimilarityRecord`; of
+            `CameraCorrections.z`; and of the lens parameters beyond the part that follows z. All other unknowns
+            are marginalised out.
         pivot: (3,) in geo.
     """
 
@@ -173,24 +174,26 @@ class Posterior:
         """Return the covariance (J, 3, 3) in m² of points (J, 3).
 
         Args:
-            point_in_geo: (J, 3).
-            by_cameras: (J, 3, k) metres in geo by which they follow the corrections, and the lens that goes with
-                these.
-            by_lens: (J, 3, L) likewise the rest of the lens.
+            point_in_geo: (J, 3) metres.
+            by_cameras: (J, 3, k) derivative of the points in geo by the corrections z, and the lens that follows
+                z.
+            by_lens: (J, 3, L) derivative of the points in geo by the rest of the lens.
         """
         jacobian = np.concatenate([jacobian_at(point_in_geo, self.pivot), by_cameras, by_lens], axis=2)
         return np.asarray(jacobian @ self.covariance @ np.swapaxes(jacobian, 1, 2))
 
 
 def posterior(problem: GeoProblem, lens: FreeLens | None = None) -> Posterior:
-    """Return the joint covariance at the present state.
+    """Return the joint covariance of all unknowns at the present state.
 
-    Of the lens, only what follows the cameras is estimated here. The rest d, which is independent of the estimate's
-    own error e₁, shifts the intersections of the control points, and so pulls the estimate by −G d, with G the
-    response to the control points: e = e₁ − G d.
+    1. Only the part of the lens that follows the cameras is estimated.
+    2. The rest d is independent of the estimate's own error e₁.
+    3. d shifts the intersections of the control points. With G the response of the estimate to the control points,
+       d therefore moves the estimate by −G d: the total error is e = e₁ − G d.
 
     Args:
-        lens: None where there is no such rest.
+        problem: at its minimum.
+        lens: the rest of the lens; None: there is no rest.
 
     Raises:
         DegenerateGeometryError: the measurements leave the similarity open.
@@ -214,14 +217,14 @@ def posterior(problem: GeoProblem, lens: FreeLens | None = None) -> Posterior:
 
 
 def _pull_of_lens(control: ControlTerm, lens: FreeLens, normal: NormalEquations, weights: Weights) -> FloatArray:
-    """G (P, L): by what another lens, of the intersections alone, pulls the parameters."""
+    """Return G (P, L): the response of the parameters to intersections with another lens."""
     moved = weights[control.kind][:, None, None] * (_numpy(control.root_information) @ lens.by_control)
     jacobian = normal.observations[control.kind].jacobian
     return normal.inverse_times(weights, np.einsum("jdp,jdl->pl", jacobian, moved))
 
 
 def _joint_from_parameters(problem: GeoProblem, equations: GeoEquations) -> FloatArray:
-    """(7 + k, P): similarity about its pivot and camera corrections z of the parameters (y, v, w)."""
+    """Return the derivative (7 + k, P) of similarity and corrections z by the parameters (y, v, w)."""
     count = len(equations.normal.precision)
     corrections = np.eye(count - 7 - equations.errors) if equations.seen is None else equations.seen
     turn = np.zeros((7 + len(corrections), count))
@@ -232,11 +235,11 @@ def _joint_from_parameters(problem: GeoProblem, equations: GeoEquations) -> Floa
 
 @dataclass(frozen=True)
 class LeftOut:
-    """J control points, each measured by a solution that does not know it.
+    """J control points, each compared with the solution that does not use it.
 
     Attributes:
-        error_in_geo: (J, 3) intersected minus surveyed, metres; NaN where the others leave it open.
-        cov_in_geo: (J, 3, 3) m² that is expected of it: solution, marks and survey; NaN likewise.
+        error_in_geo: (J, 3) intersected minus surveyed, metres; NaN if the other observations leave it open.
+        cov_in_geo: (J, 3, 3) m², expected covariance of that error: solution, marks and survey; NaN likewise.
     """
 
     error_in_geo: FloatArray
@@ -246,9 +249,9 @@ class LeftOut:
 def leave_one_out(problem: GeoProblem) -> LeftOut:
     """Return the error of each control point against the solution of all other observations, at a minimum.
 
-    Linear and without a second solution: of the normal matrix N of all observations, a point with Jacobian A and
-    weight w has the leverage H = w A N⁻¹ Aᵀ, and its residual without it is (I − H)⁻¹ r (Cook and Weisberg 1982,
-    section 2.2). The weights of the others are held.
+    The computation is linear and needs no second solution. With the normal matrix N of all observations, a point
+    with Jacobian A and weight w has the leverage H = w A N⁻¹ Aᵀ. Its residual without it is (I − H)⁻¹ r (Cook and
+    Weisberg 1982, section 2.2). The weights of the other observations are held.
 
     Raises:
         DegenerateGeometryError: the measurements leave the similarity open.
@@ -274,7 +277,10 @@ def leave_one_out(problem: GeoProblem) -> LeftOut:
 
 
 def _seen(by_z: list[FloatArray], count: int) -> FloatArray | None:
-    """Orthonormal directions (k, r) of the corrections that the residuals see; None where that saves nothing."""
+    """Return orthonormal directions (k, r) of the corrections that change the residuals.
+
+    None: there are at least as many residuals as corrections, and the directions would save nothing.
+    """
     if sum(rows.shape[0] * rows.shape[1] for rows in by_z) >= count:
         return None
     stacked = np.concatenate([np.zeros((0, count)), *(rows.reshape(-1, count) for rows in by_z)])

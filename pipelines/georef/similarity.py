@@ -1,4 +1,4 @@
-"""The similarity that is learned: seven whitened coordinates about the initial estimate, in float64."""
+"""Learnable similarity: seven whitened coordinates about the initial estimate, in float64."""
 
 from __future__ import annotations
 
@@ -15,21 +15,22 @@ from pipelines.georef.so3 import exp_so3
 
 
 class LearnableSimilarity(torch.nn.Module):
-    """`geo_from_model` = perturbation(root · y) ∘ base, with y ~ N(0, diag(1 / held)) a priori.
+    """Similarity `geo_from_model` = perturbation(root · y) ∘ base, with y ~ N(0, diag(1 / held)) a priori.
 
-    The perturbation is that of `products.SimilarityRecord`: (δ ln s, δω, δt) about `pivot` in the target frame.
-    In the coordinates y all seven unknowns are of one size, whatever the extent of the scene, so that one
+    The perturbation is that of `geometry.similarity.SimilarityRecord`: (δ ln s, δω, δt) about `pivot` in the
+    target frame. All seven coordinates y are of the same size, whatever the extent of the scene, so that one
     learning rate fits.
 
-    What was known before the fixes is all of the initial estimate, or only the `attitude` that it took in beside
-    them. Then the axes of y are turned so that this prior is diagonal too: `held` is what part of the information
-    in the initial estimate came from the attitude, and y = 0 is where the attitude would have the rotation.
+    The prior is the whole initial estimate, or only the `attitude` that entered it. In the second case, the axes
+    of y are rotated to make this prior diagonal too: `held` is the attitude's share of the information in the
+    initial estimate along each axis, and y = 0 has the rotation of the attitude.
 
     Args:
         initial: initial estimate.
         covariance: (7, 7) of the initial estimate; its root is the unit of y.
-        pivot: (3,) in the target frame.
-        attitude: measured rotation geo ← model that the initial estimate has made use of.
+        pivot: (3,) in the target frame, metres.
+        attitude: measured rotation geo ← model that the initial estimate used; None: the prior is the whole
+            estimate.
     """
 
     def __init__(
@@ -54,11 +55,11 @@ class LearnableSimilarity(torch.nn.Module):
         self.register_buffer("pivot", torch.tensor(self.pivot_in_geo))
 
     def forward(self, points: Tensor) -> Tensor:
-        """Map points (N, 3) float64 of `model` to `geo`."""
+        """Return points (N, 3), float64, mapped from `model` to `geo`."""
         return self.at(self.y).apply(points)
 
     def at(self, y: Tensor) -> TensorSimilarity:
-        """The similarity of coordinates (7,), differentiable in them."""
+        """Return the similarity of coordinates y (7,), differentiable in them."""
         delta = self.root @ y
         turn, grow = exp_so3(delta[1:4]), torch.exp(delta[0])
         return TensorSimilarity(
@@ -68,7 +69,7 @@ class LearnableSimilarity(torch.nn.Module):
         )
 
     def place(self, value: Similarity) -> None:
-        """Set the present estimate."""
+        """Set the present similarity to `value`."""
         away = value @ self.base.inverse()
         shift = away.apply(self.pivot_in_geo) - self.pivot_in_geo
         delta = np.array([np.log(away.scale), *rotations.log_so3(away.rotation), *shift])
@@ -76,16 +77,16 @@ class LearnableSimilarity(torch.nn.Module):
             self.y.copy_(torch.from_numpy(np.linalg.solve(self.root.cpu().numpy(), delta)))
 
     def current(self) -> Similarity:
-        """Return the present estimate."""
+        """Return the present similarity."""
         delta = (self.root @ self.y).detach().cpu().numpy()
         return perturbation(delta, self.pivot_in_geo) @ self.base
 
     def prior(self) -> Tensor:
-        """Twice the negative logarithm of the density of y a priori, but for a constant; scalar."""
+        """Return −2 ln of the prior density of y, up to a constant; scalar."""
         return self.held @ self.y.square()
 
     def prior_covariance(self) -> FloatArray:
-        """Covariance (7, 7) of the initial estimate."""
+        """Return the covariance (7, 7) of the initial estimate."""
         root = self.root.cpu().numpy()
         return np.asarray(root @ root.T)
 
@@ -93,9 +94,9 @@ class LearnableSimilarity(torch.nn.Module):
 def _about_attitude(
     root: FloatArray, rotation: FloatArray, attitude: RotationPrior
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Root with axes in which the attitude's information is diagonal; that information; y of the initial estimate.
+    """Return the root along whose axes the attitude's information is diagonal; that information; y of the estimate.
 
-    The attitude says nothing of scale and shift: four of the seven axes are free of it.
+    The attitude has no information on scale and translation: four of the seven axes are free of it.
     """
     information = np.zeros((7, 7))
     information[1:4, 1:4] = np.linalg.solve(attitude.cov_rad2, np.eye(3))
@@ -108,6 +109,6 @@ def _about_attitude(
 
 
 def _root(covariance: FloatArray) -> FloatArray:
-    """A square root of a positive semi-definite matrix; a direction without uncertainty keeps a tiny one."""
+    """Return a square root of a positive semi-definite matrix, with a floor for directions without uncertainty."""
     value, vector = np.linalg.eigh((covariance + covariance.T) / 2)
     return np.asarray(vector * np.sqrt(np.maximum(value, 1e-12 * max(value.max(), 1e-12))))

@@ -1,4 +1,4 @@
-"""Rotations in torch: exponential map and logarithm, differentiable also at zero."""
+"""Rotations in torch: exponential map and logarithm, differentiable at zero too."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from torch import Tensor
 
 
 def cross_matrix(vector: Tensor) -> Tensor:
-    """Return cross-product matrices (…, 3, 3) of vectors (…, 3)."""
+    """Return the cross-product matrices (…, 3, 3) of vectors (…, 3)."""
     x, y, z = vector.unbind(-1)
     zero = torch.zeros_like(x)
     return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).reshape(*vector.shape[:-1], 3, 3)
 
 
 def exp_so3(rotation_vector: Tensor) -> Tensor:
-    """Return rotation matrices (…, 3, 3) of rotation vectors (…, 3).
+    """Return the rotation matrices (…, 3, 3) of rotation vectors (…, 3), in radians.
 
-    Rodrigues' formula: `torch.linalg.matrix_exp` would wait for the device.
+    Rodrigues' formula is used, because `torch.linalg.matrix_exp` would wait for the device.
     """
     squared = rotation_vector.square().sum(dim=-1, keepdim=True)[..., None]
     angle = (squared + torch.finfo(squared.dtype).tiny).sqrt()  # the root has no derivative at zero
@@ -29,10 +29,10 @@ def exp_so3(rotation_vector: Tensor) -> Tensor:
 
 
 def log_so3(rotation: Tensor) -> Tensor:
-    """Return rotation vectors (…, 3) of rotations (…, 3, 3) by less than π."""
+    """Return the rotation vectors (…, 3), in radians, of rotations (…, 3, 3) by less than π."""
     skewed = rotation - rotation.transpose(-1, -2)
     sine_axis = 0.5 * torch.stack([skewed[..., 2, 1], skewed[..., 0, 2], skewed[..., 1, 0]], dim=-1)
-    # The root has no derivative at zero: 1e-12 rad stand for none.
+    # The root has no derivative at zero: a rotation by 0 counts as one by 1e-12 rad.
     sine = (sine_axis.square().sum(dim=-1, keepdim=True) + 1e-24).sqrt()
     cosine = 0.5 * (rotation.diagonal(dim1=-2, dim2=-1).sum(dim=-1, keepdim=True) - 1.0)
     return sine_axis * (torch.atan2(sine, cosine) / sine)

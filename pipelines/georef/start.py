@@ -1,4 +1,4 @@
-"""Where the constant errors start, in which unit they are learned, and whether there is reason to have them."""
+"""Start of the constant errors: their least-squares values, the unit of their learning, and a test of biases."""
 
 from __future__ import annotations
 
@@ -11,18 +11,23 @@ from pipelines.georef.normal_equations import RobustMinimum, posterior_weights
 from pipelines.georef.posterior import GeoEquations, equations_of
 from pipelines.georef.problem import GeoProblem
 
-# The similarity turns, and so may a boresight: as many linearisations are enough from 20°.
-_ROUNDS, _NEAR = 4, 0.1  # or until a step is a tenth of a σ
+# Rotations of similarity and boresight are not linear: four linearisations are enough from 20°.
+_ROUNDS, _NEAR = 4, 0.1  # a step below a tenth of a σ ends them earlier
 
 
 def begin(problem: GeoProblem) -> float:
-    """Start the problem's constant errors at their least-squares values, and learn them in units of their σ then.
+    """Set the constant errors of a problem to their least-squares values, and return the gain in likelihood.
 
-    The errors and the similarity are adjusted to all measurements, with Cauchy's weights, twice: from where the
-    similarity is, and from the control points, with the fixes' offset taken for their bias. The better one counts.
+    All unknowns are adjusted to all measurements with Cauchy's weights, from two starts: the present similarity,
+    and the control points with the fixes' offset as their bias. The likelier minimum counts. The unit of the
+    errors' coordinates x becomes the root of their covariance there. The similarity and the cameras stay as they
+    were.
 
     Returns:
-        What the errors save in −2 ln likelihood against having none.
+        Decrease of −2 ln likelihood by the errors, against a solution without them.
+
+    Raises:
+        DegenerateGeometryError: the measurements leave the similarity open.
     """
     y, errors = problem.similarity.y, problem.errors
     before = y.detach().clone()
@@ -46,20 +51,20 @@ def begin(problem: GeoProblem) -> float:
 
 
 def bias_pays(problem: GeoProblem, saved: float) -> bool:
-    """Return whether biases that save so much of −2 ln likelihood are to be believed.
+    """Return whether biases are accepted that lower −2 ln likelihood by `saved`.
 
-    A bias that is not there costs accuracy, since the fixes then say nothing of the position: with RTK and a few
-    control points, twice the σ and more. So it has to be evident, as for the initial similarity.
+    A bias that does not exist costs accuracy, since the fixes then have no information on the position: with RTK
+    and a few control points, σ doubles at least. The bias has to be evident, as for the initial similarity.
     """
     return saved > BIAS_COST * problem.errors.flights
 
 
 def _best(problem: GeoProblem, equations: GeoEquations, *, with_errors: bool) -> RobustMinimum:
-    """The likelier of the minima from two starts, with the constant errors free or held at zero."""
+    """Return the likelier of the minima from two starts, with the constant errors free or held at zero."""
     free: BoolArray = np.ones(len(equations.normal.precision), dtype=bool)
     free[equations.constant] = with_errors
-    here = np.zeros(len(free))
-    starts = [here, _step_to_control(problem, equations)]
+    no_step = np.zeros(len(free))
+    starts = [no_step, _step_to_control(problem, equations)]
     if not with_errors:
         for start in starts:
             start[equations.constant] = -equations.normal.offset[equations.constant]
@@ -68,7 +73,7 @@ def _best(problem: GeoProblem, equations: GeoEquations, *, with_errors: bool) ->
 
 @torch.no_grad()
 def _step_to_control(problem: GeoProblem, equations: GeoEquations) -> FloatArray:
-    """Step (P,) that moves the similarity onto the control points, and takes the biases from the fixes there."""
+    """Return the step (P,) that shifts the similarity onto the control points, with the fixes' offset as biases."""
     step, at = np.zeros(len(equations.normal.precision)), problem.estimate()
     fixes, control, errors = problem.fixes, problem.control, problem.errors
     if fixes is None or control is None:
@@ -77,9 +82,9 @@ def _step_to_control(problem: GeoProblem, equations: GeoEquations) -> FloatArray
     root = problem.similarity.root
     step[equations.similarity] = torch.linalg.solve(root, torch.cat([root.new_zeros(4), shift])).cpu().numpy()
     if errors.flights:
-        missed = fixes.residuals(at) + shift
+        residual = fixes.residuals(at) + shift
         flight = torch.zeros_like(fixes.camera) if fixes.flight is None else fixes.flight
-        middle = torch.stack([missed[flight == index].median(dim=0).values for index in range(errors.flights)])
+        middle = torch.stack([residual[flight == index].median(dim=0).values for index in range(errors.flights)])
         biases = equations.constant.start + np.arange(3 * errors.flights)
         step[biases] = -middle.cpu().numpy().ravel()
     return step

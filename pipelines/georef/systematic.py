@@ -1,11 +1,12 @@
-"""Constant errors of the measurements that training may estimate: what a whole flight's fixes or attitudes share.
+"""Constant errors of the measurements that training may estimate, common to all fixes or attitudes of a flight.
 
-    bias       a fix lies at the true antenna place + b, one b for each flight; control points alone show it
-    lever-arm  the antenna seen from the camera, in the camera's axes: it lies at the centre + geo_from_cam · l
-    boresight  nominal_from_true: recorded are the rotations of nominal axes, from which the true ones are turned
+- bias: fix minus true position of the antenna, one for each flight. Only control points make it observable.
+- lever-arm: l, the antenna seen from the camera, in the camera's axes: antenna = centre + geo_from_cam · l.
+- boresight: B = nominal_from_true. The attitudes are recorded of the nominal axes: geo_from_true = recorded · B.
 
-With a boresight comes what all attitudes of a flight share in the axes of geo (compass, tilt of the gimbal): it has
-the σ of one attitude as its prior, so that hundreds of attitudes claim no more of the rotation than one.
+With the boresight, training estimates a rotation in the axes of geo that all attitudes share (compass, tilt of the
+gimbal). Its prior has the σ of one attitude: hundreds of attitudes therefore have no more information on the
+rotation than one.
 """
 
 from __future__ import annotations
@@ -21,23 +22,23 @@ from torch import Tensor
 from pipelines.core.types import FloatArray
 from pipelines.georef.estimated_error import EstimatedError
 
-# Weak priors: wide enough for whatever a flight brings, finite so that what is not observable is recognised.
+# Weak priors: wider than the errors of any flight, and finite, so that unobservable errors show by their σ.
 SIGMA_BIAS_M = (5.0, 5.0, 10.0)
 SIGMA_ARM_M = 1.0
 SIGMA_BORESIGHT_RAD = math.radians(5.0)
-# With a σ above this part of its prior's, a component has not been observed.
+# A component counts as observed if its σ is at most this part of the prior's.
 OBSERVED_PART = 0.5
 
 
 @dataclass(frozen=True)
 class SystematicErrorValues:
-    """Values of the errors; None where one is not estimated.
+    """Values of the errors; None for errors that are not estimated.
 
     Attributes:
-        bias_m: (G, 3) of the fixes of each flight, axes of geo, fix minus truth.
-        arm_m: (3,) antenna seen from the camera beyond what the survey has applied, axes of the camera.
+        bias_m: (G, 3) metres of the fixes of each flight, axes of geo, fix minus truth.
+        arm_m: (3,) metres, antenna seen from the camera beyond the arm that the survey has applied, camera axes.
         boresight_rad: (3,) rotation vector from the true to the nominal camera axes.
-        common_rad: (3,) rotation vector, axes of geo, of all recorded attitudes.
+        common_rad: (3,) rotation vector common to all recorded attitudes, axes of geo.
     """
 
     bias_m: Tensor | None = None
@@ -48,7 +49,13 @@ class SystematicErrorValues:
 
 @dataclass(frozen=True)
 class ErrorBlock:
-    """One error in the vector of all: `name` as in `TrainOptions.estimate` or "common", flight counted from 0."""
+    """Three components of the vector of all errors.
+
+    Attributes:
+        name: as in `TrainOptions.estimate`, or "common".
+        flight: of a bias, counted from 0; None: of all flights.
+        sigma: (3) of the prior, in metres or radians.
+    """
 
     name: Literal["bias", "lever-arm", "boresight", "common"]
     flight: int | None
@@ -56,15 +63,15 @@ class ErrorBlock:
 
 
 class SystematicErrors(torch.nn.Module):
-    """The vector v = start + unit · x of all errors (p,), in metres and radians, with v ~ N(0, diag σ²) a priori.
+    """Vector v = start + unit · x of all errors (p,), in metres and radians, with v ~ N(0, diag σ²) a priori.
 
-    `start` and `unit` (the root of v's covariance once the data are known, see `georef.start.begin`) only make the
-    learned x of size one.
+    `start` and `unit` scale the learned x to size one. The unit is the root of v's covariance, see
+    `georef.start.begin`.
 
     Args:
-        flights: whose biases to estimate; 0: none.
+        flights: number of flights whose biases to estimate; 0: no bias.
         arm: estimate the lever arm.
-        attitude_sigma_rad: σ of one attitude; given: estimate the boresight.
+        attitude_sigma_rad: σ of one attitude, to estimate the boresight; None: no boresight.
     """
 
     def __init__(self, flights: int = 0, *, arm: bool = False, attitude_sigma_rad: float | None = None) -> None:
@@ -90,7 +97,7 @@ class SystematicErrors(torch.nn.Module):
         return len(self.sigma)
 
     def begin(self, start: FloatArray, unit: FloatArray) -> None:
-        """Set the values (p,) at which to start, and the unit (p, p) of x; x becomes zero."""
+        """Set the values (p,) to start from, and the unit (p, p) of x; x becomes zero."""
         with torch.no_grad():
             self.start.copy_(torch.from_numpy(start))
             self.unit.copy_(torch.from_numpy(unit))
@@ -102,15 +109,15 @@ class SystematicErrors(torch.nn.Module):
             self.x.copy_(torch.linalg.solve(self.unit, vector - self.start))
 
     def vector(self) -> Tensor:
-        """Present values v (p,)."""
+        """Return the present values v (p,)."""
         return self.start + self.unit @ self.x
 
     def prior(self, vector: Tensor) -> Tensor:
-        """Σ (v/σ)²; scalar."""
+        """Return Σ (v/σ)² of a vector (p,); scalar."""
         return (vector / self.sigma).square().sum()
 
     def split(self, vector: Tensor) -> SystematicErrorValues:
-        """The errors of a vector (p,)."""
+        """Return the errors of a vector (p,) by their kind."""
         rows = vector.view(-1, 3)
         common = {block.name: row for block, row in zip(self.blocks, rows, strict=True) if block.flight is None}
         return SystematicErrorValues(
@@ -121,23 +128,26 @@ class SystematicErrors(torch.nn.Module):
         )
 
     def estimates(self, covariance: FloatArray) -> tuple[EstimatedError, ...]:
-        """The present values with the σ of their covariance (p, p); what all attitudes share is not among them."""
+        """Return the present values with the σ of their covariance (p, p), in metres and degrees.
+
+        The rotation that all attitudes share is not included.
+        """
         value, prior = self.vector().detach().cpu().numpy(), self.sigma.cpu().numpy()
         sigma = np.sqrt(np.diag(covariance))
         estimates = []
         for index, block in enumerate(self.blocks):
             if block.name == "common":
                 continue
-            here, turned = slice(3 * index, 3 * index + 3), block.name == "boresight"
-            unit = math.degrees(1.0) if turned else 1.0
+            axes, is_angle = slice(3 * index, 3 * index + 3), block.name == "boresight"
+            unit = math.degrees(1.0) if is_angle else 1.0
             estimates.append(
                 EstimatedError(
                     name=block.name,
                     flight=block.flight,
-                    unit="deg" if turned else "m",
-                    value=tuple(unit * value[here]),
-                    sigma=tuple(unit * sigma[here]),
-                    observed=tuple(sigma[here] <= OBSERVED_PART * prior[here]),
+                    unit="deg" if is_angle else "m",
+                    value=tuple(unit * value[axes]),
+                    sigma=tuple(unit * sigma[axes]),
+                    observed=tuple(sigma[axes] <= OBSERVED_PART * prior[axes]),
                 )
             )
         return tuple(estimates)

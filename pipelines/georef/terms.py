@@ -1,9 +1,10 @@
-"""The terms of the adjustment (GeoRefGS section 2.4, doi 10.3390/drones10030195), in float64.
+"""Terms of the adjustment (GeoRefGS section 2.4, doi 10.3390/drones10030195), in float64.
 
-A term is the observations of one kind: residuals against an estimate, their root information, and their share in
-the loss. A new measurement is one subclass of `Term`; nothing else knows which terms there are. Residuals are
-whitened by their covariance: each term is half of a χ² and the whole a maximum a posteriori estimate; `paper`
-takes plain mean squares in metres instead. A Cauchy kernel bounds the effect of one bad fix.
+A term consists of the observations of one kind: residuals against an estimate, their root information, and their
+share in the loss. A new kind of measurement is one subclass of `Term`; no other code depends on the kinds.
+
+The residuals are whitened by their covariance: each term is half of a χ², and the whole a maximum a posteriori
+estimate. `paper` takes plain mean squares in metres instead. A Cauchy kernel bounds the effect of one bad fix.
 """
 
 from __future__ import annotations
@@ -25,13 +26,13 @@ Weighting = Literal["whitened", "paper"]
 
 
 def cauchy(chi2: Tensor, dimension: int) -> Tensor:
-    """Return Cauchy's ρ of squared whitened residuals (N,) of a dimension: c² ln(1 + χ²/c²)."""
+    """Return Cauchy's ρ (N,) of squared whitened residuals (N,) of a dimension: c² ln(1 + χ²/c²)."""
     scale2 = CAUCHY_SCALE2[dimension]
     return scale2 * torch.log1p(chi2 / scale2)
 
 
 def moved_tensors(record: RecordT, move: Callable[[Tensor], Tensor]) -> RecordT:
-    """Return a dataclass with every tensor replaced by `move` of it: to another device, say."""
+    """Return a dataclass with every tensor replaced by `move` of it, e.g. for another device."""
     tensors = {
         field.name: move(getattr(record, field.name))
         for field in fields(record)  # type: ignore[arg-type]
@@ -46,11 +47,11 @@ class Term(ABC):
     Attributes:
         kind: name in losses, metrics and normal equations.
         dimension: d, of a residual.
-        measures: whether the observations are measurements of their own. A term that repeats what others say
-            steadies the training and has no part in the posterior.
-        in_metres: whether the residuals are lengths, which plain mean squares take as they are.
+        measures: whether the observations are independent measurements. A term that is a function of others
+            steadies the training, and is not part of the posterior.
+        in_metres: whether the residuals are lengths, which plain mean squares need no whitening for.
         root_information: (M, d, d) float64, W with WᵀW = Σ⁻¹.
-        share: what each observation counts for in the loss, 0 to 1.
+        share: weight of each observation in the loss, 0 to 1.
     """
 
     kind: ClassVar[str]
@@ -75,13 +76,13 @@ class Term(ABC):
 
 @dataclass(frozen=True)
 class FixTerm(Term):
-    """Measured centres of F training cameras: the term L_abs.
+    """Measured positions of F training cameras: the term L_abs.
 
     Attributes:
         camera: (F,) int64 index into the cameras.
         position_in_geo: (F, 3) float64 metres.
-        root_information: (F, 3, 3) float64.
-        flight: (F,) int64, the flight that each was measured in; None: all in one.
+        root_information: (F, 3, 3) float64, in 1/m.
+        flight: (F,) int64, flight of each fix; None: all in one.
     """
 
     kind: ClassVar[str] = "absolute"
@@ -103,7 +104,7 @@ class FixTerm(Term):
 
 @dataclass(frozen=True)
 class ControlTerm(Term):
-    """Control points against the intersection of their image marks: the term L_gcp; J points, K marks in all.
+    """Control points against the intersections of their image marks: the term L_gcp; J points, K marks in all.
 
     Attributes:
         point: (K,) int64 index into the points.
@@ -111,11 +112,11 @@ class ControlTerm(Term):
         bearing_in_cam: (K, 3) float64 unit vectors.
         sigma_rad: (K,) float64 angular σ of a mark.
         position_in_geo: (J, 3) float64 metres, surveyed.
-        root_information: (J, 3, 3) float64 of survey and intersection together, and of the surface where the points
-            are found by depth.
+        root_information: (J, 3, 3) float64 of survey and intersection together, in 1/m; for control points through
+            the rendered depth, of the surface too.
         point_id: of the points (J), as in the survey.
         bearing_by_lens: (K, 3, L) float64, derivative of the bearings by the lens parameters, in the order of
-            `geometry.lens.Lenses`; None: the lens that they were read through is taken for exact.
+            `geometry.lens.Lenses`; None: the lens of the bearings is exact.
     """
 
     kind: ClassVar[str] = "control"
@@ -130,19 +131,20 @@ class ControlTerm(Term):
     bearing_by_lens: Tensor | None = None
 
     def residuals(self, at: Estimate) -> Tensor:
-        """Return T(x_j) − X_j (J, 3) in metres, x_j intersected from its marks and the cameras."""
+        """Return T(x_j) − X_j (J, 3) in metres, with x_j the intersection of the marks of point j."""
         return at.geo_from_model.apply(self.intersected(at)) - self.position_in_geo
 
     def bearings(self, lens: Tensor) -> Tensor:
-        """Return unit vectors (K, 3) with the lens changed by (L,), to first order; L = 0: as it was."""
+        """Return the unit vectors (K, 3) of the marks, to first order in the lens change (L,); L = 0: none."""
         if self.bearing_by_lens is None or not len(lens):
             return self.bearing_in_cam
         return torch.nn.functional.normalize(self.bearing_in_cam + self.bearing_by_lens @ lens, dim=1)
 
     def intersected(self, at: Estimate) -> Tensor:
-        """Return points (J, 3) in `model` nearest to the rays of their marks, differentiable in cameras and lens.
+        """Return the points (J, 3) in `model` nearest to the rays of their marks, differentiable.
 
-        Rays are weighted by the inverse of their lateral σ at the point (angular σ × distance); GeoRefGS eqs 4–8.
+        The rays are weighted by their inverse lateral variance at the point, (angular σ × distance)⁻²; GeoRefGS
+        eqs 4–8. The derivative reaches cameras and lens.
         """
         rotation, center = at.rotation[self.camera], at.center[self.camera]
         direction = (rotation.transpose(1, 2) @ self.bearings(at.lens)[:, :, None])[:, :, 0]
@@ -151,7 +153,7 @@ class ControlTerm(Term):
         )
         weight = 1.0 / self.sigma_rad**2
         point = torch.zeros(0)
-        for _ in range(2):  # the second pass knows the distances
+        for _ in range(2):  # the first pass gives the distances, and so the weights
             normal = self._sum_by_point(weight[:, None, None] * projector)
             right = self._sum_by_point(weight[:, None, None] * (projector @ center[:, :, None]))
             point = torch.linalg.solve_ex(normal, right).result[:, :, 0]  # `solve` would wait for the device
@@ -182,7 +184,7 @@ class AttitudeTerm(Term):
     root_information: Tensor
 
     def residuals(self, at: Estimate) -> Tensor:
-        """Return Log(R_iᵀ G_i B) (A, 3) in radians, from a camera to its recorded axes less the boresight B."""
+        """Return Log(R_iᵀ G_i B) (A, 3) in radians, from a camera to its recorded axes, with the boresight B."""
         turned = at.geo_from_cam(self.camera)
         recorded = self.geo_from_cam
         if at.errors.common_rad is not None:
@@ -194,20 +196,20 @@ class AttitudeTerm(Term):
 
 @dataclass(frozen=True)
 class DistanceTerm(Term):
-    """Distances between P pairs of points that were located on Earth, or of cameras with fixes: the term L_rel.
+    """Distances between P pairs of geolocated points, or of cameras with fixes: the term L_rel.
 
-    The distances are functions of the fixes, not measurements of their own.
+    The distances are functions of the fixes, not independent measurements.
 
-    Points stay where SfM put them. They would follow the cameras' corrections; but these are such that the points
-    keep their mean place, turn and size (`geometry.bundle.correction_basis`), so that fixed ones are right to first
-    order for what the pairs can say: the scale.
+    The points are fixed at their SfM positions. In the bundle, they would follow the corrections of the cameras.
+    These corrections keep the points' mean position, rotation and size (`geometry.bundle.correction_basis`). Fixed
+    points are therefore right to first order for the scale, the only quantity that the pairs determine.
 
     Attributes:
-        distance_in_model: (P,) float64; None: of the cameras below.
-        camera: (P, 2) int64 indices into the cameras; None: fixed points of the scene.
+        distance_in_model: (P,) float64; None: between the cameras below.
+        camera: (P, 2) int64 indices into the cameras; None: between fixed points of the scene.
         distance_in_geo: (P,) float64 metres.
         root_information: (P, 1, 1) float64, 1/σ of the measured distance in 1/m.
-        share: see `scale_share`.
+        share: see `scene.measurements.scale_share`.
     """
 
     kind: ClassVar[str] = "relative"
