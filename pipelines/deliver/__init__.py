@@ -1,1 +1,1 @@
-"""Deliverables of a survey, one module each."""
+"""Deliverables of a survey, one module for each."""

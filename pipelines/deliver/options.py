@@ -8,6 +8,6 @@ from pipelines.core.options import StageOptions
 
 
 class ExportPlyOptions(StageOptions):
-    """Options of the splat as a 3DGS PLY with its sidecar."""
+    """Options of the export of the splat as a 3DGS PLY with its sidecar."""
 
     min_opacity: float = Field(0.005, ge=0, lt=1, description="Leave out Gaussians that are less opaque.")

@@ -1,10 +1,10 @@
 """Export of the splat as a 3DGS PLY in real-world metres, with a sidecar that states its place on Earth.
 
-Reads `ingest/survey.json`, `train/model.json` and `train/gaussians.ply`; writes `export/splat.ply` and
-`export/splat.ply.georef.json` (docs/formats.md). GeoRefGS section 2.4: the similarity carries the model to Earth.
+Reads `ingest/survey.json`, `train/model.json` and `train/gaussians.ply`. Writes `export/splat.ply` and
+`export/splat.ply.georef.json` (docs/formats.md). The similarity maps the model to Earth (GeoRefGS section 2.4).
 
-The PLY's frame is East-North-Up at its own origin in the middle of the scene. There float32 coordinates stay small,
-and "up" is the vertical at the splat, not at the start of the survey.
+The PLY's frame is East-North-Up at its own origin in the middle of the scene. There, float32 coordinates stay
+small, and "up" is the vertical at the splat, not at the start of the survey.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.storage import read_gaussians, write_gaussians
 from pipelines.splat.transform import transformed
 
-_ORIGIN_DECIMALS_DEG = 6  # 0.1 m: short numbers that people can copy without loss
+_ORIGIN_DECIMALS_DEG = 6  # 0.1 m: short numbers can be copied without loss
 _ORIGIN_DECIMALS_M = 1
 
 
@@ -59,11 +59,11 @@ class ExportedSplat:
 
 
 def run(stage: StageRun, options: ExportPlyOptions) -> Summary:
-    """Write the PLY and its sidecar.
+    """Write the PLY and its sidecar, and return their key figures.
 
     Raises:
         MissingProductError: ingest or train has not been run.
-        InputError: a product does not have its form.
+        InputError: a product is damaged.
         DegenerateGeometryError: no Gaussian is opaque enough.
     """
     survey = load_survey(stage.workspace)
@@ -90,6 +90,12 @@ def export_splat(
 ) -> ExportedSplat:
     """Return the Gaussians of a model in an East-North-Up frame at the scene, with the sidecar of that frame.
 
+    Args:
+        gaussians: in the frame `model`.
+        model: has the similarity geo ← model and its covariance.
+        survey: has the origin of geo and the vertical datum.
+        options: the least opacity.
+
     Raises:
         DegenerateGeometryError: no Gaussian is opaque enough.
     """
@@ -109,13 +115,13 @@ def export_splat(
 
 
 def _rounded_origin(point_in_geo: FloatArray, origin: Origin) -> FloatArray:
-    """Return latitude, longitude and height of a point, rounded: these short numbers define the frame exactly."""
+    """Return latitude, longitude and height of a point, rounded: these numbers define the frame exactly."""
     lla = lla_from_ecef(ecef_from_enu(point_in_geo, origin))
     return np.array([*np.round(lla[:2], _ORIGIN_DECIMALS_DEG), np.round(lla[2], _ORIGIN_DECIMALS_M)])
 
 
 def _enu_at(lla: FloatArray) -> Similarity:
-    """Return ecef_from_enu of the frame at a place."""
+    """Return the similarity ecef ← enu of the East-North-Up frame at latitude, longitude and height (3,)."""
     return Similarity(1.0, ecef_from_enu_rotation(lla), ecef_from_lla(lla))
 
 
