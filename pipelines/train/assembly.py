@@ -1,4 +1,4 @@
-"""The trainer, put together from scene, measurements and options."""
+"""Assembly of the trainer from scene, measurements and options."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from pipelines.train.presets import effort
 from pipelines.train.schedule import JointOptions
 from pipelines.train.trainer import JointTrainer, TrainingViews
 
-# Shrunken so much, up to this fraction of the training. More would push Gaussians, which are then smaller than a
-# pixel, off the surface that they start on.
+# Factor by which photographs are shrunken, and the fraction of the training up to which they are. A larger factor
+# would make the Gaussians smaller than a pixel, and push them off the surface that they start on.
 _COARSE = ((2, 0.3),)
 
 
 def training_size(scene: Scene, images: ImageCache, options: TrainOptions) -> TrainingSize:
-    """Return what the memory of a training depends on."""
+    """Return the quantities that determine the memory of a training."""
     cameras = [images.pinhole(index) for index in map(int, scene.train)]
     largest = max(cameras, key=lambda camera: camera.width * camera.height)
     corrected = len(images) if options.optimize_cameras else 0
@@ -39,10 +39,16 @@ def training_size(scene: Scene, images: ImageCache, options: TrainOptions) -> Tr
 def make_trainer(
     training: TrainingScene, problem: GeoProblem, backend: Rasterizer, options: TrainOptions
 ) -> JointTrainer:
-    """Return Gaussians on the surface, and everything that moves them.
+    """Return the trainer with its initial Gaussians, before the first iteration.
+
+    Args:
+        training: cameras, photographs and surface.
+        problem: the geographic losses, moved to the backend's device.
+        backend: the rasteriser.
+        options: of the training.
 
     Raises:
-        DegenerateGeometryError: too few SfM points.
+        DegenerateGeometryError: fewer than two different points to start from.
     """
     preset, device = effort(options), device_of(backend)
     scene, images = training.scene, training.images

@@ -1,8 +1,8 @@
-"""Gaussians for what cameras see but no point is known on: sky, horizon, bare ground around the scene.
+"""Background points for parts of the photographs without known points: sky, horizon, bare ground around the scene.
 
-Left empty, these parts of the photographs are filled by floaters: Gaussians of the scene that grow in mid-air until
-they cover the gap, in front of everything else. So rays through such parts start with a Gaussian of the pixel's
-colour on the ground, or far away where they do not meet the ground.
+Floaters would fill these parts if they started empty: Gaussians of the scene that grow in mid-air until they cover
+the gap, in front of everything else. Rays through such parts therefore start with a Gaussian of the pixel's colour:
+on the ground, or far away if the ray does not meet the ground.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ from pipelines.scene.scene import Scene
 
 _COLUMNS = 24  # cells across an image
 _MOST_VIEWS = 120
-_GROUND_SHARE = 0.1  # of the SfM points lie below the ground
-_STEEPEST = 0.5  # rise of the ground; a steeper plane was fitted to walls
-_GROUND_REACH = 6.0  # in scene radii: beyond, the ground is as good as infinitely far
+_GROUND_SHARE = 0.1  # of the points lie below the ground
+_STEEPEST = 0.5  # largest slope of the ground; a steeper plane was fitted to walls
+_GROUND_REACH = 6.0  # in scene radii: beyond, the ground counts as infinitely far
 _SKY_RADIUS = 12.0  # in scene radii
 
 
 @dataclass(frozen=True)
 class Background:
-    """B points beyond the SfM points.
+    """B points on rays that meet no known point.
 
     Attributes:
         point_in_model: (B, 3) metres.
         rgb: (B, 3) uint8.
-        sigma_m: (B,) half the width of the image cell that each stands for.
+        sigma_m: (B,) half the width of the image cell, at the distance of the point.
     """
 
     point_in_model: FloatArray
@@ -41,9 +41,14 @@ class Background:
 
 
 def background(scene: Scene, images: ImageCache, points: FloatArray) -> Background:
-    """Points on the rays of those image cells of the training views in which none of `points` (N, 3) is seen.
+    """Return points on the rays of all image cells of the training views that show none of the known points.
 
-    The frame `model` has its z axis up; the ground is taken to be a plane below most of the points.
+    The z axis of `model` points up, and the ground is a plane below most of the points.
+
+    Args:
+        scene: cameras.
+        images: undistorted photographs, for the colours.
+        points: (N, 3) known points in `model`, metres.
     """
     middle = np.median(points, axis=0)
     radius = float(np.percentile(np.linalg.norm(points - middle, axis=1), 90))
@@ -63,7 +68,7 @@ def background(scene: Scene, images: ImageCache, points: FloatArray) -> Backgrou
 
 
 def _empty_cells(scene: Scene, index: int, camera: Pinhole, points: FloatArray) -> FloatArray:
-    """Cells (E, 2) as column and row, without a point in them or beside them."""
+    """Return the cells (E, 2), as column and row, that have no point in them or in a cell beside them."""
     rows = max(1, round(_COLUMNS * camera.height / camera.width))
     in_cam = (points - scene.poses.cam_center_in_model[index]) @ scene.poses.cam_from_model[index].T
     in_cam = in_cam[in_cam[:, 2] > 0]
@@ -85,14 +90,15 @@ def _rays(pixel: FloatArray, camera: Pinhole) -> FloatArray:
 
 
 def ground_plane(points: FloatArray) -> FloatArray:
-    """The plane z = a x + b y + c as (a, b, c), below which a tenth of points (N, 3) lies.
+    """Return (a, b, c) of the plane z = a x + b y + c below which a tenth of points (N, 3) lies.
 
-    Quantile regression (doi 10.2307/1913643) by reweighted least squares; level where the points allow no slope.
+    The method is quantile regression (doi 10.2307/1913643) by reweighted least squares. The plane is level if the
+    points determine no slope, or a slope that is too steep for ground.
     """
     center = np.median(points, axis=0)
     spread = max(float(np.abs(points - center).mean()), 1e-9)
     arm = (points - center) / spread
-    near = (np.abs(arm) < _GROUND_REACH).all(axis=1)  # a mismatch far out would tilt the plane
+    near = (np.abs(arm) < _GROUND_REACH).all(axis=1)  # a wrong match far out would tilt the plane
     design, height = np.column_stack([arm[near, :2], np.ones(near.sum())]), arm[near, 2]
     plane = np.array([0.0, 0.0, float(np.quantile(height, _GROUND_SHARE))])
     for _ in range(50):
@@ -105,7 +111,7 @@ def ground_plane(points: FloatArray) -> FloatArray:
 
 
 def _distance(ray: FloatArray, center: FloatArray, ground: FloatArray, radius: float) -> FloatArray:
-    """Along the rays (E, 3): to the ground where it is met within reach, else to the sky."""
+    """Return distances (E,) along rays (E, 3): to the ground if the ray meets it within reach, else to the sky."""
     height = center[2] - ground[:2] @ center[:2] - ground[2]
     fall = ground[:2] @ ray[:, :2].T - ray[:, 2]
     to_ground = height / np.maximum(fall, 1e-6)
@@ -120,7 +126,7 @@ def _colours(image: ByteArray, pixel: FloatArray) -> ByteArray:
 
 
 def _thinned(all_points: Background) -> Background:
-    """One point a cube of its own size: neighbouring views see the same places."""
+    """Return one point in each cube of its own size, because neighbouring views see the same places."""
     if not len(all_points.sigma_m):
         return all_points
     first = thin_to_voxels(all_points.point_in_model, 2 * all_points.sigma_m)

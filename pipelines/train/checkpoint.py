@@ -1,4 +1,4 @@
-"""Checkpoints: named tensors in one NPZ file, replaced in one step, without pickle."""
+"""Checkpoints: named tensors in one NPZ file without pickle, replaced in one step."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pipelines.core.errors import InputError
 
 
 def save_checkpoint(path: Path, state: Mapping[str, Tensor]) -> None:
-    """Write tensors; a file that is there is replaced when the new one is complete."""
+    """Write tensors to an NPZ file, which replaces an existing file only when complete."""
     draft = path.with_suffix(".tmp")
     with draft.open("wb") as handle:
         arrays = {name: tensor.detach().cpu().numpy() for name, tensor in state.items()}
@@ -24,10 +24,10 @@ def save_checkpoint(path: Path, state: Mapping[str, Tensor]) -> None:
 
 
 def load_checkpoint(path: Path) -> dict[str, Tensor]:
-    """Read tensors.
+    """Return the tensors of a checkpoint by name.
 
     Raises:
-        InputError: unreadable.
+        InputError: the file cannot be read as a checkpoint.
     """
     try:
         with np.load(path, allow_pickle=False) as archive:
@@ -37,12 +37,12 @@ def load_checkpoint(path: Path) -> dict[str, Tensor]:
 
 
 def prefixed(prefix: str, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The same tensors under `prefix/name`."""
+    """Return the tensors with `prefix/name` for names."""
     return {f"{prefix}/{name}": tensor for name, tensor in state.items()}
 
 
 def unprefixed(prefix: str, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Those tensors that `prefixed` put under `prefix`, under their own names."""
+    """Return the tensors whose names begin with `prefix/`, without that prefix: inverts `prefixed`."""
     return {
         name.removeprefix(f"{prefix}/"): tensor for name, tensor in state.items() if name.startswith(f"{prefix}/")
     }

@@ -1,6 +1,8 @@
-"""Depth maps of the training photographs by multi-view stereo, kept on disk: a depth where views agree.
+"""Depth maps of the training photographs by multi-view stereo, cached on disk: depths on which views agree.
 
-Each view is swept by planes on coarse pixels; what views agree on is refined on finer ones, and agreed on again.
+1. A plane sweep gives each view's depths on coarse pixels.
+2. The refinement on finer pixels starts from the depths on which views agree, elsewhere from the view's own.
+3. The depth map keeps the refined depths on which views agree.
 """
 
 from __future__ import annotations
@@ -24,22 +26,22 @@ from pipelines.stereo.neighbours import PointVisibility, best_neighbours, planes
 from pipelines.stereo.refinement import refine, surface_prior
 from pipelines.stereo.sweep import NormalMap, Planes, StereoCamera, StereoView, SweepResult, plane_sweep
 
-# Of what is kept: other forms have other folders.
+# Form of the cached arrays, a part of their key: files of another form lie in another folder.
 _FORM = b"coarse, fine: direction, offset, score, step, sharpness"
 
 
 @dataclass(frozen=True)
 class StereoOptions:
-    """How to look for depths.
+    """Options of the depth maps.
 
     Attributes:
-        coarse_px: longest side of the photographs that planes are swept through.
-        fine_px: longest side of the photographs that the result is refined on.
-        neighbours: views that each is compared with.
-        matching: how they are compared,
-        refining: and how on the finer ones. A wide window finds the surface where there is little texture; with its
-            place nearly known, a small one does not lay it across the foot of a wall.
-        agreement: when views agree.
+        coarse_px: longest side of the photographs in the plane sweep.
+        fine_px: longest side of the photographs in the refinement, and of the depth maps.
+        neighbours: number of views that each view is compared with.
+        matching: comparison in the plane sweep; a wide window finds the surface where there is little texture.
+        refining: comparison in the refinement, where the surface is nearly known; a small window does not extend it
+            across the foot of a wall.
+        agreement: thresholds of agreement.
     """
 
     coarse_px: int = 320
@@ -51,15 +53,15 @@ class StereoOptions:
 
 
 class DepthMaps:
-    """Depth maps of the training photographs, made once.
+    """Depth maps of the training photographs, computed once and cached on disk.
 
-    Memory holds no more than a view and its neighbours.
+    Memory holds no more than one view and its neighbours.
 
     Args:
-        folder: where they are kept, each scene's in a folder of its own.
-        scene: cameras and points.
-        images: the photographs.
-        options: how.
+        folder: cache, in which each scene has a folder of its own.
+        scene: cameras and SfM points.
+        images: undistorted photographs.
+        options: of the depth maps; None: the defaults.
     """
 
     def __init__(
@@ -71,13 +73,20 @@ class DepthMaps:
         self._visibility = PointVisibility(
             scene.point_in_model, scene.poses.cam_center_in_model, sparse.obs_point, sparse.obs_image
         )
-        # Asked for again by each of a view's neighbours, and the same each time.
+        # All neighbours of a view need the view's own planes and neighbours again, and these do not change.
         self._neighbours = cache(self._find_neighbours)
         self._planes = cache(self._find_planes)
         self.folder = folder / self._key()
 
     def build(self, progress: Progress = SILENT) -> None:
-        """Make them, one step for all views after the other: each needs what its neighbours have found."""
+        """Compute the depth maps that are not in the cache.
+
+        A view needs the previous step of its neighbours. Each step therefore finishes all views before the next
+        step begins.
+
+        Raises:
+            InputError: a photograph cannot be read, or has another size than its camera.
+        """
         train = [int(index) for index in self.scene.train]
         steps = (("coarse", self._sweep), ("fine", self._refine), ("depth", self._agree))
         if not all(self._path(index, "depth").exists() for index in train):
@@ -87,21 +96,21 @@ class DepthMaps:
                         if not self._path(index, kind).exists():
                             save_array(self._path(index, kind), make(index))
                         task.advance()
-        for kind, _ in steps[:-1]:  # also those that an interrupted run has left
+        for kind, _ in steps[:-1]:  # and the files that an interrupted run has left
             for index in train:
                 self._path(index, kind).unlink(missing_ok=True)
 
     def camera(self, index: int) -> Pinhole:
-        """Camera of a depth map."""
+        """Return the camera of a depth map."""
         return self.images.pinhole(index).limited(self._options.fine_px)
 
     def depth(self, index: int) -> Float32Array:
-        """Depth (H, W) in metres along the optical axis of a training view, 0 where unknown; mapped from disk."""
+        """Return the depth (H, W) in metres along a training view's optical axis, mapped from disk; 0: unknown."""
         array: Float32Array = np.load(self._path(index, "depth"), mmap_mode="r", allow_pickle=False)
         return array
 
     def rgb(self, index: int) -> ByteArray:
-        """Photograph (H, W, 3) at the pixels of its depth map."""
+        """Return the photograph (H, W, 3) at the pixels of its depth map."""
         return self._rgb(self.camera(index), index)
 
     def _sweep(self, index: int) -> Float32Array:
@@ -127,10 +136,10 @@ class DepthMaps:
         return self._agreed(own, index, "fine")
 
     def _agreed(self, own: DepthEstimate, index: int, kind: str) -> Float32Array:
-        """Depths (H, W) that views agree on, 0 elsewhere."""
+        """Return the depths (H, W) on which views agree; 0 elsewhere."""
         others, options = [self._surface(j, kind) for j in self._neighbours(index)], self._options
         depth = agreed_depth(own, [other for other in others if other is not None], options.agreement)
-        # What is refined has started from what coarse windows saw.
+        # Refined depths started from the sweep: its window sets the width of a rim on fine pixels too.
         window_px = options.matching.window_px * own.camera.pinhole.width / self._coarse(index).width
         return without_rims(depth, int(window_px / 2), options.agreement.rim)
 
@@ -176,7 +185,7 @@ class DepthMaps:
         return self.folder / f"{index:06d}.{kind}.npy"
 
     def _key(self) -> str:
-        """Changes with all that the maps depend on."""
+        """Return a hash of all inputs of the depth maps."""
         digest = hashlib.sha256(_FORM)
         poses, sparse = self.scene.poses, self.scene.sparse
         arrays = (
@@ -192,13 +201,13 @@ class DepthMaps:
 
 
 def _packed(sweep: SweepResult) -> Float32Array:
-    """(5, H, W): direction, offset, score, step and sharpness of each pixel."""
+    """Return direction, offset, score, step and sharpness of each pixel as one array (5, H, W)."""
     which = sweep.normals.index.astype(np.float32)
     return np.stack([which, sweep.offset_m, sweep.score, sweep.step_m, sweep.sharpness])
 
 
 def _empty_maps(pinhole: Pinhole) -> Float32Array:
-    """The same of a view without neighbours."""
+    """Return the array (5, H, W) of `_packed` for a view without planes: no pixel has a depth."""
     empty = np.zeros((5, pinhole.height, pinhole.width), dtype=np.float32)
     empty[1], empty[2] = np.nan, UNSEEN
     return empty

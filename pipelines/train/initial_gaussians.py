@@ -1,4 +1,4 @@
-"""The scene that training starts from, and its first Gaussians."""
+"""Initial Gaussians of a training, and the points that its surface losses hold them to."""
 
 from __future__ import annotations
 
@@ -19,16 +19,22 @@ from pipelines.splat.initialise import InitialisationOptions, gaussians_from_poi
 from pipelines.train.background import background
 from pipelines.train.surface import SceneSurface, SurfacePoints
 
-_SURFACE_SHARE = 0.8  # of the Gaussians that there may be start on the surface; density control places the others
-_MOSTLY_KNOWN = 0.6  # of the pixels: where less is known of the surface, more Gaussians are needed elsewhere
-_STRIDE = 3  # every third pixel of a depth map is enough to hold Gaussians, which are wider
+_SURFACE_SHARE = 0.8  # of the limit of Gaussians starts on the surface; density control places the others
+_MOSTLY_KNOWN = 0.6  # of the pixels: with fewer known depths, more Gaussians are needed off the surface
+_STRIDE = 3  # of rows and columns of a depth map: Gaussians are wider than its pixels
 _KEPT_VIEWS = 128  # views whose points stay on the device
-_OFF_SURFACE = 3.0  # gaps between points of the surface: an SfM point so near to one lies on it
+_OFF_SURFACE = 3.0  # gaps between points of the surface: an SfM point nearer than that lies on it
 
 
 @dataclass(frozen=True)
 class TrainingScene:
-    """Cameras and SfM points, photographs, and the surface, if it was looked for."""
+    """Inputs of a training.
+
+    Attributes:
+        scene: cameras and SfM points.
+        images: undistorted photographs.
+        surface: surface from depth maps; None: the training goes without.
+    """
 
     scene: Scene
     images: ImageCache
@@ -36,19 +42,21 @@ class TrainingScene:
 
 
 def initial_gaussians(training: TrainingScene, options: InitialisationOptions, most: int, seed: int) -> Gaussians:
-    """On the surface as densely as photographs show it, at SfM points where none is known, and in the background.
+    """Return the Gaussians that a training starts from.
 
-    Where the surface is known its discs are the better start: an SfM point says nothing of where it faces, and a
-    ball reaches as far behind a wall as the wall's next point is away.
+    1. Discs lie on the surface, as dense as the photographs resolve it.
+    2. Balls lie at SfM points where no surface is known. On a surface discs are better: an SfM point has no normal,
+       and a ball reaches as far behind a wall as the gap to the wall's next point.
+    3. Balls lie in the background, as far as the limit leaves room.
 
     Args:
         training: cameras, photographs and surface.
-        options: how each of them starts.
-        most: how many there may be.
-        seed: of the choice of points.
+        options: settings of the Gaussians.
+        most: limit of the Gaussians.
+        seed: seed of the choice of surface points.
 
     Raises:
-        DegenerateGeometryError: too few points.
+        DegenerateGeometryError: fewer than two different points.
     """
     scene = training.scene
     start = SurfacePoints(scene.point_in_model, scene.sparse.point_rgb, np.full_like(scene.point_in_model, np.nan))
@@ -65,7 +73,7 @@ def initial_gaussians(training: TrainingScene, options: InitialisationOptions, m
 
 
 def _off_surface(points: SurfacePoints, surface: SurfacePoints) -> IntArray:
-    """Rows of the points that no point of the surface is near to."""
+    """Return the rows of the points that are not near any point of the surface."""
     if len(surface.rgb) < 2:
         return np.arange(len(points.rgb))
     tree = cKDTree(surface.point_in_model)
@@ -75,7 +83,14 @@ def _off_surface(points: SurfacePoints, surface: SurfacePoints) -> IntArray:
 
 
 def points_to_hold(training: TrainingScene, device: torch.device) -> Callable[[int], Tensor]:
-    """By image, the points (K, 3) in `model`, float32, of SfM and of the surface that it shows."""
+    """Return a function of an image's index that gives the points (K, 3) in `model`, float32, that the image shows.
+
+    These are SfM points and, in training images, points of the surface.
+
+    Args:
+        training: SfM points and surface.
+        device: holds the points.
+    """
     scene = training.scene
     shown = set(map(int, scene.train))
 

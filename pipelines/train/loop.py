@@ -1,4 +1,4 @@
-"""The training loop: iterations, metrics, checkpoints, interruption, and one recovery from a divergence."""
+"""Training loop: iterations, metrics, checkpoints, interruption, and one recovery from a divergence."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from pipelines.train.trainer import JointTrainer, StepReport
 
 log = logging.getLogger(__name__)
 
-_RECOVERY_RATE = 0.3  # of the learning rates, after a divergence
+_RECOVERY_RATE = 0.3  # factor on the learning rates after a divergence
 
 
 @dataclass(frozen=True)
 class LoopOptions:
-    """Where and how often to write.
+    """Files of a training, and intervals of writing them.
 
     Attributes:
         checkpoint: file of the latest checkpoint.
-        metrics: file of the metrics, a JSON object a line.
+        metrics: file of the metrics, one JSON object a line.
         checkpoint_every: iterations between checkpoints.
         log_every: iterations between lines of metrics.
-        resume: go on from the checkpoint, if it is there.
+        resume: continue from the checkpoint, if the file exists.
     """
 
     checkpoint: Path
@@ -48,8 +48,8 @@ class TrainingRecord:
     """Time and incidents of a training.
 
     Attributes:
-        seconds: of all runs together, if it was interrupted.
-        recovery: what was not finite, and what was done about it; None: nothing was.
+        seconds: duration; of an interrupted training, the sum over its runs.
+        recovery: sentence on the value that was not finite, and on the recovery; None: all values were finite.
     """
 
     seconds: float
@@ -57,12 +57,18 @@ class TrainingRecord:
 
 
 def optimise(trainer: JointTrainer, options: LoopOptions, progress: Progress) -> TrainingRecord:
-    """Iterate to the end.
+    """Run all remaining iterations and return the record of the training.
+
+    Args:
+        trainer: state of the optimisation.
+        options: files and intervals.
+        progress: shows iteration, PSNR and number of Gaussians.
 
     Raises:
         KeyboardInterrupt: the user asked to stop; a checkpoint was written.
-        ConvergenceError: a loss or gradient is not finite, again after going back to the last checkpoint and on at
-            a lower rate.
+        ConvergenceError: a loss or gradient was not finite, and again after the return to the last checkpoint and
+            the continuation at a lower rate.
+        InputError: the checkpoint cannot be read.
     """
     loop = _Loop(trainer, options)
     with progress.task("training", trainer.options.iterations) as task, deferred_interrupts() as stop:
@@ -91,6 +97,8 @@ def optimise(trainer: JointTrainer, options: LoopOptions, progress: Progress) ->
 
 
 class _Loop:
+    """Iterations of a trainer, with their files; begins anew or from the checkpoint."""
+
     def __init__(self, trainer: JointTrainer, options: LoopOptions) -> None:
         self.trainer, self.options = trainer, options
         self.recovery: str | None = None
@@ -103,15 +111,19 @@ class _Loop:
             self.save()
 
     def seconds(self) -> float:
-        """Spent so far, before a resume included."""
+        """Return the duration so far, with the runs before a resume."""
         return self._spent + time.monotonic() - self._clock
 
     def iterate(self, show: Callable[[dict[str, float]], None]) -> None:
-        """One iteration, and what is due after it."""
+        """Run one iteration, and check, log and save where due.
+
+        Raises:
+            NonFiniteError: a loss or gradient was not finite.
+        """
         trainer, options = self.trainer, self.options
         report = trainer.step()
         due = trainer.iteration % options.log_every == 0 or trainer.iteration == trainer.options.iterations
-        if due or trainer.device.type == "cpu":  # elsewhere, a look at every iteration would make it wait
+        if due or trainer.device.type == "cpu":  # a GPU would have to wait for a check at every iteration
             trainer.check_finite()
         if due:
             row = _metrics_row(trainer, report, self.seconds())
@@ -122,10 +134,10 @@ class _Loop:
             self.save()
 
     def save(self) -> None:
-        """Write a checkpoint of a sound state.
+        """Write a checkpoint, if no loss or gradient has diverged.
 
         Raises:
-            NonFiniteError: it is not sound.
+            NonFiniteError: a loss or gradient was not finite.
         """
         self.trainer.check_finite()
         more = {
@@ -135,10 +147,10 @@ class _Loop:
         save_checkpoint(self.options.checkpoint, {**self.trainer.state(), **more})
 
     def recover(self, error: NonFiniteError) -> None:
-        """Go back to the last checkpoint, and on at a lower rate; once.
+        """Return to the last checkpoint and lower the learning rates, once in a training.
 
         Raises:
-            ConvergenceError: that was tried before.
+            ConvergenceError: the training has recovered before.
         """
         advice = "train again with a smaller --geo-weight, another --seed or fewer --max-gaussians"
         if self.recovery is not None:
@@ -152,7 +164,7 @@ class _Loop:
         self.save()
 
     def _go_back(self) -> float:
-        """Take over the checkpoint and drop the metrics that came after it; returns its seconds."""
+        """Restore the checkpoint, drop the metrics of later iterations, and return the checkpoint's seconds."""
         state = load_checkpoint(self.options.checkpoint)
         self.trainer.restore(state)
         self.recovery = bytes(state["recovery"].tolist()).decode() or None

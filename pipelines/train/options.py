@@ -1,4 +1,4 @@
-"""The options of `georef train`: of the splat, of the geographic losses, and of the run itself."""
+"""Options of `georef train`: of the splat, of the geographic losses, and of the run."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pipelines.scene.geographic_options import GeographicOptions
 
 
 class SplatOptions(StageOptions):
-    """Effort, and how the Gaussians are trained."""
+    """Options of the splat: effort, backend, density control, exposure and surface."""
 
     preset: Literal["smoke", "fast", "standard", "high"] = Field("standard", description="Effort.")
     iterations: int | None = Field(None, ge=1, description="Iterations (default: the preset's).")
@@ -31,7 +31,7 @@ class SplatOptions(StageOptions):
 
 
 class TrainOptions(GeographicOptions, SplatOptions):
-    """Joint optimisation of Gaussians, similarity and camera corrections."""
+    """Options of the joint optimisation of Gaussians, similarity and camera corrections."""
 
     checkpoint_every: int = Field(500, ge=1, description="Iterations between checkpoints.")
     log_every: int = Field(10, ge=1, description="Iterations between lines of metrics.jsonl.")

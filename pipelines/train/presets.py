@@ -9,7 +9,13 @@ from pipelines.train.options import TrainOptions
 
 @dataclass(frozen=True)
 class Preset:
-    """Effort: iterations, longest image side in pixels, most Gaussians."""
+    """Effort of a training.
+
+    Attributes:
+        iterations: length of the training.
+        max_image_size: longest side of a photograph in pixels.
+        max_gaussians: limit of the Gaussians.
+    """
 
     iterations: int
     max_image_size: int
@@ -25,7 +31,7 @@ PRESETS = {
 
 
 def effort(options: TrainOptions) -> Preset:
-    """Return the preset, with what the user changed of it."""
+    """Return the effort of the preset, with the values that the user set instead."""
     preset = PRESETS[options.preset]
     return Preset(
         options.iterations or preset.iterations,

@@ -1,4 +1,4 @@
-"""The product of a training, and the summary and warnings that go with it."""
+"""Product of a training, with its summary and its warnings."""
 
 from __future__ import annotations
 
@@ -26,7 +26,15 @@ _CAUSES = {
 
 
 def trained_model(trainer: JointTrainer, scene: Scene) -> TrainedModel:
-    """Return the product of `train` beside the Gaussians."""
+    """Return the product of `train` without the Gaussians.
+
+    Args:
+        trainer: at the end of the training.
+        scene: cameras at the start of the training.
+
+    Raises:
+        DegenerateGeometryError: the measurements do not determine the similarity.
+    """
     problem, gaussians = trainer.problem, trainer.optimizer.gaussians
     similarity, control = problem.similarity, problem.control
     measured = problem.fixes is not None or control is not None
@@ -57,9 +65,9 @@ def summary_of(model: TrainedModel, metrics: list[dict[str, Any]], record: Train
     """Return headline, values and warnings of a training.
 
     Args:
-        model: its product.
+        model: product of the training.
         metrics: rows of `metrics.jsonl`.
-        record: time and incidents.
+        record: time and incidents of the training.
     """
     psnr = float(np.mean([row["psnr"] for row in metrics[-20:]]))
     sigma = np.sqrt(np.diag(np.array(model.geo_from_model.covariance)))
@@ -89,7 +97,7 @@ def _warnings(model: TrainedModel, record: TrainingRecord) -> list[str]:
 
 
 def _warning_of(error: EstimatedError) -> str | None:
-    """A warning of an error beyond 3 σ, or of one that could not be observed."""
+    """Return a warning if the error exceeds 3 σ or is not observable along every axis, else None."""
     axes = "east, north, up" if error.name == "bias" else "right, down, forward"
     flight = "" if error.flight is None else f" of flight {error.flight + 1}"
     subject = f"{error.name}{flight}"
@@ -133,7 +141,7 @@ def _cameras(trainer: JointTrainer, scene: Scene) -> tuple[TrainedCamera, ...]:
 
 
 def _lenses(trainer: JointTrainer, scene: Scene) -> tuple[TrainedLens, ...]:
-    """The lenses that have followed the cameras; none where they stayed."""
+    """Return the lenses that have followed the cameras; none if the lenses were held."""
     change = trainer.problem.cameras.lens().detach().cpu().numpy()
     if not len(change):
         return ()

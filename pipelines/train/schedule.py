@@ -1,4 +1,4 @@
-"""The schedule of the joint optimisation: view, size, harmonics, weight and rate at an iteration."""
+"""Schedule of the joint optimisation: view, image size, harmonics, weight and rate of each iteration."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pipelines.core.types import IntArray
 from pipelines.georef.weights import WeightSchedule, rising_weight
 from pipelines.splat.surface import SurfaceSettings
 
-_FINAL_RATE = 0.05  # of the geographic learning rates, relative to the first
+_FINAL_RATE = 0.05  # of the geographic unknowns, relative to their first learning rate
 
 
 @dataclass(frozen=True)
@@ -25,13 +25,13 @@ class JointOptions:
         geo_schedule: "rising" as in eq. 27, or "constant": w_max from the first iteration.
         similarity_rate: first learning rate of the similarity and of constant errors of the measurements, in
             standard deviations an iteration.
-        camera_rate: first learning rate of the camera corrections, likewise.
+        camera_rate: first learning rate of the camera corrections, in standard deviations an iteration.
         variance_rate: first learning rate of the log-variances of the geographic terms.
-        background: colour behind the scene.
-        seed: of the order of views.
-        coarse: (shrink, fraction) pairs: photographs are shrunken so much up to this fraction of the training.
-        coarse_least_px: but never to a longest side of less than this.
-        surface: weights of the surface losses; None: the photographs alone decide.
+        background: RGB behind the scene, 0 … 1.
+        seed: seed of the order of views.
+        coarse: (factor, fraction) pairs: photographs are shrunken by a factor up to a fraction of the training.
+        coarse_least_px: lower limit of the longest side of a shrunken photograph.
+        surface: weights of the surface losses; None: no surface losses.
     """
 
     iterations: int
@@ -50,7 +50,7 @@ class JointOptions:
 
 
 class TrainingSchedule:
-    """Everything that follows from the number of an iteration, counted from 1.
+    """Settings of an iteration that follow from its number, counted from 1.
 
     Args:
         options: settings of the optimisation.
@@ -61,33 +61,40 @@ class TrainingSchedule:
         self._options, self._views = options, views
 
     def view(self, iteration: int) -> int:
-        """Return the training image: every one once an epoch, in an order that seed and epoch alone decide."""
+        """Return the training image of an iteration.
+
+        Each epoch shows every image once, in an order that depends only on seed and epoch.
+        """
         epoch, place = divmod(iteration - 1, len(self._views))
         order = np.random.default_rng([self._options.seed, epoch]).permutation(len(self._views))
         return int(self._views[order[place]])
 
     def shrink(self, iteration: int, longest_side_px: int) -> int:
-        """Return how many times smaller the photograph of that size is shown."""
+        """Return the factor by which a photograph of that size is shrunken."""
         most = max(longest_side_px // self._options.coarse_least_px, 1)
         progress = self.progress(iteration)
         return min(next((shrink for shrink, until in self._options.coarse if progress <= until), 1), most)
 
     def sh_degree(self, iteration: int) -> int:
-        """Return the degree: one more each sixth of the training, up to half of it (3DGS: each 1 000 of 30 000)."""
+        """Return the degree of the harmonics.
+
+        The degree rises by one after each sixth of the training, and so reaches 3 at half of it (3DGS: after each
+        1 000 of 30 000 iterations).
+        """
         every = max(self._options.iterations // 6, 1)
         return min(self._options.sh_degree, iteration // every)
 
     def geographic_weight(self, iteration: int) -> float:
-        """Return w(t) of eq. 27, or its final value where the weight is constant."""
+        """Return w(t) of eq. 27, or w_max if the weight is constant."""
         options = self._options
         if options.geo_schedule == "constant":
             return options.geo_weight
         return rising_weight(iteration, options.geo_weight, options.geo_rise * options.iterations)
 
     def geographic_rate(self, iteration: int) -> float:
-        """Return the learning rates of the geographic unknowns, relative to the first."""
+        """Return the factor on the first learning rates of the geographic unknowns."""
         return float(_FINAL_RATE ** self.progress(iteration))
 
     def progress(self, iteration: int) -> float:
-        """Return the part of the training that is done, 0 … 1."""
+        """Return the fraction of the training that is done, 0 … 1."""
         return iteration / self._options.iterations

@@ -1,8 +1,9 @@
-"""Training: Gaussians, similarity and cameras optimised together (GeoRefGS section 2.4).
+"""Stage `train`: joint optimisation of Gaussians, similarity and cameras (GeoRefGS, section 2.4).
 
 Reads the survey, the SfM model, the geolocated points and the initial similarity. Writes `train/gaussians.ply`
 (frame `model`), `train/model.json` (similarity with covariance, cameras, constant errors), `train/metrics.jsonl`
-and the latest checkpoint. An interrupted run leaves a checkpoint in `train.partial/` for `--resume` to go on from.
+and the latest checkpoint. An interrupted run leaves a checkpoint in `train.partial/`, from which `--resume`
+continues.
 """
 
 from __future__ import annotations
@@ -32,14 +33,16 @@ from pipelines.train.surface import SceneSurface
 
 
 def run(stage: StageRun, options: TrainOptions) -> Summary:
-    """Train, with checkpoints, and write the result.
+    """Train the model, write products and checkpoints, and return the summary.
 
     Raises:
         BackendUnavailableError: `--backend cuda` without a GPU or without gsplat.
         ResourceError: the training would not fit into memory.
-        ConvergenceError: it diverged twice.
+        ConvergenceError: the training diverged twice.
+        KeyboardInterrupt: the user asked to stop; a checkpoint was written.
+        GeorefError: a product or a photograph cannot be read, or the scene has too few points.
     """
-    backend = rasterizer(options.backend)  # first: without a GPU, `--backend cuda` need not wait for its refusal
+    backend = rasterizer(options.backend)  # first, so that `--backend cuda` without a GPU fails at once
     workspace = stage.workspace
     survey = load_survey(workspace)
     initial = load_json(InitialSimilarity, workspace.path(SIM3))

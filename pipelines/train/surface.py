@@ -1,7 +1,7 @@
-"""The scene's surface, from the depth maps of its training photographs.
+"""Surface of the scene, from the depth maps of its training photographs.
 
-Training starts from it and holds the Gaussians to it. On ground with little texture they would otherwise float
-metres above where they belong, with the photographs none the worse for it.
+Training starts from this surface and holds the Gaussians to it. On ground with little texture, Gaussians would
+otherwise float metres above the ground, and their renders would fit the photographs as well.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from pipelines.geometry.thinning import thin_to_voxels
 from pipelines.train.depth_maps import DepthMaps
 
 _NORMAL_REACH_PX = 3
-_BEND = 0.02  # of the depth, by which a pixel departs from the middle between those on either side
-_CANDIDATES = 8  # drawn for each point wanted: enough to cover what few views see
+_BEND = 0.02  # limit of |z/z₁ + z/z₂ − 2| for a depth z between opposite neighbours z₁, z₂ on a smooth surface
+_CANDIDATES = 8  # drawn for each wanted point, so that they cover places that few views see
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class SurfacePoints:
     Attributes:
         point_in_model: (P, 3) metres.
         rgb: (P, 3) uint8.
-        normal_in_model: (P, 3) unit vectors, of either sign; NaN where unknown.
+        normal_in_model: (P, 3) unit vectors with an arbitrary sign; NaN where unknown.
     """
 
     point_in_model: FloatArray
@@ -35,7 +35,7 @@ class SurfacePoints:
 
     @staticmethod
     def concatenate(parts: list[SurfacePoints]) -> SurfacePoints:
-        """All of some, one after the other; at least one."""
+        """Return the points of all `parts` in their order; at least one part."""
         return SurfacePoints(
             np.concatenate([part.point_in_model for part in parts]),
             np.concatenate([part.rgb for part in parts]),
@@ -43,15 +43,15 @@ class SurfacePoints:
         )
 
     def part(self, rows: IntArray) -> SurfacePoints:
-        """Some of them."""
+        """Return the points of the given rows."""
         return SurfacePoints(self.point_in_model[rows], self.rgb[rows], self.normal_in_model[rows])
 
 
 class SceneSurface:
-    """The surface that depth maps show together.
+    """Surface that the depth maps of all training views show together.
 
     Args:
-        maps: built.
+        maps: depth maps, already built.
     """
 
     def __init__(self, maps: DepthMaps) -> None:
@@ -59,17 +59,27 @@ class SceneSurface:
         self._train, self._poses = maps.scene.train, maps.scene.poses
 
     def points(self, index: int, stride: int = 1) -> FloatArray:
-        """Surface points (P, 3) in `model` that a training view sees, of every `stride`-th row and column."""
+        """Return the surface points (P, 3) in `model` that a training view sees, in metres.
+
+        Args:
+            index: of the view.
+            stride: use every `stride`-th row and column of the depth map.
+        """
         rows, columns = np.nonzero(self._maps.depth(index)[::stride, ::stride])
         return self._points(index, stride * rows, stride * columns)
 
     def known_share(self) -> float:
-        """Part of the training photographs' pixels whose surface is known, 0 … 1."""
+        """Return the fraction of the training photographs' pixels whose depth is known, 0 … 1."""
         depths = (self._maps.depth(index) for index in map(int, self._train))
         return float(np.mean([np.mean(depth > 0) for depth in depths]))
 
     def sample(self, count: int, seed: int) -> SurfacePoints:
-        """At most `count` points of the whole surface, as dense as the photographs show it."""
+        """Return points of the whole surface, as dense as the photographs resolve it.
+
+        Args:
+            count: limit of the points.
+            seed: seed of their choice.
+        """
         rng = np.random.default_rng(seed)
         share = -(-_CANDIDATES * count // max(len(self._train), 1))
         views, sizes = [], []
@@ -85,7 +95,7 @@ class SceneSurface:
         return candidates.part(spread_evenly(candidates.point_in_model, np.concatenate(sizes), count))
 
     def _normals(self, index: int, rows: IntArray, columns: IntArray) -> FloatArray:
-        """Unit vectors (P, 3) across the surface at pixels of a view; NaN at its edges."""
+        """Return unit normals (P, 3) of the surface at pixels of a view; NaN at the edges of surface and image."""
         depth = self._maps.depth(index)
         inside = (rows >= _NORMAL_REACH_PX) & (rows < depth.shape[0] - _NORMAL_REACH_PX)
         inside &= (columns >= _NORMAL_REACH_PX) & (columns < depth.shape[1] - _NORMAL_REACH_PX)
@@ -95,7 +105,7 @@ class SceneSurface:
             (rows[inner] + _NORMAL_REACH_PX * down, columns[inner] + _NORMAL_REACH_PX * right)
             for down, right in ((0, 1), (0, -1), (1, 0), (-1, 0))
         ]
-        # On a plane the inverse depth is linear, however steeply it is seen.
+        # The inverse depth of a plane is linear on the image, at any angle of view.
         with np.errstate(divide="ignore"):
             around = np.stack([depth[rows[inner], columns[inner]] / depth[place] for place in places])
         smooth = (np.abs(around[::2] + around[1::2] - 2) < _BEND).all(axis=0)
@@ -112,7 +122,13 @@ class SceneSurface:
 
 
 def spread_evenly(points: FloatArray, size_m: FloatArray, count: int) -> IntArray:
-    """Indices of points (P, 3), at most `count`, one in each cube whose side is proportional to their size (P,)."""
+    """Return the indices of evenly spread points: one in each cube, whose side is proportional to the point's size.
+
+    Args:
+        points: (P, 3) metres.
+        size_m: (P,) size of each point.
+        count: limit of the result; with no more points than that, all are kept.
+    """
     if len(points) <= count:
         return np.arange(len(points))
     fine, coarse = 2.0**-4, 2.0**12

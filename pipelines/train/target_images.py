@@ -1,4 +1,4 @@
-"""Photographs on their way to the device: shrunken as the schedule asks, and read ahead where that saves time."""
+"""Photographs on the device: shrunken as the schedule demands, and read ahead on a GPU."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from pipelines.geometry.cameras import Pinhole
 from pipelines.scene.photographs import ImageCache
 from pipelines.scene.pinholes import Pinholes
 
-_MASKS = 64  # on the device; one serves all photographs of a camera
+_MASKS = 64  # limit on the device; all photographs of a camera share one
 
 
 @dataclass(frozen=True)
 class TargetImage:
-    """A photograph as a render is compared with it.
+    """Photograph to compare a render with.
 
     Attributes:
-        colour: (H, W, 3) float32 from 0 to 1.
+        colour: (H, W, 3) float32, 0 … 1.
         mask: (H, W) bool, the pixels that count; None: all.
-        camera: of these pixels, with the lens as it is now.
+        camera: of H × W pixels, with the lens in use.
     """
 
     colour: Tensor
@@ -34,10 +34,15 @@ class TargetImage:
 
 
 class TargetImages:
-    """Training photographs on `device`.
+    """Training photographs on a device.
 
-    On a GPU the next photograph is read from disk into pinned memory while this one is trained on, so that no
-    iteration waits for either. On a CPU reading ahead would only take a core from the kernels.
+    On a GPU a thread reads the next photograph from disk into pinned memory during an iteration, so that no
+    iteration waits for disk or transfer. On a CPU reading ahead would only take a core from the kernels.
+
+    Args:
+        images: undistorted photographs.
+        pinholes: their cameras, with the lens in use.
+        device: holds the photographs of `get`.
     """
 
     def __init__(self, images: ImageCache, pinholes: Pinholes, device: torch.device) -> None:
@@ -47,12 +52,12 @@ class TargetImages:
         self._next: tuple[int, Future[Tensor]] | None = None
 
     def get(self, index: int, shrink: int = 1, upcoming: int | None = None) -> TargetImage:
-        """One photograph at 1/`shrink` of its size.
+        """Return a photograph at 1/`shrink` of its size.
 
         Args:
-            index: into the images.
-            shrink: every pixel is the mean of shrink × shrink.
-            upcoming: the photograph that will be asked for next, if known.
+            index: of the photograph.
+            shrink: every pixel is the mean of shrink × shrink pixels.
+            upcoming: index of the next photograph, to read ahead; None: unknown.
         """
         pixels = self._pixels(index)
         if self._reader is not None and upcoming is not None:
@@ -91,7 +96,10 @@ class TargetImages:
 
 
 def shrunken(camera: Pinhole, shrink: int) -> Pinhole:
-    """The camera of an image whose pixels are shrink × shrink blocks; what remains at the far edges is cut off."""
+    """Return the camera of an image whose pixels are blocks of shrink × shrink pixels.
+
+    Incomplete blocks at the right and lower edges are cut off.
+    """
     return Pinhole(
         camera.width // shrink,
         camera.height // shrink,

@@ -1,4 +1,4 @@
-"""The joint optimisation: Gaussians, similarity and cameras, one training view an iteration (GeoRefGS 2.4)."""
+"""Joint optimisation of Gaussians, similarity and cameras, one view an iteration (GeoRefGS, section 2.4)."""
 
 from __future__ import annotations
 
@@ -34,20 +34,20 @@ _UNKNOWNS = {
     "x": "the constant errors",
     "u": "the weights of the losses",
 }
-_LENS_EVERY = 100  # iterations: to look where the lens has come to waits for the device
-# A gradient that is not finite shows in one of these: colours pass theirs on to the opacities.
+_LENS_EVERY = 100  # iterations between two reads of the lens: each read waits for the device
+# Each non-finite gradient shows in one of these: colours pass it on to the opacities.
 _WATCHED = ("means", "quats_wxyz", "log_scales", "logit_opacities")
 
 
 @dataclass(frozen=True)
 class TrainingViews:
-    """Training views.
+    """Training views, with the data that their renders are compared with.
 
     Attributes:
-        camera: (V,) indices into the cameras (and the images) of those to train on.
-        images: all undistorted images.
-        surface: gives the points (K, 3) in `model` that an image shows; only the surface losses need them.
-        lenses: that the images were undistorted with; None: they stay.
+        camera: (V,) indices of the training views, into cameras and images.
+        images: all undistorted photographs.
+        surface: returns the points (K, 3) in `model`, float32, that an image shows; None: no depth loss.
+        lenses: lenses with which the images were undistorted; None: the lenses never change.
     """
 
     camera: IntArray
@@ -58,7 +58,15 @@ class TrainingViews:
 
 @dataclass(frozen=True)
 class StepReport:
-    """What one iteration saw: scalars, not yet fetched from the device; `by_depth` only of a view with marks."""
+    """Figures of one iteration; the scalar tensors are still on the device, because fetching them would wait.
+
+    Attributes:
+        photometric: photometric loss.
+        mean_square_error: of colours from 0 to 1, over the pixels that count.
+        geographic: geographic losses, not yet multiplied by the weight.
+        weight: w(t), the weight of the geographic losses.
+        by_depth: part of `geographic` from control points by rendered depth; None: the view has no such marks.
+    """
 
     photometric: Tensor
     mean_square_error: Tensor
@@ -68,19 +76,19 @@ class StepReport:
 
 
 class JointTrainer:
-    """State of a joint optimisation; every iteration is a pure function of it.
+    """State of a joint optimisation; every iteration is a pure function of this state.
 
-    Nothing in an iteration waits for the device, but for the lens: views are rendered through the one that followed
-    the cameras when it was last looked at, each hundred iterations.
+    An iteration waits for the device only to read the lens. Every hundredth iteration reads the lens that has
+    followed the cameras, and all views are rendered through that lens until the next read.
 
     Args:
         optimizer: the Gaussians and their moments.
         strategy: density control.
-        problem: the geographic half.
-        views: what to compare with.
+        problem: similarity, cameras and constant errors, with the geographic losses.
+        views: training views.
         rasterizer: backend.
-        options: schedule.
-        exposures: of the photographs; None: all alike.
+        options: settings, with the schedule.
+        exposures: exposures of the photographs, optimised as well; None: all photographs have the same exposure.
     """
 
     def __init__(
@@ -116,7 +124,12 @@ class JointTrainer:
         )
 
     def step(self) -> StepReport:
-        """Render one view, compare, and move everything a little."""
+        """Run one iteration and return its figures.
+
+        1. One training view is rendered and compared with its photograph.
+        2. The gradient of all losses moves Gaussians, similarity, cameras, constant errors, weights and exposures.
+        3. Density control records the render, and edits the Gaussians if its schedule says so.
+        """
         self.iteration += 1
         if self.iteration % _LENS_EVERY == 1:
             self._look_through(self.problem.cameras.lens().detach().cpu().numpy())
@@ -149,7 +162,12 @@ class JointTrainer:
 
     @torch.no_grad()
     def sample_contributions(self, count: int, generator: torch.Generator) -> list[ViewContributions]:
-        """What `count` different training views say of the Gaussians; see `splat.contributions.Probe`."""
+        """Return the contributions of all Gaussians to different training views (`splat.contributions.Probe`).
+
+        Args:
+            count: number of views; fewer if there are not as many.
+            generator: draws the views.
+        """
         contributions = []
         for place in torch.randperm(len(self.views.camera), generator=generator)[:count].tolist():
             index = int(self.views.camera[place])
@@ -161,16 +179,16 @@ class JointTrainer:
             error = (colour - target.colour).abs().mean(dim=-1)
             error = error if target.mask is None else error * target.mask
             seen = view_contributions(self.optimizer.gaussians, pose, target.camera, error, self.rasterizer)
-            # Strategies count pixels of the photographs, whatever the schedule makes of them.
+            # Strategies count pixels of the whole photographs, which the schedule may have shrunken.
             contributions.append(ViewContributions(shrink**2 * seen.weight_px, shrink**2 * seen.high_error_px))
         return contributions
 
     def pinhole(self, index: int) -> Pinhole:
-        """Camera of an undistorted photograph, with the lens in use."""
+        """Return the camera of an undistorted photograph, with the lens in use."""
         return self._pinholes.of(index)
 
     def check_finite(self) -> None:
-        """Wait for the device and stop before a divergence spoils everything.
+        """Wait for the device, and stop the training if it has diverged.
 
         Raises:
             NonFiniteError: a loss or gradient was not finite; names the first and its iteration.
@@ -178,18 +196,18 @@ class JointTrainer:
         self._watch.check()
 
     def slow_down(self, factor: float) -> None:
-        """Lower all learning rates from here on; forget what was not finite."""
+        """Multiply all learning rates but the exposures' by `factor`, and forget values that were not finite."""
         self.optimizer.rate_factor *= factor
         self._watch.reset()
 
     def _look_through(self, lens: np.ndarray) -> None:
-        """Use SfM's lenses with a change (L,) of their parameters."""
+        """Render from now on through SfM's lenses with a change (L,) of their parameters."""
         self._lens = lens.copy()
         if self.views.lenses is not None and len(lens):
             self._pinholes.renew(self.views.lenses.moved(self._lens))
 
     def _by_depth(self, index: int, render: Render, target: TargetImage) -> Tensor | None:
-        """The control points of this view, where they are found through the rendered depth."""
+        """Return the loss of the view's control points by rendered depth, or None if the view has no such marks."""
         if render.expected_depth is None:
             return None
         return self.problem.depth_loss(index, render.expected_depth, render.alpha, target.camera)
@@ -202,7 +220,7 @@ class JointTrainer:
         return self.rasterizer.render(self.optimizer.gaussians, pose, camera, settings)
 
     def _surface(self, render: Render, pose: Tensor, target: TargetImage, index: int) -> Tensor | None:
-        """The surface losses, where they are wanted."""
+        """Return the weighted sum of the surface losses, or None if the options have no surface losses."""
         wanted, gaussians = self.options.surface, self.optimizer.gaussians
         if wanted is None:
             return None
@@ -243,12 +261,12 @@ class JointTrainer:
             self.exposures.step(self.iteration)
 
     def _shrink(self, index: int) -> int:
-        """How much a photograph is shrunken at this iteration."""
+        """Return the factor by which a photograph is shrunken at this iteration."""
         camera = self.views.images.pinhole(index)
         return self._schedule.shrink(self.iteration, max(camera.width, camera.height))
 
     def state(self) -> dict[str, Tensor]:
-        """Everything that the next iteration depends on."""
+        """Return all tensors that the next iteration depends on, by name, for a checkpoint."""
         parameters = self.problem.learned()
         geo: dict[str, Tensor] = {**parameters}
         for name, parameter in parameters.items():
@@ -267,7 +285,7 @@ class JointTrainer:
         }
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
-        """Go on from `state`."""
+        """Restore a state, from which the next iteration continues."""
         self.iteration = int(state["iteration"])
         self.optimizer.rate_factor = float(state["rate_factor"])
         self._look_through(state["lens"].cpu().numpy())
@@ -285,7 +303,7 @@ class JointTrainer:
         for name, parameter in self.problem.learned().items():
             with torch.no_grad():
                 parameter.copy_(geo[name])
-            # Adam counts its steps on the CPU, whatever the device.
+            # Adam keeps its count of steps on the CPU, for parameters on any device.
             self._geo_adam.state[parameter] = {
                 key: geo[f"{name}_{key}"].to("cpu" if key == "step" else self.device)
                 for key in ("step", "exp_avg", "exp_avg_sq")
@@ -295,7 +313,7 @@ class JointTrainer:
 
 @torch.no_grad()
 def _mean_square(colour: Tensor, target: TargetImage) -> Tensor:
-    """Mean square error over the pixels that count, without waiting for the device to count them."""
+    """Return the mean square error over the pixels that count, without waiting for the device to count them."""
     error = (colour - target.colour).square()
     if target.mask is None:
         return error.mean()
