@@ -1,1 +1,1 @@
-"""Stage `evaluate`: test views, check points, predicted accuracy."""
+"""Stage `evaluate`: figures of test views, errors of check points, predicted accuracy."""

@@ -1,4 +1,4 @@
-"""The predicted accuracy over the scene: σ on a grid, and the grid as a table for other programs."""
+"""Predicted accuracy over the scene: σ on a grid, and the grid as a table for other programs."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from pipelines.geodesy.enu import Origin, ecef_from_enu, lla_from_ecef
 from pipelines.scene.report import AccuracySummary
 from pipelines.scene.solved_survey import SolvedSurvey
 
-_CELLS = 48  # of the longer side
-_LEAST_RAYS = 3  # of an SfM point that stands for the scene
-_NEIGHBOURS = 3  # SfM points that give a cell its height and its cameras
-_FARTHEST_CELLS = 1.5  # from an SfM point: beyond, there is no scene
-_RIM = 0.01  # share of the SfM points outside the grid on each side
+_CELLS = 48  # along the longer side of the grid
+_LEAST_RAYS = 3  # of an SfM point that counts as a part of the scene
+_NEIGHBOURS = 3  # nearest SfM points, which give a cell its height and its cameras
+_FARTHEST_CELLS = 1.5  # distance from an SfM point beyond which there is no scene
+_RIM = 0.01  # fraction of the SfM points outside the grid on each side
 _CHUNK = 256
 _PLACE = ("east_m", "north_m", "up_m", "latitude_deg", "longitude_deg", "ellipsoidal_height_m")
 _SIGMA = ("sigma_e_m", "sigma_n_m", "sigma_u_m", "sigma_h_m", "sigma_v_m")
@@ -27,15 +27,15 @@ _SIGMA = ("sigma_e_m", "sigma_n_m", "sigma_u_m", "sigma_h_m", "sigma_v_m")
 
 @dataclass(frozen=True)
 class AccuracyGrid:
-    """Predicted standard deviations at C cells of a grid over the scene, in metres.
+    """Predicted σ at C cells of a grid over the scene, in metres.
 
     Attributes:
         position_in_geo: (C, 3) middle of each cell, at the height of the scene there.
         sigma_m: (C, 3) east, north, up.
         cell: (C, 2) column from the west and row from the south.
         size_m: side of a cell.
-        corner_in_geo: (2,) south-western corner of the grid.
-        shape: columns and rows.
+        corner_in_geo: (2,) east and north of the south-western corner.
+        shape: numbers of columns and rows.
     """
 
     position_in_geo: FloatArray
@@ -47,23 +47,23 @@ class AccuracyGrid:
 
     @property
     def sigma_h_m(self) -> FloatArray:
-        """Horizontal (C,): √(σ_E² + σ_N²)."""
+        """Horizontal σ (C,): √(σ_E² + σ_N²)."""
         return np.asarray(np.hypot(self.sigma_m[:, 0], self.sigma_m[:, 1]))
 
     @property
     def sigma_v_m(self) -> FloatArray:
-        """Vertical (C,)."""
+        """Vertical σ (C,)."""
         return self.sigma_m[:, 2]
 
     def raster(self, values: FloatArray) -> FloatArray:
-        """Return values (C,) of the cells as rows from the south and columns from the west; NaN off the scene."""
+        """Return values (C,) of the cells as a raster, rows from the south, columns from the west; NaN: no cell."""
         columns, rows = self.shape
         raster = np.full((rows, columns), np.nan)
         raster[self.cell[:, 1], self.cell[:, 0]] = values
         return raster
 
     def summary(self, cautions: tuple[str, ...]) -> AccuracySummary:
-        """Return the grid in short, with limits of the prediction."""
+        """Return least, median and largest σ, with `cautions`, the limits of the prediction."""
         horizontal, vertical = self.sigma_h_m, self.sigma_v_m
         return AccuracySummary(
             cells=len(self.cell),
@@ -80,9 +80,13 @@ class AccuracyGrid:
 
 
 def accuracy_grid(solved: SolvedSurvey, prediction: AccuracyPrediction) -> AccuracyGrid | None:
-    """Predict σ at the middle of each cell, seen by the cameras that see the SfM points there.
+    """Return the predicted σ on a grid over the scene, at the middle of each cell; None: too few points.
 
-    None for a scene of too few points.
+    The cameras that observe the nearest SfM points observe the cell.
+
+    Args:
+        solved: the survey, with its SfM points.
+        prediction: of the same survey.
     """
     sparse, geo_from_model = solved.scene.sparse, solved.trained.geo_from_model
     rays = np.bincount(sparse.obs_point, minlength=len(sparse.point_id))
@@ -109,7 +113,7 @@ def accuracy_grid(solved: SolvedSurvey, prediction: AccuracyPrediction) -> Accur
 
 
 def _seen_by(obs_point: IntArray, obs_image: IntArray, near: IntArray) -> tuple[IntArray, IntArray]:
-    """Pairs (cell, camera), each once and by cell: the cameras that see any of the near points (C, k)."""
+    """Return unique pairs (cell, camera), ordered by cell: cameras that observe any of the near points (C, k)."""
     order = np.argsort(obs_point, kind="stable")
     start = np.searchsorted(obs_point[order], np.arange(int(obs_point.max()) + 2))
     cameras = [
@@ -120,7 +124,7 @@ def _seen_by(obs_point: IntArray, obs_image: IntArray, near: IntArray) -> tuple[
 
 
 def _sigma(prediction: AccuracyPrediction, position: FloatArray, owner: IntArray, camera: IntArray) -> FloatArray:
-    """σ (C, 3) at cells, of pairs of cell and camera."""
+    """Return σ (C, 3) at the cells, for pairs (cell, camera)."""
     sigma = []
     for first in range(0, len(position), _CHUNK):
         in_chunk = (owner >= first) & (owner < first + _CHUNK)
@@ -130,7 +134,13 @@ def _sigma(prediction: AccuracyPrediction, position: FloatArray, owner: IntArray
 
 
 def write_csv(grid: AccuracyGrid, origin: Origin, path: Path) -> None:
-    """Write the grid as a table, a line a cell, in `geo` and on the ellipsoid."""
+    """Write the grid as a CSV table, one line a cell, with positions in `geo` and on the ellipsoid.
+
+    Args:
+        grid: σ at the cells.
+        origin: of `geo`.
+        path: of the table.
+    """
     lla = lla_from_ecef(ecef_from_enu(grid.position_in_geo, origin))
     values = np.column_stack([grid.sigma_m, grid.sigma_h_m, grid.sigma_v_m])
     with path.open("w", encoding="utf-8", newline="") as handle:

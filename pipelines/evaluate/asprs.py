@@ -1,8 +1,11 @@
 """Errors at check points, stated after the ASPRS Positional Accuracy Standards for Digital Geospatial Data.
 
-Edition 2 (2023, doi 10.14358/PERS.89.10.581) measures by RMSE alone, horizontally in both axes together, names an
-accuracy class after the RMSE in centimetres that it allows, adds the check points' own survey error to the
-measured one in quadrature, and asks for at least 30 check points.
+Edition 2 (2023, doi 10.14358/PERS.89.10.581) demands:
+
+1. The RMSE alone states the accuracy. The horizontal RMSE takes both axes together.
+2. An accuracy class is named after the RMSE in centimetres that it allows.
+3. The survey error of the check points is added to the measured error in quadrature.
+4. There are at least 30 check points.
 """
 
 from __future__ import annotations
@@ -18,22 +21,22 @@ from pipelines.scene.report import AsprsStatement, ErrorStats, Rmse, TotalRmse
 
 LEAST_POINTS = 30
 BLUNDER_FACTOR = 3.0
-# RMSE over median of |error|, horizontal and vertical: of a Rayleigh and of a half normal distribution.
+# Ratio of RMSE to median of |error|: horizontal by a Rayleigh, vertical by a half-normal distribution.
 _RMSE_OF_MEDIAN = np.array([1.2011, 1.4826])
 _MOST_ROUNDS = 20
 
 
 @dataclass(frozen=True)
 class Assessment:
-    """Accuracy of a product after N check points.
+    """Accuracy of a product at N check points.
 
     Attributes:
-        stats: of the errors as they are, blunders included.
-        survey: of the check points' own survey (RMSE_H2, RMSE_V2 of the standard); None without points.
-        with_survey: errors and survey in quadrature: the accuracy that the standard states.
-        asprs: the classes that `with_survey` meets.
-        blunder: (N,) errors beyond three times the class that the other points meet.
-        without_blunders: figures of the others; None where there are no blunders.
+        stats: figures of all errors, blunders included.
+        survey: RMSE of the check points' own survey (RMSE_H2, RMSE_V2 of the standard); None without points.
+        with_survey: errors and survey in quadrature, the accuracy after the standard; None without points.
+        asprs: classes that `with_survey` meets.
+        blunder: (N,) mask of the errors beyond three times the class that the other points meet.
+        without_blunders: figures of the other points; None without blunders.
     """
 
     stats: ErrorStats
@@ -45,9 +48,13 @@ class Assessment:
 
 
 def assess(error_in_geo: ArrayLike, cov_survey: ArrayLike) -> Assessment:
-    """Assess errors (N, 3) at check points that were surveyed with covariances (N, 3, 3), both in metres.
+    """Return the accuracy after the standard, from the errors at check points.
 
-    The errors are distances from the surveyed positions; the standard adds how far these may be from the datum.
+    The errors count from the surveyed positions; the standard adds the error of these positions in the datum.
+
+    Args:
+        error_in_geo: (N, 3) metres.
+        cov_survey: (N, 3, 3) m², of the surveyed positions.
     """
     error = np.asarray(error_in_geo, dtype=np.float64).reshape(-1, 3)
     variance = np.diagonal(np.asarray(cov_survey, dtype=np.float64).reshape(-1, 3, 3), axis1=1, axis2=2)
@@ -87,18 +94,18 @@ def error_stats(error_in_geo: ArrayLike) -> ErrorStats:
 
 
 def classes_cm(rmse: Rmse) -> tuple[int, int]:
-    """Return the smallest horizontal and vertical class in whole centimetres; the standard allows any number."""
+    """Return the smallest class, horizontal and vertical, in whole centimetres; the standard allows any number."""
     horizontal, vertical = (max(math.ceil(100 * rmse_m - 1e-9), 1) for rmse_m in (rmse.rmse_h_m, rmse.rmse_v_m))
     return horizontal, vertical
 
 
 def few_points(count: int) -> str:
-    """Return the remark on fewer check points than the standard asks for."""
+    """Return the warning of fewer check points than the standard demands."""
     return f"{count} check points; ASPRS 2nd ed. asks for at least {LEAST_POINTS}: the class is indicative"
 
 
 def _statement(count: int, tested: Rmse | None) -> AsprsStatement:
-    """The classes that check points meet, and the sentence that gives their count against the minimum."""
+    """Return the classes that check points meet, with a sentence that names their number and the minimum."""
     enough = count >= LEAST_POINTS
     if tested is None:
         return AsprsStatement(
@@ -122,16 +129,18 @@ def _statement(count: int, tested: Rmse | None) -> AsprsStatement:
 
 
 def _rmse(square: FloatArray) -> Rmse:
-    """Of squares (N, 3), east, north and up."""
+    """Return the RMSE of squared errors (N, 3) east, north and up."""
     east, north, up = square.mean(axis=0).tolist()
     return Rmse(rmse_h_m=math.sqrt(east + north), rmse_v_m=math.sqrt(up))
 
 
 def _blunders(error: FloatArray, variance: FloatArray) -> BoolArray:
-    """Which errors (N,) exceed three times the class that the others meet, horizontally or vertically.
+    """Return the mask (N,) of errors beyond three times the class of the other points, horizontally or vertically.
 
-    Against the class of *all* points a blunder among nine or fewer would hide itself. The first class is of the
-    medians, which half of the points may spoil.
+    1. The class of *all* points would hide a blunder among nine or fewer. The first class therefore follows from
+       the medians, which tolerate blunders in up to half of the points.
+    2. The class of the remaining points gives the next mask, until the mask stays the same.
+    3. If the mask never stays the same, or if all points are blunders, the first mask counts.
     """
     size = np.column_stack([np.hypot(error[:, 0], error[:, 1]), np.abs(error[:, 2])])
     horizontal, vertical = (np.median(size, axis=0) * _RMSE_OF_MEDIAN).tolist()
@@ -148,6 +157,6 @@ def _blunders(error: FloatArray, variance: FloatArray) -> BoolArray:
 
 
 def _beyond(size: FloatArray, others: Rmse) -> BoolArray:
-    """Which errors (N, 2), horizontal and vertical, exceed three times the class that `others` meet."""
+    """Return the mask (N,) of errors (N, 2), horizontal and vertical, beyond three times the class of `others`."""
     allowed_m = BLUNDER_FACTOR * np.array(classes_cm(others)) / 100
     return np.asarray((size > allowed_m).any(axis=1))

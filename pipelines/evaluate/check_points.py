@@ -1,4 +1,4 @@
-"""Surveyed points measured in the trained survey: check points, cross-validation, and residuals of the fit."""
+"""Surveyed points, measured in the trained survey: check points, cross-validation, and residuals of the fit."""
 
 from __future__ import annotations
 
@@ -43,7 +43,13 @@ log = logging.getLogger(__name__)
 def measure_check_points(
     renderer: ModelRenderer, propagation: ErrorPropagation | NoErrorPropagation, progress: Progress
 ) -> CheckPoints:
-    """Measure the check points by camera and by model."""
+    """Return the errors of the check points, measured by camera and by model.
+
+    Args:
+        renderer: of the trained model.
+        propagation: gives predicted covariances and the Cramér–Rao bound.
+        progress: shows the depth maps.
+    """
     trained = renderer.trained
     rays = mark_rays(trained.survey.check_points, trained.sparse)
     return CheckPoints(camera=_by_camera(trained, rays, propagation), model=_by_model(renderer, rays, progress))
@@ -52,7 +58,15 @@ def measure_check_points(
 def cross_validate(
     trained: TrainedSurvey, propagation: ErrorPropagation | NoErrorPropagation
 ) -> CrossValidation | NoCrossValidation:
-    """Measure each control point by a solution without it."""
+    """Return the errors of the control points, each measured by a solution without that point.
+
+    Args:
+        trained: the trained survey.
+        propagation: its solved measurements, or the reason why there are none.
+
+    Raises:
+        DegenerateGeometryError: the measurements do not determine the similarity.
+    """
     if isinstance(propagation, NoErrorPropagation):
         return NoCrossValidation(count=0, reason=propagation.reason)
     points = trained.survey.control_points
@@ -62,14 +76,14 @@ def cross_validate(
 
 
 def fit_residuals(trained: TrainedSurvey) -> Fit:
-    """Return the residuals of fixes and control points: how the solution fits, not how accurate it is."""
+    """Return the residuals of fixes and control points: the fit of the solution, not its accuracy."""
     return Fit(gnss=_fix_residuals(trained), gcp=_control_residuals(trained))
 
 
 def _by_camera(
     trained: TrainedSurvey, rays: MarkRays, propagation: ErrorPropagation | NoErrorPropagation
 ) -> CheckPointErrors:
-    """Where the rays of the marks meet, with prediction and bound."""
+    """Return the errors of the intersections of the marks' rays, with prediction and bound."""
     points = trained.survey.check_points
     position = points_by_camera(trained, rays)
     measured = _compared(points, position, rays)
@@ -85,7 +99,7 @@ def _by_camera(
 
 
 def _by_model(renderer: ModelRenderer, rays: MarkRays, progress: Progress) -> CheckPointErrors:
-    """Where the surface of the Gaussians lies behind the marks."""
+    """Return the errors of the places of the Gaussians' surface behind the marks."""
     points, depth_m = renderer.trained.survey.check_points, _depth_maps(renderer, rays, progress)
     pinholes = {index: renderer.pinhole(index) for index in depth_m}
     position = points_by_model(renderer.trained, rays, depth_m, pinholes)
@@ -93,7 +107,7 @@ def _by_model(renderer: ModelRenderer, rays: MarkRays, progress: Progress) -> Ch
 
 
 def _depth_maps(renderer: ModelRenderer, rays: MarkRays, progress: Progress) -> dict[int, FloatArray]:
-    """Depth of the surface by camera, of those that show a mark."""
+    """Return the depth of the surface (H, W) in metres, by camera, for the cameras that show a mark."""
     depth_m = {}
     cameras = sorted({int(index) for index in rays.camera})
     with progress.task("depth maps", len(cameras)) as task:
@@ -104,15 +118,16 @@ def _depth_maps(renderer: ModelRenderer, rays: MarkRays, progress: Progress) -> 
 
 
 def _compared(points: tuple[SurveyedPoint, ...], position_in_geo: FloatArray, rays: MarkRays) -> MeasuredPoints:
-    """Positions (J, 3) of surveyed points against their survey."""
+    """Return surveyed points with the errors of their measured positions (J, 3)."""
     surveyed = np.array([point.position_in_geo for point in points]).reshape(-1, 3)
     return MeasuredPoints(points, position_in_geo - surveyed, rays.marks_of_point)
 
 
 def _left_out(solved: SolvedSurvey) -> LeftOut:
-    """Each control point of the survey (J) measured without it; NaN for one that entered no solution.
+    """Return the J control points of the survey, each measured by a solution without that point.
 
-    The covariance is that of the solution and the marks: the survey's own is taken off again.
+    The covariance is that of the solution and the marks: the survey's own covariance is subtracted. A point that
+    entered no solution is NaN.
     """
     points, control = solved.trained.survey.control_points, solved.problem.control
     error, cov = np.full((len(points), 3), np.nan), np.full((len(points), 3, 3), np.nan)
@@ -136,7 +151,7 @@ def _control_residuals(trained: TrainedSurvey) -> ControlResiduals:
 
 
 def _fix_residuals(trained: TrainedSurvey) -> FixResiduals:
-    """Of the training cameras, outliers left out."""
+    """Return the residuals of the training cameras' fixes, without outliers."""
     center_in_geo = trained.geo_from_model.apply(trained.poses.cam_center_in_model)
     outliers = set(trained.model.gnss_outliers)
     residuals, left_out_count = [], 0

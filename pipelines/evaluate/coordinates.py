@@ -1,4 +1,4 @@
-"""The report's positions in a CRS of the user's: ENU → ECEF → CRS, point by point."""
+"""Positions of the report in a CRS that the user names: ENU → ECEF → CRS, point by point."""
 
 from __future__ import annotations
 
@@ -14,8 +14,12 @@ from pipelines.scene.survey import Survey
 def target_crs(text: str, survey: Survey) -> PointCrs:
     """Return the CRS in which to list positions of a survey.
 
+    Args:
+        text: name of the CRS, such as EPSG:32632.
+        survey: its origin must lie within the area of the CRS.
+
     Raises:
-        InputError: not a CRS, one that is not for this place, or one that needs a grid that is not installed.
+        InputError: the text is not a CRS, the CRS is not for this place, or a grid that it needs is not installed.
     """
     crs = parse_crs(text, field="--crs")
     crs.xyz_from_lla(lla_of(survey.origin))
@@ -27,15 +31,15 @@ def coordinates_in(crs: PointCrs, checkpoints: CheckPoints, survey: Survey) -> C
 
     Args:
         crs: from `target_crs`.
-        checkpoints: of the report.
-        survey: whose check points they are.
+        checkpoints: errors of the check points.
+        survey: has the same check points, and the origin.
 
     Raises:
-        InputError: a point outside the CRS's domain.
+        InputError: a point lies outside the CRS's domain.
     """
     surveyed = np.array([point.position_in_geo for point in survey.check_points]).reshape(-1, 3)
     by_camera, by_model = (surveyed + _errors(way) for way in (checkpoints.camera, checkpoints.model))
-    # One call for all: one operation serves them all.
+    # One call for all points, so that one operation transforms them all.
     in_geo = np.concatenate([np.zeros((1, 3)), surveyed, by_camera, by_model])
     known = np.isfinite(in_geo).all(axis=1)
     lla = lla_from_ecef(ecef_from_enu(in_geo[known], survey.origin))
@@ -60,7 +64,7 @@ def coordinates_in(crs: PointCrs, checkpoints: CheckPoints, survey: Survey) -> C
 
 
 def _errors(checkpoints: CheckPointErrors) -> FloatArray:
-    """(J, 3) measured minus surveyed in metres; NaN where not measured."""
+    """Return the errors (J, 3), measured minus surveyed, in metres; NaN: not measured."""
     errors = [(row.de_m, row.dn_m, row.du_m) for row in checkpoints.points]
     return np.array(errors, dtype=np.float64).reshape(-1, 3)  # None becomes NaN
 

@@ -1,10 +1,14 @@
-"""The Cramér–Rao bound: how well any unbiased estimate can know a point, from what was measured and how well.
+"""Cramér–Rao bound: least covariance of a point by any unbiased estimate from the measurements and their σ.
 
-Fisher information of a Gaussian model of *all* observations: image observations of tie points, marks of control
-and wanted points, fixes of camera centres, surveyed control points. Unknown are every pose, every point and the
-lens, in the frame in which fixes and control points were measured, so that a similarity is not needed. Nothing is
-robust here, no observation is an outlier, and nothing is known beforehand: no unbiased estimate does better, and a
-good one comes near (Kay, Fundamentals of Statistical Signal Processing I, 1993, section 3.9).
+The bound comes from the Fisher information of a Gaussian model of *all* observations: image observations of tie
+points, marks of control and wanted points, fixes of camera centres, surveyed control points.
+
+- The unknowns are every pose, every point and the lens. Their frame is that of fixes and control points, so that
+  no similarity is needed.
+- No observation is an outlier, no weight is robust, and no unknown has a prior.
+
+No unbiased estimate has a smaller covariance, and a good estimate comes near (Kay, Fundamentals of Statistical
+Signal Processing I, 1993, section 3.9).
 """
 
 from __future__ import annotations
@@ -29,20 +33,20 @@ from pipelines.geometry.bundle import (
 from pipelines.scene.marks import MarkRays
 from pipelines.scene.solved_survey import SolvedSurvey
 
-_WORST_SCALED = 1e-10  # pivot of the scaled normal matrix below which a direction is open
-_RIDGE = 1e-12  # for a point that its rays leave open
+_WORST_SCALED = 1e-10  # least pivot of the scaled normal matrix: a smaller one leaves a direction undetermined
+_RIDGE = 1e-12  # for a point that its rays do not determine
 
 
 @dataclass(frozen=True)
 class Anchors:
-    """What ties a network to the Earth.
+    """Observations that tie a network to the Earth.
 
     Attributes:
-        camera: (F,) index of the camera that each fix is of.
-        cov_fix: (F, 3, 3) m² of the fixes.
-        control: control points with their marks, or None; its cameras are those of the network.
-        control_sigma_px: (K,) of these marks.
-        cov_control: (J, 3, 3) m² of the surveyed positions.
+        camera: (F,) index of the camera of each fix.
+        cov_fix: (F, 3, 3) m², of the fixes.
+        control: control points with their marks, and the cameras of the network; None: no control points.
+        control_sigma_px: (K,) σ of these marks.
+        cov_control: (J, 3, 3) m², of the surveyed positions.
     """
 
     camera: IntArray
@@ -54,22 +58,22 @@ class Anchors:
 
 @dataclass(frozen=True)
 class _Rows:
-    """Whitened image observations of points: derivatives by cameras and lens, and by the points themselves."""
+    """Derivatives of whitened image observations by cameras and lens, and by the observed points."""
 
     by_cameras: csr_matrix  # (2 M, 6 n + L)
     by_point: FloatArray  # (M, 2, 3)
 
 
 class CameraInformation:
-    """Fisher information of n poses and L lens parameters, all tie and control points eliminated.
+    """Fisher information of n poses and L lens parameters; all tie and control points are eliminated.
 
     Args:
-        ties: the bundle, in the frame of the anchors; its own pixels are not looked at.
-        sigma_px: of its image observations, per coordinate.
+        ties: bundle of the tie points, in the frame of the anchors; its pixels are not used.
+        sigma_px: σ of its image observations, per coordinate.
         anchors: fixes and control points.
 
     Raises:
-        DegenerateGeometryError: the observations leave the cameras open.
+        DegenerateGeometryError: the observations do not determine cameras and lens.
     """
 
     def __init__(self, ties: Network, sigma_px: float, anchors: Anchors) -> None:
@@ -91,14 +95,14 @@ class CameraInformation:
             raise DegenerateGeometryError("the observations leave cameras or lens open: there is no bound")
 
     def bound(self, wanted: Network, sigma_px: FloatArray) -> FloatArray:
-        """Least covariance (J, 3, 3) in m² of points that are known by their marks alone.
+        """Return the least covariance (J, 3, 3) in m² of points that are observed only by their marks.
 
-        The marks of a point count for the cameras as well, those of the others do not. NaN for a point that its
-        marks do not determine.
+        The marks of a point inform on the cameras as well; the marks of the other points do not. NaN for a point
+        that its marks do not determine.
 
         Args:
-            wanted: the points and their K marks; its cameras are those of the bundle.
-            sigma_px: (K,) of the marks.
+            wanted: the points and their K marks, with the cameras of the bundle.
+            sigma_px: (K,) σ of the marks.
         """
         sigma_px, wanted = sigma_px[has_positive_depth(wanted)], with_positive_depths(wanted)
         bounds = np.full((len(wanted.point_in_world), 3, 3), np.nan)
@@ -115,8 +119,8 @@ class CameraInformation:
         if value[2] < 1e-6 * value[0]:
             return np.full((3, 3), np.nan)
         by_cameras = rows.by_cameras.toarray()[:, self._used] * self._unit
-        response = (right.T / value) @ left[:, :3].T @ by_cameras  # of the point, to the cameras
-        free = left[:, 3:].T @ by_cameras  # what the marks say of the cameras alone
+        response = (right.T / value) @ left[:, :3].T @ by_cameras  # of the point to the cameras
+        free = left[:, 3:].T @ by_cameras  # combinations of the marks that do not depend on the point
         solved = cho_solve(self._factor, np.concatenate([response, free]).T)
         of_response, of_free = solved[:, :3], solved[:, 3:]
         gain = np.linalg.solve(np.eye(len(free)) + free @ of_free, free @ of_response)
@@ -125,7 +129,7 @@ class CameraInformation:
 
 
 def _only(network: Network, mine: BoolArray) -> Network:
-    """The marks of one point."""
+    """Return the network of one point, from the mask of its marks."""
     owner = network.obs_point[mine][:1]
     return replace(
         network,
@@ -145,7 +149,13 @@ def _rows(network: Network, sigma_px: FloatArray) -> _Rows:
 
 
 def _eliminated(network: Network, sigma_px: FloatArray, cov_known: FloatArray | None) -> FloatArray:
-    """Information of cameras and lens (6 n + L, 6 n + L), the points eliminated, which may be known beforehand."""
+    """Return the information of cameras and lens (6 n + L, 6 n + L), with the points eliminated.
+
+    Args:
+        network: N points and their M observations.
+        sigma_px: (M,) σ of the observations.
+        cov_known: (N, 3, 3) covariances of points that were also surveyed; None: they were not.
+    """
     sigma_px, network = sigma_px[has_positive_depth(network)], with_positive_depths(network)
     rows, count = _rows(network, sigma_px), len(network.point_in_world)
     normal = np.zeros((count, 3, 3))
@@ -160,14 +170,14 @@ def _eliminated(network: Network, sigma_px: FloatArray, cov_known: FloatArray | 
 
 
 def cramer_rao_bound(solved: SolvedSurvey, rays: MarkRays) -> FloatArray:
-    """Return the least covariance (J, 3, 3) in m² of the check points, from all measurements with the σ they state.
+    """Return the least covariance (J, 3, 3) in m² of the check points, from all measurements with their stated σ.
 
     Args:
         solved: the survey.
-        rays: of the marks of all J check points.
+        rays: rays of the marks of all J check points.
 
     Raises:
-        DegenerateGeometryError: there is none: too many cameras, or too little measured.
+        DegenerateGeometryError: too many cameras, or the measurements do not determine cameras and lens.
     """
     scene, trained = solved.scene, solved.trained
     if scene.correction_basis is None:
@@ -179,7 +189,7 @@ def cramer_rao_bound(solved: SolvedSurvey, rays: MarkRays) -> FloatArray:
 
 
 def _anchors(solved: SolvedSurvey, network: Network) -> Anchors:
-    """Fixes and control points as the training used them."""
+    """Return fixes and control points as the training used them."""
     fixes = solved.problem.fixes
     camera, cov_fix = np.empty(0, dtype=np.int64), np.empty((0, 3, 3))
     if fixes is not None:

@@ -1,4 +1,4 @@
-"""The measurements' errors, propagated to the trained survey: the basis of every predicted accuracy."""
+"""Propagation of the measurements' errors to the trained survey: the basis of every predicted accuracy."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from pipelines.scene.trained_survey import TrainedSurvey
 
 @dataclass(frozen=True)
 class ErrorPropagation:
-    """Covariances of a trained survey that follow from its measurements.
+    """Covariances of a trained survey, from those of its measurements.
 
     Attributes:
-        solved: the geographic half of the training, solved.
-        prediction: covariance of any point.
-        grid: σ over the scene; None for a scene of too few points.
+        solved: the survey with its measurements solved, without photographs.
+        prediction: gives the covariance of any point.
+        grid: predicted σ over the scene; None: the scene has too few points.
     """
 
     solved: SolvedSurvey
@@ -31,7 +31,7 @@ class ErrorPropagation:
 
 @dataclass(frozen=True)
 class NoErrorPropagation:
-    """The reason why the measurements do not determine the trained survey."""
+    """Reason why the measurements do not determine the trained survey."""
 
     reason: str
 
@@ -39,12 +39,15 @@ class NoErrorPropagation:
 def propagate_errors(
     trained: TrainedSurvey, initial: InitialSimilarity, options: GeographicOptions
 ) -> ErrorPropagation | NoErrorPropagation:
-    """Return the covariances of a trained survey, or why there are none.
+    """Return the covariances of a trained survey, or the reason why there are none.
 
     Args:
-        trained: the model.
-        initial: the similarity with which the training began.
-        options: those of the training.
+        trained: the trained survey.
+        initial: similarity at the start of the training.
+        options: options of the training.
+
+    Raises:
+        InputError: a constant error is to be estimated, but its measurements were not recorded.
     """
     try:
         solved = solve_survey(trained, initial, options)
@@ -55,10 +58,10 @@ def propagate_errors(
 
 
 def accuracy_summary(propagation: ErrorPropagation | NoErrorPropagation, *, of_initial: bool) -> AccuracySummary:
-    """Return the predicted accuracy over the scene in short.
+    """Return the summary of the predicted accuracy over the scene.
 
     Args:
-        propagation: of the trained survey.
+        propagation: gives the grid of σ, or the reason why there is none.
         of_initial: whether the points are measured with the initial similarity.
     """
     if isinstance(propagation, NoErrorPropagation):

@@ -1,4 +1,4 @@
-"""Derivatives of intersected points by the poses and the lens of the cameras that see them."""
+"""Derivatives of intersected points by poses and lens of the cameras that see them."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from pipelines.geometry.bundle import (
 
 @dataclass(frozen=True)
 class IntersectionJacobian:
-    """What poses, lens and marks do to N intersected points, to first order.
+    """Effect of poses, lens and marks on N intersected points, to first order.
 
     Attributes:
         by_poses: (3 N, 6 n) sparse, metres by (δω, δc) of each camera as in `geometry.bundle.CorrectionBasis`.
         by_lens: (N, 3, L) metres by the lens parameters, in the order of `CorrectionBasis`.
-        cov_of_marks: (N, 3, 3) m², what the marks' own σ leaves; NaN for a point that its rays do not determine.
+        cov_of_marks: (N, 3, 3) m², from the σ of the marks; NaN for a point that its rays do not determine.
     """
 
     by_poses: csr_matrix
@@ -32,20 +32,21 @@ class IntersectionJacobian:
     cov_of_marks: FloatArray
 
     def by_corrections(self, basis: FloatArray) -> FloatArray:
-        """Metres (N, 3, k) per unit of each of the k corrections of a basis (n, 6, k)."""
+        """Return the derivatives (N, 3, k) in metres by the k corrections of a basis (n, 6, k)."""
         n, rows, width = basis.shape
         moved = np.asarray(self.by_poses @ basis.reshape(rows * n, width))
         return moved.reshape(len(moved) // 3, 3, width)
 
 
 def intersection_jacobian(marks: Network, sigma_px: FloatArray) -> IntersectionJacobian:
-    """Return how the points of a network, each intersected from its own marks, depend on poses and lens.
+    """Return the derivatives by poses and lens of the points of a network, each intersected from its own marks.
 
-    Where the marks are does not enter, but the places where the points appear do.
+    The derivatives are taken at the projections of the points; the pixels of the marks do not enter. Marks of
+    points behind their camera do not count.
 
     Args:
         marks: N points, M marks.
-        sigma_px: (M,) of the marks. Those of points behind their camera do not count.
+        sigma_px: (M,) σ of the marks.
     """
     sigma_px, marks = sigma_px[has_positive_depth(marks)], with_positive_depths(marks)
     lin, count = linearise_bundle(marks), len(marks.point_in_world)
@@ -63,7 +64,7 @@ def intersection_jacobian(marks: Network, sigma_px: FloatArray) -> IntersectionJ
 
 
 def _blocks(marks: Network, blocks: FloatArray, column_block: IntArray, width: int) -> csr_matrix:
-    """Sparse (3 N, width) of blocks (M, 3, w) of each mark, those of one place added up."""
+    """Return a sparse matrix (3 N, width) of the marks' blocks (M, 3, w); blocks at one place are added."""
     rows = (3 * marks.obs_point)[:, None, None] + np.arange(3)[:, None]
     columns = (blocks.shape[2] * column_block)[:, None, None] + np.arange(blocks.shape[2])
     rows, columns = np.broadcast_to(rows, blocks.shape), np.broadcast_to(columns, blocks.shape)

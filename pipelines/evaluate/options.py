@@ -1,4 +1,4 @@
-"""The options of `georef evaluate`."""
+"""Options of `georef evaluate`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pipelines.core.options import InputPath, StageOptions
 
 
 class EvaluateOptions(StageOptions):
-    """Test views and check points."""
+    """Options of the evaluation with test views and check points."""
 
     backend: Literal["auto", "cpu", "cuda"] = Field("auto", description="Rasteriser.")
     renders: int = Field(8, ge=0, description="Side-by-side renders to write at the most.")

@@ -1,4 +1,4 @@
-"""The test views against their photographs; their cameras were never fitted to them (method, section 4)."""
+"""Photometric figures of the test views: training fits neither Gaussians nor cameras to their photographs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from pipelines.splat.exposure import fitted_affine, with_affine
 from pipelines.splat.lpips import Lpips
 from pipelines.splat.metrics import psnr, ssim
 
-# Takes the name of a photograph, and (H, 3 W, 3) RGB: the photograph, its render, their difference.
+# Saves, for the name of a photograph, (H, 3 W, 3) RGB: the photograph, its render, their difference.
 SaveRender = Callable[[str, ByteArray], None]
 
 _DIFFERENCE_GAIN = 3
@@ -33,17 +33,20 @@ def compare_test_views(
     *,
     saved: int,
 ) -> PhotometricFigures:
-    """Measure PSNR, SSIM and LPIPS of the test views.
+    """Return PSNR, SSIM and LPIPS of the test views.
 
-    `psnr` compares the render as it is. `psnr_compensated` first gives it the photograph's own exposure, an affine
-    change of colour fitted to that very photograph: what is left then is not a matter of exposure.
+    `psnr` compares the render as it is. `psnr_compensated` first gives the render the exposure of the photograph,
+    by an affine change of colour fitted to that photograph. The remaining difference is not one of exposure.
 
     Args:
         renderer: of the trained model.
         lpips_weights: NPZ file; None: no LPIPS.
-        save_render: gets the first views side by side with their photographs.
-        progress: whom to tell of progress.
+        save_render: saves the first views side by side with their photographs.
+        progress: shows the views.
         saved: number of views for `save_render`.
+
+    Raises:
+        InputError: a photograph or the weights cannot be read.
     """
     indices, views = renderer.trained.indices("test"), []
     distance = None if lpips_weights is None else Lpips(lpips_weights)
@@ -69,17 +72,23 @@ def compare_test_views(
 
 
 def write_render(folder: Path, image: str, strip: ByteArray) -> None:
-    """Write a photograph and its render, side by side (H, 3 W, 3) RGB, as PNG."""
+    """Write a photograph beside its render as PNG.
+
+    Args:
+        folder: of the PNG.
+        image: name of the photograph.
+        strip: (H, 3 W, 3) RGB: the photograph, its render, their difference.
+    """
     cv2.imwrite(str(folder / render_name(image)), np.ascontiguousarray(strip[..., ::-1]))
 
 
 def render_name(image: str) -> str:
-    """Return the file name of an image's render, folders included: images in two folders may share their names."""
+    """Return the file name of an image's render; folders are a part, because images in two may share a name."""
     return Path(image).with_suffix(".png").as_posix().replace("/", "_")
 
 
 def _figures(name: str, render: Tensor, photo: Tensor, mask: Tensor, distance: Lpips | None) -> ViewFigures:
-    """Of a render (H, W, 3) against its photograph, colours from 0 to 1, where the mask (H, W) is true."""
+    """Return the figures of a render (H, W, 3) against its photograph, colours 0 … 1, within the mask (H, W)."""
     return ViewFigures(
         image=name,
         psnr=psnr(render, photo, mask),
@@ -95,7 +104,7 @@ def _mean(values: Iterable[float | None]) -> float | None:
 
 
 def _side_by_side(photo: Tensor, render: Tensor) -> ByteArray:
-    """Photograph, render, and their difference (× 3): (H, 3 W, 3)."""
+    """Return photograph, render, and their difference (× 3), side by side (H, 3 W, 3)."""
     difference = (_DIFFERENCE_GAIN * (photo - render).abs()).clamp(0, 1)
     strip = torch.cat([photo, render, difference], dim=1).mul(255).round().byte()
     return np.asarray(strip.numpy())

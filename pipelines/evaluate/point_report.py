@@ -1,4 +1,4 @@
-"""The report's sections on surveyed points: errors, accuracy after ASPRS, and the accuracy that was predicted."""
+"""Sections of the report on surveyed points: errors, accuracy after ASPRS, and predicted accuracy."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ class MeasuredPoints:
     """J surveyed points, measured in the model.
 
     Attributes:
-        points: as surveyed.
+        points: positions and covariances of the survey.
         error_in_geo: (J, 3) m, measured minus surveyed; NaN for a point that was not measured.
-        rays: (J,) marks in registered images.
-        cov_in_geo: (J, 3, 3) m², predicted of the measured positions; None where it is not known.
+        rays: (J,) number of marks in registered images.
+        cov_in_geo: (J, 3, 3) m², predicted covariance of the measured positions; None: no prediction.
     """
 
     points: tuple[SurveyedPoint, ...]
@@ -40,21 +40,21 @@ class MeasuredPoints:
 
     @property
     def is_measured(self) -> BoolArray:
-        """Which points (J,) were measured."""
+        """Mask (J,) of the points that were measured."""
         return np.asarray(np.isfinite(self.error_in_geo).all(axis=1))
 
     @property
     def cov_survey(self) -> FloatArray:
-        """Covariance (J, 3, 3) of the surveyed positions in m²."""
+        """Covariances (J, 3, 3) of the surveyed positions in m²."""
         return np.array([point.cov_in_geo for point in self.points]).reshape(-1, 3, 3)
 
 
 def check_point_errors(measured: MeasuredPoints, bound: FloatArray | None = None) -> CheckPointErrors:
-    """Return the section on check points.
+    """Return the report's section on check points.
 
     Args:
         measured: J check points.
-        bound: (J, 3, 3) m², the least covariance that is possible; None where it is not known.
+        bound: (J, 3, 3) m², Cramér–Rao bound of the covariance; None: not known.
     """
     assessment = _assess(measured)
     blunder = _among_all(assessment, measured)
@@ -72,9 +72,9 @@ def check_point_errors(measured: MeasuredPoints, bound: FloatArray | None = None
 
 
 def cross_validation_errors(measured: MeasuredPoints) -> CrossValidation:
-    """Return the section on control points that were each measured by a solution without it.
+    """Return the report's section on control points, each measured by a solution without that point.
 
-    They get neither class nor bound: they are not check points.
+    The section states neither class nor bound, because control points are not check points.
     """
     assessment = _assess(measured)
     blunder = _among_all(assessment, measured)
@@ -92,7 +92,7 @@ def cross_validation_errors(measured: MeasuredPoints) -> CrossValidation:
 
 
 def point_residuals(measured: MeasuredPoints) -> tuple[PointResidual, ...]:
-    """Return a row for each point that entered the solution."""
+    """Return one row for each point: its name, marks and residual."""
     residual = _by_axis(measured.error_in_geo)
     return tuple(
         PointResidual(name=point.name, rays=rays, de_m=east, dn_m=north, du_m=up)
@@ -106,7 +106,7 @@ def _assess(measured: MeasuredPoints) -> Assessment:
 
 
 def _among_all(assessment: Assessment, measured: MeasuredPoints) -> list[bool]:
-    """Which of all J points are blunders."""
+    """Return for each of all J points whether it is a blunder."""
     blunder = np.zeros(len(measured.points), dtype=bool)
     blunder[measured.is_measured] = assessment.blunder
     return [bool(is_blunder) for is_blunder in blunder]
@@ -117,7 +117,7 @@ def _names(measured: MeasuredPoints, chosen: list[bool]) -> tuple[str, ...]:
 
 
 def _rows(measured: MeasuredPoints, blunder: list[bool]) -> PointRows:
-    """A row for each point, with its predicted σ where there is a prediction."""
+    """Return one row for each point, with its predicted σ if there is a prediction."""
     rows = [
         PointError(**residual.model_dump(), blunder=is_blunder)
         for residual, is_blunder in zip(point_residuals(measured), blunder, strict=True)
@@ -132,13 +132,13 @@ def _rows(measured: MeasuredPoints, blunder: list[bool]) -> PointRows:
 
 
 def _by_axis(values: FloatArray) -> list[tuple[float, float, float] | tuple[None, None, None]]:
-    """Rows (J, 3) as numbers; None for a row that is not known in all axes."""
+    """Return rows (J, 3) as numbers; None for a row that is not finite along every axis."""
     rows = ((float(east), float(north), float(up)) for east, north, up in values)
     return [row if np.isfinite(row).all() else (None, None, None) for row in rows]
 
 
 def _rms_sigma(cov: FloatArray) -> RmsSigma:
-    """Root mean square of the standard deviations of points (J, 3, 3), as far as they are known."""
+    """Return the root mean square of σ over the points whose covariance of (J, 3, 3) is finite."""
     known = cov[np.isfinite(cov).all(axis=(1, 2))]
     if not len(known):
         return RmsSigma(count=0, rms_h_m=None, rms_v_m=None)
@@ -147,7 +147,10 @@ def _rms_sigma(cov: FloatArray) -> RmsSigma:
 
 
 def _predicted_sigma(measured: MeasuredPoints) -> PredictedSigma | None:
-    """Predicted σ, and errors squared over their variances (survey included): 1 on the average if both are true."""
+    """Return the predicted σ, and the mean of error² over variance, by axis.
+
+    The variance includes the survey's. The mean is 1 on the average if both variances are true.
+    """
     if measured.cov_in_geo is None:
         return None
     variance = np.diagonal(measured.cov_in_geo + measured.cov_survey, axis1=1, axis2=2)

@@ -1,4 +1,4 @@
-"""Surveyed points measured in the model by its cameras: where the rays of their marks meet."""
+"""Surveyed points, measured by camera: intersections of the rays of their marks."""
 
 from __future__ import annotations
 
@@ -8,14 +8,19 @@ from pipelines.core.types import FloatArray
 from pipelines.scene.marks import MarkRays, RayErrors, intersect_marks
 from pipelines.scene.trained_survey import TrainedSurvey
 
-# Rays of a mark are held to agree within their mark's σ and this much of the cameras' own error.
+# Errors of the trained cameras: rays agree within these errors and the σ of their marks.
 _CAMERA_ERRORS = RayErrors(sigma_center=0.02, sigma_attitude_rad=2e-4)
 
 
 def points_by_camera(trained: TrainedSurvey, rays: MarkRays) -> FloatArray:
-    """Return points (J, 3) in `geo` where the rays of their marks meet; NaN for one in fewer than two images."""
+    """Return the intersections (J, 3) in `geo` of the rays of each point; NaN: marks in fewer than two images.
+
+    Args:
+        trained: cameras and similarity.
+        rays: of the marks of J points.
+    """
     poses = trained.poses
     solved = intersect_marks(rays, poses.cam_from_model, poses.cam_center_in_model, _CAMERA_ERRORS)
-    position = solved.position_in_geo.copy()  # the frame of the cameras stands for `geo` there
+    position = solved.position_in_geo.copy()  # in the frame of the cameras, `model`
     position[rays.marks_of_point < 2] = np.nan
     return trained.geo_from_model.apply(position)

@@ -1,4 +1,4 @@
-"""Surveyed points measured in the model by its surface: where it lies behind their marks."""
+"""Surveyed points, measured by model: places of the Gaussians' surface behind their marks."""
 
 from __future__ import annotations
 
@@ -10,24 +10,26 @@ from pipelines.robust.statistics import spatial_median
 from pipelines.scene.marks import MarkRays
 from pipelines.scene.trained_survey import TrainedSurvey
 
-_REACH_PX = 1  # of what is looked at around a mark
-_EDGE_STEP = 0.04  # of the depth; ground seen under 30° changes by 0.6 % within the reach
-_SAME_SURFACE = 0.01  # of the depth
+_REACH_PX = 1  # around the pixel of a mark
+_EDGE_STEP = 0.04  # of the depth; on ground seen under 30° the depth changes by 0.6 % within the reach
+_SAME_SURFACE = 0.01  # of the depth: largest difference between pixels of one surface
 
 
 def points_by_model(
     trained: TrainedSurvey, rays: MarkRays, depth_m: dict[int, FloatArray], pinholes: dict[int, Pinhole]
 ) -> FloatArray:
-    """Return points (J, 3) in `geo` where the model's surface lies behind their marks: spatial median of the views.
+    """Return the points (J, 3) in `geo` at which the model's surface lies behind their marks.
 
-    Where a mark lies beside an edge of the surface, a fraction of a pixel decides between roof and ground: such
-    views do not count for a point that two or more others show on unbroken surface.
+    1. In each view, the point is the place of the surface on the ray of its mark.
+    2. Beside an edge of the surface, a fraction of a pixel decides between roof and ground. Views with an edge at
+       the mark do not count for a point that two or more other views show on unbroken surface.
+    3. The result is the spatial median of the views; NaN for a point with fewer than two.
 
     Args:
-        trained: the model.
+        trained: the trained model.
         rays: of the marks of J points.
-        depth_m: depth (H, W) of the surface along z by camera, 0 where there is none.
-        pinholes: cameras of these depth maps.
+        depth_m: by camera, depth (H, W) of the surface along z in metres; 0 where there is none.
+        pinholes: by camera, pinhole of the depth map.
     """
     unbroken: list[list[FloatArray]] = [[] for _ in rays.point_id]
     at_edge: list[list[FloatArray]] = [[] for _ in rays.point_id]
@@ -44,16 +46,16 @@ def points_by_model(
 
 
 def _is_at_edge(depth_m: FloatArray, camera: Pinhole, xy: FloatArray) -> bool:
-    """Whether the depth around a ray changes by more than a slope does."""
+    """Return whether the depth around a ray changes by more than on a slope."""
     around = _around(depth_m, *_pixel(camera, xy))
     return bool(around.size == 0 or around.max() > (1 + _EDGE_STEP) * around.min())
 
 
 def _depth_at(depth_m: FloatArray, camera: Pinhole, xy: FloatArray) -> float:
-    """Depth at a ray, of a plane through what lies around it on the same surface; 0 where there is none.
+    """Return the depth at a ray, on a plane through the pixels of the same surface around it; 0: no surface.
 
-    Gaussians make the surface rough from pixel to pixel, which a plane through some of them evens out. Its inverse
-    depth is linear on the image.
+    Gaussians make the surface rough from pixel to pixel, and a plane through several pixels evens that out. The
+    inverse depth of a plane is linear on the image.
     """
     x, y = _pixel(camera, xy)
     if not (0 <= x < camera.width and 0 <= y < camera.height):
@@ -63,7 +65,7 @@ def _depth_at(depth_m: FloatArray, camera: Pinhole, xy: FloatArray) -> float:
     rows, columns = np.nonzero((np.abs(around - here) < _SAME_SURFACE * here) & (around > 0))
     right = columns + max(int(x) - _REACH_PX, 0) + 0.5 - x
     down = rows + max(int(y) - _REACH_PX, 0) + 0.5 - y
-    if len(rows) < 3 or np.ptp(rows) == 0 or np.ptp(columns) == 0:  # no plane
+    if len(rows) < 3 or np.ptp(rows) == 0 or np.ptp(columns) == 0:  # these pixels determine no plane
         return here
     design = np.stack([np.ones(len(rows)), right, down], axis=1)
     return float(1.0 / np.linalg.lstsq(design, 1.0 / around[rows, columns])[0][0])
@@ -74,6 +76,6 @@ def _pixel(camera: Pinhole, xy: FloatArray) -> tuple[float, float]:
 
 
 def _around(depth_m: FloatArray, x: float, y: float) -> FloatArray:
-    """The depths within the reach of a place on the image."""
+    """Return the depths of the pixels within the reach of a place on the image."""
     top, left = max(int(y) - _REACH_PX, 0), max(int(x) - _REACH_PX, 0)
     return depth_m[top : int(y) + _REACH_PX + 1, left : int(x) + _REACH_PX + 1]

@@ -1,4 +1,4 @@
-"""The accuracy that is predicted of points of a trained survey, from the covariances of what was measured."""
+"""Predicted covariance of points of a trained survey, from the covariances of its measurements."""
 
 from __future__ import annotations
 
@@ -15,10 +15,13 @@ from pipelines.scene.solved_survey import SolvedSurvey
 
 
 class AccuracyPrediction:
-    """Covariance at any point of the scene, from the joint posterior of similarity, cameras and lens.
+    """Prediction of the covariance at any point, from the joint posterior of similarity, cameras and lens.
+
+    Args:
+        solved: the survey, with its measurements solved.
 
     Raises:
-        DegenerateGeometryError: the measurements leave the similarity open.
+        DegenerateGeometryError: the measurements do not determine the similarity.
     """
 
     def __init__(self, solved: SolvedSurvey) -> None:
@@ -30,7 +33,7 @@ class AccuracyPrediction:
 
     @property
     def cautions(self) -> tuple[str, ...]:
-        """Where the prediction is not that of this training."""
+        """Limits of the prediction: sentences on assumptions that this training does not meet."""
         cautions, options = [], self._solved.options
         if not self._basis.shape[2]:
             cautions.append("the cameras were held: the prediction leaves out their own error, and is too good")
@@ -43,9 +46,13 @@ class AccuracyPrediction:
         return tuple(cautions)
 
     def of_marked_points(self, point_in_geo: FloatArray, rays: MarkRays) -> FloatArray:
-        """Covariance (J, 3, 3) in m² of points (J, 3) that are intersected from their marks, these included.
+        """Return covariances (J, 3, 3) in m² of points intersected from their marks, errors of the marks included.
 
-        NaN for a point that is NaN or that its marks do not determine.
+        NaN for a point that is NaN, or that its marks do not determine.
+
+        Args:
+            point_in_geo: (J, 3) metres.
+            rays: of the marks.
         """
         rays = rays.part(np.flatnonzero(np.isfinite(point_in_geo[rays.point]).all(axis=1)))
         position = np.nan_to_num(point_in_geo)
@@ -56,8 +63,14 @@ class AccuracyPrediction:
         return cov
 
     def of_scene(self, point_in_geo: FloatArray, point: IntArray, camera: IntArray) -> FloatArray:
-        """Covariance (J, 3, 3) in m² of points (J, 3) of the scene that cameras see (pairs of point and camera)."""
-        sigma_px = mean_focal_px(self._solved.scene.sparse, camera)  # rays of equal angular σ
+        """Return the covariance (J, 3, 3) in m² of points of the scene, without errors of marks.
+
+        Args:
+            point_in_geo: (J, 3) metres.
+            point: (K,) index into the points, of each ray.
+            camera: (K,) index of the camera that sees the point.
+        """
+        sigma_px = mean_focal_px(self._solved.scene.sparse, camera)  # all rays have the same angular σ
         jacobian = jacobian_of_points(self._solved, point_in_geo, point, camera, sigma_px)
         return self._covariance(point_in_geo, jacobian)
 
@@ -74,11 +87,11 @@ def jacobian_of_points(
     """Return the derivatives, in metres of `model`, of points by the trained cameras that see them.
 
     Args:
-        solved: the survey.
-        point_in_geo: (J, 3) points.
+        solved: the survey, with the trained cameras.
+        point_in_geo: (J, 3) metres.
         point: (K,) index into the points, of each ray.
         camera: (K,) index into the images.
-        sigma_px: (K,) σ of a ray on its image.
+        sigma_px: (K,) σ of each ray on its image.
     """
     trained = solved.trained
     position = trained.geo_from_model.inverse().apply(point_in_geo)
@@ -104,6 +117,6 @@ def _free_lens(solved: SolvedSurvey) -> FreeLens | None:
 
 
 def _geo_by_model(solved: SolvedSurvey) -> FloatArray:
-    """Metres of `geo` by metres of `model` (3, 3)."""
+    """Return the derivative (3, 3) of positions in `geo` by positions in `model`."""
     geo_from_model = solved.trained.geo_from_model
     return geo_from_model.scale * geo_from_model.rotation

@@ -1,8 +1,8 @@
-"""Evaluation: images against held-out photographs, positions against check points (method, section 4).
+"""Stage `evaluate`: renders against held-out photographs, positions against check points.
 
 Reads the trained model, the survey and the initial similarity. Writes `evaluate/report.json`, side-by-side
 renders, and the predicted accuracy over the scene as `accuracy.csv` and `accuracy.png`. Check points enter no
-solve; what was used in one is reported as a fit, not as an accuracy (docs/accuracy.md).
+solution. Residuals of observations that entered one are reported as a fit, not as an accuracy (docs/accuracy.md).
 """
 
 from __future__ import annotations
@@ -43,7 +43,12 @@ from pipelines.splat.rasterizer.backends import rasterizer
 
 
 def run(stage: StageRun, options: EvaluateOptions) -> Summary:
-    """Measure, and write the report, the renders and the predicted accuracy."""
+    """Evaluate the trained survey, write report, renders and predicted accuracy, and return the summary.
+
+    Raises:
+        BackendUnavailableError: `--backend cuda` without a GPU or without gsplat.
+        GeorefError: a product, a photograph or the LPIPS weights cannot be read, or the CRS cannot be used.
+    """
     trained = load_trained(stage.workspace, options.similarity)
     crs = None if options.crs is None else target_crs(options.crs, trained.survey)
     initial = load_json(InitialSimilarity, stage.workspace.path(SIM3))
@@ -75,11 +80,14 @@ def evaluate(
 
     Args:
         renderer: of the trained model.
-        propagation: covariances that follow from the measurements.
+        propagation: covariances from the measurements, or the reason why there are none.
         options: of the stage.
-        crs: in which to list the check points too, or None.
-        save_render: gets the first test views side by side with their photographs.
-        progress: whom to tell of progress.
+        crs: CRS in which the report lists the check points too; None: none.
+        save_render: saves the first test views side by side with their photographs.
+        progress: shows depth maps and test views.
+
+    Raises:
+        InputError: a photograph or the LPIPS weights cannot be read, or a point lies outside the CRS's domain.
     """
     trained = renderer.trained
     checkpoints = measure_check_points(renderer, propagation, progress)
@@ -96,13 +104,13 @@ def evaluate(
 
 
 def _similarity_sigma(record: SimilarityRecord) -> SimilaritySigma:
-    """Square roots of the covariance's diagonal: δ ln s, three angles, translation."""
+    """Return σ of ln s and of the translation, from a covariance in the order ln s, three angles, translation."""
     log_scale, *_, east, north, up = np.sqrt(np.diag(record.covariance)).tolist()
     return SimilaritySigma(sigma_ln_scale=log_scale, sigma_translation_m=(east, north, up))
 
 
 def _draw(grid: AccuracyGrid, trained: TrainedSurvey, path: Path) -> None:
-    """Draw the predicted accuracy with cameras, control and check points."""
+    """Draw a map of the predicted accuracy, with cameras, control points and check points."""
     raster = SigmaRaster(grid.raster(grid.sigma_h_m), grid.raster(grid.sigma_v_m), grid.corner_in_geo, grid.size_m)
     points = MapPoints(
         trained.geo_from_model.apply(trained.poses.cam_center_in_model)[:, :2],
@@ -113,5 +121,5 @@ def _draw(grid: AccuracyGrid, trained: TrainedSurvey, path: Path) -> None:
 
 
 def _plan(points: tuple[SurveyedPoint, ...]) -> FloatArray:
-    """East and north (K, 2) of surveyed points in metres."""
+    """Return east and north (K, 2) of surveyed points in metres."""
     return np.array([point.position_in_geo for point in points]).reshape(-1, 3)[:, :2]

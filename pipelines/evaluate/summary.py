@@ -1,4 +1,4 @@
-"""The headline, figures and warnings of an evaluation."""
+"""Headline, figures and warnings of an evaluation."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _NAMES_SHOWN = 8
 
 
 def summarise(report: EvaluationReport) -> Summary:
-    """Return what the command line says of a report."""
+    """Return headline, figures and warnings of a report, for the command line."""
     test, ways = report.photometric.test, _by_way(report.checkpoints)
     parts = [f"test PSNR {test.psnr:.2f} dB" if test.psnr is not None else "no test views"]
     parts += [f"check points by {way} {errors.mean_h_m:.3f} m H" for way, errors in ways.items() if errors.count]

@@ -1,1 +1,1 @@
-"""Stage `train`: Gaussians, similarity and cameras together."""
+"""Stage `train`: joint optimisation of Gaussians, similarity and cameras."""
