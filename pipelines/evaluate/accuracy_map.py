@@ -119,7 +119,7 @@ def _seen_by(obs_point: IntArray, obs_image: IntArray, near: IntArray) -> tuple[
     cameras = [
         np.unique(np.concatenate([obs_image[order[start[p] : start[p + 1]]] for p in points])) for points in near
     ]
-    owner = np.repeat(np.arange(len(near)), [len(seen) for seen in cameras])
+    owner = np.repeat(np.arange(len(near)), [len(of_cell) for of_cell in cameras])
     return owner, np.concatenate(cameras)
 
 

@@ -56,9 +56,12 @@ def coordinates_in(crs: PointCrs, checkpoints: CheckPoints, survey: Survey) -> C
         origin=_vector(xyz[0]),
         points=tuple(
             PointCoordinates(
-                name=point.name, surveyed=_vector(there), camera=_measured(camera), model=_measured(model)
+                name=point.name,
+                surveyed=_vector(surveyed_xyz),
+                camera=_measured(camera_xyz),
+                model=_measured(model_xyz),
             )
-            for point, (there, camera, model) in zip(survey.check_points, by_point, strict=True)
+            for point, (surveyed_xyz, camera_xyz, model_xyz) in zip(survey.check_points, by_point, strict=True)
         ),
     )
 

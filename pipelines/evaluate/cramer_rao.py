@@ -107,9 +107,9 @@ class CameraInformation:
         sigma_px, wanted = sigma_px[has_positive_depth(wanted)], with_positive_depths(wanted)
         bounds = np.full((len(wanted.point_in_world), 3, 3), np.nan)
         for j in np.unique(wanted.obs_point):
-            mine = wanted.obs_point == j
-            if mine.sum() >= 2:
-                bounds[j] = self._bound_of(_only(wanted, mine), sigma_px[mine])
+            of_point = wanted.obs_point == j
+            if of_point.sum() >= 2:
+                bounds[j] = self._bound_of(_only(wanted, of_point), sigma_px[of_point])
         return bounds
 
     def _bound_of(self, marks: Network, sigma_px: FloatArray) -> FloatArray:
@@ -128,15 +128,15 @@ class CameraInformation:
         return np.asarray((cov + cov.T) / 2)
 
 
-def _only(network: Network, mine: BoolArray) -> Network:
+def _only(network: Network, of_point: BoolArray) -> Network:
     """Return the network of one point, from the mask of its marks."""
-    owner = network.obs_point[mine][:1]
+    owner = network.obs_point[of_point][:1]
     return replace(
         network,
         point_in_world=network.point_in_world[owner],
-        obs_point=np.zeros(int(mine.sum()), dtype=np.int64),
-        obs_image=network.obs_image[mine],
-        obs_xy_px=network.obs_xy_px[mine],
+        obs_point=np.zeros(int(of_point.sum()), dtype=np.int64),
+        obs_image=network.obs_image[of_point],
+        obs_xy_px=network.obs_xy_px[of_point],
     )
 
 

@@ -60,13 +60,13 @@ def _depth_at(depth_m: FloatArray, camera: Pinhole, xy: FloatArray) -> float:
     x, y = _pixel(camera, xy)
     if not (0 <= x < camera.width and 0 <= y < camera.height):
         return 0.0
-    here = float(depth_m[int(y), int(x)])
+    own_depth_m = float(depth_m[int(y), int(x)])
     around = np.asarray(_around(depth_m, x, y), dtype=np.float64)
-    rows, columns = np.nonzero((np.abs(around - here) < _SAME_SURFACE * here) & (around > 0))
+    rows, columns = np.nonzero((np.abs(around - own_depth_m) < _SAME_SURFACE * own_depth_m) & (around > 0))
     right = columns + max(int(x) - _REACH_PX, 0) + 0.5 - x
     down = rows + max(int(y) - _REACH_PX, 0) + 0.5 - y
     if len(rows) < 3 or np.ptp(rows) == 0 or np.ptp(columns) == 0:  # these pixels determine no plane
-        return here
+        return own_depth_m
     design = np.stack([np.ones(len(rows)), right, down], axis=1)
     return float(1.0 / np.linalg.lstsq(design, 1.0 / around[rows, columns])[0][0])
 

@@ -148,8 +148,8 @@ class DepthMaps:
         if not sweeps:
             return None
         pinhole = self._coarse(index) if kind == "coarse" else self.camera(index)
-        which, *rest = np.load(self._path(index, kind), mmap_mode="r", allow_pickle=False)
-        normals = NormalMap(np.stack([planes.normal_in_world for planes in sweeps]), which.astype(np.uint8))
+        normal_index, *rest = np.load(self._path(index, kind), mmap_mode="r", allow_pickle=False)
+        normals = NormalMap(np.stack([planes.normal_in_world for planes in sweeps]), normal_index.astype(np.uint8))
         return DepthEstimate(self._camera(pinhole, index), SweepResult(normals, *rest))
 
     def _find_planes(self, index: int) -> list[Planes]:
@@ -202,8 +202,8 @@ class DepthMaps:
 
 def _packed(sweep: SweepResult) -> Float32Array:
     """Return direction, offset, score, step and sharpness of each pixel as one array (5, H, W)."""
-    which = sweep.normals.index.astype(np.float32)
-    return np.stack([which, sweep.offset_m, sweep.score, sweep.step_m, sweep.sharpness])
+    normal_index = sweep.normals.index.astype(np.float32)
+    return np.stack([normal_index, sweep.offset_m, sweep.score, sweep.step_m, sweep.sharpness])
 
 
 def _empty_maps(pinhole: Pinhole) -> Float32Array:

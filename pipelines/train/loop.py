@@ -140,11 +140,11 @@ class _Loop:
             NonFiniteError: a loss or gradient was not finite.
         """
         self.trainer.check_finite()
-        more = {
+        loop_state = {
             "seconds": torch.tensor(self.seconds(), dtype=torch.float64),
             "recovery": torch.tensor(list((self.recovery or "").encode()), dtype=torch.uint8),
         }
-        save_checkpoint(self.options.checkpoint, {**self.trainer.state(), **more})
+        save_checkpoint(self.options.checkpoint, {**self.trainer.state(), **loop_state})
 
     def recover(self, error: NonFiniteError) -> None:
         """Return to the last checkpoint and lower the learning rates, once in a training.

@@ -178,9 +178,11 @@ class JointTrainer:
                 colour = self.exposures.apply(index, colour)
             error = (colour - target.colour).abs().mean(dim=-1)
             error = error if target.mask is None else error * target.mask
-            seen = view_contributions(self.optimizer.gaussians, pose, target.camera, error, self.rasterizer)
+            of_view = view_contributions(self.optimizer.gaussians, pose, target.camera, error, self.rasterizer)
             # Strategies count pixels of the whole photographs, which the schedule may have shrunken.
-            contributions.append(ViewContributions(shrink**2 * seen.weight_px, shrink**2 * seen.high_error_px))
+            contributions.append(
+                ViewContributions(shrink**2 * of_view.weight_px, shrink**2 * of_view.high_error_px)
+            )
         return contributions
 
     def pinhole(self, index: int) -> Pinhole:
@@ -221,21 +223,21 @@ class JointTrainer:
 
     def _surface(self, render: Render, pose: Tensor, target: TargetImage, index: int) -> Tensor | None:
         """Return the weighted sum of the surface losses, or None if the options have no surface losses."""
-        wanted, gaussians = self.options.surface, self.optimizer.gaussians
-        if wanted is None:
+        surface, gaussians = self.options.surface, self.optimizer.gaussians
+        if surface is None:
             return None
-        loss = wanted.flatness * flatness_loss(gaussians, render.stats.visible, self.optimizer.extent_m)
+        loss = surface.flatness * flatness_loss(gaussians, render.stats.visible, self.optimizer.extent_m)
         if render.expected_depth is not None and render.depth_variance is not None:
             spread = compactness_loss(render.expected_depth, render.depth_variance, render.alpha)
-            loss = loss + wanted.compactness * spread
+            loss = loss + surface.compactness * spread
         if self.views.surface is not None and render.expected_depth is not None:
             points = self.views.surface(index)
             depth = depth_loss(render.expected_depth, render.alpha, points, pose, target.camera)
-            loss = loss + wanted.depth * depth
-        late = self.iteration > wanted.normals_from * self.options.iterations
-        if late and self.iteration % wanted.normals_every == 0:
-            normals = normal_loss(gaussians, pose, target.camera, self.rasterizer, wanted.edge)
-            loss = loss + wanted.normals_every * wanted.normals * normals
+            loss = loss + surface.depth * depth
+        late = self.iteration > surface.normals_from * self.options.iterations
+        if late and self.iteration % surface.normals_every == 0:
+            normals = normal_loss(gaussians, pose, target.camera, self.rasterizer, surface.edge)
+            loss = loss + surface.normals_every * surface.normals * normals
         return loss
 
     def _watched(self) -> dict[str, Tensor]:
