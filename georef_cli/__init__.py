@@ -1,1 +1,1 @@
-"""The command line of GeoRefGS: parse, call, print."""
+"""Command line of GeoRefGS: parses arguments, calls the stages, prints results."""

@@ -1,7 +1,7 @@
-"""The edge of the program: errors become messages and exit codes, log records become lines.
+"""Boundary of the program: errors become messages and exit codes, log records become lines.
 
-Exit codes: 0 done, 1 known failure, 2 usage, 130 interrupted. An exception that nobody foresaw keeps its
-traceback. Everything said here goes to stderr; stdout is the result's.
+Exit codes: 0 done, 1 known failure, 2 usage, 130 interrupted. An unexpected exception keeps its traceback. All
+messages go to stderr; stdout is for the result.
 """
 
 from __future__ import annotations
@@ -26,14 +26,19 @@ from pipelines.core.errors import GeorefError
 from pipelines.core.interrupts import SIGNALS
 
 FAILED, INTERRUPTED = 1, 130
-OURS = ("pipelines", "georef_cli")
+LOGGERS = ("pipelines", "georef_cli")
 FILE_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 
 log = logging.getLogger(__name__)
 
 
 def guarded(group: click.Group, arguments: Sequence[str] | None) -> int:
-    """Run the command line and turn how it ended into an exit code."""
+    """Run the command line and return its exit code.
+
+    Args:
+        group: the commands.
+        arguments: of the command line; None: those of the process.
+    """
     try:
         _escape_on_stdout()
         with _signals_interrupt():
@@ -49,7 +54,7 @@ def guarded(group: click.Group, arguments: Sequence[str] | None) -> int:
         click.echo(f"error: {error}", err=True)
         return FAILED
     except BrokenPipeError:
-        # Whoever read the result has enough; what is left in the buffer must not raise again at exit.
+        # The reader of the pipe has closed it. The rest of the buffer must not raise again at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILED
     except OSError as error:
@@ -61,14 +66,14 @@ def guarded(group: click.Group, arguments: Sequence[str] | None) -> int:
 
 
 def _escape_on_stdout() -> None:
-    """Let stdout escape the signs that its encoding lacks, as stderr does: a pipe on Windows has no σ."""
+    """Make stdout escape characters that its encoding lacks, as stderr does: a pipe on Windows has no σ."""
     if isinstance(sys.stdout, io.TextIOWrapper) and codecs.lookup(sys.stdout.encoding).name != "utf-8":
         sys.stdout.reconfigure(errors="backslashreplace")
 
 
 @contextmanager
 def _signals_interrupt() -> Iterator[None]:
-    """Let every signal that asks for an end do as Ctrl-C does, so that a stage can save what it has."""
+    """Make every signal that asks for termination act as Ctrl-C, so that a stage can save its work."""
 
     def interrupt(_signal: int, _frame: FrameType | None) -> None:
         raise KeyboardInterrupt
@@ -82,8 +87,8 @@ def _signals_interrupt() -> Iterator[None]:
 
 
 @contextmanager
-def told(verbosity: Verbosity) -> Iterator[None]:
-    """Tell log records on stderr while the context lasts, and the traceback of its error if asked."""
+def logged_to_stderr(verbosity: Verbosity) -> Iterator[None]:
+    """Print log records on stderr while the context lasts, and the traceback of its error if asked."""
     handler = _terminal_handler() if sys.stderr.isatty() else _line_handler()
     handler.setLevel(verbosity.level)
     with _attached(handler, logging.DEBUG if verbosity.verbose else logging.INFO):
@@ -96,7 +101,7 @@ def told(verbosity: Verbosity) -> Iterator[None]:
 
 
 @contextmanager
-def written(path: Path) -> Iterator[None]:
+def logged_to_file(path: Path) -> Iterator[None]:
     """Append log records to the file `path` while the context lasts, and the error that ends it."""
     handler = _LateFileHandler(path)
     handler.setFormatter(logging.Formatter(FILE_FORMAT))
@@ -104,16 +109,16 @@ def written(path: Path) -> Iterator[None]:
         try:
             yield
         except BaseException as error:
-            handler.tell_end(error)
+            handler.emit_end(error)
             raise
 
 
 @contextmanager
 def _attached(handler: logging.Handler, level: int) -> Iterator[None]:
     root = logging.getLogger()
-    levels = {name: logging.getLogger(name).level for name in OURS}
+    levels = {name: logging.getLogger(name).level for name in LOGGERS}
     root.addHandler(handler)
-    for name in OURS:
+    for name in LOGGERS:
         logger = logging.getLogger(name)
         logger.setLevel(min(level, logger.level or level))
     try:
@@ -138,9 +143,9 @@ def _line_handler() -> logging.Handler:
 
 
 class _LateFileHandler(logging.FileHandler):
-    """Opens its file at the first record, in a workspace that is there by then.
+    """Handler that opens its file at the first record, in a workspace that exists by then.
 
-    A command that is refused before it began leaves nothing behind, not even a folder.
+    A command that is refused before it begins leaves neither file nor folder behind.
     """
 
     def __init__(self, path: Path) -> None:
@@ -152,8 +157,8 @@ class _LateFileHandler(logging.FileHandler):
             self.path.parent.mkdir(exist_ok=True)
             super().emit(record)
 
-    def tell_end(self, error: BaseException) -> None:
-        """Record how a stage was ended."""
+    def emit_end(self, error: BaseException) -> None:
+        """Record the error that ended a stage."""
         known = isinstance(error, GeorefError | KeyboardInterrupt)
         text = str(error) or type(error).__name__
         self.emit(

@@ -1,4 +1,4 @@
-"""Copies of products outside the workspace: never half written, never over a file by accident."""
+"""Copies of products outside the workspace: complete or absent, and never over a file by accident."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pipelines.core.errors import InputError
 
 
 def check_target(target: Path, *, overwrite: bool) -> None:
-    """See before the work begins that its result can be put at `target`.
+    """Check, before the work begins, that its result can be written to `target`.
 
     Raises:
         InputError: the folder is missing, or the file exists and may not be replaced.
@@ -21,7 +21,9 @@ def check_target(target: Path, *, overwrite: bool) -> None:
 
 
 def deliver(source: Path, target: Path) -> None:
-    """Copy a file and its sidecars (`source.*`); they appear, or are replaced, when all copies are complete.
+    """Copy a file and its sidecars (`source.*`) to `target`.
+
+    The copies appear, or replace older files, when all of them are complete.
 
     Raises:
         InputError: the target cannot be written.

@@ -1,4 +1,4 @@
-"""Progress for people: bars on a terminal, a line now and then in a log."""
+"""Display of progress: bars on a terminal, a line every half minute in a log."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ log = logging.getLogger(__name__)
 
 @cache
 def stderr_console() -> Console:
-    """The one console on stderr: bars and log lines must share it so as not to overwrite each other."""
+    """Return the console on stderr, always the same: bars and log lines must not overwrite each other."""
     return Console(stderr=True)
 
 
 class ConsoleHandler(logging.Handler):
-    """Log records as coloured lines above the bars."""
+    """Handler that prints log records as coloured lines above the bars."""
 
     def __init__(self, console: Console) -> None:
         super().__init__()
@@ -53,17 +53,17 @@ class ConsoleHandler(logging.Handler):
 
 
 def progress_for(verbosity: Verbosity) -> Progress:
-    """Bars on a terminal, sparse log lines elsewhere, nothing with `--quiet`."""
+    """Return the display of progress: bars on a terminal, log lines elsewhere, nothing with `--quiet`."""
     if verbosity.quiet:
         return SILENT
     return BarProgress(stderr_console()) if sys.stderr.isatty() else LineProgress()
 
 
 class SpeedColumn(Column):
-    """Steps per second, or seconds per step where that reads better."""
+    """Column of steps per second, or of seconds per step below one step per second."""
 
     def render(self, task: Task) -> Text:
-        """The speed of a task."""
+        """Return the speed of a task."""
         speed = task.finished_speed or task.speed
         if not speed:
             return Text("")
@@ -71,7 +71,7 @@ class SpeedColumn(Column):
 
 
 class BarProgress:
-    """Bars, one below the other; a finished one stays as the record of its time."""
+    """Progress as bars, one below the other; a finished bar stays and shows its time."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
@@ -79,7 +79,7 @@ class BarProgress:
 
     @contextmanager
     def task(self, name: str, total: int | None = None) -> Iterator[ProgressTask]:
-        """Open a bar; tasks opened inside it are drawn below."""
+        """Open a bar; tasks that are opened inside it are drawn below."""
         outermost = self._bars is None
         bars = self._bars or self._start()
         bar = bars.add_task(name, total=total, note="")
@@ -112,7 +112,7 @@ class _Bar:
         self._bars, self._bar = bars, bar
 
     def advance(self, steps: int = 1, note: str = "") -> None:
-        """Move the bar."""
+        """Add `steps` to the bar, and show `note` behind it."""
         if note:
             self._bars.update(self._bar, advance=steps, note=note)
         else:
@@ -120,35 +120,35 @@ class _Bar:
 
 
 class LineProgress:
-    """A log line when a task ends, and every half minute of a long one."""
+    """Progress as log lines: at the end of a task, and every half minute of a long one."""
 
     @contextmanager
     def task(self, name: str, total: int | None = None) -> Iterator[ProgressTask]:
-        """Open a task that is told in lines."""
+        """Open a task that is logged in lines."""
         line = _Line(name, total)
         try:
             yield line
         finally:
-            line.tell()
+            line.log_count()
 
 
 class _Line:
     def __init__(self, name: str, total: int | None) -> None:
         self._name, self._total = name, total
         self._done, self._note = 0, ""
-        self._started = self._told = time.monotonic()
+        self._started = self._logged = time.monotonic()
 
     def advance(self, steps: int = 1, note: str = "") -> None:
-        """Count, and tell if nothing was told for a while."""
+        """Add `steps` to the count, and log it if the last line is half a minute old."""
         self._done += steps
         self._note = note or self._note
-        if time.monotonic() - self._told >= LINE_EVERY_S:
-            self.tell()
+        if time.monotonic() - self._logged >= LINE_EVERY_S:
+            self.log_count()
 
-    def tell(self) -> None:
-        """Log where the task is."""
-        self._told = time.monotonic()
-        elapsed_s = self._told - self._started
-        of = "" if self._total is None else f"/{self._total}"
+    def log_count(self) -> None:
+        """Log the count of the task."""
+        self._logged = time.monotonic()
+        elapsed_s = self._logged - self._started
+        total = "" if self._total is None else f"/{self._total}"
         note = f", {self._note}" if self._note else ""
-        log.info("%s: %d%s after %.0f s%s", self._name, self._done, of, elapsed_s, note)
+        log.info("%s: %d%s after %.0f s%s", self._name, self._done, total, elapsed_s, note)

@@ -1,7 +1,7 @@
-"""The group `georef`: a table of commands, each imported when it is called.
+"""Group `georef`: a table of commands, each imported when it is called.
 
-`georef --help` reads the table alone, so that it answers at once: no command module, and with it neither the
-validation library nor anything heavier, is imported for it.
+`georef --help` reads the table alone, to answer at once. It imports no command module, and therefore neither the
+validation library nor any heavier one.
 """
 
 from __future__ import annotations
@@ -21,15 +21,21 @@ from pipelines import __version__
 
 PROGRAM = "georef"
 
-# Threads that are done wait asleep. By default OpenMP's spin, and where another program has one of two cores, each
-# spins away the time that the other one needs: training was six times slower beside one busy program. The library
-# reads this when it is loaded, which no import above does.
+# Idle threads of OpenMP sleep instead of spinning. Spinning threads take the time of the busy one if another
+# program uses a core: on two cores, training was six times slower. OpenMP reads the variable when it is loaded, and
+# no import above loads it.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 
 @dataclass(frozen=True)
 class HelpLine:
-    """One line of `georef --help`: the module that holds `command`, the section and one line of help."""
+    """Line of `georef --help`.
+
+    Attributes:
+        module: module in `georef_cli.commands` that defines `command`.
+        section: heading above the line.
+        help: the text.
+    """
 
     module: str
     section: str
@@ -51,19 +57,19 @@ COMMANDS: dict[str, HelpLine] = {
     "init-sim3": HelpLine("init_sim3", "Stages", "Estimate the similarity from the SfM model to the Earth."),
     "train": HelpLine("train", "Stages", "Train the Gaussians with the similarity and the cameras."),
     "evaluate": HelpLine("evaluate", "Stages", "Measure test views and check points."),
-    "export-ply": HelpLine("export_ply", "Stages", "Write the splat as a PLY that knows where it is."),
+    "export-ply": HelpLine("export_ply", "Stages", "Write the splat as a PLY with its place on Earth."),
 }
 
 
 class LazyGroup(click.Group):
-    """A group whose subcommands live in `georef_cli.commands`, imported one at a time."""
+    """Group whose subcommands are modules of `georef_cli.commands`, imported one at a time."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """Names in the order of the table, which is that of the work."""
+        """Return the names in the order of the table, which is that of the work."""
         return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Import the command of that name; None if there is none."""
+        """Return the command of a name, imported now; None if there is none."""
         entry = COMMANDS.get(cmd_name)
         if entry is None:
             return None
@@ -72,15 +78,19 @@ class LazyGroup(click.Group):
         return command
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run a subcommand with the verbosity that the group's options ask for."""
+        """Run a subcommand with the verbosity of the group's options, and return its result.
+
+        Raises:
+            click.UsageError: both `--verbose` and `--quiet` are given.
+        """
         if ctx.params["verbose"] and ctx.params["quiet"]:
             raise click.UsageError("--verbose and --quiet exclude each other.", ctx)
         ctx.obj = Verbosity(**ctx.params)
-        with boundary.told(ctx.obj):
+        with boundary.logged_to_stderr(ctx.obj):
             return super().invoke(ctx)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the commands from the table, without importing one."""
+        """Write the commands from the table, without an import."""
         for section in dict.fromkeys(entry.section for entry in COMMANDS.values()):
             with formatter.section(section):
                 formatter.write_dl([(name, e.help) for name, e in COMMANDS.items() if e.section == section])
@@ -94,8 +104,8 @@ def _print_version(ctx: click.Context, _param: click.Parameter, value: bool) -> 
 
 
 @click.group(name=PROGRAM, cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
-@click.option("-v", "--verbose", is_flag=True, help="Tell more.")
-@click.option("-q", "--quiet", is_flag=True, help="Tell warnings and errors only.")
+@click.option("-v", "--verbose", is_flag=True, help="Show more messages.")
+@click.option("-q", "--quiet", is_flag=True, help="Show warnings and errors only.")
 @click.option("--traceback", is_flag=True, help="Show where in the program an error was raised.")
 @click.option(
     "--version",
@@ -118,5 +128,5 @@ def cli(**_verbosity: bool) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """HelpLine point of `georef`: run the command line and exit with its code."""
+    """Entry point of `georef`: run the command line and exit with its code."""
     sys.exit(boundary.guarded(cli, arguments))

@@ -1,6 +1,6 @@
-"""Options of the commands: what all share, and what follows from a stage's own options.
+"""Options of the commands: those that all commands share, and those of a stage.
 
-A stage's options are read off its class of options (names, types, meaning, defaults), so that each exists once.
+A stage's options are derived from its class of options (names, types, meaning, defaults): each is defined once.
 """
 
 from __future__ import annotations
@@ -20,39 +20,42 @@ _BOUNDS = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
 
 
 class WorkspaceType(click.Path):
-    """A workspace directory as an argument."""
+    """Type of an argument that is a workspace directory."""
 
     def __init__(self) -> None:
         super().__init__(file_okay=False, resolve_path=True, path_type=Path)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Return the workspace at that path."""
+        """Return the workspace at a path."""
         return value if isinstance(value, Workspace) else Workspace(Path(str(super().convert(value, param, ctx))))
 
 
 def workspace_argument() -> click.Argument:
-    """Return the workspace as an argument, shown as WS."""
+    """Return the argument of the workspace, shown as WS."""
     return click.Argument(["workspace"], type=WorkspaceType(), metavar="WS")
 
 
 def json_option() -> click.Option:
-    """Return `--json`."""
+    """Return the option `--json`."""
     return click.Option(["--json", "as_json"], is_flag=True, help="Print the result as one JSON document.")
 
 
 def force_option(help_text: str = "Run even if the product is current.") -> click.Option:
-    """Return `--force`."""
+    """Return the option `--force`."""
     return click.Option(["--force"], is_flag=True, help=help_text)
 
 
 def stage_options(options_type: type[StageOptions], only: Iterable[str] | None = None) -> list[click.Option]:
-    """Return a click option for each field, or for those named in `only`."""
+    """Return the click options of all fields, or of the fields named in `only`."""
     names = list(options_type.model_fields) if only is None else list(only)
     return [stage_option(options_type, name) for name in names]
 
 
 def stage_option(options_type: type[StageOptions], name: str) -> click.Option:
-    """Return the click option of one field: without a default of its own, only a text that states the field's."""
+    """Return the click option of a field.
+
+    The option has no default of its own: its help states the field's.
+    """
     info, flag = options_type.model_fields[name], flag_name(options_type, name)
     help_text = " ".join(filter(None, [info.description, _default_and_range(info)]))
     if is_written(info):
@@ -70,7 +73,7 @@ def stage_option(options_type: type[StageOptions], name: str) -> click.Option:
 
 
 def given(ctx: click.Context, names: Iterable[str]) -> dict[str, Any]:
-    """Return those values that the user gave; `georef.toml` and the defaults decide the others."""
+    """Return the values that the user gave; `georef.toml` and the defaults determine all others."""
     return {
         name: ctx.params[name]
         for name in names
@@ -95,7 +98,7 @@ def _click_type(kind: Any) -> click.ParamType[Any]:
 
 
 def _default_and_range(info: FieldInfo) -> str:
-    """Return `[default: 1200; ≥ 128]`: default and range, as far as there are any."""
+    """Return the default and range of a field as `[default: 1200; ≥ 128]`; empty without any."""
     parts = []
     if info.default not in (None, ()):
         parts.append(f"default: {_shown(info)}")

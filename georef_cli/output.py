@@ -23,14 +23,14 @@ def print_json(document: Any) -> None:
 
 
 def print_rich(*parts: RenderableType) -> None:
-    """Print for people: in colour on a terminal, plain elsewhere."""
+    """Print renderables: in colour on a terminal, plain elsewhere."""
     console = Console(width=None if sys.stdout.isatty() else PIPED_WIDTH, highlight=False, file=sys.stdout)
     for part in parts:
         console.print(part)
 
 
 def document_of(outcome: Outcome) -> dict[str, Any]:
-    """The JSON form of a stage's result."""
+    """Return the JSON form of a stage's result."""
     manifest = outcome.manifest
     return {
         "stage": outcome.stage,
@@ -43,7 +43,7 @@ def document_of(outcome: Outcome) -> dict[str, Any]:
 
 
 def print_outcome(workspace: Workspace, outcome: Outcome, *, as_json: bool) -> None:
-    """Print a stage's result."""
+    """Print the result of a stage."""
     if as_json:
         print_json(document_of(outcome))
     else:

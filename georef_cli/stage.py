@@ -1,4 +1,4 @@
-"""What the commands of single stages have in common: build the command, run the stage, print its result."""
+"""Common part of the commands of single stages: build the command, run the stage, print its result."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from pipelines.core.stages import BY_NAME
 
 
 class StageCommand(click.Command):
-    """`georef STAGE WS …`: the options of the stage, `--force` and `--json`.
+    """Command `georef STAGE WS …`: the options of the stage, `--force` and `--json`.
 
     Args:
         name: of the stage.
         doc: help, with examples.
-        extra: further options, handed to `act`.
+        extra: further options, passed to `act`.
     """
 
     def __init__(self, name: str, doc: str, extra: Sequence[click.Option] = ()) -> None:
@@ -45,12 +45,21 @@ class StageCommand(click.Command):
         print_outcome(values["workspace"], outcome, as_json=values["as_json"])
 
     def run(self, ctx: click.Context, values: Mapping[str, Any], *, resume: bool = False) -> runner.Outcome:
-        """Run the stage with the options that the user gave; to resume, on top of those given before."""
+        """Return the outcome of the stage with the options that the user gave.
+
+        Args:
+            ctx: has the verbosity, and the origin of the options' values.
+            values: of all options.
+            resume: continue the interrupted run, with its options where the user gave none.
+
+        Raises:
+            GeorefError: the stage failed.
+        """
         flags = options.given(ctx, self.spec.options.model_fields)
         workspace = values["workspace"]
         if resume:
             flags = runner.remembered(workspace, self.spec, flags)
-        with boundary.written(workspace.log_file(self.spec)):
+        with boundary.logged_to_file(workspace.log_file(self.spec)):
             return runner.run_stage(
                 workspace,
                 self.spec,

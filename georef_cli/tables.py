@@ -1,4 +1,4 @@
-"""Products as people see them: typed products in, rich renderables out."""
+"""Tables for people: typed products in, rich renderables out."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ Renderable = Group | Table | str
 
 
 def states(rows: Iterable[StageState]) -> Table:
-    """`georef status`: stage, state, when, how long, key figure."""
+    """Return the table of `georef status`: stage, state, time of the end, duration, key figure."""
     table = _table("stage", "state", "finished", "took", "result")
     table.columns[3].justify = "right"
     for row in rows:
@@ -61,7 +61,7 @@ def states(rows: Iterable[StageState]) -> Table:
 
 
 def outcome(workspace: Workspace, result: Outcome) -> list[Renderable]:
-    """The result of one stage: headline, figures, and what was warned of when it ran earlier."""
+    """Return the result of one stage: headline, figures, and the warnings of an earlier run."""
     manifest = result.manifest
     effort = duration(manifest.duration_s) if result.ran else "current, nothing to do"
     parts: list[Renderable] = [f"[bold]{result.stage}[/]: {escape(manifest.key_figure)} ({effort})"]
@@ -69,13 +69,13 @@ def outcome(workspace: Workspace, result: Outcome) -> list[Renderable]:
         parts += report_of(workspace)
     elif manifest.values:
         parts.append(_figures(manifest.values))
-    if not result.ran:  # those of a stage that just ran stand on stderr already
+    if not result.ran:  # the warnings of a stage that just ran are on stderr already
         parts += [f"[yellow]warning:[/] {escape(text)}" for text in manifest.warnings]
     return parts
 
 
 def outcomes(results: Sequence[Outcome]) -> Table:
-    """The results of `georef run`, a line a stage."""
+    """Return the table of the results of `georef run`, a line for each stage."""
     table = _table("stage", "", "took", "result")
     table.columns[2].justify = "right"
     for result in results:
@@ -88,7 +88,7 @@ def outcomes(results: Sequence[Outcome]) -> Table:
 
 
 def comparison(table: Comparison) -> list[Renderable]:
-    """`georef compare`: a line a configuration, and what sets it apart below."""
+    """Return the tables of `georef compare`: a line for each configuration, and its distinctive features below."""
     heads = [f"{way}\n{name}" for way in ("camera", "model") for name in ("mean H", "median H", "RMSE H", "RMSE V")]
     del heads[1]  # by camera, mean and median hardly differ
     figures = _table("", "test\nPSNR", "\nSSIM", *heads, "check\npoints", "\ntraining")
@@ -102,7 +102,7 @@ def comparison(table: Comparison) -> list[Renderable]:
 
 
 def topics(rows: Iterable[Mapping[str, Any]]) -> Table:
-    """`georef inspect`: a line a topic."""
+    """Return the table of `georef inspect`, a line for each topic."""
     table = _table("topic", "type", "messages", "Hz", "span", "longest gap", "frame", "use", "")
     table.columns[0].overflow = table.columns[1].overflow = "fold"
     for column in table.columns[2:6]:
@@ -132,7 +132,7 @@ def report_of(workspace: Workspace) -> list[Renderable]:
     """Return the tables of a workspace's evaluation.
 
     Raises:
-        InputError: the report was replaced by something else.
+        InputError: the report is damaged.
     """
     return report(read_report(workspace.path(REPORT)))
 
@@ -140,7 +140,7 @@ def report_of(workspace: Workspace) -> list[Renderable]:
 def report(document: EvaluationReport) -> list[Renderable]:
     """Return the tables of a report: test views, check points, cross-validation, residuals of the fit.
 
-    A fit residual is not an accuracy, and a control point no check point: they never share a table.
+    A residual of the fit is not an accuracy, and a control point is not a check point: they never share a table.
     """
     ways = {"camera": document.checkpoints.camera, "model": document.checkpoints.model}
     crossed = document.cross_validation
@@ -160,7 +160,7 @@ def report(document: EvaluationReport) -> list[Renderable]:
 
 
 def duration(seconds: float | None) -> str:
-    """`0.4 s`, `12 s`, `3 min 20 s`, `1 h 05 min`."""
+    """Return a duration as `0.4 s`, `12 s`, `3 min 20 s` or `1 h 05 min`; empty for None."""
     if seconds is None:
         return ""
     if seconds < 10:
@@ -172,7 +172,7 @@ def duration(seconds: float | None) -> str:
 
 
 def _rows(title: str, rows: Mapping[str, Mapping[str, Any]], columns: Mapping[str, str]) -> Group | None:
-    """One table under its title, a line a row, with those columns that any row has."""
+    """Return a table under its title, a line for each row, with the columns that any row has; None without any."""
     heads = {key: head for key, head in columns.items() if any(key in row for row in rows.values())}
     if not heads:
         return None
@@ -185,7 +185,7 @@ def _rows(title: str, rows: Mapping[str, Mapping[str, Any]], columns: Mapping[st
 
 
 def _accuracy(ways: Mapping[str, CheckPointErrors]) -> Group | None:
-    """The check points after the standard, beside the prediction and the bound."""
+    """Return the accuracy by the check points after the standard, beside the prediction and the bound."""
     rows = {way: _accuracy_row(errors) for way, errors in ways.items() if errors.with_survey is not None}
     columns = {head: head for row in rows.values() for head in row}
     title = "Accuracy with the check points' own survey (ASPRS, 2nd ed.), prediction and Cramér–Rao bound, metres"
@@ -207,7 +207,7 @@ def _accuracy_row(errors: CheckPointErrors) -> dict[str, float | str | None]:
 
 
 def _figures(values: Mapping[str, Any]) -> Table:
-    """Plain values as a two-column table; what is nested is for `--json`."""
+    """Return plain values as a table of two columns; nested values are shown by `--json` only."""
     table = _table("", "", header=False)
     table.columns[1].justify = "right"
     for name, value in values.items():

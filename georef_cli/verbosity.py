@@ -1,4 +1,4 @@
-"""How much the program says, and how a record of its log reads."""
+"""Verbosity of the program, and the form of its log lines."""
 
 from __future__ import annotations
 
@@ -8,7 +8,13 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Verbosity:
-    """How the program talks: the options of the group."""
+    """Verbosity of the program: the options of the group.
+
+    Attributes:
+        verbose: show messages for debugging too.
+        quiet: show warnings and errors only.
+        traceback: show the traceback of an error.
+    """
 
     verbose: bool = False
     quiet: bool = False
@@ -16,12 +22,12 @@ class Verbosity:
 
     @property
     def level(self) -> int:
-        """The least severe level that is told on stderr."""
+        """Least severe level that is shown on stderr."""
         return logging.DEBUG if self.verbose else logging.WARNING if self.quiet else logging.INFO
 
 
 class LineFormatter(logging.Formatter):
-    """`message`, or `warning: message`."""
+    """Formatter of log lines: `message`, or `warning: message`."""
 
     def format(self, record: logging.LogRecord) -> str:
         text = super().format(record)

@@ -1,1 +1,1 @@
-"""One module a command."""
+"""Commands of `georef`, one module for each."""

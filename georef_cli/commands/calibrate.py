@@ -1,4 +1,4 @@
-"""`georef calibrate`."""
+"""Command `georef calibrate`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _COMPONENTS = {"boresight": ("x", "y", "z"), "lever-arm": ("forward", "right", "
 
 
 class CalibrateCommand(StageCommand):
-    """`georef calibrate`: prints the table of the estimates too."""
+    """Command of the stage that also prints the table of the estimates."""
 
     def act(self, ctx: click.Context, **values: Any) -> None:
         """Run the stage and print its result."""
@@ -32,7 +32,7 @@ class CalibrateCommand(StageCommand):
 
 
 def _estimates(calibration: RigCalibration) -> Table:
-    """Return a line for each component."""
+    """Return the table of the estimates, a line for each component."""
     table = Table("", "estimated", "± σ", "ingest", "unit", "", box=None, pad_edge=False)
     for column in table.columns[1:4]:
         column.justify = "right"
@@ -64,10 +64,11 @@ command = CalibrateCommand(
     "calibrate",
     """Estimate time offset, boresight and lever arm from the SfM cameras.
 
-    After sfm, the track of the cameras is laid on the navigation that ingest kept from a bag or a trajectory by
-    time. Each parameter comes with its σ; one that the flight does not show is said to be not observable, and
-    is not applied. What ingest was asked to estimate (--time-offset auto, --estimate) is applied to the positions
-    and attitudes that later stages use, other parameters only with --apply. The survey itself stays as recorded.
+    After sfm, the track of the cameras is fitted to the navigation that ingest recorded from a bag or a trajectory
+    by time. Each parameter is stated with its σ. A parameter that the flight does not determine is reported as not
+    observable, and is not applied. Parameters requested in ingest (--time-offset auto, --estimate) are applied to
+    the positions and attitudes of later stages; other parameters only with --apply. The survey itself stays as
+    recorded.
 
     \b
     Examples:

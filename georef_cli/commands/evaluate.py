@@ -1,4 +1,4 @@
-"""`georef evaluate`."""
+"""Command `georef evaluate`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`georef export-ply`."""
+"""Command `georef export-ply`."""
 
 from __future__ import annotations
 
@@ -14,10 +14,14 @@ from pipelines.core.stages import SPLAT
 
 
 class ExportCommand(StageCommand):
-    """The stage with `-o FILE`."""
+    """Command of the stage, with `-o FILE`."""
 
     def act(self, ctx: click.Context, **values: Any) -> None:
-        """Export, copy the result where the user wants it, and print it."""
+        """Run the stage, copy its result to the user's file, and print it.
+
+        Raises:
+            InputError: the file exists already, or cannot be written.
+        """
         workspace, output = values["workspace"], values["output"]
         if output is not None:
             check_target(output, overwrite=values["force"])
@@ -30,10 +34,10 @@ class ExportCommand(StageCommand):
 
 command = ExportCommand(
     "export-ply",
-    """Write the splat as a PLY that knows where it is.
+    """Write the splat as a PLY with its place on Earth.
 
-    The PLY is in an East-North-Up frame in metres; FILE.georef.json beside it tells where that frame lies on
-    Earth, and how well.
+    The PLY is in an East-North-Up frame in metres. FILE.georef.json beside it states the place of that frame on
+    Earth, and its accuracy.
 
     \b
     Examples:

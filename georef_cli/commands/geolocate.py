@@ -1,4 +1,4 @@
-"""`georef geolocate`."""
+"""Command `georef geolocate`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`georef ingest`."""
+"""Command `georef ingest`."""
 
 from __future__ import annotations
 

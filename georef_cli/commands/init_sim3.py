@@ -1,4 +1,4 @@
-"""`georef init-sim3`."""
+"""Command `georef init-sim3`."""
 
 from __future__ import annotations
 

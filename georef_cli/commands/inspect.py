@@ -1,4 +1,4 @@
-"""`georef inspect`."""
+"""Command `georef inspect`."""
 
 from __future__ import annotations
 

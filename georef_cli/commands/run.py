@@ -1,4 +1,4 @@
-"""`georef run`."""
+"""Command `georef run`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pipelines.core.errors import GeorefError
 from pipelines.core.stages import BY_NAME, PIPELINE, StageSpec, stage_slice
 from pipelines.ingest.options import IngestOptions
 
-# Options of later stages that `run` offers too, and the stages that each is for. The others are set in
+# Options of later stages that `run` offers too, with the stages that they are for. All other options are set in
 # georef.toml, or with the stage's own command.
 LATER: dict[str, tuple[str, ...]] = {
     "mapper": ("sfm",),
@@ -41,7 +41,7 @@ def _run(ctx: click.Context, **values: Any) -> None:
         flags,
         force=values["force"],
         progress=progress_for(ctx.obj),
-        around=lambda spec: boundary.written(workspace.log_file(spec)),
+        around=lambda spec: boundary.logged_to_file(workspace.log_file(spec)),
     )
     print_outcomes(workspace, outcomes, as_json=values["as_json"])
 
@@ -57,7 +57,7 @@ def _flags(ctx: click.Context, stages: tuple[StageSpec, ...]) -> dict[str, dict[
     """Return the given options by stage.
 
     Raises:
-        click.UsageError: an option is for stages that are not to run.
+        click.UsageError: an option is for stages that do not run.
     """
     running = {spec.name for spec in stages}
     flags: dict[str, dict[str, Any]] = {}

@@ -1,4 +1,4 @@
-"""`georef sfm`."""
+"""Command `georef sfm`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`georef simulate`."""
+"""Command `georef simulate`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`georef status`."""
+"""Command `georef status`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`georef train`."""
+"""Command `georef train`."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from georef_cli.stage import StageCommand
 
 
 class TrainCommand(StageCommand):
-    """The stage with `--resume`."""
+    """Command of the stage, with `--resume`."""
 
     def act(self, ctx: click.Context, **values: Any) -> None:
-        """Train, or continue to train, and print the result."""
+        """Run or resume the stage, and print its result."""
         outcome = self.run(ctx, values, resume=values["resume"])
         print_outcome(values["workspace"], outcome, as_json=values["as_json"])
 

@@ -173,7 +173,7 @@ PIPELINE: tuple[StageSpec, ...] = (
         folder="export",
         reads=(*whole(SURVEY, MODEL, GAUSSIANS), APPLIED_RIG),
         product=SPLAT,
-        title="Write the splat as a PLY that knows where it is.",
+        title="Write the splat as a PLY with its place on Earth.",
     ),
 )
 
