@@ -62,6 +62,10 @@ class DegenerateGeometryError(GeorefError):
     """Observations that do not determine the unknowns (parallel rays, collinear cameras …)."""
 
 
+class ContradictionError(GeorefError):
+    """Sources that contradict each other as a whole; the message names both sides and what would reconcile them."""
+
+
 class ConvergenceError(GeorefError):
     """Optimisation that diverged, or ended outside the bound that the user set."""
 

@@ -20,3 +20,6 @@ class InitSim3Options(StageOptions):
     )
     control_points: bool = Field(True, description="Use the control points.")
     seed: int = Field(0, ge=0, description="Seed of the RANSAC.")
+    accept_contradiction: bool = Field(
+        False, description="Go on where sources contradict each other, with a caution and larger σ."
+    )

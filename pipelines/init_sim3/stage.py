@@ -8,11 +8,13 @@ adjustment over camera centres and control points. Its starts come from these an
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import Any, Literal
 
 import numpy as np
 
-from pipelines.core.errors import ConvergenceError, DegenerateGeometryError, InputError
+from pipelines.core.cautions import Caution
+from pipelines.core.errors import ContradictionError, ConvergenceError, DegenerateGeometryError, InputError
 from pipelines.core.products import save_json
 from pipelines.core.stages import POINTS, SPARSE
 from pipelines.core.types import FloatArray
@@ -21,8 +23,12 @@ from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
 from pipelines.geometry.similarity import Similarity, jacobian_at, spread_ratio_similarity, umeyama
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.georef.adjustment import OUTLIER_GATE, AdjustedSimilarity, Correspondences, RotationPrior
+from pipelines.georef.adjustment import OUTLIER_GATE, Correspondences, RotationPrior
 from pipelines.georef.alignment import Alignment, align, layout_of
+from pipelines.georef.posterior import solution_covariances
+from pipelines.georef.terms import ControlTerm, FixTerm
+from pipelines.init_sim3.contradictions import judge
+from pipelines.init_sim3.joint import JointAdjustment, adjust_jointly
 from pipelines.init_sim3.options import InitSim3Options
 from pipelines.robust.ransac import RansacOptions, ransac
 from pipelines.robust.statistics import ResidualStats, residual_stats, squared_mahalanobis
@@ -33,7 +39,6 @@ from pipelines.scene.observations import attitude_prior, control_correspondences
 from pipelines.scene.survey import Survey
 
 _GUESS_POINTS = 1000
-_LOUD_EXCESS = 2.0  # times the stated σ
 
 
 def run(stage: StageRun, options: InitSim3Options) -> Summary:
@@ -84,7 +89,8 @@ def estimate_similarity(
             guesses=(guess,) if guess else (),
         )
         initial = _robust_product(model, points, data, alignment)
-        warnings += _warnings(data, alignment.solution)
+        initial, more = _adjusted(survey, model, points, initial, _starts(data, initial, options.seed), options)
+        warnings += more
     _check_residual(initial, options.max_residual)
     return initial, warnings
 
@@ -211,34 +217,89 @@ def _check_residual(initial: InitialSimilarity, limit_m: float | None) -> None:
     )
 
 
-def _warnings(data: Correspondences, solution: AdjustedSimilarity) -> tuple[str, ...]:
-    state, warnings = solution.state, []
-    if state.fix_bias_in_geo is not None:
-        sigma = np.sqrt(np.diag(solution.bias_cov))
-        offset = ", ".join(f"{value:+.3f} ± {s:.3f}" for value, s in zip(state.fix_bias_in_geo, sigma, strict=True))
-        warnings.append(
-            f"all fixes are off the control points by ({offset}) m east, north, up, which σ do not allow: the "
-            "control points decide the position. Check the base station, the vertical datum and the antenna offset"
-        )
-    for kind, what in ((False, "fixes"), (True, "control points")):
-        members = data.control == kind
-        bad = members & ~state.inlier
-        if bad.any():
-            far = np.linalg.norm(solution.residual, axis=1)
-            named = [f"{data.name[index]} ({far[index]:.2f} m)" for index in np.flatnonzero(bad)]
-            more = " …" if len(named) > 8 else ""
-            warnings.append(f"{bad.sum()} of {members.sum()} {what} are outliers: {', '.join(named[:8])}{more}")
-        if members.any():
-            stated = float(np.sqrt(np.median(np.trace(data.cov_in_geo[members], axis1=1, axis2=2)) / 3))
-            excess = state.excess_m[int(kind)]
-            if excess > _LOUD_EXCESS * stated:
-                warnings.append(
-                    f"{what} scatter by {np.hypot(excess, stated):.3f} m an axis, their σ is {stated:.3f} m: "
-                    "σ is optimistic or the SfM model is bent; the covariance is widened"
+def _starts(data: Correspondences, initial: InitialSimilarity, seed: int) -> tuple[InitialSimilarity, ...]:
+    """Return the initial similarity, and those of the fixes and of the control points alone, where they differ."""
+    starts = [initial]
+    for members in (~data.control, data.control):
+        if 3 <= members.sum() < len(data):
+            with suppress(DegenerateGeometryError):
+                solution = align(data.part(members), np.random.default_rng(seed)).solution
+                record = solution.state.geo_from_local.to_record(
+                    "local", "geo", covariance=solution.covariance, pivot=solution.pivot
                 )
-    if state.inlier.sum() < 0.5 * len(data):
-        warnings.append(f"only {state.inlier.sum()} of {len(data)} positions agree with each other")
-    return tuple(warnings)
+                starts.append(initial.model_copy(update={"geo_from_local": record, "layout": "volume"}))
+    return tuple(starts)
+
+
+def _adjusted(
+    survey: Survey,
+    model: SparseModel,
+    points: GeolocatedPoints,
+    initial: InitialSimilarity,
+    starts: tuple[InitialSimilarity, ...],
+    options: InitSim3Options,
+) -> tuple[InitialSimilarity, tuple[str, ...]]:
+    """Return the result of the joint adjustment with its cautions, and warnings of outliers.
+
+    Raises:
+        ContradictionError: sources contradict each other, and the options do not accept that.
+    """
+    try:
+        joint = adjust_jointly(survey, model, starts)
+    except DegenerateGeometryError as error:
+        sentence = f"nothing checks the stated σ: {error}"
+        return initial.model_copy(update={"cautions": (Caution(code="not-checked", sentence=sentence),)}), ()
+    verdict = judge(survey, model, joint)
+    if verdict.contradictions and not options.accept_contradiction:
+        raise ContradictionError(
+            "; ".join(caution.sentence for caution in verdict.contradictions)
+            + ". Correct what is wrong, or accept it with --accept-contradiction, which widens every σ"
+        )
+    cautions = (*verdict.contradictions, *verdict.cautions)
+    return _joint_product(model, points, initial, joint, cautions)
+
+
+def _joint_product(
+    model: SparseModel,
+    points: GeolocatedPoints,
+    initial: InitialSimilarity,
+    joint: JointAdjustment,
+    cautions: tuple[Caution, ...],
+) -> tuple[InitialSimilarity, tuple[str, ...]]:
+    similarity, residuals, warnings = joint.geo_from_local, dict(initial.residuals), []
+    inliers = initial.inliers | {"points": int(_agreeing(model, points, similarity).sum())}
+    outliers: tuple[str, ...] = ()
+    for kind, term, what in (("gnss", FixTerm, "fixes"), ("gcp", ControlTerm, "control points")):
+        names, missed, used = joint.residuals(term)
+        if not len(names):
+            continue
+        residuals[kind], inliers[kind] = residual_stats(missed[used]), int(used.sum())
+        bad = [(name, miss) for name, miss, good in zip(names, missed, used, strict=True) if not good]
+        if bad:
+            listed = ", ".join(f"{name} ({np.linalg.norm(miss):.2f} m)" for name, miss in bad[:8])
+            warnings.append(
+                f"{len(bad)} of {len(names)} {what} are outliers: {listed}{' …' if len(bad) > 8 else ''}"
+            )
+        if kind == "gnss":
+            outliers = tuple(name for name, _ in bad)
+    good = points.inlier
+    residuals["points"] = residual_stats(
+        points.position_in_geo[good] - similarity.apply(model.point_in_local[good])
+    )
+    covariance = solution_covariances(joint.problem)[0]
+    record = similarity.to_record(
+        "local", "geo", covariance=covariance, pivot=joint.problem.similarity.pivot_in_geo
+    )
+    return initial.model_copy(
+        update={
+            "geo_from_local": record,
+            "inliers": inliers,
+            "gnss_outliers": outliers,
+            "residuals": residuals,
+            "variance_factors": joint.factors,
+            "cautions": cautions,
+        }
+    ), tuple(warnings)
 
 
 def _summary(initial: InitialSimilarity, warnings: tuple[str, ...]) -> Summary:

@@ -26,6 +26,13 @@ def chi2_quantile(probability: float, degrees: ArrayLike) -> FloatArray:
     return np.asarray(values[place].reshape(dof.shape), dtype=np.float64)
 
 
+def chi2_probability_above(value: float, degrees: float) -> float:
+    """Return the probability that χ² with `degrees` of freedom, a real number, exceeds `value`."""
+    from scipy.stats import chi2
+
+    return float(chi2.sf(value, degrees))
+
+
 @cache
 def outlier_gate(dimension: int) -> float:
     """Return the χ² beyond which a residual of a dimension is an outlier: 99.9 % of plain noise stays below."""

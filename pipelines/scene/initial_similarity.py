@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from typing import Literal
 
+from pipelines.core.cautions import Caution
 from pipelines.core.products import Covariance3, Product, Rotation
 from pipelines.geometry.similarity import SimilarityRecord
 from pipelines.robust.statistics import ResidualStats
+from pipelines.scene.variance_factors import VarianceFactor
 
 
 class AttitudeRecord(Product):
@@ -37,6 +39,8 @@ class InitialSimilarity(Product):
         layout: extent of the correspondences: they fill a volume, lie in a plane, or on a line.
         attitude_used: whether recorded attitudes contributed to the rotation.
         attitude: rotation of the recorded attitudes, if the robust method needed it.
+        variance_factors: tests of the stated σ, with the factors that apply to all later stages.
+        cautions: limits of the result.
     """
 
     format_version: Literal[1] = 1
@@ -50,3 +54,5 @@ class InitialSimilarity(Product):
     layout: Literal["volume", "plane", "line"]
     attitude_used: bool
     attitude: AttitudeRecord | None = None
+    variance_factors: tuple[VarianceFactor, ...] = ()
+    cautions: tuple[Caution, ...] = ()

@@ -134,6 +134,7 @@ class Survey(Product):
         assumptions: decisions that `ingest` made where the input states nothing.
         warnings: messages that the user should read.
         estimate: parameters of the rig to be estimated after sfm.
+        default_sigmas: groups of measurements whose σ nobody stated.
     """
 
     format_version: Literal[1] = 1
@@ -148,6 +149,7 @@ class Survey(Product):
     assumptions: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     estimate: tuple[RigParameter, ...] = ()
+    default_sigmas: tuple[Literal["fixes", "control points", "marks", "attitudes"], ...] = ()
 
     @model_validator(mode="before")
     @classmethod

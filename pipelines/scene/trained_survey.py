@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from pipelines.core.errors import InputError
+from pipelines.core.errors import InputError, MissingProductError
 from pipelines.core.products import load_json
 from pipelines.core.stages import GAUSSIANS, MODEL, SIM3, SPARSE
 from pipelines.core.workspace import Workspace
@@ -23,6 +23,7 @@ from pipelines.scene.photographs import ImageCache
 from pipelines.scene.pinholes import Pinholes
 from pipelines.scene.survey import Survey
 from pipelines.scene.trained_model import TrainedModel
+from pipelines.scene.variance_factors import Group, applied_factors, with_variance_factors
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.storage import read_gaussians
 
@@ -91,12 +92,20 @@ def load_trained(workspace: Workspace, similarity: Literal["trained", "initial"]
     rotation = matrix_from_quat_xyzw([camera.quat_xyzw for camera in model.cameras])
     translation = np.array([camera.translation for camera in model.cameras])
     return TrainedSurvey(
-        survey=load_survey(workspace),
+        survey=with_variance_factors(load_survey(workspace), _applied(workspace)),
         sfm=sparse,
         model=model,
         poses=CameraPoses(rotation, -np.einsum("nji,nj->ni", rotation, translation)),
         gaussians=read_gaussians(workspace.path(GAUSSIANS)),
     )
+
+
+def _applied(workspace: Workspace) -> dict[Group, float]:
+    """Return the variance factors of `init-sim3`; none for a model that was put there by hand."""
+    try:
+        return applied_factors(load_json(InitialSimilarity, workspace.path(SIM3)).variance_factors)
+    except MissingProductError:
+        return {}
 
 
 def trained_pinholes(trained: TrainedSurvey, images: ImageCache) -> Pinholes:

@@ -1,0 +1,226 @@
+"""Contradictions between sources: fixes against the SfM model, control points against the fixes.
+
+Single outliers are rejected in the adjustment. Where more than a third of a group would have to be rejected, or σ
+would have to be ten times the stated one, one side is wrong as a whole. The known mistakes are tried, and the one
+that fits is named. One contradiction is everyday work: a constant shift of all fixes by up to five metres, of an
+autonomous base station. There the control points decide.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipelines.core.cautions import Caution
+from pipelines.core.errors import DegenerateGeometryError
+from pipelines.core.types import FloatArray
+from pipelines.geometry.rotations import log_so3
+from pipelines.geometry.similarity import Similarity
+from pipelines.geometry.sparse_model import SparseModel
+from pipelines.georef.terms import ControlTerm, FixTerm
+from pipelines.init_sim3.hypotheses import (
+    Hypothesis,
+    explanations_of_fixes,
+    fit,
+    mirrored,
+    shift_sentence,
+)
+from pipelines.init_sim3.joint import JointAdjustment
+from pipelines.init_sim3.plausibility import hangs_upside_down, looks_at_sky
+from pipelines.scene.observations import attitude_prior, fix_correspondences
+from pipelines.scene.survey import Survey
+from pipelines.scene.variance_factors import VarianceFactor
+
+# A stated σ that is too small by this factor, with a scatter of this many metres, is a contradiction.
+_WRONG_SIGMA, _WRONG_SCATTER_M = 10.0, 0.3
+_EVERYDAY_SHIFT_M = 5.0
+_ATTITUDE_SIGMAS, _ATTITUDE_RAD = 4.0, np.radians(8.0)
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Findings on a solution.
+
+    Attributes:
+        contradictions: cautions that end the stage, unless the user accepts them.
+        cautions: further limits of the result.
+    """
+
+    contradictions: tuple[Caution, ...]
+    cautions: tuple[Caution, ...]
+
+
+def judge(survey: Survey, model: SparseModel, joint: JointAdjustment) -> Verdict:
+    """Return the contradictions and cautions of a joint adjustment.
+
+    Args:
+        survey: as stated.
+        model: SfM model.
+        joint: its adjustment.
+    """
+    contradictions: list[Caution] = []
+    cautions: list[Caution] = []
+    fixes = _factor(joint, "fixes")
+    upside_down = _upside_down(survey, model, joint.geo_from_local)
+    contradictions += upside_down
+    if fixes is not None and not upside_down:
+        of_fixes = _fixes_against_model(survey, model, fixes, joint)
+        (contradictions if of_fixes and _is_wrong(fixes) else cautions).extend(of_fixes)
+    control = _control_against_fixes(joint)
+    contradictions += [caution for fatal, caution in control if fatal]
+    cautions += [caution for fatal, caution in control if not fatal]
+    if looks_at_sky(model, joint.geo_from_local) and not upside_down:
+        sentence = "most cameras look up at the sky: if that is not so, the positions are wrong"
+        cautions.append(Caution(code="looks-at-sky", sentence=sentence))
+    cautions += _attitudes(survey, model, joint)
+    cautions += _weak_checks(joint)
+    return Verdict(tuple(contradictions), tuple(cautions))
+
+
+def _factor(joint: JointAdjustment, group: str) -> VarianceFactor | None:
+    return next((factor for factor in joint.factors if factor.group == group), None)
+
+
+def _is_wrong(factor: VarianceFactor) -> bool:
+    """Return whether a group contradicts as a whole, rather than by an optimistic σ."""
+    return factor.sigma_source == "stated" and factor.applied > _WRONG_SIGMA**2
+
+
+def _upside_down(survey: Survey, model: SparseModel, geo_from_local: Similarity) -> list[Caution]:
+    if not hangs_upside_down(model, geo_from_local):
+        return []
+    fixes = fix_correspondences(survey, model)
+    sentence = "the cameras hang upside down in this solution: the positions contradict the SfM model"
+    try:
+        similarity, scatter = fit(fixes.in_local, mirrored(fixes.in_geo))
+        if not hangs_upside_down(model, similarity):
+            sentence += (
+                f"; the mirrored track fits upright (scatter {scatter:.2f} m): east and north, or the axes of the CRS, "
+                "are exchanged"
+            )
+    except DegenerateGeometryError:
+        pass
+    return [Caution(code="upside-down", sentence=sentence)]
+
+
+def _fixes_against_model(
+    survey: Survey, model: SparseModel, factor: VarianceFactor, joint: JointAdjustment
+) -> list[Caution]:
+    """Return the contradiction of fixes and SfM model, with the mistake that explains it."""
+    if factor.applied <= 1.0 and factor.used == factor.count:
+        return []
+    correspondences = fix_correspondences(survey, model)
+    sigma = _sigma_m(correspondences.cov_in_geo)
+    rejected = factor.count - factor.used
+    if factor.applied <= 1.0:
+        return []
+    sides = (
+        f"the fixes scatter by {sigma * factor.applied**0.5:.2f} m an axis about the SfM model, their σ is "
+        f"{sigma:.3g} m"
+    )
+    if rejected:
+        sides += f", and {rejected} of {factor.count} are outliers"
+    explained = explanations_of_fixes(
+        correspondences.in_local, correspondences.in_geo, _times(survey, correspondences.name), survey.origin
+    )
+    if explained and factor.applied**0.5 * sigma > _WRONG_SCATTER_M:
+        best: Hypothesis = explained[0]
+        return [
+            Caution(
+                code=best.code, sentence=f"{sides}; with this they fit to {best.scatter_m:.2f} m: {best.sentence}"
+            )
+        ]
+    remedy = "σ is optimistic, or the fixes or the SfM model are bent; every σ of the result is widened"
+    return [Caution(code="sigma-refuted", sentence=f"{sides}: {remedy}")]
+
+
+def _control_against_fixes(joint: JointAdjustment) -> list[tuple[bool, Caution]]:
+    """Return whether the control points contradict the fixes, as (ends the stage, caution)."""
+    problem, found = joint.problem, []
+    bias = joint.bias
+    if bias is not None:
+        length = float(np.linalg.norm(bias.value))
+        values = ", ".join(
+            f"{value:+.3f} ± {sigma:.3f}" for value, sigma in zip(bias.value, bias.sigma, strict=True)
+        )
+        sentence = (
+            f"all fixes are shifted by ({values}) m east, north, up against the control points, which decide the "
+            f"position. Either side may be wrong: {shift_sentence(np.array(bias.value))}"
+        )
+        found.append((length > _EVERYDAY_SHIFT_M, Caution(code="fixes-shifted", sentence=sentence)))
+    control, factor = problem.term(ControlTerm), _factor(joint, "control points")
+    if control is None or factor is None or (factor.applied <= 1.0 and factor.used == factor.count):
+        return found
+    residual = -control.residuals(problem.estimate()).detach().cpu().numpy()
+    shift = np.median(residual, axis=0)
+    spread = float(np.linalg.norm(residual - shift, axis=1).mean())
+    rejected = [
+        f"{name} ({np.linalg.norm(miss):.2f} m)"
+        for name, miss, used in zip(control.point_id, residual, joint.components[control.kind].used, strict=True)
+        if not used
+    ]
+    shifted = problem.term(FixTerm) is not None and len(residual) >= 2 and np.linalg.norm(shift) > 5 * spread
+    scatter = float(np.sqrt((residual**2).mean()))
+    if shifted:
+        values = ", ".join(f"{value:+.2f}" for value in shift)
+        sentence = (
+            f"control points and fixes are apart by one constant shift of ({values}) m east, north, up: "
+            f"{shift_sentence(shift)}"
+        )
+        found.append((True, Caution(code="control-shifted", sentence=sentence)))
+    elif factor.applied > 1.0:
+        sigma = (
+            _sigma_m(np.array([point.cov_in_geo for point in joint.survey.control_points])) / factor.applied**0.5
+        )
+        who = "which nobody stated" if factor.sigma_source == "default" else "as stated"
+        sentence = (
+            f"the control points miss by {scatter:.2f} m RMS an axis, their σ is {sigma:.3g} m, {who}: coordinates, "
+            "marks or the SfM model are wrong; every σ of the result is widened"
+        )
+        found.append(
+            (_is_wrong(factor) and scatter > _WRONG_SCATTER_M, Caution(code="sigma-refuted", sentence=sentence))
+        )
+    elif rejected:
+        sentence = f"{len(rejected)} of {factor.count} control points are outliers: {', '.join(rejected[:8])}"
+        found.append((False, Caution(code="control-outliers", sentence=sentence)))
+    return found
+
+
+def _attitudes(survey: Survey, model: SparseModel, joint: JointAdjustment) -> list[Caution]:
+    prior = attitude_prior(survey, model)
+    if prior is None:
+        return []
+    turn = log_so3(prior.rotation @ joint.geo_from_local.rotation.T)
+    sigma = float(np.sqrt(prior.cov_rad2[0, 0]))
+    angle = float(np.linalg.norm(turn))
+    if angle <= max(_ATTITUDE_SIGMAS * sigma, _ATTITUDE_RAD):
+        return []
+    sentence = (
+        f"the recorded attitudes are turned by {np.degrees(angle):.1f}° against this solution (σ {np.degrees(sigma):.1f}°): "
+        "the compass, the mount, or the positions (their times, their axes) are wrong"
+    )
+    return [Caution(code="attitudes-contradict", sentence=sentence)]
+
+
+def _weak_checks(joint: JointAdjustment) -> list[Caution]:
+    """Return cautions of σ that little or nothing checks."""
+    tested = [factor for factor in joint.factors if factor.group in ("fixes", "control points")]
+    redundancy, cautions = sum(factor.redundancy for factor in tested), []
+    if redundancy < 6.0:
+        sentence = (
+            f"only {redundancy:.0f} degrees of freedom check the σ of the positions: a wrong position can go unnoticed; "
+            "add fixes or control points"
+        )
+        cautions.append(Caution(code="hardly-checked", sentence=sentence))
+    return cautions
+
+
+def _times(survey: Survey, names: tuple[str, ...]) -> FloatArray:
+    times = {image.name: image.timestamp_s for image in survey.images}
+    return np.array([np.nan if times[name] is None else times[name] for name in names], dtype=np.float64)
+
+
+def _sigma_m(covariances: FloatArray) -> float:
+    """Return the typical σ per axis of covariances (n, 3, 3)."""
+    return float(np.sqrt(np.median(np.trace(covariances, axis1=1, axis2=2)) / 3))
