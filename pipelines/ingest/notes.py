@@ -5,15 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from pipelines.core.cautions import Caution
+
 _SHOWN = 4
 
 
 @dataclass
 class Notes:
-    """Assumptions and warnings, gathered while a survey is read, in order and without repeats."""
+    """Assumptions, warnings and cautions, gathered while a survey is read, in order and without repeats."""
 
     assumptions: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
+    cautions: list[Caution] = field(default_factory=list)
 
     def assume(self, text: str) -> None:
         """Record an assumption."""
@@ -24,6 +27,11 @@ class Notes:
         """Record a warning."""
         if text not in self.warnings:
             self.warnings.append(text)
+
+    def caution(self, caution: Caution) -> None:
+        """Record a limit of every result of this survey."""
+        if caution not in self.cautions:
+            self.cautions.append(caution)
 
     def warn_counted(self, items: Sequence[str], singular: str, plural: str) -> None:
         """Record one warning for all `items`, with their count and the first few; none if there are none.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
@@ -68,9 +69,26 @@ def assemble_survey(
         check_points=point_records(check, origin, options),
         assumptions=tuple(notes.assumptions),
         warnings=tuple(notes.warnings),
+        cautions=tuple(notes.cautions),
         estimate=options.estimated,
+        default_sigmas=_default_sigmas(poses, options),
     )
     return survey, track
+
+
+def _default_sigmas(
+    poses: ImagePoses, options: IngestOptions
+) -> tuple[Literal["fixes", "control points", "marks", "attitudes"], ...]:
+    """Return the groups of measurements whose σ neither a file nor an option states."""
+    stated = options.model_fields_set
+    attitudes = np.isfinite(poses.enu_from_cam).all(axis=(1, 2)).any() and options.sigma_attitude is None
+    groups: list[tuple[bool, Literal["fixes", "control points", "marks", "attitudes"]]] = [
+        ("default" in poses.sigma_source, "fixes"),
+        (not {"sigma_gcp_h", "sigma_gcp_v"} <= stated, "control points"),
+        ("sigma_mark" not in stated, "marks"),
+        (bool(attitudes) and not np.isfinite(poses.sigma_attitude_deg).any(), "attitudes"),
+    ]
+    return tuple(group for is_default, group in groups if is_default)
 
 
 def _without_far_fixes(flight: FlightRecord, notes: Notes) -> ImagePoses:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -12,7 +11,7 @@ from pipelines.core.errors import InputError
 from pipelines.core.types import FloatArray
 from pipelines.formats.pose_table import PoseTable, complete
 from pipelines.geodesy.crs import PointCrs
-from pipelines.geodesy.enu import ecef_from_lla, median_lla
+from pipelines.geodesy.enu import ecef_from_lla
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.trajectory import Trajectory
 from pipelines.ingest.image_poses import AttitudeSource, ImagePoses
@@ -24,8 +23,7 @@ from pipelines.ingest.pose_matching import match_by_name, match_by_time
 from pipelines.ingest.pose_tables import usable_rows
 from pipelines.ingest.position_sigma import with_defaults
 from pipelines.ingest.reference_system import crs_of_table, note_operation
-
-_DISAGREEMENT_M = 2_000.0
+from pipelines.ingest.table_against_exif import compare_with_exif
 
 
 def poses_from_table(table: PoseTable, photos: Sequence[Photo], options: IngestOptions, notes: Notes) -> ImagePoses:
@@ -35,6 +33,7 @@ def poses_from_table(table: PoseTable, photos: Sequence[Photo], options: IngestO
     even if its EXIF has one: two receivers are not mixed unseen.
 
     Raises:
+        ContradictionError: the positions contradict those in EXIF.
         InputError: no row with a position, no CRS for x,y,z, contradicting options, impossible coordinates, or no
             image matched.
     """
@@ -47,7 +46,6 @@ def poses_from_table(table: PoseTable, photos: Sequence[Photo], options: IngestO
     note_operation(crs, lla, notes)
     if table.sigma_enu_m is not None and "foot" in crs.units[0]:
         notes.assume(f"σ in {table.path.name} are in metres, although {crs.name} counts in feet")
-    _compare_with_exif(median_lla(lla), photos, table.path, notes)
     if table.names is not None:
         placed = _by_name(table, ecef_from_lla(lla), photos)
     else:
@@ -63,7 +61,7 @@ def poses_from_table(table: PoseTable, photos: Sequence[Photo], options: IngestO
     )
     from_file = np.asarray(np.isfinite(placed.enu_from_cam).all(axis=(1, 2)))
     attitude_source: list[AttitudeSource] = [table.source if row else "gimbal" for row in from_file]
-    return ImagePoses(
+    poses = ImagePoses(
         position_in_ecef=placed.position_in_ecef,
         sigma_enu_m=sigma,
         sigma_source=sigma_source,
@@ -76,6 +74,8 @@ def poses_from_table(table: PoseTable, photos: Sequence[Photo], options: IngestO
         vertical=crs.vertical,
         recorded=placed.recorded,
     )
+    compare_with_exif(poses, photos, table.path, options, notes)
+    return poses
 
 
 @dataclass(frozen=True)
@@ -150,19 +150,6 @@ def _with_heights(table: PoseTable, photos: Sequence[Photo], crs: PointCrs, note
     if not filled.any():
         raise InputError("has no heights (z), and EXIF has none either", path=table.path)
     return replace(table, xyz=xyz).take(filled)
-
-
-def _compare_with_exif(middle: FloatArray, photos: Sequence[Photo], path: Path, notes: Notes) -> None:
-    """Warn when a table and EXIF disagree by kilometres: a wrong zone passes all other checks."""
-    tagged = [(tags.gps.lat_deg, tags.gps.lon_deg, 0.0) for tags in (photo.tags for photo in photos) if tags.gps]
-    if not tagged:
-        return
-    in_exif, in_table = ecef_from_lla(np.stack([median_lla(tagged), middle * [1.0, 1.0, 0.0]]))
-    distance_m = float(np.linalg.norm(in_exif - in_table))
-    if distance_m > _DISAGREEMENT_M:
-        notes.warn(
-            f"positions in {path.name} are {distance_m / 1000:.0f} km from those in EXIF: wrong CRS or zone?"
-        )
 
 
 def _times(table: PoseTable) -> FloatArray:

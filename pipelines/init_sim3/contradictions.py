@@ -28,6 +28,7 @@ from pipelines.init_sim3.hypotheses import (
 )
 from pipelines.init_sim3.joint import JointAdjustment
 from pipelines.init_sim3.plausibility import hangs_upside_down, looks_at_sky
+from pipelines.robust.statistics import outlier_gate
 from pipelines.scene.observations import attitude_prior, fix_correspondences
 from pipelines.scene.survey import Survey
 from pipelines.scene.variance_factors import VarianceFactor
@@ -124,7 +125,7 @@ def _fixes_against_model(
     explained = explanations_of_fixes(
         correspondences.in_local, correspondences.in_geo, _times(survey, correspondences.name), survey.origin
     )
-    if explained and factor.applied**0.5 * sigma > _WRONG_SCATTER_M:
+    if explained:
         best: Hypothesis = explained[0]
         return [
             Caution(
@@ -139,7 +140,8 @@ def _control_against_fixes(joint: JointAdjustment) -> list[tuple[bool, Caution]]
     """Return whether the control points contradict the fixes, as (ends the stage, caution)."""
     problem, found = joint.problem, []
     bias = joint.bias
-    if bias is not None:
+    within = bias is not None and _within_sigma(joint, np.array(bias.value))
+    if bias is not None and not within:
         length = float(np.linalg.norm(bias.value))
         values = ", ".join(
             f"{value:+.3f} ± {sigma:.3f}" for value, sigma in zip(bias.value, bias.sigma, strict=True)
@@ -187,6 +189,15 @@ def _control_against_fixes(joint: JointAdjustment) -> list[tuple[bool, Caution]]
     return found
 
 
+def _within_sigma(joint: JointAdjustment, shift_m: FloatArray) -> bool:
+    """Return whether a shift that all fixes share is no larger than the σ of one of them allows."""
+    fixes = joint.problem.term(FixTerm)
+    if fixes is None:
+        return False
+    information = (fixes.root_information.transpose(1, 2) @ fixes.root_information).mean(dim=0).cpu().numpy()
+    return bool(shift_m @ information @ shift_m <= outlier_gate(3))
+
+
 def _attitudes(survey: Survey, model: SparseModel, joint: JointAdjustment) -> list[Caution]:
     prior = attitude_prior(survey, model)
     if prior is None:
@@ -213,6 +224,14 @@ def _weak_checks(joint: JointAdjustment) -> list[Caution]:
             "add fixes or control points"
         )
         cautions.append(Caution(code="hardly-checked", sentence=sentence))
+    fixes = joint.problem.term(FixTerm)
+    if fixes is not None and not any(factor.group == "control points" for factor in tested):
+        sigma = _sigma_m(np.array([image.fix.cov_in_geo for image in joint.survey.images if image.fix is not None]))
+        sentence = (
+            "no control point checks an error that all fixes share, of the base station or of a receiver without "
+            f"corrections: σ count the fixes, of {sigma:.2g} m, as independent"
+        )
+        cautions.append(Caution(code="no-control-points", sentence=sentence))
     return cautions
 
 

@@ -20,7 +20,7 @@ from pipelines.robust.statistics import median_chi2
 
 FOOT_M = 0.3048
 # A hypothesis explains a contradiction if it lowers the scatter by so much.
-_EXPLAINS = 5.0
+_EXPLAINS = 3.0
 _CLOCK_S, _CLOCK_STEP_S = 15.0, 0.25
 _ROUNDS = 20
 _LEAST = 4

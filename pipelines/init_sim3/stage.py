@@ -248,14 +248,16 @@ def _adjusted(
         joint = adjust_jointly(survey, model, starts)
     except DegenerateGeometryError as error:
         sentence = f"nothing checks the stated σ: {error}"
-        return initial.model_copy(update={"cautions": (Caution(code="not-checked", sentence=sentence),)}), ()
+        return initial.model_copy(
+            update={"cautions": (*survey.cautions, Caution(code="not-checked", sentence=sentence))}
+        ), ()
     verdict = judge(survey, model, joint)
     if verdict.contradictions and not options.accept_contradiction:
         raise ContradictionError(
             "; ".join(caution.sentence for caution in verdict.contradictions)
             + ". Correct what is wrong, or accept it with --accept-contradiction, which widens every σ"
         )
-    cautions = (*verdict.contradictions, *verdict.cautions)
+    cautions = (*survey.cautions, *verdict.contradictions, *verdict.cautions)
     return _joint_product(model, points, initial, joint, cautions)
 
 

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
+from pipelines.core.cautions import Caution
 from pipelines.core.products import Covariance3, ImageName, Product, Rotation
 from pipelines.core.types import Vector3
 from pipelines.core.validators import image_dir
@@ -133,6 +134,7 @@ class Survey(Product):
         check_points: points that enter no solution.
         assumptions: decisions that `ingest` made where the input states nothing.
         warnings: messages that the user should read.
+        cautions: limits of every result of the survey.
         estimate: parameters of the rig to be estimated after sfm.
         default_sigmas: groups of measurements whose σ nobody stated.
     """
@@ -148,6 +150,7 @@ class Survey(Product):
     check_points: tuple[SurveyedPoint, ...] = ()
     assumptions: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
+    cautions: tuple[Caution, ...] = ()
     estimate: tuple[RigParameter, ...] = ()
     default_sigmas: tuple[Literal["fixes", "control points", "marks", "attitudes"], ...] = ()
 

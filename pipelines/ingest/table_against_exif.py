@@ -1,0 +1,110 @@
+"""Positions of a table against those in the photographs' EXIF, image by image, in view of the σ of both.
+
+EXIF is not used where a table is given. But two receivers that disagree by far more than their σ are a contradiction
+that nothing later would notice: heights in feet, another zone, exchanged axes, times that are off.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.core.cautions import Caution
+from pipelines.core.errors import ContradictionError
+from pipelines.core.types import FloatArray
+from pipelines.geodesy.enu import ecef_from_enu_rotation, lla_from_ecef
+from pipelines.ingest.image_poses import ImagePoses
+from pipelines.ingest.notes import Notes
+from pipelines.ingest.options import IngestOptions
+from pipelines.ingest.photo_folder import Photo
+from pipelines.ingest.photo_poses import poses_from_tags
+from pipelines.robust.statistics import mad_sigma
+
+_SIGMAS, _LEAST_M = 4.0, 1.0
+_LEAST_IMAGES = 3
+_MOST_CONTRADICTING = 1 / 3
+# Between the ellipsoid and any geoid lie at most 110 m.
+_GEOID_M = 110.0
+_FOOT_M = 0.3048
+_KILOMETRES_M = 2_000.0
+
+
+def compare_with_exif(
+    poses: ImagePoses, photos: Sequence[Photo], path: Path, options: IngestOptions, notes: Notes
+) -> None:
+    """Compare the positions of a table with those of EXIF.
+
+    Args:
+        poses: by the table.
+        photos: the photographs.
+        path: of the table.
+        options: of `ingest`.
+        notes: cautions of what differs.
+
+    Raises:
+        ContradictionError: most positions differ beyond the σ of both, and the options do not accept that.
+    """
+    exif = poses_from_tags(photos, options, Notes())
+    both = np.flatnonzero(poses.located & exif.located)
+    if len(both) < _LEAST_IMAGES:
+        return
+    lla = lla_from_ecef(exif.position_in_ecef[both])
+    enu_from_ecef = np.swapaxes(ecef_from_enu_rotation(lla), 1, 2)
+    apart = np.einsum("nij,nj->ni", enu_from_ecef, poses.position_in_ecef[both] - exif.position_in_ecef[both])
+    sigma = np.hypot(poses.sigma_enu_m[both], exif.sigma_enu_m[both])
+    found = [*_horizontal(apart, sigma, path), *_heights(poses, lla, apart, sigma, both, path)]
+    for fatal, caution in found:
+        if fatal and not options.accept_contradiction:
+            raise ContradictionError(
+                f"{path}: {caution.sentence}. Correct what is wrong, or go on with --accept-contradiction"
+            )
+        notes.caution(caution)
+
+
+def _horizontal(apart: FloatArray, sigma: FloatArray, path: Path) -> list[tuple[bool, Caution]]:
+    distance = np.hypot(apart[:, 0], apart[:, 1])
+    allowed = np.maximum(_SIGMAS * np.hypot(sigma[:, 0], sigma[:, 1]), _LEAST_M)
+    contradicting = distance > allowed
+    if contradicting.mean() <= _MOST_CONTRADICTING:
+        return []
+    typical = float(np.median(distance))
+    scatter = float(np.hypot(mad_sigma(apart[:, 0]), mad_sigma(apart[:, 1])))
+    if typical > _KILOMETRES_M:
+        cause = f"are {typical / 1000:.0f} km from those in EXIF: another CRS or zone, or exchanged axes?"
+    elif scatter < 0.2 * typical:
+        east, north = np.median(apart[:, :2], axis=0)
+        cause = (
+            f"are shifted by {east:+.1f} m east and {north:+.1f} m north against EXIF: another datum, or a base "
+            "station in a wrong place?"
+        )
+    else:
+        cause = (
+            f"differ from those in EXIF by {typical:.1f} m, in changing directions: times that are off, exchanged "
+            "axes, or rows of other images?"
+        )
+    sentence = f"{int(contradicting.sum())} of {len(apart)} positions in {path.name} {cause}"
+    return [(True, Caution(code="table-against-exif", sentence=sentence))]
+
+
+def _heights(
+    poses: ImagePoses, lla: FloatArray, apart: FloatArray, sigma: FloatArray, both: np.ndarray, path: Path
+) -> list[tuple[bool, Caution]]:
+    offset, spread = float(np.median(apart[:, 2])), mad_sigma(apart[:, 2])
+    allowed = max(_SIGMAS * float(np.median(sigma[:, 2])), _LEAST_M)
+    if abs(offset) <= allowed:
+        return []
+    in_table, in_exif = lla_from_ecef(poses.position_in_ecef[both])[:, 2], lla[:, 2]
+    for factor, cause in (
+        (_FOOT_M, "in feet, and taken for metres"),
+        (1 / _FOOT_M, "in metres, and taken for feet"),
+    ):
+        if abs(float(np.median(in_table * factor - in_exif))) < max(allowed, 0.05 * abs(offset)):
+            sentence = f"the heights in {path.name} are {cause}: those in EXIF are {factor:.4g} times as large"
+            return [(True, Caution(code="feet", sentence=sentence))]
+    sentence = (
+        f"the heights in {path.name} differ from those in EXIF by {offset:+.1f} m (± {spread:.1f} m): one is above the "
+        "ellipsoid, the other above a geoid, the take-off or a barometer's zero; see --vertical"
+    )
+    return [(abs(offset) > _GEOID_M, Caution(code="heights-apart", sentence=sentence))]
