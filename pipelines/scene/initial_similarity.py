@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
+from pipelines.core.cautions import Caution
 from pipelines.core.products import Covariance3, Product, Rotation
 from pipelines.geometry.similarity import SimilarityRecord
 from pipelines.robust.statistics import ResidualStats
@@ -37,6 +38,7 @@ class InitialSimilarity(Product):
         layout: extent of the correspondences: they fill a volume, lie in a plane, or on a line.
         attitude_used: whether recorded attitudes contributed to the rotation.
         attitude: rotation of the recorded attitudes, if the robust method needed it.
+        cautions: limits of the similarity.
     """
 
     format_version: Literal[1] = 1
@@ -50,3 +52,4 @@ class InitialSimilarity(Product):
     layout: Literal["volume", "plane", "line"]
     attitude_used: bool
     attitude: AttitudeRecord | None = None
+    cautions: tuple[Caution, ...] = ()
