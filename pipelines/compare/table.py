@@ -122,7 +122,7 @@ def markdown(table: Comparison) -> str:
     lines = [
         "# Comparison\n",
         "Check points, which entered no solve, in metres: by *camera* their image marks intersected with the "
-        "cameras, by *model* where the Gaussians' surface lies behind the marks.\n",
+        "cameras, by *model* where the Gaussians' rendered surface lies behind the marks.\n",
         _line(heads),
         _line(["---", *["---:"] * (len(heads) - 1)]),
         *(_line([f"**{row.configuration}**", *cells(row)]) for row in table.rows),
