@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import click
 from rich.console import Console, RenderableType
 
 from georef_cli import tables
+from pipelines.core.cautions import Caution
 from pipelines.core.products import dump_json
 from pipelines.core.runner import Outcome
+from pipelines.core.staleness import cautions_by_stage
 from pipelines.core.workspace import Workspace
 
 PIPED_WIDTH = 120
@@ -42,20 +44,32 @@ def document_of(outcome: Outcome) -> dict[str, Any]:
     }
 
 
-def print_outcome(workspace: Workspace, outcome: Outcome, *, as_json: bool) -> None:
-    """Print the result of a stage."""
+def document_of_cautions(by_stage: Mapping[str, Sequence[Caution]]) -> list[dict[str, str]]:
+    """Return the JSON form of cautions by stage."""
+    return [
+        {"stage": stage, **caution.model_dump()} for stage, cautions in by_stage.items() for caution in cautions
+    ]
+
+
+def print_outcome(workspace: Workspace, outcome: Outcome, *more: RenderableType, as_json: bool) -> None:
+    """Print the result of a stage, then the cautions of the workspace."""
+    cautions = cautions_by_stage(workspace)
     if as_json:
-        print_json(document_of(outcome))
+        print_json({**document_of(outcome), "cautions": document_of_cautions(cautions)})
     else:
-        print_rich(*tables.outcome(workspace, outcome))
+        print_rich(*tables.outcome(workspace, outcome), *more, *tables.cautions(cautions))
 
 
 def print_outcomes(workspace: Workspace, outcomes: Sequence[Outcome], *, as_json: bool) -> None:
-    """Print the results of several stages."""
+    """Print the results of several stages, and last the cautions of the workspace."""
+    cautions = cautions_by_stage(workspace)
     if as_json:
-        print_json({"workspace": str(workspace.root), "stages": [document_of(outcome) for outcome in outcomes]})
+        stages = [document_of(outcome) for outcome in outcomes]
+        document = {"workspace": str(workspace.root), "stages": stages}
+        print_json({**document, "cautions": document_of_cautions(cautions)})
         return
     print_rich(tables.outcomes(outcomes))
     for outcome in outcomes:
         if outcome.stage == "evaluate":
             print_rich(*tables.report_of(workspace))
+    print_rich(*tables.cautions(cautions))

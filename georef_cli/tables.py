@@ -11,6 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from pipelines.compare.table import Comparison, cells, remarks_on
+from pipelines.core.cautions import Caution
 from pipelines.core.runner import Outcome
 from pipelines.core.stages import REPORT
 from pipelines.core.staleness import StageState
@@ -43,10 +44,11 @@ IMAGE_COLUMNS = {"views": "views", "psnr": "PSNR dB", "ssim": "SSIM", "lpips": "
 Renderable = Group | Table | str
 
 
-def states(rows: Iterable[StageState]) -> Table:
-    """Return the table of `georef status`: stage, state, time of the end, duration, key figure."""
-    table = _table("stage", "state", "finished", "took", "result")
-    table.columns[3].justify = "right"
+def states(rows: Iterable[StageState], cautions: Mapping[str, Sequence[Caution]]) -> Table:
+    """Return the table of `georef status`: stage, state, end, duration, number of new cautions if any, key figure."""
+    table = _table("stage", "state", "finished", "took", *(["cautions"] if cautions else []), "result")
+    for column in table.columns[3:-1]:
+        column.justify = "right"
     for row in rows:
         remarks = [escape(text) for text in (row.key_figure, row.reason) if text]
         style = STATE_STYLE[row.state]
@@ -55,9 +57,19 @@ def states(rows: Iterable[StageState]) -> Table:
             f"[{style}]{row.state}[/]",
             _when(row.finished),
             duration(row.duration_s),
+            *([str(len(cautions.get(row.stage, ())) or "")] if cautions else []),
             " · ".join(remarks),
         )
     return table
+
+
+def cautions(by_stage: Mapping[str, Sequence[Caution]]) -> list[Renderable]:
+    """Return the cautions, one line each."""
+    return [
+        f"[bold yellow]caution:[/] {escape(caution.sentence)} ({stage}, {caution.code})"
+        for stage, of_stage in by_stage.items()
+        for caution in of_stage
+    ]
 
 
 def outcome(workspace: Workspace, result: Outcome) -> list[Renderable]:

@@ -14,6 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
+from pipelines.core.cautions import Caution
 from pipelines.core.options import StageOptions
 from pipelines.core.products import dump_json
 from pipelines.core.stages import PIPELINE, STAGES, StageSpec, producer_of, products_of
@@ -78,7 +79,7 @@ def _in_form(spec: StageSpec, text: str) -> str:
         return text
     from tests.reports import report_with
 
-    return dump_json(report_with(cautions=(text,)).model_dump(mode="json"))
+    return dump_json(report_with(cautions=(Caution(code="fake", sentence=text),)).model_dump(mode="json"))
 
 
 def _digest(text: str) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
+from pipelines.core.cautions import Caution
 from pipelines.core.stages import REPORT
 from pipelines.core.workspace import Workspace
 from pipelines.robust.statistics import ResidualStats
@@ -51,7 +52,7 @@ def report_with(
     model: CheckPointErrors | None = None,
     crossed: CrossValidation | None = None,
     gnss: dict[str, Any] | None = None,
-    cautions: tuple[str, ...] = (),
+    cautions: tuple[Caution, ...] = (),
 ) -> EvaluationReport:
     """A report with the given parts; nothing was measured of the others.
 
@@ -67,12 +68,13 @@ def report_with(
         ),
         checkpoints=CheckPoints(camera=camera or check_points_with(), model=model or check_points_with()),
         cross_validation=crossed,
-        accuracy=AccuracySummary(cells=0, reason="the scene has too few points", cautions=cautions),
+        accuracy=AccuracySummary(cells=0, reason="the scene has too few points"),
         fit=Fit(
             gnss=FixResiduals(**{**no_residuals, "outliers": 0, **(gnss or {})}),
             gcp=ControlResiduals(**no_residuals, points=()),
         ),
         similarity=SimilaritySigma(sigma_ln_scale=1e-4, sigma_translation_m=(0.01, 0.01, 0.02)),
+        cautions=cautions,
     )
 
 

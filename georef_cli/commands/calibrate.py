@@ -5,16 +5,23 @@ from __future__ import annotations
 from typing import Any
 
 import click
+from rich.console import RenderableType
 from rich.markup import escape
 from rich.table import Table
 
-from georef_cli.output import print_outcome, print_rich
+from georef_cli.output import print_outcome
 from georef_cli.stage import StageCommand
 from pipelines.core.products import load_json
 from pipelines.core.stages import RIG
+from pipelines.core.workspace import Workspace
 from pipelines.scene.rig import RigCalibration
 
 _COMPONENTS = {"boresight": ("x", "y", "z"), "lever-arm": ("forward", "right", "down"), "time-offset": ("",)}
+
+
+def _tables(workspace: Workspace) -> tuple[RenderableType, ...]:
+    calibration = load_json(RigCalibration, workspace.path(RIG))
+    return (_estimates(calibration), _residuals(calibration)) if calibration.estimates else ()
 
 
 class CalibrateCommand(StageCommand):
@@ -22,13 +29,8 @@ class CalibrateCommand(StageCommand):
 
     def act(self, ctx: click.Context, **values: Any) -> None:
         """Run the stage and print its result."""
-        workspace, outcome = values["workspace"], self.run(ctx, values)
-        print_outcome(workspace, outcome, as_json=values["as_json"])
-        if values["as_json"]:
-            return
-        calibration = load_json(RigCalibration, workspace.path(RIG))
-        if calibration.estimates:
-            print_rich(_estimates(calibration), _residuals(calibration))
+        workspace, outcome, as_json = values["workspace"], self.run(ctx, values), values["as_json"]
+        print_outcome(workspace, outcome, *(() if as_json else _tables(workspace)), as_json=as_json)
 
 
 def _estimates(calibration: RigCalibration) -> Table:

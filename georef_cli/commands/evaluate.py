@@ -8,10 +8,10 @@ command = StageCommand(
     "evaluate",
     """Measure test views and check points.
 
-    Check points are measured by camera (their marks intersected) and by model (the depth of the Gaussians at
-    the marks), and stated as the ASPRS standard asks. The predicted accuracy over the scene is drawn in
-    evaluate/accuracy.png. A survey without check points has --cross-validate: every control point measured by a
-    solution that does not know it. The report is evaluate/report.json.
+    Check points are measured by camera (their marks intersected) and by model (the rendered depth of the
+    Gaussians at the marks, not their centres), and stated as the ASPRS standard asks. The predicted accuracy over
+    the scene is drawn in evaluate/accuracy.png. A survey without check points has --cross-validate: every control
+    point measured by a solution that does not know it. The report is evaluate/report.json.
 
     \b
     Examples:

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 
 from pipelines.compare.configurations import BY_CONFIGURATION, COMMON_TRAIN_OPTIONS, Configuration
 from pipelines.compare.table import ComparedRow, Comparison, JsonScalar, point_accuracy, write_comparison
+from pipelines.core.cautions import union
 from pipelines.core.errors import ConvergenceError, DegenerateGeometryError, GeorefError
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.runner import Outcome, run_pipeline, run_stage
@@ -199,4 +200,5 @@ def _row(configuration: Configuration, plan: Sequence[PlannedStage], runner: _Pl
         gaussians=training.get("gaussians"),
         training_s=training.get("seconds") if configuration.trained_by is None else None,
         warnings=tuple(text for manifest in manifests.values() for text in manifest.warnings),
+        cautions=union(*(manifest.cautions for manifest in manifests.values())),
     )

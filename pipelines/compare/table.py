@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Literal
 
+from pipelines.core.cautions import Caution
 from pipelines.core.products import Product
 from pipelines.core.workspace import replace_text
 from pipelines.plots.bars import Panel, write_bars
@@ -35,6 +36,7 @@ class ComparedRow(Product):
         iterations, gaussians: of the training.
         training_s: duration; None if the training is that of another configuration.
         warnings: of its stages.
+        cautions: of its stages, each once.
     """
 
     configuration: str
@@ -49,6 +51,7 @@ class ComparedRow(Product):
     gaussians: int | None = None
     training_s: float | None = None
     warnings: tuple[str, ...] = ()
+    cautions: tuple[Caution, ...] = ()
 
 
 class Comparison(Product):
@@ -119,7 +122,7 @@ def markdown(table: Comparison) -> str:
     lines = [
         "# Comparison\n",
         "Check points, which entered no solve, in metres: by *camera* their image marks intersected with the "
-        "cameras, by *model* where the Gaussians' surface lies behind the marks.\n",
+        "cameras, by *model* where the Gaussians' rendered surface lies behind the marks.\n",
         _line(heads),
         _line(["---", *["---:"] * (len(heads) - 1)]),
         *(_line([f"**{row.configuration}**", *cells(row)]) for row in table.rows),
@@ -148,8 +151,9 @@ def cells(row: ComparedRow) -> tuple[str, ...]:
 
 
 def remarks_on(row: ComparedRow) -> tuple[str, ...]:
-    """Return the reason why a row is empty, and the warnings of its stages."""
-    return (*(() if row.failure is None else (f"failed: {row.failure}",)), *row.warnings)
+    """Return the reason why a row is empty, and the warnings and cautions of its stages."""
+    failure = () if row.failure is None else (f"failed: {row.failure}",)
+    return (*failure, *row.warnings, *(caution.sentence for caution in row.cautions))
 
 
 def _line(parts: Iterable[str]) -> str:

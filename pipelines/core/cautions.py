@@ -1,17 +1,26 @@
-"""Cautions: limits of a result that a machine and the next reader must see."""
+"""Cautions: limits of a result that its next reader must know. Products carry those of their inputs on."""
 
 from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import StringConstraints
 
 from pipelines.core.products import Product
 
 
 class Caution(Product):
-    """Limit of a result.
+    """Limit of a result, for machines and for people.
 
     Attributes:
-        code: stable kebab-case word for machines.
+        code: kind of the limit, for machines: lower-case words joined by hyphens (docs/accuracy.md lists them).
         sentence: one full sentence for people.
     """
 
-    code: str
-    sentence: str
+    code: Annotated[str, StringConstraints(pattern=r"^[a-z0-9]+(-[a-z0-9]+)*$")]
+    sentence: Annotated[str, StringConstraints(min_length=1)]
+
+
+def union(*groups: tuple[Caution, ...]) -> tuple[Caution, ...]:
+    """Return the cautions of all groups in order, each once."""
+    return tuple(dict.fromkeys(caution for group in groups for caution in group))

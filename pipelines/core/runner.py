@@ -14,11 +14,22 @@ from importlib import metadata
 from typing import Any
 
 from pipelines import __version__
+from pipelines.core.cautions import union
 from pipelines.core.errors import GeorefError, InputError, MissingProductError
 from pipelines.core.fingerprints import Memo
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.stages import StageSpec, producer_of, products_of
-from pipelines.core.staleness import BY_HAND, Flags, Request, must_exist, request, stage_config, status, why_stale
+from pipelines.core.staleness import (
+    BY_HAND,
+    Flags,
+    Request,
+    cautions_by_stage,
+    must_exist,
+    request,
+    stage_config,
+    status,
+    why_stale,
+)
 from pipelines.core.workspace import Manifest, Resume, StageRun, Summary, Workspace, now
 
 log = logging.getLogger(__name__)
@@ -152,6 +163,10 @@ def _execute(workspace: Workspace, asked: Request, resume: Resume, progress: Pro
             raise RuntimeError(f"{spec.module} did not write {product}")
     for warning in summary.warnings:
         log.warning("%s: %s", spec.name, warning)
+    carried = set(union(*cautions_by_stage(workspace, before=spec).values()))
+    for caution in summary.cautions:
+        if caution not in carried:
+            log.warning("%s: %s", spec.name, caution.sentence)
     manifest = Manifest(
         stage=spec.name,
         config=resolved,
@@ -162,6 +177,7 @@ def _execute(workspace: Workspace, asked: Request, resume: Resume, progress: Pro
         key_figure=summary.key_figure,
         values=summary.values,
         warnings=list(summary.warnings),
+        cautions=summary.cautions,
     )
     workspace.commit(spec, manifest)
     log.info("%s: %s (%.1f s)", spec.name, summary.key_figure, manifest.duration_s)

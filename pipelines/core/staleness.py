@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta
 from typing import Any, Literal
 
+from pipelines.core.cautions import Caution, union
 from pipelines.core.errors import InputError, MissingProductError
 from pipelines.core.fingerprints import Memo, fingerprints
 from pipelines.core.options import StageOptions, load_toml, resolve
@@ -93,10 +94,37 @@ def status(workspace: Workspace, memo: Memo | None = None, before: StageSpec | N
     look = _Look(workspace, {} if memo is None else memo, workspace.requests())
     writer = workspace.writer()
     rows = []
-    for spec in PIPELINE[: PIPELINE.index(before) if before in PIPELINE else len(PIPELINE)]:
+    for spec in _ahead_of(before):
         row = look.at(spec)
         rows.append(replace(row, state="running", reason="") if spec.name == writer else row)
     return rows
+
+
+def cautions_by_stage(workspace: Workspace, before: StageSpec | None = None) -> dict[str, tuple[Caution, ...]]:
+    """Return the cautions of a workspace's products, each under the first stage that has it, in order.
+
+    A damaged manifest tells none; `status` names it.
+
+    Args:
+        workspace: holds the manifests.
+        before: stage of the pipeline; only the stages ahead of it are read.
+    """
+    by_stage: dict[str, tuple[Caution, ...]] = {}
+    known: set[Caution] = set()
+    for spec in _ahead_of(before):
+        try:
+            manifest = workspace.manifest(spec)
+        except InputError:
+            continue
+        new = () if manifest is None else tuple(c for c in union(manifest.cautions) if c not in known)
+        known.update(new)
+        if new:
+            by_stage[spec.name] = new
+    return by_stage
+
+
+def _ahead_of(before: StageSpec | None) -> tuple[StageSpec, ...]:
+    return PIPELINE[: PIPELINE.index(before) if before in PIPELINE else len(PIPELINE)]
 
 
 def must_exist(workspace: Workspace) -> None:

@@ -18,6 +18,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict
 
+from pipelines.core.cautions import Caution
 from pipelines.core.errors import InputError, MissingProductError
 from pipelines.core.lock import WriteLock
 from pipelines.core.options import CONFIG_FILE
@@ -47,6 +48,7 @@ class Manifest(BaseModel):
         key_figure: one line for tables.
         values: plain numbers and strings for `--json`.
         warnings: messages that the user should read.
+        cautions: limits of the product, those of its inputs among them.
     """
 
     model_config = ConfigDict(extra="forbid")
@@ -61,6 +63,7 @@ class Manifest(BaseModel):
     key_figure: str
     values: dict[str, Any]
     warnings: list[str]
+    cautions: tuple[Caution, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -71,11 +74,13 @@ class Summary:
         key_figure: one line for tables, e.g. "48 of 48 registered".
         values: plain numbers and strings for `--json`.
         warnings: messages that the user should read.
+        cautions: limits of the product, those of its inputs among them.
     """
 
     key_figure: str
     values: dict[str, Any] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
+    cautions: tuple[Caution, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from pipelines.core.cautions import Caution
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.products import load_json
 from pipelines.core.stages import GAUSSIANS, MODEL, SPLAT
@@ -82,7 +83,7 @@ def run(stage: StageRun, options: ExportPlyOptions) -> Summary:
         "sigma_h_m": None if accuracy is None else accuracy.sigma_h_m,
         "sigma_v_m": None if accuracy is None else accuracy.sigma_v_m,
     }
-    return Summary(f"{len(export.gaussians)} Gaussians{sigma}", values)
+    return Summary(f"{len(export.gaussians)} Gaussians{sigma}", values, cautions=export.sidecar.cautions)
 
 
 def export_splat(
@@ -110,7 +111,8 @@ def export_splat(
     origin_lla = _rounded_origin(scene_in_geo, survey.origin)
     ply_from_geo = _enu_at(origin_lla).inverse() @ _enu_at(lla_of(survey.origin))
     in_ply = transformed(kept, ply_from_geo @ geo_from_model)
-    sidecar = _sidecar(origin_lla, _covariance_in_ply(model.geo_from_model, ply_from_geo), survey)
+    covariance = _covariance_in_ply(model.geo_from_model, ply_from_geo)
+    sidecar = _sidecar(origin_lla, covariance, survey, model.cautions)
     return ExportedSplat(in_ply, sidecar, len(gaussians) - len(kept))
 
 
@@ -137,7 +139,9 @@ def _covariance_in_ply(geo_from_model: SimilarityRecord, ply_from_geo: Similarit
     return np.asarray(turn @ about_origin @ turn.T)
 
 
-def _sidecar(origin_lla: FloatArray, covariance: FloatArray | None, survey: Survey) -> GeorefSidecar:
+def _sidecar(
+    origin_lla: FloatArray, covariance: FloatArray | None, survey: Survey, cautions: tuple[Caution, ...]
+) -> GeorefSidecar:
     ecef_from_ply = _enu_at(origin_lla)
     return GeorefSidecar(
         origin=_vector(ecef_from_ply.translation),
@@ -148,6 +152,7 @@ def _sidecar(origin_lla: FloatArray, covariance: FloatArray | None, survey: Surv
         crs_wkt=parse_crs(ECEF).wkt,
         covariance=None if covariance is None else tuple(map(_row, covariance)),
         accuracy=None if covariance is None else predicted_accuracy(covariance, np.zeros(3)),
+        cautions=cautions,
     )
 
 

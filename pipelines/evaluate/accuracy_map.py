@@ -62,8 +62,8 @@ class AccuracyGrid:
         raster[self.cell[:, 1], self.cell[:, 0]] = values
         return raster
 
-    def summary(self, cautions: tuple[str, ...]) -> AccuracySummary:
-        """Return least, median and largest σ, with `cautions`, the limits of the prediction."""
+    def summary(self) -> AccuracySummary:
+        """Return least, median and largest σ."""
         horizontal, vertical = self.sigma_h_m, self.sigma_v_m
         return AccuracySummary(
             cells=len(self.cell),
@@ -75,7 +75,6 @@ class AccuracyGrid:
             median_sigma_v_m=float(np.median(vertical)),
             largest_sigma_v_m=float(vertical.max()),
             reason=None,
-            cautions=cautions,
         )
 
 

@@ -57,18 +57,14 @@ def propagate_errors(
         return NoErrorPropagation(str(error))
 
 
-def accuracy_summary(propagation: ErrorPropagation | NoErrorPropagation, *, of_initial: bool) -> AccuracySummary:
+def accuracy_summary(propagation: ErrorPropagation | NoErrorPropagation) -> AccuracySummary:
     """Return the summary of the predicted accuracy over the scene.
 
     Args:
         propagation: gives the grid of σ, or the reason why there is none.
-        of_initial: whether the points are measured with the initial similarity.
     """
     if isinstance(propagation, NoErrorPropagation):
-        return AccuracySummary(cells=0, reason=propagation.reason, cautions=())
-    cautions = propagation.prediction.cautions
-    if of_initial:
-        cautions += ("measured with the initial similarity: the prediction is that of the trained one",)
+        return AccuracySummary(cells=0, reason=propagation.reason)
     if propagation.grid is None:
-        return AccuracySummary(cells=0, reason="the scene has too few points", cautions=cautions)
-    return propagation.grid.summary(cautions)
+        return AccuracySummary(cells=0, reason="the scene has too few points")
+    return propagation.grid.summary()

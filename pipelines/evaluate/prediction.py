@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy.linalg import block_diag
 
+from pipelines.core.cautions import Caution
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.evaluate.intersection_jacobian import IntersectionJacobian, intersection_jacobian
 from pipelines.evaluate.networks import control_rays, mean_focal_px, network_of_points
@@ -32,18 +34,22 @@ class AccuracyPrediction:
         self._posterior = posterior(solved.problem, self._lens)
 
     @property
-    def cautions(self) -> tuple[str, ...]:
-        """Limits of the prediction: sentences on assumptions that this training does not meet."""
-        cautions, options = [], self._solved.options
+    def cautions(self) -> tuple[Caution, ...]:
+        """Limits of the prediction: assumptions that this training does not meet."""
+        limits, options = {}, self._solved.options
         if not self._basis.shape[2]:
-            cautions.append("the cameras were held: the prediction leaves out their own error, and is too good")
-        if not options.geo_loss:
-            cautions.append("trained without geographic losses: the prediction is that of the initial similarity")
-        elif options.weighting != "whitened":
-            cautions.append(
-                f"trained with --weighting {options.weighting}: the prediction is that of whitened residuals"
+            limits["prediction-holds-cameras"] = (
+                "The cameras were held: the prediction leaves out their own error, and is too good."
             )
-        return tuple(cautions)
+        if not options.geo_loss:
+            limits["prediction-of-initial-similarity"] = (
+                "Trained without geographic losses: the prediction is that of the initial similarity."
+            )
+        elif options.weighting != "whitened":
+            limits["prediction-of-whitened-residuals"] = (
+                f"Trained with --weighting {options.weighting}: the prediction is that of whitened residuals."
+            )
+        return tuple(Caution(code=code, sentence=sentence) for code, sentence in limits.items())
 
     def of_marked_points(self, point_in_geo: FloatArray, rays: MarkRays) -> FloatArray:
         """Return covariances (J, 3, 3) in m² of points intersected from their marks, errors of the marks included.
@@ -57,10 +63,22 @@ class AccuracyPrediction:
         rays = rays.part(np.flatnonzero(np.isfinite(point_in_geo[rays.point]).all(axis=1)))
         position = np.nan_to_num(point_in_geo)
         jacobian = jacobian_of_points(self._solved, position, rays.point, rays.camera, rays.sigma_px)
-        axes = _geo_by_model(self._solved)
-        cov = self._covariance(position, jacobian) + axes @ jacobian.cov_of_marks @ axes.T
+        cov = self._covariance(position, jacobian) + self._cov_of_marks(jacobian)
         cov[rays.marks_of_point < 2] = np.nan
         return cov
+
+    def jointly_of_marked_points(self, point_in_geo: FloatArray, rays: MarkRays) -> FloatArray:
+        """Return the joint covariance (3 J, 3 J) in m² of points intersected from their marks.
+
+        The points share the errors of similarity, cameras and lens. Those of the marks are independent.
+
+        Args:
+            point_in_geo: (J, 3) metres; all are determined by their marks.
+            rays: of the marks.
+        """
+        jacobian = jacobian_of_points(self._solved, point_in_geo, rays.point, rays.camera, rays.sigma_px)
+        joint = self._posterior.jointly_at(point_in_geo, *self._derivatives(jacobian))
+        return np.asarray(joint + block_diag(*self._cov_of_marks(jacobian)))
 
     def of_scene(self, point_in_geo: FloatArray, point: IntArray, camera: IntArray) -> FloatArray:
         """Return the covariance (J, 3, 3) in m² of points of the scene, without errors of marks.
@@ -75,10 +93,17 @@ class AccuracyPrediction:
         return self._covariance(point_in_geo, jacobian)
 
     def _covariance(self, point_in_geo: FloatArray, jacobian: IntersectionJacobian) -> FloatArray:
+        return self._posterior.at(point_in_geo, *self._derivatives(jacobian))
+
+    def _derivatives(self, jacobian: IntersectionJacobian) -> tuple[FloatArray, FloatArray]:
+        """Return the derivatives of points in geo by the cameras' corrections, and by the rest of the lens."""
         axes = _geo_by_model(self._solved)
         by_lens = axes @ jacobian.by_lens[:, :, : len(self._lens_basis)]
-        by_cameras = axes @ jacobian.by_corrections(self._basis) + by_lens @ self._lens_basis
-        return self._posterior.at(point_in_geo, by_cameras, by_lens)
+        return axes @ jacobian.by_corrections(self._basis) + by_lens @ self._lens_basis, by_lens
+
+    def _cov_of_marks(self, jacobian: IntersectionJacobian) -> FloatArray:
+        axes = _geo_by_model(self._solved)
+        return axes @ jacobian.cov_of_marks @ axes.T
 
 
 def jacobian_of_points(

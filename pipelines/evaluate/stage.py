@@ -12,12 +12,14 @@ from pathlib import Path
 
 import numpy as np
 
+from pipelines.core.cautions import union
 from pipelines.core.products import load_json
 from pipelines.core.progress import Progress
 from pipelines.core.stages import SIM3
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.evaluate.accuracy_map import AccuracyGrid, write_csv
+from pipelines.evaluate.cautions import cautions_of_prediction, dependent_check_points
 from pipelines.evaluate.check_points import cross_validate, fit_residuals, measure_check_points
 from pipelines.evaluate.coordinates import coordinates_in, target_crs
 from pipelines.evaluate.error_propagation import (
@@ -96,10 +98,17 @@ def evaluate(
         photometric=Photometric(test=test),
         checkpoints=checkpoints,
         cross_validation=cross_validate(trained, propagation) if options.cross_validate else None,
-        accuracy=accuracy_summary(propagation, of_initial=options.similarity == "initial"),
+        accuracy=accuracy_summary(propagation),
         fit=fit_residuals(trained),
         similarity=_similarity_sigma(trained.model.geo_from_model),
         coordinates=None if crs is None else coordinates_in(crs, checkpoints, trained.survey),
+        cautions=union(
+            trained.model.cautions,
+            cautions_of_prediction(
+                trained, propagation, checkpoints.camera, of_initial=options.similarity == "initial"
+            ),
+            dependent_check_points(trained.survey),
+        ),
     )
 
 

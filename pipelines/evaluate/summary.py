@@ -1,4 +1,4 @@
-"""Headline, figures and warnings of an evaluation."""
+"""Headline, figures, warnings and cautions of an evaluation."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _NAMES_SHOWN = 8
 
 
 def summarise(report: EvaluationReport) -> Summary:
-    """Return headline, figures and warnings of a report, for the command line."""
+    """Return headline, figures, warnings and cautions of a report, for the command line."""
     test, ways = report.photometric.test, _by_way(report.checkpoints)
     parts = [f"test PSNR {test.psnr:.2f} dB" if test.psnr is not None else "no test views"]
     parts += [f"check points by {way} {errors.mean_h_m:.3f} m H" for way, errors in ways.items() if errors.count]
@@ -30,7 +30,7 @@ def summarise(report: EvaluationReport) -> Summary:
             f"{way}_rmse_v_m": errors.rmse_v_m,
             f"{way}_rmse_3d_m": errors.rmse_3d_m,
         }
-    return Summary(", ".join(parts), values, _warnings(report))
+    return Summary(", ".join(parts), values, _warnings(report), report.cautions)
 
 
 def _by_way(checkpoints: CheckPoints) -> dict[str, CheckPointErrors]:
@@ -38,7 +38,7 @@ def _by_way(checkpoints: CheckPoints) -> dict[str, CheckPointErrors]:
 
 
 def _warnings(report: EvaluationReport) -> tuple[str, ...]:
-    warnings = list(report.accuracy.cautions)
+    warnings = []
     count = report.checkpoints.camera.count
     if 0 < count < LEAST_POINTS:
         warnings.append(few_points(count))

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from pydantic import ConfigDict, Field, field_validator
 from pydantic.alias_generators import to_camel
 
+from pipelines.core.cautions import Caution
 from pipelines.core.products import Product, load_json
 from pipelines.core.types import FloatArray, Quaternion, Row7, Vector3
 from pipelines.geodesy.vertical import VerticalDatum
@@ -63,6 +64,7 @@ class GeorefSidecar(_CamelCase):
     crs_wkt: str
     covariance: Covariance7 | None
     accuracy: PredictedAccuracy | None
+    cautions: tuple[Caution, ...] = ()
 
     @field_validator("rotation")
     @classmethod

@@ -88,6 +88,26 @@ def covariance_at(points: ArrayLike, covariance: ArrayLike, pivot: ArrayLike) ->
     return jacobian @ np.asarray(covariance, dtype=np.float64) @ np.swapaxes(jacobian, -1, -2)
 
 
+def second_moment_at(points: ArrayLike, covariance: ArrayLike, pivot: ArrayLike) -> FloatArray:
+    """Return the second moment (3 N, 3 N) of the second-order errors that an uncertain similarity causes.
+
+    With A = δ ln s I + [δω]× the error is ½ A² (p − pivot), quadratic in Gaussian parameters (Isserlis' theorem).
+
+    Args:
+        points: (N, 3) in the target frame.
+        covariance: (7, 7) of (δ ln s, δω, δt) about `pivot`.
+        pivot: (3,) in the target frame.
+    """
+    arm = np.asarray(points, dtype=np.float64) - np.asarray(pivot, dtype=np.float64)
+    cov = np.asarray(covariance, dtype=np.float64)[:4, :4]
+    generators = np.concatenate([np.eye(3)[None], skew(np.eye(3))])
+    by_squares = np.einsum("iab,jbc,nc->naij", generators, generators, arm).reshape(-1, 4, 4) / 2
+    moments = np.einsum("ij,kl->ijkl", cov, cov)
+    moments = moments + np.einsum("ik,jl->ijkl", cov, cov) + np.einsum("il,jk->ijkl", cov, cov)
+    flat = by_squares.reshape(-1, 16)
+    return np.asarray(flat @ moments.reshape(16, 16) @ flat.T)
+
+
 def moved_pivot(covariance: ArrayLike, pivot: ArrayLike, new_pivot: ArrayLike) -> FloatArray:
     """The same uncertainty (7, 7), expressed about another pivot."""
     transfer = np.eye(7)

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from pipelines.core.types import FloatArray
-from pipelines.geometry.similarity import jacobian_at
+from pipelines.geometry.similarity import jacobian_at, second_moment_at
 from pipelines.georef.normal_equations import (
     NormalEquations,
     Observations,
@@ -179,8 +179,21 @@ class Posterior:
                 z.
             by_lens: (J, 3, L) derivative of the points in geo by the rest of the lens.
         """
-        jacobian = np.concatenate([jacobian_at(point_in_geo, self.pivot), by_cameras, by_lens], axis=2)
+        jacobian = self._jacobian(point_in_geo, by_cameras, by_lens)
         return np.asarray(jacobian @ self.covariance @ np.swapaxes(jacobian, 1, 2))
+
+    def jointly_at(self, point_in_geo: FloatArray, by_cameras: FloatArray, by_lens: FloatArray) -> FloatArray:
+        """Return the joint covariance (3 J, 3 J) in m² of points (J, 3); the arguments are those of `at`.
+
+        The second-order error of the similarity is included. Relative positions are known far better than the
+        similarity, so that the square of a rotation can exceed their σ.
+        """
+        jacobian = np.concatenate(self._jacobian(point_in_geo, by_cameras, by_lens))
+        of_similarity = second_moment_at(point_in_geo, self.covariance[:7, :7], self.pivot)
+        return np.asarray(jacobian @ self.covariance @ jacobian.T) + of_similarity
+
+    def _jacobian(self, point_in_geo: FloatArray, by_cameras: FloatArray, by_lens: FloatArray) -> FloatArray:
+        return np.concatenate([jacobian_at(point_in_geo, self.pivot), by_cameras, by_lens], axis=2)
 
 
 def posterior(problem: GeoProblem, lens: FreeLens | None = None) -> Posterior:

@@ -35,7 +35,12 @@ from pipelines.robust.statistics import ResidualStats, residual_stats, squared_m
 from pipelines.scene.calibrated import load_survey
 from pipelines.scene.geolocated import GeolocatedPoints
 from pipelines.scene.initial_similarity import AttitudeRecord, InitialSimilarity
-from pipelines.scene.observations import attitude_prior, control_correspondences, fix_correspondences
+from pipelines.scene.observations import (
+    attitude_prior,
+    control_correspondences,
+    fix_correspondences,
+    positions_in_use,
+)
 from pipelines.scene.survey import Survey
 
 _GUESS_POINTS = 1000
@@ -76,18 +81,23 @@ def estimate_similarity(
     fixes = fix_correspondences(survey, model)
     if not options.control_points:
         survey = survey.model_copy(update={"control_points": ()})
-    control, warnings = control_correspondences(survey, model)
+    control, unused = control_correspondences(survey, model)
+    warnings = tuple(point.sentence for point in unused)
     data = fixes.joined(control)
     if options.method == "paper":
         initial = _by_paper(model, points, data)
     else:
         guess = _guess(model, points, np.random.default_rng(options.seed))
-        alignment = align(
-            data,
-            np.random.default_rng(options.seed),
-            attitude=attitude_prior(survey, model),
-            guesses=(guess,) if guess else (),
-        )
+        try:
+            alignment = align(
+                data,
+                np.random.default_rng(options.seed),
+                attitude=attitude_prior(survey, model),
+                guesses=(guess,) if guess else (),
+            )
+        except DegenerateGeometryError as error:
+            reasons = positions_in_use(survey, model, data, unused)
+            raise DegenerateGeometryError(f"{error}. {reasons}") from error
         initial = _robust_product(model, points, data, alignment)
         initial, more = _adjusted(survey, model, points, initial, _starts(data, initial, options.seed), options)
         warnings += more
@@ -324,4 +334,6 @@ def _summary(initial: InitialSimilarity, warnings: tuple[str, ...]) -> Summary:
         "gnss_outliers": list(initial.gnss_outliers),
         "residuals": {kind: stats.model_dump() for kind, stats in initial.residuals.items()},
     }
-    return Summary(f"σ of position {position:.3f} m; residuals {', '.join(parts)}", values, warnings)
+    return Summary(
+        f"σ of position {position:.3f} m; residuals {', '.join(parts)}", values, warnings, initial.cautions
+    )

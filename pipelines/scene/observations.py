@@ -17,6 +17,8 @@ from pipelines.scene.survey import Survey
 
 _CONTRADICTION_SIGMAS = 6.0
 _CONTRADICTION_RAD = np.radians(15.0)  # lower limit, because the σ of attitudes are often optimistic
+_NAMES_SHOWN = 8
+_WIDE_RAD = 1.0
 _TINY = 1e-9  # σ of exact values, where a covariance must be regular
 
 
@@ -37,6 +39,42 @@ class RecordedRotations:
     contradicting: tuple[str, ...] = ()
 
 
+@dataclass(frozen=True)
+class UnusedControlPoint:
+    """Control point that its marks do not determine.
+
+    Attributes:
+        name: as in the survey.
+        unregistered: names of the images with marks that are not in the SfM model.
+        registered: names of the images with usable marks.
+        residual_px: angles between these marks and the point that most of them agree on, else their least-squares
+            point, in pixels; infinite: the rays are parallel.
+    """
+
+    name: str
+    unregistered: tuple[str, ...]
+    registered: tuple[str, ...]
+    residual_px: tuple[float, ...] = ()
+
+    @property
+    def sentence(self) -> str:
+        """Reason for people: images that are missing, or marks that do not meet."""
+        missing = f" ({_listed(self.unregistered)} not registered)" if self.unregistered else ""
+        if len(self.registered) < 2:
+            return f"control point {self.name}: marked in fewer than 2 registered images{missing}, not used"
+        marks = sorted(zip(self.residual_px, self.registered, strict=True), reverse=True)
+        rays = f"control point {self.name}: its {len(marks)} marks do not meet in one point"
+        if not np.isfinite(self.residual_px).all():
+            return f"{rays}: their rays are parallel ({_listed(self.registered)}), not used; check the marks"
+        rms = float(np.sqrt(np.mean(np.square(self.residual_px))))
+        worst = _listed(tuple(f"{image} {residual:.1f} px" for residual, image in marks))
+        return f"{rays}: up to {marks[0][0]:.1f} px off, RMS {rms:.1f} px ({worst}), not used; check the marks"
+
+
+def _listed(names: tuple[str, ...]) -> str:
+    return ", ".join(names[:_NAMES_SHOWN]) + (" …" if len(names) > _NAMES_SHOWN else "")
+
+
 def fix_correspondences(survey: Survey, model: SparseModel) -> Correspondences:
     """Return the camera centres of registered images with their fixes.
 
@@ -55,28 +93,21 @@ def fix_correspondences(survey: Survey, model: SparseModel) -> Correspondences:
     )
 
 
-def control_correspondences(survey: Survey, model: SparseModel) -> tuple[Correspondences, tuple[str, ...]]:
-    """Return the control points, intersected in local from their marks, with their survey; and warnings.
+def control_correspondences(
+    survey: Survey, model: SparseModel
+) -> tuple[Correspondences, tuple[UnusedControlPoint, ...]]:
+    """Return the control points, intersected in local from their marks, with their survey; and those left out.
 
-    A point that its marks do not determine is left out with a warning. The covariance in local is that of the marks
+    A point that its marks do not determine is left out. The covariance in local is that of the marks
     alone. The model's own error is not known at this point: the adjustment measures it as excess scatter.
     """
     points = survey.control_points
     rays = mark_rays(points, model)
     marked = rays.marks_of_point >= 2
-    warnings = {
-        point.name: f"control point {point.name}: marked in fewer than 2 registered images, not used"
-        for point, enough in zip(points, marked, strict=True)
-        if not enough
-    }
-    rays = rays.of_points(marked)
-    position, cov, meets = _intersect_in_local(model, rays)
-    for name, count, good in zip(rays.point_id, rays.marks_of_point, meets, strict=True):
-        if not good:
-            warnings[name] = (
-                f"control point {name}: its {count} marks do not meet in one point, not used; check the marks"
-            )
-    meeting = [point for point in points if point.name not in warnings]
+    position, cov, meets = _intersect_in_local(model, rays.of_points(marked))
+    used = marked.copy()
+    used[marked] = meets
+    meeting = [point for point, is_used in zip(points, used, strict=True) if is_used]
     return Correspondences(
         name=tuple(point.name for point in meeting),
         control=np.ones(len(meeting), dtype=bool),
@@ -84,7 +115,52 @@ def control_correspondences(survey: Survey, model: SparseModel) -> tuple[Corresp
         cov_in_local=cov[meets],
         in_geo=np.array([point.position_in_geo for point in meeting]).reshape(-1, 3),
         cov_in_geo=np.array([point.cov_in_geo for point in meeting]).reshape(-1, 3, 3),
-    ), tuple(warnings.values())
+    ), _unused(survey, model, rays.of_points(~used))
+
+
+def positions_in_use(
+    survey: Survey, model: SparseModel, data: Correspondences, unused: tuple[UnusedControlPoint, ...]
+) -> str:
+    """Return how many fixes and control points there are, how many are used, and why the others are not."""
+    fixes, control = int((~data.control).sum()), int(data.control.sum())
+    counts = (
+        f"{len(model.image_name)} of {len(survey.images)} images are registered; in use are {fixes} of "
+        f"{sum(image.fix is not None for image in survey.images)} fixes and {control} of "
+        f"{len(survey.control_points)} control points"
+    )
+    return "; ".join([counts, *(point.sentence for point in unused)])
+
+
+def _unused(survey: Survey, model: SparseModel, rays: MarkRays) -> tuple[UnusedControlPoint, ...]:
+    """Return the record of each point of `rays`, with the residuals of its marks."""
+    by_name, registered = {point.name: point for point in survey.control_points}, set(model.image_name)
+    residual_px = _residuals_px(model, rays)
+    unused = []
+    for index, name in enumerate(rays.point_id):
+        mine = rays.point == index
+        unused.append(
+            UnusedControlPoint(
+                name=name,
+                unregistered=tuple(m.image for m in by_name[name].marks if m.image not in registered),
+                registered=tuple(model.image_name[camera] for camera in rays.camera[mine]),
+                residual_px=tuple(residual_px[mine].tolist()),
+            )
+        )
+    return tuple(unused)
+
+
+def _residuals_px(model: SparseModel, rays: MarkRays) -> FloatArray:
+    """Return the angles (K,), in pixels, between the rays and the intersections of their points."""
+    position, *_ = _intersect_in_local(model, rays)
+    # Where the rays contradict each other, none is left: within a wide σ they meet in the least-squares point.
+    wide = RayErrors(_TINY, _TINY, _WIDE_RAD)
+    compromise = intersect_marks(rays, model.rotation_cam_from_local, model.cam_center_in_local, wide)
+    position = np.where(np.isfinite(position), position, compromise.position_in_geo)
+    arm = position[rays.point] - model.cam_center_in_local[rays.camera]
+    in_cam = np.einsum("kij,kj->ki", model.rotation_cam_from_local[rays.camera], arm)
+    across = np.linalg.norm(np.cross(rays.bearing_in_cam, in_cam), axis=1)
+    along = np.einsum("ki,ki->k", rays.bearing_in_cam, in_cam)
+    return np.asarray(np.nan_to_num(np.arctan2(across, along) * rays.sigma_px / rays.sigma_rad, nan=np.inf))
 
 
 def _intersect_in_local(model: SparseModel, rays: MarkRays) -> tuple[FloatArray, FloatArray, BoolArray]:

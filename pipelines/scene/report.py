@@ -9,8 +9,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import SerializerFunctionWrapHandler, model_serializer
+from pydantic import SerializerFunctionWrapHandler, model_serializer, model_validator
 
+from pipelines.core.cautions import Caution
 from pipelines.core.errors import InputError
 from pipelines.core.products import ImageName, Product, dump_json, load_json
 from pipelines.core.types import Vector3
@@ -215,7 +216,7 @@ class CheckPointErrors(StatedErrors):
 
 
 class CheckPoints(Product):
-    """Check points by camera (intersection of their marks) and by model (surface behind their marks)."""
+    """Check points by camera (intersection of their marks) and by model (rendered surface behind their marks)."""
 
     camera: CheckPointErrors
     model: CheckPointErrors
@@ -255,7 +256,6 @@ class AccuracySummary(_OptionalKeys):
         least_sigma_h_m, median_sigma_h_m, largest_sigma_h_m: horizontal.
         least_sigma_v_m, median_sigma_v_m, largest_sigma_v_m: vertical.
         reason: reason why there are no cells, else None.
-        cautions: limits of the prediction.
     """
 
     cells: int
@@ -267,7 +267,6 @@ class AccuracySummary(_OptionalKeys):
     median_sigma_v_m: float | None = None
     largest_sigma_v_m: float | None = None
     reason: str | None
-    cautions: tuple[str, ...]
 
 
 class FixResiduals(ResidualStats):
@@ -339,6 +338,7 @@ class EvaluationReport(_OptionalKeys):
         fit: residuals of the solution.
         similarity: σ of the similarity.
         coordinates: check points in the CRS of `--crs`; absent without it.
+        cautions: limits of the result: those of the model, then those that `evaluate` found.
     """
 
     format_version: Literal[1] = 1
@@ -349,6 +349,21 @@ class EvaluationReport(_OptionalKeys):
     fit: Fit
     similarity: SimilaritySigma
     coordinates: Coordinates | None = None
+    cautions: tuple[Caution, ...] = ()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_cautions_in_one_list(cls, document: Any) -> Any:
+        """Read a report from before cautions had codes: `accuracy` held the limits of the prediction as text."""
+        accuracy = document.get("accuracy") if isinstance(document, dict) else None
+        if not isinstance(accuracy, dict) or "cautions" not in accuracy:
+            return document
+        texts = accuracy["cautions"] if isinstance(accuracy["cautions"], list) else [accuracy["cautions"]]
+        return {
+            **document,
+            "accuracy": {name: value for name, value in accuracy.items() if name != "cautions"},
+            "cautions": [{"code": "prediction-limited", "sentence": text} for text in texts],
+        }
 
 
 def write_report(report: EvaluationReport, path: Path) -> None:

@@ -6,6 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
+from pipelines.core.cautions import Caution
 from pipelines.core.products import ImageName, Product, Rotation
 from pipelines.core.types import Matrix34, Vector3
 from pipelines.geometry.similarity import SimilarityRecord
@@ -56,6 +57,7 @@ class TrainedModel(Product):
         gnss_outliers: names of the images whose fixes contradict the solution.
         control_outliers: names of the control points that contradict the solution.
         estimated_errors: constant errors of the measurements.
+        cautions: limits of the model: those of the initial similarity, then the training's own.
     """
 
     format_version: Literal[1] = 1
@@ -72,3 +74,4 @@ class TrainedModel(Product):
     gnss_outliers: tuple[str, ...] = ()
     control_outliers: tuple[str, ...] = ()
     estimated_errors: tuple[EstimatedError, ...] = ()
+    cautions: tuple[Caution, ...] = ()

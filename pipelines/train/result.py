@@ -6,12 +6,14 @@ from typing import Any
 
 import numpy as np
 
+from pipelines.core.cautions import union
 from pipelines.core.workspace import Summary
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
 from pipelines.georef.estimated_error import EstimatedError
 from pipelines.georef.posterior import solution_covariances
 from pipelines.georef.problem import GeoProblem
 from pipelines.georef.terms import ControlTerm, FixTerm
+from pipelines.scene.initial_similarity import InitialSimilarity
 from pipelines.scene.scene import Scene
 from pipelines.scene.trained_model import TrainedCamera, TrainedLens, TrainedModel
 from pipelines.train.loop import TrainingRecord
@@ -25,12 +27,13 @@ _CAUSES = {
 }
 
 
-def trained_model(trainer: JointTrainer, scene: Scene) -> TrainedModel:
+def trained_model(trainer: JointTrainer, scene: Scene, initial: InitialSimilarity) -> TrainedModel:
     """Return the product of `train` without the Gaussians.
 
     Args:
         trainer: at the end of the training.
         scene: cameras at the start of the training.
+        initial: similarity at the start of the training; its cautions are carried on.
 
     Raises:
         DegenerateGeometryError: the measurements do not determine the similarity.
@@ -58,6 +61,7 @@ def trained_model(trainer: JointTrainer, scene: Scene) -> TrainedModel:
         if control is None
         else tuple(control.point_id[row] for row in problem.contradicting(ControlTerm)),
         estimated_errors=estimates,
+        cautions=union(initial.cautions),
     )
 
 
@@ -82,9 +86,8 @@ def summary_of(model: TrainedModel, metrics: list[dict[str, Any]], record: Train
         "control_outliers": list(model.control_outliers),
         "estimated_errors": [error.model_dump() for error in model.estimated_errors],
     }
-    return Summary(
-        f"{model.gaussians} gaussians, train PSNR {psnr:.2f} dB", values, tuple(_warnings(model, record))
-    )
+    key_figure = f"{model.gaussians} gaussians, train PSNR {psnr:.2f} dB"
+    return Summary(key_figure, values, tuple(_warnings(model, record)), model.cautions)
 
 
 def _warnings(model: TrainedModel, record: TrainingRecord) -> list[str]:

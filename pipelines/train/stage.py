@@ -67,7 +67,7 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
         stage.resumed,
     )
     record = optimise(trainer, files, stage.progress)
-    model = trained_model(trainer, scene)
+    model = trained_model(trainer, scene, initial)
     write_gaussians(stage.out / "gaussians.ply", trainer.optimizer.gaussians.detached())
     save_json(model, stage.out / "model.json")
     metrics = [json.loads(row) for row in files.metrics.read_text(encoding="utf-8").splitlines()]

@@ -35,7 +35,9 @@ def test_stage_by_stage(georef: Georef, workspace: Workspace, photos: Path) -> N
         options = ["--images", photos] if name == "ingest" else []
         result = georef(name, workspace.root, *options, "--json")
         assert result.code == 0
-        assert set(result.document) == {"stage", "ran", "key_figure", "values", "warnings", "duration_s"}
+        assert set(result.document) == {
+            *("stage", "ran", "key_figure", "values", "warnings", "cautions", "duration_s")
+        }
         assert (result.document["stage"], result.document["ran"]) == (name, True)
         assert not georef(name, workspace.root, *options, "--json").document["ran"]
         assert georef(name, workspace.root, *options, "--force", "--json").document["ran"]

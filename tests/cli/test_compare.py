@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from pipelines.compare.configurations import BY_CONFIGURATION
+from pipelines.core.cautions import Caution
 from pipelines.core.errors import ConvergenceError, InputError
 from pipelines.core.options import StageOptions
 from pipelines.core.products import dump_json
@@ -36,7 +37,8 @@ def reporting(stage: StageRun, config: StageOptions) -> Summary:
     error = error_of(text)
     # Two points, as far off.
     points = check_points_with(count=2, mean_h_m=error, median_h_m=error, rmse_h_m=error, rmse_v_m=2 * error)
-    report = report_with(test={"psnr": 20.0 + error, "ssim": 0.5}, camera=points, model=points, cautions=(text,))
+    cautions = (Caution(code="fake", sentence=text),)
+    report = report_with(test={"psnr": 20.0 + error, "ssim": 0.5}, camera=points, model=points, cautions=cautions)
     fakes.write_products(stage, spec, dump_json(report.model_dump(mode="json")))
     return Summary("evaluated", {}, ("few check points",))
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from pipelines.core.cautions import Caution
 from pipelines.core.errors import DegenerateGeometryError, InputError
 from pipelines.core.products import save_json
 from pipelines.core.stages import GAUSSIANS, MODEL, SURVEY
@@ -175,11 +176,24 @@ def test_sidecar_has_the_fields_that_were_promised(stage: StageRun) -> None:
     run(stage, OPTIONS)
     document = json.loads(sidecar_path(stage.out / "splat.ply").read_text(encoding="utf-8"))
     fields = "format version crsId origin rotation scale epoch originLla verticalDatum crsWkt covariance accuracy"
-    assert list(document) == fields.split()
+    assert list(document) == [*fields.split(), "cautions"]
     assert (document["format"], document["version"], document["crsId"]) == ("georefgs", 1, "EPSG:4978")
     assert document["crsWkt"].startswith("GEODCRS[")
     assert np.array(document["covariance"]).shape == (7, 7)
     assert document["verticalDatum"] == {"name": "EGM2008", "stated": True, "note": ""}
+
+
+def test_sidecar_carries_the_cautions_of_the_model_on(stage: StageRun) -> None:
+    caution = Caution(code="fixes-shifted", sentence="All fixes are 1.2 m too high.")
+    path = stage.workspace.root / MODEL
+    save_json(model(covariance()).model_copy(update={"cautions": (caution,)}), path)
+    assert run(stage, OPTIONS).cautions == read_sidecar(stage.out / "splat.ply").cautions == (caution,)
+    for product in (path, sidecar_path(stage.out / "splat.ply")):  # as they were before cautions
+        document = json.loads(product.read_text(encoding="utf-8"))
+        del document["cautions"]
+        product.write_text(json.dumps(document), encoding="utf-8")
+    assert read_sidecar(stage.out / "splat.ply").cautions == ()
+    assert run(stage, OPTIONS).cautions == ()
 
 
 def test_damaged_sidecar_is_refused(stage: StageRun) -> None:

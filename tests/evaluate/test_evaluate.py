@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from pipelines.core.cautions import Caution
 from pipelines.core.errors import InputError
 from pipelines.core.products import load_json, save_json
 from pipelines.core.runner import Outcome, run_stage
@@ -142,7 +143,8 @@ def test_survey_that_leaves_the_similarity_open_is_evaluated_without_prediction(
     run_stage(altered, EVALUATE, {"renders": 0, "cross_validate": True})
     report = report_of(altered)
     reason = "0 registered training images are too few to train on"
-    assert report["accuracy"] == {"cells": 0, "reason": reason, "cautions": []}
+    assert report["accuracy"] == {"cells": 0, "reason": reason}
+    assert report["cautions"] == []
     assert report["cross_validation"] == {"count": 0, "reason": reason}
     by_camera = report["checkpoints"]["camera"]
     assert (by_camera["count"], by_camera["predicted"], by_camera["cramer_rao"]) == (6, None, None)
@@ -188,8 +190,10 @@ def test_accuracy_is_stated_after_the_standard(evaluated: tuple[Workspace, Outco
 def test_a_prediction_that_is_not_of_this_training_is_told(trained: list[tuple[Workspace, Workspace]]) -> None:
     assert not geographic_options_of(trained[0][1]).geo_loss
     outcome = run_stage(trained[0][1], EVALUATE, {"renders": 0})
-    assert "without geographic losses" in report_of(trained[0][1])["accuracy"]["cautions"][0]
-    assert any("without geographic losses" in text for text in outcome.manifest.warnings)
+    limit = report_of(trained[0][1])["cautions"][0]
+    assert limit["code"] == "prediction-of-initial-similarity"
+    assert "without geographic losses" in limit["sentence"]
+    assert outcome.manifest.cautions[0].model_dump() == limit
 
 
 def test_held_cameras_make_the_prediction_too_good(evaluated: tuple[Workspace, Outcome]) -> None:
@@ -197,8 +201,43 @@ def test_held_cameras_make_the_prediction_too_good(evaluated: tuple[Workspace, O
     trained, initial = load_trained(workspace), load_json(InitialSimilarity, workspace.path(SIM3))
     config = geographic_options_of(workspace)
     held = AccuracyPrediction(solve_survey(trained, initial, config.model_copy(update={"optimize_cameras": False})))
-    assert "too good" in held.cautions[0]
+    assert "too good" in held.cautions[0].sentence
     assert AccuracyPrediction(solve_survey(trained, initial, config)).cautions == ()
+
+
+def test_cautions_of_the_model_stand_first_in_the_report(altered: Workspace) -> None:
+    caution = Caution(code="fixes-shifted", sentence="All fixes are 1.2 m too high.")
+    model = load_json(TrainedModel, altered.path(MODEL))
+    save_json(model.model_copy(update={"cautions": (caution,)}), altered.root / MODEL)
+    survey = load_json(Survey, altered.path(SURVEY))
+    first = survey.check_points[0]
+    beside = tuple(np.array(first.position_in_geo) + np.array([0.3, 0.0, 0.4]))
+    twin = first.model_copy(update={"name": "twin", "position_in_geo": beside})
+    change_survey(altered, control_points=(twin,))
+    outcome = run_stage(altered, EVALUATE, {"renders": 0})
+    cautions = report_of(altered)["cautions"]
+    assert cautions[0] == caution.model_dump()
+    near = next(row for row in cautions if row["code"] == "check-point-not-independent")
+    assert "1 of 6 check points may be the same feature as a control point" in near["sentence"]
+    assert f"{first.name} (0.50 m from twin)" in near["sentence"]
+    assert [row.model_dump() for row in outcome.manifest.cautions] == cautions
+
+
+def test_check_points_that_are_off_together_refute_the_prediction(altered: Workspace) -> None:
+    survey = load_json(Survey, altered.path(SURVEY))
+    up = np.array([0.0, 0.0, 1.5])
+    shifted = tuple(
+        point.model_copy(update={"position_in_geo": tuple(np.array(point.position_in_geo) + up)})
+        for point in survey.check_points
+    )
+    change_survey(altered, check_points=shifted)
+    run_stage(altered, EVALUATE, {"renders": 0})
+    (caution,) = report_of(altered)["cautions"]
+    assert caution["code"] == "prediction-refuted"
+    assert "over 6 check points by camera" in caution["sentence"]
+    change_survey(altered, check_points=shifted[:2])
+    run_stage(altered, EVALUATE, {"renders": 0})
+    assert report_of(altered)["cautions"] == []
 
 
 def test_a_blunder_is_named_and_kept(altered: Workspace) -> None:

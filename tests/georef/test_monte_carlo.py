@@ -9,12 +9,16 @@ which leaves the principal point, and with it the heights, to the fixes.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 import pytest
 import torch
+from scipy.linalg import block_diag
 
+from pipelines.evaluate.cautions import refutation
 from pipelines.evaluate.cramer_rao import Anchors, CameraInformation
 from pipelines.evaluate.intersection_jacobian import intersection_jacobian
 from pipelines.geometry.bundle import Network, correction_basis
@@ -41,10 +45,10 @@ CHECK = PLACES.uniform([-9, -9, -6], [9, 9, 9], (12, 3))
 
 @dataclass(frozen=True)
 class Run:
-    """Errors (J, 3) at the held-out points, and their predicted covariance (J, 3, 3)."""
+    """Errors (J, 3) at the held-out points, and their joint predicted covariance (3 J, 3 J)."""
 
     error: np.ndarray
-    predicted: np.ndarray
+    joint: np.ndarray
 
 
 def marked(points: np.ndarray, truth: Network, network: Network | None = None) -> Network:
@@ -119,16 +123,24 @@ def one_run(seed: int, setting: Setting, solve: np.ndarray) -> Run:
         measured = problem.similarity(marks_of(at_check, np.zeros((3, 3)), rng).intersected(problem.estimate()))
     moved = intersection_jacobian(at_check, np.full(len(at_check.obs_point), MARK_PX))
     by_cameras = moved.by_corrections(found.matrix) + moved.by_lens @ found.lens_matrix
-    predicted = joint.at(measured.numpy(), by_cameras, moved.by_lens) + moved.cov_of_marks
+    predicted = joint.jointly_at(measured.numpy(), by_cameras, moved.by_lens) + block_diag(*moved.cov_of_marks)
     return Run(measured.numpy() - CHECK, predicted)
 
 
-def runs(count: int, setting: Setting) -> tuple[np.ndarray, np.ndarray]:
-    """Squared errors and predicted variances (count, J, 3)."""
+@cache
+def runs_of(count: int, profile: str) -> tuple[Run, ...]:
+    return tuple(draw(count, PROFILES[profile]))
+
+
+def draw(count: int, setting: Setting) -> list[Run]:
     solve = adjuster(setting.truth)
-    found = [one_run(seed, setting, solve) for seed in range(count)]
-    predicted = np.diagonal([run.predicted for run in found], axis1=2, axis2=3)
-    return np.array([run.error**2 for run in found]), predicted
+    return [one_run(seed, setting, solve) for seed in range(count)]
+
+
+def squares(found: Iterable[Run]) -> tuple[np.ndarray, np.ndarray]:
+    """Squared errors and predicted variances (count, J, 3)."""
+    predicted = [np.diagonal(run.joint).reshape(-1, 3) for run in found]
+    return np.array([run.error**2 for run in found]), np.array(predicted)
 
 
 def bound(setting: Setting) -> np.ndarray:
@@ -156,10 +168,35 @@ ABOVE_BOUND = 1.15  # robust weights cost some per cent, and thirty runs know a 
 @pytest.mark.parametrize("profile", PROFILES)
 def test_predicted_accuracy_is_true(profile: str) -> None:
     setting = PROFILES[profile]
-    squared, variance = runs(30, setting)
+    squared, variance = squares(runs_of(30, profile))
     # Points of a run share most of their error: 30 values and a few more for each axis, σ of the mean 0.13.
     assert (squared / variance).mean() == pytest.approx(1.0, abs=0.25)
     assert np.sqrt(squared.mean() / bound(setting).mean()) < ABOVE_BOUND
+
+
+def test_true_predictions_are_not_refuted_by_the_errors_that_points_share() -> None:
+    codes = [code_of(run.error, run.joint) for profile in PROFILES for run in runs_of(30, profile)]
+    assert codes.count(None) >= 0.97 * len(codes)
+    # The points share most of their error: taken for independent, a third of these draws would be refuted.
+    alone = [code_of(run.error, blocks_of(run.joint)) for profile in PROFILES for run in runs_of(30, profile)]
+    assert alone.count(None) < 0.8 * len(alone)
+
+
+@pytest.mark.parametrize(("factor", "code"), [(2.0, "prediction-refuted"), (0.5, "prediction-pessimistic")])
+def test_wrong_predictions_are_refuted(factor: float, code: str) -> None:
+    found = [code_of(factor * run.error, run.joint) for profile in PROFILES for run in runs_of(30, profile)]
+    assert found.count(code) > 0.97 * len(found)
+
+
+def code_of(error: np.ndarray, cov: np.ndarray) -> str | None:
+    """The code of the caution that check points with these errors cause."""
+    caution = refutation(tuple(map(str, range(len(error)))), error.ravel(), cov)
+    return None if caution is None else caution.code
+
+
+def blocks_of(cov: np.ndarray) -> np.ndarray:
+    """The covariance of points as if they shared no error."""
+    return block_diag(*(cov[row : row + 3, row : row + 3] for row in range(0, len(cov), 3)))
 
 
 def test_heights_come_near_the_bound_because_the_lens_follows() -> None:
@@ -169,7 +206,7 @@ def test_heights_come_near_the_bound_because_the_lens_follows() -> None:
     setting = PROFILES["rtk, all level"]
     least = np.sqrt(bound(setting)[:, 2].mean())
     following, held = (
-        np.sqrt(runs(12, each)[0][:, :, 2].mean()) for each in (setting, replace(setting, follows=False))
+        np.sqrt(squares(draw(12, each))[0][:, :, 2].mean()) for each in (setting, replace(setting, follows=False))
     )
     # Twelve runs know a root mean square to a fifth.
     assert following < 1.4 * least
@@ -180,7 +217,7 @@ def test_heights_come_near_the_bound_because_the_lens_follows() -> None:
 @pytest.mark.parametrize("profile", PROFILES)
 def test_predicted_accuracy_is_true_for_each_axis(profile: str) -> None:
     setting = PROFILES[profile]
-    squared, variance = runs(200, setting)
+    squared, variance = squares(draw(200, setting))
     np.testing.assert_allclose((squared / variance).mean(axis=(0, 1)), 1.0, atol=0.2)  # σ of the mean up to 0.1
     least = bound(setting).mean(axis=0)
     # No estimate is better than the bound, but for the draw: 200 values know their root mean square to 5 %.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from pipelines.init_sim3.options import InitSim3Options
 from pipelines.init_sim3.stage import estimate_similarity
 from pipelines.scene.geolocated import GeolocatedPoints
 from pipelines.scene.initial_similarity import InitialSimilarity
+from pipelines.scene.observations import control_correspondences
 from pipelines.scene.survey import Survey
 from tests.scenes import (
     GEO_FROM_LOCAL,
@@ -166,6 +168,51 @@ def test_unusable_control_points_are_named() -> None:
     assert found.correspondences["gcp"] == 4
     assert any("gcp0: marked in fewer than 2" in text for text in warnings)
     assert any("gcp1: its" in text and "do not meet" in text for text in warnings)
+
+
+def test_error_carries_the_reasons_why_control_points_are_not_used() -> None:
+    survey, model, points = material(Noise(), Measured(fixes=False, attitudes=False, gcps=True))
+    two_marks = [
+        point.model_copy(update={"marks": (point.marks[0], point.marks[len(point.marks) // 3])})
+        for point in survey.control_points[:4]
+    ]
+    missing, apart = two_marks[2].marks[1], two_marks[3].marks[0]
+    two_marks[2] = two_marks[2].model_copy(
+        update={"marks": (two_marks[2].marks[0], missing.model_copy(update={"image": "kite_07.jpg"}))}
+    )
+    moved = apart.model_copy(update={"y_px": apart.y_px + 60.0, "x_px": apart.x_px + 60.0})
+    two_marks[3] = two_marks[3].model_copy(update={"marks": (moved, two_marks[3].marks[1])})
+    kite = survey.model_copy(update={"control_points": tuple(two_marks)})
+    with pytest.raises(DegenerateGeometryError) as raised:
+        estimate_similarity(kite, model, points, CONFIG)
+    message = str(raised.value)
+    assert "2 positions" in message
+    assert "24 of 24 images are registered; in use are 0 of 0 fixes and 2 of 4 control points" in message
+    assert "gcp2: marked in fewer than 2 registered images (kite_07.jpg not registered)" in message
+    found = re.search(
+        r"gcp3: its 2 marks do not meet in one point: up to ([\d.]+) px off, RMS ([\d.]+) px", message
+    )
+    assert found is not None
+    worst_px, rms_px = map(float, found.groups())
+    # 85 px of which the part across the epipolar line counts, shared between the two marks.
+    assert 5 < rms_px <= worst_px < 85
+    assert f"{apart.image} " in message
+    assert f"{two_marks[3].marks[1].image} " in message
+
+
+def test_worst_mark_of_a_control_point_is_named_first() -> None:
+    survey, model, _ = material(Noise(), Measured(gcps=True))
+    point = survey.control_points[0]
+    off = {0: 300.0, 1: -200.0, 2: 150.0}
+    marks = tuple(
+        mark.model_copy(update={"x_px": mark.x_px + off.get(index, 0.0)})
+        for index, mark in enumerate(point.marks[:5])
+    )
+    spoilt = survey.model_copy(update={"control_points": (point.model_copy(update={"marks": marks}),)})
+    _, (unused,) = control_correspondences(spoilt, model)
+    assert len(unused.residual_px) == len(unused.registered) == 5
+    worst = unused.registered[int(np.argmax(unused.residual_px))]
+    assert f"px ({worst} {max(unused.residual_px):.1f} px, " in unused.sentence
 
 
 def test_points_of_another_model_are_refused() -> None:

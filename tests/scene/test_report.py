@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from pipelines.core.cautions import Caution
 from pipelines.core.errors import InputError
 from pipelines.scene.report import (
     Coordinates,
@@ -20,6 +21,7 @@ from pipelines.scene.report import (
 )
 from tests.reports import check_points_with, report_with
 
+CAUTION = Caution(code="prediction-refuted", sentence="Check points refute the predicted accuracy.")
 MEASURED = {"name": "P1", "rays": 4, "de_m": 0.01, "dn_m": -0.02, "du_m": 0.1 + 0.2, "blunder": False}
 UNMEASURED = {"name": "P2", "rays": 1, "de_m": None, "dn_m": None, "du_m": None, "blunder": False}
 
@@ -38,7 +40,7 @@ def test_report_is_read_as_written(tmp_path: Path) -> None:
         count=1, points=(PredictedPointError(**MEASURED, **sigma), PredictedPointError(**UNMEASURED, **unknown))
     )
     model = check_points_with(count=1, points=(PointError(**MEASURED), PointError(**UNMEASURED)))
-    report = report_with(test={"views": 3, "psnr": 24.0}, camera=camera, model=model, cautions=("one",))
+    report = report_with(test={"views": 3, "psnr": 24.0}, camera=camera, model=model, cautions=(CAUTION,))
     document = document_of(report, tmp_path / "report.json")
     assert read_report(tmp_path / "report.json") == report
     rows = document["checkpoints"]
@@ -50,11 +52,26 @@ def test_keys_that_were_not_asked_for_are_absent_and_unknown_figures_are_null(tm
     document = document_of(report_with(), tmp_path / "report.json")
     assert "coordinates" not in document
     assert document["cross_validation"] is None
-    assert document["accuracy"] == {"cells": 0, "reason": "the scene has too few points", "cautions": []}
+    assert document["accuracy"] == {"cells": 0, "reason": "the scene has too few points"}
+    assert document["cautions"] == []
     test = document["photometric"]["test"]
     assert test == {"views": 0, "psnr": None, "psnr_compensated": None, "ssim": None, "lpips": None, "per_view": []}
     with_reason = report_with(test={"lpips_reason": "no weights"})
     assert document_of(with_reason, tmp_path / "other.json")["photometric"]["test"]["lpips_reason"] == "no weights"
+
+
+def test_report_from_before_cautions_had_codes_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "report.json"
+    document = document_of(report_with(), path)
+    del document["cautions"]
+    document["accuracy"]["cautions"] = ["the prediction is too good"]
+    path.write_text(json.dumps(document), encoding="utf-8")
+    (caution,) = read_report(path).cautions
+    assert (caution.code, caution.sentence) == ("prediction-limited", "the prediction is too good")
+    document["accuracy"]["cautions"] = 3
+    path.write_text(json.dumps(document), encoding="utf-8")
+    with pytest.raises(InputError, match="not a report"):
+        read_report(path)
 
 
 def test_coordinates_of_an_unmeasured_point_are_null(tmp_path: Path) -> None:

@@ -1,0 +1,143 @@
+"""Cautions of an evaluation: predictions that check points refute, and check points that check little."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from pipelines.core.cautions import Caution
+from pipelines.core.types import FloatArray
+from pipelines.evaluate.error_propagation import ErrorPropagation, NoErrorPropagation
+from pipelines.evaluate.points_by_camera import points_by_camera
+from pipelines.evaluate.prediction import AccuracyPrediction
+from pipelines.robust.statistics import chi2_quantile
+from pipelines.scene.marks import mark_rays
+from pipelines.scene.report import CheckPointErrors
+from pipelines.scene.survey import Survey
+from pipelines.scene.trained_survey import TrainedSurvey
+
+_LEAST_POINTS = 3
+_RANGE = (0.005, 0.995)  # of χ²: 99 % of true predictions lie within
+_NEAR_M = 1.0
+_NAMES_SHOWN = 8
+_SINGULAR = 1e-12  # of the largest variance
+
+
+def cautions_of_prediction(
+    trained: TrainedSurvey,
+    propagation: ErrorPropagation | NoErrorPropagation,
+    by_camera: CheckPointErrors,
+    *,
+    of_initial: bool,
+) -> tuple[Caution, ...]:
+    """Return the limits of the predicted accuracy; none without a prediction.
+
+    Args:
+        trained: the trained survey.
+        propagation: gives the prediction, or the reason why there is none.
+        by_camera: errors of the check points by camera.
+        of_initial: whether the points are measured with the initial similarity.
+    """
+    if isinstance(propagation, NoErrorPropagation):
+        return ()
+    cautions = propagation.prediction.cautions
+    if of_initial:
+        sentence = "Measured with the initial similarity: the prediction is that of the trained one."
+        return (*cautions, Caution(code="prediction-of-trained-similarity", sentence=sentence))
+    test = _test_by_check_points(trained, propagation.prediction, frozenset(by_camera.blunders))
+    return cautions if test is None else (*cautions, test)
+
+
+def refutation(
+    names: tuple[str, ...], error: FloatArray, cov: FloatArray, blunders: frozenset[str] = frozenset()
+) -> Caution | None:
+    """Return a caution if the errors of J points are outside the 99 % range that their covariance allows.
+
+    The points share errors, so the test takes their joint covariance: eᵀ C⁻¹ e is χ² with 3 J degrees of freedom.
+
+    Args:
+        names: of the points.
+        error: (3 J,) metres, by point and axis.
+        cov: (3 J, 3 J) m², of the prediction and the survey.
+        blunders: names of the points that are blunders.
+    """
+    if len(names) < _LEAST_POINTS:
+        return None
+    squared, freedom = _squared_whitened(error, cov)
+    least, most = (float(chi2_quantile(quantile, freedom)) for quantile in _RANGE)
+    if least <= squared <= most:
+        return None
+    ratio = squared / freedom
+    figures = (
+        f"normalised error² is {ratio:.2g} over {len(names)} check points by camera, "
+        f"and {least / freedom:.2g} to {most / freedom:.2g} was to be expected (99 %)"
+    )
+    if squared < least:
+        return Caution(
+            code="prediction-pessimistic",
+            sentence=f"The predicted accuracy is pessimistic: {figures}; the σ of prediction, marks and check "
+            f"points together are too large by a factor of {ratio**-0.5:.1f}.",
+        )
+    others = tuple(name for name in names if name not in blunders)
+    good = np.repeat([name not in blunders for name in names], 3)
+    alone = ""
+    if _LEAST_POINTS <= len(others) < len(names) and not refutation(others, error[good], cov[np.ix_(good, good)]):
+        left_out = tuple(name for name in names if name in blunders)
+        alone = f"; without the blunders ({_listed(left_out)}) the errors agree with the prediction"
+    return Caution(
+        code="prediction-refuted",
+        sentence=f"Check points refute the predicted accuracy: {figures}; the σ of prediction, marks and check "
+        f"points together are too small by a factor of {ratio**0.5:.1f}{alone}.",
+    )
+
+
+def dependent_check_points(survey: Survey) -> tuple[Caution, ...]:
+    """Return a caution that names the check points within 1 m of a control point, horizontally and vertically."""
+    control = np.array([point.position_in_geo for point in survey.control_points]).reshape(-1, 3)
+    pairs = []
+    for point in survey.check_points if len(control) else ():
+        away = np.array(point.position_in_geo) - control
+        distance = np.linalg.norm(away, axis=1)
+        near = (np.hypot(away[:, 0], away[:, 1]) <= _NEAR_M) & (np.abs(away[:, 2]) <= _NEAR_M)
+        if near.any():
+            index = int(np.argmin(np.where(near, distance, np.inf)))
+            pairs.append(f"{point.name} ({distance[index]:.2f} m from {survey.control_points[index].name})")
+    if not pairs:
+        return ()
+    sentence = (
+        f"{len(pairs)} of {len(survey.check_points)} check points may be the same feature as a control point, so "
+        f"that their errors say little of the accuracy: {_listed(tuple(pairs))}."
+    )
+    return (Caution(code="check-point-not-independent", sentence=sentence),)
+
+
+def _test_by_check_points(
+    trained: TrainedSurvey, prediction: AccuracyPrediction, blunders: frozenset[str]
+) -> Caution | None:
+    """Return the caution of the test of a prediction by the check points that it determines."""
+    points = trained.survey.check_points
+    if len(points) < _LEAST_POINTS:
+        return None
+    rays = mark_rays(points, trained.sparse)
+    position = points_by_camera(trained, rays)
+    variance = np.diagonal(prediction.of_marked_points(position, rays), axis1=1, axis2=2)
+    known = np.asarray(np.isfinite(position + variance).all(axis=1))
+    if known.sum() < _LEAST_POINTS:
+        return None
+    chosen = [point for point, is_known in zip(points, known, strict=True) if is_known]
+    error = position[known] - np.array([point.position_in_geo for point in chosen])
+    cov = prediction.jointly_of_marked_points(position[known], rays.of_points(known))
+    cov = cov + block_diag(*(point.cov_in_geo for point in chosen))
+    return refutation(tuple(point.name for point in chosen), error.ravel(), cov, blunders)
+
+
+def _squared_whitened(error: FloatArray, cov: FloatArray) -> tuple[float, int]:
+    """Return eᵀ C⁺ e of errors (n,), and its degrees of freedom: the rank of the covariance (n, n)."""
+    variance, axis = np.linalg.eigh((cov + cov.T) / 2)
+    regular = variance > _SINGULAR * variance[-1]
+    white = (axis.T @ error)[regular] / np.sqrt(variance[regular])
+    return float(white @ white), int(regular.sum())
+
+
+def _listed(names: tuple[str, ...]) -> str:
+    return ", ".join(names[:_NAMES_SHOWN]) + (" …" if len(names) > _NAMES_SHOWN else "")
