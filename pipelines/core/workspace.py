@@ -19,6 +19,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict
 
 from pipelines.core.errors import InputError, MissingProductError
+from pipelines.core.files import file_size
 from pipelines.core.lock import WriteLock
 from pipelines.core.options import CONFIG_FILE
 from pipelines.core.products import load_json, save_json
@@ -273,9 +274,10 @@ class Workspace:
         path = self.root / REQUESTS
         if not path.exists():
             return {}
+        file_size(path)
         try:
             document = json.loads(path.read_text(encoding="utf-8"))
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise InputError("not valid JSON: delete it and give the options again", path=path) from error
         if not isinstance(document, dict) or not all(isinstance(flags, dict) for flags in document.values()):
             raise InputError("not a table of options by stage: delete it and give them again", path=path)
