@@ -17,9 +17,9 @@ from typing import Any
 
 from pipelines.core.errors import InputError
 from pipelines.formats.bag.definitions import DEFINITIONS
+from pipelines.formats.bag.limits import bound_decompressors, check_files, refuse_large_chunk, unpacked
+from pipelines.formats.image_file import MAX_BYTES
 
-# A chunk is unpacked in one piece, with up to three copies in memory; ROS writes 0.8 to 4 MiB.
-_MAX_CHUNK_BYTES = 200 * 1024 * 1024
 # Schemas of mcap that do not belong in a ROS bag; the reader cannot open a bag with them.
 _FOREIGN_SCHEMAS = ("jsonschema", "protobuf", "flatbuffer", "ros1msg")
 # PX4 sends a message within milliseconds of its sample.
@@ -62,6 +62,7 @@ class Bag:
 
     def __init__(self, path: Path, reader: Any, ros2: bool) -> None:
         self.path, self._reader, self._ros2 = path, reader, ros2
+        self._packed = _unpack_here(reader)
         self._connections = list(reader.connections)
         # Any file of a split bag may have the definition.
         links = [link for part in _parts(reader) for link in part.connections] + self._connections
@@ -95,6 +96,8 @@ class Bag:
         while True:
             try:
                 link, bag_ns, data = next(stream)
+                if self._packed:
+                    data = unpacked(data, MAX_BYTES)
             except StopIteration:
                 return
             except Exception as error:  # the library raises any error of its parsers
@@ -228,12 +231,16 @@ def _reader(path: Path, ros2: bool) -> Any:
             path=path,
             field="--bag",
         )
-    if path.is_file() and path.suffix not in (".bag", ".mcap", ".db3"):
+    if not path.is_dir() and path.suffix not in (".bag", ".mcap", ".db3"):
         raise InputError(
             "is no bag: give a rosbag2 folder, or a .mcap, .db3 or .bag file", path=path, field="--bag"
         )
     try:
+        check_files(path)
+        bound_decompressors()
         return rosbag2.Reader(path) if ros2 else rosbag1.Reader(path)
+    except InputError:
+        raise
     except Exception as error:
         raise InputError(f"is no bag, or is damaged ({_describe(error)}): {_REPAIR}", path=path) from error
 
@@ -241,12 +248,16 @@ def _reader(path: Path, ros2: bool) -> Any:
 def _check_chunks(reader: Any, path: Path) -> None:
     for storage in _parts(reader):
         largest = max((chunk.uncompressed_size for chunk in getattr(storage, "chunks", ())), default=0)
-        if largest > _MAX_CHUNK_BYTES:
-            raise InputError(
-                f"has a chunk of {largest / 2**20:.0f} MiB (limit {_MAX_CHUNK_BYTES // 2**20}): rewrite it with "
-                "smaller ones, e.g. `mcap compress --chunk-size 4194304`",
-                path=path,
-            )
+        refuse_large_chunk(path, largest)
+
+
+def _unpack_here(reader: Any) -> bool:
+    """Return whether messages are compressed one by one, and let rosbags hand them over packed."""
+    storage = getattr(reader, "storage", None)
+    if getattr(getattr(storage, "metadata", None), "compression_mode", None) != "message":
+        return False
+    storage.metadata = storage.metadata._replace(compression_mode=None)
+    return True
 
 
 def _parts(reader: Any) -> list[Any]:
