@@ -52,7 +52,9 @@ def file_size(path: Path, *, limit_bytes: int | None = None, kind: str = "file",
         raise InputError(f"cannot be read: it is {other}, give a file", path=path, field=field)
     if limit_bytes is not None and status.st_size > limit_bytes:
         size, limit = status.st_size / 2**20, limit_bytes / 2**20
-        raise InputError(f"{size:.0f} MiB is too large for a {kind} (limit {limit:.0f} MiB)", path=path, field=field)
+        raise InputError(
+            f"{size:.0f} MiB is too large for a {kind} (limit {limit:.0f} MiB)", path=path, field=field
+        )
     return status.st_size
 
 

@@ -30,7 +30,11 @@ def load_checkpoint(path: Path) -> dict[str, Tensor]:
     """
     try:
         return {name: torch.from_numpy(array) for name, array in read_npz(path).items()}
-    except (InputError, TypeError, ValueError) as error:  # torch has no complex halves, texts or foreign byte orders
+    except (
+        InputError,
+        TypeError,
+        ValueError,
+    ) as error:  # torch has no complex halves, texts or foreign byte orders
         raise InputError(f"not a readable checkpoint: {error}; train without --resume") from error
 
 

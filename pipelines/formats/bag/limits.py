@@ -1,7 +1,7 @@
 """Limits of a bag, checked before rosbags opens it: sizes of records and chunks, and what they unpack to.
 
-rosbags trusts sizes: it allocates what a record claims, unpacks what a compressed block holds, and has all chunks in
-memory that overlap in time.
+rosbags trusts sizes: it allocates what a record claims, unpacks what a compressed block holds, and has all chunks
+in memory that overlap in time.
 """
 
 from __future__ import annotations

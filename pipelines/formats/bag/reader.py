@@ -253,7 +253,7 @@ def _check_chunks(reader: Any, path: Path) -> None:
 
 def _unpack_here(reader: Any) -> bool:
     """Return whether messages are compressed one by one, and let rosbags hand them over packed."""
-    storage = getattr(reader, "storage", None)
+    storage: Any = getattr(reader, "storage", None)
     if getattr(getattr(storage, "metadata", None), "compression_mode", None) != "message":
         return False
     storage.metadata = storage.metadata._replace(compression_mode=None)
