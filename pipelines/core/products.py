@@ -59,6 +59,8 @@ def load_json(product_type: type[ProductT], path: Path) -> ProductT:
         raise InputError(first["msg"], path=path, field=where or None) from error
     except UnicodeDecodeError as error:
         raise InputError("not a UTF-8 text file", path=path) from error
+    except (np.linalg.LinAlgError, RecursionError) as error:  # of a validator that computes
+        raise InputError(f"has values that cannot be used: {error}", path=path) from error
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}", path=path) from error
 

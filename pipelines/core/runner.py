@@ -13,8 +13,10 @@ from dataclasses import dataclass
 from importlib import metadata
 from typing import Any
 
+import numpy as np
+
 from pipelines import __version__
-from pipelines.core.errors import GeorefError, InputError, MissingProductError
+from pipelines.core.errors import DegenerateGeometryError, GeorefError, InputError, MissingProductError
 from pipelines.core.fingerprints import Memo
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.stages import StageSpec, producer_of, products_of
@@ -147,6 +149,14 @@ def _execute(workspace: Workspace, asked: Request, resume: Resume, progress: Pro
     except GeorefError as error:
         workspace.fail(spec, str(error))
         raise
+    # Products that were edited by hand have numbers that no stage writes.
+    except (np.linalg.LinAlgError, RecursionError) as error:
+        degenerate = DegenerateGeometryError(
+            f"the products that {spec.name} reads lead to no solution ({error}): were they edited? "
+            f"`georef run {workspace.root} --force` makes them again"
+        )
+        workspace.fail(spec, str(degenerate))
+        raise degenerate from error
     for product in products_of(spec):
         if not (out / product.removeprefix(f"{spec.folder}/")).exists():
             raise RuntimeError(f"{spec.module} did not write {product}")
