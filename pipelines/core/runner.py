@@ -14,6 +14,7 @@ from importlib import metadata
 from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 
 from pipelines import __version__
 from pipelines.core.errors import DegenerateGeometryError, GeorefError, InputError, MissingProductError
@@ -25,6 +26,8 @@ from pipelines.core.workspace import Manifest, Resume, StageRun, Summary, Worksp
 
 log = logging.getLogger(__name__)
 
+# Numbers that no matrix, no float and no product can hold.
+_WITHOUT_SOLUTION = (np.linalg.LinAlgError, OverflowError, FloatingPointError, RecursionError, ValidationError)
 LIBRARIES = ("numpy", "pycolmap", "torch", "numba", "pyproj")
 
 
@@ -150,9 +153,10 @@ def _execute(workspace: Workspace, asked: Request, resume: Resume, progress: Pro
         workspace.fail(spec, str(error))
         raise
     # Products that were edited by hand have numbers that no stage writes.
-    except (np.linalg.LinAlgError, RecursionError) as error:
+    except _WITHOUT_SOLUTION as error:
+        cause = " ".join(str(error).split())[:200]
         degenerate = DegenerateGeometryError(
-            f"the products that {spec.name} reads lead to no solution ({error}): were they edited? "
+            f"the products that {spec.name} reads lead to no solution ({cause}): were they edited? "
             f"`georef run {workspace.root} --force` makes them again"
         )
         workspace.fail(spec, str(degenerate))

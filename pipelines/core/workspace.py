@@ -171,7 +171,7 @@ class Workspace:
     def failure(self, spec: StageSpec) -> str | None:
         """Return the message with which the latest run of a stage failed, or None."""
         path = self.partial(spec) / FAILURE
-        return path.read_text(encoding="utf-8") if path.exists() else None
+        return path.read_text(encoding="utf-8", errors="replace") if path.is_file() else None
 
     def partial(self, spec: StageSpec) -> Path:
         """Return the folder that a stage writes into until it is complete."""
@@ -237,8 +237,8 @@ class Workspace:
         """
         partial = self.partial(spec)
         held = partial / TOKEN
-        if spec.resumable and held.exists() and resume != "never":
-            if held.read_text(encoding="utf-8") == token:
+        if spec.resumable and held.is_file() and resume != "never":
+            if held.read_text(encoding="utf-8", errors="replace") == token:
                 (partial / FAILURE).unlink(missing_ok=True)
                 return partial, True
             if resume == "always":

@@ -73,9 +73,10 @@ def forged(shape: str, content: bytes, descr: str = "<f8") -> bytes:
         ("(-2, -1)", "<f8", "not a readable NPZ file"),
         ("(2.0,)", "<f8", "not a readable NPZ file"),
         ("(1,)", "|O", "allow_pickle=False"),
+        ("(1,", "<f8", "not a readable NPZ file"),
         ("(" * 300 + "1" + ",)" * 300, "<f8", "not a readable NPZ file"),
     ],
-    ids=["huge", "product", "negative", "fraction", "objects", "nested"],
+    ids=["huge", "product", "negative", "fraction", "objects", "unclosed", "nested"],
 )
 def test_headers_are_checked_before_the_data(tmp_path: Path, shape: str, descr: str, message: str) -> None:
     (tmp_path / "a.npz").write_bytes(forged(shape, bytes(16), descr))

@@ -362,7 +362,10 @@ def test_large_input_file_counts_by_size_and_time(tmp_path: Path, monkeypatch: p
     assert seen() != large
 
 
-@pytest.mark.parametrize("error", [np.linalg.LinAlgError("Singular matrix"), RecursionError("nested too deeply")])
+@pytest.mark.parametrize(
+    "error",
+    [np.linalg.LinAlgError("Singular matrix"), RecursionError("nested too deeply"), OverflowError("out of range")],
+)
 def test_products_without_a_solution_are_a_known_failure(
     workspace: Workspace, photos: Path, error: Exception
 ) -> None:

@@ -249,3 +249,18 @@ def test_variant_reads_what_is_lent_and_writes_its_own(tmp_path: Path) -> None:
     assert variant.photographs("/photos") == Path("/photos")
     with pytest.raises(MissingProductError, match=f"georef compare {workspace.root}"):
         variant.path(MODEL)  # not the workspace's own, even if it were there
+
+
+def test_failure_that_is_no_text_is_shown_as_far_as_it_is(workspace: Workspace) -> None:
+    partial = workspace.partial(TRAIN)
+    partial.mkdir(parents=True)
+    (partial / "failure.txt").write_bytes(b"no \xe3 overlap")
+    assert workspace.failure(TRAIN) == "no \ufffd overlap"
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, '{"a":' * 100_000])
+def test_requests_nested_too_deeply_are_refused(workspace: Workspace, text: str) -> None:
+    workspace.root.mkdir()
+    (workspace.root / "requests.json").write_text(text)
+    with pytest.raises(InputError, match=r"requests\.json: not valid JSON: delete it"):
+        workspace.requests()

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import sqlite3
 import struct
 import sys
 import tracemalloc
 from pathlib import Path
 
 import pytest
+from rosbags.rosbag2 import StoragePlugin
 
 from pipelines.core.errors import InputError
 from pipelines.formats.bag.limits import MAX_CHUNK_BYTES, unpacked
 from pipelines.formats.bag.reader import open_bag
+from tests import bags
 
 if sys.version_info >= (3, 14):
     from compression import zstd
@@ -123,4 +127,34 @@ def test_metadata_and_files_of_a_folder(tmp_path: Path) -> None:
     with (tmp_path / "metadata.yaml").open("wb") as handle:
         handle.truncate(2**30)
     with pytest.raises(InputError, match=r"1024 MiB is too large for a metadata\.yaml"), open_bag(tmp_path):
+        pass
+
+
+@pytest.mark.parametrize("name", ["message_count: some", "message_count: 1.5"])
+def test_metadata_with_a_count_that_is_none(tmp_path: Path, name: str) -> None:
+    """YAML has any type in any place."""
+    path = bags.write(tmp_path / "bag", bags.imu(bags.Flight(count=1))[:3])
+    text = (path / "metadata.yaml").read_text()
+    at = text.index("topic_metadata")
+    changed = text[:at].replace("message_count: 3", name) if "- message_count: 3" in text[:at] else text
+    changed = text.replace("- message_count: 3", f"- {name}") if changed == text else changed + text[at:]
+    (path / "metadata.yaml").write_text(changed)
+    with pytest.raises(InputError, match="is damaged"), open_bag(path):
+        pass
+
+
+def test_sqlite_with_a_number_in_place_of_bytes(tmp_path: Path) -> None:
+    """`bytes(10**12)` would be a terabyte of zeros."""
+    path = bags.write(tmp_path / "bag", bags.imu(bags.Flight(count=1))[:3], bags.Form(StoragePlugin.SQLITE3))
+    (file,) = path.glob("*.db3")
+    with contextlib.closing(sqlite3.connect(file)) as base:
+        base.execute("UPDATE messages SET data = 1000000000000 WHERE id = 2")
+        base.commit()
+    with open_bag(file) as bag:
+        assert len(list(bag.messages(bag.topics))) == 1
+        assert bag.damage is not None and "is no bytes" in bag.damage
+    with contextlib.closing(sqlite3.connect(file)) as base:
+        base.execute("UPDATE topics SET name = x'00ff'")
+        base.commit()
+    with pytest.raises(InputError, match="is damaged"), open_bag(file):
         pass
