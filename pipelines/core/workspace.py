@@ -12,11 +12,11 @@ import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, FiniteFloat, model_validator
 
 from pipelines.core.errors import InputError, MissingProductError
 from pipelines.core.files import file_size
@@ -58,10 +58,23 @@ class Manifest(BaseModel):
     inputs: dict[str, str]
     versions: dict[str, str]
     started: datetime
-    duration_s: float
+    duration_s: FiniteFloat
     key_figure: str
     values: dict[str, Any]
     warnings: list[str]
+
+    @model_validator(mode="after")
+    def _ends_in_the_calendar(self) -> Manifest:
+        try:
+            _ = self.finished
+        except OverflowError as error:
+            raise ValueError("duration_s: ends beyond the calendar") from error
+        return self
+
+    @property
+    def finished(self) -> datetime:
+        """Time at which the stage ended, UTC."""
+        return self.started + timedelta(seconds=self.duration_s)
 
 
 @dataclass(frozen=True)

@@ -264,3 +264,14 @@ def test_requests_nested_too_deeply_are_refused(workspace: Workspace, text: str)
     (workspace.root / "requests.json").write_text(text)
     with pytest.raises(InputError, match=r"requests\.json: not valid JSON: delete it"):
         workspace.requests()
+
+
+@pytest.mark.parametrize("duration", ["1e300", "1e999", "NaN"])
+def test_manifest_that_ends_beyond_the_calendar_is_damaged(workspace: Workspace, duration: str) -> None:
+    document = {key: {} for key in ("config", "inputs", "versions", "values")}
+    document |= {"stage": "train", "key_figure": "", "warnings": [], "started": "2026-01-01T00:00:00Z"}
+    folder = workspace.root / TRAIN.folder
+    folder.mkdir(parents=True)
+    (folder / "manifest.json").write_text(json.dumps(document)[:-1] + f', "duration_s": {duration}}}')
+    with pytest.raises(InputError, match=r"manifest\.json"):
+        workspace.manifest(TRAIN)
