@@ -26,7 +26,9 @@ def print_json(document: Any) -> None:
 
 def print_rich(*parts: RenderableType) -> None:
     """Print renderables: in colour on a terminal, plain elsewhere."""
-    console = Console(width=None if sys.stdout.isatty() else PIPED_WIDTH, highlight=False, file=sys.stdout)
+    console = Console(
+        width=None if sys.stdout.isatty() else PIPED_WIDTH, highlight=False, emoji=False, file=sys.stdout
+    )
     for part in parts:
         console.print(part)
 

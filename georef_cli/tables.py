@@ -107,9 +107,11 @@ def comparison(table: Comparison) -> list[Renderable]:
     for column in figures.columns[1:]:
         column.justify, column.no_wrap = "right", True
     for row in table.rows:
-        figures.add_row(row.configuration, *cells(row))
-    notes = [f"[bold]{row.configuration}[/] {escape(f'{row.title}: {row.note}')}" for row in table.rows]
-    remarks = [f"[yellow]{row.configuration}:[/] {escape(text)}" for row in table.rows for text in remarks_on(row)]
+        figures.add_row(escape(row.configuration), *map(escape, cells(row)))
+    notes = [f"[bold]{escape(row.configuration)}[/] {escape(f'{row.title}: {row.note}')}" for row in table.rows]
+    remarks = [
+        f"[yellow]{escape(row.configuration)}:[/] {escape(text)}" for row in table.rows for text in remarks_on(row)
+    ]
     return ["[bold]Test views in dB, check points in metres[/]", figures, "", *notes, *remarks]
 
 
@@ -134,7 +136,7 @@ def topics(rows: Iterable[Mapping[str, Any]]) -> Table:
             duration(span),
             duration(row["longest_gap_s"]),
             escape(row["frame"]),
-            f"[green]{row['use']}[/]",
+            f"[green]{escape(row['use'])}[/]",
             escape(", ".join(filter(None, remarks))),
         )
     return table
@@ -192,7 +194,7 @@ def _rows(title: str, rows: Mapping[str, Mapping[str, Any]], columns: Mapping[st
     for column in table.columns[1:]:
         column.justify = "right"
     for name, row in rows.items():
-        table.add_row(name, *(_number(row.get(key)) for key in heads))
+        table.add_row(escape(name), *(escape(_number(row.get(key))) for key in heads))
     return Group(f"\n[bold]{title}[/]", table)
 
 

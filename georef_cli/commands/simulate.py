@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+from rich.markup import escape
 
 from georef_cli import options, tables
 from georef_cli.display import progress_for
@@ -29,7 +30,7 @@ def _simulate(ctx: click.Context, **values: Any) -> None:
         print_json({**dataclasses.asdict(summary), "directory": str(summary.directory)})
         return
     took = tables.duration(time.monotonic() - started)
-    print_rich(f"[bold]simulate[/]: {summary.key_figure} in {summary.directory} ({took})")
+    print_rich(f"[bold]simulate[/]: {escape(f'{summary.key_figure} in {summary.directory} ({took})')}")
 
 
 command = click.Command(

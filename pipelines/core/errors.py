@@ -74,5 +74,9 @@ class ResourceError(GeorefError):
     """Machine too small for the options; the message names options that need less."""
 
 
+class CrashError(GeorefError):
+    """Native library that ended its process."""
+
+
 class BackendUnavailableError(GeorefError):
     """Missing optional library or device; the message names the extra to install."""

@@ -13,9 +13,12 @@ from dataclasses import dataclass
 from importlib import metadata
 from typing import Any
 
+import numpy as np
+from pydantic import ValidationError
+
 from pipelines import __version__
 from pipelines.core.cautions import union
-from pipelines.core.errors import GeorefError, InputError, MissingProductError
+from pipelines.core.errors import DegenerateGeometryError, GeorefError, InputError, MissingProductError
 from pipelines.core.fingerprints import Memo
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.stages import StageSpec, producer_of, products_of
@@ -34,6 +37,8 @@ from pipelines.core.workspace import Manifest, Resume, StageRun, Summary, Worksp
 
 log = logging.getLogger(__name__)
 
+# Numbers that no matrix, no float and no product can hold.
+_WITHOUT_SOLUTION = (np.linalg.LinAlgError, OverflowError, FloatingPointError, RecursionError, ValidationError)
 LIBRARIES = ("numpy", "pycolmap", "torch", "numba", "pyproj")
 
 
@@ -158,6 +163,15 @@ def _execute(workspace: Workspace, asked: Request, resume: Resume, progress: Pro
     except GeorefError as error:
         workspace.fail(spec, str(error))
         raise
+    # Products that were edited by hand have numbers that no stage writes.
+    except _WITHOUT_SOLUTION as error:
+        cause = " ".join(str(error).split())[:200]
+        degenerate = DegenerateGeometryError(
+            f"the products that {spec.name} reads lead to no solution ({cause}): were they edited? "
+            f"`georef run {workspace.root} --force` makes them again"
+        )
+        workspace.fail(spec, str(degenerate))
+        raise degenerate from error
     for product in products_of(spec):
         if not (out / product.removeprefix(f"{spec.folder}/")).exists():
             raise RuntimeError(f"{spec.module} did not write {product}")

@@ -12,14 +12,15 @@ import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, FiniteFloat, model_validator
 
 from pipelines.core.cautions import Caution
 from pipelines.core.errors import InputError, MissingProductError
+from pipelines.core.files import file_size
 from pipelines.core.lock import WriteLock
 from pipelines.core.options import CONFIG_FILE
 from pipelines.core.products import load_json, save_json
@@ -59,11 +60,24 @@ class Manifest(BaseModel):
     inputs: dict[str, str]
     versions: dict[str, str]
     started: datetime
-    duration_s: float
+    duration_s: FiniteFloat
     key_figure: str
     values: dict[str, Any]
     warnings: list[str]
     cautions: tuple[Caution, ...] = ()
+
+    @model_validator(mode="after")
+    def _ends_in_the_calendar(self) -> Manifest:
+        try:
+            _ = self.finished
+        except OverflowError as error:
+            raise ValueError("duration_s: ends beyond the calendar") from error
+        return self
+
+    @property
+    def finished(self) -> datetime:
+        """Time at which the stage ended, UTC."""
+        return self.started + timedelta(seconds=self.duration_s)
 
 
 @dataclass(frozen=True)
@@ -175,7 +189,7 @@ class Workspace:
     def failure(self, spec: StageSpec) -> str | None:
         """Return the message with which the latest run of a stage failed, or None."""
         path = self.partial(spec) / FAILURE
-        return path.read_text(encoding="utf-8") if path.exists() else None
+        return path.read_text(encoding="utf-8", errors="replace") if path.is_file() else None
 
     def partial(self, spec: StageSpec) -> Path:
         """Return the folder that a stage writes into until it is complete."""
@@ -241,8 +255,8 @@ class Workspace:
         """
         partial = self.partial(spec)
         held = partial / TOKEN
-        if spec.resumable and held.exists() and resume != "never":
-            if held.read_text(encoding="utf-8") == token:
+        if spec.resumable and held.is_file() and resume != "never":
+            if held.read_text(encoding="utf-8", errors="replace") == token:
                 (partial / FAILURE).unlink(missing_ok=True)
                 return partial, True
             if resume == "always":
@@ -278,9 +292,10 @@ class Workspace:
         path = self.root / REQUESTS
         if not path.exists():
             return {}
+        file_size(path)
         try:
             document = json.loads(path.read_text(encoding="utf-8"))
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise InputError("not valid JSON: delete it and give the options again", path=path) from error
         if not isinstance(document, dict) or not all(isinstance(flags, dict) for flags in document.values()):
             raise InputError("not a table of options by stage: delete it and give them again", path=path)

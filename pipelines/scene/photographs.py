@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.core.errors import InputError
+from pipelines.core.files import file_size
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import BoolArray, ByteArray, Float32Array
 from pipelines.geometry.cameras import Camera, Pinhole, distort, undistort
@@ -144,6 +145,7 @@ class ImageCache:
     def _write(self, index: int) -> None:
         photograph, pinhole = self._photographs[index], self.pinhole(index)
         # COLMAP ignores the EXIF orientation of images, and so must this cache.
+        file_size(photograph.file)
         full = cv2.imread(str(photograph.file), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
         if full is None:
             raise InputError("the photograph cannot be read", path=photograph.file)
