@@ -203,7 +203,7 @@ def _warnings(observed: _CameraObservations, source: str) -> list[str]:
         if turn > 4 * sigma:
             warnings.append(
                 f"recorded attitudes are turned by {np.degrees(turn):.1f}° against the fixes "
-                f"(σ {np.degrees(sigma):.1f}°): boresight or compass? `--attitude sfm` does without them"
+                f"(σ {np.degrees(sigma):.1f}°): boresight, compass, or positions at other times or in other axes?"
             )
     return warnings
 

@@ -1,7 +1,7 @@
 """Positions of a table against those in the photographs' EXIF, image by image, in view of the σ of both.
 
-EXIF is not used where a table is given. But two receivers that disagree by far more than their σ are a contradiction
-that nothing later would notice: heights in feet, another zone, exchanged axes, times that are off.
+EXIF is not used where a table is given. But two receivers that disagree by far more than their σ are a
+contradiction that nothing later would notice: heights in feet, another zone, exchanged axes, times that are off.
 """
 
 from __future__ import annotations
@@ -54,7 +54,9 @@ def compare_with_exif(
     enu_from_ecef = np.swapaxes(ecef_from_enu_rotation(lla), 1, 2)
     apart = np.einsum("nij,nj->ni", enu_from_ecef, poses.position_in_ecef[both] - exif.position_in_ecef[both])
     sigma = np.hypot(poses.sigma_enu_m[both], exif.sigma_enu_m[both])
-    found = [*_horizontal(apart, sigma, path), *_heights(poses, lla, apart, sigma, both, path)]
+    in_table = lla_from_ecef(poses.position_in_ecef[both])[:, 2]
+    heights = _heights(np.column_stack([in_table, lla[:, 2]]), apart[:, 2], sigma[:, 2], path)
+    found = [*_horizontal(apart, sigma, path), *heights]
     for fatal, caution in found:
         if fatal and not options.accept_contradiction:
             raise ContradictionError(
@@ -89,22 +91,22 @@ def _horizontal(apart: FloatArray, sigma: FloatArray, path: Path) -> list[tuple[
 
 
 def _heights(
-    poses: ImagePoses, lla: FloatArray, apart: FloatArray, sigma: FloatArray, both: np.ndarray, path: Path
+    heights_m: FloatArray, apart_m: FloatArray, sigma_m: FloatArray, path: Path
 ) -> list[tuple[bool, Caution]]:
-    offset, spread = float(np.median(apart[:, 2])), mad_sigma(apart[:, 2])
-    allowed = max(_SIGMAS * float(np.median(sigma[:, 2])), _LEAST_M)
+    """Compare heights (n, 2) of table and EXIF, which are apart (n,), with the σ (n,) of both."""
+    offset, spread = float(np.median(apart_m)), mad_sigma(apart_m)
+    allowed = max(_SIGMAS * float(np.median(sigma_m)), _LEAST_M)
     if abs(offset) <= allowed:
         return []
-    in_table, in_exif = lla_from_ecef(poses.position_in_ecef[both])[:, 2], lla[:, 2]
     for factor, cause in (
         (_FOOT_M, "in feet, and taken for metres"),
         (1 / _FOOT_M, "in metres, and taken for feet"),
     ):
-        if abs(float(np.median(in_table * factor - in_exif))) < max(allowed, 0.05 * abs(offset)):
+        if abs(float(np.median(heights_m[:, 0] * factor - heights_m[:, 1]))) < max(allowed, 0.05 * abs(offset)):
             sentence = f"the heights in {path.name} are {cause}: those in EXIF are {factor:.4g} times as large"
             return [(True, Caution(code="feet", sentence=sentence))]
     sentence = (
-        f"the heights in {path.name} differ from those in EXIF by {offset:+.1f} m (± {spread:.1f} m): one is above the "
-        "ellipsoid, the other above a geoid, the take-off or a barometer's zero; see --vertical"
+        f"the heights in {path.name} differ from those in EXIF by {offset:+.1f} m (± {spread:.1f} m): one is above "
+        "the ellipsoid, the other above a geoid, the take-off or a barometer's zero; see --vertical"
     )
     return [(abs(offset) > _GEOID_M, Caution(code="heights-apart", sentence=sentence))]

@@ -36,6 +36,7 @@ from pipelines.scene.variance_factors import VarianceFactor
 # A stated σ that is too small by this factor, with a scatter of this many metres, is a contradiction.
 _WRONG_SIGMA, _WRONG_SCATTER_M = 10.0, 0.3
 _EVERYDAY_SHIFT_M = 5.0
+_LEAST_FIXES = 4
 _ATTITUDE_SIGMAS, _ATTITUDE_RAD = 4.0, np.radians(8.0)
 
 
@@ -50,6 +51,11 @@ class Verdict:
 
     contradictions: tuple[Caution, ...]
     cautions: tuple[Caution, ...]
+
+    @property
+    def all(self) -> tuple[Caution, ...]:
+        """Contradictions, then cautions."""
+        return self.contradictions + self.cautions
 
 
 def judge(survey: Survey, model: SparseModel, joint: JointAdjustment) -> Verdict:
@@ -79,6 +85,29 @@ def judge(survey: Survey, model: SparseModel, joint: JointAdjustment) -> Verdict
     return Verdict(tuple(contradictions), tuple(cautions))
 
 
+def unadjustable(survey: Survey, model: SparseModel, geo_from_local: Similarity, reason: str) -> Verdict:
+    """Return the findings on an alignment that no joint adjustment could confirm.
+
+    Args:
+        survey: as stated.
+        model: SfM model.
+        geo_from_local: the alignment.
+        reason: why there is no joint adjustment.
+    """
+    contradictions = _upside_down(survey, model, geo_from_local)
+    fixes = fix_correspondences(survey, model)
+    if len(fixes) >= _LEAST_FIXES and not contradictions:
+        scatter = fit(fixes.in_local, fixes.in_geo)[1]
+        explained = explanations_of_fixes(fixes.in_local, fixes.in_geo, _times(survey, fixes.name), survey.origin)
+        cause = f": {explained[0].sentence}" if explained else ": are they those of these photographs?"
+        sentence = (
+            f"the fixes scatter by {scatter:.2f} m an axis about the SfM model and determine no similarity{cause}"
+        )
+        contradictions.append(Caution(code=explained[0].code if explained else "sigma-refuted", sentence=sentence))
+    checked = Caution(code="not-checked", sentence=f"nothing checks the stated σ: {reason}")
+    return Verdict(tuple(contradictions), (checked,))
+
+
 def _factor(joint: JointAdjustment, group: str) -> VarianceFactor | None:
     return next((factor for factor in joint.factors if factor.group == group), None)
 
@@ -97,8 +126,8 @@ def _upside_down(survey: Survey, model: SparseModel, geo_from_local: Similarity)
         similarity, scatter = fit(fixes.in_local, mirrored(fixes.in_geo))
         if not hangs_upside_down(model, similarity):
             sentence += (
-                f"; the mirrored track fits upright (scatter {scatter:.2f} m): east and north, or the axes of the CRS, "
-                "are exchanged"
+                f"; the mirrored track fits upright (scatter {scatter:.2f} m): east and north, or the axes of the "
+                "CRS, are exchanged"
             )
     except DegenerateGeometryError:
         pass
@@ -138,17 +167,16 @@ def _fixes_against_model(
 
 def _control_against_fixes(joint: JointAdjustment) -> list[tuple[bool, Caution]]:
     """Return whether the control points contradict the fixes, as (ends the stage, caution)."""
-    problem, found = joint.problem, []
-    bias = joint.bias
+    problem = joint.problem
+    found: list[tuple[bool, Caution]] = []
+    bias, height_m = joint.bias, _height_of_control(joint)
     within = bias is not None and _within_sigma(joint, np.array(bias.value))
     if bias is not None and not within:
         length = float(np.linalg.norm(bias.value))
-        values = ", ".join(
-            f"{value:+.3f} ± {sigma:.3f}" for value, sigma in zip(bias.value, bias.sigma, strict=True)
-        )
+        values = _with_sigma(bias.value, bias.sigma)
         sentence = (
             f"all fixes are shifted by ({values}) m east, north, up against the control points, which decide the "
-            f"position. Either side may be wrong: {shift_sentence(np.array(bias.value))}"
+            f"position. Either side may be wrong: {shift_sentence(np.array(bias.value), height_m)}"
         )
         found.append((length > _EVERYDAY_SHIFT_M, Caution(code="fixes-shifted", sentence=sentence)))
     control, factor = problem.term(ControlTerm), _factor(joint, "control points")
@@ -168,7 +196,7 @@ def _control_against_fixes(joint: JointAdjustment) -> list[tuple[bool, Caution]]
         values = ", ".join(f"{value:+.2f}" for value in shift)
         sentence = (
             f"control points and fixes are apart by one constant shift of ({values}) m east, north, up: "
-            f"{shift_sentence(shift)}"
+            f"{shift_sentence(shift, height_m)}"
         )
         found.append((True, Caution(code="control-shifted", sentence=sentence)))
     elif factor.applied > 1.0:
@@ -177,8 +205,8 @@ def _control_against_fixes(joint: JointAdjustment) -> list[tuple[bool, Caution]]
         )
         who = "which nobody stated" if factor.sigma_source == "default" else "as stated"
         sentence = (
-            f"the control points miss by {scatter:.2f} m RMS an axis, their σ is {sigma:.3g} m, {who}: coordinates, "
-            "marks or the SfM model are wrong; every σ of the result is widened"
+            f"the control points miss by {scatter:.2f} m RMS an axis, their σ is {sigma:.3g} m, {who}: "
+            "coordinates, marks or the SfM model are wrong; every σ of the result is widened"
         )
         found.append(
             (_is_wrong(factor) and scatter > _WRONG_SCATTER_M, Caution(code="sigma-refuted", sentence=sentence))
@@ -187,6 +215,16 @@ def _control_against_fixes(joint: JointAdjustment) -> list[tuple[bool, Caution]]
         sentence = f"{len(rejected)} of {factor.count} control points are outliers: {', '.join(rejected[:8])}"
         found.append((False, Caution(code="control-outliers", sentence=sentence)))
     return found
+
+
+def _height_of_control(joint: JointAdjustment) -> float:
+    """Return the median ellipsoidal height of the control points as stated, NaN without any."""
+    heights = [point.position_in_geo[2] for point in joint.survey.control_points]
+    return float(np.median(heights)) + joint.survey.origin.alt_m if heights else float("nan")
+
+
+def _with_sigma(values: tuple[float, ...], sigmas: tuple[float, ...]) -> str:
+    return ", ".join(f"{value:+.3f} ± {sigma:.3f}" for value, sigma in zip(values, sigmas, strict=True))
 
 
 def _within_sigma(joint: JointAdjustment, shift_m: FloatArray) -> bool:
@@ -208,8 +246,8 @@ def _attitudes(survey: Survey, model: SparseModel, joint: JointAdjustment) -> li
     if angle <= max(_ATTITUDE_SIGMAS * sigma, _ATTITUDE_RAD):
         return []
     sentence = (
-        f"the recorded attitudes are turned by {np.degrees(angle):.1f}° against this solution (σ {np.degrees(sigma):.1f}°): "
-        "the compass, the mount, or the positions (their times, their axes) are wrong"
+        f"the recorded attitudes are turned by {np.degrees(angle):.1f}° against this solution "
+        f"(σ {np.degrees(sigma):.1f}°): the compass, the mount, or the positions (their times, their axes) are wrong"
     )
     return [Caution(code="attitudes-contradict", sentence=sentence)]
 
@@ -220,8 +258,8 @@ def _weak_checks(joint: JointAdjustment) -> list[Caution]:
     redundancy, cautions = sum(factor.redundancy for factor in tested), []
     if redundancy < 6.0:
         sentence = (
-            f"only {redundancy:.0f} degrees of freedom check the σ of the positions: a wrong position can go unnoticed; "
-            "add fixes or control points"
+            f"only {redundancy:.0f} degrees of freedom check the σ of the positions: a wrong position can go "
+            "unnoticed; add fixes or control points"
         )
         cautions.append(Caution(code="hardly-checked", sentence=sentence))
     fixes = joint.problem.term(FixTerm)

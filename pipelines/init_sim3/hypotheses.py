@@ -19,8 +19,9 @@ from pipelines.geometry.similarity import Similarity, umeyama
 from pipelines.robust.statistics import median_chi2
 
 FOOT_M = 0.3048
+_LEAST_FEET_M, _GEOID_M = 50.0, 110.0
 # A hypothesis explains a contradiction if it lowers the scatter by so much.
-_EXPLAINS = 3.0
+_EXPLAINS = 2.0
 _CLOCK_S, _CLOCK_STEP_S = 15.0, 0.25
 _ROUNDS = 20
 _LEAST = 4
@@ -153,8 +154,8 @@ def _drifts(position: FloatArray, center: FloatArray, time_s: FloatArray) -> Ite
     if best is not None:
         yield (
             "step",
-            f"the last {len(order) - best[3]} of {len(order)} fixes are shifted by {_vector(best[2])} m east, north, "
-            "up against the others: another base station or datum",
+            f"the last {len(order) - best[3]} of {len(order)} fixes are shifted by {_vector(best[2])} m east, "
+            "north, up against the others: another base station or datum",
             best[1],
         )
 
@@ -201,11 +202,25 @@ def _clock(center: FloatArray, position: FloatArray, time_s: FloatArray) -> list
     return [Hypothesis("clock", sentence, best[0], best[2])]
 
 
-def shift_sentence(shift_m: FloatArray) -> str:
-    """Return the likely cause of a constant shift (3,) of the fixes against the control points, in metres."""
+def shift_sentence(shift_m: FloatArray, height_m: float) -> str:
+    """Return the likely cause of a constant shift between fixes and control points.
+
+    Args:
+        shift_m: (3,) east, north, up; of which of the two is of no account.
+        height_m: height of the control points as stated.
+    """
     horizontal, vertical = float(np.hypot(shift_m[0], shift_m[1])), abs(float(shift_m[2]))
-    if horizontal < 0.2 * vertical and 5.0 < vertical < 110.0:
-        return f"heights apart by {vertical:.1f} m: one is above the ellipsoid, the other above a geoid or the take-off"
+    for sign in (-1.0, 1.0):
+        other_m = height_m + sign * float(shift_m[2])
+        for high, low, side in ((height_m, other_m, "control points"), (other_m, height_m, "fixes")):
+            if vertical > _LEAST_FEET_M and abs(high * FOOT_M - low) < 0.02 * abs(low):
+                return f"the heights of the {side} are in feet, and taken for metres"
+    if horizontal < 0.2 * vertical and 5.0 < vertical < _GEOID_M:
+        return (
+            f"heights apart by {vertical:.1f} m: one above the ellipsoid, the other above a geoid or the take-off"
+        )
+    if horizontal < 0.2 * vertical and vertical >= _GEOID_M:
+        return "heights above another zero: the take-off, or another unit"
     if horizontal > 100_000.0:
         return "another zone, or exchanged axes"
     if horizontal > 20.0:
