@@ -105,19 +105,14 @@ def geolocate(survey: Survey, model: SparseModel, options: GeolocateOptions) -> 
 
     Raises:
         InputError: the options demand `recorded` attitudes, and fewer than two images have a fix and an attitude.
-        DegenerateGeometryError: SfM's rotations are needed, the fixes do not determine their direction, and there
-            are fewer than three control points.
     """
     observed = _observed(survey, model)
     if len(observed.fixes) == 0:
         return _without_positions(model, _NO_FIXES)
     source = _rotation_source(observed, options)
     if source == "sfm" and observed.alignment is None:
-        if len(survey.control_points) >= 3:
-            return _without_positions(
-                model, f"no directions: positions come from control points ({observed.problem})"
-            )
-        raise DegenerateGeometryError(f"SfM's rotations cannot be turned to the Earth: {observed.problem}")
+        # Control points may place the model nevertheless, or `init-sim3` finds what is wrong with the fixes.
+        return _without_positions(model, f"no directions for the SfM points: {observed.problem}")
     warnings = _warnings(observed, source)
     views, usable = _views(observed, source, options.sigma_px)
     rays = _rays(model, usable)

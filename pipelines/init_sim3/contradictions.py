@@ -36,7 +36,11 @@ from pipelines.scene.variance_factors import VarianceFactor
 # A stated σ that is too small by this factor, with a scatter of this many metres, is a contradiction.
 _WRONG_SIGMA, _WRONG_SCATTER_M = 10.0, 0.3
 _EVERYDAY_SHIFT_M = 5.0
+# A variance factor up to this, of σ that are half as large again, is applied without blame.
+_QUIET_FACTOR = 2.25
 _LEAST_FIXES = 4
+# Residuals share a shift that is so many times as large as what is left without it.
+_SHIFT_SPREADS = 5.0
 _ATTITUDE_SIGMAS, _ATTITUDE_RAD = 4.0, np.radians(8.0)
 
 
@@ -85,27 +89,28 @@ def judge(survey: Survey, model: SparseModel, joint: JointAdjustment) -> Verdict
     return Verdict(tuple(contradictions), tuple(cautions))
 
 
-def unadjustable(survey: Survey, model: SparseModel, geo_from_local: Similarity, reason: str) -> Verdict:
-    """Return the findings on an alignment that no joint adjustment could confirm.
+def unadjustable(survey: Survey, model: SparseModel, geo_from_local: Similarity | None) -> tuple[Caution, ...]:
+    """Return the contradictions of measurements that determine no adjustment.
 
     Args:
         survey: as stated.
         model: SfM model.
-        geo_from_local: the alignment.
-        reason: why there is no joint adjustment.
+        geo_from_local: alignment of the two; None: not even that.
     """
-    contradictions = _upside_down(survey, model, geo_from_local)
+    if geo_from_local is not None and (upside_down := _upside_down(survey, model, geo_from_local)):
+        return tuple(upside_down)
     fixes = fix_correspondences(survey, model)
-    if len(fixes) >= _LEAST_FIXES and not contradictions:
-        scatter = fit(fixes.in_local, fixes.in_geo)[1]
-        explained = explanations_of_fixes(fixes.in_local, fixes.in_geo, _times(survey, fixes.name), survey.origin)
-        cause = f": {explained[0].sentence}" if explained else ": are they those of these photographs?"
-        sentence = (
-            f"the fixes scatter by {scatter:.2f} m an axis about the SfM model and determine no similarity{cause}"
-        )
-        contradictions.append(Caution(code=explained[0].code if explained else "sigma-refuted", sentence=sentence))
-    checked = Caution(code="not-checked", sentence=f"nothing checks the stated σ: {reason}")
-    return Verdict(tuple(contradictions), (checked,))
+    if len(fixes) < _LEAST_FIXES:
+        return ()
+    try:
+        scatter, best = fit(fixes.in_local, fixes.in_geo)[1], _explanation(survey, model)
+    except DegenerateGeometryError:
+        return ()
+    if scatter < max(_WRONG_SIGMA * _sigma_m(fixes.cov_in_geo), _WRONG_SCATTER_M):
+        return ()
+    cause = "are they those of these photographs?" if best is None else best.sentence
+    sentence = f"the fixes scatter by {scatter:.2f} m an axis about the SfM model, and fix no similarity: {cause}"
+    return (Caution(code="sigma-refuted" if best is None else best.code, sentence=sentence),)
 
 
 def _factor(joint: JointAdjustment, group: str) -> VarianceFactor | None:
@@ -138,24 +143,22 @@ def _fixes_against_model(
     survey: Survey, model: SparseModel, factor: VarianceFactor, joint: JointAdjustment
 ) -> list[Caution]:
     """Return the contradiction of fixes and SfM model, with the mistake that explains it."""
-    if factor.applied <= 1.0 and factor.used == factor.count:
+    if factor.applied <= _QUIET_FACTOR:
         return []
+    shift = _constant_shift(joint.residuals(FixTerm)[1])
+    if shift is not None and joint.problem.control is not None:
+        return [_apart(-shift, _height_of_control(joint))]
     correspondences = fix_correspondences(survey, model)
     sigma = _sigma_m(correspondences.cov_in_geo)
     rejected = factor.count - factor.used
-    if factor.applied <= 1.0:
-        return []
     sides = (
         f"the fixes scatter by {sigma * factor.applied**0.5:.2f} m an axis about the SfM model, their σ is "
         f"{sigma:.3g} m"
     )
     if rejected:
         sides += f", and {rejected} of {factor.count} are outliers"
-    explained = explanations_of_fixes(
-        correspondences.in_local, correspondences.in_geo, _times(survey, correspondences.name), survey.origin
-    )
-    if explained:
-        best: Hypothesis = explained[0]
+    best = _explanation(survey, model)
+    if best is not None:
         return [
             Caution(
                 code=best.code, sentence=f"{sides}; with this they fit to {best.scatter_m:.2f} m: {best.sentence}"
@@ -182,24 +185,17 @@ def _control_against_fixes(joint: JointAdjustment) -> list[tuple[bool, Caution]]
     control, factor = problem.term(ControlTerm), _factor(joint, "control points")
     if control is None or factor is None or (factor.applied <= 1.0 and factor.used == factor.count):
         return found
-    residual = -control.residuals(problem.estimate()).detach().cpu().numpy()
-    shift = np.median(residual, axis=0)
-    spread = float(np.linalg.norm(residual - shift, axis=1).mean())
+    residual = joint.residuals(ControlTerm)[1]
+    shift = _constant_shift(residual)
     rejected = [
         f"{name} ({np.linalg.norm(miss):.2f} m)"
         for name, miss, used in zip(control.point_id, residual, joint.components[control.kind].used, strict=True)
         if not used
     ]
-    shifted = problem.term(FixTerm) is not None and len(residual) >= 2 and np.linalg.norm(shift) > 5 * spread
     scatter = float(np.sqrt((residual**2).mean()))
-    if shifted:
-        values = ", ".join(f"{value:+.2f}" for value in shift)
-        sentence = (
-            f"control points and fixes are apart by one constant shift of ({values}) m east, north, up: "
-            f"{shift_sentence(shift, height_m)}"
-        )
-        found.append((True, Caution(code="control-shifted", sentence=sentence)))
-    elif factor.applied > 1.0:
+    if shift is not None and problem.fixes is not None:
+        found.append((True, _apart(shift, height_m)))
+    elif factor.applied > _QUIET_FACTOR:
         sigma = (
             _sigma_m(np.array([point.cov_in_geo for point in joint.survey.control_points])) / factor.applied**0.5
         )
@@ -215,6 +211,31 @@ def _control_against_fixes(joint: JointAdjustment) -> list[tuple[bool, Caution]]
         sentence = f"{len(rejected)} of {factor.count} control points are outliers: {', '.join(rejected[:8])}"
         found.append((False, Caution(code="control-outliers", sentence=sentence)))
     return found
+
+
+def _constant_shift(residual: FloatArray) -> FloatArray | None:
+    """Return the shift (3,) that residuals (M, 3) share, if they have little else in common; or None."""
+    shift = np.median(residual, axis=0)
+    spread = float(np.linalg.norm(residual - shift, axis=1).mean())
+    return shift if len(residual) > 1 and np.linalg.norm(shift) > _SHIFT_SPREADS * spread else None
+
+
+def _apart(shift_m: FloatArray, height_m: float) -> Caution:
+    values = ", ".join(f"{value:+.2f}" for value in shift_m)
+    sentence = (
+        f"control points and fixes are apart by one constant shift of ({values}) m east, north, up: "
+        f"{shift_sentence(shift_m, height_m)}"
+    )
+    return Caution(code="control-shifted", sentence=sentence)
+
+
+def _explanation(survey: Survey, model: SparseModel) -> Hypothesis | None:
+    """Return the known mistake that explains why the fixes do not fit the SfM model, if one does."""
+    fixes = fix_correspondences(survey, model)
+    times_s = _times(survey, fixes.name)
+    found = explanations_of_fixes(fixes.in_local, fixes.in_geo, times_s, survey.origin)
+    upright = [hypothesis for hypothesis in found if not hangs_upside_down(model, hypothesis.geo_from_local)]
+    return upright[0] if upright else None
 
 
 def _height_of_control(joint: JointAdjustment) -> float:

@@ -66,6 +66,7 @@ def robust_similarity(inputs: Inputs, options: InitSim3Options) -> tuple[Initial
             guesses=(guess,) if guess else (),
         )
     except DegenerateGeometryError as error:
+        _refuse(unadjustable(survey, model, None), options)
         raise DegenerateGeometryError(f"{error}. {positions_in_use(survey, model, data, unused)}") from error
     aligned = _aligned_product(inputs, data, alignment)
     warnings = tuple(point.sentence for point in unused)
@@ -74,9 +75,11 @@ def robust_similarity(inputs: Inputs, options: InitSim3Options) -> tuple[Initial
     try:
         joint = adjust_jointly(survey, model, _starts(data, aligned, options.seed))
     except DegenerateGeometryError as error:
-        verdict = unadjustable(survey, model, alignment.geo_from_local, str(error))
-        _refuse(verdict.contradictions, options)
-        return _without_joint(aligned, alignment.solution, union(survey.cautions, verdict.all)), warnings
+        contradictions = unadjustable(survey, model, alignment.geo_from_local)
+        _refuse(contradictions, options)
+        unchecked = Caution(code="not-checked", sentence=f"nothing checks the stated σ: {error}")
+        cautions = union(survey.cautions, contradictions, (unchecked,))
+        return _without_joint(aligned, alignment.solution, cautions), warnings
     verdict = judge(survey, model, joint)
     _refuse(verdict.contradictions, options)
     initial, more = _joint_product(inputs, aligned, joint)
