@@ -45,7 +45,7 @@ Renderable = Group | Table | str
 
 
 def states(rows: Iterable[StageState], cautions: Mapping[str, Sequence[Caution]]) -> Table:
-    """Return the table of `georef status`: stage, state, end, duration, number of new cautions if any, key figure."""
+    """Return the table of `georef status`: stage, state, end, duration, new cautions if any, key figure."""
     table = _table("stage", "state", "finished", "took", *(["cautions"] if cautions else []), "result")
     for column in table.columns[3:-1]:
         column.justify = "right"

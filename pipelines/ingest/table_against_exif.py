@@ -23,11 +23,12 @@ from pipelines.ingest.photo_poses import poses_from_tags
 from pipelines.robust.statistics import mad_sigma
 
 _SIGMAS, _LEAST_M = 4.0, 1.0
-_LEAST_IMAGES = 3
 _MOST_CONTRADICTING = 1 / 3
 # Between the ellipsoid and any geoid lie at most 110 m.
 _GEOID_M = 110.0
 _FOOT_M = 0.3048
+# Another unit shows if heights differ by this many times what σ allow, and that unit leaves this part of it.
+_EVIDENT, _UNIT_PART = 2.0, 0.1
 _KILOMETRES_M = 2_000.0
 
 
@@ -48,7 +49,7 @@ def compare_with_exif(
     """
     exif = poses_from_tags(photos, options, Notes())
     both = np.flatnonzero(poses.located & exif.located)
-    if len(both) < _LEAST_IMAGES:
+    if not len(both):
         return
     lla = lla_from_ecef(exif.position_in_ecef[both])
     enu_from_ecef = np.swapaxes(ecef_from_enu_rotation(lla), 1, 2)
@@ -102,7 +103,8 @@ def _heights(
         (_FOOT_M, "in feet, and taken for metres"),
         (1 / _FOOT_M, "in metres, and taken for feet"),
     ):
-        if abs(float(np.median(heights_m[:, 0] * factor - heights_m[:, 1]))) < max(allowed, 0.05 * abs(offset)):
+        left = abs(float(np.median(heights_m[:, 0] * factor - heights_m[:, 1])))
+        if abs(offset) > _EVIDENT * allowed and left < _UNIT_PART * abs(offset):
             sentence = f"the heights in {path.name} are {cause}: those in EXIF are {factor:.4g} times as large"
             return [(True, Caution(code="feet", sentence=sentence))]
     sentence = (

@@ -268,7 +268,7 @@ def _attitudes(survey: Survey, model: SparseModel, joint: JointAdjustment) -> li
         return []
     sentence = (
         f"the recorded attitudes are turned by {np.degrees(angle):.1f}° against this solution "
-        f"(σ {np.degrees(sigma):.1f}°): the compass, the mount, or the positions (their times, their axes) are wrong"
+        f"(σ {np.degrees(sigma):.1f}°): compass, mount, or the positions (their times, their axes) are wrong"
     )
     return [Caution(code="attitudes-contradict", sentence=sentence)]
 

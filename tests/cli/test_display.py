@@ -14,6 +14,7 @@ from rich.console import Console
 from georef_cli import display, tables
 from georef_cli.output import print_rich
 from georef_cli.verbosity import Verbosity
+from pipelines.core.cautions import Caution
 from pipelines.core.progress import SILENT
 from pipelines.core.runner import Outcome
 from pipelines.core.staleness import StageState
@@ -107,8 +108,9 @@ def test_markup_in_names_is_printed_as_it_stands(monkeypatch: pytest.MonkeyPatch
         duration_s=1.0, key_figure=HOSTILE, values={HOSTILE: HOSTILE}, warnings=[HOSTILE],
     )  # fmt: skip
     outcome = Outcome("ingest", False, manifest)
-    parts = [tables.topics([row]), tables.states([state]), tables.outcomes([outcome])]
-    parts += tables.outcome(Workspace(Path("ws")), outcome)
+    cautions = {"ingest": [Caution(code="hostile", sentence=HOSTILE)]}
+    parts = [tables.topics([row]), tables.states([state], cautions), tables.outcomes([outcome])]
+    parts += [*tables.outcome(Workspace(Path("ws")), outcome), *tables.cautions(cautions)]
     for part in parts:
         with (capture := io.StringIO()), monkeypatch.context() as patched:
             patched.setattr("sys.stdout", capture)

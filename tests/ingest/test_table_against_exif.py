@@ -1,0 +1,92 @@
+"""Positions of a table against those of EXIF: what is wrong is named, and what is everyday is let through."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipelines.core.errors import ContradictionError
+from pipelines.formats.exif import GpsTag, PhotoTags
+from pipelines.formats.image_file import ImageFile
+from pipelines.geodesy.enu import Origin, ecef_from_enu, ecef_from_lla, lla_from_ecef
+from pipelines.geodesy.vertical import VerticalDatum
+from pipelines.ingest.image_poses import ImagePoses
+from pipelines.ingest.notes import Notes
+from pipelines.ingest.options import IngestOptions
+from pipelines.ingest.photo_folder import Photo
+from pipelines.ingest.table_against_exif import compare_with_exif
+
+ORIGIN = Origin(lat_deg=46.0, lon_deg=7.75, alt_m=1600.0)
+PATH = Path("t.csv")
+_ANGLE = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+TRACK = np.column_stack([90 * np.cos(_ANGLE), 60 * np.sin(_ANGLE), 80 + 5 * np.cos(3 * _ANGLE)])
+
+
+def photos_at(positions: np.ndarray) -> list[Photo]:
+    """Photographs whose EXIF has these positions (n, 3) in geo, of a receiver without corrections."""
+    lla = lla_from_ecef(ecef_from_enu(positions, ORIGIN))
+    tags = [PhotoTags(gps=GpsTag(*map(float, place), None, "")) for place in lla]
+    return [Photo(f"{row}.jpg", ImageFile(64, 48, str(row)), tag) for row, tag in enumerate(tags)]
+
+
+def table_of(positions_in_ecef: np.ndarray) -> ImagePoses:
+    """Poses of a table with RTK."""
+    count = len(positions_in_ecef)
+    return ImagePoses(
+        position_in_ecef=positions_in_ecef,
+        sigma_enu_m=np.tile([0.02, 0.02, 0.03], (count, 1)),
+        sigma_source=("file",) * count,
+        enu_from_cam=np.full((count, 3, 3), np.nan),
+        attitude_source=("csv",) * count,
+        sigma_attitude_deg=np.full(count, np.nan),
+        time_s=np.full(count, np.nan),
+        source="csv",
+        crs_name="EPSG:4979",
+        vertical=VerticalDatum(name="ellipsoidal", stated=True),
+    )
+
+
+def compared(positions: np.ndarray, options: IngestOptions | None = None) -> Notes:
+    """Notes of a table with these positions (n, 3) in geo, whose photographs are on `TRACK`."""
+    notes = Notes()
+    table = table_of(ecef_from_enu(positions, ORIGIN))
+    compare_with_exif(table, photos_at(TRACK), PATH, options or IngestOptions(), notes)
+    return notes
+
+
+def test_receivers_that_differ_by_metres_agree() -> None:
+    noise = np.random.default_rng(0).normal(0, [2.5, 2.5, 5.0], TRACK.shape)
+    assert compared(TRACK + noise).cautions == []
+
+
+@pytest.mark.parametrize(
+    ("positions", "says"),
+    [
+        (TRACK[:, [1, 0, 2]], "in changing directions"),
+        (np.roll(TRACK, 1, axis=0), "times that are off"),
+        (TRACK + np.array([60.0, 80.0, 0.0]), r"shifted by \+60.0 m east and \+80.0 m north"),
+        (TRACK + np.array([30_000.0, 0.0, 0.0]), "30 km from those in EXIF: another CRS or zone"),
+        (TRACK - [0.0, 0.0, 1600.0], r"differ from those in EXIF by -1600.0 m"),
+    ],
+    ids=["mirrored", "late", "shifted", "zone", "take-off"],
+)
+def test_contradictions_are_named_and_can_be_accepted(positions: np.ndarray, says: str) -> None:
+    with pytest.raises(ContradictionError, match=says):
+        compared(positions)
+    (caution,) = compared(positions, IngestOptions(accept_contradiction=True)).cautions
+    assert caution.code in ("table-against-exif", "heights-apart")
+
+
+@pytest.mark.parametrize(("factor", "says"), [(1 / 0.3048, "in feet"), (0.3048, "in metres, and taken for feet")])
+def test_heights_in_feet_are_recognised(factor: float, says: str) -> None:
+    lla = lla_from_ecef(ecef_from_enu(TRACK, ORIGIN)) * [1.0, 1.0, factor]
+    with pytest.raises(ContradictionError, match=says):
+        compare_with_exif(table_of(ecef_from_lla(lla)), photos_at(TRACK), PATH, IngestOptions(), Notes())
+
+
+def test_a_geoid_between_the_heights_is_a_caution() -> None:
+    (caution,) = compared(TRACK - [0.0, 0.0, 52.0]).cautions
+    assert caution.code == "heights-apart"
+    assert "-52.0 m" in caution.sentence and "geoid" in caution.sentence
