@@ -21,6 +21,7 @@ LATER: dict[str, tuple[str, ...]] = {
     "mapper": ("sfm",),
     "import_model": ("sfm",),
     "max_residual": ("init-sim3",),
+    "accept_contradiction": ("ingest", "init-sim3"),
     "preset": ("train",),
     "iterations": ("train",),
     "max_image_size": ("train",),

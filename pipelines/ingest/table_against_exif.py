@@ -27,8 +27,8 @@ _MOST_CONTRADICTING = 1 / 3
 # Between the ellipsoid and any geoid lie at most 110 m.
 _GEOID_M = 110.0
 _FOOT_M = 0.3048
-# Another unit shows if heights differ by this many times what σ allow, and that unit leaves this part of it.
-_EVIDENT, _UNIT_PART = 2.0, 0.1
+# Another unit shows if heights differ by this many times what σ allow, and that unit leaves this part of a height.
+_EVIDENT, _UNIT_PART = 2.0, 0.05
 _KILOMETRES_M = 2_000.0
 
 
@@ -104,7 +104,8 @@ def _heights(
         (1 / _FOOT_M, "in metres, and taken for feet"),
     ):
         left = abs(float(np.median(heights_m[:, 0] * factor - heights_m[:, 1])))
-        if abs(offset) > _EVIDENT * allowed and left < _UNIT_PART * abs(offset):
+        tolerance = max(_UNIT_PART * abs(float(np.median(heights_m[:, 1]))), allowed / _SIGMAS)
+        if abs(offset) > _EVIDENT * allowed and left < tolerance:
             sentence = f"the heights in {path.name} are {cause}: those in EXIF are {factor:.4g} times as large"
             return [(True, Caution(code="feet", sentence=sentence))]
     sentence = (

@@ -33,7 +33,7 @@ def table(header: str, *rows: str, ends: str = "\n") -> bytes:
 
 def positions(*last: str, header: str = "image,latitude,longitude,altitude") -> bytes:
     """A trajectory of three good rows and those given, from line 5 on."""
-    good = [f"IMG_{index:04d}.JPG,46.02,{7.75 + 1e-4 * index:.4f},500" for index in range(3)]
+    good = [f"IMG_{index:04d}.JPG,46.02,{7.75 + 1e-4 * index:.4f},120" for index in range(3)]
     return table(header, *good, *last)
 
 
