@@ -40,6 +40,14 @@ POINT_COLUMNS = {
     "rmse_3d_m": "RMSE 3D",
     "max_3d_m": "max 3D",
 }
+FACTOR_COLUMNS = {
+    "count": "count",
+    "used": "used",
+    "redundancy": "redundancy",
+    "estimated": "factor",
+    "applied": "applied",
+    "sigma_source": "σ",
+}
 IMAGE_COLUMNS = {"views": "views", "psnr": "PSNR dB", "ssim": "SSIM", "lpips": "LPIPS"}
 Renderable = Group | Table | str
 
@@ -159,6 +167,7 @@ def report(document: EvaluationReport) -> list[Renderable]:
     ways = {"camera": document.checkpoints.camera, "model": document.checkpoints.model}
     crossed = document.cross_validation
     fit = {"gnss": dict(document.fit.gnss), "gcp": dict(document.fit.gcp)}
+    factors: dict[str, dict[str, Any]] = {factor.group: dict(factor) for factor in document.variance_factors}
     tables = (
         _rows("Test views", {"test": dict(document.photometric.test)}, IMAGE_COLUMNS),
         _rows("Check points, metres", {way: dict(errors) for way, errors in ways.items()}, POINT_COLUMNS),
@@ -169,6 +178,7 @@ def report(document: EvaluationReport) -> list[Renderable]:
             POINT_COLUMNS,
         ),
         _rows("Residuals of the fit (not an accuracy), metres", fit, POINT_COLUMNS),
+        _rows("Variance factors: estimated over stated variance (tie points: in px²)", factors, FACTOR_COLUMNS),
     )
     return [table for table in tables if table is not None]
 

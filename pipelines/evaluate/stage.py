@@ -102,6 +102,7 @@ def evaluate(
         fit=fit_residuals(trained),
         similarity=_similarity_sigma(trained.model.geo_from_model),
         coordinates=None if crs is None else coordinates_in(crs, checkpoints, trained.survey),
+        variance_factors=trained.model.variance_factors,
         cautions=union(
             trained.model.cautions,
             cautions_of_prediction(

@@ -85,7 +85,7 @@ def judge(survey: Survey, model: SparseModel, joint: JointAdjustment) -> Verdict
         sentence = "most cameras look up at the sky: if that is not so, the positions are wrong"
         cautions.append(Caution(code="looks-at-sky", sentence=sentence))
     cautions += _attitudes(survey, model, joint)
-    cautions += _weak_checks(joint)
+    cautions += [*_weak_checks(joint), *_guesses(joint)]
     return Verdict(tuple(contradictions), tuple(cautions))
 
 
@@ -292,6 +292,21 @@ def _weak_checks(joint: JointAdjustment) -> list[Caution]:
         )
         cautions.append(Caution(code="no-control-points", sentence=sentence))
     return cautions
+
+
+def _guesses(joint: JointAdjustment) -> list[Caution]:
+    """Return a caution of the σ that nobody stated, with the variance factors that stand in for them."""
+    guessed = [
+        f"{factor.group} ({'not checked' if factor.estimated is None else f'factor {factor.estimated:.2g}'})"
+        for factor in joint.factors
+        if factor.sigma_source == "default" and factor.group in ("fixes", "control points", "marks")
+    ]
+    if not guessed:
+        return []
+    sentence = (
+        f"nobody stated the σ of {', '.join(guessed)}: defaults stand in, and every σ of the result hangs on them"
+    )
+    return [Caution(code="default-sigma", sentence=sentence)]
 
 
 def _times(survey: Survey, names: tuple[str, ...]) -> FloatArray:

@@ -104,6 +104,7 @@ def _summary(initial: InitialSimilarity, warnings: tuple[str, ...]) -> Summary:
         "condition_number": initial.condition_number,
         "inliers": initial.inliers,
         "gnss_outliers": list(initial.gnss_outliers),
+        "variance_factors": [factor.model_dump() for factor in initial.variance_factors],
         "residuals": {kind: stats.model_dump() for kind, stats in initial.residuals.items()},
     }
     return Summary(

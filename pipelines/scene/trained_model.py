@@ -11,6 +11,7 @@ from pipelines.core.products import ImageName, Product, Rotation
 from pipelines.core.types import Matrix34, Vector3
 from pipelines.geometry.similarity import SimilarityRecord
 from pipelines.georef.estimated_error import EstimatedError
+from pipelines.scene.variance_factors import VarianceFactor
 
 
 class TrainedCamera(Product):
@@ -57,6 +58,7 @@ class TrainedModel(Product):
         gnss_outliers: names of the images whose fixes contradict the solution.
         control_outliers: names of the control points that contradict the solution.
         estimated_errors: constant errors of the measurements.
+        variance_factors: tests of the stated σ, of the initial similarity.
         cautions: limits of the model: those of the initial similarity, then the training's own.
     """
 
@@ -74,4 +76,5 @@ class TrainedModel(Product):
     gnss_outliers: tuple[str, ...] = ()
     control_outliers: tuple[str, ...] = ()
     estimated_errors: tuple[EstimatedError, ...] = ()
+    variance_factors: tuple[VarianceFactor, ...] = ()
     cautions: tuple[Caution, ...] = ()

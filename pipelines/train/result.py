@@ -61,6 +61,7 @@ def trained_model(trainer: JointTrainer, scene: Scene, initial: InitialSimilarit
         if control is None
         else tuple(control.point_id[row] for row in problem.contradicting(ControlTerm)),
         estimated_errors=estimates,
+        variance_factors=initial.variance_factors,
         cautions=union(initial.cautions),
     )
 

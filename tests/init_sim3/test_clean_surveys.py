@@ -15,7 +15,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 CONTROL = 8  # ground points of a block before its check points
 RTK, PPK, CONSUMER = (0.02, 0.02, 0.03), (0.05, 0.05, 0.08), (1.5, 1.5, 3.0)
 # They name what nothing checks, and blame no source.
-BLAMELESS = {"no-control-points", "hardly-checked"}
+BLAMELESS = {"no-control-points", "hardly-checked", "default-sigma"}
 
 
 @dataclass(frozen=True)
