@@ -8,6 +8,9 @@ from pydantic import StringConstraints
 
 from pipelines.core.products import Product
 
+# Code of the caution that nothing checks the σ of the positions: no accuracy is stated then.
+NOT_CHECKED = "not-checked"
+
 
 class Caution(Product):
     """Limit of a result, for machines and for people.

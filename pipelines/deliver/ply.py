@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from pipelines.core.cautions import Caution
+from pipelines.core.cautions import NOT_CHECKED, Caution
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.products import load_json
 from pipelines.core.stages import GAUSSIANS, MODEL, SPLAT
@@ -143,6 +143,7 @@ def _sidecar(
     origin_lla: FloatArray, covariance: FloatArray | None, survey: Survey, cautions: tuple[Caution, ...]
 ) -> GeorefSidecar:
     ecef_from_ply = _enu_at(origin_lla)
+    unchecked = any(caution.code == NOT_CHECKED for caution in cautions)
     return GeorefSidecar(
         origin=_vector(ecef_from_ply.translation),
         rotation=_quaternion(ecef_from_ply.rotation),
@@ -151,7 +152,7 @@ def _sidecar(
         vertical_datum=survey.vertical,
         crs_wkt=parse_crs(ECEF).wkt,
         covariance=None if covariance is None else tuple(map(_row, covariance)),
-        accuracy=None if covariance is None else predicted_accuracy(covariance, np.zeros(3)),
+        accuracy=None if covariance is None or unchecked else predicted_accuracy(covariance, np.zeros(3)),
         cautions=cautions,
     )
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.core.cautions import Caution, union
+from pipelines.core.cautions import NOT_CHECKED, Caution, union
 from pipelines.core.errors import ContradictionError, DegenerateGeometryError
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
 from pipelines.geometry.similarity import Similarity, umeyama
@@ -77,7 +77,7 @@ def robust_similarity(inputs: Inputs, options: InitSim3Options) -> tuple[Initial
     except DegenerateGeometryError as error:
         contradictions = unadjustable(survey, model, alignment.geo_from_local)
         _refuse(contradictions, options)
-        unchecked = Caution(code="not-checked", sentence=f"nothing checks the stated σ: {error}")
+        unchecked = Caution(code=NOT_CHECKED, sentence=f"nothing checks the stated σ: {error}")
         cautions = union(survey.cautions, contradictions, (unchecked,))
         return _without_joint(aligned, alignment.solution, cautions), warnings
     verdict = judge(survey, model, joint)
