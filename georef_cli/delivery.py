@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 from pathlib import Path
 
-from pipelines.core.errors import InputError
+from pipelines.core.durable import replace_file
+from pipelines.core.errors import InputError, storage_failures
 
 
 def check_target(target: Path, *, overwrite: bool) -> None:
@@ -24,18 +26,22 @@ def deliver(source: Path, target: Path) -> None:
     """Copy a file and its sidecars (`source.*`); they appear, or are replaced, when all copies are complete.
 
     Raises:
-        InputError: the target cannot be written.
+        StorageError: the target cannot be written.
     """
     family = sorted(source.parent.glob(f"{source.name}*"))
     targets = [target.with_name(target.name + member.name.removeprefix(source.name)) for member in family]
     drafts = [path.with_name(f".{path.name}.partial") for path in targets]
     try:
-        for member, draft in zip(family, drafts, strict=True):
-            shutil.copyfile(member, draft)
-        for draft, path in zip(drafts, targets, strict=True):
-            draft.replace(path)
-    except PermissionError as error:
-        raise InputError("cannot be written", path=target.parent) from error
+        with storage_failures():
+            _copy(family, drafts, targets)
     finally:
         for draft in drafts:
-            draft.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                draft.unlink(missing_ok=True)
+
+
+def _copy(family: list[Path], drafts: list[Path], targets: list[Path]) -> None:
+    for member, draft in zip(family, drafts, strict=True):
+        shutil.copyfile(member, draft)
+    for draft, path in zip(drafts, targets, strict=True):
+        replace_file(draft, path)

@@ -20,6 +20,7 @@ from pipelines.scene.report import CheckPointErrors, EvaluationReport, read_repo
 STATE_STYLE = {
     "current": "green",
     "stale": "yellow",
+    "damaged": "red",
     "running": "cyan",
     "interrupted": "yellow",
     "failed": "red",

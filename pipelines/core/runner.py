@@ -14,12 +14,28 @@ from importlib import metadata
 from typing import Any
 
 from pipelines import __version__
-from pipelines.core.errors import GeorefError, InputError, MissingProductError
-from pipelines.core.fingerprints import Memo
+from pipelines.core.errors import (
+    DamagedPartialError,
+    GeorefError,
+    InputError,
+    MissingProductError,
+    storage_failures,
+)
+from pipelines.core.manifest import MANIFEST, Manifest, Memo, record_files
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.stages import StageSpec, producer_of, products_of
-from pipelines.core.staleness import BY_HAND, Flags, Request, must_exist, request, stage_config, status, why_stale
-from pipelines.core.workspace import Manifest, Resume, StageRun, Summary, Workspace, now
+from pipelines.core.staleness import (
+    BY_HAND,
+    Flags,
+    Request,
+    must_exist,
+    request,
+    stage_config,
+    status,
+    why_damaged,
+    why_stale,
+)
+from pipelines.core.workspace import Resume, StageRun, Summary, Workspace, now
 
 log = logging.getLogger(__name__)
 
@@ -35,6 +51,7 @@ class Outcome:
     manifest: Manifest
 
 
+@storage_failures()
 def run_stage(
     workspace: Workspace,
     spec: StageSpec,
@@ -65,9 +82,10 @@ def run_stage(
         memo: Memo = {}
         asked = request(workspace, spec, flags, memo)
         _warn_of_stale_inputs(workspace, spec, memo)
+        _refuse_damaged_inputs(workspace, spec, memo)
         before = workspace.requests().get(spec.name, {})
         workspace.remember({spec.name: flags})
-        previous = None if force else _current(workspace, asked)
+        previous = None if force else _current(workspace, asked, memo)
         if previous is not None:
             return Outcome(spec.name, False, previous)
         try:
@@ -78,6 +96,7 @@ def run_stage(
         return Outcome(spec.name, True, manifest)
 
 
+@storage_failures()
 def run_pipeline(
     workspace: Workspace,
     stages: tuple[StageSpec, ...],
@@ -138,15 +157,9 @@ def _execute(workspace: Workspace, asked: Request, resume: Resume, progress: Pro
     token = hashlib.sha256(json.dumps([resolved, asked.inputs], sort_keys=True).encode()).hexdigest()
     if resume == "never" and spec.resumable and workspace.partial(spec).exists():
         log.warning("%s: starts afresh; what an interrupted run had done is dropped", spec.name)
-    out, resumed = workspace.begin(spec, token, resume)
     started, clock = now(), time.monotonic()
-    log.info("%s: %s", spec.name, "resumed" if resumed else "started")
-    try:
-        run = importlib.import_module(spec.module).run
-        summary: Summary = run(StageRun(workspace, out, progress, resumed), asked.options)
-    except GeorefError as error:
-        workspace.fail(spec, str(error))
-        raise
+    summary = _run(workspace, asked, token, resume, progress)
+    out = workspace.partial(spec)
     for product in products_of(spec):
         if not (out / product.removeprefix(f"{spec.folder}/")).exists():
             raise RuntimeError(f"{spec.module} did not write {product}")
@@ -162,13 +175,39 @@ def _execute(workspace: Workspace, asked: Request, resume: Resume, progress: Pro
         key_figure=summary.key_figure,
         values=summary.values,
         warnings=list(summary.warnings),
+        files=record_files(out, spec.working),
     )
+    workspace.set_aside(_damaged(workspace, spec, {}, by_content=False))
     workspace.commit(spec, manifest)
     log.info("%s: %s (%.1f s)", spec.name, summary.key_figure, manifest.duration_s)
     return manifest
 
 
-def _current(workspace: Workspace, asked: Request) -> Manifest | None:
+def _run(workspace: Workspace, asked: Request, token: str, resume: Resume, progress: Progress) -> Summary:
+    """Run the module of a stage; afresh, if the partial product to be continued is damaged.
+
+    Raises:
+        GeorefError: a known failure, which is recorded.
+    """
+    spec = asked.spec
+    run = importlib.import_module(spec.module).run
+    out, resumed = workspace.begin(spec, token, resume)
+    log.info("%s: %s", spec.name, "resumed" if resumed else "started")
+    try:
+        with storage_failures():
+            try:
+                summary: Summary = run(StageRun(workspace, out, progress, resumed), asked.options)
+            except DamagedPartialError as error:
+                log.warning("%s: starts afresh; what the interrupted run left is damaged (%s)", spec.name, error)
+                out, _ = workspace.begin(spec, token, "never")
+                summary = run(StageRun(workspace, out, progress), asked.options)
+    except GeorefError as error:
+        workspace.fail(spec, str(error))
+        raise
+    return summary
+
+
+def _current(workspace: Workspace, asked: Request, memo: Memo) -> Manifest | None:
     """Return the manifest of a product that need not be made again, or None."""
     spec = asked.spec
     if workspace.placed_by_hand(spec):
@@ -191,6 +230,10 @@ def _current(workspace: Workspace, asked: Request) -> Manifest | None:
         return None
     if manifest is None:
         return None
+    damage = why_damaged(workspace.damaged(spec, manifest, memo, by_content=True))
+    if damage:
+        log.warning("%s: damaged, made again: %s", spec.name, damage)
+        return None
     reason = why_stale(workspace, asked, manifest)
     log.info("%s: %s", spec.name, f"made again: {reason}" if reason else "current, nothing to do")
     return None if reason else manifest
@@ -202,6 +245,31 @@ def _warn_of_stale_inputs(workspace: Workspace, spec: StageSpec, memo: Memo) -> 
     for row in status(workspace, memo, before=spec):
         if row.stage in producers and row.state == "stale":
             log.warning("%s builds on %s, which is stale (%s)", spec.name, row.stage, row.reason)
+
+
+def _refuse_damaged_inputs(workspace: Workspace, spec: StageSpec, memo: Memo) -> None:
+    """Refuse to build on a product that is not as its stage wrote it.
+
+    Raises:
+        InputError: a file of a stage that `spec` reads has changed since that stage ended.
+    """
+    for producer in dict.fromkeys(producer_of(part.product) for part in spec.reads):
+        files = _damaged(workspace, producer, memo, by_content=True)
+        if files:
+            raise InputError(
+                f"{why_damaged(files)}: `georef run {(workspace.base or workspace).root}` makes it again; to "
+                f"keep it as it is, delete {producer.folder}/{MANIFEST}",
+                path=workspace.root,
+            )
+
+
+def _damaged(workspace: Workspace, spec: StageSpec, memo: Memo, *, by_content: bool) -> list[str]:
+    """Return the files of a finished product that differ from its manifest; none without a readable manifest."""
+    try:
+        manifest = workspace.manifest(spec)
+    except InputError:
+        return []
+    return [] if manifest is None else workspace.damaged(spec, manifest, memo, by_content=by_content)
 
 
 def _versions() -> dict[str, str]:

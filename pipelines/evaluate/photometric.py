@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from pipelines.splat.metrics import psnr, ssim
 SaveRender = Callable[[str, ByteArray], None]
 
 _DIFFERENCE_GAIN = 3
+_LONGEST_NAME_BYTES = 255
 _NO_WEIGHTS = "no weights were given: they are not part of the package (--lpips-weights FILE.npz)"
 
 
@@ -70,12 +72,16 @@ def compare_test_views(
 
 def write_render(folder: Path, image: str, strip: ByteArray) -> None:
     """Write a photograph and its render, side by side (H, 3 W, 3) RGB, as PNG."""
-    cv2.imwrite(str(folder / render_name(image)), np.ascontiguousarray(strip[..., ::-1]))
+    _, png = cv2.imencode(".png", np.ascontiguousarray(strip[..., ::-1]))  # `imwrite` says nothing on a full disk
+    (folder / render_name(image)).write_bytes(png.tobytes())
 
 
 def render_name(image: str) -> str:
-    """Return the file name of an image's render, folders included: images in two folders may share their names."""
-    return Path(image).with_suffix(".png").as_posix().replace("/", "_")
+    """Return the file name of an image's render: folders and name, or a hash of them beyond 255 bytes."""
+    name = Path(image).with_suffix(".png").as_posix().replace("/", "_")
+    if len(name.encode()) <= _LONGEST_NAME_BYTES:
+        return name
+    return f"{hashlib.sha256(name.encode()).hexdigest()[:32]}.png"
 
 
 def _figures(name: str, render: Tensor, photo: Tensor, mask: Tensor, distance: Lpips | None) -> ViewFigures:

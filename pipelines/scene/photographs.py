@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.core.durable import replace_file
 from pipelines.core.errors import InputError
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import BoolArray, ByteArray, Float32Array
@@ -172,7 +173,7 @@ def save_array(path: Path, array: NDArray[Any]) -> None:
     draft = path.with_suffix(".tmp")
     with draft.open("wb") as handle:
         np.save(handle, array, allow_pickle=False)
-    draft.replace(path)
+    replace_file(draft, path)
 
 
 def _distortion_map(camera: Camera, pinhole: Pinhole) -> tuple[Float32Array, BoolArray]:
