@@ -8,6 +8,7 @@ from pathlib import Path
 
 from pipelines.core.durable import replace_file
 from pipelines.core.errors import InputError, storage_failures
+from pipelines.core.validators import require_text
 
 
 def check_target(target: Path, *, overwrite: bool) -> None:
@@ -16,6 +17,7 @@ def check_target(target: Path, *, overwrite: bool) -> None:
     Raises:
         InputError: the folder is missing, or the file exists and may not be replaced.
     """
+    require_text(target)
     if not target.parent.is_dir():
         raise InputError("no such folder: make it first", path=target.parent)
     if target.exists() and not overwrite:

@@ -8,8 +8,10 @@ from typing import Any
 
 import click
 from rich.console import Console, RenderableType
+from rich.text import Text
 
 from georef_cli import tables
+from georef_cli.markup import Safe
 from pipelines.core.products import dump_json
 from pipelines.core.runner import Outcome
 from pipelines.core.workspace import Workspace
@@ -26,7 +28,7 @@ def print_rich(*parts: RenderableType) -> None:
     """Print for people: in colour on a terminal, plain elsewhere."""
     console = Console(width=None if sys.stdout.isatty() else PIPED_WIDTH, highlight=False, file=sys.stdout)
     for part in parts:
-        console.print(part)
+        console.print(Safe(part if not isinstance(part, str) else Text.from_markup(part)))
 
 
 def document_of(outcome: Outcome) -> dict[str, Any]:

@@ -7,9 +7,9 @@ from datetime import datetime
 from typing import Any
 
 from rich.console import Group
-from rich.markup import escape
 from rich.table import Table
 
+from georef_cli.markup import shown
 from pipelines.compare.table import Comparison, cells, remarks_on
 from pipelines.core.runner import Outcome
 from pipelines.core.stages import REPORT
@@ -49,7 +49,7 @@ def states(rows: Iterable[StageState]) -> Table:
     table = _table("stage", "state", "finished", "took", "result")
     table.columns[3].justify = "right"
     for row in rows:
-        remarks = [escape(text) for text in (row.key_figure, row.reason) if text]
+        remarks = [shown(text) for text in (row.key_figure, row.reason) if text]
         style = STATE_STYLE[row.state]
         table.add_row(
             row.stage,
@@ -65,13 +65,13 @@ def outcome(workspace: Workspace, result: Outcome) -> list[Renderable]:
     """The result of one stage: headline, figures, and what was warned of when it ran earlier."""
     manifest = result.manifest
     effort = duration(manifest.duration_s) if result.ran else "current, nothing to do"
-    parts: list[Renderable] = [f"[bold]{result.stage}[/]: {escape(manifest.key_figure)} ({effort})"]
+    parts: list[Renderable] = [f"[bold]{result.stage}[/]: {shown(manifest.key_figure)} ({effort})"]
     if result.stage == "evaluate":
         parts += report_of(workspace)
     elif manifest.values:
         parts.append(_figures(manifest.values))
     if not result.ran:  # those of a stage that just ran stand on stderr already
-        parts += [f"[yellow]warning:[/] {escape(text)}" for text in manifest.warnings]
+        parts += [f"[yellow]warning:[/] {shown(text)}" for text in manifest.warnings]
     return parts
 
 
@@ -82,9 +82,9 @@ def outcomes(results: Sequence[Outcome]) -> Table:
     for result in results:
         manifest = result.manifest
         done = "[green]done[/]" if result.ran else "[dim]current[/]"
-        table.add_row(result.stage, done, duration(manifest.duration_s), escape(manifest.key_figure))
+        table.add_row(result.stage, done, duration(manifest.duration_s), shown(manifest.key_figure))
         for warning in () if result.ran else manifest.warnings:
-            table.add_row("", "[yellow]warning[/]", "", escape(warning))
+            table.add_row("", "[yellow]warning[/]", "", shown(warning))
     return table
 
 
@@ -97,8 +97,8 @@ def comparison(table: Comparison) -> list[Renderable]:
         column.justify, column.no_wrap = "right", True
     for row in table.rows:
         figures.add_row(row.configuration, *cells(row))
-    notes = [f"[bold]{row.configuration}[/] {escape(f'{row.title}: {row.note}')}" for row in table.rows]
-    remarks = [f"[yellow]{row.configuration}:[/] {escape(text)}" for row in table.rows for text in remarks_on(row)]
+    notes = [f"[bold]{row.configuration}[/] {shown(f'{row.title}: {row.note}')}" for row in table.rows]
+    remarks = [f"[yellow]{row.configuration}:[/] {shown(text)}" for row in table.rows for text in remarks_on(row)]
     return ["[bold]Test views in dB, check points in metres[/]", figures, "", *notes, *remarks]
 
 
@@ -116,15 +116,15 @@ def topics(rows: Iterable[Mapping[str, Any]]) -> Table:
         ]
         remarks += ["no stamps" if row["clock"] == "recording" else "", row["problem"]]
         table.add_row(
-            escape(row["name"]),
-            escape(row["type"].replace("/msg/", "/")),
+            shown(row["name"]),
+            shown(row["type"].replace("/msg/", "/")),
             str(row["messages"]),
             _number(row["rate_hz"]),
             duration(span),
             duration(row["longest_gap_s"]),
-            escape(row["frame"]),
+            shown(row["frame"]),
             f"[green]{row['use']}[/]",
-            escape(", ".join(filter(None, remarks))),
+            shown(", ".join(filter(None, remarks))),
         )
     return table
 
@@ -213,7 +213,7 @@ def _figures(values: Mapping[str, Any]) -> Table:
     table.columns[1].justify = "right"
     for name, value in values.items():
         if isinstance(value, str | int | float) or value is None:
-            table.add_row(escape(name), escape(_number(value)))
+            table.add_row(shown(name), shown(_number(value)))
     return table
 
 

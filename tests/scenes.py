@@ -159,7 +159,7 @@ def survey_of(scene: TrueScene, noise: Noise, measured: Measured, rng: np.random
         fix = Fix(position_in_geo=_vector(fixes[index]), cov_in_geo=cov, source="csv", sigma_source="file")
         quat = tuple(quat_xyzw_from_matrix(turned[index]).tolist())
         attitude = Attitude(quat_xyzw=quat, sigma_deg=noise.attitude_deg, source="csv")
-        image = SurveyImage(name=name, camera_id=1, sha256="0" * 64)
+        image = SurveyImage(name=name, camera_id=1, sha256="")
         if measured.fixes:
             image = image.model_copy(update={"fix": fix})
         if measured.attitudes:

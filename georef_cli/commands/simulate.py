@@ -12,6 +12,7 @@ import click
 
 from georef_cli import options, tables
 from georef_cli.display import progress_for
+from georef_cli.markup import shown
 from georef_cli.output import print_json, print_rich
 from pipelines.core.options import CONFIG_FILE, resolve
 from pipelines.simulate.options import SimulateOptions
@@ -29,7 +30,7 @@ def _simulate(ctx: click.Context, **values: Any) -> None:
         print_json({**dataclasses.asdict(summary), "directory": str(summary.directory)})
         return
     took = tables.duration(time.monotonic() - started)
-    print_rich(f"[bold]simulate[/]: {summary.key_figure} in {summary.directory} ({took})")
+    print_rich(f"[bold]simulate[/]: {summary.key_figure} in {shown(str(summary.directory))} ({took})")
 
 
 command = click.Command(

@@ -97,6 +97,7 @@ class DamagedPartialError(InputError):
 
 
 _SQLITE_ERRNO = {8: errno.EROFS, 10: errno.EIO, 13: errno.ENOSPC}
+_DISK_FAILURES = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 _STORAGE_REASONS = {
     errno.ENOSPC: "the disk is full",
     errno.EDQUOT: "the disk quota is used up: delete files or have it raised",
@@ -118,8 +119,8 @@ _STORAGE_REASONS = {
 def storage_error(error: BaseException) -> StorageError | None:
     """Return the storage failure behind an exception, or None.
 
-    Libraries replace an OSError by an error of their own while they close a half-written file. The exceptions in
-    whose handling the error arose count too.
+    Libraries replace an OSError by an error of their own while they close a half-written file. Failures
+    of the disk count also if the exception arose in their handling.
     """
     seen: set[int] = set()
     cause: BaseException | None = error
@@ -128,9 +129,9 @@ def storage_error(error: BaseException) -> StorageError | None:
         code = cause.errno if isinstance(cause, OSError) else None
         # An error of sqlite3, known by its code: the module need not be imported for it.
         code = _SQLITE_ERRNO.get(getattr(cause, "sqlite_errorcode", 0) & 0xFF, code)
-        if code in _STORAGE_REASONS:
+        if code in _STORAGE_REASONS and (cause is error or code in _DISK_FAILURES):
             path = getattr(cause, "filename", None)
-            return StorageError(f"{'workspace' if path is None else path}: {_STORAGE_REASONS[code]}")
+            return StorageError(f"{'workspace or output' if path is None else path}: {_STORAGE_REASONS[code]}")
         cause = cause.__cause__ or cause.__context__
     return None
 

@@ -12,6 +12,7 @@ from pipelines.core.fingerprints import fingerprints
 from pipelines.core.manifest import Manifest, Memo
 from pipelines.core.options import StageOptions, load_toml, resolve
 from pipelines.core.stages import BY_NAME, PIPELINE, StageSpec, producer_of, products_of
+from pipelines.core.validators import require_text
 from pipelines.core.workspace import Workspace
 
 BY_HAND = "put there by hand"
@@ -116,6 +117,7 @@ def must_exist(workspace: Workspace) -> None:
     Raises:
         InputError: the directory does not exist.
     """
+    require_text(workspace.root)
     if not workspace.root.is_dir():
         raise InputError("no such workspace: `georef ingest` makes one", path=workspace.root)
 
