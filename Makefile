@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
 DEMO := demo
 
-.PHONY: setup demo test lint types docs check release clean
+.PHONY: setup demo test fuzz lint types docs check release clean
 
 setup test lint types docs:
 	@.ci/run $@
@@ -23,6 +23,10 @@ demo: setup
 	$(BIN)/georef status $(DEMO)/workspace
 	$(BIN)/georef evaluate $(DEMO)/workspace
 	@echo "The splat: $(DEMO)/workspace/export/splat.ply (and splat.ply.georef.json beside it)"
+
+# Mutated files for every reader, for an hour or FUZZ_SECONDS; a finding is printed with the case that repeats it.
+fuzz: setup
+	$(BIN)/python -m tests.fuzz
 
 # `make release VERSION=0.2.0`: checks, version, changelog, commit, tag. Nothing is pushed.
 release: setup

@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 @cache
 def stderr_console() -> Console:
     """The one console on stderr: bars and log lines must share it so as not to overwrite each other."""
-    return Console(stderr=True)
+    return Console(stderr=True, emoji=False)
 
 
 class ConsoleHandler(logging.Handler):
@@ -93,13 +93,13 @@ class BarProgress:
 
     def _start(self) -> Bars:
         self._bars = Bars(
-            TextColumn("{task.description}"),
+            TextColumn("{task.description}", markup=False),
             BarColumn(),
             MofNCompleteColumn(),
             SpeedColumn(),
             TimeElapsedColumn(),
             TimeRemainingColumn(),
-            TextColumn("{task.fields[note]}"),
+            TextColumn("{task.fields[note]}", markup=False),
             console=self._console,
             refresh_per_second=4,
         )

@@ -26,9 +26,11 @@ def print_json(document: Any) -> None:
 
 def print_rich(*parts: RenderableType) -> None:
     """Print for people: in colour on a terminal, plain elsewhere."""
-    console = Console(width=None if sys.stdout.isatty() else PIPED_WIDTH, highlight=False, file=sys.stdout)
+    console = Console(
+        width=None if sys.stdout.isatty() else PIPED_WIDTH, highlight=False, emoji=False, file=sys.stdout
+    )
     for part in parts:
-        console.print(Safe(part if not isinstance(part, str) else Text.from_markup(part)))
+        console.print(Safe(part if not isinstance(part, str) else Text.from_markup(part, emoji=False)))
 
 
 def document_of(outcome: Outcome) -> dict[str, Any]:

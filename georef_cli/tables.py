@@ -96,9 +96,11 @@ def comparison(table: Comparison) -> list[Renderable]:
     for column in figures.columns[1:]:
         column.justify, column.no_wrap = "right", True
     for row in table.rows:
-        figures.add_row(row.configuration, *cells(row))
-    notes = [f"[bold]{row.configuration}[/] {shown(f'{row.title}: {row.note}')}" for row in table.rows]
-    remarks = [f"[yellow]{row.configuration}:[/] {shown(text)}" for row in table.rows for text in remarks_on(row)]
+        figures.add_row(shown(row.configuration), *map(shown, cells(row)))
+    notes = [f"[bold]{shown(row.configuration)}[/] {shown(f'{row.title}: {row.note}')}" for row in table.rows]
+    remarks = [
+        f"[yellow]{shown(row.configuration)}:[/] {shown(text)}" for row in table.rows for text in remarks_on(row)
+    ]
     return ["[bold]Test views in dB, check points in metres[/]", figures, "", *notes, *remarks]
 
 
@@ -123,7 +125,7 @@ def topics(rows: Iterable[Mapping[str, Any]]) -> Table:
             duration(span),
             duration(row["longest_gap_s"]),
             shown(row["frame"]),
-            f"[green]{row['use']}[/]",
+            f"[green]{shown(row['use'])}[/]",
             shown(", ".join(filter(None, remarks))),
         )
     return table
@@ -181,7 +183,7 @@ def _rows(title: str, rows: Mapping[str, Mapping[str, Any]], columns: Mapping[st
     for column in table.columns[1:]:
         column.justify = "right"
     for name, row in rows.items():
-        table.add_row(name, *(_number(row.get(key)) for key in heads))
+        table.add_row(shown(name), *(shown(_number(row.get(key))) for key in heads))
     return Group(f"\n[bold]{title}[/]", table)
 
 

@@ -30,7 +30,7 @@ def _simulate(ctx: click.Context, **values: Any) -> None:
         print_json({**dataclasses.asdict(summary), "directory": str(summary.directory)})
         return
     took = tables.duration(time.monotonic() - started)
-    print_rich(f"[bold]simulate[/]: {summary.key_figure} in {shown(str(summary.directory))} ({took})")
+    print_rich(f"[bold]simulate[/]: {shown(f'{summary.key_figure} in {summary.directory} ({took})')}")
 
 
 command = click.Command(

@@ -6,7 +6,12 @@ import contextlib
 import os
 import shutil
 import sys
+import tempfile
 from pathlib import Path
+
+from pipelines.core.errors import StorageError, storage_error
+
+_PROBE_BYTES = 1 << 20
 
 
 def replace_file(draft: Path, path: Path) -> None:
@@ -63,6 +68,19 @@ def sync_tree(folder: Path) -> None:
         elif path.is_file():
             sync_file(path)
     sync_folder(folder)
+
+
+def storage_failure_of(folder: Path) -> StorageError | None:
+    """Return the failure that meets whoever writes a megabyte into a folder, or None."""
+    try:
+        with tempfile.TemporaryFile(dir=folder) as handle:
+            handle.write(bytes(_PROBE_BYTES))
+            handle.flush()
+            os.fsync(handle.fileno())
+    except OSError as error:
+        error.filename = str(folder)
+        return storage_error(error)
+    return None
 
 
 def remove(path: Path) -> None:

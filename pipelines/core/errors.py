@@ -10,21 +10,10 @@ import errno
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 
 class GeorefError(Exception):
     """Failure that the user can understand and act on."""
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Return the parts from which another process makes the same error, without the arguments of its class."""
-        return _remake, (type(self), str(self), self.__dict__)
-
-
-def _remake(kind: type[GeorefError], message: str, attributes: dict[str, Any]) -> GeorefError:
-    error = kind.__new__(kind, message)
-    error.__dict__.update(attributes)
-    return error
 
 
 class InputError(GeorefError):
@@ -84,6 +73,10 @@ class ResourceError(GeorefError):
     """Machine too small for the options; the message names options that need less."""
 
 
+class CrashError(GeorefError):
+    """Native library that ended its process."""
+
+
 class BackendUnavailableError(GeorefError):
     """Missing optional library or device; the message names the extra to install."""
 
@@ -98,6 +91,15 @@ class DamagedPartialError(InputError):
 
 _SQLITE_ERRNO = {8: errno.EROFS, 10: errno.EIO, 13: errno.ENOSPC}
 _DISK_FAILURES = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
+_NATIVE_WORDS = {
+    "disk is full": errno.ENOSPC,
+    "No space left on device": errno.ENOSPC,
+    "quota exceeded": errno.EDQUOT,
+    "disk I/O error": errno.EIO,
+    "Input/output error": errno.EIO,
+    "readonly database": errno.EROFS,
+    "Read-only file system": errno.EROFS,
+}
 _STORAGE_REASONS = {
     errno.ENOSPC: "the disk is full",
     errno.EDQUOT: "the disk quota is used up: delete files or have it raised",
@@ -134,6 +136,17 @@ def storage_error(error: BaseException) -> StorageError | None:
             return StorageError(f"{'workspace or output' if path is None else path}: {_STORAGE_REASONS[code]}")
         cause = cause.__cause__ or cause.__context__
     return None
+
+
+def storage_error_in(text: str, path: Path) -> StorageError | None:
+    """Return the storage failure that the messages of a native library name, or None.
+
+    Args:
+        text: messages of SQLite or of the C library.
+        path: of the file or folder that was written.
+    """
+    reason = next((reason for words, reason in _NATIVE_WORDS.items() if words in text), None)
+    return None if reason is None else StorageError(f"{path}: {_STORAGE_REASONS[reason]}")
 
 
 @contextmanager

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from pipelines.core.errors import InputError, MissingProductError
+from pipelines.core.files import file_size
 from pipelines.core.manifest import Memo, hash_file
 from pipelines.core.options import StageOptions, flag_name, input_paths
 from pipelines.core.stages import ProductPart, StageSpec
@@ -42,7 +43,7 @@ def fingerprints(workspace: Workspace, spec: StageSpec, options: StageOptions, m
             flag = flag_name(type(options), name)
             if not path.exists():
                 raise InputError("no such file or folder", path=path, field=flag)
-            hashes[flag] = _hash_input(path, workspace.root)
+            hashes[flag] = _hash_input(path, workspace.root, flag)
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}", path=error.filename) from error
     return hashes
@@ -75,6 +76,7 @@ def _values(path: Path, fields: Sequence[str]) -> list[Any] | None:
     """Return the values of a JSON document's fields; None if `fields` is empty."""
     if not fields:
         return None
+    file_size(path)
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except RecursionError as error:
@@ -95,9 +97,10 @@ def _is_empty(value: Any) -> bool:
     return value is None or (isinstance(value, list) and all(_is_empty(item) for item in value))
 
 
-def _hash_input(path: Path, workspace_root: Path) -> str:
+def _hash_input(path: Path, workspace_root: Path, flag: str) -> str:
     if path.is_dir():
         return _hash_listing(path, workspace_root)
+    file_size(path, field=flag)
     stat = path.stat()
     if stat.st_size > _WHOLE_BYTES:
         return hashlib.sha256(f"{path.name} {stat.st_size} {stat.st_mtime_ns}".encode()).hexdigest()
@@ -106,7 +109,7 @@ def _hash_input(path: Path, workspace_root: Path) -> str:
 
 def _hash_product(path: Path, memo: Memo) -> str:
     if path not in memo:
-        memo[path] = hash_file(path, memo) if path.is_file() else _hash_folder(path, memo)
+        memo[path] = _hash_folder(path, memo) if path.is_dir() else hash_file(path, memo)
     return memo[path]
 
 

@@ -1,21 +1,18 @@
-"""Delayed interrupts: a loop ends its step and saves first; a library that ignores signals runs in a thread."""
+"""Delayed interrupts: a loop ends its step and saves first."""
 
 from __future__ import annotations
 
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from types import FrameType
-from typing import TypeVar
 
-ResultT = TypeVar("ResultT")
 SIGNALS = [signal.SIGINT, signal.SIGTERM]
 if sys.platform == "win32":  # There SIGTERM kills without a handler; another process can send Ctrl-Break instead.
     SIGNALS.append(signal.SIGBREAK)
-_LOOK_UP_S = 0.2
 
 
 @dataclass
@@ -52,30 +49,3 @@ def deferred_interrupts() -> Iterator[StopRequest]:
         for number, handler in previous.items():
             # None stands for a handler that was not set from Python and cannot be set again from here.
             signal.signal(number, signal.SIG_DFL if handler is None else handler)
-
-
-def interruptible(work: Callable[[], ResultT]) -> ResultT:
-    """Return the result of long work in a library that releases Python's lock but handles no signals.
-
-    The work runs in a thread of its own, and `SIGNALS` interrupt the wait for its result. After an interrupt the
-    thread runs on until the process ends; the process does not wait for the thread.
-
-    Raises:
-        BaseException: the exception of the work.
-    """
-    results: list[ResultT] = []
-    errors: list[BaseException] = []
-
-    def run() -> None:
-        try:
-            results.append(work())
-        except BaseException as error:  # raised again in the waiting thread
-            errors.append(error)
-
-    thread = threading.Thread(target=run, daemon=True)
-    thread.start()
-    while thread.is_alive():
-        thread.join(_LOOK_UP_S)
-    if errors:
-        raise errors[0]
-    return results[0]

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable
-from datetime import datetime
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, FiniteFloat, model_validator
+
+from pipelines.core.files import file_size
 
 MANIFEST = "manifest.json"
 Memo = dict[Path, str]
@@ -49,11 +51,24 @@ class Manifest(BaseModel):
     inputs: dict[str, str]
     versions: dict[str, str]
     started: datetime
-    duration_s: float
+    duration_s: FiniteFloat
     key_figure: str
     values: dict[str, Any]
     warnings: list[str]
     files: dict[str, FileRecord] = {}
+
+    @model_validator(mode="after")
+    def _ends_in_the_calendar(self) -> Manifest:
+        try:
+            _ = self.finished
+        except OverflowError as error:
+            raise ValueError("duration_s: ends beyond the calendar") from error
+        return self
+
+    @property
+    def finished(self) -> datetime:
+        """Time at which the stage ended, UTC."""
+        return self.started + timedelta(seconds=self.duration_s)
 
 
 def record_files(folder: Path, left_out: Iterable[str]) -> dict[str, FileRecord]:
@@ -112,6 +127,7 @@ def hash_file(path: Path, memo: Memo) -> str:
         OSError: the file cannot be read.
     """
     if path not in memo:
+        file_size(path)
         with path.open("rb") as handle:
             memo[path] = hashlib.file_digest(handle, "sha256").hexdigest()
     return memo[path]

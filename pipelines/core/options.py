@@ -20,10 +20,12 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Val
 from pydantic.fields import FieldInfo
 
 from pipelines.core.errors import InputError
+from pipelines.core.files import file_size
 from pipelines.core.types import Vector3
 from pipelines.core.validators import require_text
 
 CONFIG_FILE = "georef.toml"
+_MAX_TOML_BYTES = 1024 * 1024
 
 
 class InputMarker:
@@ -164,9 +166,10 @@ def load_toml(path: Path, stages: Collection[str]) -> dict[str, dict[str, Any]]:
     """
     if not path.exists():
         return {}
+    file_size(path, limit_bytes=_MAX_TOML_BYTES)
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(f"not valid TOML: {error}", path=path) from error
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}", path=path) from error

@@ -9,8 +9,6 @@ Gaussians.
 from __future__ import annotations
 
 import json
-import zipfile
-import zlib
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -19,6 +17,7 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
 
 from pipelines.core.errors import InputError
+from pipelines.core.files import file_size, read_npz
 from pipelines.core.types import Matrix3, Quaternion
 from pipelines.core.validators import covariance, image_name, unit_quaternion
 
@@ -52,8 +51,7 @@ def load_json(product_type: type[ProductT], path: Path) -> ProductT:
         InputError: the file is unreadable, too large, not JSON, or not of that type; names file and field.
     """
     try:
-        if path.stat().st_size > _MAX_JSON_BYTES:
-            raise InputError("is too large for a product", path=path)
+        file_size(path, limit_bytes=_MAX_JSON_BYTES, kind="product")
         return product_type.model_validate_json(path.read_text(encoding="utf-8"))
     except ValidationError as error:
         first = error.errors()[0]
@@ -61,6 +59,8 @@ def load_json(product_type: type[ProductT], path: Path) -> ProductT:
         raise InputError(first["msg"], path=path, field=where or None) from error
     except UnicodeDecodeError as error:
         raise InputError("not a UTF-8 text file", path=path) from error
+    except (np.linalg.LinAlgError, RecursionError) as error:  # of a validator that computes
+        raise InputError(f"has values that cannot be used: {error}", path=path) from error
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}", path=path) from error
 
@@ -86,11 +86,4 @@ def load_npz(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
     Raises:
         InputError: the file is unreadable, or lacks one of the arrays.
     """
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            missing = [name for name in names if name not in archive]
-            if missing:
-                raise InputError(f"array {missing[0]!r} is missing", path=path)
-            return {name: archive[name] for name in names}
-    except (OSError, ValueError, EOFError, MemoryError, zipfile.BadZipFile, zlib.error) as error:
-        raise InputError(f"not a readable NPZ file: {error}", path=path) from error
+    return read_npz(path, names)

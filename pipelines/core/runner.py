@@ -13,9 +13,13 @@ from dataclasses import dataclass
 from importlib import metadata
 from typing import Any
 
+import numpy as np
+from pydantic import ValidationError
+
 from pipelines import __version__
 from pipelines.core.errors import (
     DamagedPartialError,
+    DegenerateGeometryError,
     GeorefError,
     InputError,
     MissingProductError,
@@ -39,6 +43,8 @@ from pipelines.core.workspace import Resume, StageRun, Summary, Workspace, now
 
 log = logging.getLogger(__name__)
 
+# Numbers that no matrix, no float and no product can hold.
+_WITHOUT_SOLUTION = (np.linalg.LinAlgError, OverflowError, FloatingPointError, RecursionError, ValidationError)
 LIBRARIES = ("numpy", "pycolmap", "torch", "numba", "pyproj")
 
 
@@ -204,6 +210,15 @@ def _run(workspace: Workspace, asked: Request, token: str, resume: Resume, progr
     except GeorefError as error:
         workspace.fail(spec, str(error))
         raise
+    # Products that were edited by hand have numbers that no stage writes.
+    except _WITHOUT_SOLUTION as error:
+        cause = " ".join(str(error).split())[:200]
+        degenerate = DegenerateGeometryError(
+            f"the products that {spec.name} reads lead to no solution ({cause}): were they edited? "
+            f"`georef run {workspace.root} --force` makes them again"
+        )
+        workspace.fail(spec, str(degenerate))
+        raise degenerate from error
     return summary
 
 

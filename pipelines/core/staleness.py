@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from datetime import datetime, timedelta
+from datetime import datetime
 from typing import Any, Literal
 
 from pipelines.core.errors import InputError, MissingProductError
@@ -160,7 +160,7 @@ class _Look:
             spec.name,
             "damaged" if damage else "stale" if reason else "current",
             "; ".join(filter(None, (reason, later))),
-            manifest.started + timedelta(seconds=manifest.duration_s),
+            manifest.finished,
             manifest.duration_s,
             manifest.key_figure,
         )

@@ -18,6 +18,7 @@ from typing import Any, Literal
 
 from pipelines.core.durable import remove, replace_file, replace_text, sync_folder, sync_tree
 from pipelines.core.errors import InputError, MissingProductError
+from pipelines.core.files import file_size
 from pipelines.core.lock import WriteLock
 from pipelines.core.manifest import MANIFEST, Manifest, Memo, damaged_files
 from pipelines.core.options import CONFIG_FILE
@@ -209,7 +210,7 @@ class Workspace:
         if partial.is_symlink() or not partial.is_dir():
             remove(partial)
         held = partial / TOKEN
-        if spec.resumable and held.exists() and resume != "never":
+        if spec.resumable and held.is_file() and resume != "never":
             if held.read_bytes() == token.encode():
                 (partial / FAILURE).unlink(missing_ok=True)
                 return partial, True
@@ -267,9 +268,10 @@ class Workspace:
         path = self.root / REQUESTS
         if not path.exists():
             return {}
+        file_size(path)
         try:
             document = json.loads(path.read_text(encoding="utf-8"))
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise InputError("not valid JSON: delete it and give the options again", path=path) from error
         if not isinstance(document, dict) or not all(isinstance(flags, dict) for flags in document.values()):
             raise InputError("not a table of options by stage: delete it and give them again", path=path)

@@ -13,9 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.core.errors import BackendUnavailableError, InputError
+from pipelines.core.durable import storage_failure_of
+from pipelines.core.errors import BackendUnavailableError, InputError, StorageError
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.core.validators import stays_inside
+from pipelines.formats.colmap_check import check_model_files
 from pipelines.geometry.cameras import Camera
 from pipelines.geometry.sparse_model import SparseModel
 
@@ -26,10 +28,6 @@ log = logging.getLogger(__name__)
 _COLMAP_ERRORS_ONLY = 2
 
 _INVALID_POINT = np.uint64(2**64 - 1)
-
-# Least bytes of one record of each binary file. COLMAP trusts the record count at the head of the file, and reads
-# without end past the end of a truncated or forged file.
-_LEAST_RECORD_BYTES = {"cameras.bin": 48, "images.bin": 73, "points3D.bin": 51, "frames.bin": 8, "rigs.bin": 8}
 
 
 def read_sparse(path: Path) -> SparseModel:
@@ -108,32 +106,48 @@ def quiet_colmap() -> Iterator[Any]:
         pycolmap.logging.minloglevel = level
 
 
+def write_reconstruction(reconstruction: Any, folder: Path) -> None:
+    """Write a `pycolmap.Reconstruction` in COLMAP's binary form into a new folder, and read it back.
+
+    COLMAP does not notice that a disk is full while it writes.
+
+    Raises:
+        StorageError: the files are shorter than what was written.
+        OSError: the folder cannot be made.
+    """
+    folder.mkdir()
+    reconstruction.write_binary(str(folder))
+    try:
+        copy = load_reconstruction(folder)
+        whole = _counts(copy) == _counts(reconstruction)
+    except InputError:
+        whole = False
+    if not whole:
+        failure = storage_failure_of(folder) or StorageError(f"{folder}: the model could not be written whole")
+        raise failure
+
+
+def _counts(reconstruction: Any) -> tuple[int, int, int]:
+    return (
+        reconstruction.num_images(),
+        reconstruction.num_points3D(),
+        reconstruction.compute_num_observations(),
+    )
+
+
 def load_reconstruction(path: Path) -> Any:
     """Return the COLMAP model in a folder as a `pycolmap.Reconstruction`.
 
     Raises:
-        InputError: no such folder, or not a readable model.
+        InputError: no such folder, not a readable model, or one whose counts do not fit its files.
         BackendUnavailableError: pycolmap is not installed.
     """
     pycolmap = pycolmap_module()
-    if not path.is_dir():
-        raise InputError("no such folder; expected a COLMAP model (cameras, images, points3D)", path=path)
-    for name, least in _LEAST_RECORD_BYTES.items():
-        _check_count(path / name, least)
+    check_model_files(path)
     try:
         return pycolmap.Reconstruction(str(path))
     except (ValueError, RuntimeError, IndexError, MemoryError) as error:
         raise InputError(f"not a readable COLMAP model: {error}", path=path) from error
-
-
-def _check_count(file: Path, least_record_bytes: int) -> None:
-    if not file.is_file():
-        return
-    with file.open("rb") as handle:
-        head = handle.read(8)
-    count = int.from_bytes(head, "little")
-    if len(head) < 8 or count * least_record_bytes > file.stat().st_size - 8:
-        raise InputError("shorter than the number of its records says: it is truncated, copy it again", path=file)
 
 
 def _observations(images: list[Any], point_ids: IntArray) -> tuple[IntArray, IntArray, FloatArray]:

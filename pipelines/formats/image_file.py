@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.core.errors import InputError
+from pipelines.core.files import file_size
 
 SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff"})
 MAX_BYTES = 512 * 1024 * 1024
@@ -42,11 +43,8 @@ def read_bytes(path: Path) -> bytes:
         InputError: unreadable, empty, or larger than 512 MiB.
     """
     try:
-        size = path.stat().st_size
-        if size == 0:
+        if file_size(path, limit_bytes=MAX_BYTES, kind="photograph") == 0:
             raise InputError("is empty", path=path)
-        if size > MAX_BYTES:
-            raise InputError(f"{size / 2**20:.0f} MiB is too large for a photograph (limit 512 MiB)", path=path)
         return path.read_bytes()
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}", path=path) from error

@@ -16,6 +16,7 @@ from plyfile import PlyData, PlyElement, PlyParseError
 
 from pipelines.core.durable import replace_file
 from pipelines.core.errors import InputError
+from pipelines.core.files import file_size
 from pipelines.core.types import Float32Array
 
 _HEADER_LIMIT = 64 * 1024
@@ -143,10 +144,10 @@ class _Table:
 
 def _check_header(path: Path) -> None:
     """Refuse, before memory is allocated, a file whose size differs from the promise of its header."""
+    size = file_size(path)
     try:
         with path.open("rb") as stream:
             start = stream.read(_HEADER_LIMIT)
-        size = path.stat().st_size
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}", path=path) from error
     head, end_marker, _ = start.partition(b"end_header")

@@ -6,6 +6,7 @@ import math
 from pathlib import Path
 
 from pipelines.core.errors import InputError
+from pipelines.core.files import file_size
 
 MAX_BYTES = 128 * 1024 * 1024
 
@@ -17,9 +18,7 @@ def read_lines(path: Path) -> list[str]:
         InputError: missing, a folder, larger than 128 MiB, empty, or not UTF-8.
     """
     try:
-        size = path.stat().st_size
-        if size > MAX_BYTES:
-            raise InputError(f"{size / 2**20:.0f} MiB is too large for a text table (limit 128 MiB)", path=path)
+        file_size(path, limit_bytes=MAX_BYTES, kind="text table")
         data = path.read_bytes()
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}", path=path) from error

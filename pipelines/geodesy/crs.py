@@ -19,11 +19,12 @@ from numpy.typing import ArrayLike
 from pyproj import CRS, Transformer
 from pyproj.crs import CompoundCRS
 from pyproj.enums import TransformDirection
-from pyproj.exceptions import CRSError
+from pyproj.exceptions import CRSError, ProjError
 
 from pipelines.core.errors import InputError
 from pipelines.core.types import FloatArray
-from pipelines.geodesy.operations import Operation, OperationRequest, best_operation
+from pipelines.geodesy.crs_text import file_in
+from pipelines.geodesy.operations import Operation, OperationRequest, best_operation, proj_errors
 from pipelines.geodesy.plausible import ListedPoints, check_area, horizontal_of, rough_lon_lat
 from pipelines.geodesy.vertical import ELLIPSOIDAL, VerticalChoice, VerticalDatum, assumed_ellipsoidal, name_of
 
@@ -85,10 +86,11 @@ class PointCrs:
         if not len(points):
             return points
         listed = ListedPoints(points, self.name, path, lines)
-        lon, lat = rough_lon_lat(self._crs, listed)
-        transformer, _ = best_operation(self._request(path), lon, lat)
         height = points[:, 2] * (1.0 if self._three_dimensional else self._height_unit_m)
-        x, y, z = transformer.transform(points[:, 0], points[:, 1], height)
+        with proj_errors(self.name, path):
+            lon, lat = rough_lon_lat(self._crs, listed)
+            transformer, _ = best_operation(self._request(path), lon, lat)
+            x, y, z = transformer.transform(points[:, 0], points[:, 1], height)
         lla = np.stack([y, x, z if self._three_dimensional else height], axis=-1)
         lla[:, 1] -= 360.0 * np.round(lla[:, 1] / 360.0)
         listed.require(np.isfinite(lla).all(axis=1), f"outside the domain of {self.name}")
@@ -105,9 +107,10 @@ class PointCrs:
             return points
         listed = ListedPoints(points, self.name)
         listed.require(np.isfinite(points).all(axis=1), "not a number")
-        check_area(self._crs, points[:, 1], points[:, 0], listed)
-        transformer, _ = best_operation(self._request(), points[:, 1], points[:, 0])
-        x, y, z = _inverse(transformer, points[:, 1], points[:, 0], points[:, 2])
+        with proj_errors(self.name):
+            check_area(self._crs, points[:, 1], points[:, 0], listed)
+            transformer, _ = best_operation(self._request(), points[:, 1], points[:, 0])
+            x, y, z = _inverse(transformer, points[:, 1], points[:, 0], points[:, 2])
         if not self._three_dimensional:
             # PROJ's flat datum shifts take a height for one above their own ellipsoid, on the way there and on the
             # way back: millimetres between the two. What a file's points mean is the way there.
@@ -165,15 +168,22 @@ def parse_crs(
         InputError: not a CRS, or not one of points on Earth.
     """
     name = " ".join(text.split())
-    crs = _parse(name, path, line, field)
+    try:
+        crs = _parse(name, path, line, field)
+        if not (crs.is_geographic or crs.is_projected or crs.is_geocentric):
+            raise InputError(
+                f"{_short(name)} is a {crs.type_name}, which places no points on Earth",
+                path=path,
+                line=line,
+                field=field,
+            )
+        return _point_crs(crs, name, vertical)
+    except ProjError as error:  # of a CRS that PROJ reads, but whose parts it does not combine
+        raise InputError(f"PROJ cannot use {_short(name)!r}: {error}", path=path, line=line, field=field) from error
+
+
+def _point_crs(crs: CRS, name: str, vertical: VerticalChoice | None) -> PointCrs:
     horizontal = horizontal_of(crs)
-    if not (crs.is_geographic or crs.is_projected or crs.is_geocentric):
-        raise InputError(
-            f"{_short(name)} is a {crs.type_name}, which places no points on Earth",
-            path=path,
-            line=line,
-            field=field,
-        )
     axes = (crs.source_crs or crs if crs.is_bound else crs).axis_info
     if len(axes) == 3:
         stated = _own_vertical(crs, _short(name))
@@ -195,6 +205,14 @@ def parse_crs(
 def _parse(name: str, path: Path | str | None, line: int | None, field: str | None) -> CRS:
     if len(name) > _MAX_TEXT:
         raise InputError(f"no CRS is {len(name)} characters long", path=path, line=line, field=field)
+    file = file_in(name)
+    if file is not None:
+        raise InputError(
+            f"{_short(file)!r} would open a file: give EPSG:n, or a grid by its bare name in PROJ's own folders",
+            path=path,
+            line=line,
+            field=field,
+        )
     utm = _UTM.fullmatch(name)
     if utm:
         zone, south = int(utm[1]), utm[2].upper() == "S"

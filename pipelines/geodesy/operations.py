@@ -8,13 +8,15 @@ errors that name the grid.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 from pyproj import CRS, Transformer
 from pyproj.crs import CoordinateOperation
 from pyproj.datadir import get_user_data_dir
+from pyproj.exceptions import ProjError
 from pyproj.transformer import AreaOfInterest, TransformerGroup
 
 from pipelines.core.errors import InputError
@@ -53,6 +55,19 @@ class OperationRequest:
     path: Path | str | None = None
 
 
+@contextmanager
+def proj_errors(name: str, path: Path | str | None = None) -> Iterator[None]:
+    """Turn the exceptions of PROJ into errors that name the CRS and the file.
+
+    Raises:
+        InputError: PROJ refuses the CRS or the points.
+    """
+    try:
+        yield
+    except ProjError as error:
+        raise InputError(f"PROJ cannot transform points of {name}: {error}", path=path) from error
+
+
 def best_operation(request: OperationRequest, lon: FloatArray, lat: FloatArray) -> tuple[Transformer, Operation]:
     """Return the best transformation for points at `lon`, `lat` (N,) in degrees: one for all of them.
 
@@ -81,7 +96,8 @@ def _group(crs: CRS, target: str, area: AreaOfInterest | None) -> TransformerGro
         warnings.simplefilter("ignore", UserWarning)  # "best transformation is not available": told by us
         try:
             return TransformerGroup(crs, target, always_xy=True, allow_ballpark=False, area_of_interest=area)
-        except IndexError:  # pyproj's, for a few CRS of the nineteenth century
+        # pyproj raises IndexError for a few CRS of the nineteenth century, and ProjError for damaged grids.
+        except (IndexError, ProjError):
             return None
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,9 +89,37 @@ class NavigationTrack:
         """Read the navigation from NPZ.
 
         Raises:
-            InputError: the file is no NPZ file with these arrays.
+            InputError: the file is no NPZ file with these arrays, or an array has another form.
         """
-        return cls(**load_npz(path, tuple(field.name for field in fields(cls))))
+        arrays = load_npz(path, tuple(field.name for field in fields(cls)))
+        lengths: dict[str, int] = {}
+        for name, (kind, *shape) in _TRACK_ARRAYS.items():
+            array = arrays[name]
+            matches = array.dtype.kind in kind and array.ndim == len(shape)
+            for length, wanted in zip(array.shape, shape, strict=False):
+                expected = lengths.setdefault(wanted, length) if isinstance(wanted, str) else wanted
+                matches = matches and length == expected
+            if not matches:
+                raise InputError(f"has the form {array.shape} {array.dtype}", path=path, field=name)
+        return cls(**arrays)
+
+
+# Kind of number, and shape, in which a letter stands for a length that several arrays share.
+_TRACK_ARRAYS: dict[str, tuple[Any, ...]] = {
+    "position_time_s": ("f", "K"),
+    "antenna_in_geo": ("f", "K", 3),
+    "sigma_m": ("f", "K", 3),
+    "attitude_time_s": ("f", "M"),
+    "geo_from_body": ("f", "M", 3, 3),
+    "image": ("U", "n"),
+    "image_time_s": ("f", "n"),
+    "cam_from_body": ("f", "n", 3, 3),
+    "antenna_in_body": ("f", "n", 3),
+    "nominal_from_cam": ("f", 3, 3),
+    "time_offset_s": ("fi",),
+    "max_gap_s": ("fi",),
+    "body_known": ("b",),
+}
 
 
 def load_track(workspace: Workspace) -> NavigationTrack:

@@ -9,16 +9,26 @@ of GeoRefGS (doi 10.3390/drones10030195), and the last step of COLMAP's `pose_pr
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from pipelines.core.child import run_in_child
 from pipelines.core.errors import ConvergenceError, DegenerateGeometryError
 from pipelines.core.products import save_json
+from pipelines.core.progress import Progress
 from pipelines.core.stages import SPARSE
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import StageRun, Summary
-from pipelines.formats.colmap import load_reconstruction, pycolmap_module, quiet_colmap, read_sparse
+from pipelines.formats.colmap import (
+    load_reconstruction,
+    pycolmap_module,
+    quiet_colmap,
+    read_sparse,
+    write_reconstruction,
+)
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.georef.alignment import Alignment, align
@@ -31,6 +41,7 @@ from pipelines.scene.survey import Fix, Survey
 from pipelines.sfm.options import AdjustOptions
 
 _MOST_ITERATIONS = 100
+_FORCE_SFM = "COLMAP cannot adjust the model: reconstruct it again (`georef sfm --force`)"
 # COLMAP aligns the model with the fixes before it adjusts. Its limit of an inlier is this factor times the largest
 # residual of the inliers of `align`: with too tight a limit COLMAP has no start.
 _ALIGNMENT_SLACK = 3.0
@@ -40,23 +51,44 @@ def run(stage: StageRun, options: AdjustOptions) -> Summary:
     """Adjust the workspace's model and write it.
 
     Raises:
-        GeorefError: unreadable products, or one of `adjust_to_fixes`.
+        GeorefError: unreadable products, one of `adjust_to_fixes`, or a crash of COLMAP.
     """
-    survey = load_survey(stage.workspace)
-    path, sparse = stage.workspace.path(SPARSE), stage.out / "sparse"
-    alignment = _aligned(read_sparse(path), survey, options.seed)
+    arguments = {
+        "survey": load_survey(stage.workspace).model_dump(mode="json"),
+        "model": str(stage.workspace.path(SPARSE)),
+        "out": str(stage.out),
+        "seed": options.seed,
+    }
+    task = "pipelines.sfm.pose_prior:write_adjusted"
+    document = run_in_child(task, arguments, _FORCE_SFM, stage.progress, writes=stage.out)
+    return Summary(document["key_figure"], document["values"])
+
+
+def write_adjusted(arguments: Mapping[str, Any], progress: Progress) -> dict[str, Any]:
+    """Adjust a model and write it; return the summary as a document.
+
+    Args:
+        arguments: the calibrated `survey`, paths of `model` and `out`, and `seed`.
+        progress: shows the adjustment.
+
+    Raises:
+        GeorefError: as `run`.
+    """
+    survey, path = Survey.model_validate(arguments["survey"]), Path(arguments["model"])
+    out, seed = Path(arguments["out"]), int(arguments["seed"])
+    sparse = out / "sparse"
+    alignment = _aligned(read_sparse(path), survey, seed)
     model = load_reconstruction(path)
-    with quiet_colmap(), stage.progress.task("adjustment", 1) as task:
-        adjust_to_fixes(model, survey, alignment, options.seed)
+    with quiet_colmap(), progress.task("adjustment", 1) as task:
+        adjust_to_fixes(model, survey, alignment, seed)
         task.advance()
-    sparse.mkdir()
-    model.write_binary(str(sparse))
+    write_reconstruction(model, sparse)
     names = tuple(image.name for image, _ in _located(model, survey))
-    similarity = _identity(_aligned(read_sparse(sparse), survey, options.seed), names, _residuals(model, survey))
-    save_json(similarity, stage.out / "geo_from_local.json")
+    similarity = _identity(_aligned(read_sparse(sparse), survey, seed), names, _residuals(model, survey))
+    save_json(similarity, out / "geo_from_local.json")
     fixes = similarity.residuals["gnss"]
     values = {"residuals": fixes.model_dump(), "reprojection_error_px": model.compute_mean_reprojection_error()}
-    return Summary(f"{fixes.rmse_3d_m:.3f} m RMS from {fixes.count} fixes", values)
+    return {"key_figure": f"{fixes.rmse_3d_m:.3f} m RMS from {fixes.count} fixes", "values": values}
 
 
 def adjust_to_fixes(model: Any, survey: Survey, alignment: Alignment, seed: int = 0) -> None:

@@ -1,4 +1,7 @@
-"""Reconstruction by COLMAP: features, matches, mapping, and a last, robust adjustment."""
+"""Reconstruction by COLMAP: features, matches, mapping, and a last, robust adjustment.
+
+COLMAP hears no interrupts while it works: the stage runs this in a child process.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from pipelines.core.errors import DegenerateGeometryError, InputError
-from pipelines.core.interrupts import interruptible
 from pipelines.core.progress import Progress
 from pipelines.core.stages import SURVEY
 from pipelines.core.types import IntArray
@@ -208,7 +210,7 @@ def _map(colmap: Any, job: SfmJob, progress: Progress) -> list[Any]:
         if job.options.mapper == "global":
             options = colmap.GlobalPipelineOptions()
             options.num_threads, options.random_seed = job.options.threads, job.options.seed
-            models = interruptible(lambda: colmap.global_mapping(job.database, job.images, out, options))
+            models = colmap.global_mapping(job.database, job.images, out, options)
             task.advance(len(job.survey.images))
             return list(models.values())
         options = colmap.IncrementalPipelineOptions()

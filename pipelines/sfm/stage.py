@@ -9,64 +9,102 @@ from __future__ import annotations
 
 import logging
 import shutil
+import sqlite3
+from collections.abc import Mapping
+from contextlib import closing
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from pipelines.core.errors import DegenerateGeometryError, InputError
+from pipelines.core.child import run_in_child
+from pipelines.core.errors import CrashError, DamagedPartialError, DegenerateGeometryError, storage_error
 from pipelines.core.products import load_json
+from pipelines.core.progress import Progress
 from pipelines.core.stages import SURVEY
 from pipelines.core.workspace import StageRun, Summary
-from pipelines.formats.colmap import load_reconstruction, quiet_colmap
+from pipelines.formats.colmap import quiet_colmap, write_reconstruction
 from pipelines.scene.survey import Survey
+from pipelines.sfm.imported import import_model
 from pipelines.sfm.options import SfmOptions
 from pipelines.sfm.reconstruction import SfmJob, reconstruct
 
 log = logging.getLogger(__name__)
 
 _FEW_REGISTERED = 0.8
+_RUN_AGAIN = "run it again (finished features and matches are kept), or with a smaller `--max-image-size`"
+_EXPORT_AGAIN = "COLMAP cannot read the imported model: export it again"
 
 
 def run(stage: StageRun, options: SfmOptions) -> Summary:
     """Reconstruct the cameras and points, or import a model, and write the model.
 
     Raises:
-        GeorefError: unreadable products, or an error of `reconstruct` or `import_model`.
+        GeorefError: unreadable products, an error of `reconstruct` or `import_model`, or a crash of COLMAP.
         DegenerateGeometryError: fewer than three photographs are registered.
     """
-    survey = load_json(Survey, stage.workspace.path(SURVEY))
-    images = stage.workspace.photographs(survey.image_dir)
-    sparse = stage.out / "sparse"
+    path = stage.workspace.path(SURVEY)
+    survey = load_json(Survey, path)
+    arguments = {
+        "survey": str(path),
+        "images": str(stage.workspace.photographs(survey.image_dir)),
+        "out": str(stage.out),
+        "options": options.model_dump(mode="json"),
+    }
+    remedy = _EXPORT_AGAIN if options.import_model is not None else _RUN_AGAIN
+    task = "pipelines.sfm.stage:write_model"
+    try:
+        document = run_in_child(task, arguments, remedy, stage.progress, writes=stage.out)
+    except (CrashError, RuntimeError) as error:
+        if stage.resumed:
+            cause = str(error).strip().splitlines()[-1]
+            raise DamagedPartialError(f"COLMAP cannot continue it: {cause}", path=stage.out) from error
+        raise
+    return Summary(document["key_figure"], document["values"], tuple(document["warnings"]))
+
+
+def write_model(arguments: Mapping[str, Any], progress: Progress) -> dict[str, Any]:
+    """Reconstruct or import the model and write it; return the summary as a document.
+
+    Args:
+        arguments: paths of `survey`, `images` and `out`, and the `options` of the stage.
+        progress: shows features, matches and mapping.
+
+    Raises:
+        GeorefError: as `run`.
+    """
+    survey, out = load_json(Survey, Path(arguments["survey"])), Path(arguments["out"])
+    options = SfmOptions.model_validate(arguments["options"])
+    sparse = out / "sparse"
     if sparse.exists():
         shutil.rmtree(sparse)
     with quiet_colmap() as colmap:
         if options.import_model is not None:
             model = import_model(options.import_model, survey)
         else:
-            job = SfmJob(survey, images, stage.out / "database.db", options)
-            model = reconstruct(colmap, job, stage.progress)
-        sparse.mkdir()
-        model.write_binary(str(sparse))
-    return _summarise(model, survey)
+            _require_sound(out / "database.db")
+            job = SfmJob(survey, Path(arguments["images"]), out / "database.db", options)
+            model = reconstruct(colmap, job, progress)
+        write_reconstruction(model, sparse)
+    return asdict(_summarise(model, survey))
 
 
-def import_model(path: Path, survey: Survey) -> Any:
-    """Return the COLMAP model at `path` (a `pycolmap.Reconstruction`), reduced to the survey's images.
+def _require_sound(database: Path) -> None:
+    """Refuse a damaged database of an interrupted run; COLMAP would abort, or continue without a part of it.
 
     Raises:
-        InputError: the folder holds no COLMAP model, or fewer than 3 of its images are in the survey.
+        DamagedPartialError: SQLite finds the file damaged.
     """
-    model = load_reconstruction(path)
-    names = {image.name for image in survey.images}
-    foreign = [image.image_id for image in model.images.values() if image.name not in names]
-    for image_id in foreign:
-        model.deregister_frame(model.images[image_id].frame_id)
-    if model.num_reg_images() < 3:
-        raise InputError(
-            f"only {model.num_reg_images()} of its images are in the survey: names must be equal", path=path
-        )
-    if foreign:
-        log.warning("%d images of the imported model are not in the survey and were left out", len(foreign))
-    return model
+    if not database.exists():
+        return
+    try:
+        with closing(sqlite3.connect(database)) as connection:
+            (verdict,) = connection.execute("pragma quick_check(1)").fetchone()
+    except sqlite3.DatabaseError as error:
+        if storage_error(error) is not None:
+            raise
+        verdict = str(error)
+    if verdict != "ok":
+        raise DamagedPartialError(f"the database is damaged: {verdict}", path=database)
 
 
 def _summarise(model: Any, survey: Survey) -> Summary:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -13,6 +11,7 @@ from torch import Tensor
 
 from pipelines.core.durable import replace_file
 from pipelines.core.errors import InputError
+from pipelines.core.files import read_npz
 
 
 def save_checkpoint(path: Path, state: Mapping[str, Tensor]) -> None:
@@ -31,10 +30,13 @@ def load_checkpoint(path: Path) -> dict[str, Tensor]:
         InputError: unreadable.
     """
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            return {name: torch.from_numpy(archive[name]) for name in archive.files}
-    except (OSError, ValueError, EOFError, MemoryError, BadZipFile, zlib.error) as error:
-        raise InputError(f"not a readable checkpoint: {error}; train without --resume", path=path) from error
+        return {name: torch.from_numpy(array) for name, array in read_npz(path).items()}
+    except (
+        InputError,
+        TypeError,
+        ValueError,
+    ) as error:  # torch has no complex halves, texts or foreign byte orders
+        raise InputError(f"not a readable checkpoint: {error}; train without --resume") from error
 
 
 def prefixed(prefix: str, state: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -19,6 +20,7 @@ from pipelines.core.products import load_json
 from pipelines.core.stages import BY_NAME, RIG, SURVEY, TRACK, stage_slice
 from pipelines.core.workspace import Workspace
 from pipelines.geodesy.enu import lla_from_enu
+from pipelines.geometry.cameras import Camera
 from pipelines.geometry.rig import boresight
 from pipelines.geometry.rotations import log_so3, matrix_from_quat_xyzw
 from pipelines.scene.calibrated import load_survey
@@ -34,6 +36,7 @@ from tests.scenes import Noise, TrueScene, sparse_model
 
 OFFSET_S, BORESIGHT_DEG = 0.2, np.array([0.7, -0.5, 0.4])
 EXACT = Noise(pixel_px=0.05)
+SIZE = (1200, 900)  # of the photographs in the bags, and of the cameras of `sparse_model`
 Command = Callable[..., Any]
 
 
@@ -58,12 +61,22 @@ def command(capsys: pytest.CaptureFixture[str]) -> Command:
     return call
 
 
-def write_model(path: Path, names: list[str], centers: np.ndarray, geo_from_cam: np.ndarray) -> Path:
+def photograph(index: int) -> np.ndarray:
+    """A JPEG of one grey, which no other photograph has."""
+    return cv2.imencode(".jpg", np.full((SIZE[1], SIZE[0], 3), 5 * index + 10, np.uint8))[1].ravel()
+
+
+def write_model(
+    path: Path, names: list[str], centers: np.ndarray, geo_from_cam: np.ndarray, width: int = SIZE[0]
+) -> Path:
     """What SfM would make of cameras (n, 3) and (n, 3, 3) above a landscape, in a frame of its own."""
     rng = np.random.default_rng(0)
     land = np.column_stack([rng.uniform(-150, 150, (1500, 2)), rng.uniform(0, 15, 1500)])
     scene = TrueScene(centers, geo_from_cam, land, np.empty((0, 3)))
     model = sparse_model(scene, EXACT, rng)
+    camera = model.cameras[1]
+    factor = width / camera.width
+    params = np.concatenate([camera.params[:4] * factor, camera.params[4:]])
     seen = np.bincount(model.obs_point, minlength=len(land)) > 2
     keep = seen[model.obs_point]
     model = replace(
@@ -75,7 +88,8 @@ def write_model(path: Path, names: list[str], centers: np.ndarray, geo_from_cam:
         point_error_px=model.point_error_px[seen],
         obs_point=(np.cumsum(seen) - 1)[model.obs_point[keep]],
         obs_image=model.obs_image[keep],
-        obs_xy_px=model.obs_xy_px[keep],
+        obs_xy_px=model.obs_xy_px[keep] * factor,
+        cameras={1: Camera(camera.model, width, round(camera.height * factor), params)},
     )
     path.mkdir(parents=True)
     write_sparse(model, path)
@@ -85,8 +99,9 @@ def write_model(path: Path, names: list[str], centers: np.ndarray, geo_from_cam:
 def flown(path: Path, flight: bags.Flight) -> dict[str, Path]:
     """A bag whose photographs are stamped 0.2 s late of the navigation's clock, and the true cameras as SfM's."""
     messages = [one for one in bags.usual(flight) if "image" not in one[0]]
-    for topic, kind, ns, message in bags.images(flight):
+    for index, (topic, kind, ns, message) in enumerate(bags.images(flight)):
         message.header.stamp = bags.time(ns - round(OFFSET_S * 1e9))
+        message.data = photograph(index)
         messages.append((topic, kind, ns, message))
     centers, nominal = bags.expected(flight, bags.ORIGIN)
     names = [f"frame_{i:06d}.jpg" for i in range(flight.count)]
@@ -275,7 +290,7 @@ def test_offset_of_a_trajectory_by_time(tmp_path: Path, command: Command) -> Non
     simulate(SimulateOptions(**options, clock_offset=OFFSET_S), tmp_path / "survey")
     truth = load_json(Truth, tmp_path / "survey/truth.json")
     turns = np.swapaxes(np.array(truth.cam_from_enu), 1, 2)
-    model = write_model(tmp_path / "model", list(truth.images), np.array(truth.centers), turns)
+    model = write_model(tmp_path / "model", list(truth.images), np.array(truth.centers), turns, width=64)
     files = tmp_path / "survey"
     table = ["--images", files / "images", "--trajectory", files / "gnss.csv", "--import", model]
     document = command("run", tmp_path / "ws", *table, "--time-offset", "auto", "--to", "geolocate")

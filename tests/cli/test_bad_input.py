@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -165,6 +167,38 @@ def test_refused(real_georef: Georef, flight: Path, case: Case) -> None:
     assert case.told in last
     assert "Traceback" not in result.err
     assert products_in(workspace) == before
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no pipes and devices in folders")
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ("--trajectory {here}/pipe", "pipe [--trajectory]: cannot be read: it is a named pipe, give a file"),
+        ("--trajectory /dev/zero", "/dev/zero [--trajectory]: cannot be read: it is a device, give a file"),
+        ("--geo {here}/pipe", "pipe [--geo]: cannot be read: it is a named pipe"),
+        ("--gcp {here}/pipe", "pipe [--gcp]: cannot be read: it is a named pipe"),
+        ("--bag {here}/pipe.bag", "cannot be read: it is a named pipe"),
+    ],
+)
+def test_pipes_and_devices_are_refused_at_once(real_georef: Georef, flight: Path, options: str, told: str) -> None:
+    os.mkfifo(flight / "pipe")
+    os.mkfifo(flight / "pipe.bag")
+    result = real_georef(
+        "ingest", flight / "ws", "--images", flight / "photos", *options.format(here=flight).split()
+    )
+    assert (result.code, result.out) == (1, "")
+    assert told in result.err.splitlines()[-1]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no pipes and devices in folders")
+def test_pipe_among_the_photographs_is_left_out(real_georef: Georef, flight: Path) -> None:
+    os.mkfifo(flight / "photos/Z.JPG")
+    result = real_georef("ingest", flight / "ws", "--images", flight / "photos")
+    assert result.code == 0, result.err
+    assert "1 image was left out: Z.JPG (cannot be read: it is a named pipe, give a file)" in result.err
+    (flight / "ws/georef.toml").unlink(missing_ok=True)
+    os.mkfifo(flight / "ws/georef.toml")
+    assert "georef.toml: cannot be read: it is a named pipe" in real_georef("status", flight / "ws").err
 
 
 COUNTED = (

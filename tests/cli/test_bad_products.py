@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import struct
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -151,6 +154,33 @@ def test_import_of_something_else(real_georef: Georef, made: Path, files: dict[s
     assert str(made.parent / "model") in result.err
     kept = {name: data for name, data in products_in(made).items() if not name.startswith("sfm.partial/")}
     assert {name: data for name, data in kept.items() if name != "requests.json"} == before
+
+
+def test_import_of_a_project_and_of_a_forged_track(real_georef: Georef, made: Path) -> None:
+    """The model lies in `sparse/0`. COLMAP would read a track of 2³⁶ images for ever."""
+    project = made.parent / "project"
+    model = project / "sparse/0"
+    shutil.copytree(made / SPARSE, model)
+    assert real_georef("sfm", made, "--import", project, "--force").code == 0
+    points = bytearray((model / "points3D.bin").read_bytes())
+    struct.pack_into("<Q", points, 8 + 43, 2**36)
+    (model / "points3D.bin").write_bytes(points)
+    result = real_georef("sfm", made, "--import", project, "--force")
+    assert (result.code, result.out) == (1, "")
+    assert "points3D.bin: shorter than the number of its records says" in result.err.splitlines()[-1]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no pipes in folders")
+@pytest.mark.parametrize(
+    ("stage", "product"), [("geolocate", SURVEY), ("geolocate", f"{SPARSE}/images.bin"), ("init-sim3", POINTS)]
+)
+def test_pipe_in_place_of_a_product(real_georef: Georef, made: Path, stage: str, product: str) -> None:
+    (made / product).parent.mkdir(exist_ok=True)
+    (made / product).unlink(missing_ok=True)
+    os.mkfifo(made / product)
+    result = real_georef(stage, made)
+    assert (result.code, result.out) == (1, "")
+    assert f"{product}: cannot be read: it is a named pipe, give a file" in result.err.splitlines()[-1]
 
 
 def test_import_of_another_flight(real_georef: Georef, made: Path) -> None:

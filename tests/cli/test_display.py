@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import io
 import logging
+from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 import pytest
 from rich.console import Console
 
 from georef_cli import display, tables
+from georef_cli.output import print_rich
 from georef_cli.verbosity import Verbosity
 from pipelines.core.progress import SILENT
+from pipelines.core.runner import Outcome
+from pipelines.core.staleness import StageState
+from pipelines.core.workspace import Manifest, Workspace
 from pipelines.scene.report import AsprsStatement, ByAxis, NoCrossValidation, PredictedSigma, TotalRmse
 from tests.reports import check_points_with, cross_validation_with, report_with
 
@@ -83,6 +89,35 @@ class TestReport:
         document = report_with().model_copy(update={"cross_validation": crossed})
         lines = text_of(tables.report(document)[2]).splitlines()
         assert lines[-1].split() == ["left", "out", "0"]
+
+
+HOSTILE = "[red]a[/] [/] [link=file:///x]b[/link] :smile:"
+
+
+def test_markup_in_names_is_printed_as_it_stands(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither a style, nor a crash by an end without a beginning, nor a picture."""
+    row = {
+        **dict.fromkeys(("name", "type", "frame", "use", "problem"), HOSTILE),
+        **dict.fromkeys(("first_s", "last_s", "rate_hz", "longest_gap_s")),
+        "messages": 1, "gaps": 0, "backwards": 0, "clock": "recording",
+    }  # fmt: skip
+    state = StageState("ingest", "failed", HOSTILE, key_figure=HOSTILE)
+    manifest = Manifest(
+        stage="ingest", config={}, inputs={}, versions={}, started=datetime(2026, 1, 1, tzinfo=UTC),
+        duration_s=1.0, key_figure=HOSTILE, values={HOSTILE: HOSTILE}, warnings=[HOSTILE],
+    )  # fmt: skip
+    outcome = Outcome("ingest", False, manifest)
+    parts = [tables.topics([row]), tables.states([state]), tables.outcomes([outcome])]
+    parts += tables.outcome(Workspace(Path("ws")), outcome)
+    for part in parts:
+        with (capture := io.StringIO()), monkeypatch.context() as patched:
+            patched.setattr("sys.stdout", capture)
+            patched.setattr("georef_cli.output.PIPED_WIDTH", 1000)
+            print_rich(part)
+            assert HOSTILE in capture.getvalue()
+    bar = display.BarProgress(Console(file=io.StringIO(), width=200, force_terminal=True))
+    with bar.task(HOSTILE, 2) as task:
+        task.advance(note=HOSTILE)
 
 
 @pytest.mark.parametrize(

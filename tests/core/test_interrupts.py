@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import signal
 import threading
-import time
 
 import pytest
 
-from pipelines.core.interrupts import deferred_interrupts, interruptible
+from pipelines.core.interrupts import deferred_interrupts
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -42,19 +41,3 @@ def test_other_threads_are_left_alone() -> None:
     thread.start()
     thread.join()
     assert seen == [(False, before)]
-
-
-def test_work_that_hears_no_signals_is_not_waited_for() -> None:
-    done = threading.Event()
-    threading.Timer(0.1, signal.raise_signal, [signal.SIGINT]).start()
-    started = time.monotonic()
-    with pytest.raises(KeyboardInterrupt):
-        interruptible(lambda: done.wait(60))
-    assert time.monotonic() - started < 30
-    done.set()
-
-
-def test_result_and_error_of_work_come_through() -> None:
-    assert interruptible(lambda: 7) == 7
-    with pytest.raises(ZeroDivisionError):
-        interruptible(lambda: 1 / 0)

@@ -208,3 +208,9 @@ def test_constant_errors_are_named(text: str | list[str], names: tuple[str, ...]
 def test_constant_errors_that_cannot_be(flags: dict[str, str], message: str) -> None:
     with pytest.raises(InputError, match=message):
         resolve(TrainOptions, {}, flags, Path("georef.toml"))
+
+
+def test_toml_nested_too_deeply_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "georef.toml").write_text("a = " + "[" * 10_000)
+    with pytest.raises(InputError, match="not valid TOML"):
+        load_toml(tmp_path / "georef.toml", ("train",))

@@ -7,11 +7,18 @@ import os
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from pipelines.core import runner
 from pipelines.core import staleness as states
-from pipelines.core.errors import ConvergenceError, GeorefError, InputError, MissingProductError
+from pipelines.core.errors import (
+    ConvergenceError,
+    DegenerateGeometryError,
+    GeorefError,
+    InputError,
+    MissingProductError,
+)
 from pipelines.core.fingerprints import fingerprints
 from pipelines.core.stages import BY_NAME, PIPELINE, SPARSE, stage_slice
 from pipelines.core.workspace import StageRun, Summary, Workspace
@@ -357,3 +364,23 @@ def test_large_input_file_counts_by_size_and_time(tmp_path: Path, monkeypatch: p
     assert large != whole and seen() == large
     os.utime(bag, (1, 1))
     assert seen() != large
+
+
+@pytest.mark.parametrize(
+    "error",
+    [np.linalg.LinAlgError("Singular matrix"), RecursionError("nested too deeply"), OverflowError("out of range")],
+)
+def test_products_without_a_solution_are_a_known_failure(
+    workspace: Workspace, photos: Path, error: Exception
+) -> None:
+    """Numbers that were edited by hand reach the linear algebra of a stage."""
+
+    def fail(stage: StageRun, options: object) -> Summary:
+        raise error
+
+    fakes.install(sfm=fail)
+    with pytest.raises(
+        DegenerateGeometryError, match=rf"sfm reads lead to no solution \({error}\): were they edited"
+    ):
+        complete(workspace, ingest={"images": photos})
+    assert str(error) in reason_of(workspace, "sfm")

@@ -249,3 +249,29 @@ def test_variant_reads_what_is_lent_and_writes_its_own(tmp_path: Path) -> None:
     assert variant.photographs("/photos") == Path("/photos")
     with pytest.raises(MissingProductError, match=f"georef compare {workspace.root}"):
         variant.path(MODEL)  # not the workspace's own, even if it were there
+
+
+def test_failure_that_is_no_text_is_shown_as_far_as_it_is(workspace: Workspace) -> None:
+    partial = workspace.partial(TRAIN)
+    partial.mkdir(parents=True)
+    (partial / "failure.txt").write_bytes(b"no \xe3 overlap")
+    assert workspace.failure(TRAIN) == "no \ufffd overlap"
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, '{"a":' * 100_000])
+def test_requests_nested_too_deeply_are_refused(workspace: Workspace, text: str) -> None:
+    workspace.root.mkdir()
+    (workspace.root / "requests.json").write_text(text)
+    with pytest.raises(InputError, match=r"requests\.json: not valid JSON: delete it"):
+        workspace.requests()
+
+
+@pytest.mark.parametrize("duration", ["1e300", "1e999", "NaN"])
+def test_manifest_that_ends_beyond_the_calendar_is_damaged(workspace: Workspace, duration: str) -> None:
+    document = {key: {} for key in ("config", "inputs", "versions", "values")}
+    document |= {"stage": "train", "key_figure": "", "warnings": [], "started": "2026-01-01T00:00:00Z"}
+    folder = workspace.root / TRAIN.folder
+    folder.mkdir(parents=True)
+    (folder / "manifest.json").write_text(json.dumps(document)[:-1] + f', "duration_s": {duration}}}')
+    with pytest.raises(InputError, match=r"manifest\.json"):
+        workspace.manifest(TRAIN)

@@ -236,3 +236,27 @@ def test_what_cannot_be_estimated(
     given = None if change is None else replace(track, **change)
     with pytest.raises(InputError, match=message):
         require_estimable(given, [wanted], "--estimate")
+
+
+@pytest.mark.parametrize(
+    ("name", "array"),
+    [
+        ("sigma_m", np.zeros((9, 2))),
+        ("geo_from_body", np.zeros((3, 3))),
+        ("image_time_s", np.array(["now"])),
+        ("max_gap_s", np.zeros(2)),
+    ],
+)
+def test_navigation_by_hand_is_checked(tmp_path: Path, name: str, array: np.ndarray) -> None:
+    shapes = {
+        "position_time_s": (9,), "antenna_in_geo": (9, 3), "sigma_m": (9, 3), "attitude_time_s": (5,),
+        "geo_from_body": (5, 3, 3), "image_time_s": (2,), "cam_from_body": (2, 3, 3), "antenna_in_body": (2, 3),
+        "nominal_from_cam": (3, 3), "time_offset_s": (), "max_gap_s": (),
+    }  # fmt: skip
+    zeros = {key: np.zeros(shape) for key, shape in shapes.items()}
+    track = NavigationTrack(image=np.array(["a", "b"]), body_known=np.array(True), **zeros)
+    track.save(tmp_path / "track.npz")
+    assert NavigationTrack.load(tmp_path / "track.npz").image.tolist() == ["a", "b"]
+    replace(track, **{name: array}).save(tmp_path / "track.npz")
+    with pytest.raises(InputError, match=rf"track\.npz \[{name}\]: has the form"):
+        NavigationTrack.load(tmp_path / "track.npz")

@@ -26,9 +26,10 @@ from pipelines.geodesy.enu import Origin
 from pipelines.geodesy.vertical import VerticalDatum
 from pipelines.geometry.similarity import umeyama
 from pipelines.scene.survey import CameraPrior, Fix, Survey, SurveyedPoint, SurveyImage
+from pipelines.sfm.imported import import_model
 from pipelines.sfm.options import SfmOptions
 from pipelines.sfm.reconstruction import SfmJob, candidate_pairs, reconstruct
-from pipelines.sfm.stage import _summarise, import_model, run
+from pipelines.sfm.stage import _summarise, run
 from pipelines.simulate.options import SimulateOptions
 from pipelines.simulate.stage import simulate
 

@@ -12,14 +12,15 @@ import struct
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from pipelines.core.errors import InputError
 from pipelines.formats.bag.definitions import DEFINITIONS
+from pipelines.formats.bag.limits import bound_decompressors, check_files, refuse_large_chunk, unpacked
+from pipelines.formats.image_file import MAX_BYTES
 
-# A chunk is unpacked in one piece, with up to three copies in memory; ROS writes 0.8 to 4 MiB.
-_MAX_CHUNK_BYTES = 200 * 1024 * 1024
 # Schemas of mcap that do not belong in a ROS bag; the reader cannot open a bag with them.
 _FOREIGN_SCHEMAS = ("jsonschema", "protobuf", "flatbuffer", "ros1msg")
 # PX4 sends a message within milliseconds of its sample.
@@ -62,6 +63,7 @@ class Bag:
 
     def __init__(self, path: Path, reader: Any, ros2: bool) -> None:
         self.path, self._reader, self._ros2 = path, reader, ros2
+        self._packed = _unpack_here(reader)
         self._connections = list(reader.connections)
         # Any file of a split bag may have the definition.
         links = [link for part in _parts(reader) for link in part.connections] + self._connections
@@ -95,12 +97,15 @@ class Bag:
         while True:
             try:
                 link, bag_ns, data = next(stream)
+                if not isinstance(bag_ns, int) or not isinstance(data, bytes | bytearray | memoryview):
+                    raise TypeError(f"a message of {link.topic} is no bytes")  # SQLite has any type in any column
+                data = unpacked(bytes(data), MAX_BYTES) if self._packed else bytes(data)
             except StopIteration:
                 return
             except Exception as error:  # the library raises any error of its parsers
                 self.damage = f"{type(error).__name__}: {error}"
                 return
-            yield RawMessage(link.topic, link.msgtype, int(bag_ns), bytes(data))
+            yield RawMessage(link.topic, link.msgtype, bag_ns, data)
 
     def decode(self, message: RawMessage) -> Any:
         """Return the message as an object with the fields of its definition.
@@ -154,17 +159,13 @@ class Bag:
 
     def _make_store(self, kind: str, stated: Any | None) -> Any:
         """Return a typestore that has `kind` by the bag's or a default definition, or the reason why none has."""
-        from rosbags.typesys import Stores, get_typestore
-
         if stated is not None:
-            store = get_typestore(Stores.EMPTY)
             try:
-                store.register(_parsed(stated, kind))
-                return store
+                return _stated_store(stated, kind)
             except Exception as error:  # a grammar error, an unknown word, a repeated name …
                 return f"its definition of {kind} cannot be read: {type(error).__name__}: {error}"
         self.fallback_types.add(kind)
-        common = get_typestore(Stores.ROS2_JAZZY if self._ros2 else Stores.ROS1_NOETIC)
+        common = _common_store(self._ros2)
         return common if kind in common.types else f"it has no definition of {kind}"
 
     def _store_that_fits(self, message: RawMessage) -> Any:
@@ -212,6 +213,7 @@ def open_bag(path: Path) -> Iterator[Bag]:
         raise InputError(f"is no bag, or is damaged ({_describe(error)}): {_REPAIR}", path=path) from error
     try:
         _check_chunks(reader, path)
+        _check_topics(reader, path)
         yield Bag(path, reader, ros2)
     finally:
         reader.close()
@@ -228,12 +230,16 @@ def _reader(path: Path, ros2: bool) -> Any:
             path=path,
             field="--bag",
         )
-    if path.is_file() and path.suffix not in (".bag", ".mcap", ".db3"):
+    if not path.is_dir() and path.suffix not in (".bag", ".mcap", ".db3"):
         raise InputError(
             "is no bag: give a rosbag2 folder, or a .mcap, .db3 or .bag file", path=path, field="--bag"
         )
     try:
+        check_files(path)
+        bound_decompressors()
         return rosbag2.Reader(path) if ros2 else rosbag1.Reader(path)
+    except InputError:
+        raise
     except Exception as error:
         raise InputError(f"is no bag, or is damaged ({_describe(error)}): {_REPAIR}", path=path) from error
 
@@ -241,18 +247,47 @@ def _reader(path: Path, ros2: bool) -> Any:
 def _check_chunks(reader: Any, path: Path) -> None:
     for storage in _parts(reader):
         largest = max((chunk.uncompressed_size for chunk in getattr(storage, "chunks", ())), default=0)
-        if largest > _MAX_CHUNK_BYTES:
-            raise InputError(
-                f"has a chunk of {largest / 2**20:.0f} MiB (limit {_MAX_CHUNK_BYTES // 2**20}): rewrite it with "
-                "smaller ones, e.g. `mcap compress --chunk-size 4194304`",
-                path=path,
-            )
+        refuse_large_chunk(path, largest)
+
+
+def _check_topics(reader: Any, path: Path) -> None:
+    """Refuse topics whose names, types or counts are none: SQLite and YAML have any type in any place."""
+    for link in reader.connections:
+        if not (isinstance(link.topic, str) and isinstance(link.msgtype, str) and isinstance(link.msgcount, int)):
+            raise InputError(f"is damaged (topic {str(link.topic)[:40]!r}): {_REPAIR}", path=path)
+
+
+def _unpack_here(reader: Any) -> bool:
+    """Return whether messages are compressed one by one, and let rosbags hand them over packed."""
+    storage: Any = getattr(reader, "storage", None)
+    if getattr(getattr(storage, "metadata", None), "compression_mode", None) != "message":
+        return False
+    storage.metadata = storage.metadata._replace(compression_mode=None)
+    return True
 
 
 def _parts(reader: Any) -> list[Any]:
     """Return the files of a rosbag2."""
     outer = getattr(reader, "storage", None)
     return list(getattr(outer, "storages", [] if outer is None else [outer]))
+
+
+@lru_cache(maxsize=256)
+def _stated_store(definition: Any, kind: str) -> Any:
+    """Return a typestore with the types of a definition; the code that decodes them is generated once."""
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.EMPTY)
+    store.register(_parsed(definition, kind))
+    return store
+
+
+@lru_cache
+def _common_store(ros2: bool) -> Any:
+    """Return a typestore with the types of a ROS distribution."""
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_JAZZY if ros2 else Stores.ROS1_NOETIC)
 
 
 def _parsed(definition: Any, kind: str) -> Any:

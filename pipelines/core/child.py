@@ -1,0 +1,255 @@
+"""Work of native libraries in a process of its own, which ends with an interrupt and with its parent.
+
+Native code hears no signals while it works, and its failed checks abort the process. In a child both are harmless:
+an interrupt kills the child at once, and a crash becomes one error. Parent and child exchange lines of JSON.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import json
+import logging
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import traceback
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
+from typing import IO, Any, TextIO
+
+from pipelines.core import errors
+from pipelines.core.durable import storage_failure_of
+from pipelines.core.errors import (
+    CrashError,
+    GeorefError,
+    MissingProductError,
+    ResourceError,
+    StorageError,
+    storage_error,
+    storage_error_in,
+)
+from pipelines.core.progress import SILENT, Progress, ProgressTask
+
+log = logging.getLogger(__name__)
+
+_LIBRARY = "pipelines"
+_DIE_WITH_PARENT = 1  # PR_SET_PDEATHSIG of Linux
+_MOST_OF_A_LINE = 300
+
+
+def run_in_child(
+    task: str,
+    arguments: Mapping[str, Any],
+    remedy: str,
+    progress: Progress = SILENT,
+    *,
+    writes: Path | None = None,
+) -> Any:
+    """Return the result of a function that runs in a child process.
+
+    Log records and progress of the child appear as those of this process.
+
+    Args:
+        task: `module:function`; the function takes a document and a `Progress`, and returns a document.
+        arguments: document for JSON.
+        remedy: what to do if the child crashes.
+        progress: shows the tasks of the child.
+        writes: folder that the function writes into, if native code writes there.
+
+    Raises:
+        GeorefError: raised by the function, with its message.
+        StorageError: native code could not write.
+        CrashError: the child ended without a result.
+        ResourceError: the system killed the child, as it does when memory is short.
+        RuntimeError: any other exception of the function, with its traceback.
+    """
+    with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as native_log:
+        process = subprocess.Popen(
+            [sys.executable, "-m", __name__, task, str(os.getpid())],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=native_log,
+            encoding="utf-8",
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        )
+        try:
+            return _follow(process, arguments, progress)
+        except EOFError:
+            crash = _crash(process.wait(), native_log, remedy)
+            storage = _storage_failure(native_log, writes)
+            raise storage or crash from None
+        except RuntimeError as defect:
+            storage = storage_error_in(str(defect), writes) if writes is not None else None
+            raise storage or _storage_failure(native_log, writes) or defect from None
+        finally:
+            process.kill()
+            process.wait()
+            for pipe in (process.stdin, process.stdout):
+                assert pipe is not None
+                with contextlib.suppress(OSError):
+                    pipe.close()
+
+
+def _follow(process: subprocess.Popen[str], arguments: Mapping[str, Any], progress: Progress) -> Any:
+    """Hand over the arguments, and follow the child's messages to its result.
+
+    Raises:
+        EOFError: the child ended without a result.
+    """
+    assert process.stdin is not None
+    assert process.stdout is not None
+    document = {"arguments": arguments, "level": logging.getLogger(_LIBRARY).getEffectiveLevel()}
+    try:
+        process.stdin.write(json.dumps(document) + "\n")
+        process.stdin.flush()  # It stays open: the child ends when it is closed.
+    except BrokenPipeError as error:
+        raise EOFError from error
+    open_tasks: list[tuple[AbstractContextManager[ProgressTask], ProgressTask]] = []
+    try:
+        for line in process.stdout:
+            message = json.loads(line)
+            match message["kind"]:
+                case "log":
+                    logging.getLogger(message["name"]).log(message["level"], "%s", message["text"])
+                case "begin":
+                    context = progress.task(message["name"], message["total"])
+                    open_tasks.append((context, context.__enter__()))
+                case "advance":
+                    open_tasks[-1][1].advance(message["steps"], message["note"])
+                case "end":
+                    open_tasks.pop()[0].__exit__(None, None, None)
+                case "result":
+                    return message["result"]
+                case _:
+                    raise _error(message)
+    finally:
+        for context, _ in reversed(open_tasks):
+            context.__exit__(None, None, None)
+    raise EOFError
+
+
+def _storage_failure(native_log: IO[str], folder: Path | None) -> StorageError | None:
+    """Return why native code could not write into a folder, by its messages or by trial; None: it could."""
+    if folder is None:
+        return None
+    native_log.seek(0)
+    return storage_error_in(native_log.read(), folder) or storage_failure_of(folder)
+
+
+def _error(message: Mapping[str, Any]) -> Exception:
+    """Return the exception of the child."""
+    if message["kind"] != "error":
+        return RuntimeError(f"in a child process:\n{message['text']}")
+    kind = getattr(errors, message["type"], GeorefError)
+    kind = GeorefError if kind is MissingProductError else kind
+    error: Exception = kind(message["text"])
+    return error
+
+
+def _crash(code: int, native_log: IO[str], remedy: str) -> GeorefError:
+    native_log.seek(0)
+    lines = [line.strip() for line in native_log if line.strip()]
+    for line in lines[-50:]:
+        log.debug("the child process wrote: %s", line)
+    if code == -signal.SIGKILL:
+        return ResourceError(f"the system killed the computation, as it does when memory is short: {remedy}")
+    ending = signal.Signals(-code).name if code < 0 else f"exit code {code}"
+    # glog begins the line of a failed check with F and the date; the first line is the cause of those below.
+    checks = [line for line in lines if line[:1] == "F" and line[1:5].isdigit()]
+    cause = (checks or lines[-1:] or ["no message"])[0].rpartition("] ")[2]
+    return CrashError(f"a native library crashed ({ending}: {cause[:_MOST_OF_A_LINE]}): {remedy}")
+
+
+class _Messages:
+    """Child's end of the exchange."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream, self._lock = stream, threading.Lock()
+
+    def send(self, kind: str, **content: Any) -> None:
+        """Send one message."""
+        with self._lock:
+            self._stream.write(json.dumps({"kind": kind, **content}) + "\n")
+            self._stream.flush()
+
+    @contextmanager
+    def task(self, name: str, total: int | None = None) -> Iterator[ProgressTask]:
+        """Open a task that the parent shows."""
+        self.send("begin", name=name, total=total)
+        try:
+            yield _SentTask(self)
+        finally:
+            self.send("end")
+
+
+class _SentTask:
+    def __init__(self, messages: _Messages) -> None:
+        self._messages = messages
+
+    def advance(self, steps: int = 1, note: str = "") -> None:
+        """Send the steps."""
+        self._messages.send("advance", steps=steps, note=note)
+
+
+class _SentRecords(logging.Handler):
+    def __init__(self, messages: _Messages) -> None:
+        super().__init__()
+        self._messages = messages
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Send a record."""
+        self._messages.send("log", name=record.name, level=record.levelno, text=self.format(record))
+
+
+def _main(task: str, parent: str) -> None:
+    """Run a function and send its result: entry point of the child."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # The parent decides what an interrupt of both ends.
+    messages = _Messages(os.fdopen(os.dup(1), "w", encoding="utf-8"))
+    os.dup2(2, 1)  # Native libraries write to stdout, too.
+    document = json.loads(sys.stdin.readline())
+    _end_with(int(parent))
+    logger = logging.getLogger(_LIBRARY)
+    logger.setLevel(document["level"])
+    logger.addHandler(_SentRecords(messages))
+    logger.propagate = False
+    module, _, name = task.partition(":")
+    try:
+        result = getattr(importlib.import_module(module), name)(document["arguments"], messages)
+        messages.send("result", result=result)
+    except GeorefError as error:
+        messages.send("error", type=type(error).__name__, text=str(error))
+    except MemoryError:
+        messages.send("error", type="ResourceError", text="memory is short: use smaller or fewer photographs")
+    except Exception as error:
+        storage = storage_error(error)
+        if storage is not None:
+            messages.send("error", type="StorageError", text=str(storage))
+        else:
+            messages.send("defect", text=traceback.format_exc())
+    sys.stderr.flush()
+    os._exit(0)  # The watching thread and native threads are not waited for.
+
+
+def _end_with(parent: int) -> None:
+    """End this process when its parent ends, also while native code holds the interpreter."""
+    if sys.platform == "linux":
+        import ctypes
+
+        ctypes.CDLL(None).prctl(_DIE_WITH_PARENT, signal.SIGKILL)
+        if os.getppid() != parent:
+            os._exit(1)
+
+    def watch() -> None:
+        sys.stdin.read()
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+if __name__ == "__main__":
+    _main(*sys.argv[1:])

@@ -1,0 +1,346 @@
+"""Every reader with small, valid files: `prepare` makes a folder of them, `read` reads that folder."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import cv2
+import numpy as np
+from pydantic import BaseModel
+from pyproj import CRS
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import CompressionMode, StoragePlugin
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from pipelines.core.errors import GeorefError
+from pipelines.core.options import load_toml, resolve
+from pipelines.core.products import load_json, save_json
+from pipelines.core.runner import run_stage
+from pipelines.core.stages import BY_NAME, POINTS, SPARSE
+from pipelines.core.staleness import status
+from pipelines.core.workspace import Manifest, Workspace
+from pipelines.formats.bag.images import COMPRESSED, IMAGE, BadImageError, ImageWriter
+from pipelines.formats.bag.reader import UndecodableError, open_bag
+from pipelines.formats.colmap import pycolmap_module, read_sparse
+from pipelines.formats.exif import read_tags
+from pipelines.formats.georef_sidecar import GeorefSidecar, read_sidecar, write_sidecar
+from pipelines.formats.image_file import inspect_image, read_bytes
+from pipelines.formats.odm import read_geo, read_ground_points
+from pipelines.formats.splat_ply import SplatArrays, read_splat_ply, write_splat_ply
+from pipelines.formats.trajectory_csv import read_trajectory
+from pipelines.geodesy.crs import parse_crs
+from pipelines.geodesy.vertical import VerticalDatum
+from pipelines.geometry.similarity import Similarity
+from pipelines.ingest.bag.inspection import inspect_bag
+from pipelines.scene.geolocated import GeolocatedPoints
+from pipelines.scene.initial_similarity import InitialSimilarity
+from pipelines.scene.navigation import NavigationTrack
+from pipelines.scene.report import EvaluationReport
+from pipelines.scene.rig import RigCalibration, RigEstimate
+from pipelines.scene.survey import Survey
+from pipelines.scene.trained_model import TrainedModel
+from pipelines.train.checkpoint import load_checkpoint
+from tests import bags
+from tests.photos import Exif, dji_xmp, gps_entries, jpeg
+from tests.reports import check_points_with, report_with
+from tests.scenes import initial, material, trained_model, write_workspace
+
+LIMIT = 200  # messages that are decoded
+ProductT = TypeVar("ProductT", bound=BaseModel)
+
+
+@dataclass(frozen=True)
+class Reader:
+    """A reader with its files.
+
+    Attributes:
+        prepare: writes valid files into an empty folder.
+        read: reads the folder; raises nothing but `GeorefError`.
+        files: pattern of the files to mutate.
+        slow: whether a case takes a tenth of a second or more.
+    """
+
+    prepare: Callable[[Path], None]
+    read: Callable[[Path], object]
+    files: str = "*"
+    slow: bool = False
+
+
+def _photographs(folder: Path) -> None:
+    exif = Exif(gps=gps_entries(46.0, 7.0), photo=[(0x9003, 2, "2024:05:01 12:00:00"), (0x920A, 5, [(24, 1)])])
+    (folder / "a.jpg").write_bytes(jpeg(size=(16, 12), exif=exif, xmp=dji_xmp(RtkFlag="50", RtkStdLon="0.01")))
+    pixels = np.zeros((12, 16, 3), np.uint8)
+    for suffix in (".png", ".tif"):
+        (folder / f"a{suffix}").write_bytes(cv2.imencode(suffix, pixels)[1].tobytes())
+    (folder / "b.tif").write_bytes(exif.tiff())
+
+
+def _read_photographs(folder: Path) -> None:
+    for path in folder.iterdir():
+        data = _attempt(lambda path=path: read_bytes(path))
+        if data is not None:
+            read_tags(data)
+            _attempt(lambda data=data, path=path: inspect_image(data, path))
+
+
+def _trajectories(folder: Path) -> None:
+    (folder / "a.csv").write_text(
+        "image,timestamp,latitude,longitude,altitude,yaw,pitch,roll,sigma_e,sigma_n,sigma_u\n"
+        + "".join(f"a{i}.jpg,2024-05-01T12:00:0{i}Z,46.{i},7.{i},500,1{i},-90,0,0.1,0.1,0.2\n" for i in range(5))
+    )
+    (folder / "b.csv").write_text(
+        "timestamp;x;y;z;qx;qy;qz;qw\n" + "".join(f"17000000{i},5;4000{i},5;50{i};9;1;0;0;0\n" for i in range(5))
+    )
+
+
+def _ground_points(folder: Path) -> None:
+    rows = "".join(f"4000{i}.25 510000{i}.5 50{i} {10 * i} 20 a{i}.jpg P{i // 2}\n" for i in range(6))
+    (folder / "gcp_list.txt").write_text("WGS84 UTM 32N\n# comment\n" + rows)
+
+
+def _read_ground_points(folder: Path) -> None:
+    points = read_ground_points(folder / "gcp_list.txt")
+    xyz = [mark.xyz for mark in points.marks]
+    parse_crs(points.crs_text, path=points.path, line=1).lla_from_xyz(xyz, path=points.path)
+
+
+def _geo(folder: Path) -> None:
+    rows = "".join(f"a{i}.jpg 7.{i} 46.{i} 500 {i} 1 2 0.1 0.2\n" for i in range(6))
+    (folder / "geo.txt").write_text("EPSG:4326\n" + rows)
+
+
+def _crs(folder: Path) -> None:
+    bound = CRS("+proj=longlat +ellps=intl +nadgrids=@grid.gsb +type=crs")
+    for number, text in enumerate((
+        "+proj=utm +zone=32 +ellps=intl +towgs84=1,2,3,0,0,0,0 +units=m +vunits=m", "EPSG:32632+5773",
+        CRS("EPSG:2056").to_wkt(), CRS("EPSG:2056").to_json(), bound.to_wkt(), CRS("EPSG:7415").to_wkt("WKT1_GDAL"),
+        "+proj=omerc +lat_0=4 +lonc=115 +alpha=53 +k=0.99984 +x_0=590476 +y_0=442857 +gamma=53.1 +ellps=evrstSS",
+    )):  # fmt: skip
+        (folder / f"{number}.txt").write_text(text)
+
+
+def _read_crs(folder: Path) -> None:
+    """Read the texts that differ from the valid ones only: PROJ takes its time."""
+    for path in folder.iterdir():
+        text = path.read_bytes().decode("utf-8", "replace")
+        if text not in _KNOWN:
+            crs = _attempt(lambda text=text: parse_crs(text))
+            if crs is not None:
+                _attempt(lambda crs=crs: (crs.units, crs.wkt, crs.lla_from_xyz([[4e5, 5.1e6, 500.0]])))
+                _attempt(lambda crs=crs: crs.xyz_from_lla([[46.0, 7.0, 500.0]]))
+
+
+_KNOWN: set[str] = set()
+
+
+def _sparse(folder: Path) -> None:
+    _, model, survey = material(images=4, points=30)
+    write_workspace(folder / "ws", survey, model)
+    for path in (folder / "ws" / SPARSE).iterdir():
+        path.rename(folder / path.name)
+    shutil.rmtree(folder / "ws")
+
+
+def _sparse_text(folder: Path) -> None:
+    _sparse(folder)
+    model = pycolmap_module().Reconstruction(str(folder))
+    for path in folder.iterdir():
+        path.unlink()
+    model.write_text(str(folder))
+
+
+def _bag(storage: StoragePlugin, compression: CompressionMode | None = None) -> Callable[[Path], None]:
+    def prepare(folder: Path) -> None:
+        flight = bags.Flight(count=2)
+        messages = [
+            *bags.usual(flight)[:12],
+            *bags.images(flight),
+            *bags.raw_images(flight, "rgb8", lambda rgb: rgb),
+        ]
+        bags.write(folder / "bag", messages, bags.Form(storage, compression))
+
+    return prepare
+
+
+def _bag1(folder: Path) -> None:
+    store = get_typestore(Stores.ROS1_NOETIC)
+    store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
+    writer = Writer1(folder / "a.bag")
+    writer.set_compression(Writer1.CompressionFormat.BZ2)
+    with writer:
+        links: dict[str, Any] = {}
+        for topic, kind, ns, message in sorted(bags.usual(bags.Flight(count=2))[:12], key=lambda one: one[2]):
+            if topic not in links:
+                links[topic] = writer.add_connection(topic, kind, typestore=store)
+            writer.write(links[topic], int(ns), store.serialize_ros1(bags.as_ros1(message, store), kind))
+
+
+def _read_bag(pattern: str) -> Callable[[Path], None]:
+    def read(folder: Path) -> None:
+        (path,) = folder.glob(pattern)
+        with open_bag(path) as bag:
+            for number, message in enumerate(bag.messages(bag.topics)):
+                bag.header_stamp_ns(message)
+                try:
+                    decoded = bag.decode(message)
+                    if message.type in (IMAGE, COMPRESSED):
+                        ImageWriter().encoded(message.type, decoded)
+                except (UndecodableError, BadImageError):
+                    pass
+                if number > LIMIT:
+                    break
+        if path.is_file():  # The YAML of a folder takes longer than all else.
+            inspect_bag(path)
+
+    return read
+
+
+def _splat(folder: Path) -> None:
+    rng = np.random.default_rng(0)
+    shapes = {"means": (5, 3), "quats_wxyz": (5, 4), "log_scales": (5, 3), "logit_opacities": (5,), "sh": (5, 4, 3)}
+    arrays = {name: rng.normal(size=shape).astype(np.float32) for name, shape in shapes.items()}
+    write_splat_ply(folder / "a.ply", SplatArrays(**arrays))
+
+
+def _sidecar(folder: Path) -> None:
+    covariance = tuple(tuple(row) for row in (np.eye(7) * 1e-4).tolist())
+    sidecar = GeorefSidecar(
+        origin=(4e6, 6e5, 4.8e6), rotation=(0, 0, 0, 1), scale=1.0, origin_lla=(46, 7, 500), crs_wkt="",
+        vertical_datum=VerticalDatum(name="ellipsoidal", stated=True), covariance=covariance, accuracy=None,
+    )  # fmt: skip
+    write_sidecar(sidecar, folder / "a.ply")
+
+
+def _read_sidecar(folder: Path) -> None:
+    sidecar = read_sidecar(folder / "a.ply")
+    sidecar.ecef_from_file()
+    sidecar.covariance_at([[1.0, 2.0, 3.0]])
+
+
+def _products(folder: Path) -> None:
+    save_json(material(images=4)[2], folder / "Survey.json")
+    save_json(initial(), folder / "InitialSimilarity.json")
+    save_json(trained_model(Similarity()), folder / "TrainedModel.json")
+    shift = RigEstimate(name="time-offset", unit="s", value=(1,), sigma=(1,), start=(0,), observable=(True,))
+    save_json(RigCalibration(applied=(shift,)), folder / "RigCalibration.json")
+    report = report_with(camera=check_points_with(count=3, rmse_h_m=0.1, rmse_v_m=0.1, rmse_3d_m=0.2))
+    save_json(report, folder / "EvaluationReport.json")
+
+
+def _read_products(folder: Path) -> None:
+    for kind in (Survey, InitialSimilarity, TrainedModel, RigCalibration, EvaluationReport):
+        _attempt(lambda kind=kind: _read_product(kind, folder))
+
+
+def _read_product(kind: type[ProductT], folder: Path) -> None:
+    product = load_json(kind, folder / f"{kind.__name__}.json")
+    if isinstance(product, InitialSimilarity):
+        Similarity.from_record(product.geo_from_local)
+
+
+def _arrays(folder: Path) -> None:
+    count = 4
+    points = GeolocatedPoints(
+        np.arange(count), np.zeros((count, 3)), np.zeros((count, 3, 3)), np.ones(count, np.int32), np.ones(count),
+        np.ones(count), np.ones(count, bool), "sfm",
+    )  # fmt: skip
+    points.save(folder / Path(POINTS).name)
+    shapes = {
+        "position_time_s": (3,), "antenna_in_geo": (3, 3), "sigma_m": (3, 3), "attitude_time_s": (3,),
+        "geo_from_body": (3, 3, 3), "image_time_s": (2,), "cam_from_body": (2, 3, 3), "antenna_in_body": (2, 3),
+        "nominal_from_cam": (3, 3), "time_offset_s": (), "max_gap_s": (),
+    }  # fmt: skip
+    zeros = {name: np.zeros(shape) for name, shape in shapes.items()}
+    track = NavigationTrack(image=np.array(["a.jpg", "b.jpg"]), body_known=np.array(True), **zeros)
+    track.save(folder / "track.npz")
+    np.savez(folder / "checkpoint.npz", iteration=np.array(3), **{"gaussians/means": np.zeros((5, 3), np.float32)})
+
+
+def _read_arrays(folder: Path) -> None:
+    _attempt(lambda: GeolocatedPoints.load(folder / Path(POINTS).name))
+    _attempt(lambda: NavigationTrack.load(folder / "track.npz"))
+    _attempt(lambda: load_checkpoint(folder / "checkpoint.npz"))
+
+
+def _workspace(folder: Path) -> None:
+    _, model, survey = material(images=3, points=20)
+    workspace = write_workspace(folder, survey, model)
+    (folder / "georef.toml").write_text(
+        '[ingest]\nsigma_h = 0.02\nlever_arm = "0.1,0,-0.3"\ntime_offset = "2"\n[train]\niterations = 40\n'
+    )
+    workspace.remember({"sfm": {"threads": 1}, "train": {"preset": "smoke"}})
+    manifest = Manifest(
+        stage="sfm", config={}, inputs={}, versions={}, started="2026-01-01T00:00:00Z", duration_s=1.0,
+        key_figure="3 of 3", values={"registered": 3}, warnings=["careful"],
+    )  # fmt: skip
+    save_json(manifest, folder / "sfm/manifest.json")
+    (folder / "geolocate.partial").mkdir()
+    (folder / "geolocate.partial/failure.txt").write_text("no overlap")
+
+
+def _read_workspace(folder: Path) -> None:
+    status(Workspace(folder))
+    tables = load_toml(folder / "georef.toml", BY_NAME)
+    for name, table in tables.items():
+        resolve(BY_NAME[name].options, table, {}, folder / "georef.toml")
+
+
+def _stages(folder: Path) -> None:
+    """A workspace up to the initial similarity, without manifests: as put there by hand."""
+    _, model, survey = material(images=6, points=40)
+    workspace = write_workspace(folder, survey, model)
+    for name in ("geolocate", "init-sim3"):
+        run_stage(workspace, BY_NAME[name], {})
+    for manifest in folder.rglob("manifest.json"):
+        manifest.unlink()
+
+
+def _run_stages(folder: Path) -> None:
+    """Run each stage on the products as they are, also if one before it refused them."""
+    workspace = Workspace(folder)
+    for name in ("geolocate", "init-sim3"):
+        spec = BY_NAME[name]
+        kept = {path: path.read_bytes() for path in (folder / spec.folder).iterdir()}
+        try:
+            _attempt(lambda spec=spec: run_stage(workspace, spec, {}, force=True))
+        finally:
+            shutil.rmtree(folder / spec.folder)
+            (folder / spec.folder).mkdir()
+            for path, data in kept.items():
+                path.write_bytes(data)
+
+
+def _attempt(read: Callable[[], Any]) -> Any:
+    """Return what a reader returns; None for a refused file."""
+    try:
+        return read()
+    except GeorefError:
+        return None
+
+
+READERS: dict[str, Reader] = {
+    "photographs": Reader(_photographs, _read_photographs),
+    "trajectory": Reader(
+        _trajectories, lambda folder: [_attempt(lambda p=p: read_trajectory(p)) for p in folder.iterdir()]
+    ),
+    "geo.txt": Reader(_geo, lambda folder: read_geo(folder / "geo.txt")),
+    "gcp_list.txt": Reader(_ground_points, _read_ground_points),
+    "crs": Reader(_crs, _read_crs, slow=True),
+    "colmap-binary": Reader(_sparse, read_sparse),
+    "colmap-text": Reader(_sparse_text, read_sparse),
+    "bag-mcap": Reader(_bag(StoragePlugin.MCAP), _read_bag("bag/*.mcap"), "bag/*.mcap"),
+    "bag-mcap-zstd": Reader(_bag(StoragePlugin.MCAP, CompressionMode.STORAGE), _read_bag("bag"), "bag/*"),
+    "bag-db3": Reader(_bag(StoragePlugin.SQLITE3), _read_bag("bag/*.db3"), "bag/*.db3"),
+    "bag-db3-zstd": Reader(_bag(StoragePlugin.SQLITE3, CompressionMode.MESSAGE), _read_bag("bag"), "bag/*"),
+    "bag-ros1": Reader(_bag1, _read_bag("*.bag")),
+    "splat-ply": Reader(_splat, lambda folder: read_splat_ply(folder / "a.ply")),
+    "sidecar": Reader(_sidecar, _read_sidecar),
+    "products": Reader(_products, _read_products),
+    "arrays": Reader(_arrays, _read_arrays),
+    "workspace": Reader(_workspace, _read_workspace, "**/*"),
+    "stages": Reader(_stages, _run_stages, "[gis][efn]*/**/*.[jnb]*", slow=True),
+}
