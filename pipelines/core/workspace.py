@@ -185,7 +185,12 @@ class Workspace:
         if final.exists():
             remove(old)
             final.rename(old)
-        partial.rename(final)
+        try:
+            partial.rename(final)
+        except OSError:
+            if old.exists():
+                old.rename(final)
+            raise
         sync_folder(self.root)
         remove(old)
 

@@ -164,7 +164,12 @@ def _draft(directory: Path) -> Iterator[Path]:
         sync_tree(draft)
         if directory.exists():
             directory.rename(old)
-        draft.rename(directory)
+        try:
+            draft.rename(directory)
+        except OSError:
+            if old.exists():
+                old.rename(directory)
+            raise
         sync_folder(directory.parent)
     finally:
         for left in (draft, old):
