@@ -6,8 +6,7 @@ messages go to stderr; stdout is for the result.
 
 from __future__ import annotations
 
-import codecs
-import errno
+import contextlib
 import io
 import logging
 import os
@@ -17,12 +16,14 @@ import traceback as tracebacks
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType
+from types import FrameType, TracebackType
+from typing import IO, TextIO
 
 import click
 
-from georef_cli.verbosity import LineFormatter, Verbosity
-from pipelines.core.errors import GeorefError
+from georef_cli.printable import printable, printable_lines
+from georef_cli.verbosity import LineFormatter, SafeFormatter, Verbosity
+from pipelines.core.errors import GeorefError, storage_error
 from pipelines.core.interrupts import SIGNALS
 
 FAILED, INTERRUPTED = 1, 130
@@ -45,29 +46,52 @@ def guarded(group: click.Group, arguments: Sequence[str] | None) -> int:
             code = group.main(args=arguments, prog_name=group.name, standalone_mode=False)
             sys.stdout.flush()
     except click.ClickException as error:
-        error.show()
+        text = io.StringIO()
+        error.show(text)
+        _say(printable_lines(text.getvalue().rstrip("\n")))
         return error.exit_code
     except (click.Abort, KeyboardInterrupt):
-        click.echo("interrupted", err=True)
+        _say("interrupted")
         return INTERRUPTED
     except GeorefError as error:
-        click.echo(f"error: {error}", err=True)
+        _say(f"error: {printable(str(error))}")
         return FAILED
     except BrokenPipeError:
-        # The reader of the pipe has closed it. The rest of the buffer must not raise again at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        # The reader of the pipe has closed it.
+        _drop_stdout()
         return FAILED
-    except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+    except Exception as error:
+        storage = storage_error(error)
+        if storage is None:
             raise
-        click.echo(f"error: {error.filename or 'workspace'}: the disk is full", err=True)
+        _say(f"error: {printable(str(storage))}")
+        _drop_stdout()
         return FAILED
     return code if isinstance(code, int) else 0
 
 
+def _say(text: str) -> None:
+    """Print a line on stderr, which may lie on the disk that is full."""
+    with contextlib.suppress(OSError):
+        click.echo(text, err=True)
+
+
+def _drop_stdout() -> None:
+    """Drop a result that stdout cannot take, lest it raise again at exit."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def safe_traceback(kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:
+    """Print the traceback of an exception that nobody foresaw, as Python does, but safe for a terminal."""
+    _say(printable_lines("".join(tracebacks.format_exception(kind, error, traceback)).rstrip("\n")))
+
+
 def _escape_on_stdout() -> None:
     """Make stdout escape characters that its encoding lacks, as stderr does: a pipe on Windows has no σ."""
-    if isinstance(sys.stdout, io.TextIOWrapper) and codecs.lookup(sys.stdout.encoding).name != "utf-8":
+    if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")
 
 
@@ -96,7 +120,7 @@ def logged_to_stderr(verbosity: Verbosity) -> Iterator[None]:
             yield
         except GeorefError:
             if verbosity.traceback:
-                tracebacks.print_exc()
+                safe_traceback(*sys.exc_info())
             raise
 
 
@@ -104,7 +128,7 @@ def logged_to_stderr(verbosity: Verbosity) -> Iterator[None]:
 def logged_to_file(path: Path) -> Iterator[None]:
     """Append log records to the file `path` while the context lasts, and the error that ends it."""
     handler = _LateFileHandler(path)
-    handler.setFormatter(logging.Formatter(FILE_FORMAT))
+    handler.setFormatter(SafeFormatter(FILE_FORMAT))
     with _attached(handler, logging.INFO):
         try:
             yield
@@ -137,25 +161,54 @@ def _terminal_handler() -> logging.Handler:
 
 
 def _line_handler() -> logging.Handler:
-    handler = logging.StreamHandler(sys.stderr)
+    handler = _StderrHandler(sys.stderr)
     handler.setFormatter(LineFormatter())
     return handler
 
 
-class _LateFileHandler(logging.FileHandler):
+class _StderrHandler(logging.StreamHandler[TextIO]):
+    """Handler that writes lines to stderr, and drops those for which a full disk has no room."""
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        """Report defects of a record, and no failure of the disk."""
+        if not isinstance(sys.exc_info()[1], OSError):
+            super().handleError(record)
+
+
+class _LateFileHandler(logging.Handler):
     """Handler that opens its file at the first record, in a workspace that exists by then.
 
-    A command that is refused before it begins leaves neither file nor folder behind.
+    A command that is refused before it begins leaves neither file nor folder behind. Where the log cannot be
+    written, nothing is said: stderr has the same lines.
     """
 
     def __init__(self, path: Path) -> None:
-        super().__init__(path, mode="a", encoding="utf-8", delay=True)
+        super().__init__()
         self.path = path
+        self._file: IO[bytes] | None = None
+        self._failed = False
 
     def emit(self, record: logging.LogRecord) -> None:
-        if self.path.parent.parent.is_dir():
+        """Write a record."""
+        line = self.format(record) + "\n"
+        try:
+            if not self._failed and self.path.parent.parent.is_dir():
+                self._open().write(line.encode("utf-8", "backslashreplace"))
+        except OSError:
+            self._failed = True
+
+    def _open(self) -> IO[bytes]:
+        if self._file is None:
             self.path.parent.mkdir(exist_ok=True)
-            super().emit(record)
+            self._file = self.path.open("ab", buffering=0)
+        return self._file
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._file is not None:
+            with contextlib.suppress(OSError):
+                self._file.close()
+        super().close()
 
     def emit_end(self, error: BaseException) -> None:
         """Record the error that ended a stage."""

@@ -129,4 +129,5 @@ def cli(**_verbosity: bool) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of `georef`: run the command line and exit with its code."""
+    sys.excepthook = boundary.safe_traceback
     sys.exit(boundary.guarded(cli, arguments))

@@ -8,8 +8,10 @@ from typing import Any
 
 import click
 from rich.console import Console, RenderableType
+from rich.text import Text
 
 from georef_cli import tables
+from georef_cli.markup import Safe
 from pipelines.core.cautions import Caution
 from pipelines.core.products import dump_json
 from pipelines.core.runner import Outcome
@@ -30,7 +32,7 @@ def print_rich(*parts: RenderableType) -> None:
         width=None if sys.stdout.isatty() else PIPED_WIDTH, highlight=False, emoji=False, file=sys.stdout
     )
     for part in parts:
-        console.print(part)
+        console.print(Safe(part if not isinstance(part, str) else Text.from_markup(part, emoji=False)))
 
 
 def document_of(outcome: Outcome) -> dict[str, Any]:

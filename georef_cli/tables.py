@@ -7,9 +7,9 @@ from datetime import datetime
 from typing import Any
 
 from rich.console import Group
-from rich.markup import escape
 from rich.table import Table
 
+from georef_cli.markup import shown
 from pipelines.compare.table import Comparison, cells, remarks_on
 from pipelines.core.cautions import Caution
 from pipelines.core.runner import Outcome
@@ -21,6 +21,7 @@ from pipelines.scene.report import CheckPointErrors, EvaluationReport, read_repo
 STATE_STYLE = {
     "current": "green",
     "stale": "yellow",
+    "damaged": "red",
     "running": "cyan",
     "interrupted": "yellow",
     "failed": "red",
@@ -58,7 +59,7 @@ def states(rows: Iterable[StageState], cautions: Mapping[str, Sequence[Caution]]
     for column in table.columns[3:-1]:
         column.justify = "right"
     for row in rows:
-        remarks = [escape(text) for text in (row.key_figure, row.reason) if text]
+        remarks = [shown(text) for text in (row.key_figure, row.reason) if text]
         style = STATE_STYLE[row.state]
         table.add_row(
             row.stage,
@@ -74,7 +75,7 @@ def states(rows: Iterable[StageState], cautions: Mapping[str, Sequence[Caution]]
 def cautions(by_stage: Mapping[str, Sequence[Caution]]) -> list[Renderable]:
     """Return the cautions, one line each."""
     return [
-        f"[bold yellow]caution:[/] {escape(caution.sentence)} ({stage}, {caution.code})"
+        f"[bold yellow]caution:[/] {shown(caution.sentence)} ({stage}, {caution.code})"
         for stage, of_stage in by_stage.items()
         for caution in of_stage
     ]
@@ -84,13 +85,13 @@ def outcome(workspace: Workspace, result: Outcome) -> list[Renderable]:
     """Return the result of one stage: headline, figures, and the warnings of an earlier run."""
     manifest = result.manifest
     effort = duration(manifest.duration_s) if result.ran else "current, nothing to do"
-    parts: list[Renderable] = [f"[bold]{result.stage}[/]: {escape(manifest.key_figure)} ({effort})"]
+    parts: list[Renderable] = [f"[bold]{result.stage}[/]: {shown(manifest.key_figure)} ({effort})"]
     if result.stage == "evaluate":
         parts += report_of(workspace)
     elif manifest.values:
         parts.append(_figures(manifest.values))
     if not result.ran:  # the warnings of a stage that just ran are on stderr already
-        parts += [f"[yellow]warning:[/] {escape(text)}" for text in manifest.warnings]
+        parts += [f"[yellow]warning:[/] {shown(text)}" for text in manifest.warnings]
     return parts
 
 
@@ -101,9 +102,9 @@ def outcomes(results: Sequence[Outcome]) -> Table:
     for result in results:
         manifest = result.manifest
         done = "[green]done[/]" if result.ran else "[dim]current[/]"
-        table.add_row(result.stage, done, duration(manifest.duration_s), escape(manifest.key_figure))
+        table.add_row(result.stage, done, duration(manifest.duration_s), shown(manifest.key_figure))
         for warning in () if result.ran else manifest.warnings:
-            table.add_row("", "[yellow]warning[/]", "", escape(warning))
+            table.add_row("", "[yellow]warning[/]", "", shown(warning))
     return table
 
 
@@ -115,10 +116,10 @@ def comparison(table: Comparison) -> list[Renderable]:
     for column in figures.columns[1:]:
         column.justify, column.no_wrap = "right", True
     for row in table.rows:
-        figures.add_row(escape(row.configuration), *map(escape, cells(row)))
-    notes = [f"[bold]{escape(row.configuration)}[/] {escape(f'{row.title}: {row.note}')}" for row in table.rows]
+        figures.add_row(shown(row.configuration), *map(shown, cells(row)))
+    notes = [f"[bold]{shown(row.configuration)}[/] {shown(f'{row.title}: {row.note}')}" for row in table.rows]
     remarks = [
-        f"[yellow]{escape(row.configuration)}:[/] {escape(text)}" for row in table.rows for text in remarks_on(row)
+        f"[yellow]{shown(row.configuration)}:[/] {shown(text)}" for row in table.rows for text in remarks_on(row)
     ]
     return ["[bold]Test views in dB, check points in metres[/]", figures, "", *notes, *remarks]
 
@@ -137,15 +138,15 @@ def topics(rows: Iterable[Mapping[str, Any]]) -> Table:
         ]
         remarks += ["no stamps" if row["clock"] == "recording" else "", row["problem"]]
         table.add_row(
-            escape(row["name"]),
-            escape(row["type"].replace("/msg/", "/")),
+            shown(row["name"]),
+            shown(row["type"].replace("/msg/", "/")),
             str(row["messages"]),
             _number(row["rate_hz"]),
             duration(span),
             duration(row["longest_gap_s"]),
-            escape(row["frame"]),
-            f"[green]{escape(row['use'])}[/]",
-            escape(", ".join(filter(None, remarks))),
+            shown(row["frame"]),
+            f"[green]{shown(row['use'])}[/]",
+            shown(", ".join(filter(None, remarks))),
         )
     return table
 
@@ -204,7 +205,7 @@ def _rows(title: str, rows: Mapping[str, Mapping[str, Any]], columns: Mapping[st
     for column in table.columns[1:]:
         column.justify = "right"
     for name, row in rows.items():
-        table.add_row(escape(name), *(escape(_number(row.get(key))) for key in heads))
+        table.add_row(shown(name), *(shown(_number(row.get(key))) for key in heads))
     return Group(f"\n[bold]{title}[/]", table)
 
 
@@ -236,7 +237,7 @@ def _figures(values: Mapping[str, Any]) -> Table:
     table.columns[1].justify = "right"
     for name, value in values.items():
         if isinstance(value, str | int | float) or value is None:
-            table.add_row(escape(name), escape(_number(value)))
+            table.add_row(shown(name), shown(_number(value)))
     return table
 
 

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
+from typing import Any
+
+from georef_cli.printable import printable, printable_lines
 
 
 @dataclass(frozen=True)
@@ -26,7 +29,19 @@ class Verbosity:
         return logging.DEBUG if self.verbose else logging.WARNING if self.quiet else logging.INFO
 
 
-class LineFormatter(logging.Formatter):
+class SafeFormatter(logging.Formatter):
+    """Formatter of records in one line each, but for tracebacks; nothing in them can steer a terminal."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:
+        """Return the line of a record."""
+        return printable(super().formatMessage(record))
+
+    def formatException(self, ei: Any) -> str:
+        """Return the lines of a traceback."""
+        return printable_lines(super().formatException(ei))
+
+
+class LineFormatter(SafeFormatter):
     """Formatter of log lines: `message`, or `warning: message`."""
 
     def format(self, record: logging.LogRecord) -> str:

@@ -8,8 +8,9 @@ from typing import Literal
 
 import numpy as np
 
+from pipelines.core.manifest import MANIFEST
 from pipelines.core.products import save_json
-from pipelines.core.stages import SPARSE, SURVEY
+from pipelines.core.stages import SPARSE, SURVEY, StageSpec
 from pipelines.core.workspace import Workspace
 from pipelines.geodesy.enu import Origin
 from pipelines.geodesy.vertical import VerticalDatum
@@ -158,7 +159,7 @@ def survey_of(scene: TrueScene, noise: Noise, measured: Measured, rng: np.random
         fix = Fix(position_in_geo=_vector(fixes[index]), cov_in_geo=cov, source="csv", sigma_source="file")
         quat = tuple(quat_xyzw_from_matrix(turned[index]).tolist())
         attitude = Attitude(quat_xyzw=quat, sigma_deg=noise.attitude_deg, source="csv")
-        image = SurveyImage(name=name, camera_id=1, sha256="0" * 64)
+        image = SurveyImage(name=name, camera_id=1, sha256="")
         if measured.fixes:
             image = image.model_copy(update={"fix": fix})
         if measured.attitudes:
@@ -256,6 +257,13 @@ def write_workspace(root: Path, survey: Survey, model: SparseModel) -> Workspace
     save_json(survey, root / SURVEY)
     write_sparse(model, root / SPARSE)
     return Workspace(root)
+
+
+def without_hashes(workspace: Workspace, spec: StageSpec) -> None:
+    """Take the hashes of its files out of a product's manifest, so that a test may change the product."""
+    manifest = workspace.manifest(spec)
+    assert manifest is not None
+    save_json(manifest.model_copy(update={"files": {}}), workspace.path(f"{spec.folder}/{MANIFEST}"))
 
 
 def without_fixes(survey: Survey, names: tuple[str, ...]) -> Survey:

@@ -6,9 +6,9 @@ from typing import Any
 
 import click
 from rich.console import RenderableType
-from rich.markup import escape
 from rich.table import Table
 
+from georef_cli.markup import shown
 from georef_cli.output import print_outcome
 from georef_cli.stage import StageCommand
 from pipelines.core.products import load_json
@@ -59,7 +59,7 @@ def _residuals(calibration: RigCalibration) -> str:
     parts = [] if calibration.rms_position_m is None else [f"{calibration.rms_position_m:.3f} m an axis"]
     parts += [] if calibration.rms_attitude_deg is None else [f"{calibration.rms_attitude_deg:.2f}°"]
     images, points = calibration.images, calibration.control_points
-    return escape(f"left over: {', '.join(parts)} ({images} images, {points} control points)")
+    return shown(f"left over: {', '.join(parts)} ({images} images, {points} control points)")
 
 
 command = CalibrateCommand(

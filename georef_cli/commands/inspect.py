@@ -7,10 +7,10 @@ import inspect
 from pathlib import Path
 
 import click
-from rich.markup import escape
 
 from georef_cli import options, tables
 from georef_cli.display import progress_for
+from georef_cli.markup import shown
 from georef_cli.output import print_json, print_rich
 
 
@@ -24,9 +24,9 @@ def _inspect(ctx: click.Context, bag: Path, as_json: bool) -> None:
         return
     print_rich(tables.topics(document["topics"]))
     for text in report.remarks:
-        print_rich(f"[dim]chosen:[/] {escape(text)}")
+        print_rich(f"[dim]chosen:[/] {shown(text)}")
     for text in report.missing:
-        print_rich(f"[yellow]missing:[/] {escape(text)}")
+        print_rich(f"[yellow]missing:[/] {shown(text)}")
 
 
 command = click.Command(

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import click
-from rich.markup import escape
 
 from georef_cli import options, tables
 from georef_cli.display import progress_for
+from georef_cli.markup import shown
 from georef_cli.output import print_json, print_rich
 from pipelines.core.options import CONFIG_FILE, resolve
 from pipelines.simulate.options import SimulateOptions
@@ -30,7 +30,7 @@ def _simulate(ctx: click.Context, **values: Any) -> None:
         print_json({**dataclasses.asdict(summary), "directory": str(summary.directory)})
         return
     took = tables.duration(time.monotonic() - started)
-    print_rich(f"[bold]simulate[/]: {escape(f'{summary.key_figure} in {summary.directory} ({took})')}")
+    print_rich(f"[bold]simulate[/]: {shown(f'{summary.key_figure} in {summary.directory} ({took})')}")
 
 
 command = click.Command(

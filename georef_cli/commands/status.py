@@ -27,7 +27,7 @@ command = click.Command(
     params=[options.workspace_argument(), options.json_option()],
     callback=_status,
     help="""Show the state of every stage: missing, current, stale (its inputs or options have changed since),
-interrupted or failed; and the cautions, which limit the result.
+damaged (a file is not as the stage wrote it), interrupted or failed; and the cautions, which limit the result.
 
 \b
 Examples:

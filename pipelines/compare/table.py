@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Literal
 
 from pipelines.core.cautions import Caution
+from pipelines.core.durable import replace_text
 from pipelines.core.products import Product
-from pipelines.core.workspace import replace_text
 from pipelines.plots.bars import Panel, write_bars
 from pipelines.scene.report import CheckPointErrors
 

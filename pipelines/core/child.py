@@ -19,10 +19,20 @@ import threading
 import traceback
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
 from typing import IO, Any, TextIO
 
 from pipelines.core import errors
-from pipelines.core.errors import CrashError, GeorefError, MissingProductError, ResourceError
+from pipelines.core.durable import storage_failure_of
+from pipelines.core.errors import (
+    CrashError,
+    GeorefError,
+    MissingProductError,
+    ResourceError,
+    StorageError,
+    storage_error,
+    storage_error_in,
+)
 from pipelines.core.progress import SILENT, Progress, ProgressTask
 
 log = logging.getLogger(__name__)
@@ -32,7 +42,14 @@ _DIE_WITH_PARENT = 1  # PR_SET_PDEATHSIG of Linux
 _MOST_OF_A_LINE = 300
 
 
-def run_in_child(task: str, arguments: Mapping[str, Any], remedy: str, progress: Progress = SILENT) -> Any:
+def run_in_child(
+    task: str,
+    arguments: Mapping[str, Any],
+    remedy: str,
+    progress: Progress = SILENT,
+    *,
+    writes: Path | None = None,
+) -> Any:
     """Return the result of a function that runs in a child process.
 
     Log records and progress of the child appear as those of this process.
@@ -42,9 +59,11 @@ def run_in_child(task: str, arguments: Mapping[str, Any], remedy: str, progress:
         arguments: document for JSON.
         remedy: what to do if the child crashes.
         progress: shows the tasks of the child.
+        writes: folder that the function writes into, if native code writes there.
 
     Raises:
         GeorefError: raised by the function, with its message.
+        StorageError: native code could not write.
         CrashError: the child ended without a result.
         ResourceError: the system killed the child, as it does when memory is short.
         RuntimeError: any other exception of the function, with its traceback.
@@ -61,7 +80,12 @@ def run_in_child(task: str, arguments: Mapping[str, Any], remedy: str, progress:
         try:
             return _follow(process, arguments, progress)
         except EOFError:
-            raise _crash(process.wait(), native_log, remedy) from None
+            crash = _crash(process.wait(), native_log, remedy)
+            storage = _storage_failure(native_log, writes)
+            raise storage or crash from None
+        except RuntimeError as defect:
+            storage = storage_error_in(str(defect), writes) if writes is not None else None
+            raise storage or _storage_failure(native_log, writes) or defect from None
         finally:
             process.kill()
             process.wait()
@@ -109,6 +133,14 @@ def _follow(process: subprocess.Popen[str], arguments: Mapping[str, Any], progre
     raise EOFError
 
 
+def _storage_failure(native_log: IO[str], folder: Path | None) -> StorageError | None:
+    """Return why native code could not write into a folder, by its messages or by trial; None: it could."""
+    if folder is None:
+        return None
+    native_log.seek(0)
+    return storage_error_in(native_log.read(), folder) or storage_failure_of(folder)
+
+
 def _error(message: Mapping[str, Any]) -> Exception:
     """Return the exception of the child."""
     if message["kind"] != "error":
@@ -122,7 +154,8 @@ def _error(message: Mapping[str, Any]) -> Exception:
 def _crash(code: int, native_log: IO[str], remedy: str) -> GeorefError:
     native_log.seek(0)
     lines = [line.strip() for line in native_log if line.strip()]
-    log.info("the child process wrote:\n%s", "\n".join(lines[-50:]))
+    for line in lines[-50:]:
+        log.debug("the child process wrote: %s", line)
     if code == -signal.SIGKILL:
         return ResourceError(f"the system killed the computation, as it does when memory is short: {remedy}")
     ending = signal.Signals(-code).name if code < 0 else f"exit code {code}"
@@ -192,8 +225,12 @@ def _main(task: str, parent: str) -> None:
         messages.send("error", type=type(error).__name__, text=str(error))
     except MemoryError:
         messages.send("error", type="ResourceError", text="memory is short: use smaller or fewer photographs")
-    except Exception:
-        messages.send("defect", text=traceback.format_exc())
+    except Exception as error:
+        storage = storage_error(error)
+        if storage is not None:
+            messages.send("error", type="StorageError", text=str(storage))
+        else:
+            messages.send("defect", text=traceback.format_exc())
     sys.stderr.flush()
     os._exit(0)  # The watching thread and native threads are not waited for.
 

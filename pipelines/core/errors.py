@@ -6,6 +6,9 @@ its traceback.
 
 from __future__ import annotations
 
+import errno
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 
@@ -80,3 +83,89 @@ class CrashError(GeorefError):
 
 class BackendUnavailableError(GeorefError):
     """Missing optional library or device; the message names the extra to install."""
+
+
+class StorageError(GeorefError):
+    """Disk or file system that is full, fails, or may not be written; names the file."""
+
+
+class DamagedPartialError(InputError):
+    """Partial product of an interrupted run that cannot be continued; the runner starts the stage afresh."""
+
+
+_SQLITE_ERRNO = {8: errno.EROFS, 10: errno.EIO, 13: errno.ENOSPC}
+_DISK_FAILURES = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
+_NATIVE_WORDS = {
+    "disk is full": errno.ENOSPC,
+    "No space left on device": errno.ENOSPC,
+    "quota exceeded": errno.EDQUOT,
+    "disk I/O error": errno.EIO,
+    "Input/output error": errno.EIO,
+    "readonly database": errno.EROFS,
+    "Read-only file system": errno.EROFS,
+}
+_STORAGE_REASONS = {
+    errno.ENOSPC: "the disk is full",
+    errno.EDQUOT: "the disk quota is used up: delete files or have it raised",
+    errno.EFBIG: "the file would be larger than the system allows",
+    errno.EIO: "the disk reports an input/output error: check the disk, then run the command again",
+    errno.EROFS: "the file system is read-only: use a workspace elsewhere",
+    errno.EACCES: "permission denied: change the permissions, or use a workspace elsewhere",
+    errno.EPERM: "permission denied: change the permissions, or use a workspace elsewhere",
+    errno.ENAMETOOLONG: "the name is too long: file names have at most 255 bytes",
+    errno.ELOOP: "symbolic links lead in a circle",
+    errno.ENOTDIR: "a file stands where a folder is needed: move it away",
+    errno.EISDIR: "a folder stands where a file is needed: move it away",
+    errno.EEXIST: "a file stands where a folder is needed: move it away",
+    errno.EMFILE: "too many open files: raise the limit (`ulimit -n`)",
+    errno.ESTALE: "the network file system has lost the file: mount it again",
+}
+
+
+def storage_error(error: BaseException) -> StorageError | None:
+    """Return the storage failure behind an exception, or None.
+
+    Libraries replace an OSError by an error of their own while they close a half-written file. Failures
+    of the disk count also if the exception arose in their handling.
+    """
+    seen: set[int] = set()
+    cause: BaseException | None = error
+    while cause is not None and id(cause) not in seen:
+        seen.add(id(cause))
+        code = cause.errno if isinstance(cause, OSError) else None
+        # An error of sqlite3, known by its code: the module need not be imported for it.
+        code = _SQLITE_ERRNO.get(getattr(cause, "sqlite_errorcode", 0) & 0xFF, code)
+        if code in _STORAGE_REASONS and (cause is error or code in _DISK_FAILURES):
+            path = getattr(cause, "filename", None)
+            return StorageError(f"{'workspace or output' if path is None else path}: {_STORAGE_REASONS[code]}")
+        cause = cause.__cause__ or cause.__context__
+    return None
+
+
+def storage_error_in(text: str, path: Path) -> StorageError | None:
+    """Return the storage failure that the messages of a native library name, or None.
+
+    Args:
+        text: messages of SQLite or of the C library.
+        path: of the file or folder that was written.
+    """
+    reason = next((reason for words, reason in _NATIVE_WORDS.items() if words in text), None)
+    return None if reason is None else StorageError(f"{path}: {_STORAGE_REASONS[reason]}")
+
+
+@contextmanager
+def storage_failures() -> Iterator[None]:
+    """Turn storage failures of any library into `StorageError` while the context lasts.
+
+    Raises:
+        StorageError: a disk or file system failed.
+    """
+    try:
+        yield
+    except GeorefError:
+        raise
+    except Exception as error:
+        storage = storage_error(error)
+        if storage is None:
+            raise
+        raise storage from error

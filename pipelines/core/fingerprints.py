@@ -10,11 +10,11 @@ from typing import Any
 
 from pipelines.core.errors import InputError, MissingProductError
 from pipelines.core.files import file_size
+from pipelines.core.manifest import Memo, hash_file
 from pipelines.core.options import StageOptions, flag_name, input_paths
 from pipelines.core.stages import ProductPart, StageSpec
 from pipelines.core.workspace import Workspace
 
-Memo = dict[Path, str]
 _WHOLE_BYTES = 256 * 1024 * 1024
 
 
@@ -29,7 +29,7 @@ def fingerprints(workspace: Workspace, spec: StageSpec, options: StageOptions, m
         workspace: holds the products.
         spec: the stage.
         options: the stage's options.
-        memo: hashes of whole products by path, extended here: a product that several stages read is hashed once.
+        memo: hashes of products and of their files by path, extended here: each is hashed once.
 
     Raises:
         MissingProductError: a product does not exist.
@@ -104,25 +104,19 @@ def _hash_input(path: Path, workspace_root: Path, flag: str) -> str:
     stat = path.stat()
     if stat.st_size > _WHOLE_BYTES:
         return hashlib.sha256(f"{path.name} {stat.st_size} {stat.st_mtime_ns}".encode()).hexdigest()
-    return _hash_file(path)
-
-
-def _hash_file(path: Path) -> str:
-    file_size(path)
-    with path.open("rb") as handle:
-        return hashlib.file_digest(handle, "sha256").hexdigest()
+    return hash_file(path, {})
 
 
 def _hash_product(path: Path, memo: Memo) -> str:
     if path not in memo:
-        memo[path] = _hash_folder(path) if path.is_dir() else _hash_file(path)
+        memo[path] = _hash_folder(path, memo) if path.is_dir() else hash_file(path, memo)
     return memo[path]
 
 
-def _hash_folder(path: Path) -> str:
+def _hash_folder(path: Path, memo: Memo) -> str:
     digest = hashlib.sha256()
     for file in _files(path):
-        digest.update(f"{file.relative_to(path)}={_hash_file(file)}\n".encode())
+        digest.update(f"{file.relative_to(path)}={hash_file(file, memo)}\n".encode())
     return digest.hexdigest()
 
 

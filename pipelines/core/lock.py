@@ -17,6 +17,7 @@ from typing import BinaryIO
 from filelock import lock_descriptor, unlock_descriptor
 
 from pipelines.core.errors import InputError, WorkspaceBusyError
+from pipelines.core.validators import require_text
 
 LOCK = ".lock"
 HOLDER = ".lock.holder"
@@ -46,6 +47,7 @@ class WriteLock:
             WorkspaceBusyError: another process holds the lock; names that process and its activity.
             InputError: the folder cannot be made, written or locked.
         """
+        require_text(self.folder)
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             handle = (self.folder / LOCK).open("ab")

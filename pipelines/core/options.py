@@ -22,6 +22,7 @@ from pydantic.fields import FieldInfo
 from pipelines.core.errors import InputError
 from pipelines.core.files import file_size
 from pipelines.core.types import Vector3
+from pipelines.core.validators import require_text
 
 CONFIG_FILE = "georef.toml"
 _MAX_TOML_BYTES = 1024 * 1024
@@ -141,7 +142,7 @@ def resolve(
     """
     merged = {**_anchored(options_type, table, toml.parent), **flags}
     try:
-        return options_type.model_validate(merged)
+        options = options_type.model_validate(merged)
     except ValidationError as error:
         first = error.errors()[0]
         key = str(first["loc"][0]) if first["loc"] else "?"
@@ -150,6 +151,11 @@ def resolve(
         hint = f"unknown key; known keys: {known}" if first["type"] == "extra_forbidden" else first["msg"]
         name = key if from_file else flag_name(options_type, key)
         raise InputError(hint, path=toml if from_file else None, field=name) from error
+    for name in options_type.model_fields:
+        value = getattr(options, name)
+        if isinstance(value, Path):
+            require_text(value, flag_name(options_type, name))
+    return options
 
 
 def load_toml(path: Path, stages: Collection[str]) -> dict[str, dict[str, Any]]:

@@ -18,8 +18,15 @@ from pydantic import ValidationError
 
 from pipelines import __version__
 from pipelines.core.cautions import union
-from pipelines.core.errors import DegenerateGeometryError, GeorefError, InputError, MissingProductError
-from pipelines.core.fingerprints import Memo
+from pipelines.core.errors import (
+    DamagedPartialError,
+    DegenerateGeometryError,
+    GeorefError,
+    InputError,
+    MissingProductError,
+    storage_failures,
+)
+from pipelines.core.manifest import MANIFEST, Manifest, Memo, record_files
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.stages import StageSpec, producer_of, products_of
 from pipelines.core.staleness import (
@@ -31,9 +38,10 @@ from pipelines.core.staleness import (
     request,
     stage_config,
     status,
+    why_damaged,
     why_stale,
 )
-from pipelines.core.workspace import Manifest, Resume, StageRun, Summary, Workspace, now
+from pipelines.core.workspace import Resume, StageRun, Summary, Workspace, now
 
 log = logging.getLogger(__name__)
 
@@ -51,6 +59,7 @@ class Outcome:
     manifest: Manifest
 
 
+@storage_failures()
 def run_stage(
     workspace: Workspace,
     spec: StageSpec,
@@ -81,9 +90,10 @@ def run_stage(
         memo: Memo = {}
         asked = request(workspace, spec, flags, memo)
         _warn_of_stale_inputs(workspace, spec, memo)
+        _refuse_damaged_inputs(workspace, spec, memo)
         before = workspace.requests().get(spec.name, {})
         workspace.remember({spec.name: flags})
-        previous = None if force else _current(workspace, asked)
+        previous = None if force else _current(workspace, asked, memo)
         if previous is not None:
             return Outcome(spec.name, False, previous)
         try:
@@ -94,6 +104,7 @@ def run_stage(
         return Outcome(spec.name, True, manifest)
 
 
+@storage_failures()
 def run_pipeline(
     workspace: Workspace,
     stages: tuple[StageSpec, ...],
@@ -154,24 +165,9 @@ def _execute(workspace: Workspace, asked: Request, resume: Resume, progress: Pro
     token = hashlib.sha256(json.dumps([resolved, asked.inputs], sort_keys=True).encode()).hexdigest()
     if resume == "never" and spec.resumable and workspace.partial(spec).exists():
         log.warning("%s: starts afresh; what an interrupted run had done is dropped", spec.name)
-    out, resumed = workspace.begin(spec, token, resume)
     started, clock = now(), time.monotonic()
-    log.info("%s: %s", spec.name, "resumed" if resumed else "started")
-    try:
-        run = importlib.import_module(spec.module).run
-        summary: Summary = run(StageRun(workspace, out, progress, resumed), asked.options)
-    except GeorefError as error:
-        workspace.fail(spec, str(error))
-        raise
-    # Products that were edited by hand have numbers that no stage writes.
-    except _WITHOUT_SOLUTION as error:
-        cause = " ".join(str(error).split())[:200]
-        degenerate = DegenerateGeometryError(
-            f"the products that {spec.name} reads lead to no solution ({cause}): were they edited? "
-            f"`georef run {workspace.root} --force` makes them again"
-        )
-        workspace.fail(spec, str(degenerate))
-        raise degenerate from error
+    summary = _run(workspace, asked, token, resume, progress)
+    out = workspace.partial(spec)
     for product in products_of(spec):
         if not (out / product.removeprefix(f"{spec.folder}/")).exists():
             raise RuntimeError(f"{spec.module} did not write {product}")
@@ -192,13 +188,48 @@ def _execute(workspace: Workspace, asked: Request, resume: Resume, progress: Pro
         values=summary.values,
         warnings=list(summary.warnings),
         cautions=summary.cautions,
+        files=record_files(out, spec.working),
     )
+    workspace.set_aside(_damaged(workspace, spec, {}, by_content=False))
     workspace.commit(spec, manifest)
     log.info("%s: %s (%.1f s)", spec.name, summary.key_figure, manifest.duration_s)
     return manifest
 
 
-def _current(workspace: Workspace, asked: Request) -> Manifest | None:
+def _run(workspace: Workspace, asked: Request, token: str, resume: Resume, progress: Progress) -> Summary:
+    """Run the module of a stage; afresh, if the partial product to be continued is damaged.
+
+    Raises:
+        GeorefError: a known failure, which is recorded.
+    """
+    spec = asked.spec
+    run = importlib.import_module(spec.module).run
+    out, resumed = workspace.begin(spec, token, resume)
+    log.info("%s: %s", spec.name, "resumed" if resumed else "started")
+    try:
+        with storage_failures():
+            try:
+                summary: Summary = run(StageRun(workspace, out, progress, resumed), asked.options)
+            except DamagedPartialError as error:
+                log.warning("%s: starts afresh; what the interrupted run left is damaged (%s)", spec.name, error)
+                out, _ = workspace.begin(spec, token, "never")
+                summary = run(StageRun(workspace, out, progress), asked.options)
+    except GeorefError as error:
+        workspace.fail(spec, str(error))
+        raise
+    # Products that were edited by hand have numbers that no stage writes.
+    except _WITHOUT_SOLUTION as error:
+        cause = " ".join(str(error).split())[:200]
+        degenerate = DegenerateGeometryError(
+            f"the products that {spec.name} reads lead to no solution ({cause}): were they edited? "
+            f"`georef run {workspace.root} --force` makes them again"
+        )
+        workspace.fail(spec, str(degenerate))
+        raise degenerate from error
+    return summary
+
+
+def _current(workspace: Workspace, asked: Request, memo: Memo) -> Manifest | None:
     """Return the manifest of a product that need not be made again, or None."""
     spec = asked.spec
     if workspace.placed_by_hand(spec):
@@ -221,6 +252,10 @@ def _current(workspace: Workspace, asked: Request) -> Manifest | None:
         return None
     if manifest is None:
         return None
+    damage = why_damaged(workspace.damaged(spec, manifest, memo, by_content=True))
+    if damage:
+        log.warning("%s: damaged, made again: %s", spec.name, damage)
+        return None
     reason = why_stale(workspace, asked, manifest)
     log.info("%s: %s", spec.name, f"made again: {reason}" if reason else "current, nothing to do")
     return None if reason else manifest
@@ -232,6 +267,31 @@ def _warn_of_stale_inputs(workspace: Workspace, spec: StageSpec, memo: Memo) -> 
     for row in status(workspace, memo, before=spec):
         if row.stage in producers and row.state == "stale":
             log.warning("%s builds on %s, which is stale (%s)", spec.name, row.stage, row.reason)
+
+
+def _refuse_damaged_inputs(workspace: Workspace, spec: StageSpec, memo: Memo) -> None:
+    """Refuse to build on a product that is not as its stage wrote it.
+
+    Raises:
+        InputError: a file of a stage that `spec` reads has changed since that stage ended.
+    """
+    for producer in dict.fromkeys(producer_of(part.product) for part in spec.reads):
+        files = _damaged(workspace, producer, memo, by_content=True)
+        if files:
+            raise InputError(
+                f"{why_damaged(files)}: `georef run {(workspace.base or workspace).root}` makes it again; to "
+                f"keep it as it is, delete {producer.folder}/{MANIFEST}",
+                path=workspace.root,
+            )
+
+
+def _damaged(workspace: Workspace, spec: StageSpec, memo: Memo, *, by_content: bool) -> list[str]:
+    """Return the files of a finished product that differ from its manifest; none without a readable manifest."""
+    try:
+        manifest = workspace.manifest(spec)
+    except InputError:
+        return []
+    return [] if manifest is None else workspace.damaged(spec, manifest, memo, by_content=by_content)
 
 
 def _versions() -> dict[str, str]:

@@ -80,6 +80,8 @@ class StageSpec:
         title: one line of help.
         resumable: whether a partial product can be continued.
         also: further products in its folder, besides those that the stages of the pipeline read.
+        working: files and folders in its folder that no hash guards: other programs may change them, or the survey
+            has hashes of its own.
     """
 
     name: str
@@ -91,6 +93,7 @@ class StageSpec:
     title: str
     resumable: bool = False
     also: tuple[str, ...] = ()
+    working: tuple[str, ...] = ()
 
     @property
     def options(self) -> type[StageOptions]:
@@ -109,6 +112,7 @@ PIPELINE: tuple[StageSpec, ...] = (
         reads=(),
         product=SURVEY,
         title="Read photographs, positions, attitudes and control points into one survey.",
+        working=("images",),
     ),
     StageSpec(
         name="sfm",
@@ -119,6 +123,7 @@ PIPELINE: tuple[StageSpec, ...] = (
         product=SPARSE,
         title="Reconstruct cameras and points with COLMAP.",
         resumable=True,
+        working=("database.db",),
     ),
     StageSpec(
         name="calibrate",
@@ -156,6 +161,7 @@ PIPELINE: tuple[StageSpec, ...] = (
         product=MODEL,
         title="Train the Gaussians together with the similarity and the cameras.",
         resumable=True,
+        working=("checkpoint.npz",),
     ),
     StageSpec(
         name="evaluate",

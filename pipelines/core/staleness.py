@@ -9,13 +9,15 @@ from typing import Any, Literal
 
 from pipelines.core.cautions import Caution, union
 from pipelines.core.errors import InputError, MissingProductError
-from pipelines.core.fingerprints import Memo, fingerprints
+from pipelines.core.fingerprints import fingerprints
+from pipelines.core.manifest import Manifest, Memo
 from pipelines.core.options import StageOptions, load_toml, resolve
 from pipelines.core.stages import BY_NAME, PIPELINE, StageSpec, producer_of, products_of
-from pipelines.core.workspace import Manifest, Workspace
+from pipelines.core.validators import require_text
+from pipelines.core.workspace import Workspace
 
 BY_HAND = "put there by hand"
-State = Literal["missing", "current", "stale", "running", "interrupted", "failed"]
+State = Literal["missing", "current", "stale", "damaged", "running", "interrupted", "failed"]
 Flags = Mapping[str, Any]
 
 
@@ -79,12 +81,22 @@ def why_stale(workspace: Workspace, asked: Request, manifest: Manifest) -> str:
     return f"{', '.join(gone)} is gone" if gone else ""
 
 
+def why_damaged(files: list[str]) -> str:
+    """Return the reason why a product with these changed files is damaged; empty without any."""
+    if not files:
+        return ""
+    names = f"{', '.join(files[:3])}{' …' if len(files) > 3 else ''}"
+    return (
+        f"{names} is not as the stage wrote it" if len(files) == 1 else f"{names} are not as the stage wrote them"
+    )
+
+
 def status(workspace: Workspace, memo: Memo | None = None, before: StageSpec | None = None) -> list[StageState]:
     """Return the state of every stage, in order.
 
     Args:
         workspace: an existing workspace.
-        memo: hashes of whole products by path, extended here.
+        memo: hashes of products and of their files by path, extended here.
         before: stage of the pipeline; only the stages ahead of it are returned.
 
     Raises:
@@ -133,6 +145,7 @@ def must_exist(workspace: Workspace) -> None:
     Raises:
         InputError: the directory does not exist.
     """
+    require_text(workspace.root)
     if not workspace.root.is_dir():
         raise InputError("no such workspace: `georef ingest` makes one", path=workspace.root)
 
@@ -149,7 +162,7 @@ class _Look:
     def at(self, spec: StageSpec) -> StageState:
         """Return the state of the next stage."""
         row = self._state(spec)
-        if row.state == "stale":
+        if row.state in ("stale", "damaged"):
             self.stale.add(spec.name)
         return row
 
@@ -167,12 +180,13 @@ class _Look:
         if manifest is None:
             state: State = "failed" if failure else "interrupted" if interrupted else "missing"
             return StageState(spec.name, state, failure or "")
-        reason = self._reason(spec, manifest)
+        damage = why_damaged(self.workspace.damaged(spec, manifest, self.memo, by_content=False))
+        reason = damage or self._reason(spec, manifest)
         later = "a later run was interrupted" if interrupted else ""
         later = f"a later run failed: {failure}" if failure else later
         return StageState(
             spec.name,
-            "stale" if reason else "current",
+            "damaged" if damage else "stale" if reason else "current",
             "; ".join(filter(None, (reason, later))),
             manifest.finished,
             manifest.duration_s,

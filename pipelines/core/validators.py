@@ -6,10 +6,11 @@ A validator returns its argument, or raises a ValueError that names the fault; `
 from __future__ import annotations
 
 import unicodedata
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from pipelines.core.errors import InputError
 from pipelines.core.types import Vector3
 
 _UNIT_TOLERANCE = 1e-3
@@ -24,6 +25,18 @@ def stays_inside(path: str) -> bool:
     pure = PurePosixPath(path)
     is_text = not any(unicodedata.category(character) in ("Cc", "Cs") for character in path)
     return bool(pure.parts) and not pure.is_absolute() and ".." not in pure.parts and is_text
+
+
+def require_text(path: Path, field: str | None = None) -> None:
+    """Refuse a path that is not UTF-8 text: it could not be recorded.
+
+    Raises:
+        InputError: the path has bytes that are not UTF-8.
+    """
+    try:
+        str(path).encode("utf-8")
+    except UnicodeEncodeError as error:
+        raise InputError("the name is not UTF-8 text: rename it", path=path, field=field) from error
 
 
 def image_name(name: str) -> str:

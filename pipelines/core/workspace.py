@@ -7,77 +7,32 @@ rename. One writer at a time holds the workspace's lock.
 
 from __future__ import annotations
 
+import contextlib
 import json
-import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, FiniteFloat, model_validator
-
 from pipelines.core.cautions import Caution
+from pipelines.core.durable import remove, replace_file, replace_text, sync_folder, sync_tree
 from pipelines.core.errors import InputError, MissingProductError
 from pipelines.core.files import file_size
 from pipelines.core.lock import WriteLock
+from pipelines.core.manifest import MANIFEST, Manifest, Memo, damaged_files
 from pipelines.core.options import CONFIG_FILE
 from pipelines.core.products import load_json, save_json
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.stages import STAGES, StageSpec, producer_of, products_of
 
-MANIFEST = "manifest.json"
 TOKEN = "token.txt"
 FAILURE = "failure.txt"
 REQUESTS = "requests.json"
+DAMAGED = "damaged"
 
 Resume = Literal["never", "if-same", "always"]
-
-
-class Manifest(BaseModel):
-    """Record of how a product was made: inputs, resolved options, versions, time, and key figure.
-
-    Attributes:
-        format_version: version of the manifest's format.
-        stage: the subcommand.
-        config: resolved options by field.
-        inputs: SHA-256 by product or flag, from `fingerprints`.
-        versions: versions of this package and its libraries.
-        started: UTC.
-        duration_s: wall-clock time.
-        key_figure: one line for tables.
-        values: plain numbers and strings for `--json`.
-        warnings: messages that the user should read.
-        cautions: limits of the product, those of its inputs among them.
-    """
-
-    model_config = ConfigDict(extra="forbid")
-
-    format_version: Literal[1] = 1
-    stage: str
-    config: dict[str, Any]
-    inputs: dict[str, str]
-    versions: dict[str, str]
-    started: datetime
-    duration_s: FiniteFloat
-    key_figure: str
-    values: dict[str, Any]
-    warnings: list[str]
-    cautions: tuple[Caution, ...] = ()
-
-    @model_validator(mode="after")
-    def _ends_in_the_calendar(self) -> Manifest:
-        try:
-            _ = self.finished
-        except OverflowError as error:
-            raise ValueError("duration_s: ends beyond the calendar") from error
-        return self
-
-    @property
-    def finished(self) -> datetime:
-        """Time at which the stage ended, UTC."""
-        return self.started + timedelta(seconds=self.duration_s)
 
 
 @dataclass(frozen=True)
@@ -224,19 +179,23 @@ class Workspace:
             self._swap(spec)
         elif old.exists() and not final.exists():
             old.rename(final)
-        if old.exists():
-            shutil.rmtree(old)
+        remove(old)
 
     def _swap(self, spec: StageSpec) -> None:
         final, old, partial = self.root / spec.folder, self._old(spec), self.partial(spec)
+        _refuse_what_is_no_folder(final)
         (partial / TOKEN).unlink(missing_ok=True)
         if final.exists():
-            if old.exists():
-                shutil.rmtree(old)
+            remove(old)
             final.rename(old)
-        partial.rename(final)
-        if old.exists():
-            shutil.rmtree(old)
+        try:
+            partial.rename(final)
+        except OSError:
+            if old.exists():
+                old.rename(final)
+            raise
+        sync_folder(self.root)
+        remove(old)
 
     def begin(self, spec: StageSpec, token: str, resume: Resume) -> tuple[Path, bool]:
         """Open the partial folder of a stage: as an interrupted run left it, or empty.
@@ -251,12 +210,16 @@ class Workspace:
             The folder, and whether it holds a run to be continued.
 
         Raises:
-            InputError: `resume` is `always`, and the interrupted run has another token.
+            InputError: `resume` is `always`, and the interrupted run has another token; or the stage's folder is a
+                symbolic link or a file.
         """
         partial = self.partial(spec)
+        _refuse_what_is_no_folder(self.root / spec.folder)
+        if partial.is_symlink() or not partial.is_dir():
+            remove(partial)
         held = partial / TOKEN
         if spec.resumable and held.is_file() and resume != "never":
-            if held.read_text(encoding="utf-8", errors="replace") == token:
+            if held.read_bytes() == token.encode():
                 (partial / FAILURE).unlink(missing_ok=True)
                 return partial, True
             if resume == "always":
@@ -265,23 +228,44 @@ class Workspace:
                     path=partial,
                 )
         held.unlink(missing_ok=True)  # first, so that a half deleted run is never continued
-        if partial.exists():
-            shutil.rmtree(partial)
+        remove(partial)
         partial.mkdir(parents=True)
         held.write_text(token, encoding="utf-8")
         return partial, False
 
     def fail(self, spec: StageSpec, message: str) -> None:
-        """Record the message with which a stage failed."""
-        (self.partial(spec) / FAILURE).write_text(message, encoding="utf-8")
+        """Record the message with which a stage failed; a full disk has no room even for that."""
+        with contextlib.suppress(OSError):
+            (self.partial(spec) / FAILURE).write_text(message, encoding="utf-8", errors="backslashreplace")
 
     def commit(self, spec: StageSpec, manifest: Manifest) -> None:
-        """Write the manifest, and rename the partial folder to the stage's folder."""
+        """Write the manifest, flush all to the disk, and rename the partial folder to the stage's folder."""
         partial = self.partial(spec)
         draft = partial / f"{MANIFEST}.tmp"
         save_json(manifest, draft)
-        draft.replace(partial / MANIFEST)  # The manifest marks the folder as complete, even if the rename fails.
+        sync_tree(partial)
+        replace_file(draft, partial / MANIFEST)  # It marks the folder as complete, even if the next rename fails.
         self._swap(spec)
+
+    def damaged(self, spec: StageSpec, manifest: Manifest, memo: Memo, *, by_content: bool) -> list[str]:
+        """Return the files of a finished product, by workspace path, that differ from the manifest's records.
+
+        Args:
+            spec: the stage.
+            manifest: of the product.
+            memo: hashes of files by path, extended here.
+            by_content: whether a file whose size and time of modification are unchanged is hashed too.
+        """
+        folder = self._folder(spec.folder)
+        names = damaged_files(folder, manifest, memo, by_content=by_content)
+        return [f"{spec.folder}/{name}" for name in names]
+
+    def set_aside(self, product_files: Sequence[str]) -> None:
+        """Move files of a product into `damaged/`, under their workspace paths: they may be edits of the user."""
+        for name in product_files:
+            target = self.root / DAMAGED / name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            (self.root / name).replace(target)
 
     def requests(self) -> dict[str, dict[str, Any]]:
         """Return the flags that stages were last requested with, by stage; `georef run` starts from them.
@@ -307,11 +291,20 @@ class Workspace:
         replace_text(self.root / REQUESTS, json.dumps(document, indent=1, default=str) + "\n")
 
 
-def replace_text(path: Path, text: str) -> None:
-    """Write a file; an existing file is replaced when the new one is complete."""
-    draft = path.with_suffix(".tmp")
-    draft.write_text(text, encoding="utf-8")
-    draft.replace(path)
+def _refuse_what_is_no_folder(folder: Path) -> None:
+    """Refuse a stage folder that could not be replaced by a rename.
+
+    Raises:
+        InputError: the folder is a symbolic link or a file.
+    """
+    if folder.is_symlink():
+        raise InputError(
+            "is a symbolic link, and a stage replaces its folder as a whole: put the folder itself there, or the "
+            "whole workspace on the other disk",
+            path=folder,
+        )
+    if folder.exists() and not folder.is_dir():
+        raise InputError("is a file where the stage's folder belongs: move it away", path=folder)
 
 
 def now() -> datetime:

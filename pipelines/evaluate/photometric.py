@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from pipelines.splat.metrics import psnr, ssim
 SaveRender = Callable[[str, ByteArray], None]
 
 _DIFFERENCE_GAIN = 3
+_LONGEST_NAME_BYTES = 255
 _NO_WEIGHTS = "no weights were given: they are not part of the package (--lpips-weights FILE.npz)"
 
 
@@ -79,12 +81,16 @@ def write_render(folder: Path, image: str, strip: ByteArray) -> None:
         image: name of the photograph.
         strip: (H, 3 W, 3) RGB: the photograph, its render, their difference.
     """
-    cv2.imwrite(str(folder / render_name(image)), np.ascontiguousarray(strip[..., ::-1]))
+    _, png = cv2.imencode(".png", np.ascontiguousarray(strip[..., ::-1]))  # `imwrite` reports no full disk
+    (folder / render_name(image)).write_bytes(png.tobytes())
 
 
 def render_name(image: str) -> str:
-    """Return the file name of an image's render; folders are a part, because images in two may share a name."""
-    return Path(image).with_suffix(".png").as_posix().replace("/", "_")
+    """Return the file name of an image's render: its folders and name, or their hash beyond 255 bytes."""
+    name = Path(image).with_suffix(".png").as_posix().replace("/", "_")
+    if len(name.encode()) <= _LONGEST_NAME_BYTES:
+        return name
+    return f"{hashlib.sha256(name.encode()).hexdigest()[:32]}.png"
 
 
 def _figures(name: str, render: Tensor, photo: Tensor, mask: Tensor, distance: Lpips | None) -> ViewFigures:

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.core.errors import BackendUnavailableError, InputError
+from pipelines.core.durable import storage_failure_of
+from pipelines.core.errors import BackendUnavailableError, InputError, StorageError
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.core.validators import stays_inside
 from pipelines.formats.colmap_check import check_model_files
@@ -103,6 +104,35 @@ def quiet_colmap() -> Iterator[Any]:
         yield pycolmap
     finally:
         pycolmap.logging.minloglevel = level
+
+
+def write_reconstruction(reconstruction: Any, folder: Path) -> None:
+    """Write a `pycolmap.Reconstruction` in COLMAP's binary form into a new folder, and read it back.
+
+    COLMAP does not notice that a disk is full while it writes.
+
+    Raises:
+        StorageError: the files are shorter than what was written.
+        OSError: the folder cannot be made.
+    """
+    folder.mkdir()
+    reconstruction.write_binary(str(folder))
+    try:
+        copy = load_reconstruction(folder)
+        whole = _counts(copy) == _counts(reconstruction)
+    except InputError:
+        whole = False
+    if not whole:
+        failure = storage_failure_of(folder) or StorageError(f"{folder}: the model could not be written whole")
+        raise failure
+
+
+def _counts(reconstruction: Any) -> tuple[int, int, int]:
+    return (
+        reconstruction.num_images(),
+        reconstruction.num_points3D(),
+        reconstruction.compute_num_observations(),
+    )
 
 
 def load_reconstruction(path: Path) -> Any:

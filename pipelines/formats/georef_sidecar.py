@@ -17,6 +17,7 @@ from pydantic import ConfigDict, Field, field_validator
 from pydantic.alias_generators import to_camel
 
 from pipelines.core.cautions import Caution
+from pipelines.core.durable import replace_file
 from pipelines.core.products import Product, load_json
 from pipelines.core.types import FloatArray, Quaternion, Row7, Vector3
 from pipelines.geodesy.vertical import VerticalDatum
@@ -113,7 +114,7 @@ def write_sidecar(sidecar: GeorefSidecar, artefact: Path) -> None:
     path = sidecar_path(artefact)
     draft = path.with_name(path.name + ".tmp")
     draft.write_text(sidecar.model_dump_json(by_alias=True, indent=1) + "\n", encoding="utf-8")
-    draft.replace(path)
+    replace_file(draft, path)
 
 
 def read_sidecar(artefact: Path) -> GeorefSidecar:

@@ -50,6 +50,24 @@ def read_bytes(path: Path) -> bytes:
         raise InputError(f"cannot be read: {error.strerror}", path=path) from error
 
 
+def require_unchanged(data: bytes, sha256: str, path: Path) -> None:
+    """Refuse a photograph that is not the recorded one.
+
+    Args:
+        data: the file.
+        sha256: recorded hash of the whole file, hexadecimal; empty: none was recorded.
+        path: its name, for errors.
+
+    Raises:
+        InputError: the hashes differ.
+    """
+    if sha256 and hashlib.sha256(data).hexdigest() != sha256:
+        raise InputError(
+            "the photograph has changed since `georef ingest` read it: put it back, or run `georef ingest` again",
+            path=path,
+        )
+
+
 def inspect_image(data: bytes, path: Path) -> ImageFile:
     """Return size and hash of a JPEG, PNG or TIFF file, after decoding it to its end.
 

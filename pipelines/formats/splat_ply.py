@@ -14,6 +14,7 @@ from numpy.lib import recfunctions
 from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement, PlyParseError
 
+from pipelines.core.durable import replace_file
 from pipelines.core.errors import InputError
 from pipelines.core.files import file_size
 from pipelines.core.types import Float32Array
@@ -70,7 +71,7 @@ def write_splat_ply(path: Path, splat: SplatArrays) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_name(path.name + ".tmp")
     PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(draft))
-    draft.replace(path)
+    replace_file(draft, path)
 
 
 def read_splat_ply(path: Path) -> SplatArrays:

@@ -8,6 +8,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from pipelines.core.durable import replace_file
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
@@ -51,4 +53,4 @@ def write_png(figure: Figure, path: Path) -> None:
     draft = path.with_suffix(".tmp")
     with draft.open("wb") as handle:
         figure.savefig(handle, format="png", dpi="figure", metadata={"Software": None})
-    draft.replace(path)
+    replace_file(draft, path)

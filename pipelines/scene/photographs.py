@@ -12,10 +12,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.core.durable import replace_file
 from pipelines.core.errors import InputError
-from pipelines.core.files import file_size
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import BoolArray, ByteArray, Float32Array
+from pipelines.formats.image_file import read_bytes, require_unchanged
 from pipelines.geometry.cameras import Camera, Pinhole, distort, undistort
 
 log = logging.getLogger(__name__)
@@ -27,11 +28,12 @@ _SAME_RAY = 1e-6  # of normalised coordinates
 
 @dataclass(frozen=True)
 class Photograph:
-    """Photograph to undistort: its name, its file, and its camera at full size."""
+    """Photograph to undistort: its name, its file, its camera at full size, and the survey's hash of the file."""
 
     name: str
     file: Path
     camera: Camera
+    sha256: str = ""
 
 
 def pinhole_of(camera: Camera, max_size_px: int) -> Pinhole:
@@ -77,7 +79,7 @@ class ImageCache:
         """Make all images that are not yet in the cache.
 
         Raises:
-            InputError: a photograph cannot be read, or has another size than its camera.
+            InputError: a photograph cannot be read, is not that of the survey, or has another size than its camera.
         """
         with progress.task("undistorting", len(self)) as task:
             for index in range(len(self)):
@@ -124,7 +126,7 @@ class ImageCache:
         return self._folder / f"{self.key(index)}.npy"
 
     def key(self, index: int) -> str:
-        """Return the key of an undistorted image: a hash of file name, size and time, camera and limit.
+        """Return the key of an undistorted image: a hash of file name, size, time and content, camera and limit.
 
         Raises:
             InputError: the photograph does not exist.
@@ -138,15 +140,17 @@ class ImageCache:
         camera = photograph.camera
         key = (
             f"{photograph.name}|{stat.st_size}|{stat.st_mtime_ns}|{camera.model}|{camera.width}x{camera.height}|"
-            f"{camera.params.tobytes().hex()}|{self.max_size_px}"
+            f"{camera.params.tobytes().hex()}|{self.max_size_px}|{photograph.sha256}"
         )
         return hashlib.sha256(key.encode()).hexdigest()[:32]
 
     def _write(self, index: int) -> None:
         photograph, pinhole = self._photographs[index], self.pinhole(index)
         # COLMAP ignores the EXIF orientation of images, and so must this cache.
-        file_size(photograph.file)
-        full = cv2.imread(str(photograph.file), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        data = read_bytes(photograph.file)
+        require_unchanged(data, photograph.sha256, photograph.file)
+        flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+        full = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
         if full is None:
             raise InputError("the photograph cannot be read", path=photograph.file)
         if (full.shape[1], full.shape[0]) != (photograph.camera.width, photograph.camera.height):
@@ -174,7 +178,7 @@ def save_array(path: Path, array: NDArray[Any]) -> None:
     draft = path.with_suffix(".tmp")
     with draft.open("wb") as handle:
         np.save(handle, array, allow_pickle=False)
-    draft.replace(path)
+    replace_file(draft, path)
 
 
 def _distortion_map(camera: Camera, pinhole: Pinhole) -> tuple[Float32Array, BoolArray]:

@@ -128,7 +128,7 @@ def photographs(sparse: SparseModel, survey: Survey, workspace: Workspace, max_s
     Raises:
         InputError: an image of the model is not in the survey.
     """
-    known = {image.name for image in survey.images}
+    known = {image.name: image.sha256 for image in survey.images}
     foreign = [name for name in sparse.image_name if name not in known]
     if foreign:
         raise InputError(
@@ -138,6 +138,7 @@ def photographs(sparse: SparseModel, survey: Survey, workspace: Workspace, max_s
         )
     folder = workspace.photographs(survey.image_dir)
     shots = [
-        Photograph(name, folder / name, sparse.camera_of(index)) for index, name in enumerate(sparse.image_name)
+        Photograph(name, folder / name, sparse.camera_of(index), known[name])
+        for index, name in enumerate(sparse.image_name)
     ]
     return ImageCache(workspace.cache / "undistorted", shots, max_size_px)

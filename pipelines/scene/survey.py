@@ -75,7 +75,7 @@ class SurveyImage(Product):
     Attributes:
         name: path relative to the survey's `image_dir`.
         camera_id: of the survey's `cameras`.
-        sha256: hash of the file.
+        sha256: hash of the file; empty in a survey written by hand: the photograph is not checked then.
         timestamp_s: time of exposure, camera clock.
         fix: measured position of its centre.
         attitude: measured rotation.

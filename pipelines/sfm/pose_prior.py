@@ -22,7 +22,13 @@ from pipelines.core.progress import Progress
 from pipelines.core.stages import SPARSE
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import StageRun, Summary
-from pipelines.formats.colmap import load_reconstruction, pycolmap_module, quiet_colmap, read_sparse
+from pipelines.formats.colmap import (
+    load_reconstruction,
+    pycolmap_module,
+    quiet_colmap,
+    read_sparse,
+    write_reconstruction,
+)
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.georef.alignment import Alignment, align
@@ -53,7 +59,8 @@ def run(stage: StageRun, options: AdjustOptions) -> Summary:
         "out": str(stage.out),
         "seed": options.seed,
     }
-    document = run_in_child("pipelines.sfm.pose_prior:write_adjusted", arguments, _FORCE_SFM, stage.progress)
+    task = "pipelines.sfm.pose_prior:write_adjusted"
+    document = run_in_child(task, arguments, _FORCE_SFM, stage.progress, writes=stage.out)
     return Summary(document["key_figure"], document["values"])
 
 
@@ -75,8 +82,7 @@ def write_adjusted(arguments: Mapping[str, Any], progress: Progress) -> dict[str
     with quiet_colmap(), progress.task("adjustment", 1) as task:
         adjust_to_fixes(model, survey, alignment, seed)
         task.advance()
-    sparse.mkdir()
-    model.write_binary(str(sparse))
+    write_reconstruction(model, sparse)
     names = tuple(image.name for image, _ in _located(model, survey))
     similarity = _identity(_aligned(read_sparse(sparse), survey, seed), names, _residuals(model, survey))
     save_json(similarity, out / "geo_from_local.json")

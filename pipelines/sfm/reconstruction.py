@@ -19,6 +19,7 @@ from pipelines.core.errors import DegenerateGeometryError, InputError
 from pipelines.core.progress import Progress
 from pipelines.core.stages import SURVEY
 from pipelines.core.types import IntArray
+from pipelines.formats.image_file import read_bytes, require_unchanged
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.scene.survey import CameraPrior, Survey
 from pipelines.sfm.last_adjustment import LastAdjustment, adjust_finally
@@ -58,7 +59,8 @@ def reconstruct(colmap: Any, job: SfmJob, progress: Progress) -> Any:
         progress: shows features, matches and mapping.
 
     Raises:
-        InputError: a photograph does not exist, or a camera prior is none of COLMAP's cameras.
+        InputError: a photograph does not exist or is not that of the survey, or a camera prior is none of COLMAP's
+            cameras.
         DegenerateGeometryError: COLMAP found no model.
         ConvergenceError: the last adjustment found no solution.
     """
@@ -120,6 +122,7 @@ def _extract(colmap: Any, job: SfmJob, progress: Progress) -> None:
     options.max_image_size = job.options.max_image_size
     options.num_threads = job.options.threads
     options.sift.max_num_features = job.options.max_features
+    sha256_of = {image.name: image.sha256 for image in job.survey.images}
     with progress.task("features", len(job.survey.images)) as task:
         for prior in job.survey.cameras:
             names = [image.name for image in job.survey.images if image.camera_id == prior.camera_id]
@@ -127,6 +130,8 @@ def _extract(colmap: Any, job: SfmJob, progress: Progress) -> None:
             reader = colmap.ImageReaderOptions()
             reader.existing_camera_id = prior.camera_id
             for chunk in _chunks(names, _IMAGES_PER_CHUNK):
+                for name in chunk:
+                    require_unchanged(read_bytes(job.images / name), sha256_of[name], job.images / name)
                 colmap.extract_features(
                     job.database,
                     job.images,

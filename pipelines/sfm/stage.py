@@ -9,18 +9,20 @@ from __future__ import annotations
 
 import logging
 import shutil
+import sqlite3
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from pipelines.core.child import run_in_child
-from pipelines.core.errors import DegenerateGeometryError
+from pipelines.core.errors import CrashError, DamagedPartialError, DegenerateGeometryError, storage_error
 from pipelines.core.products import load_json
 from pipelines.core.progress import Progress
 from pipelines.core.stages import SURVEY
 from pipelines.core.workspace import StageRun, Summary
-from pipelines.formats.colmap import quiet_colmap
+from pipelines.formats.colmap import quiet_colmap, write_reconstruction
 from pipelines.scene.survey import Survey
 from pipelines.sfm.imported import import_model
 from pipelines.sfm.options import SfmOptions
@@ -49,7 +51,14 @@ def run(stage: StageRun, options: SfmOptions) -> Summary:
         "options": options.model_dump(mode="json"),
     }
     remedy = _EXPORT_AGAIN if options.import_model is not None else _RUN_AGAIN
-    document = run_in_child("pipelines.sfm.stage:write_model", arguments, remedy, stage.progress)
+    task = "pipelines.sfm.stage:write_model"
+    try:
+        document = run_in_child(task, arguments, remedy, stage.progress, writes=stage.out)
+    except (CrashError, RuntimeError) as error:
+        if stage.resumed:
+            cause = str(error).strip().splitlines()[-1]
+            raise DamagedPartialError(f"COLMAP cannot continue it: {cause}", path=stage.out) from error
+        raise
     return Summary(document["key_figure"], document["values"], tuple(document["warnings"]))
 
 
@@ -72,11 +81,30 @@ def write_model(arguments: Mapping[str, Any], progress: Progress) -> dict[str, A
         if options.import_model is not None:
             model = import_model(options.import_model, survey)
         else:
+            _require_sound(out / "database.db")
             job = SfmJob(survey, Path(arguments["images"]), out / "database.db", options)
             model = reconstruct(colmap, job, progress)
-        sparse.mkdir()
-        model.write_binary(str(sparse))
+        write_reconstruction(model, sparse)
     return asdict(_summarise(model, survey))
+
+
+def _require_sound(database: Path) -> None:
+    """Refuse a damaged database of an interrupted run; COLMAP would abort, or continue without a part of it.
+
+    Raises:
+        DamagedPartialError: SQLite finds the file damaged.
+    """
+    if not database.exists():
+        return
+    try:
+        with closing(sqlite3.connect(database)) as connection:
+            (verdict,) = connection.execute("pragma quick_check(1)").fetchone()
+    except sqlite3.DatabaseError as error:
+        if storage_error(error) is not None:
+            raise
+        verdict = str(error)
+    if verdict != "ok":
+        raise DamagedPartialError(f"the database is damaged: {verdict}", path=database)
 
 
 def _summarise(model: Any, survey: Survey) -> Summary:

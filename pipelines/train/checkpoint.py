@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pipelines.core.durable import replace_file
 from pipelines.core.errors import InputError
 from pipelines.core.files import read_npz
 
@@ -19,7 +20,7 @@ def save_checkpoint(path: Path, state: Mapping[str, Tensor]) -> None:
     with draft.open("wb") as handle:
         arrays = {name: tensor.detach().cpu().numpy() for name, tensor in state.items()}
         np.savez(handle, **arrays)  # type: ignore[arg-type]
-    draft.replace(path)
+    replace_file(draft, path)
 
 
 def load_checkpoint(path: Path) -> dict[str, Tensor]:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import torch
 
-from pipelines.core.errors import ConvergenceError
+from pipelines.core.errors import ConvergenceError, DamagedPartialError, InputError
 from pipelines.core.interrupts import deferred_interrupts
 from pipelines.core.progress import Progress
 from pipelines.splat.finiteness import NonFiniteError
@@ -104,11 +104,23 @@ class _Loop:
         self.recovery: str | None = None
         self._spent, self._clock = 0.0, time.monotonic()
         if options.resume and options.checkpoint.exists():
-            self._spent = self._go_back()
+            self._spent = self._resumed()
             log.info("resumed at iteration %d", trainer.iteration)
         else:
             options.metrics.write_text("", encoding="utf-8")
             self.save()
+
+    def _resumed(self) -> float:
+        """Take over the checkpoint of an interrupted run; returns its seconds.
+
+        Raises:
+            DamagedPartialError: the checkpoint is damaged, or is not of this training.
+        """
+        try:
+            return self._go_back()
+        except (InputError, KeyError, ValueError, RuntimeError, TypeError) as error:
+            path = self.options.checkpoint
+            raise DamagedPartialError(f"the checkpoint is damaged: {error}", path=path) from error
 
     def seconds(self) -> float:
         """Return the duration so far, with the runs before a resume."""

@@ -159,8 +159,12 @@ class TestStatus:
 class TestByHand:
     """A product can be replaced by hand: it is kept, and what builds on it follows."""
 
-    def test_edited_product_makes_downstream_stale(self, done: Workspace) -> None:
+    def test_edited_product_counts_as_damaged_until_its_manifest_is_deleted(self, done: Workspace) -> None:
+        """A hash cannot tell an edit from damage: the user says which it is."""
         (done.root / SPARSE / "content.txt").write_text("a better model")
+        assert state_of(done)["sfm"] == "damaged"
+        assert state_of(done)["geolocate"] == "stale"
+        (done.root / "sfm/manifest.json").unlink()
         states_now = state_of(done)
         assert states_now["sfm"] == "current"
         assert states_now["geolocate"] == "stale"

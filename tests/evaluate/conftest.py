@@ -10,6 +10,7 @@ import pytest
 from pipelines.core.runner import Outcome, run_stage
 from pipelines.core.stages import BY_NAME
 from pipelines.core.workspace import Workspace
+from tests.scenes import without_hashes
 
 
 @pytest.fixture(scope="session")
@@ -24,4 +25,6 @@ def altered(evaluated: tuple[Workspace, Outcome], tmp_path: Path) -> Workspace:
     """A copy whose survey or model a test may change."""
     root = tmp_path / "copy"
     shutil.copytree(evaluated[0].root, root, symlinks=True, ignore=shutil.ignore_patterns("evaluate"))
-    return Workspace(root)
+    workspace = Workspace(root)
+    without_hashes(workspace, BY_NAME["train"])
+    return workspace

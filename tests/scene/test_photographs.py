@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -136,3 +138,12 @@ def test_strong_lens_does_not_fold_the_outside_in(tmp_path: Path) -> None:
     beyond = np.linalg.norm(ray, axis=-1) > 0.75
     assert beyond.any()
     assert not cache.mask(0)[beyond].any()
+
+
+def test_photograph_that_was_replaced_after_ingest_is_refused(tmp_path: Path) -> None:
+    shot = photograph(BARREL, tmp_path / "a.png")
+    recorded = replace(shot, sha256=hashlib.sha256(shot.file.read_bytes()).hexdigest())
+    ImageCache(tmp_path / "cache", [recorded], WIDTH).build()
+    shot.file.write_bytes(shot.file.read_bytes() + b"\0")  # decodes as before
+    with pytest.raises(InputError, match=r"a\.png: the photograph has changed since `georef ingest` read it"):
+        ImageCache(tmp_path / "cache", [recorded], WIDTH).build()

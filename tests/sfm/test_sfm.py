@@ -89,7 +89,7 @@ def survey_of(names: list[str], image_dir: str = "photos") -> Survey:
         vertical=VerticalDatum(name="ellipsoidal", stated=True),
         image_dir=image_dir,
         cameras=(prior,),
-        images=tuple(SurveyImage(name=name, camera_id=1, sha256="0" * 64) for name in names),
+        images=tuple(SurveyImage(name=name, camera_id=1, sha256="") for name in names),
     )
 
 
@@ -263,6 +263,17 @@ def test_missing_photographs_are_named(mapped: Workspace, tmp_path: Path) -> Non
     with (
         quiet_colmap() as colmap,
         pytest.raises(InputError, match=r"gone\.jpg.*1 photographs of the survey are gone"),
+    ):
+        reconstruct(colmap, job, SILENT)
+
+
+def test_photographs_that_were_replaced_after_ingest_are_refused(photographs: Photographs, tmp_path: Path) -> None:
+    survey = survey_of(photographs.names)
+    others = tuple(image.model_copy(update={"sha256": "0" * 64}) for image in survey.images)
+    job = SfmJob(survey.model_copy(update={"images": others}), photographs.folder, tmp_path / "database.db", CONFIG)
+    with (
+        quiet_colmap() as colmap,
+        pytest.raises(InputError, match="photograph has changed since `georef"),
     ):
         reconstruct(colmap, job, SILENT)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from pipelines.core.errors import ConvergenceError
+from pipelines.core.errors import ConvergenceError, DamagedPartialError
 from pipelines.core.progress import SILENT
 from pipelines.scene.photographs import ImageCache
 from pipelines.splat.densify import Strategy
@@ -135,3 +135,14 @@ def test_training_brings_the_renders_to_the_photographs(images: ImageCache, tmp_
     rows = [json.loads(row)["psnr"] for row in (tmp_path / "metrics.jsonl").read_text().splitlines()]
     # From grey blobs at 64 × 48 pixels: these are renders of just as many Gaussians.
     assert rows[-1] > rows[0] + 6 and rows[-1] > 20
+
+
+@pytest.mark.parametrize("damage", [b"", b"PK\x03\x04 nonsense", None], ids=["empty", "nonsense", "cut off"])
+def test_damaged_checkpoint_is_recognised(images: ImageCache, tmp_path: Path, damage: bytes | None) -> None:
+    """The runner drops what is damaged and trains afresh."""
+    optimise(tiny.trainer(images, JointOptions(1, sh_degree=0)), files(tmp_path), SILENT)
+    checkpoint = files(tmp_path).checkpoint
+    whole = checkpoint.read_bytes()
+    checkpoint.write_bytes(whole[: len(whole) // 2] if damage is None else damage)
+    with pytest.raises(DamagedPartialError, match=r"checkpoint\.npz: the checkpoint is damaged"):
+        optimise(tiny.trainer(images, JointOptions(1, sh_degree=0)), files(tmp_path, resume=True), SILENT)

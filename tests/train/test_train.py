@@ -13,7 +13,7 @@ import pytest
 import torch
 from scipy.stats import chi2
 
-from pipelines.core.errors import BackendUnavailableError, DegenerateGeometryError, InputError
+from pipelines.core.errors import BackendUnavailableError, DegenerateGeometryError
 from pipelines.core.products import load_json, save_json
 from pipelines.core.runner import run_stage
 from pipelines.core.stages import BY_NAME, GAUSSIANS, MODEL, SIM3, SURVEY
@@ -192,14 +192,17 @@ def test_resumed_run_ends_as_an_uninterrupted_one(
     assert [row["seconds"] for row in rows] == sorted(row["seconds"] for row in rows)
 
 
-def test_damaged_checkpoint_is_told(flights: list[RenderedFlight]) -> None:
+def test_damaged_checkpoint_is_told_and_training_starts_afresh(
+    flights: list[RenderedFlight], caplog: pytest.LogCaptureFixture
+) -> None:
     workspace = flights[0].workspace("damaged")
     with pytest.raises(KilledError):
         run_stage(workspace, TRAIN, SHORT, progress=Signalling(10, kill))
     checkpoint = workspace.root / "train.partial" / "checkpoint.npz"
     checkpoint.write_bytes(checkpoint.read_bytes()[:1000])
-    with pytest.raises(InputError, match="not a readable checkpoint"):
-        run_stage(workspace, TRAIN, SHORT, resume="always")
+    assert run_stage(workspace, TRAIN, SHORT, resume="always").ran
+    assert "train: starts afresh; what the interrupted run left is damaged" in caplog.text
+    assert "not a readable checkpoint" in caplog.text
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")

@@ -1,0 +1,91 @@
+"""Files that survive a power failure: flushed to the disk before a name leads to them."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import sys
+import tempfile
+from pathlib import Path
+
+from pipelines.core.errors import StorageError, storage_error
+
+_PROBE_BYTES = 1 << 20
+
+
+def replace_file(draft: Path, path: Path) -> None:
+    """Rename a complete draft to `path`; after a power failure `path` is the old or the new file, whole.
+
+    Raises:
+        OSError: the draft cannot be flushed or renamed.
+    """
+    sync_file(draft)
+    draft.replace(path)
+    sync_folder(path.parent)
+
+
+def replace_text(path: Path, text: str) -> None:
+    """Write a text file; an existing file is replaced when the new one is complete.
+
+    Raises:
+        OSError: the file cannot be written; the existing one stays.
+    """
+    draft = path.with_suffix(".tmp")
+    try:
+        draft.write_text(text, encoding="utf-8")
+        replace_file(draft, path)
+    except OSError:
+        with contextlib.suppress(OSError):
+            draft.unlink()
+        raise
+
+
+def sync_file(path: Path) -> None:
+    """Flush a file's content to the disk."""
+    with path.open("r+b" if os.access(path, os.W_OK) else "rb") as handle:
+        os.fsync(handle.fileno())
+
+
+def sync_folder(path: Path) -> None:
+    """Flush the names in a folder to the disk; Windows does so by itself."""
+    if sys.platform == "win32":
+        return
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def sync_tree(folder: Path) -> None:
+    """Flush all files and folders below a folder, and itself, to the disk."""
+    for path in folder.rglob("*"):
+        if path.is_symlink():
+            continue
+        if path.is_dir():
+            sync_folder(path)
+        elif path.is_file():
+            sync_file(path)
+    sync_folder(folder)
+
+
+def storage_failure_of(folder: Path) -> StorageError | None:
+    """Return the failure that meets whoever writes a megabyte into a folder, or None."""
+    try:
+        with tempfile.TemporaryFile(dir=folder) as handle:
+            handle.write(bytes(_PROBE_BYTES))
+            handle.flush()
+            os.fsync(handle.fileno())
+    except OSError as error:
+        error.filename = str(folder)
+        return storage_error(error)
+    return None
+
+
+def remove(path: Path) -> None:
+    """Remove a folder, a file, or a symbolic link but not its target; a missing path is no error."""
+    if path.is_symlink() or path.is_file():
+        path.unlink()
+    elif path.exists():
+        shutil.rmtree(path)
