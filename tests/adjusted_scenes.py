@@ -9,8 +9,10 @@ import numpy as np
 
 from pipelines.geometry.bundle import Network
 from pipelines.geometry.sparse_model import SparseModel
-from tests.bundle_scenes import adjuster, readjusted
+from tests.bundle_scenes import adjuster, pixels, readjusted, size
 from tests.scenes import Layout, Noise, TrueScene, looking_at, make_scene, sparse_model
+
+_STEPS = 3
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,9 @@ def adjusted_model(of: Block, noise: Noise, rng: np.random.Generator) -> SparseM
     pixel_noise = rng.normal(0, noise.pixel_px, of.network.obs_xy_px.shape)
     drawn = replace(of.network, obs_xy_px=of.network.obs_xy_px + pixel_noise)
     adjusted = readjusted(drawn, of.solve @ pixel_noise.ravel())
+    for _ in range(_STEPS):  # of Gauss–Newton: a weak lens moves far enough for second-order terms to count
+        left = drawn.obs_xy_px - pixels(adjusted, np.zeros(size(adjusted)))
+        adjusted = readjusted(adjusted, of.solve @ left.ravel())
     exact, local_from_geo = sparse_model(of.scene, noise, rng), of.scene.geo_from_local.inverse()
     rotation = adjusted.cam_from_world @ of.scene.geo_from_local.rotation
     center = local_from_geo.apply(adjusted.cam_center_in_world)

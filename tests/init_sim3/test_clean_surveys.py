@@ -32,12 +32,12 @@ CASES = [
     Case(layout, images, fix_m, control)
     for layout, images, receivers in (
         ("orbit", 10, (RTK, CONSUMER)),
-        ("orbit", 16, (RTK, PPK)),
+        ("orbit", 12, (RTK, PPK)),
         ("grid", 12, (RTK, CONSUMER)),
     )
     for fix_m in receivers
     for control in (0, 3, 8)
-] + [Case("orbit", 24, CONSUMER, 0), Case("orbit", 24, RTK, 4)]
+] + [Case("orbit", 16, CONSUMER, 0), Case("orbit", 16, RTK, 4)]
 
 
 def test_statements_of_clean_surveys_are_true_and_blame_nobody() -> None:

@@ -163,7 +163,7 @@ FALSIFIED = {
     "15 % of the fixes 15 m off": Falsified(wrong(0.15, 15.0), codes=("no-control-points",)),
     "half of the fixes 15 m off": Falsified(wrong(0.5, 15.0), says=("scatter by", "no similarity")),
 }
-FLIGHTS = {"orbit": ("orbit", 16), "grid": ("grid", 12)}
+FLIGHTS = {"orbit": ("orbit", 12), "grid": ("grid", 12)}
 
 
 def falsified(kind: Falsified, of: Block, rng: np.random.Generator) -> Survey:
@@ -213,8 +213,15 @@ def outcome(
         return str(error), true
 
 
-@pytest.mark.parametrize("flight", FLIGHTS)
-@pytest.mark.parametrize("name", FALSIFIED)
+# Each kind on the orbit; those that the flight's shape matters for on the grid too.
+CASES = [(name, "orbit") for name in FALSIFIED] + [
+    (name, "grid")
+    for name, kind in FALSIFIED.items()
+    if kind.fixes not in (None, as_they_are) and name not in ("5 fixes, 1 m noise", "heights drift by 4 m")
+]
+
+
+@pytest.mark.parametrize(("name", "flight"), CASES)
 def test_no_confident_wrong_statement(name: str, flight: str) -> None:
     kind = FALSIFIED[name]
     result, true = outcome(kind, flight)
