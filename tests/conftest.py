@@ -18,7 +18,9 @@ from tests import fakes
 if TYPE_CHECKING:
     from tests.splat_scenes import RenderedFlight
 
-SEEDS = 3
+# Two: a third one hardly moves a mean. The squared errors of the similarity are 4.3 and 3.5 (the third 3.8), and
+# what the geographic losses gain in quality is 0.27 and 0.08 dB (the third 0.09 dB).
+SEEDS = 2
 
 # As the command line does, and for the same reason: see georef_cli/main.py.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")

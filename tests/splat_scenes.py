@@ -152,17 +152,22 @@ def write_rendered(root: Path, rendered: Rendered, initial: InitialSimilarity) -
 
 @dataclass(frozen=True)
 class RenderedFlight:
-    """Rendered survey and the folder of its photographs."""
+    """Rendered survey, the folder of its photographs and the cache of what is made from these."""
 
     rendered: Rendered
     root: Path
     seed: int
 
     def workspace(self, name: str) -> Workspace:
-        """Return a new workspace of that name, ready to train."""
+        """Return a new workspace of that name, ready to train.
+
+        Workspaces of one flight share their cache: depth maps would take half of the time of a short training.
+        """
         root = self.root / name
         root.mkdir()
-        (root / "photos").symlink_to(self.root / "photos")
+        for shared in ("photos", "cache"):
+            (self.root / shared).mkdir(exist_ok=True)
+            (root / shared).symlink_to(self.root / shared)
         pivot = self.rendered.scene.center_in_geo.mean(axis=0)
         initial = initial_similarity(np.random.default_rng(self.seed), START_COVARIANCE, pivot)
         return write_rendered(root, self.rendered, initial)

@@ -83,21 +83,25 @@ def sources() -> dict[str, ast.Module]:
     return found
 
 
-def imports(tree: ast.AST) -> Iterator[str]:
+@functools.cache
+def imports(module: str) -> tuple[str, ...]:
     """Full names of everything that a file imports; relative imports are not used here, and fail."""
-    for node in ast.walk(tree):
+    names: list[str] = []
+    for node in ast.walk(sources()[module]):
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
+            names += (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f"line {node.lineno}: relative import"
-            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+            assert node.level == 0, f"{module}:{node.lineno}: relative import"
+            names += (f"{node.module}.{alias.name}" for alias in node.names)
+    return tuple(names)
 
 
+@functools.cache
 def own_imports() -> list[tuple[str, str]]:
     """(importer, imported module) for all imports among our own files."""
     pairs = []
-    for module, tree in sources().items():
-        for name in imports(tree):
+    for module in sources():
+        for name in imports(module):
             if name.startswith(PACKAGES):
                 pairs.append((module, name if name in sources() else name.rpartition(".")[0]))
     return pairs
@@ -204,15 +208,15 @@ def test_a_planted_circle_is_found() -> None:
 
 @pytest.mark.parametrize("library", HOMES)
 def test_library_stays_at_home(library: str) -> None:
-    users = {module for module, tree in sources().items() for name in imports(tree) if inside(name, library)}
+    users = {module for module in sources() for name in imports(module) if inside(name, library)}
     strangers = [user for user in sorted(users) if not any(inside(user, home) for home in HOMES[library])]
     assert strangers == []
 
 
 def test_core_is_light() -> None:
-    for module, tree in sources().items():
+    for module in sources():
         if inside(module, "pipelines.core"):
-            libraries = {name.partition(".")[0] for name in imports(tree)}
+            libraries = {name.partition(".")[0] for name in imports(module)}
             assert libraries <= {*sys.stdlib_module_names, *CORE_LIBRARIES, "pipelines"}, module
 
 
@@ -246,9 +250,8 @@ def keyword(call: ast.Call, name: str) -> object:
 @pytest.mark.parametrize("module", sorted(sources()))
 def test_files_are_read_safely_and_talk_through_logs(module: str) -> None:
     """No code from data: no pickle, no eval. No print and no log handlers in the library."""
-    tree = sources()[module]
-    assert not {"pickle", "marshal", "shelve", "dill"} & {name.partition(".")[0] for name in imports(tree)}
-    for name, call in calls(tree):
+    assert not {"pickle", "marshal", "shelve", "dill"} & {name.partition(".")[0] for name in imports(module)}
+    for name, call in calls(sources()[module]):
         where = f"{module}:{call.lineno}"
         assert name not in ("eval", "exec", "os.system"), where
         assert keyword(call, "shell") is not True, where

@@ -54,10 +54,10 @@ def test_small_residuals_count_in_full_and_large_ones_less(weight) -> None:
 @pytest.mark.parametrize("dimension", DIMENSIONS)
 def test_factors_are_those_of_gaussian_residuals(dimension: int) -> None:
     """Both tables against their definitions, by quadrature over χ² with as many degrees of freedom."""
-    scale2 = CAUCHY_SCALE2[dimension]
+    scale2, density = CAUCHY_SCALE2[dimension], chi2(dimension).pdf
 
     def mean(of: Callable[[float], float]) -> float:
-        return quad(lambda x: of(x) * chi2(dimension).pdf(x), 0, 300, limit=200)[0]
+        return quad(lambda x: of(x) * density(x), 0, 300, limit=200)[0]
 
     def weight(x: float) -> float:
         return 1 / (1 + x / scale2)
