@@ -44,7 +44,7 @@ def test_statements_of_clean_surveys_are_true_and_blame_nobody() -> None:
     pooled, blamed = [], {}
     for seed, case in enumerate(CASES):
         of, rng = block(case.layout, case.images), np.random.default_rng(seed)
-        noise = Noise(fix_m=case.fix_m, pixel_px=0.4)
+        noise = Noise(fix_m=case.fix_m, pixel_px=0.2)
         model, survey = adjusted_model(of, noise, rng), survey_of(of.scene, noise, WITH_GCPS, rng)
         points = survey.control_points
         survey = survey.model_copy(

@@ -169,7 +169,7 @@ FLIGHTS = {"orbit": ("orbit", 12), "grid": ("grid", 12)}
 def falsified(kind: Falsified, of: Block, rng: np.random.Generator) -> Survey:
     """Return the survey of a block, falsified."""
     measured = replace(WITH_GCPS, attitudes=kind.attitudes)
-    survey = survey_of(of.scene, Noise(fix_m=kind.fix_m, pixel_px=0.4), measured, rng)
+    survey = survey_of(of.scene, Noise(fix_m=kind.fix_m, pixel_px=0.2), measured, rng)
     places = np.array([image.fix.position_in_geo for image in survey.images if image.fix is not None])
     changed = np.full_like(places, np.nan) if kind.fixes is None else kind.fixes(places, rng)
     images = tuple(
@@ -205,7 +205,7 @@ def outcome(
 ) -> tuple[Statement | str, np.ndarray]:
     """Return the statement, or the text of the refusal, and the true check points."""
     of, rng = block(*FLIGHTS[flight]), np.random.default_rng(len(kind.codes) + len(kind.says))
-    model = adjusted_model(of, Noise(pixel_px=0.4), rng)
+    model = adjusted_model(of, Noise(pixel_px=0.2), rng)
     true = of.scene.gcp_in_geo[CONTROL:]
     try:
         return state(falsified(kind, of, rng), model, options), true
