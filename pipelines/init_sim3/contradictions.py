@@ -129,7 +129,8 @@ def _upside_down(survey: Survey, model: SparseModel, geo_from_local: Similarity)
     sentence = "the cameras hang upside down in this solution: the positions contradict the SfM model"
     try:
         similarity, scatter = fit(fixes.in_local, mirrored(fixes.in_geo))
-        if not hangs_upside_down(model, similarity):
+        fits = scatter < max(_WRONG_SIGMA * _sigma_m(fixes.cov_in_geo), _WRONG_SCATTER_M)
+        if fits and not hangs_upside_down(model, similarity):
             sentence += (
                 f"; the mirrored track fits upright (scatter {scatter:.2f} m): east and north, or the axes of the "
                 "CRS, are exchanged"

@@ -20,6 +20,7 @@ from pipelines.robust.statistics import median_chi2
 
 FOOT_M = 0.3048
 _LEAST_FEET_M, _GEOID_M = 50.0, 110.0
+_FEET_PART = 0.05  # of a height, by which cameras are higher than control points
 # A hypothesis explains a contradiction if it lowers the scatter by so much.
 _EXPLAINS = 2.0
 _CLOCK_S, _CLOCK_STEP_S = 15.0, 0.25
@@ -213,7 +214,7 @@ def shift_sentence(shift_m: FloatArray, height_m: float) -> str:
     for sign in (-1.0, 1.0):
         other_m = height_m + sign * float(shift_m[2])
         for high, low, side in ((height_m, other_m, "control points"), (other_m, height_m, "fixes")):
-            if vertical > _LEAST_FEET_M and abs(high * FOOT_M - low) < 0.02 * abs(low):
+            if vertical > _LEAST_FEET_M and abs(high * FOOT_M - low) < _FEET_PART * abs(low):
                 return f"the heights of the {side} are in feet, and taken for metres"
     if horizontal < 0.2 * vertical and 5.0 < vertical < _GEOID_M:
         return (
