@@ -33,7 +33,7 @@ from pipelines.scene.observations import attitude_prior, fix_correspondences
 from pipelines.scene.survey import Survey
 from pipelines.scene.variance_factors import VarianceFactor
 
-# A stated σ that is too small by this factor, with a scatter of this many metres, is a contradiction.
+# A stated σ that is too small by this factor is a contradiction, if the scatter is so many metres or is explained.
 _WRONG_SIGMA, _WRONG_SCATTER_M = 10.0, 0.3
 _EVERYDAY_SHIFT_M = 5.0
 # A variance factor up to this, of σ that are half as large again, is applied without blame.
@@ -77,7 +77,10 @@ def judge(survey: Survey, model: SparseModel, joint: JointAdjustment) -> Verdict
     contradictions += upside_down
     if fixes is not None and not upside_down:
         of_fixes = _fixes_against_model(survey, model, fixes, joint)
-        (contradictions if of_fixes and _is_wrong(fixes) else cautions).extend(of_fixes)
+        scatter_m = _sigma_m(fix_correspondences(survey, model).cov_in_geo) * fixes.applied**0.5
+        explained = any(caution.code != "sigma-refuted" for caution in of_fixes)
+        is_wrong = _is_wrong(fixes) and (explained or scatter_m > _WRONG_SCATTER_M)
+        (contradictions if is_wrong else cautions).extend(of_fixes)
     control = _control_against_fixes(joint)
     contradictions += [caution for fatal, caution in control if fatal]
     cautions += [caution for fatal, caution in control if not fatal]
@@ -118,7 +121,7 @@ def _factor(joint: JointAdjustment, group: str) -> VarianceFactor | None:
 
 
 def _is_wrong(factor: VarianceFactor) -> bool:
-    """Return whether a group contradicts as a whole, rather than by an optimistic σ."""
+    """Return whether a stated σ is too small by so much that it is no optimism."""
     return factor.sigma_source == "stated" and factor.applied > _WRONG_SIGMA**2
 
 

@@ -14,6 +14,7 @@ import logging
 import os
 import random
 import resource
+import selectors
 import shutil
 import signal
 import sys
@@ -22,7 +23,6 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -67,44 +67,66 @@ def main() -> int:
     deadline = time.monotonic() + arguments.seconds
     first = time.time_ns() if arguments.first is None else arguments.first
     counts, done = Counter[str](), 0
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        while done < arguments.cases if arguments.cases else time.monotonic() < deadline:
-            size = min(BLOCK, arguments.cases - done) if arguments.cases else BLOCK
-            blocks = [
-                range(first + done, first + done + (min(size, arguments.slow) if READERS[name].slow else size))
-                for name in names
-            ]
-            for findings in pool.map(_block, names, blocks):
-                for finding in findings:
-                    counts[finding.reader] += 1
-                    print(json.dumps(vars(finding)), flush=True)
-            done += size
+    while done < arguments.cases if arguments.cases else time.monotonic() < deadline:
+        size = min(BLOCK, arguments.cases - done) if arguments.cases else BLOCK
+        blocks = [
+            (name, range(first + done, first + done + (min(size, arguments.slow) if READERS[name].slow else size)))
+            for name in names
+        ]
+        for finding in _findings(blocks):
+            counts[finding.reader] += 1
+            print(json.dumps(vars(finding)), flush=True)
+        done += size
     print(
         f"{done} cases of each of {len(names)} readers, {counts.total()} findings {dict(counts)}", file=sys.stderr
     )
     return 1 if counts else 0
 
 
-def _block(name: str, cases: range) -> list[Finding]:
-    """Run cases of a reader in child processes; a new one begins behind each case that ended the last."""
-    findings: list[Finding] = []
-    while cases:
-        done, problem = _child(name, cases)
-        if not problem:
-            break
-        findings.append(Finding(name, cases[done], _file(name, cases[done]), problem))
-        cases = cases[done + 1 :]
-    return findings
+def _findings(blocks: list[tuple[str, range]]) -> Iterator[Finding]:
+    """Run the cases of readers in child processes; a new one begins behind each case that ended the last.
+
+    This process has one thread, so that no child begins with a lock that another thread held.
+    """
+    waiting, running = list(reversed(blocks)), selectors.DefaultSelector()
+    while waiting or running.get_map():
+        while waiting and len(running.get_map()) < (os.cpu_count() or 1):
+            name, cases = waiting.pop()
+            child = _start(name, cases)
+            running.register(child.reading, selectors.EVENT_READ, child)
+        for key, _ in running.select():
+            child = key.data
+            data = os.read(child.reading, 65536)
+            child.output += data
+            if data:
+                continue
+            running.unregister(child.reading)
+            done, problem = _ended(child)
+            if problem:
+                case = child.cases[done]
+                yield Finding(child.name, case, _file(child.name, case), problem)
+                if child.cases[done + 1 :]:
+                    waiting.append((child.name, child.cases[done + 1 :]))
 
 
-def _child(name: str, cases: range) -> tuple[int, str]:
-    """Run cases until one is a finding; return its place among them and the problem, empty if there is none."""
+@dataclass
+class _Child:
+    name: str
+    cases: range
+    pid: int
+    reading: int
+    output: bytes = b""
+
+
+def _start(name: str, cases: range) -> _Child:
+    """Begin a child process that runs cases until one is a finding."""
     reading, writing = os.pipe()
     pid = os.fork()
     if pid == 0:
         os.close(reading)
         os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
         try:
+            signal.alarm(LIMIT_WAITING_S)  # also for the valid files
             _limit_memory()
             with _folder(name) as folder:
                 for case in cases:
@@ -115,13 +137,18 @@ def _child(name: str, cases: range) -> tuple[int, str]:
         finally:
             os._exit(0)
     os.close(writing)
-    with os.fdopen(reading, encoding="utf-8") as stream:
-        problems = [json.loads(line) for line in stream if line.endswith("\n")]
-    _, status = os.waitpid(pid, 0)
+    return _Child(name, cases, pid, reading)
+
+
+def _ended(child: _Child) -> tuple[int, str]:
+    """Return the place of a child's finding among its cases and the problem, empty if there is none."""
+    os.close(child.reading)
+    problems = [json.loads(line) for line in child.output.splitlines(keepends=True) if line.endswith(b"\n")]
+    _, status = os.waitpid(child.pid, 0)
     if problems and problems[-1]:
         return len(problems) - 1, problems[-1]
-    if len(problems) == len(cases):
-        return len(cases), ""
+    if len(problems) == len(child.cases):
+        return len(child.cases), ""
     code = os.waitstatus_to_exitcode(status)
     if -code in (signal.SIGALRM, signal.SIGPROF):
         return len(problems), f"hangs: {signal.Signals(-code).name}"

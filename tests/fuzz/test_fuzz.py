@@ -65,7 +65,7 @@ def defect(number):
     return Reader(prepare, read)
 for number in range(5):
     READERS["planted"] = defect(number)
-    print(fuzz._block("planted", range(1))[0].problem.partition(":")[0])
+    print(next(fuzz._findings([("planted", range(1))])).problem.partition(":")[0])
 """
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
