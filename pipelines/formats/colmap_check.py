@@ -22,6 +22,7 @@ _LONGEST_NAME = 4096
 # Parameters of COLMAP's camera models by number of the model, from SIMPLE_PINHOLE on.
 _CAMERA_PARAMS = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2)
 _INVALID_CAMERA = "has a camera model that is unknown"
+_INVALID_NAME = "has a name that is not UTF-8"
 
 
 class _CutOffError(ValueError):
@@ -49,6 +50,8 @@ def check_model_files(folder: Path) -> None:
         size = file_size(file)
         if suffix == ".bin":
             _check_binary(file, size, _RECORDS[name])
+        elif name == "images":
+            _check_text(file)
 
 
 def _check_binary(file: Path, size: int, record_end: Callable[[_Bytes, int], int]) -> None:
@@ -70,6 +73,15 @@ def _check_binary(file: Path, size: int, record_end: Callable[[_Bytes, int], int
                 raise InputError(f"record {number + 1} of {count} {error}: it is damaged", path=file) from error
         if at != size:
             raise InputError(f"has {size - at} bytes behind its {count} records: it is damaged", path=file)
+
+
+def _check_text(file: Path) -> None:
+    with file.open("rb") as stream:
+        for number, line in enumerate(stream, start=1):
+            try:
+                line.decode("utf-8")
+            except UnicodeDecodeError as error:
+                raise InputError(_INVALID_NAME, path=file, line=number) from error
 
 
 @dataclass(frozen=True)
@@ -102,6 +114,10 @@ def _image(record: _Bytes, at: int) -> int:
     name_end = record.data.find(b"\0", name_at, min(record.size, name_at + _LONGEST_NAME))
     if name_end < 0:
         raise _CutOffError
+    try:
+        record.data[name_at:name_end].decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise ValueError(_INVALID_NAME) from error
     return record.end(name_end + 9 + _OBSERVATION_BYTES * record.unsigned(name_end + 1, 8))
 
 

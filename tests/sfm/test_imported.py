@@ -55,6 +55,15 @@ def test_forged_inner_count_is_refused_before_reading(
     assert caught.value.path == tmp_path / name
 
 
+def test_image_name_that_is_not_utf_8_is_refused(surveyed: tuple[SparseModel, Survey], tmp_path: Path) -> None:
+    write_sparse(surveyed[0], tmp_path)
+    file = tmp_path / "images.bin"
+    file.write_bytes(file.read_bytes().replace(b"image_003", b"image\x85003"))
+    with pytest.raises(InputError, match=r"record 4 of 6 has a name that is not UTF-8") as caught:
+        load_reconstruction(tmp_path)
+    assert caught.value.path == file
+
+
 def test_unknown_camera_model_and_bytes_behind_the_records(
     surveyed: tuple[SparseModel, Survey], tmp_path: Path
 ) -> None:
