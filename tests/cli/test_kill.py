@@ -41,10 +41,10 @@ sys.addaudithook(kill_at)
 from georef_cli.main import main
 main()
 """
-# In the order of the pipeline; each run goes on from where the last was killed. Native code tells nobody where it
-# is: there the kill comes from outside, a moment after a file has appeared.
+# One moment of each kind in stages with native code, and some of the other stages, whose every change to the disk is
+# tried in tests/core and tests/faults. Each run goes on from where the last was killed. Native code tells nobody
+# where it is: there the kill comes from outside, a moment after a file has appeared.
 MOMENTS: tuple[tuple[str, float | None], ...] = (
-    ("os.rename {ws}/requests.tmp", None),
     ("open {ws}/ingest.partial/survey.json", None),
     ("os.rename {ws}/ingest.partial/manifest", None),
     ("sfm.partial/database.db", 0.1),  # features
@@ -52,13 +52,11 @@ MOMENTS: tuple[tuple[str, float | None], ...] = (
     ("sfm.partial/mapping", 0.02),  # mapping
     ("os.rename {ws}/sfm.partial", None),
     ("open {ws}/geolocate.partial/points.npz", None),
-    ("open {ws}/sim3.partial/geo_from_local.json", None),
     ("train.partial/metrics.jsonl", 0.0),  # iterations
     ("os.rename {ws}/train.partial/checkpoint.tmp", None),
     ("open {ws}/train.partial/model.json", None),
     ("open {ws}/evaluate.partial/report.json", None),
     ("open {ws}/export.partial/splat.ply.tmp", None),
-    ("os.rename {ws}/export.partial/manifest", None),
 )
 STOPS = (
     ("sfm.partial/database.db", signal.SIGTERM),

@@ -37,7 +37,7 @@ CASES = [
     )
     for fix_m in receivers
     for control in (0, 3, 8)
-] + [Case("orbit", 16, CONSUMER, 0), Case("orbit", 16, RTK, 4)]
+] + [Case("orbit", 12, CONSUMER, 0), Case("grid", 12, PPK, 4)]
 
 
 def test_statements_of_clean_surveys_are_true_and_blame_nobody() -> None:
