@@ -41,8 +41,8 @@ sys.addaudithook(kill_at)
 from georef_cli.main import main
 main()
 """
-# One moment of each kind in stages with native code, and some of the other stages, whose every change to the disk is
-# tried in tests/core and tests/faults. Each run goes on from where the last was killed. Native code tells nobody
+# One moment of each kind in stages with native code, and some of the other stages, whose every change to the disk
+# is tried in tests/core and tests/faults. Each run goes on from where the last was killed. Native code tells nobody
 # where it is: there the kill comes from outside, a moment after a file has appeared.
 MOMENTS: tuple[tuple[str, float | None], ...] = (
     ("open {ws}/ingest.partial/survey.json", None),
