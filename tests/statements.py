@@ -26,7 +26,6 @@ from pipelines.scene.solved_survey import solve_survey
 from pipelines.scene.survey import Survey
 from pipelines.scene.trained_model import TrainedCamera, TrainedLens
 from pipelines.scene.trained_survey import TrainedSurvey
-from pipelines.scene.variance_factors import applied_factors, with_variance_factors
 from tests.scenes import trained_model
 
 OPTIONS = GeographicOptions(rel_loss=False)
@@ -78,7 +77,7 @@ def state(survey: Survey, model: SparseModel, options: InitSim3Options | None = 
     """
     points = geolocate(survey, model, GeolocateOptions()).points
     initial, warnings = estimate_similarity(survey, model, points, options or InitSim3Options())
-    weighted = with_variance_factors(survey, applied_factors(initial.variance_factors))
+    weighted = initial.weighted(survey)
     scene = initial_scene(model, weighted, initial)
     problem = geo_problem(scene, weighted, initial, OPTIONS)
     minimise(problem)

@@ -41,6 +41,26 @@ def replace_text(path: Path, text: str) -> None:
         raise
 
 
+def replace_folder(draft: Path, folder: Path, aside: Path) -> None:
+    """Rename a complete and flushed draft to `folder`; an existing folder is moved to `aside` first.
+
+    If the draft cannot be renamed, the existing folder returns to its place.
+
+    Raises:
+        OSError: a folder cannot be renamed.
+    """
+    if folder.exists():
+        remove(aside)
+        folder.rename(aside)
+    try:
+        draft.rename(folder)
+    except OSError:
+        if aside.exists():
+            aside.rename(folder)
+        raise
+    sync_folder(folder.parent)
+
+
 def sync_file(path: Path) -> None:
     """Flush a file's content to the disk."""
     with path.open("r+b" if os.access(path, os.W_OK) else "rb") as handle:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from pipelines.core.cautions import Caution
-from pipelines.core.durable import remove, replace_file, replace_text, sync_folder, sync_tree
+from pipelines.core.durable import remove, replace_file, replace_folder, replace_text, sync_tree
 from pipelines.core.errors import InputError, MissingProductError
 from pipelines.core.files import file_size
 from pipelines.core.lock import WriteLock
@@ -185,16 +185,7 @@ class Workspace:
         final, old, partial = self.root / spec.folder, self._old(spec), self.partial(spec)
         _refuse_what_is_no_folder(final)
         (partial / TOKEN).unlink(missing_ok=True)
-        if final.exists():
-            remove(old)
-            final.rename(old)
-        try:
-            partial.rename(final)
-        except OSError:
-            if old.exists():
-                old.rename(final)
-            raise
-        sync_folder(self.root)
+        replace_folder(partial, final, old)
         remove(old)
 
     def begin(self, spec: StageSpec, token: str, resume: Resume) -> tuple[Path, bool]:

@@ -6,6 +6,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from pipelines.core.cautions import Caution
+from pipelines.core.sentences import listed
 from pipelines.core.types import FloatArray
 from pipelines.evaluate.error_propagation import ErrorPropagation, NoErrorPropagation
 from pipelines.evaluate.points_by_camera import points_by_camera
@@ -19,7 +20,6 @@ from pipelines.scene.trained_survey import TrainedSurvey
 _LEAST_POINTS = 3
 _RANGE = (0.005, 0.995)  # of χ²: 99 % of true predictions lie within
 _NEAR_M = 1.0
-_NAMES_SHOWN = 8
 _SINGULAR = 1e-12  # of the largest variance
 
 
@@ -83,7 +83,7 @@ def refutation(
     alone = ""
     if _LEAST_POINTS <= len(others) < len(names) and not refutation(others, error[good], cov[np.ix_(good, good)]):
         left_out = tuple(name for name in names if name in blunders)
-        alone = f"; without the blunders ({_listed(left_out)}) the errors agree with the prediction"
+        alone = f"; without the blunders ({listed(left_out)}) the errors agree with the prediction"
     return Caution(
         code="prediction-refuted",
         sentence=f"Check points refute the predicted accuracy: {figures}; the σ of prediction, marks and check "
@@ -106,7 +106,7 @@ def dependent_check_points(survey: Survey) -> tuple[Caution, ...]:
         return ()
     sentence = (
         f"{len(pairs)} of {len(survey.check_points)} check points may be the same feature as a control point, so "
-        f"that their errors say little of the accuracy: {_listed(tuple(pairs))}."
+        f"that their errors say little of the accuracy: {listed(tuple(pairs))}."
     )
     return (Caution(code="check-point-not-independent", sentence=sentence),)
 
@@ -137,7 +137,3 @@ def _squared_whitened(error: FloatArray, cov: FloatArray) -> tuple[float, int]:
     regular = variance > _SINGULAR * variance[-1]
     white = (axis.T @ error)[regular] / np.sqrt(variance[regular])
     return float(white @ white), int(regular.sum())
-
-
-def _listed(names: tuple[str, ...]) -> str:
-    return ", ".join(names[:_NAMES_SHOWN]) + (" …" if len(names) > _NAMES_SHOWN else "")

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
+from pipelines.core.sentences import listed
 from pipelines.core.workspace import Summary
 from pipelines.evaluate.asprs import LEAST_POINTS, few_points
 from pipelines.scene.report import CheckPointErrors, CheckPoints, EvaluationReport
-
-_NAMES_SHOWN = 8
 
 
 def summarise(report: EvaluationReport) -> Summary:
@@ -44,10 +43,9 @@ def _warnings(report: EvaluationReport) -> tuple[str, ...]:
         warnings.append(few_points(count))
     for way, errors in _by_way(report.checkpoints).items():
         if errors.blunders:
-            more = " …" if len(errors.blunders) > _NAMES_SHOWN else ""
             warnings.append(
                 f"by {way}, {len(errors.blunders)} of {errors.count} check points are off by more than three times "
-                f"the class that the others meet: {', '.join(errors.blunders[:_NAMES_SHOWN])}{more}"
+                f"the class that the others meet: {listed(errors.blunders)}"
             )
     crossed = report.cross_validation
     if crossed is not None and crossed.reason is not None:

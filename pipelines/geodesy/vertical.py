@@ -15,6 +15,8 @@ from pipelines.core.errors import InputError
 from pipelines.core.products import Product
 
 ELLIPSOIDAL = "ellipsoidal"
+MOST_GEOID_M = 110.0  # between the ellipsoid and any geoid
+FOOT_M = 0.3048  # international foot; the US survey foot differs by 2e-6
 _EPSG_OF = {"EGM84": 5798, "EGM96": 5773, "EGM2008": 3855}
 
 

@@ -16,6 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 from pipelines.core.errors import DegenerateGeometryError, InputError
+from pipelines.core.sentences import listed
 from pipelines.core.stages import SPARSE
 from pipelines.core.types import BoolArray, FloatArray
 from pipelines.core.workspace import StageRun, Summary
@@ -176,8 +177,8 @@ def _warnings(observed: _CameraObservations, source: str) -> list[str]:
     turned = observed.recorded.contradicting
     if turned:
         warnings.append(
-            f"{len(turned)} attitudes contradict the SfM model and are not used: {', '.join(sorted(turned)[:8])}"
-            f"{' …' if len(turned) > 8 else ''}. Were these photographs turned in an image viewer?"
+            f"{len(turned)} attitudes contradict the SfM model and are not used: {listed(sorted(turned))}. "
+            "Were these photographs turned in an image viewer?"
         )
     total, fixes, alignment = len(observed.model.image_name), observed.fixes, observed.alignment
     if len(fixes) < total:
@@ -188,8 +189,7 @@ def _warnings(observed: _CameraObservations, source: str) -> list[str]:
     if rejected:
         warnings.append(
             f"{len(rejected)} of {len(fixes)} fixes contradict the SfM model and give no rays: "
-            + ", ".join(sorted(rejected)[:8])
-            + (" …" if len(rejected) > 8 else "")
+            f"{listed(sorted(rejected))}"
         )
     prior = observed.prior
     if source == "recorded" and prior is not None and not alignment.attitude_used:

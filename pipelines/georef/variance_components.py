@@ -16,9 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipelines.core.types import BoolArray, FloatArray
-from pipelines.georef.normal_equations import posterior_weights
-from pipelines.georef.posterior import equations_of
-from pipelines.georef.problem import GeoProblem
+from pipelines.georef.normal_equations import NormalEquations, posterior_weights
 from pipelines.robust.statistics import chi2_probability_above, median_chi2, outlier_gate
 
 # Observations agree if so large a part of them is within the gate, and so many degrees of freedom check them.
@@ -80,9 +78,8 @@ def component_of(squared: FloatArray, free: FloatArray, dimension: int) -> Varia
     return VarianceComponent(used, agree, float(squared[used].sum()), float(free[used].sum()))
 
 
-def variance_components(problem: GeoProblem) -> dict[str, VarianceComponent]:
-    """Return the test of each kind of observation that measures, at the minimum of a problem."""
-    normal = equations_of(problem).normal
+def variance_components(normal: NormalEquations) -> dict[str, VarianceComponent]:
+    """Return the test of each kind of observation, from the normal equations at their minimum."""
     residuals = normal.residuals()
     weights = posterior_weights(residuals)
     components = {}

@@ -15,6 +15,7 @@ from pipelines.core.cautions import Caution
 from pipelines.core.errors import ContradictionError
 from pipelines.core.types import FloatArray
 from pipelines.geodesy.enu import ecef_from_enu_rotation, lla_from_ecef
+from pipelines.geodesy.vertical import FOOT_M, MOST_GEOID_M
 from pipelines.ingest.image_poses import ImagePoses
 from pipelines.ingest.notes import Notes
 from pipelines.ingest.options import IngestOptions
@@ -24,9 +25,6 @@ from pipelines.robust.statistics import mad_sigma
 
 _SIGMAS, _LEAST_M = 4.0, 1.0
 _MOST_CONTRADICTING = 1 / 3
-# Between the ellipsoid and any geoid lie at most 110 m.
-_GEOID_M = 110.0
-_FOOT_M = 0.3048
 # Another unit shows if heights differ by this many times what σ allow, and that unit leaves this part of a height.
 _EVIDENT, _UNIT_PART = 2.0, 0.05
 _KILOMETRES_M = 2_000.0
@@ -100,8 +98,8 @@ def _heights(
     if abs(offset) <= allowed:
         return []
     for factor, cause in (
-        (_FOOT_M, "in feet, and taken for metres"),
-        (1 / _FOOT_M, "in metres, and taken for feet"),
+        (FOOT_M, "in feet, and taken for metres"),
+        (1 / FOOT_M, "in metres, and taken for feet"),
     ):
         left = abs(float(np.median(heights_m[:, 0] * factor - heights_m[:, 1])))
         tolerance = max(_UNIT_PART * abs(float(np.median(heights_m[:, 1]))), allowed / _SIGMAS)
@@ -112,4 +110,4 @@ def _heights(
         f"the heights in {path.name} differ from those in EXIF by {offset:+.1f} m (± {spread:.1f} m): one is above "
         "the ellipsoid, the other above a geoid, the take-off or a barometer's zero; see --vertical"
     )
-    return [(abs(offset) > _GEOID_M, Caution(code="heights-apart", sentence=sentence))]
+    return [(abs(offset) > MOST_GEOID_M, Caution(code="heights-apart", sentence=sentence))]

@@ -14,6 +14,7 @@ import numpy as np
 
 from pipelines.core.cautions import Caution
 from pipelines.core.errors import DegenerateGeometryError
+from pipelines.core.sentences import listed
 from pipelines.core.types import FloatArray
 from pipelines.geometry.rotations import log_so3
 from pipelines.geometry.similarity import Similarity
@@ -31,8 +32,9 @@ from pipelines.init_sim3.plausibility import hangs_upside_down, looks_at_sky
 from pipelines.robust.statistics import outlier_gate
 from pipelines.scene.observations import attitude_prior, fix_correspondences
 from pipelines.scene.survey import Survey
-from pipelines.scene.variance_factors import VarianceFactor
+from pipelines.scene.variance_factors import Group, VarianceFactor
 
+_SIGMA_REFUTED = "sigma-refuted"
 # A stated σ that is too small by this factor is a contradiction, if the scatter is so many metres or is explained.
 _WRONG_SIGMA, _WRONG_SCATTER_M = 10.0, 0.3
 _EVERYDAY_SHIFT_M = 5.0
@@ -62,6 +64,14 @@ class Verdict:
         return self.contradictions + self.cautions
 
 
+@dataclass(frozen=True)
+class _Finding:
+    """Caution, and whether it is a contradiction that ends the stage."""
+
+    caution: Caution
+    ends: bool = False
+
+
 def judge(survey: Survey, model: SparseModel, joint: JointAdjustment) -> Verdict:
     """Return the contradictions and cautions of a joint adjustment.
 
@@ -70,26 +80,16 @@ def judge(survey: Survey, model: SparseModel, joint: JointAdjustment) -> Verdict
         model: SfM model.
         joint: its adjustment.
     """
-    contradictions: list[Caution] = []
-    cautions: list[Caution] = []
-    fixes = _factor(joint, "fixes")
-    upside_down = _upside_down(survey, model, joint.geo_from_local)
-    contradictions += upside_down
-    if fixes is not None and not upside_down:
-        of_fixes = _fixes_against_model(survey, model, fixes, joint)
-        scatter_m = _sigma_m(fix_correspondences(survey, model).cov_in_geo) * fixes.applied**0.5
-        explained = any(caution.code != "sigma-refuted" for caution in of_fixes)
-        is_wrong = _is_wrong(fixes) and (explained or scatter_m > _WRONG_SCATTER_M)
-        (contradictions if is_wrong else cautions).extend(of_fixes)
-    control = _control_against_fixes(joint)
-    contradictions += [caution for fatal, caution in control if fatal]
-    cautions += [caution for fatal, caution in control if not fatal]
-    if looks_at_sky(model, joint.geo_from_local) and not upside_down:
-        sentence = "most cameras look up at the sky: if that is not so, the positions are wrong"
-        cautions.append(Caution(code="looks-at-sky", sentence=sentence))
-    cautions += _attitudes(survey, model, joint)
-    cautions += [*_weak_checks(joint), *_guesses(joint)]
-    return Verdict(tuple(contradictions), tuple(cautions))
+    fixes = _Fixes(survey, model)
+    findings = _upside_down(fixes, joint.geo_from_local)
+    if not findings:
+        findings = [*_fixes_against_model(fixes, joint), *_view(model, joint.geo_from_local)]
+    findings += [*_shift_of_fixes(joint), *_control_points(joint)]
+    findings += [*_attitudes(survey, model, joint), *_weak_checks(joint), *_guesses(joint)]
+    return Verdict(
+        tuple(finding.caution for finding in findings if finding.ends),
+        tuple(finding.caution for finding in findings if not finding.ends),
+    )
 
 
 def unadjustable(survey: Survey, model: SparseModel, geo_from_local: Similarity | None) -> tuple[Caution, ...]:
@@ -100,23 +100,49 @@ def unadjustable(survey: Survey, model: SparseModel, geo_from_local: Similarity 
         model: SfM model.
         geo_from_local: alignment of the two; None: not even that.
     """
-    if geo_from_local is not None and (upside_down := _upside_down(survey, model, geo_from_local)):
-        return tuple(upside_down)
-    fixes = fix_correspondences(survey, model)
-    if len(fixes) < _LEAST_FIXES:
+    fixes = _Fixes(survey, model)
+    if geo_from_local is not None and (upside_down := _upside_down(fixes, geo_from_local)):
+        return tuple(finding.caution for finding in upside_down)
+    if len(fixes.positions) < _LEAST_FIXES:
         return ()
     try:
-        scatter, best = fit(fixes.in_local, fixes.in_geo)[1], _explanation(survey, model)
+        scatter, best = fit(fixes.positions.in_local, fixes.positions.in_geo)[1], fixes.explanation()
     except DegenerateGeometryError:
         return ()
-    if scatter < max(_WRONG_SIGMA * _sigma_m(fixes.cov_in_geo), _WRONG_SCATTER_M):
+    if scatter < fixes.tolerance_m:
         return ()
     cause = "are they those of these photographs?" if best is None else best.sentence
     sentence = f"the fixes scatter by {scatter:.2f} m an axis about the SfM model, and fix no similarity: {cause}"
-    return (Caution(code="sigma-refuted" if best is None else best.code, sentence=sentence),)
+    return (Caution(code=_SIGMA_REFUTED if best is None else best.code, sentence=sentence),)
 
 
-def _factor(joint: JointAdjustment, group: str) -> VarianceFactor | None:
+class _Fixes:
+    """Fixes of a survey as stated, against its SfM model."""
+
+    def __init__(self, survey: Survey, model: SparseModel) -> None:
+        self.survey, self.model = survey, model
+        self.positions = fix_correspondences(survey, model)
+
+    @property
+    def sigma_m(self) -> float:
+        """Typical σ per axis."""
+        return _sigma_m(self.positions.cov_in_geo)
+
+    @property
+    def tolerance_m(self) -> float:
+        """Scatter about the SfM model beyond which the fixes contradict it."""
+        return max(_WRONG_SIGMA * self.sigma_m, _WRONG_SCATTER_M)
+
+    def explanation(self) -> Hypothesis | None:
+        """Return the known mistake that explains why the fixes do not fit the SfM model, if one does."""
+        times = {image.name: image.timestamp_s for image in self.survey.images}
+        times_s = np.array([times[name] for name in self.positions.name], dtype=np.float64)
+        found = explanations_of_fixes(self.positions.in_local, self.positions.in_geo, times_s, self.survey.origin)
+        upright = (one for one in found if not hangs_upside_down(self.model, one.geo_from_local))
+        return next(upright, None)
+
+
+def _factor(joint: JointAdjustment, group: Group) -> VarianceFactor | None:
     return next((factor for factor in joint.factors if factor.group == group), None)
 
 
@@ -125,96 +151,94 @@ def _is_wrong(factor: VarianceFactor) -> bool:
     return factor.sigma_source == "stated" and factor.applied > _WRONG_SIGMA**2
 
 
-def _upside_down(survey: Survey, model: SparseModel, geo_from_local: Similarity) -> list[Caution]:
-    if not hangs_upside_down(model, geo_from_local):
+def _upside_down(fixes: _Fixes, geo_from_local: Similarity) -> list[_Finding]:
+    if not hangs_upside_down(fixes.model, geo_from_local):
         return []
-    fixes = fix_correspondences(survey, model)
     sentence = "the cameras hang upside down in this solution: the positions contradict the SfM model"
     try:
-        similarity, scatter = fit(fixes.in_local, mirrored(fixes.in_geo))
-        fits = scatter < max(_WRONG_SIGMA * _sigma_m(fixes.cov_in_geo), _WRONG_SCATTER_M)
-        if fits and not hangs_upside_down(model, similarity):
+        similarity, scatter = fit(fixes.positions.in_local, mirrored(fixes.positions.in_geo))
+        if scatter < fixes.tolerance_m and not hangs_upside_down(fixes.model, similarity):
             sentence += (
                 f"; the mirrored track fits upright (scatter {scatter:.2f} m): east and north, or the axes of the "
                 "CRS, are exchanged"
             )
     except DegenerateGeometryError:
         pass
-    return [Caution(code="upside-down", sentence=sentence)]
+    return [_Finding(Caution(code="upside-down", sentence=sentence), ends=True)]
 
 
-def _fixes_against_model(
-    survey: Survey, model: SparseModel, factor: VarianceFactor, joint: JointAdjustment
-) -> list[Caution]:
-    """Return the contradiction of fixes and SfM model, with the mistake that explains it."""
-    if factor.applied <= _QUIET_FACTOR:
+def _view(model: SparseModel, geo_from_local: Similarity) -> list[_Finding]:
+    if not looks_at_sky(model, geo_from_local):
         return []
+    sentence = "most cameras look up at the sky: if that is not so, the positions are wrong"
+    return [_Finding(Caution(code="looks-at-sky", sentence=sentence))]
+
+
+def _fixes_against_model(fixes: _Fixes, joint: JointAdjustment) -> list[_Finding]:
+    """Return the finding that the fixes do not fit the SfM model, with the mistake that explains it."""
+    factor = _factor(joint, "fixes")
+    if factor is None or factor.applied <= _QUIET_FACTOR:
+        return []
+    is_wrong = _is_wrong(factor)
     shift = _constant_shift(joint.residuals(FixTerm)[1])
     if shift is not None and joint.problem.control is not None:
-        return [_apart(-shift, _height_of_control(joint))]
-    correspondences = fix_correspondences(survey, model)
-    sigma = _sigma_m(correspondences.cov_in_geo)
-    rejected = factor.count - factor.used
-    sides = (
-        f"the fixes scatter by {sigma * factor.applied**0.5:.2f} m an axis about the SfM model, their σ is "
-        f"{sigma:.3g} m"
-    )
+        return [_Finding(_apart(-shift, _height_of_control(joint)), ends=is_wrong)]
+    scatter_m, rejected = fixes.sigma_m * factor.applied**0.5, factor.count - factor.used
+    sides = f"the fixes scatter by {scatter_m:.2f} m an axis about the SfM model, their σ is {fixes.sigma_m:.3g} m"
     if rejected:
         sides += f", and {rejected} of {factor.count} are outliers"
-    best = _explanation(survey, model)
+    best = fixes.explanation()
     if best is not None:
-        return [
-            Caution(
-                code=best.code, sentence=f"{sides}; with this they fit to {best.scatter_m:.2f} m: {best.sentence}"
-            )
-        ]
+        sentence = f"{sides}; with this they fit to {best.scatter_m:.2f} m: {best.sentence}"
+        return [_Finding(Caution(code=best.code, sentence=sentence), ends=is_wrong)]
     remedy = "σ is optimistic, or the fixes or the SfM model are bent; every σ of the result is widened"
-    return [Caution(code="sigma-refuted", sentence=f"{sides}: {remedy}")]
+    caution = Caution(code=_SIGMA_REFUTED, sentence=f"{sides}: {remedy}")
+    return [_Finding(caution, ends=is_wrong and scatter_m > _WRONG_SCATTER_M)]
 
 
-def _control_against_fixes(joint: JointAdjustment) -> list[tuple[bool, Caution]]:
-    """Return whether the control points contradict the fixes, as (ends the stage, caution)."""
-    problem = joint.problem
-    found: list[tuple[bool, Caution]] = []
-    bias, height_m = joint.bias, _height_of_control(joint)
-    within = bias is not None and _within_sigma(joint, np.array(bias.value))
-    if bias is not None and not within:
-        length = float(np.linalg.norm(bias.value))
-        values = _with_sigma(bias.value, bias.sigma)
-        sentence = (
-            f"all fixes are shifted by ({values}) m east, north, up against the control points, which decide the "
-            f"position. Either side may be wrong: {shift_sentence(np.array(bias.value), height_m)}"
-        )
-        found.append((length > _EVERYDAY_SHIFT_M, Caution(code="fixes-shifted", sentence=sentence)))
-    control, factor = problem.term(ControlTerm), _factor(joint, "control points")
-    if control is None or factor is None or (factor.applied <= 1.0 and factor.used == factor.count):
-        return found
-    residual = joint.residuals(ControlTerm)[1]
+def _shift_of_fixes(joint: JointAdjustment) -> list[_Finding]:
+    """Return the finding that all fixes are shifted against the control points, beyond the σ of one fix."""
+    bias = joint.bias
+    if bias is None or _within_sigma(joint, np.array(bias.value)):
+        return []
+    values = ", ".join(f"{value:+.3f} ± {sigma:.3f}" for value, sigma in zip(bias.value, bias.sigma, strict=True))
+    sentence = (
+        f"all fixes are shifted by ({values}) m east, north, up against the control points, which decide the "
+        f"position. Either side may be wrong: {shift_sentence(np.array(bias.value), _height_of_control(joint))}"
+    )
+    caution = Caution(code="fixes-shifted", sentence=sentence)
+    return [_Finding(caution, ends=float(np.linalg.norm(bias.value)) > _EVERYDAY_SHIFT_M)]
+
+
+def _control_points(joint: JointAdjustment) -> list[_Finding]:
+    """Return the finding that the control points contradict the fixes, or each other."""
+    names, residual, used = joint.residuals(ControlTerm)
+    factor = _factor(joint, "control points")
+    if factor is None or (factor.applied <= 1.0 and factor.used == factor.count):
+        return []
     shift = _constant_shift(residual)
-    rejected = [
-        f"{name} ({np.linalg.norm(miss):.2f} m)"
-        for name, miss, used in zip(control.point_id, residual, joint.components[control.kind].used, strict=True)
-        if not used
-    ]
-    scatter = float(np.sqrt((residual**2).mean()))
-    if shift is not None and problem.fixes is not None:
-        found.append((True, _apart(shift, height_m)))
-    elif factor.applied > _QUIET_FACTOR:
-        sigma = (
-            _sigma_m(np.array([point.cov_in_geo for point in joint.survey.control_points])) / factor.applied**0.5
-        )
+    if shift is not None and joint.problem.fixes is not None:
+        return [_Finding(_apart(shift, _height_of_control(joint)), ends=True)]
+    if factor.applied > _QUIET_FACTOR:
+        scatter_m = float(np.sqrt((residual**2).mean()))
+        weighted_m = _sigma_m(np.array([point.cov_in_geo for point in joint.survey.control_points]))
         who = "which nobody stated" if factor.sigma_source == "default" else "as stated"
         sentence = (
-            f"the control points miss by {scatter:.2f} m RMS an axis, their σ is {sigma:.3g} m, {who}: "
-            "coordinates, marks or the SfM model are wrong; every σ of the result is widened"
+            f"the control points miss by {scatter_m:.2f} m RMS an axis, their σ is "
+            f"{weighted_m / factor.applied**0.5:.3g} m, {who}: coordinates, marks or the SfM model are wrong; "
+            "every σ of the result is widened"
         )
-        found.append(
-            (_is_wrong(factor) and scatter > _WRONG_SCATTER_M, Caution(code="sigma-refuted", sentence=sentence))
-        )
-    elif rejected:
-        sentence = f"{len(rejected)} of {factor.count} control points are outliers: {', '.join(rejected[:8])}"
-        found.append((False, Caution(code="control-outliers", sentence=sentence)))
-    return found
+        caution = Caution(code=_SIGMA_REFUTED, sentence=sentence)
+        return [_Finding(caution, ends=_is_wrong(factor) and scatter_m > _WRONG_SCATTER_M)]
+    rejected = [
+        f"{name} ({np.linalg.norm(miss):.2f} m)"
+        for name, miss, is_used in zip(names, residual, used, strict=True)
+        if not is_used
+    ]
+    if not rejected:
+        return []
+    sentence = f"{len(rejected)} of {factor.count} control points are outliers: {listed(rejected)}"
+    return [_Finding(Caution(code="control-outliers", sentence=sentence))]
 
 
 def _constant_shift(residual: FloatArray) -> FloatArray | None:
@@ -233,23 +257,10 @@ def _apart(shift_m: FloatArray, height_m: float) -> Caution:
     return Caution(code="control-shifted", sentence=sentence)
 
 
-def _explanation(survey: Survey, model: SparseModel) -> Hypothesis | None:
-    """Return the known mistake that explains why the fixes do not fit the SfM model, if one does."""
-    fixes = fix_correspondences(survey, model)
-    times_s = _times(survey, fixes.name)
-    found = explanations_of_fixes(fixes.in_local, fixes.in_geo, times_s, survey.origin)
-    upright = [hypothesis for hypothesis in found if not hangs_upside_down(model, hypothesis.geo_from_local)]
-    return upright[0] if upright else None
-
-
 def _height_of_control(joint: JointAdjustment) -> float:
     """Return the median ellipsoidal height of the control points as stated, NaN without any."""
     heights = [point.position_in_geo[2] for point in joint.survey.control_points]
     return float(np.median(heights)) + joint.survey.origin.alt_m if heights else float("nan")
-
-
-def _with_sigma(values: tuple[float, ...], sigmas: tuple[float, ...]) -> str:
-    return ", ".join(f"{value:+.3f} ± {sigma:.3f}" for value, sigma in zip(values, sigmas, strict=True))
 
 
 def _within_sigma(joint: JointAdjustment, shift_m: FloatArray) -> bool:
@@ -261,7 +272,7 @@ def _within_sigma(joint: JointAdjustment, shift_m: FloatArray) -> bool:
     return bool(shift_m @ information @ shift_m <= outlier_gate(3))
 
 
-def _attitudes(survey: Survey, model: SparseModel, joint: JointAdjustment) -> list[Caution]:
+def _attitudes(survey: Survey, model: SparseModel, joint: JointAdjustment) -> list[_Finding]:
     prior = attitude_prior(survey, model)
     if prior is None:
         return []
@@ -274,19 +285,19 @@ def _attitudes(survey: Survey, model: SparseModel, joint: JointAdjustment) -> li
         f"the recorded attitudes are turned by {np.degrees(angle):.1f}° against this solution "
         f"(σ {np.degrees(sigma):.1f}°): compass, mount, or the positions (their times, their axes) are wrong"
     )
-    return [Caution(code="attitudes-contradict", sentence=sentence)]
+    return [_Finding(Caution(code="attitudes-contradict", sentence=sentence))]
 
 
-def _weak_checks(joint: JointAdjustment) -> list[Caution]:
-    """Return cautions of σ that little or nothing checks."""
+def _weak_checks(joint: JointAdjustment) -> list[_Finding]:
+    """Return findings of σ that little or nothing checks."""
     tested = [factor for factor in joint.factors if factor.group in ("fixes", "control points")]
-    redundancy, cautions = sum(factor.redundancy for factor in tested), []
+    redundancy, findings = sum(factor.redundancy for factor in tested), []
     if redundancy < 6.0:
         sentence = (
             f"only {redundancy:.0f} degrees of freedom check the σ of the positions: a wrong position can go "
             "unnoticed; add fixes or control points"
         )
-        cautions.append(Caution(code="hardly-checked", sentence=sentence))
+        findings.append(_Finding(Caution(code="hardly-checked", sentence=sentence)))
     fixes = joint.problem.term(FixTerm)
     if fixes is not None and not any(factor.group == "control points" for factor in tested):
         sigma = _sigma_m(np.array([image.fix.cov_in_geo for image in joint.survey.images if image.fix is not None]))
@@ -294,12 +305,12 @@ def _weak_checks(joint: JointAdjustment) -> list[Caution]:
             "no control point checks an error that all fixes share, of the base station or of a receiver without "
             f"corrections: σ count the fixes, of {sigma:.2g} m, as independent"
         )
-        cautions.append(Caution(code="no-control-points", sentence=sentence))
-    return cautions
+        findings.append(_Finding(Caution(code="no-control-points", sentence=sentence)))
+    return findings
 
 
-def _guesses(joint: JointAdjustment) -> list[Caution]:
-    """Return a caution of the σ that nobody stated, with the variance factors that stand in for them."""
+def _guesses(joint: JointAdjustment) -> list[_Finding]:
+    """Return a finding of the σ that nobody stated, with the variance factors that stand in for them."""
     guessed = [
         f"{factor.group} ({'not checked' if factor.estimated is None else f'factor {factor.estimated:.2g}'})"
         for factor in joint.factors
@@ -310,12 +321,7 @@ def _guesses(joint: JointAdjustment) -> list[Caution]:
     sentence = (
         f"nobody stated the σ of {', '.join(guessed)}: defaults stand in, and every σ of the result hangs on them"
     )
-    return [Caution(code="default-sigma", sentence=sentence)]
-
-
-def _times(survey: Survey, names: tuple[str, ...]) -> FloatArray:
-    times = {image.name: image.timestamp_s for image in survey.images}
-    return np.array([np.nan if times[name] is None else times[name] for name in names], dtype=np.float64)
+    return [_Finding(Caution(code="default-sigma", sentence=sentence))]
 
 
 def _sigma_m(covariances: FloatArray) -> float:

@@ -15,11 +15,11 @@ from scipy.interpolate import CubicSpline
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import FloatArray
 from pipelines.geodesy.enu import Origin, ecef_from_enu, ecef_from_lla, enu_from_ecef, lla_from_ecef
+from pipelines.geodesy.vertical import FOOT_M, MOST_GEOID_M
 from pipelines.geometry.similarity import Similarity, umeyama
 from pipelines.robust.statistics import median_chi2
 
-FOOT_M = 0.3048
-_LEAST_FEET_M, _GEOID_M = 50.0, 110.0
+_LEAST_FEET_M = 50.0
 _FEET_PART = 0.05  # of a height, by which cameras are higher than control points
 # A hypothesis explains a contradiction if it lowers the scatter by so much.
 _EXPLAINS = 2.0
@@ -135,23 +135,23 @@ def _drifts(position: FloatArray, center: FloatArray, time_s: FloatArray) -> Ite
     if since.max() <= 0:
         return
     part = since / since.max()
-    changed, slope = _without(position, center, part[:, None])
+    changed, slope = _without(position, center, part)
     yield (
         "drift",
-        f"the fixes drift by {_vector(slope[0])} m east, north, up from the first photograph to the last",
+        f"the fixes drift by {_vector(slope)} m east, north, up from the first photograph to the last",
         changed,
     )
     best: tuple[float, FloatArray, FloatArray, int] | None = None
     for first in range(_LEAST, len(order) - _LEAST + 1, max(1, len(order) // 24)):
         later = np.zeros(len(order))
         later[order[first:]] = 1.0
-        moved, step = _without(position, center, later[:, None])
+        moved, step = _without(position, center, later)
         try:
             scatter = fit(center, moved)[1]
         except DegenerateGeometryError:
             continue
         if best is None or scatter < best[0]:
-            best = (scatter, moved, step[0], first)
+            best = (scatter, moved, step, first)
     if best is not None:
         yield (
             "step",
@@ -162,13 +162,13 @@ def _drifts(position: FloatArray, center: FloatArray, time_s: FloatArray) -> Ite
 
 
 def _without(position: FloatArray, center: FloatArray, shape: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the fixes less an error that is proportional to columns of `shape` (n, k), and its values (k, 3)."""
-    changed, total = position, np.zeros((shape.shape[1], 3))
+    """Return the fixes less an error that is proportional to `shape` (n,), and the error (3,) of shape 1."""
+    changed, total = position, np.zeros(3)
+    design = np.column_stack([shape, np.ones(len(shape))])
     for _ in range(10):
         residual = changed - fit(center, changed)[0].apply(center)
-        design = np.concatenate([shape, np.ones((len(shape), 1))], axis=1)
-        step = np.linalg.lstsq(design, residual, rcond=None)[0][:-1]
-        total, changed = total + step, changed - shape @ step
+        step = np.linalg.lstsq(design, residual, rcond=None)[0][0]
+        total, changed = total + step, changed - shape[:, None] * step
         if np.abs(step).max() < 1e-3:
             break
     return changed, total
@@ -216,11 +216,11 @@ def shift_sentence(shift_m: FloatArray, height_m: float) -> str:
         for high, low, side in ((height_m, other_m, "control points"), (other_m, height_m, "fixes")):
             if vertical > _LEAST_FEET_M and abs(high * FOOT_M - low) < _FEET_PART * abs(low):
                 return f"the heights of the {side} are in feet, and taken for metres"
-    if horizontal < 0.2 * vertical and 5.0 < vertical < _GEOID_M:
+    if horizontal < 0.2 * vertical and 5.0 < vertical < MOST_GEOID_M:
         return (
             f"heights apart by {vertical:.1f} m: one above the ellipsoid, the other above a geoid or the take-off"
         )
-    if horizontal < 0.2 * vertical and vertical >= _GEOID_M:
+    if horizontal < 0.2 * vertical and vertical >= MOST_GEOID_M:
         return "heights above another zero: the take-off, or another unit"
     if horizontal > 100_000.0:
         return "another zone, or exchanged axes"

@@ -6,8 +6,7 @@ result and in its covariance, and the factors are those with which training and 
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,18 +27,22 @@ from pipelines.georef.variance_components import VarianceComponent, component_of
 from pipelines.scene.geographic import geo_problem
 from pipelines.scene.geographic_options import GeographicOptions
 from pipelines.scene.initial_similarity import InitialSimilarity
-from pipelines.scene.marks import RayErrors, intersect_marks, mark_rays
+from pipelines.scene.marks import RayErrors, intersect_marks, mark_angles, mark_rays
 from pipelines.scene.observations import recorded_rotations
 from pipelines.scene.scene import Scene, initial_scene
 from pipelines.scene.survey import Survey
-from pipelines.scene.variance_factors import Group, VarianceFactor, applied_factors, with_variance_factors
-
-log = logging.getLogger(__name__)
+from pipelines.scene.variance_factors import (
+    Group,
+    SigmaSource,
+    VarianceFactor,
+    applied_factors,
+    with_variance_factors,
+)
 
 _OPTIONS = GeographicOptions(rel_loss=False)
 _ROUNDS, _SETTLED = 8, 0.02  # of the factors, and their relative change at which they are final
 # Level of the test below which a σ is refuted: a stated one, and one that nobody stated.
-_LEVEL = {"stated": 0.001, "default": 0.01}
+_LEVEL: dict[SigmaSource, float] = {"stated": 0.001, "default": 0.01}
 _KIND: dict[Group, str] = {"fixes": FixTerm.kind, "control points": ControlTerm.kind}
 _EXACT = 1e-9
 
@@ -99,7 +102,7 @@ class JointAdjustment:
         return self.problem.errors.estimates(of_errors)[0]
 
 
-def adjust_jointly(survey: Survey, model: SparseModel, starts: Sequence[InitialSimilarity]) -> JointAdjustment:
+def adjust_jointly(survey: Survey, model: SparseModel, starts: Iterable[InitialSimilarity]) -> JointAdjustment:
     """Return the adjustment from the first start, or the likeliest of several where the first finds disagreement.
 
     Raises:
@@ -127,14 +130,15 @@ def _adjust(survey: Survey, model: SparseModel, start: InitialSimilarity) -> Joi
     fixed = {factor.group: factor for factor in (*_marks(survey, scene), *_attitudes(survey, model), *_ties(scene))}
     applied = applied_factors(tuple(fixed.values()))
     problem = _solved(scene, with_variance_factors(survey, applied), start)
-    cost = _cost(problem)
-    at_stated = components = variance_components(problem)
+    normal = equations_of(problem).normal
+    cost = normal.minimum().cost + BIAS_COST * problem.errors.flights
+    at_stated = components = variance_components(normal)
     for _ in range(_ROUNDS):
         before, applied = applied, applied | _next_factors(survey, components, applied)
         if all(abs(applied.get(group, 1.0) / before.get(group, 1.0) - 1) < _SETTLED for group in _KIND):
             break
         problem = _solved(scene, with_variance_factors(survey, applied), start)
-        components = variance_components(problem)
+        components = variance_components(equations_of(problem).normal)
     factors = [
         _factor(survey, group, components[kind], applied.get(group, 1.0))
         for group, kind in _KIND.items()
@@ -150,10 +154,6 @@ def _solved(scene: Scene, survey: Survey, start: InitialSimilarity) -> GeoProble
         raise DegenerateGeometryError("fewer than three positions of one kind take part in a joint adjustment")
     minimise(problem)
     return problem
-
-
-def _cost(problem: GeoProblem) -> float:
-    return equations_of(problem).normal.minimum().cost + BIAS_COST * problem.errors.flights
 
 
 def _next_factors(
@@ -174,7 +174,7 @@ def _next_factors(
     return factors
 
 
-def _source(survey: Survey, group: Group) -> str:
+def _source(survey: Survey, group: Group) -> SigmaSource:
     return "default" if group in survey.default_sigmas else "stated"
 
 
@@ -188,7 +188,7 @@ def _factor(survey: Survey, group: Group, component: VarianceComponent, applied:
         estimated=None if estimated is None else applied * estimated,
         probability=component.probability(applied),
         applied=applied,
-        sigma_source="default" if _source(survey, group) == "default" else "stated",
+        sigma_source=_source(survey, group),
     )
 
 
@@ -200,10 +200,8 @@ def _marks(survey: Survey, scene: Scene) -> list[VarianceFactor]:
         return []
     poses = scene.poses
     solved = intersect_marks(rays, poses.cam_from_model, poses.cam_center_in_model, RayErrors(_EXACT, _EXACT))
-    toward = solved.position_in_geo[rays.point] - poses.cam_center_in_model[rays.camera]
-    in_cam = np.einsum("kij,kj->ki", poses.cam_from_model[rays.camera], toward)
-    in_cam /= np.linalg.norm(in_cam, axis=1, keepdims=True)
-    squared = (np.linalg.norm(np.cross(in_cam, rays.bearing_in_cam), axis=1) / rays.sigma_rad) ** 2
+    angle = mark_angles(rays, solved.position_in_geo, poses.cam_from_model, poses.cam_center_in_model)
+    squared = (angle / rays.sigma_rad) ** 2
     free = 2.0 - 3.0 / rays.marks_of_point[rays.point]
     good = np.isfinite(squared)
     component = component_of(squared[good], free[good], 2)
@@ -216,7 +214,7 @@ def _attitudes(survey: Survey, model: SparseModel) -> list[VarianceFactor]:
     count = len(recorded.image)
     if count < 2:
         return []
-    geo_from_local = recorded.geo_from_cam @ model.rotation_cam_from_local[recorded.image]
+    geo_from_local = recorded.geo_from_local(model)
     mean = mean_rotation(geo_from_local, recorded.sigma_rad).rotation
     squared = (log_so3(geo_from_local @ mean.T) ** 2).sum(axis=1) / recorded.sigma_rad**2
     component = component_of(squared, np.full(count, 3.0 * (count - 1) / count), 3)
@@ -225,7 +223,7 @@ def _attitudes(survey: Survey, model: SparseModel) -> list[VarianceFactor]:
 
 
 def _independent(survey: Survey, group: Group, component: VarianceComponent) -> VarianceFactor:
-    """A test of errors that members do not share, whose σ is therefore lowered too if nobody stated it."""
+    """Return the test of errors that members do not share, whose σ is therefore lowered too if nobody stated it."""
     level = _LEVEL[_source(survey, group)]
     probability = component.probability()
     small = probability > 1 - level and _source(survey, group) == "default"

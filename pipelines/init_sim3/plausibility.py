@@ -14,15 +14,10 @@ _UPSIDE_DOWN = -0.2
 _AT_SKY = 0.3  # median up component of the view
 
 
-def uprightness(model: SparseModel, geo_from_local: Similarity) -> float:
-    """Return the median, over the cameras, of how far the image's top points up and the view down; 1 is upright."""
-    up_in_cam = _up_in_cam(model, geo_from_local)
-    return float(np.median(-up_in_cam[:, 1] - up_in_cam[:, 2]))
-
-
 def hangs_upside_down(model: SparseModel, geo_from_local: Similarity) -> bool:
     """Return whether most cameras hang upside down."""
-    return uprightness(model, geo_from_local) < _UPSIDE_DOWN
+    up_in_cam = _up_in_cam(model, geo_from_local)
+    return float(np.median(-up_in_cam[:, 1] - up_in_cam[:, 2])) < _UPSIDE_DOWN
 
 
 def looks_at_sky(model: SparseModel, geo_from_local: Similarity) -> bool:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from pipelines.core.cautions import NOT_CHECKED, Caution, union
 from pipelines.core.errors import ContradictionError, DegenerateGeometryError
+from pipelines.core.sentences import listed
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
-from pipelines.geometry.similarity import Similarity, umeyama
+from pipelines.geometry.similarity import Similarity, SimilarityRecord, umeyama
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.georef.adjustment import OUTLIER_GATE, AdjustedSimilarity, Correspondences, RotationPrior
 from pipelines.georef.alignment import Alignment, align
@@ -34,7 +35,6 @@ from pipelines.scene.observations import (
 from pipelines.scene.survey import Survey
 
 _GUESS_POINTS = 1000
-_NAMED = 8
 _LEVEL = 0.01  # of the test that refutes σ where no joint adjustment is possible
 
 
@@ -119,7 +119,7 @@ def _aligned_product(inputs: Inputs, data: Correspondences, alignment: Alignment
     inlier = solution.state.inlier
     agreeing = agreeing_points(inputs.model, inputs.points, similarity)
     return InitialSimilarity(
-        geo_from_local=similarity.to_record("local", "geo", covariance=solution.covariance, pivot=solution.pivot),
+        geo_from_local=_record_of(solution),
         method="robust",
         correspondences=counts_of(data.control, inputs.points.inlier),
         inliers=counts_of(data.control[inlier], agreeing),
@@ -143,18 +143,22 @@ def _attitude(prior: RotationPrior | None) -> AttitudeRecord | None:
     return AttitudeRecord(quat_xyzw=(x, y, z, w), cov_rad2=(first, second, third))
 
 
-def _starts(data: Correspondences, aligned: InitialSimilarity, seed: int) -> tuple[InitialSimilarity, ...]:
-    """Return the alignment, and those of the fixes and of the control points alone."""
-    starts = [aligned]
+def _starts(data: Correspondences, aligned: InitialSimilarity, seed: int) -> Iterator[InitialSimilarity]:
+    """Yield the alignment, then, if they are needed, those of the fixes and of the control points alone."""
+    yield aligned
     for members in (~data.control, data.control):
-        if 3 <= members.sum() < len(data):
-            with suppress(DegenerateGeometryError):
-                solution = align(data.part(members), np.random.default_rng(seed)).solution
-                record = solution.state.geo_from_local.to_record(
-                    "local", "geo", covariance=solution.covariance, pivot=solution.pivot
-                )
-                starts.append(aligned.model_copy(update={"geo_from_local": record, "layout": "volume"}))
-    return tuple(starts)
+        if not 3 <= members.sum() < len(data):
+            continue
+        try:
+            solution = align(data.part(members), np.random.default_rng(seed)).solution
+        except DegenerateGeometryError:
+            continue
+        yield aligned.model_copy(update={"geo_from_local": _record_of(solution), "layout": "volume"})
+
+
+def _record_of(solution: AdjustedSimilarity) -> SimilarityRecord:
+    similarity = solution.state.geo_from_local
+    return similarity.to_record("local", "geo", covariance=solution.covariance, pivot=solution.pivot)
 
 
 def _without_joint(
@@ -188,9 +192,8 @@ def _joint_product(
         residuals[kind], inliers[kind] = residual_stats(missed[used]), int(used.sum())
         bad = [(name, miss) for name, miss, good in zip(names, missed, used, strict=True) if not good]
         if bad:
-            listed = ", ".join(f"{name} ({np.linalg.norm(miss):.2f} m)" for name, miss in bad[:_NAMED])
-            more = " …" if len(bad) > _NAMED else ""
-            warnings.append(f"{len(bad)} of {len(names)} {group} are outliers: {listed}{more}")
+            sizes = [f"{name} ({np.linalg.norm(miss):.2f} m)" for name, miss in bad]
+            warnings.append(f"{len(bad)} of {len(names)} {group} are outliers: {listed(sizes)}")
         if kind == "gnss":
             outliers = tuple(name for name, _ in bad)
     record = similarity.to_record(

@@ -8,7 +8,8 @@ from pipelines.core.cautions import Caution
 from pipelines.core.products import Covariance3, Product, Rotation
 from pipelines.geometry.similarity import SimilarityRecord
 from pipelines.robust.statistics import ResidualStats
-from pipelines.scene.variance_factors import VarianceFactor
+from pipelines.scene.survey import Survey
+from pipelines.scene.variance_factors import VarianceFactor, applied_factors, with_variance_factors
 
 
 class AttitudeRecord(Product):
@@ -56,3 +57,7 @@ class InitialSimilarity(Product):
     attitude: AttitudeRecord | None = None
     variance_factors: tuple[VarianceFactor, ...] = ()
     cautions: tuple[Caution, ...] = ()
+
+    def weighted(self, survey: Survey) -> Survey:
+        """Return a survey with the applied variance factors in its covariances."""
+        return with_variance_factors(survey, applied_factors(self.variance_factors))

@@ -161,3 +161,21 @@ def intersect_marks(
         sigma_ray=np.hypot(rays.sigma_rad, errors.sigma_lens_rad),
     )
     return intersect_rays(Rays(rays.point, np.arange(count), rays.xy), views, len(rays.point_id))
+
+
+def mark_angles(
+    rays: MarkRays, position_in_frame: FloatArray, cam_from_frame: FloatArray, center_in_frame: FloatArray
+) -> FloatArray:
+    """Return the angles (K,) in radians between the marks and their points; NaN for a point without position.
+
+    Args:
+        rays: rays of the marks.
+        position_in_frame: (J, 3) points.
+        cam_from_frame: (n, 3, 3) rotations of all images.
+        center_in_frame: (n, 3) projection centres of all images.
+    """
+    arm = position_in_frame[rays.point] - center_in_frame[rays.camera]
+    in_cam = np.einsum("kij,kj->ki", cam_from_frame[rays.camera], arm)
+    across = np.linalg.norm(np.cross(rays.bearing_in_cam, in_cam), axis=1)
+    along = np.einsum("ki,ki->k", rays.bearing_in_cam, in_cam)
+    return np.asarray(np.arctan2(across, along))

@@ -6,18 +6,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipelines.core.sentences import listed
 from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.geometry.cameras import undistort
 from pipelines.geometry.rotations import log_so3, matrix_from_quat_xyzw
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.georef.adjustment import Correspondences, RotationPrior
 from pipelines.georef.alignment import mean_rotation
-from pipelines.scene.marks import MarkRays, RayErrors, intersect_marks, mark_rays
+from pipelines.scene.marks import MarkRays, RayErrors, intersect_marks, mark_angles, mark_rays
 from pipelines.scene.survey import Survey
 
 _CONTRADICTION_SIGMAS = 6.0
 _CONTRADICTION_RAD = np.radians(15.0)  # lower limit, because the σ of attitudes are often optimistic
-_NAMES_SHOWN = 8
 _WIDE_RAD = 1.0
 _TINY = 1e-9  # σ of exact values, where a covariance must be regular
 
@@ -37,6 +37,10 @@ class RecordedRotations:
     geo_from_cam: FloatArray
     sigma_rad: FloatArray
     contradicting: tuple[str, ...] = ()
+
+    def geo_from_local(self, model: SparseModel) -> FloatArray:
+        """Return the rotation geo ← local (k, 3, 3) that each attitude gives to a model."""
+        return np.asarray(self.geo_from_cam @ model.rotation_cam_from_local[self.image])
 
 
 @dataclass(frozen=True)
@@ -59,20 +63,16 @@ class UnusedControlPoint:
     @property
     def sentence(self) -> str:
         """Reason for people: images that are missing, or marks that do not meet."""
-        missing = f" ({_listed(self.unregistered)} not registered)" if self.unregistered else ""
+        missing = f" ({listed(self.unregistered)} not registered)" if self.unregistered else ""
         if len(self.registered) < 2:
             return f"control point {self.name}: marked in fewer than 2 registered images{missing}, not used"
         marks = sorted(zip(self.residual_px, self.registered, strict=True), reverse=True)
         rays = f"control point {self.name}: its {len(marks)} marks do not meet in one point"
         if not np.isfinite(self.residual_px).all():
-            return f"{rays}: their rays are parallel ({_listed(self.registered)}), not used; check the marks"
+            return f"{rays}: their rays are parallel ({listed(self.registered)}), not used; check the marks"
         rms = float(np.sqrt(np.mean(np.square(self.residual_px))))
-        worst = _listed(tuple(f"{image} {residual:.1f} px" for residual, image in marks))
+        worst = listed(tuple(f"{image} {residual:.1f} px" for residual, image in marks))
         return f"{rays}: up to {marks[0][0]:.1f} px off, RMS {rms:.1f} px ({worst}), not used; check the marks"
-
-
-def _listed(names: tuple[str, ...]) -> str:
-    return ", ".join(names[:_NAMES_SHOWN]) + (" …" if len(names) > _NAMES_SHOWN else "")
 
 
 def fix_correspondences(survey: Survey, model: SparseModel) -> Correspondences:
@@ -156,11 +156,8 @@ def _residuals_px(model: SparseModel, rays: MarkRays) -> FloatArray:
     wide = RayErrors(_TINY, _TINY, _WIDE_RAD)
     compromise = intersect_marks(rays, model.rotation_cam_from_local, model.cam_center_in_local, wide)
     position = np.where(np.isfinite(position), position, compromise.position_in_geo)
-    arm = position[rays.point] - model.cam_center_in_local[rays.camera]
-    in_cam = np.einsum("kij,kj->ki", model.rotation_cam_from_local[rays.camera], arm)
-    across = np.linalg.norm(np.cross(rays.bearing_in_cam, in_cam), axis=1)
-    along = np.einsum("ki,ki->k", rays.bearing_in_cam, in_cam)
-    return np.asarray(np.nan_to_num(np.arctan2(across, along) * rays.sigma_px / rays.sigma_rad, nan=np.inf))
+    angle = mark_angles(rays, position, model.rotation_cam_from_local, model.cam_center_in_local)
+    return np.asarray(np.nan_to_num(angle * rays.sigma_px / rays.sigma_rad, nan=np.inf))
 
 
 def _intersect_in_local(model: SparseModel, rays: MarkRays) -> tuple[FloatArray, FloatArray, BoolArray]:
@@ -208,8 +205,7 @@ def attitude_prior(survey: Survey, model: SparseModel) -> RotationPrior | None:
     recorded = recorded_rotations(survey, model)
     if len(recorded.image) == 0:
         return None
-    geo_from_local = recorded.geo_from_cam @ model.rotation_cam_from_local[recorded.image]
-    return mean_rotation(geo_from_local, recorded.sigma_rad)
+    return mean_rotation(recorded.geo_from_local(model), recorded.sigma_rad)
 
 
 def observation_rays(model: SparseModel) -> FloatArray:

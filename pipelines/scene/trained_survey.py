@@ -23,7 +23,6 @@ from pipelines.scene.photographs import ImageCache
 from pipelines.scene.pinholes import Pinholes
 from pipelines.scene.survey import Survey
 from pipelines.scene.trained_model import TrainedModel
-from pipelines.scene.variance_factors import Group, applied_factors, with_variance_factors
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.storage import read_gaussians
 
@@ -92,7 +91,7 @@ def load_trained(workspace: Workspace, similarity: Literal["trained", "initial"]
     rotation = matrix_from_quat_xyzw([camera.quat_xyzw for camera in model.cameras])
     translation = np.array([camera.translation for camera in model.cameras])
     return TrainedSurvey(
-        survey=with_variance_factors(load_survey(workspace), _applied(workspace)),
+        survey=_weighted_survey(workspace),
         sfm=sparse,
         model=model,
         poses=CameraPoses(rotation, -np.einsum("nji,nj->ni", rotation, translation)),
@@ -100,12 +99,13 @@ def load_trained(workspace: Workspace, similarity: Literal["trained", "initial"]
     )
 
 
-def _applied(workspace: Workspace) -> dict[Group, float]:
-    """Return the variance factors of `init-sim3`; none for a model that was put there by hand."""
+def _weighted_survey(workspace: Workspace) -> Survey:
+    """Return the survey with the variance factors of `init-sim3`; as stated for a model put there by hand."""
+    survey = load_survey(workspace)
     try:
-        return applied_factors(load_json(InitialSimilarity, workspace.path(SIM3)).variance_factors)
+        return load_json(InitialSimilarity, workspace.path(SIM3)).weighted(survey)
     except MissingProductError:
-        return {}
+        return survey
 
 
 def trained_pinholes(trained: TrainedSurvey, images: ImageCache) -> Pinholes:

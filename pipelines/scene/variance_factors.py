@@ -11,6 +11,7 @@ from pipelines.core.types import Matrix3
 from pipelines.scene.survey import Survey, SurveyedPoint, SurveyImage
 
 Group = Literal["fixes", "control points", "marks", "attitudes", "tie points"]
+SigmaSource = Literal["stated", "default"]
 
 
 class VarianceFactor(Product):
@@ -34,7 +35,7 @@ class VarianceFactor(Product):
     estimated: float | None
     probability: float
     applied: float
-    sigma_source: Literal["stated", "default"]
+    sigma_source: SigmaSource
 
 
 def applied_factors(factors: tuple[VarianceFactor, ...]) -> dict[Group, float]:

@@ -77,6 +77,7 @@ def _pixels(corners: ArrayLike) -> NDArray[np.int32]:
 
 
 def paint_meadows(painter: GroundPainter, rng: np.random.Generator) -> None:
+    """Paint patches of grass and earth of some metres, everywhere."""
     for _ in range(260):
         middle, size = rng.uniform(-REACH_M, REACH_M, 2), rng.uniform(1.5, 7)
         angles = np.sort(rng.uniform(0, 2 * np.pi, 9))
@@ -87,6 +88,7 @@ def paint_meadows(painter: GroundPainter, rng: np.random.Generator) -> None:
 
 
 def paint_streets(painter: GroundPainter, rng: np.random.Generator) -> None:
+    """Paint two square rings of streets and those that join them, with kerbs, wear and markings."""
     ends = [(OUTER_M + 3.5, -OUTER_M - 3.5)]
     for walk, color, kind in ((2.2, KERB, PAVING), (0.0, _TAR, ASPHALT)):
         for middle in (RING_M, OUTER_M):
@@ -127,6 +129,7 @@ def _paint_wear(painter: GroundPainter, rng: np.random.Generator) -> None:
 
 
 def paint_square(painter: GroundPainter, rng: np.random.Generator) -> None:
+    """Paint the paved square in the middle, with slabs of different tones."""
     half = SQUARE_M
     painter.box((-half, -half), (half, half), (0.40, 0.36, 0.30), PAVING)
     for x in np.arange(-half, half, 4.0):

@@ -18,7 +18,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from pipelines.core.durable import sync_folder, sync_tree
+from pipelines.core.durable import replace_folder, sync_tree
 from pipelines.core.errors import InputError
 from pipelines.core.products import save_json
 from pipelines.core.progress import SILENT, Progress
@@ -162,15 +162,7 @@ def _draft(directory: Path) -> Iterator[Path]:
     try:
         yield draft
         sync_tree(draft)
-        if directory.exists():
-            directory.rename(old)
-        try:
-            draft.rename(directory)
-        except OSError:
-            if old.exists():
-                old.rename(directory)
-            raise
-        sync_folder(directory.parent)
+        replace_folder(draft, directory, old)
     finally:
         for left in (draft, old):
             shutil.rmtree(left, ignore_errors=True)

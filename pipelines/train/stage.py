@@ -19,7 +19,6 @@ from pipelines.scene.geographic import geo_problem
 from pipelines.scene.geolocated import GeolocatedPoints
 from pipelines.scene.initial_similarity import InitialSimilarity
 from pipelines.scene.scene import initial_scene, photographs
-from pipelines.scene.variance_factors import applied_factors, with_variance_factors
 from pipelines.splat.memory import free_memory_bytes, require_memory
 from pipelines.splat.rasterizer.backends import device_of, rasterizer
 from pipelines.splat.storage import write_gaussians
@@ -46,7 +45,7 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     backend = rasterizer(options.backend)  # first, so that `--backend cuda` without a GPU fails at once
     workspace = stage.workspace
     initial = load_json(InitialSimilarity, workspace.path(SIM3))
-    survey = with_variance_factors(load_survey(workspace), applied_factors(initial.variance_factors))
+    survey = initial.weighted(load_survey(workspace))
     scene = initial_scene(read_sparse(workspace.path(SPARSE)), survey, initial)
     images = photographs(scene.sparse, survey, workspace, effort(options).max_image_size)
     require_memory(training_size(scene, images, options), free_memory_bytes(device_of(backend)))
