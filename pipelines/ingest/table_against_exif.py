@@ -45,7 +45,9 @@ def compare_with_exif(
     Raises:
         ContradictionError: most positions differ beyond the σ of both, and the options do not accept that.
     """
-    exif = poses_from_tags(photos, options, Notes())
+    # Stated σ are those of the table: a track with σ of centimetres says nothing about the receiver of the photographs.
+    own_sigma = options.model_copy(update={"sigma_h": None, "sigma_v": None})
+    exif = poses_from_tags(photos, own_sigma, Notes())
     both = np.flatnonzero(poses.located & exif.located)
     if not len(both):
         return

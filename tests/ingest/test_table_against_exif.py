@@ -61,6 +61,11 @@ def test_receivers_that_differ_by_metres_agree() -> None:
     assert compared(TRACK + noise).cautions == []
 
 
+def test_sigma_stated_for_the_table_is_not_that_of_exif() -> None:
+    noise = np.random.default_rng(0).normal(0, [2.5, 2.5, 5.0], TRACK.shape)
+    assert compared(TRACK + noise, IngestOptions(sigma_h=0.02, sigma_v=0.03)).cautions == []
+
+
 @pytest.mark.parametrize(
     ("positions", "says"),
     [
