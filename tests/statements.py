@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipelines.accuracy.prediction import AccuracyPrediction
 from pipelines.core.cautions import Caution
 from pipelines.evaluate.points_by_camera import points_by_camera
-from pipelines.evaluate.prediction import AccuracyPrediction
 from pipelines.geolocate.options import GeolocateOptions
 from pipelines.geolocate.stage import geolocate
 from pipelines.geometry.rotations import quat_xyzw_from_matrix

@@ -26,7 +26,14 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     ("pipelines.core",),
     ("pipelines.geodesy", "pipelines.geometry", "pipelines.robust"),
     ("pipelines.formats",),
-    ("pipelines.georef", "pipelines.plots", "pipelines.scene", "pipelines.splat", "pipelines.stereo"),
+    (
+        "pipelines.accuracy",
+        "pipelines.georef",
+        "pipelines.plots",
+        "pipelines.scene",
+        "pipelines.splat",
+        "pipelines.stereo",
+    ),
     (
         "pipelines.calibrate",
         "pipelines.compare",

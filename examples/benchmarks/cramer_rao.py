@@ -18,15 +18,15 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from pipelines.accuracy.intersection_jacobian import IntersectionJacobian
+from pipelines.accuracy.networks import control_rays
+from pipelines.accuracy.prediction import jacobian_of_points
 from pipelines.core.products import load_json
 from pipelines.core.stages import SIM3
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import Workspace
 from pipelines.evaluate.cramer_rao import cramer_rao_bound
-from pipelines.evaluate.intersection_jacobian import IntersectionJacobian
-from pipelines.evaluate.networks import control_rays
 from pipelines.evaluate.points_by_camera import points_by_camera
-from pipelines.evaluate.prediction import jacobian_of_points
 from pipelines.georef.adjustment import Correspondences
 from pipelines.georef.alignment import align
 from pipelines.georef.cameras import CameraCorrections

@@ -1,1 +1,1 @@
-"""Stage `evaluate`: figures of test views, errors of check points, predicted accuracy."""
+"""Stage `evaluate`: figures of test views, errors of check points."""

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import block_diag
 
+from pipelines.accuracy.error_propagation import ErrorPropagation, NoErrorPropagation
+from pipelines.accuracy.prediction import AccuracyPrediction
 from pipelines.core.cautions import Caution
 from pipelines.core.sentences import listed
 from pipelines.core.types import FloatArray
-from pipelines.evaluate.error_propagation import ErrorPropagation, NoErrorPropagation
 from pipelines.evaluate.points_by_camera import points_by_camera
-from pipelines.evaluate.prediction import AccuracyPrediction
 from pipelines.robust.statistics import chi2_quantile
 from pipelines.scene.marks import mark_rays
 from pipelines.scene.report import CheckPointErrors

@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from pipelines.accuracy.error_propagation import ErrorPropagation, NoErrorPropagation
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.progress import Progress
 from pipelines.core.types import FloatArray
 from pipelines.evaluate.cramer_rao import cramer_rao_bound
-from pipelines.evaluate.error_propagation import ErrorPropagation, NoErrorPropagation
 from pipelines.evaluate.point_report import (
     MeasuredPoints,
     check_point_errors,

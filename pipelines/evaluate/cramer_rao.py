@@ -19,9 +19,9 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import csr_matrix, hstack
 
+from pipelines.accuracy.networks import control_points, control_rays, in_geo, network_of_points
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import BoolArray, FloatArray, IntArray
-from pipelines.evaluate.networks import control_points, control_rays, in_geo, network_of_points
 from pipelines.geometry.bundle import (
     Network,
     has_positive_depth,

@@ -12,33 +12,29 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.core.cautions import union
-from pipelines.core.products import load_json
-from pipelines.core.progress import Progress
-from pipelines.core.stages import SIM3
-from pipelines.core.types import FloatArray
-from pipelines.core.workspace import StageRun, Summary
-from pipelines.evaluate.accuracy_map import AccuracyGrid, write_csv
-from pipelines.evaluate.cautions import cautions_of_prediction, dependent_check_points
-from pipelines.evaluate.check_points import cross_validate, fit_residuals, measure_check_points
-from pipelines.evaluate.coordinates import coordinates_in, target_crs
-from pipelines.evaluate.error_propagation import (
+from pipelines.accuracy.accuracy_grid import AccuracyGrid, write_csv
+from pipelines.accuracy.error_propagation import (
     ErrorPropagation,
     NoErrorPropagation,
     accuracy_summary,
     propagate_errors,
 )
+from pipelines.core.cautions import union
+from pipelines.core.progress import Progress
+from pipelines.core.types import FloatArray
+from pipelines.core.workspace import StageRun, Summary
+from pipelines.evaluate.cautions import cautions_of_prediction, dependent_check_points
+from pipelines.evaluate.check_points import cross_validate, fit_residuals, measure_check_points
+from pipelines.evaluate.coordinates import coordinates_in, target_crs
 from pipelines.evaluate.options import EvaluateOptions
 from pipelines.evaluate.photometric import SaveRender, compare_test_views, write_render
 from pipelines.evaluate.summary import summarise
 from pipelines.geodesy.crs import PointCrs
 from pipelines.geometry.similarity import SimilarityRecord
 from pipelines.plots.accuracy_map import MapPoints, SigmaRaster, write_accuracy_map
-from pipelines.scene.initial_similarity import InitialSimilarity
 from pipelines.scene.renderer import ModelRenderer
 from pipelines.scene.report import EvaluationReport, Photometric, SimilaritySigma, write_report
 from pipelines.scene.scene import photographs
-from pipelines.scene.solved_survey import geographic_options_of
 from pipelines.scene.survey import SurveyedPoint
 from pipelines.scene.trained_survey import TrainedSurvey, load_trained
 from pipelines.splat.rasterizer.backends import rasterizer
@@ -53,11 +49,10 @@ def run(stage: StageRun, options: EvaluateOptions) -> Summary:
     """
     trained = load_trained(stage.workspace, options.similarity)
     crs = None if options.crs is None else target_crs(options.crs, trained.survey)
-    initial = load_json(InitialSimilarity, stage.workspace.path(SIM3))
     images = photographs(trained.sfm, trained.survey, stage.workspace, trained.model.max_image_size)
     images.build(stage.progress)
     renderer = ModelRenderer(trained, images, rasterizer(options.backend))
-    propagation = propagate_errors(trained, initial, geographic_options_of(stage.workspace))
+    propagation = propagate_errors(stage.workspace, trained)
     renders = stage.out / "renders"
     renders.mkdir(parents=True, exist_ok=True)
     save_render = partial(write_render, renders)

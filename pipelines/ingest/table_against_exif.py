@@ -45,7 +45,7 @@ def compare_with_exif(
     Raises:
         ContradictionError: most positions differ beyond the σ of both, and the options do not accept that.
     """
-    # Stated σ are those of the table: a track with σ of centimetres says nothing about the receiver of the photographs.
+    # Stated σ are those of the table: a track good to centimetres says nothing about the photographs' receiver.
     own_sigma = options.model_copy(update={"sigma_h": None, "sigma_v": None})
     exif = poses_from_tags(photos, own_sigma, Notes())
     both = np.flatnonzero(poses.located & exif.located)

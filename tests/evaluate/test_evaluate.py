@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from pipelines.accuracy.prediction import AccuracyPrediction
 from pipelines.core.cautions import Caution
 from pipelines.core.errors import InputError
 from pipelines.core.products import load_json, save_json
@@ -17,7 +18,6 @@ from pipelines.core.runner import Outcome, run_stage
 from pipelines.core.stages import BY_NAME, MODEL, SIM3, SURVEY
 from pipelines.core.workspace import Workspace
 from pipelines.evaluate.asprs import few_points
-from pipelines.evaluate.prediction import AccuracyPrediction
 from pipelines.scene.initial_similarity import InitialSimilarity
 from pipelines.scene.solved_survey import geographic_options_of, solve_survey
 from pipelines.scene.survey import Mark, Survey

@@ -18,9 +18,9 @@ import pytest
 import torch
 from scipy.linalg import block_diag
 
+from pipelines.accuracy.intersection_jacobian import intersection_jacobian
 from pipelines.evaluate.cautions import refutation
 from pipelines.evaluate.cramer_rao import Anchors, CameraInformation
-from pipelines.evaluate.intersection_jacobian import intersection_jacobian
 from pipelines.geometry.bundle import Network, correction_basis
 from pipelines.geometry.lens import Lenses, bearings
 from pipelines.geometry.similarity import Similarity

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 from scipy.linalg import block_diag
 
+from pipelines.accuracy.intersection_jacobian import IntersectionJacobian, intersection_jacobian
+from pipelines.accuracy.networks import control_rays, mean_focal_px, network_of_points
 from pipelines.core.cautions import Caution
 from pipelines.core.types import FloatArray, IntArray
-from pipelines.evaluate.intersection_jacobian import IntersectionJacobian, intersection_jacobian
-from pipelines.evaluate.networks import control_rays, mean_focal_px, network_of_points
 from pipelines.georef.posterior import FreeLens, posterior
 from pipelines.scene.marks import MarkRays
 from pipelines.scene.solved_survey import SolvedSurvey

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipelines.evaluate.intersection_jacobian import intersection_jacobian
+from pipelines.accuracy.intersection_jacobian import intersection_jacobian
 from tests.bundle_scenes import exact_network, jacobian
 
 

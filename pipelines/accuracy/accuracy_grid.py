@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
+from pipelines.accuracy.prediction import AccuracyPrediction
 from pipelines.core.types import FloatArray, IntArray
-from pipelines.evaluate.prediction import AccuracyPrediction
 from pipelines.geodesy.enu import Origin, ecef_from_enu, lla_from_ecef
 from pipelines.scene.report import AccuracySummary
 from pipelines.scene.solved_survey import SolvedSurvey
@@ -19,6 +19,7 @@ _CELLS = 48  # along the longer side of the grid
 _LEAST_RAYS = 3  # of an SfM point that counts as a part of the scene
 _NEIGHBOURS = 3  # nearest SfM points, which give a cell its height and its cameras
 _FARTHEST_CELLS = 1.5  # distance from an SfM point beyond which there is no scene
+_NEAR = 0.1  # of a cell: a nearer cell's middle has no larger weight
 _RIM = 0.01  # fraction of the SfM points outside the grid on each side
 _CHUNK = 256
 _PLACE = ("east_m", "north_m", "up_m", "latitude_deg", "longitude_deg", "ellipsoidal_height_m")
@@ -61,6 +62,16 @@ class AccuracyGrid:
         raster = np.full((rows, columns), np.nan)
         raster[self.cell[:, 1], self.cell[:, 0]] = values
         return raster
+
+    def sigma_at(self, position_in_geo: FloatArray) -> FloatArray:
+        """Return σ (N, 3) east, north, up at points (N, 3) of the scene, in metres.
+
+        σ varies slowly over a scene: that of the nearest cells is weighted by inverse distance in plan.
+        """
+        near = min(_NEIGHBOURS, len(self.cell))
+        distance, cell = cKDTree(self.position_in_geo[:, :2]).query(position_in_geo[:, :2], k=[*range(1, near + 1)])
+        weight = 1.0 / np.maximum(distance, _NEAR * self.size_m)
+        return np.asarray(np.einsum("nk,nki->ni", weight / weight.sum(axis=1, keepdims=True), self.sigma_m[cell]))
 
     def summary(self) -> AccuracySummary:
         """Return least, median and largest σ."""

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from pipelines.accuracy.accuracy_grid import AccuracyGrid, accuracy_grid
+from pipelines.accuracy.prediction import AccuracyPrediction
 from pipelines.core.errors import DegenerateGeometryError
-from pipelines.evaluate.accuracy_map import AccuracyGrid, accuracy_grid
-from pipelines.evaluate.prediction import AccuracyPrediction
-from pipelines.scene.geographic_options import GeographicOptions
+from pipelines.core.products import load_json
+from pipelines.core.stages import SIM3
+from pipelines.core.workspace import Workspace
 from pipelines.scene.initial_similarity import InitialSimilarity
 from pipelines.scene.report import AccuracySummary
-from pipelines.scene.solved_survey import SolvedSurvey, solve_survey
+from pipelines.scene.solved_survey import SolvedSurvey, geographic_options_of, solve_survey
 from pipelines.scene.trained_survey import TrainedSurvey
 
 
@@ -36,21 +38,21 @@ class NoErrorPropagation:
     reason: str
 
 
-def propagate_errors(
-    trained: TrainedSurvey, initial: InitialSimilarity, options: GeographicOptions
-) -> ErrorPropagation | NoErrorPropagation:
-    """Return the covariances of a trained survey, or the reason why there are none.
+def propagate_errors(workspace: Workspace, trained: TrainedSurvey) -> ErrorPropagation | NoErrorPropagation:
+    """Return the covariances of the trained survey of a workspace, or the reason why there are none.
 
     Args:
+        workspace: has the initial similarity and the options of the training.
         trained: the trained survey.
-        initial: similarity at the start of the training.
-        options: options of the training.
 
     Raises:
-        InputError: a constant error is to be estimated, but its measurements were not recorded.
+        MissingProductError: init-sim3 has not been run.
+        InputError: a product is damaged, or a constant error is to be estimated whose measurements were not
+            recorded.
     """
+    initial = load_json(InitialSimilarity, workspace.path(SIM3))
     try:
-        solved = solve_survey(trained, initial, options)
+        solved = solve_survey(trained, initial, geographic_options_of(workspace))
         prediction = AccuracyPrediction(solved)
         return ErrorPropagation(solved, prediction, accuracy_grid(solved, prediction))
     except DegenerateGeometryError as error:
