@@ -2,37 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
+from georef_cli.deliverable import DeliverableCommand
 
-import click
-
-from georef_cli.delivery import check_target, deliver
-from georef_cli.output import print_outcome
-from georef_cli.stage import StageCommand
-from pipelines.core.stages import SPLAT
-
-
-class ExportCommand(StageCommand):
-    """Command of the stage, with `-o FILE`."""
-
-    def act(self, ctx: click.Context, **values: Any) -> None:
-        """Run the stage, copy its result to the user's file, and print it.
-
-        Raises:
-            InputError: the file exists already, or cannot be written.
-        """
-        workspace, output = values["workspace"], values["output"]
-        if output is not None:
-            check_target(output, overwrite=values["force"])
-        outcome = self.run(ctx, values)
-        if output is not None:
-            with workspace.lock("export-ply"):
-                deliver(workspace.path(SPLAT), output)
-        print_outcome(workspace, outcome, as_json=values["as_json"])
-
-
-command = ExportCommand(
+command = DeliverableCommand(
     "export-ply",
     """Write the splat as a PLY with its place on Earth.
 
@@ -42,14 +14,6 @@ command = ExportCommand(
     \b
     Examples:
       georef export-ply flight
-      georef export-ply flight -o splat.ply --min-opacity 0.02
+      georef export-ply flight --to splat.ply --min-opacity 0.02
     """,
-    extra=[
-        click.Option(
-            ["-o", "--output"],
-            type=click.Path(dir_okay=False, resolve_path=True, path_type=Path),
-            metavar="FILE",
-            help="Copy the PLY and its sidecar here; an existing file is replaced only with --force.",
-        )
-    ],
 )

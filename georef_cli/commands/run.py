@@ -12,7 +12,8 @@ from georef_cli.display import progress_for
 from georef_cli.output import print_outcomes
 from pipelines.core import runner
 from pipelines.core.errors import GeorefError
-from pipelines.core.stages import BY_NAME, PIPELINE, StageSpec, stage_slice
+from pipelines.core.options import listed_names
+from pipelines.core.stages import BY_NAME, DELIVERABLES, PIPELINE, StageSpec, stage_slice
 from pipelines.ingest.options import IngestOptions
 
 # Options of later stages that `run` offers too, with the stages that they are for. All other options are set in
@@ -29,11 +30,12 @@ LATER: dict[str, tuple[str, ...]] = {
     "backend": ("train", "evaluate"),
     "seed": ("sfm", "init-sim3", "train"),
 }
+_DELIVERABLE_NAMES = ", ".join(spec.name.removeprefix("export-") for spec in DELIVERABLES)
 OWNERS: dict[str, tuple[str, ...]] = {**dict.fromkeys(IngestOptions.model_fields, ("ingest",)), **LATER}
 
 
 def _run(ctx: click.Context, **values: Any) -> None:
-    stages = _stages(values["first"], values["last"])
+    stages = (*_stages(values["first"], values["last"]), *_deliverables(values["deliver"]))
     flags = _flags(ctx, stages)
     workspace = values["workspace"]
     outcomes = runner.run_pipeline(
@@ -52,6 +54,20 @@ def _stages(first: str | None, last: str | None) -> tuple[StageSpec, ...]:
         return stage_slice(first, last)
     except GeorefError as error:
         raise click.UsageError(str(error)) from error
+
+
+def _deliverables(text: str | None) -> tuple[StageSpec, ...]:
+    """Return the stages of the deliverables in a text, such as `raster,cloud` or `all`.
+
+    Raises:
+        click.UsageError: an unknown name.
+    """
+    by_name = {spec.name.removeprefix("export-"): spec for spec in DELIVERABLES}
+    try:
+        names = () if text is None else listed_names(text, (*by_name, "all"))
+    except ValueError as error:
+        raise click.UsageError(f"--deliver: {error}") from error
+    return DELIVERABLES if "all" in names else tuple(spec for name, spec in by_name.items() if name in names)
 
 
 def _flags(ctx: click.Context, stages: tuple[StageSpec, ...]) -> dict[str, dict[str, Any]]:
@@ -85,6 +101,12 @@ command = click.Command(
         _slice_option("--from", "first", "First stage to run."),
         _slice_option("--to", "last", "Last stage to run."),
         *(options.stage_option(BY_NAME[owners[0]].options, name) for name, owners in OWNERS.items()),
+        click.Option(
+            ["--deliver"],
+            metavar="NAMES",
+            help=f"Make these as well: {_DELIVERABLE_NAMES}, with commas, or all. Their options are set in "
+            "georef.toml or with their own commands.",
+        ),
         options.force_option("Run the stages even if their products are current."),
         options.json_option(),
     ],

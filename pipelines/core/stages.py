@@ -183,6 +183,9 @@ PIPELINE: tuple[StageSpec, ...] = (
     ),
 )
 
+# What a survey hands over besides the PLY: each is made on request, and none is read by another stage.
+DELIVERABLES: tuple[StageSpec, ...] = ()
+
 # No part of the pipeline: `georef compare` runs this stage for the baseline, whose later stages read its folder in
 # place of those of sfm and init-sim3.
 ADJUST = StageSpec(
@@ -196,8 +199,8 @@ ADJUST = StageSpec(
     also=("adjust/geo_from_local.json",),
 )
 
-STAGES = (*PIPELINE, ADJUST)
-BY_NAME = {spec.name: spec for spec in PIPELINE}
+STAGES = (*PIPELINE, *DELIVERABLES, ADJUST)
+BY_NAME = {spec.name: spec for spec in (*PIPELINE, *DELIVERABLES)}
 
 
 def producer_of(path: str) -> StageSpec:

@@ -12,7 +12,7 @@ from pipelines.core.errors import InputError, MissingProductError
 from pipelines.core.fingerprints import fingerprints
 from pipelines.core.manifest import Manifest, Memo
 from pipelines.core.options import StageOptions, load_toml, resolve
-from pipelines.core.stages import BY_NAME, PIPELINE, StageSpec, producer_of, products_of
+from pipelines.core.stages import BY_NAME, DELIVERABLES, PIPELINE, StageSpec, producer_of, products_of
 from pipelines.core.validators import require_text
 from pipelines.core.workspace import Workspace
 
@@ -92,7 +92,7 @@ def why_damaged(files: list[str]) -> str:
 
 
 def status(workspace: Workspace, memo: Memo | None = None, before: StageSpec | None = None) -> list[StageState]:
-    """Return the state of every stage, in order.
+    """Return the state of every stage of the pipeline, in order, and of the deliverables that there are.
 
     Args:
         workspace: an existing workspace.
@@ -106,7 +106,8 @@ def status(workspace: Workspace, memo: Memo | None = None, before: StageSpec | N
     look = _Look(workspace, {} if memo is None else memo, workspace.requests())
     writer = workspace.writer()
     rows = []
-    for spec in _ahead_of(before):
+    made = [spec for spec in DELIVERABLES if before is None and _has_begun(workspace, spec)]
+    for spec in (*_ahead_of(before), *made):
         row = look.at(spec)
         rows.append(replace(row, state="running", reason="") if spec.name == writer else row)
     return rows
@@ -123,7 +124,7 @@ def cautions_by_stage(workspace: Workspace, before: StageSpec | None = None) -> 
     """
     by_stage: dict[str, tuple[Caution, ...]] = {}
     known: set[Caution] = set()
-    for spec in _ahead_of(before):
+    for spec in (*_ahead_of(before), *(DELIVERABLES if before is None else ())):
         try:
             manifest = workspace.manifest(spec)
         except InputError:
@@ -137,6 +138,10 @@ def cautions_by_stage(workspace: Workspace, before: StageSpec | None = None) -> 
 
 def _ahead_of(before: StageSpec | None) -> tuple[StageSpec, ...]:
     return PIPELINE[: PIPELINE.index(before) if before in PIPELINE else len(PIPELINE)]
+
+
+def _has_begun(workspace: Workspace, spec: StageSpec) -> bool:
+    return (workspace.root / spec.folder).exists() or workspace.partial(spec).exists()
 
 
 def must_exist(workspace: Workspace) -> None:

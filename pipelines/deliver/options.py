@@ -5,9 +5,29 @@ from __future__ import annotations
 from pydantic import Field
 
 from pipelines.core.options import StageOptions
+from pipelines.geodesy.vertical import Vertical
 
 
-class ExportPlyOptions(StageOptions):
-    """Options of the export of the splat as a 3DGS PLY with its sidecar."""
+class SplatOptions(StageOptions):
+    """Options of every file that holds the Gaussians."""
 
     min_opacity: float = Field(0.005, ge=0, lt=1, description="Leave out Gaussians that are less opaque.")
+
+
+class ExportPlyOptions(SplatOptions):
+    """Options of the export of the splat as a 3DGS PLY with its sidecar."""
+
+
+class CrsOptions(StageOptions):
+    """Options of every file whose coordinates are in a CRS."""
+
+    crs: str | None = Field(
+        None,
+        description="CRS of the file: EPSG:32632, EPSG:32632+3855, a PROJ string or WKT. Without it: the UTM zone "
+        "of the scene.",
+    )
+    vertical: Vertical | None = Field(
+        None,
+        description="Datum of the heights where --crs is silent: ellipsoidal, EGM96, EGM2008 or EPSG:n. Without "
+        "it: that of the survey.",
+    )

@@ -88,6 +88,52 @@ class GeorefSidecar(_CamelCase):
         return covariance_at(point_in_file, self.covariance, np.zeros(3))
 
 
+class SceneSigma(Product):
+    """Predicted standard deviations in metres over a file's points or cells: medians, and the largest.
+
+    `counts` says which errors they hold.
+    """
+
+    kind: Literal["predicted"] = "predicted"
+    counts: str
+    median_sigma_h_m: float
+    median_sigma_v_m: float
+    largest_sigma_h_m: float
+    largest_sigma_v_m: float
+
+
+class CrsSidecar(_CamelCase):
+    """Sidecar of a file whose coordinates are in a CRS; names in the file are in camelCase.
+
+    Attributes:
+        crs: as the user named it, or the default.
+        crs_wkt: WKT2:2019; without a vertical part, `vertical_datum` says what the heights count from.
+        vertical_datum: of the heights in the file.
+        units: of the three coordinates, easting or longitude first.
+        epoch: year of the coordinates in a dynamic datum; None: not stated.
+        operation: published operation from WGS84.
+        operation_accuracy_m: its accuracy; None: not known.
+        bounds: least and largest of each coordinate.
+        accuracy: predicted σ; None: not known, or nothing checks it.
+        assumed: what the user did not state.
+        cautions: limits of the place and its accuracy.
+    """
+
+    format: Literal["georefgs"] = "georefgs"
+    version: Literal[1] = 1
+    crs: str
+    crs_wkt: str
+    vertical_datum: VerticalDatum
+    units: tuple[str, str, str]
+    epoch: float | None = None
+    operation: str
+    operation_accuracy_m: float | None
+    bounds: tuple[Vector3, Vector3]
+    accuracy: SceneSigma | None
+    assumed: tuple[str, ...] = ()
+    cautions: tuple[Caution, ...] = ()
+
+
 def predicted_accuracy(covariance: ArrayLike, point_in_file: ArrayLike) -> PredictedAccuracy:
     """Return the accuracy that the sidecar's covariance (7, 7) predicts at a point (3,) of the file's frame."""
     at = np.asarray(point_in_file, dtype=np.float64)
@@ -109,7 +155,7 @@ def sidecar_path(artefact: Path) -> Path:
     return artefact.with_name(artefact.name + SUFFIX)
 
 
-def write_sidecar(sidecar: GeorefSidecar, artefact: Path) -> None:
+def write_sidecar(sidecar: GeorefSidecar | CrsSidecar, artefact: Path) -> None:
     """Write the sidecar beside its file; the sidecar appears whole or not at all."""
     path = sidecar_path(artefact)
     draft = path.with_name(path.name + ".tmp")

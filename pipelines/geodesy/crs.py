@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -51,11 +51,17 @@ class PointCrs:
     _crs: CRS = field(repr=False)
     _height_unit_m: float = field(repr=False)
     _three_dimensional: bool = field(repr=False)
+    _chosen: tuple[Transformer, Operation] | None = field(default=None, repr=False, compare=False)
 
     @property
     def is_geographic(self) -> bool:
         """Whether the horizontal coordinates are angles."""
         return horizontal_of(self._crs).is_geographic
+
+    @property
+    def is_geocentric(self) -> bool:
+        """Whether the coordinates are Earth-centred, without a map plane and heights."""
+        return bool(self._crs.is_geocentric)
 
     @property
     def units(self) -> tuple[str, str, str]:
@@ -89,7 +95,7 @@ class PointCrs:
         height = points[:, 2] * (1.0 if self._three_dimensional else self._height_unit_m)
         with proj_errors(self.name, path):
             lon, lat = rough_lon_lat(self._crs, listed)
-            transformer, _ = best_operation(self._request(path), lon, lat)
+            transformer, _ = self._operation(lon, lat, path)
             x, y, z = transformer.transform(points[:, 0], points[:, 1], height)
         lla = np.stack([y, x, z if self._three_dimensional else height], axis=-1)
         lla[:, 1] -= 360.0 * np.round(lla[:, 1] / 360.0)
@@ -109,7 +115,7 @@ class PointCrs:
         listed.require(np.isfinite(points).all(axis=1), "not a number")
         with proj_errors(self.name):
             check_area(self._crs, points[:, 1], points[:, 0], listed)
-            transformer, _ = best_operation(self._request(), points[:, 1], points[:, 0])
+            transformer, _ = self._operation(points[:, 1], points[:, 0])
             x, y, z = _inverse(transformer, points[:, 1], points[:, 0], points[:, 2])
         if not self._three_dimensional:
             # PROJ's flat datum shifts take a height for one above their own ellipsoid, on the way there and on the
@@ -130,10 +136,27 @@ class PointCrs:
             InputError: as `lla_from_xyz`.
         """
         points = np.asarray(lla, dtype=np.float64).reshape(-1, 3)
-        return best_operation(self._request(), points[:, 1], points[:, 0])[1]
+        return self._operation(points[:, 1], points[:, 0])[1]
 
-    def _request(self, path: Path | str | None = None) -> OperationRequest:
-        return OperationRequest(self._crs, self.name, self._three_dimensional, path)
+    def serving(self, lla: ArrayLike) -> PointCrs:
+        """Return the same CRS with the operation that serves points `lla` (N, 3), for every later call.
+
+        Points that are transformed in several calls have no step between them then.
+
+        Raises:
+            InputError: as `xyz_from_lla`.
+        """
+        self.xyz_from_lla(lla)
+        points = np.asarray(lla, dtype=np.float64).reshape(-1, 3)
+        return replace(self, _chosen=self._operation(points[:, 1], points[:, 0]))
+
+    def _operation(
+        self, lon: FloatArray, lat: FloatArray, path: Path | str | None = None
+    ) -> tuple[Transformer, Operation]:
+        if self._chosen is not None:
+            return self._chosen
+        request = OperationRequest(self._crs, self.name, self._three_dimensional, path)
+        return best_operation(request, lon, lat)
 
 
 def _inverse(

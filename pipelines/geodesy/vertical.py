@@ -10,8 +10,10 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from pipelines.core.errors import InputError
+from pipelines.core.options import WRITTEN, from_text
 from pipelines.core.products import Product
 
 ELLIPSOIDAL = "ellipsoidal"
@@ -87,6 +89,10 @@ def missing_grid_error(
         f"{instead}",
         path=path,
     )
+
+
+# Datum of heights as an option.
+Vertical = Annotated[VerticalChoice, from_text(parse_vertical), WRITTEN]
 
 
 class VerticalDatum(Product):

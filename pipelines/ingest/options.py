@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field
 
 from pipelines.core.options import WRITTEN, InputPath, PlaceOnEarth, StageOptions, Triple, from_text
-from pipelines.geodesy.vertical import VerticalChoice, parse_vertical
+from pipelines.geodesy.vertical import Vertical
 from pipelines.scene.rig import RigParameter, RigParameters, in_usual_order
 
 
@@ -41,7 +41,6 @@ def _sensible(offset: float | Literal["auto"]) -> float | Literal["auto"]:
     return offset
 
 
-Vertical = Annotated[VerticalChoice, from_text(parse_vertical), WRITTEN]
 FrameDistance = Annotated[Every, from_text(_every), WRITTEN]
 TimeOffset = Annotated[float | Literal["auto"], from_text(_seconds), AfterValidator(_sensible), WRITTEN]
 

@@ -186,6 +186,13 @@ class TestExport:
         assert georef("export-ply", done, "-o", target, "--force").code == 0
         assert target.read_text() == "ply"
 
+    def test_a_name_of_another_format_is_refused(self, georef: Georef, done: Path, tmp_path: Path) -> None:
+        target = tmp_path / "site.spz"
+        result = georef("export-ply", done, "--to", target)
+        expected = f"error: {target}: export-ply writes .ply, not a .spz file: end the name with .ply\n"
+        assert (result.code, result.err) == (1, expected)
+        assert not target.exists()
+
     def test_missing_folder(self, georef: Georef, done: Path, tmp_path: Path) -> None:
         result = georef("export-ply", done, "-o", tmp_path / "out" / "site.ply")
         assert (result.code, result.err) == (1, f"error: {tmp_path}/out: no such folder: make it first\n")

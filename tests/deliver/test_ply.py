@@ -15,7 +15,8 @@ from pipelines.core.products import save_json
 from pipelines.core.stages import GAUSSIANS, MODEL, SURVEY
 from pipelines.core.workspace import StageRun, Workspace
 from pipelines.deliver.options import ExportPlyOptions
-from pipelines.deliver.ply import export_splat, run
+from pipelines.deliver.ply import run
+from pipelines.deliver.splat import placed_splat
 from pipelines.formats.georef_sidecar import read_sidecar, sidecar_path
 from pipelines.geodesy.enu import Origin, ecef_from_enu, ecef_from_lla, enu_from_ecef
 from pipelines.geodesy.vertical import VerticalDatum
@@ -136,20 +137,20 @@ def _axes(origin: Origin) -> np.ndarray:
 
 
 def test_covariance_predicts_the_same_uncertainty_in_the_new_frame() -> None:
-    export = export_splat(gaussians(), model(covariance()), survey(), OPTIONS)
+    export = placed_splat(gaussians(), model(covariance()), survey(), OPTIONS)
     points_in_model = np.array([[0.0, 0, 0], [30, -20, 5]])
     in_geo = covariance_at(GEO_FROM_MODEL.apply(points_in_model), covariance(), PIVOT_IN_GEO)
-    to_ecef, turn = export.sidecar.ecef_from_file(), _axes(survey().origin)
+    to_ecef, turn = export.placement.sidecar().ecef_from_file(), _axes(survey().origin)
     points_in_ply = to_ecef.inverse().apply(ecef_from_enu(GEO_FROM_MODEL.apply(points_in_model), survey().origin))
-    in_ply = covariance_at(points_in_ply, np.array(export.sidecar.covariance), np.zeros(3))
+    in_ply = covariance_at(points_in_ply, np.array(export.placement.sidecar().covariance), np.zeros(3))
     expected = turn @ in_geo @ turn.T
     np.testing.assert_allclose(to_ecef.rotation @ in_ply @ to_ecef.rotation.T, expected, rtol=1e-6, atol=1e-12)
 
 
 def test_predicted_accuracy_is_that_of_the_covariance_at_the_origin() -> None:
-    accuracy = export_splat(gaussians(), model(covariance()), survey(), OPTIONS).sidecar.accuracy
+    accuracy = placed_splat(gaussians(), model(covariance()), survey(), OPTIONS).placement.sidecar().accuracy
     assert accuracy is not None
-    cov = np.array(export_splat(gaussians(), model(covariance()), survey(), OPTIONS).sidecar.covariance)
+    cov = np.array(placed_splat(gaussians(), model(covariance()), survey(), OPTIONS).placement.sidecar().covariance)
     east, north, up = np.sqrt(np.diagonal(cov)[4:])
     assert (accuracy.sigma_e_m, accuracy.sigma_n_m, accuracy.sigma_u_m) == pytest.approx((east, north, up))
     assert accuracy.sigma_h_m == pytest.approx(np.hypot(east, north))
@@ -157,7 +158,7 @@ def test_predicted_accuracy_is_that_of_the_covariance_at_the_origin() -> None:
 
 
 def test_unknown_uncertainty_is_null_and_not_zero() -> None:
-    sidecar = export_splat(gaussians(), model(), survey(), OPTIONS).sidecar
+    sidecar = placed_splat(gaussians(), model(), survey(), OPTIONS).placement.sidecar()
     assert sidecar.covariance is None
     assert sidecar.accuracy is None
 
@@ -165,11 +166,11 @@ def test_unknown_uncertainty_is_null_and_not_zero() -> None:
 def test_transparent_gaussians_are_left_out() -> None:
     start = gaussians()
     start.logit_opacities[:5] = -8.0
-    export = export_splat(start, model(), survey(), OPTIONS)
+    export = placed_splat(start, model(), survey(), OPTIONS)
     assert (len(export.gaussians), export.left_out) == (35, 5)
     start.logit_opacities[:] = -8.0
     with pytest.raises(DegenerateGeometryError, match="--min-opacity"):
-        export_splat(start, model(), survey(), OPTIONS)
+        placed_splat(start, model(), survey(), OPTIONS)
 
 
 def test_sidecar_has_the_fields_that_were_promised(stage: StageRun) -> None:

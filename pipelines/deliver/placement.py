@@ -1,0 +1,141 @@
+"""The one placement of a trained model on Earth, which all deliverables of a survey share.
+
+Frame-based files (PLY, SPZ, tiles) are East-North-Up at their own origin in the middle of the scene. There, float32
+coordinates stay small, and "up" is the vertical at the splat, not at the start of the survey. The similarity maps
+the model to Earth (GeoRefGS section 2.4).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from pipelines.core.cautions import NOT_CHECKED, Caution
+from pipelines.core.types import FloatArray, Quaternion, Row7, Vector3
+from pipelines.formats.georef_sidecar import GeorefSidecar, predicted_accuracy
+from pipelines.geodesy.crs import ECEF, parse_crs
+from pipelines.geodesy.enu import (
+    Origin,
+    ecef_from_enu,
+    ecef_from_enu_rotation,
+    ecef_from_lla,
+    lla_from_ecef,
+    lla_of,
+)
+from pipelines.geodesy.vertical import VerticalDatum
+from pipelines.geometry.rotations import quat_xyzw_from_matrix
+from pipelines.geometry.similarity import Similarity, SimilarityRecord, moved_pivot
+from pipelines.scene.survey import Survey
+from pipelines.scene.trained_model import TrainedModel
+
+_ORIGIN_DECIMALS_DEG = 6  # 0.1 m: short numbers can be copied without loss
+_ORIGIN_DECIMALS_M = 1
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Place of a model on Earth, through the East-North-Up frame `file` in the middle of the scene.
+
+    Attributes:
+        origin_lla: (3,) latitude, longitude in degrees and ellipsoidal height of the origin of `file`, rounded:
+            these numbers define the frame exactly.
+        file_from_geo: rigid.
+        geo_from_model: the trained similarity.
+        covariance: (7, 7) of the similarity about the origin of `file`, along its axes; None if unknown.
+        vertical: what the survey's input heights referred to.
+        cautions: limits of the model.
+    """
+
+    origin_lla: FloatArray
+    file_from_geo: Similarity
+    geo_from_model: Similarity
+    covariance: FloatArray | None
+    vertical: VerticalDatum
+    cautions: tuple[Caution, ...]
+
+    @property
+    def file_from_model(self) -> Similarity:
+        """Similarity from the model's frame."""
+        return self.file_from_geo @ self.geo_from_model
+
+    @property
+    def ecef_from_file(self) -> Similarity:
+        """Rigid transformation to the Earth-centred frame EPSG:4978."""
+        return _enu_at(self.origin_lla)
+
+    @property
+    def is_checked(self) -> bool:
+        """Whether something checks the σ of the positions; no accuracy is stated otherwise."""
+        return all(caution.code != NOT_CHECKED for caution in self.cautions)
+
+    def sidecar(self) -> GeorefSidecar:
+        """Return the sidecar of a file in the frame `file`, with the accuracy predicted at its origin."""
+        x, y, z, w = quat_xyzw_from_matrix(self.ecef_from_file.rotation).tolist()
+        quaternion: Quaternion = (x, y, z, w)
+        covariance = self.covariance
+        known = covariance is not None and self.is_checked
+        return GeorefSidecar(
+            origin=_vector(self.ecef_from_file.translation),
+            rotation=quaternion,
+            scale=1.0,
+            origin_lla=_vector(self.origin_lla),
+            vertical_datum=self.vertical,
+            crs_wkt=parse_crs(ECEF).wkt,
+            covariance=None if covariance is None else tuple(map(_row, covariance)),
+            accuracy=predicted_accuracy(covariance, np.zeros(3)) if known and covariance is not None else None,
+            cautions=self.cautions,
+        )
+
+
+def place(model: TrainedModel, survey: Survey, means_in_model: ArrayLike) -> Placement:
+    """Return the placement of a trained model on Earth.
+
+    Args:
+        model: has the similarity geo ← model and its covariance.
+        survey: has the origin of geo and the vertical datum.
+        means_in_model: (N, 3) centres of all its Gaussians, N ≥ 1; their median is the middle of the scene.
+    """
+    geo_from_model = Similarity.from_record(model.geo_from_model)
+    scene_in_geo = np.median(geo_from_model.apply(means_in_model), axis=0)
+    origin_lla = _rounded_origin(scene_in_geo, survey.origin)
+    file_from_geo = _enu_at(origin_lla).inverse() @ _enu_at(lla_of(survey.origin))
+    return Placement(
+        origin_lla=origin_lla,
+        file_from_geo=file_from_geo,
+        geo_from_model=geo_from_model,
+        covariance=_covariance_in_file(model.geo_from_model, file_from_geo),
+        vertical=survey.vertical,
+        cautions=model.cautions,
+    )
+
+
+def _rounded_origin(point_in_geo: FloatArray, origin: Origin) -> FloatArray:
+    lla = lla_from_ecef(ecef_from_enu(point_in_geo, origin))
+    return np.array([*np.round(lla[:2], _ORIGIN_DECIMALS_DEG), np.round(lla[2], _ORIGIN_DECIMALS_M)])
+
+
+def _enu_at(lla: FloatArray) -> Similarity:
+    """Return the similarity ecef ← enu of the East-North-Up frame at latitude, longitude and height (3,)."""
+    return Similarity(1.0, ecef_from_enu_rotation(lla), ecef_from_lla(lla))
+
+
+def _covariance_in_file(geo_from_model: SimilarityRecord, file_from_geo: Similarity) -> FloatArray | None:
+    covariance = np.array(geo_from_model.covariance)
+    if not covariance.any():
+        return None
+    about_origin = moved_pivot(covariance, geo_from_model.pivot, file_from_geo.inverse().translation)
+    turn = np.eye(7)
+    turn[1:4, 1:4] = turn[4:, 4:] = file_from_geo.rotation
+    return np.asarray(turn @ about_origin @ turn.T)
+
+
+def _row(values: FloatArray) -> Row7:
+    s, rx, ry, rz, x, y, z = values.tolist()
+    return s, rx, ry, rz, x, y, z
+
+
+def _vector(values: FloatArray) -> Vector3:
+    x, y, z = values.tolist()
+    return x, y, z
