@@ -33,7 +33,7 @@ from pipelines.splat.rasterizer.api import BackendName, RasterSettings, Render, 
 _Array = NDArray[Any]
 
 # Kernels use all cores, and numba's fallback threading layer crashes if two threads launch kernels at once.
-_KERNEL_LOCK = threading.Lock()
+KERNEL_LOCK = threading.Lock()
 
 
 class CpuRasterizer:
@@ -112,7 +112,7 @@ class _RenderContext:
     visible: _Array = field(init=False)
     rank: _Array = field(init=False)
     table: _Array = field(init=False)
-    lists: _TileLists = field(init=False)
+    lists: TileLists = field(init=False)
 
     @property
     def background(self) -> _Array:
@@ -125,8 +125,8 @@ class _RenderContext:
 
 
 @dataclass
-class _TileLists:
-    """H hits of M splats in the tiles.
+class TileLists:
+    """H hits of M splats in the tiles of an image.
 
     Attributes:
         hits: (H,) packed, by tile, nearest first.
@@ -150,9 +150,16 @@ class _Rasterize(torch.autograd.Function):
     def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, ...]:
         *tensors, context = inputs
         *parameters, pose, center = (_array(tensor) for tensor in tensors)
-        with _KERNEL_LOCK:
+        with KERNEL_LOCK:
             _project(context, parameters, pose, center)
-            images = _blend(context)
+            images = blend_tiles(
+                context.table,
+                context.lists,
+                (context.camera.height, context.camera.width),
+                context.background,
+                depth=context.settings.depth,
+                workers=context.workers,
+            )
         outputs = tuple(torch.from_numpy(image) for image in images)
         ctx.context = context
         ctx.save_for_backward(*tensors, *outputs)
@@ -167,7 +174,7 @@ class _Rasterize(torch.autograd.Function):
         *parameters, pose, center = saved[:7]
         grads = tuple(_array(grad) for grad in grad_outputs[:4])
         outputs = [np.empty_like(parameter) for parameter in parameters]
-        with _KERNEL_LOCK:
+        with KERNEL_LOCK:
             hit_gradient = _hit_gradient(context, tuple(saved[7:]), grads)
             camera = _gaussian_gradients(context, [*parameters, pose, center], hit_gradient, outputs)
         gradients = [*outputs, camera[:12].reshape(3, 4), camera[12:]]
@@ -194,7 +201,7 @@ def _project(context: _RenderContext, parameters: list[_Array], pose: _Array, ce
         *(*parameters, pose, center, view, context.settings.sh_degree),
         *(context.visible, context.rank, context.table, ellipses, radius, context.workers),
     )
-    context.lists = _list_tiles(ellipses, context.camera)
+    context.lists = list_tiles(ellipses, context.camera.width, context.camera.height)
     context.stats = ScreenStats(visible=torch.from_numpy(context.visible), radius_px=torch.from_numpy(radius))
 
 
@@ -212,32 +219,39 @@ def _depth_rank(depth: _Array) -> _Array:
     return rank
 
 
-def _list_tiles(ellipses: _Array, camera: Pinhole) -> _TileLists:
-    columns, rows = cpu_tiles.tile_grid(camera.width, camera.height)
+def list_tiles(ellipses: _Array, width: int, height: int) -> TileLists:
+    """Return the hits of ellipses (M, ELLIPSE_WIDTH), nearest first, on the tiles of an image."""
+    columns, rows = cpu_tiles.tile_grid(width, height)
     tiles = columns * rows
     per_tile = np.empty((cpu_tiles.RUNS, tiles), dtype=np.int64)
     splat_start = np.zeros(len(ellipses) + 1, dtype=np.int64)
-    cpu_tiles.count_hits(ellipses, camera.width, camera.height, per_tile, splat_start[1:])
+    cpu_tiles.count_hits(ellipses, width, height, per_tile, splat_start[1:])
     np.cumsum(splat_start, out=splat_start)
     tile_start = np.empty(tiles + 1, dtype=np.int64)
     cpu_tiles.starts_from_counts(per_tile, tile_start)
     hits = np.empty(splat_start[-1], dtype=np.int64)
     places = np.empty(splat_start[-1], dtype=np.int64)
-    cpu_tiles.list_hits(ellipses, camera.width, camera.height, per_tile, splat_start, hits, places)
-    return _TileLists(hits, tile_start, np.empty(tiles, dtype=np.int64), splat_start, places)
+    cpu_tiles.list_hits(ellipses, width, height, per_tile, splat_start, hits, places)
+    return TileLists(hits, tile_start, np.empty(tiles, dtype=np.int64), splat_start, places)
 
 
-def _blend(context: _RenderContext) -> tuple[_Array, ...]:
-    """Return colour, alpha, Σ w z, Σ w z² and median depth, the last three of size (0, 0) if not wanted."""
-    size = (context.camera.height, context.camera.width)
-    depth_size = size if context.settings.depth else (0, 0)
+def blend_tiles(
+    table: _Array, lists: TileLists, size: tuple[int, int], background: _Array, *, depth: bool, workers: int
+) -> tuple[_Array, ...]:
+    """Return colour, alpha, Σ w z, Σ w z² and median depth, the last three of size (0, 0) if not wanted.
+
+    Args:
+        table: (M, SPLAT_WIDTH) splats, nearest first.
+        lists: their hits; `tile_end` is written.
+        size: height and width of the image.
+        background: (3,) float64.
+        depth: whether depths are wanted.
+        workers: number of threads.
+    """
+    depth_size = size if depth else (0, 0)
     shapes: tuple[tuple[int, ...], ...] = ((*size, 3), size, *3 * (depth_size,))
-    images = tuple(np.empty(shape, dtype=context.table.dtype) for shape in shapes)
-    lists = context.lists
-    cpu_blend.blend(
-        *(context.table, lists.hits, lists.tile_start),
-        *(context.background, images, lists.tile_end, context.workers),
-    )
+    images = tuple(np.empty(shape, dtype=table.dtype) for shape in shapes)
+    cpu_blend.blend(table, lists.hits, lists.tile_start, background, images, lists.tile_end, workers)
     return images
 
 

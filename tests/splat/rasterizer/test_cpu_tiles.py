@@ -16,9 +16,9 @@ from pipelines.splat.rasterizer.cpu_tiles import TILE_HEIGHT, TILE_WIDTH, tile_g
 def frame(make_scene, camera, monkeypatch):
     gaussians, pose = make_scene(300, seed=21, log_scale=-1.5)
     tables = {}
-    listing = cpu._list_tiles
+    listing = cpu.list_tiles
     monkeypatch.setattr(
-        cpu, "_list_tiles", lambda ellipses, size: tables.update(e=ellipses) or listing(ellipses, size)
+        cpu, "list_tiles", lambda ellipses, *size: tables.update(e=ellipses) or listing(ellipses, *size)
     )
     frame = cpu._RenderContext(camera, RasterSettings())
     center = -torch.linalg.solve(pose[:3, :3], pose[:3, 3])
