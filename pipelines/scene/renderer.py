@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from pipelines.core.types import FloatArray
+from pipelines.core.types import ByteArray, Float32Array, FloatArray
 from pipelines.geometry.cameras import Pinhole
 from pipelines.scene.photographs import ImageCache
 from pipelines.scene.trained_survey import TrainedSurvey, trained_pinholes
@@ -51,8 +51,16 @@ class ModelRenderer:
 
     def depth_m(self, index: int) -> FloatArray:
         """Return the depth (H, W) in metres of the surface along the z axis of camera `index`; 0: no surface."""
+        return np.asarray(_measured(self.render(index, depth=True)).cpu().numpy())
+
+    def surface(self, index: int) -> tuple[Float32Array, ByteArray]:
+        """Return the depth (H, W) as `depth_m` does, and the colours (H, W, 3) of the same render."""
         view = self.render(index, depth=True)
-        assert view.median_depth is not None and view.expected_depth is not None
-        assert view.depth_variance is not None  # of every render with depth
-        depth = measured_depth(view.median_depth, view.expected_depth, view.depth_variance)
-        return np.asarray(depth.cpu().numpy())
+        rgb = (255 * view.colour.clamp(0, 1)).round().to(torch.uint8)
+        return _measured(view).cpu().numpy().astype(np.float32), rgb.cpu().numpy()
+
+
+def _measured(view: Render) -> torch.Tensor:
+    assert view.median_depth is not None and view.expected_depth is not None
+    assert view.depth_variance is not None  # of every render with depth
+    return measured_depth(view.median_depth, view.expected_depth, view.depth_variance)
