@@ -68,6 +68,9 @@ HOMES: dict[str, tuple[str, ...]] = {
     "rosbags": ("pipelines.formats",),
     "embreex": ("pipelines.simulate",),
     "matplotlib": ("pipelines.plots",),
+    "rasterio": ("pipelines.formats",),
+    "pyogrio": ("pipelines.formats",),
+    "ezdxf": ("pipelines.formats",),
 }
 # The entry point of a process whose log records go to its parent.
 CHILD = "pipelines.core.child"

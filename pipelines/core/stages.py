@@ -184,7 +184,19 @@ PIPELINE: tuple[StageSpec, ...] = (
 )
 
 # What a survey hands over besides the PLY: each is made on request, and none is read by another stage.
-DELIVERABLES: tuple[StageSpec, ...] = ()
+DELIVERABLES: tuple[StageSpec, ...] = (
+    StageSpec(
+        name="export-raster",
+        module="pipelines.deliver.raster.stage",
+        options_place="pipelines.deliver.options:ExportRasterOptions",
+        folder="raster",
+        reads=(*whole(SURVEY, SPARSE, MODEL, GAUSSIANS, SIM3), APPLIED_RIG),
+        product="raster/orthophoto.tif",
+        title="Write orthophoto, surface model and their σ as rasters in a CRS.",
+        resumable=True,
+        also=("raster/dsm.tif", "raster/sigma_h.tif", "raster/sigma_v.tif"),
+    ),
+)
 
 # No part of the pipeline: `georef compare` runs this stage for the baseline, whose later stages read its folder in
 # place of those of sfm and init-sim3.
