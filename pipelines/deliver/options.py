@@ -43,6 +43,6 @@ class ExportRasterOptions(CrsOptions):
         "photographs.",
     )
     contours: float | None = Field(None, gt=0, description="Interval of contour lines, in the unit of the heights.")
-    min_views: int = Field(2, ge=1, description="Leave out cells whose surface fewer training views show.")
+    min_views: int = Field(4, ge=2, description="Leave out cells whose surface fewer training views show.")
     max_pixels: float = Field(1e9, gt=0, description="Refuse a raster with more cells.")
     hillshade: bool = Field(True, description="Draw hillshade.png and preview.png.")

@@ -27,7 +27,7 @@ from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.rasterizer.backends import rasterizer
 
 _LEAST_OPACITY = 1 / 255
-_AROUND = 0.1  # of the scene's extent: Gaussians further outside it reach into no cell
+_AROUND = 0.1  # of the scene's extent: Gaussians further outside it, in plan, reach into no cell
 _HAZE_VIEWS = 2  # training views that look through a Gaussian, and none that shows a surface there
 
 
@@ -84,7 +84,7 @@ def _within(trained: TrainedSurvey, gaussians: Gaussians) -> Gaussians:
     """Return the Gaussians that reach into the scene; far ones may lie outside the domain of the CRS."""
     points = scene_points(trained)
     low, high = points.min(axis=0), points.max(axis=0)
-    around = _AROUND * float(np.linalg.norm(high - low))
+    around = float(np.linalg.norm(high - low)) * np.array([_AROUND, _AROUND, 1.0])  # masts stand above all points
     in_geo = trained.geo_from_model.apply(gaussians.means.numpy())
     inside = ((in_geo >= low - around) & (in_geo <= high + around)).all(axis=1)
     solid = torch.sigmoid(gaussians.logit_opacities) >= _LEAST_OPACITY
