@@ -53,8 +53,9 @@ def raster_source(stage: StageRun, wanted: Request) -> tuple[RasterSource, str]:
     """
     trained, target, frame = wanted.trained, wanted.target, wanted.frame
     images = photographs(trained.sfm, trained.survey, stage.workspace, trained.model.max_image_size)
+    images.build(stage.progress)
     renderer = ModelRenderer(trained, images, rasterizer("auto"))
-    views = SurfaceViews(renderer, stage.out / "depth_maps", progress=stage.progress)
+    views = SurfaceViews(renderer, stage.out / "depth_maps", confirmed=True, progress=stage.progress)
     gaussians = _within(trained, trained.gaussians)
     scene = PlanScene(
         _without_haze(gaussians, views),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import binary_closing, uniform_filter
+from scipy.ndimage import binary_closing, binary_opening, uniform_filter
 
 from pipelines.accuracy.accuracy_grid import AccuracyGrid
 from pipelines.core.types import BoolArray, ByteArray, FloatArray, IntArray
@@ -20,9 +20,10 @@ _SOLID = 0.5  # least opacity of a surface
 _ONE_SURFACE_GSD = 4.0  # training pixels: largest spread of the heights of the Gaussians of one surface
 _DILATION_PX2 = 0.3  # of the training
 _AVERAGED = 5  # checked cells on a side over which the surface's own noise is averaged
-_CLOSED = 2  # checked cells: half the width of the gaps between seen cells that are closed
-# RMS angle between the views' rays below which depth is a guess: its σ is more than 20 times that on the image.
-_LEAST_PARALLAX_RAD = 0.05
+_MOST_THROUGH = 0.5  # largest number of views that look through a surface, as a part of those that agree
+# Checked cells: half the width of slivers that are dropped, and of gaps that are closed.
+_OPENED, _CLOSED = 2, 2
+_SIGMA_PX = 0.25  # of a ray through a photograph, in training pixels
 _NODE_PX = 64  # cells between two nodes at which the georeference's σ is taken
 _NODES = 4  # nodes along each side, at which the way from the CRS to `geo` is fitted
 
@@ -153,26 +154,40 @@ def _support(
         cell = np.column_stack([columns[at_column], rows[at_row]]) + 0.5
         in_geo = _in_geo(source, frame, cell, checked[at_row, at_column])
         support = source.views.support(source.geo_from_model.inverse().apply(in_geo))
-        shown = (support.views >= source.min_views) & (support.views > support.seen_through)
-        seen[at_row, at_column] = shown & (support.spread_rad > _LEAST_PARALLAX_RAD)
-        up[at_row, at_column] = np.nan_to_num(support.rms_up_m) ** 2
+        # All views may agree on a wrong surface where their rays meet at small angles.
+        lateral_m = _SIGMA_PX * source.training_gsd_m / np.sqrt(np.maximum(support.views, 1))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            square = np.nan_to_num(support.rms_up_m**2 + (lateral_m / support.spread_rad) ** 2, nan=np.inf)
+        enough = (support.views >= source.min_views) & (support.seen_through <= _MOST_THROUGH * support.views)
+        shown = enough & (square < source.training_gsd_m**2)
+        seen[at_row, at_column] = shown
+        up[at_row, at_column] = np.where(shown, square, 0.0)
         horizontal[at_row, at_column] = 2 * up[at_row, at_column] * np.nan_to_num(support.spread_rad) ** 2
     weight = uniform_filter(seen.astype(np.float64), _AVERAGED, mode="constant")
     noise_up_m, noise_h_m = (
         np.sqrt(
-            np.maximum(uniform_filter(np.where(seen, square, 0.0), _AVERAGED, mode="constant"), 0.0)
+            np.maximum(uniform_filter(square, _AVERAGED, mode="constant"), 0.0)
             / np.maximum(weight, 0.5 / _AVERAGED**2)
         )
         for square in (up, horizontal)
     )
-    # At the edge of a roof no view agrees with the mixed height. Cells between seen ones were seen too.
-    seen = binary_closing(np.pad(seen, _CLOSED, mode="edge"), iterations=_CLOSED)[
-        _CLOSED:-_CLOSED, _CLOSED:-_CLOSED
-    ]
+    seen = _tidied(seen)
     row_of = np.minimum(np.arange(height.shape[0]) // stride, len(rows) - 1)
     column_of = np.minimum(np.arange(height.shape[1]) // stride, len(columns) - 1)
     whole = np.ix_(row_of, column_of)
     return seen[whole], noise_up_m[whole], noise_h_m[whole]
+
+
+def _tidied(seen: BoolArray) -> BoolArray:
+    """Return seen cells (H, W) without slivers and narrow gaps.
+
+    Slivers are agreements by chance. At the edge of a roof no view agrees with the mixed height of a cell, and
+    cells between seen ones were seen too.
+    """
+    margin = _OPENED + _CLOSED
+    wider = np.pad(seen, margin, mode="edge")
+    wider = binary_closing(binary_opening(wider, iterations=_OPENED), iterations=_CLOSED)
+    return np.asarray(wider[margin:-margin, margin:-margin])
 
 
 def _every(stride: int, size: int) -> IntArray:
