@@ -68,6 +68,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     "rosbags": ("pipelines.formats",),
     "embreex": ("pipelines.simulate",),
     "matplotlib": ("pipelines.plots",),
+    "zstandard": ("pipelines.formats",),
 }
 # The entry point of a process whose log records go to its parent.
 CHILD = "pipelines.core.child"

@@ -1,0 +1,343 @@
+"""SPZ: compressed Gaussians, as Niantic's library, CesiumJS, Spark and PlayCanvas exchange them.
+
+A file has a header and six sections of bytes: positions, opacities, colours, scales, rotations, harmonics. Versions
+2 and 3 are one gzip stream. Version 4 is a plain header of 32 bytes, a table of sizes, and a zstd stream for each
+section. Version 2, which is only read, has another form of the rotations. The layout is that of
+github.com/nianticlabs/spz (`load-spz.cc`). The quantisation is:
+
+| value | step | range |
+|---|---|---|
+| position | 2⁻¹² m (`fractional_bits`) | ±2048 m; beyond it, other writers wrap without a word |
+| opacity | 1/255 | 0 … 1 |
+| constant harmonic | 1/38.25 | ±3.33 |
+| logarithm of the scale | 1/16 | −10 … 5.94 |
+| rotation | quaternion, smallest three components with 9 bits and a sign each | |
+| harmonics of degree 1 | 1/16 | −1 … 1 |
+| harmonics of degree 2 and 3 | 1/8 | −1 … 1 |
+
+Readers of SPZ take its axes for right, up, back (x right, y up, z towards the viewer). The codec turns nothing.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.core.durable import replace_file
+from pipelines.core.errors import InputError
+from pipelines.core.files import file_size
+from pipelines.core.types import ByteArray, Float32Array, FloatArray
+from pipelines.formats.splat_ply import SplatArrays
+
+SpzVersion = Literal[3, 4]
+
+FRACTIONAL_BITS = 12
+_MAGIC = 0x5053474E
+_HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, degree, fractional bits, flags, reserved or streams
+_HEADER4_BYTES = 32
+_TABLE_ROW = struct.Struct("<QQ")  # compressed bytes, bytes
+_HAS_EXTENSIONS = 0x2
+_POSITION_LIMIT = 1 << 23
+_COLOUR_STEPS = 0.15 * 255
+_LARGEST_COMPONENT = 511 / np.sqrt(0.5)  # of the components that are not the largest, √½ is the bound
+_GZIP_LEVEL, _ZSTD_LEVEL = 6, 12
+_CHUNK = 1 << 18  # Gaussians that are quantised at once: bounds the memory of the intermediate values
+# Real splats compress by a factor of two or three; more is a forgery, or a small file.
+_MOST_UNPACKED, _SMALL_BYTES = 16, 256 * 1024 * 1024
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """Sizes of the sections, as the header states them."""
+
+    version: int
+    count: int
+    degree: int
+    fractional_bits: int
+
+    @property
+    def higher(self) -> int:
+        """Number of harmonics above the constant one."""
+        return (self.degree + 1) ** 2 - 1
+
+    @property
+    def widths(self) -> tuple[int, ...]:
+        """Bytes a Gaussian of the sections that are not empty."""
+        rotation = 3 if self.version == 2 else 4
+        return tuple(width for width in (9, 1, 3, 3, rotation, 3 * self.higher) if width)
+
+    @property
+    def body_bytes(self) -> int:
+        return self.count * sum(self.widths)
+
+
+def write_spz(path: Path, splat: SplatArrays, version: SpzVersion = 3) -> None:
+    """Write Gaussians; the file appears whole or not at all.
+
+    Raises:
+        InputError: as `encode_spz`.
+        OSError: the file cannot be written.
+    """
+    data = encode_spz(splat, version)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draft = path.with_name(path.name + ".tmp")
+    draft.write_bytes(data)
+    replace_file(draft, path)
+
+
+def read_spz(path: Path) -> SplatArrays:
+    """Read Gaussians of version 2, 3 or 4.
+
+    Raises:
+        InputError: no such file, not an SPZ file of that form, cut off, with extensions, or a file that would
+            unpack to more than sixteen times its size (and 256 MiB).
+    """
+    limit = max(_SMALL_BYTES, _MOST_UNPACKED * file_size(path))
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror}", path=path) from error
+    return decode_spz(data, limit_bytes=limit, path=path)
+
+
+def encode_spz(splat: SplatArrays, version: SpzVersion = 3, fractional_bits: int = FRACTIONAL_BITS) -> bytes:
+    """Return the bytes of an SPZ file.
+
+    Opacities, colours, scales and harmonics beyond the format's range are clamped to it.
+
+    Args:
+        splat: N ≥ 1 Gaussians of degree 0 to 3.
+        version: 3 or 4.
+        fractional_bits: positions have steps of 2^−bits m and lie within ±2^(23 − bits) m.
+
+    Raises:
+        InputError: values that are not finite, a rotation of length zero, or positions out of range.
+        ValueError: shapes do not agree, or no Gaussians.
+    """
+    degree = _degree(splat)
+    _check(splat, fractional_bits)
+    layout = _Layout(version, len(splat), degree, fractional_bits)
+    sections = _quantised(splat, layout)
+    if version == 3:
+        head = _HEADER.pack(_MAGIC, 3, layout.count, degree, fractional_bits, 0, 0)
+        stream = zlib.compressobj(_GZIP_LEVEL, zlib.DEFLATED, 16 + zlib.MAX_WBITS)
+        parts = [stream.compress(head), *(stream.compress(section.data) for section in sections), stream.flush()]
+        return b"".join(parts)
+    import zstandard
+
+    packed = [zstandard.ZstdCompressor(level=_ZSTD_LEVEL).compress(section.data) for section in sections]
+    head = _HEADER.pack(_MAGIC, 4, layout.count, degree, fractional_bits, 0, len(packed))
+    head += struct.pack("<I12x", _HEADER4_BYTES)
+    table = [_TABLE_ROW.pack(len(part), section.size) for part, section in zip(packed, sections, strict=True)]
+    return b"".join((head, *table, *packed))
+
+
+def decode_spz(data: bytes, *, limit_bytes: int, path: Path | None = None) -> SplatArrays:
+    """Return the Gaussians in the bytes of an SPZ file.
+
+    An opacity of 0 or 255 steps is read a quarter of a step inside, so that its logit is finite.
+
+    Args:
+        data: the file.
+        limit_bytes: most bytes that the sections may unpack to.
+        path: of the file, for errors.
+
+    Raises:
+        InputError: as `read_spz`.
+    """
+    try:
+        if data[:2] == b"\x1f\x8b":
+            layout, body = _unpacked_gzip(data, limit_bytes)
+        else:
+            layout, body = _unpacked_zstd(data, limit_bytes)
+    except ValueError as error:
+        raise InputError(str(error), path=path) from error
+    return _dequantised(layout, body)
+
+
+def _degree(splat: SplatArrays) -> int:
+    count, coefficients = len(splat), splat.sh.shape[1]
+    if coefficients not in (1, 4, 9, 16) or splat.sh.shape != (count, coefficients, 3):
+        raise ValueError(f"expected spherical harmonics (N, 1 | 4 | 9 | 16, 3), got {splat.sh.shape}")
+    if count == 0:
+        raise ValueError("an SPZ file has at least one Gaussian")
+    return int(np.sqrt(coefficients)) - 1
+
+
+def _check(splat: SplatArrays, fractional_bits: int) -> None:
+    for name, values in vars(splat).items():
+        if not np.isfinite(values).all():
+            raise InputError("Gaussians with values that are not finite cannot be written as SPZ", field=name)
+    if not splat.quats_wxyz.any(axis=1).all():
+        raise InputError("a rotation of length zero cannot be written as SPZ", field="quats_wxyz")
+    furthest = float(np.abs(splat.means).max())
+    reach = _POSITION_LIMIT / 2.0**fractional_bits
+    # The rounded positive end of the range would be the negative one.
+    if furthest >= reach - 0.5 / 2.0**fractional_bits:
+        outside = int((np.abs(splat.means).max(axis=1) >= reach).sum())
+        raise InputError(
+            f"SPZ holds positions within ±{reach:.0f} m, and {max(outside, 1)} of {len(splat)} Gaussians lie "
+            f"beyond, up to {furthest:.0f} m from the origin",
+            field="means",
+        )
+
+
+def _chunks(count: int) -> Iterator[slice]:
+    return (slice(first, min(first + _CHUNK, count)) for first in range(0, count, _CHUNK))
+
+
+def _quantised(splat: SplatArrays, layout: _Layout) -> list[ByteArray]:
+    """Return the sections (N · width,) that are not empty."""
+    sections = [np.empty((layout.count, width), np.uint8) for width in layout.widths]
+    for rows in _chunks(layout.count):
+        fixed = np.rint(splat.means[rows].astype(np.float64) * 2.0**layout.fractional_bits).astype("<i4")
+        sections[0][rows] = fixed.view(np.uint8).reshape(-1, 3, 4)[:, :, :3].reshape(-1, 9)
+        opacity = 0.5 + 0.5 * np.tanh(0.5 * splat.logit_opacities[rows, None].astype(np.float64))
+        sections[1][rows] = _bytes(255 * opacity)
+        sections[2][rows] = _bytes(_COLOUR_STEPS * splat.sh[rows, 0].astype(np.float64) + 127.5)
+        sections[3][rows] = _bytes(16 * (splat.log_scales[rows].astype(np.float64) + 10))
+        sections[4][rows] = _packed_rotations(splat.quats_wxyz[rows]).view(np.uint8).reshape(-1, 4)
+        if layout.higher:
+            sections[5][rows] = _coarse_harmonics(splat.sh[rows, 1:]).reshape(-1, 3 * layout.higher)
+    return [section.reshape(-1) for section in sections]
+
+
+def _bytes(values: FloatArray) -> ByteArray:
+    return np.clip(np.rint(values), 0, 255).astype(np.uint8)
+
+
+def _coarse_harmonics(higher: Float32Array) -> ByteArray:
+    """Return harmonics (N, K − 1, 3) as bytes of which the lowest 3 or 4 bits are zero: they compress well."""
+    step = np.full((higher.shape[1], 1), 16)
+    step[:3] = 8
+    exact = 128 * np.clip(higher, -2, 2) + 128
+    coarse: ByteArray = np.clip(np.floor(exact / step + 0.5) * step, 0, 255).astype(np.uint8)
+    return coarse
+
+
+def _packed_rotations(quats_wxyz: Float32Array) -> NDArray[np.uint32]:
+    """Return quaternions (N, 4) as words: index of the largest component of xyzw, then the others from x on."""
+    xyzw = np.roll(quats_wxyz.astype(np.float64), -1, axis=1)
+    xyzw /= np.linalg.norm(xyzw, axis=1, keepdims=True)
+    largest = np.abs(xyzw).argmax(axis=1)
+    xyzw *= np.where(np.take_along_axis(xyzw, largest[:, None], 1) < 0, -1.0, 1.0)
+    words = largest.astype(np.uint32)
+    for axis in range(4):
+        size = np.minimum(np.rint(_LARGEST_COMPONENT * np.abs(xyzw[:, axis])), 511).astype(np.uint32)
+        signed = (xyzw[:, axis] < 0).astype(np.uint32) << np.uint32(9) | size
+        words = np.where(largest == axis, words, words << np.uint32(10) | signed)
+    little_endian: NDArray[np.uint32] = words.astype("<u4")
+    return little_endian
+
+
+def _unpacked_gzip(data: bytes, limit_bytes: int) -> tuple[_Layout, ByteArray]:
+    stream = zlib.decompressobj(16 + zlib.MAX_WBITS)
+    try:
+        head = stream.decompress(data, _HEADER.size)
+        layout = _layout(head, versions=(2, 3), limit_bytes=limit_bytes)
+        # One byte more than promised tells a longer stream from a whole one.
+        body = stream.decompress(stream.unconsumed_tail, layout.body_bytes + 1)
+    except zlib.error as error:
+        raise ValueError(f"damaged SPZ file: {error}") from error
+    if len(body) != layout.body_bytes or not stream.eof:
+        raise ValueError(
+            f"the header promises {layout.count} Gaussians in {layout.body_bytes} bytes, the file holds "
+            f"{'more' if len(body) > layout.body_bytes else 'fewer'}: it is cut off or damaged"
+        )
+    return layout, np.frombuffer(body, np.uint8)
+
+
+def _unpacked_zstd(data: bytes, limit_bytes: int) -> tuple[_Layout, ByteArray]:
+    import zstandard
+
+    layout = _layout(data[: _HEADER.size], versions=(4,), limit_bytes=limit_bytes)
+    streams = data[_HEADER.size - 1]
+    if streams != len(layout.widths) or len(data) < _HEADER4_BYTES:
+        raise ValueError(f"{streams} streams where a degree of {layout.degree} has {len(layout.widths)}")
+    (table,) = struct.unpack_from("<I", data, _HEADER.size)
+    place = table + streams * _TABLE_ROW.size
+    if table < _HEADER4_BYTES or place > len(data):
+        raise ValueError("damaged SPZ file: its table lies outside the file")
+    parts = []
+    for index, width in enumerate(layout.widths):
+        packed, size = _TABLE_ROW.unpack_from(data, table + index * _TABLE_ROW.size)
+        if size != width * layout.count or packed > len(data) - place:
+            raise ValueError(f"stream {index} has another size than the header promises: cut off or damaged")
+        try:
+            with zstandard.ZstdDecompressor().stream_reader(data[place : place + packed]) as reader:
+                part = reader.read(size + 1)
+        except zstandard.ZstdError as error:
+            raise ValueError(f"damaged SPZ file: {error}") from error
+        if len(part) != size:
+            raise ValueError(f"stream {index} unpacks to another size than promised: cut off or damaged")
+        parts.append(part)
+        place += packed
+    return layout, np.frombuffer(b"".join(parts), np.uint8)
+
+
+def _layout(head: bytes, versions: tuple[int, ...], limit_bytes: int) -> _Layout:
+    if len(head) < _HEADER.size or head[:4] != struct.pack("<I", _MAGIC):
+        raise ValueError("not an SPZ file")
+    _, version, count, degree, fractional_bits, flags, _ = _HEADER.unpack(head)
+    if version not in versions:
+        raise ValueError(f"SPZ version {version} is not read: versions 2, 3 and 4 are")
+    if degree > 3 or not 1 <= fractional_bits <= 23 or count == 0:
+        raise ValueError(
+            f"{count} Gaussians of degree {degree} with {fractional_bits} fractional bits: expected at least one "
+            "Gaussian, degree 0 to 3 and 1 to 23 bits"
+        )
+    if flags & _HAS_EXTENSIONS:
+        raise ValueError("SPZ files with extensions are not read")
+    layout = _Layout(version, count, degree, fractional_bits)
+    if layout.body_bytes > limit_bytes:
+        raise ValueError(
+            f"the header promises {layout.body_bytes / 2**20:.0f} MiB, and {limit_bytes / 2**20:.0f} MiB are the "
+            "limit for a file of this size"
+        )
+    return layout
+
+
+def _dequantised(layout: _Layout, body: ByteArray) -> SplatArrays:
+    ends = np.cumsum([layout.count * width for width in layout.widths])
+    sections = [part.reshape(layout.count, -1) for part in np.split(body, ends[:-1])]
+    words = np.zeros((layout.count, 3, 4), np.uint8)
+    words[:, :, 1:] = sections[0].reshape(-1, 3, 3)
+    fixed = words.view("<i4")[:, :, 0] >> 8  # an arithmetic shift extends the sign
+    opacity = np.clip(sections[1][:, 0].astype(np.float64), 0.25, 254.75) / 255
+    sh = np.empty((layout.count, 1 + layout.higher, 3), np.float32)
+    sh[:, 0] = (sections[2] - 127.5) / _COLOUR_STEPS
+    if layout.higher:
+        sh[:, 1:] = sections[5].reshape(layout.count, layout.higher, 3) / np.float32(128) - 1
+    return SplatArrays(
+        means=(fixed / 2.0**layout.fractional_bits).astype(np.float32),
+        quats_wxyz=_unpacked_rotations(sections[4]),
+        log_scales=(sections[3] / 16 - 10).astype(np.float32),
+        logit_opacities=np.log(opacity / (1 - opacity)).astype(np.float32),
+        sh=sh,
+    )
+
+
+def _unpacked_rotations(section: ByteArray) -> Float32Array:
+    """Return quaternions (N, 4) wxyz of three bytes (x, y, z) or of four (smallest three)."""
+    if section.shape[1] == 3:
+        xyz = section / 127.5 - 1
+        w = np.sqrt(np.maximum(0, 1 - (xyz**2).sum(axis=1)))
+        return np.column_stack([w, xyz]).astype(np.float32)
+    words = np.ascontiguousarray(section).view("<u4")[:, 0]
+    largest = words >> np.uint32(30)
+    xyzw = np.zeros((len(words), 4))
+    for axis in (3, 2, 1, 0):
+        stored = largest != axis
+        size = (words & np.uint32(511)) / _LARGEST_COMPONENT
+        xyzw[:, axis] = np.where(stored, np.where(words & np.uint32(512), -size, size), 0)
+        words = np.where(stored, words >> np.uint32(10), words)
+    rest = np.sqrt(np.maximum(0, 1 - (xyzw**2).sum(axis=1)))
+    np.put_along_axis(xyzw, largest[:, None].astype(np.int64), rest[:, None], 1)
+    return np.roll(xyzw, 1, axis=1).astype(np.float32)
