@@ -21,6 +21,9 @@ MODEL = "train/model.json"
 GAUSSIANS = "train/gaussians.ply"
 REPORT = "evaluate/report.json"
 SPLAT = "export/splat.ply"
+SPZ = "spz/splat.spz"
+TILES = "tiles/tileset.json"
+TILES_GLB = "tiles/splat.glb"
 
 
 @dataclass(frozen=True)
@@ -184,7 +187,27 @@ PIPELINE: tuple[StageSpec, ...] = (
 )
 
 # What a survey hands over besides the PLY: each is made on request, and none is read by another stage.
-DELIVERABLES: tuple[StageSpec, ...] = ()
+DELIVERABLES: tuple[StageSpec, ...] = (
+    StageSpec(
+        name="export-spz",
+        module="pipelines.deliver.spz",
+        options_place="pipelines.deliver.options:ExportSpzOptions",
+        folder="spz",
+        reads=(*whole(SURVEY, MODEL, GAUSSIANS), APPLIED_RIG),
+        product=SPZ,
+        title="Write the splat as SPZ, for viewers on the web.",
+    ),
+    StageSpec(
+        name="export-tiles",
+        module="pipelines.deliver.tiles.stage",
+        options_place="pipelines.deliver.options:ExportTilesOptions",
+        folder="tiles",
+        reads=(*whole(SURVEY, MODEL, GAUSSIANS), APPLIED_RIG),
+        product=TILES,
+        title="Write the splat as 3D Tiles, for web globes.",
+        also=(TILES_GLB,),
+    ),
+)
 
 # No part of the pipeline: `georef compare` runs this stage for the baseline, whose later stages read its folder in
 # place of those of sfm and init-sim3.
