@@ -82,6 +82,14 @@ def encode_glb(
     return struct.pack("<III", _MAGIC, 2, size) + b"".join(chunks)
 
 
+def spz_in_glb(data: bytes) -> bytes:
+    """Return the SPZ file in a glb that `encode_glb` made, with its padding; empty if the file is no glb."""
+    if len(data) < 20 or data[:4] != struct.pack("<I", _MAGIC):
+        return b""
+    (size,) = struct.unpack_from("<I", data, 12)
+    return data[20 + size + 8 :]
+
+
 def _chunk(kind: int, data: bytes, filler: bytes) -> bytes:
     padding = -len(data) % 4
     return struct.pack("<II", len(data) + padding, kind) + data + filler * padding

@@ -8,14 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.core.types import FloatArray
-from pipelines.formats.gltf import encode_glb
+from pipelines.core.files import file_size
+from pipelines.formats.gltf import encode_glb, spz_in_glb
 from pipelines.formats.splat_ply import SplatArrays
-from pipelines.formats.spz import FRACTIONAL_BITS, encode_spz
-from pipelines.geometry.rotations import matrix_from_quat_xyzw
+from pipelines.formats.spz import FRACTIONAL_BITS, decode_spz, encode_spz
 
 _REACH_M = 2.0 ** (23 - FRACTIONAL_BITS)
-_SIGMAS = 3.0  # viewers draw a Gaussian up to about three standard deviations
+_LEAST_LIMIT_BYTES = 256 * 1024 * 1024
 
 
 def write_glb(path: Path, splat: SplatArrays, extras: dict[str, Any] | None = None) -> None:
@@ -40,13 +39,11 @@ def write_glb(path: Path, splat: SplatArrays, extras: dict[str, Any] | None = No
     path.write_bytes(encode_glb(spz, len(splat), math.isqrt(splat.sh.shape[1]) - 1, (low, high), extras))
 
 
-def bounds_of(splat: SplatArrays) -> FloatArray:
-    """Return the box (2, 3), least and largest coordinates, that holds Gaussians up to three times their σ."""
-    scales = np.exp(splat.log_scales.astype(np.float64))
-    reach = _SIGMAS * np.sqrt(np.einsum("nij,nj->ni", _rotations(splat) ** 2, scales**2))
-    means = splat.means.astype(np.float64)
-    return np.stack([(means - reach).min(axis=0), (means + reach).max(axis=0)])
+def read_glb(path: Path) -> SplatArrays:
+    """Return the Gaussians of a glb that `write_glb` wrote.
 
-
-def _rotations(splat: SplatArrays) -> FloatArray:
-    return matrix_from_quat_xyzw(np.roll(splat.quats_wxyz, -1, axis=1))
+    Raises:
+        InputError: the file cannot be read, or is damaged.
+    """
+    limit = max(_LEAST_LIMIT_BYTES, 16 * file_size(path))
+    return decode_spz(spz_in_glb(path.read_bytes()), limit_bytes=limit, path=path)

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from pipelines.core.durable import replace_text
-from pipelines.core.types import FloatArray
 from pipelines.formats.georef_sidecar import GeorefSidecar
 from pipelines.formats.gltf import SPLATS, SPZ_IN_GLTF
+from pipelines.splat.level_of_detail import DetailTile
 
 TILESET = "tileset.json"
 # A viewer draws nothing of a tileset whose own error is below its limit (16 pixels by default): with this factor,
@@ -20,26 +19,12 @@ TILESET = "tileset.json"
 _UNSEEN_FACTOR = 16.0
 
 
-@dataclass(frozen=True)
-class Tile:
-    """Tile with its content.
-
-    Attributes:
-        uri: of the glb, relative to the tileset.
-        bounds: (2, 3) least and largest coordinates of its content and of its children, in the root's frame.
-        error_m: geometric error: size of the details that the content does not show; 0 for a leaf.
-        count: number of its Gaussians.
-        children: tiles that together replace it.
-    """
-
-    uri: str
-    bounds: FloatArray
-    error_m: float
-    count: int
-    children: tuple[Tile, ...] = ()
+def content_uri(name: str) -> str:
+    """Return the address of a tile's content, relative to the tileset."""
+    return f"content/{name}.glb"
 
 
-def write_tileset(folder: Path, root: Tile, sidecar: GeorefSidecar) -> None:
+def write_tileset(folder: Path, root: DetailTile, sidecar: GeorefSidecar) -> None:
     """Write `tileset.json` into the folder of the contents; the file appears whole or not at all.
 
     Args:
@@ -54,7 +39,7 @@ def write_tileset(folder: Path, root: Tile, sidecar: GeorefSidecar) -> None:
     replace_text(folder / TILESET, text + "\n")
 
 
-def tileset_document(root: Tile, sidecar: GeorefSidecar) -> dict[str, Any]:
+def tileset_document(root: DetailTile, sidecar: GeorefSidecar) -> dict[str, Any]:
     """Return the content of `tileset.json`. Only the root has a transform: that of the frame to EPSG:4978."""
     extensions = {"3DTILES_content_gltf": {"extensionsUsed": [SPLATS, SPZ_IN_GLTF]}}
     extensions["3DTILES_content_gltf"]["extensionsRequired"] = [SPLATS, SPZ_IN_GLTF]
@@ -68,13 +53,13 @@ def tileset_document(root: Tile, sidecar: GeorefSidecar) -> dict[str, Any]:
     }
 
 
-def _tile(tile: Tile) -> dict[str, Any]:
+def _tile(tile: DetailTile) -> dict[str, Any]:
     middle, half = tile.bounds.mean(axis=0), (tile.bounds[1] - tile.bounds[0]) / 2
     document: dict[str, Any] = {
         "boundingVolume": {"box": [*middle.tolist(), *np.diag(half).ravel().tolist()]},
         "geometricError": tile.error_m,
         "refine": "REPLACE",
-        "content": {"uri": tile.uri},
+        "content": {"uri": content_uri(tile.name)},
     }
     if tile.children:
         document["children"] = [_tile(child) for child in tile.children]
