@@ -22,8 +22,8 @@ _LEAST_MASS = 1e-300
 _LOG_SCALES = (-20.0, 20.0)  # a file may state more, with which nobody can calculate
 _MOST_OPACITY = 0.99
 # Mass that an opaque Gaussian of the mixture's covariance cannot take makes it larger, by at most this factor of
-# its variance: an opaque surface of cells of edge h has σ = h / √12 in each, and is closed again from σ = h / 2 on.
-_MOST_GROWTH = 3.0
+# its variance: an opaque surface in cells of edge h has σ = h / √12 in each, and is closed again at σ = h / √3.
+_MOST_GROWTH = 4.0
 # A viewer shows no Gaussian whose σ is less than about a third of a pixel. In the farthest view of a level, a cell
 # is at least a pixel wide (see `level_of_detail`).
 _LEAST_SIGMA_CELLS = 0.35
@@ -130,7 +130,7 @@ def drawn(mixture: Mixture, cell_m: float) -> SplatArrays:
     growth = np.sqrt(np.clip(excess, 1, _MOST_GROWTH))
     growth = np.maximum(growth, _LEAST_SIGMA_CELLS * cell_m / sigmas[:, 2])
     sigmas = sigmas * growth[:, None]
-    opacity = np.clip(mixture.mass / shadow_areas(sigmas), 1e-6, _MOST_OPACITY)
+    opacity = np.clip(mixture.mass / shadow_areas(sigmas), 1e-12, _MOST_OPACITY)
     return SplatArrays(
         means=mixture.means.astype(np.float32),
         quats_wxyz=np.roll(quat_xyzw_from_matrix(axes), 1, axis=1).astype(np.float32),
