@@ -57,7 +57,8 @@ COMMANDS: dict[str, HelpLine] = {
     "init-sim3": HelpLine("init_sim3", "Stages", "Estimate the similarity from the SfM model to the Earth."),
     "train": HelpLine("train", "Stages", "Train the Gaussians with the similarity and the cameras."),
     "evaluate": HelpLine("evaluate", "Stages", "Measure test views and check points."),
-    "export-ply": HelpLine("export_ply", "Stages", "Write the splat as a PLY with its place on Earth."),
+    "export-ply": HelpLine("export_ply", "Deliverables", "Write the splat as a PLY with its place on Earth."),
+    "export-raster": HelpLine("export_raster", "Deliverables", "Write orthophoto, surface model and σ as rasters."),
     "export-spz": HelpLine("export_spz", "Deliverables", "Write the splat as SPZ, for viewers on the web."),
     "export-tiles": HelpLine("export_tiles", "Deliverables", "Write the splat as 3D Tiles, for web globes."),
 }

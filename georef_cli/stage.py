@@ -13,6 +13,7 @@ from georef_cli.display import progress_for
 from georef_cli.output import print_outcome
 from pipelines.core import runner
 from pipelines.core.stages import BY_NAME
+from pipelines.core.workspace import Resume
 
 
 class StageCommand(click.Command):
@@ -44,20 +45,20 @@ class StageCommand(click.Command):
         outcome = self.run(ctx, values)
         print_outcome(values["workspace"], outcome, as_json=values["as_json"])
 
-    def run(self, ctx: click.Context, values: Mapping[str, Any], *, resume: bool = False) -> runner.Outcome:
+    def run(self, ctx: click.Context, values: Mapping[str, Any], *, resume: Resume = "never") -> runner.Outcome:
         """Return the outcome of the stage with the options that the user gave.
 
         Args:
             ctx: has the verbosity, and the origin of the options' values.
             values: of all options.
-            resume: continue the interrupted run, with its options where the user gave none.
+            resume: whether to continue an interrupted run; `always` takes its options where the user gave none.
 
         Raises:
             GeorefError: the stage failed.
         """
         flags = options.given(ctx, self.spec.options.model_fields)
         workspace = values["workspace"]
-        if resume:
+        if resume == "always":
             flags = runner.remembered(workspace, self.spec, flags)
         with boundary.logged_to_file(workspace.log_file(self.spec)):
             return runner.run_stage(
@@ -65,6 +66,6 @@ class StageCommand(click.Command):
                 self.spec,
                 flags,
                 force=values["force"],
-                resume="always" if resume else "never",
+                resume=resume,
                 progress=progress_for(ctx.obj),
             )

@@ -69,6 +69,9 @@ HOMES: dict[str, tuple[str, ...]] = {
     "embreex": ("pipelines.simulate",),
     "matplotlib": ("pipelines.plots",),
     "zstandard": ("pipelines.formats",),
+    "rasterio": ("pipelines.formats",),
+    "pyogrio": ("pipelines.formats",),
+    "ezdxf": ("pipelines.formats",),
 }
 # The entry point of a process whose log records go to its parent.
 CHILD = "pipelines.core.child"

@@ -15,7 +15,7 @@ class TrainCommand(StageCommand):
 
     def act(self, ctx: click.Context, **values: Any) -> None:
         """Run or resume the stage, and print its result."""
-        outcome = self.run(ctx, values, resume=values["resume"])
+        outcome = self.run(ctx, values, resume="always" if values["resume"] else "never")
         print_outcome(values["workspace"], outcome, as_json=values["as_json"])
 
 

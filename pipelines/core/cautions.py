@@ -27,3 +27,8 @@ class Caution(Product):
 def union(*groups: tuple[Caution, ...]) -> tuple[Caution, ...]:
     """Return the cautions of all groups in order, each once."""
     return tuple(dict.fromkeys(caution for group in groups for caution in group))
+
+
+def is_checked(cautions: tuple[Caution, ...]) -> bool:
+    """Return whether something checks the σ of the positions; no accuracy is stated otherwise."""
+    return all(caution.code != NOT_CHECKED for caution in cautions)

@@ -189,6 +189,17 @@ PIPELINE: tuple[StageSpec, ...] = (
 # What a survey hands over besides the PLY: each is made on request, and none is read by another stage.
 DELIVERABLES: tuple[StageSpec, ...] = (
     StageSpec(
+        name="export-raster",
+        module="pipelines.deliver.raster.stage",
+        options_place="pipelines.deliver.options:ExportRasterOptions",
+        folder="raster",
+        reads=(*whole(SURVEY, SPARSE, MODEL, GAUSSIANS, SIM3), APPLIED_RIG),
+        product="raster/orthophoto.tif",
+        title="Write orthophoto, surface model and their σ as rasters in a CRS.",
+        resumable=True,
+        also=("raster/dsm.tif", "raster/sigma_h.tif", "raster/sigma_v.tif"),
+    ),
+    StageSpec(
         name="export-spz",
         module="pipelines.deliver.spz",
         options_place="pipelines.deliver.options:ExportSpzOptions",

@@ -61,3 +61,18 @@ class CrsOptions(StageOptions):
         description="Datum of the heights where --crs is silent: ellipsoidal, EGM96, EGM2008 or EPSG:n. Without "
         "it: that of the survey.",
     )
+
+
+class ExportRasterOptions(CrsOptions):
+    """Options of the export of orthophoto, surface model, σ and contours."""
+
+    gsd: float | None = Field(
+        None,
+        gt=0,
+        description="Size of a cell in units of the CRS. Without it: the ground sample distance of the "
+        "photographs.",
+    )
+    contours: float | None = Field(None, gt=0, description="Interval of contour lines, in the unit of the heights.")
+    min_views: int = Field(2, ge=1, description="Leave out cells whose surface fewer training views show.")
+    max_pixels: float = Field(1e9, gt=0, description="Refuse a raster with more cells.")
+    hillshade: bool = Field(True, description="Draw hillshade.png and preview.png.")

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pipelines.core.cautions import NOT_CHECKED, Caution
+from pipelines.core.cautions import Caution, is_checked
 from pipelines.core.types import FloatArray, Quaternion, Row7, Vector3
 from pipelines.formats.georef_sidecar import GeorefSidecar, predicted_accuracy
 from pipelines.geodesy.crs import ECEF, parse_crs
@@ -68,7 +68,7 @@ class Placement:
     @property
     def is_checked(self) -> bool:
         """Whether something checks the σ of the positions; no accuracy is stated otherwise."""
-        return all(caution.code != NOT_CHECKED for caution in self.cautions)
+        return is_checked(self.cautions)
 
     def sidecar(self, file_from_axes: FloatArray | None = None) -> GeorefSidecar:
         """Return the sidecar of a file in the frame `file`, with the accuracy predicted at its origin.

@@ -13,7 +13,15 @@ from pipelines.core.types import FloatArray, Vector3
 from pipelines.deliver.options import CrsOptions
 from pipelines.formats.georef_sidecar import CrsSidecar, SceneSigma
 from pipelines.geodesy.crs import PointCrs, parse_crs
-from pipelines.geodesy.enu import Origin, ecef_from_enu, ecef_from_lla, enu_from_ecef, lla_from_ecef, median_lla
+from pipelines.geodesy.enu import (
+    SEMI_MAJOR_M,
+    Origin,
+    ecef_from_enu,
+    ecef_from_lla,
+    enu_from_ecef,
+    lla_from_ecef,
+    median_lla,
+)
 from pipelines.geodesy.vertical import VerticalChoice, VerticalDatum, parse_vertical
 
 
@@ -32,6 +40,18 @@ class TargetCrs:
     origin: Origin
     lla: FloatArray
     assumed: tuple[str, ...] = ()
+
+    @property
+    def horizontal_unit_m(self) -> float:
+        """Unit of the plan in metres; of degrees along a meridian, by which a raster's cells are judged."""
+        if self.crs.is_geographic:
+            return self.crs.horizontal_unit * SEMI_MAJOR_M
+        return self.crs.horizontal_unit
+
+    @property
+    def height_unit_m(self) -> float:
+        """Unit of the heights in metres."""
+        return self.crs.height_unit_m
 
     def xyz_from_geo(self, points: ArrayLike) -> FloatArray:
         """Return points (N, 3) in the CRS, easting or longitude first, of points (N, 3) in `geo`.

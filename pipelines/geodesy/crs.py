@@ -71,6 +71,20 @@ class PointCrs:
         return first, second, self.height_unit
 
     @property
+    def height_unit_m(self) -> float:
+        """Unit of the heights in metres."""
+        axes = self._crs.axis_info
+        if self._three_dimensional and len(axes) == 3:
+            return float(axes[2].unit_conversion_factor)
+        return self._height_unit_m
+
+    @property
+    def horizontal_unit(self) -> float:
+        """The horizontal unit in metres; of a geographic CRS in radians."""
+        source = self._crs.source_crs if self._crs.is_bound else None
+        return float(horizontal_of(source or self._crs).axis_info[0].unit_conversion_factor)
+
+    @property
     def wkt(self) -> str:
         """As WKT2:2019."""
         return str(self._crs.to_wkt("WKT2_2019"))

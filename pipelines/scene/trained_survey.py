@@ -11,6 +11,7 @@ import numpy as np
 from pipelines.core.errors import InputError, MissingProductError
 from pipelines.core.products import load_json
 from pipelines.core.stages import GAUSSIANS, MODEL, SIM3, SPARSE
+from pipelines.core.types import FloatArray
 from pipelines.core.workspace import Workspace
 from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
@@ -58,6 +59,11 @@ class TrainedSurvey:
     def geo_from_model(self) -> Similarity:
         """Similarity of `model`."""
         return Similarity.from_record(self.model.geo_from_model)
+
+    @property
+    def point_in_model(self) -> FloatArray:
+        """SfM points (N, 3) in `model`, in metres."""
+        return Similarity.from_record(self.model.model_from_local).apply(self.sfm.point_in_local)
 
     def indices(self, split: str) -> list[int]:
         """Return the indices of the cameras of a split."""

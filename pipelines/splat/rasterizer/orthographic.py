@@ -43,6 +43,11 @@ class PlanSplats:
         """Return the rows that `index` picks."""
         return PlanSplats(self.mean[index], self.cov[index], self.opacity[index], self.colour[index])
 
+    def scaled(self, factor: float) -> PlanSplats:
+        """Return the same Gaussians over pixels that are smaller by a factor; depths stay."""
+        scale = np.array([factor, factor, 1.0])
+        return PlanSplats(self.mean * scale, self.cov * np.outer(scale, scale), self.opacity, self.colour)
+
 
 @dataclass(frozen=True)
 class PlanView:

@@ -1,0 +1,1 @@
+"""Stage `export-raster`: orthophoto, surface model and their σ as rasters in a CRS, contours and pictures."""

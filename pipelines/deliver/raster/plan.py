@@ -1,0 +1,128 @@
+"""Gaussians over the map plane: every one through ENU → ECEF → CRS by itself.
+
+A centre is transformed exactly. Its covariance is carried by the derivative of that way, which varies so slowly
+that it is taken from a few nodes over the scene.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from scipy.interpolate import RegularGridInterpolator
+from scipy.spatial import cKDTree
+
+from pipelines.core.errors import DegenerateGeometryError
+from pipelines.core.types import FloatArray
+from pipelines.deliver.target_crs import TargetCrs
+from pipelines.formats.geotiff import RasterFrame
+from pipelines.geometry.similarity import Similarity
+from pipelines.splat.gaussians import Gaussians, rotation_matrices
+from pipelines.splat.rasterizer.orthographic import PlanSplats
+from pipelines.splat.sh import basis
+
+_CHUNK = 1 << 17
+_NODES = 5  # along each axis of the scene
+_STEP_M = 1.0
+_ABOVE = 1.0  # unit of the heights, between the level from which depths count and the highest centre
+_MOST_REACH = 3.34  # standard deviations at which an opaque Gaussian falls below 1/255
+_VIEWS_OF_COLOUR = 4
+
+
+class PlanScene:
+    """Gaussians over the plane of a raster.
+
+    Args:
+        gaussians: in `model`.
+        geo_from_model: similarity.
+        target: the CRS.
+        frame: of the raster.
+        centers_in_model: (V, 3) centres of the training cameras, V ≥ 1.
+
+    Attributes:
+        splats: columns and rows of the raster's cells, depths below `level`.
+        level: height in the CRS's unit, above all Gaussians.
+    """
+
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        geo_from_model: Similarity,
+        target: TargetCrs,
+        frame: RasterFrame,
+        centers_in_model: FloatArray,
+    ) -> None:
+        mean_in_geo = geo_from_model.apply(gaussians.means.numpy())
+        xyz = np.concatenate(
+            [target.xyz_from_geo(mean_in_geo[i : i + _CHUNK]) for i in range(0, len(mean_in_geo), _CHUNK)]
+        )
+        derivative = _Derivative(mean_in_geo, target, frame)
+        cov = np.empty((len(xyz), 3, 3))
+        for start in range(0, len(xyz), _CHUNK):
+            part = slice(start, start + _CHUNK)
+            axes = geo_from_model.scale * geo_from_model.rotation @ _principal_axes(gaussians, part)
+            axes = derivative.at(mean_in_geo[part]) @ axes
+            cov[part] = axes @ np.swapaxes(axes, 1, 2)
+        reach = _MOST_REACH * np.sqrt(cov[:, 2, 2])
+        self.level = float((xyz[:, 2] + reach).max()) + _ABOVE
+        column = (xyz[:, 0] - frame.west) / frame.step_x
+        row = (frame.north - xyz[:, 1]) / frame.step_y
+        self.splats = PlanSplats(
+            np.column_stack([column, row, self.level - xyz[:, 2]]),
+            cov,
+            torch.sigmoid(gaussians.logit_opacities.double()).numpy(),
+            colours_from_above(gaussians, geo_from_model, centers_in_model),
+        )
+
+
+class _Derivative:
+    """Derivative (3, 3) of column, row and depth by a place in `geo`, interpolated between nodes."""
+
+    def __init__(self, points: FloatArray, target: TargetCrs, frame: RasterFrame) -> None:
+        low, high = points.min(axis=0), points.max(axis=0)
+        high = np.maximum(high, low + _STEP_M)
+        axes = [np.linspace(a, b, _NODES) for a, b in zip(low, high, strict=True)]
+        nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+        ends = [target.xyz_from_geo(nodes + _STEP_M / 2 * sign * axis) for axis in np.eye(3) for sign in (1, -1)]
+        by_geo = np.stack([ends[0] - ends[1], ends[2] - ends[3], ends[4] - ends[5]], axis=-1) / _STEP_M
+        by_geo = by_geo / np.array([frame.step_x, -frame.step_y, -1.0])[:, None]
+        if not np.isfinite(by_geo).all():
+            raise DegenerateGeometryError(f"{target.crs.name} has no derivative over the scene")
+        self._at = RegularGridInterpolator(tuple(axes), by_geo.reshape(*3 * (_NODES,), 9))
+
+    def at(self, points: FloatArray) -> FloatArray:
+        return np.asarray(self._at(points)).reshape(-1, 3, 3)
+
+
+def _principal_axes(gaussians: Gaussians, part: slice) -> FloatArray:
+    """Return the principal axes (N, 3, 3) in columns, one standard deviation long, in `model`."""
+    rotation = rotation_matrices(gaussians.quats_wxyz[part].double())
+    return np.asarray((rotation * gaussians.log_scales[part].double().exp()[:, None]).numpy())
+
+
+def colours_from_above(
+    gaussians: Gaussians, geo_from_model: Similarity, centers_in_model: FloatArray
+) -> FloatArray:
+    """Return colours (N, 3) as the training cameras nearest in plan see the Gaussians, averaged over these cameras.
+
+    Straight down would be a direction from which an oblique flight has never looked: harmonics say nothing there.
+
+    Args:
+        gaussians: N Gaussians in `model`.
+        geo_from_model: similarity.
+        centers_in_model: (V, 3) centres of the training cameras.
+    """
+    tree = cKDTree(geo_from_model.apply(centers_in_model)[:, :2])
+    nearest = min(_VIEWS_OF_COLOUR, len(centers_in_model))
+    centers = torch.from_numpy(np.ascontiguousarray(centers_in_model))
+    colours = np.empty((len(gaussians), 3))
+    for start in range(0, len(gaussians), _CHUNK):
+        part = gaussians.select(torch.arange(start, min(start + _CHUNK, len(gaussians))))
+        means = part.means.double()
+        _, camera = tree.query(geo_from_model.apply(means.numpy())[:, :2], k=[*range(1, nearest + 1)])
+        total = torch.zeros(len(part), 3, dtype=torch.float64)
+        for rank in range(nearest):
+            direction = torch.nn.functional.normalize(means - centers[camera[:, rank]], dim=1)
+            values = torch.einsum("nk,nkc->nc", basis(direction, part.sh_degree), part.sh.double())
+            total += (0.5 + values).clamp_min(0.0)
+        colours[start : start + len(part)] = (total / nearest).numpy()
+    return colours

@@ -1,0 +1,116 @@
+"""What the rasters are made from, read from the workspace."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from pipelines.accuracy.accuracy_grid import AccuracyGrid
+from pipelines.accuracy.error_propagation import NoErrorPropagation, propagate_errors
+from pipelines.core.cautions import is_checked
+from pipelines.core.errors import DegenerateGeometryError
+from pipelines.core.types import FloatArray
+from pipelines.core.workspace import StageRun
+from pipelines.deliver.options import ExportRasterOptions
+from pipelines.deliver.raster.extent import GroundSampling, scene_points
+from pipelines.deliver.raster.plan import PlanScene
+from pipelines.deliver.raster.window import RasterSource
+from pipelines.deliver.target_crs import TargetCrs
+from pipelines.formats.geotiff import RasterFrame
+from pipelines.scene.renderer import ModelRenderer
+from pipelines.scene.scene import photographs
+from pipelines.scene.surface_views import SurfaceViews
+from pipelines.scene.trained_survey import TrainedSurvey
+from pipelines.splat.gaussians import Gaussians
+from pipelines.splat.rasterizer.backends import rasterizer
+
+_LEAST_OPACITY = 1 / 255
+_AROUND = 0.1  # of the scene's extent: Gaussians further outside it reach into no cell
+_HAZE_VIEWS = 2  # training views that look through a Gaussian, and none that shows a surface there
+
+
+@dataclass(frozen=True)
+class Request:
+    """What rasters are wanted of what survey."""
+
+    trained: TrainedSurvey
+    target: TargetCrs
+    frame: RasterFrame
+    sampling: GroundSampling
+    options: ExportRasterOptions
+
+
+def raster_source(stage: StageRun, wanted: Request) -> tuple[RasterSource, str]:
+    """Return what the windows are made from, and the reason why σ is not known, or an empty text.
+
+    Args:
+        stage: the run; its folder holds the depth maps until the stage ends.
+        wanted: the rasters.
+
+    Raises:
+        InputError: a photograph cannot be read, or the depth maps do not fit on the disk.
+        DegenerateGeometryError: no Gaussian lies within the scene.
+    """
+    trained, target, frame = wanted.trained, wanted.target, wanted.frame
+    images = photographs(trained.sfm, trained.survey, stage.workspace, trained.model.max_image_size)
+    renderer = ModelRenderer(trained, images, rasterizer("auto"))
+    views = SurfaceViews(renderer, stage.out / "depth_maps", progress=stage.progress)
+    gaussians = _within(trained, trained.gaussians)
+    scene = PlanScene(
+        _without_haze(gaussians, views),
+        trained.geo_from_model,
+        target,
+        frame,
+        trained.poses.cam_center_in_model[trained.indices("train")],
+    )
+    sigma, reason = _sigma(stage, trained)
+    source = RasterSource(
+        scene=scene,
+        views=views,
+        geo_from_model=trained.geo_from_model,
+        target=target,
+        sigma=sigma,
+        training_px=wanted.sampling.training_m / (frame.step_x * target.horizontal_unit_m),
+        height_unit_m=target.height_unit_m,
+        training_gsd_m=wanted.sampling.training_m,
+        min_views=wanted.options.min_views,
+    )
+    return source, reason
+
+
+def _within(trained: TrainedSurvey, gaussians: Gaussians) -> Gaussians:
+    """Return the Gaussians that reach into the scene; far ones may lie outside the domain of the CRS."""
+    points = scene_points(trained)
+    low, high = points.min(axis=0), points.max(axis=0)
+    around = _AROUND * float(np.linalg.norm(high - low))
+    in_geo = trained.geo_from_model.apply(gaussians.means.numpy())
+    inside = ((in_geo >= low - around) & (in_geo <= high + around)).all(axis=1)
+    solid = torch.sigmoid(gaussians.logit_opacities) >= _LEAST_OPACITY
+    chosen = gaussians.select(solid & torch.from_numpy(inside))
+    if len(chosen) == 0:
+        raise DegenerateGeometryError("no Gaussian lies within the scene of the SfM points: train again")
+    return chosen
+
+
+def _without_haze(gaussians: Gaussians, views: SurfaceViews) -> Gaussians:
+    """Return the Gaussians without those in the air, through which the training views look at the surface."""
+    support = views.support(gaussians.means.double().numpy())
+    haze = (support.views == 0) & (support.seen_through >= _HAZE_VIEWS)
+    return gaussians.select(torch.from_numpy(~haze))
+
+
+def _sigma(stage: StageRun, trained: TrainedSurvey) -> tuple[AccuracyGrid | None, str]:
+    if not is_checked(trained.model.cautions):
+        return None, "nothing checks the σ of the positions"
+    propagation = propagate_errors(stage.workspace, trained)
+    if isinstance(propagation, NoErrorPropagation):
+        return None, propagation.reason
+    return propagation.grid, "" if propagation.grid is not None else "the scene has too few points"
+
+
+def corners(points: FloatArray) -> FloatArray:
+    """Return the corners (8, 3) of the box around points."""
+    box = np.stack([points.min(axis=0), points.max(axis=0)])
+    return np.stack(np.meshgrid(*box.T, indexing="ij"), axis=-1).reshape(-1, 3)

@@ -1,0 +1,201 @@
+"""Rasters as Cloud Optimized GeoTIFF (OGC 21-026), made of parts so that a large one never lies in memory.
+
+Parts are small GeoTIFFs. A mosaic of them (GDAL's VRT) is copied once into the final file, with overviews.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.core.durable import replace_file
+
+NODATA = -9999.0
+_CACHE_BYTES = 256 * 1024 * 1024
+_BLOCK_PX = 512
+
+_GDAL_TYPE = {"uint8": "Byte", "float32": "Float32"}
+
+
+@dataclass(frozen=True)
+class RasterFrame:
+    """Place of a raster's cells: rows from the north, columns from the west.
+
+    Attributes:
+        wkt: CRS as WKT2.
+        west, north: outer corner of the first cell, in the CRS's units, easting or longitude first.
+        step_x, step_y: size of a cell, > 0.
+        columns, rows: numbers of cells.
+    """
+
+    wkt: str
+    west: float
+    north: float
+    step_x: float
+    step_y: float
+    columns: int
+    rows: int
+
+    def part(self, column: int, row: int, columns: int, rows: int) -> RasterFrame:
+        """Return the frame of a part whose first cell is at `column`, `row`."""
+        west, north = self.west + column * self.step_x, self.north - row * self.step_y
+        return RasterFrame(self.wkt, west, north, self.step_x, self.step_y, columns, rows)
+
+    @property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """West, south, east, north of the outer edge."""
+        return (
+            self.west,
+            self.north - self.rows * self.step_y,
+            self.west + self.columns * self.step_x,
+            self.north,
+        )
+
+
+@dataclass(frozen=True)
+class Band:
+    """Meaning of a band: description, unit (empty: none) and colour."""
+
+    description: str
+    unit: str = ""
+    colour: Literal["Gray", "Red", "Green", "Blue", "Alpha"] = "Gray"
+
+
+@dataclass(frozen=True)
+class RasterKind:
+    """Bands of a raster. Without a value, float32 rasters have `NODATA`; bytes have an alpha band instead."""
+
+    dtype: Literal["uint8", "float32"]
+    bands: tuple[Band, ...]
+
+
+def write_part(path: Path, values: NDArray[Any], frame: RasterFrame) -> None:
+    """Write the cells of a part; the file appears whole or not at all.
+
+    Args:
+        path: of the part.
+        values: (bands, rows, columns) of the raster's type; NaN becomes `NODATA`.
+        frame: of the part.
+    """
+    import rasterio
+    from rasterio.transform import from_origin
+
+    if values.dtype.kind == "f":
+        values = np.where(np.isfinite(values), values, NODATA).astype(np.float32)
+    draft = path.with_name(path.name + ".tmp")
+    with rasterio.open(
+        draft,
+        "w",
+        driver="GTiff",
+        width=frame.columns,
+        height=frame.rows,
+        count=len(values),
+        dtype=values.dtype,
+        nodata=NODATA if values.dtype.kind == "f" else None,
+        transform=from_origin(frame.west, frame.north, frame.step_x, frame.step_y),
+        tiled=True,
+        blockxsize=_BLOCK_PX,
+        blockysize=_BLOCK_PX,
+        compress="DEFLATE",
+        zlevel=1,
+    ) as part:
+        part.write(values)
+    replace_file(draft, path)
+
+
+def write_mosaic(
+    path: Path,
+    parts: Sequence[tuple[Path, int, int]],
+    frame: RasterFrame,
+    kind: RasterKind,
+    tags: Mapping[str, str],
+) -> None:
+    """Write the mosaic of parts as a Cloud Optimized GeoTIFF.
+
+    Args:
+        path: of the raster.
+        parts: path, first column and first row of each part, all in one folder.
+        frame: of the raster.
+        kind: its bands.
+        tags: metadata of the raster.
+    """
+    import rasterio
+    import rasterio.shutil
+
+    mosaic = parts[0][0].parent / f"{path.stem}.vrt"
+    mosaic.write_bytes(_vrt(parts, frame, kind, tags))
+    draft = path.with_name(path.name + ".tmp")
+    with rasterio.Env(GDAL_CACHEMAX=_CACHE_BYTES):
+        rasterio.shutil.copy(
+            mosaic,
+            draft,
+            driver="COG",
+            COMPRESS="DEFLATE",
+            PREDICTOR="YES",
+            BLOCKSIZE=str(_BLOCK_PX),
+            OVERVIEW_RESAMPLING="AVERAGE",
+            NUM_THREADS="ALL_CPUS",
+            BIGTIFF="IF_SAFER",
+        )
+    replace_file(draft, path)
+
+
+def read_reduced(path: Path, longest_px: int) -> tuple[NDArray[Any], float]:
+    """Return the bands (bands, rows, columns) of a raster, averaged to a longest side, and the size of a cell.
+
+    Float rasters have NaN where there is no value.
+    """
+    import rasterio
+    from rasterio.enums import Resampling
+
+    with rasterio.open(path) as raster:
+        factor = max(max(raster.width, raster.height) / longest_px, 1.0)
+        shape = (raster.count, max(round(raster.height / factor), 1), max(round(raster.width / factor), 1))
+        values = raster.read(out_shape=shape, resampling=Resampling.average, masked=True)
+        cell = abs(raster.transform.a) * raster.width / shape[2]
+    if values.dtype.kind == "f":
+        return values.filled(np.nan), cell
+    return np.asarray(values.data), cell
+
+
+def _vrt(
+    parts: Sequence[tuple[Path, int, int]], frame: RasterFrame, kind: RasterKind, tags: Mapping[str, str]
+) -> bytes:
+    """Return the mosaic as XML that GDAL reads (https://gdal.org/drivers/raster/vrt.html)."""
+    root = ElementTree.Element("VRTDataset", rasterXSize=str(frame.columns), rasterYSize=str(frame.rows))
+    ElementTree.SubElement(root, "SRS").text = frame.wkt
+    corner = (frame.west, frame.step_x, 0.0, frame.north, 0.0, -frame.step_y)
+    ElementTree.SubElement(root, "GeoTransform").text = ", ".join(f"{value:.17g}" for value in corner)
+    metadata = ElementTree.SubElement(root, "Metadata")
+    for key, value in tags.items():
+        ElementTree.SubElement(metadata, "MDI", key=key).text = value
+    sizes = [_size(path) for path, _, _ in parts]
+    for number, band in enumerate(kind.bands, start=1):
+        element = ElementTree.SubElement(root, "VRTRasterBand", dataType=_GDAL_TYPE[kind.dtype], band=str(number))
+        ElementTree.SubElement(element, "Description").text = band.description
+        if band.unit:
+            ElementTree.SubElement(element, "UnitType").text = band.unit
+        if kind.dtype == "float32":
+            ElementTree.SubElement(element, "NoDataValue").text = str(NODATA)
+        ElementTree.SubElement(element, "ColorInterp").text = band.colour
+        for (path, column, row), (columns, rows) in zip(parts, sizes, strict=True):
+            source = ElementTree.SubElement(element, "SimpleSource")
+            ElementTree.SubElement(source, "SourceFilename", relativeToVRT="1").text = path.name
+            ElementTree.SubElement(source, "SourceBand").text = str(number)
+            for name, x, y in (("SrcRect", 0, 0), ("DstRect", column, row)):
+                place = {"xOff": str(x), "yOff": str(y), "xSize": str(columns), "ySize": str(rows)}
+                ElementTree.SubElement(source, name, place)
+    return b"<?xml version='1.0' encoding='utf-8'?>\n" + bytes(ElementTree.tostring(root, encoding="utf-8"))
+
+
+def _size(path: Path) -> tuple[int, int]:
+    import rasterio
+
+    with rasterio.open(path) as part:
+        return part.width, part.height
