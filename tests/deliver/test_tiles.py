@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import struct
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from pipelines.core.errors import InputError
 from pipelines.core.workspace import StageRun
 from pipelines.deliver.options import ExportTilesOptions
 from pipelines.deliver.tiles.content import read_glb, write_glb
@@ -129,3 +131,14 @@ def test_a_large_scene_has_coarser_steps(tmp_path: Path) -> None:
     splat.means[0] = [-9000, 2100, 30]
     write_glb(tmp_path / "a.glb", splat)
     np.testing.assert_allclose(read_glb(tmp_path / "a.glb").means, splat.means, atol=0.5 / 2**9 + 1e-3)
+
+
+def test_a_disk_that_is_too_small_is_said_before_the_work(
+    tmp_path: Path, scene: SplatArrays, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stage = write_trained(tmp_path / "ws", scene, "tiles")
+    usage = type(shutil.disk_usage(tmp_path))(2**40, 2**40, 10_000)
+    monkeypatch.setattr(shutil, "disk_usage", lambda folder: usage)
+    with pytest.raises(InputError, match=r"tiles of 2600 Gaussians may need .* --sh-degree"):
+        run(stage, ExportTilesOptions())
+    assert list(stage.out.iterdir()) == []

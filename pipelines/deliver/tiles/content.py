@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import math
+import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from pipelines.core.errors import InputError
 from pipelines.core.files import file_size
 from pipelines.formats.gltf import encode_glb, spz_in_glb
 from pipelines.formats.splat_ply import SplatArrays
 from pipelines.formats.spz import FRACTIONAL_BITS, decode_spz, encode_spz
 
 _REACH_M = 2.0 ** (23 - FRACTIONAL_BITS)
+_COPIES, _BYTES = 3, 17  # bytes of a Gaussian in SPZ before its compression, without harmonics above the constant
 _LEAST_LIMIT_BYTES = 256 * 1024 * 1024
 
 
@@ -37,6 +40,22 @@ def write_glb(path: Path, splat: SplatArrays, extras: dict[str, Any] | None = No
     low, high = splat.means.min(axis=0).tolist(), splat.means.max(axis=0).tolist()
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(encode_glb(spz, len(splat), math.isqrt(splat.sh.shape[1]) - 1, (low, high), extras))
+
+
+def require_space(folder: Path, splat: SplatArrays) -> None:
+    """Refuse tiles that the disk would not hold: each Gaussian is in a leaf, in splat.glb, and merged in levels.
+
+    Raises:
+        InputError: too little space is free.
+    """
+    needed = _COPIES * len(splat) * (_BYTES + 3 * splat.sh.shape[1])
+    free = shutil.disk_usage(folder).free
+    if needed > free:
+        raise InputError(
+            f"tiles of {len(splat)} Gaussians may need {needed / 2**30:.1f} GiB, and {free / 2**30:.1f} GiB are "
+            "free: give a lower --sh-degree or a larger --min-opacity, or make room on this disk",
+            path=folder,
+        )
 
 
 def read_glb(path: Path) -> SplatArrays:

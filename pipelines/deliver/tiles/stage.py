@@ -17,7 +17,7 @@ from pipelines.core.stages import TILES_GLB
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.deliver.options import ExportTilesOptions
 from pipelines.deliver.splat import codec_arrays, load_splat
-from pipelines.deliver.tiles.content import read_glb, write_glb
+from pipelines.deliver.tiles.content import read_glb, require_space, write_glb
 from pipelines.deliver.tiles.tileset import TILESET, content_uri, write_tileset
 from pipelines.formats.georef_sidecar import GeorefSidecar, write_sidecar
 from pipelines.formats.splat_ply import SplatArrays
@@ -33,11 +33,12 @@ def run(stage: StageRun, options: ExportTilesOptions) -> Summary:
 
     Raises:
         MissingProductError: ingest or train has not been run.
-        InputError: a product is damaged.
+        InputError: a product is damaged, or the disk is too small.
         DegenerateGeometryError: no Gaussian is opaque enough.
     """
     splat = load_splat(stage.workspace, options)
     arrays = codec_arrays(splat.gaussians, options.sh_degree)
+    require_space(stage.out, arrays)
     sidecar = splat.placement.sidecar()
     root = write_tiles(stage.out, arrays, sidecar, options.max_tile_gaussians, stage.progress)
     in_glb = write_whole(stage.out, arrays, root, sidecar)
