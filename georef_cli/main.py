@@ -59,6 +59,9 @@ COMMANDS: dict[str, HelpLine] = {
     "evaluate": HelpLine("evaluate", "Stages", "Measure test views and check points."),
     "export-ply": HelpLine("export_ply", "Deliverables", "Write the splat as a PLY with its place on Earth."),
     "export-raster": HelpLine("export_raster", "Deliverables", "Write orthophoto, surface model and σ as rasters."),
+    "export-cloud": HelpLine(
+        "export_cloud", "Deliverables", "Write the surface as a georeferenced point cloud (LAZ)."
+    ),
     "export-spz": HelpLine("export_spz", "Deliverables", "Write the splat as SPZ, for viewers on the web."),
     "export-tiles": HelpLine("export_tiles", "Deliverables", "Write the splat as 3D Tiles, for web globes."),
 }

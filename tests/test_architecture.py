@@ -62,6 +62,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     "gsplat": ("pipelines.splat.rasterizer.cuda",),
     "torch": ("pipelines.splat", "pipelines.georef", "pipelines.scene", *STAGE_ROOMS),
     "filelock": ("pipelines.core",),
+    "laspy": ("pipelines.formats",),
     "plyfile": ("pipelines.formats",),
     "exifread": ("pipelines.formats",),
     "defusedxml": ("pipelines.formats",),

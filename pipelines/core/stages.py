@@ -21,6 +21,7 @@ MODEL = "train/model.json"
 GAUSSIANS = "train/gaussians.ply"
 REPORT = "evaluate/report.json"
 SPLAT = "export/splat.ply"
+CLOUD = "cloud/cloud.laz"
 SPZ = "spz/splat.spz"
 TILES = "tiles/tileset.json"
 TILES_GLB = "tiles/splat.glb"
@@ -198,6 +199,16 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         title="Write orthophoto, surface model and their σ as rasters in a CRS.",
         resumable=True,
         also=("raster/dsm.tif", "raster/sigma_h.tif", "raster/sigma_v.tif"),
+    ),
+    StageSpec(
+        name="export-cloud",
+        module="pipelines.deliver.cloud.stage",
+        options_place="pipelines.deliver.options:ExportCloudOptions",
+        folder="cloud",
+        reads=(*whole(SURVEY, SPARSE, MODEL, GAUSSIANS, SIM3), APPLIED_RIG),
+        product=CLOUD,
+        title="Write the surface as a georeferenced point cloud (LAZ).",
+        resumable=True,
     ),
     StageSpec(
         name="export-spz",

@@ -73,6 +73,19 @@ class ExportRasterOptions(CrsOptions):
         "photographs.",
     )
     contours: float | None = Field(None, gt=0, description="Interval of contour lines, in the unit of the heights.")
-    min_views: int = Field(2, ge=1, description="Leave out cells whose surface fewer training views show.")
+    min_views: int = Field(4, ge=2, description="Leave out cells whose surface fewer training views show.")
     max_pixels: float = Field(1e9, gt=0, description="Refuse a raster with more cells.")
     hillshade: bool = Field(True, description="Draw hillshade.png and preview.png.")
+
+
+class ExportCloudOptions(CrsOptions):
+    """Options of the export of the surface as a point cloud."""
+
+    spacing: float | None = Field(
+        None,
+        ge=0.001,
+        description="Side of the voxels that hold one point each, in metres (default: the width of a pixel of the "
+        "training photographs on the ground).",
+    )
+    min_views: int = Field(3, ge=2, description="Number of training views that must agree on a point.")
+    ply: bool = Field(False, description="Write the same points as cloud.ply too.")

@@ -30,6 +30,10 @@ from pipelines.geodesy.vertical import ELLIPSOIDAL, VerticalChoice, VerticalDatu
 
 ECEF = "EPSG:4978"
 _MAX_TEXT = 20_000
+_ELLIPSOID_HEIGHT = (
+    'VERT_CS["Ellipsoid (metre)",VERT_DATUM["Ellipsoid",2002],UNIT["metre",1,AUTHORITY["EPSG","9001"]],'
+    'AXIS["Up",UP]]'
+)
 _UTM = re.compile(r"WGS\s?84\s*/?\s*UTM(?:\s+zone)?\s+(\d{1,2})\s*([NS])", re.IGNORECASE)
 
 
@@ -88,6 +92,25 @@ class PointCrs:
     def wkt(self) -> str:
         """As WKT2:2019."""
         return str(self._crs.to_wkt("WKT2_2019"))
+
+    @property
+    def wkt1(self) -> str:
+        """As WKT1 in GDAL's dialect, for formats older than WKT2, such as LAS.
+
+        WKT1 has no ellipsoidal heights. GDAL writes them as heights above a vertical datum of type 2002, and PROJ
+        reads that as the three-dimensional CRS again.
+
+        Raises:
+            InputError: the CRS cannot be written as WKT1.
+        """
+        three_axes = self._three_dimensional and not self._crs.is_compound and not self._crs.is_geocentric
+        try:
+            if not three_axes:
+                return str(self._crs.to_wkt("WKT1_GDAL"))
+            flat = self._crs.to_2d().to_wkt("WKT1_GDAL")
+        except CRSError as error:
+            raise InputError(f"{self.name} cannot be written as WKT1, which the file needs: {error}") from error
+        return f'COMPD_CS["{self._crs.name.replace(chr(34), "")} + Ellipsoid (metre)",{flat},{_ELLIPSOID_HEIGHT}]'
 
     def lla_from_xyz(
         self, xyz: ArrayLike, *, path: Path | str | None = None, lines: Sequence[int] | None = None

@@ -22,6 +22,7 @@ from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import ByteArray, Float32Array, FloatArray, IntArray
 from pipelines.geometry.cameras import Pinhole
 from pipelines.geometry.depth_support import DepthViews, Support, support
+from pipelines.scene.likeness import shows_photograph
 from pipelines.scene.renderer import ModelRenderer
 
 # The trained surface of a simulated flight departs from the true one by less than 0.5 % of the depth at nine of ten
@@ -66,6 +67,7 @@ class SurfaceViews:
         renderer: of the trained model.
         folder: scratch folder, made if missing. It belongs to the maps alone: maps that are there are continued.
         colours: keep the colours of the renders too.
+        confirmed: keep only depths where the render shows its photograph (`scene.likeness`).
         progress: shows the renders.
 
     Raises:
@@ -73,7 +75,13 @@ class SurfaceViews:
     """
 
     def __init__(
-        self, renderer: ModelRenderer, folder: Path, *, colours: bool = False, progress: Progress = SILENT
+        self,
+        renderer: ModelRenderer,
+        folder: Path,
+        *,
+        colours: bool = False,
+        confirmed: bool = False,
+        progress: Progress = SILENT,
     ) -> None:
         self.folder = folder
         self._trained = renderer.trained
@@ -82,6 +90,7 @@ class SurfaceViews:
         pixels = [pinhole.width * pinhole.height for pinhole in self.pinholes]
         self._start = np.concatenate([[0], np.cumsum(pixels)]).astype(np.int64)
         folder.mkdir(parents=True, exist_ok=True)
+        self._confirmed = confirmed
         self._render(renderer, colours, progress)
         self._depth = _mapped(folder / _DEPTHS, np.dtype(np.float32), int(self._start[-1]))
         self._rgb = _mapped(folder / _COLOURS, np.dtype(np.uint8), 3 * int(self._start[-1])) if colours else None
@@ -147,7 +156,10 @@ class SurfaceViews:
                 handle.truncate(size * int(self._start[done]))
             task.advance(done)
             for index in self.cameras[done:]:
-                maps: tuple[NDArray[Any], ...] = renderer.surface(index)
+                depth, rgb = renderer.surface(index)
+                if self._confirmed:
+                    depth[~shows_photograph(rgb, renderer.images.image(index))] = 0
+                maps: tuple[NDArray[Any], ...] = depth, rgb
                 for handle, values in zip(handles, maps, strict=False):
                     handle.write(values.tobytes())
                     handle.flush()

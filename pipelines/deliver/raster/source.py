@@ -7,13 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from pipelines.accuracy.accuracy_grid import AccuracyGrid
-from pipelines.accuracy.error_propagation import NoErrorPropagation, propagate_errors
-from pipelines.core.cautions import is_checked
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import StageRun
 from pipelines.deliver.options import ExportRasterOptions
+from pipelines.deliver.predicted_sigma import predicted_sigma
 from pipelines.deliver.raster.extent import GroundSampling, scene_points
 from pipelines.deliver.raster.plan import PlanScene
 from pipelines.deliver.raster.window import RasterSource
@@ -27,7 +25,7 @@ from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.rasterizer.backends import rasterizer
 
 _LEAST_OPACITY = 1 / 255
-_AROUND = 0.1  # of the scene's extent: Gaussians further outside it reach into no cell
+_AROUND = 0.1  # of the scene's extent: Gaussians further outside it, in plan, reach into no cell
 _HAZE_VIEWS = 2  # training views that look through a Gaussian, and none that shows a surface there
 
 
@@ -65,26 +63,26 @@ def raster_source(stage: StageRun, wanted: Request) -> tuple[RasterSource, str]:
         frame,
         trained.poses.cam_center_in_model[trained.indices("train")],
     )
-    sigma, reason = _sigma(stage, trained)
+    sigma = predicted_sigma(stage.workspace, trained)
     source = RasterSource(
         scene=scene,
         views=views,
         geo_from_model=trained.geo_from_model,
         target=target,
-        sigma=sigma,
+        sigma=sigma.grid,
         training_px=wanted.sampling.training_m / (frame.step_x * target.horizontal_unit_m),
         height_unit_m=target.height_unit_m,
         training_gsd_m=wanted.sampling.training_m,
         min_views=wanted.options.min_views,
     )
-    return source, reason
+    return source, sigma.reason
 
 
 def _within(trained: TrainedSurvey, gaussians: Gaussians) -> Gaussians:
     """Return the Gaussians that reach into the scene; far ones may lie outside the domain of the CRS."""
     points = scene_points(trained)
     low, high = points.min(axis=0), points.max(axis=0)
-    around = _AROUND * float(np.linalg.norm(high - low))
+    around = float(np.linalg.norm(high - low)) * np.array([_AROUND, _AROUND, 1.0])  # masts stand above all points
     in_geo = trained.geo_from_model.apply(gaussians.means.numpy())
     inside = ((in_geo >= low - around) & (in_geo <= high + around)).all(axis=1)
     solid = torch.sigmoid(gaussians.logit_opacities) >= _LEAST_OPACITY
@@ -99,15 +97,6 @@ def _without_haze(gaussians: Gaussians, views: SurfaceViews) -> Gaussians:
     support = views.support(gaussians.means.double().numpy())
     haze = (support.views == 0) & (support.seen_through >= _HAZE_VIEWS)
     return gaussians.select(torch.from_numpy(~haze))
-
-
-def _sigma(stage: StageRun, trained: TrainedSurvey) -> tuple[AccuracyGrid | None, str]:
-    if not is_checked(trained.model.cautions):
-        return None, "nothing checks the σ of the positions"
-    propagation = propagate_errors(stage.workspace, trained)
-    if isinstance(propagation, NoErrorPropagation):
-        return None, propagation.reason
-    return propagation.grid, "" if propagation.grid is not None else "the scene has too few points"
 
 
 def corners(points: FloatArray) -> FloatArray:

@@ -159,13 +159,16 @@ def _support(
         horizontal[at_row, at_column] = 2 * up[at_row, at_column] * np.nan_to_num(support.spread_rad) ** 2
     weight = uniform_filter(seen.astype(np.float64), _AVERAGED, mode="constant")
     noise_up_m, noise_h_m = (
-        np.sqrt(np.maximum(uniform_filter(np.where(seen, square, 0.0), _AVERAGED, mode="constant"), 0.0) / weight)
-        if seen.any()
-        else np.full(checked.shape, np.nan)
+        np.sqrt(
+            np.maximum(uniform_filter(np.where(seen, square, 0.0), _AVERAGED, mode="constant"), 0.0)
+            / np.maximum(weight, 0.5 / _AVERAGED**2)
+        )
         for square in (up, horizontal)
     )
     # At the edge of a roof no view agrees with the mixed height. Cells between seen ones were seen too.
-    seen = binary_closing(seen, iterations=_CLOSED)
+    seen = binary_closing(np.pad(seen, _CLOSED, mode="edge"), iterations=_CLOSED)[
+        _CLOSED:-_CLOSED, _CLOSED:-_CLOSED
+    ]
     row_of = np.minimum(np.arange(height.shape[0]) // stride, len(rows) - 1)
     column_of = np.minimum(np.arange(height.shape[1]) // stride, len(columns) - 1)
     whole = np.ix_(row_of, column_of)

@@ -1,0 +1,1 @@
+"""Point cloud: the fused surface of the trained model."""

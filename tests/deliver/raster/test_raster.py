@@ -1,0 +1,261 @@
+"""Rasters of a model whose surface is known exactly: level ground with a chequerboard, and a tower on it.
+
+The Gaussians are laid on the surface by hand, so that all errors are those of the export.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pyproj
+import pytest
+import rasterio
+import torch
+from rio_cogeo.cogeo import cog_validate
+
+from pipelines.accuracy.error_propagation import ErrorPropagation, propagate_errors
+from pipelines.core.errors import InputError
+from pipelines.core.products import load_json, save_json
+from pipelines.core.runner import run_stage
+from pipelines.core.stages import BY_NAME, GAUSSIANS, MODEL, POINTS, SIM3
+from pipelines.core.workspace import Workspace
+from pipelines.formats.georef_sidecar import CrsSidecar, sidecar_path
+from pipelines.geodesy.enu import lla_from_enu
+from pipelines.geolocate.options import GeolocateOptions
+from pipelines.geolocate.stage import geolocate
+from pipelines.geometry.cameras import Camera
+from pipelines.geometry.rotations import exp_so3, quat_xyzw_from_matrix
+from pipelines.geometry.similarity import Similarity
+from pipelines.scene.trained_model import TrainedCamera
+from pipelines.scene.trained_survey import load_trained
+from pipelines.splat.gaussians import Gaussians
+from pipelines.splat.sh import sh_from_rgb
+from pipelines.splat.storage import write_gaussians
+from pipelines.splat.transform import transformed
+from tests.scenes import (
+    Measured,
+    Noise,
+    TrueScene,
+    initial_product,
+    looking_at,
+    sparse_model,
+    survey_of,
+    trained_model,
+    write_workspace,
+)
+
+CAMERA = Camera("PINHOLE", 192, 144, np.array([150.0, 150.0, 96.0, 72.0]))
+GEO_FROM_MODEL = Similarity(1.7, exp_so3(np.array([0.3, -0.2, 1.0])), np.array([12.0, -7.0, 4.0]))
+TOWER_M, TOWER_HEIGHT_M = 3.0, 9.0  # half width
+SQUARE_M = 4.0
+GSD = 0.2  # about a pixel of the cameras
+UTM = "EPSG:32632"
+
+
+def surface_gaussians() -> Gaussians:
+    """Return flat, opaque Gaussians in `geo` on ground, roof and walls."""
+    step, sigma = SQUARE_M / 27, 0.08  # borders of squares lie in the middle between Gaussians
+    grid = np.arange(-4 * SQUARE_M + step / 2, 4 * SQUARE_M, step)
+    east, north = (axis.ravel() for axis in np.meshgrid(grid, grid))
+    on_roof = (np.abs(east) < TOWER_M) & (np.abs(north) < TOWER_M)
+    # Blending goes by height. On perfectly level ground the Earth's curvature would decide which of two lies above.
+    rough = np.random.default_rng(2).normal(0, 0.002, east.shape)
+    level = np.column_stack([east, north, np.where(on_roof, TOWER_HEIGHT_M, 0.0) + rough])
+    dark = (np.floor(east / SQUARE_M) + np.floor(north / SQUARE_M)) % 2 == 0
+    colour = np.where(on_roof[:, None], [0.8, 0.2, 0.1], np.where(dark[:, None], 0.15, 0.85))
+    along = np.arange(-TOWER_M + step / 2, TOWER_M, step)
+    height = np.arange(step / 2, TOWER_HEIGHT_M, step)
+    a, h = (axis.ravel() for axis in np.meshgrid(along, height))
+    walls, wall_scales = [], []
+    for sign in (-1, 1):
+        walls += [np.column_stack([np.full_like(a, sign * TOWER_M), a, h])]
+        wall_scales += [np.tile([0.01, sigma, sigma], (len(a), 1))]
+        walls += [np.column_stack([a, np.full_like(a, sign * TOWER_M), h])]
+        wall_scales += [np.tile([sigma, 0.01, sigma], (len(a), 1))]
+    means = np.concatenate([level, *walls])
+    scales = np.concatenate([np.tile([sigma, sigma, 0.01], (len(level), 1)), *wall_scales])
+    colour = np.concatenate([colour, np.tile([0.1, 0.2, 0.9], (len(means) - len(level), 1))])
+    return Gaussians(
+        torch.from_numpy(means).float(),
+        torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(means), 1),
+        torch.from_numpy(np.log(scales)).float(),
+        torch.full((len(means),), 4.0),
+        sh_from_rgb(torch.from_numpy(colour)).float()[:, None],
+    )
+
+
+def write_trained(root: Path) -> Workspace:
+    """Return a workspace with the model, as `train` would leave it."""
+    rng = np.random.default_rng(0)
+    center = np.array([[e, n, 30.0] for e in (-9, -3, 3, 9) for n in (-9, -3, 3, 9)], dtype=float)
+    points = np.column_stack([rng.uniform(-14, 14, (400, 2)), np.zeros(400)])
+    scene = TrueScene(
+        center,
+        looking_at(center, center * [0.7, 0.7, 0] + [0.0, 1e-3, 0.0]),
+        points,
+        np.zeros((0, 3)),
+        camera=CAMERA,
+        geo_from_local=GEO_FROM_MODEL,
+    )
+    noise = Noise(pixel_px=0.2)
+    survey, sparse = survey_of(scene, noise, Measured(), rng), sparse_model(scene, noise, rng)
+    workspace = write_workspace(root, survey, sparse)
+    cameras = tuple(
+        TrainedCamera(
+            name=name,
+            split="train",
+            quat_xyzw=tuple(quat_xyzw_from_matrix(rotation).tolist()),
+            translation=tuple(translation.tolist()),
+        )
+        for name, rotation, translation in zip(
+            sparse.image_name, sparse.rotation_cam_from_local, sparse.translation_cam_from_local, strict=True
+        )
+    )
+    covariance = np.diag([1e-3, 1e-3, 1e-3, 1e-3, 0.02, 0.02, 0.03]) ** 2
+    record = GEO_FROM_MODEL.to_record("local", "geo", covariance=covariance)
+    save_json(initial_product(record), root / SIM3)
+    geolocate(survey, sparse, GeolocateOptions()).points.save(root / POINTS)
+    save_json(trained_model(GEO_FROM_MODEL, max_image_size=192, cameras=cameras), root / MODEL)
+    write_gaussians(root / GAUSSIANS, transformed(surface_gaussians(), GEO_FROM_MODEL.inverse()))
+    return workspace
+
+
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
+    made = write_trained(tmp_path_factory.mktemp("raster") / "ws")
+    run_stage(made, BY_NAME["export-raster"], {"crs": UTM, "gsd": GSD, "contours": 1.0})
+    return made
+
+
+def in_utm(points_in_geo: np.ndarray, workspace: Workspace) -> np.ndarray:
+    """Return points (N, 3) in UTM, by pyproj alone."""
+    from pipelines.scene.calibrated import load_survey
+
+    lat, lon, height = lla_from_enu(points_in_geo, load_survey(workspace).origin).T
+    east, north = pyproj.Transformer.from_crs("EPSG:4326", UTM, always_xy=True).transform(lon, lat)
+    return np.column_stack([east, north, height])
+
+
+def at(path: Path, xyz: np.ndarray, band: int = 1) -> np.ndarray:
+    """Return the values of the cells at places."""
+    with rasterio.open(path) as raster:
+        return np.array([value[band - 1] for value in raster.sample(xyz[:, :2])], dtype=np.float64)
+
+
+def test_heights_are_those_of_ground_and_roof(workspace: Workspace) -> None:
+    """To a tenth of a cell: the Gaussians lie on the surface, and only blending and the grid err."""
+    rng = np.random.default_rng(1)
+    ground = rng.uniform(-12, 12, (300, 3)) * [1, 1, 0]
+    ground = ground[np.abs(ground[:, :2]).max(axis=1) > TOWER_M + 0.5]
+    roof = rng.uniform(-1, 1, (100, 3)) * [TOWER_M - 0.4, TOWER_M - 0.4, 0] + [0, 0, TOWER_HEIGHT_M]
+    for points in (ground, roof):
+        xyz = in_utm(points, workspace)
+        off = at(workspace.path("raster/dsm.tif"), xyz) - xyz[:, 2]
+        assert np.sqrt(np.mean(off**2)) < 0.1 * GSD
+
+
+def test_walls_do_not_lean(workspace: Workspace) -> None:
+    """Roof and foot of a wall lie at the same place: a cell beyond it is ground, a cell within it roof."""
+    beside = np.linspace(-TOWER_M + 0.5, TOWER_M - 0.5, 12)
+    for side in (-1.0, 1.0):
+        for axis in (0, 1):
+            edge = np.zeros((len(beside), 3))
+            edge[:, axis], edge[:, 1 - axis] = side * TOWER_M, beside
+            outwards = np.zeros(3)
+            outwards[axis] = side
+            for step, height in ((1.6 * GSD, 0.0), (-1.6 * GSD, TOWER_HEIGHT_M)):
+                xyz = in_utm(edge + step * outwards, workspace)
+                off = at(workspace.path("raster/dsm.tif"), xyz) - (xyz[:, 2] + height)
+                assert np.median(np.abs(off)) < 0.2
+                red = at(workspace.path("raster/orthophoto.tif"), xyz, band=1)
+                blue = at(workspace.path("raster/orthophoto.tif"), xyz, band=3)
+                # Red over blue is the roof; the wall would be blue over red, the ground is grey.
+                assert np.median(red - blue) > 60 if height else abs(np.median(red - blue)) < 40
+
+
+def test_chequerboard_corners_are_at_their_surveyed_places(workspace: Workspace) -> None:
+    """To half a cell: where the four squares around a corner balance, found by the saddle of the grey values."""
+    corners = np.array([[e, n, 0.0] for e in (-8, -4, 0, 8, 4) for n in (-8, 8)], dtype=float)
+    with rasterio.open(workspace.path("raster/orthophoto.tif")) as raster:
+        grey, inverse = raster.read(1).astype(np.float64), ~raster.transform
+    for place in in_utm(corners, workspace):
+        column, row = inverse * (place[0], place[1])
+        found = _saddle(grey, column, row)
+        assert np.hypot(found[0] - column, found[1] - row) < 0.5
+
+
+def _saddle(grey: np.ndarray, column: float, row: float, reach: int = 6) -> tuple[float, float]:
+    """Return the saddle of a quadratic that is fitted to the smoothed grey values around a place."""
+    from scipy.ndimage import gaussian_filter
+
+    smooth = gaussian_filter(grey, 2.0)
+    x0, y0 = int(column), int(row)
+    y, x = np.mgrid[y0 - reach : y0 + reach + 1, x0 - reach : x0 + reach + 1]
+    u, v = (x + 0.5 - column).ravel(), (y + 0.5 - row).ravel()
+    design = np.stack([u * u, u * v, v * v, u, v, np.ones_like(u)], axis=1)
+    a, b, c, d, e, _ = np.linalg.lstsq(design, smooth[y, x].ravel(), rcond=None)[0]
+    du, dv = np.linalg.solve([[2 * a, b], [b, 2 * c]], [-d, -e])
+    return column + du, row + dv
+
+
+def test_rasters_are_valid_and_say_where_they_are(workspace: Workspace) -> None:
+    for name in ("orthophoto", "dsm", "sigma_h", "sigma_v"):
+        path = workspace.path(f"raster/{name}.tif")
+        valid, errors, warnings = cog_validate(path)
+        assert (valid, errors, warnings) == (True, [], [])
+        sidecar = load_json(CrsSidecar, sidecar_path(path))
+        with rasterio.open(path) as raster:
+            assert raster.crs.to_epsg() == 32632
+            assert raster.tags()["GEOREF_VERTICAL_DATUM"] == sidecar.vertical_datum.name == "ellipsoidal"
+            assert float(raster.tags()["GEOREF_SIGMA_V_M"]) == pytest.approx(
+                sidecar.accuracy.median_sigma_v_m, abs=1e-4
+            )
+
+
+def test_sigma_is_that_of_georeference_and_surface(workspace: Workspace) -> None:
+    """On a surface without noise it is the σ that is predicted for the place."""
+    propagation = propagate_errors(workspace, load_trained(workspace))
+    assert isinstance(propagation, ErrorPropagation) and propagation.grid is not None
+    points = np.array([[-8.0, 6, 0], [0, 10, 0], [7, -7, 0]])
+    expected, xyz = propagation.grid.sigma_at(points), in_utm(points, workspace)
+    horizontal, vertical = (at(workspace.path(f"raster/{name}.tif"), xyz) for name in ("sigma_h", "sigma_v"))
+    np.testing.assert_allclose(vertical, expected[:, 2], rtol=0.03)
+    np.testing.assert_allclose(horizontal, np.hypot(expected[:, 0], expected[:, 1]), rtol=0.1)
+
+
+def test_nothing_is_invented_where_nothing_was_seen(workspace: Workspace) -> None:
+    with rasterio.open(workspace.path("raster/dsm.tif")) as raster:
+        known = raster.read_masks(1) > 0
+    with rasterio.open(workspace.path("raster/orthophoto.tif")) as raster:
+        np.testing.assert_array_equal(raster.read(4) > 0, known)
+    assert 0.5 < known.mean() < 1
+
+
+def test_contours_run_around_the_tower(workspace: Workspace) -> None:
+    import pyogrio
+
+    fields, _, _, (height, _) = pyogrio.raw.read(workspace.path("raster/contours.gpkg"))
+    assert fields["crs"] == UTM
+    base = in_utm(np.zeros((1, 3)), workspace)[0, 2]
+    assert ((height > base - 0.5) & (height < base + TOWER_HEIGHT_M + 0.5)).all()
+    assert len(set(height)) >= TOWER_HEIGHT_M - 1
+    assert workspace.path("raster/contours.dxf").stat().st_size > 1000
+
+
+@pytest.mark.parametrize(
+    ("flags", "says"),
+    [
+        ({"crs": "EPSG:4326"}, "give the size of a cell in that unit"),
+        ({"crs": "EPSG:4326", "gsd": 0.05}, "more than a kilometre"),
+        ({"crs": "EPSG:4978", "gsd": 0.05}, "has no map plane"),
+        ({"crs": "EPSG:999999"}, "is no CRS that PROJ knows"),
+        ({"gsd": 1e-5}, "more than --max-pixels"),
+        ({"crs": "EPSG:2056+3855"}, "us_nga_egm08_25.tif is not installed"),
+    ],
+    ids=["degrees", "metres", "geocentric", "unknown", "cells", "grid"],
+)
+def test_bad_requests_are_refused(workspace: Workspace, flags: dict[str, object], says: str) -> None:
+    with pytest.raises(InputError, match=says):
+        run_stage(workspace, BY_NAME["export-raster"], flags)
+    assert workspace.path("raster/dsm.tif").exists()
