@@ -31,7 +31,7 @@ def splats(draw: st.DrawFn) -> SplatArrays:
 
 
 @given(splat=splats(), version=st.sampled_from([3, 4]))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 def test_round_trip_within_the_bounds_of_the_format(splat: SplatArrays, version: SpzVersion) -> None:
     again = decode_spz(encode_spz(splat, version), limit_bytes=LIMIT)
     rounding = 1e-6
@@ -55,7 +55,7 @@ def test_round_trip_within_the_bounds_of_the_format(splat: SplatArrays, version:
 
 
 @given(noise=st.binary(max_size=200), cut=st.integers(0, 400), version=st.sampled_from([3, 4]))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 def test_damaged_files_are_refused_with_a_message(noise: bytes, cut: int, version: SpzVersion) -> None:
     ones = np.ones((2, 3), dtype=np.float32)
     whole = encode_spz(SplatArrays(ones, np.ones((2, 4), np.float32), ones, ones[:, 0], ones[:, None]), version)
