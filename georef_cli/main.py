@@ -62,6 +62,8 @@ COMMANDS: dict[str, HelpLine] = {
     "export-cloud": HelpLine(
         "export_cloud", "Deliverables", "Write the surface as a georeferenced point cloud (LAZ)."
     ),
+    "export-spz": HelpLine("export_spz", "Deliverables", "Write the splat as SPZ, for viewers on the web."),
+    "export-tiles": HelpLine("export_tiles", "Deliverables", "Write the splat as 3D Tiles, for web globes."),
 }
 
 

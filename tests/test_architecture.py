@@ -69,6 +69,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     "rosbags": ("pipelines.formats",),
     "embreex": ("pipelines.simulate",),
     "matplotlib": ("pipelines.plots",),
+    "zstandard": ("pipelines.formats",),
     "rasterio": ("pipelines.formats",),
     "pyogrio": ("pipelines.formats",),
     "ezdxf": ("pipelines.formats",),

@@ -22,6 +22,9 @@ GAUSSIANS = "train/gaussians.ply"
 REPORT = "evaluate/report.json"
 SPLAT = "export/splat.ply"
 CLOUD = "cloud/cloud.laz"
+SPZ = "spz/splat.spz"
+TILES = "tiles/tileset.json"
+TILES_GLB = "tiles/splat.glb"
 
 
 @dataclass(frozen=True)
@@ -206,6 +209,25 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         product=CLOUD,
         title="Write the surface as a georeferenced point cloud (LAZ).",
         resumable=True,
+    ),
+    StageSpec(
+        name="export-spz",
+        module="pipelines.deliver.spz",
+        options_place="pipelines.deliver.options:ExportSpzOptions",
+        folder="spz",
+        reads=(*whole(SURVEY, MODEL, GAUSSIANS), APPLIED_RIG),
+        product=SPZ,
+        title="Write the splat as SPZ, for viewers on the web.",
+    ),
+    StageSpec(
+        name="export-tiles",
+        module="pipelines.deliver.tiles.stage",
+        options_place="pipelines.deliver.options:ExportTilesOptions",
+        folder="tiles",
+        reads=(*whole(SURVEY, MODEL, GAUSSIANS), APPLIED_RIG),
+        product=TILES,
+        title="Write the splat as 3D Tiles, for web globes.",
+        also=(TILES_GLB,),
     ),
 )
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field
 
 from pipelines.core.options import StageOptions
@@ -16,6 +18,34 @@ class SplatOptions(StageOptions):
 
 class ExportPlyOptions(SplatOptions):
     """Options of the export of the splat as a 3DGS PLY with its sidecar."""
+
+
+class WebSplatOptions(SplatOptions):
+    """Options of the compressed forms of the splat."""
+
+    sh_degree: int | None = Field(
+        None,
+        ge=0,
+        le=3,
+        description="Degree of the spherical harmonics in the file: a lower one makes it smaller. Without it: that "
+        "of the model.",
+    )
+
+
+class ExportSpzOptions(WebSplatOptions):
+    """Options of the export of the splat as SPZ with its sidecar."""
+
+    spz_version: Literal["3", "4"] = Field(
+        "3", description="Version of the format: CesiumJS and Spark read 3, PlayCanvas reads 4 only."
+    )
+
+
+class ExportTilesOptions(WebSplatOptions):
+    """Options of the export of the splat as 3D Tiles and as glb."""
+
+    max_tile_gaussians: int = Field(
+        200_000, ge=1000, le=3_000_000, description="Largest number of Gaussians in a tile."
+    )
 
 
 class CrsOptions(StageOptions):

@@ -70,12 +70,18 @@ class Placement:
         """Whether something checks the σ of the positions; no accuracy is stated otherwise."""
         return is_checked(self.cautions)
 
-    def sidecar(self) -> GeorefSidecar:
-        """Return the sidecar of a file in the frame `file`, with the accuracy predicted at its origin."""
-        x, y, z, w = quat_xyzw_from_matrix(self.ecef_from_file.rotation).tolist()
+    def sidecar(self, file_from_axes: FloatArray | None = None) -> GeorefSidecar:
+        """Return the sidecar of a file in the frame `file`, with the accuracy predicted at its origin.
+
+        Args:
+            file_from_axes: (3, 3) rotation from the axes of the file, for one whose axes are not East-North-Up. The
+                sidecar's rotation and covariance are those of its axes, σ remain those of east, north and up.
+        """
+        axes = np.eye(3) if file_from_axes is None else file_from_axes
+        x, y, z, w = quat_xyzw_from_matrix(self.ecef_from_file.rotation @ axes).tolist()
         quaternion: Quaternion = (x, y, z, w)
-        covariance = self.covariance
-        known = covariance is not None and self.is_checked
+        covariance = None if self.covariance is None else _turned(self.covariance, axes.T)
+        known = self.covariance is not None and self.is_checked
         return GeorefSidecar(
             origin=_vector(self.ecef_from_file.translation),
             rotation=quaternion,
@@ -84,7 +90,9 @@ class Placement:
             vertical_datum=self.vertical,
             crs_wkt=parse_crs(ECEF).wkt,
             covariance=None if covariance is None else tuple(map(_row, covariance)),
-            accuracy=predicted_accuracy(covariance, np.zeros(3)) if known and covariance is not None else None,
+            accuracy=predicted_accuracy(self.covariance, np.zeros(3))
+            if known and self.covariance is not None
+            else None,
             cautions=self.cautions,
         )
 
@@ -126,9 +134,14 @@ def _covariance_in_file(geo_from_model: SimilarityRecord, file_from_geo: Similar
     if not covariance.any():
         return None
     about_origin = moved_pivot(covariance, geo_from_model.pivot, file_from_geo.inverse().translation)
+    return _turned(about_origin, file_from_geo.rotation)
+
+
+def _turned(covariance: FloatArray, to_from_from: FloatArray) -> FloatArray:
+    """Return a similarity's covariance (7, 7) along other axes, about the same origin."""
     turn = np.eye(7)
-    turn[1:4, 1:4] = turn[4:, 4:] = file_from_geo.rotation
-    return np.asarray(turn @ about_origin @ turn.T)
+    turn[1:4, 1:4] = turn[4:, 4:] = to_from_from
+    return np.asarray(turn @ covariance @ turn.T)
 
 
 def _row(values: FloatArray) -> Row7:

@@ -12,10 +12,12 @@ from pipelines.core.stages import GAUSSIANS, MODEL
 from pipelines.core.workspace import Workspace
 from pipelines.deliver.options import SplatOptions
 from pipelines.deliver.placement import Placement, place
+from pipelines.formats.splat_ply import SplatArrays
 from pipelines.scene.calibrated import load_survey
 from pipelines.scene.survey import Survey
 from pipelines.scene.trained_model import TrainedModel
 from pipelines.splat.gaussians import Gaussians
+from pipelines.splat.sh import coefficient_count
 from pipelines.splat.storage import read_gaussians
 from pipelines.splat.transform import transformed
 
@@ -86,3 +88,11 @@ def placed_splat(gaussians: Gaussians, model: TrainedModel, survey: Survey, opti
     # The placement is that of the model, whatever part of it a file holds.
     placement = place(model, survey, gaussians.means.numpy())
     return PlacedSplat(transformed(kept, placement.file_from_model), placement, len(gaussians) - len(kept))
+
+
+def codec_arrays(gaussians: Gaussians, sh_degree: int | None = None) -> SplatArrays:
+    """Return Gaussians for a codec, with spherical harmonics up to a degree; None: all that there are."""
+    arrays = gaussians.arrays()
+    if sh_degree is not None:
+        arrays["sh"] = arrays["sh"][:, : coefficient_count(sh_degree)]
+    return SplatArrays(**arrays)

@@ -17,7 +17,7 @@ from plyfile import PlyData, PlyElement, PlyParseError
 from pipelines.core.durable import replace_file
 from pipelines.core.errors import InputError
 from pipelines.core.files import file_size
-from pipelines.core.types import Float32Array
+from pipelines.core.types import Float32Array, IntArray
 
 _HEADER_LIMIT = 64 * 1024
 _POSITION = ("x", "y", "z")
@@ -48,6 +48,10 @@ class SplatArrays:
 
     def __len__(self) -> int:
         return len(self.means)
+
+    def select(self, index: IntArray) -> SplatArrays:
+        """Return copies of the rows (M,)."""
+        return SplatArrays(**{name: values[index] for name, values in vars(self).items()})
 
 
 def write_splat_ply(path: Path, splat: SplatArrays) -> None:

@@ -9,20 +9,35 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-_BITS = 21  # three coordinates of 21 bits fill the 63 bits of a positive int64
+BITS = 21  # three coordinates of 21 bits fill the 63 bits of a positive int64
 
 
 def morton_order(means: Tensor) -> Tensor:
     """Return the permutation (N,) int64 that sorts points (N, 3) along a Z-order curve in their bounding box."""
     if len(means) == 0:
         return torch.zeros(0, dtype=torch.int64, device=means.device)
-    low, high = means.amin(dim=0), means.amax(dim=0)
-    extent = (high - low).max().clamp_min(torch.finfo(means.dtype).tiny)
-    cells = ((means - low) / extent * (2**_BITS - 1)).long()
-    code = torch.zeros(len(means), dtype=torch.int64, device=means.device)
+    return torch.argsort(morton_codes(means)[0], stable=True)
+
+
+def morton_codes(points: Tensor) -> tuple[Tensor, float]:
+    """Return the places of points along a Z-order curve, and the edge of its cells.
+
+    The curve runs through the cube of 2^21 cells a side at the least corner of the points' bounding box. Codes
+    without their lowest 3 k bits are those of cells that are 2^k times as large.
+
+    Args:
+        points: (N, 3), N ≥ 1.
+
+    Returns:
+        (N,) int64 codes, and the edge in the points' unit.
+    """
+    low, high = points.amin(dim=0), points.amax(dim=0)
+    extent = (high - low).max().clamp_min(torch.finfo(points.dtype).tiny)
+    cells = ((points - low) / extent * (2**BITS - 1)).long()
+    code = torch.zeros(len(points), dtype=torch.int64, device=points.device)
     for axis in range(3):
         code |= _spread_bits(cells[:, axis]) << axis
-    return torch.argsort(code, stable=True)
+    return code, float(extent) / (2**BITS - 1)
 
 
 def _spread_bits(value: Tensor) -> Tensor:

@@ -31,6 +31,7 @@ from pipelines.formats.georef_sidecar import GeorefSidecar, read_sidecar, write_
 from pipelines.formats.image_file import inspect_image, read_bytes
 from pipelines.formats.odm import read_geo, read_ground_points
 from pipelines.formats.splat_ply import SplatArrays, read_splat_ply, write_splat_ply
+from pipelines.formats.spz import read_spz, write_spz
 from pipelines.formats.trajectory_csv import read_trajectory
 from pipelines.geodesy.crs import parse_crs
 from pipelines.geodesy.vertical import VerticalDatum
@@ -206,6 +207,14 @@ def _splat(folder: Path) -> None:
     write_splat_ply(folder / "a.ply", SplatArrays(**arrays))
 
 
+def _spz(folder: Path) -> None:
+    _splat(folder)
+    splat = read_splat_ply(folder / "a.ply")
+    (folder / "a.ply").unlink()
+    write_spz(folder / "a.spz", splat, 3)
+    write_spz(folder / "b.spz", splat, 4)
+
+
 def _sidecar(folder: Path) -> None:
     covariance = tuple(tuple(row) for row in (np.eye(7) * 1e-4).tolist())
     sidecar = GeorefSidecar(
@@ -337,6 +346,7 @@ READERS: dict[str, Reader] = {
     "bag-db3": Reader(_bag(StoragePlugin.SQLITE3), _read_bag("bag/*.db3"), "bag/*.db3"),
     "bag-db3-zstd": Reader(_bag(StoragePlugin.SQLITE3, CompressionMode.MESSAGE), _read_bag("bag"), "bag/*"),
     "bag-ros1": Reader(_bag1, _read_bag("*.bag")),
+    "spz": Reader(_spz, lambda folder: (read_spz(folder / "a.spz"), read_spz(folder / "b.spz"))),
     "splat-ply": Reader(_splat, lambda folder: read_splat_ply(folder / "a.ply")),
     "sidecar": Reader(_sidecar, _read_sidecar),
     "products": Reader(_products, _read_products),

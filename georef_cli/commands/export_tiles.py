@@ -1,0 +1,21 @@
+"""Command `georef export-tiles`."""
+
+from __future__ import annotations
+
+from georef_cli.deliverable import DeliverableCommand
+
+command = DeliverableCommand(
+    "export-tiles",
+    """Write the splat as 3D Tiles, for web globes such as CesiumJS.
+
+    The folder is ready for a web server: tileset.json with levels of detail in Earth-centred coordinates, its
+    contents, and splat.glb, the whole splat in one file. The files *.georef.json state the place on Earth and its
+    accuracy.
+
+    \b
+    Examples:
+      georef export-tiles flight
+      georef export-tiles flight --to www/flight --max-tile-gaussians 100000
+    """,
+    folder=True,
+)

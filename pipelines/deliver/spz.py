@@ -1,0 +1,47 @@
+"""Export of the splat as SPZ, with a sidecar that states its place on Earth.
+
+Reads `ingest/survey.json`, `train/model.json` and `train/gaussians.ply`. Writes `spz/splat.spz` and
+`spz/splat.spz.georef.json` (docs/formats.md).
+
+Readers of SPZ take its axes for right, up and back, and turn them into their own. The file's axes are therefore
+east, up and south, so that every reader sees the scene upright. The rotation of the sidecar is that of these axes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipelines.core.errors import InputError
+from pipelines.core.stages import SPZ
+from pipelines.core.workspace import StageRun, Summary
+from pipelines.deliver.options import ExportSpzOptions
+from pipelines.deliver.splat import codec_arrays, load_splat
+from pipelines.formats.georef_sidecar import write_sidecar
+from pipelines.formats.spz import SpzVersion, write_spz
+from pipelines.geometry.similarity import Similarity
+from pipelines.splat.transform import transformed
+
+# Columns: the file's right, up and back, along east, north and up.
+ENU_FROM_RUB = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+
+
+def run(stage: StageRun, options: ExportSpzOptions) -> Summary:
+    """Write the SPZ file and its sidecar, and return their key figures.
+
+    Raises:
+        MissingProductError: ingest or train has not been run.
+        InputError: a product is damaged, or the scene is larger than the format can hold.
+        DegenerateGeometryError: no Gaussian is opaque enough.
+    """
+    splat = load_splat(stage.workspace, options)
+    upright = transformed(splat.gaussians, Similarity(1.0, ENU_FROM_RUB.T))
+    path = stage.out / SPZ.rpartition("/")[2]
+    version: SpzVersion = 3 if options.spz_version == "3" else 4
+    try:
+        write_spz(path, codec_arrays(upright, options.sh_degree), version)
+    except InputError as error:
+        raise InputError(f"{error}: georef export-tiles writes scenes of any size") from error
+    write_sidecar(splat.placement.sidecar(ENU_FROM_RUB), path)
+    values = {**splat.figures(), "spz_version": version, "bytes": path.stat().st_size}
+    size = f"{path.stat().st_size / 2**20:.1f} MiB"
+    return Summary(f"{splat.key_figure()}, {size}", values, cautions=splat.placement.cautions)

@@ -1,0 +1,144 @@
+"""The tiles: read as a web globe reads them, every Gaussian is once where the survey put it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from pipelines.core.errors import InputError
+from pipelines.core.workspace import StageRun
+from pipelines.deliver.options import ExportTilesOptions
+from pipelines.deliver.tiles.content import read_glb, write_glb
+from pipelines.deliver.tiles.stage import run, write_whole
+from pipelines.formats.georef_sidecar import read_sidecar
+from pipelines.formats.splat_ply import SplatArrays
+from pipelines.splat.level_of_detail import DetailTile
+from tests.delivered_scenes import splat_arrays, true_ecef, write_trained
+
+COUNT = 2600
+Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # glTF's axes to those of 3D Tiles
+STEP_M = np.sqrt(3) * 0.5 / 4096 + 1e-4  # of SPZ along each axis, and float32 of the frame `model`
+
+
+@pytest.fixture(scope="module")
+def scene() -> SplatArrays:
+    return splat_arrays(COUNT, extent_m=20.0)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory, scene: SplatArrays) -> StageRun:
+    stage = write_trained(tmp_path_factory.mktemp("tiles") / "ws", scene, "tiles")
+    summary = run(stage, ExportTilesOptions(max_tile_gaussians=1000))
+    assert summary.values["gaussians"] == summary.values["glb_gaussians"] == COUNT
+    assert summary.values["tiles"] == len(all_tiles(document(stage)["root"]))
+    return stage
+
+
+def document(stage: StageRun) -> dict[str, Any]:
+    content: dict[str, Any] = json.loads((stage.out / "tileset.json").read_text(encoding="utf-8"))
+    return content
+
+
+def all_tiles(tile: dict[str, Any]) -> list[dict[str, Any]]:
+    return [tile, *(below for child in tile.get("children", []) for below in all_tiles(child))]
+
+
+def gltf_of(path: Path) -> dict[str, Any]:
+    data = path.read_bytes()
+    content: dict[str, Any] = json.loads(data[20 : 20 + struct.unpack_from("<I", data, 12)[0]])
+    return content
+
+
+def in_ecef(stage: StageRun, path: Path) -> np.ndarray:
+    """Places of a content by the matrices of tileset and glTF alone."""
+    root = np.array(document(stage)["root"]["transform"]).reshape(4, 4).T
+    node = np.array(gltf_of(path)["nodes"][0]["matrix"]).reshape(4, 4).T
+    means = read_glb(path).means.astype(np.float64)
+    return (np.column_stack([means, np.ones(len(means))]) @ (root @ Y_UP @ node).T)[:, :3]
+
+
+def test_leaves_hold_every_gaussian_once_at_its_place(made: StageRun, scene: SplatArrays) -> None:
+    leaves = [tile for tile in all_tiles(document(made)["root"]) if "children" not in tile]
+    assert len(leaves) > 3
+    places = np.concatenate([in_ecef(made, made.out / tile["content"]["uri"]) for tile in leaves])
+    expected = true_ecef(scene)
+    _assert_same_places(places, expected)
+    _assert_same_places(in_ecef(made, made.out / "splat.glb"), expected)
+
+
+def _assert_same_places(places: np.ndarray, expected: np.ndarray) -> None:
+    distance, index = cKDTree(expected).query(places)
+    np.testing.assert_array_equal(np.sort(index), np.arange(len(expected)))
+    assert distance.max() < STEP_M
+
+
+def test_tileset_says_what_a_globe_must_know(made: StageRun) -> None:
+    content = document(made)
+    assert content["asset"]["version"] == "1.1"
+    assert content["extensionsUsed"] == ["3DTILES_content_gltf"]
+    extensions = content["extensions"]["3DTILES_content_gltf"]
+    assert extensions["extensionsRequired"] == gltf_of(made.out / "splat.glb")["extensionsRequired"]
+    georef = content["asset"]["extras"]["georef"]
+    assert georef == json.loads((made.out / "tileset.json.georef.json").read_text(encoding="utf-8"))
+    assert georef["crsId"] == "EPSG:4978"
+    assert georef["verticalDatum"]["name"] == "EGM2008"
+    assert georef["accuracy"]["sigma_h_m"] > 0
+    assert gltf_of(made.out / "splat.glb")["asset"]["extras"]["georef"] == georef
+    transform = read_sidecar(made.out / "tileset.json").ecef_from_file().matrix()
+    np.testing.assert_array_equal(np.array(content["root"]["transform"]).reshape(4, 4).T, transform)
+    assert content["geometricError"] > 2 * content["root"]["geometricError"]
+
+
+def test_tiles_are_inside_their_boxes_and_refine(made: StageRun) -> None:
+    for tile in all_tiles(document(made)["root"]):
+        assert tile["refine"] == "REPLACE"
+        splat = read_glb(made.out / tile["content"]["uri"])
+        box = np.array(tile["boundingVolume"]["box"]).reshape(4, 3)
+        middle, half = box[0], np.diag(box[1:])
+        assert (np.abs(splat.means - middle) <= half).all()
+        assert (tile["geometricError"] > 0) == ("children" in tile)
+        for child in tile.get("children", []):
+            assert "transform" not in child
+            assert child["geometricError"] <= tile["geometricError"] / 2
+            inner = np.array(child["boundingVolume"]["box"]).reshape(4, 3)
+            assert (np.abs(inner[0] - middle) + np.diag(inner[1:]) <= half + 1e-9).all()
+
+
+def test_a_splat_too_large_for_one_file_is_shown_by_its_tiles(made: StageRun, scene: SplatArrays) -> None:
+    def tile(content: dict[str, Any]) -> DetailTile:
+        name, children = Path(content["content"]["uri"]).stem, content.get("children", [])
+        count = len(read_glb(made.out / content["content"]["uri"]))
+        below = tuple(map(tile, children))
+        return DetailTile(name, count, content["geometricError"], np.zeros((2, 3)), below)
+
+    root = tile(document(made)["root"])
+    whole = (made.out / "splat.glb").read_bytes()
+    count = write_whole(made.out, scene, root, read_sidecar(made.out / "tileset.json"), most=1500)
+    assert root.count < count <= 1500
+    assert len(read_glb(made.out / "splat.glb")) == count
+    (made.out / "splat.glb").write_bytes(whole)
+
+
+def test_a_large_scene_has_coarser_steps(tmp_path: Path) -> None:
+    splat = splat_arrays(5)
+    splat.means[0] = [-9000, 2100, 30]
+    write_glb(tmp_path / "a.glb", splat)
+    np.testing.assert_allclose(read_glb(tmp_path / "a.glb").means, splat.means, atol=0.5 / 2**9 + 1e-3)
+
+
+def test_a_disk_that_is_too_small_is_said_before_the_work(
+    tmp_path: Path, scene: SplatArrays, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stage = write_trained(tmp_path / "ws", scene, "tiles")
+    usage = type(shutil.disk_usage(tmp_path))(2**40, 2**40, 10_000)
+    monkeypatch.setattr(shutil, "disk_usage", lambda folder: usage)
+    with pytest.raises(InputError, match=r"tiles of 2600 Gaussians may need .* --sh-degree"):
+        run(stage, ExportTilesOptions())
+    assert list(stage.out.iterdir()) == []
