@@ -16,8 +16,9 @@ from pipelines.core.products import load_json
 from pipelines.core.runner import run_stage
 from pipelines.core.stages import BY_NAME, CLOUD
 from pipelines.core.workspace import Workspace
-from pipelines.deliver.cloud import fusion
-from pipelines.deliver.cloud.fusion import FusionSettings, SurfaceCloud, fused_squares, pixel_on_surface_m
+from pipelines.deliver.cloud import plan
+from pipelines.deliver.cloud.fusion import FusionSettings, SurfaceCloud, fused_squares
+from pipelines.deliver.cloud.plan import pixel_on_surface_m
 from pipelines.formats.georef_sidecar import CrsSidecar, sidecar_path
 from pipelines.geodesy.enu import enu_from_ecef
 from pipelines.geometry.similarity import Similarity
@@ -86,7 +87,7 @@ def test_each_voxel_holds_one_point(tmp_path: Path) -> None:
 def test_squares_have_no_seam(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     views = surface_views(tmp_path, np.random.default_rng(2).normal(0, 0.03, len(CENTERS)))
     whole = cloud(views)
-    monkeypatch.setattr(fusion, "_MOST_CANDIDATES", 3000)
+    monkeypatch.setattr(plan, "_MOST_CANDIDATES", 3000)
     parts = list(fused_squares(views, GEO_FROM_MODEL, SETTINGS))
     assert len(parts) > 8
     together = np.concatenate([part.position for part in parts])
