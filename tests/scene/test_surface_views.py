@@ -29,6 +29,7 @@ class Renderer:
     def __init__(self, fails_at: int = -1) -> None:
         self.rendered: list[int] = []
         self.fails_at = fails_at
+        self.images: Any = None
         poses = CameraPoses(np.tile(DOWN, (5, 1, 1)), np.array(CENTERS))
         self.trained = SimpleNamespace(
             poses=poses, geo_from_model=GEO_FROM_MODEL, indices=lambda split: TRAINING if split == "train" else [2]
@@ -78,6 +79,17 @@ def test_interrupted_maps_are_continued(tmp_path: Path) -> None:
     assert complete.rendered == []
     views.close()
     assert not tmp_path.exists()
+
+
+def test_unconfirmed_depths_are_left_out(tmp_path: Path) -> None:
+    """The render is plain where the photograph has a pattern: only where that has none, the depth stays."""
+    renderer = Renderer()
+    pattern = np.full((CAMERA.height, CAMERA.width, 3), 100, np.uint8)
+    pattern[:, :40:2] = 160
+    renderer.images = SimpleNamespace(image=lambda _index: pattern)
+    depth = SurfaceViews(renderer, tmp_path, confirmed=True).view(0).depth_m  # type: ignore[arg-type]
+    assert (depth[:, :32] == 0).all()
+    np.testing.assert_array_equal(depth[:, 48:], depth_map(CENTERS[0])[:, 48:])
 
 
 def test_support_is_in_metres_on_earth(tmp_path: Path) -> None:

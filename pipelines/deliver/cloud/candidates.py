@@ -99,14 +99,6 @@ def candidates_in(view: SurfaceView, geo_from_model: Similarity, look: Look) -> 
     return Candidates(point[chosen], towards_camera, view.rgb[rows, columns][chosen], pixel_m[chosen])
 
 
-def coarse_points(view: SurfaceView, geo_from_model: Similarity, coarsest_m: float, step: int) -> FloatArray:
-    """Return every `step`-th surface point (P, 3) of a view in `geo`, without regard to normals."""
-    rows, columns = np.nonzero(view.depth_m[step // 2 :: step, step // 2 :: step])
-    rows, columns = step * rows + step // 2, step * columns + step // 2
-    fine = geo_from_model.scale * view.depth_m[rows, columns] / view.pinhole.fx < coarsest_m
-    return geo_from_model.apply(view.points(rows[fine], columns[fine]))
-
-
 def _window(view: SurfaceView, geo_from_model: Similarity, look: Look) -> tuple[slice, slice] | None:
     """Return rows and columns that hold the pixels of a view in a square, but for slivers of a few pixels."""
     height, width = view.depth_m.shape

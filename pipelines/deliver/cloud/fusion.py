@@ -11,20 +11,19 @@ from numpy.typing import NDArray
 
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import ByteArray, FloatArray
-from pipelines.deliver.cloud.candidates import Candidates, Look, Square, candidates_in, coarse_points
+from pipelines.deliver.cloud.candidates import Candidates, Look, Square, candidates_in
+from pipelines.deliver.cloud.plan import pixel_on_surface_m, plan_squares
 from pipelines.geometry.depth_support import Support
 from pipelines.geometry.similarity import Similarity
 from pipelines.scene.surface_views import SurfaceViews
 
-# Memory: candidates of one square, of about 100 bytes each, with the copies that sorting them makes.
-_MOST_CANDIDATES = 4_000_000
-_LOOK_PX = 8  # between the pixels from which sizes and extent are estimated
 _MARGIN = 4  # spacings around a square: fusion moves points by less, mostly
 _MOST_THROUGH = 0.5  # largest number of views that look through a point, as a part of those that agree
 # σ of a ray through a photograph, in pixels of the training size: on simulated flights, this and the views' own
 # disagreement explain the distances to the true surface at 68 of 100 points.
 _SIGMA_PX = 0.25
-# A point is left out if its σ exceeds this part of the pixel: beyond, one point in ten was a floater.
+# A point is left out if its σ exceeds this part of the pixel: beyond, one point in five was a floater on simulated
+# flights.
 _RESOLVED = 1.0
 
 
@@ -64,17 +63,6 @@ class SurfaceCloud:
         return len(self.position)
 
 
-def pixel_on_surface_m(views: SurfaceViews, geo_from_model: Similarity) -> float:
-    """Return the median width of a pixel on the surface in metres; NaN: no view shows a surface."""
-    widths = [
-        geo_from_model.scale * depth[depth > 0] / view.pinhole.fx
-        for view in map(views.view, range(len(views)))
-        for depth in (view.depth_m[::_LOOK_PX, ::_LOOK_PX],)
-    ]
-    together = np.concatenate(widths) if widths else np.zeros(0)
-    return float(np.median(together)) if len(together) else float("nan")
-
-
 def fused_squares(
     views: SurfaceViews, geo_from_model: Similarity, settings: FusionSettings, progress: Progress = SILENT
 ) -> Iterator[SurfaceCloud]:
@@ -94,37 +82,15 @@ def fused_squares(
         progress: shows the squares.
     """
     step = max(1, int(settings.spacing_m / pixel_on_surface_m(views, geo_from_model)))
-    squares = plan_squares(views, geo_from_model, settings, step)
+    squares = plan_squares(views, geo_from_model, settings.spacing_m, settings.coarsest_m, step)
     with progress.task("squares", len(squares)) as task:
-        for square in squares:
-            look = Look(square, _MARGIN * settings.spacing_m, settings.coarsest_m, step)
-            found = (candidates_in(views.view(number), geo_from_model, look) for number in range(len(views)))
+        for planned in squares:
+            look = Look(planned.square, _MARGIN * settings.spacing_m, settings.coarsest_m, step)
+            found = (candidates_in(views.view(int(number)), geo_from_model, look) for number in planned.views)
             parts = [part for part in found if part is not None]
             if parts:
-                yield fuse(Candidates.concatenate(parts), views, geo_from_model, square, settings)
+                yield fuse(Candidates.concatenate(parts), views, geo_from_model, planned.square, settings)
             task.advance()
-
-
-def plan_squares(
-    views: SurfaceViews, geo_from_model: Similarity, settings: FusionSettings, step: int
-) -> list[Square]:
-    """Return the squares of the plan that hold the surface, none with more candidates than memory has room for."""
-    look = max(_LOOK_PX, step)
-    points = [
-        coarse_points(views.view(number), geo_from_model, settings.coarsest_m, look)[:, :2]
-        for number in range(len(views))
-    ]
-    plan = np.concatenate(points) if points else np.zeros((0, 2))
-    if not len(plan):
-        return []
-    each = (look / step) ** 2  # candidates that a point of the look stands for
-    # Squares consist of whole voxels, so that no voxel is cut.
-    cell_m = settings.spacing_m * 2.0 ** np.ceil(np.log2(np.ptp(plan, axis=0).max() / settings.spacing_m + 1))
-    while True:
-        cell, count = np.unique(np.floor(plan / cell_m), axis=0, return_counts=True)
-        if each * count.max() <= _MOST_CANDIDATES or cell_m <= 16 * settings.spacing_m:
-            return [Square((float(east * cell_m), float(north * cell_m)), float(cell_m)) for east, north in cell]
-        cell_m /= 2
 
 
 def fuse(

@@ -14,7 +14,8 @@ from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.deliver.cloud.files import SIGMA_COUNTS, CloudFiles
 from pipelines.deliver.cloud.frame import cloud_frame
-from pipelines.deliver.cloud.fusion import FusionSettings, fused_squares, pixel_on_surface_m
+from pipelines.deliver.cloud.fusion import FusionSettings, fused_squares
+from pipelines.deliver.cloud.plan import pixel_on_surface_m
 from pipelines.deliver.cloud.tally import Tally
 from pipelines.deliver.options import ExportCloudOptions
 from pipelines.deliver.predicted_sigma import predicted_sigma
