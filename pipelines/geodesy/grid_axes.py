@@ -18,7 +18,8 @@ def grid_from_enu(crs: PointCrs, lla: ArrayLike) -> FloatArray:
 
     The third axis stays up, along the normal of the ellipsoid. The first two are the directions in which the first
     and the second coordinate grow. In a projection that is not conformal they are not at right angles: the result
-    is the rotation nearest to them. A CRS without a grid (angles, or geocentric) has the axes of true East-North-Up.
+    is the rotation nearest to them. A CRS without a grid (angles, or geocentric) has the axes of true
+    East-North-Up.
 
     Raises:
         InputError: the axes of the CRS are left-handed, or a place lies outside its domain.

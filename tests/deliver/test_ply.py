@@ -176,10 +176,8 @@ def test_transparent_gaussians_are_left_out() -> None:
 def test_sidecar_has_the_fields_that_were_promised(stage: StageRun) -> None:
     run(stage, OPTIONS)
     document = json.loads(sidecar_path(stage.out / "splat.ply").read_text(encoding="utf-8"))
-    fields = (
-        "format version crsId origin rotation scale ecefFromFile epoch originLla verticalDatum crsWkt covariance"
-    )
-    assert list(document) == [*fields.split(), "accuracy", "cautions"]
+    place = "format version crsId origin rotation scale ecefFromFile epoch originLla verticalDatum crsWkt"
+    assert list(document) == [*place.split(), "covariance", "accuracy", "cautions"]
     assert (document["format"], document["version"], document["crsId"]) == ("georefgs", 1, "EPSG:4978")
     assert document["crsWkt"].startswith("GEODCRS[")
     assert np.array(document["covariance"]).shape == (7, 7)
