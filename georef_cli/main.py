@@ -62,6 +62,7 @@ COMMANDS: dict[str, HelpLine] = {
     "export-cloud": HelpLine(
         "export_cloud", "Deliverables", "Write the surface as a georeferenced point cloud (LAZ)."
     ),
+    "export-cameras": HelpLine("export_cameras", "Deliverables", "Write the trained cameras for other programs."),
 }
 
 

@@ -100,7 +100,7 @@ def _project(network: Network, in_cam: FloatArray) -> FloatArray:
 def _residuals(network: Network, point: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Return projected minus observed (M, 2), and the mask of points before their camera; zero behind it."""
     residual = _project(network, _in_cam(network, point)) - network.obs_xy_px
-    usable = np.isfinite(residual).all(axis=1)
+    usable = np.asarray(np.isfinite(residual).all(axis=1))
     return np.where(usable[:, None], residual, 0.0), usable
 
 
@@ -123,5 +123,5 @@ def _sums(network: Network, values: FloatArray) -> FloatArray:
     """Return the sums (N, …) of values (M, …) over the observations of each point."""
     flat = values.reshape(len(values), -1)
     count = len(network.point_in_world)
-    sums = [np.bincount(network.obs_point, column, count) for column in flat.T]
-    return np.stack(sums, axis=-1).reshape(count, *values.shape[1:])
+    sums = [np.bincount(network.obs_point, column, count).astype(np.float64) for column in flat.T]
+    return np.asarray(np.stack(sums, axis=-1).reshape(count, *values.shape[1:]))

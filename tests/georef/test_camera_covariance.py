@@ -38,7 +38,9 @@ def on_earth(problem: GeoProblem, delta: np.ndarray) -> tuple[np.ndarray, np.nda
         moved.z.copy_(cameras.z + torch.from_numpy(delta[7:]))
     similarity = perturbation(delta[:7], problem.similarity.pivot_in_geo) @ problem.similarity.current()
     poses = moved.current()
-    return similarity.rotation @ np.swapaxes(poses.cam_from_model, 1, 2), similarity.apply(poses.cam_center_in_model)
+    return similarity.rotation @ np.swapaxes(poses.cam_from_model, 1, 2), similarity.apply(
+        poses.cam_center_in_model
+    )
 
 
 @pytest.mark.parametrize("held", [False, True], ids=["corrected", "held"])

@@ -1,0 +1,111 @@
+"""Footprints of photographs: the rays of the image's border, intersected with the surface of the scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from pipelines.core.types import FloatArray
+from pipelines.geometry.cameras import Camera, undistort
+
+_PER_SIDE = 16  # border pixels: the bow of a lens and the relief show in the outline
+_SHALLOWEST = 0.1  # tangent of the angle below the horizon: beyond, a ray ends at ten times the height above ground
+_NEIGHBOURS = 9  # points whose median is the height of the surface
+_STEPS = 6
+
+
+class PointSurface:
+    """Surface through a cloud of points: at each place, the median height of the nearest points.
+
+    Args:
+        points: (N, 3) with z up, metres; N ≥ 1.
+    """
+
+    def __init__(self, points: FloatArray) -> None:
+        self._height = points[:, 2]
+        self._tree = cKDTree(points[:, :2])
+        self._neighbours = min(_NEIGHBOURS, len(points))
+        self.median = float(np.median(self._height))
+
+    def heights(self, places: FloatArray) -> FloatArray:
+        """Return the heights (K,) at places (K, 2)."""
+        _, near = self._tree.query(places, k=self._neighbours)
+        return np.asarray(np.median(self._height[near.reshape(len(places), -1)], axis=1))
+
+
+@dataclass(frozen=True)
+class Footprint:
+    """Outline of what a photograph shows.
+
+    Attributes:
+        outline: (K, 3) metres, z up, anticlockwise seen from above, not closed; K = 0: the photograph shows no
+            ground.
+        clipped: whether the photograph also shows what lies above the horizon, or too near below it to be placed.
+    """
+
+    outline: FloatArray
+    clipped: bool
+
+
+def border_rays(camera: Camera) -> FloatArray:
+    """Return rays (K, 3) in the camera's frame through the border of its image, clockwise from the upper left.
+
+    The corners are among them. A pixel that the lens gives no ray is left out.
+    """
+    step = np.linspace(0.0, 1.0, _PER_SIDE, endpoint=False)
+    zero, one = np.zeros(_PER_SIDE), np.ones(_PER_SIDE)
+    sides = [np.column_stack(side) for side in ((step, zero), (one, step), (1 - step, one), (zero, 1 - step))]
+    slopes = undistort(camera, np.concatenate(sides) * [camera.width, camera.height])
+    slopes = slopes[np.isfinite(slopes).all(axis=1)]
+    return np.concatenate([slopes, np.ones((len(slopes), 1))], axis=1)
+
+
+def footprint(rays: FloatArray, center: FloatArray, surface: PointSurface) -> Footprint:
+    """Return the outline at which rays (K, 3) from a centre (3,) meet a surface, z up.
+
+    1. The part of the outline that does not point at least `_SHALLOWEST` below the horizon is cut off.
+    2. Each ray is intersected with the horizontal plane at the height of the surface where the ray met it last.
+    """
+    unit = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    below = -unit[:, 2] - _SHALLOWEST * np.hypot(unit[:, 0], unit[:, 1])
+    clipped = bool((below < 0).any())
+    seen = clipped_ring(unit, below)
+    drop = center[2] - float(surface.heights(center[None, :2])[0])
+    if drop <= 0:
+        drop = center[2] - surface.median
+    if len(seen) < 3 or drop <= 0:
+        return Footprint(np.zeros((0, 3)), clipped)
+    ray = seen / -seen[:, 2:]
+    depth = np.full(len(ray), drop)
+    for _ in range(_STEPS):
+        height = surface.heights(center[:2] + depth[:, None] * ray[:, :2])
+        # Half of each step: on a slope that faces the ray, full steps would swing.
+        depth = np.maximum((depth + center[2] - height) / 2, 0.1 * drop)
+    outline = center + depth[:, None] * ray
+    return Footprint(outline if _area(outline) > 0 else outline[::-1], clipped)
+
+
+def clipped_ring(ring: FloatArray, inside: FloatArray) -> FloatArray:
+    """Return the part of a ring (K, d) where a function is not negative (Sutherland and Hodgman 1974).
+
+    Args:
+        ring: corners, not closed.
+        inside: (K,) the function at the corners; linear between them.
+    """
+    kept = []
+    for index in range(len(ring)):
+        before, here = inside[index - 1], inside[index]
+        if (before < 0) != (here < 0):
+            share = before / (before - here)
+            kept.append(ring[index - 1] + share * (ring[index] - ring[index - 1]))
+        if here >= 0:
+            kept.append(ring[index])
+    return np.array(kept).reshape(-1, ring.shape[1])
+
+
+def _area(outline: FloatArray) -> float:
+    """Return the area of an outline in plan, negative if it runs clockwise."""
+    x, y = outline[:, 0] - outline[0, 0], outline[:, 1] - outline[0, 1]
+    return float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2
