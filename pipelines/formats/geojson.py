@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -11,7 +12,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pipelines.core.durable import replace_file
-from pipelines.core.products import dump_json
 from pipelines.core.types import FloatArray
 from pipelines.geometry.footprints import clipped_ring
 
@@ -47,13 +47,14 @@ def feature(geometry: Json | None, properties: Mapping[str, Any], bbox: Sequence
 
 
 def write_features(path: Path, features: Sequence[Json]) -> None:
-    """Write a FeatureCollection; the file appears whole or not at all.
+    """Write a FeatureCollection, one feature a line; the file appears whole or not at all.
 
     Raises:
         OSError: the file cannot be written.
     """
     draft = path.with_name(path.name + ".tmp")
-    draft.write_text(dump_json({"type": "FeatureCollection", "features": list(features)}) + "\n", encoding="utf-8")
+    lines = ",\n".join(json.dumps(one, allow_nan=False, ensure_ascii=False) for one in features)
+    draft.write_text(f'{{"type": "FeatureCollection", "features": [\n{lines}\n]}}\n', encoding="utf-8")
     replace_file(draft, path)
 
 

@@ -13,7 +13,8 @@ from pipelines.geometry.cameras import Camera, undistort
 _PER_SIDE = 16  # border pixels: the bow of a lens and the relief show in the outline
 _SHALLOWEST = 0.1  # tangent of the angle below the horizon: beyond, a ray ends at ten times the height above ground
 _NEIGHBOURS = 9  # points whose median is the height of the surface
-_STEPS = 6
+_SAMPLES = 48  # along a ray, from the camera down to the lowest point
+_BISECTIONS = 20
 
 
 class PointSurface:
@@ -27,12 +28,12 @@ class PointSurface:
         self._height = points[:, 2]
         self._tree = cKDTree(points[:, :2])
         self._neighbours = min(_NEIGHBOURS, len(points))
-        self.median = float(np.median(self._height))
+        self.median, self.lowest = float(np.median(self._height)), float(self._height.min())
 
     def heights(self, places: FloatArray) -> FloatArray:
-        """Return the heights (K,) at places (K, 2)."""
+        """Return the heights (…,) at places (…, 2)."""
         _, near = self._tree.query(places, k=self._neighbours)
-        return np.asarray(np.median(self._height[near.reshape(len(places), -1)], axis=1))
+        return np.asarray(np.median(self._height[np.reshape(near, (*places.shape[:-1], -1))], axis=-1))
 
 
 @dataclass(frozen=True)
@@ -65,26 +66,38 @@ def border_rays(camera: Camera) -> FloatArray:
 def footprint(rays: FloatArray, center: FloatArray, surface: PointSurface) -> Footprint:
     """Return the outline at which rays (K, 3) from a centre (3,) meet a surface, z up.
 
-    1. The part of the outline that does not point at least `_SHALLOWEST` below the horizon is cut off.
-    2. Each ray is intersected with the horizontal plane at the height of the surface where the ray met it last.
+    1. The part of the border that does not point at least `_SHALLOWEST` below the horizon is cut off.
+    2. Each ray ends where it first passes below the surface. A ray that never runs above it ends at the median
+       height.
     """
     unit = rays / np.linalg.norm(rays, axis=1, keepdims=True)
     below = -unit[:, 2] - _SHALLOWEST * np.hypot(unit[:, 0], unit[:, 1])
     clipped = bool((below < 0).any())
     seen = clipped_ring(unit, below)
-    drop = center[2] - float(surface.heights(center[None, :2])[0])
-    if drop <= 0:
-        drop = center[2] - surface.median
-    if len(seen) < 3 or drop <= 0:
+    if len(seen) < 3 or center[2] <= surface.median:
         return Footprint(np.zeros((0, 3)), clipped)
     ray = seen / -seen[:, 2:]
-    depth = np.full(len(ray), drop)
-    for _ in range(_STEPS):
-        height = surface.heights(center[:2] + depth[:, None] * ray[:, :2])
-        # Half of each step: on a slope that faces the ray, full steps would swing.
-        depth = np.maximum((depth + center[2] - height) / 2, 0.1 * drop)
-    outline = center + depth[:, None] * ray
+    outline = center + _depths(ray, center, surface)[:, None] * ray
     return Footprint(outline if _area(outline) > 0 else outline[::-1], clipped)
+
+
+def _depths(ray: FloatArray, center: FloatArray, surface: PointSurface) -> FloatArray:
+    """Return how far (K,) below the centre rays (K, 3), which descend by one, first pass below the surface."""
+
+    def above(depth: FloatArray) -> FloatArray:
+        places = center[:2] + depth[..., None] * ray[:, :2]
+        return np.asarray(center[2] - depth - surface.heights(places))
+
+    depth = np.linspace(0.0, center[2] - surface.lowest, _SAMPLES)
+    free = above(np.repeat(depth[:, None], len(ray), axis=1)) > 0
+    passes = free[:-1] & ~free[1:]
+    first = passes.argmax(axis=0)
+    low, high = depth[first], depth[first + 1]
+    for _ in range(_BISECTIONS):
+        middle = (low + high) / 2
+        is_free = above(middle) > 0
+        low, high = np.where(is_free, middle, low), np.where(is_free, high, middle)
+    return np.where(passes.any(axis=0), high, center[2] - surface.median)
 
 
 def clipped_ring(ring: FloatArray, inside: FloatArray) -> FloatArray:
