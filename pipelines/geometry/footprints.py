@@ -97,7 +97,7 @@ def _depths(ray: FloatArray, center: FloatArray, surface: PointSurface) -> Float
         middle = (low + high) / 2
         is_free = above(middle) > 0
         low, high = np.where(is_free, middle, low), np.where(is_free, high, middle)
-    return np.where(passes.any(axis=0), high, center[2] - surface.median)
+    return np.asarray(np.where(passes.any(axis=0), high, center[2] - surface.median))
 
 
 def clipped_ring(ring: FloatArray, inside: FloatArray) -> FloatArray:
