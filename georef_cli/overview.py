@@ -17,7 +17,7 @@ _UNITS = ("B", "kB", "MB", "GB", "TB")
 
 
 def whole(result: Overview) -> list[Renderable]:
-    """Return the text of `georef info`: place, accuracy, files with state and use, further deliverables, cautions."""
+    """Return the text of `georef info`: place, accuracy, files with their use, further deliverables, cautions."""
     parts: list[Renderable] = [_headline(result), _place(result), _files(result)]
     if result.further:
         parts.append("\n[bold]Not made yet[/]")

@@ -15,7 +15,7 @@ from pipelines.core.cautions import NOT_CHECKED, Caution
 from pipelines.core.errors import InputError
 from pipelines.core.manifest import MANIFEST, Manifest
 from pipelines.core.products import load_json, save_json
-from pipelines.core.stages import GAUSSIANS, MODEL, SIM3, SURVEY
+from pipelines.core.stages import MODEL, SURVEY
 from pipelines.core.workspace import StageRun, Summary, Workspace, now
 from pipelines.deliver.cameras.stage import run
 from pipelines.deliver.options import ExportCamerasOptions
@@ -23,31 +23,14 @@ from pipelines.formats.georef_sidecar import CrsSidecar, read_sidecar, sidecar_p
 from pipelines.formats.trajectory_csv import read_trajectory
 from pipelines.geodesy.enu import Origin, ecef_from_enu, ecef_from_lla, enu_from_ecef, geo_from_enu_at, lla_from_enu
 from pipelines.geometry.cameras import project
-from pipelines.geometry.rotations import map_from_cam, matrix_from_quat_xyzw, quat_xyzw_from_matrix
-from pipelines.geometry.similarity import Similarity
+from pipelines.geometry.rotations import map_from_cam, matrix_from_quat_xyzw
 from pipelines.scene.survey import Survey
-from pipelines.scene.trained_model import TrainedCamera, TrainedModel
-from pipelines.splat.initialise import gaussians_of_size
-from pipelines.splat.storage import write_gaussians
-from tests.scenes import (
-    GEO_FROM_LOCAL,
-    WITH_GCPS,
-    Noise,
-    TrueScene,
-    initial,
-    make_scene,
-    sparse_model,
-    survey_of,
-    trained_model,
-    write_workspace,
-)
+from pipelines.scene.trained_model import TrainedModel
+from tests.scenes import TrueScene
+from tests.trained_workspaces import IMAGES, trained_workspace
 
 pycolmap = pytest.importorskip("pycolmap")
 pytestmark = pytest.mark.usefixtures("one_thread")
-# In `model` the axes are those of geo, and the origin lies elsewhere.
-GEO_FROM_MODEL = Similarity(translation=np.array([40.0, -30.0, 60.0]))
-NOISE = Noise(pixel_px=0.3)
-IMAGES = 8
 
 
 @dataclass(frozen=True)
@@ -75,32 +58,6 @@ class Handover:
     def ecef(self) -> np.ndarray:
         """True centres, Earth-centred."""
         return ecef_from_enu(self.scene.center_in_geo, self.origin)
-
-
-def trained_workspace(root: Path) -> tuple[TrueScene, Workspace]:
-    scene, rng = make_scene(images=IMAGES, points=80), np.random.default_rng(0)
-    survey = survey_of(scene, NOISE, WITH_GCPS, rng)
-    images = tuple(
-        image.model_copy(update={"timestamp_s": 1.7e9 + index}) for index, image in enumerate(survey.images)
-    )
-    workspace = write_workspace(root, survey.model_copy(update={"images": images}), sparse_model(scene, NOISE, rng))
-    model_from_geo = GEO_FROM_MODEL.inverse()
-    rotation = np.swapaxes(scene.geo_from_cam, 1, 2)
-    centers = model_from_geo.apply(scene.center_in_geo)
-    cameras = tuple(
-        TrainedCamera(
-            name=name,
-            split="test" if index == 2 else "train",
-            quat_xyzw=tuple(quat_xyzw_from_matrix(rotation[index])),
-            translation=tuple(-rotation[index] @ centers[index]),
-        )
-        for index, name in enumerate(scene.names)
-    )
-    save_json(trained_model(GEO_FROM_MODEL, model_from_geo @ GEO_FROM_LOCAL, cameras=cameras), root / MODEL)
-    save_json(initial(), root / SIM3)
-    means = model_from_geo.apply(scene.point_in_geo)
-    write_gaussians(root / GAUSSIANS, gaussians_of_size(means, np.zeros_like(means), np.ones(len(means))))
-    return scene, workspace
 
 
 def handed_over(workspace: Workspace, out: Path, **options: object) -> Summary:
