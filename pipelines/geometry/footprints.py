@@ -13,8 +13,8 @@ from pipelines.geometry.cameras import Camera, undistort
 _PER_SIDE = 16  # border pixels: the bow of a lens and the relief show in the outline
 _SHALLOWEST = 0.1  # tangent of the angle below the horizon: beyond, a ray ends at ten times the height above ground
 _NEIGHBOURS = 9  # points whose median is the height of the surface
-_SAMPLES = 48  # along a ray, from the camera down to the lowest point
-_BISECTIONS = 20
+_SAMPLES = 32  # along a ray, from the camera down to the lowest point
+_BISECTIONS = 16
 
 
 class PointSurface:
