@@ -28,9 +28,10 @@ def whole(result: Overview) -> list[Renderable]:
 def short(result: Overview) -> list[Renderable]:
     """Return the end of `georef run`: where the result is, how good it is, where the files are, what comes next."""
     parts: list[Renderable] = ["", _headline(result), _place(result, brief=True)]
-    parts += [
-        f"  {shown(str(result.workspace / file.path))}  [dim]{shown(file.purpose)}[/]" for file in result.files
-    ]
+    for file in result.files:
+        style = tables.STATE_STYLE.get(file.state, "dim")
+        state = "" if file.state == "current" else f"[{style}]{file.state}[/] "
+        parts.append(f"  {shown(str(result.workspace / file.path))}  {state}[dim]{shown(file.purpose)}[/]")
     names = ",".join(command.split()[1].removeprefix("export-") for command in result.further)
     more = f"; more: georef run {result.workspace} --deliver {names}" if names else ""
     return [*parts, f"[dim]all of it:[/] georef info {shown(str(result.workspace))}{shown(more)}"]

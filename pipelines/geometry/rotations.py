@@ -100,8 +100,8 @@ def map_from_cam(omega_phi_kappa_deg: ArrayLike) -> FloatArray:
     """Return rotations (…, 3, 3) camera → map axes of photogrammetric angles ω, φ, κ (…, 3) in degrees.
 
     R_x(ω) R_y(φ) R_z(κ) turns image axes (x right, y up, z backward) into map axes (east, north, up). With
-    ω = φ = κ = 0 a camera looks straight down, and the upper edge of its image faces north (Bäumker and Heimes 2001,
-    New calibration and computing method for direct georeferencing; PIX4D has the same angles).
+    ω = φ = κ = 0 a camera looks straight down, and the upper edge of its image faces north (Bäumker and Heimes
+    2001, New calibration and computing method for direct georeferencing; PIX4D has the same angles).
     """
     angles = np.asarray(omega_phi_kappa_deg, dtype=np.float64)
     map_from_photo = Rotation.from_euler("XYZ", angles.reshape(-1, 3), degrees=True).as_matrix()
