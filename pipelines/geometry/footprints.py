@@ -69,6 +69,7 @@ def footprint(rays: FloatArray, center: FloatArray, surface: PointSurface) -> Fo
     1. The part of the border that does not point at least `_SHALLOWEST` below the horizon is cut off.
     2. Each ray ends where it first passes below the surface. A ray that never runs above it ends at the median
        height.
+    3. Where the relief makes the outline cross itself, the outline is that on the plane of its median height.
     """
     unit = rays / np.linalg.norm(rays, axis=1, keepdims=True)
     below = -unit[:, 2] - _SHALLOWEST * np.hypot(unit[:, 0], unit[:, 1])
@@ -77,7 +78,10 @@ def footprint(rays: FloatArray, center: FloatArray, surface: PointSurface) -> Fo
     if len(seen) < 3 or center[2] <= surface.median:
         return Footprint(np.zeros((0, 3)), clipped)
     ray = seen / -seen[:, 2:]
-    outline = center + _depths(ray, center, surface)[:, None] * ray
+    depth = _depths(ray, center, surface)
+    outline = center + depth[:, None] * ray
+    if _crosses_itself(outline[:, :2]):
+        outline = center + np.median(depth) * ray
     return Footprint(outline if _area(outline) > 0 else outline[::-1], clipped)
 
 
@@ -116,6 +120,20 @@ def clipped_ring(ring: FloatArray, inside: FloatArray) -> FloatArray:
         if here >= 0:
             kept.append(ring[index])
     return np.array(kept).reshape(-1, ring.shape[1])
+
+
+def _crosses_itself(ring: FloatArray) -> bool:
+    """Return whether any two edges of a ring (K, 2) that have no corner in common cross."""
+    following = np.roll(ring, -1, axis=0)
+    edge = following - ring
+
+    def sides(points: FloatArray) -> FloatArray:
+        """Return on which side of each edge (rows) points (columns) lie."""
+        arm = points[None] - ring[:, None]
+        return np.asarray(np.sign(edge[:, None, 0] * arm[..., 1] - edge[:, None, 1] * arm[..., 0]))
+
+    parted = sides(ring) * sides(following) < 0
+    return bool((parted & parted.T).any())
 
 
 def _area(outline: FloatArray) -> float:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import combinations
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -58,6 +60,20 @@ def test_ray_ends_at_the_roof_that_hides_the_ground_behind() -> None:
     ahead = outline[np.abs(outline[:, 0] - 5) < 20]
     assert outline_of((0.0, -60.0, 0.0), PLANE)[:, 1].max() > 200
     assert 15 < ahead[:, 1].max() < 65
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_outline_over_any_relief_does_not_cross_itself(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    town = PointSurface(np.column_stack([GRID, rng.choice([0.0, 30.0, 60.0], len(GRID))]))
+    outline = outline_of((rng.uniform(-180, 180), rng.uniform(-90, -45), 0.0), town)
+    edges = list(zip(outline, np.roll(outline, -1, axis=0), strict=True))
+    for (a, b), (c, d) in combinations(edges, 2):
+        assert not (_turn(a, b, c) * _turn(a, b, d) < 0 and _turn(c, d, a) * _turn(c, d, b) < 0)
+
+
+def _turn(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> float:
+    return float((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]))
 
 
 def test_camera_below_the_points_shows_no_ground() -> None:
