@@ -6,6 +6,7 @@ import csv
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,14 +16,16 @@ from pipelines.core.cautions import NOT_CHECKED, Caution
 from pipelines.core.errors import InputError
 from pipelines.core.manifest import MANIFEST, Manifest
 from pipelines.core.products import load_json, save_json
-from pipelines.core.stages import MODEL, SURVEY
+from pipelines.core.stages import MODEL, SPARSE, SURVEY
 from pipelines.core.workspace import StageRun, Summary, Workspace, now
 from pipelines.deliver.cameras.stage import run
 from pipelines.deliver.options import ExportCamerasOptions
+from pipelines.formats.colmap import read_sparse
+from pipelines.formats.colmap_writer import write_sparse
 from pipelines.formats.georef_sidecar import CrsSidecar, read_sidecar, sidecar_path
 from pipelines.formats.trajectory_csv import read_trajectory
 from pipelines.geodesy.enu import Origin, ecef_from_enu, ecef_from_lla, enu_from_ecef, geo_from_enu_at, lla_from_enu
-from pipelines.geometry.cameras import project
+from pipelines.geometry.cameras import Camera, project
 from pipelines.geometry.rotations import map_from_cam, matrix_from_quat_xyzw
 from pipelines.scene.survey import Survey
 from pipelines.scene.trained_model import TrainedModel
@@ -185,6 +188,14 @@ def test_footprints_project_back_to_the_border_of_their_photograph(handover: Han
         # Heights in steps of 0.05 m move a pixel by less than one.
         assert np.max(off) < 1.0
         assert not properties["clipped"]
+    text = sidecar_path(handover.out / "footprints.geojson").read_text(encoding="utf-8")
+    sidecar = CrsSidecar.model_validate_json(text)
+    assert (sidecar.crs, sidecar.vertical_datum.name, sidecar.units[0]) == ("EPSG:4979", "ellipsoidal", "degree")
+    assert sidecar.bounds[0][:2] == pytest.approx(_corners(document).min(axis=0), abs=1e-8)
+
+
+def _corners(document: dict[str, Any]) -> np.ndarray:
+    return np.concatenate([feature["geometry"]["coordinates"][0] for feature in document["features"]])
 
 
 def _inside(pixel: np.ndarray, width: int, height: int) -> np.ndarray:
@@ -224,3 +235,22 @@ def test_crs_of_another_country_is_refused_before_the_work_begins(handover: Hand
     with pytest.raises(InputError, match="EPSG:28992"):
         handed_over(handover.workspace, tmp_path / "out", crs="EPSG:28992")
     assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_nerfstudio_leaves_out_the_lens_that_it_cannot_hold_beside_the_others(tmp_path: Path) -> None:
+    """COLMAP's model holds both."""
+    _, workspace = trained_workspace(tmp_path / "ws")
+    sparse = read_sparse(workspace.path(SPARSE))
+    fisheye = Camera("OPENCV_FISHEYE", 1200, 900, np.array([900.0, 900.0, 600.0, 450.0, 0.01, 0.0, 0.0, 0.0]))
+    owner = np.where(np.arange(IMAGES) < 2, 2, 1)
+    write_sparse(
+        replace(sparse, cameras={**sparse.cameras, 2: fisheye}, image_camera_id=owner), workspace.path(SPARSE)
+    )
+    summary = handed_over(workspace, tmp_path / "out")
+    document = json.loads((tmp_path / "out" / "transforms.json").read_text(encoding="utf-8"))
+    assert [frame["file_path"] for frame in document["frames"]] == list(sparse.image_name[2:])
+    assert "nerfstudio-one-camera-model" in {caution.code for caution in summary.cautions}
+    assert [caution.code for caution in read_sidecar(tmp_path / "out" / "transforms.json").cautions] == [
+        "nerfstudio-one-camera-model"
+    ]
+    assert pycolmap.Reconstruction(str(tmp_path / "out" / "colmap")).num_cameras() == 2

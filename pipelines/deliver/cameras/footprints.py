@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from datetime import UTC, datetime
 
 import numpy as np
@@ -19,8 +20,21 @@ _LEAST_RAYS = 3  # of a point that counts as a part of the surface
 _RIM = 0.005  # fraction of the points that are taken for errors above, and below
 
 
-def footprint_features(survey: Survey, model: SparseModel, table: CameraTable, placement: Placement) -> list[Json]:
-    """Return a feature for each photograph: the outline of the ground that it shows, and its properties.
+@dataclass(frozen=True)
+class Footprints:
+    """Footprints of n photographs.
+
+    Attributes:
+        features: n, the outline of the ground that each photograph shows, with its properties.
+        corner_lla: (M, 3) corners of all outlines; the centres of the cameras if none shows ground.
+    """
+
+    features: list[Json]
+    corner_lla: FloatArray
+
+
+def footprints_of(survey: Survey, model: SparseModel, table: CameraTable, placement: Placement) -> Footprints:
+    """Return the footprints of the photographs.
 
     The geometry is null for a photograph that shows no ground. `clipped` says that part of the photograph lies
     above the horizon, or so near below it that the outline ends at ten times the height above ground.
@@ -34,7 +48,7 @@ def footprint_features(survey: Survey, model: SparseModel, table: CameraTable, p
     surface = PointSurface(_surface_points(model))
     times = {image.name: image.timestamp_s for image in survey.images}
     rays = {key: border_rays(camera) for key, camera in model.cameras.items()}
-    features = []
+    features, corners = [], []
     for index, (name, center) in enumerate(zip(model.image_name, model.cam_center_in_local, strict=True)):
         in_file = rays[int(model.image_camera_id[index])] @ model.rotation_cam_from_local[index]
         found = footprint(in_file, center, surface)
@@ -50,7 +64,11 @@ def footprint_features(survey: Survey, model: SparseModel, table: CameraTable, p
             "clipped": found.clipped,
         }
         features.append(feature(polygon(lla[:, [1, 0]]), properties))
-    return features
+        corners.append(lla)
+    seen = np.concatenate(corners)
+    if not len(seen):
+        seen = lla_from_ecef(placement.ecef_from_file.apply(model.cam_center_in_local))
+    return Footprints(features, seen)
 
 
 def _surface_points(model: SparseModel) -> FloatArray:

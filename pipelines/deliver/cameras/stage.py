@@ -19,16 +19,17 @@ import numpy as np
 from pipelines.core.cautions import Caution, union
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import StageRun, Summary
-from pipelines.deliver.cameras.footprints import footprint_features
+from pipelines.deliver.cameras.footprints import footprints_of
 from pipelines.deliver.cameras.on_earth import camera_table, cameras_on_earth, predicted_covariance
 from pipelines.deliver.options import ExportCamerasOptions
 from pipelines.deliver.placement import Placement, place
-from pipelines.deliver.target_crs import target_crs
+from pipelines.deliver.target_crs import TargetCrs, target_crs
 from pipelines.formats.camera_table import CameraTable, write_camera_table
 from pipelines.formats.colmap_writer import write_sparse
 from pipelines.formats.geojson import write_features
 from pipelines.formats.georef_sidecar import CrsSidecar, SceneSigma, write_sidecar
 from pipelines.formats.nerfstudio import Frame, lens_of, write_transforms
+from pipelines.geodesy.crs import parse_crs
 from pipelines.geometry.bundle import Network
 from pipelines.geometry.refined_points import refined_points
 from pipelines.geometry.similarity import Similarity
@@ -61,15 +62,17 @@ def run(stage: StageRun, options: ExportCamerasOptions) -> Summary:
         task.advance(note="COLMAP")
         lens_limits = _write_nerfstudio(stage.out / "transforms.json", model, placement)
         task.advance(note="nerfstudio")
-        footprints = footprint_features(trained.survey, model, table, placement)
-        write_features(stage.out / "footprints.geojson", footprints)
+        footprints = footprints_of(trained.survey, model, table, placement)
+        write_features(stage.out / "footprints.geojson", footprints.features)
         task.advance(note="footprints")
-    cautions = union(trained.model.cautions, limits, lens_limits)
+    cautions, sigma = union(trained.model.cautions, limits), _scene_sigma(table)
+    on_ellipsoid = TargetCrs(parse_crs("EPSG:4979"), crs.origin, footprints.corner_lla)
+    bounds = _bounds(footprints.corner_lla[:, [1, 0, 2]])
+    write_sidecar(on_ellipsoid.sidecar(bounds, sigma, cautions), stage.out / "footprints.geojson")
     write_camera_table(stage.out / "cameras.csv", table)
-    bounds = np.stack([table.position.min(axis=0), table.position.max(axis=0)])
-    sidecar = crs.sidecar(bounds, _scene_sigma(table), cautions)
+    sidecar = crs.sidecar(_bounds(table.position), sigma, cautions)
     write_sidecar(sidecar, stage.out / "cameras.csv")
-    return _summary(table, model, sidecar)
+    return _summary(table, model, sidecar, union(cautions, lens_limits))
 
 
 def model_in_file(trained: TrainedSurvey, placement: Placement) -> SparseModel:
@@ -117,7 +120,6 @@ def _write_nerfstudio(path: Path, model: SparseModel, placement: Placement) -> t
         for index in chosen
     ]
     write_transforms(path, frames, [owner[index] for index in chosen])
-    write_sidecar(placement.sidecar(), path)
     limits = {}
     if len(chosen) < len(owner):
         limits["nerfstudio-one-camera-model"] = (
@@ -130,7 +132,14 @@ def _write_nerfstudio(path: Path, model: SparseModel, placement: Placement) -> t
             f"transforms.json has a polynomial in place of the rational lens FULL_OPENCV: {error:.2f} px off at "
             "most."
         )
-    return tuple(Caution(code=code, sentence=sentence) for code, sentence in limits.items())
+    cautions = tuple(Caution(code=code, sentence=sentence) for code, sentence in limits.items())
+    sidecar = placement.sidecar()
+    write_sidecar(sidecar.model_copy(update={"cautions": union(sidecar.cautions, cautions)}), path)
+    return cautions
+
+
+def _bounds(points: FloatArray) -> FloatArray:
+    return np.stack([points.min(axis=0), points.max(axis=0)])
 
 
 def _scene_sigma(table: CameraTable) -> SceneSigma | None:
@@ -148,7 +157,7 @@ def _scene_sigma(table: CameraTable) -> SceneSigma | None:
     )
 
 
-def _summary(table: CameraTable, model: SparseModel, sidecar: CrsSidecar) -> Summary:
+def _summary(table: CameraTable, model: SparseModel, sidecar: CrsSidecar, cautions: tuple[Caution, ...]) -> Summary:
     sigma, count = sidecar.accuracy, len(table.name)
     figure = f"{count} cameras, {sidecar.crs}"
     if sigma is not None:
@@ -165,4 +174,4 @@ def _summary(table: CameraTable, model: SparseModel, sidecar: CrsSidecar) -> Sum
         "median_sigma_h_m": None if sigma is None else sigma.median_sigma_h_m,
         "median_sigma_v_m": None if sigma is None else sigma.median_sigma_v_m,
     }
-    return Summary(figure, values, cautions=sidecar.cautions)
+    return Summary(figure, values, cautions=cautions)
