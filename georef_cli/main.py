@@ -49,6 +49,7 @@ COMMANDS: dict[str, HelpLine] = {
     ),
     "run": HelpLine("run", "Pipeline", "Run all stages, or some, skipping what is current."),
     "status": HelpLine("status", "Pipeline", "Show the state of every stage."),
+    "info": HelpLine("info", "Pipeline", "Show where on Earth the result is, and what each file is for."),
     "ingest": HelpLine("ingest", "Stages", "Read photographs, positions and control points into one survey."),
     "sfm": HelpLine("sfm", "Stages", "Reconstruct cameras and points with COLMAP."),
     "calibrate": HelpLine("calibrate", "Stages", "Estimate time offset, boresight and lever arm after sfm."),
@@ -64,6 +65,7 @@ COMMANDS: dict[str, HelpLine] = {
     ),
     "export-spz": HelpLine("export_spz", "Deliverables", "Write the splat as SPZ, for viewers on the web."),
     "export-tiles": HelpLine("export_tiles", "Deliverables", "Write the splat as 3D Tiles, for web globes."),
+    "export-cameras": HelpLine("export_cameras", "Deliverables", "Write the trained cameras for other programs."),
 }
 
 

@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 from rich.console import Console, RenderableType
 from rich.text import Text
 
-from georef_cli import tables
+from georef_cli import overview, tables
 from georef_cli.markup import Safe
 from pipelines.core.cautions import Caution
 from pipelines.core.products import dump_json
 from pipelines.core.runner import Outcome
 from pipelines.core.staleness import cautions_by_stage
 from pipelines.core.workspace import Workspace
+
+if TYPE_CHECKING:
+    from pipelines.deliver.overview import Overview
 
 PIPED_WIDTH = 120
 
@@ -64,16 +67,20 @@ def print_outcome(workspace: Workspace, outcome: Outcome, *more: RenderableType,
         print_rich(*tables.outcome(workspace, outcome), *more, *tables.cautions(cautions))
 
 
-def print_outcomes(workspace: Workspace, outcomes: Sequence[Outcome], *, as_json: bool) -> None:
-    """Print the results of several stages, and last the cautions of the workspace."""
+def print_outcomes(
+    workspace: Workspace, outcomes: Sequence[Outcome], result: Overview | None, *, as_json: bool
+) -> None:
+    """Print the results of several stages, the overview of the whole if there is one, and last the cautions."""
     cautions = cautions_by_stage(workspace)
     if as_json:
         stages = [document_of(outcome) for outcome in outcomes]
-        document = {"workspace": str(workspace.root), "stages": stages}
+        document = {"workspace": str(workspace.root), "stages": stages, "result": result and result.feature()}
         print_json({**document, "cautions": document_of_cautions(cautions)})
         return
     print_rich(tables.outcomes(outcomes))
     for outcome in outcomes:
         if outcome.stage == "evaluate":
             print_rich(*tables.report_of(workspace))
+    if result is not None:
+        print_rich(*overview.short(result))
     print_rich(*tables.cautions(cautions))

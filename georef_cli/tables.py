@@ -64,7 +64,7 @@ def states(rows: Iterable[StageState], cautions: Mapping[str, Sequence[Caution]]
         table.add_row(
             row.stage,
             f"[{style}]{row.state}[/]",
-            _when(row.finished),
+            when(row.finished),
             duration(row.duration_s),
             *([str(len(cautions.get(row.stage, ())) or "")] if cautions else []),
             " · ".join(remarks),
@@ -253,5 +253,6 @@ def _number(value: Any) -> str:
     return str(value)
 
 
-def _when(moment: datetime | None) -> str:
+def when(moment: datetime | None) -> str:
+    """Return a time as people write it, in the local zone; empty for None."""
     return "" if moment is None else moment.astimezone().strftime("%Y-%m-%d %H:%M")

@@ -18,12 +18,12 @@ from pipelines.core.products import load_json
 from pipelines.core.stages import POINTS, SPARSE, SURVEY
 from pipelines.core.workspace import Workspace
 from pipelines.formats.colmap import read_sparse
+from pipelines.formats.colmap_writer import write_sparse
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.stage import survey_and_track
 from pipelines.scene.geolocated import GeolocatedPoints
 from pipelines.scene.scene import photographs
 from pipelines.scene.survey import Survey
-from tests.colmap_writer import write_sparse
 from tests.photos import Exif, gps_entries, jpeg, write_flight
 from tests.scenes import Measured, Noise, make_scene, sparse_model, survey_of, write_workspace
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import inspect
-from typing import Any
+import logging
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -14,7 +15,14 @@ from pipelines.core import runner
 from pipelines.core.errors import GeorefError
 from pipelines.core.options import listed_names
 from pipelines.core.stages import BY_NAME, DELIVERABLES, PIPELINE, StageSpec, stage_slice
+from pipelines.core.workspace import Workspace
+from pipelines.deliver.options import CrsOptions
 from pipelines.ingest.options import IngestOptions
+
+if TYPE_CHECKING:
+    from pipelines.deliver.overview import Overview
+
+log = logging.getLogger(__name__)
 
 # Options of later stages that `run` offers too, with the stages that they are for. All other options are set in
 # georef.toml, or with the stage's own command.
@@ -46,7 +54,18 @@ def _run(ctx: click.Context, **values: Any) -> None:
         progress=progress_for(ctx.obj),
         around=lambda spec: boundary.logged_to_file(workspace.log_file(spec)),
     )
-    print_outcomes(workspace, outcomes, as_json=values["as_json"])
+    print_outcomes(workspace, outcomes, _overview(workspace), as_json=values["as_json"])
+
+
+def _overview(workspace: Workspace) -> Overview | None:
+    """Return the overview of what the run has reached; None before training."""
+    from pipelines.deliver.overview import overview
+
+    try:
+        return overview(workspace, CrsOptions())
+    except GeorefError as error:  # The run has succeeded all the same.
+        log.debug("no overview of the result: %s", error)
+        return None
 
 
 def _stages(first: str | None, last: str | None) -> tuple[StageSpec, ...]:

@@ -11,6 +11,7 @@ from pipelines.accuracy.intersection_jacobian import IntersectionJacobian, inter
 from pipelines.accuracy.networks import control_rays, mean_focal_px, network_of_points
 from pipelines.core.cautions import Caution
 from pipelines.core.types import FloatArray, IntArray
+from pipelines.georef.camera_covariance import camera_covariances
 from pipelines.georef.posterior import FreeLens, posterior
 from pipelines.scene.marks import MarkRays
 from pipelines.scene.solved_survey import SolvedSurvey
@@ -37,7 +38,7 @@ class AccuracyPrediction:
     def cautions(self) -> tuple[Caution, ...]:
         """Limits of the prediction: assumptions that this training does not meet."""
         limits, options = {}, self._solved.options
-        if not self._basis.shape[2]:
+        if self.holds_cameras:
             limits["prediction-holds-cameras"] = (
                 "The cameras were held: the prediction leaves out their own error, and is too good."
             )
@@ -91,6 +92,20 @@ class AccuracyPrediction:
         sigma_px = mean_focal_px(self._solved.scene.sparse, camera)  # all rays have the same angular σ
         jacobian = jacobian_of_points(self._solved, point_in_geo, point, camera, sigma_px)
         return self._covariance(point_in_geo, jacobian)
+
+    def of_cameras(self) -> FloatArray:
+        """Return the covariance (n, 6, 6) of (δθ [rad], δc [m]) of the trained cameras, along the axes of `geo`.
+
+        If the cameras were held, this is that of the similarity alone.
+        """
+        trained = self._solved.trained
+        center = trained.geo_from_model.apply(trained.poses.cam_center_in_model)
+        return camera_covariances(self._posterior, center, trained.geo_from_model, self._basis)
+
+    @property
+    def holds_cameras(self) -> bool:
+        """Whether the training held the cameras, so that their own errors are not predicted."""
+        return not self._basis.shape[2]
 
     def _covariance(self, point_in_geo: FloatArray, jacobian: IntersectionJacobian) -> FloatArray:
         return self._posterior.at(point_in_geo, *self._derivatives(jacobian))

@@ -229,6 +229,16 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         title="Write the splat as 3D Tiles, for web globes.",
         also=(TILES_GLB,),
     ),
+    StageSpec(
+        name="export-cameras",
+        module="pipelines.deliver.cameras.stage",
+        options_place="pipelines.deliver.options:ExportCamerasOptions",
+        folder="cameras",
+        reads=(*whole(SURVEY, SPARSE, MODEL, GAUSSIANS, SIM3), APPLIED_RIG),
+        product="cameras/cameras.csv",
+        title="Write the trained cameras for COLMAP, nerfstudio, surveyors and maps.",
+        also=("cameras/colmap", "cameras/transforms.json", "cameras/footprints.geojson"),
+    ),
 )
 
 # No part of the pipeline: `georef compare` runs this stage for the baseline, whose later stages read its folder in

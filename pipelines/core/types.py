@@ -19,4 +19,5 @@ Vector4 = tuple[float, float, float, float]
 Quaternion = Vector4
 Matrix3 = tuple[Vector3, Vector3, Vector3]
 Matrix34 = tuple[Vector4, Vector4, Vector4]
+Matrix4 = tuple[Vector4, Vector4, Vector4, Vector4]
 Row7 = tuple[float, float, float, float, float, float, float]

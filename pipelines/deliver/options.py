@@ -89,3 +89,7 @@ class ExportCloudOptions(CrsOptions):
     )
     min_views: int = Field(3, ge=2, description="Number of training views that must agree on a point.")
     ply: bool = Field(False, description="Write the same points as cloud.ply too.")
+
+
+class ExportCamerasOptions(CrsOptions):
+    """Options of the export of the trained cameras."""

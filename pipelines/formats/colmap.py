@@ -107,7 +107,7 @@ def quiet_colmap() -> Iterator[Any]:
 
 
 def write_reconstruction(reconstruction: Any, folder: Path) -> None:
-    """Write a `pycolmap.Reconstruction` in COLMAP's binary form into a new folder, and read it back.
+    """Write a `pycolmap.Reconstruction` in COLMAP's binary form into a folder, made if missing, and read it back.
 
     COLMAP does not notice that a disk is full while it writes.
 
@@ -115,7 +115,7 @@ def write_reconstruction(reconstruction: Any, folder: Path) -> None:
         StorageError: the files are shorter than what was written.
         OSError: the folder cannot be made.
     """
-    folder.mkdir()
+    folder.mkdir(parents=True, exist_ok=True)
     reconstruction.write_binary(str(folder))
     try:
         copy = load_reconstruction(folder)

@@ -1,30 +1,32 @@
 """Sidecar of an exported artefact: its place on Earth, with the uncertainty of that place.
 
 The sidecar is JSON beside the file (`splat.ply.georef.json`), because popular tools lose PLY comments. Its content
-mirrors SPZ_NIANTIC_georeference: p_ecef = scale · R(rotation) · p_file + origin, in float64. docs/formats.md has
-every field and a worked example.
+mirrors SPZ_NIANTIC_georeference: p_ecef = scale · R(rotation) · p_file + origin, in float64. The same similarity
+stands there as a 4×4 matrix. docs/formats.md has every field and a worked example.
 """
 
 from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import ConfigDict, Field, field_validator
+from pydantic import ConfigDict, Field, field_validator, model_validator
 from pydantic.alias_generators import to_camel
 
 from pipelines.core.cautions import Caution
 from pipelines.core.durable import replace_file
 from pipelines.core.products import Product, load_json
-from pipelines.core.types import FloatArray, Quaternion, Row7, Vector3
+from pipelines.core.types import FloatArray, Matrix4, Quaternion, Row7, Vector3
 from pipelines.geodesy.vertical import VerticalDatum
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.similarity import Similarity, covariance_at
 
 SUFFIX = ".georef.json"
+# Between the matrix and the similarity, for sidecars whose numbers somebody has rounded: 1 mm at 1 km.
+_MATRIX_TOLERANCE, _MATRIX_TOLERANCE_M = 1e-6, 1e-3
 
 Covariance7 = Annotated[tuple[Row7, ...], Field(min_length=7, max_length=7)]
 
@@ -50,8 +52,24 @@ class PredictedAccuracy(Product):
     sigma_3d_m: float
 
 
+def _matrix_of(fields: dict[str, Any]) -> Matrix4:
+    """Return the matrix of a sidecar's similarity, row by row; sidecars of earlier versions do not hold it."""
+    similarity = Similarity(fields["scale"], matrix_from_quat_xyzw(fields["rotation"]), np.array(fields["origin"]))
+    first, second, third, last = (_vector4(row) for row in similarity.matrix())
+    return first, second, third, last
+
+
+def _vector4(row: FloatArray) -> tuple[float, float, float, float]:
+    x, y, z, w = row.tolist()
+    return x, y, z, w
+
+
 class GeorefSidecar(_CamelCase):
-    """Content of the sidecar; names in the file are in camelCase."""
+    """Content of the sidecar; names in the file are in camelCase.
+
+    `matrix` (`ecefFromFile` in the file) is the similarity of `origin`, `rotation` and `scale` as a 4×4 matrix, row
+    by row, for columns of homogeneous coordinates.
+    """
 
     format: Literal["georefgs"] = "georefgs"
     version: Literal[1] = 1
@@ -59,6 +77,7 @@ class GeorefSidecar(_CamelCase):
     origin: Vector3
     rotation: Quaternion
     scale: float = Field(gt=0)
+    matrix: Matrix4 = Field(default_factory=_matrix_of, alias="ecefFromFile")
     epoch: float | None = None
     origin_lla: Vector3
     vertical_datum: VerticalDatum
@@ -73,6 +92,13 @@ class GeorefSidecar(_CamelCase):
         if abs(float(np.linalg.norm(rotation)) - 1) > 1e-6:
             raise ValueError("not a unit quaternion")
         return rotation
+
+    @model_validator(mode="after")
+    def _agrees(self) -> GeorefSidecar:
+        off = np.abs(np.array(self.matrix) - self.ecef_from_file().matrix())
+        if off[:, :3].max() > _MATRIX_TOLERANCE or off[:, 3].max() > _MATRIX_TOLERANCE_M:
+            raise ValueError("ecefFromFile: is not the matrix of origin, rotation and scale")
+        return self
 
     def ecef_from_file(self) -> Similarity:
         """Return the similarity p_ecef = s R p_file + origin."""

@@ -138,8 +138,12 @@ def _is_fisheye(camera: Camera) -> bool:
     return camera.model == "OPENCV_FISHEYE"
 
 
-def _split_params(camera: Camera) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return focal lengths (2,), principal point (2,) and distortion (8,), zero for terms that the model lacks."""
+def full_parameters(camera: Camera) -> FloatArray:
+    """Return fx fy cx cy, then k1 k2 p1 p2 k3 k4 k5 k6 (fisheye: k1 k2 k3 k4), zero for terms that the model lacks.
+
+    Raises:
+        InputError: as `undistort`.
+    """
     layout = _LAYOUT.get(camera.model)
     if layout is None:
         raise InputError(f"camera model {camera.model} is not supported; use one of {', '.join(MODELS)}")
@@ -150,6 +154,12 @@ def _split_params(camera: Camera) -> tuple[FloatArray, FloatArray, FloatArray]:
         full[list(slots)] = value
     if not (full[:2] > 0).all():
         raise InputError(f"focal length {full[0]:g} px is not positive")
+    return full
+
+
+def _split_params(camera: Camera) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return focal lengths (2,), principal point (2,) and distortion (8,), zero for terms that the model lacks."""
+    full = full_parameters(camera)
     return full[:2], full[2:4], full[4:]
 
 

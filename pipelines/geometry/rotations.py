@@ -1,4 +1,4 @@
-"""Rotations: quaternions, matrices, exponential map, and the gimbal's yaw, pitch, roll.
+"""Rotations: quaternions, matrices, exponential map, the gimbal's yaw, pitch, roll, and photogrammetry's ω, φ, κ.
 
 All functions are batched over leading dimensions and work in float64. Quaternions carry their order in the name.
 """
@@ -15,8 +15,11 @@ from pipelines.core.types import FloatArray
 
 # Columns: the gimbal's forward, right and down axes seen from a camera (x right, y down, z forward).
 _CAM_FROM_GIMBAL = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
+# Photogrammetry's image axes (x right, y up, z backward) seen from a camera.
+_CAM_FROM_PHOTO = np.diag([1.0, -1.0, -1.0])
 # Also the attitude in East-North-Up of a body (forward, right, down) that is level and heads north.
 ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+_LOCKED = 1e-9  # cosine of φ below which ω and κ turn about the same axis
 
 
 def matrix_from_quat_xyzw(quat_xyzw: ArrayLike) -> FloatArray:
@@ -91,3 +94,50 @@ def yaw_pitch_roll_deg(geo_from_cam_rotation: ArrayLike) -> FloatArray:
         warnings.filterwarnings("ignore", message="Gimbal lock", category=UserWarning)
         angles = Rotation.from_matrix(ned_from_gimbal.reshape(-1, 3, 3)).as_euler("ZYX", degrees=True)
     return np.asarray(angles).reshape(*matrix.shape[:-2], 3)
+
+
+def map_from_cam(omega_phi_kappa_deg: ArrayLike) -> FloatArray:
+    """Return rotations (…, 3, 3) camera → map axes of photogrammetric angles ω, φ, κ (…, 3) in degrees.
+
+    R_x(ω) R_y(φ) R_z(κ) turns image axes (x right, y up, z backward) into map axes (east, north, up). With
+    ω = φ = κ = 0 a camera looks straight down, and the upper edge of its image faces north (Bäumker and Heimes
+    2001, New calibration and computing method for direct georeferencing; PIX4D has the same angles).
+    """
+    angles = np.asarray(omega_phi_kappa_deg, dtype=np.float64)
+    map_from_photo = Rotation.from_euler("XYZ", angles.reshape(-1, 3), degrees=True).as_matrix()
+    rotation = np.asarray(map_from_photo) @ _CAM_FROM_PHOTO.T
+    return np.asarray(rotation.reshape(*angles.shape[:-1], 3, 3))
+
+
+def omega_phi_kappa_deg(map_from_cam_rotation: ArrayLike) -> FloatArray:
+    """Return ω, φ, κ (…, 3) in degrees of rotations (…, 3, 3) camera → map axes: inverts `map_from_cam`.
+
+    ω and κ lie within ±180°, φ within ±90°. With φ = ±90°, ω and κ turn about the same axis: κ is then zero.
+    """
+    matrix = np.asarray(map_from_cam_rotation, dtype=np.float64)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Gimbal lock", category=UserWarning)
+        angles = Rotation.from_matrix((matrix @ _CAM_FROM_PHOTO).reshape(-1, 3, 3)).as_euler("XYZ", degrees=True)
+    return np.asarray(angles).reshape(*matrix.shape[:-2], 3)
+
+
+def omega_phi_kappa_jacobian(omega_phi_kappa_deg: ArrayLike) -> FloatArray:
+    """Return derivatives (…, 3, 3) of ω, φ, κ by a small rotation δθ about the map axes: R' = Exp(δθ) R.
+
+    Angles and δθ are in the same unit; NaN at φ = ±90°.
+
+    Args:
+        omega_phi_kappa_deg: (…, 3) the angles, degrees.
+    """
+    omega, phi, _ = np.moveaxis(np.radians(np.asarray(omega_phi_kappa_deg, dtype=np.float64)), -1, 0)
+    # The axes of the three turns in map axes: x; then y, turned by ω; then z, turned by ω and φ.
+    axes = np.zeros((*omega.shape, 3, 3))
+    axes[..., 0, 0] = 1.0
+    axes[..., 1, 1], axes[..., 2, 1] = np.cos(omega), np.sin(omega)
+    axes[..., 0, 2] = np.sin(phi)
+    axes[..., 1, 2], axes[..., 2, 2] = -np.sin(omega) * np.cos(phi), np.cos(omega) * np.cos(phi)
+    locked = np.abs(np.cos(phi)) < _LOCKED
+    axes[locked] = np.eye(3)
+    jacobian = np.linalg.inv(axes)
+    jacobian[locked] = np.nan
+    return np.asarray(jacobian)

@@ -19,6 +19,7 @@ from pipelines.core.fingerprints import fingerprints
 from pipelines.core.products import load_json
 from pipelines.core.stages import BY_NAME, RIG, SURVEY, TRACK, stage_slice
 from pipelines.core.workspace import Workspace
+from pipelines.formats.colmap_writer import write_sparse
 from pipelines.geodesy.enu import lla_from_enu
 from pipelines.geometry.cameras import Camera
 from pipelines.geometry.rig import boresight
@@ -30,7 +31,6 @@ from pipelines.simulate.options import SimulateOptions
 from pipelines.simulate.stage import simulate
 from pipelines.simulate.truth import Truth
 from tests import bags
-from tests.colmap_writer import write_sparse
 from tests.earth import enu_from_lla
 from tests.scenes import Noise, TrueScene, sparse_model
 

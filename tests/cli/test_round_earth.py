@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from pipelines.core.products import load_json, save_json
 from pipelines.core.stages import GAUSSIANS, MODEL, REPORT, SIM3, SPARSE, SURVEY
+from pipelines.formats.colmap_writer import write_sparse
 from pipelines.geometry.cameras import Camera
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
@@ -29,7 +30,6 @@ from pipelines.scene.trained_model import TrainedCamera
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.storage import write_gaussians
 from tests.cli_runs import Georef
-from tests.colmap_writer import write_sparse
 from tests.map_projections import US_FOOT_M, long_island, utm
 from tests.photos import jpeg
 from tests.scenes import initial_product, trained_model

@@ -176,12 +176,31 @@ def test_transparent_gaussians_are_left_out() -> None:
 def test_sidecar_has_the_fields_that_were_promised(stage: StageRun) -> None:
     run(stage, OPTIONS)
     document = json.loads(sidecar_path(stage.out / "splat.ply").read_text(encoding="utf-8"))
-    fields = "format version crsId origin rotation scale epoch originLla verticalDatum crsWkt covariance accuracy"
-    assert list(document) == [*fields.split(), "cautions"]
+    place = "format version crsId origin rotation scale ecefFromFile epoch originLla verticalDatum crsWkt"
+    assert list(document) == [*place.split(), "covariance", "accuracy", "cautions"]
     assert (document["format"], document["version"], document["crsId"]) == ("georefgs", 1, "EPSG:4978")
     assert document["crsWkt"].startswith("GEODCRS[")
     assert np.array(document["covariance"]).shape == (7, 7)
     assert document["verticalDatum"] == {"name": "EGM2008", "stated": True, "note": ""}
+
+
+def test_matrix_is_the_similarity_of_the_sidecar(stage: StageRun) -> None:
+    run(stage, OPTIONS)
+    path, sidecar = sidecar_path(stage.out / "splat.ply"), read_sidecar(stage.out / "splat.ply")
+    document = json.loads(path.read_text(encoding="utf-8"))
+    matrix = np.array(document["ecefFromFile"])
+    points = np.random.default_rng(0).uniform(-500, 500, (20, 3))
+    expected = sidecar.scale * points @ sidecar.ecef_from_file().rotation.T + sidecar.origin
+    # Coordinates of 6e6 m, summed in another order, differ by units in the last place.
+    np.testing.assert_allclose((matrix @ np.column_stack([points, np.ones(20)]).T).T[:, :3], expected, atol=4e-9)
+    np.testing.assert_array_equal(matrix[3], [0, 0, 0, 1])
+    del document["ecefFromFile"]  # as it was before the matrix
+    path.write_text(json.dumps(document), encoding="utf-8")
+    assert read_sidecar(stage.out / "splat.ply") == sidecar
+    matrix[0, 3] += 0.01
+    path.write_text(json.dumps({**document, "ecefFromFile": matrix.tolist()}), encoding="utf-8")
+    with pytest.raises(InputError, match="ecefFromFile"):
+        read_sidecar(stage.out / "splat.ply")
 
 
 def test_sidecar_carries_the_cautions_of_the_model_on(stage: StageRun) -> None:

@@ -11,8 +11,8 @@ import pytest
 
 from pipelines.core.errors import InputError
 from pipelines.formats.colmap import read_sparse
+from pipelines.formats.colmap_writer import write_sparse
 from pipelines.geometry.sparse_model import SparseModel
-from tests.colmap_writer import write_sparse
 from tests.scenes import Noise, make_scene, sparse_model
 
 pycolmap = pytest.importorskip("pycolmap")

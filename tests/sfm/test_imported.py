@@ -12,11 +12,11 @@ import pytest
 
 from pipelines.core.errors import InputError
 from pipelines.formats.colmap import load_reconstruction
+from pipelines.formats.colmap_writer import write_sparse
 from pipelines.geometry.cameras import Camera
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.scene.survey import Survey
 from pipelines.sfm.imported import find_model, import_model
-from tests.colmap_writer import write_sparse
 from tests.scenes import Measured, Noise, make_scene, sparse_model, survey_of
 
 pytest.importorskip("pycolmap")

@@ -1,4 +1,4 @@
-"""COLMAP models of known content, written as COLMAP writes them."""
+"""Flat numpy arrays as COLMAP sparse models, written as COLMAP writes them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from pipelines.core.types import IntArray
-from pipelines.formats.colmap import pycolmap_module
+from pipelines.formats.colmap import pycolmap_module, write_reconstruction
 from pipelines.geometry.sparse_model import SparseModel
 
 
@@ -19,6 +19,8 @@ def write_sparse(model: SparseModel, path: Path) -> None:
 
     Raises:
         BackendUnavailableError: pycolmap is not installed.
+        StorageError: the disk is full.
+        OSError: the folder cannot be made.
     """
     pycolmap = pycolmap_module()
     reconstruction = pycolmap.Reconstruction()
@@ -34,8 +36,7 @@ def write_sparse(model: SparseModel, path: Path) -> None:
         )
     rank = _add_images(reconstruction, model)
     _add_points(reconstruction, model, rank)
-    path.mkdir(parents=True, exist_ok=True)
-    reconstruction.write_binary(path)
+    write_reconstruction(reconstruction, path)
 
 
 def _add_images(reconstruction: Any, model: SparseModel) -> IntArray:

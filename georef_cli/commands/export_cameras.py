@@ -1,0 +1,21 @@
+"""Command `georef export-cameras`."""
+
+from __future__ import annotations
+
+from georef_cli.deliverable import DeliverableCommand
+
+command = DeliverableCommand(
+    "export-cameras",
+    """Write the trained cameras and lenses, placed on Earth.
+
+    colmap/ and transforms.json (nerfstudio) are in the frame of splat.ply. cameras.csv has positions in the CRS of
+    the contract, angles (omega phi kappa against grid north, yaw pitch roll against true north) and sigma.
+    footprints.geojson shows on a map what each photograph shows.
+
+    \b
+    Examples:
+      georef export-cameras flight
+      georef export-cameras flight --crs EPSG:32632 --to handover/cameras
+    """,
+    folder=True,
+)

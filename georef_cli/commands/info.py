@@ -1,0 +1,48 @@
+"""Command `georef info`."""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any
+
+import click
+
+from georef_cli import options
+from georef_cli.output import print_json, print_rich
+from pipelines.core.options import resolve
+from pipelines.core.staleness import must_exist
+from pipelines.core.workspace import Workspace
+from pipelines.deliver.options import CrsOptions
+
+
+def _info(ctx: click.Context, workspace: Workspace, as_json: bool, **_values: Any) -> None:
+    from georef_cli.overview import whole
+    from pipelines.deliver.overview import overview
+
+    must_exist(workspace)
+    flags = options.given(ctx, CrsOptions.model_fields)
+    result = overview(workspace, resolve(CrsOptions, {}, flags, workspace.config_file))
+    if as_json:
+        print_json(result.feature())
+    else:
+        print_rich(*whole(result))
+
+
+command = click.Command(
+    "info",
+    params=[options.workspace_argument(), *options.stage_options(CrsOptions), options.json_option()],
+    callback=click.pass_context(_info),
+    help=inspect.cleandoc(
+        """Show where on Earth the result is, how good it is, what was made and what each file is for.
+
+        The bounds hold 98 % of the Gaussians along each coordinate. With --json: a GeoJSON feature, the bounds as
+        its polygon. Nothing is written.
+
+        \b
+        Examples:
+          georef info flight
+          georef info flight --crs EPSG:32632+3855
+          georef info flight --json > flight.geojson
+        """
+    ),
+)

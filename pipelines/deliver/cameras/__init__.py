@@ -1,0 +1,1 @@
+"""Export of the trained cameras: COLMAP, nerfstudio, a table for surveyors, footprints for maps."""

@@ -1,0 +1,285 @@
+"""Overview of a result: where on Earth it is, how good it is, what was made, and what each file is for.
+
+Reads survey, trained model and the centres of its Gaussians. Writes nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.core.cautions import Caution
+from pipelines.core.errors import GeorefError, InputError
+from pipelines.core.products import load_json
+from pipelines.core.stages import BY_NAME, DELIVERABLES, GAUSSIANS, MODEL, REPORT
+from pipelines.core.staleness import StageState, cautions_by_stage, status
+from pipelines.core.types import FloatArray, Vector3
+from pipelines.core.workspace import Workspace
+from pipelines.deliver.options import CrsOptions
+from pipelines.deliver.placement import Placement, place
+from pipelines.deliver.purposes import PURPOSES
+from pipelines.deliver.target_crs import TargetCrs, target_crs
+from pipelines.formats.geojson import Json, feature, polygon
+from pipelines.formats.splat_ply import read_centres
+from pipelines.geodesy.enu import ecef_from_enu, lla_from_ecef
+from pipelines.geodesy.vertical import ELLIPSOIDAL, VerticalChoice
+from pipelines.scene.calibrated import load_survey
+from pipelines.scene.report import read_report
+from pipelines.scene.survey import Survey
+from pipelines.scene.trained_model import TrainedModel
+
+_RIM = 0.01  # fraction of the Gaussians outside the bounds at either end: sky, and floaters
+_MOST = 100_000  # Gaussians that the bounds are taken from
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Bounds of 98 % of the Gaussians along each coordinate.
+
+    Attributes:
+        west, south, east, north: WGS84 degrees; west > east across the date line.
+        height_m: least and largest ellipsoidal height.
+        crs: name of a CRS.
+        units: of its three coordinates.
+        heights: datum of its heights.
+        low, high: least and largest coordinates in it, easting or longitude first.
+        assumed: what the user did not state of it.
+    """
+
+    west: float
+    south: float
+    east: float
+    north: float
+    height_m: tuple[float, float]
+    crs: str
+    units: tuple[str, str, str]
+    heights: str
+    low: Vector3
+    high: Vector3
+    assumed: tuple[str, ...]
+
+    def geometry(self) -> Json | None:
+        """Return the rectangle in longitude and latitude as GeoJSON."""
+        east = self.east if self.east >= self.west else self.east + 360.0
+        corners = [(self.west, self.south), (east, self.south), (east, self.north), (self.west, self.north)]
+        return polygon(corners)
+
+
+@dataclass(frozen=True)
+class Quality:
+    """Predicted σ and measured errors in metres; None: not known.
+
+    Attributes:
+        sigma_h_m, sigma_v_m: predicted.
+        counts: errors that σ holds, and where; empty if σ is not known.
+        check_points: number of check points.
+        rmse_h_m, rmse_v_m: of the check points by camera.
+        psnr: of the test views, dB.
+    """
+
+    sigma_h_m: float | None
+    sigma_v_m: float | None
+    counts: str
+    check_points: int = 0
+    rmse_h_m: float | None = None
+    rmse_v_m: float | None = None
+    psnr: float | None = None
+
+
+@dataclass(frozen=True)
+class MadeFile:
+    """File or folder that was made.
+
+    Attributes:
+        path: in the workspace.
+        purpose: use of it.
+        bytes: size, that of all its files for a folder.
+        made: time; None: not recorded.
+        state: state of its stage, as in `georef status`.
+    """
+
+    path: str
+    purpose: str
+    bytes: int
+    made: datetime | None
+    state: str
+
+
+@dataclass(frozen=True)
+class Overview:
+    """Result of a workspace.
+
+    Attributes:
+        workspace: its root.
+        gaussians: number of Gaussians.
+        center_lla: latitude, longitude and ellipsoidal height of the middle of the scene.
+        bounds: of the scene.
+        quality: predicted and measured accuracy.
+        files: those that there are, with their use.
+        further: commands of the deliverables that were not made, with what each makes.
+        cautions: limits of the result, by stage.
+    """
+
+    workspace: Path
+    gaussians: int
+    center_lla: Vector3
+    bounds: Bounds
+    quality: Quality
+    files: tuple[MadeFile, ...]
+    further: dict[str, str]
+    cautions: dict[str, tuple[Caution, ...]]
+
+    def feature(self) -> Json:
+        """Return the overview as a GeoJSON feature: the bounds as geometry, all else as properties."""
+        bounds = self.bounds
+        lat, lon, height = self.center_lla
+        properties = {
+            "workspace": str(self.workspace),
+            "gaussians": self.gaussians,
+            "center": {"longitude": lon, "latitude": lat, "ellipsoidal_height_m": height},
+            "ellipsoidal_height_m": bounds.height_m,
+            "crs": {
+                "name": bounds.crs,
+                "units": bounds.units,
+                "heights": bounds.heights,
+                "low": bounds.low,
+                "high": bounds.high,
+                "assumed": bounds.assumed,
+            },
+            "quality": asdict(self.quality),
+            "files": [{**asdict(file), "made": file.made and file.made.isoformat()} for file in self.files],
+            "further": self.further,
+            "cautions": [
+                {"stage": stage, **caution.model_dump()}
+                for stage, cautions in self.cautions.items()
+                for caution in cautions
+            ],
+        }
+        return feature(bounds.geometry(), properties, (bounds.west, bounds.south, bounds.east, bounds.north))
+
+
+def overview(workspace: Workspace, options: CrsOptions) -> Overview:
+    """Return the overview of a trained workspace.
+
+    Args:
+        workspace: has at least the products of ingest and train.
+        options: CRS of the bounds.
+
+    Raises:
+        MissingProductError: nothing has been trained; names the command.
+        InputError: a product is damaged, or the CRS cannot be used here.
+    """
+    model = load_json(TrainedModel, workspace.path(MODEL))
+    survey = load_survey(workspace)
+    means = read_centres(workspace.path(GAUSSIANS)).astype(np.float64)
+    placement = place(model, survey, means)
+    states = {BY_NAME[row.stage].folder: row for row in status(workspace)}
+    x, y, z = placement.origin_lla.tolist()
+    return Overview(
+        workspace=workspace.root,
+        gaussians=len(means),
+        center_lla=(x, y, z),
+        bounds=_bounds(placement.geo_from_model.apply(means[:: max(1, len(means) // _MOST)]), survey, options),
+        quality=_quality(workspace, placement),
+        files=_files(workspace, states),
+        further={
+            f"georef {spec.name} {workspace.root}": spec.title
+            for spec in DELIVERABLES
+            if not (workspace.root / spec.product).exists()
+        },
+        cautions=cautions_by_stage(workspace),
+    )
+
+
+def _bounds(points_in_geo: FloatArray, survey: Survey, options: CrsOptions) -> Bounds:
+    lla = lla_from_ecef(ecef_from_enu(points_in_geo, survey.origin))
+    lla[:, 1] -= 360.0 * np.round((lla[:, 1] - lla[0, 1]) / 360.0)
+    (south, west, low_m), (north, east, high_m) = (row.tolist() for row in _robust(lla))
+    spanning = _robust(points_in_geo)
+    crs, assumed = _target(survey, spanning, options)
+    low, high = _robust(crs.xyz_from_geo(points_in_geo))
+    return Bounds(
+        west=_wrapped(west),
+        south=south,
+        east=_wrapped(east),
+        north=north,
+        height_m=(low_m, high_m),
+        crs=crs.crs.name,
+        units=crs.crs.units,
+        heights=crs.crs.vertical.name,
+        low=_vector(low),
+        high=_vector(high),
+        assumed=assumed,
+    )
+
+
+def _target(survey: Survey, spanning: FloatArray, options: CrsOptions) -> tuple[TargetCrs, tuple[str, ...]]:
+    """Return the CRS of the bounds; ellipsoidal heights if the survey's datum needs a grid that is not installed.
+
+    Only the default gives way: a user who names a CRS or a datum learns what is missing.
+    """
+    try:
+        crs = target_crs(options, survey.origin, spanning, survey.vertical)
+        return crs, crs.assumed
+    except InputError:
+        if options.crs is not None or options.vertical is not None:
+            raise
+    choice = VerticalChoice(ELLIPSOIDAL, None)
+    crs = target_crs(CrsOptions(vertical=choice), survey.origin, spanning, survey.vertical)
+    return crs, (*crs.assumed, f"heights are ellipsoidal: the grid of {survey.vertical.name} is not installed")
+
+
+def _quality(workspace: Workspace, placement: Placement) -> Quality:
+    """Return the accuracy by `evaluate`, or that of the georeference alone where nothing was evaluated."""
+    accuracy = placement.sidecar().accuracy
+    quality = Quality(None, None, "")
+    if accuracy is not None:
+        counts = "of the georeference, at the middle of the scene"
+        quality = Quality(accuracy.sigma_h_m, accuracy.sigma_v_m, counts)
+    try:
+        report = read_report(workspace.path(REPORT))
+    except GeorefError:  # not evaluated, or damaged: `georef status` tells
+        return quality
+    scene, points = report.accuracy, report.checkpoints.camera
+    over_scene = placement.is_checked and scene.median_sigma_h_m is not None
+    return Quality(
+        sigma_h_m=scene.median_sigma_h_m if over_scene else quality.sigma_h_m,
+        sigma_v_m=scene.median_sigma_v_m if over_scene else quality.sigma_v_m,
+        counts="of georeference, cameras and lens, median over the scene" if over_scene else quality.counts,
+        check_points=points.count,
+        rmse_h_m=points.rmse_h_m,
+        rmse_v_m=points.rmse_v_m,
+        psnr=report.photometric.test.psnr,
+    )
+
+
+def _files(workspace: Workspace, states: dict[str, StageState]) -> tuple[MadeFile, ...]:
+    """Return the files that there are, with the state of the stage of their folder."""
+    files = []
+    for name, purpose in PURPOSES.items():
+        path, row = workspace.root / name, states.get(name.partition("/")[0])
+        if row is not None and path.exists():
+            files.append(MadeFile(name, purpose, _size(path), row.finished, row.state))
+    return tuple(files)
+
+
+def _size(path: Path) -> int:
+    files = path.rglob("*") if path.is_dir() else (path,)
+    return sum(file.stat().st_size for file in files if file.is_file())
+
+
+def _robust(points: FloatArray) -> FloatArray:
+    """Return the bounds (2, d) of points (N, d) without the rim."""
+    return np.asarray(np.quantile(points, [_RIM, 1 - _RIM], axis=0))
+
+
+def _wrapped(lon: float) -> float:
+    return lon - 360.0 * round(lon / 360.0)
+
+
+def _vector(values: FloatArray) -> Vector3:
+    x, y, z = values.tolist()
+    return x, y, z

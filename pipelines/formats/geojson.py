@@ -1,0 +1,79 @@
+"""GeoJSON (RFC 7946): longitude and latitude in WGS84 degrees, outer rings anticlockwise, cut at the date line."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from pipelines.core.durable import replace_file
+from pipelines.core.types import FloatArray
+from pipelines.geometry.footprints import clipped_ring
+
+_DECIMALS = 8  # of a degree: 1 mm
+
+Json = dict[str, Any]
+
+
+def polygon(lon_lat: ArrayLike) -> Json | None:
+    """Return the geometry of a ring (K, 2) in degrees, not closed: a Polygon, or two if it crosses the date line.
+
+    None, which is the geometry of an unlocated feature, if the ring has no area.
+    """
+    ring = np.asarray(lon_lat, dtype=np.float64)
+    if len(ring) < 3:
+        return None
+    ring = ring.copy()
+    ring[:, 0] -= 360.0 * np.round((ring[:, 0] - ring[0, 0]) / 360.0)
+    turned = [ring + np.array([turn, 0.0]) for turn in (-360.0, 0.0, 360.0)]
+    rings = [closed for part in turned if (closed := _closed(_between_date_lines(part))) is not None]
+    if not rings:
+        return None
+    if len(rings) == 1:
+        return {"type": "Polygon", "coordinates": [rings[0]]}
+    return {"type": "MultiPolygon", "coordinates": [[one] for one in rings]}
+
+
+def feature(geometry: Json | None, properties: Mapping[str, Any], bbox: Sequence[float] | None = None) -> Json:
+    """Return a feature; NaN among the properties becomes null."""
+    box = {} if bbox is None else {"bbox": list(bbox)}
+    known = {name: None if _is_nan(value) else value for name, value in properties.items()}
+    return {"type": "Feature", **box, "geometry": geometry, "properties": known}
+
+
+def write_features(path: Path, features: Sequence[Json]) -> None:
+    """Write a FeatureCollection, one feature a line; the file appears whole or not at all.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    draft = path.with_name(path.name + ".tmp")
+    lines = ",\n".join(json.dumps(one, allow_nan=False, ensure_ascii=False) for one in features)
+    draft.write_text(f'{{"type": "FeatureCollection", "features": [\n{lines}\n]}}\n', encoding="utf-8")
+    replace_file(draft, path)
+
+
+def _between_date_lines(ring: FloatArray) -> FloatArray:
+    east_of = clipped_ring(ring, ring[:, 0] + 180.0)
+    return clipped_ring(east_of, 180.0 - east_of[:, 0])
+
+
+def _closed(ring: FloatArray) -> list[list[float]] | None:
+    if len(ring) < 3:
+        return None
+    rounded = np.round(ring, _DECIMALS)
+    x, y = rounded[:, 0] - rounded[0, 0], rounded[:, 1] - rounded[0, 1]
+    area = float(x @ np.roll(y, -1) - y @ np.roll(x, -1))
+    if area == 0.0:
+        return None
+    outline = rounded if area > 0 else rounded[::-1]
+    return [*outline.tolist(), outline[0].tolist()]
+
+
+def _is_nan(value: object) -> bool:
+    return isinstance(value, float) and math.isnan(value)

@@ -1,0 +1,142 @@
+"""Footprints of photographs: the rays of the image's border, intersected with the surface of the scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from pipelines.core.types import FloatArray
+from pipelines.geometry.cameras import Camera, undistort
+
+_PER_SIDE = 16  # border pixels: the bow of a lens and the relief show in the outline
+_SHALLOWEST = 0.1  # tangent of the angle below the horizon: beyond, a ray ends at ten times the height above ground
+_NEIGHBOURS = 9  # points whose median is the height of the surface
+_SAMPLES = 32  # along a ray, from the camera down to the lowest point
+_BISECTIONS = 16
+
+
+class PointSurface:
+    """Surface through a cloud of points: at each place, the median height of the nearest points.
+
+    Args:
+        points: (N, 3) with z up, metres; N ≥ 1.
+    """
+
+    def __init__(self, points: FloatArray) -> None:
+        self._height = points[:, 2]
+        self._tree = cKDTree(points[:, :2])
+        self._neighbours = min(_NEIGHBOURS, len(points))
+        self.median, self.lowest = float(np.median(self._height)), float(self._height.min())
+
+    def heights(self, places: FloatArray) -> FloatArray:
+        """Return the heights (…,) at places (…, 2)."""
+        _, near = self._tree.query(places, k=self._neighbours)
+        return np.asarray(np.median(self._height[np.reshape(near, (*places.shape[:-1], -1))], axis=-1))
+
+
+@dataclass(frozen=True)
+class Footprint:
+    """Outline of what a photograph shows.
+
+    Attributes:
+        outline: (K, 3) metres, z up, anticlockwise seen from above, not closed; K = 0: the photograph shows no
+            ground.
+        clipped: whether the photograph also shows what lies above the horizon, or too near below it to be placed.
+    """
+
+    outline: FloatArray
+    clipped: bool
+
+
+def border_rays(camera: Camera) -> FloatArray:
+    """Return rays (K, 3) in the camera's frame through the border of its image, clockwise from the upper left.
+
+    The corners are among them. A pixel that the lens gives no ray is left out.
+    """
+    step = np.linspace(0.0, 1.0, _PER_SIDE, endpoint=False)
+    zero, one = np.zeros(_PER_SIDE), np.ones(_PER_SIDE)
+    sides = [np.column_stack(side) for side in ((step, zero), (one, step), (1 - step, one), (zero, 1 - step))]
+    slopes = undistort(camera, np.concatenate(sides) * [camera.width, camera.height])
+    slopes = slopes[np.isfinite(slopes).all(axis=1)]
+    return np.concatenate([slopes, np.ones((len(slopes), 1))], axis=1)
+
+
+def footprint(rays: FloatArray, center: FloatArray, surface: PointSurface) -> Footprint:
+    """Return the outline at which rays (K, 3) from a centre (3,) meet a surface, z up.
+
+    1. The part of the border that does not point at least `_SHALLOWEST` below the horizon is cut off.
+    2. Each ray ends where it first passes below the surface. A ray that never runs above it ends at the median
+       height.
+    3. Where the relief makes the outline cross itself, the outline is that on the plane of its median height.
+    """
+    unit = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    below = -unit[:, 2] - _SHALLOWEST * np.hypot(unit[:, 0], unit[:, 1])
+    clipped = bool((below < 0).any())
+    seen = clipped_ring(unit, below)
+    if len(seen) < 3 or center[2] <= surface.median:
+        return Footprint(np.zeros((0, 3)), clipped)
+    ray = seen / -seen[:, 2:]
+    depth = _depths(ray, center, surface)
+    outline = center + depth[:, None] * ray
+    if _crosses_itself(outline[:, :2]):
+        outline = center + np.median(depth) * ray
+    return Footprint(outline if _area(outline) > 0 else outline[::-1], clipped)
+
+
+def _depths(ray: FloatArray, center: FloatArray, surface: PointSurface) -> FloatArray:
+    """Return how far (K,) below the centre rays (K, 3), which descend by one, first pass below the surface."""
+
+    def above(depth: FloatArray) -> FloatArray:
+        places = center[:2] + depth[..., None] * ray[:, :2]
+        return np.asarray(center[2] - depth - surface.heights(places))
+
+    depth = np.linspace(0.0, center[2] - surface.lowest, _SAMPLES)
+    free = above(np.repeat(depth[:, None], len(ray), axis=1)) > 0
+    passes = free[:-1] & ~free[1:]
+    first = passes.argmax(axis=0)
+    low, high = depth[first], depth[first + 1]
+    for _ in range(_BISECTIONS):
+        middle = (low + high) / 2
+        is_free = above(middle) > 0
+        low, high = np.where(is_free, middle, low), np.where(is_free, high, middle)
+    return np.asarray(np.where(passes.any(axis=0), high, center[2] - surface.median))
+
+
+def clipped_ring(ring: FloatArray, inside: FloatArray) -> FloatArray:
+    """Return the part of a ring (K, d) where a function is not negative (Sutherland and Hodgman 1974).
+
+    Args:
+        ring: corners, not closed.
+        inside: (K,) the function at the corners; linear between them.
+    """
+    kept = []
+    for index in range(len(ring)):
+        before, here = inside[index - 1], inside[index]
+        if (before < 0) != (here < 0):
+            share = before / (before - here)
+            kept.append(ring[index - 1] + share * (ring[index] - ring[index - 1]))
+        if here >= 0:
+            kept.append(ring[index])
+    return np.array(kept).reshape(-1, ring.shape[1])
+
+
+def _crosses_itself(ring: FloatArray) -> bool:
+    """Return whether any two edges of a ring (K, 2) that have no corner in common cross."""
+    following = np.roll(ring, -1, axis=0)
+    edge = following - ring
+
+    def sides(points: FloatArray) -> FloatArray:
+        """Return on which side of each edge (rows) points (columns) lie."""
+        arm = points[None] - ring[:, None]
+        return np.asarray(np.sign(edge[:, None, 0] * arm[..., 1] - edge[:, None, 1] * arm[..., 0]))
+
+    parted = sides(ring) * sides(following) < 0
+    return bool((parted & parted.T).any())
+
+
+def _area(outline: FloatArray) -> float:
+    """Return the area of an outline in plan, negative if it runs clockwise."""
+    x, y = outline[:, 0] - outline[0, 0], outline[:, 1] - outline[0, 1]
+    return float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2

@@ -1,0 +1,58 @@
+"""`georef info`, and the end of `georef run`: what users read of a result."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from georef_cli.output import print_outcomes
+from georef_cli.overview import size
+from pipelines.core.stages import MODEL, SPLAT
+from pipelines.core.workspace import Workspace
+from pipelines.deliver.options import CrsOptions
+from pipelines.deliver.overview import overview
+from tests.cli_runs import Georef
+from tests.trained_workspaces import trained_workspace
+
+
+@pytest.fixture
+def flight(tmp_path: Path) -> Workspace:
+    """A trained workspace with a splat that stands for one."""
+    workspace = trained_workspace(tmp_path / "ws")[1]
+    (workspace.root / "export").mkdir()
+    (workspace.root / SPLAT).write_bytes(bytes(12_345))
+    return workspace
+
+
+def test_command_tells_place_files_and_what_can_be_made(real_georef: Georef, flight: Workspace) -> None:
+    result = real_georef("info", flight.root, "--crs", "EPSG:4326")
+    assert result.code == 0
+    for text in ("46.00", "7.75", "EPSG:4326", "export/splat.ply", "12.3 kB", "for viewers", "Not made yet"):
+        assert text in result.out
+    document = real_georef("info", flight.root, "--json").document
+    assert document["type"] == "Feature"
+    assert document["properties"]["files"][0]["path"] == SPLAT
+
+
+def test_command_names_what_is_missing(real_georef: Georef, flight: Workspace, tmp_path: Path) -> None:
+    flight.path(MODEL).unlink()
+    result = real_georef("info", flight.root)
+    assert (result.code, result.out) == (1, "")
+    assert f"georef train {flight.root}" in result.err
+    assert "no such workspace" in real_georef("info", tmp_path / "nowhere").err
+
+
+def test_run_ends_with_where_the_files_are(flight: Workspace, capsys: pytest.CaptureFixture[str]) -> None:
+    print_outcomes(flight, (), overview(flight, CrsOptions()), as_json=False)
+    out = " ".join(capsys.readouterr().out.split())
+    for text in ("at 46.00", "longitude 7.74", "/export/splat.ply", "georef info", "--deliver"):
+        assert text in out
+
+
+@pytest.mark.parametrize(
+    ("count", "text"),
+    [(0, "0 B"), (812, "812 B"), (1000, "1.0 kB"), (3_140_000, "3.1 MB"), (5 * 10**15, "5000.0 TB")],
+)
+def test_sizes_are_read_at_a_glance(count: int, text: str) -> None:
+    assert size(count) == text

@@ -1,0 +1,256 @@
+"""Trained cameras handed over: every file alone puts every photograph where the truth is."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pyproj import Proj, Transformer
+
+from pipelines.core.cautions import NOT_CHECKED, Caution
+from pipelines.core.errors import InputError
+from pipelines.core.manifest import MANIFEST, Manifest
+from pipelines.core.products import load_json, save_json
+from pipelines.core.stages import MODEL, SPARSE, SURVEY
+from pipelines.core.workspace import StageRun, Summary, Workspace, now
+from pipelines.deliver.cameras.stage import run
+from pipelines.deliver.options import ExportCamerasOptions
+from pipelines.formats.colmap import read_sparse
+from pipelines.formats.colmap_writer import write_sparse
+from pipelines.formats.georef_sidecar import CrsSidecar, read_sidecar, sidecar_path
+from pipelines.formats.trajectory_csv import read_trajectory
+from pipelines.geodesy.enu import Origin, ecef_from_enu, ecef_from_lla, enu_from_ecef, geo_from_enu_at, lla_from_enu
+from pipelines.geometry.cameras import Camera, project
+from pipelines.geometry.rotations import map_from_cam, matrix_from_quat_xyzw
+from pipelines.scene.survey import Survey
+from pipelines.scene.trained_model import TrainedModel
+from tests.scenes import TrueScene
+from tests.trained_workspaces import IMAGES, trained_workspace
+
+pycolmap = pytest.importorskip("pycolmap")
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+@dataclass(frozen=True)
+class Handover:
+    """True scene, workspace with its trained model, and what the stage made of it."""
+
+    scene: TrueScene
+    workspace: Workspace
+    out: Path
+    summary: Summary
+
+    def rows(self) -> list[dict[str, str]]:
+        with (self.out / "cameras.csv").open(encoding="utf-8") as handle:
+            return list(csv.DictReader(handle))
+
+    def columns(self, *names: str) -> np.ndarray:
+        return np.array([[float(row[name]) for name in names] for row in self.rows()])
+
+    @property
+    def origin(self) -> Origin:
+        """Of the frame `geo`."""
+        return load_json(Survey, self.workspace.path(SURVEY)).origin
+
+    @property
+    def ecef(self) -> np.ndarray:
+        """True centres, Earth-centred."""
+        return ecef_from_enu(self.scene.center_in_geo, self.origin)
+
+
+def handed_over(workspace: Workspace, out: Path, **options: object) -> Summary:
+    out.mkdir()
+    return run(StageRun(workspace, out), ExportCamerasOptions(**options))
+
+
+@pytest.fixture(scope="module")
+def handover(tmp_path_factory: pytest.TempPathFactory) -> Handover:
+    root = tmp_path_factory.mktemp("cameras")
+    scene, workspace = trained_workspace(root / "ws")
+    return Handover(scene, workspace, root / "out", handed_over(workspace, root / "out"))
+
+
+def test_table_has_the_true_positions_in_the_utm_zone_of_the_scene(handover: Handover) -> None:
+    from_ecef = Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)
+    lon, lat, alt = from_ecef.transform(*handover.ecef.T)
+    easting, northing = Proj("EPSG:32632")(lon, lat)
+    expected = np.column_stack([easting, northing, alt])
+    np.testing.assert_allclose(handover.columns("x", "y", "z"), expected, atol=1e-4)  # four decimals
+    assert [row["name"] for row in handover.rows()] == list(handover.scene.names)
+    assert [row["split"] for row in handover.rows()].index("test") == 2
+    sidecar = CrsSidecar.model_validate_json(sidecar_path(handover.out / "cameras.csv").read_text(encoding="utf-8"))
+    assert (sidecar.crs, sidecar.vertical_datum.name) == ("EPSG:32632", "ellipsoidal")
+    assert "UTM" in sidecar.assumed[0]
+
+
+def test_angles_count_from_grid_north_by_the_convergence_of_the_projection(handover: Handover) -> None:
+    origin = handover.origin
+    lla = lla_from_enu(handover.scene.center_in_geo, origin)
+    for index, angles in enumerate(handover.columns("omega_deg", "phi_deg", "kappa_deg")):
+        convergence = np.radians(Proj("EPSG:32632").get_factors(lla[index, 1], lla[index, 0]).meridian_convergence)
+        cos, sin = np.cos(convergence), np.sin(convergence)
+        grid_from_enu = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
+        enu_from_cam = geo_from_enu_at(lla[index], origin).T @ handover.scene.geo_from_cam[index]
+        np.testing.assert_allclose(map_from_cam(angles), grid_from_enu @ enu_from_cam, atol=1e-7)
+        assert abs(np.degrees(convergence)) > 0.5  # the test would notice if it were left out
+
+
+def test_table_is_the_input_of_another_survey(handover: Handover) -> None:
+    poses = read_trajectory(handover.out / "cameras.csv")
+    assert poses.names == handover.scene.names
+    np.testing.assert_array_equal(poses.xyz, handover.columns("x", "y", "z"))
+    np.testing.assert_array_equal(poses.sigma_enu_m, handover.columns("sigma_e_m", "sigma_n_m", "sigma_u_m"))
+    origin = handover.origin
+    turn = geo_from_enu_at(lla_from_enu(handover.scene.center_in_geo, origin), origin)
+    assert poses.quat_xyzw is not None
+    np.testing.assert_allclose(
+        turn @ matrix_from_quat_xyzw(poses.quat_xyzw), handover.scene.geo_from_cam, atol=1e-7
+    )
+
+
+def test_sigma_is_that_of_the_measurements(handover: Handover) -> None:
+    """Control points of 1 cm fix the scene; at 100 m, cameras of 0.3 px are known to centimetres and 0.01°."""
+    position = handover.columns("sigma_e_m", "sigma_n_m", "sigma_u_m")
+    angles = handover.columns("sigma_omega_deg", "sigma_phi_deg", "sigma_kappa_deg")
+    assert (position > 1e-3).all()
+    assert (position < 0.1).all()
+    assert (angles > 1e-3).all()
+    assert (angles < 0.2).all()
+    assert handover.summary.values["median_sigma_v_m"] == pytest.approx(np.median(position[:, 2]), abs=1e-4)
+
+
+def test_colmap_model_opens_with_small_reprojection_error_in_the_frame_of_the_splat(handover: Handover) -> None:
+    model = pycolmap.Reconstruction(str(handover.out / "colmap"))
+    assert (model.num_reg_images(), model.num_points3D()) == (IMAGES, 80)
+    # Mean length of a residual of 0.3 px in two axes, less what three coordinates of each point take up.
+    assert 0.2 < model.compute_mean_reprojection_error() < 0.3 * np.sqrt(np.pi / 2)
+    ecef_from_file = read_sidecar(handover.out / "colmap").ecef_from_file()
+    centers = {image.name: image.projection_center() for image in model.images.values()}
+    found = ecef_from_file.apply(np.array([centers[name] for name in handover.scene.names]))
+    np.testing.assert_allclose(found, handover.ecef, atol=1e-6)
+    origin = handover.origin
+    points = np.array([model.points3D[index + 1].xyz for index in range(80)])
+    off = enu_from_ecef(ecef_from_file.apply(points), origin) - handover.scene.point_in_geo
+    assert np.abs(off).max() < 0.2  # 0.3 px at 100 m, a tenth of that along good rays
+
+
+def test_nerfstudio_projects_a_point_to_its_pixel(handover: Handover) -> None:
+    """Its own formulas: OpenGL axes, then OpenCV's polynomial."""
+    document = json.loads((handover.out / "transforms.json").read_text(encoding="utf-8"))
+    file_from_ecef = read_sidecar(handover.out / "transforms.json").ecef_from_file().inverse()
+    origin = handover.origin
+    point_in_geo = np.array([3.0, -4.0, 5.0])
+    point = file_from_ecef.apply(ecef_from_enu(point_in_geo, origin))
+    assert document["camera_model"] == "OPENCV"
+    for frame, center, rotation in zip(
+        document["frames"], handover.scene.center_in_geo, handover.scene.geo_from_cam, strict=True
+    ):
+        x, y, z, _ = np.linalg.inv(frame["transform_matrix"]) @ [*point, 1.0]
+        u, v = x / -z, -y / -z
+        r2 = u * u + v * v
+        radial = 1 + r2 * (frame["k1"] + r2 * (frame["k2"] + r2 * frame["k3"]))
+        p1, p2 = frame["p1"], frame["p2"]
+        bent = (
+            u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u),
+            v * radial + p1 * (r2 + 2 * v * v) + 2 * p2 * u * v,
+        )
+        pixel = (frame["fl_x"] * bent[0] + frame["cx"], frame["fl_y"] * bent[1] + frame["cy"])
+        expected = project(handover.scene.camera, ((point_in_geo - center) @ rotation)[None])[0]
+        np.testing.assert_allclose(pixel, expected, atol=1e-5)
+    assert [frame["file_path"] for frame in document["frames"]] == list(handover.scene.names)
+
+
+def test_footprints_project_back_to_the_border_of_their_photograph(handover: Handover) -> None:
+    document = json.loads((handover.out / "footprints.geojson").read_text(encoding="utf-8"))
+    assert len(document["features"]) == IMAGES
+    origin = handover.origin
+    lens = handover.scene.camera
+    for index, feature in enumerate(document["features"]):
+        properties = feature["properties"]
+        assert (properties["name"], properties["time"][:10]) == (handover.scene.names[index], "2023-11-14")
+        assert properties["sigma_e_m"] > 0
+        ring = np.array(feature["geometry"]["coordinates"][0])
+        lla = np.column_stack([ring[:, ::-1], np.full(len(ring), origin.alt_m)])
+        east_north = enu_from_ecef(ecef_from_lla(lla), origin)[:, :2]
+        # On its ray, the height is unknown to the file: find the one at which the vertex meets the border.
+        center, rotation = handover.scene.center_in_geo[index], handover.scene.geo_from_cam[index]
+        off = []
+        for east, north in east_north:
+            heights = np.linspace(-5, 25, 601)
+            candidates = np.column_stack([np.full((601, 2), (east, north)), heights])
+            pixel = project(lens, (candidates - center) @ rotation)
+            off.append(np.nanmin(np.abs(_inside(pixel, lens.width, lens.height))))
+        # Heights in steps of 0.05 m move a pixel by less than one.
+        assert np.max(off) < 1.0
+        assert not properties["clipped"]
+    text = sidecar_path(handover.out / "footprints.geojson").read_text(encoding="utf-8")
+    sidecar = CrsSidecar.model_validate_json(text)
+    assert (sidecar.crs, sidecar.vertical_datum.name, sidecar.units[0]) == ("EPSG:4979", "ellipsoidal", "degree")
+    assert sidecar.bounds[0][:2] == pytest.approx(_corners(document).min(axis=0), abs=1e-8)
+
+
+def _corners(document: dict[str, Any]) -> np.ndarray:
+    return np.concatenate([feature["geometry"]["coordinates"][0] for feature in document["features"]])
+
+
+def _inside(pixel: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Distance of pixels from the border of the image, negative outside."""
+    return np.minimum.reduce([pixel[:, 0], width - pixel[:, 0], pixel[:, 1], height - pixel[:, 1]])
+
+
+def test_unchecked_positions_have_no_sigma(handover: Handover, tmp_path: Path) -> None:
+    _, workspace = trained_workspace(tmp_path / "ws")
+    model = load_json(TrainedModel, workspace.path(MODEL))
+    unchecked = Caution(code=NOT_CHECKED, sentence="Nothing checks the positions.")
+    save_json(model.model_copy(update={"cautions": (unchecked,)}), workspace.root / MODEL)
+    summary = handed_over(workspace, tmp_path / "out", crs="EPSG:4326")
+    table = replace(handover, out=tmp_path / "out")
+    assert {row["sigma_e_m"] + row["sigma_kappa_deg"] for row in table.rows()} == {""}
+    assert {caution.code for caution in summary.cautions} == {NOT_CHECKED, "cameras-without-sigma"}
+    assert summary.values["median_sigma_h_m"] is None
+    # Degrees with nine decimals; ω φ κ count from true north where the CRS has no grid.
+    poses = read_trajectory(tmp_path / "out" / "cameras.csv")
+    assert poses.geographic
+    assert table.columns("kappa_deg")[0, 0] != handover.columns("kappa_deg")[0, 0]
+
+
+def test_cameras_that_training_held_have_no_sigma(tmp_path: Path) -> None:
+    _, workspace = trained_workspace(tmp_path / "ws")
+    manifest = Manifest(
+        stage="train", config={"optimize_cameras": False}, inputs={}, versions={}, started=now(), duration_s=1.0,
+        key_figure="", values={}, warnings=[],
+    )  # fmt: skip
+    save_json(manifest, workspace.root / "train" / MANIFEST)
+    summary = handed_over(workspace, tmp_path / "out")
+    assert [caution.code for caution in summary.cautions] == ["cameras-without-sigma"]
+    assert "held" in summary.cautions[0].sentence
+
+
+def test_crs_of_another_country_is_refused_before_the_work_begins(handover: Handover, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="EPSG:28992"):
+        handed_over(handover.workspace, tmp_path / "out", crs="EPSG:28992")
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_nerfstudio_leaves_out_the_lens_that_it_cannot_hold_beside_the_others(tmp_path: Path) -> None:
+    """COLMAP's model holds both."""
+    _, workspace = trained_workspace(tmp_path / "ws")
+    sparse = read_sparse(workspace.path(SPARSE))
+    fisheye = Camera("OPENCV_FISHEYE", 1200, 900, np.array([900.0, 900.0, 600.0, 450.0, 0.01, 0.0, 0.0, 0.0]))
+    owner = np.where(np.arange(IMAGES) < 2, 2, 1)
+    write_sparse(
+        replace(sparse, cameras={**sparse.cameras, 2: fisheye}, image_camera_id=owner), workspace.path(SPARSE)
+    )
+    summary = handed_over(workspace, tmp_path / "out")
+    document = json.loads((tmp_path / "out" / "transforms.json").read_text(encoding="utf-8"))
+    assert [frame["file_path"] for frame in document["frames"]] == list(sparse.image_name[2:])
+    assert "nerfstudio-one-camera-model" in {caution.code for caution in summary.cautions}
+    assert [caution.code for caution in read_sidecar(tmp_path / "out" / "transforms.json").cautions] == [
+        "nerfstudio-one-camera-model"
+    ]
+    assert pycolmap.Reconstruction(str(tmp_path / "out" / "colmap")).num_cameras() == 2

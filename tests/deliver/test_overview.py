@@ -1,0 +1,123 @@
+"""Overview of a result: its bounds against PROJ, its accuracy, and what was made."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pyproj import Transformer
+
+from pipelines.core.cautions import NOT_CHECKED, Caution
+from pipelines.core.errors import InputError, MissingProductError
+from pipelines.core.products import load_json, save_json
+from pipelines.core.stages import DELIVERABLES, MODEL, SPLAT, SURVEY
+from pipelines.core.workspace import Workspace
+from pipelines.deliver.options import CrsOptions
+from pipelines.deliver.overview import Bounds, overview
+from pipelines.deliver.purposes import PURPOSES
+from pipelines.geodesy.enu import ecef_from_enu
+from pipelines.geodesy.vertical import VerticalDatum, parse_vertical
+from pipelines.scene.survey import Survey
+from pipelines.scene.trained_model import TrainedModel
+from tests.reports import check_points_with, report_with
+from tests.scenes import TrueScene
+from tests.trained_workspaces import trained_workspace
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[TrueScene, Workspace]:
+    return trained_workspace(tmp_path_factory.mktemp("flight"))
+
+
+@pytest.fixture
+def copied(tmp_path: Path) -> Workspace:
+    return trained_workspace(tmp_path / "ws")[1]
+
+
+def ecef(scene: TrueScene, workspace: Workspace) -> np.ndarray:
+    return ecef_from_enu(scene.point_in_geo, load_json(Survey, workspace.path(SURVEY)).origin)
+
+
+def test_bounds_are_those_of_the_points_in_the_coordinates_of_proj(made: tuple[TrueScene, Workspace]) -> None:
+    scene, workspace = made
+    bounds = overview(workspace, CrsOptions(crs="EPSG:2056")).bounds
+    from_ecef = Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)
+    lon, lat, height = from_ecef.transform(*ecef(scene, workspace).T)
+    # Float32 means of a frame 100 m away: 1e-5 m, or 1e-10°.
+    expected = np.quantile(np.column_stack([lon, lat]), [0.01, 0.99], axis=0)
+    np.testing.assert_allclose([[bounds.west, bounds.south], [bounds.east, bounds.north]], expected, atol=1e-9)
+    np.testing.assert_allclose(bounds.height_m, np.quantile(height, [0.01, 0.99]), atol=1e-4)
+    swiss = Transformer.from_crs("EPSG:4326", "EPSG:2056", always_xy=True).transform(lon, lat)
+    np.testing.assert_allclose(bounds.low[:2], np.quantile(swiss, 0.01, axis=1), atol=1e-2)
+    np.testing.assert_allclose(bounds.high[:2], np.quantile(swiss, 0.99, axis=1), atol=1e-2)
+    assert bounds.crs == "EPSG:2056"
+
+
+def test_without_a_crs_the_zone_of_the_scene_is_said(made: tuple[TrueScene, Workspace]) -> None:
+    result = overview(made[1], CrsOptions())
+    assert (result.bounds.crs, result.bounds.heights) == ("EPSG:32632", "ellipsoidal")
+    assert "EPSG:32632" in result.bounds.assumed[0]
+    assert result.gaussians == 80
+    assert result.center_lla[:2] == pytest.approx((46.0, 7.75), abs=1e-3)
+
+
+def test_geoid_without_its_grid_gives_way_only_where_nobody_asked_for_it(copied: Workspace) -> None:
+    survey = load_json(Survey, copied.path(SURVEY))
+    datum = VerticalDatum(name="EGM2008", stated=True)
+    save_json(survey.model_copy(update={"vertical": datum}), copied.path(SURVEY))
+    bounds = overview(copied, CrsOptions()).bounds
+    assert bounds.heights == "ellipsoidal"
+    assert "EGM2008 is not installed" in bounds.assumed[-1]
+    with pytest.raises(InputError, match="not installed"):
+        overview(copied, CrsOptions(vertical=parse_vertical("EGM2008")))
+    with pytest.raises(InputError, match="far outside"):
+        overview(copied, CrsOptions(crs="EPSG:28992"))
+
+
+def test_accuracy_is_that_of_the_evaluation_and_unknown_where_nothing_checks_it(copied: Workspace) -> None:
+    assert overview(copied, CrsOptions()).quality.sigma_h_m is None  # neither evaluated, nor a covariance
+    report = report_with(camera=check_points_with(count=3, rmse_h_m=0.1, rmse_v_m=0.2, rmse_3d_m=0.22))
+    accuracy = report.accuracy.model_copy(
+        update={"cells": 4, "median_sigma_h_m": 0.03, "median_sigma_v_m": 0.04, "reason": None}
+    )
+    save_json(report.model_copy(update={"accuracy": accuracy}), copied.root / "evaluate/report.json")
+    quality = overview(copied, CrsOptions()).quality
+    assert (quality.sigma_h_m, quality.sigma_v_m, quality.check_points, quality.rmse_v_m) == (0.03, 0.04, 3, 0.2)
+    model = load_json(TrainedModel, copied.path(MODEL))
+    unchecked = Caution(code=NOT_CHECKED, sentence="Nothing checks the positions.")
+    save_json(model.model_copy(update={"cautions": (unchecked,)}), copied.path(MODEL))
+    assert overview(copied, CrsOptions()).quality.sigma_h_m is None
+
+
+def test_untrained_workspace_says_what_to_run(copied: Workspace) -> None:
+    copied.path(MODEL).unlink()
+    with pytest.raises(MissingProductError, match=f"georef train {copied.root}"):
+        overview(copied, CrsOptions())
+
+
+def test_every_file_that_is_handed_over_has_its_purpose() -> None:
+    handed_over = [SPLAT, *(product for spec in DELIVERABLES for product in (spec.product, *spec.also))]
+    assert [product for product in handed_over if product not in PURPOSES] == []
+
+
+def test_feature_is_the_rectangle_with_all_the_rest(copied: Workspace) -> None:
+    (copied.root / "cameras/colmap").mkdir(parents=True)
+    (copied.root / "cameras/colmap/cameras.bin").write_bytes(bytes(1500))
+    result = overview(copied, CrsOptions())
+    document = result.feature()
+    bounds = result.bounds
+    assert document["bbox"] == [bounds.west, bounds.south, bounds.east, bounds.north]
+    ring = np.array(document["geometry"]["coordinates"][0])
+    assert ring.min(axis=0) == pytest.approx([bounds.west, bounds.south], abs=1e-8)
+    files = {file["path"]: file["bytes"] for file in document["properties"]["files"]}
+    assert files == {"cameras/colmap": 1500}
+    assert f"georef export-cameras {copied.root}" in document["properties"]["further"]
+
+
+def test_rectangle_across_the_date_line_has_two_parts(made: tuple[TrueScene, Workspace]) -> None:
+    bounds: Bounds = replace(overview(made[1], CrsOptions()).bounds, west=179.9, east=-179.8)
+    geometry = bounds.geometry()
+    assert geometry is not None
+    assert geometry["type"] == "MultiPolygon"

@@ -1,0 +1,62 @@
+"""GeoJSON after RFC 7946: rings closed and anticlockwise, cut at the date line, and no NaN."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipelines.formats.geojson import feature, polygon, write_features
+
+
+def area(ring: list[list[float]]) -> float:
+    x, y = (np.array(ring[:-1]) - ring[0]).T
+    return float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2
+
+
+@given(st.floats(-180, 180), st.floats(-80, 80), st.floats(1e-4, 5), st.booleans())
+def test_ring_anywhere_on_earth_is_valid_and_keeps_its_area(
+    lon: float, lat: float, size: float, clockwise: bool
+) -> None:
+    box = np.array([[0, 0], [size, 0], [size, size], [0, size]])
+    corners = (box + np.array([lon, lat]))[:: -1 if clockwise else 1]
+    corners[:, 0] -= 360.0 * np.round(corners[:, 0] / 360.0)  # as `lla_from_ecef` gives them
+    geometry = polygon(corners)
+    assert geometry is not None
+    polygons = [geometry["coordinates"]] if geometry["type"] == "Polygon" else geometry["coordinates"]
+    total = 0.0
+    for (ring,) in polygons:
+        assert ring[0] == ring[-1]
+        assert area(ring) > 0
+        assert np.abs(np.array(ring)[:, 0]).max() <= 180
+        total += area(ring)
+    # Coordinates have eight decimals; a sliver of less than one of them beyond the date line is left out.
+    assert total == pytest.approx(size**2, abs=4e-8 * size + 1e-12)
+
+
+def test_ring_across_the_date_line_becomes_two() -> None:
+    geometry = polygon([[179.0, -17], [-179.0, -17], [-179.0, -16], [179.0, -16]])
+    assert geometry is not None
+    assert geometry["type"] == "MultiPolygon"
+    assert {min(lon for lon, _ in ring) for (ring,) in geometry["coordinates"]} == {179.0, -180.0}
+
+
+def test_ring_without_area_is_an_unlocated_feature() -> None:
+    assert polygon(np.zeros((0, 2))) is None
+    assert polygon([[7.0, 46.0]] * 4) is None
+
+
+def test_collection_is_json_without_nan(tmp_path: Path) -> None:
+    path = tmp_path / "a.geojson"
+    write_features(
+        path, [feature(None, {"name": "Aé", "sigma_e_m": float("nan"), "clipped": True}), feature(None, {})]
+    )
+    document = json.loads(path.read_text(encoding="utf-8"))
+    assert document["type"] == "FeatureCollection"
+    assert document["features"][0]["properties"] == {"name": "Aé", "sigma_e_m": None, "clipped": True}
+    assert document["features"][1] == {"type": "Feature", "geometry": None, "properties": {}}
+    assert [path.name for path in tmp_path.iterdir()] == ["a.geojson"]
