@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from pipelines.core.errors import InputError
 from pipelines.core.workspace import StageRun
 from pipelines.deliver.options import ExportTilesOptions
 from pipelines.deliver.tiles.content import read_glb, write_glb
@@ -129,3 +130,14 @@ def test_a_large_scene_has_coarser_steps(tmp_path: Path) -> None:
     splat.means[0] = [-9000, 2100, 30]
     write_glb(tmp_path / "a.glb", splat)
     np.testing.assert_allclose(read_glb(tmp_path / "a.glb").means, splat.means, atol=0.5 / 2**9 + 1e-3)
+
+
+def test_page_shows_ellipsoidal_heights_where_a_grid_is_missing(made: StageRun, tmp_path: Path) -> None:
+    """The tiles need no grid, and must not fail without one; a CRS that the user asks for must."""
+    page = (made.out / "index.html").read_text(encoding="utf-8")
+    assert "heights are ellipsoidal, because heights above EGM2008" in page
+    assert '"name":"h"' in page
+    stage = StageRun(made.workspace, tmp_path)
+    with pytest.raises(InputError, match="grid"):
+        run(stage, ExportTilesOptions(crs="EPSG:32630+3855"))
+    assert list(tmp_path.iterdir()) == []
