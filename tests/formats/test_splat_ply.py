@@ -10,7 +10,7 @@ import pytest
 from plyfile import PlyData, PlyElement
 
 from pipelines.core.errors import InputError
-from pipelines.formats.splat_ply import SplatArrays, read_splat_ply, write_splat_ply
+from pipelines.formats.splat_ply import SplatArrays, read_centres, read_splat_ply, write_splat_ply
 
 
 def splat(count: int = 3, degree: int = 3) -> SplatArrays:
@@ -58,6 +58,15 @@ def test_other_order_and_types_are_read_too(tmp_path: Path) -> None:
     again = read_splat_ply(tmp_path / "mixed.ply")
     for name, values in vars(gaussians).items():
         np.testing.assert_array_equal(getattr(again, name), values)
+
+
+def test_centres_are_read_alone(tmp_path: Path) -> None:
+    gaussians = splat(7)
+    write_splat_ply(tmp_path / "s.ply", gaussians)
+    np.testing.assert_array_equal(read_centres(tmp_path / "s.ply"), gaussians.means)
+    (tmp_path / "s.ply").write_bytes((tmp_path / "s.ply").read_bytes()[:-1])
+    with pytest.raises(InputError, match="cut off"):
+        read_centres(tmp_path / "s.ply")
 
 
 @pytest.mark.parametrize(
