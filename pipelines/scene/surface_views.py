@@ -7,6 +7,7 @@ stage goes on after those.
 
 from __future__ import annotations
 
+import os
 import shutil
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -163,6 +164,7 @@ class SurfaceViews:
                 for handle, values in zip(handles, maps, strict=False):
                     handle.write(values.tobytes())
                     handle.flush()
+                    os.fsync(handle.fileno())  # The size counts after a power failure too.
                 task.advance()
 
 
