@@ -26,6 +26,24 @@ _STEP_M = 1.0
 _ABOVE = 1.0  # unit of the heights, between the level from which depths count and the highest centre
 _MOST_REACH = 3.34  # standard deviations at which an opaque Gaussian falls below 1/255
 _VIEWS_OF_COLOUR = 4
+_DILATION_PX2 = 0.3  # of the training, in its pixels
+
+
+def samples_per_cell(training_px: float) -> int:
+    """Return the number of samples along a side of a cell: odd, so that one lies in the middle.
+
+    Args:
+        training_px: size of a training pixel on the ground, in cells.
+    """
+    return max(round(1.0 / training_px) | 1, 1)
+
+
+def dilation_cells2(training_px: float) -> float:
+    """Return the variance that rendering adds on the screen, in squared cells: that of the training.
+
+    What the training saw was blurred by its own pixels. A finer raster must not let holes show between Gaussians.
+    """
+    return _DILATION_PX2 * max(training_px, 1.0 / samples_per_cell(training_px)) ** 2
 
 
 class PlanScene:
@@ -37,6 +55,7 @@ class PlanScene:
         target: the CRS.
         frame: of the raster.
         centers_in_model: (V, 3) centres of the training cameras, V ≥ 1.
+        training_px: size of a training pixel on the ground, in cells.
 
     Attributes:
         splats: columns and rows of the raster's cells, depths below `level`.
@@ -49,7 +68,9 @@ class PlanScene:
         geo_from_model: Similarity,
         target: TargetCrs,
         frame: RasterFrame,
+        *,
         centers_in_model: FloatArray,
+        training_px: float,
     ) -> None:
         mean_in_geo = geo_from_model.apply(gaussians.means.numpy())
         xyz = np.concatenate(
@@ -62,6 +83,7 @@ class PlanScene:
             axes = geo_from_model.scale * geo_from_model.rotation @ _principal_axes(gaussians, part)
             axes = derivative.at(mean_in_geo[part]) @ axes
             cov[part] = axes @ np.swapaxes(axes, 1, 2)
+        metric = np.array([1.0, 1.0, target.height_unit_m / (frame.step_x * target.horizontal_unit_m)])
         reach = _MOST_REACH * np.sqrt(cov[:, 2, 2])
         self.level = float((xyz[:, 2] + reach).max()) + _ABOVE
         column = (xyz[:, 0] - frame.west) / frame.step_x
@@ -69,7 +91,8 @@ class PlanScene:
         self.splats = PlanSplats(
             np.column_stack([column, row, self.level - xyz[:, 2]]),
             cov,
-            torch.sigmoid(gaussians.logit_opacities.double()).numpy(),
+            torch.sigmoid(gaussians.logit_opacities.double()).numpy()
+            * _edge_on(cov * np.outer(metric, metric), dilation_cells2(training_px)),
             colours_from_above(gaussians, geo_from_model, centers_in_model),
         )
 
@@ -91,6 +114,24 @@ class _Derivative:
 
     def at(self, points: FloatArray) -> FloatArray:
         return np.asarray(self._at(points)).reshape(-1, 3, 3)
+
+
+def _edge_on(cov: FloatArray, dilation: float) -> FloatArray:
+    """Return factors (N,) of the opacity that take from discs seen edge-on the area that dilation gives them.
+
+    A wall is a stack of discs. Each would be widened to a pixel without getting fainter, and a hundred of them
+    would paint the wall pixels wide beside its roof. A disc seen face-on keeps the opacity of the training.
+
+    Args:
+        cov: (N, 3, 3) of columns, rows and depth, all in cells.
+        dilation: variance that rendering adds on the screen, in squared cells.
+    """
+    seen = cov[:, :2, :2]
+    squared = np.linalg.eigvalsh(cov)[:, 1:]
+    face = np.prod(squared / (squared + dilation), axis=1)
+    dilated = (seen[:, 0, 0] + dilation) * (seen[:, 1, 1] + dilation) - seen[:, 0, 1] ** 2
+    area = np.maximum(np.linalg.det(seen), 0.0) / dilated
+    return np.asarray(np.sqrt(np.clip(area / np.maximum(face, 1e-300), 0.0, 1.0)))
 
 
 def _principal_axes(gaussians: Gaussians, part: slice) -> FloatArray:

@@ -56,13 +56,15 @@ def raster_source(stage: StageRun, wanted: Request) -> tuple[RasterSource, str]:
     images.build(stage.progress)
     renderer = ModelRenderer(trained, images, rasterizer("auto"))
     views = SurfaceViews(renderer, stage.out / "depth_maps", confirmed=True, progress=stage.progress)
+    training_px = wanted.sampling.training_m / (frame.step_x * target.horizontal_unit_m)
     gaussians = _within(trained, trained.gaussians)
     scene = PlanScene(
         _without_haze(gaussians, views),
         trained.geo_from_model,
         target,
         frame,
-        trained.poses.cam_center_in_model[trained.indices("train")],
+        centers_in_model=trained.poses.cam_center_in_model[trained.indices("train")],
+        training_px=training_px,
     )
     sigma = predicted_sigma(stage.workspace, trained)
     source = RasterSource(
@@ -71,7 +73,7 @@ def raster_source(stage: StageRun, wanted: Request) -> tuple[RasterSource, str]:
         geo_from_model=trained.geo_from_model,
         target=target,
         sigma=sigma.grid,
-        training_px=wanted.sampling.training_m / (frame.step_x * target.horizontal_unit_m),
+        training_px=training_px,
         height_unit_m=target.height_unit_m,
         training_gsd_m=wanted.sampling.training_m,
         min_views=wanted.options.min_views,

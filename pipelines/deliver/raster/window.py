@@ -9,7 +9,7 @@ from scipy.ndimage import binary_closing, binary_opening, uniform_filter
 
 from pipelines.accuracy.accuracy_grid import AccuracyGrid
 from pipelines.core.types import BoolArray, ByteArray, FloatArray, IntArray
-from pipelines.deliver.raster.plan import PlanScene
+from pipelines.deliver.raster.plan import PlanScene, dilation_cells2, samples_per_cell
 from pipelines.deliver.target_crs import TargetCrs
 from pipelines.formats.geotiff import RasterFrame
 from pipelines.geometry.similarity import Similarity
@@ -18,7 +18,6 @@ from pipelines.splat.rasterizer.orthographic import PlanView, render_orthographi
 
 _SOLID = 0.5  # least opacity of a surface
 _ONE_SURFACE_GSD = 4.0  # training pixels: largest spread of the heights of the Gaussians of one surface
-_DILATION_PX2 = 0.3  # of the training
 _AVERAGED = 5  # checked cells on a side over which the surface's own noise is averaged
 _MOST_THROUGH = 0.5  # largest number of views that look through a surface, as a part of those that agree
 # Checked cells: half the width of slivers that are dropped, and of gaps that are closed.
@@ -86,7 +85,7 @@ def render_window(source: RasterSource, frame: RasterFrame, column: int, row: in
         frame: of the window.
         column, row: of its first cell in the raster.
     """
-    inner = max(round(1.0 / source.training_px) | 1, 1)  # odd: the middle sample lies in the middle of the cell
+    inner = samples_per_cell(source.training_px)
     view = _render(source, frame, column, row, inner)
     depth = _depth(view, source)
     middle = inner // 2
@@ -108,8 +107,7 @@ def render_window(source: RasterSource, frame: RasterFrame, column: int, row: in
 def _render(source: RasterSource, frame: RasterFrame, column: int, row: int, inner: int) -> PlanView:
     """Return the view with `inner` × `inner` samples a cell, blurred as the training was."""
     splats = source.scene.splats
-    # What the training saw was blurred by its own pixels: a finer raster must not let holes show between Gaussians.
-    dilation = _DILATION_PX2 * max(source.training_px, 1.0 / inner) ** 2 * inner**2
+    dilation = dilation_cells2(source.training_px) * inner**2
     if inner > 1:
         splats = splats.scaled(float(inner))
     return render_orthographic(
