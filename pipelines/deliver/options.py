@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
+from urllib.parse import urlsplit
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from pipelines.core.options import StageOptions
 from pipelines.geodesy.vertical import Vertical
+
+# The page was tried with this version: the extensions of splats in glTF are younger than those of meshes.
+CESIUM = "https://cesium.com/downloads/cesiumjs/releases/1.145/Build/Cesium/"
 
 
 class SplatOptions(StageOptions):
@@ -37,14 +41,6 @@ class ExportSpzOptions(WebSplatOptions):
 
     spz_version: Literal["3", "4"] = Field(
         "3", description="Version of the format: CesiumJS and Spark read 3, PlayCanvas reads 4 only."
-    )
-
-
-class ExportTilesOptions(WebSplatOptions):
-    """Options of the export of the splat as 3D Tiles and as glb."""
-
-    max_tile_gaussians: int = Field(
-        200_000, ge=1000, le=3_000_000, description="Largest number of Gaussians in a tile."
     )
 
 
@@ -89,3 +85,37 @@ class ExportCloudOptions(CrsOptions):
     )
     min_views: int = Field(3, ge=2, description="Number of training views that must agree on a point.")
     ply: bool = Field(False, description="Write the same points as cloud.ply too.")
+
+
+def _cesium_folder(text: str) -> str:
+    address = urlsplit(text)
+    if not text.strip() or any(char.isspace() or not char.isprintable() for char in text):
+        raise ValueError("an address without spaces, such as Cesium/")
+    if address.query or address.fragment:
+        raise ValueError("the address of a folder, such as Cesium/, without ? and #")
+    if address.scheme not in ("", "http", "https") or (address.scheme and not address.netloc):
+        raise ValueError("an https:// or http:// address, or a path relative to the page, such as Cesium/")
+    return text if text.endswith("/") else text + "/"
+
+
+class PageOptions(CrsOptions):
+    """Options of the page that shows tiles in a browser."""
+
+    crs: str | None = Field(
+        None,
+        description="CRS in which the page shows coordinates: EPSG:32632, EPSG:32632+3855, a PROJ string or WKT. "
+        "Without it: the UTM zone of the scene.",
+    )
+    cesium: Annotated[str, AfterValidator(_cesium_folder)] = Field(
+        CESIUM,
+        description="Address of the folder that holds Cesium.js: https://…, or a path relative to the page, such "
+        "as Cesium/.",
+    )
+
+
+class ExportTilesOptions(WebSplatOptions, PageOptions):
+    """Options of the export of the splat as 3D Tiles with their page, and as glb."""
+
+    max_tile_gaussians: int = Field(
+        200_000, ge=1000, le=3_000_000, description="Largest number of Gaussians in a tile."
+    )

@@ -1,7 +1,8 @@
 """Export of the splat as 3D Tiles with levels of detail, for web globes, and as a single glb.
 
 Reads `ingest/survey.json`, `train/model.json` and `train/gaussians.ply`. Writes `tiles/tileset.json` with the
-contents in `tiles/content/`, `tiles/splat.glb`, and a sidecar of each (docs/formats.md).
+contents in `tiles/content/`, `tiles/splat.glb`, a sidecar of each (docs/formats.md), and `tiles/index.html`, which
+shows the tiles in a browser.
 
 All files are in the frame of the placement, East-North-Up; the tileset's root places it on Earth.
 """
@@ -14,13 +15,16 @@ import numpy as np
 
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.stages import TILES_GLB
-from pipelines.core.workspace import StageRun, Summary
+from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.deliver.options import ExportTilesOptions
-from pipelines.deliver.splat import codec_arrays, load_splat
+from pipelines.deliver.splat import PlacedSplat, codec_arrays, load_splat
+from pipelines.deliver.target_crs import target_crs
 from pipelines.deliver.tiles.content import read_glb, require_space, write_glb
+from pipelines.deliver.tiles.page import ScenePage, scene_page, write_page
 from pipelines.deliver.tiles.tileset import TILESET, content_uri, write_tileset
 from pipelines.formats.georef_sidecar import GeorefSidecar, write_sidecar
 from pipelines.formats.splat_ply import SplatArrays
+from pipelines.scene.calibrated import load_survey
 from pipelines.splat.level_of_detail import DetailTile, best_cut, build_tiles
 
 GLB = TILES_GLB.rpartition("/")[2]
@@ -37,6 +41,7 @@ def run(stage: StageRun, options: ExportTilesOptions) -> Summary:
         DegenerateGeometryError: no Gaussian is opaque enough.
     """
     splat = load_splat(stage.workspace, options)
+    page = _page(stage.workspace, splat, options)
     arrays = codec_arrays(splat.gaussians, options.sh_degree)
     require_space(stage.out, arrays)
     sidecar = splat.placement.sidecar()
@@ -44,6 +49,7 @@ def run(stage: StageRun, options: ExportTilesOptions) -> Summary:
     in_glb = write_whole(stage.out, arrays, root, sidecar)
     for name in (TILESET, GLB):
         write_sidecar(sidecar, stage.out / name)
+    write_page(page, stage.out)
     tiles = list(root.all())
     size = sum(path.stat().st_size for path in stage.out.rglob("*") if path.is_file())
     values = {
@@ -61,6 +67,13 @@ def run(stage: StageRun, options: ExportTilesOptions) -> Summary:
         warnings=merged if in_glb < len(arrays) else (),
         cautions=splat.placement.cautions,
     )
+
+
+def _page(workspace: Workspace, splat: PlacedSplat, options: ExportTilesOptions) -> ScenePage:
+    survey, placement = load_survey(workspace), splat.placement
+    middle_in_geo = placement.file_from_geo.inverse().apply(np.zeros((1, 3)))
+    target = target_crs(options, survey.origin, middle_in_geo, survey.vertical)
+    return scene_page(workspace.root.resolve().name, splat, survey, target, options.cesium)
 
 
 def write_tiles(

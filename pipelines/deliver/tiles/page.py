@@ -1,0 +1,147 @@
+"""The page `index.html` beside a tileset: CesiumJS shows it with coordinates, scale bar and surveyed points.
+
+The page's program is the package's `index.html`; a scene enters it as one JSON document. It needs a web server, the
+tiles and CesiumJS, and loads nothing else: no account, no imagery, no terrain.
+"""
+
+from __future__ import annotations
+
+import re
+from importlib import resources
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from pipelines.core.durable import replace_file
+from pipelines.core.products import Product
+from pipelines.core.types import Vector3
+from pipelines.deliver.placement import Placement
+from pipelines.deliver.splat import PlacedSplat
+from pipelines.deliver.target_crs import TargetCrs
+from pipelines.deliver.tiles.local_crs import LocalCrs, fit_local_crs
+from pipelines.deliver.tiles.tileset import TILESET
+from pipelines.geodesy.enu import ecef_from_enu
+from pipelines.scene.survey import Survey, SurveyedPoint
+
+PAGE = "index.html"
+_PLACEHOLDER = '{"to be filled": "page.py"}'
+# The first view shows these of the Gaussians: single ones of the sky or of a far background lie kilometres away.
+_SHOWN = 0.9
+_LEAST_RADIUS_M = 1.0
+_CRS_BOX = 4.0  # of the radius, to each side: cameras of the usual views lie inside
+_LEAST_CRS_BOX_M = 300.0
+_MOST_CRS_BOX_M = 10_000.0
+
+
+class Fact(Product):
+    """Line of the page: what it tells, and the value."""
+
+    name: str
+    value: str
+
+
+class PagePoint(Product):
+    """Control or check point with its surveyed place in EPSG:4978."""
+
+    name: str
+    kind: Literal["control", "check"]
+    ecef: Vector3
+
+
+class ScenePage(Product):
+    """Content of the page.
+
+    Attributes:
+        title: name of the scene.
+        tileset: address of the tileset, relative to the page.
+        cesium: address of the folder of CesiumJS, relative to the page or absolute; ends in a slash.
+        origin_lla: latitude, longitude in degrees, ellipsoidal height: middle of the scene.
+        radius_m: of the scene, for the first view.
+        facts: what the reader must know of the coordinates.
+        cautions: limits of the model, one sentence each.
+        points: surveyed points to label.
+        crs: coordinates to show beside longitude, latitude and ellipsoidal height; None: no others.
+    """
+
+    title: str
+    tileset: str
+    cesium: str
+    origin_lla: Vector3
+    radius_m: float = Field(gt=0)
+    facts: tuple[Fact, ...]
+    cautions: tuple[str, ...]
+    points: tuple[PagePoint, ...]
+    crs: LocalCrs | None = None
+
+
+def scene_page(title: str, splat: PlacedSplat, survey: Survey, target: TargetCrs, cesium: str) -> ScenePage:
+    """Return the content of the page of a splat.
+
+    Args:
+        title: name of the scene.
+        splat: its Gaussians and its place on Earth.
+        survey: has the control and check points.
+        target: CRS in which coordinates are shown.
+        cesium: address of the folder of CesiumJS.
+
+    Raises:
+        InputError: the scene is outside the domain of the CRS, or a grid is missing.
+    """
+    placement = splat.placement
+    distance_m = np.linalg.norm(splat.gaussians.means.numpy(), axis=1)
+    radius = max(float(np.quantile(distance_m, _SHOWN)), _LEAST_RADIUS_M)
+    box = float(np.clip(_CRS_BOX * radius, _LEAST_CRS_BOX_M, _MOST_CRS_BOX_M))
+    lat, lon, height = placement.origin_lla.tolist()
+    return ScenePage(
+        title=title,
+        tileset=TILESET,
+        cesium=cesium,
+        origin_lla=(lat, lon, height),
+        radius_m=radius,
+        facts=_facts(placement, target),
+        cautions=tuple(caution.sentence for caution in placement.cautions),
+        points=(
+            *(_page_point(point, "control", survey) for point in survey.control_points),
+            *(_page_point(point, "check", survey) for point in survey.check_points),
+        ),
+        crs=fit_local_crs(target.crs, placement.origin_lla, (box, box, box)),
+    )
+
+
+def write_page(page: ScenePage, folder: Path) -> None:
+    """Write the page into a folder; the file appears whole or not at all.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    program = resources.files(__package__).joinpath(PAGE).read_text(encoding="utf-8")
+    draft = folder / f"{PAGE}.tmp"
+    draft.write_text(program.replace(_PLACEHOLDER, _script_json(page), 1), encoding="utf-8")
+    replace_file(draft, folder / PAGE)
+
+
+def _script_json(page: ScenePage) -> str:
+    """Return JSON that no name in it can break out of an HTML script element: `<` only occurs escaped."""
+    return re.sub("[<>&\u2028\u2029]", lambda found: f"\\u{ord(found[0]):04x}", page.model_dump_json())
+
+
+def _page_point(point: SurveyedPoint, kind: Literal["control", "check"], survey: Survey) -> PagePoint:
+    x, y, z = ecef_from_enu(point.position_in_geo, survey.origin).tolist()
+    return PagePoint(name=point.name, kind=kind, ecef=(x, y, z))
+
+
+def _facts(placement: Placement, target: TargetCrs) -> tuple[Fact, ...]:
+    accuracy = placement.sidecar().accuracy
+    sigma = "not known" if placement.is_checked else "not stated: nothing checks the σ of the positions"
+    if accuracy is not None:
+        sigma = f"{accuracy.sigma_h_m:.3f} m horizontal, {accuracy.sigma_v_m:.3f} m vertical"
+    input_heights = placement.vertical.name + ("" if placement.vertical.stated else " (assumed)")
+    facts = (
+        Fact(name="CRS", value=target.crs.name),
+        Fact(name="Heights", value=f"{target.crs.vertical.name}; of the survey's input: {input_heights}"),
+        Fact(name="h", value="height above the WGS84 ellipsoid; labels stand at it, too"),
+        Fact(name="Predicted σ", value=sigma),
+    )
+    return facts + tuple(Fact(name="Assumed", value=sentence) for sentence in target.assumed)
