@@ -9,10 +9,12 @@ All files are in the frame of the placement, East-North-Up; the tileset's root p
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from pipelines.core.errors import InputError
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.stages import TILES_GLB
 from pipelines.core.workspace import StageRun, Summary, Workspace
@@ -24,6 +26,7 @@ from pipelines.deliver.tiles.page import ScenePage, scene_page, write_page
 from pipelines.deliver.tiles.tileset import TILESET, content_uri, write_tileset
 from pipelines.formats.georef_sidecar import GeorefSidecar, write_sidecar
 from pipelines.formats.splat_ply import SplatArrays
+from pipelines.geodesy.vertical import ELLIPSOIDAL, parse_vertical
 from pipelines.scene.calibrated import load_survey
 from pipelines.splat.level_of_detail import DetailTile, best_cut, build_tiles
 
@@ -70,9 +73,17 @@ def run(stage: StageRun, options: ExportTilesOptions) -> Summary:
 
 
 def _page(workspace: Workspace, splat: PlacedSplat, options: ExportTilesOptions) -> ScenePage:
-    survey, placement = load_survey(workspace), splat.placement
-    middle_in_geo = placement.file_from_geo.inverse().apply(np.zeros((1, 3)))
-    target = target_crs(options, survey.origin, middle_in_geo, survey.vertical)
+    survey = load_survey(workspace)
+    middle_in_geo = splat.placement.file_from_geo.inverse().apply(np.zeros((1, 3)))
+    try:
+        target = target_crs(options, survey.origin, middle_in_geo, survey.vertical)
+    except InputError as error:
+        if options.crs is not None or options.vertical is not None:
+            raise
+        # The tiles themselves need no grid: without one, the page shows ellipsoidal heights, and says so.
+        without_grid = options.model_copy(update={"vertical": parse_vertical(ELLIPSOIDAL)})
+        target = target_crs(without_grid, survey.origin, middle_in_geo, survey.vertical)
+        target = replace(target, assumed=(*target.assumed, f"heights are ellipsoidal, because {error}"))
     return scene_page(workspace.root.resolve().name, splat, survey, target, options.cesium)
 
 
