@@ -5,10 +5,14 @@ VENV := .venv
 BIN := $(VENV)/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
 DEMO := demo
 
-.PHONY: setup demo test fuzz lint types docs check release clean
+.PHONY: setup demo test test-browser fuzz lint types docs check release clean
 
 setup test lint types docs:
 	@.ci/run $@
+
+# The tiles in CesiumJS, in headless Chromium without a network: needs chromium and npm.
+test-browser:
+	@.ci/run browser
 
 check:
 	@.ci/run

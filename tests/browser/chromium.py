@@ -1,0 +1,257 @@
+"""Headless Chromium with software rendering and without a network, and what it takes to look at a page with it."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import functools
+import hashlib
+import os
+import shutil
+import subprocess
+import sys
+import tarfile
+import tempfile
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from playwright.sync_api import Browser, ConsoleMessage, Page, Response, Route, sync_playwright
+
+from pipelines.geometry.cameras import Pinhole
+from pipelines.geometry.similarity import Similarity
+
+CACHE = Path(__file__).parents[2] / "build/browser"
+CESIUM_VERSION = "1.145.0"
+CESIUM_SHA512 = (
+    "e80ce2c7c6f92cfa68552c7c5d0eb33f3b6996e2559aaf8210edd6dab396c6d7"
+    "3a6eb8ba35cf4cbc26212a64d6d4b004c1f8ac57bcb33607ee9425f0f7ce36fa"
+)
+# WebGL 2 on the CPU: the same on every machine, and no GPU is needed.
+FLAGS = (
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist",
+    "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1",
+)
+_PATIENCE_MS = 60_000
+# Where Chrome is on macOS and Windows, which do not put it on PATH.
+_INSTALLED = (
+    "/Applications/Google Chrome.app/Contents/MacOS/Google Chrome",
+    "C:/Program Files/Google/Chrome/Application/chrome.exe",
+)
+
+
+class MissingProgramError(Exception):
+    """Program that the tests need and that is not there; the message says what to install."""
+
+
+def chromium_path() -> str:
+    """Return the path of Chromium or Chrome: that of the variable CHROMIUM, on PATH, or where it is installed.
+
+    Raises:
+        MissingProgramError: there is none.
+    """
+    on_path = (shutil.which(name) for name in ("chromium", "chromium-browser", "google-chrome"))
+    installed = (place for place in _INSTALLED if Path(place).is_file())
+    found = os.environ.get("CHROMIUM") or next(filter(None, [*on_path, *installed]), None)
+    if found is None:
+        raise MissingProgramError(
+            "Chromium is missing: `apt-get install chromium`, or name a Chromium or Chrome in the variable CHROMIUM"
+        )
+    return found
+
+
+@functools.cache
+def cesium_folder() -> Path:
+    """Return the folder of CesiumJS, which npm fetches once into a folder that git ignores.
+
+    Raises:
+        MissingProgramError: npm is missing or cannot fetch it.
+    """
+    folder = CACHE / f"cesium-{CESIUM_VERSION}"
+    if folder.is_dir():
+        return folder
+    npm = shutil.which("npm")
+    if npm is None:
+        raise MissingProgramError(f"npm is missing, which fetches CesiumJS into {CACHE}: `apt-get install npm`")
+    with tempfile.TemporaryDirectory(dir=_made(CACHE)) as draft:
+        command = [npm, "pack", "--silent", f"cesium@{CESIUM_VERSION}"]
+        done = subprocess.run(command, cwd=draft, capture_output=True, text=True, check=False)
+        archive = Path(draft) / f"cesium-{CESIUM_VERSION}.tgz"
+        if done.returncode != 0 or not archive.is_file():
+            raise MissingProgramError(f"npm could not fetch CesiumJS {CESIUM_VERSION}: {done.stderr.strip()}")
+        if hashlib.sha512(archive.read_bytes()).hexdigest() != CESIUM_SHA512:
+            raise MissingProgramError(f"npm did not give the published CesiumJS {CESIUM_VERSION}")
+        with tarfile.open(archive) as package:
+            package.extractall(draft, filter="data")
+        (Path(draft) / "package/Build/Cesium").rename(folder)
+    return folder
+
+
+def _made(folder: Path) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+@contextlib.contextmanager
+def served(folder: Path) -> Iterator[str]:
+    """Serve a folder on loopback, as `python -m http.server --bind 127.0.0.1` does; gives its address."""
+
+    class Quiet(SimpleHTTPRequestHandler):
+        def log_message(self, format: str, *args: Any) -> None:
+            pass
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=str(folder)))
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{server.server_port}/"
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
+
+
+@contextlib.contextmanager
+def chromium() -> Iterator[Browser]:
+    """Start headless Chromium."""
+    with sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=chromium_path(), args=list(FLAGS))
+        yield browser
+        browser.close()
+
+
+@dataclass
+class Viewer:
+    """Open page, with all that went wrong in it.
+
+    Attributes:
+        page: of the browser.
+        problems: errors of scripts and on the console, failed tiles and requests.
+        outside: addresses beyond this machine that were asked for; all were refused.
+    """
+
+    page: Page
+    problems: list[str] = field(default_factory=list)
+    outside: list[str] = field(default_factory=list)
+
+    def show(self, address: str) -> None:
+        """Load the page."""
+        page = self.page
+        page.on("pageerror", lambda error: self.problems.append(f"script: {error}"))
+        page.on("console", self._heard)
+        page.on("requestfailed", lambda request: self.problems.append(f"request: {request.url}"))
+        page.on("response", self._answered)
+        page.route("**/*", self._loopback_only)
+        page.goto(address)
+
+    def open(self, address: str) -> None:
+        """Load the page, and wait until it has opened the tileset."""
+        self.show(address)
+        self.page.evaluate(
+            """async () => {
+                const { tileset } = await georef;
+                window.failedTiles = [];
+                tileset.tileFailed.addEventListener(({ url, message }) => failedTiles.push(`${url}: ${message}`));
+            }"""
+        )
+
+    def _heard(self, line: ConsoleMessage) -> None:
+        if line.type == "error":
+            self.problems.append(f"console: {line.text}")
+
+    def _answered(self, response: Response) -> None:
+        if response.status >= 400:
+            self.problems.append(f"{response.status}: {response.url}")
+
+    def _loopback_only(self, route: Route) -> None:
+        if route.request.url.startswith(("http://127.0.0.1:", "data:", "blob:")):
+            route.continue_()
+            return
+        self.outside.append(route.request.url)
+        route.abort()
+
+    def failed_tiles(self) -> list[str]:
+        """Return the tiles that could not be loaded."""
+        return list(self.page.evaluate("failedTiles"))
+
+    def stand(self, ecef_from_cam: Similarity, camera: Pinhole) -> None:
+        """Put Cesium's camera where a pinhole camera is; the principal point must be in the middle.
+
+        Args:
+            ecef_from_cam: its pose; the camera's axes are x right, y down, z forward.
+            camera: of the view's size.
+        """
+        assert (camera.cx, camera.cy) == (camera.width / 2, camera.height / 2) and camera.fx == camera.fy
+        longer = max(camera.width, camera.height)
+        self.page.set_viewport_size({"width": camera.width, "height": camera.height})
+        self.page.evaluate(
+            """async ({ position, direction, up, fov }) => {
+                const { widget } = await georef;
+                const vector = (values) => Cesium.Cartesian3.fromArray(values);
+                widget.resize();
+                widget.camera.frustum.fov = fov;
+                widget.camera.setView({
+                    destination: vector(position), orientation: { direction: vector(direction), up: vector(up) },
+                });
+            }""",
+            {
+                "position": ecef_from_cam.translation.tolist(),
+                "direction": ecef_from_cam.rotation[:, 2].tolist(),
+                "up": (-ecef_from_cam.rotation[:, 1]).tolist(),
+                "fov": 2 * float(np.arctan(longer / 2 / camera.fx)),
+            },
+        )
+        self.settle()
+
+    def settle(self) -> None:
+        """Wait until the tiles of the view are loaded, their splats are sorted, and the picture stands still."""
+        self.page.evaluate(
+            """async (patience) => {
+                const { widget, tileset } = await georef;
+                const end = performance.now() + patience;
+                let before, still = 0;
+                while (still < 3) {
+                    if (performance.now() > end) throw new Error("the view does not come to rest");
+                    await new Promise(requestAnimationFrame);
+                    const splats = tileset.gaussianSplatPrimitive;
+                    const drawn = tileset._selectedTiles.reduce((sum, tile) => sum + tile.content.pointsLength, 0);
+                    const idle = tileset.tilesLoaded && drawn > 0 && splats.isStable && splats._numSplats === drawn
+                        && !splats._needsSnapshotRebuild && splats._sorterState === 0;  // 0: IDLE
+                    widget.render();
+                    const now = idle ? widget.canvas.toDataURL() : undefined;
+                    still = now !== undefined && now === before ? still + 1 : 0;
+                    before = now;
+                }
+            }""",
+            _PATIENCE_MS,
+        )
+
+    def splats(self) -> int:
+        """Return the number of splats in the tiles of the view."""
+        count = (
+            "async () => (await georef).tileset._selectedTiles.reduce((sum, t) => sum + t.content.pointsLength, 0)"
+        )
+        return int(self.page.evaluate(count))
+
+    def picture(self) -> np.ndarray:
+        """Return the drawn scene (H, W, 3) without the page's panels, RGB in 0 … 1."""
+        data = self.page.evaluate(
+            "async () => { const { widget } = await georef; widget.render(); return widget.canvas.toDataURL(); }"
+        )
+        png = np.frombuffer(base64.b64decode(data.partition(",")[2]), np.uint8)
+        return cv2.imdecode(png, cv2.IMREAD_COLOR)[..., ::-1] / 255.0
+
+
+if __name__ == "__main__":
+    try:
+        print(f"{chromium_path()}, CesiumJS in {cesium_folder()}")
+    except MissingProgramError as error:
+        sys.exit(f"browser tests: {error}")
