@@ -102,13 +102,21 @@ def _made(folder: Path) -> Path:
 
 @contextlib.contextmanager
 def served(folder: Path) -> Iterator[str]:
-    """Serve a folder on loopback, as `python -m http.server --bind 127.0.0.1` does; gives its address."""
+    """Serve a folder on loopback, with CesiumJS in `Cesium/`; gives its address.
 
-    class Quiet(SimpleHTTPRequestHandler):
+    The server is that of `python -m http.server --bind 127.0.0.1`.
+    """
+
+    class Handler(SimpleHTTPRequestHandler):
+        def translate_path(self, path: str) -> str:
+            library = path.startswith("/Cesium/")
+            self.directory = str(cesium_folder() if library else folder)
+            return super().translate_path(path.removeprefix("/Cesium") if library else path)
+
         def log_message(self, format: str, *args: Any) -> None:
             pass
 
-    server = ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=str(folder)))
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
     thread = threading.Thread(target=server.serve_forever, daemon=True)
     thread.start()
     try:

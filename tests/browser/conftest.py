@@ -14,7 +14,7 @@ from pipelines.deliver.tiles.stage import write_tiles
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.level_of_detail import DetailTile
 from tests.browser import hill
-from tests.browser.chromium import Viewer, cesium_folder, chromium, served
+from tests.browser.chromium import Viewer, chromium, served
 
 
 @pytest.fixture(scope="session")
@@ -34,11 +34,10 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 
 def write_scene(folder: Path, gaussians: Gaussians, largest_tile: int = 200_000) -> DetailTile:
-    """Write tiles and page of Gaussians of the hill, with CesiumJS beside them; return the root of the tiles."""
+    """Write tiles and page of Gaussians of the hill; return the root of the tiles."""
     splat = hill.placed(gaussians)
     root = write_tiles(folder, codec_arrays(splat.gaussians), splat.placement.sidecar(), largest_tile)
     write_page(hill.page(splat, "Cesium/"), folder)
-    (folder / "Cesium").symlink_to(cesium_folder())
     return root
 
 

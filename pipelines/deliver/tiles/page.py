@@ -28,7 +28,7 @@ from pipelines.scene.survey import Survey, SurveyedPoint
 PAGE = "index.html"
 _PLACEHOLDER = '{"to be filled": "page.py"}'
 # The first view shows these of the Gaussians: single ones of the sky or of a far background lie kilometres away.
-_SHOWN = 0.9
+_SHOWN = 0.75
 _LEAST_RADIUS_M = 1.0
 _CRS_BOX = 4.0  # of the radius, to each side: cameras of the usual views lie inside
 _LEAST_CRS_BOX_M = 300.0
