@@ -120,6 +120,7 @@ def evaluated(fit: LocalCrs, enu: np.ndarray) -> np.ndarray:
         ("EPSG:2056", (46.02, 7.75, 1620.0), 1000.0, 1e-3),
         ("EPSG:4326", (70.0, 180.0, 30.0), 1000.0, 1e-3),  # across the date line
         ("EPSG:4978", (-33.0, 151.0, 30.0), 5000.0, 1e-6),
+        ("EPSG:2263", (40.7, -74.0, 30.0), 1000.0, 1e-3),  # in feet
     ],
 )
 def test_polynomials_are_the_crs(crs: str, lla: tuple[float, ...], half_m: float, bound_m: float) -> None:

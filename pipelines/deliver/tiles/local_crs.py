@@ -17,7 +17,6 @@ _DEGREE = 3
 _EXPONENTS = tuple(powers for powers in itertools.product(range(_DEGREE + 1), repeat=3) if sum(powers) <= _DEGREE)
 _NODES = 7  # of each axis: more than the polynomial has coefficients along it
 _MOST_DECIMALS = 3
-_DEGREE_M = float(np.radians(1.0) * SEMI_MAJOR_M)
 _SHORT_UNIT = {"metre": "m", "degree": "°"}
 
 
@@ -63,7 +62,8 @@ def fit_local_crs(crs: PointCrs, origin_lla: ArrayLike, half_extent_m: Vector3) 
     chebyshev = np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
     between = np.linspace(-1.0, 1.0, _NODES + 1)
     nodes, checks = _cube(chebyshev), _cube(between)
-    unit_m = np.array([_DEGREE_M if unit == "degree" else 1.0 for unit in crs.units])
+    plan_m = crs.horizontal_unit * (SEMI_MAJOR_M if crs.is_geographic else 1.0)
+    unit_m = np.array([plan_m, plan_m, crs.height_unit_m])
     values = _coordinates(crs, origin_lla, np.vstack([nodes, checks]) * half_extent_m)
     solved = np.linalg.lstsq(_powers(nodes), values[: len(nodes)], rcond=None)[0]
     errors = np.abs(_powers(checks) @ solved - values[len(nodes) :]).max(axis=0)

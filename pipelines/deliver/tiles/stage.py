@@ -26,7 +26,7 @@ from pipelines.deliver.tiles.page import ScenePage, scene_page, write_page
 from pipelines.deliver.tiles.tileset import TILESET, content_uri, write_tileset
 from pipelines.formats.georef_sidecar import GeorefSidecar, write_sidecar
 from pipelines.formats.splat_ply import SplatArrays
-from pipelines.geodesy.vertical import assumed_ellipsoidal
+from pipelines.geodesy.vertical import ELLIPSOIDAL, parse_vertical
 from pipelines.scene.calibrated import load_survey
 from pipelines.splat.level_of_detail import DetailTile, best_cut, build_tiles
 
@@ -81,7 +81,8 @@ def _page(workspace: Workspace, splat: PlacedSplat, options: ExportTilesOptions)
         if options.crs is not None or options.vertical is not None:
             raise
         # The tiles themselves need no grid: without one, the page shows ellipsoidal heights, and says so.
-        target = target_crs(options, survey.origin, middle_in_geo, assumed_ellipsoidal("no grid is installed"))
+        without_grid = options.model_copy(update={"vertical": parse_vertical(ELLIPSOIDAL)})
+        target = target_crs(without_grid, survey.origin, middle_in_geo, survey.vertical)
         target = replace(target, assumed=(*target.assumed, f"heights are ellipsoidal, because {error}"))
     return scene_page(workspace.root.resolve().name, splat, survey, target, options.cesium)
 
