@@ -19,8 +19,7 @@ from pipelines.deliver.cloud.plan import pixel_on_surface_m
 from pipelines.deliver.cloud.tally import Tally
 from pipelines.deliver.options import ExportCloudOptions
 from pipelines.deliver.predicted_sigma import predicted_sigma
-from pipelines.deliver.raster.extent import scene_points
-from pipelines.deliver.raster.source import corners
+from pipelines.deliver.scene_extent import corners, scene_points
 from pipelines.deliver.target_crs import target_crs
 from pipelines.formats.georef_sidecar import CrsSidecar, write_sidecar
 from pipelines.scene.renderer import ModelRenderer

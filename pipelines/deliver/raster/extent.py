@@ -9,31 +9,17 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.core.errors import DegenerateGeometryError, InputError
+from pipelines.core.errors import InputError
 from pipelines.core.types import FloatArray
 from pipelines.deliver.options import ExportRasterOptions
 from pipelines.deliver.target_crs import TargetCrs
 from pipelines.formats.geotiff import RasterFrame
 from pipelines.scene.trained_survey import TrainedSurvey
 
-_RIM = 0.002  # fraction of the SfM points outside the raster on each side
 _MARGIN = 0.02  # of the extent, on each side
 _LARGEST_DEG = 0.01  # about a kilometre
 # Bytes of a cell on the disk at most: colours, height and two σ, as parts and as final rasters.
 _BYTES_PER_CELL = 32
-
-
-def scene_points(trained: TrainedSurvey) -> FloatArray:
-    """Return the SfM points (P, 3) in `geo` that lie within the scene: those at its rim are left out.
-
-    Raises:
-        DegenerateGeometryError: the SfM model has no points.
-    """
-    if not len(trained.sfm.point_in_local):
-        raise DegenerateGeometryError("the SfM model has no points: nothing says where the scene ends")
-    points = trained.geo_from_model.apply(trained.point_in_model)
-    low, high = np.quantile(points[:, :2], [_RIM, 1 - _RIM], axis=0)
-    return np.asarray(points[((points[:, :2] >= low) & (points[:, :2] <= high)).all(axis=1)])
 
 
 @dataclass(frozen=True)

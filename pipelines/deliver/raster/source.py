@@ -8,13 +8,13 @@ import numpy as np
 import torch
 
 from pipelines.core.errors import DegenerateGeometryError
-from pipelines.core.types import FloatArray
 from pipelines.core.workspace import StageRun
 from pipelines.deliver.options import ExportRasterOptions
 from pipelines.deliver.predicted_sigma import predicted_sigma
-from pipelines.deliver.raster.extent import GroundSampling, scene_points
+from pipelines.deliver.raster.extent import GroundSampling
 from pipelines.deliver.raster.plan import PlanScene
 from pipelines.deliver.raster.window import RasterSource
+from pipelines.deliver.scene_extent import scene_points
 from pipelines.deliver.target_crs import TargetCrs
 from pipelines.formats.geotiff import RasterFrame
 from pipelines.scene.renderer import ModelRenderer
@@ -100,9 +100,3 @@ def _without_haze(gaussians: Gaussians, views: SurfaceViews) -> Gaussians:
     support = views.support(gaussians.means.double().numpy())
     haze = (support.views == 0) & (support.seen_through >= _HAZE_VIEWS)
     return gaussians.select(torch.from_numpy(~haze))
-
-
-def corners(points: FloatArray) -> FloatArray:
-    """Return the corners (8, 3) of the box around points."""
-    box = np.stack([points.min(axis=0), points.max(axis=0)])
-    return np.stack(np.meshgrid(*box.T, indexing="ij"), axis=-1).reshape(-1, 3)

@@ -21,11 +21,11 @@ from pipelines.deliver.raster.extent import (
     ground_sampling,
     make_frame,
     require_space,
-    scene_points,
 )
 from pipelines.deliver.raster.mosaic import Mosaic
 from pipelines.deliver.raster.pictures import write_pictures
-from pipelines.deliver.raster.source import Request, corners, raster_source
+from pipelines.deliver.raster.source import Request, raster_source
+from pipelines.deliver.scene_extent import corners, scene_points
 from pipelines.deliver.target_crs import TargetCrs, target_crs
 from pipelines.formats.georef_sidecar import SceneSigma, write_sidecar
 from pipelines.formats.geotiff import RasterFrame

@@ -1,0 +1,30 @@
+"""Extent of the scene that files cover: that of the SfM points, without those at its rim."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipelines.core.errors import DegenerateGeometryError
+from pipelines.core.types import FloatArray
+from pipelines.scene.trained_survey import TrainedSurvey
+
+_RIM = 0.002  # fraction of the SfM points outside the extent on each side
+
+
+def scene_points(trained: TrainedSurvey) -> FloatArray:
+    """Return the SfM points (P, 3) in `geo` that lie within the scene: those at its rim are left out.
+
+    Raises:
+        DegenerateGeometryError: the SfM model has no points.
+    """
+    if not len(trained.sfm.point_in_local):
+        raise DegenerateGeometryError("the SfM model has no points: nothing says where the scene ends")
+    points = trained.geo_from_model.apply(trained.point_in_model)
+    low, high = np.quantile(points[:, :2], [_RIM, 1 - _RIM], axis=0)
+    return np.asarray(points[((points[:, :2] >= low) & (points[:, :2] <= high)).all(axis=1)])
+
+
+def corners(points: FloatArray) -> FloatArray:
+    """Return the corners (8, 3) of the box around points."""
+    box = np.stack([points.min(axis=0), points.max(axis=0)])
+    return np.stack(np.meshgrid(*box.T, indexing="ij"), axis=-1).reshape(-1, 3)
