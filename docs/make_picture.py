@@ -1,11 +1,15 @@
-"""Make the README's picture from an evaluated workspace: `python docs/make_picture.py WORKSPACE --view 1`.
+"""Make the pictures of the documents: `python docs/make_picture.py flight WORKSPACE --view 1`,
+or `orthophoto WORKSPACE`.
 
-The picture shows this flight:
+`flight` needs an evaluated workspace, and shows this flight:
 
     georef simulate survey --images 48 --size 960x720 --seed 3
     georef run WORKSPACE --images survey/images --trajectory survey/trajectory.csv --vertical ellipsoidal \\
         --gcp survey/gcp_list.txt --checkpoints survey/checkpoints.txt \\
         --preset fast --iterations 2500 --max-image-size 720
+
+`orthophoto` needs the rasters, and shows a flight with `--flight grid --images 40 --size 960x720 --seed 5`, run
+likewise.
 """
 
 from __future__ import annotations
@@ -16,7 +20,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-PICTURE = Path(__file__).parent / "images" / "flight.jpg"
+IMAGES = Path(__file__).parent / "images"
 GAP_PX, WIDTH_PX, QUALITY = 12, 1600, 85
 
 
@@ -37,22 +41,47 @@ def compose(render: Path, accuracy: Path) -> np.ndarray:
     gap = np.full((height, GAP_PX, 3), 255, dtype=np.uint8)
     small = cv2.resize(horizontal, size, interpolation=cv2.INTER_AREA)
     picture = np.hstack([strip[:, :width], gap, strip[:, width : 2 * width], gap, small])
+    return sized(picture)
+
+
+def beside_hillshade(preview: Path, hillshade: Path) -> np.ndarray:
+    """Return orthophoto and hillshade side by side on white, BGR, cut to what was seen."""
+    parts = []
+    for path in (preview, hillshade):
+        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        if image is None:
+            raise SystemExit("no pictures there: run `georef export-raster` on the workspace first")
+        alpha = image[..., 3:] / 255.0
+        parts.append((image[..., :3] * alpha + 255 * (1 - alpha)).round().astype(np.uint8))
+        rows, columns = np.nonzero(image[..., 3])
+    seen = np.s_[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
+    gap = np.full((parts[0][seen].shape[0], GAP_PX, 3), 255, dtype=np.uint8)
+    return sized(np.hstack([parts[0][seen], gap, parts[1][seen]]))
+
+
+def sized(picture: np.ndarray) -> np.ndarray:
+    """Return a picture at the width of the documents' pictures."""
     scale = WIDTH_PX / picture.shape[1]
     return cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
 
 
 def main() -> None:
     """Write the picture."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("picture", choices=["flight", "orthophoto"])
     parser.add_argument("workspace", type=Path)
     parser.add_argument("--view", type=int, default=0, help="number of the test view")
     options = parser.parse_args()
-    renders = sorted((options.workspace / "evaluate" / "renders").glob("*.png"))
-    if not renders:
-        raise SystemExit("no renders there: run `georef evaluate` on the workspace first")
-    PICTURE.parent.mkdir(exist_ok=True)
-    picture = compose(renders[options.view], options.workspace / "evaluate" / "accuracy.png")
-    cv2.imwrite(str(PICTURE), picture, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    if options.picture == "orthophoto":
+        rasters = options.workspace / "raster"
+        picture = beside_hillshade(rasters / "preview.png", rasters / "hillshade.png")
+    else:
+        renders = sorted((options.workspace / "evaluate" / "renders").glob("*.png"))
+        if not renders:
+            raise SystemExit("no renders there: run `georef evaluate` on the workspace first")
+        picture = compose(renders[options.view], options.workspace / "evaluate" / "accuracy.png")
+    IMAGES.mkdir(exist_ok=True)
+    cv2.imwrite(str(IMAGES / f"{options.picture}.jpg"), picture, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
 
 
 if __name__ == "__main__":
