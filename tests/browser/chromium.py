@@ -40,7 +40,8 @@ FLAGS = (
     "--ignore-gpu-blocklist",
     "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1",
 )
-_PATIENCE_MS = 60_000
+# CesiumJS rebuilds a changed choice of tiles after up to 30 frames, which software draws one a second at worst.
+_PATIENCE_MS = 180_000
 # Where Chrome is on macOS and Windows, which do not put it on PATH.
 _INSTALLED = (
     "/Applications/Google Chrome.app/Contents/MacOS/Google Chrome",
@@ -225,14 +226,15 @@ class Viewer:
             """async (patience) => {
                 const { widget, tileset } = await georef;
                 const end = performance.now() + patience;
-                let before, still = 0;
+                let before, state, still = 0;
                 while (still < 3) {
-                    if (performance.now() > end) throw new Error("the view does not come to rest");
+                    if (performance.now() > end) throw new Error(`the view does not come to rest: ${state}`);
                     await new Promise(requestAnimationFrame);
                     const splats = tileset.gaussianSplatPrimitive;
                     const drawn = tileset._selectedTiles.reduce((sum, tile) => sum + tile.content.pointsLength, 0);
                     const idle = tileset.tilesLoaded && drawn > 0 && splats.isStable && splats._numSplats === drawn
                         && !splats._needsSnapshotRebuild && splats._sorterState === 0;  // 0: IDLE
+                    state = `${tileset.tilesLoaded} ${drawn} ${splats?._numSplats} ${splats?._sorterState}`;
                     widget.render();
                     const now = idle ? widget.canvas.toDataURL() : undefined;
                     still = now !== undefined && now === before ? still + 1 : 0;
