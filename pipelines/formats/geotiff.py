@@ -146,6 +146,14 @@ def write_mosaic(
     replace_file(draft, path)
 
 
+def read_all(path: Path) -> NDArray[Any]:
+    """Return the bands (bands, rows, columns) of a part as they are stored."""
+    import rasterio
+
+    with rasterio.open(path) as part:
+        return np.asarray(part.read())
+
+
 def read_reduced(path: Path, longest_px: int) -> tuple[NDArray[Any], float]:
     """Return the bands (bands, rows, columns) of a raster, averaged to a longest side, and the size of a cell.
 

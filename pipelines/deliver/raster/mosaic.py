@@ -9,17 +9,29 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import label
 
 from pipelines import __version__
 from pipelines.core.progress import Progress
-from pipelines.core.types import FloatArray
+from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.deliver.raster.window import RasterSource, WindowCells, render_window
 from pipelines.deliver.target_crs import TargetCrs
 from pipelines.formats.georef_sidecar import SceneSigma
-from pipelines.formats.geotiff import Band, RasterFrame, RasterKind, read_reduced, write_mosaic, write_part
+from pipelines.formats.geotiff import (
+    NODATA,
+    Band,
+    RasterFrame,
+    RasterKind,
+    read_all,
+    read_reduced,
+    write_mosaic,
+    write_part,
+)
 
 _WINDOW_PX = 1536
 _SAMPLES_PX = 192  # a side of a window
+_ISLANDS_PX = 4000  # along the longer side, at which islands are looked for
+_LEAST_ISLAND = 0.01  # of the largest part of the surface
 
 _COLOURS = (
     Band("red", colour="Red"),
@@ -37,6 +49,14 @@ class _Window:
     row: int
     columns: int
     rows: int
+
+    def coarse(self, step: int) -> tuple[IntArray, IntArray]:
+        """Return the places of its rows and columns in a raster with one cell for `step` × `step`, as `np.ix_`."""
+        rows, columns = (
+            np.arange(self.row, self.row + self.rows),
+            np.arange(self.column, self.column + self.columns),
+        )
+        return np.ix_(rows // step, columns // step)
 
 
 class Mosaic:
@@ -67,6 +87,30 @@ class Mosaic:
                 if not all(self._part(name, window).exists() for name in self._kinds):
                     self._render(source, window)
                 task.advance()
+
+    def drop_islands(self) -> None:
+        """Empty the cells of islands: small parts, apart from all other surface, are agreements by chance."""
+        step = -(-max(self.frame.columns, self.frame.rows) // _ISLANDS_PX)
+        seen = np.zeros((-(-self.frame.rows // step), -(-self.frame.columns // step)), dtype=bool)
+        for window in self._windows():
+            np.logical_or.at(seen, window.coarse(step), read_all(self._part("orthophoto", window))[3] > 0)
+        number, _ = label(seen, structure=np.ones((3, 3)))
+        sizes = np.bincount(number.ravel())
+        if len(sizes) < 3:
+            return
+        island = sizes < _LEAST_ISLAND * sizes[1:].max()
+        island[0] = False
+        for window in self._windows():
+            dropped = island[number[window.coarse(step)]]
+            if dropped.any():
+                self._empty(window, dropped)
+
+    def _empty(self, window: _Window, dropped: BoolArray) -> None:
+        part = self.frame.part(window.column, window.row, window.columns, window.rows)
+        for name, kind in self._kinds.items():
+            values = read_all(self._part(name, window))
+            values[:, dropped] = 0 if kind.dtype == "uint8" else NODATA
+            write_part(self._part(name, window), values, part)
 
     def sample(self, name: str) -> FloatArray:
         """Return values (K,) of cells all over a raster that have one; enough for medians and bounds."""

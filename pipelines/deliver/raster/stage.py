@@ -50,6 +50,7 @@ def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
     source, reason = raster_source(stage, Request(trained, target, frame, sampling, options))
     mosaic = Mosaic(stage.out / "parts", frame, target)
     mosaic.render(source, stage.progress)
+    mosaic.drop_islands()
     height = mosaic.sample("dsm")
     if not len(height):
         raise DegenerateGeometryError(

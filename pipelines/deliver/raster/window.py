@@ -21,7 +21,7 @@ _ONE_SURFACE_GSD = 4.0  # training pixels: largest spread of the heights of the 
 _AVERAGED = 5  # checked cells on a side over which the surface's own noise is averaged
 _MOST_THROUGH = 0.5  # largest number of views that look through a surface, as a part of those that agree
 # Checked cells: half the width of slivers that are dropped, and of gaps that are closed.
-_OPENED, _CLOSED = 2, 2
+_OPENED, _CLOSED = 2, 3
 _SIGMA_PX = 0.25  # of a ray through a photograph, in training pixels
 _NODE_PX = 64  # cells between two nodes at which the georeference's σ is taken
 _NODES = 4  # nodes along each side, at which the way from the CRS to `geo` is fitted
@@ -183,8 +183,8 @@ def _tidied(seen: BoolArray) -> BoolArray:
     cells between seen ones were seen too.
     """
     margin = _OPENED + _CLOSED
-    wider = np.pad(seen, margin, mode="edge")
-    wider = binary_closing(binary_opening(wider, iterations=_OPENED), iterations=_CLOSED)
+    wider = binary_opening(np.pad(seen, margin, mode="edge"), iterations=_OPENED)
+    wider = binary_closing(wider, iterations=_CLOSED)
     return np.asarray(wider[margin:-margin, margin:-margin])
 
 
