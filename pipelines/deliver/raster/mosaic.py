@@ -51,12 +51,10 @@ class _Window:
     rows: int
 
     def coarse(self, step: int) -> tuple[IntArray, IntArray]:
-        """Return the places of its rows and columns in a raster with one cell for `step` × `step`, as `np.ix_`."""
-        rows, columns = (
-            np.arange(self.row, self.row + self.rows),
-            np.arange(self.column, self.column + self.columns),
-        )
-        return np.ix_(rows // step, columns // step)
+        """Return its rows (H, 1) and columns (1, W) in a raster with one cell for `step` × `step`."""
+        rows = (self.row + np.arange(self.rows, dtype=np.int64)) // step
+        columns = (self.column + np.arange(self.columns, dtype=np.int64)) // step
+        return rows[:, None], columns[None, :]
 
 
 class Mosaic:
