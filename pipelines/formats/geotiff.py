@@ -28,7 +28,7 @@ class RasterFrame:
     """Place of a raster's cells: rows from the north, columns from the west.
 
     Attributes:
-        wkt: CRS as WKT2.
+        wkt: CRS as WKT1, which keeps the codes of its parts.
         west, north: outer corner of the first cell, in the CRS's units, easting or longitude first.
         step_x, step_y: size of a cell, > 0.
         columns, rows: numbers of cells.

@@ -90,7 +90,7 @@ def make_frame(
             f"--max-pixels {options.max_pixels:.3g}: give --gsd {enough:.2g} or larger, or a larger --max-pixels",
             field="--gsd",
         )
-    return RasterFrame(crs.wkt, west * step, north * step, step, step, columns, rows)
+    return RasterFrame(crs.wkt1, west * step, north * step, step, step, columns, rows)
 
 
 def require_space(folder: Path, frame: RasterFrame) -> None:

@@ -22,7 +22,7 @@ _AVERAGED = 5  # checked cells on a side over which the surface's own noise is a
 _MOST_THROUGH = 0.5  # largest number of views that look through a surface, as a part of those that agree
 # Checked cells: half the width of slivers that are dropped, and of gaps that are closed.
 _OPENED, _CLOSED = 2, 3
-_SIGMA_PX = 0.2  # of a ray through a photograph, in training pixels: by simulated flights
+_SIGMA_PX = 0.15  # of a ray through a photograph, in training pixels: by simulated flights
 _NODE_PX = 64  # cells between two nodes at which the georeference's σ is taken
 _NODES = 4  # nodes along each side, at which the way from the CRS to `geo` is fitted
 

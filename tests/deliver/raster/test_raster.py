@@ -5,6 +5,7 @@ The Gaussians are laid on the surface by hand, so that all errors are those of t
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import cv2
@@ -279,3 +280,13 @@ def test_bad_requests_are_refused(workspace: Workspace, flags: dict[str, object]
     with pytest.raises(InputError, match=says):
         run_stage(workspace, BY_NAME["export-raster"], flags)
     assert workspace.path("raster/dsm.tif").exists()
+
+
+def test_a_disk_that_is_too_small_is_said_before_the_work(
+    workspace: Workspace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usage = type(shutil.disk_usage(workspace.root))(2**40, 2**40, 100_000)
+    monkeypatch.setattr(shutil, "disk_usage", lambda folder: usage)
+    with pytest.raises(InputError, match=r"rasters of .* cells may need .* give a larger --gsd"):
+        run_stage(workspace, BY_NAME["export-raster"], {"gsd": 0.3})
+    assert not (workspace.root / "raster.partial/parts").exists()
