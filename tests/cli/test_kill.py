@@ -46,16 +46,13 @@ main()
 # where it is: there the kill comes from outside, a moment after a file has appeared.
 MOMENTS: tuple[tuple[str, float | None], ...] = (
     ("open {ws}/ingest.partial/survey.json", None),
-    ("os.rename {ws}/ingest.partial/manifest", None),
     ("sfm.partial/database.db", 0.1),  # features
     ("sfm.partial/pairs.txt", 0.05),  # matching
     ("sfm.partial/mapping", 0.02),  # mapping
     ("os.rename {ws}/sfm.partial", None),
-    ("open {ws}/geolocate.partial/points.npz", None),
     ("train.partial/metrics.jsonl", 0.0),  # iterations
     ("os.rename {ws}/train.partial/checkpoint.tmp", None),
     ("open {ws}/train.partial/model.json", None),
-    ("open {ws}/evaluate.partial/report.json", None),
     ("open {ws}/export.partial/splat.ply.tmp", None),
 )
 STOPS = (
