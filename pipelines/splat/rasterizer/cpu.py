@@ -97,6 +97,7 @@ class _RenderContext:
 
     Attributes:
         camera, settings: of the render.
+        image: camera of the image that is rendered.
         workers: number of threads.
         stats: handed out with the render.
         visible: (M,) rows of the visible Gaussians, ascending.
@@ -107,12 +108,16 @@ class _RenderContext:
 
     camera: Pinhole
     settings: RasterSettings
+    image: Pinhole = field(init=False)
     workers: int = field(default_factory=numba.get_num_threads)
     stats: ScreenStats = field(init=False)
     visible: _Array = field(init=False)
     rank: _Array = field(init=False)
     table: _Array = field(init=False)
     lists: TileLists = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.image = self.settings.image_of(self.camera)
 
     @property
     def background(self) -> _Array:
@@ -155,7 +160,7 @@ class _Rasterize(torch.autograd.Function):
             images = blend_tiles(
                 context.table,
                 context.lists,
-                (context.camera.height, context.camera.width),
+                (context.image.height, context.image.width),
                 context.background,
                 depth=context.settings.depth,
                 workers=context.workers,
@@ -201,7 +206,7 @@ def _project(context: _RenderContext, parameters: list[_Array], pose: _Array, ce
         *(*parameters, pose, center, view, context.settings.sh_degree),
         *(context.visible, context.rank, context.table, ellipses, radius, context.workers),
     )
-    context.lists = list_tiles(ellipses, context.camera.width, context.camera.height)
+    context.lists = list_tiles(ellipses, context.image.width, context.image.height)
     context.stats = ScreenStats(visible=torch.from_numpy(context.visible), radius_px=torch.from_numpy(radius))
 
 
@@ -302,5 +307,6 @@ def _validate(gaussians: Gaussians, cam_from_model: Tensor, camera: Pinhole, set
         raise InputError(f"must be 0 to {highest}, is {settings.sh_degree}", field="sh_degree")
     if settings.near_m <= 0:
         raise InputError(f"must be positive, is {settings.near_m}", field="near_m")
-    if camera.width < 1 or camera.height < 1:
-        raise InputError(f"image of {camera.width} × {camera.height} pixels", field="camera")
+    image = settings.image_of(camera)
+    if image.width < 1 or image.height < 1:
+        raise InputError(f"image of {image.width} × {image.height} pixels", field="camera")
