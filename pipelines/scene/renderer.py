@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -13,6 +14,7 @@ from pipelines.scene.photographs import ImageCache
 from pipelines.scene.trained_survey import TrainedSurvey, trained_pinholes
 from pipelines.splat.depth import measured_depth
 from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings, Render, Window
+from pipelines.splat.spatial_blocks import SpatialBlocks
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,10 @@ class ModelRenderer:
         device = torch.device("cuda" if backend.name == "cuda" else "cpu")
         self._gaussians = trained.gaussians.to(device)
 
+    @cached_property
+    def _blocks(self) -> SpatialBlocks:
+        return SpatialBlocks(self.trained.gaussians)
+
     def pinhole(self, index: int) -> Pinhole:
         """Return the pinhole of camera `index`, at the size of its render."""
         return self._pinholes.of(index)
@@ -77,9 +83,13 @@ class ModelRenderer:
         matrix[:3, :3] = pose.cam_from_model
         matrix[:3, 3] = -pose.cam_from_model @ pose.center_in_model
         settings = RasterSettings(model.sh_degree, model.background, depth=depth, window=window)
-        cam_from_model = torch.as_tensor(matrix, dtype=torch.float32, device=self._gaussians.means.device)
+        gaussians = self._gaussians
+        if window is not None:  # A pass over millions of Gaussians takes longer than the window itself.
+            rows = self._blocks.shown(matrix, pose.pinhole, settings)
+            gaussians = gaussians.select(rows.to(gaussians.means.device))
+        cam_from_model = torch.as_tensor(matrix, dtype=torch.float32, device=gaussians.means.device)
         with torch.no_grad():
-            return self._backend.render(self._gaussians, cam_from_model, pose.pinhole, settings)
+            return self._backend.render(gaussians, cam_from_model, pose.pinhole, settings)
 
     def depth_m(self, index: int) -> FloatArray:
         """Return the depth (H, W) in metres of the surface along the z axis of camera `index`; 0: no surface."""
