@@ -11,13 +11,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.core.types import FloatArray
+from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.geometry.cameras import Pinhole
 from pipelines.robust.statistics import spatial_median
 from pipelines.scene.marks import MarkRays
 from pipelines.scene.trained_survey import TrainedSurvey
 
 REACH_PX = 1  # around the pixel of a mark
+LEAST_VIEWS = 2  # that must show a point
 _EDGE_STEP = 0.04  # of the depth; on ground seen under 30° the depth changes by 0.6 % within the reach
 _SAME_SURFACE = 0.01  # of the depth: largest difference between pixels of one surface
 
@@ -37,6 +38,12 @@ class DepthMap:
     left: int = 0
     top: int = 0
 
+    def holds(self, xy: FloatArray) -> bool:
+        """Return whether the pixel of a ray (2,) is here."""
+        x, y = self._pixel(xy)
+        rows, columns = self.depth_m.shape
+        return bool(self.left <= x < self.left + columns and self.top <= y < self.top + rows)
+
     def around(self, x: float, y: float) -> FloatArray:
         """Return the depths of the pixels within the reach of a place on the image."""
         column, row = int(x) - self.left, int(y) - self.top
@@ -53,7 +60,7 @@ class DepthMap:
             xy: (2,) x/z and y/z of the ray.
         """
         x, y = self._pixel(xy)
-        if not (0 <= x < self.pinhole.width and 0 <= y < self.pinhole.height):
+        if not self.holds(xy):
             return 0.0
         own_depth_m = float(self.depth_m[int(y) - self.top, int(x) - self.left])
         around = np.asarray(self.around(x, y), dtype=np.float64)
@@ -75,28 +82,64 @@ class DepthMap:
         return camera.fx * float(xy[0]) + camera.cx, camera.fy * float(xy[1]) + camera.cy
 
 
+@dataclass(frozen=True)
+class SurfaceHits:
+    """Places of the surface on K rays, each as the ray's own view shows it.
+
+    Attributes:
+        position_in_model: (K, 3) metres; NaN: no surface.
+        at_edge: (K,) whether the surface ends within a pixel of the ray.
+    """
+
+    position_in_model: FloatArray
+    at_edge: BoolArray
+
+    def counted(self, rows: IntArray) -> IntArray:
+        """Return the rows that count for one point, among its own: those on unbroken surface, if two or more are.
+
+        Beside an edge of the surface, a fraction of a pixel decides between roof and ground.
+        """
+        rows = rows[np.isfinite(self.position_in_model[rows]).all(axis=1)]
+        unbroken = rows[~self.at_edge[rows]]
+        return unbroken if len(unbroken) >= LEAST_VIEWS else rows
+
+
+def surface_hits(trained: TrainedSurvey, rays: MarkRays, maps: Mapping[int, DepthMap]) -> SurfaceHits:
+    """Return where the rays of marks meet the surface of their own views.
+
+    Args:
+        trained: the trained model.
+        rays: of the marks.
+        maps: by camera, the depth around its marks.
+    """
+    position, at_edge = np.full((len(rays), 3), np.nan), np.zeros(len(rays), dtype=bool)
+    for row, (camera, xy) in enumerate(zip(rays.camera, rays.xy, strict=True)):
+        view = maps[int(camera)]
+        depth = view.depth_at(xy)
+        if depth > 0:
+            in_cam = depth * np.append(xy, 1.0)
+            position[row] = (
+                trained.poses.cam_from_model[camera].T @ in_cam + trained.poses.cam_center_in_model[camera]
+            )
+            at_edge[row] = view.is_at_edge(xy)
+    return SurfaceHits(position, at_edge)
+
+
 def points_by_model(trained: TrainedSurvey, rays: MarkRays, maps: Mapping[int, DepthMap]) -> FloatArray:
     """Return the points (J, 3) in `geo` at which the model's surface lies behind their marks.
 
-    1. In each view, the point is the place of the surface on the ray of its mark.
-    2. Beside an edge of the surface, a fraction of a pixel decides between roof and ground. Views with an edge at
-       the mark do not count for a point that two or more other views show on unbroken surface.
-    3. The result is the spatial median of the views; NaN for a point with fewer than two.
+    The result is the spatial median of the views that count (`SurfaceHits.counted`); NaN for a point with fewer
+    than two.
 
     Args:
         trained: the trained model.
         rays: of the marks of J points.
         maps: by camera, the depth around its marks.
     """
-    unbroken: list[list[FloatArray]] = [[] for _ in rays.point_id]
-    at_edge: list[list[FloatArray]] = [[] for _ in rays.point_id]
-    for point, camera, xy in zip(rays.point, rays.camera, rays.xy, strict=True):
-        view = maps[int(camera)]
-        depth = view.depth_at(xy)
-        if depth > 0:
-            in_cam = depth * np.append(xy, 1.0)
-            in_model = trained.poses.cam_from_model[camera].T @ in_cam + trained.poses.cam_center_in_model[camera]
-            (at_edge if view.is_at_edge(xy) else unbroken)[point].append(in_model)
-    hits = [good if len(good) >= 2 else good + poor for good, poor in zip(unbroken, at_edge, strict=True)]
-    middle = np.array([spatial_median(hit) if len(hit) >= 2 else np.full(3, np.nan) for hit in hits])
-    return trained.geo_from_model.apply(middle.reshape(-1, 3))
+    hits = surface_hits(trained, rays, maps)
+    middle = np.full((len(rays.point_id), 3), np.nan)
+    for point in range(len(middle)):
+        counted = hits.counted(np.flatnonzero(rays.point == point))
+        if len(counted) >= LEAST_VIEWS:
+            middle[point] = spatial_median(hits.position_in_model[counted])
+    return trained.geo_from_model.apply(middle)
