@@ -85,8 +85,7 @@ class ModelRenderer:
         settings = RasterSettings(model.sh_degree, model.background, depth=depth, window=window)
         gaussians = self._gaussians
         if window is not None:  # A pass over millions of Gaussians takes longer than the window itself.
-            rows = self._blocks.shown(matrix, pose.pinhole, settings)
-            gaussians = gaussians.select(rows.to(gaussians.means.device))
+            gaussians = self._blocks.shown(matrix, pose.pinhole, settings).to(gaussians.means.device)
         cam_from_model = torch.as_tensor(matrix, dtype=torch.float32, device=gaussians.means.device)
         with torch.no_grad():
             return self._backend.render(gaussians, cam_from_model, pose.pinhole, settings)

@@ -33,7 +33,8 @@ class SpatialBlocks:
         usable = torch.nonzero(torch.isfinite(means).all(dim=1) & torch.isfinite(reach)).squeeze(1)
         means, reach = means[usable], reach[usable]
         order = _order(means, reach)
-        self._row, self._count = usable[order], len(order)
+        self._row, self._count = usable[order].numpy(), len(order)
+        self._values = {name: np.ascontiguousarray(values) for name, values in gaussians.arrays().items()}
         blocks = -(-self._count // _BLOCK)
         padded = np.minimum(np.arange(blocks * _BLOCK), max(self._count - 1, 0)).reshape(blocks, _BLOCK)
         places, reaches = means[order].numpy()[padded], reach[order].numpy()[padded]
@@ -41,8 +42,8 @@ class SpatialBlocks:
         self._radius = np.linalg.norm(places - self._center[:, None], axis=2).max(axis=1, initial=0.0)
         self._reach = reaches.max(axis=1, initial=0.0)
 
-    def shown(self, cam_from_model: FloatArray, camera: Pinhole, settings: RasterSettings) -> Tensor:
-        """Return rows (M,) int64, ascending: all Gaussians that a render can show are among them.
+    def shown(self, cam_from_model: FloatArray, camera: Pinhole, settings: RasterSettings) -> Gaussians:
+        """Return few Gaussians, in their order: all that a render can show are among them.
 
         Args:
             cam_from_model: (4, 4).
@@ -64,7 +65,9 @@ class SpatialBlocks:
             ahead &= across - high * z <= math.hypot(1.0, high) * self._radius + own
             ahead &= across - low * z >= -math.hypot(1.0, low) * self._radius - own
         chosen = np.flatnonzero(ahead)[:, None] * _BLOCK + np.arange(_BLOCK)
-        return torch.sort(self._row[torch.from_numpy(chosen[chosen < self._count])]).values
+        rows = np.sort(self._row[chosen[chosen < self._count]])
+        # By numpy: torch would wake all its threads for a few thousand rows.
+        return Gaussians(**{name: torch.from_numpy(values[rows]) for name, values in self._values.items()})
 
 
 def _order(means: Tensor, reach: Tensor) -> Tensor:

@@ -82,6 +82,10 @@ class SurfaceReader:
         self._renderer, self._trained = renderer, renderer.trained
         self._train = renderer.trained.indices("train")
 
+    def focal_px(self, camera: int) -> float:
+        """Return the focal length of a camera's depth map."""
+        return self._renderer.pinhole(camera).fx
+
     def under(self, sight: Sight) -> SurfacePoint | NoSurface:
         """Return the point of the surface under a line of sight, or why there is none to measure.
 

@@ -6,7 +6,9 @@ tile by tile. Backward: `cpu_blend_gradient` walks the same lists, `cpu_gradient
 
 from __future__ import annotations
 
+import contextlib
 import threading
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -34,6 +36,8 @@ _Array = NDArray[Any]
 
 # Kernels use all cores, and numba's fallback threading layer crashes if two threads launch kernels at once.
 KERNEL_LOCK = threading.Lock()
+# Pixels up to which one thread is faster than several, which must be woken and waited for in each kernel.
+_SMALL_PX = 64 * 64
 
 
 class CpuRasterizer:
@@ -56,10 +60,11 @@ class CpuRasterizer:
         _validate(gaussians, cam_from_model, camera, settings)
         pose = cam_from_model[:3].to(torch.float64)
         center_in_model = -torch.linalg.solve(pose[:, :3], pose[:, 3])
-        context = _RenderContext(camera, settings)
-        colour, alpha, depth_sum, square_sum, median = _Rasterize.apply(
-            *gaussians.tensors().values(), pose, center_in_model, context
-        )
+        with _threads_for(settings.image_of(camera)):
+            context = _RenderContext(camera, settings)
+            colour, alpha, depth_sum, square_sum, median = _Rasterize.apply(
+                *gaussians.tensors().values(), pose, center_in_model, context
+            )
         if not settings.depth:
             return Render(colour, alpha, context.stats)
         opaque = alpha > 0
@@ -184,6 +189,17 @@ class _Rasterize(torch.autograd.Function):
             camera = _gaussian_gradients(context, [*parameters, pose, center], hit_gradient, outputs)
         gradients = [*outputs, camera[:12].reshape(3, 4), camera[12:]]
         return (*(torch.from_numpy(gradient) for gradient in gradients), None)
+
+
+@contextlib.contextmanager
+def _threads_for(image: Pinhole) -> Iterator[None]:
+    """Run the kernels of a small image on one thread."""
+    threads = numba.get_num_threads()
+    numba.set_num_threads(1 if image.width * image.height <= _SMALL_PX else threads)
+    try:
+        yield
+    finally:
+        numba.set_num_threads(threads)
 
 
 def _array(tensor: Tensor) -> _Array:
