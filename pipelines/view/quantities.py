@@ -14,6 +14,8 @@ from scipy.spatial import Delaunay
 
 from pipelines.core.types import BoolArray, FloatArray, IntArray
 
+BaseKind = Literal["plane through the corners", "level of the lowest corner"]
+
 
 @dataclass(frozen=True)
 class Quantity:
@@ -198,7 +200,7 @@ def volumes(surface: SampledSurface, base: BasePlane) -> tuple[Quantity, ...]:
 class BasePlane:
     """Base of a volume: the plane that fits the corners best, or the level of the lowest one."""
 
-    kind: Literal["plane through the corners", "level of the lowest corner"] = "plane through the corners"
+    kind: BaseKind = "plane through the corners"
     lowest: int = 0
 
     def weights(self, corners: FloatArray, places: FloatArray) -> FloatArray:
