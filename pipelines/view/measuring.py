@@ -65,7 +65,6 @@ class MeasuringModel:
     Attributes:
         trained: the trained survey.
         target: the CRS.
-        without_sigma: why no σ is stated; empty: it is.
     """
 
     def __init__(self, workspace: Workspace, renderer: ModelRenderer, crs: CrsOptions) -> None:

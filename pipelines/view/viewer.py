@@ -30,6 +30,7 @@ from pipelines.view.photo_view import PhotoView
 from pipelines.view.picture_loop import PictureLoop, camera_of
 from pipelines.view.pictures import Painter, Photographs
 from pipelines.view.signs import Kind, PointColour, PointError, Signs
+from pipelines.view.tables import paragraph
 from pipelines.view.view_frame import ViewFrame, frame_of
 
 if TYPE_CHECKING:
@@ -74,9 +75,11 @@ class Viewer:
         self._loops: dict[int, PictureLoop] = {}
         self._lock = threading.Lock()
         self.signs = Signs(server, trained, self.frame)
-        self.photo = PhotoView(server, trained, self.frame, self.wake)
+        self.photo = PhotoView(server, trained, self.frame, self.signs, self.wake)
         self._build(workspace, workspace.root / FOLDER)
         server.scene.on_click()(self._clicked)
+        # The first measurement should not wait for it, and the first picture neither.
+        threading.Thread(target=lambda: self.model.propagation, daemon=True).start()
         server.on_client_connect(self._connected)
         server.on_client_disconnect(self._left)
         for client in server.get_clients().values():
@@ -133,17 +136,18 @@ class Viewer:
         try:
             report = read_report(workspace.path(REPORT))
         except GeorefError:
-            return "<p>No errors are shown: <code>georef evaluate</code> measures them.</p>"
+            return paragraph("No errors are shown: `georef evaluate` measures them.")
         enlarged = self.signs.add_errors(point_errors(self.model, report))
-        return f"<p>Arrows: error by camera, × {enlarged:g}. Orange: control and test views.</p>"
+        return paragraph(f"Arrows: error by camera, × {enlarged:g}. Orange: control points and test views.")
 
     def _colour_points(self) -> None:
-        propagation = self.model.propagation
-        grid: AccuracyGrid | None = None if propagation is None else propagation.grid
+        grid: AccuracyGrid | None = None
+        if self._colour.value != "of the photographs" and self.model.propagation is not None:
+            grid = self.model.propagation.grid
         limits = self.signs.add_points(self._colour.value, grid)
         if limits is not None:
             low, high = limits
-            self._legend.content = f"<p>σ of the SfM points: dark {low:.3f} m, bright {high:.3f} m</p>"
+            self._legend.content = paragraph(f"σ of the SfM points: dark {low:.3f} m, bright {high:.3f} m")
 
     def _blend(self, share: float) -> None:
         self.photo.share = float(share)
@@ -214,7 +218,7 @@ class Viewer:
 
     def tell(self, sentence: str) -> None:
         """Show a sentence above the panels of all pages."""
-        self._notice.content = f'<p data-notice="yes"><b>{sentence}</b></p>'
+        self._notice.content = paragraph(sentence, mark="notice")
 
     def add_reload(self, act: Callable[[], None]) -> None:
         """Offer to read the model again."""
