@@ -78,12 +78,25 @@ class Viewer:
         self.photo = PhotoView(server, trained, self.frame, self.signs, self.wake)
         self._build(workspace, workspace.root / FOLDER)
         server.scene.on_click()(self._clicked)
-        # The first measurement should not wait for it, and the first picture neither.
-        threading.Thread(target=lambda: self.model.propagation, daemon=True).start()
+        # No picture should wait for it.
+        self._solving = threading.Thread(target=self._propagate_errors, daemon=True)
+        self._solving.start()
         server.on_client_connect(self._connected)
         server.on_client_disconnect(self._left)
         for client in server.get_clients().values():
             self._connected(client)
+
+    def _propagate_errors(self) -> None:
+        try:
+            self.model.propagate_errors()
+        except GeorefError as error:
+            self.tell(f"No σ is stated: {error}")
+        self.measuring.refresh()
+        self._colour_points()
+
+    def wait_for_sigma(self) -> None:
+        """Wait until σ are computed."""
+        self._solving.join()
 
     def _build(self, workspace: Workspace, folder: Path) -> None:
         gui, trained = self._server.gui, self.model.trained
