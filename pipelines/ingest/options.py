@@ -4,11 +4,21 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field
 
-from pipelines.core.options import WRITTEN, InputPath, PlaceOnEarth, StageOptions, Triple, from_text
+from pipelines.core.options import (
+    WRITTEN,
+    InputMarker,
+    InputPath,
+    PlaceOnEarth,
+    StageOptions,
+    Triple,
+    from_text,
+)
+from pipelines.formats.image_file import SUFFIXES
 from pipelines.geodesy.vertical import Vertical
 from pipelines.scene.rig import RigParameter, RigParameters, in_usual_order
 
@@ -41,6 +51,8 @@ def _sensible(offset: float | Literal["auto"]) -> float | Literal["auto"]:
     return offset
 
 
+# Files of other kinds beside the photographs, such as thumbnails and logs, make nothing stale.
+PhotographFolder = Annotated[Path, InputMarker(SUFFIXES)]
 FrameDistance = Annotated[Every, from_text(_every), WRITTEN]
 TimeOffset = Annotated[float | Literal["auto"], from_text(_seconds), AfterValidator(_sensible), WRITTEN]
 
@@ -48,7 +60,7 @@ TimeOffset = Annotated[float | Literal["auto"], from_text(_seconds), AfterValida
 class IngestOptions(StageOptions):
     """What `georef ingest` reads, and what it assumes where the files are silent."""
 
-    images: InputPath | None = Field(None, description="Folder of photographs.")
+    images: PhotographFolder | None = Field(None, description="Folder of photographs.")
     bag: InputPath | None = Field(
         None, description="ROS bag with photographs and navigation: rosbag2 folder, .mcap, .db3 or ROS 1 .bag."
     )
