@@ -95,10 +95,27 @@ class IngestOptions(StageOptions):
     boresight: Triple = Field(
         (0.0, 0.0, 0.0), description="Rotation vector from the true to the nominal camera axes, x,y,z in degrees."
     )
-    trajectory: InputPath | None = Field(None, description="CSV with a header: image and/or timestamp, position …")
+    trajectory: InputPath | None = Field(
+        None,
+        description="Positions: CSV with a header, RTKLIB's .pos, DJI's .MRK, or Metashape's reference; the "
+        "content decides.",
+    )
+    events: InputPath | None = Field(
+        None, description="DJI's .MRK beside a trajectory by time: times and antenna offsets of the photographs."
+    )
     geo: InputPath | None = Field(None, description="ODM geo.txt with the image positions.")
-    gcp: InputPath | None = Field(None, description="ODM gcp_list.txt: ground control points and their marks.")
-    checkpoints: InputPath | None = Field(None, description="Check points, in the form of gcp_list.txt.")
+    gcp: InputPath | None = Field(
+        None,
+        description="Ground control points: ODM's gcp_list.txt, Metashape's markers (XML) or reference, or PIX4D's "
+        "CSV; the content decides.",
+    )
+    checkpoints: InputPath | None = Field(None, description="Check points, in any form of --gcp.")
+    marks: InputPath | None = Field(
+        None, description="PIX4D's CSV of image marks: image, point, x, y; for points whose file has none."
+    )
+    gcp_crs: str | None = Field(
+        None, description="CRS of ground points whose file states none, e.g. EPSG:32632 or EPSG:4326+5773."
+    )
     check: tuple[str, ...] = Field((), description="Name of a control point to use as a check point instead.")
     test_every: int = Field(8, ge=0, description="Hold out every N-th image for testing (0: none).")
     crs: str | None = Field(None, description="CRS of x,y,z columns in the trajectory, e.g. EPSG:32632+5773.")

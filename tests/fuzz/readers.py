@@ -105,7 +105,7 @@ def _ground_points(folder: Path) -> None:
 
 def _read_ground_points(folder: Path) -> None:
     points = read_ground_points(folder / "gcp_list.txt")
-    xyz = [mark.xyz for mark in points.marks]
+    xyz = [point.xyz for point in points.points]
     parse_crs(points.crs_text, path=points.path, line=1).lla_from_xyz(xyz, path=points.path)
 
 
