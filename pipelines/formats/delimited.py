@@ -73,9 +73,18 @@ def separator_of(line: str) -> str | None:
     return best if best in line else None
 
 
-def split(line: str, separator: str | None) -> list[str]:
-    """Return the cells of a line; without separator, spaces separate them."""
-    return line.split() if separator is None else next(csv.reader([line], delimiter=separator), [])
+def split(text: str, separator: str | None, *, path: Path, line: int) -> list[str]:
+    """Return the cells of a line; without separator, spaces separate them.
+
+    Raises:
+        InputError: the line is no CSV.
+    """
+    if separator is None:
+        return text.split()
+    try:
+        return next(csv.reader([text], delimiter=separator), [])
+    except csv.Error as error:
+        raise InputError(f"is no CSV: {error}", path=path, line=line) from error
 
 
 def rows(
@@ -87,10 +96,7 @@ def rows(
         InputError: a line is no CSV.
     """
     for line, text in lines:
-        try:
-            cells = split(text, separator)
-        except csv.Error as error:
-            raise InputError(f"is no CSV: {error}", path=path, line=line) from error
+        cells = split(text, separator, path=path, line=line)
         yield Row(path, line, cells, columns, separator not in (",", None))
 
 

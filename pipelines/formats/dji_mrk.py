@@ -1,8 +1,8 @@
 """DJI's timestamp file (`…_Timestamp.MRK`): time, position and σ of the camera at each event of a flight.
 
 A line has, between tabs: number, second, [week], north,N east,E down,V latitude,Lat longitude,Lon height,Ellh,
-three σ (N, E, V), flag,Q. Position and ellipsoidal height are those of the camera; north, east and down in millimetres
-lead there from the antenna (DJI's manuals of Phantom 4 RTK and Zenmuse P1).
+three σ (N, E, V), flag,Q. Position and ellipsoidal height are those of the camera; north, east and down in
+millimetres lead there from the antenna (DJI's manuals of Phantom 4 RTK and Zenmuse P1).
 """
 
 from __future__ import annotations

@@ -117,7 +117,8 @@ class _Reference:
         self.crs_text = None if stated is None else stated[1]
         self.geographic = True if "longitude" in text.lower() else None
         separator = separator_of(text)
-        columns, unknown = named_columns(split(text.lstrip("# "), separator), _ALIASES, path, self.header_line)
+        cells = split(text.lstrip("# "), separator, path=path, line=self.header_line)
+        columns, unknown = named_columns(cells, _ALIASES, path, self.header_line)
         self.unknown_columns = tuple(name for name in unknown if not _RESULT.search(name))
         missing = [name for name in ("label", "x", "y", "z") if name not in columns]
         if missing:

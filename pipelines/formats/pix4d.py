@@ -46,7 +46,7 @@ def read_point_table(path: Path) -> GroundPoints:
     lines = _lines(path)
     first, text = lines[0]
     separator = separator_of(text)
-    header = split(text, separator)
+    header = split(text, separator, path=path, line=first)
     geographic: bool | None = None
     if len(header) < 4:
         raise InputError(f"has {len(header)} columns, expected label, two coordinates and z", path=path, line=first)
@@ -98,7 +98,7 @@ def read_marks(path: Path) -> tuple[ListedMark, ...]:
     lines = _lines(path)
     first, text = lines[0]
     separator = separator_of(text)
-    header = split(text, separator)
+    header = split(text, separator, path=path, line=first)
     if len(header) < 4:
         raise InputError(f"has {len(header)} columns, expected image, label, x and y", path=path, line=first)
     columns = {name: at for at, name in enumerate(_MARK_COLUMNS)}

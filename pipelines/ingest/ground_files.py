@@ -36,7 +36,7 @@ def read_ground_points(path: Path, notes: Notes) -> GroundPoints:
         listed = metashape_markers.read_markers_xml(path)
     elif any(metashape_reference.HEADER.match(line) for line in lines):
         listed = metashape_reference.read_markers(path)
-    elif _begins_a_table([line for line in lines if not line.startswith("#")]):
+    elif _begins_a_table([line for line in lines if not line.startswith("#")], path):
         listed = pix4d.read_point_table(path)
     else:
         return odm.read_ground_points(path)
@@ -96,10 +96,10 @@ def east_first(listed: GroundPoints, crs: PointCrs, notes: Notes) -> FloatArray:
     return xyz
 
 
-def _begins_a_table(lines: list[str]) -> bool:
+def _begins_a_table(lines: list[str], path: Path) -> bool:
     """Return whether the first line is a row or header of a table, and not a CRS, which may have commas too."""
     if not lines or any(sign in lines[0] for sign in '["=+'):
         return False
     separator = separator_of(lines[0])
-    cells = [] if separator is None else split(lines[0], separator)
+    cells = [] if separator is None else split(lines[0], separator, path=path, line=1)
     return len(cells) >= 4 and (all(map(is_number, cells[1:4])) or not any(map(is_number, cells)))

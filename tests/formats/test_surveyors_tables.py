@@ -76,7 +76,7 @@ class TestMrk:
 
 
 POS_HEAD = (
-    "% program   : RTKPOST ver.2.4.3\n% inp file  : rover.obs\n% obs start : 2024/05/01 11:59:00.0 GPST (week2312 ...)\n"
+    "% program   : RTKPOST ver.2.4.3\n% inp file  : rover.obs\n% obs start : 2024/05/01 11:59:00.0 GPST\n"
     "% ref pos   : 46.010000000   7.740000000  1600.0000\n%\n"
 )
 ELLIPSOIDAL = (
@@ -234,7 +234,7 @@ XML = f"""<?xml version="1.0" encoding="UTF-8"?>
     </cameras>
     <markers next_id="4" next_group_id="0">
       <marker id="0" label="G1"><reference x="7.75" y="46.02" z="1620.25" sxyz="0.005" enabled="true"/></marker>
-      <marker id="1" label="G2"><reference x="7.76" y="46.03" z="1621" sx="0.01" sy="0.02" sz="0.03" enabled="0"/></marker>
+      <marker id="1" label="G2"><reference x="7.76" y="46.03" z="1" sx=".01" sy=".02" sz=".03" enabled="0"/></marker>
       <marker id="2" label="point 3"/>
     </markers>
     <frames next_id="1">
