@@ -13,6 +13,7 @@ from pipelines.core.errors import InputError
 from pipelines.formats.text import number
 
 _SEPARATORS = ";\t,"
+_LONGEST_NAME = 100  # of a column that means something
 
 
 @dataclass(frozen=True)
@@ -113,7 +114,7 @@ def named_columns(
     columns: dict[str, int] = {}
     unknown = []
     for at, text in enumerate(header):
-        name = re.sub(r"[(\[][^)\]]*[)\]]|[\s_#]", "", text).lower()
+        name = re.sub(r"[(\[][^)\]]*[)\]]|[\s_#]", "", text[:_LONGEST_NAME]).lower()
         key = aliases.get(name)
         if key is None:
             unknown += [text.strip()] if name else []

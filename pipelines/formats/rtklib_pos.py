@@ -72,7 +72,7 @@ def read_pos(path: Path) -> PoseTable:
 
 
 def _header(comments: Sequence[tuple[int, str]], path: Path) -> _Header:
-    above_geoid = any(re.search(r"height=[^,)]*geodetic", text) for _, text in comments)
+    above_geoid = any("height=" in text and "/geodetic" in text for _, text in comments)
     for line, text in reversed(comments):
         words = text.lstrip("% ").split()
         clock = words[0].upper() if words else ""

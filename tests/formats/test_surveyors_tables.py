@@ -234,7 +234,7 @@ XML = f"""<?xml version="1.0" encoding="UTF-8"?>
     </cameras>
     <markers next_id="4" next_group_id="0">
       <marker id="0" label="G1"><reference x="7.75" y="46.02" z="1620.25" sxyz="0.005" enabled="true"/></marker>
-      <marker id="1" label="G2"><reference x="7.76" y="46.03" z="1" sx=".01" sy=".02" sz=".03" enabled="0"/></marker>
+      <marker id="1" label="G2"><reference x="7.76" y="46.03" z="1" sx=".1" sy=".2" sz=".3" enabled="0"/></marker>
       <marker id="2" label="point 3"/>
     </markers>
     <frames next_id="1">
@@ -265,7 +265,7 @@ class TestMetashapeMarkers:
         first, second = listed.points
         assert (first.name, first.line, first.xyz) == ("G1", 8, (7.75, 46.02, 1620.25))
         assert (first.sigma_h_m, first.sigma_v_m, first.is_check) == (0.005, 0.005, False)
-        assert (second.name, second.sigma_h_m, second.sigma_v_m, second.is_check) == ("G2", 0.02, 0.03, True)
+        assert (second.name, second.sigma_h_m, second.sigma_v_m, second.is_check) == ("G2", 0.2, 0.3, True)
         marks = [(mark.line, mark.name, mark.image, mark.x_px, mark.y_px) for mark in listed.marks]
         assert marks == [(16, "G1", "DJI_0001.JPG", 10.5, 20.25), (17, "G1", "DJI_0002", 11.5, 21.25)]
         assert listed.left_out == ("markers.xml:20",)
