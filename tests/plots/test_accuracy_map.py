@@ -8,12 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
-from pipelines.plots.accuracy_map import MapPoints, SigmaRaster, write_accuracy_map
+from pipelines.plots.accuracy_map import MapPoints, NamedPlaces, SigmaRaster, write_accuracy_map
 
 LEAST, LARGEST, EMPTY = (0x44, 0x01, 0x54), (0xFD, 0xE7, 0x25), (0xE8, 0xE8, 0xE8)  # ends of viridis; no scene
 CONTROL = (0xDD, 0x8A, 0x3B)
-NOWHERE = np.empty((0, 2))
-NO_POINTS = MapPoints(NOWHERE, NOWHERE, NOWHERE)
+NO_POINTS = MapPoints()
 
 
 def raster(sigma_h_m: np.ndarray, *, corner: tuple[float, float] = (0.0, 0.0), cell_m: float = 1.0) -> SigmaRaster:
@@ -80,7 +79,7 @@ def test_points_lie_where_they_are(size_m: float, corner: tuple[float, float], t
     sigma = np.full((6, 8), 0.05)
     sigma[0, 0] = 0.01
     place = np.array(corner) + size_m * np.array([5.5, 3.5])  # the middle of a cell
-    points = MapPoints(np.array([corner]), place[None], np.array([corner]) + size_m)
+    points = MapPoints(np.array([corner]), NamedPlaces(place[None]), NamedPlaces(np.array([corner]) + size_m))
     left, right = maps(tmp_path, raster(sigma, corner=corner, cell_m=size_m), points)
     plain, _ = maps(tmp_path, raster(sigma, corner=corner, cell_m=size_m))
     offset = middle(left, CONTROL) - middle(plain, LEAST)
@@ -92,7 +91,7 @@ def test_all_kinds_of_points_are_in_the_legend(tmp_path: Path) -> None:
     sigma = np.full((5, 5), 0.05)
     point = np.array([[2.5, 2.5]])
     heights = []
-    for points in (NO_POINTS, MapPoints(point, NOWHERE, NOWHERE), MapPoints(point, point + 1, point - 1)):
+    for points in (NO_POINTS, MapPoints(point), MapPoints(point, NamedPlaces(point + 1), NamedPlaces(point - 1))):
         left, right = maps(tmp_path, raster(sigma), points)
         foot = np.concatenate([left, right], axis=1)[-45:]
         heights.append(int((foot < 200).any(axis=2).any(axis=0).sum()))  # columns that are written on
@@ -113,7 +112,7 @@ def test_all_kinds_of_points_are_in_the_legend(tmp_path: Path) -> None:
 )
 def test_odd_scenes_are_drawn_without_a_warning(sigma: np.ndarray, tmp_path: Path) -> None:
     cameras = np.random.default_rng(0).uniform(-5, 50, (1500, 2))
-    left, right = maps(tmp_path, raster(sigma), MapPoints(cameras, NOWHERE, cameras[:3]))
+    left, right = maps(tmp_path, raster(sigma), MapPoints(cameras, check=NamedPlaces(cameras[:3])))
     assert min(left.shape[:2]) > 400
     assert right.std() > 1
 
@@ -121,6 +120,6 @@ def test_odd_scenes_are_drawn_without_a_warning(sigma: np.ndarray, tmp_path: Pat
 def test_equal_scenes_give_equal_files(tmp_path: Path) -> None:
     sigma = raster(np.random.default_rng(1).uniform(0.01, 0.02, (20, 30)))
     for name in ("a.png", "b.png"):
-        write_accuracy_map(tmp_path / name, sigma, MapPoints(NOWHERE, NOWHERE, np.array([[3.0, 4.0]])))
+        write_accuracy_map(tmp_path / name, sigma, MapPoints(check=NamedPlaces(np.array([[3.0, 4.0]]))))
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.png", "b.png"]
