@@ -1,4 +1,4 @@
-"""Errors of check and control points, one line for each."""
+"""Check and control points one by one: errors, and coordinates in a CRS of the user's."""
 
 from __future__ import annotations
 
@@ -9,9 +9,7 @@ from rich.console import Group
 from rich.table import Table
 
 from georef_cli.markup import shown
-from pipelines.core.stages import REPORT
-from pipelines.core.workspace import Workspace
-from pipelines.scene.report import read_report
+from pipelines.scene.report import EvaluationReport
 from pipelines.scene.report_points import PointLine, point_lines
 
 _TITLES = {
@@ -20,24 +18,41 @@ _TITLES = {
     "fit": "Residuals of control points one by one (not an accuracy), metres",
 }
 
+_BLUNDER = "[red]![/] off by more than three times the class that the other points meet"
 
-def point_tables(workspace: Workspace) -> list[Group]:
-    """Return the tables of a workspace's points; none of a kind that there is not.
 
-    Raises:
-        InputError: the report is damaged.
-    """
-    lines = point_lines(read_report(workspace.path(REPORT)))
+def error_tables(report: EvaluationReport) -> list[Group]:
+    """Return the tables of the errors of a report; none of a kind of points that there is not."""
+    lines = point_lines(report)
     groups = {
         "check": [line for line in lines if line.use == "check"],
         "left out": [line for line in lines if line.way == "left out"],
         "fit": [line for line in lines if line.way == "fit"],
     }
-    return [
+    tables = [
         Group(f"\n[bold]{_TITLES[name]}[/]", _table(of_group, with_way=name == "check"))
         for name, of_group in groups.items()
         if of_group
     ]
+    return [*tables, *([Group(_BLUNDER)] if any(line.is_blunder for line in lines) else [])]
+
+
+def coordinate_tables(report: EvaluationReport) -> list[Group]:
+    """Return the check points in the CRS of `--crs`, as surveyed and as measured; nothing without that option."""
+    listed = report.coordinates
+    if listed is None:
+        return []
+    table = Table("point", "", "x", "y", "z", box=None, pad_edge=False)
+    for column in table.columns[2:]:
+        column.justify, column.no_wrap = "right", True
+    table.add_row("origin", "", *listed.texts(listed.origin))
+    for point in listed.points:
+        for way, xyz in (("surveyed", point.surveyed), ("camera", point.camera), ("model", point.model)):
+            name = shown(point.name) if way == "surveyed" else ""
+            table.add_row(name, way, *(text or "–" for text in listed.texts(xyz)))
+    units = listed.units[0] if len(set(listed.units)) == 1 else ", ".join(listed.units)
+    title = f"Check points in {shown(listed.crs)}, {shown(units)}; x is the easting or longitude"
+    return [Group(f"\n[bold]{title}[/]", table, f"Heights: {shown(listed.heights)}.")]
 
 
 def _table(lines: Sequence[PointLine], *, with_way: bool) -> Table:
@@ -56,7 +71,7 @@ def _table(lines: Sequence[PointLine], *, with_way: bool) -> Table:
             str(line.row.rays),
             *lengths,
             *(predicted if has_sigma else []),
-            "[red]blunder[/]" if line.is_blunder else "",
+            "[red]![/]" if line.is_blunder else "",
         )
     return table
 

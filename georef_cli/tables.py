@@ -181,25 +181,7 @@ def report(document: EvaluationReport) -> list[Renderable]:
         _rows("Residuals of the fit (not an accuracy), metres", fit, POINT_COLUMNS),
         _rows("Variance factors: estimated over stated variance (tie points: in px²)", factors, FACTOR_COLUMNS),
     )
-    return [*(table for table in tables if table is not None), *coordinates(document)]
-
-
-def coordinates(document: EvaluationReport) -> list[Renderable]:
-    """Return the check points in the CRS of `--crs`, as surveyed and as measured; nothing without that option."""
-    listed = document.coordinates
-    if listed is None:
-        return []
-    units = listed.units[0] if len(set(listed.units)) == 1 else ", ".join(listed.units)
-    table = _table("point", "", "first", "second", "height")
-    for column in table.columns[2:]:
-        column.justify = "right"
-    table.add_row("origin", "", *listed.texts(listed.origin))
-    for point in listed.points:
-        for way, xyz in (("surveyed", point.surveyed), ("camera", point.camera), ("model", point.model)):
-            name = shown(point.name) if way == "surveyed" else ""
-            table.add_row(name, way, *(text or "–" for text in listed.texts(xyz)))
-    title = f"Check points in {shown(listed.crs)} ({shown(units)}), heights {shown(listed.heights)}"
-    return [Group(f"\n[bold]{title}[/]", table)]
+    return [table for table in tables if table is not None]
 
 
 def duration(seconds: float | None) -> str:

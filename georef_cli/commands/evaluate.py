@@ -7,18 +7,21 @@ from typing import Any
 import click
 
 from georef_cli.output import print_outcome
-from georef_cli.point_tables import point_tables
+from georef_cli.point_tables import coordinate_tables, error_tables
 from georef_cli.stage import StageCommand
+from pipelines.core.stages import REPORT
+from pipelines.scene.report import read_report
 
 
 class EvaluateCommand(StageCommand):
     """Command of the stage, with `--points`."""
 
     def act(self, ctx: click.Context, **values: Any) -> None:
-        """Run the stage and print its result, with the errors point by point if they are wanted."""
-        outcome = self.run(ctx, values)
-        more = point_tables(values["workspace"]) if values["points"] and not values["as_json"] else []
-        print_outcome(values["workspace"], outcome, *more, as_json=values["as_json"])
+        """Run the stage and print its result, with coordinates and errors point by point if they are wanted."""
+        outcome, workspace = self.run(ctx, values), values["workspace"]
+        report = read_report(workspace.path(REPORT))
+        errors = error_tables(report) if values["points"] else []
+        print_outcome(workspace, outcome, *coordinate_tables(report), *errors, as_json=values["as_json"])
 
 
 command = EvaluateCommand(

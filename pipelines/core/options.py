@@ -141,7 +141,12 @@ def is_written(info: FieldInfo) -> bool:
 
 
 def resolve(
-    options_type: type[OptionsT], table: Mapping[str, Any], flags: Mapping[str, Any], toml: Path
+    options_type: type[OptionsT],
+    table: Mapping[str, Any],
+    flags: Mapping[str, Any],
+    toml: Path,
+    *,
+    stage: str | None = None,
 ) -> OptionsT:
     """Return validated options: default < `table` < `flags`.
 
@@ -150,9 +155,10 @@ def resolve(
         table: the stage's table in `georef.toml`; its relative paths are relative to the folder of that file.
         flags: options that the user gave as flags, by field.
         toml: path of `georef.toml`.
+        stage: name of the table, for errors.
 
     Raises:
-        InputError: an unknown key or a value out of range; names the file (or flag) and the key.
+        InputError: an unknown key or a value out of range; names the file, table and key, or the flag.
     """
     merged = {**_anchored(options_type, table, toml.parent), **flags}
     try:
@@ -163,7 +169,8 @@ def resolve(
         from_file = key in table and key not in flags
         known = ", ".join(sorted(options_type.model_fields))
         hint = f"unknown key; known keys: {known}" if first["type"] == "extra_forbidden" else first["msg"]
-        name = key if from_file else flag_name(options_type, key)
+        in_file = key if stage is None else f"{stage}.{key}"
+        name = in_file if from_file else flag_name(options_type, key)
         raise InputError(hint, path=toml if from_file else None, field=name) from error
     for name in options_type.model_fields:
         value = getattr(options, name)

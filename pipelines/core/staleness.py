@@ -73,7 +73,7 @@ def stage_config(workspace: Workspace, spec: StageSpec, flags: Flags) -> StageOp
         InputError: an unknown or invalid option.
     """
     tables = load_toml(workspace.config_file, BY_NAME)
-    return resolve(spec.options, tables.get(spec.name, {}), flags, workspace.config_file)
+    return resolve(spec.options, tables.get(spec.name, {}), flags, workspace.config_file, stage=spec.name)
 
 
 def why_stale(workspace: Workspace, asked: Request, manifest: Manifest) -> str:

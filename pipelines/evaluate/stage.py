@@ -2,8 +2,8 @@
 
 Reads the trained model, the survey and the initial similarity. Writes `evaluate/report.json`, the errors point by
 point as `points.csv`, side-by-side renders, and the predicted accuracy over the scene as `accuracy.csv` and
-`accuracy.png`. Check points enter no solution. Residuals of observations that entered one are reported as a fit, not
-as an accuracy (docs/accuracy.md).
+`accuracy.png`. Check points enter no solution. Residuals of observations that entered one are reported as a fit,
+not as an accuracy (docs/accuracy.md).
 """
 
 from __future__ import annotations

@@ -43,7 +43,7 @@ _LEGEND_HEIGHT, _HEADING_DEPTH = 0.2, 0.2  # above the lower edge, below the upp
 
 _NARROWEST = 0.4  # shorter side of a map over its longer one
 _MARGIN = 0.04  # of the longer side, around everything that is shown
-_MOST_TICKS = 7  # on the longer side
+_MOST_TICKS = 8  # on the longer side
 
 _CAMERAS = {"marker": "X", "linewidths": 0.4, "color": "black", "edgecolors": "white"}
 _CHECK = {"marker": "o", "s": 24, "linewidths": 0.8, "color": "white", "edgecolors": "black"}

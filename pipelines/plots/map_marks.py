@@ -21,7 +21,7 @@ _NAME_OFFSET_POINTS = (4, 3)
 _LONGEST_ARROW = 0.14  # of the longer side of the map
 _OUTLIER = 4.0  # times the median: such an arrow may leave the map
 _METRES_PER_DEGREE = 111_320.0
-_NORTH_LENGTH, _NORTH_LEFT = 0.36, 0.45  # inches: the arrow, and its distance from the map
+_NORTH_LENGTH, _NORTH_LEFT, _NORTH_GAP = 0.28, 0.45, 0.04  # inches: the arrow, its distance from the map's corner
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ def draw_errors(axes: Axes, places: FloatArray, errors_m: FloatArray, factor: fl
     (east, north), (right, up) = places[known].T, factor * errors_m[known].T
     axes.quiver(
         east, north, right, up,
-        angles="xy", scale_units="xy", scale=1.0, width=0.006, zorder=3,
+        angles="xy", scale_units="xy", scale=1.0, width=0.006, zorder=5,
         color=ORANGE if of_control else DARK, edgecolor="white", linewidth=0.4,
     )  # fmt: skip
 
@@ -115,22 +115,20 @@ def draw_north(figure: Figure, axes: Axes) -> None:
     """Draw an arrow to the north left of a map, at its upper edge: up, as the axes of the map are."""
     width, height = figure.get_size_inches()
     box = axes.get_position()
-    x, top = box.x0 - _NORTH_LEFT / width, box.y1 + (_NORTH_LENGTH + 0.08) / height
+    x, foot = box.x0 - _NORTH_LEFT / width, box.y1 + _NORTH_GAP / height
+    head = foot + _NORTH_LENGTH / height
     axes.annotate(
-        "N",
-        xy=(x, top),
-        xytext=(x, top - _NORTH_LENGTH / height),
+        "",
+        xy=(x, head),
+        xytext=(x, foot),
         xycoords="figure fraction",
         textcoords="figure fraction",
-        ha="center",
-        va="top",
-        fontsize=LABEL_POINTS,
-        color=DARK,
         arrowprops={"arrowstyle": "-|>", "color": DARK, "shrinkA": 0, "shrinkB": 0, "linewidth": 1.4},
     )
+    figure.text(x, head, "N", ha="center", va="bottom", fontsize=LABEL_POINTS, color=DARK)
 
 
 def _decimals(side_m: float, unit: str) -> int:
-    """Return the decimals that tell apart the ticks of a map, a tenth of its side."""
-    step = side_m / 10 / (_METRES_PER_DEGREE if unit == "°" else 1.0)
+    """Return the decimals that state a coordinate to a hundredth of a map's side, or better."""
+    step = side_m / 100 / (_METRES_PER_DEGREE if unit == "°" else 1.0)
     return max(0, math.ceil(-math.log10(step)))

@@ -94,7 +94,7 @@ class TestStatus:
 
     def test_bad_toml_is_an_error(self, done: Workspace) -> None:
         done.config_file.write_text("[train]\nseeds = 9\n")
-        with pytest.raises(InputError, match=r"georef\.toml \[seeds\]: unknown key"):
+        with pytest.raises(InputError, match=r"georef\.toml \[train\.seeds\]: unknown key"):
             states.status(done)
 
     def test_vanished_product(self, done: Workspace) -> None:
