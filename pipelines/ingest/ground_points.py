@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -13,6 +13,7 @@ from pipelines.core.errors import InputError
 from pipelines.core.types import FloatArray
 from pipelines.formats.ground_points import GroundPoints, ListedMark
 from pipelines.formats.pix4d import read_marks
+from pipelines.geodesy.crs import PointCrs
 from pipelines.geodesy.enu import ecef_from_lla
 from pipelines.geodesy.vertical import VerticalDatum
 from pipelines.ingest.ground_files import crs_of_points, east_first, read_ground_points
@@ -88,35 +89,75 @@ class SortedPoints:
         )
 
 
-def read_ground_files(
-    paths: Iterable[Path | None], sizes: Mapping[str, tuple[int, int]], options: IngestOptions, notes: Notes
-) -> tuple[GroundFile | None, GroundFile | None]:
-    """Read control and check points, and tie them to images.
+@dataclass(frozen=True)
+class PlacedPoints:
+    """Points of a file with their places, not yet tied to images.
 
-    Marks in images that are not here, and marks of `--marks` that name no point, are left out and noted.
+    Attributes:
+        listed: as the file has them.
+        crs: of the file.
+        position_in_ecef: (J, 3) metres.
+    """
+
+    listed: GroundPoints
+    crs: PointCrs
+    position_in_ecef: FloatArray
+
+
+@dataclass(frozen=True)
+class ListedGround:
+    """Control and check points as their files list them, and the marks of a table of marks."""
+
+    control: PlacedPoints | None
+    check: PlacedPoints | None
+    marks: tuple[ListedMark, ...]
+
+
+def list_ground_points(options: IngestOptions, notes: Notes) -> ListedGround:
+    """Read the files of control and check points, and the table of marks.
+
+    Marks of the table that name no point are noted.
 
     Args:
-        paths: of control and check points; None: there are none.
-        sizes: width and height of each image by name.
-        options: CRS and vertical datum, table of marks, and σ of a mark.
-        notes: what was left out.
+        options: the files, CRS and vertical datum.
+        notes: what was assumed and left out.
 
     Raises:
-        InputError: a malformed file, one name at two places, two marks of a point in one image, a mark outside its
-            image, impossible coordinates, or no mark in any image here.
+        InputError: a malformed file, no CRS, one name at two places, or impossible coordinates.
     """
-    listed = [None if path is None else read_ground_points(path, notes) for path in paths]
-    apart = () if options.marks is None else read_marks(options.marks)
-    known = {point.name for file in listed if file is not None for point in file.points}
+    control, check = (
+        None if path is None else _placed(read_ground_points(path, notes), options, notes)
+        for path in (options.gcp, options.checkpoints)
+    )
+    marks = () if options.marks is None else read_marks(options.marks)
+    known = {point.name for file in (control, check) if file is not None for point in file.listed.points}
+    name = "" if options.marks is None else options.marks.name
     notes.warn_counted(
-        [f"{options.marks.name}:{mark.line} ({mark.name})" for mark in apart if mark.name not in known]
-        if options.marks is not None
-        else [],
+        [f"{name}:{mark.line} ({mark.name})" for mark in marks if mark.name not in known],
         "mark names no ground point",
         "marks name no ground point",
     )
+    return ListedGround(control, check, marks)
+
+
+def tie_ground_points(
+    ground: ListedGround, sizes: Mapping[str, tuple[int, int]], options: IngestOptions, notes: Notes
+) -> tuple[GroundFile | None, GroundFile | None]:
+    """Return control and check points with their marks in the images; marks in images that are not here are noted.
+
+    Args:
+        ground: as listed.
+        sizes: width and height of each image by name.
+        options: σ of a mark.
+        notes: what was left out.
+
+    Raises:
+        InputError: two marks of a point in one image, a mark outside its image, or no mark in any image here.
+    """
     ties = _Ties(sizes, options, notes)
-    control, check = (None if file is None else _ground_file(file, apart, ties) for file in listed)
+    control, check = (
+        None if file is None else _ground_file(file, ground.marks, ties) for file in (ground.control, ground.check)
+    )
     return control, check
 
 
@@ -180,12 +221,17 @@ class _Ties:
     notes: Notes
 
 
-def _ground_file(listed: GroundPoints, apart: Sequence[ListedMark], ties: _Ties) -> GroundFile:
-    """Return the points of a file on Earth, with its own marks and those of the table of marks."""
-    crs = crs_of_points(listed, ties.options, ties.notes)
-    xyz = east_first(listed, crs, ties.notes)
+def _placed(listed: GroundPoints, options: IngestOptions, notes: Notes) -> PlacedPoints:
+    crs = crs_of_points(listed, options, notes)
+    xyz = east_first(listed, crs, notes)
     lla = crs.lla_from_xyz(xyz, path=listed.path, lines=[point.line for point in listed.points])
-    note_operation(crs, lla, ties.notes)
+    note_operation(crs, lla, notes)
+    return PlacedPoints(listed, crs, ecef_from_lla(lla))
+
+
+def _ground_file(placed: PlacedPoints, apart: Sequence[ListedMark], ties: _Ties) -> GroundFile:
+    """Return the points of a file with its own marks and those of the table of marks."""
+    listed = placed.listed
     marks: dict[str, dict[str, Mark]] = {point.name: {} for point in listed.points}
     _add_marks(marks, listed.marks, listed.path, ties)
     if ties.options.marks is not None:
@@ -200,9 +246,9 @@ def _ground_file(listed: GroundPoints, apart: Sequence[ListedMark], ties: _Ties)
             sigma_v_m=point.sigma_v_m,
             is_check=point.is_check,
         )
-        for point, position in zip(listed.points, ecef_from_lla(lla), strict=True)
+        for point, position in zip(listed.points, placed.position_in_ecef, strict=True)
     )
-    return GroundFile(listed.path, crs.name, crs.vertical, points)
+    return GroundFile(listed.path, placed.crs.name, placed.crs.vertical, points)
 
 
 def _add_marks(marks: dict[str, dict[str, Mark]], listed: Sequence[ListedMark], path: Path, ties: _Ties) -> None:

@@ -9,7 +9,13 @@ import pytest
 
 from pipelines.core.errors import InputError
 from pipelines.geodesy.enu import ecef_from_lla
-from pipelines.ingest.ground_points import GroundFile, read_ground_files, require_near, split_checks
+from pipelines.ingest.ground_points import (
+    GroundFile,
+    list_ground_points,
+    require_near,
+    split_checks,
+    tie_ground_points,
+)
 from pipelines.ingest.notes import Notes
 from pipelines.ingest.options import IngestOptions
 
@@ -21,7 +27,8 @@ G2 = "7.76 46.02 1620 10.5 20.5 a.jpg G2\n7.76 46.02 1620 11.5 21.5 b.jpg G2\n"
 def _read(tmp_path: Path, rows: str, name: str = "gcp_list.txt", notes: Notes | None = None) -> GroundFile:
     path = tmp_path / name
     path.write_text("EPSG:4979\n" + rows)
-    file, _ = read_ground_files((path, None), SIZES, IngestOptions(), notes or Notes())
+    options, notes = IngestOptions(gcp=path), notes or Notes()
+    file, _ = tie_ground_points(list_ground_points(options, notes), SIZES, options, notes)
     assert file is not None
     return file
 
