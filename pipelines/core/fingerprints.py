@@ -191,7 +191,7 @@ def _records(
 
 def _is_as(record: FileRecord, path: Path) -> bool:
     stat = path.stat()
-    return (record.size, record.mtime_ns) == (stat.st_size, stat.st_mtime_ns)
+    return bool(record.sha256) and (record.size, record.mtime_ns) == (stat.st_size, stat.st_mtime_ns)
 
 
 def _record(path: Path) -> FileRecord:
