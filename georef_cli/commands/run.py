@@ -16,8 +16,8 @@ from pipelines.core.errors import GeorefError
 from pipelines.core.options import listed_names
 from pipelines.core.stages import BY_NAME, DELIVERABLES, PIPELINE, StageSpec, stage_slice
 from pipelines.core.workspace import Workspace
-from pipelines.deliver.options import CrsOptions
 from pipelines.ingest.options import IngestOptions
+from pipelines.scene.crs_options import CrsOptions
 
 if TYPE_CHECKING:
     from pipelines.deliver.overview import Overview

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from pipelines.core.durable import replace_file
-from pipelines.core.types import ByteArray
+from pipelines.core.types import ByteArray, FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -62,6 +62,14 @@ def pixels_of(figure: Figure) -> ByteArray:
     figure.savefig(buffer, format="rgba", dpi="figure")
     width, height = canvas.get_width_height()
     return np.frombuffer(buffer.getvalue(), np.uint8).reshape(height, width, 4)[..., :3]
+
+
+def colours_of(values: FloatArray, low: float, high: float) -> ByteArray:
+    """Return the colours (N, 3) of values (N,) on the scale of the maps, from `low` to `high`."""
+    from matplotlib import colormaps
+
+    share = np.clip((values - low) / max(high - low, 1e-12), 0.0, 1.0)
+    return np.asarray(np.round(255 * colormaps[COLOUR_MAP](share)[:, :3]), dtype=np.uint8)
 
 
 def write_png(figure: Figure, path: Path) -> None:
