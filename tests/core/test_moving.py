@@ -13,26 +13,28 @@ from pipelines.core import runner
 from pipelines.core import staleness as states
 from pipelines.core.manifest import MANIFEST
 from pipelines.core.photograph_folder import photograph_folder
-from pipelines.core.stages import BY_NAME, PIPELINE
+from pipelines.core.stages import BY_NAME, stage_slice
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from tests import fakes
 
 pytestmark = pytest.mark.usefixtures("fake_stages")
+STAGES = stage_slice(None, "geolocate")  # the photographs of a survey decide one of them, all of it two
 
 
 def stale(workspace: Workspace) -> dict[str, str]:
     """Stages that are not current, with the reason."""
-    return {row.stage: row.reason for row in states.status(workspace) if row.state != "current"}
+    rows = states.status(workspace, before=BY_NAME["init-sim3"])
+    return {row.stage: row.reason for row in rows if row.state != "current"}
 
 
 def made(workspace: Workspace, **flags: object) -> list[str]:
-    """Run the pipeline; the names of the stages that ran."""
-    return [outcome.stage for outcome in runner.run_pipeline(workspace, PIPELINE, {"ingest": flags}) if outcome.ran]
+    """Run the stages; the names of those that ran."""
+    return [outcome.stage for outcome in runner.run_pipeline(workspace, STAGES, {"ingest": flags}) if outcome.ran]
 
 
 @pytest.fixture
 def project(tmp_path: Path) -> Path:
-    """A folder with photographs, a table, and a workspace in which all stages are current."""
+    """A folder with photographs, a table, and a workspace in which these stages are current."""
     project = tmp_path / "project"
     fakes.photographs(project / "photos" / "sub")
     (project / "track.csv").write_text("image,lat\n")
