@@ -86,6 +86,20 @@ def parameter_names(camera: Camera) -> tuple[str, ...]:
     return tuple("f" if len(slots) > 1 else names[slots[0]] for slots in _LAYOUT[camera.model])
 
 
+def parameters_in(camera: Camera, model: str) -> FloatArray | None:
+    """Return a camera's parameters in the order of another model; None between a fisheye and other lenses.
+
+    What the other model lacks is dropped, and what it has besides is zero.
+
+    Raises:
+        InputError: as `undistort`.
+    """
+    full = full_parameters(camera)
+    if _is_fisheye(camera) != (model == "OPENCV_FISHEYE"):
+        return None
+    return np.asarray(full[[slots[0] for slots in _LAYOUT[model]]])
+
+
 def undistort(camera: Camera, xy_px: ArrayLike) -> FloatArray:
     """Return rays (…, 2) as (x/z, y/z) of pixels (…, 2); NaN where the lens model maps no ray to the pixel.
 

@@ -25,7 +25,7 @@ def metres(value: float | None) -> str:
     """Return metres without their unit: millimetres below 10 m, tenths of them below 1 cm, else centimetres."""
     if value is None or isnan(value):
         return MISSING
-    return number(value, 4 if abs(value) < 0.00995 else 3 if abs(value) < 9.9995 else 2)
+    return "0" if value == 0 else number(value, 4 if abs(value) < 0.00995 else 3 if abs(value) < 9.9995 else 2)
 
 
 def in_metres(value: float | None) -> str:
@@ -60,8 +60,10 @@ def similarity(value: float | None) -> str:
 
 
 def parts_per_million(value: float | None) -> str:
-    """Return a relative quantity in parts per million: `96 ppm`."""
-    return MISSING if value is None else f"{number(1e6 * value, 1)} ppm"
+    """Return a relative quantity in parts per million, or per cent from one per mille on: `96.4 ppm`, `1.86 %`."""
+    if value is None:
+        return MISSING
+    return f"{number(1e6 * value, 1)} ppm" if abs(value) < 1e-3 else f"{number(100 * value, 2)} %"
 
 
 def whole(value: int | None) -> str:

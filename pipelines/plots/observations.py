@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _AXES = ("east", "north", "up")
-_ARROW_SHARE = 0.9  # of a cell, that the longest arrow takes
+_ARROW_SHARE, _ARROW_QUANTILE = 0.9, 0.95  # of a region, that an arrow of this quantile takes
 _CHART_INCHES = (6.4, 3.2)
 
 
@@ -86,23 +86,23 @@ def residual_field(size_px: tuple[int, int], mean_px: FloatArray, rms_px: FloatA
     y = (np.arange(rows) + 0.5) * height / rows
     grid = np.stack(np.meshgrid(x, y), axis=-1)
     known = np.isfinite(mean_px).all(axis=-1)
-    longest = float(np.linalg.norm(mean_px[known], axis=-1).max()) if known.any() else 0.0
+    longest = float(np.quantile(np.linalg.norm(mean_px[known], axis=-1), _ARROW_QUANTILE)) if known.any() else 0.0
     factor = None
     if longest > 0:
         factor = nice_number(_ARROW_SHARE * min(width / columns, height / rows) / longest)
         arrow = factor * mean_px[known]
-        # A white rim keeps arrows readable on every colour.
-        for colour, thickness in (("black", 0.006), ("white", 0.003)):
-            axes.quiver(
-                *grid[known].T,
-                *arrow.T,
-                angles="xy",
-                scale_units="xy",
-                scale=1,
-                color=colour,
-                width=thickness,
-                pivot="mid",
-            )
+        axes.quiver(
+            *grid[known].T,
+            *arrow.T,
+            angles="xy",
+            scale_units="xy",
+            scale=1,
+            color="white",
+            edgecolor="black",  # readable on every colour
+            linewidth=0.5,
+            width=0.004,
+            pivot="mid",
+        )
     return DrawnField(png_of(figure), factor)
 
 
@@ -159,7 +159,7 @@ def correlation_matrix(names: Sequence[str], correlation: FloatArray) -> bytes:
             axes.text(
                 column,
                 row,
-                f"{value:.2f}".replace("-", "−"),
+                f"{round(float(value), 2) + 0.0:.2f}".replace("-", "−"),
                 ha="center",
                 va="center",
                 fontsize=FIGURE_POINTS - 1,

@@ -15,12 +15,16 @@ from pipelines.plots.style import DARK, FIGURE_POINTS, TICK_POINTS, label, new_f
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.transforms import Bbox
 
 LONGER_INCHES = 6.2
-_LEFT, _RIGHT, _BELOW, _ABOVE = 0.85, 0.25, 0.95, 0.4  # around the map, in inches
+_LEFT, _RIGHT, _BELOW, _ABOVE = 0.85, 0.25, 0.6, 0.4  # around the map, in inches
+_LEGEND_ROW = 0.22
 _NARROWEST = 0.45  # shorter side of a map over its longer one
 _MARGIN = 0.06  # of the longer side, around everything that is shown
 _BAR_SHARE = 0.25  # of the width, that the scale bar takes at most
+_SIDES = ((1, 1), (-1, 1), (1, -1), (-1, -1))  # of a sign, where its name may stand
+_SIGN_DOTS = 4.0  # half the width of a sign
 _BOX = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85}
 
 
@@ -49,18 +53,20 @@ def frame_around(*places: FloatArray) -> Frame:
     return Frame((low + high) / 2 - half, (low + high) / 2 + half)
 
 
-def new_plan(frame: Frame, title: str, *, right_inches: float = 0.0) -> tuple[Figure, Axes]:
+def new_plan(frame: Frame, title: str, *, right_inches: float = 0.0, legend_rows: int = 0) -> tuple[Figure, Axes]:
     """Return a figure with the axes of a plan.
 
     Args:
         frame: that the axes show.
         title: above them.
         right_inches: room beside the map, for a colour bar.
+        legend_rows: rows of the legend below the map.
     """
     width, height = (LONGER_INCHES * (frame.high - frame.low) / frame.longer_m).tolist()
-    size = (_LEFT + width + _RIGHT + right_inches, _BELOW + height + _ABOVE)
+    below = _BELOW + _LEGEND_ROW * (legend_rows + 0.4 * bool(legend_rows))
+    size = (_LEFT + width + _RIGHT + right_inches, below + height + _ABOVE)
     figure = new_figure(size, None)
-    axes = figure.add_axes((_LEFT / size[0], _BELOW / size[1], width / size[0], height / size[1]))
+    axes = figure.add_axes((_LEFT / size[0], below / size[1], width / size[0], height / size[1]))
     label(axes, title, x="east of the survey's origin in m", y="north of the survey's origin in m")
     axes.set_xlim(frame.low[0], frame.high[0])
     axes.set_ylim(frame.low[1], frame.high[1])
@@ -127,31 +133,50 @@ def add_legend(figure: Figure, axes: Axes, columns: int = 4) -> None:
         )
 
 
-def add_names(figure: Figure, axes: Axes, places: FloatArray, names: Sequence[str]) -> int:
-    """Write names beside places (N, 2), as many as do not overlap each other, and return their number."""
+def add_names(figure: Figure, axes: Axes, places: FloatArray, names: Sequence[str], others: FloatArray) -> int:
+    """Write names beside places (N, 2), as many as cover no sign and no other name, and return their number.
+
+    Args:
+        figure: of the axes.
+        axes: of the plan, with its limits.
+        places: (N, 2) metres.
+        names: N.
+        others: (M, 2) places of further signs, in metres.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     renderer = FigureCanvasAgg(figure).get_renderer()  # type: ignore[no-untyped-call]
     taken = [text.get_window_extent(renderer) for text in axes.texts]
+    signs = axes.transData.transform(np.concatenate([places, others]))
     inside, written = axes.get_window_extent(renderer), 0
     for place, name in zip(places, names, strict=True):
-        text = axes.annotate(
-            name,
-            xy=(float(place[0]), float(place[1])),
-            xytext=(4, 3),
-            textcoords="offset points",
-            fontsize=FIGURE_POINTS,
-            color=DARK,
-            zorder=8,
-            parse_math=False,  # A name may hold what is a formula elsewhere.
-        )
-        box = text.get_window_extent(renderer)
-        if box.x1 > inside.x1 or box.y1 > inside.y1 or any(box.overlaps(other) for other in taken):
+        for across, along in _SIDES:
+            text = axes.annotate(
+                name,
+                xy=(float(place[0]), float(place[1])),
+                xytext=(5 * across, 5 * along),
+                textcoords="offset points",
+                ha="left" if across > 0 else "right",
+                va="bottom" if along > 0 else "top",
+                fontsize=FIGURE_POINTS,
+                color=DARK,
+                zorder=8,
+                parse_math=False,  # A name may hold what is a formula elsewhere.
+            )
+            box = text.get_window_extent(renderer)
+            free = not any(box.overlaps(other) for other in taken) and not _holds_any(box, signs)
+            if free and inside.contains(box.x0, box.y0) and inside.contains(box.x1, box.y1):
+                taken.append(box)
+                written += 1
+                break
             text.remove()
-            continue
-        taken.append(box)
-        written += 1
     return written
+
+
+def _holds_any(box: Bbox, places: FloatArray) -> bool:
+    """Return whether a sign at places (N, 2) in dots touches a box."""
+    low, high = np.array([box.x0, box.y0]) - _SIGN_DOTS, np.array([box.x1, box.y1]) + _SIGN_DOTS
+    return bool(((places > low) & (places < high)).all(axis=1).any())
 
 
 def nice_number(most: float) -> float:

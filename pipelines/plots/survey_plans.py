@@ -56,8 +56,8 @@ def site_plan(
         scene_m: (N, 2) points of the scene, drawn as its ground.
     """
     frame = frame_around(training_m, test_m, control.place_m, check.place_m)
-    figure, axes = new_plan(frame, "Photographs and surveyed points")
-    axes.scatter(scene_m[:, 0], scene_m[:, 1], s=0.6, color=GREY, alpha=0.5, linewidths=0, rasterized=True)
+    figure, axes = new_plan(frame, "Photographs and surveyed points", legend_rows=1)
+    axes.scatter(scene_m[:, 0], scene_m[:, 1], s=1.5, color=GREY, alpha=0.6, linewidths=0, rasterized=True)
     size = float(np.clip(2600 / max(len(training_m), 1), 7, 24))
     styles: tuple[tuple[str, FloatArray, dict[str, Any]], ...] = (
         ("photograph for training", training_m, {"marker": "x", "s": size, "color": BLUE, "linewidths": 0.9}),
@@ -81,7 +81,8 @@ def site_plan(
         if len(places):
             axes.scatter(places[:, 0], places[:, 1], label=name, zorder=3 + order, **style)
     add_bearings(axes)
-    add_names(figure, axes, np.concatenate([control.place_m, check.place_m]), [*control.names, *check.names])
+    marked = np.concatenate([control.place_m, check.place_m])
+    add_names(figure, axes, marked, [*control.names, *check.names], np.concatenate([training_m, test_m]))
     add_legend(figure, axes)
     return png_of(figure)
 
@@ -100,7 +101,7 @@ def movement_plan(
     from matplotlib.collections import EllipseCollection
 
     frame = frame_around(center_m)
-    figure, axes = new_plan(frame, "Adjusted positions of the photographs")
+    figure, axes = new_plan(frame, "Adjusted positions of the photographs", legend_rows=2)
     axes.scatter(center_m[:, 0], center_m[:, 1], s=5, color=DARK, zorder=3, label="adjusted position")
     known = np.isfinite(moved_m).all(axis=1)
     arrow_factor = ellipse_factor = None

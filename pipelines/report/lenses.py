@@ -8,11 +8,11 @@ import numpy as np
 
 from pipelines.accuracy.error_propagation import ErrorPropagation
 from pipelines.core.types import FloatArray
-from pipelines.geometry.cameras import LENGTHS, Camera, parameter_names
+from pipelines.geometry.cameras import LENGTHS, Camera, parameter_names, parameters_in
 from pipelines.pages.pictures import Picture, picture_of_png
 from pipelines.plots.observations import correlation_matrix, residual_field
 from pipelines.report.evaluated import EvaluatedSurvey
-from pipelines.scene.survey import Survey
+from pipelines.scene.survey import CameraPrior, Survey
 
 _REGIONS = 16  # along the longer side of an image
 _LEAST_OBSERVATIONS = 10  # of a region that has an arrow
@@ -26,7 +26,7 @@ class LensParameter:
     Attributes:
         name: after COLMAP.
         unit: `px`, or empty.
-        start: before SfM; None: of another camera model.
+        start: before SfM; None: not known.
         value: after training.
         sigma: of `value`; None: not known.
     """
@@ -163,7 +163,7 @@ def _lens(
     drawn: bool,
 ) -> LensFacts:
     prior = next((prior for prior in survey.cameras if prior.camera_id == key), None)
-    start = prior.params if prior is not None and prior.model == camera.model else None
+    start = None if prior is None else parameters_in(_camera_of(prior), camera.model)
     names = parameter_names(camera)
     sigma = None if covariance is None else np.sqrt(np.maximum(np.diag(covariance), 0.0))
     size = (camera.width, camera.height)
@@ -187,7 +187,7 @@ def _lens(
             LensParameter(
                 name=name,
                 unit="px" if name in LENGTHS else "",
-                start=None if start is None else start[index],
+                start=None if start is None else float(start[index]),
                 value=float(camera.params[index]),
                 sigma=None if sigma is None else float(sigma[index]),
             )
@@ -197,6 +197,10 @@ def _lens(
         residuals=None if field is None else picture_of_png(field.png),
         factor=None if field is None else field.factor,
     )
+
+
+def _camera_of(prior: CameraPrior) -> Camera:
+    return Camera(prior.model, prior.width, prior.height, np.array(prior.params))
 
 
 def _covariance(evaluated: EvaluatedSurvey) -> tuple[FloatArray | None, str]:

@@ -21,7 +21,7 @@ ENOUGH_PHOTOGRAPHS = 5
 TIED_POINTS = 15  # that two photographs share, as SfM demands of a pair
 _CELLS = 120  # along the longer side
 _RIM = 0.01  # fraction of the scene's points outside the raster on each side
-_FARTHEST_CELLS = 2.0  # distance from a point of the scene beyond which there is no scene
+_FARTHEST_CELLS = 6.0  # distance from a point of the scene beyond which there is no scene
 _MOST_LINKS = 4000  # that are drawn
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
+from typing import Any
 
 from pipelines.core.cautions import Caution
 from pipelines.core.errors import InputError
-from pipelines.core.options import flag_name
+from pipelines.core.options import flag_name, notation
 from pipelines.core.stages import BY_NAME, StageSpec
 from pipelines.core.staleness import cautions_by_stage, status
 from pipelines.core.workspace import Workspace
@@ -93,10 +95,6 @@ def _stage(workspace: Workspace, spec: StageSpec, state: str, reason: str) -> tu
         manifest = None
     if manifest is None:
         return StageRecord(spec.name, state, reason, None, None, "", {}, {}, ()), {}
-    fields = spec.options.model_fields
-    options = {
-        flag_name(spec.options, name): _notation(value) for name, value in manifest.config.items() if name in fields
-    }
     record = StageRecord(
         name=spec.name,
         state=state,
@@ -104,22 +102,29 @@ def _stage(workspace: Workspace, spec: StageSpec, state: str, reason: str) -> tu
         made=manifest.finished,
         duration_s=manifest.duration_s,
         key_figure=manifest.key_figure,
-        options=options,
+        options=_options(spec, manifest.config),
         inputs=manifest.inputs,
         warnings=tuple(manifest.warnings),
     )
     return record, manifest.versions
 
 
+def _options(spec: StageSpec, config: Mapping[str, Any]) -> dict[str, str]:
+    """Return the recorded options of a stage by flag, as users write their values."""
+    try:
+        options = spec.options.model_validate(config)
+    except ValueError:  # of a version with other options
+        return {name: _notation(value) for name, value in config.items()}
+    fields = type(options).model_fields
+    return {flag_name(spec.options, name): _notation(getattr(options, name)) for name in fields}
+
+
 def _notation(value: object) -> str:
-    """Return the value of an option in a manifest, as a reader of the report understands it."""
     if value is None:
         return "not given"
     if isinstance(value, bool):
         return "yes" if value else "no"
-    if isinstance(value, list):
-        return ", ".join(_notation(part) for part in value) or "none"
-    return f"{value:.10g}" if isinstance(value, float) else str(value)
+    return notation(value) or "none"
 
 
 def _versions(by_version: dict[str, list[str]]) -> str:

@@ -23,6 +23,7 @@ REPROJECTION_PX = (1.0, 2.0)
 FIX_OUTLIERS = (0.05, 0.20)  # share of the fixes
 CONTROL_POINTS = (4, 3)
 NORMALISED = (2.0, 4.0)  # mean of the squared normalised errors
+CAUTIOUS = 0.5  # mean of the squared normalised errors, below which σ are larger than they need be
 TEST_PSNR_DB = (22.0, 18.0)
 
 
@@ -242,7 +243,9 @@ def _prediction(errors: CheckPointErrors) -> Verdict:
     worst = max(known)
     level = level_of(worst, NORMALISED, more_is_better=False)
     reason = (
-        "the predicted σ may be relied on"
+        "the stated σ are cautious: errors are smaller than predicted"
+        if worst < CAUTIOUS
+        else "the predicted σ may be relied on"
         if level == "good"
         else "errors are larger than predicted: control points, marks or the datum may be at fault"
     )
