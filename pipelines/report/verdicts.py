@@ -184,26 +184,20 @@ def _control(measured: Measured) -> Verdict:
 
 
 def _stated_sigma(factors: tuple[VarianceFactor, ...]) -> Verdict:
-    rule = "good if every tested group passed, fair if σ had to be widened"
+    rule = "good if the σ of every tested group passed, fair if the data changed one"
     tested = [factor for factor in factors if factor.estimated is not None]
     if not tested:
-        return Verdict("Stated σ", "unknown", "not tested", "there is no redundancy to test the σ with", rule)
-    widened = [factor.group for factor in tested if factor.applied != 1.0]
-    if widened:
         return Verdict(
-            "Stated σ",
-            "fair",
-            f"widened: {', '.join(widened)}",
-            "the data refute the stated σ",
-            rule,
+            "σ of the measurements", "unknown", "not tested", "there is no redundancy to test them with", rule
         )
-    return Verdict(
-        "Stated σ",
-        "good",
-        f"passed: {', '.join(factor.group for factor in tested)}",
-        "residuals agree with the stated σ",
-        rule,
-    )
+    changed = [factor for factor in tested if factor.applied != 1.0]
+    if changed:
+        reading = ", ".join(f"{factor.group}: variance × {number(factor.applied)}" for factor in changed)
+        refuted = any(factor.sigma_source == "stated" for factor in changed)
+        reason = "the data refute a stated σ" if refuted else "nobody stated these σ: the data gave them"
+        return Verdict("σ of the measurements", "fair", reading, reason, rule)
+    passed = ", ".join(factor.group for factor in tested)
+    return Verdict("σ of the measurements", "good", f"passed: {passed}", "residuals agree with the σ", rule)
 
 
 def _check_points(measured: Measured, errors: CheckPointErrors) -> Verdict:
@@ -263,7 +257,7 @@ def _blunders(errors: CheckPointErrors) -> Verdict:
     if not errors.count:
         return Verdict("Blunders", "unknown", "no check points measured", "nothing to look for", rule)
     if errors.blunders:
-        reason = "look at their image chips: a mark or a coordinate is wrong"
+        reason = "look at their image chips: a mark or a coordinate may be wrong"
         return Verdict("Blunders", "fair", listed(errors.blunders), reason, rule)
     return Verdict("Blunders", "good", "none", "no check point stands out", rule)
 

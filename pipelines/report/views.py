@@ -165,18 +165,15 @@ def read_metrics(path: Path) -> list[dict[str, float]]:
         InputError: too large, not text, or a line is no JSON object of numbers.
     """
     file_size(path, limit_bytes=_MOST_METRICS_BYTES, kind="file of metrics")
-    rows = []
+    rows, lines = [], 0
     try:
         for line in path.read_text(encoding="utf-8").splitlines():
-            if not line.endswith("}"):
-                continue
-            row = json.loads(line)
-            rows.append({name: float(value) for name, value in row.items()})
-            _ = rows[-1]["iteration"]
-    except (ValueError, TypeError, KeyError, RecursionError, OverflowError) as error:
-        raise InputError(
-            f"line {len(rows) + 1} is no row of metrics: run `georef train --force`", path=path
-        ) from error
+            lines += 1
+            if line.endswith("}"):
+                row = {name: float(value) for name, value in json.loads(line).items()}
+                rows.append(row | {"iteration": row["iteration"]})
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError) as error:
+        raise InputError(f"line {lines} is no row of metrics: run `georef train --force`", path=path) from error
     return rows
 
 
