@@ -76,6 +76,8 @@ HOMES: dict[str, tuple[str, ...]] = {
     "rasterio": ("pipelines.formats",),
     "pyogrio": ("pipelines.formats",),
     "ezdxf": ("pipelines.formats",),
+    "viser": ("pipelines.view",),
+    "websockets": ("pipelines.view",),
 }
 # The entry point of a process whose log records go to its parent.
 CHILD = "pipelines.core.child"
