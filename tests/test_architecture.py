@@ -47,6 +47,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
         "pipelines.sfm",
         "pipelines.simulate",
         "pipelines.train",
+        "pipelines.view",
     ),
     ("georef_cli",),
 )

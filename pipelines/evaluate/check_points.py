@@ -23,7 +23,7 @@ from pipelines.robust.statistics import residual_stats
 from pipelines.scene.fix_differences import fix_differences
 from pipelines.scene.marks import MarkRays, mark_rays
 from pipelines.scene.points_by_camera import points_by_camera
-from pipelines.scene.points_by_model import DepthMap, points_by_model
+from pipelines.scene.points_by_model import DepthMap, depth_around, points_by_model
 from pipelines.scene.renderer import ModelRenderer
 from pipelines.scene.report import (
     CheckPointErrors,
@@ -106,13 +106,12 @@ def _by_model(renderer: ModelRenderer, rays: MarkRays, progress: Progress) -> Ch
     return check_point_errors(_compared(points, position, rays))
 
 
-def _depth_maps(renderer: ModelRenderer, rays: MarkRays, progress: Progress) -> dict[int, DepthMap]:
-    """Return the depth of the surface, by camera, for the cameras that show a mark."""
-    maps = {}
-    cameras = sorted({int(index) for index in rays.camera})
-    with progress.task("depth maps", len(cameras)) as task:
-        for index in cameras:
-            maps[index] = DepthMap(renderer.pinhole(index), renderer.depth_m(index))
+def _depth_maps(renderer: ModelRenderer, rays: MarkRays, progress: Progress) -> list[DepthMap]:
+    """Return the depth of the surface around each mark."""
+    maps = []
+    with progress.task("depth at marks", len(rays)) as task:
+        for camera, xy in zip(rays.camera, rays.xy, strict=True):
+            maps.append(depth_around(renderer, int(camera), xy))
             task.advance()
     return maps
 

@@ -6,7 +6,7 @@ measures other points.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +15,9 @@ from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.geometry.cameras import Pinhole
 from pipelines.robust.statistics import spatial_median
 from pipelines.scene.marks import MarkRays
+from pipelines.scene.renderer import ModelRenderer
 from pipelines.scene.trained_survey import TrainedSurvey
+from pipelines.splat.rasterizer.api import Window
 
 REACH_PX = 1  # around the pixel of a mark
 LEAST_VIEWS = 2  # that must show a point
@@ -104,17 +106,40 @@ class SurfaceHits:
         return unbroken if len(unbroken) >= LEAST_VIEWS else rows
 
 
-def surface_hits(trained: TrainedSurvey, rays: MarkRays, maps: Mapping[int, DepthMap]) -> SurfaceHits:
+def depth_around(renderer: ModelRenderer, camera: int, xy: FloatArray, reach_px: int = REACH_PX) -> DepthMap:
+    """Return the depth within some pixels of a ray; empty if the ray misses the image.
+
+    Everybody who measures renders the same small windows. Where the Gaussians of a pixel nearly lie on one surface,
+    rounding decides how its depth is taken, and another window would round in another way.
+
+    Args:
+        renderer: of the trained model.
+        camera: index of the camera.
+        xy: (2,) x/z and y/z of the ray.
+        reach_px: pixels to each side of the ray's.
+    """
+    pose = renderer.pose(camera)
+    pinhole = pose.pinhole
+    place = np.floor([pinhole.fx * xy[0] + pinhole.cx, pinhole.fy * xy[1] + pinhole.cy])
+    column, row = np.clip(place, -reach_px - 1, [pinhole.width + reach_px, pinhole.height + reach_px]).astype(int)
+    left, top = max(int(column) - reach_px, 0), max(int(row) - reach_px, 0)
+    width = min(int(column) + reach_px + 1, pinhole.width) - left
+    height = min(int(row) + reach_px + 1, pinhole.height) - top
+    if width < 1 or height < 1:
+        return DepthMap(pinhole, np.zeros((0, 0)))
+    return DepthMap(pinhole, renderer.depth_from(pose, Window(left, top, width, height)), left, top)
+
+
+def surface_hits(trained: TrainedSurvey, rays: MarkRays, maps: Sequence[DepthMap]) -> SurfaceHits:
     """Return where the rays of marks meet the surface of their own views.
 
     Args:
         trained: the trained model.
-        rays: of the marks.
-        maps: by camera, the depth around its marks.
+        rays: of K marks.
+        maps: K, the depth around each mark in its view.
     """
     position, at_edge = np.full((len(rays), 3), np.nan), np.zeros(len(rays), dtype=bool)
-    for row, (camera, xy) in enumerate(zip(rays.camera, rays.xy, strict=True)):
-        view = maps[int(camera)]
+    for row, (camera, xy, view) in enumerate(zip(rays.camera, rays.xy, maps, strict=True)):
         depth = view.depth_at(xy)
         if depth > 0:
             in_cam = depth * np.append(xy, 1.0)
@@ -125,7 +150,7 @@ def surface_hits(trained: TrainedSurvey, rays: MarkRays, maps: Mapping[int, Dept
     return SurfaceHits(position, at_edge)
 
 
-def points_by_model(trained: TrainedSurvey, rays: MarkRays, maps: Mapping[int, DepthMap]) -> FloatArray:
+def points_by_model(trained: TrainedSurvey, rays: MarkRays, maps: Sequence[DepthMap]) -> FloatArray:
     """Return the points (J, 3) in `geo` at which the model's surface lies behind their marks.
 
     The result is the spatial median of the views that count (`SurfaceHits.counted`); NaN for a point with fewer
@@ -133,8 +158,8 @@ def points_by_model(trained: TrainedSurvey, rays: MarkRays, maps: Mapping[int, D
 
     Args:
         trained: the trained model.
-        rays: of the marks of J points.
-        maps: by camera, the depth around its marks.
+        rays: K marks of J points.
+        maps: K, the depth around each mark in its view.
     """
     hits = surface_hits(trained, rays, maps)
     middle = np.full((len(rays.point_id), 3), np.nan)

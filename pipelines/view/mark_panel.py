@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import threading
 from collections.abc import Callable
 from dataclasses import replace
@@ -28,7 +27,7 @@ from pipelines.view.measuring import MeasuringModel
 from pipelines.view.photo_view import PhotoView
 from pipelines.view.signs import Signs
 from pipelines.view.surface_points import SurfacePoint
-from pipelines.view.tables import PlaceRow, mark_table, place_table
+from pipelines.view.tables import PlaceRow, mark_table, paragraph, place_table
 
 if TYPE_CHECKING:
     import viser
@@ -190,12 +189,11 @@ class MarkPanel:
         if not files:
             self._tell("No point has both coordinates and marks: nothing to write.")
             return
-        names = ", ".join(html.escape(str(file)) for file in files)
-        heights = html.escape(self._model.target.crs.vertical.name)
-        self._result.content = f'<p data-written="yes">Written: {names}. Heights: {heights}.</p>'
+        names, heights = ", ".join(map(str, files)), self._model.target.crs.vertical.name
+        self._result.content = paragraph(f"Written: {names}. Heights: {heights}.", mark="written")
 
     def _tell(self, sentence: str) -> None:
-        self._result.content = f"<p>{html.escape(sentence)}</p>"
+        self._result.content = paragraph(sentence)
 
     def _show(self) -> None:
         """Show the chosen point: its marks, what they give, and where it must appear in the photograph."""
@@ -216,7 +214,7 @@ class MarkPanel:
                 errors = residuals_px(place, rays, self._model.trained)
                 residuals = {self._names[camera]: error for camera, error in zip(rays.camera, errors, strict=True)}
             camera = self._photo.camera
-            shown = "" if camera is None else f"<p>Shown: {html.escape(self._names[camera])}</p>"
+            shown = "" if camera is None else paragraph(f"Shown: {self._names[camera]}")
             places = place_table(self._model.target, rows, marked="marked") if rows else ""
             self._result.content = shown + places + mark_table(point.marks, residuals)
 

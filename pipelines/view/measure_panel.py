@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -26,7 +25,7 @@ from pipelines.view.saved import (
 )
 from pipelines.view.signs import Signs
 from pipelines.view.surface_points import NoSurface, Sight, SurfacePoint
-from pipelines.view.tables import PlaceRow, place_table, quantity_table, quantity_text, saved_table
+from pipelines.view.tables import PlaceRow, paragraph, place_table, quantity_table, quantity_text, saved_table
 
 if TYPE_CHECKING:
     import viser
@@ -117,6 +116,11 @@ class MeasurePanel:
         with self._lock:
             self._add(point, "")
 
+    def refresh(self) -> None:
+        """Show the present measurement anew, after σ have become known."""
+        with self._lock:
+            self._compute()
+
     def _add(self, point: SurfacePoint | NoSurface, note: str) -> None:
         if isinstance(point, NoSurface):
             self._tell(f"Nothing measured: {point.reason}.")
@@ -160,7 +164,7 @@ class MeasurePanel:
         rows = [PlaceRow("surveyed", np.array(point.position_in_geo), np.sqrt(np.diag(point.cov_in_geo)))]
         if np.isfinite(camera).all():
             rows.append(PlaceRow("by camera", camera, None if cov is None else np.sqrt(np.diag(cov))))
-        title = f"<p><b>{html.escape(point.name)}</b>, {len(rays)} marks; below by model</p>"
+        title = paragraph(f"{point.name}: {len(rays)} marks; below, by model")
         return title + place_table(self._model.target, rows)
 
     def _described(self, note: str) -> str:
@@ -176,22 +180,26 @@ class MeasurePanel:
         return (
             note
             + place_table(self._model.target, rows, marked="measured")
-            + f"<p>photographs that agree: {views}</p>"
+            + paragraph(f"photographs that agree: {views}")
             + quantity_table(self._quantities)
             + self._without_sigma()
         )
 
     def _hint(self) -> str:
-        crs = html.escape(f"{self._model.target.crs.name}, heights: {self._model.target.crs.vertical.name}")
-        assumed = "".join(f"<br>assumed: {html.escape(text)}" for text in self._model.target.assumed)
-        return f"<p>Click in the scene, or on the sign of a surveyed point.</p><p>Coordinates: {crs}{assumed}</p>"
+        crs = self._model.target.crs
+        lines = [
+            "Click in the scene, or on the sign of a surveyed point.",
+            f"Coordinates: {crs.name}; heights: {crs.vertical.name}.",
+            *(f"Assumed: {text}." for text in self._model.target.assumed),
+        ]
+        return "".join(map(paragraph, lines))
 
     def _without_sigma(self) -> str:
         reason = self._model.without_sigma
-        return f"<p>No σ is stated: {html.escape(reason)}.</p>" if reason else ""
+        return paragraph(f"No σ is stated: {reason}.") if reason else ""
 
     def _tell(self, sentence: str) -> None:
-        self._result.content = f"<p>{html.escape(sentence)}</p>"
+        self._result.content = paragraph(sentence)
 
     def take_back(self) -> None:
         """Take the last point of the measurement back."""

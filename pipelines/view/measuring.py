@@ -65,7 +65,6 @@ class MeasuringModel:
     Attributes:
         trained: the trained survey.
         target: the CRS.
-        without_sigma: why no σ is stated; empty: it is.
     """
 
     def __init__(self, workspace: Workspace, renderer: ModelRenderer, crs: CrsOptions) -> None:
@@ -73,19 +72,30 @@ class MeasuringModel:
         survey = self.trained.survey
         centers = self.trained.geo_from_model.apply(self.trained.poses.cam_center_in_model)
         self.target: TargetCrs = usable_crs(crs, survey.origin, centers, survey.vertical)
-        self._propagation: ErrorPropagation | NoErrorPropagation = propagate_errors(workspace, self.trained)
-        self.without_sigma = ""
-        if not is_checked(self.trained.model.cautions):
-            self.without_sigma = "nothing checks the σ of the positions"
-        elif isinstance(self._propagation, NoErrorPropagation):
-            self.without_sigma = self._propagation.reason
+        self._workspace = workspace
+        self._propagated: ErrorPropagation | NoErrorPropagation = NoErrorPropagation("it is being computed")
+
+    def propagate_errors(self) -> None:
+        """Compute the covariances of the model; no σ is stated before. With many cameras it takes a while.
+
+        Raises:
+            MissingProductError: init-sim3 has not been run.
+            InputError: a product is damaged.
+        """
+        if is_checked(self.trained.model.cautions):
+            self._propagated = propagate_errors(self._workspace, self.trained)
+        else:
+            self._propagated = NoErrorPropagation("nothing checks the σ of the positions")
 
     @property
     def propagation(self) -> ErrorPropagation | None:
         """Covariances of the model; None: none are stated."""
-        return (
-            None if self.without_sigma or isinstance(self._propagation, NoErrorPropagation) else self._propagation
-        )
+        return None if isinstance(self._propagated, NoErrorPropagation) else self._propagated
+
+    @property
+    def without_sigma(self) -> str:
+        """Why no σ is stated; empty: it is."""
+        return self._propagated.reason if isinstance(self._propagated, NoErrorPropagation) else ""
 
     def under(self, sight: Sight) -> SurfacePoint | NoSurface:
         """Return the point of the surface under a line of sight."""

@@ -11,7 +11,7 @@ from pipelines.core.types import FloatArray
 from pipelines.geometry.rotations import rotation_towards
 from pipelines.scene.trained_survey import TrainedSurvey
 from pipelines.view.pictures import Blend
-from pipelines.view.signs import wxyz_of
+from pipelines.view.signs import Signs, wxyz_of
 from pipelines.view.view_frame import ViewFrame
 
 if TYPE_CHECKING:
@@ -31,6 +31,7 @@ class PhotoView:
         server: of the viewer.
         trained: the trained survey.
         frame: of the viewer.
+        signs: of the scene, hidden while a photograph is shown.
         changed: called when the pictures of the pages must be drawn anew.
 
     Attributes:
@@ -39,9 +40,15 @@ class PhotoView:
     """
 
     def __init__(
-        self, server: viser.ViserServer, trained: TrainedSurvey, frame: ViewFrame, changed: Callable[[], None]
+        self,
+        server: viser.ViserServer,
+        trained: TrainedSurvey,
+        frame: ViewFrame,
+        signs: Signs,
+        changed: Callable[[], None],
     ) -> None:
-        self._server, self._trained, self._frame, self._changed = server, trained, frame, changed
+        self._server, self._trained, self._frame, self._signs = server, trained, frame, signs
+        self._changed = changed
         self.camera: int | None = None
         self.share = 1.0
         self._is_close = False
@@ -59,6 +66,7 @@ class PhotoView:
     def show(self, camera: int) -> None:
         """Show a photograph whole: all pages fly there."""
         self.camera, self._is_close = camera, False
+        self._signs.hide_all(hidden=True)  # they would cover what is to be marked
         for client in self._server.get_clients().values():
             self._stand(client, None, self._whole_fov(client, camera))
         self._changed()
@@ -71,6 +79,7 @@ class PhotoView:
     def leave(self) -> None:
         """Show no photograph any more."""
         self.camera = None
+        self._signs.hide_all(hidden=False)
         self._clear()
         self._changed()
 

@@ -28,7 +28,7 @@ _MOST_FRUSTUMS = 400  # cameras with a frustum to click on; of more, only the pl
 # In units of the viewer; the scene's radius is 10.
 CAMERA_SIZE, SIGN_RADIUS, _POINT_SIZE = 0.15, 0.06, 0.012
 _SNAP_PX = 6.0  # of a click, around a sign
-_LENGTH = 0.35  # of the longest error arrow, in units of the viewer
+_LENGTH = 0.7  # of the longest error arrow, in units of the viewer
 
 
 def rgb(colour: str) -> tuple[int, int, int]:
@@ -67,6 +67,8 @@ class Signs:
         self._centers = frame.view_from_model.apply(trained.poses.cam_center_in_model)
         self._named: dict[str, FloatArray] = {}
         self._groups = {kind: self._scene.add_frame(f"/{kind}", show_axes=False) for kind in KINDS}
+        self._wanted = dict.fromkeys(KINDS, True)
+        self._hidden = False
 
     def place(self, point_in_geo: FloatArray) -> FloatArray:
         """Return places (…, 3) in the viewer's frame."""
@@ -75,7 +77,14 @@ class Signs:
 
     def show(self, kind: Kind, visible: bool) -> None:
         """Show or hide the signs of a kind."""
-        self._groups[kind].visible = visible
+        self._wanted[kind] = visible
+        self._groups[kind].visible = visible and not self._hidden
+
+    def hide_all(self, *, hidden: bool) -> None:
+        """Hide all signs for a while, or show again those that are wanted."""
+        self._hidden = hidden
+        for kind, wanted in self._wanted.items():
+            self.show(kind, wanted)
 
     def hit(self, start: FloatArray, direction: FloatArray, pixel_rad: float) -> Hit | None:
         """Return the sign that a line of sight meets, the nearest to its start; None: it meets none.
@@ -142,7 +151,7 @@ class Signs:
             (self.place(e.surveyed), self.place(e.surveyed + enlarged * (e.measured - e.surveyed))) for e in known
         ]
         self._scene.add_arrows(
-            "/errors/all", np.array(ends), rgb(ORANGE), shaft_radius=0.008, head_radius=0.02, head_length=0.05
+            "/errors/all", np.array(ends), rgb(ORANGE), shaft_radius=0.015, head_radius=0.04, head_length=0.1
         )
         return enlarged
 

@@ -16,7 +16,7 @@ from pipelines.geometry.cameras import Pinhole
 from pipelines.geometry.rotations import rotation_towards
 from pipelines.robust.statistics import spatial_median
 from pipelines.scene.marks import MarkRays
-from pipelines.scene.points_by_model import LEAST_VIEWS, REACH_PX, DepthMap, surface_hits
+from pipelines.scene.points_by_model import LEAST_VIEWS, DepthMap, depth_around, surface_hits
 from pipelines.scene.renderer import ModelRenderer, ViewPose
 from pipelines.splat.rasterizer.api import Window
 
@@ -103,7 +103,8 @@ class SurfaceReader:
             return NoSurface("nothing of the model lies under this pixel")
         cameras = self._most_detailed(sight.at(first))
         views = {
-            camera: self._window(camera, self._slope(camera, sight.at(first)), _WINDOW_PX) for camera in cameras
+            camera: depth_around(self._renderer, camera, self._slope(camera, sight.at(first)), _WINDOW_PX)
+            for camera in cameras
         }
         unbroken: list[tuple[float, int]] = []
         at_edge: list[tuple[float, int]] = []
@@ -128,10 +129,9 @@ class SurfaceReader:
         Args:
             rays: marks of a single point.
         """
-        maps = {
-            int(camera): self._window(int(camera), xy, REACH_PX)
-            for camera, xy in zip(rays.camera, rays.xy, strict=True)
-        }
+        maps = [
+            depth_around(self._renderer, int(camera), xy) for camera, xy in zip(rays.camera, rays.xy, strict=True)
+        ]
         hits = surface_hits(self._trained, rays, maps)
         counted = hits.counted(np.arange(len(rays)))
         if len(counted) < LEAST_VIEWS:
@@ -172,17 +172,6 @@ class SurfaceReader:
         """Return x/z and y/z (2,) of a place before a camera."""
         x, y, z = self._in_cam(camera, place)
         return np.array([x / z, y / z])
-
-    def _window(self, camera: int, slope: FloatArray, reach: int) -> DepthMap:
-        """Return the depth within some pixels of a ray; empty if the ray misses the image."""
-        pose = self._renderer.pose(camera)
-        pinhole = pose.pinhole
-        column, row = int(pinhole.fx * slope[0] + pinhole.cx), int(pinhole.fy * slope[1] + pinhole.cy)
-        left, top = max(column - reach, 0), max(row - reach, 0)
-        width, height = min(column + reach + 1, pinhole.width) - left, min(row + reach + 1, pinhole.height) - top
-        if width < 1 or height < 1:
-            return DepthMap(pinhole, np.zeros((0, 0)))
-        return DepthMap(pinhole, self._renderer.depth_from(pose, Window(left, top, width, height)), left, top)
 
     def _looks_through(self, view: DepthMap, camera: int, place: FloatArray) -> bool:
         """Return whether the surface of a view lies behind a place."""

@@ -10,6 +10,7 @@ from pipelines.core.types import FloatArray
 from pipelines.scene.target_crs import TargetCrs
 from pipelines.view.quantities import Quantity
 
+_TEXT = "font-size:0.85em;margin:0.4em 0.8em"
 _TABLE = "width:100%;font-size:0.8em;border-spacing:0.3em 0.1em;font-variant-numeric:tabular-nums;text-align:right"
 
 
@@ -20,6 +21,11 @@ class PlaceRow:
     name: str
     position_in_geo: FloatArray
     sigma_m: FloatArray | None
+
+
+def paragraph(text: str, mark: str = "note") -> str:
+    """Return a paragraph; `data-…` of the name `mark` lets scripts find it."""
+    return f'<p data-{mark}="yes" style="{_TEXT}">{html.escape(text)}</p>'
 
 
 def place_table(target: TargetCrs, rows: Sequence[PlaceRow], marked: str = "place") -> str:

@@ -30,6 +30,7 @@ from pipelines.view.photo_view import PhotoView
 from pipelines.view.picture_loop import PictureLoop, camera_of
 from pipelines.view.pictures import Painter, Photographs
 from pipelines.view.signs import Kind, PointColour, PointError, Signs
+from pipelines.view.tables import paragraph
 from pipelines.view.view_frame import ViewFrame, frame_of
 
 if TYPE_CHECKING:
@@ -74,13 +75,28 @@ class Viewer:
         self._loops: dict[int, PictureLoop] = {}
         self._lock = threading.Lock()
         self.signs = Signs(server, trained, self.frame)
-        self.photo = PhotoView(server, trained, self.frame, self.wake)
+        self.photo = PhotoView(server, trained, self.frame, self.signs, self.wake)
         self._build(workspace, workspace.root / FOLDER)
         server.scene.on_click()(self._clicked)
+        # No picture should wait for it.
+        self._solving = threading.Thread(target=self._propagate_errors, daemon=True)
+        self._solving.start()
         server.on_client_connect(self._connected)
         server.on_client_disconnect(self._left)
         for client in server.get_clients().values():
             self._connected(client)
+
+    def _propagate_errors(self) -> None:
+        try:
+            self.model.propagate_errors()
+        except GeorefError as error:
+            self.tell(f"No σ is stated: {error}")
+        self.measuring.refresh()
+        self._colour_points()
+
+    def wait_for_sigma(self) -> None:
+        """Wait until σ are computed."""
+        self._solving.join()
 
     def _build(self, workspace: Workspace, folder: Path) -> None:
         gui, trained = self._server.gui, self.model.trained
@@ -133,17 +149,18 @@ class Viewer:
         try:
             report = read_report(workspace.path(REPORT))
         except GeorefError:
-            return "<p>No errors are shown: <code>georef evaluate</code> measures them.</p>"
+            return paragraph("No errors are shown: `georef evaluate` measures them.")
         enlarged = self.signs.add_errors(point_errors(self.model, report))
-        return f"<p>Arrows: error by camera, × {enlarged:g}. Orange: control and test views.</p>"
+        return paragraph(f"Arrows: error by camera, × {enlarged:g}. Orange: control points and test views.")
 
     def _colour_points(self) -> None:
-        propagation = self.model.propagation
-        grid: AccuracyGrid | None = None if propagation is None else propagation.grid
+        grid: AccuracyGrid | None = None
+        if self._colour.value != "of the photographs" and self.model.propagation is not None:
+            grid = self.model.propagation.grid
         limits = self.signs.add_points(self._colour.value, grid)
         if limits is not None:
             low, high = limits
-            self._legend.content = f"<p>σ of the SfM points: dark {low:.3f} m, bright {high:.3f} m</p>"
+            self._legend.content = paragraph(f"σ of the SfM points: dark {low:.3f} m, bright {high:.3f} m")
 
     def _blend(self, share: float) -> None:
         self.photo.share = float(share)
@@ -214,7 +231,7 @@ class Viewer:
 
     def tell(self, sentence: str) -> None:
         """Show a sentence above the panels of all pages."""
-        self._notice.content = f'<p data-notice="yes"><b>{sentence}</b></p>'
+        self._notice.content = paragraph(sentence, mark="notice")
 
     def add_reload(self, act: Callable[[], None]) -> None:
         """Offer to read the model again."""
