@@ -41,7 +41,9 @@ def run(stage: StageRun, options: ReportOptions) -> Summary:
     """
     if options.pdf:
         chromium_path()  # a missing browser is told before the work begins
-    evaluated = load_evaluated(stage.workspace, options)
+    with stage.progress.task("covariances of cameras and lenses", 1) as task:
+        evaluated = load_evaluated(stage.workspace, options)
+        task.advance()
     page = report_page(evaluated, options, stage)
     html = stage.out / REPORT_PAGE.rpartition("/")[2]
     write_page(page, _ROOM, html)
