@@ -60,8 +60,8 @@ class CamerasFacts:
     """Positions of the photographs.
 
     Attributes:
-        photographs: number in the survey, and of those that SfM has registered.
-        registered: number of those.
+        photographs: number in the survey.
+        registered: number of those in the SfM model.
         unregistered: names of the others.
         fixes: number of registered photographs with a fix.
         map: adjusted positions, with arrows and ellipses.

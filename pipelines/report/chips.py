@@ -37,7 +37,7 @@ class WantedChip:
 
     owner: tuple[str, str]
     image: int
-    mark: Pixel | None
+    mark: Pixel
     adjusted: Pixel | None
     surveyed: Pixel | None
 
@@ -85,8 +85,7 @@ def cut_chips(
             name = sparse.image_name[image]
             photograph = _photograph(evaluated, name)
             for chip in of_image:
-                if chip.mark is not None:
-                    chips[chip.owner].append(_cut(photograph, name, chip, side))
+                chips[chip.owner].append(_cut(photograph, name, chip, side))
             task.advance()
     return {owner: tuple(mine) for owner, mine in chips.items()}, side
 
@@ -105,7 +104,6 @@ def _photograph(evaluated: EvaluatedSurvey, name: str) -> ByteArray:
 
 def _cut(photograph: ByteArray, name: str, wanted: WantedChip, side: int) -> Chip:
     """Return the piece around a mark; what lies outside the photograph is black."""
-    assert wanted.mark is not None
     corner = np.floor(np.array(wanted.mark) - side / 2).astype(int)
     piece = np.zeros((side, side, 3), dtype=np.uint8)
     height, width = photograph.shape[:2]
@@ -120,14 +118,13 @@ def _cut(photograph: ByteArray, name: str, wanted: WantedChip, side: int) -> Chi
         x, y = (np.array(pixel) - corner).tolist()
         return (x, y) if 0 <= x <= side and 0 <= y <= side else None
 
-    mark = inside(wanted.mark)
-    assert mark is not None
+    x_px, y_px = (np.array(wanted.mark) - corner).tolist()
     distance = None if wanted.adjusted is None else float(np.hypot(*np.subtract(wanted.adjusted, wanted.mark)))
     return Chip(
         image=name,
         picture=picture_of(np.asarray(shown)),
         side_px=side,
-        mark=mark,
+        mark=(x_px, y_px),
         adjusted=inside(wanted.adjusted),
         surveyed=inside(wanted.surveyed),
         distance_px=distance,

@@ -208,7 +208,8 @@ def _covariance(evaluated: EvaluatedSurvey) -> tuple[FloatArray | None, str]:
     if not isinstance(evaluated.propagation, ErrorPropagation):
         return None, evaluated.propagation.reason
     covariance = evaluated.propagation.prediction.of_lens()
-    return covariance, "" if covariance is not None else "the training held cameras and lens"
+    reason = "the training held the lens, or there are too many cameras to adjust them together"
+    return covariance, "" if covariance is not None else reason
 
 
 def _sigma_px(evaluated: EvaluatedSurvey) -> float | None:

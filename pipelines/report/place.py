@@ -39,7 +39,7 @@ class PlaceFacts:
         crs, heights: names of CRS and vertical datum.
         operation: between WGS84 and the CRS, with its accuracy where that is published.
         operation_accuracy_m: None: not known.
-        recorded_crs, recorded_heights: of the survey's input; whether the datum was stated.
+        recorded_crs, recorded_heights: of the survey's input.
         heights_stated: whether the input stated its datum.
         assumed: what nobody stated of the CRS of the report.
         ground_size_m: extent of the scene along east and north.

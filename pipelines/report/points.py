@@ -123,11 +123,12 @@ def _wanted(evaluated: EvaluatedSurvey, group: _Group, each: int) -> list[Wanted
     for index, point in enumerate(group.points):
         marks = np.flatnonzero(rays.point == index)
         for mark in marks[np.argsort(-popular[rays.camera[marks]], kind="stable")][:each]:
+            x_px, y_px = rays.xy_px[mark].tolist()
             chips.append(
                 WantedChip(
                     (group.kind, point.name),
                     int(rays.camera[mark]),
-                    _pair(rays.xy_px[mark]),
+                    (x_px, y_px),
                     _pair(adjusted[mark]),
                     _pair(on_survey[mark]),
                 )

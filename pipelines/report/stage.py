@@ -24,7 +24,7 @@ from pipelines.report.overlap import overlap_facts
 from pipelines.report.place import place_facts
 from pipelines.report.points import points_facts
 from pipelines.report.record import record_facts
-from pipelines.report.summary import summary_facts
+from pipelines.report.summary import SummaryFacts, summary_facts
 from pipelines.report.views import previews_facts, training_facts, views_facts
 
 _ROOM = __name__.rpartition(".")[0]
@@ -44,26 +44,25 @@ def run(stage: StageRun, options: ReportOptions) -> Summary:
     with stage.progress.task("covariances of cameras and lenses", 1) as task:
         evaluated = load_evaluated(stage.workspace, options)
         task.advance()
-    page = report_page(evaluated, options, stage)
+    page, summary = report_page(evaluated, options, stage)
     html = stage.out / REPORT_PAGE.rpartition("/")[2]
     write_page(page, _ROOM, html)
     if options.pdf:
         with stage.progress.task("PDF") as task:
             print_pdf(html, html.with_suffix(".pdf"))
             task.advance()
-    cautions = _cautions(evaluated)
-    levels = [verdict.level for verdict in page.sections[0].facts.verdicts]  # type: ignore[attr-defined]
+    levels = [verdict.level for verdict in summary.verdicts]
     counts = {level: levels.count(level) for level in ("good", "fair", "poor", "unknown")}
     size_mb = html.stat().st_size / 1e6
     return Summary(
         f"{', '.join(f'{count} {level}' for level, count in counts.items() if count)}; {size_mb:.1f} MB",
         {**counts, "bytes": html.stat().st_size, "pdf": options.pdf, "crs": evaluated.crs.crs.name},
-        cautions=cautions,
+        cautions=_cautions(evaluated),
     )
 
 
-def report_page(evaluated: EvaluatedSurvey, options: ReportOptions, stage: StageRun) -> Page:
-    """Return the content of the report.
+def report_page(evaluated: EvaluatedSurvey, options: ReportOptions, stage: StageRun) -> tuple[Page, SummaryFacts]:
+    """Return the content of the report, and its summary.
 
     Args:
         evaluated: the survey.
@@ -92,7 +91,7 @@ def report_page(evaluated: EvaluatedSurvey, options: ReportOptions, stage: Stage
         record = record_facts(workspace, survey)
         task.advance(note="record")
     summary = summary_facts(evaluated, _cautions(evaluated), overlap, lenses, record)
-    return Page(
+    page = Page(
         title=f"Survey report: {workspace.root.name}",
         subtitle="Georeferenced 3D Gaussian splat, with its measured and predicted accuracy",
         about={
@@ -118,6 +117,7 @@ def report_page(evaluated: EvaluatedSurvey, options: ReportOptions, stage: Stage
         ),
         document=evaluated.document,
     )
+    return page, summary
 
 
 def _cautions(evaluated: EvaluatedSurvey) -> tuple[Caution, ...]:
