@@ -105,9 +105,8 @@ def movement_plan(
     axes.scatter(center_m[:, 0], center_m[:, 1], s=5, color=DARK, zorder=3, label="adjusted position")
     known = np.isfinite(moved_m).all(axis=1)
     arrow_factor = ellipse_factor = None
-    sized = (
-        known & ~is_outlier if (known & ~is_outlier).any() else known
-    )  # the arrow of a blunder may leave the map
+    used = known & ~is_outlier
+    sized = used if used.any() else known  # the arrow of an outlier may leave the map
     largest = float(np.linalg.norm(moved_m[sized], axis=1).max()) if known.any() else 0.0
     if largest > 0:
         arrow_factor = nice_number(_ARROW_SHARE * frame.longer_m / largest)
