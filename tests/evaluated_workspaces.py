@@ -14,6 +14,7 @@ from pipelines.core.products import load_json, save_json
 from pipelines.core.stages import METRICS, RENDERS, REPORT, SURVEY
 from pipelines.core.types import Vector3
 from pipelines.core.workspace import Workspace
+from pipelines.plots.strips import labelled
 from pipelines.scene.render_files import write_render
 from pipelines.scene.report import (
     PredictedPointError,
@@ -90,7 +91,8 @@ def evaluated_workspace(root: Path, rename: str = "") -> Evaluated:
     (root / REPORT).parent.mkdir(parents=True)
     write_report(report, root / REPORT)
     (root / RENDERS).mkdir()
-    write_render(root / RENDERS, scene.names[2], np.full((30, 120, 3), GREY, dtype=np.uint8))
+    pictures = [np.full((30, 40, 3), GREY, dtype=np.uint8)] * 3
+    write_render(root / RENDERS, scene.names[2], labelled(pictures, ("photograph", "render", "difference")))
     metrics = [{"iteration": 10 * step, "psnr": 10.0 + step, "gaussians": 100 + step} for step in range(1, 5)]
     (root / METRICS).write_text("".join(json.dumps(row) + "\n" for row in metrics), "utf-8")
     return Evaluated(scene, workspace)

@@ -27,6 +27,7 @@ from pipelines.core.errors import (
     storage_failures,
 )
 from pipelines.core.manifest import MANIFEST, Manifest, Memo, record_files
+from pipelines.core.options import input_paths
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.stages import StageSpec, producer_of, products_of
 from pipelines.core.staleness import (
@@ -88,14 +89,14 @@ def run_stage(
         must_exist(workspace)
     with workspace.lock(spec.name):
         memo: Memo = {}
-        asked = request(workspace, spec, flags, memo)
+        asked = request(workspace, spec, flags, memo, progress)
         _warn_of_stale_inputs(workspace, spec, memo)
         _refuse_damaged_inputs(workspace, spec, memo)
         before = workspace.requests().get(spec.name, {})
         workspace.remember({spec.name: flags})
         previous = None if force else _current(workspace, asked, memo)
         if previous is not None:
-            return Outcome(spec.name, False, previous)
+            return Outcome(spec.name, False, _with_present_files(workspace, asked, previous))
         try:
             manifest = _execute(workspace, asked, "never" if force else resume, progress)
         except InputError:
@@ -162,7 +163,7 @@ def remembered(workspace: Workspace, spec: StageSpec, flags: Flags) -> dict[str,
 
 def _execute(workspace: Workspace, asked: Request, resume: Resume, progress: Progress) -> Manifest:
     spec, resolved = asked.spec, asked.options.model_dump(mode="json")
-    token = hashlib.sha256(json.dumps([resolved, asked.inputs], sort_keys=True).encode()).hexdigest()
+    token = _token(asked, resolved)
     if resume == "never" and spec.resumable and workspace.partial(spec).exists():
         log.warning("%s: starts afresh; what an interrupted run had done is dropped", spec.name)
     started, clock = now(), time.monotonic()
@@ -180,7 +181,7 @@ def _execute(workspace: Workspace, asked: Request, resume: Resume, progress: Pro
     manifest = Manifest(
         stage=spec.name,
         config=resolved,
-        inputs=asked.inputs,
+        inputs=asked.inputs.hashes,
         versions=_versions(),
         started=started,
         duration_s=round(time.monotonic() - clock, 3),
@@ -189,11 +190,31 @@ def _execute(workspace: Workspace, asked: Request, resume: Resume, progress: Pro
         warnings=list(summary.warnings),
         cautions=summary.cautions,
         files=record_files(out, spec.working),
+        input_files=asked.inputs.files,
     )
     workspace.set_aside(_damaged(workspace, spec, {}, by_content=False))
     workspace.commit(spec, manifest)
     log.info("%s: %s (%.1f s)", spec.name, summary.key_figure, manifest.duration_s)
     return manifest
+
+
+def _token(asked: Request, resolved: Mapping[str, Any]) -> str:
+    """Return the hash of inputs and options that an interrupted run is continued with; paths may change."""
+    paths = input_paths(asked.options)
+    values = {name: value for name, value in resolved.items() if name not in paths}
+    return hashlib.sha256(json.dumps([values, asked.inputs.hashes], sort_keys=True).encode()).hexdigest()
+
+
+def _with_present_files(workspace: Workspace, asked: Request, manifest: Manifest) -> Manifest:
+    """Return the manifest of a current product with its input files as they are now, saved if they were moved.
+
+    Their content is the same, but their times may differ: without new records each look would read them again.
+    """
+    if asked.inputs.files == manifest.input_files or not workspace.manifest(asked.spec):
+        return manifest
+    renewed = manifest.model_copy(update={"input_files": asked.inputs.files})
+    workspace.renew(asked.spec, renewed)
+    return renewed
 
 
 def _run(workspace: Workspace, asked: Request, token: str, resume: Resume, progress: Progress) -> Summary:
@@ -237,7 +258,7 @@ def _current(workspace: Workspace, asked: Request, memo: Memo) -> Manifest | Non
         return Manifest(
             stage=spec.name,
             config={},
-            inputs=asked.inputs,
+            inputs=asked.inputs.hashes,
             versions={},
             started=now(),
             duration_s=0.0,

@@ -26,6 +26,7 @@ PURPOSES: dict[str, str] = {
     "report/report.html": "report to hand in: one page with accuracy, points, photographs and processing",
     "report/report.pdf": "the same report, for printing",
     "evaluate/report.json": "measured and predicted accuracy, for the record",
-    "evaluate/accuracy.png": "map of the predicted accuracy",
+    "evaluate/points.csv": "error of each check and control point",
+    "evaluate/accuracy.png": "map of the predicted accuracy, with the errors of the points",
     "evaluate/accuracy.csv": "the same map as a table",
 }

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from pipelines.core.progress import Progress
 from pipelines.core.types import ByteArray
+from pipelines.plots.strips import labelled
 from pipelines.scene.render_files import DIFFERENCE_GAIN
 from pipelines.scene.renderer import ModelRenderer
 from pipelines.scene.report import PhotometricFigures, ViewFigures
@@ -18,7 +19,7 @@ from pipelines.splat.exposure import fitted_affine, with_affine
 from pipelines.splat.lpips import Lpips
 from pipelines.splat.metrics import psnr, ssim
 
-# Saves, for the name of a photograph, (H, 3 W, 3) RGB: the photograph, its render, their difference.
+# Saves, for a test view, RGB: the photograph, its render, their difference, side by side with labels.
 SaveRender = Callable[[str, ByteArray], None]
 
 _NO_WEIGHTS = "no weights were given: they are not part of the package (--lpips-weights FILE.npz)"
@@ -57,7 +58,7 @@ def compare_test_views(
             mask = torch.from_numpy(np.array(renderer.images.mask(index)))
             views.append(_figures(name, render, photo, mask, distance))
             if place < saved:
-                save_render(name, _side_by_side(photo, render))
+                save_render(name, _side_by_side(photo, render, views[-1]))
             task.advance()
     return PhotometricFigures(
         views=len(views),
@@ -86,8 +87,13 @@ def _mean(values: Iterable[float | None]) -> float | None:
     return float(np.mean(np.array(known, dtype=np.float64))) if known else None
 
 
-def _side_by_side(photo: Tensor, render: Tensor) -> ByteArray:
-    """Return photograph, render, and their difference (× 3), side by side (H, 3 W, 3)."""
+def _side_by_side(photo: Tensor, render: Tensor, view: ViewFigures) -> ByteArray:
+    """Return photograph, render, and their difference (× 3), (H, W, 3) each, side by side with labels above."""
     difference = (DIFFERENCE_GAIN * (photo - render).abs()).clamp(0, 1)
-    strip = torch.cat([photo, render, difference], dim=1).mul(255).round().byte()
-    return np.asarray(strip.numpy())
+    pictures = [np.asarray(image.mul(255).round().byte().numpy()) for image in (photo, render, difference)]
+    labels = (
+        f"photograph {view.image}",
+        f"render, PSNR {view.psnr:.2f} dB, SSIM {view.ssim:.3f}",
+        f"difference × {DIFFERENCE_GAIN}",
+    )
+    return labelled(pictures, labels)

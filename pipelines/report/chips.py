@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from pipelines.core.errors import InputError
+from pipelines.core.photograph_folder import photograph_folder
 from pipelines.core.progress import Progress
 from pipelines.core.types import ByteArray
 from pipelines.formats.image_file import read_bytes, require_unchanged
@@ -92,7 +93,7 @@ def cut_chips(
 
 def _photograph(evaluated: EvaluatedSurvey, name: str) -> ByteArray:
     survey = evaluated.trained.survey
-    path = evaluated.workspace.photographs(survey.image_dir) / name
+    path = photograph_folder(evaluated.workspace, survey.image_dir) / name
     image = survey.image(name)
     data = read_bytes(path)
     require_unchanged(data, "" if image is None else image.sha256, path)

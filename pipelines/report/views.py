@@ -16,6 +16,7 @@ from pipelines.core.types import FloatArray
 from pipelines.core.workspace import Workspace
 from pipelines.pages.pictures import Picture, limited, picture_of, picture_of_png, read_picture
 from pipelines.plots.observations import curves
+from pipelines.plots.strips import without_labels
 from pipelines.report.evaluated import EvaluatedSurvey
 from pipelines.scene.render_files import DIFFERENCE_GAIN, render_name
 
@@ -122,12 +123,10 @@ def views_facts(evaluated: EvaluatedSurvey, most: int) -> ViewsFacts:
 
 
 def _view(name: str, field: str, file: Path) -> TestView:
-    strip = read_picture(file)
-    width = strip.shape[1] // 3
-    if not width:
+    parts = without_labels(read_picture(file), 3)
+    if not parts[0].size:
         raise InputError("is no render of evaluate: run `georef evaluate --force`", path=file)
-    parts = [limited(strip[:, start * width : (start + 1) * width], _VIEW_PX) for start in range(3)]
-    photograph, render, difference = (picture_of(part) for part in parts)
+    photograph, render, difference = (picture_of(limited(part, _VIEW_PX)) for part in parts)
     return TestView(name, field, photograph, render, difference)
 
 

@@ -20,7 +20,7 @@ def write_render(folder: Path, image: str, strip: ByteArray) -> None:
     Args:
         folder: of the PNG.
         image: name of the photograph.
-        strip: (H, 3 W, 3) RGB: the photograph, its render, their difference.
+        strip: (H, W, 3) RGB: the photograph, its render, their difference, with labels above.
     """
     _, png = cv2.imencode(".png", np.ascontiguousarray(strip[..., ::-1]))  # `imwrite` reports no full disk
     (folder / render_name(image)).write_bytes(png.tobytes())

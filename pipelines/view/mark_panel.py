@@ -18,7 +18,7 @@ from pipelines.scene.survey import SurveyedPoint
 from pipelines.view.marking import (
     MarkedPoint,
     appears_in,
-    marked_points,
+    points_to_mark,
     rays_of,
     residuals_px,
     write_marks,
@@ -52,10 +52,7 @@ class MarkPanel:
         self._model, self._signs, self._photo, self._folder = model, signs, photo, folder
         survey = model.trained.survey
         self._names = model.trained.sparse.image_name
-        self._points = [
-            *marked_points(survey.control_points, self._xyz(survey.control_points), is_check=False),
-            *marked_points(survey.check_points, self._xyz(survey.check_points), is_check=True),
-        ]
+        self._points = points_to_mark(survey, self._xyz)
         self._lock = threading.RLock()
         self._build(server.gui)
         self._show()
