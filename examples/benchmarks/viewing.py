@@ -22,9 +22,10 @@ import torch
 from playwright.sync_api import Page, sync_playwright
 
 from pipelines.core.stages import GAUSSIANS, MODEL, STAGES
+from pipelines.pages.chromium import chromium_path
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.storage import read_gaussians, write_gaussians
-from tests.browser.chromium import FLAGS, chromium_path
+from tests.browser.chromium import FLAGS
 
 _SIZE = {"width": 1280, "height": 800}
 _PANEL_PX = 420
