@@ -62,15 +62,18 @@ def test_files_of_marks_are_read_again(tmp_path: Path, model: MeasuringModel) ->
     assert write_marks(tmp_path, "EPSG:32632", [*points, new, bare]) == [tmp_path / CONTROL, tmp_path / CHECK]
     control = read_ground_points(tmp_path / CONTROL)
     assert control.crs_text == "EPSG:32632"
-    assert [(m.name, m.xyz, m.x_px, m.y_px, m.image) for m in control.marks] == [
-        ("new", new.xyz, x, y, image) for image, (x, y) in new.marks.items()
+    assert [(point.name, tuple(point.xyz)) for point in control.points] == [("new", new.xyz)]
+    assert [(m.name, m.x_px, m.y_px, m.image) for m in control.marks] == [
+        ("new", x, y, image) for image, (x, y) in new.marks.items()
     ]
     check = read_ground_points(tmp_path / CHECK)
     assert {mark.name for mark in check.marks} == {point.name for point in survey.check_points}
     for mark in check.marks:
         point = next(point for point in points if point.name == mark.name)
         assert (mark.x_px, mark.y_px) == pytest.approx(point.marks[mark.image], abs=5e-4)
-        np.testing.assert_allclose(mark.xyz, point.xyz, atol=1e-4)
+    for listed in check.points:
+        point = next(point for point in points if point.name == listed.name)
+        np.testing.assert_allclose(listed.xyz, point.xyz, atol=1e-4)
 
 
 def test_names_that_the_format_cannot_hold_are_refused(tmp_path: Path) -> None:
