@@ -1,5 +1,5 @@
 """Make the pictures of the documents: `python docs/make_picture.py flight WORKSPACE --view 1`,
-`orthophoto WORKSPACE`, or `report WORKSPACE`.
+`orthophoto WORKSPACE`, `report WORKSPACE`, or `viewer WORKSPACE`.
 
 `flight` needs an evaluated workspace, and shows this flight:
 
@@ -9,20 +9,27 @@
         --preset fast --iterations 2500 --max-image-size 720
 
 `orthophoto` needs the rasters, and shows a flight with `--flight grid --images 40 --size 960x720 --seed 5`, run
-likewise. `report` needs the report of any workspace, such as that of `make demo`, and Chromium.
+likewise. `report` needs the report of any workspace, such as that of `make demo`, and `viewer` one with four check
+points; both need Chromium.
 """
 
 from __future__ import annotations
 
 import argparse
+import time
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from pipelines.core.workspace import Workspace
 from pipelines.pages.chromium import NO_NETWORK, chromium_path
+from pipelines.view.loopback import start_server
+from pipelines.view.options import ViewOptions
+from pipelines.view.viewer import Viewer
 
 IMAGES = Path(__file__).parent / "images"
+DRAWING = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", NO_NETWORK)
 GAP_PX, WIDTH_PX, QUALITY = 12, 1600, 78
 
 
@@ -82,6 +89,31 @@ def parts_of_report(page: Path) -> np.ndarray:
     return sized(np.hstack([summary, between, np.vstack([right, short])]))
 
 
+def measuring(workspace: Workspace) -> np.ndarray:
+    """Return the viewer's page with a measured polygon, BGR."""
+    from playwright.sync_api import sync_playwright
+
+    server = start_server(8080, f"georef view {workspace.root.name}")
+    viewer = Viewer(server, workspace, ViewOptions())
+    viewer.wait_for_sigma()
+    with sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=chromium_path(), args=list(DRAWING))
+        page = browser.new_page(viewport={"width": 1280, "height": 720})
+        page.goto(f"http://{server.get_host()}:{server.get_port()}")
+        page.get_by_role("tab", name="Measure").click()
+        viewer.measuring.choose("area")
+        for point in viewer.model.trained.survey.check_points[:4]:
+            viewer.measuring.add_surveyed(point.name)
+        page.get_by_text("area on the surface").wait_for()
+        page.locator(".mantine-Notification-closeButton").first.click()
+        time.sleep(10)  # the picture at full size
+        png = page.screenshot()
+        browser.close()
+    viewer.close()
+    server.stop()
+    return sized(decoded(png))
+
+
 def decoded(png: bytes) -> np.ndarray:
     """Return a picture (H, W, 3), BGR."""
     picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
@@ -98,11 +130,13 @@ def sized(picture: np.ndarray) -> np.ndarray:
 def main() -> None:
     """Write the picture."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("picture", choices=["flight", "orthophoto", "report"])
+    parser.add_argument("picture", choices=["flight", "orthophoto", "report", "viewer"])
     parser.add_argument("workspace", type=Path)
     parser.add_argument("--view", type=int, default=0, help="number of the test view")
     options = parser.parse_args()
-    if options.picture == "report":
+    if options.picture == "viewer":
+        picture = measuring(Workspace(options.workspace))
+    elif options.picture == "report":
         page = options.workspace / "report" / "report.html"
         if not page.exists():
             raise SystemExit("no report there: run `georef report` on the workspace first")

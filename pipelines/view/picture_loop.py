@@ -34,10 +34,17 @@ class PictureLoop:
         client: the page.
         painter: of the pictures.
         blend: returns the photograph to blend over the picture, or None.
+        drawn: called after each picture at full size.
     """
 
-    def __init__(self, client: viser.ClientHandle, painter: Painter, blend: Callable[[], Blend | None]) -> None:
-        self._client, self._painter, self._blend = client, painter, blend
+    def __init__(
+        self,
+        client: viser.ClientHandle,
+        painter: Painter,
+        blend: Callable[[], Blend | None],
+        drawn: Callable[[], None],
+    ) -> None:
+        self._client, self._painter, self._blend, self._told = client, painter, blend, drawn
         self._changed, self._ended = threading.Event(), threading.Event()
         self._moving_px = 480.0
         self.drawn = 0  # pictures at full size
@@ -56,19 +63,17 @@ class PictureLoop:
         self._changed.set()
 
     def _run(self) -> None:
-        first = True
         while True:
             self._changed.wait()
             if self._ended.is_set():
                 return
             self._changed.clear()
             try:
-                if not first:
-                    self._draw_moving()
-                if first or not self._changed.wait(_STILL_S):
+                self._draw_moving()
+                if not self._changed.wait(_STILL_S):
                     self._draw(_MOST_PX, _QUALITY_STILL)
                     self.drawn += 1
-                first = False
+                    self._told()
             except GeorefError as error:
                 self._client.add_notification("No picture", str(error), color="red")
             except Exception:  # the page is gone, or the picture cannot be drawn: the next one may

@@ -40,6 +40,7 @@ log = logging.getLogger(__name__)
 
 FOLDER = "view"  # of the workspace: what the user saves in the viewer
 _WATCH_S = 2.0
+_FIRST_S = 20.0  # in which a page is expected to be opened
 _FOV_RAD = 0.9
 ClickMode = Literal["looks", "measures", "marks in the photograph"]
 
@@ -73,12 +74,11 @@ class Viewer:
         self.frame: ViewFrame = frame_of(trained)
         self.painter = Painter(self._renderer, Photographs(workspace, self._renderer), self.frame)
         self._loops: dict[int, PictureLoop] = {}
-        self._lock = threading.Lock()
+        self._lock, self._first_drawn = threading.Lock(), threading.Event()
         self.signs = Signs(server, trained, self.frame)
         self.photo = PhotoView(server, trained, self.frame, self.signs, self.wake)
         self._build(workspace, workspace.root / FOLDER)
         server.scene.on_click()(self._clicked)
-        # No picture should wait for it.
         self._solving = threading.Thread(target=self._propagate_errors, daemon=True)
         self._solving.start()
         server.on_client_connect(self._connected)
@@ -87,6 +87,8 @@ class Viewer:
             self._connected(client)
 
     def _propagate_errors(self) -> None:
+        """Compute σ after the first picture, which should not wait for them."""
+        self._first_drawn.wait(_FIRST_S)
         try:
             self.model.propagate_errors()
         except GeorefError as error:
@@ -95,7 +97,8 @@ class Viewer:
         self._colour_points()
 
     def wait_for_sigma(self) -> None:
-        """Wait until σ are computed."""
+        """Compute σ now, and wait for them."""
+        self._first_drawn.set()
         self._solving.join()
 
     def _build(self, workspace: Workspace, folder: Path) -> None:
@@ -207,7 +210,9 @@ class Viewer:
             if client.client_id in self._loops:
                 return
             self._stand_above(client)
-            self._loops[client.client_id] = PictureLoop(client, self.painter, lambda: self.photo.blend)
+            self._loops[client.client_id] = PictureLoop(
+                client, self.painter, lambda: self.photo.blend, self._first_drawn.set
+            )
 
     def _left(self, client: viser.ClientHandle) -> None:
         with self._lock:
