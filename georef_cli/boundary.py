@@ -1,7 +1,7 @@
 """Boundary of the program: errors become messages and exit codes, log records become lines.
 
 Exit codes: 0 done, 1 known failure, 2 usage, 130 interrupted. An unexpected exception keeps its traceback. All
-messages go to stderr; stdout is for the result.
+messages go to stderr; stdout is for the result, or with `--json` for the error as one JSON document.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from typing import IO, TextIO
 
 import click
 
-from georef_cli.printable import printable, printable_lines
+from georef_cli.endings import FAILED, ErrorDocument, defect_document, ending_of
+from georef_cli.printable import printable_lines
 from georef_cli.verbosity import LineFormatter, SafeFormatter, Verbosity
-from pipelines.core.errors import GeorefError, storage_error
+from pipelines.core.errors import GeorefError
 from pipelines.core.interrupts import SIGNALS
 
-FAILED, INTERRUPTED = 1, 130
 LOGGERS = ("pipelines", "georef_cli")
 FILE_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 
@@ -40,34 +40,34 @@ def guarded(group: click.Group, arguments: Sequence[str] | None) -> int:
         group: the commands.
         arguments: of the command line; None: those of the process.
     """
+    as_json = "--json" in (sys.argv[1:] if arguments is None else arguments)
     try:
         _escape_on_stdout()
         with _signals_interrupt():
             code = group.main(args=arguments, prog_name=group.name, standalone_mode=False)
             sys.stdout.flush()
-    except click.ClickException as error:
-        text = io.StringIO()
-        error.show(text)
-        _say(printable_lines(text.getvalue().rstrip("\n")))
-        return error.exit_code
-    except (click.Abort, KeyboardInterrupt):
-        _say("interrupted")
-        return INTERRUPTED
-    except GeorefError as error:
-        _say(f"error: {printable(str(error))}")
-        return FAILED
     except BrokenPipeError:
         # The reader of the pipe has closed it.
         _drop_stdout()
         return FAILED
-    except Exception as error:
-        storage = storage_error(error)
-        if storage is None:
+    except (Exception, KeyboardInterrupt) as error:
+        ending = ending_of(error)
+        if as_json:
+            _print_error(defect_document(error) if ending is None else ending.error)
+        if ending is None:
             raise
-        _say(f"error: {printable(str(storage))}")
+        _say(ending.message)
         _drop_stdout()
-        return FAILED
+        return ending.code
     return code if isinstance(code, int) else 0
+
+
+def _print_error(document: ErrorDocument) -> None:
+    """Print the document of an error on stdout, which may be what has failed."""
+    from pipelines.core.products import dump_json  # here, because it imports the validation library
+
+    with contextlib.suppress(OSError):
+        click.echo(dump_json({"error": document}))
 
 
 def _say(text: str) -> None:

@@ -46,8 +46,8 @@ def force_option(help_text: str = "Run even if the product is current.") -> clic
 
 
 def stage_options(options_type: type[StageOptions], only: Iterable[str] | None = None) -> list[click.Option]:
-    """Return the click options of all fields, or of the fields named in `only`."""
-    names = list(options_type.model_fields) if only is None else list(only)
+    """Return the click options of all fields, or of the fields named in `only`; `--threads` is for all commands."""
+    names = [name for name in options_type.model_fields if name != "threads"] if only is None else list(only)
     return [stage_option(options_type, name) for name in names]
 
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import click
 
 from georef_cli import boundary, options
+from georef_cli.command import Command
 from georef_cli.display import progress_for
 from georef_cli.output import print_outcome
 from pipelines.core import runner
@@ -16,7 +16,7 @@ from pipelines.core.stages import BY_NAME
 from pipelines.core.workspace import Resume
 
 
-class StageCommand(click.Command):
+class StageCommand(Command):
     """Command `georef STAGE WS …`: the options of the stage, `--force` and `--json`.
 
     Args:
@@ -36,7 +36,7 @@ class StageCommand(click.Command):
                 options.force_option(),
                 options.json_option(),
             ],
-            help=inspect.cleandoc(doc),
+            help=doc,
             callback=click.pass_context(self.act),
         )
 

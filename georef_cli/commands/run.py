@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import inspect
 import logging
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from georef_cli import boundary, options
+from georef_cli.command import Command
 from georef_cli.display import progress_for
 from georef_cli.output import print_outcomes
 from pipelines.core import runner
@@ -113,7 +113,7 @@ def _slice_option(flag: str, dest: str, help_text: str) -> click.Option:
     return click.Option([flag, dest], type=click.Choice([spec.name for spec in PIPELINE]), help=help_text)
 
 
-command = click.Command(
+command = Command(
     "run",
     params=[
         options.workspace_argument(),
@@ -130,8 +130,7 @@ command = click.Command(
         options.json_option(),
     ],
     callback=click.pass_context(_run),
-    help=inspect.cleandoc(
-        """Run all stages, or some, skipping what is current.
+    help="""Run all stages, or some, skipping what is current.
 
         What was interrupted is resumed. Options that a stage was given before are remembered, so that a later
         run needs only what changes. Options that are not listed here are set in WS/georef.toml or with the
@@ -143,6 +142,5 @@ command = click.Command(
           georef run flight --images photos --gcp gcp_list.txt --to init-sim3
           georef run flight --from train --iterations 2000
           georef run flight
-        """
-    ),
+        """,
 )

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 
-import click
-
 from georef_cli import options, tables
+from georef_cli.command import Command
 from georef_cli.output import document_of_cautions, print_json, print_rich
 from pipelines.core import staleness as states
 from pipelines.core.workspace import Workspace
@@ -22,7 +21,7 @@ def _status(workspace: Workspace, as_json: bool) -> None:
     print_json({**document, "cautions": document_of_cautions(cautions)})
 
 
-command = click.Command(
+command = Command(
     "status",
     params=[options.workspace_argument(), options.json_option()],
     callback=_status,

@@ -36,8 +36,13 @@ class WrittenMarker:
     """Mark of an option that users write as text; `notation` gives the text of its value."""
 
 
+class EffortMarker:
+    """Mark of an option that changes the time or the messages of a stage, and not its result."""
+
+
 InputPath = Annotated[Path, InputMarker()]
 WRITTEN = WrittenMarker()
+EFFORT = EffortMarker()
 
 
 class StageOptions(BaseModel):
@@ -119,6 +124,12 @@ def input_paths(options: StageOptions) -> dict[str, Path]:
         for name, info in fields.items()
         if _is_input(info) and (value := getattr(options, name)) is not None
     }
+
+
+def decisive_fields(options_type: type[StageOptions]) -> list[str]:
+    """Return the options that decide a stage's result: all but those of effort."""
+    fields = options_type.model_fields
+    return [name for name, info in fields.items() if not any(isinstance(m, EffortMarker) for m in _marks(info))]
 
 
 def is_written(info: FieldInfo) -> bool:

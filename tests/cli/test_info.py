@@ -38,7 +38,7 @@ def test_command_tells_place_files_and_what_can_be_made(real_georef: Georef, fli
 def test_command_names_what_is_missing(real_georef: Georef, flight: Workspace, tmp_path: Path) -> None:
     flight.path(MODEL).unlink()
     result = real_georef("info", flight.root)
-    assert (result.code, result.out) == (1, "")
+    result.assert_failed(1)
     assert f"georef train {flight.root}" in result.err
     assert "no such workspace" in real_georef("info", tmp_path / "nowhere").err
 

@@ -116,7 +116,7 @@ def test_stopped_by_the_user_and_resumed(survey: Path, whole: Workspace) -> None
         sent = time.monotonic()
         ended = _finish(process)
         assert time.monotonic() - sent < 20  # a few photographs, pairs or iterations, also on a busy machine
-        assert (ended.code, ended.out) == (130, ""), ended.err
+        ended.assert_failed(130)
         assert ended.err.splitlines()[-1] == "interrupted"
         assert not [word for word in NOISE_OF_LIBRARIES if word in ended.err]
         command = ("run", workspace.root)
