@@ -15,9 +15,8 @@ import sys
 import traceback as tracebacks
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 from types import FrameType, TracebackType
-from typing import IO, TextIO
+from typing import IO, TYPE_CHECKING, TextIO
 
 import click
 
@@ -26,6 +25,10 @@ from georef_cli.printable import printable_lines
 from georef_cli.verbosity import LineFormatter, SafeFormatter, Verbosity
 from pipelines.core.errors import GeorefError
 from pipelines.core.interrupts import SIGNALS
+
+if TYPE_CHECKING:
+    from pipelines.core.stages import StageSpec
+    from pipelines.core.workspace import Workspace
 
 LOGGERS = ("pipelines", "georef_cli")
 FILE_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
@@ -125,9 +128,9 @@ def logged_to_stderr(verbosity: Verbosity) -> Iterator[None]:
 
 
 @contextmanager
-def logged_to_file(path: Path) -> Iterator[None]:
-    """Append log records to the file `path` while the context lasts, and the error that ends it."""
-    handler = _LateFileHandler(path)
+def logged_to_file(workspace: Workspace, spec: StageSpec) -> Iterator[None]:
+    """Append log records to the log of a stage while the context lasts, and the error that ends it."""
+    handler = _LateFileHandler(workspace, spec)
     handler.setFormatter(SafeFormatter(FILE_FORMAT))
     with _attached(handler, logging.INFO):
         try:
@@ -176,24 +179,32 @@ class _StderrHandler(logging.StreamHandler[TextIO]):
 
 
 class _LateFileHandler(logging.Handler):
-    """Handler that opens its file at the first record, in a workspace that exists by then.
+    """Handler that opens its file when the workspace has its first product, or else at the end of the command.
 
-    A command that is refused before it begins leaves neither file nor folder behind. Where the log cannot be
-    written, nothing is said: stderr has the same lines.
+    A command that is refused leaves neither file nor folder behind. Where the log cannot be written, nothing is
+    said: stderr has the same lines.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, workspace: Workspace, spec: StageSpec) -> None:
         super().__init__()
-        self.path = path
+        self.path = workspace.log_file(spec)
+        self._workspace = workspace
+        self._held_back: list[str] = []
         self._file: IO[bytes] | None = None
         self._failed = False
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Write a record."""
-        line = self.format(record) + "\n"
+        """Write a record, or hold it back."""
+        self._held_back.append(self.format(record) + "\n")
+        if self._file is not None or self._workspace.has_product():
+            self._write()
+
+    def _write(self) -> None:
+        """Write what was held back."""
+        lines, self._held_back = self._held_back, []
         try:
-            if not self._failed and self.path.parent.parent.is_dir():
-                self._open().write(line.encode("utf-8", "backslashreplace"))
+            if not self._failed:
+                self._open().write("".join(lines).encode("utf-8", "backslashreplace"))
         except OSError:
             self._failed = True
 
@@ -204,7 +215,9 @@ class _LateFileHandler(logging.Handler):
         return self._file
 
     def close(self) -> None:
-        """Close the file."""
+        """Write what was held back, unless the command was refused, and close the file."""
+        if self._held_back and self._workspace.has_begun():
+            self._write()
         if self._file is not None:
             with contextlib.suppress(OSError):
                 self._file.close()

@@ -50,7 +50,7 @@ class DeliverableCommand(StageCommand):
         if target is not None:
             refuse_other_format(target, self.spec, folder=self.folder)
             check_target(target, overwrite=values["force"])
-        outcome = self.run(ctx, values, resume="if-same")
+        outcome = self.run(ctx, values)
         if target is not None:
             with workspace.lock(self.spec.name):
                 product = workspace.path(self.spec.product)

@@ -14,6 +14,7 @@ import click
 from pydantic.fields import FieldInfo
 
 from pipelines.core.options import StageOptions, flag_name, is_written, notation
+from pipelines.core.origins import names_of_flags
 from pipelines.core.workspace import Workspace
 
 _BOUNDS = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
@@ -43,6 +44,30 @@ def json_option() -> click.Option:
 def force_option(help_text: str = "Run even if the product is current.") -> click.Option:
     """Return the option `--force`."""
     return click.Option(["--force"], is_flag=True, help=help_text)
+
+
+def forget_option() -> click.Option:
+    """Return the option `--forget`."""
+    return click.Option(
+        ["--forget"],
+        multiple=True,
+        metavar="OPTION",
+        help="Forget this option of earlier commands (`--forget gcp`), or `all`.  [repeatable]",
+    )
+
+
+def forgotten(options_type: type[StageOptions], names: Iterable[str]) -> list[str]:
+    """Return the fields that the user names with `--forget`; `all` stands for each of them.
+
+    Raises:
+        click.UsageError: a name is no option.
+    """
+    if "all" in (named := list(names)):
+        return list(options_type.model_fields)
+    try:
+        return names_of_flags(options_type, named)
+    except ValueError as error:
+        raise click.UsageError(f"--forget: {error}") from error
 
 
 def stage_options(options_type: type[StageOptions], only: Iterable[str] | None = None) -> list[click.Option]:

@@ -33,6 +33,7 @@ class StageCommand(Command):
                 options.workspace_argument(),
                 *options.stage_options(self.spec.options),
                 *extra,
+                options.forget_option(),
                 options.force_option(),
                 options.json_option(),
             ],
@@ -45,22 +46,22 @@ class StageCommand(Command):
         outcome = self.run(ctx, values)
         print_outcome(values["workspace"], outcome, as_json=values["as_json"])
 
-    def run(self, ctx: click.Context, values: Mapping[str, Any], *, resume: Resume = "never") -> runner.Outcome:
-        """Return the outcome of the stage with the options that the user gave.
+    def run(self, ctx: click.Context, values: Mapping[str, Any], *, resume: Resume = "if-same") -> runner.Outcome:
+        """Return the outcome of the stage with the options that the user gave, now or before.
 
         Args:
             ctx: has the verbosity, and the origin of the options' values.
             values: of all options.
-            resume: whether to continue an interrupted run; `always` takes its options where the user gave none.
+            resume: whether to continue an interrupted run.
 
         Raises:
             GeorefError: the stage failed.
         """
         flags = options.given(ctx, self.spec.options.model_fields)
         workspace = values["workspace"]
-        if resume == "always":
-            flags = runner.remembered(workspace, self.spec, flags)
-        with boundary.logged_to_file(workspace.log_file(self.spec)):
+        forget = options.forgotten(self.spec.options, values["forget"])
+        flags = runner.remembered(workspace, self.spec, flags, forget)
+        with boundary.logged_to_file(workspace, self.spec):
             return runner.run_stage(
                 workspace,
                 self.spec,

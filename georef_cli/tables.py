@@ -12,6 +12,8 @@ from rich.table import Table
 from georef_cli.markup import shown
 from pipelines.compare.table import Comparison, cells, remarks_on
 from pipelines.core.cautions import Caution
+from pipelines.core.options import notation
+from pipelines.core.origins import OptionOrigin
 from pipelines.core.runner import Outcome
 from pipelines.core.stages import REPORT
 from pipelines.core.staleness import StageState
@@ -50,6 +52,7 @@ FACTOR_COLUMNS = {
     "sigma_source": "σ",
 }
 IMAGE_COLUMNS = {"views": "views", "psnr": "PSNR dB", "ssim": "SSIM", "lpips": "LPIPS"}
+_FORGET = "[dim]georef run WS --forget OPTION drops a remembered one[/]"
 Renderable = Group | Table | str
 
 
@@ -70,6 +73,23 @@ def states(rows: Iterable[StageState], cautions: Mapping[str, Sequence[Caution]]
             " · ".join(remarks),
         )
     return table
+
+
+def origins(rows: Sequence[OptionOrigin]) -> list[Renderable]:
+    """Return the table of options that are no defaults, with where their values come from."""
+    if not rows:
+        return ["", "[bold]Options[/]: all are defaults"]
+    table = _table("stage", "option", "value", "from")
+    table.columns[2].overflow = "fold"
+    before = ""
+    for row in rows:
+        table.add_row(row.stage if row.stage != before else "", row.flag, shown(notation(row.value)), row.origin)
+        before = row.stage
+    return [
+        "\n[bold]Options that are no defaults[/]",
+        table,
+        _FORGET,
+    ]
 
 
 def cautions(by_stage: Mapping[str, Sequence[Caution]]) -> list[Renderable]:

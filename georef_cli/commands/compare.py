@@ -25,7 +25,7 @@ def _compare(ctx: click.Context, **values: Any) -> None:
         options.given(ctx, COMMON_TRAIN_OPTIONS),
         force=values["force"],
         progress=progress_for(ctx.obj),
-        around=lambda variant, spec: boundary.logged_to_file(variant.log_file(spec)),
+        around=boundary.logged_to_file,
     )
     if values["as_json"]:
         stages = [{"configuration": stage.configuration, **document_of(stage.outcome)} for stage in finished]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from typing import Any, Literal
@@ -11,7 +11,7 @@ from pipelines.core.cautions import Caution, union
 from pipelines.core.errors import InputError, MissingProductError
 from pipelines.core.fingerprints import fingerprints
 from pipelines.core.manifest import Manifest, Memo
-from pipelines.core.options import StageOptions, load_toml, resolve
+from pipelines.core.options import StageOptions, decisive_fields, load_toml, resolve
 from pipelines.core.stages import BY_NAME, DELIVERABLES, PIPELINE, StageSpec, producer_of, products_of
 from pipelines.core.validators import require_text
 from pipelines.core.workspace import Workspace
@@ -65,20 +65,35 @@ def stage_config(workspace: Workspace, spec: StageSpec, flags: Flags) -> StageOp
 
 def why_stale(workspace: Workspace, asked: Request, manifest: Manifest) -> str:
     """Return the reason why a product is stale; empty if its inputs and options are unchanged."""
-    options = asked.options
-    try:
-        made_with = type(options).model_validate(manifest.config)
-    except ValueError:
-        return "made by a version with other options"
-    names = [name for name in type(options).model_fields if getattr(made_with, name) != getattr(options, name)]
-    if names:
-        return f"option {', '.join(names)} changed"
-    inputs = sorted({*asked.inputs, *manifest.inputs})
-    changed = [name for name in inputs if manifest.inputs.get(name) != asked.inputs.get(name)]
+    changed = changed_options(asked.options, manifest.config) or changed_inputs(asked.inputs, manifest.inputs)
     if changed:
-        return f"{', '.join(changed)} changed"
+        return changed
     gone = [product for product in products_of(asked.spec) if not (workspace.root / product).exists()]
     return f"{', '.join(gone)} is gone" if gone else ""
+
+
+def changed_options(options: StageOptions, config: Mapping[str, Any], but: Collection[str] = ()) -> str:
+    """Return which options differ from recorded ones, as a reason; empty if none does.
+
+    Args:
+        options: of now.
+        config: as recorded, by field.
+        but: options that do not count.
+    """
+    try:
+        before = type(options).model_validate(config)
+    except ValueError:
+        return "made by a version with other options"
+    decisive = [name for name in decisive_fields(type(options)) if name not in but]
+    names = [name for name in decisive if getattr(before, name) != getattr(options, name)]
+    return f"option {', '.join(names)} changed" if names else ""
+
+
+def changed_inputs(inputs: Mapping[str, str], recorded: Mapping[str, str]) -> str:
+    """Return which inputs differ from recorded ones, as a reason; empty if none does."""
+    names = sorted({*inputs, *recorded})
+    changed = [name for name in names if recorded.get(name) != inputs.get(name)]
+    return f"{', '.join(changed)} changed" if changed else ""
 
 
 def why_damaged(files: list[str]) -> str:

@@ -34,6 +34,8 @@ class LoopOptions:
         checkpoint_every: iterations between checkpoints.
         log_every: iterations between lines of metrics.
         resume: continue from the checkpoint, if the file exists.
+        extend: the checkpoint is that of a finished, shorter training.
+        note: receives how far the training has come, after each checkpoint (`1500 of 7000 iterations, 12 min`).
     """
 
     checkpoint: Path
@@ -41,6 +43,8 @@ class LoopOptions:
     checkpoint_every: int = 500
     log_every: int = 10
     resume: bool = False
+    extend: bool = False
+    note: Callable[[str], None] = lambda _text: None
 
 
 @dataclass(frozen=True)
@@ -86,7 +90,7 @@ def optimise(trainer: JointTrainer, options: LoopOptions, progress: Progress) ->
                 if stop.requested:
                     loop.save()
                     log.warning(
-                        "stopped at iteration %d of %d: --resume continues",
+                        "stopped at iteration %d of %d; the same command continues",
                         trainer.iteration, trainer.options.iterations,
                     )  # fmt: skip
                     raise KeyboardInterrupt
@@ -105,7 +109,9 @@ class _Loop:
         self._spent, self._clock = 0.0, time.monotonic()
         if options.resume and options.checkpoint.exists():
             self._spent = self._resumed()
-            log.info("resumed at iteration %d", trainer.iteration)
+            if options.extend:
+                trainer.schedule.extended_from = trainer.iteration
+            log.info("%s at iteration %d", "extended" if options.extend else "resumed", trainer.iteration)
         else:
             options.metrics.write_text("", encoding="utf-8")
             self.save()
@@ -157,6 +163,10 @@ class _Loop:
             "recovery": torch.tensor(list((self.recovery or "").encode()), dtype=torch.uint8),
         }
         save_checkpoint(self.options.checkpoint, {**self.trainer.state(), **loop_state})
+        if self.trainer.iteration > self.trainer.schedule.extended_from:
+            minutes = f"{self.seconds() / 60:.0f} min" if self.seconds() >= 60 else f"{self.seconds():.0f} s"
+            total = self.trainer.options.iterations
+            self.options.note(f"{self.trainer.iteration} of {total} iterations, {minutes}")
 
     def recover(self, error: NonFiniteError) -> None:
         """Return to the last checkpoint and lower the learning rates, once in a training.
