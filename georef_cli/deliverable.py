@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from georef_cli.delivery import check_target, deliver, deliver_folder, refuse_other_format
+from georef_cli.display import is_told
 from georef_cli.output import print_outcome
 from georef_cli.stage import StageCommand
 
@@ -58,4 +59,4 @@ class DeliverableCommand(StageCommand):
                     deliver_folder(workspace.root / self.spec.folder, target)
                 else:
                     deliver(product, target)
-        print_outcome(workspace, outcome, as_json=values["as_json"])
+        print_outcome(workspace, outcome, as_json=values["as_json"], told=is_told(ctx.obj))

@@ -9,7 +9,7 @@ import click
 
 from georef_cli import boundary, options
 from georef_cli.command import Command
-from georef_cli.display import progress_for
+from georef_cli.display import is_told, progress_for
 from georef_cli.output import print_outcome
 from pipelines.core import runner
 from pipelines.core.stages import BY_NAME
@@ -44,7 +44,7 @@ class StageCommand(Command):
     def act(self, ctx: click.Context, **values: Any) -> None:
         """Run the stage and print its result."""
         outcome = self.run(ctx, values)
-        print_outcome(values["workspace"], outcome, as_json=values["as_json"])
+        print_outcome(values["workspace"], outcome, as_json=values["as_json"], told=is_told(ctx.obj))
 
     def run(self, ctx: click.Context, values: Mapping[str, Any], *, resume: Resume = "if-same") -> runner.Outcome:
         """Return the outcome of the stage with the options that the user gave, now or before.

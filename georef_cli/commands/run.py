@@ -11,7 +11,7 @@ import click
 
 from georef_cli import boundary, options
 from georef_cli.command import Command
-from georef_cli.display import progress_for
+from georef_cli.display import is_told, progress_for
 from georef_cli.output import print_outcomes
 from pipelines.core import runner
 from pipelines.core.errors import GeorefError
@@ -61,7 +61,7 @@ def _run(ctx: click.Context, **values: Any) -> None:
         progress=progress_for(ctx.obj),
         around=lambda spec: boundary.logged_to_file(workspace, spec),
     )
-    print_outcomes(workspace, outcomes, _overview(workspace), as_json=values["as_json"])
+    print_outcomes(workspace, outcomes, _overview(workspace), as_json=values["as_json"], told=is_told(ctx.obj))
 
 
 def _overview(workspace: Workspace) -> Overview | None:

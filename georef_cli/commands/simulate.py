@@ -9,12 +9,13 @@ from typing import Any
 
 import click
 
-from georef_cli import options, tables
+from georef_cli import options
 from georef_cli.command import Command
 from georef_cli.display import progress_for
 from georef_cli.markup import shown
 from georef_cli.output import print_json, print_rich
 from pipelines.core.options import CONFIG_FILE, resolve
+from pipelines.core.sentences import duration
 from pipelines.simulate.options import SimulateOptions
 
 
@@ -29,7 +30,7 @@ def _simulate(ctx: click.Context, **values: Any) -> None:
     if values["as_json"]:
         print_json({**dataclasses.asdict(summary), "directory": str(summary.directory)})
         return
-    took = tables.duration(time.monotonic() - started)
+    took = duration(time.monotonic() - started)
     print_rich(f"[bold]simulate[/]: {shown(f'{summary.key_figure} in {summary.directory} ({took})')}")
 
 

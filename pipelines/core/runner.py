@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from pipelines.core.cautions import union
+from pipelines.core.cautions import AT_END, union
 from pipelines.core.errors import (
     ConvergenceError,
     DamagedPartialError,
@@ -35,6 +35,7 @@ from pipelines.core.manifest import Manifest, Memo, record_files
 from pipelines.core.options import decisive_fields
 from pipelines.core.partial import request_token
 from pipelines.core.progress import SILENT, Progress
+from pipelines.core.sentences import duration
 from pipelines.core.stages import StageSpec, products_of
 from pipelines.core.staleness import (
     BY_HAND,
@@ -221,7 +222,7 @@ def _execute(job: _Job) -> Manifest:
     carried = set(union(*cautions_by_stage(workspace, before=spec).values()))
     for caution in summary.cautions:
         if caution not in carried:
-            log.warning("%s: %s", spec.name, caution.sentence)
+            log.warning("%s: %s", spec.name, caution.sentence, extra={AT_END: True})
     manifest = Manifest(
         stage=spec.name,
         config=resolved,
@@ -237,7 +238,7 @@ def _execute(job: _Job) -> Manifest:
     )
     workspace.set_aside(damaged_product(workspace, spec, {}, by_content=False))
     workspace.commit(spec, manifest)
-    log.info("%s: %s (%.1f s)", spec.name, summary.key_figure, manifest.duration_s)
+    log.info("%s: %s (%s)", spec.name, summary.key_figure, duration(manifest.duration_s))
     return manifest
 
 

@@ -19,7 +19,6 @@ from pipelines.splat.rasterizer.backends import device_of
 from pipelines.splat.surface import SurfaceSettings
 from pipelines.train.initial_gaussians import TrainingScene, initial_gaussians, points_to_hold
 from pipelines.train.options import TrainOptions
-from pipelines.train.presets import effort
 from pipelines.train.schedule import JointOptions
 from pipelines.train.trainer import JointTrainer, TrainingViews
 
@@ -33,7 +32,7 @@ def training_size(scene: Scene, images: ImageCache, options: TrainOptions) -> Tr
     cameras = [images.pinhole(index) for index in map(int, scene.train)]
     largest = max(cameras, key=lambda camera: camera.width * camera.height)
     corrected = len(images) if options.optimize_cameras else 0
-    return TrainingSize(effort(options).max_gaussians, largest, options.sh_degree, corrected)
+    return TrainingSize(options.effort.max_gaussians, largest, options.sh_degree, corrected)
 
 
 def make_trainer(
@@ -50,7 +49,7 @@ def make_trainer(
     Raises:
         DegenerateGeometryError: fewer than two different points to start from.
     """
-    preset, device = effort(options), device_of(backend)
+    preset, device = options.effort, device_of(backend)
     scene, images = training.scene, training.images
     start = InitialisationOptions(sh_degree=options.sh_degree, max_gaussians=preset.max_gaussians)
     gaussians = initial_gaussians(training, start, preset.max_gaussians, options.seed).to(device)
@@ -77,7 +76,7 @@ def make_trainer(
 
 
 def _strategy(options: TrainOptions, extent_m: float, count: int) -> Strategy:
-    iterations, most = effort(options).iterations, effort(options).max_gaussians
+    iterations, most = options.effort.iterations, options.effort.max_gaussians
     if options.strategy == "mcmc":
         return McmcStrategy(McmcSettings.for_iterations(iterations, count, most), extent_m, options.seed)
     settings = DefaultSettings.for_iterations(iterations, most)

@@ -17,7 +17,9 @@ from pipelines.core.interrupts import deferred_interrupts
 from pipelines.core.progress import Progress
 from pipelines.splat.finiteness import NonFiniteError
 from pipelines.train.checkpoint import load_checkpoint, save_checkpoint
+from pipelines.train.pace import TimeLeft
 from pipelines.train.trainer import JointTrainer, StepReport
+from pipelines.train.training_progress import TrainingProgress
 
 log = logging.getLogger(__name__)
 
@@ -74,24 +76,18 @@ def optimise(trainer: JointTrainer, options: LoopOptions, progress: Progress) ->
             the continuation at a lower rate.
         InputError: the checkpoint cannot be read.
     """
-    loop = _Loop(trainer, options)
-    with progress.task("training", trainer.options.iterations) as task, deferred_interrupts() as stop:
-        shown = 0
-
-        def show(row: dict[str, float]) -> None:
-            nonlocal shown
-            now = int(row["iteration"])
-            task.advance(max(now - shown, 0), f"psnr {row['psnr']:.1f} dB, {row['gaussians']:.0f} gaussians")
-            shown = max(shown, now)
-
-        while trainer.iteration < trainer.options.iterations:
+    loop, iterations = _Loop(trainer, options), trainer.options.iterations
+    display = TrainingProgress(progress, trainer.iteration, iterations, TimeLeft(trainer.work, iterations))
+    with deferred_interrupts() as stop, display:
+        while trainer.iteration < iterations:
             try:
-                loop.iterate(show)
+                row = loop.iterate()
+                display.iterated(trainer.iteration, None if row is None else _note(row))
                 if stop.requested:
                     loop.save()
                     log.warning(
                         "stopped at iteration %d of %d; the same command continues",
-                        trainer.iteration, trainer.options.iterations,
+                        trainer.iteration, iterations,
                     )  # fmt: skip
                     raise KeyboardInterrupt
             except NonFiniteError as error:
@@ -132,8 +128,8 @@ class _Loop:
         """Return the duration so far, with the runs before a resume."""
         return self._spent + time.monotonic() - self._clock
 
-    def iterate(self, show: Callable[[dict[str, float]], None]) -> None:
-        """Run one iteration, and check, log and save where due.
+    def iterate(self) -> dict[str, float] | None:
+        """Run one iteration, check and save where due, and return the row of metrics if one was due.
 
         Raises:
             NonFiniteError: a loss or gradient was not finite.
@@ -143,13 +139,13 @@ class _Loop:
         due = trainer.iteration % options.log_every == 0 or trainer.iteration == trainer.options.iterations
         if due or trainer.device.type == "cpu":  # a GPU would have to wait for a check at every iteration
             trainer.check_finite()
-        if due:
-            row = _metrics_row(trainer, report, self.seconds())
+        row = _metrics_row(trainer, report, self.seconds()) if due else None
+        if row is not None:
             with options.metrics.open("a", encoding="utf-8") as lines:
                 lines.write(json.dumps(row) + "\n")
-            show(row)
         if trainer.iteration % options.checkpoint_every == 0:
             self.save()
+        return row
 
     def save(self) -> None:
         """Write a checkpoint, if no loss or gradient has diverged.
@@ -195,6 +191,10 @@ class _Loop:
         kept = [row for row in rows if row.endswith("}") and json.loads(row)["iteration"] <= self.trainer.iteration]
         path.write_text("".join(row + "\n" for row in kept), encoding="utf-8")
         return float(state["seconds"])
+
+
+def _note(row: dict[str, float]) -> str:
+    return f"{row['psnr']:.1f} dB, {row['gaussians'] / 1000:.0f} k Gaussians"
 
 
 def _metrics_row(trainer: JointTrainer, report: StepReport, seconds: float) -> dict[str, float]:

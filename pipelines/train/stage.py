@@ -30,7 +30,6 @@ from pipelines.train.depth_maps import DepthMaps
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.loop import LoopOptions, optimise
 from pipelines.train.options import TrainOptions
-from pipelines.train.presets import effort
 from pipelines.train.result import summary_of, trained_model
 from pipelines.train.surface import SceneSurface
 
@@ -54,7 +53,7 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     initial = load_json(InitialSimilarity, workspace.path(SIM3))
     survey = initial.weighted(load_survey(workspace))
     scene = initial_scene(read_sparse(workspace.path(SPARSE)), survey, initial)
-    images = photographs(scene.sparse, survey, workspace, effort(options).max_image_size)
+    images = photographs(scene.sparse, survey, workspace, options.effort.max_image_size)
     require_memory(training_size(scene, images, options), free_memory_bytes(device_of(backend)))
     images.build(stage.progress)
     surface = None
@@ -65,7 +64,7 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     points = GeolocatedPoints.load(workspace.path(POINTS))
     problem = geo_problem(scene, survey, initial, options, points=points, seed=options.seed)
     trainer = make_trainer(TrainingScene(scene, images, surface), problem, backend, options)
-    extend = not stage.resumed and _take_over(stage, effort(options).iterations)
+    extend = not stage.resumed and _take_over(stage, options.effort.iterations)
     files = LoopOptions(
         stage.out / CHECKPOINT,
         stage.out / METRICS,

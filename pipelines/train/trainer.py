@@ -25,6 +25,7 @@ from pipelines.splat.optimizer import GaussianAdam
 from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings, Render
 from pipelines.splat.surface import compactness_loss, depth_loss, flatness_loss, normal_loss
 from pipelines.train.checkpoint import prefixed, unprefixed
+from pipelines.train.pace import iteration_seconds
 from pipelines.train.schedule import JointOptions, TrainingSchedule
 from pipelines.train.target_images import TargetImage, TargetImages
 
@@ -184,6 +185,13 @@ class JointTrainer:
                 ViewContributions(shrink**2 * of_view.weight_px, shrink**2 * of_view.high_error_px)
             )
         return contributions
+
+    def work(self, iteration: int) -> float:
+        """Return the work of an iteration at the present number of Gaussians, relative to others' work."""
+        camera = self.views.images.pinhole(int(self.views.camera[0]))
+        shrink = self.schedule.shrink(iteration, max(camera.width, camera.height))
+        pixels, surface = camera.width * camera.height / shrink**2, self.options.surface is not None
+        return iteration_seconds(pixels, len(self.optimizer.gaussians), surface=surface)
 
     def pinhole(self, index: int) -> Pinhole:
         """Return the camera of an undistorted photograph, with the lens in use."""

@@ -17,6 +17,7 @@ from georef_cli.verbosity import Verbosity
 from pipelines.core.cautions import Caution
 from pipelines.core.progress import SILENT
 from pipelines.core.runner import Outcome
+from pipelines.core.sentences import duration
 from pipelines.core.staleness import StageState
 from pipelines.core.workspace import Manifest, Workspace
 from pipelines.scene.report import AsprsStatement, ByAxis, NoCrossValidation, PredictedSigma, TotalRmse
@@ -71,25 +72,27 @@ class TestReport:
         )
         crossed = cross_validation_with(count=8, rmse_h_m=0.044)
         parts = tables.report(report_with(camera=camera, crossed=crossed))
-        check, accuracy, cross = [text_of(part) for part in parts[1:4]]
+        check, accuracy, cross = [text_of(part) for part in parts[:3]]
         line = next(line for line in accuracy.splitlines() if line.startswith("camera"))
-        assert line.split() == ["camera", "0.018", "0.023", "2", "cm", "3", "cm", "0.017", "0.022", "–", "–"]
+        assert line.split() == ["camera", "0.018", "0.023", "2", "cm", "3", "cm", "0.017", "0.022"]
         assert "0.044" in cross
         assert "0.044" not in check
 
-    def test_unknown_is_a_dash(self) -> None:
-        assert "–" in text_of(*tables.report(REPORT)[:1])
+    def test_unknown_is_a_dash_where_another_row_is_known(self) -> None:
+        parts = [text_of(part) for part in tables.report(REPORT)]
+        assert "–" not in "".join(parts[:2]) and "LPIPS" not in parts[0] and "max 3D" not in parts[1]
+        beside = report_with(camera=check_points_with(count=3, rmse_h_m=0.1), model=check_points_with(count=2))
+        assert text_of(*tables.report(beside)).splitlines()[-1].split() == ["model", "2", "–"]
 
     def test_parts_that_are_not_there_have_no_table(self) -> None:
-        """No statement without check points, no cross-validation unless asked for."""
-        titles = [text_of(part).splitlines()[1] for part in tables.report(report_with())]
-        assert titles == ["Test views", "Check points, metres", "Residuals of the fit (not an accuracy), metres"]
+        """No table of dashes: nothing was measured, and cross-validation is made on request only."""
+        assert tables.report(report_with()) == []
 
     def test_impossible_cross_validation_counts_no_points(self) -> None:
         crossed = NoCrossValidation(count=0, reason="the measurements leave the similarity open")
         document = report_with().model_copy(update={"cross_validation": crossed})
-        lines = text_of(tables.report(document)[2]).splitlines()
-        assert lines[-1].split() == ["left", "out", "0"]
+        (part,) = tables.report(document)
+        assert text_of(part).splitlines()[-1] == "not possible: the measurements leave the similarity open"
 
 
 HOSTILE = "[red]a[/] [/] [link=file:///x]b[/link] :smile:"
@@ -127,7 +130,7 @@ def test_markup_in_names_is_printed_as_it_stands(monkeypatch: pytest.MonkeyPatch
     [(None, ""), (0.44, "0.4 s"), (12.2, "12 s"), (59.7, "1 min 00 s"), (200, "3 min 20 s"), (3900, "1 h 05 min")],
 )
 def test_duration(seconds: float | None, text: str) -> None:
-    assert tables.duration(seconds) == text
+    assert duration(seconds) == text
 
 
 class TestLines:

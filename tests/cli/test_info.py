@@ -44,9 +44,16 @@ def test_command_names_what_is_missing(real_georef: Georef, flight: Workspace, t
 
 
 def test_run_ends_with_where_the_files_are(flight: Workspace, capsys: pytest.CaptureFixture[str]) -> None:
-    print_outcomes(flight, (), overview(flight, CrsOptions()), as_json=False)
+    print_outcomes(flight, (), overview(flight, CrsOptions(crs="EPSG:4326")), as_json=False, told=False)
     out = " ".join(capsys.readouterr().out.split())
-    for text in ("at 46.00", "longitude 7.74", "/export/splat.ply", "georef info", "--deliver"):
+    for text in (
+        "at 46.00",
+        "longitude 7.74",
+        "export/splat.ply the splat",
+        "EPSG:4326 ",
+        "georef info",
+        "--deliver",
+    ):
         assert text in out
 
 
