@@ -46,6 +46,11 @@ def force_option(help_text: str = "Run even if the product is current.") -> clic
     return click.Option(["--force"], is_flag=True, help=help_text)
 
 
+def dry_run_option() -> click.Option:
+    """Return the option `--dry-run`."""
+    return click.Option(["--dry-run"], is_flag=True, help="Show what would be run, why, and how long; run nothing.")
+
+
 def forget_option() -> click.Option:
     """Return the option `--forget`."""
     return click.Option(

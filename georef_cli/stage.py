@@ -8,11 +8,12 @@ from typing import Any
 import click
 
 from georef_cli import boundary, options
-from georef_cli.command import Command
+from georef_cli.command import Command, merged_verbosity
 from georef_cli.display import is_told, progress_for
 from georef_cli.output import print_outcome
 from pipelines.core import runner
 from pipelines.core.stages import BY_NAME
+from pipelines.core.staleness import must_exist
 from pipelines.core.workspace import Resume
 
 
@@ -34,12 +35,38 @@ class StageCommand(Command):
                 *options.stage_options(self.spec.options),
                 *extra,
                 options.forget_option(),
+                options.dry_run_option(),
                 options.force_option(),
                 options.json_option(),
             ],
             help=doc,
             callback=click.pass_context(self.act),
         )
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the command, or show what it would do."""
+        if not ctx.params.pop("dry_run"):
+            return super().invoke(ctx)
+        ctx.obj = merged_verbosity(ctx)
+        with boundary.logged_to_stderr(ctx.obj):
+            self.show_plan(ctx, ctx.params)
+        return 0
+
+    def show_plan(self, ctx: click.Context, values: Mapping[str, Any]) -> None:
+        """Print what the command would do."""
+        from georef_cli.dry_run import print_dry_run
+
+        workspace = values["workspace"]
+        if self.spec.reads:
+            must_exist(workspace)
+        flags = {self.spec.name: self.flags(ctx, values)}
+        print_dry_run(workspace, (self.spec,), flags, force=values["force"], as_json=values["as_json"])
+
+    def flags(self, ctx: click.Context, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the options of this and earlier commands."""
+        given = options.given(ctx, self.spec.options.model_fields)
+        forget = options.forgotten(self.spec.options, values["forget"])
+        return runner.remembered(values["workspace"], self.spec, given, forget)
 
     def act(self, ctx: click.Context, **values: Any) -> None:
         """Run the stage and print its result."""
@@ -57,10 +84,7 @@ class StageCommand(Command):
         Raises:
             GeorefError: the stage failed.
         """
-        flags = options.given(ctx, self.spec.options.model_fields)
-        workspace = values["workspace"]
-        forget = options.forgotten(self.spec.options, values["forget"])
-        flags = runner.remembered(workspace, self.spec, flags, forget)
+        workspace, flags = values["workspace"], self.flags(ctx, values)
         with boundary.logged_to_file(workspace, self.spec):
             return runner.run_stage(
                 workspace,

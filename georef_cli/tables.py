@@ -91,7 +91,7 @@ def origins(rows: Sequence[OptionOrigin]) -> list[Renderable]:
     return [
         "\n[bold]Options that are no defaults[/]",
         table,
-        _FORGET,
+        *([_FORGET] if any(row.origin == "remembered" for row in rows) else []),
     ]
 
 

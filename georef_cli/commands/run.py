@@ -18,6 +18,7 @@ from pipelines.core.errors import GeorefError
 from pipelines.core.options import listed_names
 from pipelines.core.origins import names_of_flags
 from pipelines.core.stages import BY_NAME, DELIVERABLES, PIPELINE, StageSpec, stage_slice
+from pipelines.core.staleness import must_exist
 from pipelines.core.workspace import Workspace
 from pipelines.deliver.options import CrsOptions
 from pipelines.ingest.options import IngestOptions
@@ -52,12 +53,24 @@ def _run(ctx: click.Context, **values: Any) -> None:
     stages = (*_stages(first, values["last"]), *_deliverables(values["deliver"]))
     flags = _flags(ctx, stages)
     workspace = values["workspace"]
+    forget, force = _forgotten(values["forget"], stages), values["force"] or values["rerun_from"] is not None
+    if values["dry_run"]:
+        from georef_cli.dry_run import print_dry_run
+
+        if stages[0].reads:
+            must_exist(workspace)
+        asked = {
+            spec.name: runner.remembered(workspace, spec, flags.get(spec.name, {}), forget.get(spec.name, ()))
+            for spec in stages
+        }
+        print_dry_run(workspace, stages, asked, force=force, as_json=values["as_json"])
+        return
     outcomes = runner.run_pipeline(
         workspace,
         stages,
         flags,
-        forget=_forgotten(values["forget"], stages),
-        force=values["force"] or values["rerun_from"] is not None,
+        forget=forget,
+        force=force,
         progress=progress_for(ctx.obj),
         around=lambda spec: boundary.logged_to_file(workspace, spec),
     )
@@ -153,6 +166,7 @@ command = Command(
             "georef.toml or with their own commands.",
         ),
         options.forget_option(),
+        options.dry_run_option(),
         options.force_option("Run the stages even if their products are current."),
         options.json_option(),
     ],
@@ -166,6 +180,7 @@ command = Command(
         \b
         Examples:
           georef run flight --images photos --preset fast
+          georef run flight --images photos --preset high --dry-run
           georef run flight --images photos --gcp gcp_list.txt --to init-sim3
           georef run flight --from train --iterations 2000
           georef run flight --forget gcp

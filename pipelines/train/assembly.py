@@ -19,12 +19,8 @@ from pipelines.splat.rasterizer.backends import device_of
 from pipelines.splat.surface import SurfaceSettings
 from pipelines.train.initial_gaussians import TrainingScene, initial_gaussians, points_to_hold
 from pipelines.train.options import TrainOptions
-from pipelines.train.schedule import JointOptions
+from pipelines.train.schedule import COARSE, JointOptions
 from pipelines.train.trainer import JointTrainer, TrainingViews
-
-# Factor by which photographs are shrunken, and the fraction of the training up to which they are. A larger factor
-# would make the Gaussians smaller than a pixel, and push them off the surface that they start on.
-_COARSE = ((2, 0.3),)
 
 
 def training_size(scene: Scene, images: ImageCache, options: TrainOptions) -> TrainingSize:
@@ -68,7 +64,7 @@ def make_trainer(
             geo_weight=options.geo_weight,
             geo_schedule=options.geo_schedule,
             seed=options.seed,
-            coarse=_COARSE if options.coarse_to_fine else (),
+            coarse=COARSE if options.coarse_to_fine else (),
             surface=SurfaceSettings() if options.faithful_surface else None,
         ),
         exposures=Exposures(len(images), train, preset.iterations, device) if options.exposure else None,

@@ -11,6 +11,9 @@ from pipelines.georef.weights import WeightSchedule, rising_weight
 from pipelines.splat.surface import SurfaceSettings
 
 _FINAL_RATE = 0.05  # of the geographic unknowns, relative to their first learning rate
+# Factor by which photographs are shrunken, and the fraction of the training up to which they are. A larger factor
+# would make the Gaussians smaller than a pixel, and push them off the surface that they start on.
+COARSE = ((2, 0.3),)
 
 
 @dataclass(frozen=True)
