@@ -191,7 +191,7 @@ class _Line:
     def advance(self, steps: int = 1, note: str = "", left_s: float | None = None) -> None:
         """Add `steps` to the count, and log it if the last line is half a minute old."""
         self._done += steps
-        self._note, self._left_s = note or self._note, left_s
+        self._note, self._left_s = note.strip() if note else self._note, left_s
         if time.monotonic() - self._logged >= LINE_EVERY_S:
             self.log_count()
 

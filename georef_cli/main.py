@@ -43,6 +43,8 @@ class HelpLine:
 
 
 COMMANDS: dict[str, HelpLine] = {
+    "help": HelpLine("help", "Help", "Explain a topic, such as heights or options, or a command."),
+    "doctor": HelpLine("doctor", "Help", "Show what this machine offers: memory, GPU, backends, geoid grids."),
     "simulate": HelpLine("simulate", "Surveys", "Simulate a survey whose truth is known exactly."),
     "inspect": HelpLine(
         "inspect", "Surveys", "Show what a ROS bag holds, what ingest would choose, what is missing."
@@ -127,6 +129,7 @@ def cli() -> None:
     Examples:
       georef run flight --images photos
       georef status flight
+      georef help start
     """
 
 

@@ -42,6 +42,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
         "pipelines.geolocate",
         "pipelines.ingest",
         "pipelines.init_sim3",
+        "pipelines.machine",
         "pipelines.sfm",
         "pipelines.simulate",
         "pipelines.train",

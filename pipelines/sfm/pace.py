@@ -5,8 +5,8 @@ from __future__ import annotations
 from pipelines.core.threads import thread_count
 from pipelines.sfm.options import SfmOptions
 
-# Four reconstructions of 18, 48, 48 and 40 photographs took 61, 134, 148 and 175 s, on 2 cores of an AMD EPYC beside
-# other programs, 2026-11-22. This model says 49, 147, 125 and 103 s.
+# Four reconstructions of 18, 48, 48 and 40 photographs took 61, 134, 148 and 175 s, on 2 cores of an AMD EPYC
+# beside other programs, 2026-11-22. This model says 49, 147, 125 and 103 s.
 _MEASURED_CORES = 2
 _FEATURES_MEGAPIXEL_S, _PAIR_S, _MAPPING_S = 1.2, 0.12, 0.8
 
