@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +16,7 @@ from georef_cli.markup import shown
 from georef_cli.output import print_json, print_rich
 from georef_cli.overview import size
 from georef_cli.tables import Renderable
+from pipelines.core.errors import GeorefError
 from pipelines.core.options import notation
 from pipelines.core.plan import PlannedStage, plan
 from pipelines.core.products import load_json
@@ -28,6 +31,8 @@ from pipelines.train.options import TrainOptions
 
 if TYPE_CHECKING:
     from pipelines.train.forecast import TrainingForecast
+
+log = logging.getLogger(__name__)
 
 _STYLE = {
     "run": "yellow",
@@ -88,6 +93,23 @@ def print_dry_run(
     if training is not None:
         parts += ["\n[bold]Training[/]", *(f"  {shown(text)}" for text in training.sentences())]
     print_rich(*parts, "\n[dim]Nothing was run. Times are estimates for an idle machine.[/]")
+
+
+def announce_training(
+    workspace: Workspace, stages: tuple[StageSpec, ...], flags: Mapping[str, Flags], *, force: bool
+) -> None:
+    """Log the forecast of the training that a run will come to, at its start: not after hours of other stages.
+
+    Args:
+        workspace, stages, flags, force: as for `print_dry_run`. A run that will be refused is announced by nothing.
+    """
+    if all(spec.options is not TrainOptions for spec in stages):
+        return
+    with contextlib.suppress(GeorefError):
+        planned = plan(workspace, stages, flags, force=force)
+        training = _training(planned, _photographs(workspace, planned))
+        for sentence in () if training is None else training.sentences():
+            log.info("train: %s", sentence)
 
 
 def _document(

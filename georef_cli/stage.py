@@ -10,6 +10,7 @@ import click
 from georef_cli import boundary, options
 from georef_cli.command import Command, merged_verbosity
 from georef_cli.display import is_told, progress_for
+from georef_cli.dry_run import announce_training, print_dry_run
 from georef_cli.output import print_outcome
 from pipelines.core import runner
 from pipelines.core.stages import BY_NAME
@@ -54,8 +55,6 @@ class StageCommand(Command):
 
     def show_plan(self, ctx: click.Context, values: Mapping[str, Any]) -> None:
         """Print what the command would do."""
-        from georef_cli.dry_run import print_dry_run
-
         workspace = values["workspace"]
         if self.spec.reads:
             must_exist(workspace)
@@ -85,6 +84,7 @@ class StageCommand(Command):
             GeorefError: the stage failed.
         """
         workspace, flags = values["workspace"], self.flags(ctx, values)
+        announce_training(workspace, (self.spec,), {self.spec.name: flags}, force=values["force"])
         with boundary.logged_to_file(workspace, self.spec):
             return runner.run_stage(
                 workspace,

@@ -12,6 +12,7 @@ import click
 from georef_cli import boundary, options
 from georef_cli.command import Command
 from georef_cli.display import is_told, progress_for
+from georef_cli.dry_run import announce_training, print_dry_run
 from georef_cli.output import print_outcomes
 from pipelines.core import runner
 from pipelines.core.errors import GeorefError
@@ -54,17 +55,16 @@ def _run(ctx: click.Context, **values: Any) -> None:
     flags = _flags(ctx, stages)
     workspace = values["workspace"]
     forget, force = _forgotten(values["forget"], stages), values["force"] or values["rerun_from"] is not None
+    if stages[0].reads:
+        must_exist(workspace)
+    asked = {
+        spec.name: runner.remembered(workspace, spec, flags.get(spec.name, {}), forget.get(spec.name, ()))
+        for spec in stages
+    }
     if values["dry_run"]:
-        from georef_cli.dry_run import print_dry_run
-
-        if stages[0].reads:
-            must_exist(workspace)
-        asked = {
-            spec.name: runner.remembered(workspace, spec, flags.get(spec.name, {}), forget.get(spec.name, ()))
-            for spec in stages
-        }
         print_dry_run(workspace, stages, asked, force=force, as_json=values["as_json"])
         return
+    announce_training(workspace, stages, asked, force=force)
     outcomes = runner.run_pipeline(
         workspace,
         stages,

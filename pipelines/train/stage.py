@@ -27,7 +27,6 @@ from pipelines.splat.rasterizer.backends import device_of, rasterizer
 from pipelines.splat.storage import write_gaussians
 from pipelines.train.assembly import make_trainer, training_size
 from pipelines.train.depth_maps import DepthMaps
-from pipelines.train.forecast import forecast
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.loop import LoopOptions, optimise
 from pipelines.train.options import TrainOptions
@@ -56,9 +55,6 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     scene = initial_scene(read_sparse(workspace.path(SPARSE)), survey, initial)
     images = photographs(scene.sparse, survey, workspace, options.effort.max_image_size)
     require_memory(training_size(scene, images, options), free_memory_bytes(device_of(backend)))
-    largest = max(survey.cameras, key=lambda camera: camera.width * camera.height)
-    for sentence in forecast(len(images), (largest.width, largest.height), options).sentences():
-        log.info("%s", sentence)
     images.build(stage.progress)
     surface = None
     if options.dense:

@@ -16,7 +16,8 @@ from tests.cli_runs import Georef, finish, start
 
 @pytest.fixture
 def done(georef: Georef, workspace: Workspace, photos: Path) -> Path:
-    assert georef("run", workspace.root, "--images", photos).code == 0
+    """A workspace in which a stage can fail: ingest is done."""
+    assert georef("ingest", workspace.root, "--images", photos).code == 0
     return workspace.root
 
 

@@ -25,7 +25,7 @@ def stop(stage: StageRun, options: object) -> Summary:
 def interrupted(georef: Georef, workspace: Workspace, photos: Path) -> Path:
     """A workspace whose training, begun with `--preset fast`, was interrupted after 12 minutes."""
     fakes.install(train=stop)
-    assert georef("run", workspace.root, "--images", photos, "--preset", "fast").code == 130
+    assert georef("run", workspace.root, "--images", photos, "--to", "train", "--preset", "fast").code == 130
     fakes.install()
     return workspace.root
 
@@ -45,7 +45,7 @@ def assert_refused(result: Result, root: Path, reason: str) -> None:
     assert (root / CHECKPOINT).read_text() == "1500"
 
 
-@pytest.mark.parametrize("words", [("run",), ("run", "--from", "train"), ("train",), ("train", "--resume")])
+@pytest.mark.parametrize("words", [("run",), ("train",), ("train", "--resume")])
 def test_other_options_are_refused(georef: Georef, interrupted: Path, words: tuple[str, ...]) -> None:
     command, *options = words
     result = georef(command, interrupted, *options, "--preset", "high", "--json")
@@ -66,7 +66,7 @@ def test_other_inputs_are_refused(georef: Georef, interrupted: Path) -> None:
     assert_refused(georef("run", interrupted), interrupted, "sim3/geo_from_local.json changed")
 
 
-@pytest.mark.parametrize("words", [("run",), ("train",), ("train", "--resume"), ("train", "--preset", "fast")])
+@pytest.mark.parametrize("words", [("run",), ("train", "--resume"), ("train", "--preset", "fast")])
 def test_the_same_options_continue(georef: Georef, interrupted: Path, words: tuple[str, ...]) -> None:
     command, *options = words
     assert georef(command, interrupted, *options).code == 0
@@ -74,7 +74,7 @@ def test_the_same_options_continue(georef: Georef, interrupted: Path, words: tup
     assert not (interrupted / "train/progress.txt").exists()
 
 
-@pytest.mark.parametrize("words", [("run",), ("run", "--rerun-from", "train"), ("train",)])
+@pytest.mark.parametrize("words", [("run", "--rerun-from", "train"), ("train",)])
 def test_force_drops_it(georef: Georef, interrupted: Path, words: tuple[str, ...]) -> None:
     command, *options = words
     forced = () if "--rerun-from" in options else ("--force",)
@@ -125,13 +125,13 @@ class TestExtension:
         words: list[object],
         extends: bool,
     ) -> None:
-        assert georef("run", workspace.root, "--images", photos, "--iterations", 300).code == 0
+        assert georef("run", workspace.root, "--images", photos, "--to", "train", "--iterations", 300).code == 0
         assert georef("train", workspace.root, *words).code == 0
         assert seen == [False, extends]
 
     def test_other_inputs_do_not(
         self, georef: Georef, seen: list[bool], workspace: Workspace, photos: Path
     ) -> None:
-        assert georef("run", workspace.root, "--images", photos, "--iterations", 300).code == 0
-        assert georef("run", workspace.root, "--test-every", 4, "--iterations", 900).code == 0
+        assert georef("run", workspace.root, "--images", photos, "--to", "train", "--iterations", 300).code == 0
+        assert georef("run", workspace.root, "--to", "train", "--test-every", 4, "--iterations", 900).code == 0
         assert seen == [False, False]

@@ -12,18 +12,18 @@ from tests.cli_runs import Georef
 
 @pytest.fixture
 def done(georef: Georef, workspace: Workspace, photos: Path, tmp_path: Path) -> Path:
-    """A finished workspace with control points and an imported SfM model."""
+    """A workspace with control points and an imported SfM model, and a preset for training."""
     (tmp_path / "gcp.txt").write_text("EPSG:4326")
     (tmp_path / "model").mkdir()
     assert georef("ingest", workspace.root, "--images", photos, "--gcp", tmp_path / "gcp.txt").code == 0
     assert georef("sfm", workspace.root, "--import", tmp_path / "model").code == 0
-    assert georef("run", workspace.root, "--preset", "fast").code == 0
+    workspace.remember({"train": {"preset": "fast"}})
     return workspace.root
 
 
 def test_bare_command_repeats_what_was_asked_for(georef: Georef, done: Path) -> None:
     """An imported model is not replaced by a reconstruction of hours, because a flag was left out."""
-    for stage in ("ingest", "sfm", "train"):
+    for stage in ("ingest", "sfm"):
         assert not georef(stage, done, "--json").document["ran"], stage
 
 
@@ -33,9 +33,10 @@ def test_one_option_more_keeps_the_others(georef: Georef, done: Path, photos: Pa
     assert Workspace(done).requests()["ingest"] == expected
 
 
-@pytest.mark.parametrize("command", ["ingest", "run"])
-def test_forget_drops_one_option(georef: Georef, done: Path, photos: Path, command: str) -> None:
-    assert georef(command, done, "--forget", "gcp").code == 0
+@pytest.mark.parametrize("words", [("ingest",), ("run", "--to", "ingest")])
+def test_forget_drops_one_option(georef: Georef, done: Path, photos: Path, words: tuple[str, ...]) -> None:
+    command, *options = words
+    assert georef(command, done, *options, "--forget", "gcp").code == 0
     assert Workspace(done).requests()["ingest"] == {"images": str(photos)}
     assert Workspace(done).requests()["train"] == {"preset": "fast"}
 
@@ -72,9 +73,9 @@ def test_status_shows_options_with_their_origin(georef: Georef, done: Path, phot
 
 
 def test_aliases_of_other_programs(georef: Georef, done: Path) -> None:
-    result = georef("run", done, "--rerun-from", "geolocate", "--end-with", "init-sim3", "--json")
+    result = georef("run", done, "--rerun-from", "sfm", "--end-with", "calibrate", "--json")
     assert [(row["stage"], row["ran"]) for row in result.document["stages"]] == [
-        ("geolocate", True),
-        ("init-sim3", True),
+        ("sfm", True),
+        ("calibrate", True),
     ]
     georef("run", done, "--from", "sfm", "--rerun-from", "sfm").assert_failed(2)
