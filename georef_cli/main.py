@@ -52,6 +52,7 @@ COMMANDS: dict[str, HelpLine] = {
     "run": HelpLine("run", "Pipeline", "Run all stages, or some, skipping what is current."),
     "status": HelpLine("status", "Pipeline", "Show the state of every stage."),
     "info": HelpLine("info", "Pipeline", "Show where on Earth the result is, and what each file is for."),
+    "view": HelpLine("view", "Pipeline", "See the trained model in a browser, and measure in it."),
     "ingest": HelpLine("ingest", "Stages", "Read photographs, positions and control points into one survey."),
     "sfm": HelpLine("sfm", "Stages", "Reconstruct cameras and points with COLMAP."),
     "calibrate": HelpLine("calibrate", "Stages", "Estimate time offset, boresight and lever arm after sfm."),

@@ -37,6 +37,7 @@ def short(result: Overview) -> list[Renderable]:
         files.add_row(f"  {shown(file.path)}", f"{state}[dim]{shown(file.purpose)}[/]")
     names = ",".join(command.split()[1].removeprefix("export-") for command in result.further)
     further = {
+        f"georef view {workspace}": "see it in a browser, and measure in it",
         f"georef info {workspace}": "sizes and states of the files",
         f"georef evaluate {workspace}": "all figures of test views, check points and fit",
         **({f"georef run {workspace} --deliver {names}": "further deliverables"} if names else {}),

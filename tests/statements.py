@@ -8,7 +8,6 @@ import numpy as np
 
 from pipelines.accuracy.prediction import AccuracyPrediction
 from pipelines.core.cautions import Caution
-from pipelines.evaluate.points_by_camera import points_by_camera
 from pipelines.geolocate.options import GeolocateOptions
 from pipelines.geolocate.stage import geolocate
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
@@ -21,6 +20,7 @@ from pipelines.scene.geographic import geo_problem
 from pipelines.scene.geographic_options import GeographicOptions
 from pipelines.scene.initial_similarity import InitialSimilarity
 from pipelines.scene.marks import mark_rays
+from pipelines.scene.points_by_camera import points_by_camera
 from pipelines.scene.scene import initial_scene
 from pipelines.scene.solved_survey import solve_survey
 from pipelines.scene.survey import Survey

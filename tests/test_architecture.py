@@ -46,6 +46,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
         "pipelines.sfm",
         "pipelines.simulate",
         "pipelines.train",
+        "pipelines.view",
     ),
     ("georef_cli",),
 )
@@ -74,6 +75,8 @@ HOMES: dict[str, tuple[str, ...]] = {
     "rasterio": ("pipelines.formats",),
     "pyogrio": ("pipelines.formats",),
     "ezdxf": ("pipelines.formats",),
+    "viser": ("pipelines.view",),
+    "websockets": ("pipelines.view",),
 }
 # The entry point of a process whose log records go to its parent.
 CHILD = "pipelines.core.child"

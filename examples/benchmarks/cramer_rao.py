@@ -26,7 +26,6 @@ from pipelines.core.stages import SIM3
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import Workspace
 from pipelines.evaluate.cramer_rao import cramer_rao_bound
-from pipelines.evaluate.points_by_camera import points_by_camera
 from pipelines.georef.adjustment import Correspondences
 from pipelines.georef.alignment import align
 from pipelines.georef.cameras import CameraCorrections
@@ -36,6 +35,7 @@ from pipelines.georef.similarity import LearnableSimilarity
 from pipelines.georef.terms import ControlTerm, FixTerm
 from pipelines.scene.initial_similarity import InitialSimilarity
 from pipelines.scene.marks import MarkRays, mark_rays
+from pipelines.scene.points_by_camera import points_by_camera
 from pipelines.scene.solved_survey import SolvedSurvey, geographic_options_of, solve_survey
 from pipelines.scene.trained_survey import load_trained
 

@@ -12,7 +12,7 @@ from georef_cli.output import print_json, print_rich
 from pipelines.core.options import resolve
 from pipelines.core.staleness import must_exist
 from pipelines.core.workspace import Workspace
-from pipelines.deliver.options import CrsOptions
+from pipelines.scene.crs_options import CrsOptions
 
 
 def _info(ctx: click.Context, workspace: Workspace, as_json: bool, **_values: Any) -> None:

@@ -21,8 +21,8 @@ from pipelines.core.origins import names_of_flags
 from pipelines.core.stages import BY_NAME, DELIVERABLES, PIPELINE, StageSpec, stage_slice
 from pipelines.core.staleness import must_exist
 from pipelines.core.workspace import Workspace
-from pipelines.deliver.options import CrsOptions
 from pipelines.ingest.options import IngestOptions
+from pipelines.scene.crs_options import CrsOptions
 
 if TYPE_CHECKING:
     from pipelines.deliver.overview import Overview

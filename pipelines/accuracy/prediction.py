@@ -93,6 +93,18 @@ class AccuracyPrediction:
         jacobian = jacobian_of_points(self._solved, point_in_geo, point, camera, sigma_px)
         return self._covariance(point_in_geo, jacobian)
 
+    def jointly_of_scene(self, point_in_geo: FloatArray, point: IntArray, camera: IntArray) -> FloatArray:
+        """Return the joint covariance (3 J, 3 J) in m² of points of the scene, without errors of marks.
+
+        Args:
+            point_in_geo: (J, 3) metres.
+            point: (K,) index into the points, of each ray.
+            camera: (K,) index of the camera that sees the point.
+        """
+        sigma_px = mean_focal_px(self._solved.scene.sparse, camera)  # all rays have the same angular σ
+        jacobian = jacobian_of_points(self._solved, point_in_geo, point, camera, sigma_px)
+        return np.asarray(self._posterior.jointly_at(point_in_geo, *self._derivatives(jacobian)))
+
     def of_cameras(self) -> FloatArray:
         """Return the covariance (n, 6, 6) of (δθ [rad], δc [m]) of the trained cameras, along the axes of `geo`.
 

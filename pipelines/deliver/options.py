@@ -8,7 +8,7 @@ from urllib.parse import urlsplit
 from pydantic import AfterValidator, Field
 
 from pipelines.core.options import StageOptions
-from pipelines.geodesy.vertical import Vertical
+from pipelines.scene.crs_options import CrsOptions
 
 # The page was tried with this version: the extensions of splats in glTF are younger than those of meshes.
 CESIUM = "https://cesium.com/downloads/cesiumjs/releases/1.145/Build/Cesium/"
@@ -41,21 +41,6 @@ class ExportSpzOptions(WebSplatOptions):
 
     spz_version: Literal["3", "4"] = Field(
         "3", description="Version of the format: CesiumJS and Spark read 3, PlayCanvas reads 4 only."
-    )
-
-
-class CrsOptions(StageOptions):
-    """Options of every file whose coordinates are in a CRS."""
-
-    crs: str | None = Field(
-        None,
-        description="CRS of the file: EPSG:32632, EPSG:32632+3855, a PROJ string or WKT. Without it: the UTM zone "
-        "of the scene.",
-    )
-    vertical: Vertical | None = Field(
-        None,
-        description="Datum of the heights where --crs is silent: ellipsoidal, EGM96, EGM2008 or EPSG:n. Without "
-        "it: that of the survey.",
     )
 
 

@@ -12,23 +12,22 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.core.cautions import Caution
-from pipelines.core.errors import GeorefError, InputError
+from pipelines.core.errors import GeorefError
 from pipelines.core.products import load_json
 from pipelines.core.stages import BY_NAME, DELIVERABLES, GAUSSIANS, MODEL, REPORT
 from pipelines.core.staleness import StageState, cautions_by_stage, status
 from pipelines.core.types import FloatArray, Vector3
 from pipelines.core.workspace import Workspace
-from pipelines.deliver.options import CrsOptions
 from pipelines.deliver.placement import Placement, place
 from pipelines.deliver.purposes import PURPOSES
-from pipelines.deliver.target_crs import TargetCrs, target_crs
 from pipelines.formats.geojson import Json, feature, polygon
 from pipelines.formats.splat_ply import read_centres
 from pipelines.geodesy.enu import ecef_from_enu, lla_from_ecef
-from pipelines.geodesy.vertical import ELLIPSOIDAL, VerticalChoice
 from pipelines.scene.calibrated import load_survey
+from pipelines.scene.crs_options import CrsOptions
 from pipelines.scene.report import read_report
 from pipelines.scene.survey import Survey
+from pipelines.scene.target_crs import usable_crs
 from pipelines.scene.trained_model import TrainedModel
 
 _RIM = 0.01  # fraction of the Gaussians outside the bounds at either end: sky, and floaters
@@ -199,7 +198,7 @@ def _bounds(points_in_geo: FloatArray, survey: Survey, options: CrsOptions) -> B
     lla[:, 1] -= 360.0 * np.round((lla[:, 1] - lla[0, 1]) / 360.0)
     (south, west, low_m), (north, east, high_m) = (row.tolist() for row in _robust(lla))
     spanning = _robust(points_in_geo)
-    crs, assumed = _target(survey, spanning, options)
+    crs = usable_crs(options, survey.origin, spanning, survey.vertical)
     low, high = _robust(crs.xyz_from_geo(points_in_geo))
     return Bounds(
         west=_wrapped(west),
@@ -212,24 +211,8 @@ def _bounds(points_in_geo: FloatArray, survey: Survey, options: CrsOptions) -> B
         heights=crs.crs.vertical.name,
         low=_vector(low),
         high=_vector(high),
-        assumed=assumed,
+        assumed=crs.assumed,
     )
-
-
-def _target(survey: Survey, spanning: FloatArray, options: CrsOptions) -> tuple[TargetCrs, tuple[str, ...]]:
-    """Return the CRS of the bounds; ellipsoidal heights if the survey's datum needs a grid that is not installed.
-
-    Only the default gives way: a user who names a CRS or a datum learns what is missing.
-    """
-    try:
-        crs = target_crs(options, survey.origin, spanning, survey.vertical)
-        return crs, crs.assumed
-    except InputError:
-        if options.crs is not None or options.vertical is not None:
-            raise
-    choice = VerticalChoice(ELLIPSOIDAL, None)
-    crs = target_crs(CrsOptions(vertical=choice), survey.origin, spanning, survey.vertical)
-    return crs, (*crs.assumed, f"heights are ellipsoidal: the grid of {survey.vertical.name} is not installed")
 
 
 def _quality(workspace: Workspace, placement: Placement) -> Quality:

@@ -10,9 +10,9 @@ from pipelines.accuracy.prediction import AccuracyPrediction
 from pipelines.core.cautions import Caution
 from pipelines.core.sentences import listed
 from pipelines.core.types import FloatArray
-from pipelines.evaluate.points_by_camera import points_by_camera
 from pipelines.robust.statistics import chi2_quantile
 from pipelines.scene.marks import mark_rays
+from pipelines.scene.points_by_camera import points_by_camera
 from pipelines.scene.report import CheckPointErrors
 from pipelines.scene.survey import Survey
 from pipelines.scene.trained_survey import TrainedSurvey

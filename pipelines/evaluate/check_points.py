@@ -18,11 +18,11 @@ from pipelines.evaluate.point_report import (
     cross_validation_errors,
     point_residuals,
 )
-from pipelines.evaluate.points_by_camera import points_by_camera
-from pipelines.evaluate.points_by_model import points_by_model
 from pipelines.georef.posterior import LeftOut, leave_one_out
 from pipelines.robust.statistics import residual_stats
 from pipelines.scene.marks import MarkRays, mark_rays
+from pipelines.scene.points_by_camera import points_by_camera
+from pipelines.scene.points_by_model import DepthMap, depth_around, points_by_model
 from pipelines.scene.renderer import ModelRenderer
 from pipelines.scene.report import (
     CheckPointErrors,
@@ -100,21 +100,19 @@ def _by_camera(
 
 def _by_model(renderer: ModelRenderer, rays: MarkRays, progress: Progress) -> CheckPointErrors:
     """Return the errors of the places of the Gaussians' surface behind the marks."""
-    points, depth_m = renderer.trained.survey.check_points, _depth_maps(renderer, rays, progress)
-    pinholes = {index: renderer.pinhole(index) for index in depth_m}
-    position = points_by_model(renderer.trained, rays, depth_m, pinholes)
+    points, maps = renderer.trained.survey.check_points, _depth_maps(renderer, rays, progress)
+    position = points_by_model(renderer.trained, rays, maps)
     return check_point_errors(_compared(points, position, rays))
 
 
-def _depth_maps(renderer: ModelRenderer, rays: MarkRays, progress: Progress) -> dict[int, FloatArray]:
-    """Return the depth of the surface (H, W) in metres, by camera, for the cameras that show a mark."""
-    depth_m = {}
-    cameras = sorted({int(index) for index in rays.camera})
-    with progress.task("depth maps", len(cameras)) as task:
-        for index in cameras:
-            depth_m[index] = renderer.depth_m(index)
+def _depth_maps(renderer: ModelRenderer, rays: MarkRays, progress: Progress) -> list[DepthMap]:
+    """Return the depth of the surface around each mark."""
+    maps = []
+    with progress.task("depth at marks", len(rays)) as task:
+        for camera, xy in zip(rays.camera, rays.xy, strict=True):
+            maps.append(depth_around(renderer, int(camera), xy))
             task.advance()
-    return depth_m
+    return maps
 
 
 def _compared(points: tuple[SurveyedPoint, ...], position_in_geo: FloatArray, rays: MarkRays) -> MeasuredPoints:

@@ -61,6 +61,14 @@ def right_jacobian_inverse_so3(rotation_vector: ArrayLike) -> FloatArray:
     return np.eye(3) + 0.5 * cross + np.where(angle < 1e-4, 1.0 / 12.0, quadratic) * (cross @ cross)
 
 
+def rotation_towards(direction: ArrayLike) -> FloatArray:
+    """Return a rotation (3, 3) cam ← frame of a camera that looks along a unit vector (3,); any roll."""
+    z = np.asarray(direction, dtype=np.float64)
+    least = np.eye(3)[np.argmin(np.abs(z))]
+    x = np.cross(least, z) / np.linalg.norm(np.cross(least, z))
+    return np.stack([x, np.cross(z, x), z])
+
+
 def skew(vector: ArrayLike) -> FloatArray:
     """Return cross-product matrices (…, 3, 3): `skew(a) @ b = a × b`."""
     v = np.asarray(vector, dtype=np.float64)

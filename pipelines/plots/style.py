@@ -8,7 +8,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+import numpy as np
+
 from pipelines.core.durable import replace_file
+from pipelines.core.types import ByteArray, FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -42,6 +45,14 @@ def label(axes: Axes, title: str, *, x: str | None = None, y: str | None = None)
     axes.set_xlabel(x or "", fontsize=LABEL_POINTS)
     axes.set_ylabel(y or "", fontsize=LABEL_POINTS)
     axes.tick_params(labelsize=TICK_POINTS)
+
+
+def colours_of(values: FloatArray, low: float, high: float) -> ByteArray:
+    """Return the colours (N, 3) of values (N,) on the scale of the maps, from `low` to `high`."""
+    from matplotlib import colormaps
+
+    share = np.clip((values - low) / max(high - low, 1e-12), 0.0, 1.0)
+    return np.asarray(np.round(255 * colormaps[COLOUR_MAP](share)[:, :3]), dtype=np.uint8)
 
 
 def write_png(figure: Figure, path: Path) -> None:

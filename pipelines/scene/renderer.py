@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
+
 import numpy as np
 import torch
 
@@ -10,7 +13,23 @@ from pipelines.geometry.cameras import Pinhole
 from pipelines.scene.photographs import ImageCache
 from pipelines.scene.trained_survey import TrainedSurvey, trained_pinholes
 from pipelines.splat.depth import measured_depth
-from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings, Render
+from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings, Render, Window
+from pipelines.splat.spatial_blocks import SpatialBlocks
+
+
+@dataclass(frozen=True)
+class ViewPose:
+    """Camera somewhere in the scene.
+
+    Attributes:
+        pinhole: of its image.
+        cam_from_model: (3, 3) rotation.
+        center_in_model: (3,) metres.
+    """
+
+    pinhole: Pinhole
+    cam_from_model: FloatArray
+    center_in_model: FloatArray
 
 
 class ModelRenderer:
@@ -29,6 +48,10 @@ class ModelRenderer:
         device = torch.device("cuda" if backend.name == "cuda" else "cpu")
         self._gaussians = trained.gaussians.to(device)
 
+    @cached_property
+    def _blocks(self) -> SpatialBlocks:
+        return SpatialBlocks(self.trained.gaussians)
+
     def pinhole(self, index: int) -> Pinhole:
         """Return the pinhole of camera `index`, at the size of its render."""
         return self._pinholes.of(index)
@@ -40,18 +63,45 @@ class ModelRenderer:
             index: of the camera.
             depth: render depths as well.
         """
-        model, poses = self.trained.model, self.trained.poses
+        return self.render_from(self.pose(index), depth=depth)
+
+    def pose(self, index: int) -> ViewPose:
+        """Return the pose of camera `index`."""
+        poses = self.trained.poses
+        return ViewPose(self.pinhole(index), poses.cam_from_model[index], poses.cam_center_in_model[index])
+
+    def render_from(self, pose: ViewPose, *, depth: bool = False, window: Window | None = None) -> Render:
+        """Return the render of any camera, without gradients.
+
+        Args:
+            pose: of the camera.
+            depth: render depths as well.
+            window: part of the image to render; None: all of it.
+        """
+        model = self.trained.model
         matrix = np.eye(4)
-        matrix[:3, :3] = poses.cam_from_model[index]
-        matrix[:3, 3] = -poses.cam_from_model[index] @ poses.cam_center_in_model[index]
-        settings = RasterSettings(sh_degree=model.sh_degree, background=model.background, depth=depth)
-        cam_from_model = torch.as_tensor(matrix, dtype=torch.float32, device=self._gaussians.means.device)
+        matrix[:3, :3] = pose.cam_from_model
+        matrix[:3, 3] = -pose.cam_from_model @ pose.center_in_model
+        settings = RasterSettings(model.sh_degree, model.background, depth=depth, window=window)
+        gaussians = self._gaussians
+        if window is not None:  # A pass over millions of Gaussians takes longer than the window itself.
+            gaussians = self._blocks.shown(matrix, pose.pinhole, settings).to(gaussians.means.device)
+        cam_from_model = torch.as_tensor(matrix, dtype=torch.float32, device=gaussians.means.device)
         with torch.no_grad():
-            return self._backend.render(self._gaussians, cam_from_model, self.pinhole(index), settings)
+            return self._backend.render(gaussians, cam_from_model, pose.pinhole, settings)
 
     def depth_m(self, index: int) -> FloatArray:
         """Return the depth (H, W) in metres of the surface along the z axis of camera `index`; 0: no surface."""
-        return np.asarray(_measured(self.render(index, depth=True)).cpu().numpy())
+        return self.depth_from(self.pose(index))
+
+    def depth_from(self, pose: ViewPose, window: Window | None = None) -> FloatArray:
+        """Return the depth (H, W) in metres of the surface along the z axis of any camera; 0: no surface.
+
+        Args:
+            pose: of the camera.
+            window: part of the image to render; None: all of it.
+        """
+        return np.asarray(_measured(self.render_from(pose, depth=True, window=window)).cpu().numpy())
 
     def surface(self, index: int) -> tuple[Float32Array, ByteArray]:
         """Return the depth (H, W) as `depth_m` does, and the colours (H, W, 3) of the same render."""

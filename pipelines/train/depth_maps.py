@@ -91,7 +91,7 @@ class DepthMaps:
         steps = (("coarse", self._sweep), ("fine", self._refine), ("depth", self._agree))
         if not all(self._path(index, "depth").exists() for index in train):
             with progress.task("surface", len(steps) * len(train)) as task:
-                task.advance(0, "compiling kernels: on a new machine a minute")
+                task.advance(0, "compiling kernels (a minute, once)")
                 for kind, make in steps:
                     for index in train:
                         if not self._path(index, kind).exists():

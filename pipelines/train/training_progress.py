@@ -8,7 +8,7 @@ from types import TracebackType
 from pipelines.core.progress import Progress, ProgressTask
 from pipelines.train.pace import TimeLeft
 
-_COMPILING = "compiling kernels: on a new machine a minute"
+_COMPILING = "compiling kernels (a minute, once)"
 
 
 class TrainingProgress:

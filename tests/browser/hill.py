@@ -12,7 +12,6 @@ import torch
 
 from pipelines.deliver.options import PageOptions, SplatOptions
 from pipelines.deliver.splat import PlacedSplat, placed_splat
-from pipelines.deliver.target_crs import target_crs
 from pipelines.deliver.tiles.page import ScenePage, scene_page
 from pipelines.geodesy.enu import (
     Origin,
@@ -27,6 +26,7 @@ from pipelines.geometry.cameras import Pinhole
 from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.similarity import Similarity
 from pipelines.scene.survey import Survey, SurveyedPoint
+from pipelines.scene.target_crs import target_crs
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.cpu import CpuRasterizer

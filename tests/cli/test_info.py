@@ -10,8 +10,8 @@ from georef_cli.output import print_outcomes
 from georef_cli.overview import size
 from pipelines.core.stages import MODEL, SPLAT
 from pipelines.core.workspace import Workspace
-from pipelines.deliver.options import CrsOptions
 from pipelines.deliver.overview import overview
+from pipelines.scene.crs_options import CrsOptions
 from tests.cli_runs import Georef
 from tests.trained_workspaces import trained_workspace
 

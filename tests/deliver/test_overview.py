@@ -14,11 +14,11 @@ from pipelines.core.errors import InputError, MissingProductError
 from pipelines.core.products import load_json, save_json
 from pipelines.core.stages import DELIVERABLES, MODEL, SPLAT, SURVEY
 from pipelines.core.workspace import Workspace
-from pipelines.deliver.options import CrsOptions
 from pipelines.deliver.overview import Bounds, overview
 from pipelines.deliver.purposes import PURPOSES
 from pipelines.geodesy.enu import ecef_from_enu
 from pipelines.geodesy.vertical import VerticalDatum, parse_vertical
+from pipelines.scene.crs_options import CrsOptions
 from pipelines.scene.survey import Survey
 from pipelines.scene.trained_model import TrainedModel
 from tests.reports import check_points_with, report_with

@@ -15,7 +15,6 @@ from pydantic import ValidationError
 from pipelines.core.cautions import NOT_CHECKED, Caution
 from pipelines.deliver.options import CESIUM, PageOptions, SplatOptions
 from pipelines.deliver.splat import placed_splat
-from pipelines.deliver.target_crs import target_crs
 from pipelines.deliver.tiles.local_crs import LocalCrs, fit_local_crs
 from pipelines.deliver.tiles.page import ScenePage, scene_page, write_page
 from pipelines.geodesy.crs import parse_crs
@@ -23,6 +22,7 @@ from pipelines.geodesy.enu import ecef_from_enu, ecef_from_enu_rotation, ecef_fr
 from pipelines.geodesy.vertical import parse_vertical
 from pipelines.geometry.similarity import Similarity
 from pipelines.scene.survey import Survey
+from pipelines.scene.target_crs import target_crs
 from pipelines.splat.gaussians import Gaussians
 from tests.scenes import Measured, Noise, make_scene, survey_of, trained_model
 

@@ -11,11 +11,11 @@ from pipelines.core.cautions import Caution
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import Workspace
 from pipelines.deliver.placement import Placement
-from pipelines.deliver.target_crs import TargetCrs
 from pipelines.formats.camera_table import CameraTable
 from pipelines.geodesy.enu import geo_from_enu_at, lla_from_enu
 from pipelines.geodesy.grid_axes import grid_from_enu
 from pipelines.geometry.rotations import omega_phi_kappa_deg, omega_phi_kappa_jacobian, yaw_pitch_roll_deg
+from pipelines.scene.target_crs import TargetCrs
 from pipelines.scene.trained_survey import TrainedSurvey
 
 UNKNOWN_SIGMA = "cameras-without-sigma"

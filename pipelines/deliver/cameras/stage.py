@@ -23,7 +23,6 @@ from pipelines.deliver.cameras.footprints import footprints_of
 from pipelines.deliver.cameras.on_earth import camera_table, cameras_on_earth, predicted_covariance
 from pipelines.deliver.options import ExportCamerasOptions
 from pipelines.deliver.placement import Placement, place
-from pipelines.deliver.target_crs import TargetCrs, target_crs
 from pipelines.formats.camera_table import CameraTable, write_camera_table
 from pipelines.formats.colmap_writer import write_sparse
 from pipelines.formats.geojson import write_features
@@ -34,6 +33,7 @@ from pipelines.geometry.bundle import Network
 from pipelines.geometry.refined_points import refined_points
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
+from pipelines.scene.target_crs import TargetCrs, target_crs
 from pipelines.scene.trained_survey import TrainedSurvey, load_trained
 
 _LENS_TOLERANCE_PX = 0.01  # of a lens that nerfstudio's model replaces: below, nobody need know

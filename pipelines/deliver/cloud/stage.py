@@ -20,11 +20,11 @@ from pipelines.deliver.cloud.tally import Tally
 from pipelines.deliver.options import ExportCloudOptions
 from pipelines.deliver.predicted_sigma import predicted_sigma
 from pipelines.deliver.scene_extent import corners, scene_points
-from pipelines.deliver.target_crs import target_crs
 from pipelines.formats.georef_sidecar import CrsSidecar, write_sidecar
 from pipelines.scene.renderer import ModelRenderer
 from pipelines.scene.scene import photographs
 from pipelines.scene.surface_views import SurfaceViews
+from pipelines.scene.target_crs import target_crs
 from pipelines.scene.trained_survey import load_trained
 from pipelines.splat.rasterizer.backends import rasterizer
 

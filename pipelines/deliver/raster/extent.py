@@ -12,8 +12,8 @@ import numpy as np
 from pipelines.core.errors import InputError
 from pipelines.core.types import FloatArray
 from pipelines.deliver.options import ExportRasterOptions
-from pipelines.deliver.target_crs import TargetCrs
 from pipelines.formats.geotiff import RasterFrame
+from pipelines.scene.target_crs import TargetCrs
 from pipelines.scene.trained_survey import TrainedSurvey
 
 _MARGIN = 0.02  # of the extent, on each side

@@ -15,7 +15,6 @@ from pipelines import __version__
 from pipelines.core.progress import Progress
 from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.deliver.raster.window import RasterSource, WindowCells, render_window
-from pipelines.deliver.target_crs import TargetCrs
 from pipelines.formats.georef_sidecar import SceneSigma
 from pipelines.formats.geotiff import (
     NODATA,
@@ -27,6 +26,7 @@ from pipelines.formats.geotiff import (
     write_mosaic,
     write_part,
 )
+from pipelines.scene.target_crs import TargetCrs
 
 _WINDOW_PX = 1536
 _SAMPLES_PX = 192  # a side of a window

@@ -13,9 +13,9 @@ from scipy.spatial import cKDTree
 
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import FloatArray
-from pipelines.deliver.target_crs import TargetCrs
 from pipelines.formats.geotiff import RasterFrame
 from pipelines.geometry.similarity import Similarity
+from pipelines.scene.target_crs import TargetCrs
 from pipelines.splat.gaussians import Gaussians, rotation_matrices
 from pipelines.splat.rasterizer.orthographic import PlanSplats
 from pipelines.splat.sh import basis

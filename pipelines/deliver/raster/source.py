@@ -15,11 +15,11 @@ from pipelines.deliver.raster.extent import GroundSampling
 from pipelines.deliver.raster.plan import PlanScene
 from pipelines.deliver.raster.window import RasterSource
 from pipelines.deliver.scene_extent import scene_points
-from pipelines.deliver.target_crs import TargetCrs
 from pipelines.formats.geotiff import RasterFrame
 from pipelines.scene.renderer import ModelRenderer
 from pipelines.scene.scene import photographs
 from pipelines.scene.surface_views import SurfaceViews
+from pipelines.scene.target_crs import TargetCrs
 from pipelines.scene.trained_survey import TrainedSurvey
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.rasterizer.backends import rasterizer

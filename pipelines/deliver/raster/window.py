@@ -10,10 +10,10 @@ from scipy.ndimage import binary_closing, binary_opening, uniform_filter
 from pipelines.accuracy.accuracy_grid import AccuracyGrid
 from pipelines.core.types import BoolArray, ByteArray, FloatArray, IntArray
 from pipelines.deliver.raster.plan import PlanScene, dilation_cells2, samples_per_cell
-from pipelines.deliver.target_crs import TargetCrs
 from pipelines.formats.geotiff import RasterFrame
 from pipelines.geometry.similarity import Similarity
 from pipelines.scene.surface_views import SurfaceViews
+from pipelines.scene.target_crs import TargetCrs
 from pipelines.splat.rasterizer.orthographic import PlanView, render_orthographic
 
 _SOLID = 0.5  # least opacity of a surface

@@ -19,11 +19,11 @@ from pipelines.core.products import Product
 from pipelines.core.types import Vector3
 from pipelines.deliver.placement import Placement
 from pipelines.deliver.splat import PlacedSplat
-from pipelines.deliver.target_crs import TargetCrs
 from pipelines.deliver.tiles.local_crs import LocalCrs, fit_local_crs
 from pipelines.deliver.tiles.tileset import TILESET
 from pipelines.geodesy.enu import ecef_from_enu
 from pipelines.scene.survey import Survey, SurveyedPoint
+from pipelines.scene.target_crs import TargetCrs
 
 PAGE = "index.html"
 _PLACEHOLDER = '{"to be filled": "page.py"}'

@@ -20,7 +20,6 @@ from pipelines.core.stages import TILES_GLB
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.deliver.options import ExportTilesOptions
 from pipelines.deliver.splat import PlacedSplat, codec_arrays, load_splat
-from pipelines.deliver.target_crs import target_crs
 from pipelines.deliver.tiles.content import read_glb, require_space, write_glb
 from pipelines.deliver.tiles.page import ScenePage, scene_page, write_page
 from pipelines.deliver.tiles.tileset import TILESET, content_uri, write_tileset
@@ -28,6 +27,7 @@ from pipelines.formats.georef_sidecar import GeorefSidecar, write_sidecar
 from pipelines.formats.splat_ply import SplatArrays
 from pipelines.geodesy.vertical import ELLIPSOIDAL, parse_vertical
 from pipelines.scene.calibrated import load_survey
+from pipelines.scene.target_crs import target_crs
 from pipelines.splat.level_of_detail import DetailTile, best_cut, build_tiles
 
 GLB = TILES_GLB.rpartition("/")[2]

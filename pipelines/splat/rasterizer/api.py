@@ -36,6 +36,37 @@ BackendName = Literal["cpu", "cuda"]
 
 
 @dataclass(frozen=True)
+class Window:
+    """Part of an image, in whole pixels: `left` columns and `top` rows of the image lie before it."""
+
+    left: int
+    top: int
+    width: int
+    height: int
+
+    def of(self, camera: Pinhole) -> Pinhole:
+        """Return the camera whose image is the window of the image of `camera`."""
+        return Pinhole(self.width, self.height, camera.fx, camera.fy, camera.cx - self.left, camera.cy - self.top)
+
+    def cut(self, view: Render) -> Render:
+        """Return the part of a render of the whole image; its statistics stay those of the whole."""
+        rows = slice(self.top, self.top + self.height)
+        columns = slice(self.left, self.left + self.width)
+
+        def part(image: Tensor | None) -> Tensor | None:
+            return None if image is None else image[rows, columns]
+
+        return Render(
+            view.colour[rows, columns],
+            view.alpha[rows, columns],
+            view.stats,
+            part(view.expected_depth),
+            part(view.depth_variance),
+            part(view.median_depth),
+        )
+
+
+@dataclass(frozen=True)
 class RasterSettings:
     """Settings of a render.
 
@@ -45,6 +76,7 @@ class RasterSettings:
         near_m: Gaussians with a nearer centre are left out.
         dilation_px2: added to the diagonal of the screen covariance, in px².
         depth: whether to compute depths (colour and alpha always are).
+        window: part of the camera's image to render, which is then the image; None: all of it.
     """
 
     sh_degree: int = 3
@@ -52,6 +84,11 @@ class RasterSettings:
     near_m: float = 0.05
     dilation_px2: float = 0.3
     depth: bool = False
+    window: Window | None = None
+
+    def image_of(self, camera: Pinhole) -> Pinhole:
+        """Return the camera of the image that is rendered: `camera`, or its window."""
+        return camera if self.window is None else self.window.of(camera)
 
 
 @dataclass

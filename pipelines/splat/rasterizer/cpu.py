@@ -6,7 +6,9 @@ tile by tile. Backward: `cpu_blend_gradient` walks the same lists, `cpu_gradient
 
 from __future__ import annotations
 
+import contextlib
 import threading
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -34,6 +36,8 @@ _Array = NDArray[Any]
 
 # Kernels use all cores, and numba's fallback threading layer crashes if two threads launch kernels at once.
 KERNEL_LOCK = threading.Lock()
+# Pixels up to which one thread is faster than several, which must be woken and waited for in each kernel.
+_SMALL_PX = 64 * 64
 
 
 class CpuRasterizer:
@@ -56,10 +60,11 @@ class CpuRasterizer:
         _validate(gaussians, cam_from_model, camera, settings)
         pose = cam_from_model[:3].to(torch.float64)
         center_in_model = -torch.linalg.solve(pose[:, :3], pose[:, 3])
-        context = _RenderContext(camera, settings)
-        colour, alpha, depth_sum, square_sum, median = _Rasterize.apply(
-            *gaussians.tensors().values(), pose, center_in_model, context
-        )
+        with _threads_for(settings.image_of(camera)):
+            context = _RenderContext(camera, settings)
+            colour, alpha, depth_sum, square_sum, median = _Rasterize.apply(
+                *gaussians.tensors().values(), pose, center_in_model, context
+            )
         if not settings.depth:
             return Render(colour, alpha, context.stats)
         opaque = alpha > 0
@@ -97,6 +102,7 @@ class _RenderContext:
 
     Attributes:
         camera, settings: of the render.
+        image: camera of the image that is rendered.
         workers: number of threads.
         stats: handed out with the render.
         visible: (M,) rows of the visible Gaussians, ascending.
@@ -107,12 +113,16 @@ class _RenderContext:
 
     camera: Pinhole
     settings: RasterSettings
+    image: Pinhole = field(init=False)
     workers: int = field(default_factory=numba.get_num_threads)
     stats: ScreenStats = field(init=False)
     visible: _Array = field(init=False)
     rank: _Array = field(init=False)
     table: _Array = field(init=False)
     lists: TileLists = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.image = self.settings.image_of(self.camera)
 
     @property
     def background(self) -> _Array:
@@ -155,7 +165,7 @@ class _Rasterize(torch.autograd.Function):
             images = blend_tiles(
                 context.table,
                 context.lists,
-                (context.camera.height, context.camera.width),
+                (context.image.height, context.image.width),
                 context.background,
                 depth=context.settings.depth,
                 workers=context.workers,
@@ -181,6 +191,17 @@ class _Rasterize(torch.autograd.Function):
         return (*(torch.from_numpy(gradient) for gradient in gradients), None)
 
 
+@contextlib.contextmanager
+def _threads_for(image: Pinhole) -> Iterator[None]:
+    """Run the kernels of a small image on one thread."""
+    threads = numba.get_num_threads()
+    numba.set_num_threads(1 if image.width * image.height <= _SMALL_PX else threads)
+    try:
+        yield
+    finally:
+        numba.set_num_threads(threads)
+
+
 def _array(tensor: Tensor) -> _Array:
     array: _Array = tensor.detach().contiguous().numpy()
     return array
@@ -201,7 +222,7 @@ def _project(context: _RenderContext, parameters: list[_Array], pose: _Array, ce
         *(*parameters, pose, center, view, context.settings.sh_degree),
         *(context.visible, context.rank, context.table, ellipses, radius, context.workers),
     )
-    context.lists = list_tiles(ellipses, context.camera.width, context.camera.height)
+    context.lists = list_tiles(ellipses, context.image.width, context.image.height)
     context.stats = ScreenStats(visible=torch.from_numpy(context.visible), radius_px=torch.from_numpy(radius))
 
 
@@ -302,5 +323,6 @@ def _validate(gaussians: Gaussians, cam_from_model: Tensor, camera: Pinhole, set
         raise InputError(f"must be 0 to {highest}, is {settings.sh_degree}", field="sh_degree")
     if settings.near_m <= 0:
         raise InputError(f"must be positive, is {settings.near_m}", field="near_m")
-    if camera.width < 1 or camera.height < 1:
-        raise InputError(f"image of {camera.width} × {camera.height} pixels", field="camera")
+    image = settings.image_of(camera)
+    if image.width < 1 or image.height < 1:
+        raise InputError(f"image of {image.width} × {image.height} pixels", field="camera")

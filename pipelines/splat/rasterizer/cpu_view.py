@@ -43,13 +43,14 @@ def make_view(camera: Pinhole, settings: RasterSettings, pose: FloatArray) -> Vi
     slope_y_min, slope_y_max = -camera.cy / camera.fy - margin_y, (camera.height - camera.cy) / camera.fy + margin_y
     # The norm of a rotation is 1. Derivatives vary all entries of the pose, however, and leave the rotations.
     norm = float(np.linalg.norm(pose[:, :3], 2))
+    image = settings.image_of(camera)
     return View(
-        width=float(camera.width),
-        height=float(camera.height),
+        width=float(image.width),
+        height=float(image.height),
         fx=float(camera.fx),
         fy=float(camera.fy),
-        cx=float(camera.cx),
-        cy=float(camera.cy),
+        cx=float(image.cx),
+        cy=float(image.cy),
         slope_x_min=slope_x_min,
         slope_x_max=slope_x_max,
         slope_y_min=slope_y_min,

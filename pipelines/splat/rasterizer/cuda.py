@@ -68,7 +68,7 @@ class CudaRasterizer:
             slope = _depth_slope(gaussians, cam_from_model, camera, meta)
             view.expected_depth, view.depth_variance = self._depth_moments(meta, slope, camera, view.alpha)
             view.median_depth = self._median_depth(meta, slope, camera)
-        return view
+        return view if settings.window is None else settings.window.cut(view)
 
     def _depth_moments(
         self, meta: dict[str, Any], slope: Tensor, camera: Pinhole, alpha: Tensor

@@ -76,7 +76,8 @@ def render_reference(
         expected = mean.view(size)
         median = _median_depth(depth, before, after, counted).view(size)
     stats = _screen_stats(front, mean_px, cov_px2, sorted_gaussians.logit_opacities, camera)
-    return Render(colour.view(*size, 3), (1 - final).view(size), stats, expected, variance, median)
+    view = Render(colour.view(*size, 3), (1 - final).view(size), stats, expected, variance, median)
+    return view if settings.window is None else settings.window.cut(view)
 
 
 def project_gaussians(

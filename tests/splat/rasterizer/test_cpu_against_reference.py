@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from pipelines.geometry.cameras import Pinhole
 from pipelines.splat.gaussians import Gaussians
-from pipelines.splat.rasterizer.api import RasterSettings
+from pipelines.splat.rasterizer.api import RasterSettings, Window
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
 from pipelines.splat.rasterizer.reference import render_reference
 
@@ -52,6 +54,18 @@ def test_images_and_gradients(make_scene, leaves, loss_of, camera, dtype, case):
         assert error < gradient_error, f"{name}: {error}"
     gradient, truth = render.stats.mean_gradient, expected.stats.mean_gradient
     assert (gradient - truth).abs().max() < max(gradient_error, 1e-6) * truth.abs().max()
+
+
+@pytest.mark.parametrize("window", [Window(0, 0, 3, 2), Window(13, 9, 20, 17), Window(40, 30, 5, 5)])
+def test_window_is_a_part_of_the_image(make_scene, leaves, camera, window):
+    # Off the middle, where the limit of the linear projection would move if the window were a camera of its own.
+    gaussians, pose = make_scene(300, seed=4, log_scale=-1.0)
+    settings = RasterSettings(sh_degree=3, background=BACKGROUND, depth=True)
+    whole = render_reference(gaussians, pose, camera, settings)
+    render = CpuRasterizer().render(gaussians, pose, camera, replace(settings, window=window))
+    rows, columns = slice(window.top, window.top + window.height), slice(window.left, window.left + window.width)
+    for name in ("colour", "alpha", "expected_depth", "median_depth"):
+        torch.testing.assert_close(getattr(render, name), getattr(whole, name)[rows, columns], rtol=0, atol=1e-11)
 
 
 @pytest.mark.usefixtures("one_thread")

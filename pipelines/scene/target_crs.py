@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike
 from pipelines.core.cautions import Caution
 from pipelines.core.errors import InputError
 from pipelines.core.types import FloatArray, Vector3
-from pipelines.deliver.options import CrsOptions
 from pipelines.formats.georef_sidecar import CrsSidecar, SceneSigma
 from pipelines.geodesy.crs import PointCrs, parse_crs
 from pipelines.geodesy.enu import (
@@ -22,7 +21,8 @@ from pipelines.geodesy.enu import (
     lla_from_ecef,
     median_lla,
 )
-from pipelines.geodesy.vertical import VerticalChoice, VerticalDatum, parse_vertical
+from pipelines.geodesy.vertical import ELLIPSOIDAL, VerticalChoice, VerticalDatum, parse_vertical
+from pipelines.scene.crs_options import CrsOptions
 
 
 @dataclass(frozen=True)
@@ -116,6 +116,30 @@ def target_crs(options: CrsOptions, origin: Origin, scene_in_geo: ArrayLike, hei
         source = "stated for" if heights.stated else "assumed for"
         assumed.append(f"no --vertical was given: heights are {crs.vertical.name}, as {source} the survey's input")
     return TargetCrs(crs.serving(lla), origin, lla, tuple(assumed))
+
+
+def usable_crs(options: CrsOptions, origin: Origin, scene_in_geo: ArrayLike, heights: VerticalDatum) -> TargetCrs:
+    """Return the CRS in which a result is shown: `target_crs`, or one with ellipsoidal heights.
+
+    Only the default gives way, where the survey's datum needs a grid that is not installed: a user who names a CRS
+    or a datum learns what is missing.
+
+    Args:
+        options, origin, scene_in_geo, heights: as for `target_crs`.
+
+    Raises:
+        InputError: as `target_crs`, for a CRS or a datum that the user named.
+    """
+    try:
+        return target_crs(options, origin, scene_in_geo, heights)
+    except InputError:
+        if options.crs is not None or options.vertical is not None:
+            raise
+    choice = VerticalChoice(ELLIPSOIDAL, None)
+    crs = target_crs(CrsOptions(vertical=choice), origin, scene_in_geo, heights)
+    return replace(
+        crs, assumed=(*crs.assumed, f"heights are ellipsoidal: the grid of {heights.name} is not installed")
+    )
 
 
 def utm_zone(lla: ArrayLike) -> str:

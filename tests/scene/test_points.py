@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipelines.evaluate.points_by_camera import points_by_camera
-from pipelines.evaluate.points_by_model import points_by_model
 from pipelines.geometry.cameras import Pinhole
 from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.similarity import Similarity
 from pipelines.georef.cameras import CameraPoses
-from pipelines.scene.marks import mark_rays
+from pipelines.scene.marks import MarkRays, mark_rays
+from pipelines.scene.points_by_camera import points_by_camera
+from pipelines.scene.points_by_model import DepthMap, points_by_model
 from pipelines.scene.survey import SurveyedPoint
 from pipelines.scene.trained_survey import TrainedSurvey
 from pipelines.splat.initialise import gaussians_of_size
@@ -56,6 +56,17 @@ def planes(trained: TrainedSurvey, height_m: float) -> dict[int, np.ndarray]:
     return depth
 
 
+def maps(rays: MarkRays, depth_m: dict[int, np.ndarray]) -> list[DepthMap]:
+    return [DepthMap(PINHOLE, depth_m[int(camera)]) for camera in rays.camera]
+
+
+def measured(
+    trained: TrainedSurvey, points: tuple[SurveyedPoint, ...], depth_m: dict[int, np.ndarray]
+) -> np.ndarray:
+    rays = mark_rays(points, trained.sparse)
+    return points_by_model(trained, rays, maps(rays, depth_m))
+
+
 def test_rays_meet_in_the_surveyed_point(trained: TrainedSurvey) -> None:
     points = trained.survey.control_points
     found = points_by_camera(trained, mark_rays(points, trained.sparse))
@@ -67,14 +78,29 @@ def test_depth_gives_the_surveyed_point(trained: TrainedSurvey) -> None:
     points = trained.survey.control_points[:1]
     rays = mark_rays(points, trained.sparse)
     depth = planes(trained, points[0].position_in_geo[2])
-    found = points_by_model(trained, rays, depth, dict.fromkeys(depth, PINHOLE))
+    found = points_by_model(trained, rays, maps(rays, depth))
     np.testing.assert_allclose(found, surveyed(points), atol=1e-5)
+
+
+def test_windows_around_the_marks_are_enough(trained: TrainedSurvey) -> None:
+    points, rng = trained.survey.control_points[:1], np.random.default_rng(6)
+    rays = mark_rays(points, trained.sparse)
+    depth = planes(trained, points[0].position_in_geo[2])
+    rough = {i: each * (1 + 0.002 * rng.standard_normal(each.shape)) for i, each in depth.items()}
+    windows = []
+    for camera, xy in zip(rays.camera.tolist(), rays.xy, strict=True):
+        column, row = (int(value) for value in PINHOLE.fx * xy + [PINHOLE.cx, PINHOLE.cy])
+        left, top = max(column - 1, 0), max(row - 1, 0)
+        windows.append(DepthMap(PINHOLE, rough[camera][top : row + 2, left : column + 2], left, top))
+    np.testing.assert_array_equal(
+        points_by_model(trained, rays, windows), points_by_model(trained, rays, maps(rays, rough))
+    )
 
 
 def test_surface_at_another_height_is_measured_as_such(trained: TrainedSurvey) -> None:
     points = trained.survey.control_points[:1]
     depth = planes(trained, points[0].position_in_geo[2] - 1.0)
-    found = points_by_model(trained, mark_rays(points, trained.sparse), depth, dict.fromkeys(depth, PINHOLE))
+    found = measured(trained, points, depth)
     assert found[0, 2] - points[0].position_in_geo[2] == pytest.approx(-1.0, abs=0.05)
 
 
@@ -85,7 +111,7 @@ def test_roughness_of_the_surface_is_evened_out(trained: TrainedSurvey) -> None:
     depth = planes(trained, points[0].position_in_geo[2])
     roughness = 0.002
     rough = {i: each * (1 + roughness * rng.standard_normal(each.shape)) for i, each in depth.items()}
-    found = points_by_model(trained, rays, rough, dict.fromkeys(depth, PINHOLE))
+    found = points_by_model(trained, rays, maps(rays, rough))
     centers = trained.geo_from_model.apply(trained.poses.cam_center_in_model[rays.camera])
     distance = float(np.linalg.norm(centers - surveyed(points), axis=1).max())
     sigma_of_view = roughness * distance / 5
@@ -99,7 +125,7 @@ def test_wrong_surface_in_few_views_is_outvoted(trained: TrainedSurvey) -> None:
     views = sorted({int(i) for i in rays.camera})
     depth[views[0]] = depth[views[0]] * 0.3  # a floater before the camera
     depth[views[1]] = depth[views[1]] * 0.0  # nothing there
-    found = points_by_model(trained, rays, depth, dict.fromkeys(depth, PINHOLE))
+    found = points_by_model(trained, rays, maps(rays, depth))
     assert np.linalg.norm(found - surveyed(points)) < 0.01
 
 
@@ -109,14 +135,14 @@ def test_points_with_too_few_views_are_not_measured(trained: TrainedSurvey) -> N
     rays = mark_rays(lonely, trained.sparse)
     depth = planes(trained, 0.0)
     assert np.isnan(points_by_camera(trained, rays)).all()
-    assert np.isnan(points_by_model(trained, rays, depth, dict.fromkeys(depth, PINHOLE))).all()
+    assert np.isnan(points_by_model(trained, rays, maps(rays, depth))).all()
 
 
 def test_marks_outside_of_the_map_or_lens_are_no_hits(trained: TrainedSurvey) -> None:
     first = trained.survey.control_points[0]
     away = first.model_copy(update={"marks": tuple(m.model_copy(update={"x_px": -500.0}) for m in first.marks)})
     depth = planes(trained, 0.0)
-    found = points_by_model(trained, mark_rays((away,), trained.sparse), depth, dict.fromkeys(depth, PINHOLE))
+    found = measured(trained, (away,), depth)
     assert np.isnan(found).all()
 
 
@@ -124,4 +150,4 @@ def test_no_points_at_all(trained: TrainedSurvey) -> None:
     rays = mark_rays((), trained.sparse)
     assert rays.xy.shape == (0, 2)
     assert points_by_camera(trained, rays).shape == (0, 3)
-    assert points_by_model(trained, rays, {}, {}).shape == (0, 3)
+    assert points_by_model(trained, rays, []).shape == (0, 3)

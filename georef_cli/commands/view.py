@@ -1,0 +1,58 @@
+"""Command `georef view`."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import webbrowser
+from typing import Any
+
+import click
+
+from georef_cli import options
+from georef_cli.command import Command
+from georef_cli.display import progress_for
+from georef_cli.output import print_rich
+from pipelines.core.options import resolve
+from pipelines.core.staleness import must_exist
+from pipelines.core.workspace import Workspace
+from pipelines.view.options import ViewOptions
+
+
+def _view(ctx: click.Context, workspace: Workspace, open_page: bool, **_values: Any) -> None:
+    from pipelines.view.viewer import serve
+
+    must_exist(workspace)
+    flags = options.given(ctx, ViewOptions.model_fields)
+    wanted = resolve(ViewOptions, {}, flags, workspace.config_file)
+
+    def ready(address: str) -> None:
+        print_rich(f"{address}   (Ctrl-C ends the viewer)")
+        if open_page:
+            webbrowser.open(address)
+
+    with contextlib.suppress(KeyboardInterrupt):  # the way to end it
+        serve(workspace, wanted, ready, threading.Event(), progress_for(ctx.obj))
+
+
+command = Command(
+    "view",
+    params=[
+        options.workspace_argument(),
+        *options.stage_options(ViewOptions),
+        click.Option(["--open/--no-open", "open_page"], default=False, help="Open the page in a browser at once."),
+    ],
+    callback=click.pass_context(_view),
+    help="""See the trained model in a browser, and measure in it.
+
+        Points, distances, heights, areas and volumes are read from the model's own surface, as `georef evaluate`
+        reads it, with σ from the joint covariance. Control points are marked in photographs, and written for --gcp.
+        The page is served to this machine alone; what is saved lies in the workspace's folder view/.
+
+        \b
+        Examples:
+          georef view flight
+          georef view flight --open
+          georef view flight --crs EPSG:32632+3855 --port 9000
+        """,
+)

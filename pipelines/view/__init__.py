@@ -1,0 +1,1 @@
+"""The local viewer, and measuring in the trained model."""

@@ -1,0 +1,244 @@
+"""Panel of the viewer in which points are marked in photographs, and the marks written for `--gcp`."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipelines.core.errors import GeorefError
+from pipelines.core.types import FloatArray
+from pipelines.geometry.cameras import distort
+from pipelines.geometry.lens import bearings
+from pipelines.scene.survey import SurveyedPoint
+from pipelines.view.marking import (
+    MarkedPoint,
+    appears_in,
+    marked_points,
+    rays_of,
+    residuals_px,
+    write_marks,
+)
+from pipelines.view.measuring import MeasuringModel
+from pipelines.view.photo_view import PhotoView
+from pipelines.view.signs import Signs
+from pipelines.view.surface_points import SurfacePoint
+from pipelines.view.tables import PlaceRow, mark_table, paragraph, place_table
+
+if TYPE_CHECKING:
+    import viser
+
+_NONE = "—"
+
+
+class MarkPanel:
+    """Panel of the marks.
+
+    Args:
+        server: of the viewer.
+        model: to measure in.
+        signs: of the scene.
+        photo: shows photographs in the page.
+        folder: for the files of marks.
+    """
+
+    def __init__(
+        self, server: viser.ViserServer, model: MeasuringModel, signs: Signs, photo: PhotoView, folder: Path
+    ) -> None:
+        self._model, self._signs, self._photo, self._folder = model, signs, photo, folder
+        survey = model.trained.survey
+        self._names = model.trained.sparse.image_name
+        self._points = [
+            *marked_points(survey.control_points, self._xyz(survey.control_points), is_check=False),
+            *marked_points(survey.check_points, self._xyz(survey.check_points), is_check=True),
+        ]
+        self._lock = threading.RLock()
+        self._build(server.gui)
+        self._show()
+
+    def _xyz(self, points: tuple[SurveyedPoint, ...]) -> FloatArray:
+        position = np.array([point.position_in_geo for point in points]).reshape(-1, 3)
+        return self._model.target.xyz_from_geo(position) if len(position) else position
+
+    def _build(self, gui: viser.GuiApi) -> None:
+        self._chosen = gui.add_dropdown("Point", self._options(), hint="Point that the clicks mark")
+        self._result = gui.add_html("")
+        self._button(gui, "Next photograph (N)", lambda: self.turn(1))
+        self._button(gui, "Previous photograph (B)", lambda: self.turn(-1))
+        self._button(gui, "Whole photograph (M)", self._photo.whole)
+        self._button(gui, "Remove the mark here", self._remove)
+        with gui.add_folder("New point, or its coordinates", expand_by_default=False):
+            self._new_name = gui.add_text("Name", "")
+            self._coordinates = gui.add_text("x y z", "", hint="In the CRS of the viewer; empty: not surveyed")
+            self._is_check = gui.add_checkbox("Check point", False)
+            self._button(gui, "Set", self._set)
+        self._button(gui, "Write gcp_list.txt", self._write)
+        self._chosen.on_update(lambda _: self._show())
+        gui.add_command("Next photograph", hotkey="N").on_trigger(lambda _: self.turn(1))
+        gui.add_command("Previous photograph", hotkey="B").on_trigger(lambda _: self.turn(-1))
+        gui.add_command("Whole photograph", hotkey="M").on_trigger(lambda _: self._photo.whole())
+
+    def _button(self, gui: viser.GuiApi, label: str, act: Callable[[], None]) -> None:
+        gui.add_button(label).on_click(lambda _: self._safely(act))
+
+    def _safely(self, act: Callable[[], None]) -> None:
+        try:
+            act()
+        except GeorefError as error:
+            self._tell(str(error))
+
+    def _options(self) -> tuple[str, ...]:
+        return tuple(point.name for point in self._points) or (_NONE,)
+
+    @property
+    def point(self) -> MarkedPoint | None:
+        """The chosen point."""
+        return next((point for point in self._points if point.name == self._chosen.value), None)
+
+    def turn(self, step: int) -> None:
+        """Show the next photograph in which the point must appear, or the one before."""
+        with self._lock:
+            point = self.point
+            if point is None:
+                self._tell("Make a point first: its name, and its coordinates if it was surveyed.")
+                return
+            place = self._expected(point)
+            shown = [camera for camera, _ in appears_in(place, self._model.trained)] if place is not None else []
+            cameras = shown or list(range(len(self._names)))
+            present = self._photo.camera
+            number = (cameras.index(present) + step) % len(cameras) if present in cameras else 0
+            self._photo.show(cameras[number])
+            self._show()
+
+    def add(self, camera: int, direction_in_cam: FloatArray) -> None:
+        """Mark the chosen point where a line of sight leaves a camera.
+
+        Args:
+            camera: whose photograph is shown.
+            direction_in_cam: (3,) in the camera.
+        """
+        with self._lock:
+            point = self.point
+            if point is None:
+                self._tell("Make a point first: its name, and its coordinates if it was surveyed.")
+                return
+            lens = self._model.trained.sparse.camera_of(camera)
+            x_px, y_px = distort(lens, direction_in_cam[:2] / direction_in_cam[2]).tolist()
+            if not (0 <= x_px <= lens.width and 0 <= y_px <= lens.height):
+                self._tell("This place is outside the photograph.")
+                return
+            self._replace(point.with_mark(self._names[camera], (x_px, y_px)))
+
+    def measured(self) -> SurfacePoint | None:
+        """Return the chosen point by camera; None with fewer than two marks."""
+        point = self.point
+        if point is None:
+            return None
+        rays = rays_of(point, self._model.trained)
+        place, cov = self._model.by_camera(rays)
+        if not np.isfinite(place).all():
+            return None
+        return SurfacePoint(place, np.zeros((3, 3)) if cov is None else cov, rays.camera)
+
+    def _remove(self) -> None:
+        with self._lock:
+            if self.point is not None and self._photo.camera is not None:
+                self._replace(self.point.with_mark(self._names[self._photo.camera], None))
+
+    def _replace(self, point: MarkedPoint) -> None:
+        names = [each.name for each in self._points]
+        if point.name in names:
+            self._points[names.index(point.name)] = point
+        else:
+            self._points.append(point)
+            self._chosen.options = self._options()
+        self._chosen.value = point.name  # type: ignore[misc]
+        self._show()
+
+    def _set(self) -> None:
+        name = self._new_name.value.strip()
+        if not name:
+            self._tell("A point needs a name.")
+            return
+        xyz = None
+        if texts := self._coordinates.value.replace(",", " ").split():
+            try:
+                x, y, z = (float(text) for text in texts)
+            except ValueError:
+                self._tell("Coordinates are three numbers: x y z in the CRS of the viewer.")
+                return
+            xyz = (x, y, z)
+            self._model.target.geo_from_xyz(np.array([xyz]))  # outside the domain of the CRS: an error
+        with self._lock:
+            old = next((point for point in self._points if point.name == name), MarkedPoint(name, xyz))
+            self._replace(replace(old, xyz=xyz or old.xyz, is_check=self._is_check.value))
+
+    def _expected(self, point: MarkedPoint) -> FloatArray | None:
+        """Return where a point must be (3,) in `geo`: by its marks, or by its survey."""
+        by_marks, _ = self._model.by_camera(rays_of(point, self._model.trained))
+        if np.isfinite(by_marks).all():
+            return by_marks
+        return None if point.xyz is None else self._model.target.geo_from_xyz(np.array([point.xyz]))[0]
+
+    def _write(self) -> None:
+        files = write_marks(self._folder, self._model.target.crs.name, self._points)
+        if not files:
+            self._tell("No point has both coordinates and marks: nothing to write.")
+            return
+        names, heights = ", ".join(map(str, files)), self._model.target.crs.vertical.name
+        self._result.content = paragraph(f"Written: {names}. Heights: {heights}.", mark="written")
+
+    def _tell(self, sentence: str) -> None:
+        self._result.content = paragraph(sentence)
+
+    def _show(self) -> None:
+        """Show the chosen point: its marks, what they give, and where it must appear in the photograph."""
+        with self._lock:
+            point = self.point
+            self._photo.draw(*self._crosses(point))
+            if point is None:
+                self._tell("No point yet: make one below.")
+                return
+            rays = rays_of(point, self._model.trained)
+            place, cov = self._model.by_camera(rays)
+            rows, residuals = [], {}
+            if point.xyz is not None:
+                surveyed = self._model.target.geo_from_xyz(np.array([point.xyz]))[0]
+                rows.append(PlaceRow("surveyed", surveyed, None))
+            if np.isfinite(place).all():
+                rows.append(PlaceRow("by camera", place, None if cov is None else np.sqrt(np.diag(cov))))
+                errors = residuals_px(place, rays, self._model.trained)
+                residuals = {self._names[camera]: error for camera, error in zip(rays.camera, errors, strict=True)}
+            camera = self._photo.camera
+            shown = "" if camera is None else paragraph(f"Shown: {self._names[camera]}")
+            places = place_table(self._model.target, rows, marked="marked") if rows else ""
+            self._result.content = shown + places + mark_table(point.marks, residuals)
+
+    def _crosses(self, point: MarkedPoint | None) -> tuple[FloatArray | None, FloatArray | None, list[FloatArray]]:
+        """Return, in the shown camera: the direction of the mark, that of the expected place, and epipolar lines.
+
+        The lines are those of sight of the other marks, (2, 3) in `model` each.
+        """
+        camera, trained = self._photo.camera, self._model.trained
+        if point is None or camera is None:
+            return None, None, []
+        mark, own = None, point.marks.get(self._names[camera])
+        if own is not None:
+            mark = bearings(trained.sparse.camera_of(camera), np.array([own]))[0]
+        place = self._expected(point)
+        expected = None
+        if place is not None:
+            in_model = trained.geo_from_model.inverse().apply(place[None])[0]
+            expected = trained.poses.cam_from_model[camera] @ (in_model - trained.poses.cam_center_in_model[camera])
+        lines = []
+        rays = rays_of(point, trained)
+        for other, bearing in zip(rays.camera.tolist(), rays.bearing_in_cam, strict=True):
+            if other != camera:
+                center = trained.poses.cam_center_in_model[other]
+                along = trained.poses.cam_from_model[other].T @ bearing
+                lines.append(np.stack([center, center + self._photo.reach_m * along]))
+        return mark, expected, lines

@@ -1,0 +1,288 @@
+"""Panel of the viewer in which points are measured, named, saved and loaded again."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, get_args
+
+import numpy as np
+
+from pipelines.core.errors import GeorefError
+from pipelines.geodesy.enu import ecef_from_enu, lla_from_ecef
+from pipelines.scene.marks import mark_rays
+from pipelines.scene.survey import SurveyedPoint
+from pipelines.view.measuring import MeasuringModel
+from pipelines.view.quantities import BaseKind, BasePlane, Quantity
+from pipelines.view.saved import (
+    Kind,
+    Measurement,
+    SavedPoint,
+    SavedQuantity,
+    read_measurements,
+    write_measurements,
+)
+from pipelines.view.signs import Signs
+from pipelines.view.surface_points import NoSurface, Sight, SurfacePoint
+from pipelines.view.tables import PlaceRow, paragraph, place_table, quantity_table, quantity_text, saved_table
+
+if TYPE_CHECKING:
+    import viser
+
+_LEAST = {"point": 1, "distance": 2, "polyline": 2, "area": 3, "volume": 3}
+_MOST = {"point": 1, "distance": 2}
+_CLOSED = ("area", "volume")
+_BASES: tuple[BaseKind, ...] = get_args(BaseKind)
+
+
+class MeasurePanel:
+    """Panel of the measurements.
+
+    Args:
+        server: of the viewer.
+        model: to measure in.
+        signs: of the scene.
+        folder: of the saved measurements.
+        model_hash: of the trained model.
+    """
+
+    def __init__(
+        self, server: viser.ViserServer, model: MeasuringModel, signs: Signs, folder: Path, model_hash: str
+    ) -> None:
+        self._model, self._signs, self._folder, self._hash = model, signs, folder, model_hash
+        self._names = model.trained.sparse.image_name
+        self._index = model.trained.sparse.image_index()
+        survey = model.trained.survey
+        self._surveyed = {point.name: point for point in (*survey.control_points, *survey.check_points)}
+        self._points: list[SurfacePoint] = []
+        self._quantities: tuple[Quantity, ...] = ()
+        self._lock = threading.RLock()
+        self._saved = read_measurements(folder)
+        self._build(server)
+        for number, measurement in enumerate(self._saved):
+            self._draw_saved(number, measurement)
+        self._show_saved()
+
+    @property
+    def points(self) -> Sequence[SurfacePoint]:
+        """Points of the present measurement."""
+        return tuple(self._points)
+
+    @property
+    def quantities(self) -> Sequence[Quantity]:
+        """Quantities of the present measurement."""
+        return self._quantities
+
+    def _build(self, server: viser.ViserServer) -> None:
+        gui = server.gui
+        self.kind = gui.add_dropdown("Measure", get_args(Kind), hint="What the clicks in the scene make up")
+        self._base = gui.add_dropdown("Base of a volume", _BASES)
+        self._result = gui.add_html("")
+        self._name = gui.add_text("Name", "")
+        self._button("Save", gui, self.save)
+        self._button("Take the last point back", gui, self.take_back)
+        self._button("Clear", gui, self.clear)
+        self._list = gui.add_html("")
+        self._chosen = gui.add_dropdown("Saved", ("—",))
+        self._button("Delete the saved one", gui, self._delete)
+        self.kind.on_update(lambda _: self.clear())
+        self._base.on_update(lambda _: self._compute())
+        self.clear()
+
+    def _button(self, label: str, gui: viser.GuiApi, act: Callable[[], None]) -> None:
+        gui.add_button(label).on_click(lambda _: self._safely(act))
+
+    def _safely(self, act: Callable[[], None]) -> None:
+        try:
+            act()
+        except GeorefError as error:
+            self._tell(str(error))
+
+    def add_sight(self, sight: Sight) -> None:
+        """Measure the surface under a line of sight."""
+        with self._lock:
+            self._add(self._model.under(sight), "")
+
+    def add_surveyed(self, name: str) -> None:
+        """Measure a surveyed point behind its marks, as `evaluate` does by model."""
+        with self._lock:
+            point = self._surveyed[name]
+            rays = mark_rays((point,), self._model.trained.sparse)
+            self._add(self._model.behind_marks(rays), self._against_survey(point))
+
+    def add_point(self, point: SurfacePoint) -> None:
+        """Add a point that was measured elsewhere, such as in marked photographs."""
+        with self._lock:
+            self._add(point, "")
+
+    def refresh(self) -> None:
+        """Show the present measurement anew, after σ have become known."""
+        with self._lock:
+            self._compute()
+
+    def _add(self, point: SurfacePoint | NoSurface, note: str) -> None:
+        if isinstance(point, NoSurface):
+            self._tell(f"Nothing measured: {point.reason}.")
+            return
+        kind: Kind = self.kind.value
+        if len(self._points) >= _MOST.get(kind, 10_000):
+            self._points = []
+        self._points.append(point)
+        self._compute(note)
+
+    def _compute(self, note: str = "") -> None:
+        kind: Kind = self.kind.value
+        self._quantities = ()
+        if len(self._points) >= _LEAST[kind]:
+            if kind in _CLOSED:
+                self._tell("Reading the surface …")
+            self._quantities = self._measured(kind)
+        if self._points:
+            self._signs.add_measured("now", self._positions(), closed=kind in _CLOSED and len(self._points) > 2)
+        self._result.content = self._described(note)
+
+    def _measured(self, kind: Kind) -> tuple[Quantity, ...]:
+        if kind == "distance":
+            return self._model.distance(self._points)
+        if kind == "polyline":
+            return self._model.polyline(self._points)
+        if kind == "area":
+            return self._model.area(self._points)
+        if kind == "volume":
+            base: BaseKind = self._base.value
+            return self._model.volume(self._points, BasePlane(base))
+        return ()
+
+    def _positions(self) -> np.ndarray:
+        return np.array([point.position_in_geo for point in self._points])
+
+    def _against_survey(self, point: SurveyedPoint) -> str:
+        """Return the coordinates of a surveyed point by survey and by camera, as HTML."""
+        rays = mark_rays((point,), self._model.trained.sparse)
+        camera, cov = self._model.by_camera(rays)
+        rows = [PlaceRow("surveyed", np.array(point.position_in_geo), np.sqrt(np.diag(point.cov_in_geo)))]
+        if np.isfinite(camera).all():
+            rows.append(PlaceRow("by camera", camera, None if cov is None else np.sqrt(np.diag(cov))))
+        title = paragraph(f"{point.name}: {len(rays)} marks; below, by model")
+        return title + place_table(self._model.target, rows)
+
+    def _described(self, note: str) -> str:
+        """Return the present measurement as HTML."""
+        if not self._points:
+            return self._hint()
+        placed = [self._model.place(point) for point in self._points]
+        rows = [
+            PlaceRow(str(number), point.surface.position_in_geo, point.sigma_m)
+            for number, point in enumerate(placed, start=1)
+        ]
+        views = ", ".join(str(len(point.surface.cameras)) for point in placed)
+        return (
+            note
+            + place_table(self._model.target, rows, marked="measured")
+            + paragraph(f"photographs that agree: {views}")
+            + quantity_table(self._quantities)
+            + self._without_sigma()
+        )
+
+    def _hint(self) -> str:
+        crs = self._model.target.crs
+        lines = [
+            "Click in the scene, or on the sign of a surveyed point.",
+            f"Coordinates: {crs.name}; heights: {crs.vertical.name}.",
+            *(f"Assumed: {text}." for text in self._model.target.assumed),
+        ]
+        return "".join(map(paragraph, lines))
+
+    def _without_sigma(self) -> str:
+        reason = self._model.without_sigma
+        return paragraph(f"No σ is stated: {reason}.") if reason else ""
+
+    def _tell(self, sentence: str) -> None:
+        self._result.content = paragraph(sentence)
+
+    def take_back(self) -> None:
+        """Take the last point of the measurement back."""
+        with self._lock:
+            self._points = self._points[:-1]
+            if not self._points:
+                self._signs.remove_measured("now")
+            self._compute()
+
+    def clear(self) -> None:
+        """Begin a new measurement."""
+        with self._lock:
+            self._points, self._quantities = [], ()
+            self._signs.remove_measured("now")
+            self._result.content = self._hint()
+
+    def save(self) -> None:
+        """Save the present measurement under its name.
+
+        Raises:
+            GeorefError: the file cannot be written.
+        """
+        with self._lock:
+            kind: Kind = self.kind.value
+            if len(self._points) < _LEAST[kind]:
+                self._tell(f"A {kind} needs {_LEAST[kind]} points before it can be saved.")
+                return
+            measurement = Measurement(
+                name=self._name.value.strip()[:200] or f"{kind} {len(self._saved) + 1}",
+                kind=kind,
+                crs=self._model.target.crs.name,
+                model=self._hash,
+                points=tuple(self._saved_point(point) for point in self._points),
+                quantities=tuple(SavedQuantity(**vars(each)) for each in self._quantities),
+            )
+            self._saved.append(measurement)
+            write_measurements(self._folder, self._saved)
+            self._draw_saved(len(self._saved) - 1, measurement)
+            self._name.value = ""  # type: ignore[misc]
+            self.clear()
+            self._show_saved()
+
+    def _saved_point(self, point: SurfacePoint) -> SavedPoint:
+        placed, origin = self._model.place(point), self._model.trained.survey.origin
+        lla = lla_from_ecef(ecef_from_enu(point.position_in_geo[None], origin))[0]
+        rows = [tuple(map(float, row)) for row in point.cov_of_surface]
+        return SavedPoint.model_validate(
+            {
+                "position_in_geo": point.position_in_geo.tolist(),
+                "cov_of_surface": rows,
+                "images": [self._names[camera] for camera in point.cameras],
+                "xyz": placed.xyz.tolist(),
+                "sigma_m": None if placed.sigma_m is None else placed.sigma_m.tolist(),
+                "lla": lla.tolist(),
+            }
+        )
+
+    def _delete(self) -> None:
+        with self._lock:
+            options = [_title(number, each) for number, each in enumerate(self._saved)]
+            if self._chosen.value not in options:
+                return
+            for number in range(len(self._saved)):
+                self._signs.remove_measured(f"saved{number}")
+            del self._saved[options.index(self._chosen.value)]
+            write_measurements(self._folder, self._saved)
+            for number, measurement in enumerate(self._saved):
+                self._draw_saved(number, measurement)
+            self._show_saved()
+
+    def _draw_saved(self, number: int, measurement: Measurement) -> None:
+        points = [point.surface_point(self._index).position_in_geo for point in measurement.points]
+        self._signs.add_measured(f"saved{number}", np.array(points), closed=measurement.kind in _CLOSED)
+
+    def _show_saved(self) -> None:
+        rows = []
+        for measurement in self._saved:
+            values = "; ".join(quantity_text(Quantity(**each.model_dump())) for each in measurement.quantities[:3])
+            older = "" if measurement.model == self._hash else " (measured in an earlier model)"
+            rows.append((measurement.name, measurement.name + older, values))
+        self._list.content = saved_table(rows)
+        self._chosen.options = tuple(_title(number, each) for number, each in enumerate(self._saved)) or ("—",)
+
+
+def _title(number: int, measurement: Measurement) -> str:
+    return f"{number + 1}: {measurement.name}"

@@ -1,0 +1,218 @@
+"""Measuring in a trained model: points of its surface, their coordinates in a CRS, and σ of what they make up."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from pipelines.accuracy.error_propagation import ErrorPropagation, NoErrorPropagation, propagate_errors
+from pipelines.core.cautions import is_checked
+from pipelines.core.progress import SILENT, Progress
+from pipelines.core.types import FloatArray
+from pipelines.core.workspace import Workspace
+from pipelines.scene.crs_options import CrsOptions
+from pipelines.scene.marks import MarkRays
+from pipelines.scene.points_by_camera import points_by_camera
+from pipelines.scene.renderer import ModelRenderer
+from pipelines.scene.target_crs import TargetCrs, usable_crs
+from pipelines.view.quantities import (
+    BasePlane,
+    MeasuredPoints,
+    Quantity,
+    SampledSurface,
+    distances,
+    grid_in_polygon,
+    length,
+    plan_area,
+    surface_area,
+    volumes,
+)
+from pipelines.view.surface_points import NoSurface, Sight, SurfacePoint, SurfaceReader
+
+_MOST_SAMPLES = 400  # of the surface in a polygon: a few seconds
+_JOINT_SAMPLES = 40  # of which so many enter the joint covariance
+_LEAST_SPACING_PX = 4.0  # between samples: closer ones would show the surface's noise, not its shape
+_ABOVE_M = 30.0  # of the start of a plumb line above the highest corner, at least
+_PLUMB_PX_RAD = 1e-3
+
+
+@dataclass(frozen=True)
+class PlacedPoint:
+    """Measured point in the CRS.
+
+    Attributes:
+        surface: the point.
+        xyz: (3,) in the CRS, easting or longitude first.
+        sigma_m: (3,) east, north, up; None: not known.
+    """
+
+    surface: SurfacePoint
+    xyz: FloatArray
+    sigma_m: FloatArray | None
+
+
+class MeasuringModel:
+    """Trained model of a workspace, to measure in.
+
+    Args:
+        workspace: has a trained model.
+        renderer: of the model.
+        crs: the CRS of coordinates.
+
+    Attributes:
+        trained: the trained survey.
+        target: the CRS.
+    """
+
+    def __init__(self, workspace: Workspace, renderer: ModelRenderer, crs: CrsOptions) -> None:
+        self.trained, self.reader = renderer.trained, SurfaceReader(renderer)
+        survey = self.trained.survey
+        centers = self.trained.geo_from_model.apply(self.trained.poses.cam_center_in_model)
+        self.target: TargetCrs = usable_crs(crs, survey.origin, centers, survey.vertical)
+        self._workspace = workspace
+        self._propagated: ErrorPropagation | NoErrorPropagation = NoErrorPropagation("it is being computed")
+
+    def propagate_errors(self) -> None:
+        """Compute the covariances of the model; no σ is stated before. With many cameras it takes a while.
+
+        Raises:
+            MissingProductError: init-sim3 has not been run.
+            InputError: a product is damaged.
+        """
+        if is_checked(self.trained.model.cautions):
+            self._propagated = propagate_errors(self._workspace, self.trained)
+        else:
+            self._propagated = NoErrorPropagation("nothing checks the σ of the positions")
+
+    @property
+    def propagation(self) -> ErrorPropagation | None:
+        """Covariances of the model; None: none are stated."""
+        return None if isinstance(self._propagated, NoErrorPropagation) else self._propagated
+
+    @property
+    def without_sigma(self) -> str:
+        """Why no σ is stated; empty: it is."""
+        return self._propagated.reason if isinstance(self._propagated, NoErrorPropagation) else ""
+
+    def under(self, sight: Sight) -> SurfacePoint | NoSurface:
+        """Return the point of the surface under a line of sight."""
+        return self.reader.under(sight)
+
+    def behind_marks(self, rays: MarkRays) -> SurfacePoint | NoSurface:
+        """Return the surface behind the marks of one point, as `evaluate` measures it by model."""
+        return self.reader.behind_marks(rays)
+
+    def by_camera(self, rays: MarkRays) -> tuple[FloatArray, FloatArray | None]:
+        """Return the intersection (3,) in `geo` of the marks of one point, and its covariance (3, 3) in m².
+
+        The intersection is NaN with fewer than two marks; the covariance is None where none is stated.
+        """
+        position = points_by_camera(self.trained, rays)
+        if self.propagation is None or not np.isfinite(position).all():
+            return position[0], None
+        return position[0], self.propagation.prediction.of_marked_points(position, rays)[0]
+
+    def place(self, point: SurfacePoint) -> PlacedPoint:
+        """Return a point in the CRS, with σ of georeference, cameras, lens and surface."""
+        joint = self.jointly([point])
+        sigma = None if joint.cov_in_geo is None else np.sqrt(np.diag(joint.cov_in_geo))
+        return PlacedPoint(point, self.target.xyz_from_geo(point.position_in_geo[None])[0], sigma)
+
+    def jointly(self, points: Sequence[SurfacePoint]) -> MeasuredPoints:
+        """Return points with their joint covariance."""
+        position = np.array([point.position_in_geo for point in points]).reshape(-1, 3)
+        own = [point.cov_of_surface for point in points]
+        cov = self._joint_covariance(points)
+        cov = None if cov is None else cov + block_diag(*own)
+        return MeasuredPoints(position, cov, self._heights_m(position))
+
+    def distance(self, points: Sequence[SurfacePoint]) -> tuple[Quantity, ...]:
+        """Return distance, horizontal distance and height difference of two points."""
+        return distances(self.jointly(points))
+
+    def polyline(self, points: Sequence[SurfacePoint]) -> tuple[Quantity, ...]:
+        """Return the length of the line through points, in space and in plan."""
+        return length(self.jointly(points))
+
+    def area(self, corners: Sequence[SurfacePoint], progress: Progress = SILENT) -> tuple[Quantity, ...]:
+        """Return the area of a polygon, in plan and on the surface."""
+        surface = self._sampled(corners, progress)
+        if surface is None:
+            return (plan_area(self.jointly(corners)),)
+        return plan_area(surface.corners), surface_area(surface), _coverage(surface)
+
+    def volume(
+        self, corners: Sequence[SurfacePoint], base: BasePlane, progress: Progress = SILENT
+    ) -> tuple[Quantity, ...]:
+        """Return the volume between the surface within a polygon and a base; nothing where there is no surface."""
+        surface = self._sampled(corners, progress)
+        if surface is None:
+            return ()
+        lowest = int(np.argmin(surface.corners.height_m))
+        return (*volumes(surface, replace(base, lowest=lowest)), _coverage(surface))
+
+    def _joint_covariance(self, points: Sequence[SurfacePoint]) -> FloatArray | None:
+        """Return the joint covariance (3 J, 3 J) of points without the surface's own."""
+        if self.propagation is None or not points:
+            return None
+        position = np.array([point.position_in_geo for point in points])
+        number = np.repeat(np.arange(len(points)), [len(point.cameras) for point in points])
+        cameras = np.concatenate([point.cameras for point in points])
+        cov = self.propagation.prediction.jointly_of_scene(position, number, cameras)
+        return cov if np.isfinite(cov).all() else None
+
+    def _heights_m(self, position_in_geo: FloatArray) -> FloatArray:
+        return np.asarray(self.target.xyz_from_geo(position_in_geo)[:, 2] * self.target.height_unit_m)
+
+    def _sampled(self, corners: Sequence[SurfacePoint], progress: Progress) -> SampledSurface | None:
+        """Return the surface in a polygon, read along plumb lines; None: the polygon shows none."""
+        joint = self.jointly(corners)
+        area, pixel_m = plan_area(joint).value, self._pixel_m(corners)
+        spacing = max(float(np.sqrt(area / _MOST_SAMPLES)), _LEAST_SPACING_PX * pixel_m)
+        grid = grid_in_polygon(joint.position_in_geo[:, :2], spacing)
+        top = float(joint.position_in_geo[:, 2].max()) + _ABOVE_M + float(np.sqrt(area))
+        samples = []
+        with progress.task("surface", len(grid)) as task:
+            for east, north in grid:
+                point = self.under(self._plumb_line(np.array([east, north, top])))
+                if isinstance(point, SurfacePoint):
+                    samples.append(point)
+                task.advance()
+        if not samples:
+            return None
+        chosen = np.unique(np.linspace(0, len(samples) - 1, _JOINT_SAMPLES).astype(np.int64))
+        shared = self._joint_covariance([*corners, *(samples[row] for row in chosen)])
+        if shared is not None:
+            own = [point.cov_of_surface for point in corners]
+            shared = shared + block_diag(*own, *[np.zeros((3, 3))] * len(chosen))
+        return SampledSurface(
+            corners=joint,
+            samples=np.array([point.position_in_geo for point in samples]),
+            sigma_up_m=np.sqrt([point.cov_of_surface[2, 2] for point in samples]),
+            cov_in_geo=shared,
+            chosen=chosen,
+            spacing_m=spacing,
+            coverage=len(samples) / len(grid),
+        )
+
+    def _plumb_line(self, start_in_geo: FloatArray) -> Sight:
+        model_from_geo = self.trained.geo_from_model.inverse()
+        down = model_from_geo.rotation @ np.array([0.0, 0.0, -1.0])
+        return Sight(model_from_geo.apply(start_in_geo[None])[0], down, _PLUMB_PX_RAD)
+
+    def _pixel_m(self, points: Sequence[SurfacePoint]) -> float:
+        """Return the mean width of a training pixel at points."""
+        centers = self.trained.geo_from_model.apply(self.trained.poses.cam_center_in_model)
+        widths = [
+            float(np.linalg.norm(centers[camera] - point.position_in_geo)) / self.reader.focal_px(int(camera))
+            for point in points
+            for camera in point.cameras
+        ]
+        return float(np.mean(widths))
+
+
+def _coverage(surface: SampledSurface) -> Quantity:
+    return Quantity(f"measured every {surface.spacing_m:.2f} m, on", 100 * surface.coverage, None, "% of the area")

@@ -1,0 +1,23 @@
+"""Options of the viewer."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from pipelines.scene.crs_options import CrsOptions
+
+
+class ViewOptions(CrsOptions):
+    """Options of the viewer."""
+
+    crs: str | None = Field(
+        None,
+        description="CRS of the coordinates: EPSG:32632, EPSG:32632+3855, a PROJ string or WKT. Without it: the "
+        "UTM zone of the scene.",
+    )
+    port: int = Field(
+        8080, ge=1024, le=65000, description="Port on this machine; if it is taken, the next free one."
+    )
+    backend: Literal["auto", "cpu", "cuda"] = Field("auto", description="Rasteriser that draws the pictures.")

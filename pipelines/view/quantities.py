@@ -1,0 +1,262 @@
+"""Quantities of measured points with their σ, from the joint covariance of the points.
+
+Points share the errors of similarity, cameras and lens. In a difference, what shifts both points cancels: only a
+joint covariance gives the σ of a distance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.spatial import Delaunay
+
+from pipelines.core.types import BoolArray, FloatArray, IntArray
+
+BaseKind = Literal["plane through the corners", "level of the lowest corner"]
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """Measured quantity.
+
+    Attributes:
+        name: of the quantity.
+        value: of it.
+        sigma: its standard deviation; None: not known.
+        unit: of both.
+    """
+
+    name: str
+    value: float
+    sigma: float | None
+    unit: str
+
+
+@dataclass(frozen=True)
+class MeasuredPoints:
+    """J measured points.
+
+    Attributes:
+        position_in_geo: (J, 3) metres.
+        cov_in_geo: (3 J, 3 J) m², joint; None: nothing states it.
+        height_m: (J,) heights in the vertical datum of the CRS, in metres. Those of `geo` depart from them by
+            d²/2R, 8 cm at a distance of 1 km.
+    """
+
+    position_in_geo: FloatArray
+    cov_in_geo: FloatArray | None
+    height_m: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.position_in_geo)
+
+
+def distances(points: MeasuredPoints) -> tuple[Quantity, ...]:
+    """Return distance in space, horizontal distance and height difference from the first point to the second."""
+    line = points.position_in_geo[1] - points.position_in_geo[0]
+    rise = float(points.height_m[1] - points.height_m[0])
+    plan = np.array([*line[:2], 0.0])
+    up = np.array([0.0, 0.0, 1.0])
+    return (
+        _linear("distance", float(np.linalg.norm(line)), _ends(_unit(line)), points),
+        _linear("horizontal distance", float(np.linalg.norm(plan)), _ends(_unit(plan)), points),
+        _linear("height difference", rise, _ends(up), points),
+    )
+
+
+def length(points: MeasuredPoints) -> tuple[Quantity, ...]:
+    """Return the length of the line through the points, in space and in plan."""
+    legs = np.diff(points.position_in_geo, axis=0)
+    return (
+        _linear("length", float(np.linalg.norm(legs, axis=1).sum()), _along(legs), points),
+        _linear(
+            "horizontal length",
+            float(np.linalg.norm(legs[:, :2], axis=1).sum()),
+            _along(legs * [1.0, 1.0, 0.0]),
+            points,
+        ),
+    )
+
+
+def plan_area(points: MeasuredPoints) -> Quantity:
+    """Return the horizontal area of the polygon of the points, in either direction."""
+    x, y = points.position_in_geo[:, 0], points.position_in_geo[:, 1]
+    east, north = x - x.mean(), y - y.mean()
+    area = abs(float(east @ np.roll(north, -1) - north @ np.roll(east, -1))) / 2
+    return _linear("horizontal area", area, _area_gradient(points), points, unit="m²")
+
+
+def _linear(name: str, value: float, gradient: FloatArray, points: MeasuredPoints, unit: str = "m") -> Quantity:
+    """Return a quantity with the σ of its linear part.
+
+    Args:
+        name: of the quantity.
+        value: of it.
+        gradient: (J, 3) derivative by the points.
+        points: with their covariance.
+        unit: of the value.
+    """
+    return Quantity(name, value, propagated(gradient, points.cov_in_geo), unit)
+
+
+def propagated(gradient: FloatArray, cov: FloatArray | None) -> float | None:
+    """Return σ of a quantity with a gradient (J, 3), from a joint covariance (3 J, 3 J); None without one."""
+    if cov is None:
+        return None
+    flat = gradient.ravel()
+    return float(np.sqrt(max(float(flat @ cov @ flat), 0.0)))
+
+
+def _ends(direction: FloatArray) -> FloatArray:
+    return np.stack([-direction, direction])
+
+
+def _along(legs: FloatArray) -> FloatArray:
+    """Return the derivative (J, 3) of the sum of the lengths of legs (J − 1, 3)."""
+    size = np.linalg.norm(legs, axis=1, keepdims=True)
+    unit = np.divide(legs, size, out=np.zeros_like(legs), where=size > 0)
+    gradient = np.zeros((len(legs) + 1, 3))
+    gradient[:-1] -= unit
+    gradient[1:] += unit
+    return gradient
+
+
+def _unit(vector: FloatArray) -> FloatArray:
+    size = float(np.linalg.norm(vector))
+    return np.asarray(vector / size if size > 0 else np.zeros_like(vector))
+
+
+@dataclass(frozen=True)
+class SampledSurface:
+    """Surface within a polygon, sampled on a grid in plan.
+
+    Attributes:
+        corners: of the polygon.
+        samples: N points of the surface, without covariance.
+        sigma_up_m: (N,) σ of the samples' own heights, independent of each other.
+        cov_in_geo: (3 (J + M), 3 (J + M)) m², joint, of the corners and of those M samples that `chosen` names,
+            without the samples' own errors; None: nothing states it.
+        chosen: (M,) rows of the samples in that covariance.
+        spacing_m: of the grid.
+        coverage: share of the grid's points with a surface.
+    """
+
+    corners: MeasuredPoints
+    samples: FloatArray
+    sigma_up_m: FloatArray
+    cov_in_geo: FloatArray | None
+    chosen: IntArray
+    spacing_m: float
+    coverage: float
+
+
+def surface_area(surface: SampledSurface) -> Quantity:
+    """Return the area of the surface within the polygon, as smooth as the spacing of its samples.
+
+    Its part above the horizontal area is the mean of sec(slope) over the triangles of neighbouring samples. Its
+    relative σ is that of the horizontal area.
+    """
+    plan = plan_area(surface.corners)
+    stretch = _mean_stretch(surface.samples)
+    sigma = None if plan.sigma is None else plan.sigma * stretch
+    return Quantity("area on the surface", plan.value * stretch, sigma, "m²")
+
+
+def volumes(surface: SampledSurface, base: BasePlane) -> tuple[Quantity, ...]:
+    """Return the volume between surface and base plane: above, below, and their difference.
+
+    σ is that of the difference: of corners and samples jointly, and of the sampling, which is half the difference
+    between the volumes of every second sample and of the others.
+
+    Args:
+        surface: the surface.
+        base: the plane.
+    """
+    area = plan_area(surface.corners).value
+    weights = base.weights(surface.corners.position_in_geo[:, :2], surface.samples[:, :2])
+    above = surface.samples[:, 2] - weights @ surface.corners.position_in_geo[:, 2]
+    count = len(above)
+    gradient = np.zeros((len(surface.corners) + len(surface.chosen), 3))
+    gradient[: len(surface.corners), 2] = -area * weights.mean(axis=0)
+    gradient[: len(surface.corners)] += _area_gradient(surface.corners) * float(above.mean())
+    gradient[len(surface.corners) :, 2] = area / len(surface.chosen)
+    of_points = propagated(gradient, surface.cov_in_geo)
+    sigma = None
+    if of_points is not None:
+        of_noise = area / count * float(np.linalg.norm(surface.sigma_up_m))
+        of_sampling = area * abs(float(above[::2].mean() - above[1::2].mean())) / 2 if count > 1 else 0.0
+        sigma = float(np.sqrt(of_points**2 + of_noise**2 + of_sampling**2))
+    cut, fill = area * float(np.maximum(above, 0).mean()), area * float(np.maximum(-above, 0).mean())
+    return (
+        Quantity("volume above the base", cut, None, "m³"),
+        Quantity("volume below the base", fill, None, "m³"),
+        Quantity("volume", cut - fill, sigma, "m³"),
+    )
+
+
+@dataclass(frozen=True)
+class BasePlane:
+    """Base of a volume: the plane that fits the corners best, or the level of the lowest one."""
+
+    kind: BaseKind = "plane through the corners"
+    lowest: int = 0
+
+    def weights(self, corners: FloatArray, places: FloatArray) -> FloatArray:
+        """Return the weights (N, J) of the corners' heights in the base at places.
+
+        Args:
+            corners: (J, 2) east and north.
+            places: (N, 2) likewise.
+        """
+        if self.kind == "level of the lowest corner":
+            weights = np.zeros((len(places), len(corners)))
+            weights[:, self.lowest] = 1.0
+            return weights
+        middle = corners.mean(axis=0)
+        design = np.column_stack([np.ones(len(corners)), corners - middle])
+        return np.asarray(np.column_stack([np.ones(len(places)), places - middle]) @ np.linalg.pinv(design))
+
+
+def grid_in_polygon(corners: FloatArray, spacing: float) -> FloatArray:
+    """Return the points (N, 2) of a grid that lie in a polygon.
+
+    Args:
+        corners: (J, 2), in either direction.
+        spacing: of the grid.
+    """
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    count = np.maximum(np.ceil((high - low) / spacing).astype(int), 1)
+    axes = [low[k] + (np.arange(count[k]) + 0.5) * (high[k] - low[k]) / count[k] for k in (0, 1)]
+    places = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+    return places[_inside(places, corners)]
+
+
+def _inside(places: FloatArray, corners: FloatArray) -> BoolArray:
+    """Return whether places (N, 2) lie in a polygon (J, 2): a line to the east crosses its sides oddly often."""
+    inside = np.zeros(len(places), dtype=bool)
+    for (x1, y1), (x2, y2) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        if y1 != y2:
+            crossed = (places[:, 1] >= min(y1, y2)) & (places[:, 1] < max(y1, y2))
+            inside ^= crossed & (places[:, 0] < x1 + (places[:, 1] - y1) * (x2 - x1) / (y2 - y1))
+    return inside
+
+
+def _mean_stretch(samples: FloatArray) -> float:
+    """Return the mean of area over horizontal area of the triangles between samples (N, 3)."""
+    if len(samples) < 3:
+        return 1.0
+    triangles = samples[Delaunay(samples[:, :2]).simplices]
+    normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    return float(np.linalg.norm(normal, axis=1).sum() / np.abs(normal[:, 2]).sum())
+
+
+def _area_gradient(points: MeasuredPoints) -> FloatArray:
+    """Return the derivative (J, 3) of the horizontal area of a polygon."""
+    east, north = (points.position_in_geo[:, axis] - points.position_in_geo[:, axis].mean() for axis in (0, 1))
+    twice = float(east @ np.roll(north, -1) - north @ np.roll(east, -1))
+    gradient = np.zeros((len(east), 3))
+    gradient[:, 0] = (np.roll(north, -1) - np.roll(north, 1)) / 2
+    gradient[:, 1] = (np.roll(east, 1) - np.roll(east, -1)) / 2
+    return np.asarray(gradient * np.sign(twice))

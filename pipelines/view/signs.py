@@ -1,0 +1,209 @@
+"""Signs in the viewer's scene: cameras, control and check points with their errors, SfM points, measured points."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from pipelines.accuracy.accuracy_grid import AccuracyGrid
+from pipelines.core.types import FloatArray
+from pipelines.geometry.rotations import quat_xyzw_from_matrix
+from pipelines.plots.style import BLUE, DARK, ORANGE, colours_of
+from pipelines.scene.survey import SurveyedPoint
+from pipelines.scene.trained_survey import TrainedSurvey
+from pipelines.view.view_frame import ViewFrame
+
+if TYPE_CHECKING:
+    import viser
+
+PointColour = Literal["of the photographs", "by σ horizontal", "by σ vertical"]
+Kind = Literal["cameras", "points", "errors", "tie points", "measured"]
+KINDS: tuple[Kind, ...] = ("cameras", "points", "errors", "tie points", "measured")
+MEASURED_RGB = (220, 30, 30)
+_MOST_POINTS = 200_000  # SfM points that are drawn
+_MOST_FRUSTUMS = 400  # cameras with a frustum to click on; of more, only the places are drawn
+# In units of the viewer; the scene's radius is 10.
+CAMERA_SIZE, SIGN_RADIUS, _POINT_SIZE = 0.15, 0.06, 0.012
+_SNAP_PX = 6.0  # of a click, around a sign
+_LENGTH = 0.7  # of the longest error arrow, in units of the viewer
+
+
+def rgb(colour: str) -> tuple[int, int, int]:
+    """Return the numbers of a colour `#rrggbb`."""
+    return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
+
+
+@dataclass(frozen=True)
+class PointError:
+    """Surveyed place (3,) and measured place (3,) of a point, in `geo`."""
+
+    surveyed: FloatArray
+    measured: FloatArray
+
+
+@dataclass(frozen=True)
+class Hit:
+    """Sign under a click: a camera by its index, or a surveyed point by its name."""
+
+    kind: Literal["camera", "point"]
+    camera: int = -1
+    name: str = ""
+
+
+class Signs:
+    """Signs in the scene of a server.
+
+    Args:
+        server: of the viewer.
+        trained: the trained survey.
+        frame: of the viewer.
+    """
+
+    def __init__(self, server: viser.ViserServer, trained: TrainedSurvey, frame: ViewFrame) -> None:
+        self._scene, self._trained, self._frame = server.scene, trained, frame
+        self._centers = frame.view_from_model.apply(trained.poses.cam_center_in_model)
+        self._named: dict[str, FloatArray] = {}
+        self._groups = {kind: self._scene.add_frame(f"/{kind}", show_axes=False) for kind in KINDS}
+        self._wanted = dict.fromkeys(KINDS, True)
+        self._hidden = False
+
+    def place(self, point_in_geo: FloatArray) -> FloatArray:
+        """Return places (…, 3) in the viewer's frame."""
+        model_from_geo = self._trained.geo_from_model.inverse()
+        return (self._frame.view_from_model @ model_from_geo).apply(point_in_geo)
+
+    def show(self, kind: Kind, visible: bool) -> None:
+        """Show or hide the signs of a kind."""
+        self._wanted[kind] = visible
+        self._groups[kind].visible = visible and not self._hidden
+
+    def hide_all(self, *, hidden: bool) -> None:
+        """Hide all signs for a while, or show again those that are wanted."""
+        self._hidden = hidden
+        for kind, wanted in self._wanted.items():
+            self.show(kind, wanted)
+
+    def hit(self, start: FloatArray, direction: FloatArray, pixel_rad: float) -> Hit | None:
+        """Return the sign that a line of sight meets, the nearest to its start; None: it meets none.
+
+        Args:
+            start: (3,) in the viewer's frame.
+            direction: (3,) unit vector.
+            pixel_rad: width of a pixel of the page.
+        """
+        signs: list[tuple[FloatArray, float, Hit]] = []
+        if self._groups["points"].visible:
+            signs += [(place, SIGN_RADIUS, Hit("point", name=name)) for name, place in self._named.items()]
+        if self._groups["cameras"].visible:
+            signs += [(place, CAMERA_SIZE, Hit("camera", camera=k)) for k, place in enumerate(self._centers)]
+        met = []
+        for place, radius, sign in signs:
+            along = float((place - start) @ direction)
+            across = float(np.linalg.norm(place - start - along * direction))
+            if along > 0 and across < max(radius, _SNAP_PX * pixel_rad * along):
+                met.append((along, sign))
+        return min(met, key=lambda each: each[0])[1] if met else None
+
+    def add_cameras(self) -> None:
+        """Draw the cameras."""
+        poses, frame = self._trained.poses, self._frame
+        if len(self._centers) > _MOST_FRUSTUMS:
+            self._scene.add_point_cloud(
+                "/cameras/all", self._centers, rgb(BLUE), point_size=CAMERA_SIZE / 2, precision="float32"
+            )
+            return
+        for index, center in enumerate(self._centers):
+            lens = self._trained.sparse.camera_of(index)
+            split = self._trained.model.cameras[index].split
+            self._scene.add_camera_frustum(
+                f"/cameras/{index}",
+                fov=2 * float(np.arctan(lens.height / 2 / lens.mean_focal_px)),
+                aspect=lens.width / lens.height,
+                scale=CAMERA_SIZE,
+                thickness=1.5,
+                thickness_units="screen",
+                color=rgb(BLUE if split == "train" else ORANGE),
+                wxyz=wxyz_of(frame.view_from_model.rotation @ poses.cam_from_model[index].T),
+                position=center,
+            )
+
+    def add_surveyed(self, points: Sequence[SurveyedPoint], kind: Literal["control", "check"]) -> None:
+        """Draw surveyed points with their names."""
+        for number, point in enumerate(points):
+            place = self._named[point.name] = self.place(np.array(point.position_in_geo))
+            name = f"/points/{kind}{number}"
+            colour = rgb(ORANGE if kind == "control" else DARK)
+            self._scene.add_icosphere(name, radius=SIGN_RADIUS, color=colour, position=place, subdivisions=2)
+            self._scene.add_label(f"{name}/name", point.name, position=(0.0, 0.0, SIGN_RADIUS))
+
+    def add_errors(self, errors: Sequence[PointError]) -> float:
+        """Draw error arrows, enlarged so that they are seen; return by how much."""
+        known = [error for error in errors if np.isfinite(error.measured).all()]
+        if not known:
+            return 1.0
+        longest = max(float(np.linalg.norm(error.measured - error.surveyed)) for error in known)
+        scale = self._frame.view_from_model.scale
+        enlarged = _round_factor(_LENGTH / max(longest * scale, 1e-12))
+        ends = [
+            (self.place(e.surveyed), self.place(e.surveyed + enlarged * (e.measured - e.surveyed))) for e in known
+        ]
+        self._scene.add_arrows(
+            "/errors/all", np.array(ends), rgb(ORANGE), shaft_radius=0.015, head_radius=0.04, head_length=0.1
+        )
+        return enlarged
+
+    def add_points(self, colour: PointColour, grid: AccuracyGrid | None) -> tuple[float, float] | None:
+        """Draw the SfM points; return least and largest σ in metres where they are coloured by it."""
+        point, shown = self._trained.point_in_model, self._trained.sfm.point_rgb
+        every = max(1, -(-len(point) // _MOST_POINTS))
+        point, shown = point[::every], shown[::every]
+        limits = None
+        if colour != "of the photographs" and grid is not None and len(point):
+            sigma = grid.sigma_at(self._trained.geo_from_model.apply(point))
+            values = np.hypot(sigma[:, 0], sigma[:, 1]) if colour == "by σ horizontal" else sigma[:, 2]
+            low, high = np.quantile(values, [0.02, 0.98]).tolist()
+            shown, limits = colours_of(values, low, high), (low, high)
+        self._scene.add_point_cloud(
+            "/tie points/all",
+            self._frame.view_from_model.apply(point),
+            shown,
+            point_size=_POINT_SIZE,
+            precision="float32",
+        )
+        return limits
+
+    def add_measured(self, name: str, points_in_geo: FloatArray, *, closed: bool = False) -> None:
+        """Draw measured points, and the line through them."""
+        places = self.place(points_in_geo)
+        self._scene.add_point_cloud(
+            f"/measured/{name}/points",
+            places,
+            MEASURED_RGB,
+            point_size=SIGN_RADIUS,
+            point_shape="circle",
+            precision="float32",
+        )
+        ends = np.roll(places, -1, axis=0) if closed else places[1:]
+        if len(places) > 1:
+            segments = np.stack([places[: len(ends)], ends], axis=1)
+            self._scene.add_line_segments(
+                f"/measured/{name}/line", segments, MEASURED_RGB, thickness=3.0, thickness_units="screen"
+            )
+
+    def remove_measured(self, name: str) -> None:
+        """Remove measured points and their line."""
+        self._scene.remove_by_name(f"/measured/{name}")
+
+
+def wxyz_of(rotation: FloatArray) -> FloatArray:
+    x, y, z, w = quat_xyzw_from_matrix(rotation)
+    return np.array([w, x, y, z])
+
+
+def _round_factor(value: float) -> float:
+    """Return the largest of 1, 2, 5, 10, 20 … that is at most `value`, and at least 1."""
+    power = 10 ** np.floor(np.log10(max(value, 1.0)))
+    return float(max(step * power for step in (1, 2, 5) if step * power <= max(value, 1.0)))

@@ -1,0 +1,315 @@
+"""The viewer: a trained model in the browser, on loopback, with what measures in it."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, get_args
+
+import numpy as np
+
+from pipelines.accuracy.accuracy_grid import AccuracyGrid
+from pipelines.core.errors import GeorefError
+from pipelines.core.manifest import hash_file
+from pipelines.core.progress import SILENT, Progress
+from pipelines.core.stages import GAUSSIANS, MODEL, REPORT
+from pipelines.core.workspace import Workspace
+from pipelines.scene.renderer import ModelRenderer
+from pipelines.scene.report import EvaluationReport, read_report
+from pipelines.scene.scene import photographs
+from pipelines.scene.trained_survey import load_trained
+from pipelines.splat.rasterizer.backends import rasterizer
+from pipelines.view.loopback import start_server
+from pipelines.view.mark_panel import MarkPanel
+from pipelines.view.measure_panel import MeasurePanel
+from pipelines.view.measuring import MeasuringModel
+from pipelines.view.options import ViewOptions
+from pipelines.view.photo_view import PhotoView
+from pipelines.view.picture_loop import PictureLoop, camera_of
+from pipelines.view.pictures import Painter, Photographs
+from pipelines.view.signs import Kind, PointColour, PointError, Signs
+from pipelines.view.tables import paragraph
+from pipelines.view.view_frame import ViewFrame, frame_of
+
+if TYPE_CHECKING:
+    import viser
+
+log = logging.getLogger(__name__)
+
+FOLDER = "view"  # of the workspace: what the user saves in the viewer
+_WATCH_S = 2.0
+_FOV_RAD = 0.9
+ClickMode = Literal["looks", "measures", "marks in the photograph"]
+
+
+class Viewer:
+    """Viewer of a workspace, until the model changes.
+
+    Args:
+        server: of the pages.
+        workspace: has a trained model.
+        options: of the viewer.
+        progress: shows the reading.
+
+    Raises:
+        MissingProductError: there is no trained model; names the command that makes it.
+        GeorefError: a product is damaged, or the CRS cannot be used.
+    """
+
+    def __init__(
+        self, server: viser.ViserServer, workspace: Workspace, options: ViewOptions, progress: Progress = SILENT
+    ) -> None:
+        self._server = server
+        self.stamp = model_stamp(workspace)
+        with progress.task("reading the model", 2) as task:
+            trained = load_trained(workspace)
+            task.advance()
+            images = photographs(trained.sfm, trained.survey, workspace, trained.model.max_image_size)
+            self._renderer = ModelRenderer(trained, images, rasterizer(options.backend))
+            self.model = MeasuringModel(workspace, self._renderer, options)
+            task.advance()
+        self.frame: ViewFrame = frame_of(trained)
+        self._painter = Painter(self._renderer, Photographs(workspace, self._renderer), self.frame)
+        self._loops: dict[int, PictureLoop] = {}
+        self._lock = threading.Lock()
+        self.signs = Signs(server, trained, self.frame)
+        self.photo = PhotoView(server, trained, self.frame, self.signs, self.wake)
+        self._build(workspace, workspace.root / FOLDER)
+        server.scene.on_click()(self._clicked)
+        # No picture should wait for it.
+        self._solving = threading.Thread(target=self._propagate_errors, daemon=True)
+        self._solving.start()
+        server.on_client_connect(self._connected)
+        server.on_client_disconnect(self._left)
+        for client in server.get_clients().values():
+            self._connected(client)
+
+    def _propagate_errors(self) -> None:
+        try:
+            self.model.propagate_errors()
+        except GeorefError as error:
+            self.tell(f"No σ is stated: {error}")
+        self.measuring.refresh()
+        self._colour_points()
+
+    def wait_for_sigma(self) -> None:
+        """Wait until σ are computed."""
+        self._solving.join()
+
+    def _build(self, workspace: Workspace, folder: Path) -> None:
+        gui, trained = self._server.gui, self.model.trained
+        self._notice = gui.add_html("")
+        self._mode = gui.add_dropdown("A click", get_args(ClickMode), hint="What a click in the scene does")
+        tabs = gui.add_tab_group()
+        with tabs.add_tab("See"):
+            self._build_look(workspace)
+        with tabs.add_tab("Measure"):
+            self.measuring = MeasurePanel(
+                self._server, self.model, self.signs, folder, hash_file(workspace.path(MODEL), {})
+            )
+        with tabs.add_tab("Mark"):
+            self.marking = MarkPanel(self._server, self.model, self.signs, self.photo, folder)
+            gui.add_button("Measure with the marked point").on_click(lambda _: self._take_marked())
+        survey = trained.survey
+        self.signs.add_cameras()
+        self.signs.add_surveyed(survey.control_points, "control")
+        self.signs.add_surveyed(survey.check_points, "check")
+        self._colour_points()
+
+    def _build_look(self, workspace: Workspace) -> None:
+        gui = self._server.gui
+        names = self.model.trained.sparse.image_name
+        self._photo = gui.add_dropdown("Photograph", names, hint="Or click on a camera")
+        gui.add_button("Fly there").on_click(lambda _: self.photo.show(names.index(self._photo.value)))
+        share = gui.add_slider("Photograph over splat", 0.0, 1.0, 0.05, 1.0)
+        gui.add_button("Leave the photograph").on_click(lambda _: self._leave())
+        self._where = gui.add_html("")
+        shown: tuple[tuple[str, Kind, bool], ...] = (
+            ("Cameras", "cameras", True),
+            ("Control and check points", "points", True),
+            ("Errors of the points", "errors", True),
+            ("SfM points", "tie points", False),
+        )
+        for label, kind, visible in shown:
+            self._add_switch(label, kind, visible)
+        self._colour = gui.add_dropdown("Colour of the SfM points", get_args(PointColour))
+        self._legend = gui.add_html(self._errors(workspace))
+        self._colour.on_update(lambda _: self._colour_points())
+        share.on_update(lambda _: self._blend(share.value))
+
+    def _add_switch(self, label: str, kind: Kind, visible: bool) -> None:
+        box = self._server.gui.add_checkbox(label, visible)
+        box.on_update(lambda _: self.signs.show(kind, box.value))
+        self.signs.show(kind, visible)
+
+    def _errors(self, workspace: Workspace) -> str:
+        """Draw the errors of control and check points, and return a sentence about the arrows."""
+        try:
+            report = read_report(workspace.path(REPORT))
+        except GeorefError:
+            return paragraph("No errors are shown: `georef evaluate` measures them.")
+        enlarged = self.signs.add_errors(point_errors(self.model, report))
+        return paragraph(f"Arrows: error by camera, × {enlarged:g}. Orange: control points and test views.")
+
+    def _colour_points(self) -> None:
+        grid: AccuracyGrid | None = None
+        if self._colour.value != "of the photographs" and self.model.propagation is not None:
+            grid = self.model.propagation.grid
+        limits = self.signs.add_points(self._colour.value, grid)
+        if limits is not None:
+            low, high = limits
+            self._legend.content = paragraph(f"σ of the SfM points: dark {low:.3f} m, bright {high:.3f} m")
+
+    def _blend(self, share: float) -> None:
+        self.photo.share = float(share)
+        self.wake()
+
+    def _leave(self) -> None:
+        self.photo.leave()
+        self._where.content = ""
+        for client in self._server.get_clients().values():
+            self._stand_above(client)
+
+    def _take_marked(self) -> None:
+        point = self.marking.measured()
+        if point is not None:
+            self.measuring.add_point(point)
+
+    def wake(self) -> None:
+        """Draw the pictures of all pages anew."""
+        for loop in list(self._loops.values()):
+            loop.wake()
+
+    def _connected(self, client: viser.ClientHandle) -> None:
+        with self._lock:
+            if client.client_id in self._loops:
+                return
+            self._stand_above(client)
+            self._loops[client.client_id] = PictureLoop(client, self._painter, lambda: self.photo.blend)
+
+    def _left(self, client: viser.ClientHandle) -> None:
+        with self._lock:
+            loop = self._loops.pop(client.client_id, None)
+        if loop is not None:
+            loop.end()
+
+    def _stand_above(self, client: viser.ClientHandle) -> None:
+        """Put a page's camera in the south of the scene, looking down on it."""
+        with client.atomic():
+            client.camera.fov = _FOV_RAD
+            client.camera.up_direction = (0.0, 0.0, 1.0)
+            client.camera.position = (0.0, -14.0, 12.0)
+            client.camera.look_at = (0.0, 0.0, 0.0)
+
+    def _clicked(self, event: viser.SceneClickEvent) -> None:
+        camera = camera_of(event.client)
+        if camera is None:
+            return
+        start, direction = np.array(event.ray_origin), np.array(event.ray_direction)
+        direction /= np.linalg.norm(direction)
+        if self._mode.value == "marks in the photograph":
+            self._mark(event.client, direction)
+            return
+        sight = self.frame.sight(camera, start, direction)
+        hit = self.signs.hit(start, direction, sight.pixel_rad)
+        if hit is not None and hit.kind == "camera" and self._mode.value == "looks":
+            self._photo.value = self.model.trained.sparse.image_name[hit.camera]  # type: ignore[misc]
+            self.photo.show(hit.camera)
+        elif hit is not None and hit.kind == "point":
+            self.measuring.add_surveyed(hit.name)
+        elif self._mode.value == "measures":
+            self.measuring.add_sight(sight)
+
+    def _mark(self, client: viser.ClientHandle, direction: np.ndarray) -> None:
+        """Come closer at the first click in a photograph, and mark at the second."""
+        if self.photo.camera is None or not self.photo.is_at(client):
+            self.marking.turn(0 if self.photo.camera is not None else 1)
+        elif not self.photo.come_closer(client, direction):
+            self.marking.add(self.photo.camera, self.photo.in_cam(direction))
+
+    def tell(self, sentence: str) -> None:
+        """Show a sentence above the panels of all pages."""
+        self._notice.content = paragraph(sentence, mark="notice")
+
+    def add_reload(self, act: Callable[[], None]) -> None:
+        """Offer to read the model again."""
+        self._server.gui.add_button("Read the model again").on_click(lambda _: act())
+
+    def close(self) -> None:
+        """End the pictures, and empty the pages."""
+        for loop in list(self._loops.values()):
+            loop.end()
+        self._server.scene.remove_click_callback("all")
+        self._server.scene.reset()
+        self._server.gui.reset()
+
+
+def point_errors(model: MeasuringModel, report: EvaluationReport) -> list[PointError]:
+    """Return the errors by camera of control and check points."""
+    survey = model.trained.survey
+    place = {p.name: np.array(p.position_in_geo) for p in (*survey.control_points, *survey.check_points)}
+    rows = [*report.checkpoints.camera.points, *report.fit.gcp.points]
+    return [
+        PointError(place[row.name], place[row.name] + np.array([row.de_m, row.dn_m, row.du_m]))
+        for row in rows
+        if row.name in place and row.de_m is not None and row.dn_m is not None and row.du_m is not None
+    ]
+
+
+def model_stamp(workspace: Workspace) -> tuple[int, ...]:
+    """Return what changes when the model is trained again.
+
+    Raises:
+        MissingProductError: there is no trained model.
+    """
+    return tuple(workspace.path(product).stat().st_mtime_ns for product in (MODEL, GAUSSIANS))
+
+
+def serve(
+    workspace: Workspace,
+    options: ViewOptions,
+    ready: Callable[[str], None],
+    ended: threading.Event,
+    progress: Progress = SILENT,
+) -> None:
+    """Serve the viewer of a workspace until `ended` is set.
+
+    Args:
+        workspace: has a trained model.
+        options: of the viewer.
+        ready: called with the address when the pages can be opened.
+        ended: ends the viewer.
+        progress: shows the reading.
+
+    Raises:
+        MissingProductError: there is no trained model; names the command that makes it.
+        GeorefError: a product is damaged, no port is free, or the CRS cannot be used.
+    """
+    model_stamp(workspace)
+    server = start_server(options.port, f"georef view {workspace.root.name}")
+    try:
+        viewer = Viewer(server, workspace, options, progress)
+        ready(f"http://{server.get_host()}:{server.get_port()}")
+        again = threading.Event()
+        told = False
+        while not ended.wait(_WATCH_S):
+            if again.is_set():
+                again.clear()
+                viewer.close()
+                viewer, told = Viewer(server, workspace, options, progress), False
+            if not told and _has_changed(workspace, viewer.stamp):
+                told = True
+                log.warning("the model has changed since the viewer read it")
+                viewer.tell("The model has changed since it was read: measurements are those of the old one.")
+                viewer.add_reload(again.set)
+    finally:
+        server.stop()
+
+
+def _has_changed(workspace: Workspace, stamp: tuple[int, ...]) -> bool:
+    try:
+        return model_stamp(workspace) != stamp
+    except (GeorefError, OSError):  # between the old model and the new one
+        return False
