@@ -20,7 +20,7 @@ from pipelines.core.errors import GeorefError
 from pipelines.core.options import notation
 from pipelines.core.plan import PlannedStage, plan
 from pipelines.core.products import load_json
-from pipelines.core.sentences import duration
+from pipelines.core.sentences import about
 from pipelines.core.stages import SURVEY, StageSpec
 from pipelines.core.staleness import Flags
 from pipelines.core.workspace import Workspace
@@ -84,7 +84,7 @@ def print_dry_run(
     table = plain_table("stage", "", "about", "why", right=[2])
     for row in planned:
         action = f"[{_STYLE[row.action]}]{row.action}[/]"
-        table.add_row(row.stage, action, duration(seconds.get(row.stage)), shown(row.reason))
+        table.add_row(row.stage, action, about(seconds.get(row.stage)), shown(row.reason))
     parts: list[Renderable] = [table, *tables.origins([origin for row in planned for origin in row.options])]
     if photographs is not None:
         width, height = photographs.size_px
@@ -180,6 +180,10 @@ def _training(planned: list[PlannedStage], photographs: Photographs | None) -> T
     from pipelines.train.forecast import forecast
 
     for row in planned:
-        if isinstance(row.resolved, TrainOptions) and row.action != "keep" and photographs is not None:
+        if (
+            isinstance(row.resolved, TrainOptions)
+            and row.action not in ("keep", "refuse")
+            and photographs is not None
+        ):
             return forecast(photographs.count, photographs.size_px, row.resolved)
     return None

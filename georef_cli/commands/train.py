@@ -35,5 +35,5 @@ command = TrainCommand(
       georef train flight --iterations 4000
       georef train flight --iterations 5000 --max-image-size 800 --backend cpu
     """,
-    extra=[click.Option(["--resume"], is_flag=True, help="Continue the interrupted run, and begin no other.")],
+    extra=[click.Option(["--resume"], is_flag=True, help="Continue the interrupted run; refuse other options.")],
 )

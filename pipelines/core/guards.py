@@ -1,8 +1,9 @@
-"""Checks ahead of a stage: stale or damaged inputs, and work of an interrupted run that would be lost."""
+"""Checks ahead of a stage: stale or damaged inputs, and earlier work that would be lost or can be extended."""
 
 from __future__ import annotations
 
 import logging
+from pathlib import Path
 
 from pipelines.core.errors import InputError
 from pipelines.core.manifest import MANIFEST, Memo
@@ -45,6 +46,19 @@ def damaged_product(workspace: Workspace, spec: StageSpec, memo: Memo, *, by_con
     except InputError:
         return []
     return [] if manifest is None else workspace.damaged(spec, manifest, memo, by_content=by_content)
+
+
+def extendable_product(workspace: Workspace, asked: Request) -> Path | None:
+    """Return the folder of a finished product that differs from the request in growing options only, or None."""
+    spec = asked.spec
+    try:
+        manifest = workspace.manifest(spec)
+    except InputError:
+        return None
+    if not spec.growing or manifest is None or damaged_product(workspace, spec, {}, by_content=False):
+        return None
+    changed = changed_options(asked.options, manifest.config, but=spec.growing)
+    return None if changed or changed_inputs(asked.inputs, manifest.inputs) else workspace.root / spec.folder
 
 
 def refuse_loss(workspace: Workspace, asked: Request) -> None:

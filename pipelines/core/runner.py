@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Collection, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,6 +25,7 @@ from pipelines.core.errors import (
 )
 from pipelines.core.guards import (
     damaged_product,
+    extendable_product,
     refuse_damaged_inputs,
     refuse_loss,
     refuse_loss_by_options,
@@ -42,8 +42,6 @@ from pipelines.core.staleness import (
     Flags,
     Request,
     cautions_by_stage,
-    changed_inputs,
-    changed_options,
     must_exist,
     request,
     stage_config,
@@ -252,7 +250,7 @@ def _run(job: _Job, token: str) -> Summary:
     spec = asked.spec
     run = importlib.import_module(spec.module).run
     out, resumed = workspace.begin(spec, token, job.resume)
-    extends = None if job.resume == "never" else _extendable(workspace, asked)
+    extends = None if job.resume == "never" else extendable_product(workspace, asked)
     log.info("%s: %s%s", spec.name, "resumed" if resumed else "started", f", {place}" if place else "")
     try:
         with storage_failures():
@@ -275,19 +273,6 @@ def _run(job: _Job, token: str) -> Summary:
         workspace.partial_product(spec).fail(str(degenerate), worthless=True)
         raise degenerate from error
     return summary
-
-
-def _extendable(workspace: Workspace, asked: Request) -> Path | None:
-    """Return the folder of a finished product that differs from the request in growing options only, or None."""
-    spec = asked.spec
-    try:
-        manifest = workspace.manifest(spec)
-    except InputError:
-        return None
-    if not spec.growing or manifest is None or damaged_product(workspace, spec, {}, by_content=False):
-        return None
-    changed = changed_options(asked.options, manifest.config, but=spec.growing)
-    return None if changed or changed_inputs(asked.inputs, manifest.inputs) else workspace.root / spec.folder
 
 
 def _current(workspace: Workspace, asked: Request, memo: Memo) -> Manifest | None:

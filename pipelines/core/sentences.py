@@ -22,3 +22,12 @@ def duration(seconds: float | None) -> str:
     if minutes < 60:
         return f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"
     return f"{minutes // 60} h {minutes % 60:02d} min"
+
+
+def about(seconds: float | None) -> str:
+    """Return an estimated duration: `43 s`, `2 min 50 s`, `36 min`, `7 h 30 min`; empty for None."""
+    if seconds is None or seconds < 60:
+        return duration(seconds)
+    unit = 10 if seconds < 600 else 60 if seconds < 3600 else 600
+    text = duration(round(seconds / unit) * unit)
+    return text.removesuffix(" 00 s")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from pipelines.core.sentences import duration
+from pipelines.core.sentences import about
 from pipelines.core.threads import thread_count
 from pipelines.geometry.cameras import Pinhole
 from pipelines.splat.memory import TrainingSize, free_memory_bytes, predicted_peak_bytes
@@ -64,7 +64,7 @@ class TrainingForecast:
             size += f", 1/{self.reduction:.1f} of their side (--max-image-size)"
         took = "time not measured on a GPU"
         if self.seconds is not None:
-            took = f"about {duration(self.seconds)} on {self.threads} threads of this machine"
+            took = f"about {about(self.seconds)} on {self.threads} threads of this machine"
         free = "" if self.free_bytes is None else f" of {self.free_bytes / 2**30:.1f} GiB free"
         return [effort, size, f"{took}; memory about {self.peak_bytes / 2**30:.1f} GiB{free}"]
 
