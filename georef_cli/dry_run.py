@@ -18,6 +18,7 @@ from georef_cli.overview import size
 from georef_cli.tables import Renderable
 from pipelines.core.errors import GeorefError
 from pipelines.core.options import notation
+from pipelines.core.photograph_folder import photograph_folder
 from pipelines.core.plan import PlannedStage, plan
 from pipelines.core.products import load_json
 from pipelines.core.sentences import about
@@ -145,7 +146,7 @@ def _photographs(workspace: Workspace, planned: list[PlannedStage]) -> Photograp
             return None
         survey = load_json(Survey, workspace.path(SURVEY))
         largest = max(survey.cameras, key=lambda camera: camera.width * camera.height)
-        folder = workspace.photographs(survey.image_dir)
+        folder = photograph_folder(workspace, survey.image_dir)
         sizes = [path.stat().st_size for image in survey.images if (path := folder / image.name).is_file()]
         return Photographs(len(survey.images), (largest.width, largest.height), sum(sizes) or None)
     assert isinstance(ingest.resolved, IngestOptions)

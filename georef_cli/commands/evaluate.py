@@ -2,22 +2,46 @@
 
 from __future__ import annotations
 
-from georef_cli.stage import StageCommand
+from typing import Any
 
-command = StageCommand(
+import click
+
+from georef_cli.display import is_told
+from georef_cli.output import print_outcome
+from georef_cli.point_tables import coordinate_tables, error_tables
+from georef_cli.stage import StageCommand
+from pipelines.core.stages import REPORT
+from pipelines.scene.report import read_report
+
+
+class EvaluateCommand(StageCommand):
+    """Command of the stage, with `--points`."""
+
+    def act(self, ctx: click.Context, **values: Any) -> None:
+        """Run the stage and print its result, with coordinates and errors point by point if they are wanted."""
+        outcome, workspace = self.run(ctx, values), values["workspace"]
+        report = read_report(workspace.path(REPORT))
+        errors = error_tables(report) if values["points"] else []
+        parts = (*coordinate_tables(report), *errors)
+        print_outcome(workspace, outcome, *parts, as_json=values["as_json"], told=is_told(ctx.obj))
+
+
+command = EvaluateCommand(
     "evaluate",
     """Measure test views and check points.
 
     Check points are measured by camera (their marks intersected) and by model (the rendered depth of the
     Gaussians at the marks, not their centres), and stated as the ASPRS standard asks. The predicted accuracy over
     the scene is drawn in evaluate/accuracy.png. A survey without check points has --cross-validate: every control
-    point measured by a solution that does not know it. The report is evaluate/report.json.
+    point measured by a solution that does not know it. The report is evaluate/report.json; evaluate/points.csv has
+    the error of every point, and --points prints them.
 
     \b
     Examples:
       georef evaluate flight
       georef evaluate flight --renders 2 --json
-      georef evaluate flight --crs EPSG:32632
+      georef evaluate flight --points --crs EPSG:32632
       georef evaluate flight --cross-validate
     """,
+    extra=[click.Option(["--points"], is_flag=True, help="Print the errors of every check and control point.")],
 )

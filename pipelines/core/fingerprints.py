@@ -4,49 +4,90 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+import os
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from pipelines.core.errors import InputError, MissingProductError
 from pipelines.core.files import file_size
-from pipelines.core.manifest import Memo, hash_file
-from pipelines.core.options import StageOptions, flag_name, input_paths
+from pipelines.core.manifest import FileRecord, Memo, hash_file
+from pipelines.core.options import InputMarker, StageOptions, flag_name, input_markers, input_paths
+from pipelines.core.progress import SILENT, Progress
 from pipelines.core.stages import ProductPart, StageSpec
 from pipelines.core.workspace import Workspace
 
+# A larger file, such as a bag, counts by its size and by samples: reading gigabytes for each `georef status` would
+# be too slow, and its time of modification would make a copy stale.
 _WHOLE_BYTES = 256 * 1024 * 1024
+_SAMPLES, _SAMPLE_BYTES = 64, 1024 * 1024
+_MOST_THREADS = 4
+
+Records = Mapping[str, Mapping[str, FileRecord]]
 
 
-def fingerprints(workspace: Workspace, spec: StageSpec, options: StageOptions, memo: Memo) -> dict[str, str]:
-    """Return the hashes of all inputs that decide a stage's result, by product or flag.
+@dataclass(frozen=True)
+class Fingerprints:
+    """Inputs of a stage as they are.
+
+    Attributes:
+        hashes: of all inputs that decide the stage's result, by product or flag.
+        files: files in the folders that options name, by flag and path in that folder.
+    """
+
+    hashes: dict[str, str] = field(default_factory=dict)
+    files: dict[str, dict[str, FileRecord]] = field(default_factory=dict)
+
+
+def fingerprints(
+    workspace: Workspace,
+    spec: StageSpec,
+    options: StageOptions,
+    memo: Memo,
+    *,
+    known: Records | None = None,
+    progress: Progress = SILENT,
+) -> Fingerprints:
+    """Return the inputs of a stage: hashes of their content, wherever they lie.
 
     - Products of the workspace, or parts of them, count by content.
-    - Files that the options name count by content. Those beyond 256 MiB (bags) and folders count by the name, size
-      and modification time of each file: reading gigabytes for each `georef status` would be too slow.
+    - Files that the options name count by content; those beyond 256 MiB by their size and 64 samples of 1 MiB.
+    - Folders that the options name count by the names and contents of the visible files in them that can matter.
 
     Args:
         workspace: holds the products.
         spec: the stage.
         options: the stage's options.
         memo: hashes of products and of their files by path, extended here: each is hashed once.
+        known: earlier `files`: a file in a folder with the size and time of its record is not read again.
+        progress: shows the files that are read.
 
     Raises:
         MissingProductError: a product does not exist.
         InputError: a path that an option names does not exist, or a file cannot be read.
     """
-    hashes: dict[str, str] = {}
+    result = Fingerprints()
+    markers = input_markers(type(options))
     try:
         for part in spec.reads:
-            hashes |= _hash_part(workspace, part, memo)
+            result.hashes.update(_hash_part(workspace, part, memo))
         for name, path in input_paths(options).items():
             flag = flag_name(type(options), name)
             if not path.exists():
                 raise InputError("no such file or folder", path=path, field=flag)
-            hashes[flag] = _hash_input(path, workspace.root, flag)
+            if path.is_dir():
+                files = _input_files(path, workspace.root, markers[name])
+                records = _records(path, files, (known or {}).get(flag, {}), progress)
+                result.files[flag] = records
+                result.hashes[flag] = _hash_listing({inside: record.sha256 for inside, record in records.items()})
+            else:
+                file_size(path, field=flag)
+                result.hashes[flag] = _hash_file(path)
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}", path=error.filename) from error
-    return hashes
+    return result
 
 
 def _hash_part(workspace: Workspace, part: ProductPart, memo: Memo) -> dict[str, str]:
@@ -58,30 +99,34 @@ def _hash_part(workspace: Workspace, part: ProductPart, memo: Memo) -> dict[str,
             return {}
         raise
     try:
-        values = _values(path, part.fields)
+        values = _values(path, part)
     except ValueError:  # not JSON: the stage that reads the product raises the error
         values = None
     if values is None or (_is_empty(values) and not part.optional):
         return {part.product: _hash_product(path, memo)}
     if _is_empty(values):
         return {}
-    text = json.dumps(dict(zip(part.fields, values, strict=True)), sort_keys=True)
+    text = json.dumps(values, sort_keys=True)
     hashes = {part.product: hashlib.sha256(text.encode()).hexdigest()}
     for product in part.brings:
         hashes |= _hash_part(workspace, ProductPart(product, optional=True), memo)
     return hashes
 
 
-def _values(path: Path, fields: Sequence[str]) -> list[Any] | None:
-    """Return the values of a JSON document's fields; None if `fields` is empty."""
-    if not fields:
+def _values(path: Path, part: ProductPart) -> dict[str, Any] | None:
+    """Return the values of a JSON document that count, by field; None if all of it does."""
+    if not part.fields and not part.without:
         return None
     file_size(path)
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except RecursionError as error:
         raise ValueError("nested too deeply") from error
-    return [_value(document, field.split(".")) for field in fields]
+    if part.fields:
+        return {name: _value(document, name.split(".")) for name in part.fields}
+    if not isinstance(document, dict):
+        return None
+    return {name: value for name, value in document.items() if name not in part.without}
 
 
 def _value(document: Any, keys: Sequence[str]) -> Any:
@@ -94,42 +139,91 @@ def _value(document: Any, keys: Sequence[str]) -> Any:
 
 
 def _is_empty(value: Any) -> bool:
+    if isinstance(value, dict):
+        return all(_is_empty(item) for item in value.values())
     return value is None or (isinstance(value, list) and all(_is_empty(item) for item in value))
-
-
-def _hash_input(path: Path, workspace_root: Path, flag: str) -> str:
-    if path.is_dir():
-        return _hash_listing(path, workspace_root)
-    file_size(path, field=flag)
-    stat = path.stat()
-    if stat.st_size > _WHOLE_BYTES:
-        return hashlib.sha256(f"{path.name} {stat.st_size} {stat.st_mtime_ns}".encode()).hexdigest()
-    return hash_file(path, {})
 
 
 def _hash_product(path: Path, memo: Memo) -> str:
     if path not in memo:
-        memo[path] = _hash_folder(path, memo) if path.is_dir() else hash_file(path, memo)
+        if path.is_dir():
+            memo[path] = _hash_listing(
+                {_text(file.relative_to(path)): hash_file(file, memo) for file in _files(path)}
+            )
+        else:
+            hash_file(path, memo)
     return memo[path]
 
 
-def _hash_folder(path: Path, memo: Memo) -> str:
-    digest = hashlib.sha256()
-    for file in _files(path):
-        digest.update(f"{file.relative_to(path)}={hash_file(file, memo)}\n".encode())
+def _hash_listing(hashes: Mapping[str, str]) -> str:
+    """Return the hash of names and hashes of files."""
+    lines = "".join(f"{name}={hashes[name]}\n" for name in sorted(hashes))
+    return hashlib.sha256(lines.encode()).hexdigest()
+
+
+def _hash_file(path: Path) -> str:
+    """Return the SHA-256 of a file, or of its size and samples if it is large."""
+    size = path.stat().st_size
+    if size <= _WHOLE_BYTES:
+        return hash_file(path, {})
+    digest = hashlib.sha256(f"{size}".encode())
+    with path.open("rb") as handle:
+        for sample in range(_SAMPLES):
+            handle.seek(sample * (size - _SAMPLE_BYTES) // (_SAMPLES - 1))
+            digest.update(handle.read(_SAMPLE_BYTES))
     return digest.hexdigest()
 
 
-def _hash_listing(path: Path, workspace_root: Path) -> str:
-    """Return the hash of the names, sizes and times of visible files; a workspace inside the folder is left out."""
-    digest = hashlib.sha256()
-    for file in _files(path):
-        hidden = any(part.startswith(".") for part in file.relative_to(path).parts)
-        if hidden or file.is_relative_to(workspace_root):
-            continue
-        stat = file.stat()
-        digest.update(f"{file.relative_to(path)} {stat.st_size} {stat.st_mtime_ns}\n".encode())
-    return digest.hexdigest()
+def _records(
+    folder: Path, files: Sequence[Path], known: Mapping[str, FileRecord], progress: Progress
+) -> dict[str, FileRecord]:
+    """Return records of files by their path in a folder; those as a known record has them are not read."""
+    by_name = {_text(file.relative_to(folder)): file for file in files}
+    records = {name: known[name] for name, file in by_name.items() if name in known and _is_as(known[name], file)}
+    unread = {name: file for name, file in by_name.items() if name not in records}
+    if unread:
+        with progress.task("input files", len(unread)) as task, ThreadPoolExecutor(_threads()) as pool:
+            for name, record in zip(unread, pool.map(_record, unread.values()), strict=True):
+                records[name] = record
+                task.advance()
+    return records
+
+
+def _is_as(record: FileRecord, path: Path) -> bool:
+    stat = path.stat()
+    return bool(record.sha256) and (record.size, record.mtime_ns) == (stat.st_size, stat.st_mtime_ns)
+
+
+def _record(path: Path) -> FileRecord:
+    """Return the record of a file; one that cannot be read has no hash: the stage says what is wrong with it."""
+    stat = path.stat()
+    try:
+        sha256 = _hash_file(path)
+    except OSError:
+        sha256 = ""
+    return FileRecord(size=stat.st_size, mtime_ns=stat.st_mtime_ns, sha256=sha256)
+
+
+def _text(name: Path) -> str:
+    """Return a path as text that JSON can hold."""
+    return name.as_posix().encode("utf-8", "backslashreplace").decode()
+
+
+def _threads() -> int:
+    return min(_MOST_THREADS, os.cpu_count() or 1)
+
+
+def _input_files(folder: Path, workspace_root: Path, marker: InputMarker) -> list[Path]:
+    """Return the visible files that count in a folder; a workspace inside the folder is left out."""
+    # Resolved, because `workspace/../photos` is not in the workspace.
+    place, workspace = folder.resolve(), workspace_root.resolve()
+    return [
+        file
+        for file in _files(folder)
+        if not any(part.startswith(".") for part in file.relative_to(folder).parts)
+        and not (place / file.relative_to(folder)).is_relative_to(workspace)
+        and (not marker.suffixes or file.suffix.lower() in marker.suffixes)
+    ]
 
 
 def _files(folder: Path) -> list[Path]:

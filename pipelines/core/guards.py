@@ -58,7 +58,7 @@ def extendable_product(workspace: Workspace, asked: Request) -> Path | None:
     if not spec.growing or manifest is None or damaged_product(workspace, spec, {}, by_content=False):
         return None
     changed = changed_options(asked.options, manifest.config, but=spec.growing)
-    return None if changed or changed_inputs(asked.inputs, manifest.inputs) else workspace.root / spec.folder
+    return None if changed or changed_inputs(asked.inputs.hashes, manifest.inputs) else workspace.root / spec.folder
 
 
 def refuse_loss(workspace: Workspace, asked: Request) -> None:
@@ -72,7 +72,7 @@ def refuse_loss(workspace: Workspace, asked: Request) -> None:
     if progress is None or before is None:
         return
     config, inputs = before
-    reason = changed_options(asked.options, config) or changed_inputs(asked.inputs, inputs)
+    reason = changed_options(asked.options, config) or changed_inputs(asked.inputs.hashes, inputs)
     if reason:
         raise _loss(workspace, asked.spec, progress, reason)
 

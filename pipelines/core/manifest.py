@@ -43,6 +43,7 @@ class Manifest(BaseModel):
         warnings: messages that the user should read.
         cautions: limits of the product, those of its inputs among them.
         files: files of the product by path in the stage's folder; empty in manifests of earlier versions.
+        input_files: files in the folders that options name, by flag and path in that folder.
     """
 
     model_config = ConfigDict(extra="forbid")
@@ -59,6 +60,7 @@ class Manifest(BaseModel):
     warnings: list[str]
     cautions: tuple[Caution, ...] = ()
     files: dict[str, FileRecord] = {}
+    input_files: dict[str, dict[str, FileRecord]] = {}
 
     @model_validator(mode="after")
     def _ends_in_the_calendar(self) -> Manifest:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -28,8 +29,15 @@ CONFIG_FILE = "georef.toml"
 _MAX_TOML_BYTES = 1024 * 1024
 
 
+@dataclass(frozen=True)
 class InputMarker:
-    """Mark of a path whose content decides the stage's result: its fingerprint enters the manifest."""
+    """Mark of a path whose content decides the stage's result: its fingerprint enters the manifest.
+
+    Attributes:
+        suffixes: of the files that count in a folder, in lower case; empty: all.
+    """
+
+    suffixes: frozenset[str] = frozenset()
 
 
 class WrittenMarker:
@@ -116,20 +124,26 @@ def flag_name(options_type: type[StageOptions], name: str) -> str:
     return str(stated) if stated else "--" + name.replace("_", "-")
 
 
-def input_paths(options: StageOptions) -> dict[str, Path]:
-    """Return the paths among the options whose content decides the stage's result, by field."""
-    fields = type(options).model_fields
+def input_markers(options_type: type[StageOptions]) -> dict[str, InputMarker]:
+    """Return the marks of the options that are paths whose content decides the stage's result, by field."""
     return {
-        name: Path(value)
-        for name, info in fields.items()
-        if _is_input(info) and (value := getattr(options, name)) is not None
+        name: mark
+        for name, info in options_type.model_fields.items()
+        for mark in _marks(info)
+        if isinstance(mark, InputMarker)
     }
 
 
+def input_paths(options: StageOptions) -> dict[str, Path]:
+    """Return the paths among the options whose content decides the stage's result, by field."""
+    paths = {name: getattr(options, name) for name in input_markers(type(options))}
+    return {name: Path(path) for name, path in paths.items() if path is not None}
+
+
 def decisive_fields(options_type: type[StageOptions]) -> list[str]:
-    """Return the options that decide a stage's result: all but those of effort."""
-    fields = options_type.model_fields
-    return [name for name, info in fields.items() if not any(isinstance(m, EffortMarker) for m in _marks(info))]
+    """Return the options whose values decide a stage's result: all but those of effort, and paths of inputs."""
+    fields, no_value = options_type.model_fields, (EffortMarker, InputMarker)
+    return [name for name, info in fields.items() if not any(isinstance(mark, no_value) for mark in _marks(info))]
 
 
 def is_written(info: FieldInfo) -> bool:
@@ -138,7 +152,12 @@ def is_written(info: FieldInfo) -> bool:
 
 
 def resolve(
-    options_type: type[OptionsT], table: Mapping[str, Any], flags: Mapping[str, Any], toml: Path
+    options_type: type[OptionsT],
+    table: Mapping[str, Any],
+    flags: Mapping[str, Any],
+    toml: Path,
+    *,
+    stage: str | None = None,
 ) -> OptionsT:
     """Return validated options: default < `table` < `flags`.
 
@@ -147,9 +166,10 @@ def resolve(
         table: the stage's table in `georef.toml`; its relative paths are relative to the folder of that file.
         flags: options that the user gave as flags, by field.
         toml: path of `georef.toml`.
+        stage: name of the table, for errors.
 
     Raises:
-        InputError: an unknown key or a value out of range; names the file (or flag) and the key.
+        InputError: an unknown key or a value out of range; names the file, table and key, or the flag.
     """
     merged = {**_anchored(options_type, table, toml.parent), **flags}
     try:
@@ -160,7 +180,8 @@ def resolve(
         from_file = key in table and key not in flags
         known = ", ".join(sorted(options_type.model_fields))
         hint = f"unknown key; known keys: {known}" if first["type"] == "extra_forbidden" else first["msg"]
-        name = key if from_file else flag_name(options_type, key)
+        in_file = key if stage is None else f"{stage}.{key}"
+        name = in_file if from_file else flag_name(options_type, key)
         raise InputError(hint, path=toml if from_file else None, field=name) from error
     for name in options_type.model_fields:
         value = getattr(options, name)
@@ -192,10 +213,6 @@ def load_toml(path: Path, stages: Collection[str]) -> dict[str, dict[str, Any]]:
     return document
 
 
-def _is_input(info: FieldInfo) -> bool:
-    return any(isinstance(mark, InputMarker) for mark in _marks(info))
-
-
 def _marks(info: FieldInfo) -> list[object]:
     """Return a field's marks, with those that `… | None` hides in a member of the union."""
     members = getattr(info.annotation, "__args__", ())
@@ -204,8 +221,8 @@ def _marks(info: FieldInfo) -> list[object]:
 
 def _anchored(options_type: type[StageOptions], table: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """Return the table with its input paths made absolute."""
-    fields = options_type.model_fields
+    inputs = input_markers(options_type)
     return {
-        key: str(folder / value) if isinstance(value, str) and key in fields and _is_input(fields[key]) else value
+        key: str(folder / value) if isinstance(value, str) and key in inputs else value
         for key, value in table.items()
     }

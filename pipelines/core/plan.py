@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from pipelines.core.errors import InputError, MissingProductError
+from pipelines.core.errors import InputError
 from pipelines.core.guards import damaged_product, refuse_loss, refuse_loss_by_options
 from pipelines.core.manifest import Memo
-from pipelines.core.options import StageOptions
+from pipelines.core.options import StageOptions, flag_name, input_paths
 from pipelines.core.origins import OptionOrigin, option_origins
 from pipelines.core.stages import StageSpec, producer_of
 from pipelines.core.staleness import (
@@ -94,8 +93,7 @@ def _action(
     partial = workspace.partial_product(spec)
     ahead = [name for part in spec.reads if (name := producer_of(part.product).name) in running]
     if manifest is None:
-        with contextlib.suppress(MissingProductError):
-            request(workspace, spec, asked, memo)  # a missing file is told now
+        _require_inputs(options)  # not their hashes, which take minutes for photographs that no run has read
         return ("resume", "interrupted") if spec.resumable and partial.exists() else ("run", "never run")
     damage = why_damaged(damaged_product(workspace, spec, memo, by_content=False))
     if damage:
@@ -115,6 +113,17 @@ def _action(
         return "keep", manifest.key_figure
     if spec.resumable and partial.exists():
         return "resume", reason
-    inputs = changed_inputs(present.inputs, manifest.inputs)
+    inputs = changed_inputs(present.inputs.hashes, manifest.inputs)
     grown = spec.growing and not inputs and not changed_options(options, manifest.config, but=spec.growing)
     return ("extend" if grown else "run"), reason
+
+
+def _require_inputs(options: StageOptions) -> None:
+    """Refuse a missing input.
+
+    Raises:
+        InputError: a path that an option names does not exist.
+    """
+    for name, path in input_paths(options).items():
+        if not path.exists():
+            raise InputError("no such file or folder", path=path, field=flag_name(type(options), name))

@@ -112,14 +112,14 @@ def run_stage(
         must_exist(workspace)
     with no_traces_of_refusal(workspace), workspace.lock(spec.name):
         memo: Memo = {}
-        asked = request(workspace, spec, flags, memo)
+        asked = request(workspace, spec, flags, memo, progress)
         warn_of_stale_inputs(workspace, spec, memo)
         refuse_damaged_inputs(workspace, spec, memo)
         before = workspace.requests().get(spec.name, {})
         workspace.remember({spec.name: flags})
         previous = None if force else _current(workspace, asked, memo)
         if previous is not None:
-            return Outcome(spec.name, False, previous)
+            return Outcome(spec.name, False, _with_present_files(workspace, asked, previous))
         try:
             if not force:
                 refuse_loss(workspace, asked)
@@ -205,7 +205,7 @@ def remembered(workspace: Workspace, spec: StageSpec, flags: Flags, forget: Coll
 def _execute(job: _Job) -> Manifest:
     workspace, asked = job.workspace, job.asked
     spec, resolved = asked.spec, asked.options.model_dump(mode="json")
-    token = request_token({name: resolved[name] for name in decisive_fields(spec.options)}, asked.inputs)
+    token = request_token({name: resolved[name] for name in decisive_fields(spec.options)}, asked.inputs.hashes)
     partial = workspace.partial_product(spec)
     if spec.resumable and partial.exists() and (job.resume == "never" or not partial.is_of(token)):
         log.warning("%s: starts afresh; what an interrupted run had done is dropped", spec.name)
@@ -224,7 +224,7 @@ def _execute(job: _Job) -> Manifest:
     manifest = Manifest(
         stage=spec.name,
         config=resolved,
-        inputs=asked.inputs,
+        inputs=asked.inputs.hashes,
         versions=library_versions(),
         started=started,
         duration_s=round(time.monotonic() - clock, 3),
@@ -233,11 +233,24 @@ def _execute(job: _Job) -> Manifest:
         warnings=list(summary.warnings),
         cautions=summary.cautions,
         files=record_files(out, spec.working),
+        input_files=asked.inputs.files,
     )
     workspace.set_aside(damaged_product(workspace, spec, {}, by_content=False))
     workspace.commit(spec, manifest)
     log.info("%s: %s (%s)", spec.name, summary.key_figure, duration(manifest.duration_s))
     return manifest
+
+
+def _with_present_files(workspace: Workspace, asked: Request, manifest: Manifest) -> Manifest:
+    """Return the manifest of a current product with its input files as they are now, saved if they were moved.
+
+    Their content is the same, but their times may differ: without new records each look would read them again.
+    """
+    if asked.inputs.files == manifest.input_files or not workspace.manifest(asked.spec):
+        return manifest
+    renewed = manifest.model_copy(update={"input_files": asked.inputs.files})
+    workspace.renew(asked.spec, renewed)
+    return renewed
 
 
 def _run(job: _Job, token: str) -> Summary:
@@ -283,7 +296,7 @@ def _current(workspace: Workspace, asked: Request, memo: Memo) -> Manifest | Non
         return Manifest(
             stage=spec.name,
             config={},
-            inputs=asked.inputs,
+            inputs=asked.inputs.hashes,
             versions={},
             started=now(),
             duration_s=0.0,

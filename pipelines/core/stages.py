@@ -35,12 +35,14 @@ class ProductPart:
         product: workspace path of a file or a folder.
         fields: paths of keys in the JSON document, through every item of a list: `images.fix.position_in_geo`.
             No other field of the document makes the stage stale. Without fields, the whole product counts.
+        without: keys of the JSON document that do not count, where `fields` names none.
         optional: whether the stage runs without this product. A part without any value then counts as missing.
         brings: further products that count if they exist and this part has a value.
     """
 
     product: str
     fields: tuple[str, ...] = ()
+    without: tuple[str, ...] = ()
     optional: bool = False
     brings: tuple[str, ...] = ()
 
@@ -50,12 +52,14 @@ def whole(*products: str) -> tuple[ProductPart, ...]:
     return tuple(ProductPart(product) for product in products)
 
 
+# Photographs count by content, wherever their folder lies. Messages to the user change no result, and points
+# without marks enter none.
+MEASURED = ProductPart(SURVEY, without=("image_dir", "assumptions", "warnings", "unmarked_points"))
 # The photographs, and the positions and attitudes by which `sfm` chooses the pairs to match. Control points, σ and
 # the split of a survey do not make an SfM model stale.
 PHOTOGRAPHS = ProductPart(
     SURVEY,
     fields=(
-        "image_dir",
         "cameras",
         "images.name",
         "images.camera_id",
@@ -136,7 +140,7 @@ PIPELINE: tuple[StageSpec, ...] = (
         module="pipelines.calibrate.stage",
         options_place="pipelines.calibrate.options:CalibrateOptions",
         folder="calibrate",
-        reads=(*whole(SURVEY, SPARSE), ProductPart(TRACK, optional=True)),
+        reads=(MEASURED, *whole(SPARSE), ProductPart(TRACK, optional=True)),
         product=RIG,
         title="Estimate time offset, boresight and lever arm after sfm.",
     ),
@@ -145,7 +149,7 @@ PIPELINE: tuple[StageSpec, ...] = (
         module="pipelines.geolocate.stage",
         options_place="pipelines.geolocate.options:GeolocateOptions",
         folder="geolocate",
-        reads=(*whole(SURVEY, SPARSE), APPLIED_RIG),
+        reads=(MEASURED, *whole(SPARSE), APPLIED_RIG),
         product=POINTS,
         title="Intersect every SfM point on Earth from the measured positions and attitudes.",
     ),
@@ -154,7 +158,7 @@ PIPELINE: tuple[StageSpec, ...] = (
         module="pipelines.init_sim3.stage",
         options_place="pipelines.init_sim3.options:InitSim3Options",
         folder="sim3",
-        reads=(*whole(SURVEY, SPARSE, POINTS), APPLIED_RIG),
+        reads=(MEASURED, *whole(SPARSE, POINTS), APPLIED_RIG),
         product=SIM3,
         title="Estimate the similarity from the SfM model to the Earth.",
     ),
@@ -163,7 +167,7 @@ PIPELINE: tuple[StageSpec, ...] = (
         module="pipelines.train.stage",
         options_place="pipelines.train.options:TrainOptions",
         folder="train",
-        reads=(*whole(SURVEY, SPARSE, SIM3, POINTS), APPLIED_RIG),
+        reads=(MEASURED, *whole(SPARSE, SIM3, POINTS), APPLIED_RIG),
         product=MODEL,
         title="Train the Gaussians together with the similarity and the cameras.",
         resumable=True,
@@ -175,7 +179,7 @@ PIPELINE: tuple[StageSpec, ...] = (
         module="pipelines.evaluate.stage",
         options_place="pipelines.evaluate.options:EvaluateOptions",
         folder="evaluate",
-        reads=(*whole(SURVEY, SPARSE, MODEL, GAUSSIANS, SIM3), APPLIED_RIG),
+        reads=(MEASURED, *whole(SPARSE, MODEL, GAUSSIANS, SIM3), APPLIED_RIG),
         product=REPORT,
         title="Measure test views and check points.",
     ),
@@ -184,7 +188,7 @@ PIPELINE: tuple[StageSpec, ...] = (
         module="pipelines.deliver.ply",
         options_place="pipelines.deliver.options:ExportPlyOptions",
         folder="export",
-        reads=(*whole(SURVEY, MODEL, GAUSSIANS), APPLIED_RIG),
+        reads=(MEASURED, *whole(MODEL, GAUSSIANS), APPLIED_RIG),
         product=SPLAT,
         title="Write the splat as a PLY with its place on Earth.",
     ),
@@ -197,7 +201,7 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         module="pipelines.deliver.raster.stage",
         options_place="pipelines.deliver.options:ExportRasterOptions",
         folder="raster",
-        reads=(*whole(SURVEY, SPARSE, MODEL, GAUSSIANS, SIM3), APPLIED_RIG),
+        reads=(MEASURED, *whole(SPARSE, MODEL, GAUSSIANS, SIM3), APPLIED_RIG),
         product="raster/orthophoto.tif",
         title="Write orthophoto, surface model and their σ as rasters in a CRS.",
         resumable=True,
@@ -208,7 +212,7 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         module="pipelines.deliver.cloud.stage",
         options_place="pipelines.deliver.options:ExportCloudOptions",
         folder="cloud",
-        reads=(*whole(SURVEY, SPARSE, MODEL, GAUSSIANS, SIM3), APPLIED_RIG),
+        reads=(MEASURED, *whole(SPARSE, MODEL, GAUSSIANS, SIM3), APPLIED_RIG),
         product=CLOUD,
         title="Write the surface as a georeferenced point cloud (LAZ).",
         resumable=True,
@@ -218,7 +222,7 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         module="pipelines.deliver.spz",
         options_place="pipelines.deliver.options:ExportSpzOptions",
         folder="spz",
-        reads=(*whole(SURVEY, MODEL, GAUSSIANS), APPLIED_RIG),
+        reads=(MEASURED, *whole(MODEL, GAUSSIANS), APPLIED_RIG),
         product=SPZ,
         title="Write the splat as SPZ, for viewers on the web.",
     ),
@@ -227,7 +231,7 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         module="pipelines.deliver.tiles.stage",
         options_place="pipelines.deliver.options:ExportTilesOptions",
         folder="tiles",
-        reads=(*whole(SURVEY, MODEL, GAUSSIANS), APPLIED_RIG),
+        reads=(MEASURED, *whole(MODEL, GAUSSIANS), APPLIED_RIG),
         product=TILES,
         title="Write the splat as 3D Tiles, for web globes.",
         also=(TILES_GLB,),
@@ -237,7 +241,7 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         module="pipelines.deliver.cameras.stage",
         options_place="pipelines.deliver.options:ExportCamerasOptions",
         folder="cameras",
-        reads=(*whole(SURVEY, SPARSE, MODEL, GAUSSIANS, SIM3), APPLIED_RIG),
+        reads=(MEASURED, *whole(SPARSE, MODEL, GAUSSIANS, SIM3), APPLIED_RIG),
         product="cameras/cameras.csv",
         title="Write the trained cameras for COLMAP, nerfstudio, surveyors and maps.",
         also=("cameras/colmap", "cameras/transforms.json", "cameras/footprints.geojson"),
@@ -251,7 +255,7 @@ ADJUST = StageSpec(
     module="pipelines.sfm.pose_prior",
     options_place="pipelines.sfm.options:AdjustOptions",
     folder="adjust",
-    reads=(*whole(SURVEY, SPARSE), APPLIED_RIG),
+    reads=(MEASURED, *whole(SPARSE), APPLIED_RIG),
     product="adjust/sparse",
     title="Adjust the bundle with the fixes as priors of the camera positions.",
     also=("adjust/geo_from_local.json",),

@@ -9,9 +9,10 @@ from typing import Any, Literal
 
 from pipelines.core.cautions import Caution, union
 from pipelines.core.errors import InputError, MissingProductError
-from pipelines.core.fingerprints import fingerprints
+from pipelines.core.fingerprints import Fingerprints, Records, fingerprints
 from pipelines.core.manifest import Manifest, Memo
 from pipelines.core.options import StageOptions, decisive_fields, load_toml, resolve
+from pipelines.core.progress import SILENT, Progress
 from pipelines.core.stages import BY_NAME, DELIVERABLES, PIPELINE, StageSpec, producer_of, products_of
 from pipelines.core.validators import require_text
 from pipelines.core.workspace import Workspace
@@ -39,10 +40,12 @@ class Request:
 
     spec: StageSpec
     options: StageOptions
-    inputs: dict[str, str]
+    inputs: Fingerprints
 
 
-def request(workspace: Workspace, spec: StageSpec, flags: Flags, memo: Memo) -> Request:
+def request(
+    workspace: Workspace, spec: StageSpec, flags: Flags, memo: Memo, progress: Progress = SILENT
+) -> Request:
     """Return the options (default < `georef.toml` < flags) and the inputs of a stage.
 
     Raises:
@@ -50,7 +53,17 @@ def request(workspace: Workspace, spec: StageSpec, flags: Flags, memo: Memo) -> 
         InputError: an unknown or invalid option, or a missing file.
     """
     options = stage_config(workspace, spec, flags)
-    return Request(spec, options, fingerprints(workspace, spec, options, memo))
+    known = _input_files(workspace, spec)
+    return Request(spec, options, fingerprints(workspace, spec, options, memo, known=known, progress=progress))
+
+
+def _input_files(workspace: Workspace, spec: StageSpec) -> Records:
+    """Return the records of the input files that the product was made from; none without a readable manifest."""
+    try:
+        manifest = workspace.manifest(spec)
+    except InputError:
+        return {}
+    return {} if manifest is None else manifest.input_files
 
 
 def stage_config(workspace: Workspace, spec: StageSpec, flags: Flags) -> StageOptions:
@@ -60,12 +73,16 @@ def stage_config(workspace: Workspace, spec: StageSpec, flags: Flags) -> StageOp
         InputError: an unknown or invalid option.
     """
     tables = load_toml(workspace.config_file, BY_NAME)
-    return resolve(spec.options, tables.get(spec.name, {}), flags, workspace.config_file)
+    return resolve(spec.options, tables.get(spec.name, {}), flags, workspace.config_file, stage=spec.name)
 
 
 def why_stale(workspace: Workspace, asked: Request, manifest: Manifest) -> str:
-    """Return the reason why a product is stale; empty if its inputs and options are unchanged."""
-    changed = changed_options(asked.options, manifest.config) or changed_inputs(asked.inputs, manifest.inputs)
+    """Return the reason why a product is stale; empty if its inputs and options are unchanged.
+
+    Input files count by content: a path that differs is no other option.
+    """
+    of_inputs = changed_inputs(asked.inputs.hashes, manifest.inputs)
+    changed = changed_options(asked.options, manifest.config) or of_inputs
     if changed:
         return changed
     gone = [product for product in products_of(asked.spec) if not (workspace.root / product).exists()]

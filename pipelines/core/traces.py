@@ -10,8 +10,9 @@ from pathlib import Path
 from pipelines.core.durable import remove
 from pipelines.core.errors import GeorefError, WorkspaceBusyError
 from pipelines.core.lock import WriteLock
+from pipelines.core.requests import REQUESTS
 from pipelines.core.stages import STAGES
-from pipelines.core.workspace import REQUESTS, Workspace
+from pipelines.core.workspace import Workspace
 
 
 @contextmanager

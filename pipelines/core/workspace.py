@@ -7,7 +7,6 @@ rename. One writer at a time holds the workspace's lock.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -18,16 +17,15 @@ from typing import Any, Literal
 from pipelines.core.cautions import Caution
 from pipelines.core.durable import remove, replace_file, replace_folder, replace_text, sync_tree
 from pipelines.core.errors import InputError, MissingProductError
-from pipelines.core.files import file_size
 from pipelines.core.lock import WriteLock
 from pipelines.core.manifest import MANIFEST, Manifest, Memo, damaged_files
 from pipelines.core.options import CONFIG_FILE
 from pipelines.core.partial import PartialProduct
 from pipelines.core.products import load_json, save_json
 from pipelines.core.progress import SILENT, Progress
+from pipelines.core.requests import REQUESTS, read_requests, write_requests
 from pipelines.core.stages import STAGES, StageSpec, producer_of, products_of
 
-REQUESTS = "requests.json"
 DAMAGED = "damaged"
 
 Resume = Literal["never", "if-same", "always"]
@@ -113,10 +111,6 @@ class Workspace:
 
     def _folder(self, name: str) -> Path:
         return self.lent.get(name, self.root / name)
-
-    def photographs(self, image_dir: str) -> Path:
-        """Return the path of the folder of photographs that a survey names."""
-        return (self.base or self).root / image_dir
 
     @property
     def cache(self) -> Path:
@@ -237,6 +231,10 @@ class Workspace:
         replace_file(draft, partial / MANIFEST)  # It marks the folder as complete, even if the next rename fails.
         self._swap(spec)
 
+    def renew(self, spec: StageSpec, manifest: Manifest) -> None:
+        """Replace the manifest of a finished stage."""
+        replace_text(self._folder(spec.folder) / MANIFEST, f"{manifest.model_dump_json(indent=1)}\n")
+
     def damaged(self, spec: StageSpec, manifest: Manifest, memo: Memo, *, by_content: bool) -> list[str]:
         """Return the files of a finished product, by workspace path, that differ from the manifest's records.
 
@@ -263,22 +261,11 @@ class Workspace:
         Raises:
             InputError: `requests.json` is damaged.
         """
-        path = self.root / REQUESTS
-        if not path.exists():
-            return {}
-        file_size(path)
-        try:
-            document = json.loads(path.read_text(encoding="utf-8"))
-        except (ValueError, RecursionError) as error:
-            raise InputError("not valid JSON: delete it and give the options again", path=path) from error
-        if not isinstance(document, dict) or not all(isinstance(flags, dict) for flags in document.values()):
-            raise InputError("not a table of options by stage: delete it and give them again", path=path)
-        return document
+        return read_requests(self.root)
 
     def remember(self, flags: Mapping[str, Mapping[str, Any]]) -> None:
         """Record the flags that stages were requested with, by stage."""
-        document = {**self.requests(), **{stage: dict(given) for stage, given in flags.items()}}
-        replace_text(self.root / REQUESTS, json.dumps(document, indent=1, default=str) + "\n")
+        write_requests(self.root, {**self.requests(), **flags})
 
 
 def _refuse_what_is_no_folder(folder: Path) -> None:

@@ -24,6 +24,7 @@ PURPOSES: dict[str, str] = {
     "cameras/transforms.json": "trained cameras for nerfstudio",
     "cameras/footprints.geojson": "ground that each photograph shows, for maps",
     "evaluate/report.json": "measured and predicted accuracy, for the record",
-    "evaluate/accuracy.png": "map of the predicted accuracy",
+    "evaluate/points.csv": "error of each check and control point",
+    "evaluate/accuracy.png": "map of the predicted accuracy, with the errors of the points",
     "evaluate/accuracy.csv": "the same map as a table",
 }

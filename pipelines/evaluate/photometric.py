@@ -13,13 +13,14 @@ from torch import Tensor
 
 from pipelines.core.progress import Progress
 from pipelines.core.types import ByteArray
+from pipelines.plots.strips import labelled
 from pipelines.scene.renderer import ModelRenderer
 from pipelines.scene.report import PhotometricFigures, ViewFigures
 from pipelines.splat.exposure import fitted_affine, with_affine
 from pipelines.splat.lpips import Lpips
 from pipelines.splat.metrics import psnr, ssim
 
-# Saves, for the name of a photograph, (H, 3 W, 3) RGB: the photograph, its render, their difference.
+# Saves, for a test view, RGB: the photograph, its render, their difference, side by side with labels.
 SaveRender = Callable[[str, ByteArray], None]
 
 _DIFFERENCE_GAIN = 3
@@ -60,7 +61,7 @@ def compare_test_views(
             mask = torch.from_numpy(np.array(renderer.images.mask(index)))
             views.append(_figures(name, render, photo, mask, distance))
             if place < saved:
-                save_render(name, _side_by_side(photo, render))
+                save_render(name, _side_by_side(photo, render, views[-1]))
             task.advance()
     return PhotometricFigures(
         views=len(views),
@@ -79,7 +80,7 @@ def write_render(folder: Path, image: str, strip: ByteArray) -> None:
     Args:
         folder: of the PNG.
         image: name of the photograph.
-        strip: (H, 3 W, 3) RGB: the photograph, its render, their difference.
+        strip: (H, W, 3) RGB.
     """
     _, png = cv2.imencode(".png", np.ascontiguousarray(strip[..., ::-1]))  # `imwrite` reports no full disk
     (folder / render_name(image)).write_bytes(png.tobytes())
@@ -109,8 +110,13 @@ def _mean(values: Iterable[float | None]) -> float | None:
     return float(np.mean(np.array(known, dtype=np.float64))) if known else None
 
 
-def _side_by_side(photo: Tensor, render: Tensor) -> ByteArray:
-    """Return photograph, render, and their difference (× 3), side by side (H, 3 W, 3)."""
+def _side_by_side(photo: Tensor, render: Tensor, view: ViewFigures) -> ByteArray:
+    """Return photograph, render, and their difference (× 3), (H, W, 3) each, side by side with labels above."""
     difference = (_DIFFERENCE_GAIN * (photo - render).abs()).clamp(0, 1)
-    strip = torch.cat([photo, render, difference], dim=1).mul(255).round().byte()
-    return np.asarray(strip.numpy())
+    pictures = [np.asarray(image.mul(255).round().byte().numpy()) for image in (photo, render, difference)]
+    labels = (
+        f"photograph {view.image}",
+        f"render, PSNR {view.psnr:.2f} dB, SSIM {view.ssim:.3f}",
+        f"difference × {_DIFFERENCE_GAIN}",
+    )
+    return labelled(pictures, labels)

@@ -1,18 +1,18 @@
 """Stage `evaluate`: renders against held-out photographs, positions against check points.
 
-Reads the trained model, the survey and the initial similarity. Writes `evaluate/report.json`, side-by-side
-renders, and the predicted accuracy over the scene as `accuracy.csv` and `accuracy.png`. Check points enter no
-solution. Residuals of observations that entered one are reported as a fit, not as an accuracy (docs/accuracy.md).
+Reads the trained model, the survey and the initial similarity. Writes `evaluate/report.json`, the errors point by
+point as `points.csv`, side-by-side renders, and the predicted accuracy over the scene as `accuracy.csv` and
+`accuracy.png`. Check points enter no solution. Residuals of observations that entered one are reported as a fit,
+not as an accuracy (docs/accuracy.md).
 """
 
 from __future__ import annotations
 
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 
-from pipelines.accuracy.accuracy_grid import AccuracyGrid, write_csv
+from pipelines.accuracy.accuracy_grid import write_csv
 from pipelines.accuracy.error_propagation import (
     ErrorPropagation,
     NoErrorPropagation,
@@ -21,22 +21,21 @@ from pipelines.accuracy.error_propagation import (
 )
 from pipelines.core.cautions import union
 from pipelines.core.progress import Progress
-from pipelines.core.types import FloatArray
 from pipelines.core.workspace import StageRun, Summary
+from pipelines.evaluate.accuracy_picture import draw_accuracy
 from pipelines.evaluate.cautions import cautions_of_prediction, dependent_check_points
 from pipelines.evaluate.check_points import cross_validate, fit_residuals, measure_check_points
 from pipelines.evaluate.coordinates import coordinates_in, target_crs
 from pipelines.evaluate.options import EvaluateOptions
 from pipelines.evaluate.photometric import SaveRender, compare_test_views, write_render
+from pipelines.evaluate.point_table import write_point_table
 from pipelines.evaluate.summary import summarise
 from pipelines.geodesy.crs import PointCrs
 from pipelines.geometry.similarity import SimilarityRecord
-from pipelines.plots.accuracy_map import MapPoints, SigmaRaster, write_accuracy_map
 from pipelines.scene.renderer import ModelRenderer
 from pipelines.scene.report import EvaluationReport, Photometric, SimilaritySigma, write_report
 from pipelines.scene.scene import photographs
-from pipelines.scene.survey import SurveyedPoint
-from pipelines.scene.trained_survey import TrainedSurvey, load_trained
+from pipelines.scene.trained_survey import load_trained
 from pipelines.splat.rasterizer.backends import rasterizer
 
 
@@ -59,7 +58,8 @@ def run(stage: StageRun, options: EvaluateOptions) -> Summary:
     report = evaluate(renderer, propagation, options, crs=crs, save_render=save_render, progress=stage.progress)
     if isinstance(propagation, ErrorPropagation) and propagation.grid is not None:
         write_csv(propagation.grid, trained.survey.origin, stage.out / "accuracy.csv")
-        _draw(propagation.grid, trained, stage.out / "accuracy.png")
+        draw_accuracy(propagation.grid, trained, report, crs, stage.out / "accuracy.png")
+    write_point_table(stage.out / "points.csv", report, trained.survey)
     write_report(report, stage.out / "report.json")
     return summarise(report)
 
@@ -112,19 +112,3 @@ def _similarity_sigma(record: SimilarityRecord) -> SimilaritySigma:
     """Return σ of ln s and of the translation, from a covariance in the order ln s, three angles, translation."""
     log_scale, *_, east, north, up = np.sqrt(np.diag(record.covariance)).tolist()
     return SimilaritySigma(sigma_ln_scale=log_scale, sigma_translation_m=(east, north, up))
-
-
-def _draw(grid: AccuracyGrid, trained: TrainedSurvey, path: Path) -> None:
-    """Draw a map of the predicted accuracy, with cameras, control points and check points."""
-    raster = SigmaRaster(grid.raster(grid.sigma_h_m), grid.raster(grid.sigma_v_m), grid.corner_in_geo, grid.size_m)
-    points = MapPoints(
-        trained.geo_from_model.apply(trained.poses.cam_center_in_model)[:, :2],
-        _plan(trained.survey.control_points),
-        _plan(trained.survey.check_points),
-    )
-    write_accuracy_map(path, raster, points)
-
-
-def _plan(points: tuple[SurveyedPoint, ...]) -> FloatArray:
-    """Return east and north (K, 2) of surveyed points in metres."""
-    return np.array([point.position_in_geo for point in points]).reshape(-1, 3)[:, :2]

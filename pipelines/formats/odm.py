@@ -6,42 +6,22 @@ centre of the top-left pixel is (0.5, 0.5), and marks are taken as given in that
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from pipelines.core.errors import InputError
 from pipelines.core.types import FloatArray
+from pipelines.formats.ground_points import GroundPoints, ListedMark, ListedPoint, without_repeats
 from pipelines.formats.pose_table import PoseTable, complete
 from pipelines.formats.text import number, read_lines
 from pipelines.geometry.rotations import geo_from_cam, quat_xyzw_from_matrix
 
+KIND = "OpenDroneMap's gcp_list.txt"
 _GEO_COUNTS = "image x y [z] [yaw pitch roll] [h_acc v_acc]"
 _GCP_FORM = "x y z px py image [name]"
 # OpenDroneMap's pitch is 0 straight down, the gimbal's −90.
 _GIMBAL_FROM_ODM_PITCH_DEG = -90.0
-
-
-@dataclass(frozen=True)
-class GroundMark:
-    """One line of `gcp_list.txt`: where a surveyed point is seen in one image."""
-
-    line: int
-    name: str
-    xyz: tuple[float, float, float]
-    x_px: float
-    y_px: float
-    image: str
-
-
-@dataclass(frozen=True)
-class GroundPoints:
-    """A `gcp_list.txt`: its CRS and its lines."""
-
-    path: Path
-    crs_text: str
-    marks: tuple[GroundMark, ...]
 
 
 def read_geo(path: Path) -> PoseTable:
@@ -83,10 +63,11 @@ def read_ground_points(path: Path) -> GroundPoints:
     """Read `gcp_list.txt`. Points without a name are named by their place in the file.
 
     Raises:
-        InputError: no CRS line, too few columns, a cell that is no number or NaN, or no line at all.
+        InputError: no CRS line, too few columns, a cell that is no number or NaN, no line at all, or one point at
+            two places.
     """
     crs_text, rows = _rows(path)
-    marks = []
+    points, marks = [], []
     unnamed: dict[tuple[float, float, float], str] = {}
     for line, cells in rows:
         if len(cells) < 6:
@@ -101,8 +82,9 @@ def read_ground_points(path: Path) -> GroundPoints:
                 raise InputError("is not a number", path=path, line=line, field=field)
         xyz = (values[0], values[1], values[2])
         name = cells[6] if len(cells) > 6 else unnamed.setdefault(xyz, f"point-{len(unnamed) + 1}")
-        marks.append(GroundMark(line, name, xyz, values[3], values[4], cells[5]))
-    return GroundPoints(path, crs_text, tuple(marks))
+        points.append(ListedPoint(line, name, xyz))
+        marks.append(ListedMark(line, name, cells[5], values[3], values[4]))
+    return GroundPoints(path, KIND, without_repeats(points, path), tuple(marks), crs_text)
 
 
 def _rows(path: Path) -> tuple[str, list[tuple[int, list[str]]]]:

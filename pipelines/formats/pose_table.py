@@ -26,13 +26,17 @@ class PoseTable:
         quat_xyzw: (N, 4) rotations camera → East-North-Up at the camera.
         sigma_enu_m: (N, 3) σ east, north, up.
         crs_text: the CRS that the file states.
+        crs_line: line of the CRS.
+        assumed_crs: CRS of a file that states none, where `--crs` names none either; None: WGS84 for latitude and
+            longitude, and otherwise it must be named.
+        heights_above_geoid: whether the heights are above a geoid that the file does not name.
         zoneless_times: whether a time was a text without a zone.
         unknown_columns: names in the header that mean nothing here.
         header_line: line of the header.
     """
 
     path: Path
-    source: Literal["csv", "geo.txt"]
+    source: Literal["csv", "geo.txt", "metashape", "pos", "mrk"]
     lines: IntArray
     names: tuple[str, ...] | None
     time_s: FloatArray | None
@@ -41,6 +45,9 @@ class PoseTable:
     quat_xyzw: FloatArray | None = None
     sigma_enu_m: FloatArray | None = None
     crs_text: str | None = None
+    crs_line: int = 1
+    assumed_crs: str | None = None
+    heights_above_geoid: bool = False
     zoneless_times: bool = False
     unknown_columns: tuple[str, ...] = ()
     header_line: int = 1

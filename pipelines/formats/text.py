@@ -8,6 +8,7 @@ from pathlib import Path
 from pipelines.core.errors import InputError
 from pipelines.core.files import file_size
 
+_BEGINNING_BYTES = 64 * 1024
 MAX_BYTES = 128 * 1024 * 1024
 
 
@@ -32,6 +33,20 @@ def read_lines(path: Path) -> list[str]:
     if not text.strip():
         raise InputError("is empty", path=path)
     return text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+
+
+def beginning(path: Path) -> str:
+    """Return the first 64 KiB of a file as text, to see what it is; bytes that are no UTF-8 are replaced.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    try:
+        file_size(path)
+        with path.open("rb") as handle:
+            return handle.read(_BEGINNING_BYTES).decode("utf-8-sig", "replace")
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror}", path=path) from error
 
 
 def number(text: str, *, path: Path, line: int, field: str, decimal_comma: bool = False) -> float:

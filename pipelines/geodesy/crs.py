@@ -68,6 +68,13 @@ class PointCrs:
         return bool(self._crs.is_geocentric)
 
     @property
+    def northing_first(self) -> bool:
+        """Whether the register has the northing or latitude first, and the easting or longitude second."""
+        source = self._crs.source_crs if self._crs.is_bound else None
+        first, second = (axis.direction.lower() for axis in horizontal_of(source or self._crs).axis_info[:2])
+        return (first, second) == ("north", "east")
+
+    @property
     def units(self) -> tuple[str, str, str]:
         """Names of the three coordinates' units."""
         source = self._crs.source_crs if self._crs.is_bound else None

@@ -9,13 +9,15 @@ import numpy as np
 from pipelines.core.errors import InputError
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import FloatArray
+from pipelines.formats.dji_mrk import read_mrk
 from pipelines.formats.odm import read_geo
 from pipelines.formats.pose_table import PoseTable
-from pipelines.formats.trajectory_csv import read_trajectory
 from pipelines.geometry.rig import Rig
 from pipelines.geometry.trajectory import Trajectory
+from pipelines.ingest.camera_events import at_times_of_events, event_of_each, from_antenna_to_camera
 from pipelines.ingest.camera_priors import camera_priors
 from pipelines.ingest.flight_record import FlightRecord, require_enough
+from pipelines.ingest.image_poses import ImagePoses
 from pipelines.ingest.notes import Notes
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import Photo, scan_folder
@@ -23,6 +25,7 @@ from pipelines.ingest.photo_poses import poses_from_tags
 from pipelines.ingest.recorded_navigation import RecordedNavigation
 from pipelines.ingest.rig import at_cameras, body_mount, given_rig
 from pipelines.ingest.table_poses import poses_from_table
+from pipelines.ingest.trajectory_files import read_positions
 
 
 def read_folder(folder: Path, options: IngestOptions, notes: Notes, progress: Progress = SILENT) -> FlightRecord:
@@ -32,11 +35,7 @@ def read_folder(folder: Path, options: IngestOptions, notes: Notes, progress: Pr
         InputError: anything wrong with the files, or too few photographs.
     """
     photos = _usable_photos(folder, notes, progress)
-    table = _pose_table(options)
-    if table is None:
-        poses = poses_from_tags(photos, options, notes)
-    else:
-        poses = poses_from_table(table, photos, options, notes)
+    poses = _poses(photos, options, notes)
     if options.time_offset_s and poses.recorded is None:
         raise InputError(
             "is for navigation by time: a --bag, or a --trajectory without a column of images",
@@ -65,9 +64,23 @@ def _usable_photos(folder: Path, notes: Notes, progress: Progress) -> list[Photo
     return photos
 
 
-def _pose_table(options: IngestOptions) -> PoseTable | None:
+def _poses(photos: list[Photo], options: IngestOptions, notes: Notes) -> ImagePoses:
+    table = _pose_table(photos, options, notes)
+    if table is None:
+        return poses_from_tags(photos, options, notes)
+    if options.events is None:
+        return poses_from_table(table, photos, options, notes)
+    if table.names is not None:
+        raise InputError("is for a --trajectory by time: this one names its images", field="--events")
+    events = read_mrk(options.events)
+    rows = event_of_each(events, photos, notes)
+    poses = poses_from_table(table, at_times_of_events(events, photos, rows), options, notes)
+    return from_antenna_to_camera(poses, events, rows)
+
+
+def _pose_table(photos: list[Photo], options: IngestOptions, notes: Notes) -> PoseTable | None:
     if options.trajectory is not None:
-        return read_trajectory(options.trajectory)
+        return read_positions(options.trajectory, photos, notes)
     return None if options.geo is None else read_geo(options.geo)
 
 

@@ -5,18 +5,22 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from pipelines.core.errors import InputError
 from pipelines.core.types import FloatArray
-from pipelines.formats.odm import GroundMark, read_ground_points
+from pipelines.formats.ground_points import GroundPoints, ListedMark
+from pipelines.formats.pix4d import read_marks
+from pipelines.geodesy.crs import PointCrs
 from pipelines.geodesy.enu import ecef_from_lla
 from pipelines.geodesy.vertical import VerticalDatum
+from pipelines.ingest.ground_files import crs_of_points, east_first, read_ground_points
 from pipelines.ingest.image_names import ImageNames
 from pipelines.ingest.notes import Notes
 from pipelines.ingest.options import IngestOptions
-from pipelines.ingest.reference_system import note_operation, stated_crs
+from pipelines.ingest.reference_system import note_operation
 from pipelines.scene.survey import Mark
 
 _LEAST_MARKS = 2
@@ -24,15 +28,38 @@ _LEAST_MARKS = 2
 _SAME_PLACE_M = 1e-3
 _RANGE_M = 50_000.0
 
+Use = Literal["control", "check"]
+
 
 @dataclass(frozen=True)
 class GroundPoint:
-    """A surveyed point: position (3,) in ECEF, its marks, and the line where it first stands."""
+    """A surveyed point.
+
+    Attributes:
+        name: of the point.
+        position_in_ecef: (3,) metres.
+        marks: of the point, in images that are here.
+        line: where the point first stands.
+        sigma_h_m: horizontal σ of the file; None: it states none.
+        sigma_v_m: vertical σ.
+        is_check: whether the file calls it a check point.
+    """
 
     name: str
     position_in_ecef: FloatArray
     marks: tuple[Mark, ...]
     line: int
+    sigma_h_m: float | None = None
+    sigma_v_m: float | None = None
+    is_check: bool = False
+
+    @property
+    def is_marked(self) -> bool:
+        """Whether the marks place the point."""
+        return len(self.marks) >= _LEAST_MARKS
+
+
+UnmarkedPoints = Mapping[Use, tuple[GroundPoint, ...]]
 
 
 @dataclass(frozen=True)
@@ -45,49 +72,97 @@ class GroundFile:
     points: tuple[GroundPoint, ...]
 
 
-def read_ground_file(
-    path: Path, sizes: Mapping[str, tuple[int, int]], options: IngestOptions, notes: Notes
-) -> GroundFile:
-    """Read a `gcp_list.txt` and tie it to images.
+@dataclass(frozen=True)
+class SortedPoints:
+    """The points of a survey by use: those that are marked, and those that have too few marks."""
 
-    Marks in images that are not here are left out and noted, and so are points with fewer than two marks left.
+    control: tuple[GroundPoint, ...]
+    check: tuple[GroundPoint, ...]
+    unmarked: UnmarkedPoints
+
+    def note_unmarked(self, notes: Notes) -> None:
+        """Note the points that enter nothing."""
+        notes.warn_counted(
+            [f"{point.name} ({use})" for use, points in self.unmarked.items() for point in points],
+            "ground point has marks in fewer than 2 images, and enters nothing until it is marked",
+            "ground points have marks in fewer than 2 images, and enter nothing until they are marked",
+        )
+
+
+@dataclass(frozen=True)
+class PlacedPoints:
+    """Points of a file with their places, not yet tied to images.
+
+    Attributes:
+        listed: as the file has them.
+        crs: of the file.
+        position_in_ecef: (J, 3) metres.
+    """
+
+    listed: GroundPoints
+    crs: PointCrs
+    position_in_ecef: FloatArray
+
+
+@dataclass(frozen=True)
+class ListedGround:
+    """Control and check points as their files list them, and the marks of a table of marks."""
+
+    control: PlacedPoints | None
+    check: PlacedPoints | None
+    marks: tuple[ListedMark, ...]
+
+
+def list_ground_points(options: IngestOptions, notes: Notes) -> ListedGround:
+    """Read the files of control and check points, and the table of marks.
+
+    Marks of the table that name no point are noted.
 
     Args:
-        path: the file.
+        options: the files, CRS and vertical datum.
+        notes: what was assumed and left out.
+
+    Raises:
+        InputError: a malformed file, no CRS, one name at two places, or impossible coordinates.
+    """
+    control, check = (
+        None if path is None else _placed(read_ground_points(path, notes), options, notes)
+        for path in (options.gcp, options.checkpoints)
+    )
+    marks = () if options.marks is None else read_marks(options.marks)
+    known = {point.name for file in (control, check) if file is not None for point in file.listed.points}
+    name = "" if options.marks is None else options.marks.name
+    notes.warn_counted(
+        [f"{name}:{mark.line} ({mark.name})" for mark in marks if mark.name not in known],
+        "mark names no ground point",
+        "marks name no ground point",
+    )
+    return ListedGround(control, check, marks)
+
+
+def tie_ground_points(
+    ground: ListedGround, sizes: Mapping[str, tuple[int, int]], options: IngestOptions, notes: Notes
+) -> tuple[GroundFile | None, GroundFile | None]:
+    """Return control and check points with their marks in the images; marks in images that are not here are noted.
+
+    Args:
+        ground: as listed.
         sizes: width and height of each image by name.
-        options: vertical datum, and σ of a mark.
+        options: σ of a mark.
         notes: what was left out.
 
     Raises:
-        InputError: a malformed file, one name at two places, two marks of a point in one image, a mark outside its
-            image, impossible coordinates, or no mark in any image here.
+        InputError: two marks of a point in one image, a mark outside its image, or no mark in any image here.
     """
-    listed = read_ground_points(path)
-    crs = stated_crs(listed.crs_text, path, options, notes)
-    first = _first_lines(listed.marks, path)
-    xyz = np.array([mark.xyz for mark in first.values()])
-    lla = crs.lla_from_xyz(xyz, path=path, lines=[mark.line for mark in first.values()])
-    note_operation(crs, lla, notes)
-    marks = _marks_by_point(listed.marks, sizes, options.sigma_mark, path, notes)
-    position_in_ecef = ecef_from_lla(lla)
-    points, lonely = [], []
-    for row, (name, mark) in enumerate(first.items()):
-        if len(marks[name]) < _LEAST_MARKS:
-            lonely.append(f"{name} ({path.name}:{mark.line})")
-        else:
-            points.append(GroundPoint(name, position_in_ecef[row], tuple(marks[name].values()), mark.line))
-    notes.warn_counted(
-        lonely,
-        "ground point has marks in fewer than 2 images and was left out",
-        "ground points have marks in fewer than 2 images and were left out",
+    ties = _Ties(sizes, options, notes)
+    control, check = (
+        None if file is None else _ground_file(file, ground.marks, ties) for file in (ground.control, ground.check)
     )
-    return GroundFile(path, crs.name, crs.vertical, tuple(points))
+    return control, check
 
 
-def split_checks(
-    control: GroundFile | None, check: GroundFile | None, names: Sequence[str]
-) -> tuple[tuple[GroundPoint, ...], tuple[GroundPoint, ...]]:
-    """Return control and check points, after making check points of the control points in `names`.
+def split_checks(control: GroundFile | None, check: GroundFile | None, names: Sequence[str]) -> SortedPoints:
+    """Return control and check points; those of `names`, and those that the file calls so, are check points.
 
     Raises:
         InputError: a name that is no control point, or a point that is both.
@@ -106,8 +181,16 @@ def split_checks(
                 f"{point.name} is also control point {twin.name} (line {twin.line}): it can be one of them only"
             )
             raise InputError(message, path=check.path, line=point.line)
-    kept = tuple(point for point in points if point.name not in names)
-    return kept, (*listed, *(point for point in points if point.name in names))
+    kept = tuple(point for point in points if point.name not in names and not point.is_check)
+    checks = (*listed, *(point for point in points if point.name in names or point.is_check))
+    return SortedPoints(
+        control=tuple(point for point in kept if point.is_marked),
+        check=tuple(point for point in checks if point.is_marked),
+        unmarked={
+            "control": tuple(point for point in kept if not point.is_marked),
+            "check": tuple(point for point in checks if not point.is_marked),
+        },
+    )
 
 
 def require_near(file: GroundFile, middle_in_ecef: FloatArray) -> None:
@@ -129,34 +212,55 @@ def _are_one(first: GroundPoint, second: GroundPoint) -> bool:
     return first.name == second.name or distance_m < _SAME_PLACE_M
 
 
-def _first_lines(marks: tuple[GroundMark, ...], path: Path) -> dict[str, GroundMark]:
-    """Return the first line of each point."""
-    first: dict[str, GroundMark] = {}
-    for mark in marks:
-        other = first.setdefault(mark.name, mark)
-        if mark.xyz != other.xyz:
-            message = f"{mark.name} has other coordinates in line {other.line}"
-            raise InputError(message, path=path, line=mark.line, field="x y z")
-    return first
+@dataclass(frozen=True)
+class _Ties:
+    """What ties marks to images: sizes by name, the σ of a mark, and where to note what does not fit."""
+
+    sizes: Mapping[str, tuple[int, int]]
+    options: IngestOptions
+    notes: Notes
 
 
-def _marks_by_point(
-    listed: tuple[GroundMark, ...],
-    sizes: Mapping[str, tuple[int, int]],
-    sigma_px: float,
-    path: Path,
-    notes: Notes,
-) -> dict[str, dict[str, Mark]]:
-    """Return marks by point and image."""
-    names = ImageNames(sizes)
-    marks: dict[str, dict[str, Mark]] = {mark.name: {} for mark in listed}
+def _placed(listed: GroundPoints, options: IngestOptions, notes: Notes) -> PlacedPoints:
+    crs = crs_of_points(listed, options, notes)
+    xyz = east_first(listed, crs, notes)
+    lla = crs.lla_from_xyz(xyz, path=listed.path, lines=[point.line for point in listed.points])
+    note_operation(crs, lla, notes)
+    return PlacedPoints(listed, crs, ecef_from_lla(lla))
+
+
+def _ground_file(placed: PlacedPoints, apart: Sequence[ListedMark], ties: _Ties) -> GroundFile:
+    """Return the points of a file with its own marks and those of the table of marks."""
+    listed = placed.listed
+    marks: dict[str, dict[str, Mark]] = {point.name: {} for point in listed.points}
+    _add_marks(marks, listed.marks, listed.path, ties)
+    if ties.options.marks is not None:
+        _add_marks(marks, [mark for mark in apart if mark.name in marks], ties.options.marks, ties)
+    points = tuple(
+        GroundPoint(
+            name=point.name,
+            position_in_ecef=position,
+            marks=tuple(marks[point.name].values()),
+            line=point.line,
+            sigma_h_m=point.sigma_h_m,
+            sigma_v_m=point.sigma_v_m,
+            is_check=point.is_check,
+        )
+        for point, position in zip(listed.points, placed.position_in_ecef, strict=True)
+    )
+    return GroundFile(listed.path, placed.crs.name, placed.crs.vertical, points)
+
+
+def _add_marks(marks: dict[str, dict[str, Mark]], listed: Sequence[ListedMark], path: Path, ties: _Ties) -> None:
+    """Add the marks of a file, by point and image."""
+    names = ImageNames(ties.sizes)
     unknown = []
     for mark in listed:
         image = names.find(mark.image, path=path, line=mark.line)
         if image is None:
             unknown.append(f"{path.name}:{mark.line} ({mark.image})")
             continue
-        width, height = sizes[image]
+        width, height = ties.sizes[image]
         if not (0.0 <= mark.x_px <= width and 0.0 <= mark.y_px <= height):
             raise InputError(
                 f"the mark of {mark.name} at ({mark.x_px:g}, {mark.y_px:g}) lies outside {image} ({width}×{height} "
@@ -167,9 +271,11 @@ def _marks_by_point(
             )
         if image in marks[mark.name]:
             raise InputError(f"{mark.name} is marked in {image} already", path=path, line=mark.line, field="image")
+        sigma_px = ties.options.sigma_mark
         marks[mark.name][image] = Mark(image=image, x_px=mark.x_px, y_px=mark.y_px, sigma_px=sigma_px)
-    if len(unknown) == len(listed):
-        message = f"names none of the images: it has {listed[0].image!r} …, the folder {min(sizes)!r} …"
+    if listed and len(unknown) == len(listed):
+        message = f"names none of the images: it has {listed[0].image!r} …, the folder {min(ties.sizes)!r} …"
         raise InputError(message, path=path, field="image")
-    notes.warn_counted(unknown, "mark is in an image that is not here", "marks are in images that are not here")
-    return marks
+    ties.notes.warn_counted(
+        unknown, "mark is in an image that is not here", "marks are in images that are not here"
+    )

@@ -11,9 +11,9 @@ from pipelines.geodesy.enu import lla_from_ecef
 from pipelines.geodesy.vertical import VerticalDatum
 from pipelines.geometry.trajectory import Trajectory
 
-PoseSource = Literal["exif", "csv", "geo.txt", "bag"]
+PoseSource = Literal["exif", "csv", "geo.txt", "metashape", "pos", "mrk", "bag"]
 SigmaSource = Literal["file", "option", "default"]
-AttitudeSource = Literal["gimbal", "csv", "geo.txt", "bag"]
+AttitudeSource = Literal["gimbal", "csv", "geo.txt", "metashape", "pos", "mrk", "bag"]
 
 
 @dataclass(frozen=True)

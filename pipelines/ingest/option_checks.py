@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from pipelines.core.errors import InputError
+from pipelines.core.options import flag_name
 from pipelines.ingest.options import IngestOptions
 
 _BAG_ONLY = ("image_topic", "fix_topic", "attitude_topic", "every", "origin")
@@ -28,6 +29,17 @@ def check_options(options: IngestOptions, frames: Path | None) -> None:
         raise InputError("give a trajectory or a geo.txt, not both", field="--geo")
     if options.crs is not None and options.trajectory is None:
         raise InputError("is for the columns of --trajectory; other files state their CRS", field="--crs")
+    if options.events is not None and (options.trajectory is None or options.lever_arm is not None):
+        raise InputError(
+            "is for a --trajectory of the antenna by time, and has the lever arm itself: give it with --trajectory "
+            "and without --lever-arm; as positions, a .MRK is given by --trajectory",
+            field="--events",
+        )
+    for name in ("marks", "gcp_crs"):
+        if getattr(options, name) is not None and options.gcp is None and options.checkpoints is None:
+            raise InputError(
+                "is for ground points: give --gcp or --checkpoints", field=flag_name(IngestOptions, name)
+            )
     if options.check and options.gcp is None:
         raise InputError("names points of --gcp, which is not given", field="--check")
     if options.test_every == 1:
@@ -43,6 +55,6 @@ def _check_bag(options: IngestOptions, frames: Path | None) -> None:
             "in a frame whose zero --origin names",
             field="--crs",
         )
-    beside = [name for name in ("images", "trajectory", "geo") if getattr(options, name) is not None]
+    beside = [name for name in ("images", "trajectory", "geo", "events") if getattr(options, name) is not None]
     if beside:
         raise InputError(f"has photographs and positions itself: give it without --{beside[0]}", field="--bag")

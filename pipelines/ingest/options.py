@@ -4,11 +4,21 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field
 
-from pipelines.core.options import WRITTEN, InputPath, PlaceOnEarth, StageOptions, Triple, from_text
+from pipelines.core.options import (
+    WRITTEN,
+    InputMarker,
+    InputPath,
+    PlaceOnEarth,
+    StageOptions,
+    Triple,
+    from_text,
+)
+from pipelines.formats.image_file import SUFFIXES
 from pipelines.geodesy.vertical import Vertical
 from pipelines.scene.rig import RigParameter, RigParameters, in_usual_order
 
@@ -41,6 +51,8 @@ def _sensible(offset: float | Literal["auto"]) -> float | Literal["auto"]:
     return offset
 
 
+# Files of other kinds beside the photographs, such as thumbnails and logs, make nothing stale.
+PhotographFolder = Annotated[Path, InputMarker(SUFFIXES)]
 FrameDistance = Annotated[Every, from_text(_every), WRITTEN]
 TimeOffset = Annotated[float | Literal["auto"], from_text(_seconds), AfterValidator(_sensible), WRITTEN]
 
@@ -48,7 +60,7 @@ TimeOffset = Annotated[float | Literal["auto"], from_text(_seconds), AfterValida
 class IngestOptions(StageOptions):
     """What `georef ingest` reads, and what it assumes where the files are silent."""
 
-    images: InputPath | None = Field(None, description="Folder of photographs.")
+    images: PhotographFolder | None = Field(None, description="Folder of photographs.")
     bag: InputPath | None = Field(
         None, description="ROS bag with photographs and navigation: rosbag2 folder, .mcap, .db3 or ROS 1 .bag."
     )
@@ -83,10 +95,27 @@ class IngestOptions(StageOptions):
     boresight: Triple = Field(
         (0.0, 0.0, 0.0), description="Rotation vector from the true to the nominal camera axes, x,y,z in degrees."
     )
-    trajectory: InputPath | None = Field(None, description="CSV with a header: image and/or timestamp, position …")
+    trajectory: InputPath | None = Field(
+        None,
+        description="Positions: CSV with a header, RTKLIB's .pos, DJI's .MRK, or Metashape's reference; the "
+        "content decides.",
+    )
+    events: InputPath | None = Field(
+        None, description="DJI's .MRK beside a trajectory by time: times and antenna offsets of the photographs."
+    )
     geo: InputPath | None = Field(None, description="ODM geo.txt with the image positions.")
-    gcp: InputPath | None = Field(None, description="ODM gcp_list.txt: ground control points and their marks.")
-    checkpoints: InputPath | None = Field(None, description="Check points, in the form of gcp_list.txt.")
+    gcp: InputPath | None = Field(
+        None,
+        description="Ground control points: ODM's gcp_list.txt, Metashape's markers (XML) or reference, or PIX4D's "
+        "CSV; the content decides.",
+    )
+    checkpoints: InputPath | None = Field(None, description="Check points, in any form of --gcp.")
+    marks: InputPath | None = Field(
+        None, description="PIX4D's CSV of image marks: image, point, x, y; for points whose file has none."
+    )
+    gcp_crs: str | None = Field(
+        None, description="CRS of ground points whose file states none, e.g. EPSG:32632 or EPSG:4326+5773."
+    )
     check: tuple[str, ...] = Field((), description="Name of a control point to use as a check point instead.")
     test_every: int = Field(8, ge=0, description="Hold out every N-th image for testing (0: none).")
     crs: str | None = Field(None, description="CRS of x,y,z columns in the trajectory, e.g. EPSG:32632+5773.")

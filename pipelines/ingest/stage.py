@@ -1,6 +1,6 @@
 """Stage `ingest`: photographs, positions, attitudes and ground points into one survey in one frame.
 
-Reads: a folder of photographs or a ROS bag; optionally a CSV trajectory or `geo.txt`, `gcp_list.txt`, check points.
+Reads: a folder of photographs or a ROS bag; optionally a table of positions, control and check points, marks.
 Writes: `ingest/survey.json`; `ingest/images/` with --bag or --copy; `ingest/track.npz` where the navigation was
 recorded by time. See docs/inputs.md and docs/bags.md for every format and default.
 """
@@ -18,7 +18,7 @@ from pipelines.core.workspace import StageRun, Summary
 from pipelines.ingest.bag.flight import read_bag
 from pipelines.ingest.flight_record import FlightRecord
 from pipelines.ingest.folder_flight import read_folder
-from pipelines.ingest.ground_points import read_ground_file
+from pipelines.ingest.ground_points import list_ground_points, tie_ground_points
 from pipelines.ingest.notes import Notes
 from pipelines.ingest.option_checks import check_options
 from pipelines.ingest.options import IngestOptions
@@ -76,12 +76,10 @@ def _read_inputs(options: IngestOptions, frames: Path | None, notes: Notes, prog
             f"{', '.join(options.estimated)}: as given, until `georef run` or `georef calibrate` has estimated it "
             "after sfm"
         )
+    ground = list_ground_points(options, notes)  # ahead of the photographs, which take minutes
     flight = _read_flight(options, frames, notes, progress)
     sizes = {photo.name: (photo.file.width, photo.file.height) for photo in flight.photos}
-    control, check = (
-        None if path is None else read_ground_file(path, sizes, options, notes)
-        for path in (options.gcp, options.checkpoints)
-    )
+    control, check = tie_ground_points(ground, sizes, options, notes)
     return SurveyInputs(flight, control, check)
 
 
@@ -111,10 +109,12 @@ def _summary(survey: Survey) -> Summary:
         "cameras": len(survey.cameras),
         "control_points": len(survey.control_points),
         "check_points": len(survey.check_points),
+        "unmarked_points": len(survey.unmarked_points),
     }
     key_figure = (
         f"{counts['images']} images, {counts['fixes']} positions, {counts['control_points']} control and "
         f"{counts['check_points']} check points"
+        + (f", {counts['unmarked_points']} unmarked" if survey.unmarked_points else "")
     )
     values = {**counts, "origin": survey.origin.model_dump(), "vertical": survey.vertical.model_dump()}
     return Summary(key_figure, values, survey.warnings)

@@ -16,7 +16,7 @@ from pipelines.ingest.ground_points import GroundFile, GroundPoint, require_near
 from pipelines.ingest.image_poses import ImagePoses
 from pipelines.ingest.notes import Notes
 from pipelines.ingest.options import IngestOptions
-from pipelines.ingest.survey_records import held_out, image_records, point_records
+from pipelines.ingest.survey_records import held_out, image_records, point_records, unmarked_records
 from pipelines.scene.calibrated import FIX_RANGE_M
 from pipelines.scene.navigation import NavigationTrack, require_estimable
 from pipelines.scene.survey import Survey
@@ -45,7 +45,9 @@ def assemble_survey(
     """
     flight = replace(inputs.flight, poses=_without_far_fixes(inputs.flight, notes))
     poses, files = flight.poses, [file for file in (inputs.control, inputs.check) if file is not None]
-    control, check = split_checks(inputs.control, inputs.check, options.check)
+    points = split_checks(inputs.control, inputs.check, options.check)
+    control, check = points.control, points.check
+    points.note_unmarked(notes)
     located = bool(poses.located.any())
     if located:
         middle_in_ecef = ecef_from_lla(median_lla(poses.located_lla))
@@ -67,24 +69,28 @@ def assemble_survey(
         images=image_records(flight, origin, options),
         control_points=point_records(control, origin, options),
         check_points=point_records(check, origin, options),
+        unmarked_points=unmarked_records(points.unmarked, origin, options),
         assumptions=tuple(notes.assumptions),
         warnings=tuple(notes.warnings),
         cautions=tuple(notes.cautions),
         estimate=options.estimated,
-        default_sigmas=_default_sigmas(poses, options),
+        default_sigmas=_default_sigmas(poses, control, options),
     )
     return survey, track
 
 
 def _default_sigmas(
-    poses: ImagePoses, options: IngestOptions
+    poses: ImagePoses, control: Sequence[GroundPoint], options: IngestOptions
 ) -> tuple[Literal["fixes", "control points", "marks", "attitudes"], ...]:
     """Return the groups of measurements whose σ neither a file nor an option states."""
     stated = options.model_fields_set
+    points_stated = {"sigma_gcp_h", "sigma_gcp_v"} <= stated or (
+        bool(control) and all(point.sigma_h_m and point.sigma_v_m for point in control)
+    )
     attitudes = np.isfinite(poses.enu_from_cam).all(axis=(1, 2)).any() and options.sigma_attitude is None
     groups: list[tuple[bool, Literal["fixes", "control points", "marks", "attitudes"]]] = [
         ("default" in poses.sigma_source, "fixes"),
-        (not {"sigma_gcp_h", "sigma_gcp_v"} <= stated, "control points"),
+        (not points_stated, "control points"),
         ("sigma_mark" not in stated, "marks"),
         (bool(attitudes) and not np.isfinite(poses.sigma_attitude_deg).any(), "attitudes"),
     ]

@@ -11,10 +11,10 @@ from pipelines.core.types import FloatArray, Matrix3, Vector3
 from pipelines.geodesy.enu import Origin, enu_from_ecef, geo_from_enu_at, lla_from_ecef, lla_of
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
 from pipelines.ingest.flight_record import LEAST_IMAGES, FlightRecord
-from pipelines.ingest.ground_points import GroundPoint
+from pipelines.ingest.ground_points import GroundPoint, UnmarkedPoints
 from pipelines.ingest.image_poses import ImagePoses
 from pipelines.ingest.options import IngestOptions
-from pipelines.scene.survey import Attitude, Fix, SurveyedPoint, SurveyImage
+from pipelines.scene.survey import Attitude, Fix, SurveyedPoint, SurveyImage, UnmarkedPoint
 
 SIGMA_GIMBAL_DEG = 2.0
 SIGMA_TABLE_ATTITUDE_DEG = 1.0
@@ -53,8 +53,8 @@ def point_records(
         return ()
     position_in_ecef = np.array([point.position_in_ecef for point in points])
     position = enu_from_ecef(position_in_ecef, origin)
-    sigma_m = np.array([options.sigma_gcp_h, options.sigma_gcp_h, options.sigma_gcp_v])
-    covariance = _turned(np.tile(sigma_m, (len(points), 1)), position_in_ecef, origin)
+    sigma_m = np.array([_sigma_enu_m(point, options) for point in points])
+    covariance = _turned(sigma_m, position_in_ecef, origin)
     return tuple(
         SurveyedPoint(
             name=point.name,
@@ -64,6 +64,23 @@ def point_records(
         )
         for row, point in enumerate(points)
     )
+
+
+def unmarked_records(points: UnmarkedPoints, origin: Origin, options: IngestOptions) -> tuple[UnmarkedPoint, ...]:
+    """Return points without enough marks in the frame at an origin."""
+    return tuple(
+        UnmarkedPoint(**record.model_dump(), use=use)
+        for use, of_use in points.items()
+        for record in point_records(of_use, origin, options)
+    )
+
+
+def _sigma_enu_m(point: GroundPoint, options: IngestOptions) -> Vector3:
+    """Return σ by precedence: option, then file, then default."""
+    stated = options.model_fields_set
+    horizontal = point.sigma_h_m if point.sigma_h_m and "sigma_gcp_h" not in stated else options.sigma_gcp_h
+    vertical = point.sigma_v_m if point.sigma_v_m and "sigma_gcp_v" not in stated else options.sigma_gcp_v
+    return horizontal, horizontal, vertical
 
 
 def _fixes(poses: ImagePoses, origin: Origin) -> list[Fix | None]:

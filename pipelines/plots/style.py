@@ -5,6 +5,7 @@ Figures are drawn on canvas objects of their own, so that no display, no pyplot 
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -27,16 +28,22 @@ HEADING_POINTS, TITLE_POINTS, LABEL_POINTS, TICK_POINTS, FIGURE_POINTS = 12, 11,
 _DOTS_PER_INCH = 130
 
 
-def new_figure(size_inches: tuple[float, float], layout: Literal["constrained"] | None) -> Figure:
+def new_figure(
+    size_inches: tuple[float, float],
+    layout: Literal["constrained"] | None,
+    *,
+    dots_per_inch: int = _DOTS_PER_INCH,
+) -> Figure:
     """Return an empty figure of a width and height.
 
     Args:
         size_inches: width and height.
         layout: `constrained` makes room for labels; None leaves the axes where they are put.
+        dots_per_inch: resolution.
     """
     from matplotlib.figure import Figure
 
-    return Figure(figsize=size_inches, dpi=_DOTS_PER_INCH, facecolor="white", layout=layout)
+    return Figure(figsize=size_inches, dpi=dots_per_inch, facecolor="white", layout=layout)
 
 
 def label(axes: Axes, title: str, *, x: str | None = None, y: str | None = None) -> None:
@@ -45,6 +52,16 @@ def label(axes: Axes, title: str, *, x: str | None = None, y: str | None = None)
     axes.set_xlabel(x or "", fontsize=LABEL_POINTS)
     axes.set_ylabel(y or "", fontsize=LABEL_POINTS)
     axes.tick_params(labelsize=TICK_POINTS)
+
+
+def pixels_of(figure: Figure) -> ByteArray:
+    """Return a figure as RGB values (H, W, 3)."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    canvas, buffer = FigureCanvasAgg(figure), io.BytesIO()
+    figure.savefig(buffer, format="rgba", dpi="figure")
+    width, height = canvas.get_width_height()
+    return np.frombuffer(buffer.getvalue(), np.uint8).reshape(height, width, 4)[..., :3]
 
 
 def colours_of(values: FloatArray, low: float, high: float) -> ByteArray:

@@ -326,6 +326,16 @@ class Coordinates(Product):
     origin: Vector3
     points: tuple[PointCoordinates, ...]
 
+    def texts(self, xyz: Vector3 | None) -> tuple[str, str, str]:
+        """Return coordinates as texts to a tenth of a millimetre; empty ones for None."""
+        if xyz is None:
+            return "", "", ""
+        first, second, third = (
+            f"{value:.{9 if 'degree' in unit or 'grad' in unit else 4}f}"
+            for value, unit in zip(xyz, self.units, strict=True)
+        )
+        return first, second, third
+
 
 class EvaluationReport(_OptionalKeys):
     """Product of `evaluate`.

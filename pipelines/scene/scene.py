@@ -13,6 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from pipelines.core.errors import DegenerateGeometryError, InputError
+from pipelines.core.photograph_folder import photograph_folder
 from pipelines.core.stages import SPARSE
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.core.workspace import Workspace
@@ -136,7 +137,7 @@ def photographs(sparse: SparseModel, survey: Survey, workspace: Workspace, max_s
             "`georef sfm --import`, which leaves them out",
             path=workspace.root / SPARSE,
         )
-    folder = workspace.photographs(survey.image_dir)
+    folder = photograph_folder(workspace, survey.image_dir)
     shots = [
         Photograph(name, folder / name, sparse.camera_of(index), known[name])
         for index, name in enumerate(sparse.image_name)

@@ -51,7 +51,7 @@ class Fix(Product):
 
     position_in_geo: Vector3
     cov_in_geo: Covariance3
-    source: Literal["exif", "csv", "geo.txt", "bag"]
+    source: Literal["exif", "csv", "geo.txt", "metashape", "pos", "mrk", "bag"]
     sigma_source: Literal["file", "option", "default"]
 
 
@@ -66,7 +66,7 @@ class Attitude(Product):
 
     quat_xyzw: Rotation
     sigma_deg: float = Field(gt=0)
-    source: Literal["gimbal", "csv", "geo.txt", "bag"]
+    source: Literal["gimbal", "csv", "geo.txt", "metashape", "pos", "mrk", "bag"]
 
 
 class SurveyImage(Product):
@@ -116,6 +116,16 @@ class SurveyedPoint(Product):
         return self
 
 
+class UnmarkedPoint(SurveyedPoint):
+    """Surveyed point with marks in fewer than two images: it enters nothing until it is marked.
+
+    Attributes:
+        use: what the point is surveyed for.
+    """
+
+    use: Literal["control", "check"]
+
+
 class Survey(Product):
     """Product of `ingest`: all measurements of a survey, in one frame.
 
@@ -132,6 +142,7 @@ class Survey(Product):
         images: the photographs.
         control_points: points that enter the solution.
         check_points: points that enter no solution.
+        unmarked_points: points with too few marks to be measured, which enter nothing.
         assumptions: decisions that `ingest` made where the input states nothing.
         warnings: messages that the user should read.
         cautions: limits of every result of the survey.
@@ -148,6 +159,7 @@ class Survey(Product):
     images: tuple[SurveyImage, ...]
     control_points: tuple[SurveyedPoint, ...] = ()
     check_points: tuple[SurveyedPoint, ...] = ()
+    unmarked_points: tuple[UnmarkedPoint, ...] = ()
     assumptions: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     cautions: tuple[Caution, ...] = ()
@@ -173,6 +185,7 @@ class Survey(Product):
             "images": [image.name for image in self.images],
             "control_points": [point.name for point in self.control_points],
             "check_points": [point.name for point in self.check_points],
+            "unmarked_points": [point.name for point in self.unmarked_points],
         }
         for field, of_field in names.items():
             if len(set(of_field)) != len(of_field):

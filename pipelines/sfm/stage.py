@@ -18,6 +18,7 @@ from typing import Any
 
 from pipelines.core.child import run_in_child
 from pipelines.core.errors import CrashError, DamagedPartialError, DegenerateGeometryError, storage_error
+from pipelines.core.photograph_folder import photograph_folder
 from pipelines.core.products import load_json
 from pipelines.core.progress import Progress
 from pipelines.core.stages import SURVEY
@@ -46,7 +47,7 @@ def run(stage: StageRun, options: SfmOptions) -> Summary:
     survey = load_json(Survey, path)
     arguments = {
         "survey": str(path),
-        "images": str(stage.workspace.photographs(survey.image_dir)),
+        "images": str(photograph_folder(stage.workspace, survey.image_dir)),
         "out": str(stage.out),
         "options": options.model_dump(mode="json"),
     }

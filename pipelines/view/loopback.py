@@ -66,9 +66,8 @@ def _start(port: int, title: str) -> viser.ViserServer:
 
     with _checked_connections(), contextlib.redirect_stdout(io.StringIO()):  # viser prints a banner
         server = Server(host=HOST, port=port, label=title, verbose=False)
-    server.gui.configure_theme(
-        show_logo=False, show_share_button=False, control_layout="fixed", control_width="large"
-    )
+    server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
+    server.gui.main_panel.dock_right()
     return server
 
 

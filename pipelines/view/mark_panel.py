@@ -18,7 +18,7 @@ from pipelines.scene.survey import SurveyedPoint
 from pipelines.view.marking import (
     MarkedPoint,
     appears_in,
-    marked_points,
+    points_to_mark,
     rays_of,
     residuals_px,
     write_marks,
@@ -51,11 +51,8 @@ class MarkPanel:
     ) -> None:
         self._model, self._signs, self._photo, self._folder = model, signs, photo, folder
         survey = model.trained.survey
-        self._names = model.trained.sparse.image_name
-        self._points = [
-            *marked_points(survey.control_points, self._xyz(survey.control_points), is_check=False),
-            *marked_points(survey.check_points, self._xyz(survey.check_points), is_check=True),
-        ]
+        self.names = model.trained.sparse.image_name
+        self._points = points_to_mark(survey, self._xyz)
         self._lock = threading.RLock()
         self._build(server.gui)
         self._show()
@@ -99,6 +96,11 @@ class MarkPanel:
         """The chosen point."""
         return next((point for point in self._points if point.name == self._chosen.value), None)
 
+    def choose(self, name: str) -> None:
+        """Choose the point that clicks mark."""
+        self._chosen.value = name  # type: ignore[misc]
+        self._show()
+
     def turn(self, step: int) -> None:
         """Show the next photograph in which the point must appear, or the one before."""
         with self._lock:
@@ -108,7 +110,7 @@ class MarkPanel:
                 return
             place = self._expected(point)
             shown = [camera for camera, _ in appears_in(place, self._model.trained)] if place is not None else []
-            cameras = shown or list(range(len(self._names)))
+            cameras = shown or list(range(len(self.names)))
             present = self._photo.camera
             number = (cameras.index(present) + step) % len(cameras) if present in cameras else 0
             self._photo.show(cameras[number])
@@ -131,7 +133,7 @@ class MarkPanel:
             if not (0 <= x_px <= lens.width and 0 <= y_px <= lens.height):
                 self._tell("This place is outside the photograph.")
                 return
-            self._replace(point.with_mark(self._names[camera], (x_px, y_px)))
+            self._replace(point.with_mark(self.names[camera], (x_px, y_px)))
 
     def measured(self) -> SurfacePoint | None:
         """Return the chosen point by camera; None with fewer than two marks."""
@@ -147,7 +149,7 @@ class MarkPanel:
     def _remove(self) -> None:
         with self._lock:
             if self.point is not None and self._photo.camera is not None:
-                self._replace(self.point.with_mark(self._names[self._photo.camera], None))
+                self._replace(self.point.with_mark(self.names[self._photo.camera], None))
 
     def _replace(self, point: MarkedPoint) -> None:
         names = [each.name for each in self._points]
@@ -212,9 +214,9 @@ class MarkPanel:
             if np.isfinite(place).all():
                 rows.append(PlaceRow("by camera", place, None if cov is None else np.sqrt(np.diag(cov))))
                 errors = residuals_px(place, rays, self._model.trained)
-                residuals = {self._names[camera]: error for camera, error in zip(rays.camera, errors, strict=True)}
+                residuals = {self.names[camera]: error for camera, error in zip(rays.camera, errors, strict=True)}
             camera = self._photo.camera
-            shown = "" if camera is None else paragraph(f"Shown: {self._names[camera]}")
+            shown = "" if camera is None else paragraph(f"Shown: {self.names[camera]}")
             places = place_table(self._model.target, rows, marked="marked") if rows else ""
             self._result.content = shown + places + mark_table(point.marks, residuals)
 
@@ -226,7 +228,7 @@ class MarkPanel:
         camera, trained = self._photo.camera, self._model.trained
         if point is None or camera is None:
             return None, None, []
-        mark, own = None, point.marks.get(self._names[camera])
+        mark, own = None, point.marks.get(self.names[camera])
         if own is not None:
             mark = bearings(trained.sparse.camera_of(camera), np.array([own]))[0]
         place = self._expected(point)

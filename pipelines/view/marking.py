@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from pipelines.core.errors import InputError
 from pipelines.core.types import FloatArray
 from pipelines.geometry.cameras import project
 from pipelines.scene.marks import MarkRays, mark_angles, mark_rays
-from pipelines.scene.survey import Mark, SurveyedPoint
+from pipelines.scene.survey import Mark, Survey, SurveyedPoint
 from pipelines.scene.trained_survey import TrainedSurvey
 
 CONTROL, CHECK = "gcp_list.txt", "checkpoints.txt"
@@ -43,14 +43,24 @@ class MarkedPoint:
         return replace(self, marks=others if place_px is None else {**others, image: place_px})
 
 
-def marked_points(points: Sequence[SurveyedPoint], xyz: FloatArray, *, is_check: bool) -> list[MarkedPoint]:
-    """Return surveyed points with the marks of the survey.
+def points_to_mark(survey: Survey, xyz_of: Callable[[tuple[SurveyedPoint, ...]], FloatArray]) -> list[MarkedPoint]:
+    """Return the control and check points of a survey with their marks, also those with too few marks to be used.
 
     Args:
-        points: J points.
-        xyz: (J, 3) in the CRS.
-        is_check: whether they are check points.
+        survey: has the points.
+        xyz_of: returns the coordinates (J, 3) of J points in the CRS.
     """
+    control, check = (
+        (*points, *(point for point in survey.unmarked_points if point.use == use))
+        for use, points in (("control", survey.control_points), ("check", survey.check_points))
+    )
+    return [
+        *_marked(control, xyz_of(control), is_check=False),
+        *_marked(check, xyz_of(check), is_check=True),
+    ]
+
+
+def _marked(points: Sequence[SurveyedPoint], xyz: FloatArray, *, is_check: bool) -> list[MarkedPoint]:
     return [
         MarkedPoint(
             point.name,

@@ -74,6 +74,16 @@ class MeasurePanel:
         """Quantities of the present measurement."""
         return self._quantities
 
+    @property
+    def saved(self) -> Sequence[Measurement]:
+        """Saved measurements."""
+        return tuple(self._saved)
+
+    def choose(self, kind: Kind) -> None:
+        """Begin a measurement of a kind."""
+        self.kind.value = kind  # type: ignore[misc]
+        self.clear()
+
     def _build(self, server: viser.ViserServer) -> None:
         gui = server.gui
         self.kind = gui.add_dropdown("Measure", get_args(Kind), hint="What the clicks in the scene make up")

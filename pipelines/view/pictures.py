@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from pipelines.core.errors import InputError
+from pipelines.core.photograph_folder import photograph_folder
 from pipelines.core.types import ByteArray, Float32Array, FloatArray
 from pipelines.core.workspace import Workspace
 from pipelines.formats.image_file import read_bytes, require_unchanged
@@ -50,7 +51,7 @@ class Photographs:
     """
 
     def __init__(self, workspace: Workspace, renderer: ModelRenderer) -> None:
-        self._folder = workspace.photographs(renderer.trained.survey.image_dir)
+        self._folder = photograph_folder(workspace, renderer.trained.survey.image_dir)
         self._trained = renderer.trained
         self._kept: OrderedDict[int, ByteArray] = OrderedDict()
         self._lock = threading.Lock()

@@ -168,7 +168,7 @@ def volumes(surface: SampledSurface, base: BasePlane) -> tuple[Quantity, ...]:
     """Return the volume between surface and base plane: above, below, and their difference.
 
     σ is that of the difference: of corners and samples jointly, and of the sampling, which is half the difference
-    between the volumes of every second sample and of the others.
+    between the volumes of the white and of the black samples of the grid, if that is a chequerboard.
 
     Args:
         surface: the surface.
@@ -186,7 +186,10 @@ def volumes(surface: SampledSurface, base: BasePlane) -> tuple[Quantity, ...]:
     sigma = None
     if of_points is not None:
         of_noise = area / count * float(np.linalg.norm(surface.sigma_up_m))
-        of_sampling = area * abs(float(above[::2].mean() - above[1::2].mean())) / 2 if count > 1 else 0.0
+        white = _is_white(surface.samples[:, :2])
+        of_sampling = 0.0
+        if white.any() and not white.all():
+            of_sampling = area * abs(float(above[white].mean() - above[~white].mean())) / 2
         sigma = float(np.sqrt(of_points**2 + of_noise**2 + of_sampling**2))
     cut, fill = area * float(np.maximum(above, 0).mean()), area * float(np.maximum(-above, 0).mean())
     return (
@@ -241,6 +244,12 @@ def _inside(places: FloatArray, corners: FloatArray) -> BoolArray:
             crossed = (places[:, 1] >= min(y1, y2)) & (places[:, 1] < max(y1, y2))
             inside ^= crossed & (places[:, 0] < x1 + (places[:, 1] - y1) * (x2 - x1) / (y2 - y1))
     return inside
+
+
+def _is_white(places: FloatArray) -> BoolArray:
+    """Return which points (N, 2) of a grid are white, if the grid is a chequerboard."""
+    column, row = (np.unique(np.round(places[:, axis], 3), return_inverse=True)[1] for axis in (0, 1))
+    return np.asarray((column + row) % 2 == 0)
 
 
 def _mean_stretch(samples: FloatArray) -> float:

@@ -17,8 +17,8 @@ from pydantic import Field, ValidationError
 
 from pipelines.core.durable import replace_file
 from pipelines.core.errors import InputError
-from pipelines.core.products import Covariance3, ImageName, Product
-from pipelines.core.types import Vector3
+from pipelines.core.products import ImageName, Product
+from pipelines.core.types import Matrix3, Vector3
 from pipelines.formats.geojson import Json, feature, write_features
 from pipelines.view.surface_points import SurfacePoint
 
@@ -42,7 +42,7 @@ class SavedPoint(Product):
 
     Attributes:
         position_in_geo: metres.
-        cov_of_surface: 3×3, m², of the surface alone.
+        cov_of_surface: 3×3, m², of the surface alone; of rank one under a line of sight.
         images: names of the photographs that show it.
         xyz: in the CRS.
         sigma_m: east, north, up; None: not known.
@@ -50,7 +50,7 @@ class SavedPoint(Product):
     """
 
     position_in_geo: Vector3
-    cov_of_surface: Covariance3
+    cov_of_surface: Matrix3
     images: tuple[ImageName, ...]
     xyz: Vector3
     sigma_m: Vector3 | None

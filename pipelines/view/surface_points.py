@@ -79,12 +79,12 @@ class SurfaceReader:
     """
 
     def __init__(self, renderer: ModelRenderer) -> None:
-        self._renderer, self._trained = renderer, renderer.trained
+        self.renderer, self._trained = renderer, renderer.trained
         self._train = renderer.trained.indices("train")
 
     def focal_px(self, camera: int) -> float:
         """Return the focal length of a camera's depth map."""
-        return self._renderer.pinhole(camera).fx
+        return self.renderer.pinhole(camera).fx
 
     def under(self, sight: Sight) -> SurfacePoint | NoSurface:
         """Return the point of the surface under a line of sight, or why there is none to measure.
@@ -103,7 +103,7 @@ class SurfaceReader:
             return NoSurface("nothing of the model lies under this pixel")
         cameras = self._most_detailed(sight.at(first))
         views = {
-            camera: depth_around(self._renderer, camera, self._slope(camera, sight.at(first)), _WINDOW_PX)
+            camera: depth_around(self.renderer, camera, self._slope(camera, sight.at(first)), _WINDOW_PX)
             for camera in cameras
         }
         unbroken: list[tuple[float, int]] = []
@@ -130,7 +130,7 @@ class SurfaceReader:
             rays: marks of a single point.
         """
         maps = [
-            depth_around(self._renderer, int(camera), xy) for camera, xy in zip(rays.camera, rays.xy, strict=True)
+            depth_around(self.renderer, int(camera), xy) for camera, xy in zip(rays.camera, rays.xy, strict=True)
         ]
         hits = surface_hits(self._trained, rays, maps)
         counted = hits.counted(np.arange(len(rays)))
@@ -149,14 +149,14 @@ class SurfaceReader:
         size, focal = 2 * _HALF_PX + 1, 1.0 / sight.pixel_rad
         pinhole = Pinhole(size, size, focal, focal, size / 2, size / 2)
         pose = ViewPose(pinhole, rotation_towards(sight.direction_in_model), sight.start_in_model)
-        depth = self._renderer.depth_from(pose, Window(_HALF_PX, _HALF_PX, 1, 1))
+        depth = self.renderer.depth_from(pose, Window(_HALF_PX, _HALF_PX, 1, 1))
         return float(depth[0, 0]) or None
 
     def _most_detailed(self, place: FloatArray) -> list[int]:
         """Return the training cameras that hold a place in their image, the most detailed ones first."""
         detail = []
         for camera in self._train:
-            pinhole = self._renderer.pinhole(camera)
+            pinhole = self.renderer.pinhole(camera)
             x, y, z = self._in_cam(camera, place)
             if z > 0:
                 column, row = pinhole.fx * x / z + pinhole.cx, pinhole.fy * y / z + pinhole.cy
@@ -224,6 +224,6 @@ class SurfaceReader:
         ray = arm / length[:, None]
         mean = ray.mean(axis=0) / np.linalg.norm(ray.mean(axis=0))
         spread_rad = float(np.sqrt(np.mean(np.arccos(np.clip(ray @ mean, -1.0, 1.0)) ** 2)))
-        focal = np.array([self._renderer.pinhole(int(camera)).fx for camera in cameras])
+        focal = np.array([self.renderer.pinhole(int(camera)).fx for camera in cameras])
         across = _SIGMA_PX * float(np.mean(length / focal)) / np.sqrt(len(cameras))
         return float((across / max(spread_rad, 1e-6)) ** 2)

@@ -71,7 +71,7 @@ class Viewer:
             self.model = MeasuringModel(workspace, self._renderer, options)
             task.advance()
         self.frame: ViewFrame = frame_of(trained)
-        self._painter = Painter(self._renderer, Photographs(workspace, self._renderer), self.frame)
+        self.painter = Painter(self._renderer, Photographs(workspace, self._renderer), self.frame)
         self._loops: dict[int, PictureLoop] = {}
         self._lock = threading.Lock()
         self.signs = Signs(server, trained, self.frame)
@@ -177,9 +177,29 @@ class Viewer:
         if point is not None:
             self.measuring.add_point(point)
 
+    @property
+    def click_mode(self) -> ClickMode:
+        """What a click in the scene does."""
+        mode: ClickMode = self._mode.value
+        return mode
+
+    @click_mode.setter
+    def click_mode(self, mode: ClickMode) -> None:
+        self._mode.value = mode  # type: ignore[misc]
+
+    @property
+    def loops(self) -> tuple[PictureLoop, ...]:
+        """Loops of the open pages."""
+        return tuple(self._loops.values())
+
+    @property
+    def drawn(self) -> int:
+        """Number of pictures at full size that were drawn for the open pages."""
+        return sum(loop.drawn for loop in self.loops)
+
     def wake(self) -> None:
         """Draw the pictures of all pages anew."""
-        for loop in list(self._loops.values()):
+        for loop in self.loops:
             loop.wake()
 
     def _connected(self, client: viser.ClientHandle) -> None:
@@ -187,7 +207,7 @@ class Viewer:
             if client.client_id in self._loops:
                 return
             self._stand_above(client)
-            self._loops[client.client_id] = PictureLoop(client, self._painter, lambda: self.photo.blend)
+            self._loops[client.client_id] = PictureLoop(client, self.painter, lambda: self.photo.blend)
 
     def _left(self, client: viser.ClientHandle) -> None:
         with self._lock:
@@ -209,17 +229,17 @@ class Viewer:
             return
         start, direction = np.array(event.ray_origin), np.array(event.ray_direction)
         direction /= np.linalg.norm(direction)
-        if self._mode.value == "marks in the photograph":
+        if self.click_mode == "marks in the photograph":
             self._mark(event.client, direction)
             return
         sight = self.frame.sight(camera, start, direction)
         hit = self.signs.hit(start, direction, sight.pixel_rad)
-        if hit is not None and hit.kind == "camera" and self._mode.value == "looks":
+        if hit is not None and hit.kind == "camera" and self.click_mode == "looks":
             self._photo.value = self.model.trained.sparse.image_name[hit.camera]  # type: ignore[misc]
             self.photo.show(hit.camera)
         elif hit is not None and hit.kind == "point":
             self.measuring.add_surveyed(hit.name)
-        elif self._mode.value == "measures":
+        elif self.click_mode == "measures":
             self.measuring.add_sight(sight)
 
     def _mark(self, client: viser.ClientHandle, direction: np.ndarray) -> None:
@@ -239,7 +259,7 @@ class Viewer:
 
     def close(self) -> None:
         """End the pictures, and empty the pages."""
-        for loop in list(self._loops.values()):
+        for loop in self.loops:
             loop.end()
         self._server.scene.remove_click_callback("all")
         self._server.scene.reset()

@@ -239,11 +239,11 @@ def test_a_comparison_reads_the_calibration_where_it_is(tmp_path: Path, command:
         "compare/A", {spec.folder: workspace / spec.folder for spec in stage_slice(None, "geolocate")}
     )
     spec = BY_NAME["geolocate"]
-    before = fingerprints(variant, spec, spec.options(), {})
-    assert before == fingerprints(root, spec, spec.options(), {})
+    before = fingerprints(variant, spec, spec.options(), {}).hashes
+    assert before == fingerprints(root, spec, spec.options(), {}).hashes
     assert load_survey(variant) == load_survey(root)
     command("calibrate", workspace, "--no-apply")
-    after = fingerprints(variant, spec, spec.options(), {})
+    after = fingerprints(variant, spec, spec.options(), {}).hashes
     assert set(before) - set(after) == {RIG, TRACK}
 
 

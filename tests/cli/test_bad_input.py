@@ -145,10 +145,16 @@ REFUSED = (
         "unknown table", {"ws/georef.toml": b"[traim]\n"}, "", "georef.toml [traim]: unknown table; the stages are"
     ),
     Case(
-        "unknown key", {"ws/georef.toml": b"[ingest]\nsigma = 1\n"}, "", "georef.toml [sigma]: unknown key; known"
+        "unknown key",
+        {"ws/georef.toml": b"[ingest]\nsigma = 1\n"},
+        "",
+        "georef.toml [ingest.sigma]: unknown key; known",
     ),
     Case(
-        "bad value", {"ws/georef.toml": b"[ingest]\nsigma_v = -1\n"}, "", "georef.toml [sigma_v]: Input should be"
+        "bad value",
+        {"ws/georef.toml": b"[ingest]\nsigma_v = -1\n"},
+        "",
+        "georef.toml [ingest.sigma_v]: Input should be",
     ),
     Case("no TOML", {"ws/georef.toml": b"sigma_v -1"}, "", "georef.toml: not valid TOML"),
 )

@@ -143,7 +143,7 @@ class TestFlags:
         (done / "georef.toml").write_text("[train]\nsteps = 4\n")
         result = georef("train", done)
         assert result.code == 1
-        assert result.err.startswith(f"error: {done}/georef.toml [steps]: unknown key")
+        assert result.err.startswith(f"error: {done}/georef.toml [train.steps]: unknown key")
 
 
 class TestTrainResume:

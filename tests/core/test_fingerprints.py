@@ -11,7 +11,7 @@ import pytest
 from pipelines.core.errors import MissingProductError
 from pipelines.core.fingerprints import fingerprints
 from pipelines.core.options import StageOptions
-from pipelines.core.stages import APPLIED_RIG, PHOTOGRAPHS, RIG, SURVEY, TRACK, ProductPart, StageSpec
+from pipelines.core.stages import APPLIED_RIG, MEASURED, PHOTOGRAPHS, RIG, SURVEY, TRACK, ProductPart, StageSpec
 from pipelines.core.workspace import Workspace
 
 FIX = {"position_in_geo": [1.0, 2.0, 3.0], "cov_in_geo": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}
@@ -36,7 +36,7 @@ class Look:
         path.write_text(document if isinstance(document, str) else json.dumps(document))
 
     def hashes(self) -> dict[str, str]:
-        return fingerprints(self.workspace, self.spec, StageOptions(), {})
+        return fingerprints(self.workspace, self.spec, StageOptions(), {}).hashes
 
 
 @pytest.fixture
@@ -59,12 +59,13 @@ def with_image(**changes: Any) -> dict[str, Any]:
     "document",
     [
         {**SURVEYED, "control_points": [{"name": "P1"}], "estimate": ["boresight"]},
+        {**SURVEYED, "image_dir": "/others"},
         with_image(split="test"),
         with_image(fix={**FIX, "cov_in_geo": [[4, 0, 0], [0, 4, 0], [0, 0, 4]]}),
         with_image(timestamp_s=5.0),
         dict(reversed(SURVEYED.items())),
     ],
-    ids=["control points", "split", "covariance", "time", "order of keys"],
+    ids=["control points", "folder", "split", "covariance", "time", "order of keys"],
 )
 def test_nothing_but_the_fields_counts(photographs: Look, document: dict[str, Any]) -> None:
     before = photographs.hashes()
@@ -75,7 +76,6 @@ def test_nothing_but_the_fields_counts(photographs: Look, document: dict[str, An
 @pytest.mark.parametrize(
     "document",
     [
-        {**SURVEYED, "image_dir": "/others"},
         {**SURVEYED, "cameras": [{"camera_id": 1, "width": 4}]},
         {**SURVEYED, "images": IMAGES[:1]},
         with_image(name="c.jpg"),
@@ -84,13 +84,24 @@ def test_nothing_but_the_fields_counts(photographs: Look, document: dict[str, An
         with_image(fix={**FIX, "position_in_geo": [1.0, 2.0, 4.0]}),
         with_image(attitude={"quat_xyzw": [0, 0, 0, 1]}),
     ],
-    ids=["folder", "cameras", "images", "name", "content", "no fix", "position", "attitude"],
+    ids=["cameras", "images", "name", "content", "no fix", "position", "attitude"],
 )
 def test_each_field_counts(photographs: Look, document: dict[str, Any]) -> None:
     before = photographs.hashes()
     photographs.write(SURVEY, document)
     after = photographs.hashes()
     assert list(after) == [SURVEY] and after != before
+
+
+def test_place_and_messages_of_a_survey_do_not_count(tmp_path: Path) -> None:
+    """All stages but `sfm` read the whole survey, of which these fields change no result."""
+    look = Look(tmp_path, MEASURED)
+    look.write(SURVEY, SURVEYED)
+    before = look.hashes()
+    look.write(SURVEY, {**SURVEYED, "image_dir": "/others", "warnings": ["one"], "assumptions": ["two"]})
+    assert look.hashes() == before
+    look.write(SURVEY, {**SURVEYED, "control_points": [{"name": "P1"}]})
+    assert look.hashes() != before
 
 
 @pytest.mark.parametrize("text", ["{", "[]", '{"other": 1}', "[" * 100_000], ids=["cut", "list", "other", "deep"])

@@ -66,8 +66,8 @@ def test_changed_option_runs_that_stage_and_what_follows(done: Workspace) -> Non
 
 
 def test_equal_product_of_a_changed_stage_stops_the_change(done: Workspace, photos: Path) -> None:
-    """What is downstream depends on content: a photograph that was only touched changes no survey."""
-    os.utime(photos / "a.jpg", (1, 1))
+    """What is downstream depends on content, and the survey of the fake `ingest` does not change."""
+    (photos / "a.jpg").write_bytes(b"another")
     assert state_of(done)["ingest"] == "stale"
     assert state_of(done)["export-ply"] == "stale"
     assert complete(done) == ["ingest"]
@@ -94,7 +94,7 @@ class TestStatus:
 
     def test_bad_toml_is_an_error(self, done: Workspace) -> None:
         done.config_file.write_text("[train]\nseeds = 9\n")
-        with pytest.raises(InputError, match=r"georef\.toml \[seeds\]: unknown key"):
+        with pytest.raises(InputError, match=r"georef\.toml \[train\.seeds\]: unknown key"):
             states.status(done)
 
     def test_vanished_product(self, done: Workspace) -> None:
@@ -348,22 +348,24 @@ def test_slice_in_wrong_order() -> None:
         stage_slice("train", "sfm")
 
 
-def test_large_input_file_counts_by_size_and_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A bag of many gigabytes is not read at each look: its size and time stand for its content."""
-    bag = tmp_path / "flight.mcap"
-    bag.write_bytes(b"x" * 100)
+def test_large_input_file_counts_by_size_and_samples(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A bag of many gigabytes is not read at each look: its size and samples stand for its content."""
+    monkeypatch.setattr("pipelines.core.fingerprints._WHOLE_BYTES", 9_999)
+    monkeypatch.setattr("pipelines.core.fingerprints._SAMPLE_BYTES", 10)
+    bag, data = tmp_path / "flight.mcap", np.random.default_rng(0).bytes(10_000)
+    bag.write_bytes(data)
     workspace, spec = Workspace(tmp_path / "ws"), BY_NAME["ingest"]
     options = IngestOptions(bag=bag)
 
     def seen() -> str:
-        return fingerprints(workspace, spec, options, {})["--bag"]
+        return fingerprints(workspace, spec, options, {}).hashes["--bag"]
 
-    whole = seen()
-    monkeypatch.setattr("pipelines.core.fingerprints._WHOLE_BYTES", 99)
-    large = seen()
-    assert large != whole and seen() == large
+    before = seen()
     os.utime(bag, (1, 1))
-    assert seen() != large
+    assert seen() == before
+    for other in (data + b"x", bytes([data[0] ^ 1]) + data[1:], data[:-1] + bytes([data[-1] ^ 1])):
+        bag.write_bytes(other)
+        assert seen() != before
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ import pytest
 from pipelines.core import runner
 from pipelines.core import staleness as states
 from pipelines.core.errors import InputError, MissingProductError, WorkspaceBusyError
+from pipelines.core.photograph_folder import photograph_folder
 from pipelines.core.stages import BY_NAME, MODEL, PIPELINE, POINTS, SIM3, SPARSE, stage_slice
 from pipelines.core.workspace import Workspace
 from tests import fakes
@@ -245,8 +246,8 @@ def test_variant_reads_what_is_lent_and_writes_its_own(tmp_path: Path) -> None:
     assert variant.cache == workspace.cache
     assert {row.stage: row.state for row in states.status(variant)}["sfm"] == "current"
     assert variant.config_file == workspace.config_file
-    assert variant.photographs("ingest/images") == workspace.root / "ingest/images"
-    assert variant.photographs("/photos") == Path("/photos")
+    assert photograph_folder(variant, "ingest/images") == workspace.root / "ingest/images"
+    assert photograph_folder(variant, "/photos") == Path("/photos")
     with pytest.raises(MissingProductError, match=f"georef compare {workspace.root}"):
         variant.path(MODEL)  # not the workspace's own, even if it were there
 

@@ -10,6 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
+from georef_cli import boundary
+from georef_cli.main import cli
 from pipelines.accuracy.prediction import AccuracyPrediction
 from pipelines.core.cautions import Caution
 from pipelines.core.errors import InputError
@@ -272,6 +274,22 @@ def test_predicted_accuracy_is_mapped(evaluated: tuple[Workspace, Outcome]) -> N
     assert sigma_h[far > 20].mean() > sigma_h[far < 10].mean()
     picture = cv2.imread(str(folder / "accuracy.png"))
     assert min(picture.shape[:2]) > 400
+
+
+def test_points_are_written_and_printed(
+    evaluated: tuple[Workspace, Outcome], capsys: pytest.CaptureFixture[str]
+) -> None:
+    workspace, _ = evaluated
+    with (workspace.root / "evaluate/points.csv").open(encoding="utf-8", newline="") as handle:
+        rows = [row for row in csv.DictReader(handle) if row["measured"] == "camera"]
+    by_camera = report_of(workspace)["checkpoints"]["camera"]
+    rms = np.sqrt(np.mean([float(row["dh_m"]) ** 2 for row in rows]))
+    assert rms == pytest.approx(by_camera["rmse_h_m"], abs=1e-4)  # the file has tenths of a millimetre
+    assert boundary.guarded(cli, ["evaluate", str(workspace.root), "--renders", "1", "--points"]) == 0
+    printed = capsys.readouterr().out
+    assert "current, nothing to do" in printed and "Check points one by one, metres" in printed
+    for row in rows:
+        assert f"{float(row['du_m']):+.3f}" in printed
 
 
 def test_every_field_of_the_report_is_described(altered: Workspace, flights: list[RenderedFlight]) -> None:

@@ -13,6 +13,7 @@ from pipelines.core.runner import Outcome, run_stage
 from pipelines.core.stages import BY_NAME, GAUSSIANS, MODEL
 from pipelines.core.workspace import Workspace
 from pipelines.evaluate.photometric import render_name
+from pipelines.plots.strips import band_height_px
 from pipelines.scene.trained_model import TrainedModel
 from pipelines.splat.storage import read_gaussians, write_gaussians
 from tests.reports import report_of
@@ -41,7 +42,10 @@ def test_renders_stand_beside_the_photographs(evaluated: tuple[Workspace, Outcom
     renders = sorted((workspace.root / "evaluate" / "renders").iterdir())
     assert [path.name for path in renders] == ["image_003.png"]
     strip = cv2.imread(str(renders[0]))
-    assert strip.shape == (72, 3 * 96, 3)
+    band = band_height_px(96)
+    assert strip.shape == (72 + band, 3 * 96, 3)
+    assert [int((part < 128).any()) for part in np.split(strip[:band], 3, axis=1)] == [1, 1, 1]  # labels
+    strip = strip[band:]
     photo = cv2.imread(str(workspace.root / "photos" / "image_003.jpg"))
     np.testing.assert_array_equal(strip[:, :96], photo)
     shown = np.abs(photo.astype(float) - strip[:, 96:192])

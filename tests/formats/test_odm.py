@@ -79,7 +79,8 @@ def test_ground_points_with_and_without_names(tmp_path: Path) -> None:
     found = read_ground_points(_write(tmp_path, text, "gcp_list.txt"))
     assert found.crs_text == "WGS84 UTM 16N"
     assert [mark.name for mark in found.marks] == ["G1", "G1", "point-1", "point-1", "point-2"]
-    assert found.marks[2].xyz == (500010.5, 4000000.0, 10.0)
+    assert [point.name for point in found.points] == ["G1", "point-1", "point-2"]
+    assert found.points[1].xyz == (500010.5, 4000000.0, 10.0)
     assert (found.marks[0].x_px, found.marks[0].y_px, found.marks[0].image) == (100.5, 200.25, "a.jpg")
     assert [mark.line for mark in found.marks] == [2, 3, 4, 5, 6]
 

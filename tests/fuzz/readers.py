@@ -26,10 +26,15 @@ from pipelines.core.workspace import Manifest, Workspace
 from pipelines.formats.bag.images import COMPRESSED, IMAGE, BadImageError, ImageWriter
 from pipelines.formats.bag.reader import UndecodableError, open_bag
 from pipelines.formats.colmap import pycolmap_module, read_sparse
+from pipelines.formats.dji_mrk import read_mrk
 from pipelines.formats.exif import read_tags
 from pipelines.formats.georef_sidecar import GeorefSidecar, read_sidecar, write_sidecar
 from pipelines.formats.image_file import inspect_image, read_bytes
+from pipelines.formats.metashape_markers import read_markers_xml
+from pipelines.formats.metashape_reference import read_cameras, read_markers
 from pipelines.formats.odm import read_geo, read_ground_points
+from pipelines.formats.pix4d import read_marks, read_point_table
+from pipelines.formats.rtklib_pos import read_pos
 from pipelines.formats.splat_ply import SplatArrays, read_splat_ply, write_splat_ply
 from pipelines.formats.spz import read_spz, write_spz
 from pipelines.formats.trajectory_csv import read_trajectory
@@ -46,6 +51,7 @@ from pipelines.scene.survey import Survey
 from pipelines.scene.trained_model import TrainedModel
 from pipelines.train.checkpoint import load_checkpoint
 from tests import bags
+from tests.formats.test_surveyors_tables import DEGREES, MRK, POS_HEAD, REFERENCE, SIGMAS, TAIL, XML
 from tests.photos import Exif, dji_xmp, gps_entries, jpeg
 from tests.reports import check_points_with, report_with
 from tests.scenes import initial, material, trained_model, write_workspace
@@ -105,8 +111,23 @@ def _ground_points(folder: Path) -> None:
 
 def _read_ground_points(folder: Path) -> None:
     points = read_ground_points(folder / "gcp_list.txt")
-    xyz = [mark.xyz for mark in points.marks]
+    xyz = [point.xyz for point in points.points]
     parse_crs(points.crs_text, path=points.path, line=1).lla_from_xyz(xyz, path=points.path)
+
+
+def _write(**texts: str) -> Callable[[Path], None]:
+    """Return what writes texts into files of a folder, by name."""
+
+    def prepare(folder: Path) -> None:
+        for name, text in texts.items():
+            (folder / name).write_text(text)
+
+    return prepare
+
+
+def _each(*read: Callable[[Path], object]) -> Callable[[Path], object]:
+    """Return what reads each file of a folder in each of several ways."""
+    return lambda folder: [_attempt(lambda p=p, r=r: r(p)) for p in folder.iterdir() for r in read]
 
 
 def _geo(folder: Path) -> None:
@@ -338,6 +359,23 @@ READERS: dict[str, Reader] = {
     ),
     "geo.txt": Reader(_geo, lambda folder: read_geo(folder / "geo.txt")),
     "gcp_list.txt": Reader(_ground_points, _read_ground_points),
+    "markers": Reader(_write(markers=XML), _each(read_markers_xml)),
+    "reference": Reader(_write(reference=REFERENCE), _each(read_markers, read_cameras)),
+    "pix4d": Reader(
+        _write(
+            a="label,x,y,z,sigma_h\nP,4e5,5e6,9,0.1\n", b="P,46,7,9,0.1,0.2\nQ,47,8,9\n", c="a.jpg,P,1.5,2.5,1\n"
+        ),
+        _each(read_point_table, read_marks),
+    ),
+    "mrk": Reader(_write(mrk=MRK), _each(read_mrk)),
+    "pos": Reader(
+        _write(
+            a=DEGREES.format(clock="GPST") + f"2024/05/01 12:00:18.000 46.02 7.75 1620.25{TAIL}",
+            b=DEGREES.format(clock="UTC") + f"2312 302418.0 46.02 7.75 1620.25{TAIL}",
+            c=f"{POS_HEAD}%  GPST  x-ecef(m) y-ecef(m) z-ecef(m) {SIGMAS}2312 302418.0 4397e3 598e3 4567e3{TAIL}",
+        ),
+        _each(read_pos),
+    ),
     "crs": Reader(_crs, _read_crs, slow=True),
     "colmap-binary": Reader(_sparse, read_sparse),
     "colmap-text": Reader(_sparse_text, read_sparse),

@@ -29,6 +29,7 @@ from pipelines.georef.posterior import FreeLens, minimise, posterior
 from pipelines.georef.problem import GeoProblem
 from pipelines.georef.similarity import LearnableSimilarity
 from pipelines.georef.terms import ControlTerm, FixTerm
+from pipelines.view.quantities import MeasuredPoints, distances
 from tests.bundle_scenes import LENS, SIGMA_PX, adjuster, exact_network, noisy, pixels, readjusted, size
 from tests.georef_scenes import terms
 
@@ -172,6 +173,25 @@ def test_predicted_accuracy_is_true(profile: str) -> None:
     # Points of a run share most of their error: 30 values and a few more for each axis, σ of the mean 0.13.
     assert (squared / variance).mean() == pytest.approx(1.0, abs=0.25)
     assert np.sqrt(squared.mean() / bound(setting).mean()) < ABOVE_BOUND
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_sigma_of_a_distance_is_true(profile: str) -> None:
+    squared, of_distance, of_points = [], [], []
+    for run in runs_of(30, profile):
+        for pair in ([0, 1], [2, 7], [4, 9], [5, 10]):
+            rows = (3 * np.array(pair)[:, None] + np.arange(3)).ravel()
+            places, cov = CHECK[pair] + run.error[pair], run.joint[np.ix_(rows, rows)]
+            true = distances(MeasuredPoints(CHECK[pair], None, CHECK[pair][:, 2]))
+            for quantity, truth in zip(distances(MeasuredPoints(places, cov, places[:, 2])), true, strict=True):
+                assert quantity.sigma is not None
+                squared.append(((quantity.value - truth.value) / quantity.sigma) ** 2)
+                of_distance.append(quantity.sigma)
+            of_points.append(np.sqrt(np.trace(cov) / 6))
+    # Distances of a run share most of their error, as its points do.
+    assert np.mean(squared) == pytest.approx(1.0, abs=0.3)
+    if profile == "consumer":  # points are known to a metre: what moves all of them cancels
+        assert np.median(of_distance) < 0.3 * np.median(of_points)
 
 
 def test_true_predictions_are_not_refuted_by_the_errors_that_points_share() -> None:

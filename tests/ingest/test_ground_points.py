@@ -9,7 +9,13 @@ import pytest
 
 from pipelines.core.errors import InputError
 from pipelines.geodesy.enu import ecef_from_lla
-from pipelines.ingest.ground_points import GroundFile, read_ground_file, require_near, split_checks
+from pipelines.ingest.ground_points import (
+    GroundFile,
+    list_ground_points,
+    require_near,
+    split_checks,
+    tie_ground_points,
+)
 from pipelines.ingest.notes import Notes
 from pipelines.ingest.options import IngestOptions
 
@@ -21,14 +27,17 @@ G2 = "7.76 46.02 1620 10.5 20.5 a.jpg G2\n7.76 46.02 1620 11.5 21.5 b.jpg G2\n"
 def _read(tmp_path: Path, rows: str, name: str = "gcp_list.txt", notes: Notes | None = None) -> GroundFile:
     path = tmp_path / name
     path.write_text("EPSG:4979\n" + rows)
-    return read_ground_file(path, SIZES, IngestOptions(), notes or Notes())
+    options, notes = IngestOptions(gcp=path), notes or Notes()
+    file, _ = tie_ground_points(list_ground_points(options, notes), SIZES, options, notes)
+    assert file is not None
+    return file
 
 
 def test_points_and_marks(tmp_path: Path) -> None:
     notes = Notes()
     rows = G1 + G2 + "7.75 46.02 1620 1 1 absent.jpg G1\n7.77 46.02 1620 1 1 a.jpg G3\n"
     file = _read(tmp_path, rows, notes=notes)
-    assert [point.name for point in file.points] == ["G1", "G2"]
+    assert [(point.name, point.is_marked) for point in file.points] == [("G1", True), ("G2", True), ("G3", False)]
     np.testing.assert_allclose(
         file.points[0].position_in_ecef, ecef_from_lla([46.02, 7.75, 1620.0]), rtol=0, atol=1e-8
     )
@@ -37,7 +46,12 @@ def test_points_and_marks(tmp_path: Path) -> None:
     assert file.vertical.stated and file.vertical.name == "ellipsoidal"
     assert notes.warnings == [
         "1 mark is in an image that is not here: gcp_list.txt:6 (absent.jpg)",
-        "1 ground point has marks in fewer than 2 images and was left out: G3 (gcp_list.txt:7)",
+    ]
+    split = split_checks(file, None, [])
+    assert [point.name for point in split.control] == ["G1", "G2"]
+    split.note_unmarked(notes)
+    assert notes.warnings[1:] == [
+        "1 ground point has marks in fewer than 2 images, and enters nothing until it is marked: G3 (control)"
     ]
 
 
@@ -62,9 +76,9 @@ def test_refusals(tmp_path: Path, rows: str, message: str) -> None:
 
 
 def test_named_control_points_become_check_points(tmp_path: Path) -> None:
-    control, check = split_checks(_read(tmp_path, G1 + G2), None, ["G2"])
-    assert [point.name for point in control] == ["G1"]
-    assert [point.name for point in check] == ["G2"]
+    split = split_checks(_read(tmp_path, G1 + G2), None, ["G2"])
+    assert [point.name for point in split.control] == ["G1"]
+    assert [point.name for point in split.check] == ["G2"]
 
 
 def test_an_unknown_name_is_refused_with_the_known_ones(tmp_path: Path) -> None:

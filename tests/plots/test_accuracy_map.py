@@ -7,13 +7,18 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from pipelines.plots.accuracy_map import MapPoints, SigmaRaster, write_accuracy_map
+from pipelines.plots.accuracy_map import MapPoints, NamedPlaces, SigmaRaster, write_accuracy_map
+from pipelines.plots.map_marks import MapCoordinates, exaggeration, write_ticks
+from pipelines.plots.style import new_figure
 
 LEAST, LARGEST, EMPTY = (0x44, 0x01, 0x54), (0xFD, 0xE7, 0x25), (0xE8, 0xE8, 0xE8)  # ends of viridis; no scene
 CONTROL = (0xDD, 0x8A, 0x3B)
-NOWHERE = np.empty((0, 2))
-NO_POINTS = MapPoints(NOWHERE, NOWHERE, NOWHERE)
+NO_POINTS = MapPoints()
+LEFT, TOP = 170, 120
+INSIDE = np.s_[TOP:640, LEFT:690]  # of half a picture of a square scene: nothing but the map
 
 
 def raster(sigma_h_m: np.ndarray, *, corner: tuple[float, float] = (0.0, 0.0), cell_m: float = 1.0) -> SigmaRaster:
@@ -80,7 +85,7 @@ def test_points_lie_where_they_are(size_m: float, corner: tuple[float, float], t
     sigma = np.full((6, 8), 0.05)
     sigma[0, 0] = 0.01
     place = np.array(corner) + size_m * np.array([5.5, 3.5])  # the middle of a cell
-    points = MapPoints(np.array([corner]), place[None], np.array([corner]) + size_m)
+    points = MapPoints(np.array([corner]), NamedPlaces(place[None]), NamedPlaces(np.array([corner]) + size_m))
     left, right = maps(tmp_path, raster(sigma, corner=corner, cell_m=size_m), points)
     plain, _ = maps(tmp_path, raster(sigma, corner=corner, cell_m=size_m))
     offset = middle(left, CONTROL) - middle(plain, LEAST)
@@ -92,7 +97,7 @@ def test_all_kinds_of_points_are_in_the_legend(tmp_path: Path) -> None:
     sigma = np.full((5, 5), 0.05)
     point = np.array([[2.5, 2.5]])
     heights = []
-    for points in (NO_POINTS, MapPoints(point, NOWHERE, NOWHERE), MapPoints(point, point + 1, point - 1)):
+    for points in (NO_POINTS, MapPoints(point), MapPoints(point, NamedPlaces(point + 1), NamedPlaces(point - 1))):
         left, right = maps(tmp_path, raster(sigma), points)
         foot = np.concatenate([left, right], axis=1)[-45:]
         heights.append(int((foot < 200).any(axis=2).any(axis=0).sum()))  # columns that are written on
@@ -113,7 +118,7 @@ def test_all_kinds_of_points_are_in_the_legend(tmp_path: Path) -> None:
 )
 def test_odd_scenes_are_drawn_without_a_warning(sigma: np.ndarray, tmp_path: Path) -> None:
     cameras = np.random.default_rng(0).uniform(-5, 50, (1500, 2))
-    left, right = maps(tmp_path, raster(sigma), MapPoints(cameras, NOWHERE, cameras[:3]))
+    left, right = maps(tmp_path, raster(sigma), MapPoints(cameras, check=NamedPlaces(cameras[:3])))
     assert min(left.shape[:2]) > 400
     assert right.std() > 1
 
@@ -121,6 +126,82 @@ def test_odd_scenes_are_drawn_without_a_warning(sigma: np.ndarray, tmp_path: Pat
 def test_equal_scenes_give_equal_files(tmp_path: Path) -> None:
     sigma = raster(np.random.default_rng(1).uniform(0.01, 0.02, (20, 30)))
     for name in ("a.png", "b.png"):
-        write_accuracy_map(tmp_path / name, sigma, MapPoints(NOWHERE, NOWHERE, np.array([[3.0, 4.0]])))
+        write_accuracy_map(tmp_path / name, sigma, MapPoints(check=NamedPlaces(np.array([[3.0, 4.0]]))))
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.png", "b.png"]
+
+
+def dark(image: np.ndarray) -> np.ndarray:
+    """Mask of the pixels as dark as an arrow."""
+    return (image < 0x60).all(axis=2)
+
+
+@pytest.mark.parametrize("east_m", [0.02, -0.02])
+def test_errors_are_arrows_in_their_direction(east_m: float, tmp_path: Path) -> None:
+    """East and west on the left map; up on the right one, whatever the horizontal error is."""
+    bright = np.full((20, 20), 0.05)
+    bright[0, 0] = bright[-1, 0] = 0.01
+    sigma, place = raster(bright), np.array([[10.0, 10.0]])
+    error = np.array([[east_m, 0.0, 0.03]])
+    plain = maps(tmp_path, sigma, MapPoints(check=NamedPlaces(place)))
+    drawn = maps(tmp_path, sigma, MapPoints(check=NamedPlaces(place, (), error)))
+    added = []
+    for before, after in zip(plain, drawn, strict=True):
+        rows, columns = np.nonzero((dark(after) & ~dark(before))[INSIDE])  # the map, without its title
+        added.append((columns, rows))
+    (columns, rows), (right_columns, right_rows) = added
+    assert np.ptp(columns) > 5 * np.ptp(rows) > 0 and np.ptp(right_rows) > 3 * np.ptp(right_columns) > 0
+    spot = middle_of_signs(plain[0])
+    assert np.sign(columns.mean() + LEFT - spot[0]) == np.sign(east_m)
+    assert right_rows.mean() + TOP < middle_of_signs(plain[1])[1]
+
+
+def middle_of_signs(image: np.ndarray) -> np.ndarray:
+    """Column and row of the middle of the map's only sign, a white disc."""
+    mask = (image[INSIDE] > 250).all(axis=2).astype(np.uint8)
+    _, _, _, middles = cv2.connectedComponentsWithStats(mask)
+    return np.asarray(middles[1] + np.array([LEFT, TOP]))
+
+
+@given(
+    lengths=st.lists(st.floats(1e-5, 1e3), min_size=1, max_size=30),
+    side_m=st.floats(1.0, 1e5),
+)
+def test_arrows_are_exaggerated_by_a_round_number(lengths: list[float], side_m: float) -> None:
+    """The arrow that decides is between a twentieth and a seventh of the map, as 1, 2, 5 and 10 are 2.5 apart."""
+    factor = exaggeration(np.array([*lengths, np.nan]), side_m)
+    assert factor is not None
+    assert f"{factor:.0e}"[0] in "125"
+    decides = min(max(lengths), 4 * float(np.median(lengths)))
+    assert 0.055 < factor * decides / side_m < 0.141
+
+
+def test_nothing_measured_is_no_arrow() -> None:
+    assert exaggeration(np.array([np.nan]), 100.0) is None
+    assert exaggeration(np.array([]), 100.0) is None
+    assert exaggeration(np.zeros(3), 100.0) is None
+
+
+def test_ticks_have_the_coordinates_of_the_edges() -> None:
+    """Of a CRS that is turned and shifted against the map, as a grid is away from its meridian."""
+    turned = MapCoordinates(
+        "grid", ("easting", "northing"), "m", lambda p: p @ [[1.0, 0.1], [-0.1, 1.0]] + [500, 900]
+    )
+    axes = new_figure((4, 4), None).add_axes((0.1, 0.1, 0.8, 0.8))
+    axes.set_xlim(-50, 50)
+    axes.set_ylim(-20, 80)
+    write_ticks(axes, turned)
+    assert axes.xaxis.get_major_formatter()(10.0) == "10\n512"  # 10 + 0.1 · 20 + 500 on the lower edge
+    assert axes.yaxis.get_major_formatter()(40.0) == "40\n935"  # 40 − 0.1 · 50 + 900 on the left edge
+    degrees = MapCoordinates("WGS84", ("longitude", "latitude"), "°", lambda p: p / 111_320)
+    write_ticks(axes, degrees)
+    assert axes.xaxis.get_major_formatter()(50.0) == "50\n0.000449"
+
+
+@pytest.mark.filterwarnings("error")
+def test_names_are_written_and_no_markup(tmp_path: Path) -> None:
+    sigma, place = raster(np.full((20, 20), 0.05)), np.array([[10.0, 10.0]])
+    plain, _ = maps(tmp_path, sigma, MapPoints(control=NamedPlaces(place)))
+    named, _ = maps(tmp_path, sigma, MapPoints(control=NamedPlaces(place, ("$P_1$",))))
+    rows, columns = np.nonzero((plain != named).any(axis=2))
+    assert 30 < np.ptp(columns) < 90 and 8 < np.ptp(rows) < 30  # five letters, as they stand

@@ -13,9 +13,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipelines.core.errors import InputError
+from pipelines.formats.dji_mrk import read_mrk
 from pipelines.formats.exif import read_tags
 from pipelines.formats.image_file import header_size, inspect_image
+from pipelines.formats.metashape_reference import read_cameras, read_markers
 from pipelines.formats.odm import read_geo, read_ground_points
+from pipelines.formats.pix4d import read_marks, read_point_table
+from pipelines.formats.rtklib_pos import read_pos
 from pipelines.formats.trajectory_csv import read_trajectory
 from pipelines.geodesy.crs import parse_crs
 from tests.photos import Exif, dji_xmp, gps_entries, jpeg
@@ -28,7 +32,18 @@ CELLS = st.one_of(
     st.text(max_size=5),
 )
 HEADERS = st.sampled_from(
-    ["image,lat,lon,alt", "time;x;y;z;qx;qy;qz;qw", "EPSG:4326", "image,x,y,z,yaw,pitch,roll", ""]
+    [
+        "image,lat,lon,alt",
+        "time;x;y;z;qx;qy;qz;qw",
+        "EPSG:4326",
+        "image,x,y,z,yaw,pitch,roll",
+        "",
+        "#Label,X,Y,Z,Yaw,Pitch,Roll",
+        "label,x,y,z",
+        "%  GPST latitude(deg) longitude(deg) height(m)",
+        "%  UTC x-ecef(m) y-ecef(m) z-ecef(m)",
+        "1 2.0 [3] 4,N",
+    ]
 )
 TABLES = st.tuples(HEADERS, st.sampled_from(",; \t"), st.lists(st.lists(CELLS, max_size=9), max_size=5)).map(
     lambda drawn: drawn[0] + "\n" + "\n".join(drawn[1].join(row) for row in drawn[2])
@@ -38,8 +53,11 @@ TABLES = st.tuples(HEADERS, st.sampled_from(",; \t"), st.lists(st.lists(CELLS, m
 @settings(deadline=None, max_examples=30)
 @pytest.mark.parametrize(
     "read",
-    [read_trajectory, read_geo, read_ground_points],
-    ids=["csv", "geo.txt", "gcp_list.txt"],
+    [
+        *(read_trajectory, read_geo, read_ground_points, read_markers, read_cameras, read_point_table, read_marks),
+        *(read_pos, read_mrk),
+    ],
+    ids=["csv", "geo.txt", "gcp_list.txt", "markers", "cameras", "points", "marks", "pos", "mrk"],
 )
 @given(table=TABLES)
 def test_tables(read: Callable[[Path], Any], table: str) -> None:

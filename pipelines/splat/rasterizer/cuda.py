@@ -154,12 +154,13 @@ def _import_gsplat() -> ModuleType:
             from gsplat.cuda import _backend
     except ImportError as error:
         raise BackendUnavailableError(
-            f"gsplat cannot be imported ({error}): pip install 'georefgs[cuda]', or use the cpu backend"
+            f"gsplat cannot be imported ({error}): install the extra cuda (in the checkout: pip install '.[cuda]'; "
+            "anywhere: pip install gsplat), or use the cpu backend"
         ) from error
     if _backend._C is None:
         raise BackendUnavailableError(
             "gsplat found no CUDA toolkit (nvcc) to compile its kernels with: install one, install a prebuilt"
-            " gsplat wheel after pip install 'georefgs[cuda]', or use the cpu backend"
+            " gsplat wheel after pip install gsplat (the extra cuda), or use the cpu backend"
         )
     module: ModuleType = gsplat
     return module

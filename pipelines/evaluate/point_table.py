@@ -1,0 +1,70 @@
+"""Errors of every check and control point as a table for other programs."""
+
+from __future__ import annotations
+
+import csv
+import math
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.geodesy.enu import ecef_from_enu, lla_from_ecef
+from pipelines.scene.report import Coordinates, EvaluationReport
+from pipelines.scene.report_points import PointLine, point_lines
+from pipelines.scene.survey import Survey
+
+_NAME = ("name", "use", "measured", "rays")
+_PLACE = ("latitude_deg", "longitude_deg", "ellipsoidal_height_m", "east_m", "north_m", "up_m")
+_ERROR = ("de_m", "dn_m", "du_m", "dh_m", "d3_m", "sigma_e_m", "sigma_n_m", "sigma_u_m", "blunder")
+_IN_CRS = ("crs", "x", "y", "z", "x_measured", "y_measured", "z_measured")
+
+
+def write_point_table(path: Path, report: EvaluationReport, survey: Survey) -> None:
+    """Write one line for each point and way in which it was measured; what is not known stays empty.
+
+    The place is the surveyed one. With `--crs`, check points have their coordinates there too.
+
+    Args:
+        path: of the CSV file.
+        report: of the same survey.
+        survey: has the surveyed positions.
+    """
+    place = _places(survey)
+    in_crs = report.coordinates
+    with path.open("w", encoding="utf-8", newline="") as handle:
+        writer = csv.writer(handle)
+        writer.writerow([*_NAME, *_PLACE, *_ERROR, *(_IN_CRS if in_crs is not None else ())])
+        for line in point_lines(report):
+            name = [line.row.name, line.use, line.way, line.row.rays]
+            writer.writerow([*name, *place[line.row.name], *_error(line), *_crs_cells(in_crs, line)])
+
+
+def _places(survey: Survey) -> dict[str, list[str]]:
+    """Return the cells of each surveyed position, by name."""
+    points = (*survey.control_points, *survey.check_points)
+    in_geo = np.array([point.position_in_geo for point in points]).reshape(-1, 3)
+    lla = lla_from_ecef(ecef_from_enu(in_geo, survey.origin)) if points else in_geo
+    return {
+        point.name: [f"{lat:.9f}", f"{lon:.9f}", f"{alt:.4f}", *(f"{value:.4f}" for value in enu)]
+        for point, (lat, lon, alt), enu in zip(points, lla.tolist(), in_geo.tolist(), strict=True)
+    }
+
+
+def _error(line: PointLine) -> list[str]:
+    error, sigma = line.error_m, line.sigma_m
+    lengths = () if error is None else (*error, math.hypot(*error[:2]), math.hypot(*error))
+    cells = [f"{value:.4f}" for value in lengths] or [""] * 5
+    cells += [""] * 3 if sigma is None else [f"{value:.4f}" for value in sigma]
+    return [*cells, "" if line.way == "fit" else str(int(line.is_blunder))]
+
+
+def _crs_cells(coordinates: Coordinates | None, line: PointLine) -> list[str]:
+    """Return the cells of a point in the CRS; empty for a point that the report does not list there."""
+    if coordinates is None:
+        return []
+    point = next((point for point in coordinates.points if point.name == line.row.name), None)
+    if point is None or line.use != "check":
+        return [""] * len(_IN_CRS)
+    measured = point.camera if line.way == "camera" else point.model
+    texts = coordinates.texts(point.surveyed), coordinates.texts(measured)
+    return [coordinates.crs, *texts[0], *texts[1]]

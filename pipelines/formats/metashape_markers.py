@@ -1,0 +1,181 @@
+"""Metashape's markers with their projections (Tools ▸ Export ▸ Export Markers, XML).
+
+A camera's label names the image. The centre of the top-left pixel is (0.5, 0.5), as here. Projections that are not
+pinned were placed by Metashape and not by a person: they are left out. A marker whose reference is not enabled is a
+check point. defusedxml refuses entities and document type definitions.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+from xml.sax import ContentHandler, SAXException
+
+from pipelines.core.errors import InputError
+from pipelines.core.files import file_size
+from pipelines.formats.ground_points import GroundPoints, ListedMark, ListedPoint, without_repeats
+
+if TYPE_CHECKING:
+    from xml.sax.xmlreader import AttributesImpl, Locator
+
+KIND = "Metashape's markers"
+_MAX_BYTES = 64 * 1024 * 1024
+_MAX_DEPTH = 100
+_OFF = frozenset({"0", "false"})
+
+
+def read_markers_xml(path: Path) -> GroundPoints:
+    """Read markers and their pinned projections; markers without coordinates are left out.
+
+    Raises:
+        InputError: unreadable, not well-formed XML, not of Metashape, several chunks, a value that is no number, or
+            no marker with coordinates.
+    """
+    from defusedxml.common import DefusedXmlException
+    from defusedxml.sax import make_parser
+
+    file_size(path, limit_bytes=_MAX_BYTES, kind="file of markers")
+    reader = _Reader(path)
+    parser = make_parser()
+    parser.forbid_dtd = True
+    parser.setContentHandler(reader)
+    try:
+        parser.parse(io.BytesIO(path.read_bytes()))
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror}", path=path) from error
+    except (SAXException, DefusedXmlException, ValueError, LookupError) as error:
+        message = " ".join(str(error).split())[:200]
+        raise InputError(f"is no well-formed XML: {message}", path=path) from error
+    return reader.result()
+
+
+class _Reader(ContentHandler):
+    """Reader of one document, element by element."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self._path = path
+        self._place: Locator | None = None
+        self._open: list[str] = []
+        self._chunks = 0
+        self._marker: tuple[str, str] | None = None  # id and label
+        self._projected: str | None = None  # id
+        self._crs: list[str] = []
+        self._crs_line = 1
+        self._labels: dict[str, str] = {}  # of cameras, by id
+        self._names: dict[str, str] = {}  # of markers, by id
+        self._points: list[ListedPoint] = []
+        self._projections: list[tuple[int, str, str, float, float]] = []  # line, marker, camera, x, y
+        self._left_out: list[str] = []
+
+    def setDocumentLocator(self, locator: Locator) -> None:
+        """Keep the parser's place, for errors."""
+        self._place = locator
+
+    def startElement(self, name: str, attrs: AttributesImpl) -> None:
+        """Read an element that begins."""
+        values = {str(key): str(value) for key, value in attrs.items()}
+        parent = self._open[-1] if self._open else ""
+        self._open.append(name)
+        if len(self._open) > _MAX_DEPTH:
+            raise InputError("is nested too deeply", path=self._path, line=self._line)
+        if name == "chunk":
+            self._chunks += 1
+            if self._chunks > 1:
+                raise InputError("has several chunks: export the markers of one", path=self._path, line=self._line)
+        elif name == "camera" and "id" in values and "label" in values:
+            self._labels[values["id"]] = values["label"]
+        elif name == "marker" and "marker_id" in values:
+            self._projected = values["marker_id"]
+        elif name == "marker" and "id" in values:
+            self._marker = (values["id"], values.get("label", ""))
+        elif name == "reference" and parent == "marker" and self._marker is not None:
+            self._read_point(values)
+        elif name == "reference":
+            self._crs_line = self._line
+        elif name == "location" and parent == "marker" and self._projected is not None:
+            self._read_projection(values)
+
+    def endElement(self, name: str) -> None:
+        """Close an element."""
+        self._open.pop()
+        if name == "marker":
+            self._marker = self._projected = None
+
+    def characters(self, content: str) -> None:
+        """Gather the text of the CRS."""
+        if self._open and self._open[-1] == "reference":
+            self._crs.append(content)
+
+    def result(self) -> GroundPoints:
+        """Return the points and marks that were read."""
+        if not self._points:
+            raise InputError("has no marker with coordinates: is it an export of markers?", path=self._path)
+        known = {point.name for point in self._points}
+        marks = [
+            ListedMark(line, self._names[marker], self._labels.get(camera, f"camera {camera}"), x, y)
+            for line, marker, camera, x, y in self._projections
+            if self._names.get(marker) in known
+        ]
+        crs = "".join(self._crs).strip()
+        return GroundPoints(
+            path=self._path,
+            kind=KIND,
+            points=without_repeats(self._points, self._path),
+            marks=tuple(marks),
+            crs_text=crs or None,
+            crs_line=self._crs_line,
+            left_out=tuple(self._left_out),
+        )
+
+    @property
+    def _line(self) -> int:
+        return 1 if self._place is None else int(self._place.getLineNumber() or 1)
+
+    def _read_point(self, values: dict[str, str]) -> None:
+        marker, name = self._marker or ("", "")
+        if not {"x", "y", "z"} <= set(values):
+            return
+        if not name:
+            raise InputError("has no name", path=self._path, line=self._line, field="label")
+        if name in self._names.values() and self._names.get(marker) != name:
+            raise InputError(f"two markers have the name {name}", path=self._path, line=self._line)
+        self._names[marker] = name
+        both = self._sigma(values, "sxyz")
+        horizontal = [sigma for axis in ("sx", "sy") if (sigma := self._sigma(values, axis)) is not None]
+        self._points.append(
+            ListedPoint(
+                line=self._line,
+                name=name,
+                xyz=(self._number(values, "x"), self._number(values, "y"), self._number(values, "z")),
+                sigma_h_m=max(horizontal) if horizontal else both,
+                sigma_v_m=self._sigma(values, "sz") or both,
+                is_check=values.get("enabled", "true").lower() in _OFF,
+            )
+        )
+
+    def _read_projection(self, values: dict[str, str]) -> None:
+        marker, camera = self._projected or "", values.get("camera_id", "")
+        if not {"x", "y"} <= set(values) or values.get("valid", "true").lower() in _OFF:
+            return
+        if values.get("pinned", "true").lower() in _OFF:
+            self._left_out.append(f"{self._path.name}:{self._line}")
+            return
+        self._projections.append((self._line, marker, camera, self._number(values, "x"), self._number(values, "y")))
+
+    def _number(self, values: dict[str, str], key: str) -> float:
+        try:
+            value = float(values[key])
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            message = f"{values[key][:40]!r} is no number"
+            raise InputError(message, path=self._path, line=self._line, field=key)
+        return value
+
+    def _sigma(self, values: dict[str, str], key: str) -> float | None:
+        """Return a σ that is above zero, or None."""
+        value = self._number(values, key) if key in values else 0.0
+        return value if value > 0 else None

@@ -1,0 +1,235 @@
+"""The viewer in Chromium: its picture, clicks against `evaluate`, saved points and marks; nothing but loopback."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import pytest
+import viser
+from playwright.sync_api import Browser, Page, Route
+
+from pipelines.core.runner import run_stage
+from pipelines.core.stages import BY_NAME, REPORT
+from pipelines.core.workspace import Workspace
+from pipelines.scene.report import read_report
+from pipelines.view.loopback import start_server
+from pipelines.view.options import ViewOptions
+from pipelines.view.picture_loop import camera_of
+from pipelines.view.view_frame import ViewerCamera
+from pipelines.view.viewer import Viewer
+from tests.splat_scenes import make_rendered
+from tests.view_scenes import smooth, viewed_workspace
+
+pytestmark = pytest.mark.browser
+
+SIZE = {"width": 1000, "height": 640}
+PATIENCE_S = 60.0
+
+
+@dataclass
+class Opened:
+    """A viewer, its server, and a page of it; `outside` are addresses beyond this machine that were asked for."""
+
+    viewer: Viewer
+    server: viser.ViserServer
+    page: Page
+    outside: list[str]
+
+    @property
+    def camera(self) -> ViewerCamera:
+        """Camera of the page."""
+        camera = camera_of(next(iter(self.server.get_clients().values())))
+        assert camera is not None
+        return camera
+
+    def pixel(self, point_in_geo: np.ndarray) -> tuple[float, float]:
+        """Return where a point is on the page."""
+        camera = self.camera
+        pinhole = camera.pinhole(camera.width, camera.height)
+        x, y, z = camera.rotation.T @ (self.viewer.signs.place(point_in_geo) - camera.position)
+        return pinhole.fx * x / z + pinhole.cx, pinhole.fy * y / z + pinhole.cy
+
+    def tab(self, name: str) -> None:
+        """Open a tab of the panel."""
+        self.page.get_by_role("tab", name=name).click()
+
+    def click(self, point_in_geo: np.ndarray) -> None:
+        """Click on a point."""
+        self.page.mouse.click(*self.pixel(point_in_geo))
+
+    def measured(self) -> np.ndarray:
+        """Return the last measured point (3,) in `geo`, as the page shows it."""
+        rows = self.page.locator("[data-measured]")
+        assert rows.count()
+        return np.array([float(text) for text in str(rows.last.get_attribute("data-measured")).split(",")])
+
+
+def wait(holds: Callable[[], bool]) -> None:
+    end = time.monotonic() + PATIENCE_S
+    while not holds():
+        assert time.monotonic() < end, "the page does not get there"
+        time.sleep(0.05)
+
+
+def opened(workspace: Workspace, browser: Browser) -> Opened:
+    server = start_server(8700, "hill")
+    viewer = Viewer(server, workspace, ViewOptions())
+    viewer.wait_for_sigma()
+    page, outside = browser.new_page(viewport=SIZE), []
+
+    def loopback_only(route: Route) -> None:
+        if route.request.url.startswith((f"http://127.0.0.1:{server.get_port()}", "data:", "blob:")):
+            route.continue_()
+            return
+        outside.append(route.request.url)
+        route.abort()
+
+    page.route("**/*", loopback_only)
+    page.goto(f"http://127.0.0.1:{server.get_port()}/")
+    wait(lambda: bool(server.get_clients()) and any(loop.drawn for loop in viewer.loops))
+    before = 0
+    while before != (before := viewer.drawn):  # the panel takes a part of the page when it is laid out
+        time.sleep(1.5)
+    return Opened(viewer, server, page, outside)
+
+
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
+    """The hill, evaluated."""
+    made = viewed_workspace(tmp_path_factory.mktemp("view") / "hill", smooth(make_rendered()))
+    run_stage(made, BY_NAME["evaluate"], {"renders": 0})
+    return made
+
+
+@pytest.fixture(scope="module")
+def hill(workspace: Workspace, browser: Browser) -> Iterator[Opened]:
+    """The hill in a page."""
+    view = opened(workspace, browser)
+    yield view
+    view.page.close()
+    view.viewer.close()
+    view.server.stop()
+
+
+def test_picture_is_the_render(hill: Opened) -> None:
+    for kind in ("cameras", "points", "errors", "tie points"):
+        hill.viewer.signs.show(kind, visible=False)  # type: ignore[arg-type]
+    time.sleep(2.0)
+    camera = hill.camera
+    expected = hill.viewer.painter.paint(camera, camera.width, camera.height).rgb
+    png = hill.page.screenshot(clip={"x": 0, "y": 0, "width": camera.width, "height": camera.height})
+    shown = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)[..., ::-1] / 255.0
+    for kind in ("cameras", "points", "errors"):
+        hill.viewer.signs.show(kind, visible=True)  # type: ignore[arg-type]
+    # The lower half: viser's messages lie over the upper one.
+    ours, theirs = expected[camera.height // 2 :] / 255.0, shown[camera.height // 2 :]
+    exposure = float((ours * theirs).sum() / (theirs * theirs).sum())
+    assert ours.std() > 0.05
+    assert -10 * np.log10(np.mean((exposure * theirs - ours) ** 2)) > 25  # of a JPEG; 20 are asked for
+    assert 0.9 < exposure < 1.1
+
+
+def test_clicks_on_check_points_give_what_evaluate_states(hill: Opened, workspace: Workspace) -> None:
+    hill.viewer.click_mode = "measures"
+    hill.tab("Measure")
+    rows = {row.name: row for row in read_report(workspace.path(REPORT)).checkpoints.model.points}
+    points = hill.viewer.model.trained.survey.check_points[:5]
+    assert len(points) == 5
+    for point in points:
+        hill.viewer.measuring.clear()
+        wait(lambda: hill.page.locator("[data-measured]").count() == 0)
+        hill.click(np.array(point.position_in_geo))
+        wait(lambda: hill.page.locator("[data-measured]").count() == 1)
+        row = rows[point.name]
+        assert row.de_m is not None and row.dn_m is not None and row.du_m is not None
+        error = hill.measured() - np.array(point.position_in_geo)
+        np.testing.assert_allclose(error, [row.de_m, row.dn_m, row.du_m], atol=1e-3)
+
+
+def test_a_click_on_the_ground_measures_what_lies_under_it(hill: Opened) -> None:
+    hill.viewer.click_mode = "measures"
+    hill.tab("Measure")
+    hill.viewer.measuring.clear()
+    wait(lambda: hill.page.locator("[data-measured]").count() == 0)
+    place = np.array([5.0, -6.5, 6.0 * np.exp(-(5.0**2 + 6.5**2) / 300)])
+    hill.click(place)
+    wait(lambda: hill.page.locator("[data-measured]").count() == 1)
+    # The mouse hits a pixel, 0.07 m of the ground, and the surface is off by a part of a photograph's, 0.5 m.
+    np.testing.assert_allclose(hill.measured(), place, atol=0.3)
+
+
+def test_a_distance_states_its_sigma(hill: Opened) -> None:
+    hill.viewer.click_mode = "measures"
+    hill.tab("Measure")
+    hill.viewer.measuring.choose("distance")
+    first, second = (np.array(point.position_in_geo) for point in hill.viewer.model.trained.survey.check_points[:2])
+    hill.click(first)
+    wait(lambda: len(hill.viewer.measuring.points) == 1)
+    hill.click(second)
+    wait(lambda: hill.page.locator('[data-quantity="distance"]').count() == 1)
+    row = hill.page.locator('[data-quantity="distance"]')
+    value, sigma = (float(str(row.get_attribute(name))) for name in ("data-value", "data-sigma"))
+    assert value == pytest.approx(float(np.linalg.norm(second - first)), abs=0.3)
+    assert 0 < sigma < 0.3
+    hill.viewer.measuring.choose("point")
+
+
+def test_saved_points_come_back_after_a_restart(hill: Opened, workspace: Workspace, browser: Browser) -> None:
+    hill.viewer.click_mode = "measures"
+    hill.viewer.measuring.choose("point")
+    hill.tab("Measure")
+    wait(lambda: hill.page.locator("[data-measured]").count() == 0)
+    hill.click(np.array(hill.viewer.model.trained.survey.check_points[2].position_in_geo))
+    wait(lambda: hill.page.locator("[data-measured]").count() == 1)
+    place = hill.measured()
+    name = '<script>document.title = "run"</script> corner'
+    hill.page.locator("input:visible:not([aria-haspopup])").last.fill(name)
+    hill.page.get_by_role("button", name="Save", exact=True).click()
+    wait(lambda: hill.page.locator("[data-saved]").count() == 1)
+    again = opened(workspace, browser)
+    try:
+        again.tab("Measure")
+        wait(lambda: again.page.locator("[data-saved]").count() == 1)
+        assert name in str(again.page.locator("[data-saved]").text_content())
+        assert again.page.title() != "run"
+        saved = again.viewer.measuring.saved[0]
+        np.testing.assert_allclose(saved.points[0].position_in_geo, place, atol=1e-6)
+        assert saved.points[0].sigma_m is not None
+    finally:
+        again.page.close()
+        again.viewer.close()
+        again.server.stop()
+
+
+def test_marks_are_set_in_photographs(hill: Opened, workspace: Workspace) -> None:
+    point = hill.viewer.model.trained.survey.check_points[3]
+    hill.viewer.click_mode = "marks in the photograph"
+    hill.tab("Mark")
+    hill.viewer.marking.choose(point.name)
+    hill.page.get_by_role("button", name="Next photograph (N)").click()
+    wait(lambda: hill.viewer.photo.camera is not None)
+    client = next(iter(hill.server.get_clients().values()))
+    wait(lambda: hill.viewer.photo.is_at(client))
+    time.sleep(1.5)
+    place = np.array(point.position_in_geo)
+    hill.click(place)  # comes closer
+    wait(lambda: hill.camera.fov_rad < 0.3)
+    time.sleep(1.5)
+    hill.click(place)
+    image = hill.viewer.marking.names[hill.viewer.photo.camera]
+    true = next(mark for mark in point.marks if mark.image == image)
+    # From close by, a pixel of the page is a seventh of the photograph's.
+    wait(lambda: abs(hill.viewer.marking.point.marks[image][0] - true.x_px) < 0.5)
+    assert abs(hill.viewer.marking.point.marks[image][1] - true.y_px) < 0.5
+    hill.page.get_by_role("button", name="Write gcp_list.txt").click()
+    wait((workspace.root / "view/checkpoints.txt").exists)
+    hill.viewer.photo.leave()
+    hill.viewer.click_mode = "looks"
+
+
+def test_no_request_leaves_this_machine(hill: Opened) -> None:
+    assert hill.outside == []

@@ -1,0 +1,81 @@
+"""Marks in photographs: where points appear, what marks give, and the files that `--gcp` reads."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipelines.core.errors import InputError
+from pipelines.formats.odm import read_ground_points
+from pipelines.scene.points_by_camera import points_by_camera
+from pipelines.view.marking import (
+    CHECK,
+    CONTROL,
+    MarkedPoint,
+    appears_in,
+    marked_points,
+    rays_of,
+    residuals_px,
+    write_marks,
+)
+from pipelines.view.measuring import MeasuringModel
+
+PLACE = np.array([3.0, -2.0, 5.8])
+
+
+def test_a_point_appears_where_its_marks_intersect_again(model: MeasuringModel) -> None:
+    trained = model.trained
+    shown = appears_in(PLACE, trained)
+    assert len(shown) == len(trained.sparse.image_name)  # all cameras look at the hill
+    marks = {trained.sparse.image_name[camera]: (float(x), float(y)) for camera, (x, y) in shown}
+    rays = rays_of(MarkedPoint("P", None, marks=marks), trained)
+    found = points_by_camera(trained, rays)[0]
+    np.testing.assert_allclose(found, PLACE, atol=1e-6)
+    assert residuals_px(PLACE, rays, trained).max() < 1e-4
+    # A mark that is 5 px off shows it, and the others hardly move.
+    image, (x, y) = next(iter(marks.items()))
+    wrong = rays_of(MarkedPoint("P", None, marks={**marks, image: (x + 5.0, y)}), trained)
+    residual = residuals_px(points_by_camera(trained, wrong)[0], wrong, trained)
+    names = [trained.sparse.image_name[camera] for camera in wrong.camera]
+    assert residual[names.index(image)] == pytest.approx(5.0, abs=1.5)
+    assert np.median(residual) < 1.0
+
+
+def test_points_behind_all_cameras_appear_nowhere(model: MeasuringModel) -> None:
+    assert appears_in(np.array([0.0, 0.0, 500.0]), model.trained) == []
+
+
+def test_files_of_marks_are_read_again(tmp_path: Path, model: MeasuringModel) -> None:
+    survey = model.trained.survey
+    xyz = model.target.xyz_from_geo(np.array([point.position_in_geo for point in survey.check_points]))
+    points = marked_points(survey.check_points, xyz, is_check=True)
+    new = MarkedPoint("new", (404000.123, 5097000.25, 1650.5), marks={"a.jpg": (12.25, 700.5), "b.jpg": (1.0, 2.0)})
+    bare = MarkedPoint("bare", (1.0, 2.0, 3.0))
+    assert write_marks(tmp_path, "EPSG:32632", [*points, new, bare]) == [tmp_path / CONTROL, tmp_path / CHECK]
+    control = read_ground_points(tmp_path / CONTROL)
+    assert control.crs_text == "EPSG:32632"
+    assert [(m.name, m.xyz, m.x_px, m.y_px, m.image) for m in control.marks] == [
+        ("new", new.xyz, x, y, image) for image, (x, y) in new.marks.items()
+    ]
+    check = read_ground_points(tmp_path / CHECK)
+    assert {mark.name for mark in check.marks} == {point.name for point in survey.check_points}
+    for mark in check.marks:
+        point = next(point for point in points if point.name == mark.name)
+        assert (mark.x_px, mark.y_px) == pytest.approx(point.marks[mark.image], abs=5e-4)
+        np.testing.assert_allclose(mark.xyz, point.xyz, atol=1e-4)
+
+
+def test_names_that_the_format_cannot_hold_are_refused(tmp_path: Path) -> None:
+    point = MarkedPoint("two words", (1.0, 2.0, 3.0), marks={"a.jpg": (1.0, 1.0)})
+    with pytest.raises(InputError, match="'two words'"):
+        write_marks(tmp_path, "EPSG:4326", [point])
+    assert not (tmp_path / CONTROL).exists()
+
+
+def test_a_mark_is_replaced_and_taken_away() -> None:
+    point = MarkedPoint("P", None, marks={"a": (1.0, 2.0)})
+    assert point.with_mark("a", (3.0, 4.0)).marks == {"a": (3.0, 4.0)}
+    assert point.with_mark("a", None) == replace(point, marks={})

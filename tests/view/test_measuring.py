@@ -1,0 +1,133 @@
+"""Measuring on a hill whose surface is known: points, lengths, areas and volumes against the truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipelines.scene.crs_options import CrsOptions
+from pipelines.scene.marks import mark_rays
+from pipelines.scene.points_by_model import depth_around, points_by_model
+from pipelines.view import measuring
+from pipelines.view.measuring import MeasuringModel
+from pipelines.view.quantities import BasePlane
+from pipelines.view.surface_points import NoSurface, Sight, SurfacePoint
+from tests.splat_scenes import ground_height
+from tests.view_scenes import renderer_of
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+# The photographs are 96 px wide: a pixel is 0.5 m of the ground, and depth is linear within one.
+PIXEL_M = 0.5
+
+
+def sight(start: list[float], target: np.ndarray) -> Sight:
+    line = target - np.array(start)
+    return Sight(np.array(start), line / np.linalg.norm(line), 1 / 600)
+
+
+def on_ground(east: float, north: float) -> np.ndarray:
+    return np.array([east, north, float(ground_height(np.array(east), np.array(north)))])
+
+
+@pytest.mark.parametrize("start", [[0.0, 0.0, 60.0], [45.0, -10.0, 25.0], [-20.0, 38.0, 30.0]])
+def test_points_under_lines_of_sight_lie_on_the_hill(model: MeasuringModel, start: list[float]) -> None:
+    # From places where no photograph was taken, steep and slanting.
+    errors, sigmas = [], []
+    for east, north in np.random.default_rng(3).uniform(-12, 12, (12, 2)):
+        point = model.under(sight(start, on_ground(east, north)))
+        assert isinstance(point, SurfacePoint)
+        place = point.position_in_geo
+        line = np.array(start) - on_ground(east, north)
+        across = np.cross(place - on_ground(east, north), line / np.linalg.norm(line))
+        assert np.linalg.norm(across) < 1e-6  # it lies on the line
+        errors.append(float(place[2] - ground_height(place[0], place[1])))
+        sigmas.append(float(np.sqrt(point.cov_of_surface[2, 2])))
+    # Blurred to a pixel, the discs before a disc on a slope hide a part of it: the surface stands a little high.
+    assert 0 < np.median(errors) < 0.25 * PIXEL_M
+    scatter = np.array(errors) - np.median(errors)
+    assert np.max(np.abs(scatter)) < 0.15 * PIXEL_M
+    assert np.sqrt(np.mean((scatter / sigmas) ** 2)) < 1.5
+    assert np.median(sigmas) < 0.3 * PIXEL_M
+
+
+def test_surveyed_points_are_measured_as_by_evaluate(model: MeasuringModel) -> None:
+    survey, renderer = model.trained.survey, model.reader.renderer
+    rays = mark_rays(survey.check_points, model.trained.sparse)
+    maps = [depth_around(renderer, int(camera), xy) for camera, xy in zip(rays.camera, rays.xy, strict=True)]
+    expected = points_by_model(model.trained, rays, maps)
+    for row, point in enumerate(survey.check_points):
+        measured = model.behind_marks(mark_rays((point,), model.trained.sparse))
+        assert isinstance(measured, SurfacePoint)
+        np.testing.assert_allclose(measured.position_in_geo, expected[row], atol=1e-9)
+
+
+def test_nothing_is_measured_where_nothing_is(model: MeasuringModel) -> None:
+    up = model.under(Sight(np.array([0.0, 0.0, 40.0]), np.array([0.0, 0.0, 1.0]), 1 / 600))
+    assert isinstance(up, NoSurface)
+    assert "nothing of the model" in up.reason
+
+
+def test_what_photographs_look_through_is_no_surface(viewed, model: MeasuringModel) -> None:
+    # A disc in the air that the model has and no training view agrees on: from above, it hides the hill.
+    renderer = renderer_of(viewed)
+    gaussians = renderer.trained.gaussians
+    row = int(np.argmin(np.linalg.norm(gaussians.means.numpy()[:, :2] - [4.0, 4.0], axis=1)))
+    gaussians.means[row, 2] = 24.0
+    gaussians.log_scales[row] = np.log(0.15)
+    shown = MeasuringModel(viewed, renderer, CrsOptions())
+    place = gaussians.means[row].double().numpy()
+    point = shown.under(sight([place[0], place[1], 60.0], place))
+    assert not isinstance(point, SurfacePoint) or abs(point.position_in_geo[2] - 24.0) > 10
+
+
+def corners(model: MeasuringModel, half: float) -> list[SurfacePoint]:
+    places = [(-half, -half), (half, -half), (half, half), (-half, half)]
+    points = [model.under(sight([0.0, 0.0, 80.0], on_ground(*place))) for place in places]
+    assert all(isinstance(point, SurfacePoint) for point in points)
+    return [point for point in points if isinstance(point, SurfacePoint)]
+
+
+def test_areas_and_volume_of_the_hill(model: MeasuringModel, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(measuring, "_MOST_SAMPLES", 49)
+    square = corners(model, 10.0)
+    plan, surface, coverage = model.area(square)
+    # The corners lie on lines of sight from the middle: an error of the height moves them out by a part of it.
+    assert plan.value == pytest.approx(400.0, rel=0.01)
+    axis = np.linspace(-10, 10, 201)
+    east, north = np.meshgrid(axis, axis)
+    height = ground_height(east, north)
+    by_north, by_east = np.gradient(height, axis, axis)
+    stretch = float(np.sqrt(1 + by_east**2 + by_north**2).mean())
+    # The samples are 3 m apart, and the hill bends within that.
+    assert surface.value / plan.value == pytest.approx(stretch, rel=0.02)
+    assert coverage.value == pytest.approx(100.0, abs=3)
+    base = float(ground_height(np.array(10.0), np.array(10.0)))
+    above, _, volume, _ = model.volume(square, BasePlane())
+    expected = float((height - base).mean()) * 400.0
+    assert volume.value == pytest.approx(expected, rel=0.03)
+    assert above.value == pytest.approx(expected, rel=0.03)
+    assert volume.sigma is not None
+    assert abs(volume.value - expected) < 4 * volume.sigma
+
+
+def test_shared_errors_cancel_in_distances(model: MeasuringModel) -> None:
+    near = [model.under(sight([0.0, 0.0, 60.0], on_ground(east, 2.0))) for east in (1.0, 3.0)]
+    points = [point for point in near if isinstance(point, SurfacePoint)]
+    placed = model.place(points[0])
+    distance, plan, rise = model.distance(points)
+    assert placed.sigma_m is not None
+    assert distance.sigma is not None and plan.sigma is not None and rise.sigma is not None
+    of_surface = np.sqrt(sum(point.cov_of_surface[2, 2] for point in points))
+    # Two metres apart, similarity and cameras move both alike: what is left is the surface's own.
+    assert rise.sigma == pytest.approx(of_surface, rel=0.2)
+    assert plan.sigma < 0.7 * np.hypot(*placed.sigma_m[:2]) * np.sqrt(2)
+    assert distance.value == pytest.approx(2.0, abs=0.2)
+
+
+def test_no_sigma_is_stated_before_it_is_known(viewed, model: MeasuringModel) -> None:
+    fresh = MeasuringModel(viewed, model.reader.renderer, CrsOptions())
+    points = corners(fresh, 5.0)
+    assert fresh.without_sigma == "it is being computed"
+    assert fresh.place(points[0]).sigma_m is None
+    assert {quantity.sigma for quantity in fresh.distance(points[:2])} == {None}

@@ -1,0 +1,70 @@
+"""Quantities of points and their σ; tests/georef/test_monte_carlo.py has those of distances in whole surveys."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipelines.view.quantities import (
+    BasePlane,
+    MeasuredPoints,
+    SampledSurface,
+    grid_in_polygon,
+    length,
+    plan_area,
+    volumes,
+)
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def exact(places: np.ndarray, cov: np.ndarray | None = None) -> MeasuredPoints:
+    return MeasuredPoints(places, cov, places[:, 2])
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_sigma_is_that_of_draws(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    places = rng.uniform(-20, 20, (4, 3)) + np.arange(4)[:, None] * [10.0, 3.0, 0.0]
+    root = 0.01 * rng.standard_normal((12, 12))
+    points = exact(places, root @ root.T)
+    drawn = places + (rng.standard_normal((500, 12)) @ root.T).reshape(-1, 4, 3)
+    for quantity, draws in (
+        (length(points)[0], [length(exact(each))[0].value for each in drawn]),
+        (plan_area(points), [plan_area(exact(each)).value for each in drawn]),
+    ):
+        assert quantity.sigma == pytest.approx(np.std(draws), rel=0.16)  # 500 draws know σ to 3 %
+
+
+def test_areas_of_known_polygons() -> None:
+    square = np.array([[0.0, 0, 1], [4, 0, 2], [4, 3, 3], [0, 3, 4]])
+    assert plan_area(exact(square)).value == pytest.approx(12.0)
+    assert plan_area(exact(square[::-1])).value == pytest.approx(12.0)
+    # A polygon with a bay: the grid leaves the bay out.
+    bay = np.array([[0.0, 0], [6, 0], [6, 6], [3, 2], [0, 6]])
+    grid = grid_in_polygon(bay, 0.1)
+    assert len(grid) * 0.01 == pytest.approx(plan_area(exact(np.column_stack([bay, np.zeros(5)]))).value, rel=0.01)
+    assert not ((np.abs(grid[:, 0] - 3) < 0.5) & (grid[:, 1] > 4)).any()
+
+
+@pytest.mark.parametrize(
+    ("kind", "expected"), [("plane through the corners", 50.0), ("level of the lowest corner", 70.0)]
+)
+def test_volume_over_either_base(kind, expected: float) -> None:
+    # A slab 0.5 m above a sloping square of 10 m; its lowest side lies 0.2 m below the middle.
+    corners = np.array([[0.0, 0, 0], [10, 0, 0.4], [10, 10, 0.4], [0, 10, 0]])
+    grid = grid_in_polygon(corners[:, :2], 0.5)
+    samples = np.column_stack([grid, 0.04 * grid[:, 0] + 0.5])
+    chosen = np.arange(0, len(samples), 40)
+    cov = 1e-4 * np.eye(3 * (4 + len(chosen)))
+    surface = SampledSurface(exact(corners, cov[:12, :12]), samples, np.zeros(len(samples)), cov, chosen, 0.5, 1.0)
+    above, below, volume = volumes(surface, BasePlane(kind, lowest=0))
+    assert volume.value == pytest.approx(expected)
+    assert (above.value, below.value) == (pytest.approx(expected), 0.0)
+    assert volume.sigma is not None
+    # 100 m² over the mean of four corners, each ± 1 cm (or of one), with that of the chosen samples.
+    of_base = 1.0 / np.sqrt(4) if kind == "plane through the corners" else 1.0
+    assert volume.sigma == pytest.approx(np.hypot(of_base, 1.0 / np.sqrt(len(chosen))), rel=0.1)

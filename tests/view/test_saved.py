@@ -1,0 +1,98 @@
+"""Saved measurements come back, whatever their names; other files are refused with the place of the fault."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from pipelines.core.errors import InputError
+from pipelines.view.saved import (
+    MEASUREMENTS,
+    TABLE,
+    Kind,
+    Measurement,
+    SavedPoint,
+    SavedQuantity,
+    read_measurements,
+    write_measurements,
+)
+
+NAMES = st.text(st.characters(codec="utf-8", exclude_categories=("Cs", "Cc")), min_size=1, max_size=8)
+FINITE = st.floats(-1e6, 1e6)
+PLACES = st.tuples(FINITE, FINITE, FINITE)
+LLA = st.tuples(st.floats(-89, 89), st.floats(-179, 179), st.floats(-100, 9000))
+
+
+def saved_point(place, lla, sigma) -> SavedPoint:
+    cov = np.outer(place, place).tolist()
+    return SavedPoint.model_validate(
+        {
+            "position_in_geo": place,
+            "cov_of_surface": cov,
+            "images": ["a/b.jpg"],
+            "xyz": place,
+            "sigma_m": sigma,
+            "lla": lla,
+        }
+    )
+
+
+POINTS = st.builds(saved_point, st.tuples(*3 * (st.floats(-100, 100),)), LLA, st.none() | PLACES)
+MEASUREMENT = st.builds(
+    Measurement,
+    name=NAMES,
+    kind=st.sampled_from(["point", "distance", "polyline", "area", "volume"]),
+    crs=NAMES,
+    model=NAMES,
+    points=st.lists(POINTS, min_size=1, max_size=3).map(tuple),
+    quantities=st.lists(
+        st.builds(SavedQuantity, name=NAMES, value=FINITE, sigma=st.none() | FINITE, unit=NAMES), max_size=3
+    ).map(tuple),
+)
+
+
+@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(measurements=st.lists(MEASUREMENT, max_size=3))
+def test_what_is_saved_comes_back(tmp_path: Path, measurements: list[Measurement]) -> None:
+    write_measurements(tmp_path, measurements)
+    assert read_measurements(tmp_path) == measurements
+    document = json.loads((tmp_path / MEASUREMENTS).read_text("utf-8"))
+    for feature, measurement in zip(document["features"], measurements, strict=True):
+        assert feature["properties"]["name"] == measurement.name
+        assert feature["geometry"]["type"] in ("Point", "LineString", "Polygon")
+    with (tmp_path / TABLE).open(encoding="utf-8", newline="") as handle:
+        rows = list(csv.reader(handle))
+    assert sum(len(each.points) for each in measurements) == rows.index([]) - 1
+
+
+def test_without_a_file_nothing_is_saved(tmp_path: Path) -> None:
+    assert read_measurements(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    ("text", "field"),
+    [
+        ("no json", None),
+        ("[]", None),
+        ('{"features": [{"properties": {}}]}', None),
+        ('{"features": [{"properties": {"georef": {"name": "a"}}}]}', "features[0].properties.georef.kind"),
+    ],
+)
+def test_other_files_are_refused(tmp_path: Path, text: str, field: str | None) -> None:
+    (tmp_path / MEASUREMENTS).write_text(text, "utf-8")
+    with pytest.raises(InputError, match="move") as caught:
+        read_measurements(tmp_path)
+    assert caught.value.field == field
+    assert str(tmp_path / MEASUREMENTS) in str(caught.value)
+
+
+def test_kinds_are_those_of_the_panel() -> None:
+    from pipelines.view.measure_panel import _LEAST
+
+    assert set(_LEAST) == set(Kind.__args__)
