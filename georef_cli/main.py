@@ -43,8 +43,6 @@ class HelpLine:
 
 
 COMMANDS: dict[str, HelpLine] = {
-    "help": HelpLine("help", "Help", "Explain a topic, such as heights or options, or a command."),
-    "doctor": HelpLine("doctor", "Help", "Show what this machine offers: memory, GPU, backends, geoid grids."),
     "simulate": HelpLine("simulate", "Surveys", "Simulate a survey whose truth is known exactly."),
     "inspect": HelpLine(
         "inspect", "Surveys", "Show what a ROS bag holds, what ingest would choose, what is missing."
@@ -69,6 +67,8 @@ COMMANDS: dict[str, HelpLine] = {
     "export-spz": HelpLine("export_spz", "Deliverables", "Write the splat as SPZ, for viewers on the web."),
     "export-tiles": HelpLine("export_tiles", "Deliverables", "Write the splat as 3D Tiles, for web globes."),
     "export-cameras": HelpLine("export_cameras", "Deliverables", "Write the trained cameras for other programs."),
+    "help": HelpLine("help", "Help", "Explain a topic, such as heights or options, or a command."),
+    "doctor": HelpLine("doctor", "Help", "Show what this machine offers: memory, GPU, backends, geoid grids."),
 }
 
 
