@@ -26,7 +26,10 @@ demo: setup
 		--preset fast --iterations 1500 --max-image-size 480
 	$(BIN)/georef status $(DEMO)/workspace
 	$(BIN)/georef evaluate $(DEMO)/workspace
+	$(BIN)/georef report $(DEMO)/workspace
 	@echo "The splat: $(DEMO)/workspace/export/splat.ply (and splat.ply.georef.json beside it)"
+	@echo "The report: open $(DEMO)/workspace/report/report.html in a browser"
+	@echo "The viewer: $(BIN)/georef view $(DEMO)/workspace"
 
 # Mutated files for every reader, for an hour or FUZZ_SECONDS; a finding is printed with the case that repeats it.
 fuzz: setup

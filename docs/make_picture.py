@@ -1,5 +1,5 @@
 """Make the pictures of the documents: `python docs/make_picture.py flight WORKSPACE --view 1`,
-or `orthophoto WORKSPACE`.
+`orthophoto WORKSPACE`, or `report WORKSPACE`.
 
 `flight` needs an evaluated workspace, and shows this flight:
 
@@ -9,7 +9,7 @@ or `orthophoto WORKSPACE`.
         --preset fast --iterations 2500 --max-image-size 720
 
 `orthophoto` needs the rasters, and shows a flight with `--flight grid --images 40 --size 960x720 --seed 5`, run
-likewise.
+likewise. `report` needs the report of any workspace, such as that of `make demo`, and Chromium.
 """
 
 from __future__ import annotations
@@ -20,8 +20,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from pipelines.pages.chromium import NO_NETWORK, chromium_path
+
 IMAGES = Path(__file__).parent / "images"
-GAP_PX, WIDTH_PX, QUALITY = 12, 1600, 85
+GAP_PX, WIDTH_PX, QUALITY = 12, 1600, 78
 
 
 def compose(render: Path, accuracy: Path) -> np.ndarray:
@@ -59,6 +61,34 @@ def beside_hillshade(preview: Path, hillshade: Path) -> np.ndarray:
     return sized(np.hstack([parts[0][seen], gap, parts[1][seen]]))
 
 
+def parts_of_report(page: Path) -> np.ndarray:
+    """Return the summary of a report, beside its plan and image chips, BGR."""
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=chromium_path(), args=[NO_NETWORK])
+        tab = browser.new_page(viewport={"width": 1120, "height": 1240})
+        tab.goto(page.absolute().as_uri())
+        shots = [tab.screenshot()]
+        shots += [tab.locator(part).first.screenshot() for part in ("#place figure", "#check-points .points")]
+        browser.close()
+    summary, plan, chips = (decoded(shot) for shot in shots)
+    chips = chips[: summary.shape[0] - plan.shape[0] * chips.shape[1] // plan.shape[1] - GAP_PX]
+    plan = cv2.resize(plan, (chips.shape[1], plan.shape[0] * chips.shape[1] // plan.shape[1]))
+    gap = np.full((GAP_PX, chips.shape[1], 3), 255, dtype=np.uint8)
+    right = np.vstack([plan, gap, chips])[: summary.shape[0]]
+    short = np.full((summary.shape[0] - right.shape[0], right.shape[1], 3), 255, dtype=np.uint8)
+    between = np.full((summary.shape[0], GAP_PX, 3), 255, dtype=np.uint8)
+    return sized(np.hstack([summary, between, np.vstack([right, short])]))
+
+
+def decoded(png: bytes) -> np.ndarray:
+    """Return a picture (H, W, 3), BGR."""
+    picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+    assert picture is not None
+    return picture
+
+
 def sized(picture: np.ndarray) -> np.ndarray:
     """Return a picture at the width of the documents' pictures."""
     scale = WIDTH_PX / picture.shape[1]
@@ -68,11 +98,16 @@ def sized(picture: np.ndarray) -> np.ndarray:
 def main() -> None:
     """Write the picture."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("picture", choices=["flight", "orthophoto"])
+    parser.add_argument("picture", choices=["flight", "orthophoto", "report"])
     parser.add_argument("workspace", type=Path)
     parser.add_argument("--view", type=int, default=0, help="number of the test view")
     options = parser.parse_args()
-    if options.picture == "orthophoto":
+    if options.picture == "report":
+        page = options.workspace / "report" / "report.html"
+        if not page.exists():
+            raise SystemExit("no report there: run `georef report` on the workspace first")
+        picture = parts_of_report(page)
+    elif options.picture == "orthophoto":
         rasters = options.workspace / "raster"
         picture = beside_hillshade(rasters / "preview.png", rasters / "hillshade.png")
     else:

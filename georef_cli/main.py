@@ -67,6 +67,7 @@ COMMANDS: dict[str, HelpLine] = {
     "export-spz": HelpLine("export_spz", "Deliverables", "Write the splat as SPZ, for viewers on the web."),
     "export-tiles": HelpLine("export_tiles", "Deliverables", "Write the splat as 3D Tiles, for web globes."),
     "export-cameras": HelpLine("export_cameras", "Deliverables", "Write the trained cameras for other programs."),
+    "report": HelpLine("report", "Deliverables", "Write the report: one page, and its PDF."),
     "help": HelpLine("help", "Help", "Explain a topic, such as heights or options, or a command."),
     "doctor": HelpLine("doctor", "Help", "Show what this machine offers: memory, GPU, backends, geoid grids."),
 }

@@ -29,6 +29,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     (
         "pipelines.accuracy",
         "pipelines.georef",
+        "pipelines.pages",
         "pipelines.plots",
         "pipelines.scene",
         "pipelines.splat",
@@ -43,6 +44,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
         "pipelines.ingest",
         "pipelines.init_sim3",
         "pipelines.machine",
+        "pipelines.report",
         "pipelines.sfm",
         "pipelines.simulate",
         "pipelines.train",
@@ -71,6 +73,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     "rosbags": ("pipelines.formats",),
     "embreex": ("pipelines.simulate",),
     "matplotlib": ("pipelines.plots",),
+    "jinja2": ("pipelines.pages",),
     "zstandard": ("pipelines.formats",),
     "rasterio": ("pipelines.formats",),
     "pyogrio": ("pipelines.formats",),

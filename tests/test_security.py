@@ -32,8 +32,9 @@ FORBIDDEN = {
     "eval", "exec", "compile", "pickle", "marshal", "shelve", "yaml", "subprocess", "os.system", "os.popen",
     "torch.load", "torch.save",
 }  # fmt: skip
-# The one file that starts a process: this program again, so that native code is interruptible.
+# The files that start a process: this program again, so that native code is interruptible; and the user's browser.
 STARTS_ITSELF = REPOSITORY / "pipelines/core/child.py"
+STARTS_A_BROWSER = REPOSITORY / "pipelines/pages/chromium.py"
 ESCAPES = ["../secret.jpg", "/etc/passwd", "a/../../secret.jpg", "", "a\nb.jpg", "a\x00b.jpg"]
 
 
@@ -56,7 +57,7 @@ def test_nothing_that_is_read_can_be_executed(package: str) -> None:
     assert files
     for file in files:
         for name, node in _calls(ast.parse(file.read_text("utf-8"))):
-            if name == "subprocess" and file == STARTS_ITSELF:
+            if name == "subprocess" and file in (STARTS_ITSELF, STARTS_A_BROWSER):
                 continue
             assert name not in FORBIDDEN, f"{file}:{node.lineno} uses {name}"  # type: ignore[attr-defined]
             if name in ("np.load", "numpy.load"):
@@ -65,10 +66,17 @@ def test_nothing_that_is_read_can_be_executed(package: str) -> None:
                 assert pickle.get("allow_pickle") == "False", f"{file}:{node.lineno} may unpickle"
 
 
-def test_the_only_process_that_is_started_is_this_python() -> None:
-    calls = [node for name, node in _calls(ast.parse(STARTS_ITSELF.read_text("utf-8"))) if "subprocess" in name]
+@pytest.mark.parametrize(
+    ("file", "arguments"),
+    [
+        (STARTS_ITSELF, "[sys.executable, '-m', __name__,"),
+        (STARTS_A_BROWSER, "[*command, page.absolute().as_uri()]"),
+    ],
+)
+def test_only_this_python_and_the_browser_are_started(file: Path, arguments: str) -> None:
+    calls = [node for name, node in _calls(ast.parse(file.read_text("utf-8"))) if "subprocess" in name]
     (call,) = [node for node in calls if isinstance(node, ast.Call)]
-    assert ast.unparse(call.args[0]).startswith("[sys.executable, '-m', __name__,")
+    assert ast.unparse(call.args[0]).startswith(arguments)
     assert "shell" not in {keyword.arg for keyword in call.keywords}
 
 

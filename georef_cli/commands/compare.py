@@ -57,7 +57,7 @@ command = Command(
         Stages up to geolocate are shared, and run first where they are not current. Each configuration is kept in
         WS/compare/NAME; a second call skips what is current and resumes what was interrupted. All are trained with
         the same options: those of the last comparison and of georef train, unless given. The table is
-        WS/compare/table.json, table.md and plot.png.
+        WS/compare/table.json, table.md and plot.png, and comparison.html shows all of it.
 
         \b
         Examples:

@@ -67,7 +67,7 @@ command = Command(
 
     Without a topic: the list of the topics.
 
-    \\b
+    \b
     Examples:
       georef help
       georef help heights

@@ -12,14 +12,14 @@ import click
 from georef_cli import options
 from georef_cli.command import Command
 from georef_cli.display import progress_for
-from georef_cli.output import print_rich
+from georef_cli.output import print_json, print_rich
 from pipelines.core.options import resolve
 from pipelines.core.staleness import must_exist
 from pipelines.core.workspace import Workspace
 from pipelines.view.options import ViewOptions
 
 
-def _view(ctx: click.Context, workspace: Workspace, open_page: bool, **_values: Any) -> None:
+def _view(ctx: click.Context, workspace: Workspace, open_page: bool, as_json: bool, **_values: Any) -> None:
     from pipelines.view.viewer import serve
 
     must_exist(workspace)
@@ -27,7 +27,10 @@ def _view(ctx: click.Context, workspace: Workspace, open_page: bool, **_values: 
     wanted = resolve(ViewOptions, {}, flags, workspace.config_file)
 
     def ready(address: str) -> None:
-        print_rich(f"{address}   (Ctrl-C ends the viewer)")
+        if as_json:
+            print_json({"address": address})
+        else:
+            print_rich(f"{address}   (Ctrl-C ends the viewer)")
         if open_page:
             webbrowser.open(address)
 
@@ -41,6 +44,7 @@ command = Command(
         options.workspace_argument(),
         *options.stage_options(ViewOptions),
         click.Option(["--open/--no-open", "open_page"], default=False, help="Open the page in a browser at once."),
+        options.json_option(),
     ],
     callback=click.pass_context(_view),
     help="""See the trained model in a browser, and measure in it.
@@ -54,5 +58,6 @@ command = Command(
           georef view flight
           georef view flight --open
           georef view flight --crs EPSG:32632+3855 --port 9000
+          georef view flight --json
         """,
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 from pipelines.accuracy.accuracy_grid import AccuracyGrid, accuracy_grid
 from pipelines.accuracy.prediction import AccuracyPrediction
@@ -23,12 +24,15 @@ class ErrorPropagation:
     Attributes:
         solved: the survey with its measurements solved, without photographs.
         prediction: gives the covariance of any point.
-        grid: predicted σ over the scene; None: the scene has too few points.
     """
 
     solved: SolvedSurvey
     prediction: AccuracyPrediction
-    grid: AccuracyGrid | None
+
+    @cached_property
+    def grid(self) -> AccuracyGrid | None:
+        """Predicted σ over the scene; None: the scene has too few points."""
+        return accuracy_grid(self.solved, self.prediction)
 
 
 @dataclass(frozen=True)
@@ -53,8 +57,7 @@ def propagate_errors(workspace: Workspace, trained: TrainedSurvey) -> ErrorPropa
     initial = load_json(InitialSimilarity, workspace.path(SIM3))
     try:
         solved = solve_survey(trained, initial, geographic_options_of(workspace))
-        prediction = AccuracyPrediction(solved)
-        return ErrorPropagation(solved, prediction, accuracy_grid(solved, prediction))
+        return ErrorPropagation(solved, AccuracyPrediction(solved))
     except DegenerateGeometryError as error:
         return NoErrorPropagation(str(error))
 

@@ -114,6 +114,17 @@ class AccuracyPrediction:
         center = trained.geo_from_model.apply(trained.poses.cam_center_in_model)
         return camera_covariances(self._posterior, center, trained.geo_from_model, self._basis)
 
+    def of_lens(self) -> FloatArray | None:
+        """Return the covariance (L, L) of the lens parameters, in the order of `geometry.lens.Lenses`.
+
+        None if the cameras were held, and the lens with them.
+        """
+        if self._lens is None:
+            return None
+        follows, rest = self._lens_basis, np.eye(len(self._lens_basis))
+        jacobian = np.concatenate([np.zeros((len(rest), 7)), follows, rest], axis=1)
+        return np.asarray(jacobian @ self._posterior.covariance @ jacobian.T)
+
     @property
     def holds_cameras(self) -> bool:
         """Whether the training held the cameras, so that their own errors are not predicted."""

@@ -13,7 +13,8 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 
 from pipelines.compare.configurations import BY_CONFIGURATION, COMMON_TRAIN_OPTIONS, Configuration
-from pipelines.compare.table import ComparedRow, Comparison, JsonScalar, point_accuracy, write_comparison
+from pipelines.compare.files import write_comparison
+from pipelines.compare.table import ComparedRow, Comparison, JsonScalar, point_accuracy
 from pipelines.core.cautions import union
 from pipelines.core.errors import ConvergenceError, DegenerateGeometryError, GeorefError
 from pipelines.core.progress import SILENT, Progress
@@ -95,7 +96,7 @@ def compare(
         runner = _PlanRunner([ComparedStage(None, outcome) for outcome in shared], force, progress, around)
         rows = tuple(_row(configuration, plan, runner) for configuration, plan in plans)
         table = Comparison(options=_json_scalars(asked), rows=rows)
-        write_comparison(workspace.root / FOLDER, table)
+        write_comparison(workspace.root / FOLDER, table, workspace.root.name)
     return table, runner.finished
 
 

@@ -1,15 +1,13 @@
-"""Table of `georef compare`: the figures of each configuration, as JSON, as Markdown and as a plot."""
+"""Table of `georef compare`: the figures of each configuration, as JSON, as Markdown and as bars."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 from typing import Literal
 
 from pipelines.core.cautions import Caution
-from pipelines.core.durable import replace_text
 from pipelines.core.products import Product
-from pipelines.plots.bars import Panel, write_bars
+from pipelines.plots.bars import Panel
 from pipelines.scene.report import CheckPointErrors
 
 JsonScalar = bool | int | float | str
@@ -79,22 +77,8 @@ def point_accuracy(errors: CheckPointErrors) -> PointAccuracy:
     )
 
 
-def write_comparison(folder: Path, table: Comparison) -> None:
-    """Write `table.json`, `table.md` and `plot.png`, unless the files already hold this table."""
-    json_path, markdown_path, plot_path = (folder / name for name in ("table.json", "table.md", "plot.png"))
-    json_text, markdown_text = table.model_dump_json(indent=1) + "\n", markdown(table)
-    if plot_path.exists() and _holds(json_path, json_text) and _holds(markdown_path, markdown_text):
-        return
-    write_bars(plot_path, _panels(table.rows))
-    replace_text(markdown_path, markdown_text)
-    replace_text(json_path, json_text)
-
-
-def _holds(path: Path, text: str) -> bool:
-    return path.exists() and path.read_text(encoding="utf-8") == text
-
-
-def _panels(rows: Sequence[ComparedRow]) -> tuple[Panel, ...]:
+def panels(rows: Sequence[ComparedRow]) -> tuple[Panel, ...]:
+    """Return the bar charts of the table's figures."""
     members = tuple(row.configuration for row in rows)
     ways = {"camera": [row.camera for row in rows], "model": [row.model for row in rows]}
     geometry = (

@@ -18,13 +18,19 @@ RIG = "calibrate/rig.json"
 POINTS = "geolocate/points.npz"
 SIM3 = "sim3/geo_from_local.json"
 MODEL = "train/model.json"
+METRICS = "train/metrics.jsonl"
 GAUSSIANS = "train/gaussians.ply"
 REPORT = "evaluate/report.json"
+RENDERS = "evaluate/renders"
+ACCURACY_MAP = "evaluate/accuracy.png"  # only where the measurements determine the scene
 SPLAT = "export/splat.ply"
+ORTHOPHOTO_PREVIEW = "raster/preview.png"
+HILLSHADE = "raster/hillshade.png"
 CLOUD = "cloud/cloud.laz"
 SPZ = "spz/splat.spz"
 TILES = "tiles/tileset.json"
 TILES_GLB = "tiles/splat.glb"
+REPORT_PAGE = "report/report.html"
 
 
 @dataclass(frozen=True)
@@ -245,6 +251,22 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         product="cameras/cameras.csv",
         title="Write the trained cameras for COLMAP, nerfstudio, surveyors and maps.",
         also=("cameras/colmap", "cameras/transforms.json", "cameras/footprints.geojson"),
+    ),
+    StageSpec(
+        name="report",
+        module="pipelines.report.stage",
+        options_place="pipelines.report.options:ReportOptions",
+        folder="report",
+        reads=(
+            *whole(SURVEY, SPARSE, SIM3, MODEL, GAUSSIANS, REPORT),
+            APPLIED_RIG,
+            *(
+                ProductPart(product, optional=True)
+                for product in (RENDERS, ACCURACY_MAP, METRICS, ORTHOPHOTO_PREVIEW, HILLSHADE)
+            ),
+        ),
+        product=REPORT_PAGE,
+        title="Write the report of the survey: one page with all that is known of it.",
     ),
 )
 

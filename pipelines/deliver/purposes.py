@@ -23,6 +23,8 @@ PURPOSES: dict[str, str] = {
     "cameras/colmap": "trained cameras and points as a COLMAP model, for other trainers",
     "cameras/transforms.json": "trained cameras for nerfstudio",
     "cameras/footprints.geojson": "ground that each photograph shows, for maps",
+    "report/report.html": "report to hand in: one page with accuracy, points, photographs and processing",
+    "report/report.pdf": "the same report, for printing",
     "evaluate/report.json": "measured and predicted accuracy, for the record",
     "evaluate/points.csv": "error of each check and control point",
     "evaluate/accuracy.png": "map of the predicted accuracy, with the errors of the points",

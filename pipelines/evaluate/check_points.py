@@ -20,6 +20,7 @@ from pipelines.evaluate.point_report import (
 )
 from pipelines.georef.posterior import LeftOut, leave_one_out
 from pipelines.robust.statistics import residual_stats
+from pipelines.scene.fix_differences import fix_differences
 from pipelines.scene.marks import MarkRays, mark_rays
 from pipelines.scene.points_by_camera import points_by_camera
 from pipelines.scene.points_by_model import DepthMap, depth_around, points_by_model
@@ -150,16 +151,7 @@ def _control_residuals(trained: TrainedSurvey) -> ControlResiduals:
 
 def _fix_residuals(trained: TrainedSurvey) -> FixResiduals:
     """Return the residuals of the training cameras' fixes, without outliers."""
-    center_in_geo = trained.geo_from_model.apply(trained.poses.cam_center_in_model)
-    outliers = set(trained.model.gnss_outliers)
-    residuals, left_out_count = [], 0
-    for index in trained.indices("train"):
-        image = trained.survey.image(trained.sparse.image_name[index])
-        if image is None or image.fix is None:
-            continue
-        if image.name in outliers:
-            left_out_count += 1
-            continue
-        residuals.append(center_in_geo[index] - np.array(image.fix.position_in_geo))
-    stats = residual_stats(np.array(residuals).reshape(-1, 3))
-    return FixResiduals(**stats.model_dump(), outliers=left_out_count)
+    fixes = fix_differences(trained)
+    used = fixes.is_training & ~fixes.is_outlier
+    stats = residual_stats(fixes.difference_in_geo[used])
+    return FixResiduals(**stats.model_dump(), outliers=int((fixes.is_training & fixes.is_outlier).sum()))

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -14,6 +12,7 @@ from torch import Tensor
 from pipelines.core.progress import Progress
 from pipelines.core.types import ByteArray
 from pipelines.plots.strips import labelled
+from pipelines.scene.render_files import DIFFERENCE_GAIN
 from pipelines.scene.renderer import ModelRenderer
 from pipelines.scene.report import PhotometricFigures, ViewFigures
 from pipelines.splat.exposure import fitted_affine, with_affine
@@ -23,8 +22,6 @@ from pipelines.splat.metrics import psnr, ssim
 # Saves, for a test view, RGB: the photograph, its render, their difference, side by side with labels.
 SaveRender = Callable[[str, ByteArray], None]
 
-_DIFFERENCE_GAIN = 3
-_LONGEST_NAME_BYTES = 255
 _NO_WEIGHTS = "no weights were given: they are not part of the package (--lpips-weights FILE.npz)"
 
 
@@ -74,26 +71,6 @@ def compare_test_views(
     )
 
 
-def write_render(folder: Path, image: str, strip: ByteArray) -> None:
-    """Write a photograph beside its render as PNG.
-
-    Args:
-        folder: of the PNG.
-        image: name of the photograph.
-        strip: (H, W, 3) RGB.
-    """
-    _, png = cv2.imencode(".png", np.ascontiguousarray(strip[..., ::-1]))  # `imwrite` reports no full disk
-    (folder / render_name(image)).write_bytes(png.tobytes())
-
-
-def render_name(image: str) -> str:
-    """Return the file name of an image's render: its folders and name, or their hash beyond 255 bytes."""
-    name = Path(image).with_suffix(".png").as_posix().replace("/", "_")
-    if len(name.encode()) <= _LONGEST_NAME_BYTES:
-        return name
-    return f"{hashlib.sha256(name.encode()).hexdigest()[:32]}.png"
-
-
 def _figures(name: str, render: Tensor, photo: Tensor, mask: Tensor, distance: Lpips | None) -> ViewFigures:
     """Return the figures of a render (H, W, 3) against its photograph, colours 0 … 1, within the mask (H, W)."""
     return ViewFigures(
@@ -112,11 +89,11 @@ def _mean(values: Iterable[float | None]) -> float | None:
 
 def _side_by_side(photo: Tensor, render: Tensor, view: ViewFigures) -> ByteArray:
     """Return photograph, render, and their difference (× 3), (H, W, 3) each, side by side with labels above."""
-    difference = (_DIFFERENCE_GAIN * (photo - render).abs()).clamp(0, 1)
+    difference = (DIFFERENCE_GAIN * (photo - render).abs()).clamp(0, 1)
     pictures = [np.asarray(image.mul(255).round().byte().numpy()) for image in (photo, render, difference)]
     labels = (
         f"photograph {view.image}",
         f"render, PSNR {view.psnr:.2f} dB, SSIM {view.ssim:.3f}",
-        f"difference × {_DIFFERENCE_GAIN}",
+        f"difference × {DIFFERENCE_GAIN}",
     )
     return labelled(pictures, labels)

@@ -27,11 +27,12 @@ from pipelines.evaluate.cautions import cautions_of_prediction, dependent_check_
 from pipelines.evaluate.check_points import cross_validate, fit_residuals, measure_check_points
 from pipelines.evaluate.coordinates import coordinates_in, target_crs
 from pipelines.evaluate.options import EvaluateOptions
-from pipelines.evaluate.photometric import SaveRender, compare_test_views, write_render
+from pipelines.evaluate.photometric import SaveRender, compare_test_views
 from pipelines.evaluate.point_table import write_point_table
 from pipelines.evaluate.summary import summarise
 from pipelines.geodesy.crs import PointCrs
 from pipelines.geometry.similarity import SimilarityRecord
+from pipelines.scene.render_files import write_render
 from pipelines.scene.renderer import ModelRenderer
 from pipelines.scene.report import EvaluationReport, Photometric, SimilaritySigma, write_report
 from pipelines.scene.scene import photographs

@@ -34,6 +34,10 @@ class VerticalChoice:
     name: str
     epsg: int | None
 
+    def __str__(self) -> str:
+        """Return the name, which `parse_vertical` reads."""
+        return self.name
+
 
 def parse_vertical(text: str) -> VerticalChoice:
     """Read `ellipsoidal`, `EGM84`, `EGM96`, `EGM2008` or `EPSG:n` (any case).

@@ -26,6 +26,9 @@ _LAYOUT: dict[str, tuple[tuple[int, ...], ...]] = {
     "OPENCV_FISHEYE": tuple((slot,) for slot in range(8)),
 }
 MODELS = tuple(_LAYOUT)
+_SLOT_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+_FISHEYE_SLOT_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")
+LENGTHS = frozenset({"f", "fx", "fy", "cx", "cy"})  # parameters in pixels; all others have no unit
 
 _MAX_NEWTON_STEPS = 30
 _TOLERANCE = 1e-11  # of normalised coordinates: 1e-8 px at f = 1000 px
@@ -75,6 +78,26 @@ class Camera:
         """Mean of the two focal lengths in pixels."""
         focal, _, _ = _split_params(self)
         return float(focal.mean())
+
+
+def parameter_names(camera: Camera) -> tuple[str, ...]:
+    """Return the names of a camera's parameters in COLMAP's order; `f` is the focal length of both axes."""
+    names = _FISHEYE_SLOT_NAMES if _is_fisheye(camera) else _SLOT_NAMES
+    return tuple("f" if len(slots) > 1 else names[slots[0]] for slots in _LAYOUT[camera.model])
+
+
+def parameters_in(camera: Camera, model: str) -> FloatArray | None:
+    """Return a camera's parameters in the order of another model; None between a fisheye and other lenses.
+
+    What the other model lacks is dropped, and what it has besides is zero.
+
+    Raises:
+        InputError: as `undistort`.
+    """
+    full = full_parameters(camera)
+    if _is_fisheye(camera) != (model == "OPENCV_FISHEYE"):
+        return None
+    return np.asarray(full[[slots[0] for slots in _LAYOUT[model]]])
 
 
 def undistort(camera: Camera, xy_px: ArrayLike) -> FloatArray:

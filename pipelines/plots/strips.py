@@ -44,6 +44,13 @@ def labelled(pictures: Sequence[ByteArray], labels: Sequence[str]) -> ByteArray:
     return np.concatenate([band, strip], axis=0)
 
 
+def without_labels(strip: ByteArray, count: int) -> list[ByteArray]:
+    """Return the pictures (H, W, 3) of a strip that `labelled` has made of `count` pictures."""
+    width = strip.shape[1] // count
+    pictures = strip[band_height_px(width) :]
+    return [pictures[:, place * width : (place + 1) * width] for place in range(count)]
+
+
 def band_height_px(width_px: int) -> int:
     """Return the height of the band above pictures of a width."""
     return min(max(round(_BAND_PART * width_px), _LEAST_BAND_PX), _MOST_BAND_PX)

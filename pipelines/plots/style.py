@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 # Blue and orange stay apart with every kind of colour blindness, and the third by its lightness.
-BLUE, ORANGE, DARK = "#2b6cb0", "#dd8a3b", "#333333"
+BLUE, ORANGE, DARK, GREY = "#2b6cb0", "#dd8a3b", "#333333", "#9aa3ad"
 SERIES_COLOURS = (BLUE, ORANGE, DARK)
 COLOUR_MAP = "viridis"
 EMPTY_COLOUR = "#e8e8e8"
@@ -72,13 +72,19 @@ def colours_of(values: FloatArray, low: float, high: float) -> ByteArray:
     return np.asarray(np.round(255 * colormaps[COLOUR_MAP](share)[:, :3]), dtype=np.uint8)
 
 
-def write_png(figure: Figure, path: Path) -> None:
-    """Write a figure; a file that is there is replaced when the new one is complete."""
+def png_of(figure: Figure) -> bytes:
+    """Return a figure as PNG."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     FigureCanvasAgg(figure)
+    data = io.BytesIO()
+    figure.savefig(data, format="png", dpi="figure", metadata={"Software": None})
+    return data.getvalue()
+
+
+def write_png(figure: Figure, path: Path) -> None:
+    """Write a figure; a file that is there is replaced when the new one is complete."""
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_suffix(".tmp")
-    with draft.open("wb") as handle:
-        figure.savefig(handle, format="png", dpi="figure", metadata={"Software": None})
+    draft.write_bytes(png_of(figure))
     replace_file(draft, path)

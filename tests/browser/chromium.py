@@ -6,7 +6,6 @@ import base64
 import contextlib
 import functools
 import hashlib
-import os
 import shutil
 import subprocess
 import sys
@@ -23,8 +22,10 @@ import cv2
 import numpy as np
 from playwright.sync_api import Browser, ConsoleMessage, Page, Response, Route, sync_playwright
 
+from pipelines.core.errors import BackendUnavailableError
 from pipelines.geometry.cameras import Pinhole
 from pipelines.geometry.similarity import Similarity
+from pipelines.pages.chromium import NO_NETWORK, chromium_path
 
 CACHE = Path(__file__).parents[2] / "build/browser"
 CESIUM_VERSION = "1.145.0"
@@ -38,35 +39,14 @@ FLAGS = (
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
     "--ignore-gpu-blocklist",
-    "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1",
+    NO_NETWORK,
 )
 # CesiumJS rebuilds a changed choice of tiles after up to 30 frames, which software draws one a second at worst.
 _PATIENCE_MS = 180_000
-# Where Chrome is on macOS and Windows, which do not put it on PATH.
-_INSTALLED = (
-    "/Applications/Google Chrome.app/Contents/MacOS/Google Chrome",
-    "C:/Program Files/Google/Chrome/Application/chrome.exe",
-)
 
 
 class MissingProgramError(Exception):
     """Program that the tests need and that is not there; the message says what to install."""
-
-
-def chromium_path() -> str:
-    """Return the path of Chromium or Chrome: that of the variable CHROMIUM, on PATH, or where it is installed.
-
-    Raises:
-        MissingProgramError: there is none.
-    """
-    on_path = (shutil.which(name) for name in ("chromium", "chromium-browser", "google-chrome"))
-    installed = (place for place in _INSTALLED if Path(place).is_file())
-    found = os.environ.get("CHROMIUM") or next(filter(None, [*on_path, *installed]), None)
-    if found is None:
-        raise MissingProgramError(
-            "Chromium is missing: `apt-get install chromium`, or name a Chromium or Chrome in the variable CHROMIUM"
-        )
-    return found
 
 
 @functools.cache
@@ -257,11 +237,13 @@ class Viewer:
             "async () => { const { widget } = await georef; widget.render(); return widget.canvas.toDataURL(); }"
         )
         png = np.frombuffer(base64.b64decode(data.partition(",")[2]), np.uint8)
-        return cv2.imdecode(png, cv2.IMREAD_COLOR)[..., ::-1] / 255.0
+        pixels = cv2.imdecode(png, cv2.IMREAD_COLOR)
+        assert pixels is not None
+        return pixels[..., ::-1] / 255.0
 
 
 if __name__ == "__main__":
     try:
         print(f"{chromium_path()}, CesiumJS in {cesium_folder()}")
-    except MissingProgramError as error:
+    except (MissingProgramError, BackendUnavailableError) as error:
         sys.exit(f"browser tests: {error}")

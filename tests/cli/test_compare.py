@@ -70,7 +70,7 @@ def test_all_run_once_and_the_second_time_nothing_does(georef: Georef, survey: P
     expected += [(name, stage) for name in "CDE" for stage in OWN]
     assert ran(first) == expected
     files = {path: path.stat().st_mtime_ns for path in (survey / "compare").glob("*.*")}
-    assert {path.name for path in files} == {"table.json", "table.md", "plot.png"}
+    assert {path.name for path in files} == {"table.json", "table.md", "plot.png", "comparison.html"}
     second = georef("compare", survey, "--json")
     assert ran(second) == []
     assert second.document["rows"] == first.document["rows"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from pipelines.compare.files import PAGE, write_comparison
 from pipelines.compare.table import (
     ComparedRow,
     Comparison,
@@ -12,7 +13,6 @@ from pipelines.compare.table import (
     markdown,
     point_accuracy,
     remarks_on,
-    write_comparison,
 )
 from tests.reports import check_points_with
 
@@ -49,15 +49,16 @@ def test_markdown_is_one_table_with_notes() -> None:
 
 def test_files_are_written_when_they_say_something_new(tmp_path: Path) -> None:
     table = Comparison(options={}, rows=(ROW,))
-    write_comparison(tmp_path, table)
+    write_comparison(tmp_path, table, "flight")
     times = {path.name: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
-    assert set(times) == {"table.json", "table.md", "plot.png"}
-    write_comparison(tmp_path, table)
+    assert set(times) == {"table.json", "table.md", "plot.png", PAGE}
+    write_comparison(tmp_path, table, "flight")
     assert {path.name: path.stat().st_mtime_ns for path in tmp_path.iterdir()} == times
-    (tmp_path / "plot.png").unlink()
-    write_comparison(tmp_path, table)
-    assert (tmp_path / "plot.png").exists()
-    write_comparison(tmp_path, Comparison(options={}, rows=(FAILED,)))
+    for name in ("plot.png", PAGE):
+        (tmp_path / name).unlink()
+        write_comparison(tmp_path, table, "flight")
+        assert (tmp_path / name).exists()
+    write_comparison(tmp_path, Comparison(options={}, rows=(FAILED,)), "flight")
     assert Comparison.model_validate_json((tmp_path / "table.json").read_text("utf-8")).rows == (FAILED,)
     assert "it diverged" in (tmp_path / "table.md").read_text("utf-8")
 

@@ -12,8 +12,8 @@ from pipelines.core.products import load_json, save_json
 from pipelines.core.runner import Outcome, run_stage
 from pipelines.core.stages import BY_NAME, GAUSSIANS, MODEL
 from pipelines.core.workspace import Workspace
-from pipelines.evaluate.photometric import render_name
 from pipelines.plots.strips import band_height_px
+from pipelines.scene.render_files import render_name
 from pipelines.scene.trained_model import TrainedModel
 from pipelines.splat.storage import read_gaussians, write_gaussians
 from tests.reports import report_of

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipelines.plots.strips import band_height_px, labelled
+from pipelines.plots.strips import band_height_px, labelled, without_labels
 
 
 @pytest.mark.parametrize("width", [40, 96, 321, 1600])
@@ -15,6 +15,8 @@ def test_pictures_are_unchanged_below_their_labels(width: int) -> None:
     band = band_height_px(width)
     assert strip.shape == (30 + band, 3 * width, 3) and strip.dtype == np.uint8
     np.testing.assert_array_equal(strip[band:], np.concatenate(pictures, axis=1))
+    for picture, again in zip(pictures, without_labels(strip, 3), strict=True):
+        np.testing.assert_array_equal(picture, again)
     for part in np.split(strip[:band], 3, axis=1):
         written = (part < 128).any(axis=(0, 2))
         assert written.any() and not written[[0, -1]].any()  # within its own picture

@@ -11,12 +11,13 @@ import pytest
 from pipelines.core.errors import InputError
 from pipelines.formats.odm import read_ground_points
 from pipelines.scene.points_by_camera import points_by_camera
+from pipelines.scene.survey import SurveyedPoint
 from pipelines.view.marking import (
     CHECK,
     CONTROL,
     MarkedPoint,
     appears_in,
-    marked_points,
+    points_to_mark,
     rays_of,
     residuals_px,
     write_marks,
@@ -50,22 +51,29 @@ def test_points_behind_all_cameras_appear_nowhere(model: MeasuringModel) -> None
 
 def test_files_of_marks_are_read_again(tmp_path: Path, model: MeasuringModel) -> None:
     survey = model.trained.survey
-    xyz = model.target.xyz_from_geo(np.array([point.position_in_geo for point in survey.check_points]))
-    points = marked_points(survey.check_points, xyz, is_check=True)
+
+    def xyz_of(points: tuple[SurveyedPoint, ...]) -> np.ndarray:
+        position = np.array([point.position_in_geo for point in points]).reshape(-1, 3)
+        return model.target.xyz_from_geo(position) if len(position) else position
+
+    points = points_to_mark(survey, xyz_of)
     new = MarkedPoint("new", (404000.123, 5097000.25, 1650.5), marks={"a.jpg": (12.25, 700.5), "b.jpg": (1.0, 2.0)})
     bare = MarkedPoint("bare", (1.0, 2.0, 3.0))
     assert write_marks(tmp_path, "EPSG:32632", [*points, new, bare]) == [tmp_path / CONTROL, tmp_path / CHECK]
     control = read_ground_points(tmp_path / CONTROL)
     assert control.crs_text == "EPSG:32632"
-    assert [(m.name, m.xyz, m.x_px, m.y_px, m.image) for m in control.marks] == [
-        ("new", new.xyz, x, y, image) for image, (x, y) in new.marks.items()
+    assert [(point.name, tuple(point.xyz)) for point in control.points] == [("new", new.xyz)]
+    assert [(m.name, m.x_px, m.y_px, m.image) for m in control.marks] == [
+        ("new", x, y, image) for image, (x, y) in new.marks.items()
     ]
     check = read_ground_points(tmp_path / CHECK)
     assert {mark.name for mark in check.marks} == {point.name for point in survey.check_points}
     for mark in check.marks:
         point = next(point for point in points if point.name == mark.name)
         assert (mark.x_px, mark.y_px) == pytest.approx(point.marks[mark.image], abs=5e-4)
-        np.testing.assert_allclose(mark.xyz, point.xyz, atol=1e-4)
+    for listed in check.points:
+        point = next(point for point in points if point.name == listed.name)
+        np.testing.assert_allclose(listed.xyz, point.xyz, atol=1e-4)
 
 
 def test_names_that_the_format_cannot_hold_are_refused(tmp_path: Path) -> None:

@@ -1,0 +1,132 @@
+"""Time the viewer of a large model: python examples/benchmarks/viewing.py WORKSPACE.
+
+The workspace is copied, and its Gaussians are split into many small ones that show the same scene. Then, in
+headless Chromium with software rendering: the time from the start of `georef view` until the page shows a picture,
+and from clicks in it until the page shows the measured point. Needs Chromium and the extra `dev`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from playwright.sync_api import Page, sync_playwright
+
+from pipelines.core.stages import GAUSSIANS, MODEL, STAGES
+from pipelines.pages.chromium import chromium_path
+from pipelines.splat.gaussians import Gaussians
+from pipelines.splat.storage import read_gaussians, write_gaussians
+from tests.browser.chromium import FLAGS
+
+_SIZE = {"width": 1280, "height": 800}
+_PANEL_PX = 420
+_LEAST_CONTRAST = 20.0  # standard deviation of a picture, of 255
+
+
+def split(gaussians: Gaussians, count: int) -> Gaussians:
+    """Return at least `count` Gaussians: each as several smaller ones, spread over it."""
+    parts = -(-count // len(gaussians))
+    rng = torch.Generator().manual_seed(0)
+    rows = torch.arange(len(gaussians)).repeat_interleave(parts)
+    many = gaussians.select(rows)
+    w, x, y, z = torch.nn.functional.normalize(many.quats_wxyz, dim=1).unbind(1)
+    local = torch.randn(len(rows), 3, generator=rng) * torch.exp(many.log_scales) * 0.8
+    axis = torch.stack([x, y, z], dim=1)
+    turned = local + 2 * torch.cross(axis, torch.cross(axis, local, dim=1) + w[:, None] * local, dim=1)
+    many.means = many.means + turned
+    many.log_scales = many.log_scales - float(np.log(parts)) / 2
+    return many
+
+
+def wait_for_picture(page: Page, patience_s: float = 120.0) -> None:
+    """Wait until the page shows a picture."""
+    end = time.perf_counter() + patience_s
+    clip = {"x": 0, "y": 200, "width": _SIZE["width"] - _PANEL_PX, "height": 500}
+    while time.perf_counter() < end:
+        png = page.screenshot(clip=clip)  # type: ignore[arg-type]
+        picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_GRAYSCALE)
+        if picture is not None and picture.std() > _LEAST_CONTRAST:
+            return
+    raise TimeoutError("the page shows no picture")
+
+
+def clicked_s(page: Page, x: float, y: float) -> float | None:
+    """Return the time from a click to the answer; None: nothing was measured."""
+    shown = "() => document.querySelector('[data-measured]')?.getAttribute('data-measured') ?? ''"
+    before = page.evaluate(shown)
+    began = time.perf_counter()
+    page.mouse.click(x, y)
+    while time.perf_counter() < began + 3:
+        if page.evaluate(shown) not in ("", before):
+            return time.perf_counter() - began
+    return None
+
+
+def main() -> None:
+    """Print the times."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("workspace", type=Path)
+    parser.add_argument("--gaussians", type=int, default=1_000_000)
+    parser.add_argument("--clicks", type=int, default=30)
+    args = parser.parse_args()
+    with tempfile.TemporaryDirectory() as place, sync_playwright() as driver:
+        copy = Path(place) / "large"
+        folders = {spec.folder for spec in STAGES} & {"ingest", "sfm", "calibrate", "geolocate", "sim3", "train"}
+        for name in sorted(folders):
+            if (args.workspace / name).exists():
+                shutil.copytree(args.workspace / name, copy / name, ignore=shutil.ignore_patterns("checkpoint.npz"))
+        for name in ("requests.json", "georef.toml"):
+            if (args.workspace / name).exists():
+                shutil.copy(args.workspace / name, copy)
+        many = split(read_gaussians(args.workspace / GAUSSIANS), args.gaussians)
+        write_gaussians(copy / GAUSSIANS, many)
+        document = json.loads((copy / MODEL).read_text("utf-8"))
+        (copy / MODEL).write_text(json.dumps({**document, "gaussians": len(many)}), "utf-8")
+        browser = driver.chromium.launch(executable_path=chromium_path(), args=list(FLAGS))
+        page = browser.new_page(viewport=_SIZE)  # type: ignore[arg-type]
+        command = [
+            sys.executable,
+            "-c",
+            "from georef_cli.main import main; main()",
+            "-q",
+            "view",
+            str(copy),
+            "--json",
+        ]
+        began = time.perf_counter()
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+            assert process.stdout is not None
+            address = ""
+            while '"address"' not in address:
+                address += process.stdout.readline()
+            served = time.perf_counter()
+            page.goto(address.split('"')[3])
+            wait_for_picture(page)
+            seen = time.perf_counter()
+            print(
+                f"{len(many):,} Gaussians: served after {served - began:.1f} s, picture after {seen - began:.1f} s"
+            )
+            page.get_by_role("textbox", name="A click").or_(page.locator("input[aria-haspopup]")).first.click()
+            page.get_by_role("option", name="measures").click()
+            page.get_by_role("tab", name="Measure").click()
+            time.sleep(30)  # σ are computed beside the first pictures
+            rng = np.random.default_rng(0)
+            places = rng.uniform([250, 250], [650, 600], (args.clicks, 2))
+            taken = [each for x, y in places if (each := clicked_s(page, x, y)) is not None]
+            median, slowest = float(np.median(taken)), float(np.max(taken))
+            print(f"{len(taken)} of {args.clicks} clicks measured: median {median:.3f} s, slowest {slowest:.3f} s")
+            process.terminate()
+        browser.close()
+
+
+if __name__ == "__main__":
+    main()

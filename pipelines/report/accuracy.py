@@ -1,0 +1,154 @@
+"""Accuracy: CE90 and LE90 of the check points, predicted against measured σ, and the map of the predicted σ."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipelines.core.errors import MissingProductError
+from pipelines.core.stages import ACCURACY_MAP
+from pipelines.core.types import FloatArray
+from pipelines.pages.pictures import Picture, picture_of_png, png_file
+from pipelines.plots.observations import predicted_against_measured
+from pipelines.report.evaluated import EvaluatedSurvey
+from pipelines.scene.report import CheckPointErrors, PredictedPointError
+from pipelines.scene.survey import SurveyedPoint
+
+# Of a circular normal distribution in plan, and of a normal one in height, both without bias: 90 % lie within.
+CE90_OF_AXIS_RMSE = 2.1460
+LE90_OF_RMSE = 1.6449
+_LEAST_FOR_QUANTILE = 10
+_LEAST_FOR_CHART = 3
+
+
+@dataclass(frozen=True)
+class NinetyPercent:
+    """Radii within which 90 % of the errors are expected, and within which 90 % of those measured are.
+
+    Attributes:
+        way: `camera` or `model`.
+        ce90_m, le90_m: from the RMSE; None without check points.
+        measured_h_m, measured_v_m: empirical 90 % quantile; None with fewer than ten points.
+        count: number of check points.
+    """
+
+    way: str
+    ce90_m: float | None
+    le90_m: float | None
+    measured_h_m: float | None
+    measured_v_m: float | None
+    count: int
+
+
+@dataclass(frozen=True)
+class AccuracyFacts:
+    """Accuracy of an evaluated survey.
+
+    Attributes:
+        ninety: CE90 and LE90 by camera and by model.
+        ways: which ways have measured points.
+        chart: predicted against measured σ; None: fewer than three points have both.
+        within: share of the points within 1 σ and 2 σ of the prediction, horizontal and vertical; None likewise.
+        map: of the predicted σ; None: there is none.
+        crossed: whether control points were cross-validated with a result.
+        crossed_reason: why not; empty: they were not to be.
+        check_points: number in the survey.
+        ce90_factor, le90_factor: of the formulas.
+        quantile_points: fewest points with an empirical quantile.
+    """
+
+    ninety: tuple[NinetyPercent, ...]
+    ways: tuple[str, ...]
+    chart: Picture | None
+    within: tuple[tuple[str, float, float], ...]
+    map: Picture | None
+    crossed: bool
+    crossed_reason: str
+    check_points: int
+    ce90_factor: float
+    le90_factor: float
+    quantile_points: int
+
+
+def accuracy_facts(evaluated: EvaluatedSurvey) -> AccuracyFacts:
+    """Return the accuracy of an evaluated survey."""
+    report = evaluated.report
+    by_way = {"camera": report.checkpoints.camera, "model": report.checkpoints.model}
+    sigma, error = _compared(report.checkpoints.camera, evaluated.trained.survey.check_points)
+    enough = len(sigma) >= _LEAST_FOR_CHART
+    crossed = report.cross_validation
+    return AccuracyFacts(
+        ninety=tuple(ninety_percent(way, errors) for way, errors in by_way.items()),
+        ways=tuple(way for way, errors in by_way.items() if errors.count),
+        chart=picture_of_png(predicted_against_measured(sigma, error)) if enough else None,
+        within=_within(sigma, error) if enough else (),
+        map=_map(evaluated),
+        crossed=crossed is not None and crossed.count > 0,
+        crossed_reason="" if crossed is None or crossed.reason is None else crossed.reason,
+        check_points=len(evaluated.trained.survey.check_points),
+        ce90_factor=CE90_OF_AXIS_RMSE,
+        le90_factor=LE90_OF_RMSE,
+        quantile_points=_LEAST_FOR_QUANTILE,
+    )
+
+
+def ninety_percent(way: str, errors: CheckPointErrors) -> NinetyPercent:
+    """Return CE90 and LE90 of check points.
+
+    CE90 = 2.1460 · (RMSE_E + RMSE_N) / 2 and LE90 = 1.6449 · RMSE_V, for normal errors without bias.
+
+    Args:
+        way: in which the errors were measured.
+        errors: the errors.
+    """
+    rows = [
+        (row.de_m, row.dn_m, row.du_m)
+        for row in errors.points
+        if row.de_m is not None and row.dn_m is not None and row.du_m is not None
+    ]
+    table = np.array(rows, dtype=np.float64).reshape(-1, 3)
+    has_quantile = len(table) >= _LEAST_FOR_QUANTILE
+    ce90 = le90 = None
+    if errors.rmse_e_m is not None and errors.rmse_n_m is not None and errors.rmse_v_m is not None:
+        ce90 = CE90_OF_AXIS_RMSE * (errors.rmse_e_m + errors.rmse_n_m) / 2
+        le90 = LE90_OF_RMSE * errors.rmse_v_m
+    return NinetyPercent(
+        way=way,
+        ce90_m=ce90,
+        le90_m=le90,
+        measured_h_m=float(np.quantile(np.hypot(table[:, 0], table[:, 1]), 0.9)) if has_quantile else None,
+        measured_v_m=float(np.quantile(np.abs(table[:, 2]), 0.9)) if has_quantile else None,
+        count=errors.count,
+    )
+
+
+def _compared(errors: CheckPointErrors, points: tuple[SurveyedPoint, ...]) -> tuple[FloatArray, FloatArray]:
+    """Return predicted σ with the survey's (J, 2) and measured errors (J, 2), horizontal and vertical."""
+    surveyed = {point.name: np.diag(np.array(point.cov_in_geo)) for point in points}
+    sigma, error = [], []
+    for row in errors.points:
+        if not isinstance(row, PredictedPointError) or row.name not in surveyed:
+            continue
+        predicted = (row.sigma_e_m, row.sigma_n_m, row.sigma_u_m)
+        measured = (row.de_m, row.dn_m, row.du_m)
+        if None in predicted or None in measured:
+            continue
+        variance = np.square(np.array(predicted, dtype=np.float64)) + surveyed[row.name]
+        off = np.array(measured, dtype=np.float64)
+        sigma.append([np.sqrt(variance[0] + variance[1]), np.sqrt(variance[2])])
+        error.append([np.hypot(off[0], off[1]), abs(off[2])])
+    return np.array(sigma).reshape(-1, 2), np.array(error).reshape(-1, 2)
+
+
+def _within(sigma: FloatArray, error: FloatArray) -> tuple[tuple[str, float, float], ...]:
+    ratio = error / np.maximum(sigma, 1e-12)
+    once, twice = (ratio <= 1).mean(axis=0).tolist(), (ratio <= 2).mean(axis=0).tolist()
+    return (("horizontal", once[0], twice[0]), ("vertical", once[1], twice[1]))
+
+
+def _map(evaluated: EvaluatedSurvey) -> Picture | None:
+    try:
+        return png_file(evaluated.workspace.path(ACCURACY_MAP))
+    except MissingProductError:
+        return None

@@ -1,0 +1,200 @@
+"""Positions of the photographs: measured and adjusted, with error ellipses, residuals of the fixes in time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipelines.core.types import BoolArray, FloatArray
+from pipelines.pages.pictures import Picture, picture_of_png
+from pipelines.plots.observations import FixSeries, fix_series
+from pipelines.plots.survey_plans import movement_plan
+from pipelines.report.coordinates import Texts, heads_of, texts_of
+from pipelines.report.evaluated import EvaluatedSurvey
+from pipelines.scene.fix_differences import FixDifferences, fix_differences
+
+
+@dataclass(frozen=True)
+class FlightBias:
+    """Mean residual of the used fixes, and the scatter about it, by axis (east, north, up) in metres."""
+
+    axis: str
+    mean_m: float
+    sigma_m: float
+
+
+@dataclass(frozen=True)
+class Outlier:
+    """Fix that the solution has left out: name of the photograph, and the length of its residual in metres."""
+
+    name: str
+    residual_m: float
+
+
+@dataclass(frozen=True)
+class CameraRow:
+    """Row of the table of photographs: texts of coordinates in the CRS of the report, differences in metres.
+
+    Attributes:
+        name: of the photograph.
+        use: `train`, `test`, or `outlier` for a fix that was left out.
+        measured: coordinates of the fix; None: there is none.
+        adjusted: coordinates of the trained camera.
+        difference_m: adjusted minus measured, east, north, up; None: no fix.
+        sigma_m: of the adjusted position, east, north, up; None: not known.
+        sha256: of the file; empty: not recorded.
+    """
+
+    name: str
+    use: str
+    measured: Texts | None
+    adjusted: Texts
+    difference_m: tuple[float, float, float] | None
+    sigma_m: tuple[float, float, float] | None
+    sha256: str
+
+
+@dataclass(frozen=True)
+class CamerasFacts:
+    """Positions of the photographs.
+
+    Attributes:
+        photographs: number in the survey.
+        registered: number of those in the SfM model.
+        unregistered: names of the others.
+        fixes: number of registered photographs with a fix.
+        map: adjusted positions, with arrows and ellipses.
+        arrow_factor, ellipse_factor: magnifications; None: none are drawn.
+        no_sigma: reason why there are no ellipses; empty: there are.
+        series: residuals in time; None: no fixes.
+        by_time: whether the series runs in time; otherwise, in the order of the photographs.
+        bias: of the used fixes; empty without fixes.
+        outliers: fixes that were left out.
+        median_sigma_h_m, median_sigma_v_m: of the cameras; None: not known.
+        rows: of the table of photographs.
+        axes: names of the coordinates with their units.
+    """
+
+    photographs: int
+    registered: int
+    unregistered: tuple[str, ...]
+    fixes: int
+    map: Picture
+    arrow_factor: float | None
+    ellipse_factor: float | None
+    no_sigma: str
+    series: Picture | None
+    by_time: bool
+    bias: tuple[FlightBias, ...]
+    outliers: tuple[Outlier, ...]
+    median_sigma_h_m: float | None
+    median_sigma_v_m: float | None
+    rows: tuple[CameraRow, ...]
+    axes: Texts
+
+
+def cameras_facts(evaluated: EvaluatedSurvey) -> CamerasFacts:
+    """Return the positions of the photographs of an evaluated survey."""
+    trained, sigma = evaluated.trained, evaluated.camera_sigma
+    fixes = fix_differences(trained)
+    names, registered = trained.sparse.image_name, set(trained.sparse.image_name)
+    moved = np.full((len(names), 3), np.nan)
+    is_outlier: BoolArray = np.zeros(len(names), dtype=bool)
+    moved[fixes.camera], is_outlier[fixes.camera] = fixes.difference_in_geo, fixes.is_outlier
+    covariance = None if sigma.covariance is None else sigma.covariance[:, 3:, 3:]
+    drawn = movement_plan(
+        evaluated.center_in_geo[:, :2],
+        moved[:, :2],
+        None if covariance is None else covariance[:, :2, :2],
+        is_outlier,
+    )
+    series, by_time = _series(evaluated, fixes)
+    sigma_m = None if covariance is None else np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    return CamerasFacts(
+        photographs=len(trained.survey.images),
+        registered=len(names),
+        unregistered=tuple(image.name for image in trained.survey.images if image.name not in registered),
+        fixes=len(fixes.camera),
+        map=picture_of_png(drawn.png),
+        arrow_factor=drawn.arrow_factor,
+        ellipse_factor=drawn.ellipse_factor,
+        no_sigma=sigma.reason,
+        series=series,
+        by_time=by_time,
+        bias=bias_of(fixes),
+        outliers=tuple(
+            Outlier(names[camera], float(np.linalg.norm(difference)))
+            for camera, difference, left_out in zip(
+                fixes.camera, fixes.difference_in_geo, fixes.is_outlier, strict=True
+            )
+            if left_out
+        ),
+        median_sigma_h_m=None if sigma_m is None else float(np.median(np.hypot(sigma_m[:, 0], sigma_m[:, 1]))),
+        median_sigma_v_m=None if sigma_m is None else float(np.median(sigma_m[:, 2])),
+        rows=_rows(evaluated, moved, is_outlier, sigma_m),
+        axes=heads_of(evaluated.crs),
+    )
+
+
+def bias_of(fixes: FixDifferences) -> tuple[FlightBias, ...]:
+    """Return mean and scatter of the residuals of the used fixes; empty with fewer than two."""
+    used = fixes.difference_in_geo[fixes.is_training & ~fixes.is_outlier]
+    if len(used) < 2:
+        return ()
+    means, scatter = used.mean(axis=0).tolist(), used.std(axis=0, ddof=1).tolist()
+    return tuple(
+        FlightBias(axis, mean, sigma)
+        for axis, mean, sigma in zip(("east", "north", "up"), means, scatter, strict=True)
+    )
+
+
+def _series(evaluated: EvaluatedSurvey, fixes: FixDifferences) -> tuple[Picture | None, bool]:
+    """Return the picture of the residuals in time, and whether the times are known."""
+    if not len(fixes.camera):
+        return None, False
+    survey, names = evaluated.trained.survey, evaluated.trained.sparse.image_name
+    by_name = {image.name: image for image in survey.images}
+    images = [by_name[names[camera]] for camera in fixes.camera]
+    known = [image.timestamp_s for image in images if image.timestamp_s is not None]
+    by_time = len(known) == len(images) and len(set(known)) > 1
+    abscissa = np.array(known) - min(known) if by_time else 1.0 + np.arange(len(images), dtype=np.float64)
+    covariance = np.array([image.fix.cov_in_geo for image in images if image.fix is not None])
+    png = fix_series(
+        FixSeries(
+            abscissa=abscissa,
+            abscissa_title="time since the first photograph in s" if by_time else "photograph, in order of names",
+            residual_m=fixes.difference_in_geo,
+            sigma_m=np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)),
+            is_used=fixes.is_training,
+            is_outlier=fixes.is_outlier,
+        )
+    )
+    return picture_of_png(png), by_time
+
+
+def _rows(
+    evaluated: EvaluatedSurvey, moved: FloatArray, is_outlier: BoolArray, sigma_m: FloatArray | None
+) -> tuple[CameraRow, ...]:
+    center, crs = evaluated.center_in_geo, evaluated.crs
+    adjusted = texts_of(crs, center)
+    has_fix = np.atleast_1d(np.isfinite(moved).all(axis=1))
+    measured = dict(zip(np.flatnonzero(has_fix).tolist(), texts_of(crs, (center - moved)[has_fix]), strict=True))
+    sha256 = {image.name: image.sha256 for image in evaluated.trained.survey.images}
+    return tuple(
+        CameraRow(
+            name=camera.name,
+            use="outlier" if is_outlier[index] else camera.split,
+            measured=measured.get(index),
+            adjusted=adjusted[index],
+            difference_m=_triple(moved[index]) if has_fix[index] else None,
+            sigma_m=None if sigma_m is None else _triple(sigma_m[index]),
+            sha256=sha256.get(camera.name, ""),
+        )
+        for index, camera in enumerate(evaluated.trained.model.cameras)
+    )
+
+
+def _triple(values: FloatArray) -> tuple[float, float, float]:
+    x, y, z = values.tolist()
+    return x, y, z

@@ -1,0 +1,134 @@
+"""Record of the processing: stages with options, inputs, versions and times; assumptions, warnings, cautions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any
+
+from pipelines.core.cautions import Caution
+from pipelines.core.errors import InputError
+from pipelines.core.options import flag_name, notation
+from pipelines.core.stages import BY_NAME, StageSpec
+from pipelines.core.staleness import cautions_by_stage, status
+from pipelines.core.workspace import Workspace
+from pipelines.scene.survey import Survey
+
+_REPORT = "report"
+
+
+@dataclass(frozen=True)
+class StageRecord:
+    """Stage as it was run.
+
+    Attributes:
+        name: of the stage.
+        state: as in `georef status`, when the report was made.
+        reason: of the state.
+        made: time at which it ended; None: not recorded.
+        duration_s: None: not recorded.
+        key_figure: one line.
+        options: every option by flag, with its value.
+        inputs: SHA-256 by product or flag.
+        warnings: messages that the user should read.
+    """
+
+    name: str
+    state: str
+    reason: str
+    made: datetime | None
+    duration_s: float | None
+    key_figure: str
+    options: dict[str, str]
+    inputs: dict[str, str]
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class RecordFacts:
+    """Processing of a survey.
+
+    Attributes:
+        stages: in the order of the work.
+        total_s: sum of the recorded durations.
+        versions: of this package and its libraries, by name, with the stages that ran with them if not all did.
+        assumptions: of `ingest`.
+        cautions: by stage.
+        by_hand: stages whose product was put there by hand.
+    """
+
+    stages: tuple[StageRecord, ...]
+    total_s: float
+    versions: dict[str, str]
+    assumptions: tuple[str, ...]
+    cautions: dict[str, tuple[Caution, ...]]
+    by_hand: tuple[str, ...]
+
+
+def record_facts(workspace: Workspace, survey: Survey) -> RecordFacts:
+    """Return the record of the processing of a workspace."""
+    states = [row for row in status(workspace) if row.stage != _REPORT]
+    stages = []
+    versions: dict[str, dict[str, list[str]]] = {}
+    for row in states:
+        spec = BY_NAME[row.stage]
+        stage, used = _stage(workspace, spec, row.state, row.reason)
+        stages.append(stage)
+        for name, version in used.items():
+            versions.setdefault(name, {}).setdefault(version, []).append(row.stage)
+    return RecordFacts(
+        stages=tuple(stages),
+        total_s=sum(stage.duration_s or 0.0 for stage in stages),
+        versions={name: _versions(by_version) for name, by_version in versions.items()},
+        assumptions=survey.assumptions,
+        cautions=cautions_by_stage(workspace),
+        by_hand=tuple(stage.name for stage in stages if stage.made is None and stage.state == "current"),
+    )
+
+
+def _stage(workspace: Workspace, spec: StageSpec, state: str, reason: str) -> tuple[StageRecord, dict[str, str]]:
+    """Return the record of a stage, and the versions that it ran with."""
+    try:
+        manifest = workspace.manifest(spec)
+    except InputError:  # `state` tells
+        manifest = None
+    if manifest is None:
+        return StageRecord(spec.name, state, reason, None, None, "", {}, {}, ()), {}
+    record = StageRecord(
+        name=spec.name,
+        state=state,
+        reason=reason,
+        made=manifest.finished,
+        duration_s=manifest.duration_s,
+        key_figure=manifest.key_figure,
+        options=_options(spec, manifest.config),
+        inputs=manifest.inputs,
+        warnings=tuple(manifest.warnings),
+    )
+    return record, manifest.versions
+
+
+def _options(spec: StageSpec, config: Mapping[str, Any]) -> dict[str, str]:
+    """Return the recorded options of a stage by flag, as users write their values."""
+    try:
+        options = spec.options.model_validate(config)
+    except ValueError:  # of a version with other options
+        return {name: _notation(value) for name, value in config.items()}
+    fields = type(options).model_fields
+    return {flag_name(spec.options, name): _notation(getattr(options, name)) for name in fields}
+
+
+def _notation(value: object) -> str:
+    if value is None:
+        return "not given"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return notation(value) or "none"
+
+
+def _versions(by_version: dict[str, list[str]]) -> str:
+    """Return a version as text; several versions with the stages that ran with each."""
+    if len(by_version) == 1:
+        return next(iter(by_version))
+    return "; ".join(f"{version} ({', '.join(stages)})" for version, stages in by_version.items())

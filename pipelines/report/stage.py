@@ -1,0 +1,124 @@
+"""Report of a survey: one page with all that is known of it, for its client and for the record.
+
+Reads survey, SfM model, trained model and the report of `evaluate`; test views, accuracy map, metrics of the
+training and previews of the rasters where there are any. Writes `report/report.html` and, on request,
+`report/report.pdf`.
+"""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+
+from pipelines import __version__
+from pipelines.core.cautions import Caution, union
+from pipelines.core.stages import REPORT_PAGE
+from pipelines.core.workspace import StageRun, Summary
+from pipelines.pages.chromium import chromium_path, print_pdf
+from pipelines.pages.page import Page, Section, write_page
+from pipelines.report.accuracy import accuracy_facts
+from pipelines.report.cameras import cameras_facts
+from pipelines.report.evaluated import EvaluatedSurvey, load_evaluated
+from pipelines.report.lenses import lenses_facts
+from pipelines.report.options import ReportOptions
+from pipelines.report.overlap import overlap_facts
+from pipelines.report.place import place_facts
+from pipelines.report.points import points_facts
+from pipelines.report.record import record_facts
+from pipelines.report.summary import SummaryFacts, summary_facts
+from pipelines.report.views import previews_facts, training_facts, views_facts
+
+_ROOM = __name__.rpartition(".")[0]
+_STEPS = 8
+
+
+def run(stage: StageRun, options: ReportOptions) -> Summary:
+    """Write the report, and return its key figures.
+
+    Raises:
+        MissingProductError: a stage up to evaluate has not been run; names the command.
+        BackendUnavailableError: `--pdf` without a Chromium.
+        InputError: a product or a photograph is damaged, or the CRS cannot be used here.
+    """
+    if options.pdf:
+        chromium_path()  # a missing browser is told before the work begins
+    with stage.progress.task("covariances of cameras and lenses", 1) as task:
+        evaluated = load_evaluated(stage.workspace, options)
+        task.advance()
+    page, summary = report_page(evaluated, options, stage)
+    html = stage.out / REPORT_PAGE.rpartition("/")[2]
+    write_page(page, _ROOM, html)
+    if options.pdf:
+        with stage.progress.task("PDF") as task:
+            print_pdf(html, html.with_suffix(".pdf"))
+            task.advance()
+    levels = [verdict.level for verdict in summary.verdicts]
+    counts = {level: levels.count(level) for level in ("good", "fair", "poor", "unknown")}
+    size_mb = html.stat().st_size / 1e6
+    return Summary(
+        f"{', '.join(f'{count} {level}' for level, count in counts.items() if count)}; {size_mb:.1f} MB",
+        {**counts, "bytes": html.stat().st_size, "pdf": options.pdf, "crs": evaluated.crs.crs.name},
+        cautions=_cautions(evaluated),
+    )
+
+
+def report_page(evaluated: EvaluatedSurvey, options: ReportOptions, stage: StageRun) -> tuple[Page, SummaryFacts]:
+    """Return the content of the report, and its summary.
+
+    Args:
+        evaluated: the survey.
+        options: of the report.
+        stage: shows the progress; names the workspace.
+
+    Raises:
+        InputError: a photograph or a picture of the workspace cannot be read.
+    """
+    workspace, survey = stage.workspace, evaluated.trained.survey
+    with stage.progress.task("sections", _STEPS) as task:
+        place = place_facts(evaluated)
+        task.advance(note="place")
+        cameras = cameras_facts(evaluated)
+        task.advance(note="positions")
+        overlap = overlap_facts(evaluated)
+        task.advance(note="overlap")
+        lenses = lenses_facts(evaluated)
+        task.advance(note="lenses")
+        control, check = points_facts(evaluated, options.chips, stage.progress)
+        task.advance(note="points")
+        accuracy = accuracy_facts(evaluated)
+        task.advance(note="accuracy")
+        views, training = views_facts(evaluated, options.views), training_facts(evaluated)
+        task.advance(note="views")
+        record = record_facts(workspace, survey)
+        task.advance(note="record")
+    summary = summary_facts(evaluated, _cautions(evaluated), overlap, lenses, record)
+    page = Page(
+        title=f"Survey report: {workspace.root.name}",
+        subtitle="Georeferenced 3D Gaussian splat, with its measured and predicted accuracy",
+        about={
+            "Made": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
+            "Program": f"GeoRefGS {__version__}",
+            "Photographs": f"{cameras.registered} of {cameras.photographs} registered",
+            "Reference system": f"{place.crs}, heights {place.heights}",
+        },
+        sections=(
+            Section("summary", "Summary", "summary.html", summary),
+            Section("place", "Place on Earth", "place.html", place),
+            Section("accuracy", "Accuracy", "accuracy.html", accuracy),
+            Section("check-points", "Check points", "points.html", check),
+            Section("control-points", "Control points", "points.html", control),
+            Section("positions", "Positions of the photographs", "positions.html", cameras),
+            Section("overlap", "Overlap and matches", "overlap.html", overlap),
+            Section("lenses", "Residuals in the image, and lenses", "lenses.html", lenses),
+            Section("test-views", "Test views", "views.html", views),
+            Section("training", "Training", "training.html", training),
+            Section("rasters", "Orthophoto and surface model", "rasters.html", previews_facts(workspace)),
+            Section("processing", "Processing", "record.html", record),
+            Section("photographs", "Photographs", "photographs.html", cameras),
+        ),
+        document=evaluated.document,
+    )
+    return page, summary
+
+
+def _cautions(evaluated: EvaluatedSurvey) -> tuple[Caution, ...]:
+    return union(evaluated.trained.model.cautions, evaluated.report.cautions)

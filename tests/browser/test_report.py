@@ -1,0 +1,181 @@
+"""The report in a browser: without a network, at two widths, light and dark, on paper."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pytest
+from playwright.sync_api import Browser, Page, Route
+
+from pipelines.compare.files import PAGE, write_comparison
+from pipelines.compare.table import ComparedRow, Comparison, PointAccuracy
+from pipelines.core.workspace import StageRun
+from pipelines.pages.chromium import print_pdf
+from pipelines.report.options import ReportOptions
+from pipelines.report.stage import run
+from tests.evaluated_workspaces import evaluated_workspace
+
+pytestmark = pytest.mark.browser
+
+HOSTILE = "<script>alert(1)</script><img src=x onerror=alert(2)>"
+# Of every text that is drawn: the contrast of its colour against the background behind it (WCAG 2.2, 1.4.3).
+CONTRASTS = """() => {
+    const channels = (text) => text.match(/[\\d.]+/g).map(Number);
+    const luminance = ([r, g, b]) => [r, g, b].map((v) => v / 255)
+        .map((v) => (v <= 0.03928 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4))
+        .reduce((sum, v, i) => sum + v * [0.2126, 0.7152, 0.0722][i], 0);
+    const behind = (node) => {
+        for (let at = node; at; at = at.parentElement) {
+            const colour = channels(getComputedStyle(at).backgroundColor);
+            if (colour.length === 3 || colour[3] === 1) return colour;
+        }
+        return [255, 255, 255];
+    };
+    const found = [];
+    for (const node of document.querySelectorAll("body *")) {
+        const own = [...node.childNodes].some((child) => child.nodeType === 3 && child.textContent.trim());
+        if (!own || node.closest("svg") || node.closest(".skip")) continue;
+        const [a, b] = [luminance(channels(getComputedStyle(node).color)), luminance(behind(node))];
+        found.push((Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05));
+    }
+    return found;
+}"""
+# The deepest overlap of two neighbours in a table, a list, a grid or the text, in pixels.
+OVERLAPS = """() => {
+    const found = [0];
+    for (const node of document.querySelectorAll("main, section, tr, dl, figure, .points, .chips, .triple")) {
+        const boxes = [...node.children].map((child) => child.getBoundingClientRect());
+        boxes.slice(1).forEach((box, i) => {
+            const before = boxes[i];
+            const wide = Math.min(before.right, box.right) - Math.max(before.left, box.left);
+            const high = Math.min(before.bottom, box.bottom) - Math.max(before.top, box.top);
+            found.push(Math.min(wide, high));
+        });
+    }
+    return Math.max(...found);
+}"""
+
+
+# Elements that are wider than the printed page: A4 within its margins, upright, or on its side for broad tables.
+CUT_ON_PAPER = """() => [...document.querySelectorAll("main table, main img, main p, main svg, main pre")]
+    .filter((node) => node.getBoundingClientRect().width > (node.closest(".broad") ? 1016 : 688))
+    .map((node) => node.outerHTML.slice(0, 80))"""
+
+
+@dataclass
+class Opened:
+    """Open page, with all that it asked for and all that went wrong.
+
+    Attributes:
+        page: of the browser.
+        asked: addresses beyond the file itself.
+        problems: errors of scripts and on the console, and dialogs.
+    """
+
+    page: Page
+    asked: list[str] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)
+
+    def show(self, path: Path) -> None:
+        page = self.page
+        page.on("pageerror", lambda error: self.problems.append(f"script: {error}"))
+        page.on("console", lambda line: self.problems.append(line.text) if line.type == "error" else None)
+        page.on("dialog", lambda dialog: (self.problems.append(f"dialog: {dialog.message}"), dialog.dismiss()))
+        page.route("**/*", self._file_only)
+        page.goto(path.as_uri())
+
+    def _file_only(self, route: Route) -> None:
+        if route.request.url.startswith(("file://", "data:")):
+            route.continue_()
+            return
+        self.asked.append(route.request.url)
+        route.abort()
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Page of a survey whose names hold scripts."""
+    made = evaluated_workspace(tmp_path_factory.mktemp("report") / "flight", rename=HOSTILE)
+    out = made.workspace.root / "report"
+    out.mkdir()
+    run(StageRun(made.workspace, out), ReportOptions())
+    return out / "report.html"
+
+
+@pytest.fixture(params=[(1280, "light"), (1280, "dark"), (390, "light"), (390, "dark")], ids=str)
+def opened(request: pytest.FixtureRequest, browser: Browser, report: Path) -> Iterator[Opened]:
+    """The page at a width in pixels, light or dark."""
+    width, scheme = request.param
+    context = browser.new_context(viewport={"width": width, "height": 900}, color_scheme=scheme, offline=True)
+    page = Opened(context.new_page())
+    page.show(report)
+    yield page
+    context.close()
+
+
+def test_page_needs_nothing_and_runs_nothing(opened: Opened) -> None:
+    assert (opened.asked, opened.problems) == ([], [])
+    broken = "() => [...document.images].filter((image) => !image.complete || !image.naturalWidth).length"
+    assert opened.page.evaluate("() => document.images.length") >= 8
+    assert opened.page.evaluate(broken) == 0
+    assert opened.page.evaluate("() => document.scripts.length") == 0
+    assert HOSTILE in (opened.page.locator("#check-points").text_content() or "")
+
+
+def test_page_is_as_wide_as_the_window_and_legible(opened: Opened) -> None:
+    width = opened.page.viewport_size or {"width": 0}
+    assert opened.page.evaluate("() => document.documentElement.scrollWidth") <= width["width"]
+    contrasts = np.array(opened.page.evaluate(CONTRASTS))
+    assert len(contrasts) > 300
+    assert contrasts.min() >= 4.5  # what WCAG's level AA demands of text
+    assert opened.page.evaluate(OVERLAPS) < 1.0
+
+
+def test_wide_tables_scroll_in_their_own_box(browser: Browser, report: Path) -> None:
+    context = browser.new_context(viewport={"width": 390, "height": 800}, offline=True)
+    page = Opened(context.new_page())
+    page.show(report)
+    inside = "() => [...document.querySelectorAll('.scroll')].some((box) => box.scrollWidth > box.clientWidth + 50)"
+    assert page.page.evaluate(inside)
+    reachable = "() => [...document.querySelectorAll('.scroll')].every((box) => box.tabIndex === 0)"
+    assert page.page.evaluate(reachable)
+    context.close()
+
+
+def test_no_table_is_cut_on_paper(browser: Browser, report: Path) -> None:
+    context = browser.new_context(viewport={"width": 688, "height": 1000}, offline=True)  # A4 within its margins
+    page = Opened(context.new_page())
+    page.show(report)
+    page.page.emulate_media(media="print")
+    assert page.page.evaluate("() => getComputedStyle(document.querySelector('td')).display") == "table-cell"
+    assert page.page.evaluate(CUT_ON_PAPER) == []
+    context.close()
+
+
+def test_pdf_is_printed(report: Path, tmp_path: Path) -> None:
+    pdf = tmp_path / "report.pdf"
+    print_pdf(report, pdf)
+    data = pdf.read_bytes()
+    assert data.startswith(b"%PDF-")
+    assert data.count(b"/Type /Page\n") + data.count(b"/Type /Page ") >= 5
+    assert [path.name for path in tmp_path.iterdir()] == ["report.pdf"]
+
+
+def test_comparison_has_the_same_frame(browser: Browser, tmp_path: Path) -> None:
+    accuracy = PointAccuracy(count=3, mean_h_m=0.012, median_h_m=0.01, rmse_h_m=0.015, rmse_v_m=0.02)
+    rows = (
+        ComparedRow(configuration="A", title="plain", note="as in the paper", camera=accuracy, test_psnr=25.0),
+        ComparedRow(configuration="B", title=HOSTILE, note=HOSTILE, failure=f"it diverged {HOSTILE}"),
+    )
+    write_comparison(tmp_path, Comparison(options={"preset": "fast"}, rows=rows), "flight")
+    context = browser.new_context(viewport={"width": 390, "height": 800}, offline=True)
+    page = Opened(context.new_page())
+    page.show(tmp_path / PAGE)
+    assert (page.asked, page.problems) == ([], [])
+    assert page.page.evaluate("() => document.documentElement.scrollWidth") <= 390
+    assert page.page.locator("data[data-field='rows.0.camera.rmse_h_m']").get_attribute("data-value") == "0.015"
+    assert page.page.locator("img").count() == 1
+    context.close()

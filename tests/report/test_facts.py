@@ -1,0 +1,229 @@
+"""Facts of the report against a scene whose truth is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.stats import chi2, norm
+
+from pipelines.accuracy.error_propagation import ErrorPropagation
+from pipelines.core.errors import InputError
+from pipelines.core.products import load_json
+from pipelines.core.progress import SILENT
+from pipelines.core.stages import SURVEY
+from pipelines.report.accuracy import ninety_percent
+from pipelines.report.cameras import bias_of, cameras_facts
+from pipelines.report.chips import cut_chips
+from pipelines.report.lenses import lenses_facts, mean_by_region
+from pipelines.report.overlap import links_of, overlap_facts, photographs_that_see, ties_of
+from pipelines.report.points import points_facts
+from pipelines.report.verdicts import FIX_OUTLIERS, REGISTERED, Measured, level_of, verdicts
+from pipelines.report.views import read_metrics
+from pipelines.scene.fix_differences import fix_differences
+from pipelines.scene.survey import Survey
+from tests.evaluated_workspaces import CHECK_POINTS, ERROR_M
+from tests.report.conftest import Reported
+from tests.reports import check_points_with, report_with
+from tests.trained_workspaces import NOISE
+
+
+def test_photographs_that_see_a_point_are_those_that_observe_it(reported: Reported) -> None:
+    scene = reported.truth.scene
+    owner, _, _ = scene.pixels(scene.point_in_geo)
+    true_count = np.bincount(owner, minlength=len(scene.point_in_geo))
+    seen = photographs_that_see(reported.survey, scene.point_in_geo)
+    # The scene leaves out rays beyond a slope of 0.8, which the corners of the frame reach.
+    assert (seen >= true_count).all()
+    assert (seen == true_count).mean() > 0.95
+
+
+def test_links_count_the_points_that_two_photographs_share(reported: Reported) -> None:
+    network = reported.survey.network
+    points = [set(network.obs_point[network.obs_image == image]) for image in range(len(network.camera_id))]
+    expected = {(i, j): len(points[i] & points[j]) for i, j in combinations(range(len(points)), 2)}
+    pairs, shared = links_of(network)
+    assert dict(zip(map(tuple, pairs.tolist()), shared.tolist(), strict=True)) == {
+        pair: count for pair, count in expected.items() if count
+    }
+
+
+def test_photographs_without_a_tie_form_groups_of_their_own() -> None:
+    pairs, shared = np.array([[0, 1], [1, 2], [3, 4]]), np.array([40, 14, 15])
+    tied, parts = ties_of(6, pairs, shared)
+    assert tied.tolist() == [1, 1, 0, 1, 1, 0]
+    assert parts == 4  # {0, 1}, {2}, {3, 4}, {5}
+
+
+def test_reprojection_residuals_are_the_noise_of_the_pixels(reported: Reported) -> None:
+    facts = lenses_facts(reported.survey)
+    # The cameras are true, and each point is adjusted to its rays: 3 of 2 r parameters are fitted.
+    observations, points = facts.observations, facts.points
+    expected = NOISE.pixel_px * np.sqrt(2 - 3 * points / observations)
+    assert facts.rmse_px == pytest.approx(expected, rel=4 / np.sqrt(2 * observations))
+    assert [parameter.name for parameter in facts.lenses[0].parameters][:5] == ["fx", "fy", "cx", "cy", "k1"]
+    starts = [parameter.start for parameter in facts.lenses[0].parameters]
+    assert starts == pytest.approx(reported.truth.scene.camera.params.tolist())
+
+
+def test_mean_residuals_by_region_show_a_planted_pattern() -> None:
+    rng = np.random.default_rng(0)
+    xy = rng.uniform([0, 0], [800, 400], (40_000, 2))
+    planted = np.where(xy[:, :1] < 400, [[1.0, 0.0]], [[0.0, -2.0]])
+    mean, rms = mean_by_region(xy, planted + rng.normal(0, 0.1, xy.shape), (800, 400))
+    assert mean.shape == (8, 16, 2)
+    # 300 observations a region: σ of a mean is 0.006.
+    np.testing.assert_allclose(mean[:, :8], np.broadcast_to([1.0, 0.0], (8, 8, 2)), atol=0.03)
+    np.testing.assert_allclose(mean[:, 8:], np.broadcast_to([0.0, -2.0], (8, 8, 2)), atol=0.03)
+    np.testing.assert_allclose(rms[:, 8:], np.hypot(2.0, 0.1 * np.sqrt(2)), atol=0.03)
+    few, _ = mean_by_region(xy[:5], planted[:5], (800, 400))
+    assert np.isnan(few).all()
+
+
+def test_lens_covariance_lies_between_its_free_part_and_that_of_the_photographs(reported: Reported) -> None:
+    propagation = reported.survey.propagation
+    assert isinstance(propagation, ErrorPropagation)
+    covariance, basis = propagation.prediction.of_lens(), propagation.solved.scene.correction_basis
+    assert covariance is not None
+    assert basis is not None
+    from_photographs = basis.lens_matrix @ basis.lens_matrix.T + basis.lens_cov
+    scale = 1 / np.sqrt(np.diag(from_photographs))
+
+    def least(matrix: np.ndarray) -> float:
+        return float(np.linalg.eigvalsh(matrix * scale[:, None] * scale)[0])
+
+    assert least(from_photographs - covariance) > -1e-3  # fixes and control points add information
+    assert least(covariance - basis.lens_cov) > -1e-2  # of what no camera reveals they know little
+    assert np.trace(from_photographs - covariance) > 0
+
+
+def test_fix_differences_are_the_errors_of_the_fixes(reported: Reported) -> None:
+    survey = load_json(Survey, reported.truth.workspace.path(SURVEY))
+    fixes = np.array([image.fix.position_in_geo for image in survey.images if image.fix is not None])
+    found = fix_differences(reported.survey.trained)
+    np.testing.assert_allclose(found.difference_in_geo, reported.truth.scene.center_in_geo - fixes, atol=1e-6)
+    assert found.is_training.tolist() == [index != 2 for index in range(len(fixes))]
+    used = found.difference_in_geo[found.is_training]
+    assert [bias.mean_m for bias in bias_of(found)] == pytest.approx(used.mean(axis=0).tolist())
+    outlier = replace(found, is_outlier=np.arange(len(fixes)) == 0)
+    assert bias_of(outlier)[0].mean_m == pytest.approx(used[1:, 0].mean())
+
+
+def test_photographs_have_coordinates_and_differences(reported: Reported) -> None:
+    facts = cameras_facts(reported.survey)
+    assert [row.use for row in facts.rows].count("test") == 1
+    assert facts.by_time
+    assert all(row.measured is not None and row.difference_m is not None for row in facts.rows)
+    easting = [float(row.adjusted[0]) - float((row.measured or row.adjusted)[0]) for row in facts.rows]
+    # Grid east at 7.75° E in zone 32 turns by 0.9° from true east, and differences are a few centimetres.
+    assert easting == pytest.approx([(row.difference_m or (0.0,))[0] for row in facts.rows], abs=3e-3)
+
+
+def test_chips_show_the_mark_and_where_the_points_project(reported: Reported) -> None:
+    control, check = points_facts(reported.survey, 2, SILENT)
+    assert (len(control.rows), len(check.rows)) == (3, CHECK_POINTS)
+    scene, survey = reported.truth.scene, reported.survey.trained.survey
+    for row, point in zip(check.rows, survey.check_points, strict=True):
+        assert row.field is not None
+        assert len(row.chips) == 2
+        for chip in row.chips:
+            white = _decoded(chip.picture.address)
+            scale = chip.side_px / white.shape[0]
+            y, x = np.argwhere(white > 200).mean(axis=0) * scale
+            # The square is centred on the whole pixel of the exact mark; marks have a σ of 0.3 px.
+            assert np.hypot(chip.mark[0] - x, chip.mark[1] - y) < 2.5
+            image = scene.names.index(chip.image)
+            moved = np.array(point.position_in_geo) + ERROR_M
+            for place, pixel in ((moved, chip.adjusted), (np.array(point.position_in_geo), chip.surveyed)):
+                owner, images, xy = scene.pixels(place[None])
+                assert len(owner)
+                mark = next(mark for mark in point.marks if mark.image == chip.image)
+                expected = xy[images == image][0] - [mark.x_px, mark.y_px] + chip.mark
+                np.testing.assert_allclose(pixel, expected, atol=1e-3)
+
+
+def _decoded(address: str) -> np.ndarray:
+    import base64
+
+    data = base64.b64decode(address.partition(",")[2])
+    return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
+
+
+def test_no_chips_are_cut_when_none_are_wanted(reported: Reported) -> None:
+    chips, side_px = cut_chips(reported.survey, [], SILENT)
+    assert (chips, side_px) == ({}, 48)
+
+
+def test_ninety_percent_factors_are_those_of_the_normal_distribution() -> None:
+    errors = check_points_with(count=4, rmse_e_m=0.03, rmse_n_m=0.03, rmse_v_m=0.05)
+    radii = ninety_percent("camera", errors)
+    assert radii.ce90_m == pytest.approx(0.03 * np.sqrt(chi2.ppf(0.9, 2)), rel=1e-4)
+    assert radii.le90_m == pytest.approx(0.05 * norm.ppf(0.95), rel=1e-4)
+    assert radii.measured_h_m is None  # four points have no 90 % quantile
+    assert ninety_percent("camera", check_points_with()).ce90_m is None
+
+
+MEASURED = Measured(
+    photographs=20, registered=20, enough_share=1.0, enough=5, parts=1, rmse_px=0.5, fixes=20, fix_outliers=0,
+    control_points=5, check_points=0, stale=(), workspace="flight",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("subject", "changes", "level"),
+    [
+        ("Registered photographs", {}, "good"),
+        ("Registered photographs", {"registered": 19}, "good"),
+        ("Registered photographs", {"registered": 16}, "fair"),
+        ("Registered photographs", {"registered": 15}, "poor"),
+        ("Overlap", {"enough_share": None}, "unknown"),
+        ("Overlap", {"parts": 2}, "fair"),
+        ("Overlap", {"enough_share": 0.69}, "poor"),
+        ("Reprojection", {"rmse_px": 1.5}, "fair"),
+        ("Reprojection", {"rmse_px": None}, "unknown"),
+        ("Recorded positions", {"fix_outliers": 5}, "poor"),
+        ("Recorded positions", {"fixes": 0}, "fair"),
+        ("Control points", {"control_points": 0}, "fair"),
+        ("Control points", {"control_points": 2}, "poor"),
+        ("Check points", {}, "poor"),
+        ("Predicted against measured", {}, "unknown"),
+        ("Test views", {}, "unknown"),
+        ("State of the products", {"stale": ("train",)}, "poor"),
+    ],
+)
+def test_verdicts_follow_their_rules(subject: str, changes: dict[str, object], level: str) -> None:
+    found = {verdict.subject: verdict for verdict in verdicts(report_with(), replace(MEASURED, **changes), ())}
+    assert found[subject].level == level
+    assert found[subject].reason
+    assert found[subject].rule
+
+
+def test_limits_belong_to_the_better_verdict() -> None:
+    assert level_of(REGISTERED[0], REGISTERED, more_is_better=True) == "good"
+    assert level_of(FIX_OUTLIERS[1], FIX_OUTLIERS, more_is_better=False) == "fair"
+
+
+@pytest.mark.parametrize("line", ["[]", "{}", '{"iteration": "x"}', '{"iteration": 1, "psnr": [1]}', "no json }"])
+def test_damaged_metrics_are_refused(tmp_path: Path, line: str) -> None:
+    path = tmp_path / "metrics.jsonl"
+    path.write_text('{"iteration": 1}\n' + line + "}"[: not line.endswith("}")] + "\n", "utf-8")
+    with pytest.raises(InputError, match="line 2 is no row of metrics"):
+        read_metrics(path)
+
+
+def test_unfinished_last_line_of_the_metrics_is_left_out(tmp_path: Path) -> None:
+    path = tmp_path / "metrics.jsonl"
+    path.write_text('{"iteration": 1, "psnr": 20.5}\n{"iteration": 2, "ps', "utf-8")
+    assert read_metrics(path) == [{"iteration": 1.0, "psnr": 20.5}]
+
+
+def test_map_of_the_overlap_covers_the_scene(reported: Reported) -> None:
+    facts = overlap_facts(reported.survey)
+    assert facts.median == 8  # the orbit's eight photographs all look at its middle
+    assert facts.parts == 1
+    assert facts.enough_share is not None
+    assert facts.enough_share > 0.95

@@ -1,0 +1,164 @@
+"""The page of the report: every figure is that of `evaluate`, and what is missing is said."""
+
+from __future__ import annotations
+
+import html
+import json
+import re
+from dataclasses import dataclass, field, replace
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipelines.core.errors import BackendUnavailableError, InputError, MissingProductError
+from pipelines.core.products import load_json, save_json
+from pipelines.core.progress import SILENT
+from pipelines.core.stages import ACCURACY_MAP, METRICS, RENDERS, REPORT, SURVEY
+from pipelines.core.workspace import StageRun, Workspace
+from pipelines.pages.page import value_at
+from pipelines.report.options import ReportOptions
+from pipelines.report.points import points_facts
+from pipelines.report.stage import run
+from pipelines.scene.report import write_report
+from pipelines.scene.survey import Survey
+from tests.evaluated_workspaces import evaluated_workspace
+from tests.report.conftest import HOSTILE, Reported, page_of
+from tests.reports import report_with
+
+
+@dataclass
+class Elements(HTMLParser):
+    """Figures, addresses, headings and element names of a page.
+
+    Attributes:
+        figures: path in the report, whole value, and text of each element `data`.
+        addresses: of everything that a browser loads or follows.
+        without_text: pictures without an alternative text.
+    """
+
+    figures: list[tuple[str, Any, str]] = field(default_factory=list)
+    addresses: list[str] = field(default_factory=list)
+    headings: list[int] = field(default_factory=list)
+    names: set[str] = field(default_factory=set)
+    without_text: int = 0
+    is_open: bool = False
+
+    def __post_init__(self) -> None:
+        super().__init__()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        given = dict(attrs)
+        self.names.add(tag)
+        self.addresses += [value for name in ("src", "href") if (value := given.get(name)) is not None]
+        if re.fullmatch("h[1-6]", tag):
+            self.headings.append(int(tag[1]))
+        if tag == "img" and not given.get("alt"):
+            self.without_text += 1
+        if tag == "data":
+            self.is_open = True
+            self.figures.append((str(given["data-field"]), json.loads(str(given["data-value"])), ""))
+
+    def handle_data(self, data: str) -> None:
+        if self.is_open:
+            path, value, text = self.figures[-1]
+            self.figures[-1] = (path, value, text + data)
+
+    def handle_endtag(self, tag: str) -> None:
+        self.is_open = self.is_open and tag != "data"
+
+
+def elements(page: str) -> Elements:
+    parser = Elements()
+    parser.feed(page)
+    return parser
+
+
+def number_in(text: str) -> float:
+    """Return the number of a text, in the unit of the report: per cent and ppm are shares there."""
+    found = re.search(r"[−+]?[\d\u2009]+(?:\.\d+)?", text)
+    assert found is not None, text
+    value = float(found[0].replace("−", "-").replace("\u2009", ""))
+    return value * (1e-6 if "ppm" in text else 1e-2 if "%" in text else 1.0)
+
+
+def test_every_figure_is_that_of_the_report_of_evaluate(reported: Reported) -> None:
+    document = json.loads(reported.truth.workspace.path(REPORT).read_text("utf-8"))
+    figures = elements(reported.html).figures
+    assert len({path for path, _, _ in figures}) > 80
+    for path, value, text in figures:
+        assert value == value_at(document, path), path
+        if value is None:
+            assert text == "–", path
+        elif isinstance(value, int | float):
+            # The coarsest form: three figures behind the point, two for decibels, ratios and long distances.
+            tolerance = 5e-8 if "ppm" in text else 5.1e-3 if abs(value) >= 10 or "dB" in text else 5.1e-4
+            assert number_in(text) == pytest.approx(value, abs=tolerance), path
+
+
+def test_page_is_one_file_without_scripts(reported: Reported) -> None:
+    page = elements(reported.html)
+    assert not {"script", "link", "iframe", "object", "form"} & page.names
+    assert all(address.startswith(("#", "data:image/")) for address in page.addresses)
+    assert "default-src 'none'" in reported.html
+    anchors = set(re.findall(r'id="([^"]+)"', reported.html))
+    assert {address[1:] for address in page.addresses if address.startswith("#")} <= anchors
+    assert page.without_text == 0
+    steps = [after - before for before, after in zip(page.headings, page.headings[1:], strict=False)]
+    assert page.headings[0] == 1
+    assert max(steps) == 1  # no level is left out
+
+
+def test_hostile_names_are_text(reported: Reported) -> None:
+    assert "script" not in elements(reported.html).names
+    assert reported.html.count(html.escape(HOSTILE)) > 10
+
+
+def test_what_is_missing_is_said_with_what_to_do(tmp_path: Path) -> None:
+    made = evaluated_workspace(tmp_path / "flight")
+    root = made.workspace.root
+    survey = load_json(Survey, root / SURVEY)
+    images = tuple(image.model_copy(update={"timestamp_s": None}) for image in survey.images)
+    bare = {"control_points": (), "check_points": (), "images": images}
+    save_json(survey.model_copy(update=bare), root / SURVEY)
+    write_report(report_with(), root / REPORT)
+    (root / METRICS).unlink()
+    for file in (root / RENDERS).iterdir():
+        file.unlink()
+    assert not (root / ACCURACY_MAP).exists()
+    text = re.sub(r"\s+", " ", re.sub(r"<[^>]+>", "", page_of(made)))
+    for sentence in (
+        "The survey has no check points: no accuracy was measured. Give surveyed points",
+        "The survey has no control points: the recorded positions alone place it",
+        "the photographs have no times of exposure",
+        "georef ingest --test-every 8",
+        "train/metrics.jsonl is not there",
+        "georef export-raster writes orthophoto",
+        "The prediction cannot be compared",
+        "There is no map of the predicted σ: the scene has too few points.",
+    ):
+        assert sentence in text
+
+
+def test_without_evaluation_the_command_is_named(tmp_path: Path) -> None:
+    made = evaluated_workspace(tmp_path / "flight")
+    made.workspace.path(REPORT).unlink()
+    with pytest.raises(MissingProductError, match=r"georef evaluate .*flight"):
+        page_of(made)
+
+
+def test_photograph_that_changed_is_refused(reported: Reported) -> None:
+    trained = reported.survey.trained
+    images = tuple(image.model_copy(update={"sha256": "0" * 64}) for image in trained.survey.images)
+    changed = replace(trained, survey=trained.survey.model_copy(update={"images": images}))
+    with pytest.raises(InputError, match="has changed since `georef ingest` read it"):
+        points_facts(replace(reported.survey, trained=changed), 1, SILENT)
+
+
+def test_pdf_without_chromium_is_refused_before_the_work(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.delenv("CHROMIUM", raising=False)
+    monkeypatch.setattr("pipelines.pages.chromium._INSTALLED", ())
+    with pytest.raises(BackendUnavailableError, match="Chromium is missing: install it"):
+        run(StageRun(Workspace(tmp_path), tmp_path), ReportOptions(pdf=True))
