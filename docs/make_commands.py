@@ -11,16 +11,24 @@ import click
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
+from georef_cli.command import Command, shared_options  # noqa: E402
 from georef_cli.main import COMMANDS, cli  # noqa: E402
 
 INTRODUCTION = """# Commands
 
 Made by `python docs/make_commands.py` from the help of the commands; a test compares the two.
 
-`georef -v` tells more, `georef -q` warnings and errors only, `georef --traceback` where an error was raised.
 Results go to stdout, everything else to stderr and to `logs/<stage>.log` in the workspace. Exit codes: 0 done,
-1 known failure, 2 usage, 130 interrupted. With `--json`, stdout is one JSON document; it stays empty when the
-command fails.
+1 known failure, 2 usage (a wrong command line, an option out of range), 130 interrupted.
+
+With `--json`, stdout is one JSON document. When the command fails, the document is
+`{"error": {"code", "message", "path", "line", "field", "hint"}}`. `code` names the kind of failure: `usage`,
+`input`, `missing-product`, `busy`, `geometry`, `contradiction`, `convergence`, `resources`, `backend`, `storage`,
+`crash`, `interrupted`, `failed`, or `defect` for an exception that nobody foresaw. Keys without a value are null.
+
+Every command takes these options, before or after its name:
+
+SHARED
 """
 
 
@@ -30,7 +38,8 @@ def describe(name: str) -> str:
     assert command is not None
     text, _, examples = (command.help or "").partition("\b\nExamples:\n")
     arguments = " ".join(param.make_metavar(click.Context(command)) for param in _of(command, click.Argument))
-    rows = [f"| `{_spelling(option)}` | {_escape(option.help or '')} |" for option in _of(command, click.Option)]
+    assert isinstance(command, Command)
+    rows = [_row(option) for option in command.own_params if isinstance(option, click.Option)]
     calls = "\n".join(line.strip() for line in examples.strip().splitlines())
     return "\n".join(
         [
@@ -42,6 +51,10 @@ def describe(name: str) -> str:
             f"\n```sh\n{calls}\n```\n",
         ]
     )
+
+
+def _row(option: click.Option) -> str:
+    return f"| `{_spelling(option)}` | {_escape(option.help or '')} |"
 
 
 def _of(command: click.Command, kind: type) -> list[Any]:
@@ -65,7 +78,10 @@ def _escape(text: str) -> str:
 
 def main() -> None:
     """Write the document, or print it."""
-    document = "\n".join([INTRODUCTION, *(describe(name) for name in COMMANDS)]).rstrip() + "\n"
+    shared = "\n".join(["| option | meaning |\n|---|---|", *(_row(option) for option in shared_options())])
+    document = (
+        "\n".join([INTRODUCTION.replace("SHARED", shared), *(describe(name) for name in COMMANDS)]).rstrip() + "\n"
+    )
     if "--print" in sys.argv:
         sys.stdout.write(document)
     else:

@@ -1,7 +1,7 @@
 """Boundary of the program: errors become messages and exit codes, log records become lines.
 
 Exit codes: 0 done, 1 known failure, 2 usage, 130 interrupted. An unexpected exception keeps its traceback. All
-messages go to stderr; stdout is for the result.
+messages go to stderr; stdout is for the result, or with `--json` for the error as one JSON document.
 """
 
 from __future__ import annotations
@@ -15,18 +15,21 @@ import sys
 import traceback as tracebacks
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 from types import FrameType, TracebackType
-from typing import IO, TextIO
+from typing import IO, TYPE_CHECKING, TextIO
 
 import click
 
-from georef_cli.printable import printable, printable_lines
+from georef_cli.endings import FAILED, ErrorDocument, defect_document, ending_of
+from georef_cli.printable import printable_lines
 from georef_cli.verbosity import LineFormatter, SafeFormatter, Verbosity
-from pipelines.core.errors import GeorefError, storage_error
+from pipelines.core.errors import GeorefError
 from pipelines.core.interrupts import SIGNALS
 
-FAILED, INTERRUPTED = 1, 130
+if TYPE_CHECKING:
+    from pipelines.core.stages import StageSpec
+    from pipelines.core.workspace import Workspace
+
 LOGGERS = ("pipelines", "georef_cli")
 FILE_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 
@@ -40,34 +43,34 @@ def guarded(group: click.Group, arguments: Sequence[str] | None) -> int:
         group: the commands.
         arguments: of the command line; None: those of the process.
     """
+    as_json = "--json" in (sys.argv[1:] if arguments is None else arguments)
     try:
         _escape_on_stdout()
         with _signals_interrupt():
             code = group.main(args=arguments, prog_name=group.name, standalone_mode=False)
             sys.stdout.flush()
-    except click.ClickException as error:
-        text = io.StringIO()
-        error.show(text)
-        _say(printable_lines(text.getvalue().rstrip("\n")))
-        return error.exit_code
-    except (click.Abort, KeyboardInterrupt):
-        _say("interrupted")
-        return INTERRUPTED
-    except GeorefError as error:
-        _say(f"error: {printable(str(error))}")
-        return FAILED
     except BrokenPipeError:
         # The reader of the pipe has closed it.
         _drop_stdout()
         return FAILED
-    except Exception as error:
-        storage = storage_error(error)
-        if storage is None:
+    except (Exception, KeyboardInterrupt) as error:
+        ending = ending_of(error)
+        if as_json:
+            _print_error(defect_document(error) if ending is None else ending.error)
+        if ending is None:
             raise
-        _say(f"error: {printable(str(storage))}")
+        _say(ending.message)
         _drop_stdout()
-        return FAILED
+        return ending.code
     return code if isinstance(code, int) else 0
+
+
+def _print_error(document: ErrorDocument) -> None:
+    """Print the document of an error on stdout, which may be what has failed."""
+    from pipelines.core.products import dump_json  # here, because it imports the validation library
+
+    with contextlib.suppress(OSError):
+        click.echo(dump_json({"error": document}))
 
 
 def _say(text: str) -> None:
@@ -125,9 +128,9 @@ def logged_to_stderr(verbosity: Verbosity) -> Iterator[None]:
 
 
 @contextmanager
-def logged_to_file(path: Path) -> Iterator[None]:
-    """Append log records to the file `path` while the context lasts, and the error that ends it."""
-    handler = _LateFileHandler(path)
+def logged_to_file(workspace: Workspace, spec: StageSpec) -> Iterator[None]:
+    """Append log records to the log of a stage while the context lasts, and the error that ends it."""
+    handler = _LateFileHandler(workspace, spec)
     handler.setFormatter(SafeFormatter(FILE_FORMAT))
     with _attached(handler, logging.INFO):
         try:
@@ -176,24 +179,32 @@ class _StderrHandler(logging.StreamHandler[TextIO]):
 
 
 class _LateFileHandler(logging.Handler):
-    """Handler that opens its file at the first record, in a workspace that exists by then.
+    """Handler that opens its file when the workspace has its first product, or else at the end of the command.
 
-    A command that is refused before it begins leaves neither file nor folder behind. Where the log cannot be
-    written, nothing is said: stderr has the same lines.
+    A command that is refused leaves neither file nor folder behind. Where the log cannot be written, nothing is
+    said: stderr has the same lines.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, workspace: Workspace, spec: StageSpec) -> None:
         super().__init__()
-        self.path = path
+        self.path = workspace.log_file(spec)
+        self._workspace = workspace
+        self._held_back: list[str] = []
         self._file: IO[bytes] | None = None
         self._failed = False
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Write a record."""
-        line = self.format(record) + "\n"
+        """Write a record, or hold it back."""
+        self._held_back.append(self.format(record) + "\n")
+        if self._file is not None or self._workspace.has_product():
+            self._write()
+
+    def _write(self) -> None:
+        """Write what was held back."""
+        lines, self._held_back = self._held_back, []
         try:
-            if not self._failed and self.path.parent.parent.is_dir():
-                self._open().write(line.encode("utf-8", "backslashreplace"))
+            if not self._failed:
+                self._open().write("".join(lines).encode("utf-8", "backslashreplace"))
         except OSError:
             self._failed = True
 
@@ -204,7 +215,9 @@ class _LateFileHandler(logging.Handler):
         return self._file
 
     def close(self) -> None:
-        """Close the file."""
+        """Write what was held back, unless the command was refused, and close the file."""
+        if self._held_back and self._workspace.has_begun():
+            self._write()
         if self._file is not None:
             with contextlib.suppress(OSError):
                 self._file.close()

@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from georef_cli.delivery import check_target, deliver, deliver_folder, refuse_other_format
+from georef_cli.display import is_told
 from georef_cli.output import print_outcome
 from georef_cli.stage import StageCommand
 
@@ -50,7 +51,7 @@ class DeliverableCommand(StageCommand):
         if target is not None:
             refuse_other_format(target, self.spec, folder=self.folder)
             check_target(target, overwrite=values["force"])
-        outcome = self.run(ctx, values, resume="if-same")
+        outcome = self.run(ctx, values)
         if target is not None:
             with workspace.lock(self.spec.name):
                 product = workspace.path(self.spec.product)
@@ -58,4 +59,4 @@ class DeliverableCommand(StageCommand):
                     deliver_folder(workspace.root / self.spec.folder, target)
                 else:
                     deliver(product, target)
-        print_outcome(workspace, outcome, as_json=values["as_json"])
+        print_outcome(workspace, outcome, as_json=values["as_json"], told=is_told(ctx.obj))

@@ -16,17 +16,19 @@ from rich.progress import (
     Task,
     TaskID,
     TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
 )
 from rich.progress import Progress as Bars
 from rich.progress import ProgressColumn as Column
+from rich.table import Column as TableColumn
 from rich.text import Text
 
 from georef_cli.verbosity import LineFormatter, Verbosity
+from pipelines.core.cautions import AT_END
 from pipelines.core.progress import SILENT, Progress, ProgressTask
 
 LINE_EVERY_S = 30.0
+# Columns of a terminal from which a bar shows the speed too, and the columns of the bar itself.
+_WIDE, _WIDE_BAR, _NARROW_BAR = 100, 20, 8
 LEVEL_STYLES = {logging.ERROR: "red", logging.WARNING: "yellow", logging.INFO: ""}
 
 log = logging.getLogger(__name__)
@@ -47,9 +49,16 @@ class ConsoleHandler(logging.Handler):
         self._console = console
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Print a record."""
+        """Print a record, unless stdout, on the same terminal, ends with it."""
+        if getattr(record, AT_END, False) and sys.stdout.isatty():
+            return
         style = next((style for level, style in LEVEL_STYLES.items() if record.levelno >= level), "dim")
         self._console.print(Text(self.format(record), style=style))
+
+
+def is_told(verbosity: Verbosity) -> bool:
+    """Return whether the reader of stdout has the lines on stderr before their eyes, on the same terminal."""
+    return not verbosity.quiet and sys.stderr.isatty() and sys.stdout.isatty()
 
 
 def progress_for(verbosity: Verbosity) -> Progress:
@@ -70,6 +79,39 @@ class SpeedColumn(Column):
         return Text(f"{speed:.1f} it/s" if speed >= 1 else f"{1 / speed:.1f} s/it", style="progress.data.speed")
 
 
+class SoFarColumn(Column):
+    """Column of the time since the beginning, or that of a finished task."""
+
+    def render(self, task: Task) -> Text:
+        """Return the time."""
+        if task.finished:
+            return Text(clock(task.finished_time or 0.0))
+        return Text("" if task.elapsed is None else f"{clock(task.elapsed)} so far")
+
+
+class LeftColumn(Column):
+    """Column of the time that is left: the task's own estimate, or from the speed of its steps."""
+
+    def render(self, task: Task) -> Text:
+        """Return the time; empty where it is unknown."""
+        left_s = task.time_remaining if task.fields["left_s"] is None else task.fields["left_s"]
+        return Text("" if left_s is None or task.finished else f"{clock(left_s)} left")
+
+
+class NoteColumn(Column):
+    """Column of the note, cut off where the line ends."""
+
+    def render(self, task: Task) -> Text:
+        """Return the note."""
+        return Text(task.fields["note"], no_wrap=True, overflow="ellipsis")
+
+
+def clock(seconds: float) -> str:
+    """Return a time as `0:07`, `12:30` or `1:02:03`."""
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes // 60}:{minutes % 60:02d}:{rest:02d}" if minutes >= 60 else f"{minutes}:{rest:02d}"
+
+
 class BarProgress:
     """Progress as bars, one below the other; a finished bar stays and shows its time."""
 
@@ -79,10 +121,14 @@ class BarProgress:
 
     @contextmanager
     def task(self, name: str, total: int | None = None) -> Iterator[ProgressTask]:
-        """Open a bar; tasks that are opened inside it are drawn below."""
+        """Open a bar; tasks that are opened inside it are drawn below. A task without steps has no bar."""
+        if total == 0:
+            with SILENT.task(name) as silent:
+                yield silent
+            return
         outermost = self._bars is None
         bars = self._bars or self._start()
-        bar = bars.add_task(name, total=total, note="")
+        bar = bars.add_task(name, total=total, note="", left_s=None)
         try:
             yield _Bar(bars, bar)
         finally:
@@ -92,14 +138,18 @@ class BarProgress:
                 self._bars = None
 
     def _start(self) -> Bars:
+        wide = self._console.width >= _WIDE
+        fixed: tuple[Column, ...] = (
+            TextColumn("{task.description}", markup=False, table_column=TableColumn(no_wrap=True)),
+            BarColumn(_WIDE_BAR if wide else _NARROW_BAR),
+            MofNCompleteColumn(table_column=TableColumn(no_wrap=True)),
+            *([SpeedColumn(TableColumn(no_wrap=True))] if wide else []),
+            SoFarColumn(TableColumn(no_wrap=True)),
+            LeftColumn(TableColumn(no_wrap=True)),
+        )
         self._bars = Bars(
-            TextColumn("{task.description}", markup=False),
-            BarColumn(),
-            MofNCompleteColumn(),
-            SpeedColumn(),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
-            TextColumn("{task.fields[note]}", markup=False),
+            *fixed,
+            NoteColumn(),
             console=self._console,
             refresh_per_second=4,
         )
@@ -110,13 +160,12 @@ class BarProgress:
 class _Bar:
     def __init__(self, bars: Bars, bar: TaskID) -> None:
         self._bars, self._bar = bars, bar
+        self._note = ""
 
-    def advance(self, steps: int = 1, note: str = "") -> None:
+    def advance(self, steps: int = 1, note: str = "", left_s: float | None = None) -> None:
         """Add `steps` to the bar, and show `note` behind it."""
-        if note:
-            self._bars.update(self._bar, advance=steps, note=note)
-        else:
-            self._bars.update(self._bar, advance=steps)
+        self._note = note or self._note
+        self._bars.update(self._bar, advance=steps, note=self._note, left_s=left_s)
 
 
 class LineProgress:
@@ -136,12 +185,13 @@ class _Line:
     def __init__(self, name: str, total: int | None) -> None:
         self._name, self._total = name, total
         self._done, self._note = 0, ""
+        self._left_s: float | None = None
         self._started = self._logged = time.monotonic()
 
-    def advance(self, steps: int = 1, note: str = "") -> None:
+    def advance(self, steps: int = 1, note: str = "", left_s: float | None = None) -> None:
         """Add `steps` to the count, and log it if the last line is half a minute old."""
         self._done += steps
-        self._note = note or self._note
+        self._note, self._left_s = note.strip() if note else self._note, left_s
         if time.monotonic() - self._logged >= LINE_EVERY_S:
             self.log_count()
 
@@ -151,4 +201,5 @@ class _Line:
         elapsed_s = self._logged - self._started
         total = "" if self._total is None else f"/{self._total}"
         note = f", {self._note}" if self._note else ""
-        log.info("%s: %d%s after %.0f s%s", self._name, self._done, total, elapsed_s, note)
+        left = f", about {clock(self._left_s)} left" if self._left_s else ""
+        log.info("%s: %d%s after %.0f s%s%s", self._name, self._done, total, elapsed_s, note, left)

@@ -16,7 +16,7 @@ from typing import Any
 import click
 
 from georef_cli import boundary
-from georef_cli.verbosity import Verbosity
+from georef_cli.command import Command, merged_verbosity, shared_options
 from pipelines import __version__
 
 PROGRAM = "georef"
@@ -68,6 +68,8 @@ COMMANDS: dict[str, HelpLine] = {
     "export-tiles": HelpLine("export_tiles", "Deliverables", "Write the splat as 3D Tiles, for web globes."),
     "export-cameras": HelpLine("export_cameras", "Deliverables", "Write the trained cameras for other programs."),
     "report": HelpLine("report", "Deliverables", "Write the report: one page, and its PDF."),
+    "help": HelpLine("help", "Help", "Explain a topic, such as heights or options, or a command."),
+    "doctor": HelpLine("doctor", "Help", "Show what this machine offers: memory, GPU, backends, geoid grids."),
 }
 
 
@@ -84,20 +86,13 @@ class LazyGroup(click.Group):
         if entry is None:
             return None
         command = importlib.import_module(f"georef_cli.commands.{entry.module}").command
-        assert isinstance(command, click.Command)
+        assert isinstance(command, Command)
         return command
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run a subcommand with the verbosity of the group's options, and return its result.
-
-        Raises:
-            click.UsageError: both `--verbose` and `--quiet` are given.
-        """
-        if ctx.params["verbose"] and ctx.params["quiet"]:
-            raise click.UsageError("--verbose and --quiet exclude each other.", ctx)
-        ctx.obj = Verbosity(**ctx.params)
-        with boundary.logged_to_stderr(ctx.obj):
-            return super().invoke(ctx)
+        """Run a subcommand, which inherits the verbosity of the group's options, and return its result."""
+        ctx.obj = merged_verbosity(ctx)
+        return super().invoke(ctx)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the commands from the table, without an import."""
@@ -113,10 +108,12 @@ def _print_version(ctx: click.Context, _param: click.Parameter, value: bool) -> 
     ctx.exit()
 
 
-@click.group(name=PROGRAM, cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
-@click.option("-v", "--verbose", is_flag=True, help="Show more messages.")
-@click.option("-q", "--quiet", is_flag=True, help="Show warnings and errors only.")
-@click.option("--traceback", is_flag=True, help="Show where in the program an error was raised.")
+@click.group(
+    name=PROGRAM,
+    cls=LazyGroup,
+    params=list(shared_options()),
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
 @click.option(
     "--version",
     is_flag=True,
@@ -125,7 +122,7 @@ def _print_version(ctx: click.Context, _param: click.Parameter, value: bool) -> 
     callback=_print_version,
     help="Show the version.",
 )
-def cli(**_verbosity: bool) -> None:
+def cli() -> None:
     """From drone flights to georeferenced 3D Gaussian splats.
 
     Every command works on a workspace, a folder that holds the products of the stages.
@@ -134,6 +131,7 @@ def cli(**_verbosity: bool) -> None:
     Examples:
       georef run flight --images photos
       georef status flight
+      georef help start
     """
 
 

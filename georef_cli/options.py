@@ -14,6 +14,7 @@ import click
 from pydantic.fields import FieldInfo
 
 from pipelines.core.options import StageOptions, flag_name, is_written, notation
+from pipelines.core.origins import names_of_flags
 from pipelines.core.workspace import Workspace
 
 _BOUNDS = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
@@ -45,9 +46,38 @@ def force_option(help_text: str = "Run even if the product is current.") -> clic
     return click.Option(["--force"], is_flag=True, help=help_text)
 
 
+def dry_run_option() -> click.Option:
+    """Return the option `--dry-run`."""
+    return click.Option(["--dry-run"], is_flag=True, help="Show what would be run, why, and how long; run nothing.")
+
+
+def forget_option() -> click.Option:
+    """Return the option `--forget`."""
+    return click.Option(
+        ["--forget"],
+        multiple=True,
+        metavar="OPTION",
+        help="Forget this option of earlier commands (`--forget gcp`), or `all`.  [repeatable]",
+    )
+
+
+def forgotten(options_type: type[StageOptions], names: Iterable[str]) -> list[str]:
+    """Return the fields that the user names with `--forget`; `all` stands for each of them.
+
+    Raises:
+        click.UsageError: a name is no option.
+    """
+    if "all" in (named := list(names)):
+        return list(options_type.model_fields)
+    try:
+        return names_of_flags(options_type, named)
+    except ValueError as error:
+        raise click.UsageError(f"--forget: {error}") from error
+
+
 def stage_options(options_type: type[StageOptions], only: Iterable[str] | None = None) -> list[click.Option]:
-    """Return the click options of all fields, or of the fields named in `only`."""
-    names = list(options_type.model_fields) if only is None else list(only)
+    """Return the click options of all fields, or of the fields named in `only`; `--threads` is for all commands."""
+    names = [name for name in options_type.model_fields if name != "threads"] if only is None else list(only)
     return [stage_option(options_type, name) for name in names]
 
 

@@ -11,7 +11,7 @@ from rich.console import Console, RenderableType
 from rich.text import Text
 
 from georef_cli import overview, tables
-from georef_cli.markup import Safe
+from georef_cli.markup import Safe, shown
 from pipelines.core.cautions import Caution
 from pipelines.core.products import dump_json
 from pipelines.core.runner import Outcome
@@ -58,29 +58,45 @@ def document_of_cautions(by_stage: Mapping[str, Sequence[Caution]]) -> list[dict
     ]
 
 
-def print_outcome(workspace: Workspace, outcome: Outcome, *more: RenderableType, as_json: bool) -> None:
-    """Print the result of a stage, then the cautions of the workspace."""
+def print_outcome(workspace: Workspace, outcome: Outcome, *more: RenderableType, as_json: bool, told: bool) -> None:
+    """Print the result of a stage, then the cautions of the workspace.
+
+    Args:
+        workspace: with the result.
+        outcome: of the stage.
+        more: printed below its figures.
+        as_json: print one document.
+        told: the log on the same terminal has shown the headline.
+    """
     cautions = cautions_by_stage(workspace)
     if as_json:
         print_json({**document_of(outcome), "cautions": document_of_cautions(cautions)})
     else:
-        print_rich(*tables.outcome(workspace, outcome), *more, *tables.cautions(cautions))
+        print_rich(*tables.outcome(workspace, outcome, headline=not told), *more, *tables.cautions(cautions))
 
 
 def print_outcomes(
-    workspace: Workspace, outcomes: Sequence[Outcome], result: Overview | None, *, as_json: bool
+    workspace: Workspace, outcomes: Sequence[Outcome], result: Overview | None, *, as_json: bool, told: bool
 ) -> None:
-    """Print the results of several stages, the overview of the whole if there is one, and last the cautions."""
+    """Print the results of several stages, the overview of the whole if there is one, and last the cautions.
+
+    Args:
+        workspace: with the results.
+        outcomes: of the stages.
+        result: the overview.
+        as_json: print one document.
+        told: the log on the same terminal has shown the stages.
+    """
     cautions = cautions_by_stage(workspace)
     if as_json:
         stages = [document_of(outcome) for outcome in outcomes]
         document = {"workspace": str(workspace.root), "stages": stages, "result": result and result.feature()}
         print_json({**document, "cautions": document_of_cautions(cautions)})
         return
-    print_rich(tables.outcomes(outcomes))
-    for outcome in outcomes:
-        if outcome.stage == "evaluate":
-            print_rich(*tables.report_of(workspace))
+    if not told:
+        print_rich(tables.outcomes(outcomes))
     if result is not None:
         print_rich(*overview.short(result))
+    elif told:
+        print_rich(f"[bold]Next[/]: georef run {shown(str(workspace.root))} completes it")
     print_rich(*tables.cautions(cautions))

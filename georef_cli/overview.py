@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from rich.table import Table
 
 from georef_cli import tables
+from georef_cli.layout import ByWidth, plain_table
 from georef_cli.markup import shown
 from georef_cli.tables import Renderable
 
@@ -27,14 +28,23 @@ def whole(result: Overview) -> list[Renderable]:
 
 def short(result: Overview) -> list[Renderable]:
     """Return the end of `georef run`: where the result is, how good it is, where the files are, what comes next."""
-    parts: list[Renderable] = ["", _headline(result), _place(result, brief=True)]
+    workspace = result.workspace
+    files = plain_table("", "", header=False)
+    files.columns[0].overflow = "fold"
     for file in result.files:
         style = tables.STATE_STYLE.get(file.state, "dim")
         state = "" if file.state == "current" else f"[{style}]{file.state}[/] "
-        parts.append(f"  {shown(str(result.workspace / file.path))}  {state}[dim]{shown(file.purpose)}[/]")
+        files.add_row(f"  {shown(file.path)}", f"{state}[dim]{shown(file.purpose)}[/]")
     names = ",".join(command.split()[1].removeprefix("export-") for command in result.further)
-    more = f"; more: georef run {result.workspace} --deliver {names}" if names else ""
-    return [*parts, f"[dim]all of it:[/] georef info {shown(str(result.workspace))}{shown(more)}"]
+    further = {
+        f"georef view {workspace}": "see it in a browser, and measure in it",
+        f"georef info {workspace}": "sizes and states of the files",
+        f"georef evaluate {workspace}": "all figures of test views, check points and fit",
+        **({f"georef run {workspace} --deliver {names}": "further deliverables"} if names else {}),
+    }
+    steps = [f"  {shown(command)}  [dim]{use}[/]" for command, use in further.items()]
+    parts: list[Renderable] = ["", _headline(result), _place(result, brief=True)]
+    return [*parts, f"\n[bold]Files[/] in {shown(str(workspace))}", files, "\n[bold]Next[/]", *steps]
 
 
 def size(count: int) -> str:
@@ -56,12 +66,12 @@ def _place(result: Overview, *, brief: bool = False) -> Table:
         "longitude": f"{bounds.west:.6f} … {bounds.east:.6f}°",
         "latitude": f"{bounds.south:.6f} … {bounds.north:.6f}°",
         "height": f"{bounds.height_m[0]:.2f} … {bounds.height_m[1]:.2f} m, ellipsoidal",
-    }
-    if not brief:
-        lines[bounds.crs] = ", ".join(
+        bounds.crs: ", ".join(
             f"{low:.{_decimals(unit)}f} … {high:.{_decimals(unit)}f} {unit}"
             for low, high, unit in zip(bounds.low, bounds.high, bounds.units, strict=True)
-        )
+        ),
+    }
+    if not brief:
         lines[""] = f"heights {bounds.heights}" + "".join(f"; {text}" for text in bounds.assumed)
     if quality.sigma_h_m is not None and quality.sigma_v_m is not None:
         lines["predicted σ"] = f"{quality.sigma_h_m:.3f} m H, {quality.sigma_v_m:.3f} m V, {quality.counts}"
@@ -71,26 +81,24 @@ def _place(result: Overview, *, brief: bool = False) -> Table:
         points = f"RMSE of {quality.check_points} check points"
         lines["measured"] = f"{quality.rmse_h_m:.3f} m H, {quality.rmse_v_m:.3f} m V, {points}"
     else:
-        lines["measured"] = "nothing: no check points were evaluated"
+        lines["measured"] = "nothing: no check points (--checkpoints, --check)"
+    if quality.psnr is not None:
+        lines["test views"] = f"PSNR {quality.psnr:.2f} dB"
     table = Table(show_header=False, box=None, pad_edge=False)
     for name, text in lines.items():
         table.add_row(shown(name), shown(text))
     return table
 
 
-def _files(result: Overview) -> Table:
-    table = Table("\nfile", "\nsize", "\nmade", "\nstate", "\nuse", box=None, pad_edge=False)
-    table.columns[1].justify = "right"
+def _files(result: Overview) -> ByWidth:
+    wide = plain_table("\nfile", "\nsize", "\nmade", "\nstate", "\nuse", right=[1])
+    narrow = plain_table("\nfile", "\nsize", "\nstate", "\nuse", right=[1])
     for file in result.files:
-        style = tables.STATE_STYLE.get(file.state, "dim")
-        table.add_row(
-            shown(file.path),
-            size(file.bytes),
-            tables.when(file.made),
-            f"[{style}]{file.state}[/]",
-            shown(file.purpose),
-        )
-    return table
+        name, count, use = shown(file.path), size(file.bytes), shown(file.purpose)
+        state = f"[{tables.STATE_STYLE.get(file.state, 'dim')}]{file.state}[/]"
+        wide.add_row(name, count, tables.when(file.made), state, use)
+        narrow.add_row(name, count, state, use)
+    return ByWidth(tables.WIDE, wide, narrow)
 
 
 def _decimals(unit: str) -> int:

@@ -9,14 +9,18 @@ from typing import Any
 from rich.console import Group
 from rich.table import Table
 
+from georef_cli.layout import ByWidth, FirstThatFits, figures, plain_table
 from georef_cli.markup import shown
 from pipelines.compare.table import Comparison, cells, remarks_on
 from pipelines.core.cautions import Caution
+from pipelines.core.options import notation
+from pipelines.core.origins import OptionOrigin
 from pipelines.core.runner import Outcome
+from pipelines.core.sentences import duration
 from pipelines.core.stages import REPORT
 from pipelines.core.staleness import StageState
 from pipelines.core.workspace import Workspace
-from pipelines.scene.report import CheckPointErrors, EvaluationReport, read_report
+from pipelines.scene.report import CheckPointErrors, EvaluationReport, NoCrossValidation, read_report
 
 STATE_STYLE = {
     "current": "green",
@@ -50,26 +54,45 @@ FACTOR_COLUMNS = {
     "sigma_source": "σ",
 }
 IMAGE_COLUMNS = {"views": "views", "psnr": "PSNR dB", "ssim": "SSIM", "lpips": "LPIPS"}
-Renderable = Group | Table | str
+_CROSSED = "Control points, each left out in turn (cross-validation)"
+# Columns of a terminal from which tables show all that they have.
+WIDE = 100
+_FORGET = "[dim]georef run WS --forget OPTION drops a remembered one[/]"
+Renderable = Group | Table | ByWidth | FirstThatFits | str
 
 
-def states(rows: Iterable[StageState], cautions: Mapping[str, Sequence[Caution]]) -> Table:
-    """Return the table of `georef status`: stage, state, end, duration, new cautions if any, key figure."""
-    table = _table("stage", "state", "finished", "took", *(["cautions"] if cautions else []), "result")
-    for column in table.columns[3:-1]:
-        column.justify = "right"
+def states(rows: Iterable[StageState], cautions: Mapping[str, Sequence[Caution]]) -> ByWidth:
+    """Return the table of `georef status`: stage, state, end, duration, new cautions if any, key figure.
+
+    A narrow terminal has no room for the end and the number of cautions, whose sentences follow the table.
+    """
+    narrow = plain_table("stage", "state", "took", "result", right=[2])
+    heads = ("stage", "state", "finished", "took", *(["cautions"] if cautions else []), "result")
+    wide = plain_table(*heads, right=range(3, len(heads) - 1))
     for row in rows:
-        remarks = [shown(text) for text in (row.key_figure, row.reason) if text]
-        style = STATE_STYLE[row.state]
-        table.add_row(
-            row.stage,
-            f"[{style}]{row.state}[/]",
-            when(row.finished),
-            duration(row.duration_s),
-            *([str(len(cautions.get(row.stage, ())) or "")] if cautions else []),
-            " · ".join(remarks),
-        )
-    return table
+        remarks = " · ".join(shown(text) for text in (row.key_figure, row.reason) if text)
+        state, took = f"[{STATE_STYLE[row.state]}]{row.state}[/]", duration(row.duration_s)
+        count = [str(len(cautions.get(row.stage, ())) or "")] if cautions else []
+        wide.add_row(row.stage, state, when(row.finished), took, *count, remarks)
+        narrow.add_row(row.stage, state, took, remarks)
+    return ByWidth(WIDE, wide, narrow)
+
+
+def origins(rows: Sequence[OptionOrigin]) -> list[Renderable]:
+    """Return the table of options that are no defaults, with where their values come from."""
+    if not rows:
+        return ["", "[bold]Options[/]: all are defaults"]
+    table = plain_table("stage", "option", "value", "from")
+    table.columns[2].overflow = "fold"
+    before = ""
+    for row in rows:
+        table.add_row(row.stage if row.stage != before else "", row.flag, shown(notation(row.value)), row.origin)
+        before = row.stage
+    return [
+        "\n[bold]Options that are no defaults[/]",
+        table,
+        *([_FORGET] if any(row.origin == "remembered" for row in rows) else []),
+    ]
 
 
 def cautions(by_stage: Mapping[str, Sequence[Caution]]) -> list[Renderable]:
@@ -81,11 +104,13 @@ def cautions(by_stage: Mapping[str, Sequence[Caution]]) -> list[Renderable]:
     ]
 
 
-def outcome(workspace: Workspace, result: Outcome) -> list[Renderable]:
-    """Return the result of one stage: headline, figures, and the warnings of an earlier run."""
+def outcome(workspace: Workspace, result: Outcome, *, headline: bool = True) -> list[Renderable]:
+    """Return the result of one stage: headline if asked, figures, and the warnings of an earlier run."""
     manifest = result.manifest
     effort = duration(manifest.duration_s) if result.ran else "current, nothing to do"
-    parts: list[Renderable] = [f"[bold]{result.stage}[/]: {shown(manifest.key_figure)} ({effort})"]
+    parts: list[Renderable] = []
+    if headline:
+        parts.append(f"[bold]{result.stage}[/]: {shown(manifest.key_figure)} ({effort})")
     if result.stage == "evaluate":
         parts += report_of(workspace)
     elif manifest.values:
@@ -97,8 +122,7 @@ def outcome(workspace: Workspace, result: Outcome) -> list[Renderable]:
 
 def outcomes(results: Sequence[Outcome]) -> Table:
     """Return the table of the results of `georef run`, a line for each stage."""
-    table = _table("stage", "", "took", "result")
-    table.columns[2].justify = "right"
+    table = plain_table("stage", "", "took", "result", right=[2])
     for result in results:
         manifest = result.manifest
         done = "[green]done[/]" if result.ran else "[dim]current[/]"
@@ -110,26 +134,26 @@ def outcomes(results: Sequence[Outcome]) -> Table:
 
 def comparison(table: Comparison) -> list[Renderable]:
     """Return the tables of `georef compare`: a line for each configuration, and its distinctive features below."""
-    heads = [f"{way}\n{name}" for way in ("camera", "model") for name in ("mean H", "median H", "RMSE H", "RMSE V")]
-    del heads[1]  # by camera, mean and median hardly differ
-    figures = _table("", "test\nPSNR", "\nSSIM", *heads, "check\npoints", "\ntraining")
-    for column in figures.columns[1:]:
-        column.justify, column.no_wrap = "right", True
-    for row in table.rows:
-        figures.add_row(shown(row.configuration), *map(shown, cells(row)))
+    points = [
+        f"{way}\n{name}" for way in ("camera", "model") for name in ("mean H", "median H", "RMSE H", "RMSE V")
+    ]
+    del points[1]  # by camera, mean and median hardly differ
+    heads = ("test\nPSNR", "\nSSIM", *points, "check\npoints", "\ntraining")
+    rows = {shown(row.configuration): [shown(cell) for cell in cells(row)] for row in table.rows}
     notes = [f"[bold]{shown(row.configuration)}[/] {shown(f'{row.title}: {row.note}')}" for row in table.rows]
     remarks = [
         f"[yellow]{shown(row.configuration)}:[/] {shown(text)}" for row in table.rows for text in remarks_on(row)
     ]
-    return ["[bold]Test views in dB, check points in metres[/]", figures, "", *notes, *remarks]
+    return ["[bold]Test views in dB, check points in metres[/]", figures(heads, rows), "", *notes, *remarks]
 
 
-def topics(rows: Iterable[Mapping[str, Any]]) -> Table:
-    """Return the table of `georef inspect`, a line for each topic."""
-    table = _table("topic", "type", "messages", "Hz", "span", "longest gap", "frame", "use", "")
-    table.columns[0].overflow = table.columns[1].overflow = "fold"
-    for column in table.columns[2:6]:
-        column.justify = "right"
+def topics(rows: Iterable[Mapping[str, Any]]) -> ByWidth:
+    """Return the table of `georef inspect`, a line for each topic; a narrow terminal has no room for types."""
+    table = plain_table(
+        "topic", "type", "messages", "Hz", "span", "longest gap", "frame", "use", "", right=range(2, 6)
+    )
+    narrow = plain_table("topic", "messages", "Hz", "use", "", right=[1, 2])
+    table.columns[0].overflow = table.columns[1].overflow = narrow.columns[0].overflow = "fold"
     for row in rows:
         span = None if row["first_s"] is None else row["last_s"] - row["first_s"]
         remarks = [
@@ -137,18 +161,12 @@ def topics(rows: Iterable[Mapping[str, Any]]) -> Table:
             f"{row['backwards']} backwards" if row["backwards"] else "",
         ]
         remarks += ["no stamps" if row["clock"] == "recording" else "", row["problem"]]
-        table.add_row(
-            shown(row["name"]),
-            shown(row["type"].replace("/msg/", "/")),
-            str(row["messages"]),
-            _number(row["rate_hz"]),
-            duration(span),
-            duration(row["longest_gap_s"]),
-            shown(row["frame"]),
-            f"[green]{shown(row['use'])}[/]",
-            shown(", ".join(filter(None, remarks))),
-        )
-    return table
+        name, messages, rate = shown(row["name"]), str(row["messages"]), _number(row["rate_hz"])
+        ending = (f"[green]{shown(row['use'])}[/]", shown(", ".join(filter(None, remarks))))
+        kind, times = shown(row["type"].replace("/msg/", "/")), (duration(span), duration(row["longest_gap_s"]))
+        table.add_row(name, kind, messages, rate, *times, shown(row["frame"]), *ending)
+        narrow.add_row(name, messages, rate, *ending)
+    return ByWidth(WIDE, table, narrow)
 
 
 def report_of(workspace: Workspace) -> list[Renderable]:
@@ -173,40 +191,26 @@ def report(document: EvaluationReport) -> list[Renderable]:
         _rows("Test views", {"test": dict(document.photometric.test)}, IMAGE_COLUMNS),
         _rows("Check points, metres", {way: dict(errors) for way, errors in ways.items()}, POINT_COLUMNS),
         _accuracy(ways),
-        _rows(
-            "Control points, each left out in turn (cross-validation), metres",
-            {} if crossed is None else {"left out": dict(crossed)},
-            POINT_COLUMNS,
-        ),
+        _rows(f"{_CROSSED}, metres", {} if crossed is None else {"left out": dict(crossed)}, POINT_COLUMNS),
+        _impossible(crossed) if isinstance(crossed, NoCrossValidation) else None,
         _rows("Residuals of the fit (not an accuracy), metres", fit, POINT_COLUMNS),
         _rows("Variance factors: estimated over stated variance (tie points: in px²)", factors, FACTOR_COLUMNS),
     )
     return [table for table in tables if table is not None]
 
 
-def duration(seconds: float | None) -> str:
-    """Return a duration as `0.4 s`, `12 s`, `3 min 20 s` or `1 h 05 min`; empty for None."""
-    if seconds is None:
-        return ""
-    if seconds < 10:
-        return f"{seconds:.1f} s"
-    minutes, rest = divmod(round(seconds), 60)
-    if minutes < 60:
-        return f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"
-    return f"{minutes // 60} h {minutes % 60:02d} min"
+def _impossible(crossed: NoCrossValidation) -> Group:
+    return Group(f"\n[bold]{_CROSSED}[/]", f"not possible: {shown(crossed.reason)}")
 
 
 def _rows(title: str, rows: Mapping[str, Mapping[str, Any]], columns: Mapping[str, str]) -> Group | None:
-    """Return a table under its title, a line for each row, with the columns that any row has; None without any."""
-    heads = {key: head for key, head in columns.items() if any(key in row for row in rows.values())}
+    """Return a table under its title, with the rows and columns that have a figure; None without any."""
+    known = {name: row for name, row in rows.items() if any(row.get(key) for key in columns)}
+    heads = {key: head for key, head in columns.items() if any(row.get(key) is not None for row in known.values())}
     if not heads:
         return None
-    table = _table("", *heads.values())
-    for column in table.columns[1:]:
-        column.justify = "right"
-    for name, row in rows.items():
-        table.add_row(shown(name), *(shown(_number(row.get(key))) for key in heads))
-    return Group(f"\n[bold]{title}[/]", table)
+    cells = {shown(name): [shown(_number(row.get(key))) for key in heads] for name, row in known.items()}
+    return Group(f"\n[bold]{title}[/]", figures(tuple(heads.values()), cells))
 
 
 def _accuracy(ways: Mapping[str, CheckPointErrors]) -> Group | None:
@@ -233,16 +237,11 @@ def _accuracy_row(errors: CheckPointErrors) -> dict[str, float | str | None]:
 
 def _figures(values: Mapping[str, Any]) -> Table:
     """Return plain values as a table of two columns; nested values are shown by `--json` only."""
-    table = _table("", "", header=False)
-    table.columns[1].justify = "right"
+    table = plain_table("", "", header=False, right=[1])
     for name, value in values.items():
         if isinstance(value, str | int | float) or value is None:
             table.add_row(shown(name), shown(_number(value)))
     return table
-
-
-def _table(*columns: str, header: bool = True) -> Table:
-    return Table(*columns, show_header=header, box=None, pad_edge=False)
 
 
 def _number(value: Any) -> str:

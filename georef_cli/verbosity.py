@@ -11,7 +11,7 @@ from georef_cli.printable import printable, printable_lines
 
 @dataclass(frozen=True)
 class Verbosity:
-    """Verbosity of the program: the options of the group.
+    """Verbosity of the program: the options of the group and of the command together.
 
     Attributes:
         verbose: show messages for debugging too.

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from georef_cli.printable import printable
+
 REPOSITORY = Path(__file__).parents[1]
 WITH_FAKES = "from tests import fakes; fakes.install(); from georef_cli.main import main; main()"
 
@@ -27,6 +29,16 @@ class Result:
     def document(self) -> Any:
         """stdout as the one JSON document that it must be."""
         return json.loads(self.out)
+
+    def assert_failed(self, code: int) -> None:
+        """The command failed with this exit code: stdout has no result, at most the document of the error."""
+        assert self.code == code, self.err
+        if self.out:
+            assert set(self.document) == {"error"}
+            error = self.document["error"]
+            assert set(error) == {"code", "message", "path", "line", "field", "hint"}
+            assert (error["code"] == "usage") is (code == 2)
+            assert printable(error["message"]) in self.err
 
 
 Georef = Callable[..., Result]

@@ -43,6 +43,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
         "pipelines.geolocate",
         "pipelines.ingest",
         "pipelines.init_sim3",
+        "pipelines.machine",
         "pipelines.report",
         "pipelines.sfm",
         "pipelines.simulate",

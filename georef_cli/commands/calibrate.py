@@ -8,6 +8,7 @@ import click
 from rich.console import RenderableType
 from rich.table import Table
 
+from georef_cli.display import is_told
 from georef_cli.markup import shown
 from georef_cli.output import print_outcome
 from georef_cli.stage import StageCommand
@@ -30,7 +31,8 @@ class CalibrateCommand(StageCommand):
     def act(self, ctx: click.Context, **values: Any) -> None:
         """Run the stage and print its result."""
         workspace, outcome, as_json = values["workspace"], self.run(ctx, values), values["as_json"]
-        print_outcome(workspace, outcome, *(() if as_json else _tables(workspace)), as_json=as_json)
+        estimates = () if as_json else _tables(workspace)
+        print_outcome(workspace, outcome, *estimates, as_json=as_json, told=is_told(ctx.obj))
 
 
 def _estimates(calibration: RigCalibration) -> Table:

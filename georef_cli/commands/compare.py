@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import inspect
 from typing import Any
 
 import click
 
 from georef_cli import boundary, options, tables
+from georef_cli.command import Command
 from georef_cli.display import progress_for
 from georef_cli.output import document_of, print_json, print_rich
 from pipelines.compare.configurations import BY_CONFIGURATION, COMMON_TRAIN_OPTIONS, select_configurations
@@ -25,7 +25,7 @@ def _compare(ctx: click.Context, **values: Any) -> None:
         options.given(ctx, COMMON_TRAIN_OPTIONS),
         force=values["force"],
         progress=progress_for(ctx.obj),
-        around=lambda variant, spec: boundary.logged_to_file(variant.log_file(spec)),
+        around=boundary.logged_to_file,
     )
     if values["as_json"]:
         stages = [{"configuration": stage.configuration, **document_of(stage.outcome)} for stage in finished]
@@ -34,7 +34,7 @@ def _compare(ctx: click.Context, **values: Any) -> None:
         print_rich(*tables.comparison(table))
 
 
-command = click.Command(
+command = Command(
     "compare",
     params=[
         options.workspace_argument(),
@@ -48,8 +48,7 @@ command = click.Command(
         options.json_option(),
     ],
     callback=click.pass_context(_compare),
-    help=inspect.cleandoc(
-        """Run the ablation on one survey and put its figures into one table.
+    help="""Run the ablation on one survey and put its figures into one table.
 
         baseline: bundle adjustment with the fixes, then 3DGS. A: 3DGS, aligned afterwards with the fixes. B: its
         Gaussians, placed by the paper's initial similarity. C: similarity and cameras trained too, with L_abs.
@@ -65,6 +64,5 @@ command = click.Command(
           georef compare flight --preset fast
           georef compare flight --configs baseline,A,E --preset fast --iterations 600 --max-image-size 320
           georef compare flight --configs E --json
-        """
-    ),
+        """,
 )

@@ -6,6 +6,7 @@ from typing import Any
 
 import click
 
+from georef_cli.display import is_told
 from georef_cli.output import print_outcome
 from georef_cli.point_tables import coordinate_tables, error_tables
 from georef_cli.stage import StageCommand
@@ -21,7 +22,8 @@ class EvaluateCommand(StageCommand):
         outcome, workspace = self.run(ctx, values), values["workspace"]
         report = read_report(workspace.path(REPORT))
         errors = error_tables(report) if values["points"] else []
-        print_outcome(workspace, outcome, *coordinate_tables(report), *errors, as_json=values["as_json"])
+        parts = (*coordinate_tables(report), *errors)
+        print_outcome(workspace, outcome, *parts, as_json=values["as_json"], told=is_told(ctx.obj))
 
 
 command = EvaluateCommand(

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import inspect
 from typing import Any
 
 import click
 
 from georef_cli import options
+from georef_cli.command import Command
 from georef_cli.output import print_json, print_rich
 from pipelines.core.options import resolve
 from pipelines.core.staleness import must_exist
@@ -28,12 +28,11 @@ def _info(ctx: click.Context, workspace: Workspace, as_json: bool, **_values: An
         print_rich(*whole(result))
 
 
-command = click.Command(
+command = Command(
     "info",
     params=[options.workspace_argument(), *options.stage_options(CrsOptions), options.json_option()],
     callback=click.pass_context(_info),
-    help=inspect.cleandoc(
-        """Show where on Earth the result is, how good it is, what was made and what each file is for.
+    help="""Show where on Earth the result is, how good it is, what was made and what each file is for.
 
         The bounds hold 98 % of the Gaussians along each coordinate. With --json: a GeoJSON feature, the bounds as
         its polygon. Nothing is written.
@@ -43,6 +42,5 @@ command = click.Command(
           georef info flight
           georef info flight --crs EPSG:32632+3855
           georef info flight --json > flight.geojson
-        """
-    ),
+        """,
 )

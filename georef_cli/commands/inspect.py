@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import inspect
 from pathlib import Path
 
 import click
 
 from georef_cli import options, tables
+from georef_cli.command import Command
 from georef_cli.display import progress_for
 from georef_cli.markup import shown
 from georef_cli.output import print_json, print_rich
@@ -29,15 +29,14 @@ def _inspect(ctx: click.Context, bag: Path, as_json: bool) -> None:
         print_rich(f"[yellow]missing:[/] {shown(text)}")
 
 
-command = click.Command(
+command = Command(
     "inspect",
     params=[
         click.Argument(["bag"], type=click.Path(resolve_path=True, path_type=Path), metavar="BAG"),
         options.json_option(),
     ],
     callback=click.pass_context(_inspect),
-    help=inspect.cleandoc(
-        """Show what a ROS bag holds.
+    help="""Show what a ROS bag holds.
 
         Topics with type, rate, gaps, time span and frames; what `georef ingest` would choose, and what is missing.
         BAG is a rosbag2 folder, a .mcap or .db3 file, or a ROS 1 .bag. Nothing is written.
@@ -46,6 +45,5 @@ command = click.Command(
         Examples:
           georef inspect flight_bag
           georef inspect flight_0.mcap --json
-        """
-    ),
+        """,
 )

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
-import inspect
+import contextlib
 import logging
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from georef_cli import boundary, options
-from georef_cli.display import progress_for
+from georef_cli.command import Command
+from georef_cli.display import is_told, progress_for
+from georef_cli.dry_run import announce_training, print_dry_run
 from georef_cli.output import print_outcomes
 from pipelines.core import runner
 from pipelines.core.errors import GeorefError
 from pipelines.core.options import listed_names
+from pipelines.core.origins import names_of_flags
 from pipelines.core.stages import BY_NAME, DELIVERABLES, PIPELINE, StageSpec, stage_slice
+from pipelines.core.staleness import must_exist
 from pipelines.core.workspace import Workspace
 from pipelines.ingest.options import IngestOptions
 from pipelines.scene.crs_options import CrsOptions
@@ -43,18 +48,33 @@ OWNERS: dict[str, tuple[str, ...]] = {**dict.fromkeys(IngestOptions.model_fields
 
 
 def _run(ctx: click.Context, **values: Any) -> None:
-    stages = (*_stages(values["first"], values["last"]), *_deliverables(values["deliver"]))
+    if values["first"] and values["rerun_from"]:
+        raise click.UsageError("--from and --rerun-from exclude each other.")
+    first = values["first"] or values["rerun_from"]
+    stages = (*_stages(first, values["last"]), *_deliverables(values["deliver"]))
     flags = _flags(ctx, stages)
     workspace = values["workspace"]
+    forget, force = _forgotten(values["forget"], stages), values["force"] or values["rerun_from"] is not None
+    if stages[0].reads:
+        must_exist(workspace)
+    asked = {
+        spec.name: runner.remembered(workspace, spec, flags.get(spec.name, {}), forget.get(spec.name, ()))
+        for spec in stages
+    }
+    if values["dry_run"]:
+        print_dry_run(workspace, stages, asked, force=force, as_json=values["as_json"])
+        return
+    announce_training(workspace, stages, asked, force=force)
     outcomes = runner.run_pipeline(
         workspace,
         stages,
         flags,
-        force=values["force"],
+        forget=forget,
+        force=force,
         progress=progress_for(ctx.obj),
-        around=lambda spec: boundary.logged_to_file(workspace.log_file(spec)),
+        around=lambda spec: boundary.logged_to_file(workspace, spec),
     )
-    print_outcomes(workspace, outcomes, _overview(workspace), as_json=values["as_json"])
+    print_outcomes(workspace, outcomes, _overview(workspace), as_json=values["as_json"], told=is_told(ctx.obj))
 
 
 def _overview(workspace: Workspace) -> Overview | None:
@@ -89,6 +109,24 @@ def _deliverables(text: str | None) -> tuple[StageSpec, ...]:
     return DELIVERABLES if "all" in names else tuple(spec for name, spec in by_name.items() if name in names)
 
 
+def _forgotten(names: Sequence[str], stages: Sequence[StageSpec]) -> dict[str, list[str]]:
+    """Return the fields that the user names with `--forget`, by stage.
+
+    Raises:
+        click.UsageError: a name is an option of none of the stages.
+    """
+    if "all" in names:
+        return {spec.name: list(spec.options.model_fields) for spec in stages}
+    by_stage: dict[str, list[str]] = {}
+    for name in names:
+        for spec in stages:
+            with contextlib.suppress(ValueError):
+                by_stage.setdefault(spec.name, []).extend(names_of_flags(spec.options, [name]))
+        if not any(by_stage.values()):
+            raise click.UsageError(f"--forget: {name!r} is no option of the stages to run")
+    return by_stage
+
+
 def _flags(ctx: click.Context, stages: tuple[StageSpec, ...]) -> dict[str, dict[str, Any]]:
     """Return the given options by stage.
 
@@ -109,16 +147,17 @@ def _flags(ctx: click.Context, stages: tuple[StageSpec, ...]) -> dict[str, dict[
     return flags
 
 
-def _slice_option(flag: str, dest: str, help_text: str) -> click.Option:
-    return click.Option([flag, dest], type=click.Choice([spec.name for spec in PIPELINE]), help=help_text)
+def _slice_option(flags: list[str], dest: str, help_text: str) -> click.Option:
+    return click.Option([*flags, dest], type=click.Choice([spec.name for spec in PIPELINE]), help=help_text)
 
 
-command = click.Command(
+command = Command(
     "run",
     params=[
         options.workspace_argument(),
-        _slice_option("--from", "first", "First stage to run."),
-        _slice_option("--to", "last", "Last stage to run."),
+        _slice_option(["--from"], "first", "First stage to run."),
+        _slice_option(["--rerun-from"], "rerun_from", "First stage to run, with --force."),
+        _slice_option(["--to", "--end-with"], "last", "Last stage to run."),
         *(options.stage_option(BY_NAME[owners[0]].options, name) for name, owners in OWNERS.items()),
         click.Option(
             ["--deliver"],
@@ -126,23 +165,25 @@ command = click.Command(
             help=f"Make these as well: {_DELIVERABLE_NAMES}, with commas, or all. Their options are set in "
             "georef.toml or with their own commands.",
         ),
+        options.forget_option(),
+        options.dry_run_option(),
         options.force_option("Run the stages even if their products are current."),
         options.json_option(),
     ],
     callback=click.pass_context(_run),
-    help=inspect.cleandoc(
-        """Run all stages, or some, skipping what is current.
+    help="""Run all stages, or some, skipping what is current.
 
         What was interrupted is resumed. Options that a stage was given before are remembered, so that a later
-        run needs only what changes. Options that are not listed here are set in WS/georef.toml or with the
-        stage's own command.
+        run needs only what changes: `georef status WS --options` shows them, --forget drops one. Options that are
+        not listed here are set in WS/georef.toml or with the stage's own command.
 
         \b
         Examples:
           georef run flight --images photos --preset fast
+          georef run flight --images photos --preset high --dry-run
           georef run flight --images photos --gcp gcp_list.txt --to init-sim3
           georef run flight --from train --iterations 2000
+          georef run flight --forget gcp
           georef run flight
-        """
-    ),
+        """,
 )

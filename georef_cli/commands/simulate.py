@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
-import inspect
 import time
 from pathlib import Path
 from typing import Any
 
 import click
 
-from georef_cli import options, tables
+from georef_cli import options
+from georef_cli.command import Command
 from georef_cli.display import progress_for
 from georef_cli.markup import shown
 from georef_cli.output import print_json, print_rich
 from pipelines.core.options import CONFIG_FILE, resolve
+from pipelines.core.sentences import duration
 from pipelines.simulate.options import SimulateOptions
 
 
@@ -29,11 +30,11 @@ def _simulate(ctx: click.Context, **values: Any) -> None:
     if values["as_json"]:
         print_json({**dataclasses.asdict(summary), "directory": str(summary.directory)})
         return
-    took = tables.duration(time.monotonic() - started)
+    took = duration(time.monotonic() - started)
     print_rich(f"[bold]simulate[/]: {shown(f'{summary.key_figure} in {summary.directory} ({took})')}")
 
 
-command = click.Command(
+command = Command(
     "simulate",
     params=[
         click.Argument(
@@ -44,8 +45,7 @@ command = click.Command(
         options.json_option(),
     ],
     callback=click.pass_context(_simulate),
-    help=inspect.cleandoc(
-        """Simulate a survey whose truth is known exactly.
+    help="""Simulate a survey whose truth is known exactly.
 
         DIR gets photographs, a trajectory, raw navigation, control and check points in the form of a surveyor's
         files, and truth.json with the truth behind them. The same options give the same bytes.
@@ -56,6 +56,5 @@ command = click.Command(
           georef simulate survey --scene village --flight grid --images 60 --size 1200x900 --gnss consumer
           georef simulate survey --height 50 --height 75 --lever-arm 0.1,0,-0.3 --boresight 0.5,0.3,-1
           georef simulate survey --clock-offset 0.2 --bag mcap --depth --origin=-33.86,151.21,40
-        """
-    ),
+        """,
 )

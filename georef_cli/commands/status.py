@@ -3,28 +3,46 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import click
 
 from georef_cli import options, tables
+from georef_cli.command import Command
 from georef_cli.output import document_of_cautions, print_json, print_rich
 from pipelines.core import staleness as states
+from pipelines.core.options import notation
+from pipelines.core.origins import option_origins
+from pipelines.core.stages import BY_NAME
 from pipelines.core.workspace import Workspace
 
 
-def _status(workspace: Workspace, as_json: bool) -> None:
+def _status(workspace: Workspace, with_options: bool, as_json: bool) -> None:
     rows, cautions = states.status(workspace), states.cautions_by_stage(workspace)
+    origins = [row for spec in BY_NAME.values() for row in option_origins(workspace, spec)] if with_options else []
     if not as_json:
         print_rich(tables.states(rows, cautions), *tables.cautions(cautions))
+        if with_options:
+            print_rich(*tables.origins(origins))
         return
     stages = [{**dataclasses.asdict(row), "finished": row.finished and row.finished.isoformat()} for row in rows]
-    document = {"workspace": str(workspace.root), "stages": stages}
+    document: dict[str, Any] = {"workspace": str(workspace.root), "stages": stages}
+    if with_options:
+        document["options"] = [{**dataclasses.asdict(row), "value": notation(row.value)} for row in origins]
     print_json({**document, "cautions": document_of_cautions(cautions)})
 
 
-command = click.Command(
+command = Command(
     "status",
-    params=[options.workspace_argument(), options.json_option()],
+    params=[
+        options.workspace_argument(),
+        click.Option(
+            ["--options", "with_options"],
+            is_flag=True,
+            help="Show the options that are no defaults too: remembered from earlier commands, or of georef.toml.",
+        ),
+        options.json_option(),
+    ],
     callback=_status,
     help="""Show the state of every stage: missing, current, stale (its inputs or options have changed since),
 damaged (a file is not as the stage wrote it), interrupted or failed; and the cautions, which limit the result.
@@ -32,6 +50,7 @@ damaged (a file is not as the stage wrote it), interrupted or failed; and the ca
 \b
 Examples:
   georef status flight
+  georef status flight --options
   georef status flight --json
 """,
 )

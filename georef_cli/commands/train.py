@@ -6,6 +6,7 @@ from typing import Any
 
 import click
 
+from georef_cli.display import is_told
 from georef_cli.output import print_outcome
 from georef_cli.stage import StageCommand
 
@@ -15,21 +16,24 @@ class TrainCommand(StageCommand):
 
     def act(self, ctx: click.Context, **values: Any) -> None:
         """Run or resume the stage, and print its result."""
-        outcome = self.run(ctx, values, resume="always" if values["resume"] else "never")
-        print_outcome(values["workspace"], outcome, as_json=values["as_json"])
+        outcome = self.run(ctx, values, resume="always" if values["resume"] else "if-same")
+        print_outcome(values["workspace"], outcome, as_json=values["as_json"], told=is_told(ctx.obj))
 
 
 command = TrainCommand(
     "train",
     """Train the Gaussians together with the similarity and the cameras.
 
-    Interrupted with Ctrl-C it writes a checkpoint, and --resume goes on from there with the same options.
+    Interrupted with Ctrl-C it writes a checkpoint, and the next `georef train` goes on from there. Options that
+    would drop an interrupted training are refused without --force. A finished training is extended by more
+    --iterations.
 
     \b
     Examples:
       georef train flight --preset fast
-      georef train flight --preset fast --resume
+      georef train flight --resume
+      georef train flight --iterations 4000
       georef train flight --iterations 5000 --max-image-size 800 --backend cpu
     """,
-    extra=[click.Option(["--resume"], is_flag=True, help="Continue the interrupted run.")],
+    extra=[click.Option(["--resume"], is_flag=True, help="Continue the interrupted run; refuse other options.")],
 )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import inspect
 import threading
 import webbrowser
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import click
 
 from georef_cli import options
+from georef_cli.command import Command
 from georef_cli.display import progress_for
 from georef_cli.output import print_json, print_rich
 from pipelines.core.options import resolve
@@ -38,7 +38,7 @@ def _view(ctx: click.Context, workspace: Workspace, open_page: bool, as_json: bo
         serve(workspace, wanted, ready, threading.Event(), progress_for(ctx.obj))
 
 
-command = click.Command(
+command = Command(
     "view",
     params=[
         options.workspace_argument(),
@@ -47,8 +47,7 @@ command = click.Command(
         options.json_option(),
     ],
     callback=click.pass_context(_view),
-    help=inspect.cleandoc(
-        """See the trained model in a browser, and measure in it.
+    help="""See the trained model in a browser, and measure in it.
 
         Points, distances, heights, areas and volumes are read from the model's own surface, as `georef evaluate`
         reads it, with σ from the joint covariance. Control points are marked in photographs, and written for --gcp.
@@ -60,6 +59,5 @@ command = click.Command(
           georef view flight --open
           georef view flight --crs EPSG:32632+3855 --port 9000
           georef view flight --json
-        """
-    ),
+        """,
 )

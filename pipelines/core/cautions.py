@@ -12,6 +12,10 @@ from pipelines.core.products import Product
 NOT_CHECKED = "not-checked"
 
 
+# Attribute of log records with a caution: the command line repeats cautions at its end.
+AT_END = "at_end"
+
+
 class Caution(Product):
     """Limit of a result, for machines and for people.
 

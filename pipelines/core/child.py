@@ -120,7 +120,7 @@ def _follow(process: subprocess.Popen[str], arguments: Mapping[str, Any], progre
                     context = progress.task(message["name"], message["total"])
                     open_tasks.append((context, context.__enter__()))
                 case "advance":
-                    open_tasks[-1][1].advance(message["steps"], message["note"])
+                    open_tasks[-1][1].advance(message["steps"], message["note"], message["left_s"])
                 case "end":
                     open_tasks.pop()[0].__exit__(None, None, None)
                 case "result":
@@ -191,9 +191,9 @@ class _SentTask:
     def __init__(self, messages: _Messages) -> None:
         self._messages = messages
 
-    def advance(self, steps: int = 1, note: str = "") -> None:
+    def advance(self, steps: int = 1, note: str = "", left_s: float | None = None) -> None:
         """Send the steps."""
-        self._messages.send("advance", steps=steps, note=note)
+        self._messages.send("advance", steps=steps, note=note, left_s=left_s)
 
 
 class _SentRecords(logging.Handler):

@@ -10,10 +10,24 @@ import errno
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import ClassVar
 
 
 class GeorefError(Exception):
-    """Failure that the user can understand and act on."""
+    """Failure that the user can understand and act on.
+
+    Attributes:
+        code: kind of the failure, for machines: lower-case words joined by hyphens.
+        hint: the remedy, where it is known apart from the message.
+    """
+
+    code: ClassVar[str] = "failed"
+    hint: str | None = None
+
+    def document(self) -> dict[str, str | int | None]:
+        """Return the JSON form: code, message, path, line, field and hint."""
+        nowhere = dict.fromkeys(("path", "line", "field"))
+        return {"code": self.code, "message": str(self), **nowhere, "hint": self.hint}
 
 
 class InputError(GeorefError):
@@ -24,7 +38,10 @@ class InputError(GeorefError):
         path: the file at fault.
         line: 1-based line number in `path`.
         field: column, tag or option at fault.
+        hint: the remedy, where it is known apart from the message.
     """
+
+    code = "input"
 
     def __init__(
         self,
@@ -33,14 +50,33 @@ class InputError(GeorefError):
         path: Path | str | None = None,
         line: int | None = None,
         field: str | None = None,
+        hint: str | None = None,
     ) -> None:
+        self.message = message
         self.path = Path(path) if path is not None else None
         self.line = line
         self.field = field
+        self.hint = hint
         where = "" if path is None else str(path) + (f":{line}" if line is not None else "")
         if field is not None:
             where = f"{where} [{field}]" if where else f"[{field}]"
         super().__init__(f"{where}: {message}" if where else message)
+
+    @property
+    def is_usage(self) -> bool:
+        """Whether the fault lies in the options on the command line alone, and in no file."""
+        return self.path is None and self.field is not None and self.field.startswith("--")
+
+    def document(self) -> dict[str, str | int | None]:
+        """Return the JSON form; the message is without path and field."""
+        return {
+            **super().document(),
+            "code": "usage" if self.is_usage else self.code,
+            "message": self.message,
+            "path": None if self.path is None else str(self.path),
+            "line": self.line,
+            "field": self.field,
+        }
 
 
 class MissingProductError(GeorefError):
@@ -51,46 +87,67 @@ class MissingProductError(GeorefError):
         command: the command line that makes it.
     """
 
+    code = "missing-product"
+
     def __init__(self, product: str, command: str) -> None:
         self.product = product
         self.command = command
+        self.hint = f"run `{command}` first"
         super().__init__(f"{product} is missing: run `{command}` first")
 
 
 class WorkspaceBusyError(GeorefError):
     """Workspace that another process is writing to."""
 
+    code = "busy"
+
 
 class DegenerateGeometryError(GeorefError):
     """Observations that do not determine the unknowns (parallel rays, collinear cameras …)."""
+
+    code = "geometry"
 
 
 class ContradictionError(GeorefError):
     """Sources that contradict each other as a whole; the message names both sides and what would reconcile them."""
 
+    code = "contradiction"
+
 
 class ConvergenceError(GeorefError):
     """Optimisation that diverged, or ended outside the bound that the user set."""
+
+    code = "convergence"
 
 
 class ResourceError(GeorefError):
     """Machine too small for the options; the message names options that need less."""
 
+    code = "resources"
+
 
 class CrashError(GeorefError):
     """Native library that ended its process."""
+
+    code = "crash"
 
 
 class BackendUnavailableError(GeorefError):
     """Missing optional library or device; the message names the extra to install."""
 
+    code = "backend"
+
 
 class StorageError(GeorefError):
     """Disk or file system that is full, fails, or may not be written; names the file."""
 
+    code = "storage"
+
 
 class DamagedPartialError(InputError):
     """Partial product of an interrupted run that cannot be continued; the runner starts the stage afresh."""
+
+    code = "damaged-partial"
 
 
 _SQLITE_ERRNO = {8: errno.EROFS, 10: errno.EIO, 13: errno.ENOSPC}

@@ -6,6 +6,7 @@ a file of its own, because on Windows no other process can read a locked file.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import time
 from collections.abc import Iterator
@@ -48,25 +49,51 @@ class WriteLock:
             InputError: the folder cannot be made, written or locked.
         """
         require_text(self.folder)
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            handle = (self.folder / LOCK).open("ab")
-        except OSError as error:
-            raise InputError(f"cannot be used as a workspace: {error.strerror}", path=self.folder) from error
-        with handle:
-            try:
-                locked = _lock(handle, _ATTEMPTS)
-            except OSError as error:
-                raise InputError(f"cannot be locked: {error.strerror}", path=self.folder) from error
-            if not locked:
-                raise WorkspaceBusyError(
-                    f"{self.folder} is being written by {self._holder()}: wait for it, or stop it"
-                )
+        with self._locked_file() as handle:
             try:
                 (self.folder / HOLDER).write_text(f"{activity}{_IN_PROCESS}{os.getpid()}", encoding="utf-8")
                 yield
             finally:
                 unlock_descriptor(handle.fileno())
+
+    def discard(self) -> None:
+        """Delete the files of the lock, which this process holds; a process that waits for them makes new ones."""
+        for name in (HOLDER, LOCK):
+            with contextlib.suppress(OSError):  # Windows deletes no open file.
+                (self.folder / name).unlink(missing_ok=True)
+
+    def _locked_file(self) -> BinaryIO:
+        """Return the open and locked file.
+
+        Raises:
+            WorkspaceBusyError: another process holds the lock.
+            InputError: the folder cannot be made, written or locked.
+        """
+        while True:
+            try:
+                self.folder.mkdir(parents=True, exist_ok=True)
+                handle = (self.folder / LOCK).open("ab")
+            except OSError as error:
+                raise InputError(f"cannot be used as a workspace: {error.strerror}", path=self.folder) from error
+            try:
+                locked = _lock(handle, _ATTEMPTS)
+            except OSError as error:
+                handle.close()
+                raise InputError(f"cannot be locked: {error.strerror}", path=self.folder) from error
+            if locked and self._is_current(handle):
+                return handle
+            handle.close()
+            if not locked:
+                raise WorkspaceBusyError(
+                    f"{self.folder} is being written by {self._holder()}: wait for it, or stop it"
+                )
+
+    def _is_current(self, handle: BinaryIO) -> bool:
+        """Return whether the open file still has its name: another process may have discarded it."""
+        try:
+            return os.path.samestat(os.fstat(handle.fileno()), (self.folder / LOCK).stat())
+        except OSError:
+            return False
 
     def activity(self) -> str | None:
         """Return the activity of the process that holds the lock now, or None."""

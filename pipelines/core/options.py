@@ -44,8 +44,13 @@ class WrittenMarker:
     """Mark of an option that users write as text; `notation` gives the text of its value."""
 
 
+class EffortMarker:
+    """Mark of an option that changes the time or the messages of a stage, and not its result."""
+
+
 InputPath = Annotated[Path, InputMarker()]
 WRITTEN = WrittenMarker()
+EFFORT = EffortMarker()
 
 
 class StageOptions(BaseModel):
@@ -133,6 +138,12 @@ def input_paths(options: StageOptions) -> dict[str, Path]:
     """Return the paths among the options whose content decides the stage's result, by field."""
     paths = {name: getattr(options, name) for name in input_markers(type(options))}
     return {name: Path(path) for name, path in paths.items() if path is not None}
+
+
+def decisive_fields(options_type: type[StageOptions]) -> list[str]:
+    """Return the options whose values decide a stage's result: all but those of effort, and paths of inputs."""
+    fields, no_value = options_type.model_fields, (EffortMarker, InputMarker)
+    return [name for name, info in fields.items() if not any(isinstance(mark, no_value) for mark in _marks(info))]
 
 
 def is_written(info: FieldInfo) -> bool:

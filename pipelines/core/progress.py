@@ -14,8 +14,14 @@ from typing import Protocol
 class ProgressTask(Protocol):
     """Task that counts its steps; their total may be unknown."""
 
-    def advance(self, steps: int = 1, note: str = "") -> None:
-        """Add `steps` to the count; `note` is shown behind the bar (`psnr 23.1 dB`)."""
+    def advance(self, steps: int = 1, note: str = "", left_s: float | None = None) -> None:
+        """Add `steps` to the count.
+
+        Args:
+            steps: that are done.
+            note: shown behind the bar (`23.1 dB`).
+            left_s: seconds that the rest will take, where steps differ; None: as long a step as those before.
+        """
 
 
 class Progress(Protocol):
@@ -26,7 +32,7 @@ class Progress(Protocol):
 
 
 class _SilentTask:
-    def advance(self, steps: int = 1, note: str = "") -> None:
+    def advance(self, steps: int = 1, note: str = "", left_s: float | None = None) -> None:
         """Do nothing."""
 
 

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import hashlib
 import importlib
-import json
 import logging
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from importlib import metadata
 from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
 
-from pipelines import __version__
-from pipelines.core.cautions import union
+from pipelines.core.cautions import AT_END, union
 from pipelines.core.errors import (
+    ConvergenceError,
     DamagedPartialError,
     DegenerateGeometryError,
     GeorefError,
@@ -26,10 +23,20 @@ from pipelines.core.errors import (
     MissingProductError,
     storage_failures,
 )
-from pipelines.core.manifest import MANIFEST, Manifest, Memo, record_files
-from pipelines.core.options import input_paths
+from pipelines.core.guards import (
+    damaged_product,
+    extendable_product,
+    refuse_damaged_inputs,
+    refuse_loss,
+    refuse_loss_by_options,
+    warn_of_stale_inputs,
+)
+from pipelines.core.manifest import Manifest, Memo, record_files
+from pipelines.core.options import decisive_fields
+from pipelines.core.partial import request_token
 from pipelines.core.progress import SILENT, Progress
-from pipelines.core.stages import StageSpec, producer_of, products_of
+from pipelines.core.sentences import duration
+from pipelines.core.stages import StageSpec, products_of
 from pipelines.core.staleness import (
     BY_HAND,
     Flags,
@@ -38,17 +45,19 @@ from pipelines.core.staleness import (
     must_exist,
     request,
     stage_config,
-    status,
     why_damaged,
     why_stale,
 )
+from pipelines.core.traces import no_traces_of_refusal
+from pipelines.core.versions import library_versions
 from pipelines.core.workspace import Resume, StageRun, Summary, Workspace, now
 
 log = logging.getLogger(__name__)
 
 # Numbers that no matrix, no float and no product can hold.
 _WITHOUT_SOLUTION = (np.linalg.LinAlgError, OverflowError, FloatingPointError, RecursionError, ValidationError)
-LIBRARIES = ("numpy", "pycolmap", "torch", "numba", "pyproj")
+# Errors that are the result of a run: to continue it would lead to them again.
+_RESULTS = (ConvergenceError, DegenerateGeometryError)
 
 
 @dataclass(frozen=True)
@@ -60,6 +69,17 @@ class Outcome:
     manifest: Manifest
 
 
+@dataclass(frozen=True)
+class _Job:
+    """Stage to run, with the arguments of `run_stage`."""
+
+    workspace: Workspace
+    asked: Request
+    resume: Resume
+    progress: Progress
+    place: str
+
+
 @storage_failures()
 def run_stage(
     workspace: Workspace,
@@ -69,6 +89,7 @@ def run_stage(
     force: bool = False,
     resume: Resume = "never",
     progress: Progress = SILENT,
+    place: str = "",
 ) -> Outcome:
     """Run one stage, unless its product is current or was put there by hand.
 
@@ -79,26 +100,30 @@ def run_stage(
         spec: the stage.
         flags: only the options that the user gave, by field.
         force: run even if the product is current, and start afresh.
-        resume: whether to continue an interrupted run; see `Workspace.begin`.
+        resume: whether to continue an interrupted run (see `Workspace.begin`), or to extend a finished product.
         progress: shows the stage's tasks.
+        place: place of the stage in a longer run, for the log: `stage 2 of 8`.
 
     Raises:
-        GeorefError: any known failure; the previous product stays whole.
+        InputError: the stage refuses its input, or the request would drop what an interrupted run has done.
+        GeorefError: any other known failure; the previous product stays whole.
     """
     if spec.reads:
         must_exist(workspace)
-    with workspace.lock(spec.name):
+    with no_traces_of_refusal(workspace), workspace.lock(spec.name):
         memo: Memo = {}
         asked = request(workspace, spec, flags, memo, progress)
-        _warn_of_stale_inputs(workspace, spec, memo)
-        _refuse_damaged_inputs(workspace, spec, memo)
+        warn_of_stale_inputs(workspace, spec, memo)
+        refuse_damaged_inputs(workspace, spec, memo)
         before = workspace.requests().get(spec.name, {})
         workspace.remember({spec.name: flags})
         previous = None if force else _current(workspace, asked, memo)
         if previous is not None:
             return Outcome(spec.name, False, _with_present_files(workspace, asked, previous))
         try:
-            manifest = _execute(workspace, asked, "never" if force else resume, progress)
+            if not force:
+                refuse_loss(workspace, asked)
+            manifest = _execute(_Job(workspace, asked, "never" if force else resume, progress, place))
         except InputError:
             workspace.remember({spec.name: before})
             raise
@@ -111,6 +136,7 @@ def run_pipeline(
     stages: tuple[StageSpec, ...],
     flags: Mapping[str, Flags],
     *,
+    forget: Mapping[str, Collection[str]] | None = None,
     force: bool = False,
     progress: Progress = SILENT,
     around: Callable[[StageSpec], AbstractContextManager[None]] = lambda _: nullcontext(),
@@ -124,6 +150,7 @@ def run_pipeline(
         workspace: holds the products of all stages.
         stages: the stages, in the order of the pipeline.
         flags: options by stage; they override the remembered options of the stage.
+        forget: remembered options by stage that no longer count.
         force: run also the stages whose product is current, and start all afresh.
         progress: shows the tasks of the stages.
         around: makes the context in which a stage runs.
@@ -134,40 +161,56 @@ def run_pipeline(
     if stages[0].reads:
         must_exist(workspace)
     before = workspace.requests()
-    asked = {spec.name: remembered(workspace, spec, flags.get(spec.name, {})) for spec in stages}
+    forget = forget or {}
+    asked = {
+        spec.name: remembered(workspace, spec, flags.get(spec.name, {}), forget.get(spec.name, ()))
+        for spec in stages
+    }
     for spec in stages:
-        stage_config(workspace, spec, asked[spec.name])
-    with workspace.lock("run"):
-        workspace.remember(asked)
+        options = stage_config(workspace, spec, asked[spec.name])
+        if not force:
+            refuse_loss_by_options(workspace, spec, options)
     outcomes: list[Outcome] = []
-    try:
-        for spec in stages:
-            with around(spec):
-                outcome = run_stage(
-                    workspace, spec, asked[spec.name], force=force, resume="if-same", progress=progress
-                )
-            outcomes.append(outcome)
-    except (InputError, MissingProductError):
-        done = {outcome.stage for outcome in outcomes}
-        refused = [spec.name for spec in stages if spec.name not in done]
+    with no_traces_of_refusal(workspace):
         with workspace.lock("run"):
-            workspace.remember({name: before.get(name, {}) for name in refused})
-        raise
+            workspace.remember(asked)
+        try:
+            for number, spec in enumerate(stages, start=1):
+                with around(spec):
+                    outcome = run_stage(
+                        workspace,
+                        spec,
+                        asked[spec.name],
+                        force=force,
+                        resume="if-same",
+                        progress=progress,
+                        place=f"stage {number} of {len(stages)}",
+                    )
+                outcomes.append(outcome)
+        except (InputError, MissingProductError):
+            done = {outcome.stage for outcome in outcomes}
+            refused = [spec.name for spec in stages if spec.name not in done]
+            with workspace.lock("run"):
+                workspace.remember({name: before.get(name, {}) for name in refused})
+            raise
     return outcomes
 
 
-def remembered(workspace: Workspace, spec: StageSpec, flags: Flags) -> dict[str, Any]:
-    """Return the options that a stage was last requested with, overridden by `flags`."""
-    return {**workspace.requests().get(spec.name, {}), **flags}
+def remembered(workspace: Workspace, spec: StageSpec, flags: Flags, forget: Collection[str] = ()) -> dict[str, Any]:
+    """Return the options that a stage was last requested with but those of `forget`, overridden by `flags`."""
+    before = workspace.requests().get(spec.name, {})
+    return {**{name: value for name, value in before.items() if name not in forget}, **flags}
 
 
-def _execute(workspace: Workspace, asked: Request, resume: Resume, progress: Progress) -> Manifest:
+def _execute(job: _Job) -> Manifest:
+    workspace, asked = job.workspace, job.asked
     spec, resolved = asked.spec, asked.options.model_dump(mode="json")
-    token = _token(asked, resolved)
-    if resume == "never" and spec.resumable and workspace.partial(spec).exists():
+    token = request_token({name: resolved[name] for name in decisive_fields(spec.options)}, asked.inputs.hashes)
+    partial = workspace.partial_product(spec)
+    if spec.resumable and partial.exists() and (job.resume == "never" or not partial.is_of(token)):
         log.warning("%s: starts afresh; what an interrupted run had done is dropped", spec.name)
     started, clock = now(), time.monotonic()
-    summary = _run(workspace, asked, token, resume, progress)
+    summary = _run(job, token)
     out = workspace.partial(spec)
     for product in products_of(spec):
         if not (out / product.removeprefix(f"{spec.folder}/")).exists():
@@ -177,12 +220,12 @@ def _execute(workspace: Workspace, asked: Request, resume: Resume, progress: Pro
     carried = set(union(*cautions_by_stage(workspace, before=spec).values()))
     for caution in summary.cautions:
         if caution not in carried:
-            log.warning("%s: %s", spec.name, caution.sentence)
+            log.warning("%s: %s", spec.name, caution.sentence, extra={AT_END: True})
     manifest = Manifest(
         stage=spec.name,
         config=resolved,
         inputs=asked.inputs.hashes,
-        versions=_versions(),
+        versions=library_versions(),
         started=started,
         duration_s=round(time.monotonic() - clock, 3),
         key_figure=summary.key_figure,
@@ -192,17 +235,10 @@ def _execute(workspace: Workspace, asked: Request, resume: Resume, progress: Pro
         files=record_files(out, spec.working),
         input_files=asked.inputs.files,
     )
-    workspace.set_aside(_damaged(workspace, spec, {}, by_content=False))
+    workspace.set_aside(damaged_product(workspace, spec, {}, by_content=False))
     workspace.commit(spec, manifest)
-    log.info("%s: %s (%.1f s)", spec.name, summary.key_figure, manifest.duration_s)
+    log.info("%s: %s (%s)", spec.name, summary.key_figure, duration(manifest.duration_s))
     return manifest
-
-
-def _token(asked: Request, resolved: Mapping[str, Any]) -> str:
-    """Return the hash of inputs and options that an interrupted run is continued with; paths may change."""
-    paths = input_paths(asked.options)
-    values = {name: value for name, value in resolved.items() if name not in paths}
-    return hashlib.sha256(json.dumps([values, asked.inputs.hashes], sort_keys=True).encode()).hexdigest()
 
 
 def _with_present_files(workspace: Workspace, asked: Request, manifest: Manifest) -> Manifest:
@@ -217,26 +253,28 @@ def _with_present_files(workspace: Workspace, asked: Request, manifest: Manifest
     return renewed
 
 
-def _run(workspace: Workspace, asked: Request, token: str, resume: Resume, progress: Progress) -> Summary:
+def _run(job: _Job, token: str) -> Summary:
     """Run the module of a stage; afresh, if the partial product to be continued is damaged.
 
     Raises:
         GeorefError: a known failure, which is recorded.
     """
+    workspace, asked, place = job.workspace, job.asked, job.place
     spec = asked.spec
     run = importlib.import_module(spec.module).run
-    out, resumed = workspace.begin(spec, token, resume)
-    log.info("%s: %s", spec.name, "resumed" if resumed else "started")
+    out, resumed = workspace.begin(spec, token, job.resume)
+    extends = None if job.resume == "never" else extendable_product(workspace, asked)
+    log.info("%s: %s%s", spec.name, "resumed" if resumed else "started", f", {place}" if place else "")
     try:
         with storage_failures():
             try:
-                summary: Summary = run(StageRun(workspace, out, progress, resumed), asked.options)
+                summary: Summary = run(StageRun(workspace, out, job.progress, resumed, extends), asked.options)
             except DamagedPartialError as error:
                 log.warning("%s: starts afresh; what the interrupted run left is damaged (%s)", spec.name, error)
                 out, _ = workspace.begin(spec, token, "never")
-                summary = run(StageRun(workspace, out, progress), asked.options)
+                summary = run(StageRun(workspace, out, job.progress), asked.options)
     except GeorefError as error:
-        workspace.fail(spec, str(error))
+        workspace.partial_product(spec).fail(str(error), worthless=isinstance(error, _RESULTS))
         raise
     # Products that were edited by hand have numbers that no stage writes.
     except _WITHOUT_SOLUTION as error:
@@ -245,7 +283,7 @@ def _run(workspace: Workspace, asked: Request, token: str, resume: Resume, progr
             f"the products that {spec.name} reads lead to no solution ({cause}): were they edited? "
             f"`georef run {workspace.root} --force` makes them again"
         )
-        workspace.fail(spec, str(degenerate))
+        workspace.partial_product(spec).fail(str(degenerate), worthless=True)
         raise degenerate from error
     return summary
 
@@ -278,48 +316,5 @@ def _current(workspace: Workspace, asked: Request, memo: Memo) -> Manifest | Non
         log.warning("%s: damaged, made again: %s", spec.name, damage)
         return None
     reason = why_stale(workspace, asked, manifest)
-    log.info("%s: %s", spec.name, f"made again: {reason}" if reason else "current, nothing to do")
+    log.info("%s: %s", spec.name, f"made again: {reason}" if reason else f"current: {manifest.key_figure}")
     return None if reason else manifest
-
-
-def _warn_of_stale_inputs(workspace: Workspace, spec: StageSpec, memo: Memo) -> None:
-    """Log a warning for each stale stage whose product `spec` reads."""
-    producers = {producer_of(part.product).name for part in spec.reads}
-    for row in status(workspace, memo, before=spec):
-        if row.stage in producers and row.state == "stale":
-            log.warning("%s builds on %s, which is stale (%s)", spec.name, row.stage, row.reason)
-
-
-def _refuse_damaged_inputs(workspace: Workspace, spec: StageSpec, memo: Memo) -> None:
-    """Refuse to build on a product that is not as its stage wrote it.
-
-    Raises:
-        InputError: a file of a stage that `spec` reads has changed since that stage ended.
-    """
-    for producer in dict.fromkeys(producer_of(part.product) for part in spec.reads):
-        files = _damaged(workspace, producer, memo, by_content=True)
-        if files:
-            raise InputError(
-                f"{why_damaged(files)}: `georef run {(workspace.base or workspace).root}` makes it again; to "
-                f"keep it as it is, delete {producer.folder}/{MANIFEST}",
-                path=workspace.root,
-            )
-
-
-def _damaged(workspace: Workspace, spec: StageSpec, memo: Memo, *, by_content: bool) -> list[str]:
-    """Return the files of a finished product that differ from its manifest; none without a readable manifest."""
-    try:
-        manifest = workspace.manifest(spec)
-    except InputError:
-        return []
-    return [] if manifest is None else workspace.damaged(spec, manifest, memo, by_content=by_content)
-
-
-def _versions() -> dict[str, str]:
-    versions = {"georefgs": __version__}
-    for name in LIBRARIES:
-        try:
-            versions[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            versions[name] = "not installed"
-    return versions

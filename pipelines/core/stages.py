@@ -93,6 +93,7 @@ class StageSpec:
         product: workspace path of its main product.
         title: one line of help.
         resumable: whether a partial product can be continued.
+        growing: options of which a larger value continues the finished product.
         also: further products in its folder, besides those that the stages of the pipeline read.
         working: files and folders in its folder that no hash guards: other programs may change them, or the survey
             has hashes of its own.
@@ -106,6 +107,7 @@ class StageSpec:
     product: str
     title: str
     resumable: bool = False
+    growing: tuple[str, ...] = ()
     also: tuple[str, ...] = ()
     working: tuple[str, ...] = ()
 
@@ -175,6 +177,7 @@ PIPELINE: tuple[StageSpec, ...] = (
         product=MODEL,
         title="Train the Gaussians together with the similarity and the cameras.",
         resumable=True,
+        growing=("iterations",),
         working=("checkpoint.npz",),
     ),
     StageSpec(

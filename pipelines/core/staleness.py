@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from typing import Any, Literal
@@ -11,7 +11,7 @@ from pipelines.core.cautions import Caution, union
 from pipelines.core.errors import InputError, MissingProductError
 from pipelines.core.fingerprints import Fingerprints, Records, fingerprints
 from pipelines.core.manifest import Manifest, Memo
-from pipelines.core.options import StageOptions, input_markers, load_toml, resolve
+from pipelines.core.options import StageOptions, decisive_fields, load_toml, resolve
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.stages import BY_NAME, DELIVERABLES, PIPELINE, StageSpec, producer_of, products_of
 from pipelines.core.validators import require_text
@@ -81,22 +81,36 @@ def why_stale(workspace: Workspace, asked: Request, manifest: Manifest) -> str:
 
     Input files count by content: a path that differs is no other option.
     """
-    options = asked.options
-    try:
-        made_with = type(options).model_validate(manifest.config)
-    except ValueError:
-        return "made by a version with other options"
-    values = [name for name in type(options).model_fields if name not in input_markers(type(options))]
-    names = [name for name in values if getattr(made_with, name) != getattr(options, name)]
-    if names:
-        return f"option {', '.join(names)} changed"
-    hashes = asked.inputs.hashes
-    inputs = sorted({*hashes, *manifest.inputs})
-    changed = [name for name in inputs if manifest.inputs.get(name) != hashes.get(name)]
+    of_inputs = changed_inputs(asked.inputs.hashes, manifest.inputs)
+    changed = changed_options(asked.options, manifest.config) or of_inputs
     if changed:
-        return f"{', '.join(changed)} changed"
+        return changed
     gone = [product for product in products_of(asked.spec) if not (workspace.root / product).exists()]
     return f"{', '.join(gone)} is gone" if gone else ""
+
+
+def changed_options(options: StageOptions, config: Mapping[str, Any], but: Collection[str] = ()) -> str:
+    """Return which options differ from recorded ones, as a reason; empty if none does.
+
+    Args:
+        options: of now.
+        config: as recorded, by field.
+        but: options that do not count.
+    """
+    try:
+        before = type(options).model_validate(config)
+    except ValueError:
+        return "made by a version with other options"
+    decisive = [name for name in decisive_fields(type(options)) if name not in but]
+    names = [name for name in decisive if getattr(before, name) != getattr(options, name)]
+    return f"option {', '.join(names)} changed" if names else ""
+
+
+def changed_inputs(inputs: Mapping[str, str], recorded: Mapping[str, str]) -> str:
+    """Return which inputs differ from recorded ones, as a reason; empty if none does."""
+    names = sorted({*inputs, *recorded})
+    changed = [name for name in names if recorded.get(name) != inputs.get(name)]
+    return f"{', '.join(changed)} changed" if changed else ""
 
 
 def why_damaged(files: list[str]) -> str:

@@ -7,7 +7,6 @@ rename. One writer at a time holds the workspace's lock.
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -21,13 +20,12 @@ from pipelines.core.errors import InputError, MissingProductError
 from pipelines.core.lock import WriteLock
 from pipelines.core.manifest import MANIFEST, Manifest, Memo, damaged_files
 from pipelines.core.options import CONFIG_FILE
+from pipelines.core.partial import PartialProduct
 from pipelines.core.products import load_json, save_json
 from pipelines.core.progress import SILENT, Progress
-from pipelines.core.requests import read_requests, write_requests
+from pipelines.core.requests import REQUESTS, read_requests, write_requests
 from pipelines.core.stages import STAGES, StageSpec, producer_of, products_of
 
-TOKEN = "token.txt"
-FAILURE = "failure.txt"
 DAMAGED = "damaged"
 
 Resume = Literal["never", "if-same", "always"]
@@ -59,12 +57,19 @@ class StageRun:
         out: folder to write into; it becomes the stage's folder when complete.
         progress: shows the stage's tasks.
         resumed: whether `out` holds the partial product of an interrupted run with the same inputs and options.
+        extends: the stage's finished folder, made from the same inputs with smaller values of its growing options;
+            the run may start from it, and does not change it. None: there is none.
     """
 
     workspace: Workspace
     out: Path
     progress: Progress = SILENT
     resumed: bool = False
+    extends: Path | None = None
+
+    def record_progress(self, text: str) -> None:
+        """Record how far the run has come (`1500 of 7000 iterations`): from now on it is not dropped unasked."""
+        PartialProduct(self.out).record_progress(text)
 
 
 @dataclass(frozen=True)
@@ -137,12 +142,15 @@ class Workspace:
 
     def failure(self, spec: StageSpec) -> str | None:
         """Return the message with which the latest run of a stage failed, or None."""
-        path = self.partial(spec) / FAILURE
-        return path.read_text(encoding="utf-8", errors="replace") if path.is_file() else None
+        return self.partial_product(spec).failure()
 
     def partial(self, spec: StageSpec) -> Path:
         """Return the folder that a stage writes into until it is complete."""
         return self.root / f"{spec.folder}.partial"
+
+    def partial_product(self, spec: StageSpec) -> PartialProduct:
+        """Return the partial product of a stage, which may not exist."""
+        return PartialProduct(self.partial(spec))
 
     def _old(self, spec: StageSpec) -> Path:
         return self.root / f".{spec.folder}.old"
@@ -163,6 +171,15 @@ class Workspace:
                 self._recover(spec)
             yield
 
+    def has_product(self) -> bool:
+        """Return whether a stage has ended here, or its folder was put here by hand."""
+        return any((self.root / spec.folder).exists() for spec in STAGES)
+
+    def has_begun(self) -> bool:
+        """Return whether a command has been at work here."""
+        begun = (self.root / REQUESTS, *(self.partial(spec) for spec in STAGES))
+        return self.has_product() or any(path.exists() for path in begun)
+
     def writer(self) -> str | None:
         """Return the activity of the process that is writing now (`train`), or None."""
         return WriteLock(self.root).activity()
@@ -178,7 +195,7 @@ class Workspace:
     def _swap(self, spec: StageSpec) -> None:
         final, old, partial = self.root / spec.folder, self._old(spec), self.partial(spec)
         _refuse_what_is_no_folder(final)
-        (partial / TOKEN).unlink(missing_ok=True)
+        self.partial_product(spec).tidy()
         replace_folder(partial, final, old)
         remove(old)
 
@@ -187,7 +204,7 @@ class Workspace:
 
         Args:
             spec: the stage; only a resumable one can be continued.
-            token: hash of the inputs and options of the run.
+            token: text of the request, from `request_token`.
             resume: `never` begins afresh; `if-same` continues an interrupted run with the same token, and otherwise
                 begins afresh; `always` does the same, but refuses an interrupted run with another token.
 
@@ -198,30 +215,12 @@ class Workspace:
             InputError: `resume` is `always`, and the interrupted run has another token; or the stage's folder is a
                 symbolic link or a file.
         """
-        partial = self.partial(spec)
+        partial = self.partial_product(spec)
         _refuse_what_is_no_folder(self.root / spec.folder)
-        if partial.is_symlink() or not partial.is_dir():
-            remove(partial)
-        held = partial / TOKEN
-        if spec.resumable and held.is_file() and resume != "never":
-            if held.read_bytes() == token.encode():
-                (partial / FAILURE).unlink(missing_ok=True)
-                return partial, True
-            if resume == "always":
-                raise InputError(
-                    "the interrupted run had other inputs or options: give those, or start afresh without --resume",
-                    path=partial,
-                )
-        held.unlink(missing_ok=True)  # first, so that a half deleted run is never continued
-        remove(partial)
-        partial.mkdir(parents=True)
-        held.write_text(token, encoding="utf-8")
-        return partial, False
-
-    def fail(self, spec: StageSpec, message: str) -> None:
-        """Record the message with which a stage failed; a full disk has no room even for that."""
-        with contextlib.suppress(OSError):
-            (self.partial(spec) / FAILURE).write_text(message, encoding="utf-8", errors="backslashreplace")
+        if spec.resumable and resume != "never" and partial.go_on(token, insist=resume == "always"):
+            return partial.folder, True
+        partial.begin(token)
+        return partial.folder, False
 
     def commit(self, spec: StageSpec, manifest: Manifest) -> None:
         """Write the manifest, flush all to the disk, and rename the partial folder to the stage's folder."""

@@ -14,12 +14,12 @@ Rays are flat arrays sorted by point. The rays of a point are a run (a segment) 
 
 from __future__ import annotations
 
-import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 
+from pipelines.core.threads import thread_count
 from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.geometry.rays import CommonRotation, Intersections, Rays, UncertainCameras
 from pipelines.geometry.rotations import skew
@@ -81,7 +81,7 @@ def intersect_rays(rays: Rays, cameras: UncertainCameras, point_count: int) -> I
     def work(chunk: int) -> None:
         _intersect_chunk(rays, cameras, usable[cuts[chunk] : cuts[chunk + 1]], intersections)
 
-    with ThreadPoolExecutor(os.cpu_count()) as pool:  # numpy lets go of the interpreter in these sizes
+    with ThreadPoolExecutor(thread_count()) as pool:  # numpy lets go of the interpreter in these sizes
         list(pool.map(work, range(len(cuts) - 1)))
     return intersections
 

@@ -12,7 +12,7 @@ from pipelines.core.errors import InputError
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.validators import stays_inside
 from pipelines.formats.exif import PhotoTags, read_tags
-from pipelines.formats.image_file import SUFFIXES, ImageFile, inspect_image, read_bytes
+from pipelines.formats.image_file import SUFFIXES, ImageFile, header_size, inspect_image, read_bytes
 from pipelines.ingest.notes import Notes
 
 
@@ -63,6 +63,25 @@ def scan_folder(root: Path, notes: Notes, progress: Progress = SILENT) -> list[P
                 damaged.append(f"{_name(path, root)} ({photo})")
     notes.warn_counted(damaged, "image was left out", "images were left out")
     return _without_duplicates(photos, notes)
+
+
+def glance(root: Path) -> tuple[int, int, tuple[int, int]]:
+    """Return number and bytes of the image files below `root`, and width and height of the first by name.
+
+    Only the first is read: a folder of hundreds is answered at once.
+
+    Raises:
+        InputError: no such folder, no image in it, or the first is none.
+    """
+    if not root.is_dir():
+        raise InputError("no such folder of photographs", path=root, field="--images")
+    paths = sorted(_candidates(root))
+    if not paths:
+        raise InputError("holds no JPEG, PNG or TIFF image", path=root, field="--images")
+    size_px = header_size(read_bytes(paths[0]))
+    if size_px is None:
+        raise InputError("is no JPEG, PNG or TIFF image", path=paths[0])
+    return len(paths), sum(path.stat().st_size for path in paths), size_px
 
 
 def _candidates(root: Path) -> Iterator[Path]:

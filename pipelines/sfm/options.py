@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
-from pipelines.core.options import InputPath, StageOptions
+from pipelines.core.options import EFFORT, InputPath, StageOptions
 
 
 class SfmOptions(StageOptions):
@@ -28,7 +28,7 @@ class SfmOptions(StageOptions):
         description="Use this COLMAP model instead of reconstructing.",
         json_schema_extra={"flag": "--import"},
     )
-    threads: int = Field(-1, ge=-1, description="Threads (-1: all cores).")
+    threads: Annotated[int, EFFORT] = Field(-1, ge=-1, description="Threads (-1: all).")
     seed: int = Field(0, ge=0, description="Seed of every random choice.")
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from pipelines.core.errors import DegenerateGeometryError, InputError
 from pipelines.core.progress import Progress
 from pipelines.core.stages import SURVEY
+from pipelines.core.threads import chosen_threads
 from pipelines.core.types import IntArray
 from pipelines.formats.image_file import read_bytes, require_unchanged
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
@@ -90,7 +91,7 @@ def reconstruct(colmap: Any, job: SfmJob, progress: Progress) -> Any:
         sizes = sorted((model.num_reg_images() for model in models), reverse=True)
         log.warning("the survey fell apart into %d models of %s images; the largest is used", len(models), sizes)
     model = max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()))
-    last = LastAdjustment(job.options.principal_point, job.options.threads)
+    last = LastAdjustment(job.options.principal_point, chosen_threads(job.options.threads))
     adjust_finally(colmap, model, last, progress)
     return model
 
@@ -120,7 +121,7 @@ def _extract(colmap: Any, job: SfmJob, progress: Progress) -> None:
     """Detect features camera by camera, in chunks of images: finished chunks survive an interruption."""
     options = colmap.FeatureExtractionOptions()
     options.max_image_size = job.options.max_image_size
-    options.num_threads = job.options.threads
+    options.num_threads = chosen_threads(job.options.threads)
     options.sift.max_num_features = job.options.max_features
     sha256_of = {image.name: image.sha256 for image in job.survey.images}
     with progress.task("features", len(job.survey.images)) as task:
@@ -183,7 +184,7 @@ def _copy_shared_params(colmap: Any, prior: CameraPrior, camera: Any) -> None:
 
 def _match(colmap: Any, job: SfmJob, pairs: list[tuple[str, str]], progress: Progress) -> None:
     matching, pairing = colmap.FeatureMatchingOptions(), colmap.ImportedPairingOptions()
-    matching.num_threads = job.options.threads
+    matching.num_threads = chosen_threads(job.options.threads)
     verification = colmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = job.options.seed
     listing = job.database.with_name("pairs.txt")
@@ -209,12 +210,12 @@ def _map(colmap: Any, job: SfmJob, progress: Progress) -> list[Any]:
     with progress.task("mapping", len(job.survey.images)) as task, _scratch(job.database.parent) as out:
         if job.options.mapper == "global":
             options = colmap.GlobalPipelineOptions()
-            options.num_threads, options.random_seed = job.options.threads, job.options.seed
+            options.num_threads, options.random_seed = chosen_threads(job.options.threads), job.options.seed
             models = colmap.global_mapping(job.database, job.images, out, options)
             task.advance(len(job.survey.images))
             return list(models.values())
         options = colmap.IncrementalPipelineOptions()
-        options.num_threads, options.random_seed = job.options.threads, job.options.seed
+        options.num_threads, options.random_seed = chosen_threads(job.options.threads), job.options.seed
         options.min_model_size = 3
         models = colmap.incremental_mapping(
             job.database, job.images, out, options, next_image_callback=lambda: task.advance(1)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, field_validator
 
-from pipelines.core.options import PlaceOnEarth, StageOptions, Triple
+from pipelines.core.options import EFFORT, PlaceOnEarth, StageOptions, Triple
 
 
 class SimulateOptions(StageOptions):
@@ -80,7 +80,7 @@ class SimulateOptions(StageOptions):
     bag: Literal["none", "mcap", "sqlite3"] = Field("none", description="Write the flight as a rosbag2 too.")
     depth: bool = Field(False, description="Write true depth maps (float32, metres).")
     exif: bool = Field(True, description="Write position, attitude and lens into the photographs.")
-    threads: int = Field(-1, ge=-1, le=256, description="Threads that render (-1: all cores).")
+    threads: Annotated[int, EFFORT] = Field(-1, ge=-1, le=256, description="Threads that render (-1: all).")
 
     @property
     def size_px(self) -> tuple[int, int]:

@@ -7,7 +7,6 @@ Reads: nothing. Writes a survey folder, not a workspace: `images/`, `trajectory.
 from __future__ import annotations
 
 import logging
-import os
 import shutil
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -22,6 +21,7 @@ from pipelines.core.durable import replace_folder, sync_tree
 from pipelines.core.errors import InputError
 from pipelines.core.products import save_json
 from pipelines.core.progress import SILENT, Progress
+from pipelines.core.threads import chosen_threads
 from pipelines.formats.bag.writer import BagCamera, BagFlight, write_bag
 from pipelines.formats.exif_writer import DroneTags, with_tags
 from pipelines.simulate.options import SimulateOptions
@@ -184,8 +184,8 @@ class _PhotoWriter:
             (self.folder / "depth").mkdir()
         sensors = _sensors(self.options, rng)
         streams = rng.spawn(count)
-        threads = self.options.threads if self.options.threads > 0 else os.cpu_count() or 1
-        with progress.task("photographs", count) as task, ThreadPoolExecutor(max(1, threads)) as pool:
+        threads = chosen_threads(self.options.threads)
+        with progress.task("photographs", count) as task, ThreadPoolExecutor(threads) as pool:
             jobs = [pool.submit(self._write, i, sensors[i], streams[i]) for i in range(count)]
             try:
                 for job in jobs:

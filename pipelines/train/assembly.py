@@ -19,13 +19,8 @@ from pipelines.splat.rasterizer.backends import device_of
 from pipelines.splat.surface import SurfaceSettings
 from pipelines.train.initial_gaussians import TrainingScene, initial_gaussians, points_to_hold
 from pipelines.train.options import TrainOptions
-from pipelines.train.presets import effort
-from pipelines.train.schedule import JointOptions
+from pipelines.train.schedule import COARSE, JointOptions
 from pipelines.train.trainer import JointTrainer, TrainingViews
-
-# Factor by which photographs are shrunken, and the fraction of the training up to which they are. A larger factor
-# would make the Gaussians smaller than a pixel, and push them off the surface that they start on.
-_COARSE = ((2, 0.3),)
 
 
 def training_size(scene: Scene, images: ImageCache, options: TrainOptions) -> TrainingSize:
@@ -33,7 +28,7 @@ def training_size(scene: Scene, images: ImageCache, options: TrainOptions) -> Tr
     cameras = [images.pinhole(index) for index in map(int, scene.train)]
     largest = max(cameras, key=lambda camera: camera.width * camera.height)
     corrected = len(images) if options.optimize_cameras else 0
-    return TrainingSize(effort(options).max_gaussians, largest, options.sh_degree, corrected)
+    return TrainingSize(options.effort.max_gaussians, largest, options.sh_degree, corrected)
 
 
 def make_trainer(
@@ -50,7 +45,7 @@ def make_trainer(
     Raises:
         DegenerateGeometryError: fewer than two different points to start from.
     """
-    preset, device = effort(options), device_of(backend)
+    preset, device = options.effort, device_of(backend)
     scene, images = training.scene, training.images
     start = InitialisationOptions(sh_degree=options.sh_degree, max_gaussians=preset.max_gaussians)
     gaussians = initial_gaussians(training, start, preset.max_gaussians, options.seed).to(device)
@@ -69,7 +64,7 @@ def make_trainer(
             geo_weight=options.geo_weight,
             geo_schedule=options.geo_schedule,
             seed=options.seed,
-            coarse=_COARSE if options.coarse_to_fine else (),
+            coarse=COARSE if options.coarse_to_fine else (),
             surface=SurfaceSettings() if options.faithful_surface else None,
         ),
         exposures=Exposures(len(images), train, preset.iterations, device) if options.exposure else None,
@@ -77,7 +72,7 @@ def make_trainer(
 
 
 def _strategy(options: TrainOptions, extent_m: float, count: int) -> Strategy:
-    iterations, most = effort(options).iterations, effort(options).max_gaussians
+    iterations, most = options.effort.iterations, options.effort.max_gaussians
     if options.strategy == "mcmc":
         return McmcStrategy(McmcSettings.for_iterations(iterations, count, most), extent_m, options.seed)
     settings = DefaultSettings.for_iterations(iterations, most)

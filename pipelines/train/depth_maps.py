@@ -91,11 +91,12 @@ class DepthMaps:
         steps = (("coarse", self._sweep), ("fine", self._refine), ("depth", self._agree))
         if not all(self._path(index, "depth").exists() for index in train):
             with progress.task("surface", len(steps) * len(train)) as task:
+                task.advance(0, "compiling kernels (a minute, once)")
                 for kind, make in steps:
                     for index in train:
                         if not self._path(index, kind).exists():
                             save_array(self._path(index, kind), make(index))
-                        task.advance()
+                        task.advance(1, " ")
         for kind, _ in steps[:-1]:  # and the files that an interrupted run has left
             for index in train:
                 self._path(index, kind).unlink(missing_ok=True)

@@ -17,7 +17,9 @@ from pipelines.core.interrupts import deferred_interrupts
 from pipelines.core.progress import Progress
 from pipelines.splat.finiteness import NonFiniteError
 from pipelines.train.checkpoint import load_checkpoint, save_checkpoint
+from pipelines.train.pace import TimeLeft
 from pipelines.train.trainer import JointTrainer, StepReport
+from pipelines.train.training_progress import TrainingProgress
 
 log = logging.getLogger(__name__)
 
@@ -34,6 +36,8 @@ class LoopOptions:
         checkpoint_every: iterations between checkpoints.
         log_every: iterations between lines of metrics.
         resume: continue from the checkpoint, if the file exists.
+        extend: the checkpoint is that of a finished, shorter training.
+        note: receives how far the training has come, after each checkpoint (`1500 of 7000 iterations, 12 min`).
     """
 
     checkpoint: Path
@@ -41,6 +45,8 @@ class LoopOptions:
     checkpoint_every: int = 500
     log_every: int = 10
     resume: bool = False
+    extend: bool = False
+    note: Callable[[str], None] = lambda _text: None
 
 
 @dataclass(frozen=True)
@@ -70,24 +76,18 @@ def optimise(trainer: JointTrainer, options: LoopOptions, progress: Progress) ->
             the continuation at a lower rate.
         InputError: the checkpoint cannot be read.
     """
-    loop = _Loop(trainer, options)
-    with progress.task("training", trainer.options.iterations) as task, deferred_interrupts() as stop:
-        shown = 0
-
-        def show(row: dict[str, float]) -> None:
-            nonlocal shown
-            now = int(row["iteration"])
-            task.advance(max(now - shown, 0), f"psnr {row['psnr']:.1f} dB, {row['gaussians']:.0f} gaussians")
-            shown = max(shown, now)
-
-        while trainer.iteration < trainer.options.iterations:
+    loop, iterations = _Loop(trainer, options), trainer.options.iterations
+    display = TrainingProgress(progress, trainer.iteration, iterations, TimeLeft(trainer.work, iterations))
+    with deferred_interrupts() as stop, display:
+        while trainer.iteration < iterations:
             try:
-                loop.iterate(show)
+                row = loop.iterate()
+                display.iterated(trainer.iteration, None if row is None else _note(row))
                 if stop.requested:
                     loop.save()
                     log.warning(
-                        "stopped at iteration %d of %d: --resume continues",
-                        trainer.iteration, trainer.options.iterations,
+                        "stopped at iteration %d of %d; the same command continues",
+                        trainer.iteration, iterations,
                     )  # fmt: skip
                     raise KeyboardInterrupt
             except NonFiniteError as error:
@@ -105,7 +105,9 @@ class _Loop:
         self._spent, self._clock = 0.0, time.monotonic()
         if options.resume and options.checkpoint.exists():
             self._spent = self._resumed()
-            log.info("resumed at iteration %d", trainer.iteration)
+            if options.extend:
+                trainer.schedule.extended_from = trainer.iteration
+            log.info("%s at iteration %d", "extended" if options.extend else "resumed", trainer.iteration)
         else:
             options.metrics.write_text("", encoding="utf-8")
             self.save()
@@ -126,8 +128,8 @@ class _Loop:
         """Return the duration so far, with the runs before a resume."""
         return self._spent + time.monotonic() - self._clock
 
-    def iterate(self, show: Callable[[dict[str, float]], None]) -> None:
-        """Run one iteration, and check, log and save where due.
+    def iterate(self) -> dict[str, float] | None:
+        """Run one iteration, check and save where due, and return the row of metrics if one was due.
 
         Raises:
             NonFiniteError: a loss or gradient was not finite.
@@ -137,13 +139,13 @@ class _Loop:
         due = trainer.iteration % options.log_every == 0 or trainer.iteration == trainer.options.iterations
         if due or trainer.device.type == "cpu":  # a GPU would have to wait for a check at every iteration
             trainer.check_finite()
-        if due:
-            row = _metrics_row(trainer, report, self.seconds())
+        row = _metrics_row(trainer, report, self.seconds()) if due else None
+        if row is not None:
             with options.metrics.open("a", encoding="utf-8") as lines:
                 lines.write(json.dumps(row) + "\n")
-            show(row)
         if trainer.iteration % options.checkpoint_every == 0:
             self.save()
+        return row
 
     def save(self) -> None:
         """Write a checkpoint, if no loss or gradient has diverged.
@@ -157,6 +159,10 @@ class _Loop:
             "recovery": torch.tensor(list((self.recovery or "").encode()), dtype=torch.uint8),
         }
         save_checkpoint(self.options.checkpoint, {**self.trainer.state(), **loop_state})
+        if self.trainer.iteration > self.trainer.schedule.extended_from:
+            minutes = f"{self.seconds() / 60:.0f} min" if self.seconds() >= 60 else f"{self.seconds():.0f} s"
+            total = self.trainer.options.iterations
+            self.options.note(f"{self.trainer.iteration} of {total} iterations, {minutes}")
 
     def recover(self, error: NonFiniteError) -> None:
         """Return to the last checkpoint and lower the learning rates, once in a training.
@@ -185,6 +191,10 @@ class _Loop:
         kept = [row for row in rows if row.endswith("}") and json.loads(row)["iteration"] <= self.trainer.iteration]
         path.write_text("".join(row + "\n" for row in kept), encoding="utf-8")
         return float(state["seconds"])
+
+
+def _note(row: dict[str, float]) -> str:
+    return f"{row['psnr']:.1f} dB, {row['gaussians'] / 1000:.0f} k Gaussians"
 
 
 def _metrics_row(trainer: JointTrainer, report: StepReport, seconds: float) -> dict[str, float]:

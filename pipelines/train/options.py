@@ -8,12 +8,15 @@ from pydantic import Field
 
 from pipelines.core.options import StageOptions
 from pipelines.scene.geographic_options import GeographicOptions
+from pipelines.train.presets import PRESETS, Preset
 
 
 class SplatOptions(StageOptions):
     """Options of the splat: effort, backend, density control, exposure and surface."""
 
-    preset: Literal["smoke", "fast", "standard", "high"] = Field("standard", description="Effort.")
+    preset: Literal["smoke", "fast", "standard", "high"] = Field(
+        "standard", description=f"Effort: {'; '.join(f'{name}: {preset}' for name, preset in PRESETS.items())}."
+    )
     iterations: int | None = Field(None, ge=1, description="Iterations (default: the preset's).")
     max_image_size: int | None = Field(
         None, ge=32, description="Longest image side for training in pixels (default: the preset's)."
@@ -28,6 +31,16 @@ class SplatOptions(StageOptions):
     exposure: bool = Field(True, description="Fit the exposure of each training photograph.")
     dense: bool = Field(True, description="Find the scene's surface by multi-view stereo first, to start from.")
     faithful_surface: bool = Field(True, description="Hold the Gaussians to the surface, for depths to measure in.")
+
+    @property
+    def effort(self) -> Preset:
+        """Effort of the preset, with the values that the user set instead."""
+        preset = PRESETS[self.preset]
+        return Preset(
+            self.iterations or preset.iterations,
+            self.max_image_size or preset.max_image_size,
+            self.max_gaussians or preset.max_gaussians,
+        )
 
 
 class TrainOptions(GeographicOptions, SplatOptions):

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from pipelines.train.options import TrainOptions
-
 
 @dataclass(frozen=True)
 class Preset:
@@ -21,6 +19,10 @@ class Preset:
     max_image_size: int
     max_gaussians: int
 
+    def __str__(self) -> str:
+        """Return the effort as `2000 iterations, 480 px, 60000 Gaussians`."""
+        return f"{self.iterations} iterations, {self.max_image_size} px, {self.max_gaussians} Gaussians"
+
 
 PRESETS = {
     "smoke": Preset(200, 320, 20_000),
@@ -28,13 +30,3 @@ PRESETS = {
     "standard": Preset(7_000, 640, 120_000),
     "high": Preset(30_000, 1_600, 1_000_000),
 }
-
-
-def effort(options: TrainOptions) -> Preset:
-    """Return the effort of the preset, with the values that the user set instead."""
-    preset = PRESETS[options.preset]
-    return Preset(
-        options.iterations or preset.iterations,
-        options.max_image_size or preset.max_image_size,
-        options.max_gaussians or preset.max_gaussians,
-    )

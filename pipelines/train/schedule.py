@@ -11,6 +11,9 @@ from pipelines.georef.weights import WeightSchedule, rising_weight
 from pipelines.splat.surface import SurfaceSettings
 
 _FINAL_RATE = 0.05  # of the geographic unknowns, relative to their first learning rate
+# Factor by which photographs are shrunken, and the fraction of the training up to which they are. A larger factor
+# would make the Gaussians smaller than a pixel, and push them off the surface that they start on.
+COARSE = ((2, 0.3),)
 
 
 @dataclass(frozen=True)
@@ -52,6 +55,13 @@ class JointOptions:
 class TrainingSchedule:
     """Settings of an iteration that follow from its number, counted from 1.
 
+    A finished training can be extended: it goes on at the place of its last iteration in the schedule of the longer
+    training. Rates rise to those of that place and fall again, and density control goes on if it is not over there.
+    Coarse photographs do not come back, and harmonics that were in use stay so.
+
+    Attributes:
+        extended_from: last iteration of the finished training that this one extends; 0: none.
+
     Args:
         options: settings of the optimisation.
         views: (V,) indices of the training images.
@@ -59,6 +69,7 @@ class TrainingSchedule:
 
     def __init__(self, options: JointOptions, views: IntArray) -> None:
         self._options, self._views = options, views
+        self.extended_from = 0
 
     def view(self, iteration: int) -> int:
         """Return the training image of an iteration.
@@ -71,6 +82,8 @@ class TrainingSchedule:
 
     def shrink(self, iteration: int, longest_side_px: int) -> int:
         """Return the factor by which a photograph of that size is shrunken."""
+        if self.extended_from:
+            return 1
         most = max(longest_side_px // self._options.coarse_least_px, 1)
         progress = self.progress(iteration)
         return min(next((shrink for shrink, until in self._options.coarse if progress <= until), 1), most)
@@ -82,7 +95,8 @@ class TrainingSchedule:
         1 000 of 30 000 iterations).
         """
         every = max(self._options.iterations // 6, 1)
-        return min(self._options.sh_degree, iteration // every)
+        degree = min(self._options.sh_degree, iteration // every)
+        return self._options.sh_degree if self.extended_from else degree
 
     def geographic_weight(self, iteration: int) -> float:
         """Return w(t) of eq. 27, or w_max if the weight is constant."""

@@ -25,6 +25,7 @@ from pipelines.splat.optimizer import GaussianAdam
 from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings, Render
 from pipelines.splat.surface import compactness_loss, depth_loss, flatness_loss, normal_loss
 from pipelines.train.checkpoint import prefixed, unprefixed
+from pipelines.train.pace import iteration_seconds
 from pipelines.train.schedule import JointOptions, TrainingSchedule
 from pipelines.train.target_images import TargetImage, TargetImages
 
@@ -106,7 +107,7 @@ class JointTrainer:
         self.views, self.rasterizer, self.options = views, rasterizer, options
         self.exposures = exposures
         self.iteration = 0
-        self._schedule = TrainingSchedule(options, views.camera)
+        self.schedule = TrainingSchedule(options, views.camera)
         self.device = optimizer.gaussians.means.device
         self._pinholes = Pinholes(views.images, views.lenses)
         self._lens = np.zeros(len(problem.cameras.lens_basis))
@@ -133,13 +134,13 @@ class JointTrainer:
         self.iteration += 1
         if self.iteration % _LENS_EVERY == 1:
             self._look_through(self.problem.cameras.lens().detach().cpu().numpy())
-        index = self._schedule.view(self.iteration)
-        target = self._targets.get(index, self._shrink(index), self._schedule.view(self.iteration + 1))
+        index = self.schedule.view(self.iteration)
+        target = self._targets.get(index, self._shrink(index), self.schedule.view(self.iteration + 1))
         pose = self.problem.cameras.cam_from_model(index)
         render = self._render(pose, target.camera, depth=self.problem.sees_by_depth(index))
         colour = render.colour if self.exposures is None else self.exposures.apply(index, render.colour)
         photometric = photometric_loss(colour, target.colour, target.mask)
-        weight, by_depth = self._schedule.geographic_weight(self.iteration), self._by_depth(index, render, target)
+        weight, by_depth = self.schedule.geographic_weight(self.iteration), self._by_depth(index, render, target)
         geographic = self.problem.loss() if by_depth is None else self.problem.loss() + by_depth
         self.optimizer.zero_grad()
         self._geo_adam.zero_grad()
@@ -185,6 +186,13 @@ class JointTrainer:
             )
         return contributions
 
+    def work(self, iteration: int) -> float:
+        """Return the work of an iteration at the present number of Gaussians, relative to others' work."""
+        camera = self.views.images.pinhole(int(self.views.camera[0]))
+        shrink = self.schedule.shrink(iteration, max(camera.width, camera.height))
+        pixels, surface = camera.width * camera.height / shrink**2, self.options.surface is not None
+        return iteration_seconds(pixels, len(self.optimizer.gaussians), surface=surface)
+
     def pinhole(self, index: int) -> Pinhole:
         """Return the camera of an undistorted photograph, with the lens in use."""
         return self._pinholes.of(index)
@@ -217,7 +225,7 @@ class JointTrainer:
     def _render(self, pose: Tensor, camera: Pinhole, *, depth: bool = False) -> Render:
         depth = depth or self.options.surface is not None
         settings = RasterSettings(
-            sh_degree=self._schedule.sh_degree(self.iteration), background=self.options.background, depth=depth
+            sh_degree=self.schedule.sh_degree(self.iteration), background=self.options.background, depth=depth
         )
         return self.rasterizer.render(self.optimizer.gaussians, pose, camera, settings)
 
@@ -254,7 +262,7 @@ class JointTrainer:
         self._watch.note(self.iteration, losses | gradients)
 
     def _apply(self, visible: Tensor) -> None:
-        rate = self._schedule.geographic_rate(self.iteration)
+        rate = self.schedule.geographic_rate(self.iteration)
         for group in self._geo_adam.param_groups:
             group["lr"] = self.optimizer.rate_factor * group["rate"] * rate
         self._geo_adam.step()
@@ -265,7 +273,7 @@ class JointTrainer:
     def _shrink(self, index: int) -> int:
         """Return the factor by which a photograph is shrunken at this iteration."""
         camera = self.views.images.pinhole(index)
-        return self._schedule.shrink(self.iteration, max(camera.width, camera.height))
+        return self.schedule.shrink(self.iteration, max(camera.width, camera.height))
 
     def state(self) -> dict[str, Tensor]:
         """Return all tensors that the next iteration depends on, by name, for a checkpoint."""
@@ -277,6 +285,7 @@ class JointTrainer:
         exposures = {} if self.exposures is None else self.exposures.state()
         return {
             "iteration": torch.tensor(self.iteration),
+            "extended_from": torch.tensor(self.schedule.extended_from),
             "rate_factor": torch.tensor(self.optimizer.rate_factor, dtype=torch.float64),
             "lens": torch.from_numpy(self._lens),
             **prefixed("gaussians", self.optimizer.gaussians.tensors()),
@@ -289,6 +298,7 @@ class JointTrainer:
     def restore(self, state: Mapping[str, Tensor]) -> None:
         """Restore a state, from which the next iteration continues."""
         self.iteration = int(state["iteration"])
+        self.schedule.extended_from = int(state["extended_from"])
         self.optimizer.rate_factor = float(state["rate_factor"])
         self._look_through(state["lens"].cpu().numpy())
         self._watch.reset()

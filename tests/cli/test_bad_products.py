@@ -45,7 +45,7 @@ def made(tmp_path: Path) -> Path:
 def test_upstream_missing(real_georef: Georef, made: Path, stage: str, gone: str, told: str) -> None:
     shutil.rmtree(made / gone, ignore_errors=True)
     result = real_georef(stage, made)
-    assert (result.code, result.out) == (1, "")
+    result.assert_failed(1)
     assert result.err.splitlines()[-1] == told.format(ws=made)
 
 
@@ -69,7 +69,7 @@ def test_damaged_product(real_georef: Georef, made: Path, case: tuple[str, str, 
     absent = [read for read in needed if not (made / read).exists()]
     write_files(made, dict.fromkeys(absent, b"") | {product: data})
     result = real_georef(stage, made)
-    assert (result.code, result.out) == (1, "")
+    result.assert_failed(1)
     assert told in result.err.splitlines()[-1]
     assert "Traceback" not in result.err
 
@@ -90,7 +90,7 @@ def test_damaged_gaussians(real_georef: Georef, made: Path, data: bytes, told: s
     save_json(trained_model(Similarity()), made / MODEL)
     write_files(made, {GAUSSIANS: data})
     result = real_georef("export-ply", made)
-    assert (result.code, result.out) == (1, "")
+    result.assert_failed(1)
     assert told in result.err.splitlines()[-1]
     assert not (made / "export").exists()
 
@@ -102,7 +102,7 @@ def test_report_that_was_replaced(real_georef: Georef, made: Path, content: byte
     absent = [product for product in products if not (made / product).exists()]
     write_files(made, dict.fromkeys(absent, b"") | {REPORT: content})
     result = real_georef("evaluate", made)
-    assert (result.code, result.out) == (1, "")
+    result.assert_failed(1)
     assert f"error: {made / REPORT}" in result.err
     assert "not a report: make it again with `georef evaluate --force`" in result.err.splitlines()[-1]
     assert (made / REPORT).read_bytes() == content
@@ -117,7 +117,7 @@ def test_cuda_without_gpu(real_georef: Georef, made: Path) -> None:
     write_files(made.parent, {image.name: jpeg(index, size) for index, image in enumerate(survey.images)})
     assert real_georef("run", made, "--to", "init-sim3").code == 0
     result = real_georef("train", made, "--backend", "cuda", "--preset", "smoke")
-    assert (result.code, result.out) == (1, "")
+    result.assert_failed(1)
     assert "error: no CUDA device found: install a driver" in result.err.splitlines()[-1]
     assert not (made / "train").exists()
 
@@ -129,7 +129,7 @@ def test_points_of_another_model(real_georef: Georef, made: Path) -> None:
     GeolocatedPoints(**fewer).save(made / POINTS)
     (made / "geolocate/manifest.json").unlink()  # put there by hand
     result = real_georef("init-sim3", made)
-    assert (result.code, result.out) == (1, "")
+    result.assert_failed(1)
     assert "the geolocated points are of another model: run `georef geolocate` again" in result.err
 
 
@@ -149,7 +149,7 @@ def test_import_of_something_else(real_georef: Georef, made: Path, files: dict[s
     write_files(made.parent / "model", files)
     before = products_in(made)
     result = real_georef("sfm", made, "--import", made.parent / "model", "--force")
-    assert (result.code, result.out) == (1, "")
+    result.assert_failed(1)
     assert told in result.err.splitlines()[-1]
     assert str(made.parent / "model") in result.err
     kept = {name: data for name, data in products_in(made).items() if not name.startswith("sfm.partial/")}
@@ -166,7 +166,7 @@ def test_import_of_a_project_and_of_a_forged_track(real_georef: Georef, made: Pa
     struct.pack_into("<Q", points, 8 + 43, 2**36)
     (model / "points3D.bin").write_bytes(points)
     result = real_georef("sfm", made, "--import", project, "--force")
-    assert (result.code, result.out) == (1, "")
+    result.assert_failed(1)
     assert "points3D.bin: shorter than the number of its records says" in result.err.splitlines()[-1]
 
 
@@ -179,7 +179,7 @@ def test_pipe_in_place_of_a_product(real_georef: Georef, made: Path, stage: str,
     (made / product).unlink(missing_ok=True)
     os.mkfifo(made / product)
     result = real_georef(stage, made)
-    assert (result.code, result.out) == (1, "")
+    result.assert_failed(1)
     assert f"{product}: cannot be read: it is a named pipe, give a file" in result.err.splitlines()[-1]
 
 
@@ -189,7 +189,7 @@ def test_import_of_another_flight(real_georef: Georef, made: Path) -> None:
     save_json(survey.model_copy(update={"images": tuple(others)}), made / SURVEY)
     shutil.copytree(made / SPARSE, made.parent / "model")
     result = real_georef("sfm", made, "--import", made.parent / "model", "--force")
-    assert (result.code, result.out) == (1, "")
+    result.assert_failed(1)
     assert "only 0 of its images are in the survey: names must be equal" in result.err
 
 
@@ -198,13 +198,13 @@ def test_residual_larger_than_allowed(real_georef: Georef, made: Path) -> None:
     assert real_georef("init-sim3", made).code == 0
     before = (made / SIM3).read_bytes()
     result = real_georef("init-sim3", made, "--max-residual", "0.000001")
-    assert (result.code, result.out) == (1, "")
+    result.assert_failed(1)
     assert "--max-residual" in result.err.splitlines()[-1]
     assert (made / SIM3).read_bytes() == before
 
 
 def test_photographs_that_are_gone(real_georef: Georef, made: Path) -> None:
     result = real_georef("sfm", made, "--force")
-    assert (result.code, result.out) == (1, "")
+    result.assert_failed(1)
     assert "photographs of the survey are gone" in result.err.splitlines()[-1]
     assert real_georef("geolocate", made).code == 0  # the model that was there is kept

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
 
 from pipelines.core.errors import ConvergenceError
 from pipelines.core.stages import BY_NAME, PIPELINE
+from pipelines.core.threads import chosen_threads, thread_count
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from tests import fakes
 from tests.cli_runs import Georef
@@ -60,7 +62,7 @@ def test_status(georef: Georef, done: Path, photos: Path) -> None:
 
 def test_status_of_nothing(georef: Georef, tmp_path: Path) -> None:
     result = georef("status", tmp_path / "nowhere", "--json")
-    assert (result.code, result.out) == (1, "")
+    result.assert_failed(1)
     assert result.err == f"error: {tmp_path}/nowhere: no such workspace: `georef ingest` makes one\n"
 
 
@@ -95,7 +97,7 @@ class TestRunOptions:
         self, georef: Georef, done: Path, arguments: list[str], message: str
     ) -> None:
         result = georef("run", done, *arguments)
-        assert (result.code, result.out) == (2, "")
+        result.assert_failed(2)
         assert message in result.err
 
     def test_relative_paths_are_remembered_absolute(
@@ -128,13 +130,13 @@ class TestFlags:
 
     def test_out_of_range(self, georef: Georef, done: Path) -> None:
         result = georef("sfm", done, "--max-features", 1, "--json")
-        assert (result.code, result.out) == (1, "")
+        result.assert_failed(2)
         assert result.err == "error: [--max-features]: Input should be greater than or equal to 200\n"
 
     @pytest.mark.parametrize("arguments", [["--mapper", "best"], ["--max-features", "many"], ["--frobnicate"]])
     def test_usage(self, georef: Georef, done: Path, arguments: list[str]) -> None:
         result = georef("sfm", done, *arguments)
-        assert (result.code, result.out) == (2, "")
+        result.assert_failed(2)
         assert arguments[0] in result.err
 
     def test_unknown_key_in_file(self, georef: Georef, done: Path) -> None:
@@ -232,10 +234,32 @@ class TestTalk:
         assert "Traceback" in long
         assert long.endswith(plain)
 
-    def test_verbose_and_quiet(self, georef: Georef, done: Path) -> None:
-        result = georef("-v", "-q", "status", done)
-        assert result.code == 2
+    @pytest.mark.parametrize("place", [0, 1, 3])
+    def test_verbose_and_quiet(self, georef: Georef, done: Path, place: int) -> None:
+        words: list[object] = ["status", done]
+        words[place:place] = ["-v"]
+        result = georef(*words, "-q", "--json")
+        result.assert_failed(2)
         assert "exclude each other" in result.err
+
+    @pytest.mark.parametrize("command", ["sfm", "run"])
+    def test_verbosity_behind_the_command(self, georef: Georef, done: Path, command: str) -> None:
+        assert georef(command, done, "--force", "-q").err == georef("-q", command, done, "--force").err == ""
+        assert georef(command, done, "--force").err != ""
+        failing = ("sfm", done, "--max-features", 1)
+        assert georef(*failing, "--traceback").err == georef("--traceback", *failing).err
+
+    @pytest.mark.parametrize("words", [("-j", 1, "status"), ("status", "--threads", 1)])
+    def test_threads(
+        self, georef: Georef, done: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[object, ...]
+    ) -> None:
+        """The variables are those that OpenMP, BLAS and numba read when a stage loads them."""
+        for name in ("OMP", "NUMBA", "OPENBLAS", "MKL", "GDAL"):
+            monkeypatch.setenv(f"{name}_NUM_THREADS", "7")
+        assert georef(*words, done).code == 0
+        assert {os.environ[f"{name}_NUM_THREADS"] for name in ("OMP", "NUMBA", "OPENBLAS", "MKL")} == {"1"}
+        assert (thread_count(), chosen_threads(-1), chosen_threads(3)) == (1, 1, 3)
+        georef("status", done, "-j", 0).assert_failed(2)
 
     def test_markup_in_results_is_text(self, georef: Georef, done: Path) -> None:
         def run(stage: StageRun, options: object) -> Summary:

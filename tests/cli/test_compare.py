@@ -132,7 +132,7 @@ def test_order_is_the_users_and_each_counts_once(georef: Georef, survey: Path) -
 @pytest.mark.parametrize("names", ["A,F", "a", ","])
 def test_unknown_configuration_is_refused_before_anything_runs(georef: Georef, survey: Path, names: str) -> None:
     result = georef("compare", survey, "--configs", names)
-    assert (result.code, result.out) == (1, "")
+    result.assert_failed(2)
     assert "--configs" in result.err
     assert "baseline, A, B, C, D, E" in result.err
     assert not (survey / "compare").exists()
@@ -165,7 +165,7 @@ def test_training_is_asked_for_as_before_but_for_what_makes_the_configuration(ge
 
 def test_bad_option_is_refused_before_anything_runs(georef: Georef, survey: Path) -> None:
     result = georef("compare", survey, "--iterations", 0)
-    assert result.code == 1
+    assert result.code == 2
     assert "--iterations" in result.err
     assert not (survey / "compare").exists()
     assert georef("compare", survey, "--no-geo-loss").code == 2  # makes configurations: not for the user to set
@@ -234,7 +234,7 @@ def test_other_errors_end_it(georef: Georef, survey: Path) -> None:
 
     fakes.install(evaluate=reporting, train=refusing)
     result = georef("compare", survey)
-    assert (result.code, result.out) == (1, "")
+    result.assert_failed(1)
     assert "no such thing" in result.err
 
 

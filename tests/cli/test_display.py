@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import logging
+import re
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -14,9 +15,11 @@ from rich.console import Console
 from georef_cli import display, tables
 from georef_cli.output import print_rich
 from georef_cli.verbosity import Verbosity
+from pipelines.compare.table import ComparedRow, Comparison, PointAccuracy
 from pipelines.core.cautions import Caution
 from pipelines.core.progress import SILENT
 from pipelines.core.runner import Outcome
+from pipelines.core.sentences import duration
 from pipelines.core.staleness import StageState
 from pipelines.core.workspace import Manifest, Workspace
 from pipelines.scene.report import AsprsStatement, ByAxis, NoCrossValidation, PredictedSigma, TotalRmse
@@ -30,8 +33,8 @@ REPORT = report_with(
 )
 
 
-def text_of(*parts: Any) -> str:
-    console = Console(file=io.StringIO(), width=120)
+def text_of(*parts: Any, width: int = 120) -> str:
+    console = Console(file=io.StringIO(), width=width)
     for part in parts:
         console.print(part)
     assert isinstance(console.file, io.StringIO)
@@ -71,25 +74,107 @@ class TestReport:
         )
         crossed = cross_validation_with(count=8, rmse_h_m=0.044)
         parts = tables.report(report_with(camera=camera, crossed=crossed))
-        check, accuracy, cross = [text_of(part) for part in parts[1:4]]
+        check, accuracy, cross = [text_of(part) for part in parts[:3]]
         line = next(line for line in accuracy.splitlines() if line.startswith("camera"))
-        assert line.split() == ["camera", "0.018", "0.023", "2", "cm", "3", "cm", "0.017", "0.022", "–", "–"]
+        assert line.split() == ["camera", "0.018", "0.023", "2", "cm", "3", "cm", "0.017", "0.022"]
         assert "0.044" in cross
         assert "0.044" not in check
 
-    def test_unknown_is_a_dash(self) -> None:
-        assert "–" in text_of(*tables.report(REPORT)[:1])
+    def test_unknown_is_a_dash_where_another_row_is_known(self) -> None:
+        parts = [text_of(part) for part in tables.report(REPORT)]
+        assert "–" not in "".join(parts[:2]) and "LPIPS" not in parts[0] and "max 3D" not in parts[1]
+        beside = report_with(camera=check_points_with(count=3, rmse_h_m=0.1), model=check_points_with(count=2))
+        assert text_of(*tables.report(beside)).splitlines()[-1].split() == ["model", "2", "–"]
 
     def test_parts_that_are_not_there_have_no_table(self) -> None:
-        """No statement without check points, no cross-validation unless asked for."""
-        titles = [text_of(part).splitlines()[1] for part in tables.report(report_with())]
-        assert titles == ["Test views", "Check points, metres", "Residuals of the fit (not an accuracy), metres"]
+        """No table of dashes: nothing was measured, and cross-validation is made on request only."""
+        assert tables.report(report_with()) == []
 
     def test_impossible_cross_validation_counts_no_points(self) -> None:
         crossed = NoCrossValidation(count=0, reason="the measurements leave the similarity open")
         document = report_with().model_copy(update={"cross_validation": crossed})
-        lines = text_of(tables.report(document)[2]).splitlines()
-        assert lines[-1].split() == ["left", "out", "0"]
+        (part,) = tables.report(document)
+        assert text_of(part).splitlines()[-1] == "not possible: the measurements leave the similarity open"
+
+
+class TestWidths:
+    """Nothing is cut off: figures turn on their side, other tables have fewer columns."""
+
+    def errors(self, base: float) -> dict[str, Any]:
+        return {name: base + 0.001 * i for i, name in enumerate(list(tables.POINT_COLUMNS)[1:])}
+
+    @pytest.mark.parametrize("width", [80, 120])
+    def test_every_figure_of_a_report_is_shown(self, width: int) -> None:
+        ways = {"camera": self.errors(0.1), "model": self.errors(0.2)}
+        points = {way: check_points_with(count=47, **errors) for way, errors in ways.items()}
+        (part,) = tables.report(report_with(**points))
+        text = text_of(part, width=width)
+        assert max(map(len, text.splitlines())) <= width and "…" not in text
+        figures = [f"{value:.3f}" for errors in ways.values() for value in errors.values()]
+        assert sorted(re.findall(r"\d\.\d{3}", text)) == sorted(figures)
+        assert all(head in text for head in tables.POINT_COLUMNS.values())
+        assert (len(text.splitlines()) < 6) is (width == 120), "a line a way where there is room"
+
+    @pytest.mark.parametrize("width", [80, 120])
+    def test_comparison(self, width: int) -> None:
+        accuracy = PointAccuracy(count=47, mean_h_m=0.111, median_h_m=0.122, rmse_h_m=0.133, rmse_v_m=0.144)
+        rows = tuple(
+            ComparedRow(
+                configuration=name, title=name, note="n", test_psnr=24.5, test_ssim=0.9, camera=accuracy,
+                model=accuracy, training_s=100.0,
+            )
+            for name in ("baseline", *"ABCDE")
+        )  # fmt: skip
+        table = tables.comparison(Comparison(options={}, rows=rows))[1]
+        text = text_of(table, width=width)
+        assert max(map(len, text.splitlines())) <= width and "…" not in text
+        assert text.count("0.133") == 2 * len(rows)
+
+    @pytest.mark.parametrize("width", [80, 120])
+    def test_states(self, width: int) -> None:
+        end = datetime(2026, 1, 1, 12, tzinfo=UTC)
+        row = StageState("export-raster", "interrupted", "ingest/survey.json changed", end, 7260.0, "3 files")
+        text = text_of(tables.states([row], {}), width=width)
+        words = " ".join(text.split())
+        for part in ("export-raster", "interrupted", "2 h 01 min", "3 files", "survey.json"):
+            assert part in words
+        assert ("2026-01-01" in words) is (width == 120)
+
+    @pytest.mark.parametrize("width", [80, 120])
+    def test_bar_keeps_to_one_line_with_labelled_times(self, width: int) -> None:
+        console = Console(file=io.StringIO(), force_terminal=True, width=width)
+        with display.BarProgress(console).task("training", 30_000) as task:
+            task.advance(12_345, "24.3 dB, 1000 k Gaussians", left_s=4000.0)
+            task.advance(1, left_s=3999.0)
+        assert isinstance(console.file, io.StringIO)
+        lines = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", console.file.getvalue()).replace("\r", "\n").splitlines()
+        bars = [line for line in lines if line.strip()]
+        assert all(line.startswith("training") and len(line) <= width for line in bars)
+        last = bars[-1]
+        assert "12346/30000" in last and "0:00 so far" in last and "1:06:39 left" in last
+        assert "24.3 dB" in last
+        assert ("it/s" in last) is (width == 120)
+
+
+def test_nothing_twice_on_a_terminal(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Cautions end the result on stdout: where it is the same terminal as stderr, the log leaves them out."""
+    console = Console(file=io.StringIO(), width=80)
+    handler = display.ConsoleHandler(console)
+    record = logging.LogRecord("pipelines", logging.WARNING, "", 0, "sfm: no check", None, None)
+    record.at_end = True
+    for both in (False, True):
+        monkeypatch.setattr("sys.stdout.isatty", lambda both=both: both, raising=False)
+        handler.handle(record)
+    assert isinstance(console.file, io.StringIO)
+    assert console.file.getvalue().count("no check") == 1
+
+
+def test_task_without_steps_has_no_bar() -> None:
+    console = Console(file=io.StringIO(), force_terminal=True, width=80)
+    with display.BarProgress(console).task("depth maps", 0) as task:
+        task.advance()
+    assert isinstance(console.file, io.StringIO)
+    assert console.file.getvalue() == ""
 
 
 HOSTILE = "[red]a[/] [/] [link=file:///x]b[/link] :smile:"
@@ -127,7 +212,7 @@ def test_markup_in_names_is_printed_as_it_stands(monkeypatch: pytest.MonkeyPatch
     [(None, ""), (0.44, "0.4 s"), (12.2, "12 s"), (59.7, "1 min 00 s"), (200, "3 min 20 s"), (3900, "1 h 05 min")],
 )
 def test_duration(seconds: float | None, text: str) -> None:
-    assert tables.duration(seconds) == text
+    assert duration(seconds) == text
 
 
 class TestLines:

@@ -45,7 +45,7 @@ def test_command_explains_itself(name: str) -> None:
     assert command.name == name
     examples = examples_in(command.help or "")
     assert examples
-    assert all(f" {name} " in line for line in examples)
+    assert all(f" {name} " in f"{line} " for line in examples)
     for parameter in command.params:
         assert isinstance(parameter, click.Argument) or getattr(parameter, "help", None)
     assert "--json" in [option for parameter in command.params for option in parameter.opts]

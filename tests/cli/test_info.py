@@ -38,15 +38,22 @@ def test_command_tells_place_files_and_what_can_be_made(real_georef: Georef, fli
 def test_command_names_what_is_missing(real_georef: Georef, flight: Workspace, tmp_path: Path) -> None:
     flight.path(MODEL).unlink()
     result = real_georef("info", flight.root)
-    assert (result.code, result.out) == (1, "")
+    result.assert_failed(1)
     assert f"georef train {flight.root}" in result.err
     assert "no such workspace" in real_georef("info", tmp_path / "nowhere").err
 
 
 def test_run_ends_with_where_the_files_are(flight: Workspace, capsys: pytest.CaptureFixture[str]) -> None:
-    print_outcomes(flight, (), overview(flight, CrsOptions()), as_json=False)
+    print_outcomes(flight, (), overview(flight, CrsOptions(crs="EPSG:4326")), as_json=False, told=False)
     out = " ".join(capsys.readouterr().out.split())
-    for text in ("at 46.00", "longitude 7.74", "/export/splat.ply", "georef info", "--deliver"):
+    for text in (
+        "at 46.00",
+        "longitude 7.74",
+        "export/splat.ply the splat",
+        "EPSG:4326 ",
+        "georef info",
+        "--deliver",
+    ):
         assert text in out
 
 

@@ -60,13 +60,13 @@ def test_piped_output_is_the_result_alone(tmp_path: Path, photos: Path) -> None:
 
 def test_usage_is_2() -> None:
     result = finish(start("status"))
-    assert (result.code, result.out) == (2, "")
+    result.assert_failed(2)
     assert "Missing argument 'WS'" in result.err
 
 
 def test_unknown_error_keeps_its_traceback(tmp_path: Path, photos: Path) -> None:
     result = finish(start("ingest", tmp_path / "flight", "--images", photos, code=BROKEN))
-    assert (result.code, result.out) == (1, "")
+    result.assert_failed(1)
     assert "Traceback" in result.err
     assert "ZeroDivisionError: a defect" in result.err
     assert "ZeroDivisionError: a defect" in (tmp_path / "flight/logs/ingest.log").read_text()

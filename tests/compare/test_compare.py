@@ -158,7 +158,7 @@ class Interrupting:
         self.seen = 0 if name == "training" else -10_000
         yield self
 
-    def advance(self, steps: int = 1, note: str = "") -> None:
+    def advance(self, steps: int = 1, note: str = "", left_s: float | None = None) -> None:
         self.seen += steps
         if self.seen == self.at:
             raise KeyboardInterrupt

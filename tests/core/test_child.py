@@ -35,7 +35,7 @@ class Recorded:
         recorded = self
 
         class Task:
-            def advance(self, steps: int = 1, note: str = "") -> None:
+            def advance(self, steps: int = 1, note: str = "", left_s: float | None = None) -> None:
                 recorded.steps.append((name, steps, note))
 
         yield Task()

@@ -178,7 +178,7 @@ class Bars:
         self.total += total or 0
         yield self
 
-    def advance(self, steps: int = 1, note: str = "") -> None:
+    def advance(self, steps: int = 1, note: str = "", left_s: float | None = None) -> None:
         self.steps += steps
 
 

@@ -44,3 +44,12 @@ def test_weight_rises_or_stays_and_rates_fall() -> None:
     assert constant.geographic_weight(1) == 0.05
     assert rising.geographic_rate(0) == 1.0
     assert rising.geographic_rate(1000) == pytest.approx(0.05)
+
+
+def test_extended_training_neither_shrinks_photographs_again_nor_drops_harmonics() -> None:
+    """Where it goes on, the longer schedule has shrunken photographs and degree 0: a step back."""
+    schedule = TrainingSchedule(JointOptions(1000, sh_degree=3, coarse=((2, 0.3),)), VIEWS)
+    assert (schedule.shrink(120, 640), schedule.sh_degree(120)) == (2, 0)
+    schedule.extended_from = 100
+    assert (schedule.shrink(120, 640), schedule.sh_degree(120)) == (1, 3)
+    assert schedule.geographic_rate(120) == pytest.approx(0.05**0.12), "rates are those of the longer training"

@@ -30,7 +30,7 @@ from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
 from pipelines.splat.storage import read_gaussians
 from pipelines.train.options import TrainOptions
-from pipelines.train.presets import PRESETS, Preset, effort
+from pipelines.train.presets import PRESETS, Preset
 from tests.georef_scenes import squared_error
 from tests.scenes import GEO_FROM_LOCAL, without_fixes
 from tests.splat_scenes import TRAINING, RenderedFlight
@@ -141,7 +141,7 @@ class Signalling:
         self.seen = 0 if name == "training" else -10_000
         yield self
 
-    def advance(self, steps: int = 1, note: str = "") -> None:
+    def advance(self, steps: int = 1, note: str = "", left_s: float | None = None) -> None:
         self.seen += steps
         if self.seen == self.at:
             self.act()
@@ -329,7 +329,7 @@ def test_constant_schedule_starts_at_the_full_weight(flights: list[RenderedFligh
 
 
 def test_presets_can_be_changed_in_part() -> None:
-    assert effort(TrainOptions(preset="fast")) == PRESETS["fast"]
-    changed = effort(TrainOptions(preset="smoke", iterations=7, max_image_size=64))
+    assert TrainOptions(preset="fast").effort == PRESETS["fast"]
+    changed = TrainOptions(preset="smoke", iterations=7, max_image_size=64).effort
     assert changed == replace(PRESETS["smoke"], iterations=7, max_image_size=64)
     assert PRESETS["high"] == Preset(30_000, 1_600, 1_000_000)

@@ -9,8 +9,11 @@ import torch
 from pipelines.core.errors import BackendUnavailableError
 from pipelines.splat.rasterizer.api import Rasterizer
 
+BackendName = Literal["auto", "cpu", "cuda"]
+BACKENDS: tuple[BackendName, ...] = ("cpu", "cuda")
 
-def rasterizer(name: Literal["auto", "cpu", "cuda"]) -> Rasterizer:
+
+def rasterizer(name: BackendName) -> Rasterizer:
     """Return the backend of that name; `auto` takes cuda if a device and gsplat are present.
 
     Raises:

@@ -1,0 +1,89 @@
+"""Base of all commands: the options that each of them takes, before or after its name."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Sequence
+from dataclasses import fields
+from typing import Any
+
+import click
+
+from georef_cli import boundary
+from georef_cli.verbosity import Verbosity
+from pipelines.core.threads import limit_threads
+
+_VERBOSITY = tuple(field.name for field in fields(Verbosity))
+
+
+class Command(click.Command):
+    """Command of the program, with the options that all commands share.
+
+    Args:
+        name: of the command.
+        help: text with examples; its indentation is removed.
+        params: arguments and options of its own.
+        more: see `click.Command`.
+    """
+
+    def __init__(self, name: str, *, help: str, params: Sequence[click.Parameter] = (), **more: Any) -> None:
+        self.own_params = tuple(params)
+        super().__init__(name, help=inspect.cleandoc(help), params=[*params, *shared_options()], **more)
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the command with the verbosity of its own line and of the group's options together.
+
+        Raises:
+            click.UsageError: both `--verbose` and `--quiet` are given.
+        """
+        ctx.obj = merged_verbosity(ctx)
+        with boundary.logged_to_stderr(ctx.obj):
+            return super().invoke(ctx)
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the command's own options, and below them those of all commands."""
+        rows = [
+            (param in self.own_params, param.get_help_record(ctx))
+            for param in self.get_params(ctx)
+            if isinstance(param, click.Option)
+        ]
+        for own, title in ((True, "Options"), (False, "Options of all commands")):
+            records = [record for is_own, record in rows if is_own is own and record is not None]
+            if records:
+                with formatter.section(title):
+                    formatter.write_dl(records)
+
+
+def shared_options() -> list[click.Option]:
+    """Return the options of verbosity, and that of the threads, which takes effect when it is parsed."""
+    return [
+        click.Option(["-v", "--verbose"], is_flag=True, help="Show more messages."),
+        click.Option(["-q", "--quiet"], is_flag=True, help="Show warnings and errors only."),
+        click.Option(["--traceback"], is_flag=True, help="Show where in the program an error was raised."),
+        click.Option(
+            ["-j", "--threads"],
+            type=click.IntRange(min=1),
+            metavar="N",
+            expose_value=False,
+            callback=_limit_threads,
+            help="Use at most this many threads (default: one for each core).",
+        ),
+    ]
+
+
+def merged_verbosity(ctx: click.Context) -> Verbosity:
+    """Return the verbosity of a context and of its parents, and take its options out of the parameters.
+
+    Raises:
+        click.UsageError: both `--verbose` and `--quiet` are given.
+    """
+    above = ctx.obj if isinstance(ctx.obj, Verbosity) else Verbosity()
+    merged = Verbosity(**{name: ctx.params.pop(name) or getattr(above, name) for name in _VERBOSITY})
+    if merged.verbose and merged.quiet:
+        raise click.UsageError("--verbose and --quiet exclude each other.", ctx)
+    return merged
+
+
+def _limit_threads(ctx: click.Context, _param: click.Parameter, count: int | None) -> None:
+    if count is not None and not ctx.resilient_parsing:
+        limit_threads(count)

@@ -1,0 +1,72 @@
+"""Tables that fit: the same figures in another form where the terminal is too narrow for the first."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
+from rich.measure import Measurement
+from rich.table import Table
+
+
+class FirstThatFits:
+    """Renderable that takes the first of several forms that needs no more than the width of the terminal.
+
+    Args:
+        forms: the widest first; the last is taken if none fits.
+    """
+
+    def __init__(self, *forms: RenderableType) -> None:
+        self._forms = forms
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Yield the form."""
+        unlimited = options.update(max_width=10_000)
+        for form in self._forms[:-1]:
+            if Measurement.get(console, unlimited, form).maximum <= options.max_width:
+                yield form
+                return
+        yield self._forms[-1]
+
+
+class ByWidth:
+    """Renderable with one form for wide terminals and another for narrow ones.
+
+    Args:
+        least: number of columns from which a terminal is wide.
+        wide: form with cells that may wrap.
+        narrow: form with fewer columns.
+    """
+
+    def __init__(self, least: int, wide: RenderableType, narrow: RenderableType) -> None:
+        self._least, self._wide, self._narrow = least, wide, narrow
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Yield the form."""
+        yield self._wide if options.max_width >= self._least else self._narrow
+
+
+def plain_table(*columns: str, header: bool = True, right: Sequence[int] = ()) -> Table:
+    """Return an empty table without lines; the columns `right` are right-aligned."""
+    table = Table(*columns, show_header=header, box=None, pad_edge=False)
+    for index in right:
+        table.columns[index].justify = "right"
+    return table
+
+
+def figures(heads: Sequence[str], rows: Mapping[str, Sequence[str]]) -> FirstThatFits:
+    """Return rows of figures: a line for each row, or a line for each figure where that is too wide.
+
+    Args:
+        heads: names of the figures; a line break separates group and name.
+        rows: by name, a text for each figure; markup.
+    """
+    wide = plain_table("", *heads, right=range(1, len(heads) + 1))
+    for column in wide.columns:
+        column.no_wrap = True
+    for name, cells in rows.items():
+        wide.add_row(name, *cells)
+    tall = plain_table("", *rows, right=range(1, len(rows) + 1))
+    for index, head in enumerate(heads):
+        tall.add_row(head.replace("\n", " ").strip(), *(cells[index] for cells in rows.values()))
+    return FirstThatFits(wide, tall)

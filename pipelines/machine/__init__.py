@@ -1,0 +1,1 @@
+"""The machine: what `georef` finds on it, and what is missing."""

@@ -1,0 +1,61 @@
+"""Pace of a training: seconds of one iteration, and the time that the remaining iterations will take.
+
+The seconds are those of a stated machine. On another one they give an estimate before the training starts, and the
+proportions of iterations with shrunken and with whole photographs, for the time left of a running training.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+# Fitted to one whole iteration of docs/benchmarks.md: 10 000 … 1 000 000 Gaussians, 0.25 … 1.2 megapixels, a third
+# of the Gaussians in view. 2 cores of an AMD EPYC (AVX-512), CPU backend, 2026-11-21.
+MEASURED_ON = "2 cores of an AMD EPYC"
+MEASURED_CORES = 2
+_FIXED_S, _MEGAPIXEL_S, _MILLION_GAUSSIANS_S = 0.003, 0.092, 0.367
+# Surface losses render depth and normals too. Ratio of seven trainings with them to the fit, 1.5 … 2.0, 2026-11-22.
+_SURFACE = 1.9
+
+
+def iteration_seconds(pixels: float, gaussians: float, *, surface: bool) -> float:
+    """Return the seconds of one iteration on the machine of `MEASURED_ON`.
+
+    Args:
+        pixels: of the photograph.
+        gaussians: number of Gaussians.
+        surface: whether surface losses hold the Gaussians.
+    """
+    plain = _FIXED_S + _MEGAPIXEL_S * pixels / 1e6 + _MILLION_GAUSSIANS_S * gaussians / 1e6
+    return (_SURFACE if surface else 1.0) * plain
+
+
+class TimeLeft:
+    """Time that the remaining iterations will take, from the speed of those done and the work of each.
+
+    Args:
+        work: of an iteration, counted from 1, in any unit.
+        iterations: length of the training.
+        clock: returns seconds.
+    """
+
+    def __init__(
+        self, work: Callable[[int], float], iterations: int, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._done = np.concatenate([[0.0], np.cumsum([work(i) for i in range(1, iterations + 1)])])
+        self._clock = clock
+        self._begun: tuple[int, float] | None = None
+
+    def start(self, iteration: int) -> None:
+        """Begin to measure the speed, after `iteration`."""
+        self._begun = iteration, self._clock()
+
+    def after(self, iteration: int) -> float | None:
+        """Return the seconds that are left after an iteration; None as long as the speed is unknown."""
+        if self._begun is None or iteration <= self._begun[0]:
+            return None
+        first, began = self._begun
+        speed = (self._clock() - began) / (self._done[iteration] - self._done[first])
+        return float(speed * (self._done[-1] - self._done[iteration]))

@@ -1,0 +1,120 @@
+"""`--dry-run`: what a run would do, why, with which options, for how long; and nothing is written."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from pipelines.core.workspace import StageRun, Summary, Workspace
+from pipelines.train.pace import TimeLeft, iteration_seconds
+from tests import fakes
+from tests.cli_runs import Georef
+from tests.photos import write_flight
+
+
+def listing(folder: Path) -> dict[str, int]:
+    return {str(path): path.stat().st_mtime_ns for path in folder.rglob("*")}
+
+
+def actions(georef: Georef, *words: object) -> dict[str, str]:
+    result = georef(*words, "--dry-run", "--json")
+    assert result.code == 0, result.err
+    return {row["stage"]: row["action"] for row in result.document["stages"]}
+
+
+def test_before_the_first_run(georef: Georef, tmp_path: Path) -> None:
+    """Photographs of 64×48 px are trained as they are; no time is said for a stage that is quick."""
+    write_flight(tmp_path / "photos", 5, lat=46.0, lon=7.7)
+    words = ("run", tmp_path / "ws", "--images", tmp_path / "photos", "--preset", "smoke", "--dry-run")
+    document = georef(*words, "--json").document
+    assert not (tmp_path / "ws").exists()
+    assert {row["action"] for row in document["stages"]} == {"run"}
+    assert (document["photographs"]["count"], document["photographs"]["size_px"]) == (5, [64, 48])
+    training = document["training"]
+    assert (training["iterations"], training["max_gaussians"], training["training_px"]) == (200, 20_000, [64, 48])
+    assert training["peak_bytes"] > 100e6
+    seconds = {row["stage"]: row["seconds"] for row in document["stages"]}
+    assert seconds["sfm"] > 0 and seconds["train"] > 0 and seconds["evaluate"] is None
+    text = georef(*words).out
+    assert "smoke: 200 iterations, at most 20000 Gaussians" in text
+    assert "5 of 64×48 px" in text and "Nothing was run" in text
+
+
+def test_a_run_begins_with_the_forecast(georef: Georef, tmp_path: Path) -> None:
+    """Ahead of the first stage, and once."""
+    write_flight(tmp_path / "photos", 5, lat=46.0, lon=7.7)
+    lines = georef("run", tmp_path / "ws", "--images", tmp_path / "photos", "--max-image-size", 40).err.splitlines()
+    assert lines[0] == "train: standard: 7000 iterations, at most 120000 Gaussians"
+    assert (
+        lines[1] == "train: 5 photographs of 64×48 px are trained at 40×30, 1/1.6 of their side (--max-image-size)"
+    )
+    assert any(line.startswith("ingest: started") for line in lines[3:])
+    assert sum("Gaussians" in line for line in lines) == 1
+
+
+def test_a_missing_file_is_told(georef: Georef, tmp_path: Path) -> None:
+    georef("run", tmp_path / "ws", "--images", tmp_path / "phots", "--dry-run").assert_failed(1)
+    georef("train", tmp_path / "ws", "--dry-run").assert_failed(1)
+
+
+class TestOfAWorkspace:
+    @pytest.fixture
+    def done(self, georef: Georef, workspace: Workspace, photos: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+        monkeypatch.setattr("georef_cli.dry_run._photographs", lambda *_: None)  # fake surveys have none
+        assert georef("run", workspace.root, "--images", photos, "--iterations", 300).code == 0
+        return workspace.root
+
+    def test_current_stages_are_kept(self, georef: Georef, done: Path) -> None:
+        before = listing(done)
+        assert set(actions(georef, "run", done).values()) == {"keep"}
+        assert listing(done) == before
+
+    def test_changed_option_runs_its_stage_and_perhaps_those_after(self, georef: Georef, done: Path) -> None:
+        planned = actions(georef, "run", done, "--max-residual", 2)
+        assert [planned[name] for name in ("geolocate", "init-sim3", "train", "export-ply")] == [
+            "keep", "run", "perhaps", "perhaps",
+        ]  # fmt: skip
+        assert set(actions(georef, "run", done, "--force").values()) == {"run"}
+
+    def test_origins_of_options(self, georef: Georef, done: Path) -> None:
+        (done / "georef.toml").write_text("[train]\nseed = 7\n")
+        (row,) = georef("train", done, "--max-gaussians", 900, "--dry-run", "--json").document["stages"]
+        assert {(option["flag"], option["origin"]) for option in row["options"]} == {
+            ("--iterations", "remembered"),
+            ("--seed", "georef.toml"),
+            ("--max-gaussians", "command line"),
+        }
+        assert row["reason"] == "option max_gaussians, seed changed"
+
+    def test_longer_training_extends_and_interrupted_one_resumes(self, georef: Georef, done: Path) -> None:
+        def stop(stage: StageRun, options: object) -> Summary:
+            stage.record_progress("500 of 900 iterations, 2 min")
+            raise KeyboardInterrupt
+
+        assert actions(georef, "train", done, "--iterations", 900) == {"train": "extend"}
+        fakes.install(train=stop)
+        assert georef("train", done, "--iterations", 900).code == 130
+        assert actions(georef, "run", done)["train"] == "resume"
+        assert actions(georef, "run", done, "--seed", 3)["train"] == "refuse"
+
+
+class TestPace:
+    def test_time_left_counts_shrunken_photographs(self) -> None:
+        """30 iterations of 1 s and 70 of 4 s: after 20 s, 290 s are left, where equal steps would say 80 s."""
+        now = 0.0
+        left = TimeLeft(lambda i: 1.0 if i <= 30 else 4.0, 100, clock=lambda: now)
+        left.start(0)
+        assert left.after(0) is None
+        now = 20.0
+        assert left.after(20) == pytest.approx(290.0)
+        now = 30.0 + 70 * 4.0
+        assert left.after(100) == 0.0
+
+    @pytest.mark.parametrize(
+        ("gaussians", "pixels", "seconds"),
+        [(30_000, 600 * 450, 0.039), (100_000, 661 * 372, 0.061), (1_000_000, 1280 * 960, 0.531)],
+    )
+    def test_pace_is_that_of_the_benchmarks(self, gaussians: int, pixels: int, seconds: float) -> None:
+        """Within 20 %, the largest deviation of the fit over the table of docs/benchmarks.md."""
+        assert iteration_seconds(pixels, gaussians, surface=False) == pytest.approx(seconds, rel=0.2)

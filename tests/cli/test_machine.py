@@ -1,0 +1,99 @@
+"""What a user asks of the program itself: the machine, topics of help, completion in the shell."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+
+import pytest
+from click.shell_completion import BashComplete
+
+from georef_cli.main import PROGRAM, cli
+from georef_cli.topics import TOPICS, topic_text
+from pipelines.core.errors import BackendUnavailableError
+from pipelines.core.threads import available_cores
+from pipelines.core.versions import NOT_INSTALLED
+from pipelines.machine import inspection
+from pipelines.train.presets import PRESETS
+from tests.cli.test_help import examples_in, parse
+from tests.cli_runs import REPOSITORY, Georef
+
+
+def test_doctor_tells_what_there_is_and_why_not(real_georef: Georef, monkeypatch: pytest.MonkeyPatch) -> None:
+    def rasterizer(name: str) -> object:
+        if name == "cuda":
+            raise BackendUnavailableError("no GPU: give --backend cpu")
+        return object()
+
+    monkeypatch.setattr(inspection, "rasterizer", rasterizer)
+    monkeypatch.setenv("CHROMIUM", "/opt/chromium")
+    machine = real_georef("doctor", "--json").document
+    assert machine["cores"] == available_cores()
+    assert machine["memory_bytes"] > machine["free_bytes"] > 0
+    assert machine["backends"] == [
+        {"name": "cpu", "available": True, "reason": ""},
+        {"name": "cuda", "available": False, "reason": "no GPU: give --backend cpu"},
+    ]
+    assert machine["chromium"] == "/opt/chromium"
+    assert machine["versions"]["numpy"] != NOT_INSTALLED
+    text = real_georef("doctor").out
+    assert "no: no GPU: give --backend cpu" in text
+    assert "/opt/chromium" in text
+
+
+@pytest.mark.parametrize("topic", TOPICS)
+def test_topic_fits_a_terminal_and_its_commands_parse(topic: str) -> None:
+    text = topic_text(topic)
+    assert max(map(len, text.splitlines())) <= 80
+    for line in examples_in(text):
+        parse(re.split(r"\s{3,}", line)[0])
+
+
+def test_help_lists_topics_and_explains_commands(real_georef: Georef) -> None:
+    listing = real_georef("help").out
+    assert all(f"  {name} " in listing for name in TOPICS)
+    assert real_georef("help", "train").out == real_georef("train", "--help").out
+    presets = real_georef("help", "presets", "--json").document["text"]
+    assert all(str(preset.iterations) in presets for preset in PRESETS.values())
+    result = real_georef("help", "hights", "--json")
+    result.assert_failed(2)
+    assert "'hights' is no topic and no command" in result.err
+
+
+def test_presets_are_explained_where_they_are_chosen(real_georef: Georef) -> None:
+    for command in ("train", "run", "compare"):
+        text = " ".join(real_georef(command, "--help").out.split())
+        assert "fast: 2000 iterations, 480 px, 60000 Gaussians" in text, command
+
+
+@pytest.mark.parametrize(
+    ("words", "last", "expected"),
+    [
+        ([], "exp", {"export-ply", "export-raster", "export-cloud"}),
+        (["run", "flight"], "--pre", {"--preset"}),
+        (["run", "flight", "--preset"], "s", {"smoke", "standard"}),
+        (["help"], "he", {"heights"}),
+        (["status", "flight"], "--thr", {"--threads"}),
+    ],
+)
+def test_shell_completes(words: list[str], last: str, expected: set[str]) -> None:
+    completion = BashComplete(cli, {}, PROGRAM, "_GEOREF_COMPLETE")
+    assert expected <= {item.value for item in completion.get_completions(words, last)}
+
+
+@pytest.mark.parametrize(
+    ("variables", "told"),
+    [
+        ({"_GEOREF_COMPLETE": "zsh_source"}, "#compdef georef"),
+        ({"_GEOREF_COMPLETE": "bash_complete", "COMP_WORDS": "georef stat", "COMP_CWORD": "1"}, "plain,status"),
+    ],
+)
+def test_program_answers_the_shell(variables: dict[str, str], told: str) -> None:
+    """As the lines of `georef help completion` ask."""
+    done = subprocess.run(
+        [sys.executable, "-c", "from georef_cli.main import main; main()"],
+        capture_output=True, text=True, check=True, env={**os.environ, **variables, "PYTHONPATH": str(REPOSITORY)},
+    )  # fmt: skip
+    assert told in done.stdout
