@@ -41,7 +41,7 @@ def start_server(port: int, title: str) -> viser.ViserServer:
     """
     server = _start(port, title)
     if not _refuses_strangers(server.get_port()):
-        server.stop()
+        stop_server(server)
         raise GeorefError(
             "this version of viser cannot be kept from answering pages of other sites: install viser 1.1 "
             "(pip install --constraint constraints.txt georefgs)"
@@ -49,6 +49,12 @@ def start_server(port: int, title: str) -> viser.ViserServer:
     if server.get_port() != port:
         log.warning("port %d is taken: the viewer is at port %d", port, server.get_port())
     return server
+
+
+def stop_server(server: viser.ViserServer) -> None:
+    """Stop a server, without what viser prints about it."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        server.stop()
 
 
 def _start(port: int, title: str) -> viser.ViserServer:

@@ -21,7 +21,7 @@ from pipelines.scene.report import EvaluationReport, read_report
 from pipelines.scene.scene import photographs
 from pipelines.scene.trained_survey import load_trained
 from pipelines.splat.rasterizer.backends import rasterizer
-from pipelines.view.loopback import start_server
+from pipelines.view.loopback import start_server, stop_server
 from pipelines.view.mark_panel import MarkPanel
 from pipelines.view.measure_panel import MeasurePanel
 from pipelines.view.measuring import MeasuringModel
@@ -330,7 +330,7 @@ def serve(
                 viewer.tell("The model has changed since it was read: measurements are those of the old one.")
                 viewer.add_reload(again.set)
     finally:
-        server.stop()
+        stop_server(server)
 
 
 def _has_changed(workspace: Workspace, stamp: tuple[int, ...]) -> bool:
