@@ -28,18 +28,21 @@ _FOREIGN = "georef.invalid"
 _TIMEOUT_S = 5.0
 
 
-def start_server(port: int, title: str) -> viser.ViserServer:
+def start_server(port: int, title: str, *, dark: bool = False) -> viser.ViserServer:
     """Start a server on loopback, at a port or, if that is taken, the next free one.
 
     Args:
         port: the wanted port.
         title: of the page.
+        dark: whether its panel is light on dark.
 
     Raises:
         BackendUnavailableError: viser is not installed.
         GeorefError: no port is free, or the server would answer pages from elsewhere.
     """
     server = _start(port, title)
+    server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large", dark_mode=dark)
+    server.gui.main_panel.dock_right()
     if not _refuses_strangers(server.get_port()):
         stop_server(server)
         raise GeorefError(
@@ -71,10 +74,7 @@ def _start(port: int, title: str) -> viser.ViserServer:
             return None
 
     with _checked_connections(), contextlib.redirect_stdout(io.StringIO()):  # viser prints a banner
-        server = Server(host=HOST, port=port, label=title, verbose=False)
-    server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
-    server.gui.main_panel.dock_right()
-    return server
+        return Server(host=HOST, port=port, label=title, verbose=False)
 
 
 @contextlib.contextmanager

@@ -153,7 +153,10 @@ class Viewer:
             report = read_report(workspace.path(REPORT))
         except GeorefError:
             return paragraph("No errors are shown: `georef evaluate` measures them.")
-        enlarged = self.signs.add_errors(point_errors(self.model, report))
+        errors = point_errors(self.model, report)
+        if not errors:
+            return paragraph("No control or check point has an error to show.")
+        enlarged = self.signs.add_errors(errors)
         return paragraph(f"Arrows: error by camera, × {enlarged:g}. Orange: control points and test views.")
 
     def _colour_points(self) -> None:
@@ -313,7 +316,7 @@ def serve(
         GeorefError: a product is damaged, no port is free, or the CRS cannot be used.
     """
     model_stamp(workspace)
-    server = start_server(options.port, f"georef view {workspace.root.name}")
+    server = start_server(options.port, f"georef view {workspace.root.name}", dark=options.dark)
     try:
         viewer = Viewer(server, workspace, options, progress)
         ready(f"http://{server.get_host()}:{server.get_port()}")
