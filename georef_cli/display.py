@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import sys
 import time
 from collections.abc import Iterator
@@ -62,7 +63,11 @@ def is_told(verbosity: Verbosity) -> bool:
 
 
 def progress_for(verbosity: Verbosity) -> Progress:
-    """Return the display of progress: bars on a terminal, log lines elsewhere, nothing with `--quiet`."""
+    """Return the display of progress: bars on a terminal, log lines elsewhere; none with `--quiet`."""
+    if verbosity.json_progress:
+        from georef_cli.sender import stderr_sender
+
+        return stderr_sender()
     if verbosity.quiet:
         return SILENT
     return BarProgress(stderr_console()) if sys.stderr.isatty() else LineProgress()
@@ -95,7 +100,7 @@ class LeftColumn(Column):
     def render(self, task: Task) -> Text:
         """Return the time; empty where it is unknown."""
         left_s = task.time_remaining if task.fields["left_s"] is None else task.fields["left_s"]
-        return Text("" if left_s is None or task.finished else f"{clock(left_s)} left")
+        return Text("" if left_s is None or math.isinf(left_s) or task.finished else f"{clock(left_s)} left")
 
 
 class NoteColumn(Column):
@@ -201,5 +206,5 @@ class _Line:
         elapsed_s = self._logged - self._started
         total = "" if self._total is None else f"/{self._total}"
         note = f", {self._note}" if self._note else ""
-        left = f", about {clock(self._left_s)} left" if self._left_s else ""
+        left = f", about {clock(self._left_s)} left" if self._left_s and math.isfinite(self._left_s) else ""
         log.info("%s: %d%s after %.0f s%s%s", self._name, self._done, total, elapsed_s, note, left)
