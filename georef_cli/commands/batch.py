@@ -94,7 +94,7 @@ def _planned(mission: Mission) -> tuple[PlannedMission, RunForecast | None]:
 command = Command(
     "batch",
     params=[
-        click.Argument(["missions"], type=click.Path(exists=True, resolve_path=True, path_type=Path)),
+        click.Argument(["missions"], type=click.Path(resolve_path=True, path_type=Path)),
         click.Option(
             ["--at-a-time"],
             type=click.IntRange(min=1),

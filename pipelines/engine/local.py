@@ -58,7 +58,7 @@ class LocalEngine:
                 while running or (waiting and not stop.requested):
                     if not stop.requested:
                         for job in self._startable(waiting, running.values()):
-                            log.info("%s: started with %d threads", job.name, threads)
+                            log.info("%s: started with %d thread%s", job.name, threads, "" if threads == 1 else "s")
                             running[job.name] = JobProcess(job, self.program, threads, progress, finished)
                             waiting.remove(job)
                     elif not is_stopping:
