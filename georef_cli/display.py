@@ -30,6 +30,7 @@ from pipelines.core.progress import SILENT, Progress, ProgressTask
 LINE_EVERY_S = 30.0
 # Columns of a terminal from which a bar shows the speed too, and the columns of the bar itself.
 _WIDE, _WIDE_BAR, _NARROW_BAR = 100, 20, 8
+_MARGIN_LINES = 4  # for log lines above the bars
 LEVEL_STYLES = {logging.ERROR: "red", logging.WARNING: "yellow", logging.INFO: ""}
 
 log = logging.getLogger(__name__)
@@ -74,12 +75,12 @@ def progress_for(verbosity: Verbosity) -> Progress:
 
 
 class SpeedColumn(Column):
-    """Column of steps per second, or of seconds per step below one step per second."""
+    """Column of steps per second, or of seconds per step below one step per second; empty for steps that differ."""
 
     def render(self, task: Task) -> Text:
         """Return the speed of a task."""
         speed = task.finished_speed or task.speed
-        if not speed:
+        if not speed or task.fields["left_s"] == math.inf:
             return Text("")
         return Text(f"{speed:.1f} it/s" if speed >= 1 else f"{1 / speed:.1f} s/it", style="progress.data.speed")
 
@@ -138,9 +139,16 @@ class BarProgress:
             yield _Bar(bars, bar)
         finally:
             bars.stop_task(bar)
+            self._make_room(bars)
             if outermost:
                 bars.stop()
                 self._bars = None
+
+    def _make_room(self, bars: Bars) -> None:
+        """Remove the oldest finished bars that the height of the terminal has no room for."""
+        finished = [task.id for task in bars.tasks if task.stop_time is not None]
+        for bar in finished[: max(0, len(bars.tasks) + _MARGIN_LINES - self._console.height)]:
+            bars.remove_task(bar)
 
     def _start(self) -> Bars:
         wide = self._console.width >= _WIDE
