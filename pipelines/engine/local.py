@@ -51,6 +51,12 @@ class LocalEngine:
         """
         threads = max(self.cores // self.together(jobs), 1)
         waiting, running = list(jobs), dict[str, JobProcess]()
+
+        def end_of(end: JobEnd) -> None:
+            _tell(end)
+            task.advance()
+            ended(end)
+
         finished: queue.Queue[JobProcess] = queue.Queue()
         with progress.task(title, len(jobs)) as task, deferred_interrupts() as stop:
             try:
@@ -59,8 +65,11 @@ class LocalEngine:
                     if not stop.requested:
                         for job in self._startable(waiting, running.values()):
                             log.info("%s: started with %d thread%s", job.name, threads, "" if threads == 1 else "s")
-                            running[job.name] = JobProcess(job, self.program, threads, progress, finished)
                             waiting.remove(job)
+                            try:
+                                running[job.name] = JobProcess(job, self.program, threads, progress, finished)
+                            except OSError as error:  # a command line that is too long, no more processes
+                                end_of(JobEnd(job, 1, 0.0, "", f"cannot be started: {error.strerror}"))
                     elif not is_stopping:
                         is_stopping = True
                         log.warning("stopping %d %s: Ctrl-C again ends them at once", len(running), title)
@@ -71,9 +80,7 @@ class LocalEngine:
                     except queue.Empty:
                         continue
                     del running[end.job.name]
-                    _tell(end)
-                    task.advance()
-                    ended(end)
+                    end_of(end)
             finally:
                 for process in running.values():
                     process.kill()

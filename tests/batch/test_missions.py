@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from itertools import pairwise
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from pipelines.core.errors import InputError
 from pipelines.core.stages import BY_NAME
 from pipelines.core.workspace import Workspace
 
+REPOSITORY = Path(__file__).parents[2]
 GOOD = '[missions.a]\nimages = "a"\n'
 
 
@@ -83,6 +85,14 @@ def test_a_fault_is_named(tmp_path: Path, text: str, where: str) -> None:
     (folder / "link").symlink_to(tmp_path / "out")
     with pytest.raises(InputError, match=where):
         load_missions(written(folder, text), OWNERS)
+
+
+def test_the_lists_that_are_shown_are_lists(tmp_path: Path) -> None:
+    shown = re.findall(r"```toml\n(.*?)```", (REPOSITORY / "docs/batch.md").read_text("utf-8"), re.DOTALL)
+    lists = [load_missions(written(tmp_path, text), OWNERS) for text in shown]
+    assert [mission.name for listed in lists for mission in listed.missions] == ["north", "south"]
+    example = load_missions(REPOSITORY / "examples/batch/missions.toml", OWNERS)
+    assert [mission.place for mission in example.missions] == [f"workspace/{m.name}" for m in example.missions]
 
 
 def test_a_folder_of_mission_folders(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from pipelines.core.stages import BY_NAME
 from pipelines.core.workspace import Workspace
 from pipelines.engine import local
 from tests import fakes
-from tests.cli_runs import WITH_FAKES, Georef
+from tests.cli_runs import WITH_FAKES, Georef, start
 
 NAMES = ("north", "south", "east", "west", "mill", "broken")
 LAST = "sfm"
@@ -136,6 +136,24 @@ def test_ctrl_c_stops_all_and_the_same_command_goes_on(
     assert [row["stages"]["train"] for row in planned] == ["resume"] * 2
     text = real_georef(*words, "--dry-run").out
     assert "a " in text and "train" in text and "Nothing was run" in text
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="pipes end otherwise there")
+def test_a_mission_stops_when_nobody_follows_it(tmp_path: Path) -> None:
+    """The batch was killed: its missions save their work and end."""
+    photos = fakes.photographs(tmp_path / "photos")
+    words = ("run", tmp_path / "ws", "--images", photos, "--to", "train", "--json-progress")
+    process = start(*words, code=STUCK)
+    deadline = time.monotonic() + 60
+    while not (tmp_path / "ws/train.partial/progress.txt").exists():
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.02)
+    assert process.stderr is not None and process.stdout is not None
+    process.stderr.close()
+    assert process.wait(timeout=30) != 0
+    process.stdout.close()
+    assert (tmp_path / "ws/train.partial/progress.txt").exists()
+    assert "KeyboardInterrupt" in (tmp_path / "ws/logs/train.log").read_text("utf-8")
 
 
 @pytest.mark.parametrize(

@@ -75,6 +75,13 @@ def test_each_end_is_told_and_none_stops_another() -> None:
         assert ends["killed"].error == "it crashed (SIGABRT): glog: a line of a library"
 
 
+def test_a_job_that_cannot_be_started_stops_no_other() -> None:
+    """No system takes an argument of 20 MB."""
+    ends = ends_of(LocalEngine(1, 1, None, PROGRAM), job("long", code="#" * 20_000_000), job("done"))
+    assert {name: end.is_done for name, end in ends.items()} == {"long": False, "done": True}
+    assert ends["long"].error.startswith("cannot be started")
+
+
 def test_an_error_of_the_caller_leaves_no_process() -> None:
     """The table of a batch may meet a full disk."""
 
