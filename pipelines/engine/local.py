@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import queue
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
@@ -54,7 +55,7 @@ class LocalEngine:
 
         def end_of(end: JobEnd) -> None:
             _tell(end)
-            task.advance()
+            task.advance(left_s=math.inf)
             ended(end)
 
         finished: queue.Queue[JobProcess] = queue.Queue()
