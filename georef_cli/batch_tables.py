@@ -53,6 +53,7 @@ def dry_rows(missions: Iterable[tuple[PlannedMission, RunForecast | None]]) -> l
             "mission": planned.mission.name,
             "workspace": str(planned.mission.workspace.root),
             "stages": dict(planned.actions),
+            "refusal": planned.refusal,
             "photographs": run.photographs.count if run is not None and run.photographs is not None else None,
             "seconds": None if run is None else sum(value or 0.0 for value in run.seconds.values()),
             "peak_bytes": planned.job().peak_bytes,
@@ -76,7 +77,7 @@ def dry_run(rows: Sequence[dict[str, Any]], together: int) -> list[Renderable]:
             _DASH if row["photographs"] is None else str(row["photographs"]),
             about(row["seconds"] or None),
             f"{row['peak_bytes'] / 2**30:.1f} GiB",
-            (stages or "nothing to do") if row["stages"] else "[red]will be refused[/]",
+            f"[red]refused:[/] {shown(row['refusal'])}" if row["refusal"] else stages or "nothing to do",
         )
     return [
         table,

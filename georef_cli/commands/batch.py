@@ -78,8 +78,7 @@ def _planned(mission: Mission) -> tuple[PlannedMission, RunForecast | None]:
         }
         actions = {row.stage: row.action for row in plan(mission.workspace, mission.stages, asked)}
     except GeorefError as error:
-        log.warning("%s: %s", mission.name, error)
-        return PlannedMission(mission, {}), None
+        return PlannedMission(mission, {}, refusal=str(error)), None
     try:
         run = forecast_run(mission.workspace, mission.stages, asked, force=False)
     except GeorefError as error:  # The run itself will tell it.

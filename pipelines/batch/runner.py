@@ -29,6 +29,7 @@ class PlannedMission:
     Attributes:
         mission: the mission.
         actions: what its run would do with each stage; none where the run will be refused.
+        refusal: reason why the run will be refused, else empty.
         training_bytes: predicted peak of its training in main memory; 0 without one, or if unknown.
         uses_gpu: whether it trains on a GPU.
     """
@@ -37,6 +38,7 @@ class PlannedMission:
     actions: Mapping[str, Action]
     training_bytes: int = 0
     uses_gpu: bool = False
+    refusal: str = ""
 
     @property
     def is_current(self) -> bool:

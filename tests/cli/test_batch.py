@@ -76,6 +76,11 @@ class Rows(HTMLParser):
 
 def test_a_broken_one_is_told_and_the_others_finish(real_georef: Georef, with_fakes: None, tmp_path: Path) -> None:
     path = write_missions(tmp_path)
+    planned = {
+        row["mission"]: row for row in real_georef("batch", path, "--dry-run", "--json").document["missions"]
+    }
+    assert set(planned["north"]["stages"].values()) == {"run"} and not (tmp_path / "north").exists()
+    assert "photos/broken" in planned["broken"]["refusal"]
     first = real_georef("batch", path, "--json", "--at-a-time", 3)
     assert first.code == 1
     rows = {row["mission"]: row for row in first.document["missions"]}
