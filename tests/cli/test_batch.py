@@ -127,7 +127,8 @@ def test_ctrl_c_stops_all_and_the_same_command_goes_on(
         begun = [tmp_path / name / "train.partial/progress.txt" for name in names]
         while not all(path.exists() for path in begun) and time.monotonic() < deadline:
             time.sleep(0.02)
-        os.kill(os.getpid(), signal.SIGINT)
+        if all(path.exists() for path in begun):
+            os.kill(os.getpid(), signal.SIGINT)
 
     threading.Thread(target=interrupt).start()
     words = ("batch", tmp_path, "--to", "train")
