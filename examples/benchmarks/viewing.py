@@ -71,6 +71,26 @@ def clicked_s(page: Page, x: float, y: float) -> float | None:
     return None
 
 
+def time_viewer(process: subprocess.Popen[str], page: Page, began: float, clicks: int) -> None:
+    """Print the times of a viewer that was started at `began`."""
+    assert process.stdout is not None
+    address = ""
+    while '"address"' not in address:
+        address += process.stdout.readline()
+    served = time.perf_counter()
+    page.goto(address.split('"')[3])
+    wait_for_picture(page)
+    print(f"served after {served - began:.1f} s, picture after {time.perf_counter() - began:.1f} s", flush=True)
+    page.locator("input[aria-haspopup]:visible").first.click()
+    page.get_by_role("option", name="measures").click()
+    page.get_by_role("tab", name="Measure").click()
+    time.sleep(30)  # σ are computed beside the first pictures
+    places = np.random.default_rng(0).uniform([250, 250], [650, 600], (clicks, 2))
+    taken = [each for x, y in places if (each := clicked_s(page, x, y)) is not None]
+    median, slowest = float(np.median(taken)), float(np.max(taken))
+    print(f"{len(taken)} of {clicks} clicks measured: median {median:.3f} s, slowest {slowest:.3f} s")
+
+
 def main() -> None:
     """Print the times."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -91,6 +111,7 @@ def main() -> None:
         write_gaussians(copy / GAUSSIANS, many)
         document = json.loads((copy / MODEL).read_text("utf-8"))
         (copy / MODEL).write_text(json.dumps({**document, "gaussians": len(many)}), "utf-8")
+        print(f"{len(many):,} Gaussians", flush=True)
         browser = driver.chromium.launch(executable_path=chromium_path(), args=list(FLAGS))
         page = browser.new_page(viewport=_SIZE)  # type: ignore[arg-type]
         command = [
@@ -104,27 +125,10 @@ def main() -> None:
         ]
         began = time.perf_counter()
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-            assert process.stdout is not None
-            address = ""
-            while '"address"' not in address:
-                address += process.stdout.readline()
-            served = time.perf_counter()
-            page.goto(address.split('"')[3])
-            wait_for_picture(page)
-            seen = time.perf_counter()
-            print(
-                f"{len(many):,} Gaussians: served after {served - began:.1f} s, picture after {seen - began:.1f} s"
-            )
-            page.get_by_role("textbox", name="A click").or_(page.locator("input[aria-haspopup]")).first.click()
-            page.get_by_role("option", name="measures").click()
-            page.get_by_role("tab", name="Measure").click()
-            time.sleep(30)  # σ are computed beside the first pictures
-            rng = np.random.default_rng(0)
-            places = rng.uniform([250, 250], [650, 600], (args.clicks, 2))
-            taken = [each for x, y in places if (each := clicked_s(page, x, y)) is not None]
-            median, slowest = float(np.median(taken)), float(np.max(taken))
-            print(f"{len(taken)} of {args.clicks} clicks measured: median {median:.3f} s, slowest {slowest:.3f} s")
-            process.terminate()
+            try:
+                time_viewer(process, page, began, args.clicks)
+            finally:
+                process.terminate()
         browser.close()
 
 
