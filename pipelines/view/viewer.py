@@ -89,6 +89,7 @@ class Viewer:
     def _propagate_errors(self) -> None:
         """Compute σ after the first picture, which should not wait for them."""
         self._first_drawn.wait(_FIRST_S)
+        self._renderer.prepare_windows()  # for the first click
         try:
             self.model.propagate_errors()
         except GeorefError as error:
