@@ -45,10 +45,14 @@ class PlannedMission:
         """Whether there is nothing to do."""
         return bool(self.actions) and all(action == "keep" for action in self.actions.values())
 
-    def job(self) -> Job:
-        """Return the command that completes the mission."""
-        peak_bytes = BASE_BYTES + self.training_bytes
-        return Job(self.mission.name, run_arguments(self.mission), peak_bytes, self.uses_gpu)
+    @property
+    def peak_bytes(self) -> int:
+        """Predicted peak of the memory of its run."""
+        return BASE_BYTES + self.training_bytes
+
+    def job(self, folder: Path) -> Job:
+        """Return the command that completes the mission of a list in a folder."""
+        return Job(self.mission.name, run_arguments(self.mission), self.peak_bytes, self.uses_gpu, folder)
 
 
 def run_batch(
@@ -82,7 +86,7 @@ def run_batch(
 
     by_name = {plan.mission.name: plan.mission for plan in planned}
     write_batch(listed.folder, table())
-    jobs = [plan.job() for plan in planned if not plan.is_current]
+    jobs = [plan.job(listed.folder) for plan in planned if not plan.is_current]
     if jobs:
         engine.run("missions", jobs, ended, progress)
     return table()
