@@ -34,7 +34,8 @@ log = logging.getLogger(__name__)
 
 MOST_FAILURES = 3
 # Failures that may belong to the machine, or to the moment. Bad input fails everywhere.
-_TRIED_AGAIN = ("backend", "crash", "defect", "resources", "storage", "worker")
+_LOST = "lost"
+_TRIED_AGAIN = ("backend", "crash", "defect", "resources", "storage", _LOST)
 _LOOK_EVERY_S = 0.2
 _REFRESH_EVERY_S = 1.0
 # A process whose worker was killed saves its work, and holds its lock meanwhile.
@@ -160,7 +161,7 @@ class _Run:
                 log.warning("stopping %d %s: Ctrl-C again does not wait for them", len(self._running), title)
                 for attempt in self._running.values():
                     attempt.future.cancel()
-            self._refresh()
+            self._refresh(is_stopping)
             if not is_stopping:
                 self._start()
             self._take_events(is_stopping)
@@ -173,7 +174,7 @@ class _Run:
             self._client.cancel([attempt.future for attempt in self._running.values()])
             self._client.unsubscribe_topic(self._topic)
 
-    def _refresh(self) -> None:
+    def _refresh(self, is_stopping: bool) -> None:
         """Look which workers there are; jobs of lost workers have failed there.
 
         Raises:
@@ -195,7 +196,7 @@ class _Run:
             if attempt.place.address not in workers:
                 attempt.future.cancel()
                 seconds = time.monotonic() - attempt.since
-                self._end(name, ProcessEnd(1, seconds, "its worker was lost", "worker"), is_stopping=False)
+                self._end(name, ProcessEnd(1, seconds, "its worker was lost", _LOST), is_stopping)
 
     def _lose_scheduler(self, cause: Exception) -> None:
         """Tell that the running jobs are interrupted.
@@ -292,19 +293,21 @@ class _Run:
             self._end(name, ProcessEnd(**event["ended"]), is_stopping)
         elif "future" in event and attempt.future.status == "error":
             seconds = time.monotonic() - attempt.since
-            self._end(name, ProcessEnd(1, seconds, f"{attempt.future.exception()}", "worker"), is_stopping)
+            self._end(name, ProcessEnd(1, seconds, f"{attempt.future.exception()}", _LOST), is_stopping)
 
     def _end(self, name: str, end: ProcessEnd, is_stopping: bool) -> None:
         """Finish an attempt, or let its job wait for the next one."""
         attempt = self._running[name]
         pending, place = attempt.pending, attempt.place
         if is_stopping:
-            self._finish(name, end if end.kind != "worker" else ProcessEnd(INTERRUPTED, end.seconds))
+            self._finish(name, end if end.kind != _LOST else ProcessEnd(INTERRUPTED, end.seconds))
         elif end.kind == UNFIT:
             self._unfit.add(place.address)
             self._places.pop(place.address, None)
             self._warned = f"{place.name} {end.error}"
             log.warning("%s: it gets no jobs", self._warned)
+            self._repeat(name)
+        elif end.kind == _LOST and not attempt.has_started:
             self._repeat(name)
         elif end.code == INTERRUPTED:  # Its worker closes.
             log.warning("%s: interrupted on %s, goes on elsewhere", pending.job.name, place.name)

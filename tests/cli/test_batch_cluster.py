@@ -1,4 +1,4 @@
-"""`georef batch --cluster` on a scheduler and two workers that are killed, with fake stages that count their steps."""
+"""`georef batch --cluster` on a scheduler and two workers that are killed; fake stages count their steps."""
 
 from __future__ import annotations
 
