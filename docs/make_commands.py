@@ -45,7 +45,7 @@ def describe(name: str) -> str:
     return "\n".join(
         [
             f"## georef {name}\n",
-            f"`georef {name} {arguments} [OPTIONS]`\n",
+            f"`{' '.join(filter(None, ('georef', name, arguments)))} [OPTIONS]`\n",
             _escape(text.strip()) + "\n",
             "| option | meaning |\n|---|---|",
             *rows,

@@ -34,7 +34,7 @@ def certificates_option() -> click.Option:
     """Return the option `--certificates`."""
     return click.Option(
         ["--certificates"],
-        type=click.Path(exists=True, file_okay=False, resolve_path=True, path_type=Path),
+        type=click.Path(file_okay=False, resolve_path=True, path_type=Path),
         metavar="DIR",
         help="Folder with the certificate of the cluster, from `georef cluster certificates`.",
     )

@@ -6,15 +6,20 @@ from pathlib import Path
 
 import click
 
+from georef_cli import options
 from georef_cli.command import Command
 from georef_cli.engines import certificates_option, cluster_address
+from georef_cli.output import print_json
 
 
-def _scheduler(listen: str | None, certificates: Path | None) -> None:
+def _scheduler(listen: str | None, certificates: Path | None, as_json: bool) -> None:
     from pipelines.engine.nodes import run_scheduler
 
     everywhere = "127.0.0.1" if certificates is None else "0.0.0.0"
-    run_scheduler(cluster_address(listen or everywhere, certificates, "--listen"))
+    address = cluster_address(listen or everywhere, certificates, "--listen")
+    run_scheduler(address)
+    if as_json:
+        print_json({"scheduler": address.url})
 
 
 command = Command(
@@ -26,6 +31,7 @@ command = Command(
             help="Where to listen (default: port 8786 of every network with --certificates, else of 127.0.0.1).",
         ),
         certificates_option(),
+        options.json_option(),
     ],
     callback=_scheduler,
     help="""Start the scheduler of a cluster (docs/cluster.md). It runs until Ctrl-C.

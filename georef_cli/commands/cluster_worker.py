@@ -6,8 +6,10 @@ from pathlib import Path
 
 import click
 
+from georef_cli import options
 from georef_cli.command import Command
 from georef_cli.engines import certificates_option, cluster_address
+from georef_cli.output import print_json
 from pipelines.core.errors import ResourceError
 from pipelines.core.free_memory import free_main_memory_bytes
 from pipelines.core.threads import thread_count
@@ -24,6 +26,7 @@ def _worker(
     memory_gib: float | None,
     gpus: int | None,
     name: str | None,
+    as_json: bool,
 ) -> None:
     from pipelines.engine.nodes import run_worker
 
@@ -34,6 +37,8 @@ def _worker(
     memory_bytes = int(memory_gib * _GIB) if memory_gib is not None else int(_USABLE * (free or 0))
     count = _gpus() if gpus is None else gpus
     run_worker(scheduler, jobs=jobs, cores=thread_count(), memory_bytes=memory_bytes, gpus=count, name=name)
+    if as_json:
+        print_json({"scheduler": scheduler.url, "jobs": jobs, "memory_bytes": memory_bytes, "gpus": count})
 
 
 def _gpus() -> int:
@@ -64,6 +69,7 @@ command = Command(
             ["--gpus"], type=click.IntRange(min=0), metavar="N", help="Number of GPUs (default: as found)."
         ),
         click.Option(["--name"], metavar="NAME", help="Name for messages (default: its address)."),
+        options.json_option(),
     ],
     callback=_worker,
     help="""Lend this machine to a cluster (docs/cluster.md), until Ctrl-C or the end of the scheduler.
