@@ -27,6 +27,11 @@ def engine_options() -> list[click.Option]:
             "(docs/cluster.md; default: as processes of this machine).",
         ),
         certificates_option(),
+        click.Option(
+            ["--storage"],
+            metavar="URL",
+            help="Object store through which files go to workers that share no folder, such as s3://bucket/prefix.",
+        ),
     ]
 
 
@@ -48,16 +53,19 @@ def engine_for(values: Mapping[str, Any], at_a_time: int | None = None) -> Engin
         at_a_time: most jobs at a time; None: as many as there is room for.
 
     Raises:
-        click.UsageError: a bad address, one that needs a certificate, or certificates without a cluster.
+        click.UsageError: a bad address, one that needs a certificate, or options of a cluster without one.
     """
     if values["cluster"] is None:
-        if values["certificates"] is not None:
-            raise click.UsageError("--certificates is for --cluster.")
+        for option in ("certificates", "storage"):
+            if values[option] is not None:
+                raise click.UsageError(f"--{option} is for --cluster.")
         cores = thread_count()
         return LocalEngine(at_a_time or cores, cores, free_main_memory_bytes())
     from pipelines.engine.dask_engine import DaskEngine
+    from pipelines.engine.storage import Storage
 
-    return DaskEngine(cluster_address(values["cluster"], values["certificates"], "--cluster"), at_a_time)
+    address = cluster_address(values["cluster"], values["certificates"], "--cluster")
+    return DaskEngine(address, at_a_time, None if values["storage"] is None else Storage(values["storage"]))
 
 
 def cluster_address(text: str, certificates: Path | None, option: str) -> ClusterAddress:

@@ -20,8 +20,10 @@ from pipelines.batch.missions import Mission, MissionList, load_missions
 from pipelines.batch.runner import PlannedMission
 from pipelines.core import runner
 from pipelines.core.errors import GeorefError
+from pipelines.core.options import input_paths
 from pipelines.core.plan import plan
 from pipelines.core.stages import BY_NAME
+from pipelines.core.staleness import stage_config
 
 log = logging.getLogger(__name__)
 
@@ -74,6 +76,7 @@ def _planned(mission: Mission) -> tuple[PlannedMission, RunForecast | None]:
             for spec in mission.stages
         }
         actions = {row.stage: row.action for row in plan(mission.workspace, mission.stages, asked)}
+        configs = [stage_config(mission.workspace, spec, asked[spec.name]) for spec in mission.stages]
     except GeorefError as error:
         return PlannedMission(mission, {}, refusal=str(error)), None
     try:
@@ -81,10 +84,11 @@ def _planned(mission: Mission) -> tuple[PlannedMission, RunForecast | None]:
     except GeorefError as error:  # The run itself will tell it.
         log.debug("%s: no forecast: %s", mission.name, error)
         run = None
+    inputs = tuple(path for config in configs for path in input_paths(config).values())
     if run is None or run.training is None:
-        return PlannedMission(mission, actions), run
+        return PlannedMission(mission, actions, inputs=inputs), run
     on_gpu = run.training.backend == "cuda"
-    return PlannedMission(mission, actions, 0 if on_gpu else run.training.peak_bytes, on_gpu), run
+    return PlannedMission(mission, actions, 0 if on_gpu else run.training.peak_bytes, on_gpu, inputs), run
 
 
 command = Command(

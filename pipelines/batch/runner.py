@@ -29,6 +29,7 @@ class PlannedMission:
     Attributes:
         mission: the mission.
         actions: what its run would do with each stage; none where the run will be refused.
+        inputs: files and folders that its options name.
         refusal: reason why the run will be refused, else empty.
         training_bytes: predicted peak of its training in main memory; 0 without one, or if unknown.
         uses_gpu: whether it trains on a GPU.
@@ -38,6 +39,7 @@ class PlannedMission:
     actions: Mapping[str, Action]
     training_bytes: int = 0
     uses_gpu: bool = False
+    inputs: tuple[Path, ...] = ()
     refusal: str = ""
 
     @property
@@ -52,7 +54,16 @@ class PlannedMission:
 
     def job(self, folder: Path) -> Job:
         """Return the command that completes the mission of a list in a folder."""
-        return Job(self.mission.name, run_arguments(self.mission), self.peak_bytes, self.uses_gpu, folder)
+        workspace = self.mission.workspace.root
+        return Job(
+            self.mission.name,
+            run_arguments(self.mission),
+            self.peak_bytes,
+            self.uses_gpu,
+            folder,
+            writes=workspace,
+            reads=tuple(path for path in self.inputs if not path.is_relative_to(workspace)),
+        )
 
 
 def run_batch(

@@ -23,8 +23,10 @@ from pipelines.core.progress import Progress, ProgressTask
 from pipelines.engine.cluster import GPU, MEMORY, ClusterAddress, Place, connected, place_for, places_of
 from pipelines.engine.dask_task import UNFIT, JobRequest, run_job
 from pipelines.engine.display import JobDisplay, tell_end
+from pipelines.engine.exchange import EngineExchange
 from pipelines.engine.job import INTERRUPTED, Job, JobEnd
 from pipelines.engine.process import ProcessEnd
+from pipelines.engine.storage import Storage
 from pipelines.engine.tokens import folder_tokens
 
 if TYPE_CHECKING:
@@ -52,10 +54,12 @@ class DaskEngine:
     Attributes:
         cluster: the scheduler's address and certificate.
         at_a_time: most jobs at a time; None: as many as the workers take.
+        storage: through which the files of the jobs go; None: the workers share the folders of the jobs.
     """
 
     cluster: ClusterAddress
     at_a_time: int | None = None
+    storage: Storage | None = None
 
     def together(self, jobs: Sequence[Job]) -> int:
         """Return how many of the jobs run at a time at the beginning; see `Engine`."""
@@ -73,16 +77,23 @@ class DaskEngine:
 
         Raises:
             ClusterError: there is no scheduler, it is lost, or no worker can run the jobs.
+            InputError: a job needs files that cannot go through the storage.
+            StorageError: the storage failed.
             KeyboardInterrupt: see `Engine`.
         """
+        exchange = None
+        if self.storage is not None:
+            self.storage.check()
+            exchange = EngineExchange(self.storage)
         with (
             connected(self.cluster) as client,
-            folder_tokens([job.folder for job in jobs]) as tokens,
+            folder_tokens([job.folder for job in jobs if exchange is None]) as tokens,
             progress.task(title, len(jobs)) as task,
             deferred_interrupts() as stop,
         ):
             waiting = [_Pending(job, tokens.get(job.folder, "")) for job in jobs]
-            run = _Run(client, waiting, self.at_a_time or len(jobs), ended=ended, progress=progress, task=task)
+            at_a_time = self.at_a_time or len(jobs)
+            run = _Run(client, waiting, at_a_time, exchange, ended=ended, progress=progress, task=task)
             try:
                 run.until_all_have_ended(title, stop)
             finally:
@@ -132,12 +143,14 @@ class _Run:
         client: Client,
         waiting: list[_Pending],
         at_a_time: int,
+        exchange: EngineExchange | None,
         *,
         ended: Callable[[JobEnd], None],
         progress: Progress,
         task: ProgressTask,
     ) -> None:
         self._client, self._waiting, self._at_a_time = client, waiting, at_a_time
+        self._exchange = exchange
         self._told, self._progress, self._task = ended, progress, task
         self._running: dict[str, _Attempt] = {}
         self._places: dict[str, Place] = {}
@@ -256,6 +269,7 @@ class _Run:
             version=__version__,
             arguments=list(pending.job.arguments),
             token=pending.token,
+            parcel=None if self._exchange is None else self._exchange.send(pending.job),
         )
         resources = {MEMORY: min(pending.job.peak_bytes, place.memory_bytes)}
         if pending.job.uses_gpu:
@@ -342,6 +356,8 @@ class _Run:
     def _finish(self, name: str, end: ProcessEnd) -> None:
         attempt = self._running.pop(name)
         attempt.display.close()
+        if self._exchange is not None:
+            self._exchange.collect(attempt.pending.job)
         job_end = JobEnd(attempt.pending.job, end.code, end.seconds, attempt.display.place, end.error)
         tell_end(job_end)
         self._task.advance(left_s=math.inf)

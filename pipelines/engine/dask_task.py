@@ -8,14 +8,17 @@ from __future__ import annotations
 import dataclasses
 import queue
 import threading
-from collections.abc import Mapping
+import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypedDict
 
 from pipelines import __version__
+from pipelines.core.errors import GeorefError
 from pipelines.core.threads import available_cores
 from pipelines.engine import process
 from pipelines.engine.cluster import CORES
+from pipelines.engine.exchange import Parcel, arguments_in, worker_exchange
 from pipelines.engine.process import JobProcess, ProcessEnd
 
 UNFIT = "unfit"  # kind of the end of a job that its worker cannot run; another one may
@@ -32,6 +35,7 @@ class JobRequest(TypedDict):
         version: of this package.
         arguments: of `georef`.
         token: file that a worker sees if it shares the folder of the job; empty: none is needed.
+        parcel: parts that come from a storage; None: the folder is shared.
     """
 
     topic: str
@@ -39,6 +43,7 @@ class JobRequest(TypedDict):
     version: str
     arguments: list[str]
     token: str
+    parcel: Parcel | None
 
 
 def run_job(request: JobRequest) -> None:
@@ -52,7 +57,7 @@ def run_job(request: JobRequest) -> None:
     worker = get_worker()
     events = _Events(worker, request)
     events.send(started=True)
-    end = _obstacle(request) or _run(worker, request, events)
+    end = _obstacle(request) or _run_where_its_files_are(worker, request, events)
     events.send(ended=dataclasses.asdict(end))
 
 
@@ -65,13 +70,27 @@ def _obstacle(request: JobRequest) -> ProcessEnd | None:
     return None
 
 
-def _run(worker: Any, request: JobRequest, events: _Events) -> ProcessEnd:
+def _run_where_its_files_are(worker: Any, request: JobRequest, events: _Events) -> ProcessEnd:
+    """Run the job in the shared folder, or in a scratch folder with its parts."""
+    parcel, arguments = request["parcel"], request["arguments"]
+    if parcel is None:
+        return _run(worker, arguments, events)
+    scratch = Path(worker.local_directory).resolve() / request["attempt"]
+    started = time.monotonic()
+    try:
+        with worker_exchange(parcel, scratch):
+            return _run(worker, arguments_in(parcel, arguments, scratch), events)
+    except GeorefError as error:
+        return ProcessEnd(1, time.monotonic() - started, str(error), error.code)
+
+
+def _run(worker: Any, arguments: Sequence[str], events: _Events) -> ProcessEnd:
     ends: queue.Queue[ProcessEnd] = queue.Queue()
     key = worker.get_current_task()
     cores = int(worker.state.total_resources.get(CORES, available_cores()))
     threads = max(cores // worker.state.nthreads, 1)
     try:
-        running = JobProcess(process.THIS_PROGRAM, request["arguments"], threads, events.take, ends.put)
+        running = JobProcess(process.THIS_PROGRAM, arguments, threads, events.take, ends.put)
     except OSError as error:
         return ProcessEnd(1, 0.0, f"cannot be started: {error.strerror}")
     is_wanted = True

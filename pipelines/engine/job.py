@@ -24,6 +24,8 @@ class Job:
         peak_bytes: predicted peak of the memory.
         uses_gpu: whether it takes a whole GPU.
         folder: that its command works in, such as the workspace; a machine that does not see it cannot run the job.
+        writes: file or folder in `folder` that it changes; needed where its files go through a storage.
+        reads: further files and folders in `folder` that it needs there.
     """
 
     name: str
@@ -31,6 +33,8 @@ class Job:
     peak_bytes: int
     uses_gpu: bool = False
     folder: Path | None = None
+    writes: Path | None = None
+    reads: tuple[Path, ...] = ()
 
 
 @dataclass(frozen=True)

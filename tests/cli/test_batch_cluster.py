@@ -57,8 +57,8 @@ def steps_of(workspace: Path) -> list[int]:
     return [int(line) for line in path.read_text().split()] if path.exists() else []
 
 
-def batch(cluster: RunningCluster, missions: Path) -> subprocess.Popen[str]:
-    return start("batch", missions, "--to", "train", "--json", *cluster.words, code=PLAIN)
+def batch(cluster: RunningCluster, missions: Path, *more: str) -> subprocess.Popen[str]:
+    return start("batch", missions, "--to", "train", "--json", *cluster.words, *more, code=PLAIN)
 
 
 def wait_until(happened: Callable[[], bool], what: str) -> None:
@@ -168,3 +168,27 @@ def test_ctrl_c_keeps_the_work(tmp_path: Path) -> None:
     assert_complete(ended, missions, "a", "b", again=1)
     with contextlib.suppress(FileNotFoundError):
         assert not [path for path in missions.iterdir() if path.name.startswith(".georef")]
+
+
+def test_files_go_through_a_storage(tmp_path: Path) -> None:
+    """The workers see nothing but the store; a mission whose engine was killed goes on from its checkpoint."""
+    missions, store = write_missions(tmp_path / "missions", "a", "b"), ("--storage", (tmp_path / "store").as_uri())
+    listed = missions / "valley.toml"
+    listed.write_text('[missions.one]\nimages = "a/images"\n[missions.two]\nimages = "b/images"\n', "utf-8")
+    with running_cluster(tmp_path, COUNTING) as cluster:
+        process = batch(cluster, listed, *store)
+        scratch = tmp_path / "scratch"
+        wait_until(lambda: len(list(scratch.glob("**/train.partial/checkpoint"))) == 2, "both begin")
+        process.kill()
+        process.communicate()
+        wait_until(lambda: not list(scratch.glob("**/train.partial")), "the jobs stop")
+        assert not (missions / "one").exists()
+        ended = finish(batch(cluster, listed, *store))
+        assert not list(scratch.glob("**/ingest")), "nothing is left on the workers"
+    assert_complete(ended, missions, "one", "two", again=0)
+    made = Workspace(missions / "one")
+    assert made.requests()["ingest"]["images"] == str(missions / "a/images"), "paths of this machine"
+    planned = finish(start("batch", listed, "--to", "train", "--dry-run", "--json", code=PLAIN)).document[
+        "missions"
+    ]
+    assert all(set(row["stages"].values()) == {"keep"} for row in planned)
