@@ -191,4 +191,4 @@ def test_files_go_through_a_storage(tmp_path: Path) -> None:
     planned = finish(start("batch", listed, "--to", "train", "--dry-run", "--json", code=PLAIN)).document[
         "missions"
     ]
-    assert all(set(row["stages"].values()) == {"keep"} for row in planned)
+    assert all(set(row["stages"].values()) == {"keep"} for row in rows)
