@@ -1,7 +1,7 @@
 """Run a batch on workers that SLURM starts and stops, by dask-jobqueue: python slurm.py missions.toml CERTIFICATES.
 
-Needs `pip install dask-jobqueue` beside the extra `cluster`. The scheduler runs in this program; `--print` shows the
-script of a worker's job and starts nothing. `sbatch` with `georef cluster worker` does without this library
+Needs `pip install dask-jobqueue` beside the extra `cluster`. The scheduler runs in this program. `--print` shows
+the script of a worker's job and starts nothing. `sbatch` with `georef cluster worker` does without this library
 (docs/cluster.md).
 """
 
@@ -57,7 +57,7 @@ def main() -> int:
             return 0
         cluster.scale(asked.most)
         words = ("--cluster", cluster.scheduler_address, "--certificates", str(certificates))
-        return subprocess.run([sys.executable, "-m", "georef_cli", "batch", asked.missions, *words]).returncode
+        return subprocess.call([sys.executable, "-m", "georef_cli", "batch", asked.missions, *words])
 
 
 if __name__ == "__main__":

@@ -188,7 +188,5 @@ def test_files_go_through_a_storage(tmp_path: Path) -> None:
     assert_complete(ended, missions, "one", "two", again=0)
     made = Workspace(missions / "one")
     assert made.requests()["ingest"]["images"] == str(missions / "a/images"), "paths of this machine"
-    planned = finish(start("batch", listed, "--to", "train", "--dry-run", "--json", code=PLAIN)).document[
-        "missions"
-    ]
-    assert all(set(row["stages"].values()) == {"keep"} for row in rows)
+    planned = finish(start("batch", listed, "--to", "train", "--dry-run", "--json", code=PLAIN)).document
+    assert all(set(row["stages"].values()) == {"keep"} for row in planned["missions"])
