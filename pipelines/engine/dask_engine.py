@@ -39,6 +39,8 @@ MOST_FAILURES = 3
 _LOST = "lost"
 _TRIED_AGAIN = ("backend", "crash", "defect", "resources", "storage", _LOST)
 _LOOK_EVERY_S = 0.2
+# A cancelled job that waits behind those of another command never begins, and tells no end.
+_START_PATIENCE_S = 3.0
 _REFRESH_EVERY_S = 1.0
 # A process whose worker was killed saves its work, and holds its lock meanwhile.
 _BUSY_PAUSE_S, _BUSY_PATIENCE_S = 3.0, 600.0
@@ -167,10 +169,10 @@ class _Run:
         Raises:
             ClusterError: the scheduler is lost, or no worker can run the jobs.
         """
-        is_stopping = False
+        is_stopping, stopped = False, math.inf
         while self._running or (self._waiting and not stop.requested):
             if stop.requested and not is_stopping:
-                is_stopping = True
+                is_stopping, stopped = True, time.monotonic()
                 log.warning("stopping %d %s: Ctrl-C again does not wait for them", len(self._running), title)
                 for attempt in self._running.values():
                     attempt.future.cancel()
@@ -178,6 +180,9 @@ class _Run:
             if not is_stopping:
                 self._start()
             self._take_events(is_stopping)
+            if time.monotonic() - stopped > _START_PATIENCE_S:
+                for name in [name for name, attempt in self._running.items() if not attempt.has_started]:
+                    self._finish(name, ProcessEnd(INTERRUPTED, 0.0))
 
     def close(self) -> None:
         """Cancel what still runs, and close its lines."""
@@ -269,7 +274,7 @@ class _Run:
             version=__version__,
             arguments=list(pending.job.arguments),
             token=pending.token,
-            parcel=None if self._exchange is None else self._exchange.send(pending.job),
+            parcel=None if self._exchange is None else self._exchange.send(pending.job, attempt),
         )
         resources = {MEMORY: min(pending.job.peak_bytes, place.memory_bytes)}
         if pending.job.uses_gpu:
@@ -305,9 +310,9 @@ class _Run:
             attempt.has_started = True
         if "ended" in event:
             self._end(name, ProcessEnd(**event["ended"]), is_stopping)
-        elif "future" in event and attempt.future.status == "error":
-            seconds = time.monotonic() - attempt.since
-            self._end(name, ProcessEnd(1, seconds, f"{attempt.future.exception()}", _LOST), is_stopping)
+        elif "future" in event and not is_stopping and attempt.future.status != "finished":
+            error = attempt.future.exception() if attempt.future.status == "error" else "it was cancelled"
+            self._end(name, ProcessEnd(1, time.monotonic() - attempt.since, f"{error}", _LOST), is_stopping)
 
     def _end(self, name: str, end: ProcessEnd, is_stopping: bool) -> None:
         """Finish an attempt, or let its job wait for the next one."""

@@ -25,12 +25,14 @@ class Parcel(TypedDict):
     Attributes:
         url: of the storage.
         folder: of the engine; it stands at the beginning of paths in the arguments.
+        attempt: at the job.
         reads: parts that the job reads, relative to the folder.
         writes: part that the job reads and writes.
     """
 
     url: str
     folder: str
+    attempt: str
     reads: list[str]
     writes: str
 
@@ -46,8 +48,8 @@ class EngineExchange:
         self._storage = storage
         self._sent: dict[str, PartIndex] = {}
 
-    def send(self, job: Job) -> Parcel:
-        """Put what a job needs into the storage, after collecting what an earlier run left there.
+    def send(self, job: Job, attempt: str) -> Parcel:
+        """Put what an attempt at a job needs into the storage, after collecting what an earlier one left there.
 
         Raises:
             InputError: the job names no parts, or a part lies outside its folder.
@@ -60,8 +62,8 @@ class EngineExchange:
         self._collect(folder, writes)
         for part in reads:
             self._storage.send(folder, part, "engine")
-        self._sent[writes] = self._storage.send(folder, writes, "engine")
-        return Parcel(url=self._storage.url, folder=str(job.folder), reads=reads, writes=writes)
+        self._sent[writes] = self._storage.send(folder, writes, "engine", attempt)
+        return Parcel(url=self._storage.url, folder=str(job.folder), attempt=attempt, reads=reads, writes=writes)
 
     def collect(self, job: Job) -> None:
         """Take the results of a job into the folder of the engine.
@@ -99,7 +101,7 @@ def worker_exchange(parcel: Parcel, scratch: Path) -> Iterator[None]:
     def save() -> None:
         while not stopped.wait(_SAVE_EVERY_S):
             try:
-                storage.send(scratch, parcel["writes"], "worker")
+                storage.send(scratch, parcel["writes"], "worker", parcel["attempt"])
             except GeorefError as error:
                 log.warning("results were not put back, next attempt in a minute: %s", error)
 
@@ -112,7 +114,7 @@ def worker_exchange(parcel: Parcel, scratch: Path) -> Iterator[None]:
         yield
         stopped.set()
         saving.join()
-        storage.send(scratch, parcel["writes"], "worker")
+        storage.send(scratch, parcel["writes"], "worker", parcel["attempt"])
     finally:
         stopped.set()
         shutil.rmtree(scratch, ignore_errors=True)

@@ -1,8 +1,8 @@
 """Folders that go through an object store, where machines share no disk.
 
-A part is a file or folder inside a folder of jobs, such as a workspace. The store holds its files under the same
-relative paths, and an index: size and time of each file, and who wrote it last. The index is written after the
-files, so that an interrupted copy leaves the part as it was listed before. Only what differs from it is copied.
+A part is a file or folder inside a folder of jobs, such as a workspace. The store holds an index of it, and one
+object for each file in the state that the index lists; an object is never changed. The index is written after the
+objects, so that an interrupted copy leaves the part as it was. Only files whose size or time differs are copied.
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ from pipelines.core.validators import stays_inside
 
 log = logging.getLogger(__name__)
 
-_INDEX_FOLDER = ".georef"
 _MOST_INDEX_BYTES = 256 * 1024 * 1024
 # Files that belong to one machine, that can be made again, or that are being written.
 _LEFT_OUT_NAMES = (".lock", ".lock.holder")
@@ -40,6 +39,7 @@ class PartIndex(BaseModel):
     Attributes:
         format_version: of this document.
         part: relative path of the part.
+        attempt: at the job that the part was sent for; workers of earlier attempts may not write any more.
         writer: who wrote it; `worker`: the engine has not collected it.
         files: size in bytes and time of change in nanoseconds by path, relative to the folder of the part.
     """
@@ -48,6 +48,7 @@ class PartIndex(BaseModel):
 
     format_version: Literal[1] = 1
     part: str
+    attempt: str
     writer: Writer
     files: Mapping[str, tuple[int, int]]
 
@@ -69,7 +70,7 @@ class Storage:
             BackendUnavailableError: a library for this kind of store is not installed.
             StorageError: the URL is wrong, or the store cannot be reached.
         """
-        self._reached(lambda: self._store().exists(self._place(_INDEX_FOLDER)))
+        self._reached(lambda: self._store().exists(self._home("")))
 
     def index(self, part: str) -> PartIndex | None:
         """Return the index of a part; None: the store does not have it.
@@ -80,7 +81,7 @@ class Storage:
         """
         return self._reached(lambda: self._index(part))
 
-    def send(self, folder: Path, part: str, writer: Writer) -> PartIndex:
+    def send(self, folder: Path, part: str, writer: Writer, attempt: str = "") -> PartIndex:
         """Copy a part of a folder into the store, and delete there what it has no more.
 
         A file that vanishes meanwhile, as when a stage ends, makes the copy start anew.
@@ -89,11 +90,12 @@ class Storage:
             folder: that holds the part.
             part: relative path of a file or folder.
             writer: whose copy it is.
+            attempt: at the job that it is for.
 
         Raises:
-            StorageError: the store cannot be written.
+            StorageError: the store cannot be written, or another attempt has taken over from this worker.
         """
-        return self._reached(lambda: self._send(folder, part, writer))
+        return self._reached(lambda: self._send(folder, part, writer, attempt))
 
     def fetch(self, folder: Path, part: str, before: PartIndex | None = None) -> PartIndex | None:
         """Copy a part from the store into a folder; a file that is newer there stays.
@@ -126,29 +128,30 @@ class Storage:
             raise InputError("lists what does not belong to its part: delete it", path=place)
         return index
 
-    def _send(self, folder: Path, part: str, writer: Writer) -> PartIndex:
-        store, before = self._store(), self._index(part)
-        known = {} if before is None else before.files
-        copied: dict[str, tuple[int, int]] = dict(known)
+    def _send(self, folder: Path, part: str, writer: Writer, attempt: str) -> PartIndex:
+        store, before, home = self._store(), self._index(part), self._home(part)
+        if writer == "worker" and before is not None and before.attempt != attempt:
+            raise StorageError(f"{part}: another attempt at the job has taken over")
+        held = set() if before is None else {_object(name, state) for name, state in before.files.items()}
+        store.makedirs(home, exist_ok=True)
         while True:
             files = dict(_files_of(folder / part))
             try:
                 for name, state in files.items():
-                    if copied.get(name) != state:
-                        place = self._place(part, name)
-                        store.makedirs(place.rpartition("/")[0], exist_ok=True)
-                        store.put_file(str(folder / part / name), place)
-                        copied[name] = state
+                    if (key := _object(name, state)) not in held:
+                        store.put_file(str(folder / part / name), f"{home}/{key}")
+                        held.add(key)
                 break
             except FileNotFoundError:
                 if all((folder / part / name).exists() for name in files):
                     raise
-        index = PartIndex(part=part, writer=writer, files=files)
-        if before is None or index != before:
+        index = PartIndex(part=part, attempt=attempt, writer=writer, files=files)
+        if index != before:
             self._write_index(index)
-        for name in known.keys() - files.keys():
-            if store.exists(place := self._place(part, name)):
-                store.rm_file(place)
+            wanted = {_object(name, state) for name, state in files.items()}
+            for place in store.ls(home, detail=False):
+                if place.rpartition("/")[2] not in wanted:
+                    store.rm_file(place)
         return index
 
     def _fetch(self, folder: Path, part: str, before: PartIndex | None) -> PartIndex | None:
@@ -164,7 +167,7 @@ class Storage:
             if not path.parent.resolve().is_relative_to(folder.resolve()):
                 raise InputError("a symbolic link leads out of the folder", path=path)
             draft = path.with_name(path.name + _DRAFT)
-            store.get_file(self._place(part, name), str(draft))
+            store.get_file(f"{self._home(part)}/{_object(name, (size, time_ns))}", str(draft))
             os.utime(draft, ns=(time_ns, time_ns))
             draft.replace(path)
         for name in () if before is None else before.files.keys() - index.files.keys():
@@ -182,18 +185,17 @@ class Storage:
 
     def _write_index(self, index: PartIndex) -> None:
         place = self._index_place(index.part)
-        self._store().makedirs(place.rpartition("/")[0], exist_ok=True)
         self._store().pipe_file(place, json.dumps(index.model_dump(mode="json")).encode())
 
     def _index_place(self, part: str) -> str:
-        return self._place(_INDEX_FOLDER, hashlib.sha256(part.encode()).hexdigest()[:32] + ".json")
+        return f"{self._home(part)}.json"
 
-    def _place(self, *parts: str) -> str:
-        """Return the path of an object, as the library of the store writes it."""
+    def _home(self, part: str) -> str:
+        """Return the folder of a part's objects, as the library of the store writes it."""
         import fsspec
 
         root = fsspec.core.url_to_fs(self.url)[1].rstrip("/")
-        return "/".join((root, *(part for part in parts if part != ".")))
+        return f"{root}/{_digest(part)}"
 
     def _store(self) -> Any:
         import fsspec
@@ -209,7 +211,7 @@ class Storage:
         """
         try:
             return action()
-        except InputError:
+        except (InputError, StorageError):
             raise
         except ImportError as error:
             raise BackendUnavailableError(f"{self.url}: {error}") from error
@@ -242,3 +244,12 @@ def _state_of(path: Path) -> tuple[int, int] | None:
     except OSError:
         return None
     return status.st_size, status.st_mtime_ns
+
+
+def _object(name: str, state: tuple[int, int]) -> str:
+    """Return the name of the object that holds a file in a state."""
+    return _digest(f"{name}\0{state[0]}\0{state[1]}")
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:32]

@@ -190,6 +190,30 @@ class TestCluster:
         assert len(ends) == 2, "two workers: two of the four had begun"
         assert int((tmp_path / "count").read_text()) < 60
 
+    def test_commands_share_the_workers(
+        self, cluster: ClusterAddress, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    ) -> None:
+        """A job that waits behind those of another command has not begun, and does not hold up Ctrl-C."""
+        monkeypatch.setattr("pipelines.engine.dask_engine._START_PATIENCE_S", 0.3)
+        waiting = "pathlib.Path(sys.argv[2], str(os.getpid())).touch()\n"
+        waiting += "while not pathlib.Path(sys.argv[2], 'go').exists(): time.sleep(0.02)"
+        others: list[JobEnd] = []
+        jobs = [job(name, waiting, str(tmp_path)) for name in ("a", "b")]
+        other = threading.Thread(target=DaskEngine(cluster).run, args=("jobs", jobs, others.append, SILENT))
+        other.start()
+        deadline = time.monotonic() + PATIENCE_S
+        while len(list(tmp_path.iterdir())) < 2:
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGINT)).start()
+        ends: list[JobEnd] = []
+        with pytest.raises(KeyboardInterrupt):
+            DaskEngine(cluster).run("jobs", [job("mine", "pass")], ends.append, SILENT)
+        assert [end.is_interrupted for end in ends] == [True]
+        (tmp_path / "go").touch()
+        other.join()
+        assert [end.is_done for end in others] == [True, True]
+
     def test_a_worker_that_does_not_share_the_folder_gets_no_jobs(
         self, cluster: ClusterAddress, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     ) -> None:

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from pipelines.core.errors import BackendUnavailableError, InputError, StorageError
@@ -39,6 +39,7 @@ def read(folder: Path) -> dict[str, bytes]:
 
 
 @given(before=FOLDERS, after=FOLDERS)
+@example(before={"a": b""}, after={"a/a": b""})
 @settings(max_examples=30, deadline=None)
 def test_a_folder_arrives_as_it_was(
     tmp_path_factory: pytest.TempPathFactory, before: dict[str, bytes], after: dict[str, bytes]
@@ -117,7 +118,7 @@ def test_a_damaged_index_is_refused(tmp_path: Path, damage: Callable[[bytes], by
     storage = Storage((tmp_path / "store").as_uri())
     write(tmp_path / "a/ws", {"one": b"1"})
     storage.send(tmp_path / "a", "ws", "engine")
-    (index,) = (tmp_path / "store/.georef").iterdir()
+    (index,) = (tmp_path / "store").glob("*.json")
     index.write_bytes(damage(index.read_bytes()))
     with pytest.raises(InputError):
         storage.fetch(tmp_path / "b", "ws")
@@ -154,7 +155,7 @@ class TestExchange:
 
     def test_named_parts_go_and_results_come_back(self, storage: Storage, job: Job, tmp_path: Path) -> None:
         engine, scratch = EngineExchange(storage), tmp_path / "scratch"
-        parcel = engine.send(job)
+        parcel = engine.send(job, "1")
         with worker_exchange(parcel, scratch):
             assert read(scratch) == {"photos/a.jpg": b"a", "ws/georef.toml": b"#"}
             assert arguments_in(parcel, job.arguments, scratch) == ["run", f"{scratch}/ws"]
@@ -167,9 +168,9 @@ class TestExchange:
     def test_results_of_a_killed_engine_are_collected_later(
         self, storage: Storage, job: Job, tmp_path: Path
     ) -> None:
-        with worker_exchange(EngineExchange(storage).send(job), tmp_path / "scratch"):
+        with worker_exchange(EngineExchange(storage).send(job, "1"), tmp_path / "scratch"):
             write(tmp_path / "scratch", {"ws/product": b"p"})
-        EngineExchange(storage).send(job)
+        EngineExchange(storage).send(job, "2")
         assert (tmp_path / "base/ws/product").read_bytes() == b"p"
 
     def test_a_lost_worker_has_put_back_its_checkpoint(
@@ -177,19 +178,32 @@ class TestExchange:
     ) -> None:
         monkeypatch.setattr(exchange, "_SAVE_EVERY_S", 0.05)
         engine = EngineExchange(storage)
-        with pytest.raises(RuntimeError), worker_exchange(engine.send(job), tmp_path / "scratch"):
+        with pytest.raises(RuntimeError), worker_exchange(engine.send(job, "1"), tmp_path / "scratch"):
             write(tmp_path / "scratch", {"ws/train.partial/checkpoint.npz": b"c"})
             deadline = time.monotonic() + 10
             while (index := storage.index("ws")) is None or len(index.files) < 2:
                 assert time.monotonic() < deadline
                 time.sleep(0.02)
             raise RuntimeError("lost: nothing more is put back")
-        with worker_exchange(engine.send(job), tmp_path / "other"):
+        with worker_exchange(engine.send(job, "2"), tmp_path / "other"):
             assert (tmp_path / "other/ws/train.partial/checkpoint.npz").read_bytes() == b"c"
+
+    def test_a_worker_that_was_given_up_changes_nothing(self, storage: Storage, job: Job, tmp_path: Path) -> None:
+        """It was cut off, and another worker has begun; then it comes back with what it has."""
+        engine = EngineExchange(storage)
+        with (
+            pytest.raises(StorageError, match="taken over"),
+            worker_exchange(engine.send(job, "1"), tmp_path / "cut off"),
+        ):
+            write(tmp_path / "cut off", {"ws/product": b"old"})
+            with worker_exchange(engine.send(job, "2"), tmp_path / "other"):
+                write(tmp_path / "other", {"ws/product": b"new"})
+        engine.collect(job)
+        assert (tmp_path / "base/ws/product").read_bytes() == b"new"
 
     def test_what_lies_outside_is_refused(self, storage: Storage, tmp_path: Path) -> None:
         job = Job("job", (), 0, folder=tmp_path / "base", writes=tmp_path / "base/ws", reads=(tmp_path / "photos",))
         with pytest.raises(InputError, match="lies outside"):
-            EngineExchange(storage).send(job)
+            EngineExchange(storage).send(job, "1")
         with pytest.raises(InputError, match="--storage"):
-            EngineExchange(storage).send(Job("job", (), 0))
+            EngineExchange(storage).send(Job("job", (), 0), "1")
