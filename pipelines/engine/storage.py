@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal, TypeVar
+from urllib.parse import urlsplit
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -28,6 +29,8 @@ _MOST_INDEX_BYTES = 256 * 1024 * 1024
 _LEFT_OUT_NAMES = (".lock", ".lock.holder")
 _LEFT_OUT_FOLDERS = ("cache",)
 _DRAFT = ".tmp"
+# Stores of buckets; to make a folder there would make a bucket that is misspelt.
+_WITHOUT_FOLDERS = ("s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "adl")
 
 _Result = TypeVar("_Result")
 Writer = Literal["engine", "worker"]
@@ -133,7 +136,8 @@ class Storage:
         if writer == "worker" and before is not None and before.attempt != attempt:
             raise StorageError(f"{part}: another attempt at the job has taken over")
         held = set() if before is None else {_object(name, state) for name, state in before.files.items()}
-        store.makedirs(home, exist_ok=True)
+        if urlsplit(self.url).scheme not in _WITHOUT_FOLDERS:
+            store.makedirs(home, exist_ok=True)
         while True:
             files = dict(_files_of(folder / part))
             try:
