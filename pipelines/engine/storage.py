@@ -29,6 +29,7 @@ _MOST_INDEX_BYTES = 256 * 1024 * 1024
 _LEFT_OUT_NAMES = (".lock", ".lock.holder")
 _LEFT_OUT_FOLDERS = ("cache",)
 _DRAFT = ".tmp"
+_AT_ONCE = 64
 # Stores of buckets; to make a folder there would make a bucket that is misspelt.
 _WITHOUT_FOLDERS = ("s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "adl")
 
@@ -141,10 +142,11 @@ class Storage:
         while True:
             files = dict(_files_of(folder / part))
             try:
-                for name, state in files.items():
-                    if (key := _object(name, state)) not in held:
-                        store.put_file(str(folder / part / name), f"{home}/{key}")
-                        held.add(key)
+                keys = {name: _object(name, state) for name, state in files.items()}
+                for names in _batches([name for name, key in keys.items() if key not in held]):
+                    places = [f"{home}/{keys[name]}" for name in names]
+                    store.put([str(folder / part / name) for name in names], places)
+                    held.update(keys[name] for name in names)
                 break
             except FileNotFoundError:
                 if all((folder / part / name).exists() for name in files):
@@ -152,7 +154,7 @@ class Storage:
         index = PartIndex(part=part, attempt=attempt, writer=writer, files=files)
         if index != before:
             self._write_index(index)
-            wanted = {_object(name, state) for name, state in files.items()}
+            wanted = set(keys.values())
             for place in store.ls(home, detail=False):
                 if place.rpartition("/")[2] not in wanted:
                     store.rm_file(place)
@@ -162,18 +164,21 @@ class Storage:
         store, index = self._store(), self._index(part)
         if index is None:
             return None
-        for name, (size, time_ns) in index.files.items():
-            path = folder / part / name
-            state = _state_of(path)
-            if state is not None and (state == (size, time_ns) or state[1] > time_ns):
-                continue
-            path.parent.mkdir(parents=True, exist_ok=True)
-            if not path.parent.resolve().is_relative_to(folder.resolve()):
-                raise InputError("a symbolic link leads out of the folder", path=path)
-            draft = path.with_name(path.name + _DRAFT)
-            store.get_file(f"{self._home(part)}/{_object(name, (size, time_ns))}", str(draft))
-            os.utime(draft, ns=(time_ns, time_ns))
-            draft.replace(path)
+        for names in _batches(
+            [name for name, state in index.files.items() if _is_older(folder / part / name, state)]
+        ):
+            paths = [folder / part / name for name in names]
+            for path in paths:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                if not path.parent.resolve().is_relative_to(folder.resolve()):
+                    raise InputError("a symbolic link leads out of the folder", path=path)
+            drafts = [path.with_name(path.name + _DRAFT) for path in paths]
+            keys = [_object(name, index.files[name]) for name in names]
+            store.get([f"{self._home(part)}/{key}" for key in keys], [str(draft) for draft in drafts])
+            for name, path, draft in zip(names, paths, drafts, strict=True):
+                time_ns = index.files[name][1]
+                os.utime(draft, ns=(time_ns, time_ns))
+                draft.replace(path)
         for name in () if before is None else before.files.keys() - index.files.keys():
             if _state_of(folder / part / name) == tuple(before.files[name]):  # type: ignore[union-attr]
                 (folder / part / name).unlink()
@@ -241,6 +246,12 @@ def _files_of(path: Path) -> Iterator[tuple[str, tuple[int, int]]]:
                 yield relative, state
 
 
+def _is_older(path: Path, state: tuple[int, int]) -> bool:
+    """Return whether a file is missing, or older than a state or of another size."""
+    own = _state_of(path)
+    return own is None or (own != state and own[1] <= state[1])
+
+
 def _state_of(path: Path) -> tuple[int, int] | None:
     """Return size and time of change of a file; None: there is none."""
     try:
@@ -248,6 +259,12 @@ def _state_of(path: Path) -> tuple[int, int] | None:
     except OSError:
         return None
     return status.st_size, status.st_mtime_ns
+
+
+def _batches(names: list[str]) -> Iterator[list[str]]:
+    """Yield the names of files that are copied at once."""
+    for start in range(0, len(names), _AT_ONCE):
+        yield names[start : start + _AT_ONCE]
 
 
 def _object(name: str, state: tuple[int, int]) -> str:

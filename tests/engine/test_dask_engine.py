@@ -170,7 +170,7 @@ class TestCluster:
         self, cluster: ClusterAddress, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     ) -> None:
         """Four times busy: more often than a failure is forgiven."""
-        monkeypatch.setattr("pipelines.engine.dask_engine._BUSY_PAUSE_S", 0.05)
+        monkeypatch.setattr("pipelines.engine.dask_run._BUSY_PAUSE_S", 0.05)
         busy = "open(sys.argv[2], 'a').write('x')\n"
         busy += "if len(open(sys.argv[2]).read()) < 5: send('error', code='busy'); sys.exit(1)"
         assert ends_of(cluster, job("busy", busy, str(tmp_path / "tries")))["busy"].is_done
@@ -194,7 +194,7 @@ class TestCluster:
         self, cluster: ClusterAddress, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     ) -> None:
         """A job that waits behind those of another command has not begun, and does not hold up Ctrl-C."""
-        monkeypatch.setattr("pipelines.engine.dask_engine._START_PATIENCE_S", 0.3)
+        monkeypatch.setattr("pipelines.engine.dask_run._START_PATIENCE_S", 0.3)
         waiting = "pathlib.Path(sys.argv[2], str(os.getpid())).touch()\n"
         waiting += "while not pathlib.Path(sys.argv[2], 'go').exists(): time.sleep(0.02)"
         others: list[JobEnd] = []

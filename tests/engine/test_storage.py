@@ -70,7 +70,9 @@ def test_only_what_differs_is_copied(storage: Storage, tmp_path: Path, monkeypat
     kind = type(storage._store())
     put_file = kind.put_file
     monkeypatch.setattr(
-        kind, "put_file", lambda self, path, *rest: copied.append(Path(path).name) or put_file(self, path, *rest)
+        kind,
+        "put_file",
+        lambda self, path, *rest, **more: copied.append(Path(path).name) or put_file(self, path, *rest, **more),
     )
     storage.send(tmp_path / "b", "ws", "worker")
     assert copied == ["three"]
