@@ -156,10 +156,13 @@ class ClusterRun:
         }
         self._refreshed = time.monotonic()
         for name, attempt in list(self._running.items()):
-            if attempt.place.address not in workers:
+            # Dask cancels all tasks when its scheduler is lost, too; but then the program does not come here.
+            is_cancelled = attempt.future.status == "cancelled" and not is_stopping
+            if is_cancelled or attempt.place.address not in workers:
                 attempt.future.cancel()
                 seconds = time.monotonic() - attempt.since
-                self._end(name, ProcessEnd(1, seconds, "its worker was lost", _LOST), is_stopping)
+                why = "its task was cancelled" if is_cancelled else "its worker was lost"
+                self._end(name, ProcessEnd(1, seconds, why, _LOST), is_stopping)
 
     def _lose_scheduler(self, cause: Exception) -> None:
         """Tell that the running jobs are interrupted.
@@ -255,9 +258,9 @@ class ClusterRun:
             attempt.has_started = True
         if "ended" in event:
             self._end(name, ProcessEnd(**event["ended"]), is_stopping)
-        elif "future" in event and not is_stopping and attempt.future.status != "finished":
-            error = attempt.future.exception() if attempt.future.status == "error" else "it was cancelled"
-            self._end(name, ProcessEnd(1, time.monotonic() - attempt.since, f"{error}", _LOST), is_stopping)
+        elif "future" in event and attempt.future.status == "error":
+            seconds = time.monotonic() - attempt.since
+            self._end(name, ProcessEnd(1, seconds, f"{attempt.future.exception()}", _LOST), is_stopping)
 
     def _end(self, name: str, end: ProcessEnd, is_stopping: bool) -> None:
         """Finish an attempt, or let its job wait for the next one."""
