@@ -16,7 +16,7 @@ from pipelines.engine.cluster import ClusterAddress, connected
 from pipelines.engine.nodes import make_certificates
 from tests.cli_runs import REPOSITORY
 
-PATIENCE_S = 60.0
+PATIENCE_S = 180.0
 # Jobs of these clusters are this program in place of `georef`.
 _PRELOAD = "from pipelines.engine import process\nprocess.THIS_PROGRAM = ('-c', {program!r})\n"
 

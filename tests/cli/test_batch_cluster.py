@@ -16,7 +16,7 @@ import pytest
 
 from pipelines.core.workspace import Workspace
 from tests import fakes
-from tests.cli_runs import Result, finish, start
+from tests.cli_runs import Result, start
 from tests.clusters import PATIENCE_S, RunningCluster, running_cluster
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")]
@@ -59,6 +59,12 @@ def steps_of(workspace: Path) -> list[int]:
 
 def batch(cluster: RunningCluster, missions: Path, *more: str) -> subprocess.Popen[str]:
     return start("batch", missions, "--to", "train", "--json", *cluster.words, *more, code=PLAIN)
+
+
+def finish(process: subprocess.Popen[str]) -> Result:
+    """Wait for a batch."""
+    out, err = process.communicate(timeout=5 * PATIENCE_S)
+    return Result(process.returncode, out, err)
 
 
 def wait_until(happened: Callable[[], bool], what: str) -> None:
