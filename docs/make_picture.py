@@ -24,7 +24,7 @@ import numpy as np
 
 from pipelines.core.workspace import Workspace
 from pipelines.pages.chromium import NO_NETWORK, chromium_path
-from pipelines.view.loopback import start_server
+from pipelines.view.loopback import start_server, stop_server
 from pipelines.view.options import ViewOptions
 from pipelines.view.viewer import Viewer
 
@@ -110,7 +110,7 @@ def measuring(workspace: Workspace) -> np.ndarray:
         png = page.screenshot()
         browser.close()
     viewer.close()
-    server.stop()
+    stop_server(server)
     return sized(decoded(png))
 
 

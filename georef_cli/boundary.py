@@ -116,7 +116,10 @@ def _signals_interrupt() -> Iterator[None]:
 @contextmanager
 def logged_to_stderr(verbosity: Verbosity) -> Iterator[None]:
     """Print log records on stderr while the context lasts, and the traceback of its error if asked."""
-    handler = _terminal_handler() if sys.stderr.isatty() else _line_handler()
+    if verbosity.json_progress:
+        handler = _sending_handler()
+    else:
+        handler = _terminal_handler() if sys.stderr.isatty() else _line_handler()
     handler.setLevel(verbosity.level)
     with _attached(handler, logging.DEBUG if verbosity.verbose else logging.INFO):
         try:
@@ -155,6 +158,15 @@ def _attached(handler: logging.Handler, level: int) -> Iterator[None]:
         handler.close()
         for name, before in levels.items():
             logging.getLogger(name).setLevel(before)
+
+
+def _sending_handler() -> logging.Handler:
+    from georef_cli.sender import stderr_sender
+    from pipelines.core.messages import SentRecords
+
+    handler = SentRecords(stderr_sender())
+    handler.setFormatter(SafeFormatter())
+    return handler
 
 
 def _terminal_handler() -> logging.Handler:

@@ -61,6 +61,9 @@ def shared_options() -> list[click.Option]:
         click.Option(["-q", "--quiet"], is_flag=True, help="Show warnings and errors only."),
         click.Option(["--traceback"], is_flag=True, help="Show where in the program an error was raised."),
         click.Option(
+            ["--json-progress"], is_flag=True, help="Write messages and progress to stderr as lines of JSON."
+        ),
+        click.Option(
             ["-j", "--threads"],
             type=click.IntRange(min=1),
             metavar="N",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import sys
 import time
 from collections.abc import Iterator
@@ -29,6 +30,7 @@ from pipelines.core.progress import SILENT, Progress, ProgressTask
 LINE_EVERY_S = 30.0
 # Columns of a terminal from which a bar shows the speed too, and the columns of the bar itself.
 _WIDE, _WIDE_BAR, _NARROW_BAR = 100, 20, 8
+_MARGIN_LINES = 4  # for log lines above the bars
 LEVEL_STYLES = {logging.ERROR: "red", logging.WARNING: "yellow", logging.INFO: ""}
 
 log = logging.getLogger(__name__)
@@ -62,19 +64,23 @@ def is_told(verbosity: Verbosity) -> bool:
 
 
 def progress_for(verbosity: Verbosity) -> Progress:
-    """Return the display of progress: bars on a terminal, log lines elsewhere, nothing with `--quiet`."""
+    """Return the display of progress: bars on a terminal, log lines elsewhere; none with `--quiet`."""
+    if verbosity.json_progress:
+        from georef_cli.sender import stderr_sender
+
+        return stderr_sender()
     if verbosity.quiet:
         return SILENT
     return BarProgress(stderr_console()) if sys.stderr.isatty() else LineProgress()
 
 
 class SpeedColumn(Column):
-    """Column of steps per second, or of seconds per step below one step per second."""
+    """Column of steps per second, or of seconds per step below one step per second; empty for steps that differ."""
 
     def render(self, task: Task) -> Text:
         """Return the speed of a task."""
         speed = task.finished_speed or task.speed
-        if not speed:
+        if not speed or task.fields["left_s"] == math.inf:
             return Text("")
         return Text(f"{speed:.1f} it/s" if speed >= 1 else f"{1 / speed:.1f} s/it", style="progress.data.speed")
 
@@ -95,7 +101,7 @@ class LeftColumn(Column):
     def render(self, task: Task) -> Text:
         """Return the time; empty where it is unknown."""
         left_s = task.time_remaining if task.fields["left_s"] is None else task.fields["left_s"]
-        return Text("" if left_s is None or task.finished else f"{clock(left_s)} left")
+        return Text("" if left_s is None or math.isinf(left_s) or task.finished else f"{clock(left_s)} left")
 
 
 class NoteColumn(Column):
@@ -133,9 +139,16 @@ class BarProgress:
             yield _Bar(bars, bar)
         finally:
             bars.stop_task(bar)
+            self._make_room(bars)
             if outermost:
                 bars.stop()
                 self._bars = None
+
+    def _make_room(self, bars: Bars) -> None:
+        """Remove the oldest finished bars that the height of the terminal has no room for."""
+        finished = [task.id for task in bars.tasks if task.stop_time is not None]
+        for bar in finished[: max(0, len(bars.tasks) + _MARGIN_LINES - self._console.height)]:
+            bars.remove_task(bar)
 
     def _start(self) -> Bars:
         wide = self._console.width >= _WIDE
@@ -201,5 +214,5 @@ class _Line:
         elapsed_s = self._logged - self._started
         total = "" if self._total is None else f"/{self._total}"
         note = f", {self._note}" if self._note else ""
-        left = f", about {clock(self._left_s)} left" if self._left_s else ""
+        left = f", about {clock(self._left_s)} left" if self._left_s and math.isfinite(self._left_s) else ""
         log.info("%s: %d%s after %.0f s%s%s", self._name, self._done, total, elapsed_s, note, left)

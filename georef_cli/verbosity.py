@@ -17,11 +17,13 @@ class Verbosity:
         verbose: show messages for debugging too.
         quiet: show warnings and errors only.
         traceback: show the traceback of an error.
+        json_progress: write messages and progress for a program.
     """
 
     verbose: bool = False
     quiet: bool = False
     traceback: bool = False
+    json_progress: bool = False
 
     @property
     def level(self) -> int:

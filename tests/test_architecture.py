@@ -28,6 +28,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     ("pipelines.formats",),
     (
         "pipelines.accuracy",
+        "pipelines.engine",
         "pipelines.georef",
         "pipelines.pages",
         "pipelines.plots",
@@ -36,6 +37,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
         "pipelines.stereo",
     ),
     (
+        "pipelines.batch",
         "pipelines.calibrate",
         "pipelines.compare",
         "pipelines.deliver",
@@ -54,8 +56,9 @@ FLOORS: tuple[tuple[str, ...], ...] = (
 )
 STAGE_FLOOR = 4
 STAGE_ROOMS = FLOORS[STAGE_FLOOR]
-# The command line starts stages through the runner and shows products; what makes them is none of its business.
-SEEN_BY_CLI = ("pipelines.core", "pipelines.scene", "georef_cli", *STAGE_ROOMS)
+# The command line starts stages through the runner, chooses the engine, and shows products; what makes them is none
+# of its business.
+SEEN_BY_CLI = ("pipelines.core", "pipelines.engine", "pipelines.scene", "georef_cli", *STAGE_ROOMS)
 
 HOMES: dict[str, tuple[str, ...]] = {
     "click": ("georef_cli",),

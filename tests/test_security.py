@@ -32,8 +32,9 @@ FORBIDDEN = {
     "eval", "exec", "compile", "pickle", "marshal", "shelve", "yaml", "subprocess", "os.system", "os.popen",
     "torch.load", "torch.save",
 }  # fmt: skip
-# The files that start a process: this program again, so that native code is interruptible; and the user's browser.
+# The files that start a process: this program again, for native code and for jobs; and the user's browser.
 STARTS_ITSELF = REPOSITORY / "pipelines/core/child.py"
+STARTS_JOBS = REPOSITORY / "pipelines/engine/process.py"
 STARTS_A_BROWSER = REPOSITORY / "pipelines/pages/chromium.py"
 ESCAPES = ["../secret.jpg", "/etc/passwd", "a/../../secret.jpg", "", "a\nb.jpg", "a\x00b.jpg"]
 
@@ -57,7 +58,7 @@ def test_nothing_that_is_read_can_be_executed(package: str) -> None:
     assert files
     for file in files:
         for name, node in _calls(ast.parse(file.read_text("utf-8"))):
-            if name == "subprocess" and file in (STARTS_ITSELF, STARTS_A_BROWSER):
+            if name == "subprocess" and file in (STARTS_ITSELF, STARTS_JOBS, STARTS_A_BROWSER):
                 continue
             assert name not in FORBIDDEN, f"{file}:{node.lineno} uses {name}"  # type: ignore[attr-defined]
             if name in ("np.load", "numpy.load"):
@@ -70,6 +71,7 @@ def test_nothing_that_is_read_can_be_executed(package: str) -> None:
     ("file", "arguments"),
     [
         (STARTS_ITSELF, "[sys.executable, '-m', __name__,"),
+        (STARTS_JOBS, "[sys.executable, *program,"),
         (STARTS_A_BROWSER, "[*command, page.absolute().as_uri()]"),
     ],
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -14,11 +14,12 @@ from georef_cli.command import Command
 from georef_cli.display import is_told, progress_for
 from georef_cli.dry_run import announce_training, print_dry_run
 from georef_cli.output import print_outcomes
+from georef_cli.settings import set_option, settings
 from pipelines.core import runner
 from pipelines.core.errors import GeorefError
-from pipelines.core.options import listed_names
 from pipelines.core.origins import names_of_flags
-from pipelines.core.stages import BY_NAME, DELIVERABLES, PIPELINE, StageSpec, stage_slice
+from pipelines.core.progress import SILENT, ProgressTask
+from pipelines.core.stages import BY_NAME, DELIVERABLES, MODEL, PIPELINE, StageSpec, named_deliverables, stage_slice
 from pipelines.core.staleness import must_exist
 from pipelines.core.workspace import Workspace
 from pipelines.ingest.options import IngestOptions
@@ -52,7 +53,7 @@ def _run(ctx: click.Context, **values: Any) -> None:
         raise click.UsageError("--from and --rerun-from exclude each other.")
     first = values["first"] or values["rerun_from"]
     stages = (*_stages(first, values["last"]), *_deliverables(values["deliver"]))
-    flags = _flags(ctx, stages)
+    flags = _flags(ctx, stages, settings(values["settings"], stages))
     workspace = values["workspace"]
     forget, force = _forgotten(values["forget"], stages), values["force"] or values["rerun_from"] is not None
     if stages[0].reads:
@@ -65,20 +66,34 @@ def _run(ctx: click.Context, **values: Any) -> None:
         print_dry_run(workspace, stages, asked, force=force, as_json=values["as_json"])
         return
     announce_training(workspace, stages, asked, force=force)
-    outcomes = runner.run_pipeline(
-        workspace,
-        stages,
-        flags,
-        forget=forget,
-        force=force,
-        progress=progress_for(ctx.obj),
-        around=lambda spec: boundary.logged_to_file(workspace, spec),
-    )
+    progress = progress_for(ctx.obj)
+    # A program that follows several runs shows how many stages of each are done; bars and lines name the stages.
+    with (progress if ctx.obj.json_progress else SILENT).task("stages", len(stages)) as done:
+        outcomes = runner.run_pipeline(
+            workspace,
+            stages,
+            flags,
+            forget=forget,
+            force=force,
+            progress=progress,
+            around=lambda spec: _counted(workspace, spec, done),
+        )
     print_outcomes(workspace, outcomes, _overview(workspace), as_json=values["as_json"], told=is_told(ctx.obj))
+
+
+@contextlib.contextmanager
+def _counted(workspace: Workspace, spec: StageSpec, done: ProgressTask) -> Iterator[None]:
+    """Log a stage to its file, and count it when it has ended."""
+    with boundary.logged_to_file(workspace, spec):
+        done.advance(0, note=spec.name)
+        yield
+    done.advance()
 
 
 def _overview(workspace: Workspace) -> Overview | None:
     """Return the overview of what the run has reached; None before training."""
+    if not (workspace.root / MODEL).exists():
+        return None
     from pipelines.deliver.overview import overview
 
     try:
@@ -101,12 +116,10 @@ def _deliverables(text: str | None) -> tuple[StageSpec, ...]:
     Raises:
         click.UsageError: an unknown name.
     """
-    by_name = {spec.name.removeprefix("export-"): spec for spec in DELIVERABLES}
     try:
-        names = () if text is None else listed_names(text, (*by_name, "all"))
+        return named_deliverables(text)
     except ValueError as error:
         raise click.UsageError(f"--deliver: {error}") from error
-    return DELIVERABLES if "all" in names else tuple(spec for name, spec in by_name.items() if name in names)
 
 
 def _forgotten(names: Sequence[str], stages: Sequence[StageSpec]) -> dict[str, list[str]]:
@@ -127,14 +140,15 @@ def _forgotten(names: Sequence[str], stages: Sequence[StageSpec]) -> dict[str, l
     return by_stage
 
 
-def _flags(ctx: click.Context, stages: tuple[StageSpec, ...]) -> dict[str, dict[str, Any]]:
-    """Return the given options by stage.
+def _flags(
+    ctx: click.Context, stages: tuple[StageSpec, ...], flags: dict[str, dict[str, Any]]
+) -> dict[str, dict[str, Any]]:
+    """Return the given options by stage, those of `--set` among them.
 
     Raises:
         click.UsageError: an option is for stages that do not run.
     """
     running = {spec.name for spec in stages}
-    flags: dict[str, dict[str, Any]] = {}
     for name, value in options.given(ctx, OWNERS).items():
         owners = [owner for owner in OWNERS[name] if owner in running]
         if not owners:
@@ -147,7 +161,18 @@ def _flags(ctx: click.Context, stages: tuple[StageSpec, ...]) -> dict[str, dict[
     return flags
 
 
-def _slice_option(flags: list[str], dest: str, help_text: str) -> click.Option:
+def deliver_option() -> click.Option:
+    """Return the option `--deliver`."""
+    return click.Option(
+        ["--deliver"],
+        metavar="NAMES",
+        help=f"Make these as well: {_DELIVERABLE_NAMES}, with commas, or all. Their options are set in "
+        "georef.toml or with their own commands.",
+    )
+
+
+def slice_option(flags: list[str], dest: str, help_text: str) -> click.Option:
+    """Return an option that names a stage of the pipeline."""
     return click.Option([*flags, dest], type=click.Choice([spec.name for spec in PIPELINE]), help=help_text)
 
 
@@ -155,16 +180,12 @@ command = Command(
     "run",
     params=[
         options.workspace_argument(),
-        _slice_option(["--from"], "first", "First stage to run."),
-        _slice_option(["--rerun-from"], "rerun_from", "First stage to run, with --force."),
-        _slice_option(["--to", "--end-with"], "last", "Last stage to run."),
+        slice_option(["--from"], "first", "First stage to run."),
+        slice_option(["--rerun-from"], "rerun_from", "First stage to run, with --force."),
+        slice_option(["--to", "--end-with"], "last", "Last stage to run."),
         *(options.stage_option(BY_NAME[owners[0]].options, name) for name, owners in OWNERS.items()),
-        click.Option(
-            ["--deliver"],
-            metavar="NAMES",
-            help=f"Make these as well: {_DELIVERABLE_NAMES}, with commas, or all. Their options are set in "
-            "georef.toml or with their own commands.",
-        ),
+        deliver_option(),
+        set_option(),
         options.forget_option(),
         options.dry_run_option(),
         options.force_option("Run the stages even if their products are current."),
@@ -175,7 +196,7 @@ command = Command(
 
         What was interrupted is resumed. Options that a stage was given before are remembered, so that a later
         run needs only what changes: `georef status WS --options` shows them, --forget drops one. Options that are
-        not listed here are set in WS/georef.toml or with the stage's own command.
+        not listed here are given with --set, in WS/georef.toml, or with the stage's own command.
 
         \b
         Examples:
@@ -183,6 +204,7 @@ command = Command(
           georef run flight --images photos --preset high --dry-run
           georef run flight --images photos --gcp gcp_list.txt --to init-sim3
           georef run flight --from train --iterations 2000
+          georef run flight --set train.sh_degree=1 --set evaluate.cross_validate=true
           georef run flight --forget gcp
           georef run flight
         """,

@@ -17,10 +17,9 @@ import sys
 import tempfile
 import threading
 import traceback
-from collections.abc import Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Mapping
 from pathlib import Path
-from typing import IO, Any, TextIO
+from typing import IO, Any
 
 from pipelines.core import errors
 from pipelines.core.durable import storage_failure_of
@@ -33,7 +32,8 @@ from pipelines.core.errors import (
     storage_error,
     storage_error_in,
 )
-from pipelines.core.progress import SILENT, Progress, ProgressTask
+from pipelines.core.messages import MessageReceiver, MessageSender, SentRecords
+from pipelines.core.progress import SILENT, Progress
 
 log = logging.getLogger(__name__)
 
@@ -109,27 +109,17 @@ def _follow(process: subprocess.Popen[str], arguments: Mapping[str, Any], progre
         process.stdin.flush()  # It stays open: the child ends when it is closed.
     except BrokenPipeError as error:
         raise EOFError from error
-    open_tasks: list[tuple[AbstractContextManager[ProgressTask], ProgressTask]] = []
+    receiver = MessageReceiver(progress)
     try:
         for line in process.stdout:
             message = json.loads(line)
-            match message["kind"]:
-                case "log":
-                    logging.getLogger(message["name"]).log(message["level"], "%s", message["text"])
-                case "begin":
-                    context = progress.task(message["name"], message["total"])
-                    open_tasks.append((context, context.__enter__()))
-                case "advance":
-                    open_tasks[-1][1].advance(message["steps"], message["note"], message["left_s"])
-                case "end":
-                    open_tasks.pop()[0].__exit__(None, None, None)
-                case "result":
-                    return message["result"]
-                case _:
-                    raise _error(message)
+            if receiver.take(message):
+                continue
+            if message["kind"] == "result":
+                return message["result"]
+            raise _error(message)
     finally:
-        for context, _ in reversed(open_tasks):
-            context.__exit__(None, None, None)
+        receiver.close()
     raise EOFError
 
 
@@ -165,57 +155,16 @@ def _crash(code: int, native_log: IO[str], remedy: str) -> GeorefError:
     return CrashError(f"a native library crashed ({ending}: {cause[:_MOST_OF_A_LINE]}): {remedy}")
 
 
-class _Messages:
-    """Child's end of the exchange."""
-
-    def __init__(self, stream: TextIO) -> None:
-        self._stream, self._lock = stream, threading.Lock()
-
-    def send(self, kind: str, **content: Any) -> None:
-        """Send one message."""
-        with self._lock:
-            self._stream.write(json.dumps({"kind": kind, **content}) + "\n")
-            self._stream.flush()
-
-    @contextmanager
-    def task(self, name: str, total: int | None = None) -> Iterator[ProgressTask]:
-        """Open a task that the parent shows."""
-        self.send("begin", name=name, total=total)
-        try:
-            yield _SentTask(self)
-        finally:
-            self.send("end")
-
-
-class _SentTask:
-    def __init__(self, messages: _Messages) -> None:
-        self._messages = messages
-
-    def advance(self, steps: int = 1, note: str = "", left_s: float | None = None) -> None:
-        """Send the steps."""
-        self._messages.send("advance", steps=steps, note=note, left_s=left_s)
-
-
-class _SentRecords(logging.Handler):
-    def __init__(self, messages: _Messages) -> None:
-        super().__init__()
-        self._messages = messages
-
-    def emit(self, record: logging.LogRecord) -> None:
-        """Send a record."""
-        self._messages.send("log", name=record.name, level=record.levelno, text=self.format(record))
-
-
 def _main(task: str, parent: str) -> None:
     """Run a function and send its result: entry point of the child."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # The parent decides what an interrupt of both ends.
-    messages = _Messages(os.fdopen(os.dup(1), "w", encoding="utf-8"))
+    messages = MessageSender(os.fdopen(os.dup(1), "w", encoding="utf-8"))
     os.dup2(2, 1)  # Native libraries write to stdout, too.
     document = json.loads(sys.stdin.readline())
     _end_with(int(parent))
     logger = logging.getLogger(_LIBRARY)
     logger.setLevel(document["level"])
-    logger.addHandler(_SentRecords(messages))
+    logger.addHandler(SentRecords(messages))
     logger.propagate = False
     module, _, name = task.partition(":")
     try:

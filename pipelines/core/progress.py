@@ -20,7 +20,8 @@ class ProgressTask(Protocol):
         Args:
             steps: that are done.
             note: shown behind the bar (`23.1 dB`).
-            left_s: seconds that the rest will take, where steps differ; None: as long a step as those before.
+            left_s: seconds that the rest will take, where steps differ; None: as long a step as those before;
+                infinite: not known.
         """
 
 

@@ -9,7 +9,7 @@ import importlib
 from dataclasses import dataclass
 
 from pipelines.core.errors import GeorefError
-from pipelines.core.options import StageOptions
+from pipelines.core.options import StageOptions, listed_names
 
 SURVEY = "ingest/survey.json"
 TRACK = "ingest/track.npz"  # only for surveys with a trajectory
@@ -298,6 +298,17 @@ def products_of(spec: StageSpec) -> tuple[str, ...]:
     needed = (part.product for other in PIPELINE for part in other.reads if not part.optional)
     own = (product for product in needed if producer_of(product) is spec)
     return tuple(dict.fromkeys((spec.product, *spec.also, *own)))
+
+
+def named_deliverables(names: str | None) -> tuple[StageSpec, ...]:
+    """Return the stages of the deliverables in a text, such as `raster,cloud` or `all`; None names none.
+
+    Raises:
+        ValueError: an unknown name.
+    """
+    by_name = {spec.name.removeprefix("export-"): spec for spec in DELIVERABLES}
+    listed = () if names is None else listed_names(names, (*by_name, "all"))
+    return DELIVERABLES if "all" in listed else tuple(spec for name, spec in by_name.items() if name in listed)
 
 
 def stage_slice(first: str | None, last: str | None) -> tuple[StageSpec, ...]:

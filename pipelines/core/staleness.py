@@ -240,4 +240,4 @@ class _Look:
             return str(error)
         producers = dict.fromkeys(producer_of(part.product).name for part in spec.reads)
         upstream = [name for name in producers if name in self.stale]
-        return own or (f"{', '.join(upstream)} is stale" if upstream else "")
+        return own or (f"{', '.join(upstream)} {'are' if len(upstream) > 1 else 'is'} stale" if upstream else "")

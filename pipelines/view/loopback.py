@@ -28,20 +28,23 @@ _FOREIGN = "georef.invalid"
 _TIMEOUT_S = 5.0
 
 
-def start_server(port: int, title: str) -> viser.ViserServer:
+def start_server(port: int, title: str, *, dark: bool = False) -> viser.ViserServer:
     """Start a server on loopback, at a port or, if that is taken, the next free one.
 
     Args:
         port: the wanted port.
         title: of the page.
+        dark: whether its panel is light on dark.
 
     Raises:
         BackendUnavailableError: viser is not installed.
         GeorefError: no port is free, or the server would answer pages from elsewhere.
     """
     server = _start(port, title)
+    server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large", dark_mode=dark)
+    server.gui.main_panel.dock_right()
     if not _refuses_strangers(server.get_port()):
-        server.stop()
+        stop_server(server)
         raise GeorefError(
             "this version of viser cannot be kept from answering pages of other sites: install viser 1.1 "
             "(pip install --constraint constraints.txt georefgs)"
@@ -49,6 +52,12 @@ def start_server(port: int, title: str) -> viser.ViserServer:
     if server.get_port() != port:
         log.warning("port %d is taken: the viewer is at port %d", port, server.get_port())
     return server
+
+
+def stop_server(server: viser.ViserServer) -> None:
+    """Stop a server, without what viser prints about it."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        server.stop()
 
 
 def _start(port: int, title: str) -> viser.ViserServer:
@@ -65,10 +74,7 @@ def _start(port: int, title: str) -> viser.ViserServer:
             return None
 
     with _checked_connections(), contextlib.redirect_stdout(io.StringIO()):  # viser prints a banner
-        server = Server(host=HOST, port=port, label=title, verbose=False)
-    server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
-    server.gui.main_panel.dock_right()
-    return server
+        return Server(host=HOST, port=port, label=title, verbose=False)
 
 
 @contextlib.contextmanager

@@ -21,7 +21,7 @@ from pipelines.scene.report import EvaluationReport, read_report
 from pipelines.scene.scene import photographs
 from pipelines.scene.trained_survey import load_trained
 from pipelines.splat.rasterizer.backends import rasterizer
-from pipelines.view.loopback import start_server
+from pipelines.view.loopback import start_server, stop_server
 from pipelines.view.mark_panel import MarkPanel
 from pipelines.view.measure_panel import MeasurePanel
 from pipelines.view.measuring import MeasuringModel
@@ -153,7 +153,10 @@ class Viewer:
             report = read_report(workspace.path(REPORT))
         except GeorefError:
             return paragraph("No errors are shown: `georef evaluate` measures them.")
-        enlarged = self.signs.add_errors(point_errors(self.model, report))
+        errors = point_errors(self.model, report)
+        if not errors:
+            return paragraph("No control or check point has an error to show.")
+        enlarged = self.signs.add_errors(errors)
         return paragraph(f"Arrows: error by camera, × {enlarged:g}. Orange: control points and test views.")
 
     def _colour_points(self) -> None:
@@ -313,7 +316,7 @@ def serve(
         GeorefError: a product is damaged, no port is free, or the CRS cannot be used.
     """
     model_stamp(workspace)
-    server = start_server(options.port, f"georef view {workspace.root.name}")
+    server = start_server(options.port, f"georef view {workspace.root.name}", dark=options.dark)
     try:
         viewer = Viewer(server, workspace, options, progress)
         ready(f"http://{server.get_host()}:{server.get_port()}")
@@ -330,7 +333,7 @@ def serve(
                 viewer.tell("The model has changed since it was read: measurements are those of the old one.")
                 viewer.add_reload(again.set)
     finally:
-        server.stop()
+        stop_server(server)
 
 
 def _has_changed(workspace: Workspace, stamp: tuple[int, ...]) -> bool:

@@ -41,6 +41,7 @@ FLAGS = (
     "--ignore-gpu-blocklist",
     NO_NETWORK,
 )
+_FETCHING = threading.Lock()
 # CesiumJS rebuilds a changed choice of tiles after up to 30 frames, which software draws one a second at worst.
 _PATIENCE_MS = 180_000
 
@@ -49,13 +50,18 @@ class MissingProgramError(Exception):
     """Program that the tests need and that is not there; the message says what to install."""
 
 
-@functools.cache
 def cesium_folder() -> Path:
     """Return the folder of CesiumJS, which npm fetches once into a folder that git ignores.
 
     Raises:
         MissingProgramError: npm is missing or cannot fetch it.
     """
+    with _FETCHING:  # the server asks from many threads
+        return _cesium_folder()
+
+
+@functools.cache
+def _cesium_folder() -> Path:
     folder = CACHE / f"cesium-{CESIUM_VERSION}"
     if folder.is_dir():
         return folder

@@ -55,7 +55,8 @@ def command(capsys: pytest.CaptureFixture[str]) -> Command:
     def call(*arguments: object, fails: bool = False) -> Any:
         code = boundary.guarded(cli, [*map(str, arguments), *([] if fails else ["--json"])])
         captured = capsys.readouterr()
-        assert code == (1 if fails else 0), captured.err
+        # An option that is at fault alone, without any file, is a usage error.
+        assert code == (0 if not fails else 2 if captured.err.rpartition("error: ")[2].startswith("[--") else 1)
         return captured.err if fails else {**json.loads(captured.out), "err": captured.err}
 
     return call

@@ -282,3 +282,17 @@ def test_log_lines_on_a_terminal_are_marked_and_verbatim() -> None:
 
 def test_quiet_is_silent() -> None:
     assert display.progress_for(Verbosity(quiet=True)) is SILENT
+
+
+def test_finished_bars_make_room() -> None:
+    """Of more tasks than the terminal has lines, the first to end go first; those that run all stay."""
+    console = Console(force_terminal=True, width=100, height=10, file=io.StringIO())
+    progress = display.BarProgress(console)
+    with progress.task("missions", 20) as missions, progress.task("long", 5):
+        for number in range(20):
+            with progress.task(f"mission {number}", 3) as task:
+                task.advance(3)
+            missions.advance()
+        assert progress._bars is not None
+        shown = [task.description for task in progress._bars.tasks]
+    assert shown == ["missions", "long", *(f"mission {number}" for number in range(16, 20))]

@@ -61,7 +61,7 @@ def test_a_missing_file_is_told(georef: Georef, tmp_path: Path) -> None:
 class TestOfAWorkspace:
     @pytest.fixture
     def done(self, georef: Georef, workspace: Workspace, photos: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-        monkeypatch.setattr("georef_cli.dry_run._photographs", lambda *_: None)  # fake surveys have none
+        monkeypatch.setattr("georef_cli.forecast._photographs", lambda *_: None)  # fake surveys have none
         assert georef("run", workspace.root, "--images", photos, "--iterations", 300).code == 0
         return workspace.root
 

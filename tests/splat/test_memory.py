@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from pipelines.core.errors import ResourceError
+from pipelines.core.free_memory import _free_in_group
 from pipelines.geometry.cameras import Pinhole
 from pipelines.splat.memory import (
     TrainingSize,
-    _free_in_group,
     free_memory_bytes,
     predicted_peak_bytes,
     require_memory,

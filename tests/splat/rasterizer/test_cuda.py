@@ -104,7 +104,7 @@ def test_no_device(monkeypatch):
 def test_no_gsplat(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setitem(sys.modules, "gsplat", None)
-    with pytest.raises(BackendUnavailableError, match=r"pip install 'georefgs\[cuda\]'"):
+    with pytest.raises(BackendUnavailableError, match=r"install the extra cuda .*pip install gsplat"):
         cuda.CudaRasterizer()
 
 

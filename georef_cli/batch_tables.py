@@ -1,0 +1,95 @@
+"""Tables of `georef batch` for people."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from georef_cli.forecast import RunForecast
+from georef_cli.layout import ByWidth, plain_table
+from georef_cli.markup import shown
+from georef_cli.tables import WIDE, Renderable
+from pipelines.batch.runner import PlannedMission
+from pipelines.batch.table import BatchTable, MissionRow
+from pipelines.core.sentences import about, duration
+
+_STYLE = {"done": "green", "current": "green", "failed": "red", "interrupted": "yellow", "waiting": "dim"}
+_DASH = "–"
+
+
+def batch(table: BatchTable, page: Path) -> list[Renderable]:
+    """Return the table of a batch, its failures, and where the page of it is."""
+    wide = plain_table(
+        *("mission", "state", "took", "photographs", "σ H", "σ V", "checks", "RMSE H", "RMSE V", "PSNR", "remarks"),
+        right=range(2, 11),
+    )
+    narrow = plain_table("mission", "state", "took", "σ H", "σ V", "RMSE H", "RMSE V", "remarks", right=range(2, 8))
+    for row in table.missions:
+        state = f"[{_STYLE[row.state]}]{row.state}[/]"
+        accuracy = [_metres(value) for value in (row.sigma_h_m, row.sigma_v_m)]
+        errors = [_metres(value) for value in (row.rmse_h_m, row.rmse_v_m)]
+        took = duration(row.processing_s if row.seconds is None else row.seconds)
+        remarks = str(len(row.warnings) + len(row.cautions) or "")
+        checks = _DASH if row.check_points is None else str(row.check_points)
+        psnr = _DASH if row.test_psnr is None else f"{row.test_psnr:.2f}"
+        wide.add_row(shown(row.mission), state, took, _photographs(row), *accuracy, checks, *errors, psnr, remarks)
+        narrow.add_row(shown(row.mission), state, took, *accuracy, *errors, remarks)
+    failures = [
+        f"[red]{shown(row.mission)}[/] {shown(row.failure)}"
+        + ("" if row.log is None else f" [dim]{shown(row.log)}[/]")
+        for row in table.missions
+        if row.failure is not None
+    ]
+    states = ", ".join(f"{count} {state}" for state, count in table.counts.items())
+    ending = f"\n{len(table.missions)} missions: {states}. Accuracy in metres; all of it is in {shown(str(page))}"
+    return [ByWidth(WIDE, wide, narrow), *(["", *failures] if failures else []), ending]
+
+
+def dry_rows(missions: Iterable[tuple[PlannedMission, RunForecast | None]]) -> list[dict[str, Any]]:
+    """Return what a batch would do, a row for each mission, as plain values."""
+    return [
+        {
+            "mission": planned.mission.name,
+            "workspace": str(planned.mission.workspace.root),
+            "stages": dict(planned.actions),
+            "refusal": planned.refusal,
+            "photographs": run.photographs.count if run is not None and run.photographs is not None else None,
+            "seconds": None if run is None else sum(value or 0.0 for value in run.seconds.values()),
+            "peak_bytes": planned.job().peak_bytes,
+        }
+        for planned, run in missions
+    ]
+
+
+def dry_run(rows: Sequence[dict[str, Any]], together: int) -> list[Renderable]:
+    """Return the table of a dry run.
+
+    Args:
+        rows: from `dry_rows`.
+        together: number of missions that run at a time.
+    """
+    table = plain_table("mission", "photographs", "about", "memory", "stages to run", right=[1, 2, 3])
+    for row in rows:
+        stages = ", ".join(stage for stage, action in row["stages"].items() if action != "keep")
+        table.add_row(
+            shown(row["mission"]),
+            _DASH if row["photographs"] is None else str(row["photographs"]),
+            about(row["seconds"] or None),
+            f"{row['peak_bytes'] / 2**30:.1f} GiB",
+            f"[red]refused:[/] {shown(row['refusal'])}" if row["refusal"] else stages or "nothing to do",
+        )
+    return [
+        table,
+        f"\n{together} at a time. [dim]Nothing was run. Times are for one mission alone on an idle machine.[/]",
+    ]
+
+
+def _photographs(row: MissionRow) -> str:
+    if row.images is None:
+        return _DASH
+    return str(row.images) if row.registered is None else f"{row.registered} of {row.images}"
+
+
+def _metres(value: float | None) -> str:
+    return _DASH if value is None else f"{value:.3f}"

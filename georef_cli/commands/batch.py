@@ -1,0 +1,125 @@
+"""Command `georef batch`."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import click
+
+from georef_cli import batch_tables, options
+from georef_cli.command import Command
+from georef_cli.commands.run import OWNERS, deliver_option, slice_option
+from georef_cli.display import progress_for
+from georef_cli.forecast import RunForecast, forecast_run
+from georef_cli.output import print_json, print_rich
+from georef_cli.settings import set_option, settings
+from pipelines.batch.missions import Mission, MissionList, load_missions
+from pipelines.batch.runner import PlannedMission
+from pipelines.core import runner
+from pipelines.core.errors import GeorefError
+from pipelines.core.free_memory import free_main_memory_bytes
+from pipelines.core.plan import plan
+from pipelines.core.stages import BY_NAME
+from pipelines.core.threads import thread_count
+from pipelines.engine.local import LocalEngine
+
+log = logging.getLogger(__name__)
+
+FAILED = 1
+
+
+def _batch(ctx: click.Context, **values: Any) -> int:
+    from pipelines.batch.files import page_file
+    from pipelines.batch.runner import run_batch
+
+    listed = _missions(values)
+    forecasts = [_planned(mission) for mission in listed.missions]
+    planned = [mission for mission, _ in forecasts]
+    cores = thread_count()
+    engine = LocalEngine(values["at_a_time"] or cores, cores, free_main_memory_bytes())
+    if values["dry_run"]:
+        rows = batch_tables.dry_rows(forecasts)
+        if values["as_json"]:
+            print_json({"batch": listed.name, "missions": rows})
+        else:
+            together = engine.together([row.job() for row in planned if not row.is_current])
+            print_rich(*batch_tables.dry_run(rows, together))
+        return 0
+    table = run_batch(listed, planned, engine, progress_for(ctx.obj))
+    if values["as_json"]:
+        print_json(table.model_dump(mode="json"))
+    else:
+        print_rich(*batch_tables.batch(table, page_file(listed.folder, listed.name)))
+    return 0 if table.is_complete else FAILED
+
+
+def _missions(values: dict[str, Any]) -> MissionList:
+    """Return the missions, with the options of the command line for all of them.
+
+    Raises:
+        InputError: a bad name, key or value in the file.
+        click.UsageError: a bad option.
+    """
+    flags = settings(values["settings"], BY_NAME.values())
+    try:
+        return load_missions(values["missions"], OWNERS).overridden(values["last"], values["deliver"], flags)
+    except ValueError as error:
+        raise click.UsageError(f"--deliver: {error}") from error
+
+
+def _planned(mission: Mission) -> tuple[PlannedMission, RunForecast | None]:
+    """Return a mission with what its run needs; the forecast is None where the run will be refused, or unknown."""
+    try:
+        asked = {
+            spec.name: runner.remembered(mission.workspace, spec, mission.flags.get(spec.name, {}))
+            for spec in mission.stages
+        }
+        actions = {row.stage: row.action for row in plan(mission.workspace, mission.stages, asked)}
+    except GeorefError as error:
+        return PlannedMission(mission, {}, refusal=str(error)), None
+    try:
+        run = forecast_run(mission.workspace, mission.stages, asked, force=False)
+    except GeorefError as error:  # The run itself will tell it.
+        log.debug("%s: no forecast: %s", mission.name, error)
+        run = None
+    if run is None or run.training is None:
+        return PlannedMission(mission, actions), run
+    on_gpu = run.training.backend == "cuda"
+    return PlannedMission(mission, actions, 0 if on_gpu else run.training.peak_bytes, on_gpu), run
+
+
+command = Command(
+    "batch",
+    params=[
+        click.Argument(["missions"], type=click.Path(resolve_path=True, path_type=Path)),
+        click.Option(
+            ["--at-a-time"],
+            type=click.IntRange(min=1),
+            metavar="N",
+            help="Run at most this many missions at a time (default: as many as cores and predicted memory allow).",
+        ),
+        slice_option(["--to", "--end-with"], "last", "Last stage to run, of every mission."),
+        deliver_option(),
+        set_option(),
+        options.dry_run_option(),
+        options.json_option(),
+    ],
+    callback=click.pass_context(_batch),
+    help="""Run many missions, several at a time, and put their results into one table.
+
+        MISSIONS is a TOML file with [defaults] and one table a mission, or a folder of mission folders
+        (docs/batch.md). A mission is a workspace: georef run completes it, in a process of its own, skips what is
+        current and resumes what was interrupted. One that fails is reported, and the others finish. The table is
+        also written beside the missions, as NAME.batch.json and NAME.batch.html. Ctrl-C stops all missions, which
+        save their work; the same command goes on. Exit code 1: a mission failed.
+
+        \b
+        Examples:
+          georef batch missions.toml --dry-run
+          georef batch missions.toml
+          georef batch flights --set train.preset=fast --deliver report
+          georef batch missions.toml --at-a-time 2 --json
+        """,
+)

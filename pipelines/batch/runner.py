@@ -1,0 +1,110 @@
+"""Run of a batch: each mission is `georef run` in a process of its own, and the table follows their ends."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pipelines.batch.files import write_batch
+from pipelines.batch.missions import Mission, MissionList
+from pipelines.batch.table import BatchTable, mission_row, state_of
+from pipelines.core.plan import Action
+from pipelines.core.progress import Progress
+from pipelines.engine.job import Engine, Job, JobEnd
+
+log = logging.getLogger(__name__)
+
+# Interpreter, libraries, COLMAP's features of large photographs: on top of what is predicted for the training.
+BASE_BYTES = 1 << 30
+
+
+@dataclass(frozen=True)
+class PlannedMission:
+    """Mission with the forecast of its run.
+
+    Attributes:
+        mission: the mission.
+        actions: what its run would do with each stage; none where the run will be refused.
+        refusal: reason why the run will be refused, else empty.
+        training_bytes: predicted peak of its training in main memory; 0 without one, or if unknown.
+        uses_gpu: whether it trains on a GPU.
+    """
+
+    mission: Mission
+    actions: Mapping[str, Action]
+    training_bytes: int = 0
+    uses_gpu: bool = False
+    refusal: str = ""
+
+    @property
+    def is_current(self) -> bool:
+        """Whether there is nothing to do."""
+        return bool(self.actions) and all(action == "keep" for action in self.actions.values())
+
+    def job(self) -> Job:
+        """Return the command that completes the mission."""
+        peak_bytes = BASE_BYTES + self.training_bytes
+        return Job(self.mission.name, run_arguments(self.mission), peak_bytes, self.uses_gpu)
+
+
+def run_batch(
+    listed: MissionList, planned: Sequence[PlannedMission], engine: Engine, progress: Progress
+) -> BatchTable:
+    """Run the missions that are not current, and return the table of all; one that fails stops no other.
+
+    The table is written beside the missions at the beginning and at the end of each mission, as JSON and as a page.
+
+    Args:
+        listed: the missions.
+        planned: the same with their forecasts, in the same order.
+        engine: runs them.
+        progress: shows all missions, and one line for each that runs.
+
+    Raises:
+        KeyboardInterrupt: the user stopped the batch; the missions that ran have saved their work.
+        OSError: the table cannot be written.
+    """
+    rows = {
+        plan.mission.name: mission_row(plan.mission, "current" if plan.is_current else "waiting")
+        for plan in planned
+    }
+
+    def table() -> BatchTable:
+        return BatchTable(batch=listed.name, missions=tuple(rows.values()))
+
+    def ended(end: JobEnd) -> None:
+        rows[end.job.name] = mission_row(by_name[end.job.name], state_of(end), end)
+        write_batch(listed.folder, table())
+
+    by_name = {plan.mission.name: plan.mission for plan in planned}
+    write_batch(listed.folder, table())
+    jobs = [plan.job() for plan in planned if not plan.is_current]
+    if jobs:
+        engine.run("missions", jobs, ended, progress)
+    return table()
+
+
+def run_arguments(mission: Mission) -> tuple[str, ...]:
+    """Return the arguments of `georef` that run a mission; paths in them are absolute."""
+    running = {spec.name for spec in mission.stages}
+    settings = [
+        f"{stage}.{option}={_literal(value)}"
+        for stage, flags in mission.flags.items()
+        if stage in running
+        for option, value in flags.items()
+    ]
+    return (
+        *("run", str(mission.workspace.root.absolute())),
+        *(("--to", mission.last) if mission.last else ()),
+        *(("--deliver", mission.deliver) if mission.deliver else ()),
+        *(word for setting in settings for word in ("--set", setting)),
+    )
+
+
+def _literal(value: Any) -> str:
+    """Return a value as TOML writes it, for which JSON's form of texts, numbers and lists will do."""
+    return json.dumps(str(value) if isinstance(value, Path) else value, ensure_ascii=False)

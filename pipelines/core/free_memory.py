@@ -1,0 +1,60 @@
+"""Free main memory of the machine, or of the container that this process runs in."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import sys
+from pathlib import Path
+
+
+def free_main_memory_bytes() -> int | None:
+    """Return the memory that programs may still take; None if the system does not state it."""
+    known = [free for free in (_free_in_system(), _free_in_group(Path("/sys/fs/cgroup"))) if free is not None]
+    return min(known) if known else None
+
+
+def _free_in_system() -> int | None:
+    if sys.platform == "win32":
+        status = _WindowsMemory(length=ctypes.sizeof(_WindowsMemory))
+        return status.free_bytes if ctypes.windll.kernel32.GlobalMemoryStatusEx(ctypes.byref(status)) else None
+    try:
+        for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
+            if line.startswith("MemAvailable:"):
+                return int(line.split()[1]) * 1024
+    except (OSError, ValueError):
+        pass
+    try:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, ValueError, OSError):
+        return None
+
+
+class _WindowsMemory(ctypes.Structure):
+    """MEMORYSTATUSEX of the Windows API."""
+
+    _fields_ = (
+        ("length", ctypes.c_uint32),
+        ("load_percent", ctypes.c_uint32),
+        ("total_bytes", ctypes.c_uint64),
+        ("free_bytes", ctypes.c_uint64),
+        ("paging", ctypes.c_uint64 * 2),
+        ("address_space", ctypes.c_uint64 * 3),
+    )
+
+    length: int
+    free_bytes: int
+
+
+def _free_in_group(root: Path) -> int | None:
+    """Return the memory that a container's control group (v2) leaves; droppable file cache counts as free."""
+    try:
+        limit = (root / "memory.max").read_text(encoding="ascii").strip()
+        if limit == "max":
+            return None
+        used = int((root / "memory.current").read_text(encoding="ascii"))
+        rows = (line.split() for line in (root / "memory.stat").read_text(encoding="ascii").splitlines())
+        cache = next((int(value) for name, value in rows if name == "inactive_file"), 0)
+        return max(int(limit) - used + cache, 0)
+    except (OSError, ValueError):
+        return None
