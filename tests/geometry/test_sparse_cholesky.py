@@ -29,7 +29,7 @@ def coupled(position: np.ndarray, reach: float, extra: int, rng: np.random.Gener
     )
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(
     count=st.integers(1, 80),
     reach=st.floats(0.0, 0.4),
