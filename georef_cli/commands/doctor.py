@@ -51,7 +51,7 @@ def _lines(machine: Machine) -> list[tuple[str, str]]:
     lines += [
         ("PROJ grids", shown(", ".join(grids) + more) if grids else none),
         ("in", shown(", ".join(machine.grid_folders))),
-        ("Chromium", shown(machine.chromium or "not found; it is needed to test pages only")),
+        ("Chromium", shown(machine.chromium or "not found; `georef report --pdf` needs it")),
     ]
     versions = ", ".join(f"{name} {version}" for name, version in machine.versions.items())
     return [*lines, ("versions", shown(versions))]

@@ -89,9 +89,7 @@ class AccuracyPrediction:
             point: (K,) index into the points, of each ray.
             camera: (K,) index of the camera that sees the point.
         """
-        sigma_px = mean_focal_px(self._solved.scene.sparse, camera)  # all rays have the same angular σ
-        jacobian = jacobian_of_points(self._solved, point_in_geo, point, camera, sigma_px)
-        return self._covariance(point_in_geo, jacobian)
+        return self._covariance(point_in_geo, self._jacobian_of_scene(point_in_geo, point, camera))
 
     def jointly_of_scene(self, point_in_geo: FloatArray, point: IntArray, camera: IntArray) -> FloatArray:
         """Return the joint covariance (3 J, 3 J) in m² of points of the scene, without errors of marks.
@@ -101,8 +99,7 @@ class AccuracyPrediction:
             point: (K,) index into the points, of each ray.
             camera: (K,) index of the camera that sees the point.
         """
-        sigma_px = mean_focal_px(self._solved.scene.sparse, camera)  # all rays have the same angular σ
-        jacobian = jacobian_of_points(self._solved, point_in_geo, point, camera, sigma_px)
+        jacobian = self._jacobian_of_scene(point_in_geo, point, camera)
         return np.asarray(self._posterior.jointly_at(point_in_geo, *self._derivatives(jacobian)))
 
     def of_cameras(self) -> FloatArray:
@@ -129,6 +126,12 @@ class AccuracyPrediction:
     def holds_cameras(self) -> bool:
         """Whether the training held the cameras, so that their own errors are not predicted."""
         return not self._basis.shape[2]
+
+    def _jacobian_of_scene(
+        self, point_in_geo: FloatArray, point: IntArray, camera: IntArray
+    ) -> IntersectionJacobian:
+        sigma_px = mean_focal_px(self._solved.scene.sparse, camera)  # all rays have the same angular σ
+        return jacobian_of_points(self._solved, point_in_geo, point, camera, sigma_px)
 
     def _covariance(self, point_in_geo: FloatArray, jacobian: IntersectionJacobian) -> FloatArray:
         return self._posterior.at(point_in_geo, *self._derivatives(jacobian))

@@ -7,7 +7,6 @@ Input is hostile until parsed. Workspaces lie inside the folder of the file. A t
 from __future__ import annotations
 
 import re
-import tomllib
 import unicodedata
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -18,7 +17,7 @@ from pydantic import ValidationError
 
 from pipelines.core.errors import GeorefError, InputError
 from pipelines.core.files import file_size
-from pipelines.core.options import CONFIG_FILE, input_markers, load_toml
+from pipelines.core.options import CONFIG_FILE, input_markers, load_toml, read_toml
 from pipelines.core.requests import REQUESTS
 from pipelines.core.stages import BY_NAME, StageSpec, named_deliverables, stage_slice
 from pipelines.core.staleness import Flags
@@ -142,12 +141,7 @@ def _in_folder(folder: Path) -> MissionList:
 
 def _in_file(path: Path, owners: Owners) -> MissionList:
     file_size(path, limit_bytes=_MAX_TOML_BYTES, kind="list of missions")
-    try:
-        document = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(f"not valid TOML: {error}", path=path) from error
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", path=path) from error
+    document = read_toml(path)
     for key, value in document.items():
         if key not in ("defaults", "missions"):
             raise InputError("unknown table; there are defaults and missions", path=path, field=key)

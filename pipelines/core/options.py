@@ -190,6 +190,20 @@ def resolve(
     return options
 
 
+def read_toml(path: Path) -> dict[str, Any]:
+    """Return the document of a TOML file, whose size was checked before.
+
+    Raises:
+        InputError: the file cannot be read or is not TOML.
+    """
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise InputError(f"not valid TOML: {error}", path=path) from error
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror}", path=path) from error
+
+
 def load_toml(path: Path, stages: Collection[str]) -> dict[str, dict[str, Any]]:
     """Read `georef.toml` and return its tables by stage; a missing file has none.
 
@@ -199,12 +213,7 @@ def load_toml(path: Path, stages: Collection[str]) -> dict[str, dict[str, Any]]:
     if not path.exists():
         return {}
     file_size(path, limit_bytes=_MAX_TOML_BYTES)
-    try:
-        document = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(f"not valid TOML: {error}", path=path) from error
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", path=path) from error
+    document = read_toml(path)
     for name, table in document.items():
         if name not in stages:
             raise InputError(f"unknown table; the stages are {', '.join(stages)}", path=path, field=name)

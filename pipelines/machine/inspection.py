@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import platform
-import shutil
 from dataclasses import dataclass
 
 import torch
@@ -13,6 +12,7 @@ from pipelines.core.errors import BackendUnavailableError
 from pipelines.core.threads import available_cores, thread_count
 from pipelines.core.versions import library_versions
 from pipelines.geodesy.grids import grid_folders, installed_grids
+from pipelines.pages.chromium import named_or_installed
 from pipelines.splat.memory import free_memory_bytes
 from pipelines.splat.rasterizer.backends import BACKENDS, BackendName, rasterizer
 
@@ -20,7 +20,6 @@ _LIBRARIES = (
     *("numpy", "scipy", "numba", "torch", "gsplat", "pycolmap", "opencv-contrib-python-headless"),
     *("pyproj", "rasterio", "laspy", "pyogrio", "rosbags", "matplotlib", "click", "rich"),
 )
-_CHROMIUM = ("chromium", "chromium-browser", "google-chrome", "chrome")
 
 
 @dataclass(frozen=True)
@@ -85,7 +84,7 @@ def inspect_machine() -> Machine:
         backends=tuple(_backend(name) for name in BACKENDS),
         grid_folders=tuple(map(str, grid_folders())),
         grids=tuple(installed_grids()),
-        chromium=os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, _CHROMIUM)), None),
+        chromium=named_or_installed(),
         versions=library_versions(_LIBRARIES),
     )
 

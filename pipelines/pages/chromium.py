@@ -11,7 +11,7 @@ from pathlib import Path
 from pipelines.core.durable import replace_file
 from pipelines.core.errors import BackendUnavailableError, CrashError
 
-_ON_PATH = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "msedge")
+_ON_PATH = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome", "msedge")
 # Where browsers are on macOS and Windows, which do not put them on PATH.
 _INSTALLED = (
     "/Applications/Google Chrome.app/Contents/MacOS/Google Chrome",
@@ -24,18 +24,22 @@ _PATIENCE_S = 300.0
 _LONGEST_MESSAGE = 300
 
 
+def named_or_installed() -> str | None:
+    """Return Chromium or Chrome as the variable CHROMIUM names it, else where it is installed; None: nowhere."""
+    on_path = (shutil.which(name) for name in _ON_PATH)
+    installed = (place for place in _INSTALLED if Path(place).is_file())
+    return os.environ.get("CHROMIUM") or next(filter(None, [*on_path, *installed]), None)
+
+
 def chromium_path() -> str:
     """Return the path of Chromium or Chrome: that of the variable CHROMIUM, on PATH, or where it is installed.
 
     Raises:
         BackendUnavailableError: there is none; says what to install.
     """
-    on_path = (shutil.which(name) for name in _ON_PATH)
-    installed = (place for place in _INSTALLED if Path(place).is_file())
-    named = os.environ.get("CHROMIUM")
-    if named and shutil.which(named) is None:
-        raise BackendUnavailableError(f"the variable CHROMIUM names {named}, which is no program: correct it")
-    browser = named or next(filter(None, [*on_path, *installed]), None)
+    browser = named_or_installed()
+    if os.environ.get("CHROMIUM") and browser and shutil.which(browser) is None:
+        raise BackendUnavailableError(f"the variable CHROMIUM names {browser}, which is no program: correct it")
     if browser is None:
         raise BackendUnavailableError(
             "Chromium is missing: install it (`apt-get install chromium`, or Chrome from google.com/chrome), or "

@@ -48,6 +48,10 @@ class ModelRenderer:
         device = torch.device("cuda" if backend.name == "cuda" else "cpu")
         self._gaussians = trained.gaussians.to(device)
 
+    def prepare_windows(self) -> None:
+        """Sort the Gaussians for windows: a second for a million, which the first window would take otherwise."""
+        _ = self._blocks
+
     @cached_property
     def _blocks(self) -> SpatialBlocks:
         return SpatialBlocks(self.trained.gaussians)

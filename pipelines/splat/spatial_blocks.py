@@ -12,12 +12,12 @@ from pipelines.core.types import FloatArray
 from pipelines.geometry.cameras import Pinhole
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.morton import morton_codes
-from pipelines.splat.rasterizer.api import ALPHA_MIN, RasterSettings
+from pipelines.splat.rasterizer.api import RasterSettings
+from pipelines.splat.rasterizer.cpu_slope import WIDEST
 from pipelines.splat.rasterizer.reference import FRUSTUM_MARGIN
 
 _BLOCK = 128
 _CLASSES = 8  # of size: a few huge Gaussians must not make every block huge
-_REACH = math.sqrt(-2 * math.log(ALPHA_MIN))  # in σ, at full opacity
 
 
 class SpatialBlocks:
@@ -29,7 +29,7 @@ class SpatialBlocks:
 
     def __init__(self, gaussians: Gaussians) -> None:
         means = gaussians.means.detach().double()
-        reach = _REACH * torch.exp(gaussians.log_scales.detach().double().amax(dim=1))
+        reach = WIDEST * torch.exp(gaussians.log_scales.detach().double().amax(dim=1))
         usable = torch.nonzero(torch.isfinite(means).all(dim=1) & torch.isfinite(reach)).squeeze(1)
         means, reach = means[usable], reach[usable]
         order = _order(means, reach)
@@ -58,7 +58,7 @@ class SpatialBlocks:
             (y, image.height, image.fy, image.cy, camera.height, camera.cy),
         ):
             low, high = -middle / focal, (size - middle) / focal
-            margin = _REACH * math.sqrt(settings.dilation_px2) / focal
+            margin = WIDEST * math.sqrt(settings.dilation_px2) / focal
             slope = max(of_whole, whole - of_whole) / focal + FRUSTUM_MARGIN * 0.5 * whole / focal
             stretch = math.hypot(1.0, slope)  # of a σ on the screen
             own = stretch * self._reach + margin * np.maximum(z + self._radius, 0.0)

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines.core.errors import GeorefError
 from pipelines.core.types import FloatArray
 from pipelines.geometry.cameras import distort
 from pipelines.geometry.lens import bearings
@@ -24,6 +22,7 @@ from pipelines.view.marking import (
     write_marks,
 )
 from pipelines.view.measuring import MeasuringModel
+from pipelines.view.panel import Panel
 from pipelines.view.photo_view import PhotoView
 from pipelines.view.signs import Signs
 from pipelines.view.surface_points import SurfacePoint
@@ -35,7 +34,7 @@ if TYPE_CHECKING:
 _NONE = "—"
 
 
-class MarkPanel:
+class MarkPanel(Panel):
     """Panel of the marks.
 
     Args:
@@ -78,15 +77,6 @@ class MarkPanel:
         gui.add_command("Next photograph", hotkey="N").on_trigger(lambda _: self.turn(1))
         gui.add_command("Previous photograph", hotkey="B").on_trigger(lambda _: self.turn(-1))
         gui.add_command("Whole photograph", hotkey="M").on_trigger(lambda _: self._photo.whole())
-
-    def _button(self, gui: viser.GuiApi, label: str, act: Callable[[], None]) -> None:
-        gui.add_button(label).on_click(lambda _: self._safely(act))
-
-    def _safely(self, act: Callable[[], None]) -> None:
-        try:
-            act()
-        except GeorefError as error:
-            self._tell(str(error))
 
     def _options(self) -> tuple[str, ...]:
         return tuple(point.name for point in self._points) or (_NONE,)
@@ -193,9 +183,6 @@ class MarkPanel:
             return
         names, heights = ", ".join(map(str, files)), self._model.target.crs.vertical.name
         self._result.content = paragraph(f"Written: {names}. Heights: {heights}.", mark="written")
-
-    def _tell(self, sentence: str) -> None:
-        self._result.content = paragraph(sentence)
 
     def _show(self) -> None:
         """Show the chosen point: its marks, what they give, and where it must appear in the photograph."""

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 
-from pipelines.core.errors import GeorefError
 from pipelines.geodesy.enu import ecef_from_enu, lla_from_ecef
 from pipelines.scene.marks import mark_rays
 from pipelines.scene.survey import SurveyedPoint
 from pipelines.view.measuring import MeasuringModel
+from pipelines.view.panel import Panel
 from pipelines.view.quantities import BaseKind, BasePlane, Quantity
 from pipelines.view.saved import (
     Kind,
@@ -36,7 +36,7 @@ _CLOSED = ("area", "volume")
 _BASES: tuple[BaseKind, ...] = get_args(BaseKind)
 
 
-class MeasurePanel:
+class MeasurePanel(Panel):
     """Panel of the measurements.
 
     Args:
@@ -90,24 +90,15 @@ class MeasurePanel:
         self._base = gui.add_dropdown("Base of a volume", _BASES)
         self._result = gui.add_html("")
         self._name = gui.add_text("Name", "")
-        self._button("Save", gui, self.save)
-        self._button("Take the last point back", gui, self.take_back)
-        self._button("Clear", gui, self.clear)
+        self._button(gui, "Save", self.save)
+        self._button(gui, "Take the last point back", self.take_back)
+        self._button(gui, "Clear", self.clear)
         self._list = gui.add_html("")
         self._chosen = gui.add_dropdown("Saved", ("—",))
-        self._button("Delete the saved one", gui, self._delete)
+        self._button(gui, "Delete the saved one", self._delete)
         self.kind.on_update(lambda _: self.clear())
         self._base.on_update(lambda _: self._compute())
         self.clear()
-
-    def _button(self, label: str, gui: viser.GuiApi, act: Callable[[], None]) -> None:
-        gui.add_button(label).on_click(lambda _: self._safely(act))
-
-    def _safely(self, act: Callable[[], None]) -> None:
-        try:
-            act()
-        except GeorefError as error:
-            self._tell(str(error))
 
     def add_sight(self, sight: Sight) -> None:
         """Measure the surface under a line of sight."""
@@ -207,9 +198,6 @@ class MeasurePanel:
     def _without_sigma(self) -> str:
         reason = self._model.without_sigma
         return paragraph(f"No σ is stated: {reason}.") if reason else ""
-
-    def _tell(self, sentence: str) -> None:
-        self._result.content = paragraph(sentence)
 
     def take_back(self) -> None:
         """Take the last point of the measurement back."""

@@ -140,15 +140,12 @@ class Signs:
             self._scene.add_label(f"{name}/name", point.name, position=(0.0, 0.0, SIGN_RADIUS))
 
     def add_errors(self, errors: Sequence[PointError]) -> float:
-        """Draw error arrows, enlarged so that they are seen; return by how much."""
-        known = [error for error in errors if np.isfinite(error.measured).all()]
-        if not known:
-            return 1.0
-        longest = max(float(np.linalg.norm(error.measured - error.surveyed)) for error in known)
+        """Draw at least one error arrow, enlarged so that they are seen; return by how much."""
+        longest = max(float(np.linalg.norm(error.measured - error.surveyed)) for error in errors)
         scale = self._frame.view_from_model.scale
         enlarged = _round_factor(_LENGTH / max(longest * scale, 1e-12))
         ends = [
-            (self.place(e.surveyed), self.place(e.surveyed + enlarged * (e.measured - e.surveyed))) for e in known
+            (self.place(e.surveyed), self.place(e.surveyed + enlarged * (e.measured - e.surveyed))) for e in errors
         ]
         self._scene.add_arrows(
             "/errors/all", np.array(ends), rgb(ORANGE), shaft_radius=0.015, head_radius=0.04, head_length=0.1
@@ -199,6 +196,7 @@ class Signs:
 
 
 def wxyz_of(rotation: FloatArray) -> FloatArray:
+    """Return the quaternion (4,) of a rotation (3, 3), real part first."""
     x, y, z, w = quat_xyzw_from_matrix(rotation)
     return np.array([w, x, y, z])
 

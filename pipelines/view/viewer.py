@@ -89,6 +89,7 @@ class Viewer:
     def _propagate_errors(self) -> None:
         """Compute σ after the first picture, which should not wait for them."""
         self._first_drawn.wait(_FIRST_S)
+        self._renderer.prepare_windows()  # for the first click
         try:
             self.model.propagate_errors()
         except GeorefError as error:
@@ -128,7 +129,6 @@ class Viewer:
         gui.add_button("Fly there").on_click(lambda _: self.photo.show(names.index(self._photo.value)))
         share = gui.add_slider("Photograph over splat", 0.0, 1.0, 0.05, 1.0)
         gui.add_button("Leave the photograph").on_click(lambda _: self._leave())
-        self._where = gui.add_html("")
         shown: tuple[tuple[str, Kind, bool], ...] = (
             ("Cameras", "cameras", True),
             ("Control and check points", "points", True),
@@ -174,7 +174,6 @@ class Viewer:
 
     def _leave(self) -> None:
         self.photo.leave()
-        self._where.content = ""
         for client in self._server.get_clients().values():
             self._stand_above(client)
 
