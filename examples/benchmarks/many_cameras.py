@@ -210,7 +210,7 @@ def measure(count: int, points_per_camera: int, controls: int, seed: int) -> Non
         problem = problem_of(network, truth, control, rng)
         by_lens = intersection_jacobian(of_control(control, network), np.full(len(control.point), _MARK_PX)).by_lens
     with timed("minimum"):
-        state = minimise_sparse(problem, bundle)
+        state = minimise_sparse(problem, bundle).state
     with timed("posterior"):
         posterior = SparsePosterior(problem, bundle, state, by_lens)
     with timed("covariances of all cameras"):

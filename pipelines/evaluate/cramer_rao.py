@@ -180,10 +180,8 @@ def cramer_rao_bound(solved: SolvedSurvey, rays: MarkRays) -> FloatArray:
         DegenerateGeometryError: too many cameras, or the measurements do not determine cameras and lens.
     """
     scene, trained = solved.scene, solved.trained
-    if scene.correction_basis is None:
-        raise DegenerateGeometryError(f"{len(scene.sparse.image_name)} cameras are too many for the bound")
     network = in_geo(scene.network, trained.geo_from_model)
-    information = CameraInformation(network, scene.correction_basis.sigma_px, _anchors(solved, network))
+    information = CameraInformation(network, scene.bundle.sigma_px, _anchors(solved, network))
     position = np.array([point.position_in_geo for point in trained.survey.check_points]).reshape(-1, 3)
     return information.bound(network_of_points(network, position, rays.point, rays.camera), rays.sigma_px)
 

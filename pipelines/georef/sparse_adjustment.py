@@ -35,7 +35,7 @@ from pipelines.core.errors import ConvergenceError, DegenerateGeometryError
 from pipelines.core.types import FloatArray
 from pipelines.geometry.bundle_information import BundleInformation
 from pipelines.geometry.sparse_cholesky import SparseCholesky
-from pipelines.georef.normal_equations import Weights, robust_weights
+from pipelines.georef.normal_equations import Residuals, Weights, robust_cost, robust_weights
 from pipelines.georef.problem import GeoProblem
 from pipelines.georef.sparse_observations import (
     SparseObservations,
@@ -118,6 +118,15 @@ class SparseEquations:
         solved = self._schur.solve(left.reshape(-1, left.shape[-1]).T).T.reshape(left.shape)
         return np.asarray(left @ np.swapaxes(solved, -1, -2))
 
+    def by_border(self, kind: str) -> FloatArray:
+        """Return the derivatives (M d, b) of observations of a kind by the border unknowns."""
+        rows = _by_border(self._observations[kind], self._bundle)
+        return np.pad(rows, ((0, 0), (0, len(self._border) - rows.shape[1])))
+
+    def covariance_of_known(self, count: int) -> FloatArray:
+        """Return the covariance (count, count) of the first border unknowns: similarity, then constant errors."""
+        return self.border_form(np.eye(count, len(self._border)))
+
     def response_to(self, kind: str, change: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the change (6 n, c) and (b, c) of the unknowns by changes (M d, c) of whitened measurements."""
         rows = self._observations[kind]
@@ -128,30 +137,52 @@ class SparseEquations:
         return self.solve(np.asarray(rows.by_poses.T @ weighted), border)
 
 
-def minimise_sparse(problem: GeoProblem, bundle: BundleInformation, *, lens_follows: bool = True) -> State:
+@dataclass(frozen=True)
+class SparseMinimum:
+    """Minimum of a problem.
+
+    Attributes:
+        state: values of all unknowns.
+        cost: −2 ln likelihood, with the priors.
+        equations: factorised near the minimum, with robust weights.
+    """
+
+    state: State
+    cost: float
+    equations: SparseEquations
+
+
+def minimise_sparse(
+    problem: GeoProblem,
+    bundle: BundleInformation,
+    *,
+    lens_follows: bool = True,
+    equations: SparseEquations | None = None,
+) -> SparseMinimum:
     """Return the minimum of a problem's whitened loss over similarity, constant errors, and all cameras with lens.
 
-    The minimum is that of `georef.posterior.minimise` with the basis of `geometry.correction_basis`. Similarity and
-    constant errors start from the state of the problem, which is left as it is; cameras and lens start uncorrected.
+    The minimum is that of `georef.posterior.minimise` with the basis of `geometry.correction_basis`. All unknowns
+    start from the state of the problem, which is left as it is.
 
     Args:
-        problem: the measurements. The corrections of its cameras are not used.
-        bundle: information of the image observations, at the poses of the problem's cameras.
+        problem: the measurements.
+        bundle: information of the image observations, at the uncorrected poses of the problem's cameras.
         lens_follows: whether the lens follows the cameras, as `bundle` was made with.
+        equations: of a state near by, whose factor the first steps take; None: there are none.
 
     Raises:
         ConvergenceError: the steps do not end.
         DegenerateGeometryError: the measurements leave the similarity open.
     """
     unknowns, prior = _start(problem, bundle), (prior_of_poses(bundle), _prior_of_border(problem, bundle))
-    colours, equations, before, last = colours_of_cameras(problem), None, None, np.inf
+    colours, before, last = colours_of_cameras(problem), None, np.inf
     for _ in range(_ROUNDS):
         state = _state(problem, bundle, unknowns, lens_follows)
         residuals, slope = residuals_and_slope(problem, state, robust_weights)
         if before is not None:
             change = max((float(np.abs(residuals[kind] - before[kind]).max()) for kind in residuals), default=0.0)
-            if change < _STILL:
-                return state
+            if change < _STILL and equations is not None:
+                return SparseMinimum(state, _cost(prior, residuals, unknowns), equations)
             equations, last = (None if change > _NEW_FACTOR * last else equations), change
         if equations is None:
             rows = observed(problem, state, colours)
@@ -162,10 +193,26 @@ def minimise_sparse(problem: GeoProblem, bundle: BundleInformation, *, lens_foll
     raise ConvergenceError(f"cameras still move after {_ROUNDS} steps: a residual changes by {last:.1e} σ in one")
 
 
-def _start(problem: GeoProblem, bundle: BundleInformation) -> Unknowns:
+def state_of(problem: GeoProblem) -> State:
+    """Return the present state of a problem."""
+    cameras = problem.cameras
     with torch.no_grad():
-        known = [problem.similarity.y.cpu().numpy(), problem.errors.vector().cpu().numpy()]
-    return Unknowns(np.zeros(len(bundle.unit)), np.concatenate([*known, np.zeros(2 * len(_followers(bundle)))]))
+        parts = cameras.corrections(), cameras.lens(), problem.similarity.y, problem.errors.vector()
+        return State(*(part.detach().cpu().numpy().copy() for part in parts))
+
+
+def _start(problem: GeoProblem, bundle: BundleInformation) -> Unknowns:
+    state, followers = state_of(problem), _followers(bundle)
+    poses = state.correction.ravel()
+    values = [state.similarity, state.errors, followers @ poses, np.zeros(len(followers))]
+    return Unknowns(poses, np.concatenate(values))
+
+
+def _cost(prior: tuple[bsr_matrix, FloatArray], residuals: Residuals, unknowns: Unknowns) -> float:
+    of_poses, of_border = prior
+    values = unknowns.border[: len(of_border)]
+    from_prior = unknowns.poses @ (of_poses @ unknowns.poses) + values @ of_border @ values
+    return robust_cost(residuals) + float(from_prior)
 
 
 def _state(problem: GeoProblem, bundle: BundleInformation, unknowns: Unknowns, lens_follows: bool) -> State:
