@@ -45,8 +45,10 @@ from pipelines.georef.sparse_observations import (
     residuals_and_slope,
 )
 
-_ROUNDS = 60
-_STILL = 1e-6  # change of a whitened residual that ends the descent
+_ROUNDS = 150
+_STILL = 5e-6  # change of a whitened residual that ends the descent
+_NOISE = 1e-10  # relative rise of the cost that rounding causes
+_HALVINGS = 12  # of a step that raises the cost
 _NEW_FACTOR = 0.6  # a step that leaves more of the last change of the residuals asks for a new factor
 _EQUILIBRATIONS = 8
 _OPEN = 1e-13  # singular value of the equilibrated Schur complement over the largest
@@ -175,22 +177,47 @@ def minimise_sparse(
         DegenerateGeometryError: the measurements leave the similarity open.
     """
     unknowns, prior = _start(problem, bundle), (prior_of_poses(bundle), _prior_of_border(problem, bundle))
-    colours, before, last = colours_of_cameras(problem), None, np.inf
+    colours, last, halved = colours_of_cameras(problem), np.inf, 0
+    accepted: _Evaluated | None = None
     for _ in range(_ROUNDS):
         state = _state(problem, bundle, unknowns, lens_follows)
         residuals, slope = residuals_and_slope(problem, state, robust_weights)
-        if before is not None:
-            change = max((float(np.abs(residuals[kind] - before[kind]).max()) for kind in residuals), default=0.0)
+        cost = _cost(prior, residuals, unknowns)
+        if accepted is not None:
+            change = _largest_change(accepted.residuals, residuals)
+            if cost > accepted.cost + _NOISE * (1 + abs(cost)) and change >= _STILL:
+                halved += 1
+                if halved > _HALVINGS:
+                    break
+                unknowns, equations = _halfway(accepted.unknowns, unknowns), None if halved == 1 else equations
+                continue
             if change < _STILL and equations is not None:
-                return SparseMinimum(state, _cost(prior, residuals, unknowns), equations)
-            equations, last = (None if change > _NEW_FACTOR * last else equations), change
+                return SparseMinimum(state, cost, equations)
+            equations, last, halved = (None if change > _NEW_FACTOR * last else equations), change, 0
         if equations is None:
             rows = observed(problem, state, colours)
             equations = SparseEquations(problem, bundle, rows, robust_weights(residuals))
         by_poses, by_border = _slope_by_unknowns(prior, bundle, slope, unknowns)
         poses, border = equations.solve(-by_poses[:, None], -by_border[:, None])
-        unknowns, before = Unknowns(unknowns.poses + poses[:, 0], unknowns.border + border[:, 0]), residuals
-    raise ConvergenceError(f"cameras still move after {_ROUNDS} steps: a residual changes by {last:.1e} σ in one")
+        accepted = _Evaluated(unknowns, residuals, cost)
+        unknowns = Unknowns(unknowns.poses + poses[:, 0], unknowns.border + border[:, 0])
+    raise ConvergenceError(f"the cameras do not settle: the last step changed a residual by {last:.1e} σ")
+
+
+@dataclass(frozen=True)
+class _Evaluated:
+    unknowns: Unknowns
+    residuals: Residuals
+    cost: float
+
+
+def _halfway(start: Unknowns, end: Unknowns) -> Unknowns:
+    """Return the middle of a step."""
+    return Unknowns((start.poses + end.poses) / 2, (start.border + end.border) / 2)
+
+
+def _largest_change(before: Residuals, after: Residuals) -> float:
+    return max((float(np.abs(after[kind] - before[kind]).max()) for kind in after), default=0.0)
 
 
 def state_of(problem: GeoProblem) -> State:

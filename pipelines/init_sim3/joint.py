@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from pipelines.core.errors import DegenerateGeometryError
+from pipelines.core.errors import ConvergenceError, DegenerateGeometryError
 from pipelines.core.types import BoolArray, FloatArray
 from pipelines.geometry.rotations import log_so3
 from pipelines.geometry.similarity import Similarity
@@ -110,7 +110,7 @@ def adjust_jointly(
         survey: the measurements with their stated σ.
         model: the SfM model.
         starts: similarities to start from.
-        solve: equations of the cameras, as in `GeographicOptions`.
+        solve: equations of the cameras, as in `GeographicOptions`; "auto": those that are faster.
 
     Raises:
         DegenerateGeometryError: the measurements leave the similarity open, from every start.
@@ -124,8 +124,8 @@ def adjust_jointly(
             solutions.append(_adjust(everything, model, start, solve))
             if solutions[0].is_consistent:
                 break
-        except DegenerateGeometryError as error:
-            refusal = error
+        except (DegenerateGeometryError, ConvergenceError) as error:
+            refusal = DegenerateGeometryError(str(error))
     if not solutions:
         raise refusal
     return min(solutions, key=lambda solution: solution.cost)
@@ -156,7 +156,8 @@ def _adjust(survey: Survey, model: SparseModel, start: InitialSimilarity, solve:
 
 def _solved(scene: Scene, survey: Survey, start: InitialSimilarity, solve: Solve) -> tuple[GeoProblem, float]:
     """Return the problem at its minimum, and −2 ln likelihood there."""
-    problem = geo_problem(scene, survey, start, GeographicOptions(rel_loss=False, solve=solve))
+    options = GeographicOptions(rel_loss=False, solve=solve)
+    problem = geo_problem(scene, survey, start, options.without_photographs(len(scene.sparse.image_name)))
     if not problem.terms:
         raise DegenerateGeometryError("fewer than three positions of one kind take part in a joint adjustment")
     return problem, minimise(problem)

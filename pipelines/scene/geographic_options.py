@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Literal, Self, get_args
 
 from pydantic import Field, ValidationInfo, field_validator
 
@@ -11,6 +11,8 @@ from pipelines.core.options import WRITTEN, StageOptions, from_text, listed_name
 
 # A dense basis of more cameras takes more than 2 GiB (`geometry.correction_basis`).
 MOST_JOINT_CAMERAS = 1300
+# Sparse equations are faster for more cameras, whose time in dense ones grows with their cube.
+MOST_DENSE_CAMERAS = 100
 Solve = Literal["auto", "joint", "once"]
 ConstantError = Literal["bias", "lever-arm", "boresight"]
 CONSTANT_ERRORS: tuple[ConstantError, ...] = get_args(ConstantError)
@@ -70,6 +72,14 @@ class GeographicOptions(StageOptions):
         """Return whether that many cameras are solved once, in sparse equations, and then held."""
         wanted = self.solve == "once" or (self.solve == "auto" and cameras > MOST_JOINT_CAMERAS)
         return wanted and self.optimize_cameras and self.geo_loss
+
+    def without_photographs(self, cameras: int) -> Self:
+        """Return the options of a solution without photographs, where dense and sparse equations agree.
+
+        "auto" then means the faster ones for that many cameras.
+        """
+        faster: Solve = "once" if cameras > MOST_DENSE_CAMERAS else "joint"
+        return self.model_copy(update={"solve": faster}) if self.solve == "auto" else self
 
     def refined_cameras(self, cameras: int) -> int:
         """Return how many of that many cameras are refined together with the Gaussians: all or none."""

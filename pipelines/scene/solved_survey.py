@@ -63,11 +63,12 @@ def solve_survey(trained: TrainedSurvey, initial: InitialSimilarity, options: Ge
     scene = make_scene(trained.sfm, trained.survey, model_from_local, start.translation)
     # The distances are functions of the fixes and have no part in the posterior.
     changed: dict[str, object] = {"rel_loss": False}
-    if options.solve == "joint":  # The photographs have no part here, and more cameras than that are solved faster.
-        changed["solve"] = "auto"
     if options.weighting != "whitened":  # A training with plain mean squares estimates no constant errors.
         changed |= {"weighting": "whitened", "estimate": ()}
-    problem = geo_problem(scene, trained.survey, initial, options.model_copy(update=changed))
+    if options.solve == "joint":  # The photographs have no part here.
+        changed["solve"] = "auto"
+    solving = options.model_copy(update=changed).without_photographs(len(scene.sparse.image_name))
+    problem = geo_problem(scene, trained.survey, initial, solving)
     problem.similarity.place(trained.geo_from_model)
     minimise(problem)
     return SolvedSurvey(trained, scene, problem, options)

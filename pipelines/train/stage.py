@@ -16,8 +16,8 @@ from pipelines.core.products import load_json, save_json
 from pipelines.core.stages import POINTS, SIM3, SPARSE
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.formats.colmap import read_sparse
-from pipelines.georef.posterior import minimise
 from pipelines.scene.calibrated import load_survey
+from pipelines.scene.frozen_solution import solve_and_hold
 from pipelines.scene.geographic import geo_problem
 from pipelines.scene.geolocated import GeolocatedPoints
 from pipelines.scene.initial_similarity import InitialSimilarity
@@ -65,9 +65,7 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
         surface = SceneSurface(maps)
     points = GeolocatedPoints.load(workspace.path(POINTS))
     problem = geo_problem(scene, survey, initial, options, points=points, seed=options.seed)
-    if problem.bundle is not None:
-        minimise(problem)
-        problem.requires_grad_(requires_grad=False)
+    solve_and_hold(problem)
     trainer = make_trainer(TrainingScene(scene, images, surface), problem, backend, options)
     extend = not stage.resumed and _take_over(stage, options.effort.iterations)
     files = LoopOptions(
