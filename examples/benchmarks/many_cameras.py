@@ -33,7 +33,8 @@ from pipelines.georef.cameras import CameraCorrections, CameraPoses
 from pipelines.georef.estimate import Estimate
 from pipelines.georef.problem import GeoProblem
 from pipelines.georef.similarity import LearnableSimilarity
-from pipelines.georef.sparse_adjustment import minimise_sparse, prior_of_poses
+from pipelines.georef.sparse_adjustment import minimise_sparse
+from pipelines.georef.sparse_equations import prior_of_poses
 from pipelines.georef.sparse_observations import State
 from pipelines.georef.sparse_posterior import SparsePosterior
 from pipelines.georef.terms import ControlTerm, FixTerm

@@ -8,7 +8,8 @@ from pipelines.core.types import FloatArray
 from pipelines.geometry.bundle_information import BundleInformation
 from pipelines.georef.normal_equations import Residuals, Weights
 from pipelines.georef.problem import GeoProblem
-from pipelines.georef.sparse_adjustment import SparseEquations, state_of
+from pipelines.georef.sparse_adjustment import state_of
+from pipelines.georef.sparse_equations import SparseEquations
 from pipelines.georef.sparse_observations import SparseObservations, colours_of_cameras, observed
 
 _CHUNK = 32  # observations whose covariances are computed together

@@ -2,7 +2,7 @@
 
 The joint covariance of `georef.posterior.Posterior` is dense. Here each covariance is computed where it is asked
 for, from the factor of the normal equations. With derivatives q of a wanted quantity by the cameras' x' and c by
-the border unknowns (`georef.sparse_adjustment`), the covariance is
+the border unknowns (`georef.sparse_equations`), the covariance is
 
     q N⁻¹ qᵀ + (c − q N⁻¹ Bᵀ) S⁻¹ (c − q N⁻¹ Bᵀ)ᵀ.
 """
@@ -17,7 +17,7 @@ from pipelines.geometry.bundle_information import BundleInformation
 from pipelines.geometry.similarity import Similarity, jacobian_at, second_moment_at
 from pipelines.georef.normal_equations import posterior_weights
 from pipelines.georef.problem import GeoProblem
-from pipelines.georef.sparse_adjustment import SparseEquations
+from pipelines.georef.sparse_equations import SparseEquations
 from pipelines.georef.sparse_observations import State, colours_of_cameras, observed
 
 _CHUNK = 32  # points whose covariances are computed together

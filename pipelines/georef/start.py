@@ -7,13 +7,14 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from pipelines.core.errors import ConvergenceError, DegenerateGeometryError, GeorefError
 from pipelines.core.types import BoolArray, FloatArray
 from pipelines.geometry.bundle_information import BundleInformation
 from pipelines.georef.adjustment import BIAS_COST
 from pipelines.georef.normal_equations import RobustMinimum, posterior_weights
 from pipelines.georef.posterior import GeoEquations, equations_of, linearised, place
 from pipelines.georef.problem import GeoProblem
-from pipelines.georef.sparse_adjustment import minimise_sparse, state_of
+from pipelines.georef.sparse_adjustment import SparseMinimum, minimise_sparse, state_of
 from pipelines.georef.sparse_observations import State
 
 # Rotations of similarity and boresight are not linear: four linearisations are enough from 20°.
@@ -33,6 +34,7 @@ def begin(problem: GeoProblem) -> float:
 
     Raises:
         DegenerateGeometryError: the measurements leave the similarity open.
+        ConvergenceError: sparse equations do not settle, from either start.
     """
     if problem.bundle is not None:
         return _begin_sparse(problem, problem.bundle)
@@ -64,11 +66,19 @@ def _begin_sparse(problem: GeoProblem, bundle: BundleInformation) -> float:
     second solution without errors would cost as much as the first.
     """
     errors, here = problem.errors, state_of(problem)
-    minimum = minimise_sparse(problem, bundle)
-    place(problem, _at_control(problem, here))
-    other = minimise_sparse(problem, bundle, equations=minimum.equations)
-    if other.cost < minimum.cost:
-        minimum = other
+    minimum: SparseMinimum | None = None
+    refusal: GeorefError | None = None
+    for start in (here, _at_control(problem, here)):
+        place(problem, start)
+        try:
+            found = minimise_sparse(problem, bundle, equations=None if minimum is None else minimum.equations)
+        except (ConvergenceError, DegenerateGeometryError) as error:
+            refusal = error
+        else:
+            minimum = found if minimum is None or found.cost < minimum.cost else minimum
+    if minimum is None:
+        assert refusal is not None
+        raise refusal
     place(problem, minimum.state)
     linear = linearised(problem)
     constant = slice(7, 7 + len(errors))

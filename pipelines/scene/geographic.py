@@ -49,8 +49,9 @@ def geo_problem(
         seed: of the random pairs for L_rel.
 
     Raises:
-        InputError: a constant error is to be estimated, but its measurements were not recorded; `points` belongs to
-            another model.
+        InputError: a constant error is to be estimated, but its measurements were not recorded; or `points` belongs
+            to another model.
+        ConvergenceError: sparse equations do not settle.
     """
     bundle = scene.bundle if options.solves_once(len(scene.sparse.image_name)) else None
     record = initial.geo_from_local

@@ -65,6 +65,8 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
         surface = SceneSurface(maps)
     points = GeolocatedPoints.load(workspace.path(POINTS))
     problem = geo_problem(scene, survey, initial, options, points=points, seed=options.seed)
+    if problem.bundle is not None:
+        log.info("the %d cameras are solved once, before the training, and held", len(images))
     solve_and_hold(problem)
     trainer = make_trainer(TrainingScene(scene, images, surface), problem, backend, options)
     extend = not stage.resumed and _take_over(stage, options.effort.iterations)
