@@ -100,14 +100,17 @@ def equations_of(problem: GeoProblem) -> GeoEquations:
         y, v, z = problem.similarity.y.detach(), problem.errors.vector(), cameras.z.detach()
         moved = torch.cat([cameras.corrections().flatten(), cameras.lens()])
         white = residuals(y, v, moved)
-    by_z, by_x = {}, {}
-    if white:
-        # Derivatives by cameras that stay would take memory for all of them.
-        sources = (0, 1, 2) if basis.shape[1] else (0, 1)
-        slopes = torch.func.jacrev(residuals, argnums=sources, chunk_size=_CHUNK)(y, v, moved)
-        for kind, (by_y, by_v, *by_moved) in slopes.items():
+    by_z: dict[str, FloatArray] = {}
+    by_x: dict[str, FloatArray] = {}
+    if white and basis.shape[1]:
+        slopes = torch.func.jacrev(residuals, argnums=(0, 1, 2), chunk_size=_CHUNK)(y, v, moved)
+        for kind, (by_y, by_v, by_moved) in slopes.items():
             by_x[kind] = _numpy(torch.cat([by_y, by_v], dim=2))
-            by_z[kind] = _numpy(by_moved[0] @ basis) if by_moved else np.zeros((*by_y.shape[:2], 0))
+            by_z[kind] = _numpy(by_moved @ basis)
+    elif white:  # Derivatives by cameras that stay would take time and memory for all of them.
+        forward = torch.func.jacfwd(lambda known: residuals(known[:7], known[7:], moved))(torch.cat([y, v]))
+        by_x = {kind: _numpy(slope) for kind, slope in forward.items()}
+        by_z = {kind: np.zeros((*slope.shape[:2], 0)) for kind, slope in by_x.items()}
     seen = _seen(list(by_z.values()), basis.shape[1])
     observations = {
         kind: Observations(
