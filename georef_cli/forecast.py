@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pipelines.core.free_memory import free_main_memory_bytes
 from pipelines.core.photograph_folder import photograph_folder
 from pipelines.core.plan import PlannedStage, plan
 from pipelines.core.products import load_json
@@ -70,7 +71,18 @@ def forecast_run(
     """
     planned = plan(workspace, stages, flags, force=force)
     photographs = _photographs(workspace, planned)
+    planned = [_refused_if_too_large(row, photographs) for row in planned]
     return RunForecast(planned, photographs, _seconds(planned, photographs), _training(planned, photographs))
+
+
+def _refused_if_too_large(row: PlannedStage, photographs: Photographs | None) -> PlannedStage:
+    """Return the row, as refused if it is a reconstruction that does not fit into the free memory."""
+    from pipelines.sfm.memory import why_too_large
+
+    if not isinstance(row.resolved, SfmOptions) or row.action in ("keep", "refuse") or photographs is None:
+        return row
+    reason = why_too_large(photographs.count, photographs.size_px, row.resolved, free_main_memory_bytes())
+    return row if reason is None else replace(row, action="refuse", reason=reason)
 
 
 def _photographs(workspace: Workspace, planned: list[PlannedStage]) -> Photographs | None:

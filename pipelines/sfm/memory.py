@@ -1,0 +1,117 @@
+"""Memory of a reconstruction: the peak that COLMAP will take, predicted before it starts."""
+
+from __future__ import annotations
+
+from pipelines.core.errors import ResourceError
+from pipelines.core.threads import chosen_threads
+from pipelines.sfm.mapping import chosen_mapper
+from pipelines.sfm.options import SfmOptions
+
+_USABLE = 0.9  # of the free memory: other programs grow, too
+_FIXED_BYTES = 300 << 20  # interpreter, libraries, reserves of the allocator
+
+# Features of a chunk: bytes a pixel of the photograph, and of the image that features are detected in, by thread.
+_PHOTO_BYTES_PX, _DETECTION_BYTES_PX = 6.0, 60.0
+
+# Mapping and the adjustments after it, by `examples/benchmarks/many_photographs.py`: as if each photograph had all
+# the features and neighbours that the options allow.
+_FEATURE_BYTES = 100.0
+_MATCH_BYTES = 50.0
+_OBSERVATION_BYTES = 1500.0
+_PHOTOGRAPH_BYTES = 100_000.0
+_MATCHED, _OBSERVED = 0.1, 0.25  # matches of a pair, and observations of points: shares of the features
+
+
+def chunk_peak_bytes(photo_px: tuple[int, int], options: SfmOptions, threads: int = 1) -> int:
+    """Return the peak of a process that detects or matches features.
+
+    Args:
+        photo_px: width and height of the largest photographs.
+        options: of the stage.
+        threads: of the process.
+    """
+    pixels = photo_px[0] * photo_px[1]
+    shrink = max(max(photo_px) / options.max_image_size, 1.0)
+    a_thread = _PHOTO_BYTES_PX * pixels + _DETECTION_BYTES_PX * pixels / shrink**2
+    return int(_FIXED_BYTES + threads * a_thread)
+
+
+def mapping_peak_bytes(photographs: int, options: SfmOptions) -> int:
+    """Return the peak of mapping and the adjustments after it.
+
+    Args:
+        photographs: number of photographs.
+        options: of the stage.
+    """
+    neighbours = photographs - 1 if options.pairs == "exhaustive" else min(options.max_neighbors, photographs - 1)
+    # Most pairs are chosen by both of their photographs.
+    matches = neighbours / 2 * _MATCHED * options.max_features
+    a_photograph = (
+        _PHOTOGRAPH_BYTES
+        + _FEATURE_BYTES * options.max_features
+        + _MATCH_BYTES * matches
+        + _OBSERVATION_BYTES * _OBSERVED * options.max_features
+    )
+    return int(_FIXED_BYTES + photographs * a_photograph)
+
+
+def peak_bytes(photographs: int, photo_px: tuple[int, int], options: SfmOptions) -> int:
+    """Return the peak of the memory of a reconstruction on this machine; 0 for an imported model.
+
+    Args:
+        photographs: number of photographs.
+        photo_px: width and height of the largest.
+        options: of the stage.
+    """
+    if options.import_model is not None:
+        return 0
+    features = chunk_peak_bytes(photo_px, options, chosen_threads(options.threads))
+    return max(features, mapping_peak_bytes(photographs, options))
+
+
+def why_too_large(
+    photographs: int, photo_px: tuple[int, int], options: SfmOptions, free_bytes: int | None
+) -> str | None:
+    """Return why a reconstruction would not fit into the free memory, and what would; None: it fits.
+
+    Args:
+        photographs: number of photographs.
+        photo_px: width and height of the largest.
+        options: of the stage.
+        free_bytes: from `free_main_memory_bytes`; None: unknown, everything fits.
+    """
+    needed = peak_bytes(photographs, photo_px, options)
+    if free_bytes is None or needed <= _USABLE * free_bytes:
+        return None
+    fewer = options.max_features
+    while fewer > 1000 and peak_bytes(photographs, photo_px, _with(options, fewer)) > _USABLE * free_bytes:
+        fewer -= 500
+    fits = peak_bytes(photographs, photo_px, _with(options, fewer)) <= _USABLE * free_bytes
+    advice = f"use --max-features {fewer}" if fits else "reconstruct elsewhere and use --import"
+    mapper = chosen_mapper(photographs, options)
+    return (
+        f"SfM of {photographs} photographs needs about {_gib(needed)} at its peak ({mapper} mapper, "
+        f"{options.max_features} features a photograph) and {_gib(free_bytes)} are free: {advice}, or a machine "
+        "with more memory"
+    )
+
+
+def require_memory(
+    photographs: int, photo_px: tuple[int, int], options: SfmOptions, free_bytes: int | None
+) -> None:
+    """Refuse a reconstruction that will not fit; the arguments are those of `why_too_large`.
+
+    Raises:
+        ResourceError: states the memory needed, and options that would fit.
+    """
+    reason = why_too_large(photographs, photo_px, options, free_bytes)
+    if reason is not None:
+        raise ResourceError(reason)
+
+
+def _with(options: SfmOptions, max_features: int) -> SfmOptions:
+    return options.model_copy(update={"max_features": max_features})
+
+
+def _gib(size: float) -> str:
+    return f"{size / 2**30:.1f} GiB"
