@@ -107,7 +107,8 @@ def given(ctx: click.Context, names: Iterable[str]) -> dict[str, Any]:
     return {
         name: ctx.params[name]
         for name in names
-        if ctx.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE
+        # `--threads` of all commands has taken effect when it was parsed, and is no parameter.
+        if name in ctx.params and ctx.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE
     }
 
 
