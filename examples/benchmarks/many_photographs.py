@@ -45,7 +45,7 @@ FORWARD_OVERLAP, SIDE_OVERLAP = 0.8, 0.6
 HILLS_M, NOISE_PX, DETECTED, ROTATION_NOISE_DEG = 8.0, 0.5, 0.5, 0.1
 NEIGHBOURS = 16
 FIX_M = 0.03
-FEW = 1000  # photographs up to which the last adjustment is also run without the positions
+FEW = 500  # photographs up to which the last adjustment is also run without the positions
 
 
 @dataclass(frozen=True)

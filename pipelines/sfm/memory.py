@@ -14,13 +14,13 @@ _FIXED_BYTES = 300 << 20  # interpreter, libraries, reserves of the allocator
 # photographs of 2.3 and 20.9 megapixels at 600, 1200 and 2400 px, where they are 1.04 to 1.28 times the growth.
 _PHOTO_BYTES_PX, _DETECTION_BYTES_PX = 4.0, 310.0
 
-# Mapping and the adjustments after it, by `examples/benchmarks/many_photographs.py`: as if each photograph had all
-# the features and neighbours that the options allow.
-_FEATURE_BYTES = 100.0
-_MATCH_BYTES = 50.0
-_OBSERVATION_BYTES = 1500.0
-_PHOTOGRAPH_BYTES = 100_000.0
-_MATCHED, _OBSERVED = 0.1, 0.25  # matches of a pair, and observations of points: shares of the features
+# Mapping and the adjustments after it, of the global mapper, which needs more than the incremental one
+# (`examples/benchmarks/many_photographs.py`; docs/benchmarks.md has the runs).
+_FEATURE_BYTES = 133.0
+_OBSERVATION_BYTES = 2500.0
+# Features that COLMAP finds and observations of points, as multiples of `--max-features`: eight surveys had up to
+# 1.5 and, with real photographs, 0.14 to 0.32.
+_FOUND, _OBSERVED = 1.5, 0.35
 
 
 def chunk_peak_bytes(photo_px: tuple[int, int], options: SfmOptions, threads: int = 1) -> int:
@@ -44,15 +44,7 @@ def mapping_peak_bytes(photographs: int, options: SfmOptions) -> int:
         photographs: number of photographs.
         options: of the stage.
     """
-    neighbours = photographs - 1 if options.pairs == "exhaustive" else min(options.max_neighbors, photographs - 1)
-    # Most pairs are chosen by both of their photographs.
-    matches = neighbours / 2 * _MATCHED * options.max_features
-    a_photograph = (
-        _PHOTOGRAPH_BYTES
-        + _FEATURE_BYTES * options.max_features
-        + _MATCH_BYTES * matches
-        + _OBSERVATION_BYTES * _OBSERVED * options.max_features
-    )
+    a_photograph = (_FEATURE_BYTES * _FOUND + _OBSERVATION_BYTES * _OBSERVED) * options.max_features
     return int(_FIXED_BYTES + photographs * a_photograph)
 
 
