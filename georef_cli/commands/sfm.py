@@ -7,8 +7,10 @@ from typing import Any
 import click
 
 from georef_cli.display import progress_for
+from georef_cli.engines import engine_for, engine_options
 from georef_cli.output import print_json
 from georef_cli.stage import StageCommand
+from pipelines.engine.chosen import chosen_engine
 
 _CHUNK = click.Option(
     ["--chunk"],
@@ -22,7 +24,8 @@ class _SfmCommand(StageCommand):
         """Run the stage, or work on one of its chunks."""
         name = values.pop("chunk")
         if name is None:
-            super().act(ctx, **values)
+            with chosen_engine(engine_for(values)):
+                super().act(ctx, **values)
             return
         from pipelines.sfm.chunk_work import work_chunk
 
@@ -45,6 +48,7 @@ command = _SfmCommand(
       georef sfm flight
       georef sfm flight --mapper global --max-image-size 1600
       georef sfm flight --import colmap/sparse/0
+      georef sfm flight --cluster tls://scheduler:8786 --certificates certificates
     """,
-    extra=[_CHUNK],
+    extra=[_CHUNK, *engine_options()],
 )

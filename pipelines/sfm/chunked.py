@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from pipelines.core.durable import remove, replace_text
 from pipelines.core.errors import GeorefError
+from pipelines.core.photograph_folder import photograph_folder
 from pipelines.core.progress import Progress
 from pipelines.core.sentences import listed
+from pipelines.core.stages import SURVEY
 from pipelines.core.workspace import StageRun
 from pipelines.engine.chosen import engine_in_use
 from pipelines.engine.job import Job, JobEnd
@@ -44,9 +45,8 @@ def work_in_chunks(stage: StageRun, survey: Survey, options: SfmOptions) -> Chun
     """
     plan = plan_chunks(survey, candidate_pairs(survey, options), options)
     replace_text(stage.out / PLAN, plan.model_dump_json())
-    peak_bytes = chunk_peak_bytes(largest_photograph_px(survey), options)
-    for kind, title in _TITLES.items():
-        _work(stage, plan, title, plan.of_kind(kind), peak_bytes)
+    for kind in _TITLES:
+        _work(stage, survey, plan, kind)
     return plan
 
 
@@ -56,8 +56,8 @@ def largest_photograph_px(survey: Survey) -> tuple[int, int]:
     return largest.width, largest.height
 
 
-def _work(stage: StageRun, plan: ChunkPlan, title: str, chunks: Sequence[Chunk], peak_bytes: int) -> None:
-    """Run those of the chunks that are not finished.
+def _work(stage: StageRun, survey: Survey, plan: ChunkPlan, kind: Kind) -> None:
+    """Run those chunks of a kind that are not finished.
 
     Raises:
         GeorefError: at least one has failed.
@@ -70,9 +70,9 @@ def _work(stage: StageRun, plan: ChunkPlan, title: str, chunks: Sequence[Chunk],
         finished = sum(chunk.is_finished(stage.out) for chunk in plan.chunks)
         stage.record_progress(f"{finished} of {len(plan.chunks)} chunks")
 
-    waiting = [chunk for chunk in chunks if not chunk.is_finished(stage.out)]
-    root = str(stage.workspace.root.absolute())
-    jobs = [Job(chunk.name, ("sfm", root, "--chunk", chunk.name), peak_bytes) for chunk in waiting]
+    title = _TITLES[kind]
+    waiting = [chunk for chunk in plan.of_kind(kind) if not chunk.is_finished(stage.out)]
+    jobs = [_job(stage, survey, plan, chunk) for chunk in waiting]
     if jobs:
         engine_in_use().run(title, jobs, ended, stage.progress)
     if failed:
@@ -81,6 +81,29 @@ def _work(stage: StageRun, plan: ChunkPlan, title: str, chunks: Sequence[Chunk],
             f"{len(failed)} of {len(jobs)} {title} failed ({names}): {failed[0].error}; the same command works on "
             "those again and keeps the others"
         )
+
+
+def _job(stage: StageRun, survey: Survey, plan: ChunkPlan, chunk: Chunk) -> Job:
+    """Return the command that works on a chunk, with all that it reads and writes."""
+    root = stage.workspace.root.absolute()
+    if chunk.kind == "features":
+        images = photograph_folder(stage.workspace, survey.image_dir)
+        reads = [images / survey.images[index].name for index in chunk.images]
+    else:
+        needed = set(chunk.images)
+        reads = [
+            features.database(stage.out)
+            for features in plan.of_kind("features")
+            if not needed.isdisjoint(features.images)
+        ]
+    return Job(
+        chunk.name,
+        ("sfm", str(root), "--chunk", chunk.name),
+        chunk_peak_bytes(largest_photograph_px(survey), plan.options),
+        folder=root,
+        writes=chunk.folder(stage.out),
+        reads=(stage.workspace.path(SURVEY), stage.out / PLAN, *reads),
+    )
 
 
 def join_chunks(colmap: Any, job: SfmJob, plan: ChunkPlan, partial: Path, progress: Progress) -> None:
