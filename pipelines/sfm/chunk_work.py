@@ -121,9 +121,12 @@ def copy_finished(
     """Copy rows of a finished chunk into a database; see `copy_rows`.
 
     Raises:
-        InputError: the chunk's database is damaged. It is removed, so that the chunk is computed again.
+        InputError: the chunk is not finished, or its database is damaged; a damaged one is removed, so that the
+            chunk is computed again.
     """
     database = chunk.database(partial)
+    if not chunk.is_finished(partial):
+        raise InputError(f"{chunk.name} is not finished, and its features are needed", path=database)
     try:
         copy_rows(database, target, tables, images)
     except DamagedPartialError as error:

@@ -7,7 +7,7 @@ import signal
 import sqlite3
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -42,32 +42,63 @@ CHUNKS = ["features-0000", "features-0001", "matches-0000", "matches-0001"]
 
 @dataclass
 class InThisProcess:
-    """Engine whose jobs are calls in this process; those in `failing` fail."""
+    """Engine whose jobs are calls in this process.
+
+    Attributes:
+        failing: names of jobs that fail.
+        pretends: the other jobs leave an empty file in place of a result.
+        worked: names of the jobs that were done.
+    """
 
     failing: tuple[str, ...] = ()
+    pretends: bool = False
     worked: list[str] = field(default_factory=list)
+
+    def together(self, jobs: Iterable[Job]) -> int:
+        return 1
 
     def run(self, title: str, jobs: Sequence[Job], ended: Callable[[JobEnd], None], progress: Progress) -> None:
         for job in jobs:
             command, root, option, name = job.arguments
             assert (command, option) == ("sfm", "--chunk")
+            assert job.writes is not None
             error = "no more photographs" if name in self.failing else ""
             if not error:
-                partial = Workspace(Path(root)).partial(BY_NAME["sfm"])
-                where = {"survey": f"{root}/{SURVEY}", "images": f"{root}/photos", "partial": str(partial)}
-                write_chunk({**where, "name": name}, SILENT)
                 self.worked.append(name)
+                if self.pretends:
+                    job.writes.mkdir(parents=True, exist_ok=True)
+                    (job.writes / "database.db").touch()
+                else:
+                    assert all(path.exists() for path in job.reads)
+                    partial = Workspace(Path(root)).partial(BY_NAME["sfm"])
+                    where = {"survey": f"{root}/{SURVEY}", "images": f"{root}/photos", "partial": str(partial)}
+                    write_chunk({**where, "name": name}, SILENT)
             ended(JobEnd(job, 1 if error else 0, 0.0, "", error))
+
+
+def begun(root: Path, photographs: Photographs) -> StageRun:
+    """A run of `sfm` that has just begun."""
+    (root / "photos").symlink_to(photographs.folder)
+    save_json(survey_of(photographs.names), root / SURVEY)
+    workspace = Workspace(root)
+    workspace.partial(BY_NAME["sfm"]).mkdir()
+    return StageRun(workspace, workspace.partial(BY_NAME["sfm"]))
 
 
 @pytest.fixture
 def flight(photographs: Photographs, tmp_path: Path) -> StageRun:
     """A run of `sfm` that has just begun."""
-    (tmp_path / "photos").symlink_to(photographs.folder)
-    save_json(survey_of(photographs.names), tmp_path / SURVEY)
-    workspace = Workspace(tmp_path)
-    workspace.partial(BY_NAME["sfm"]).mkdir()
-    return StageRun(workspace, workspace.partial(BY_NAME["sfm"]))
+    return begun(tmp_path, photographs)
+
+
+@pytest.fixture(scope="module")
+def worked(photographs: Photographs, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The partial product of a run whose chunks are finished."""
+    stage, engine = begun(tmp_path_factory.mktemp("worked"), photographs), InThisProcess()
+    with chosen_engine(engine):
+        work_in_chunks(stage, survey_of(photographs.names), CHUNKED)
+    assert engine.worked == CHUNKS
+    return stage.out
 
 
 def plan_of(stage: StageRun, names: list[str]) -> ChunkPlan:
@@ -82,12 +113,13 @@ def rows(database: Path, table: str) -> list[tuple[object, ...]]:
         return connection.execute(f"select * from {table} order by 1").fetchall()
 
 
-def test_the_same_database_and_model_as_in_one_process(mapped: Workspace, flight: StageRun) -> None:
+def test_the_same_database_and_model_as_in_one_process(mapped: Workspace, flight: StageRun, worked: Path) -> None:
     """COLMAP draws its random samples pair by pair, from the seed: chunks change nothing."""
+    shutil.copytree(worked, flight.out, dirs_exist_ok=True)
     engine = InThisProcess()
     with chosen_engine(engine):
         summary = run(flight, CHUNKED)
-    assert engine.worked == CHUNKS
+    assert engine.worked == []
     assert summary.values["registered"] == IMAGES
     whole = mapped.path("sfm/database.db")
     for table in ("cameras", "images", "keypoints", "descriptors", "matches", "two_view_geometries"):
@@ -99,29 +131,30 @@ def test_the_same_database_and_model_as_in_one_process(mapped: Workspace, flight
 def test_a_failed_chunk_is_named_and_the_others_are_kept(flight: StageRun, photographs: Photographs) -> None:
     survey = survey_of(photographs.names)
     with (
-        chosen_engine(InThisProcess(failing=("features-0001",))),
-        pytest.raises(GeorefError, match=r"1 of 2 chunks of features failed \(features-0001\): no more photo"),
+        chosen_engine(InThisProcess(failing=("features-0000",), pretends=True)),
+        pytest.raises(GeorefError, match=r"1 of 2 chunks of features failed \(features-0000\): no more photo"),
     ):
         work_in_chunks(flight, survey, CHUNKED)
     assert (flight.out / "progress.txt").read_text() == "1 of 4 chunks"
-    again = InThisProcess()
+    again = InThisProcess(pretends=True)
     with chosen_engine(again):
         work_in_chunks(flight, survey, CHUNKED)
-    assert again.worked == CHUNKS[1:]
+    assert again.worked == ["features-0000", "matches-0000", "matches-0001"]
+    assert (flight.out / "progress.txt").read_text() == "4 of 4 chunks"
 
 
-def test_a_damaged_chunk_is_computed_again(flight: StageRun, photographs: Photographs) -> None:
-    plan = plan_of(flight, photographs.names)
-    engine = InThisProcess()
-    with chosen_engine(engine):
-        work_in_chunks(flight, survey_of(photographs.names), CHUNKED)
-        features, matches = plan.chunks[0].database(flight.out), plan.chunks[2].database(flight.out)
-        matches.unlink()
-        features.write_bytes(features.read_bytes()[:5000])
-        with pytest.raises(InputError, match="run `georef sfm` again"):
-            work_in_chunks(flight, survey_of(photographs.names), CHUNKED)
-        work_in_chunks(flight, survey_of(photographs.names), CHUNKED)
-    assert engine.worked == [*CHUNKS, "features-0000", "matches-0000"]
+def test_a_damaged_chunk_is_computed_again(flight: StageRun, photographs: Photographs, worked: Path) -> None:
+    shutil.copytree(worked, flight.out, dirs_exist_ok=True)
+    survey, plan = survey_of(photographs.names), plan_of(flight, photographs.names)
+    features, matches = plan.chunks[0].database(flight.out), plan.chunks[2].database(flight.out)
+    matches.unlink()
+    features.write_bytes(features.read_bytes()[:5000])
+    with chosen_engine(InThisProcess()), pytest.raises(InputError, match="run `georef sfm` again"):
+        work_in_chunks(flight, survey, CHUNKED)
+    again = InThisProcess(pretends=True)
+    with chosen_engine(again):
+        work_in_chunks(flight, survey, CHUNKED)
+    assert again.worked == ["features-0000", "matches-0000"]
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="SIGKILL")
@@ -161,6 +194,8 @@ def test_chunks_that_nobody_planned_are_refused(flight: StageRun, photographs: P
     for name in ("features-0009", "../features-0000"):
         with pytest.raises(InputError, match=r"is none of the chunks features-0000 … matches-0001"):
             work_chunk(flight.workspace, name, SILENT)
+    with pytest.raises(GeorefError, match="features-0000 is not finished"):
+        work_chunk(flight.workspace, "matches-0000", SILENT)
     plan_of(flight, [*photographs.names, "more.jpg"])
     with pytest.raises(InputError, match="more photographs than the survey"):
         work_chunk(flight.workspace, "features-0002", SILENT)
