@@ -18,7 +18,7 @@ from pipelines.engine.job import Job, JobEnd
 from pipelines.scene.survey import Survey
 from pipelines.sfm.chunk_work import copy_finished
 from pipelines.sfm.chunks import FOLDER, PLAN, Chunk, ChunkPlan, Kind, plan_chunks
-from pipelines.sfm.colmap_database import FEATURES, MATCHES, write_frame
+from pipelines.sfm.colmap_database import FEATURES, MATCHES, remove_database, write_frame
 from pipelines.sfm.features import SfmJob, candidate_pairs
 from pipelines.sfm.memory import chunk_peak_bytes
 from pipelines.sfm.options import SfmOptions
@@ -107,7 +107,7 @@ def _job(stage: StageRun, survey: Survey, plan: ChunkPlan, chunk: Chunk) -> Job:
 
 
 def join_chunks(colmap: Any, job: SfmJob, plan: ChunkPlan, partial: Path, progress: Progress) -> None:
-    """Copy the features and matches of all chunks into the database of the job.
+    """Copy the features and matches of all chunks into the database of the job, which is made anew.
 
     Args:
         colmap: the pycolmap module.
@@ -119,6 +119,7 @@ def join_chunks(colmap: Any, job: SfmJob, plan: ChunkPlan, partial: Path, progre
     Raises:
         InputError: a chunk is damaged; it was removed, and the same command computes it again.
     """
+    remove_database(job.database)  # An interrupted run may have left half of it, or one for other chunks.
     write_frame(colmap, job.database, job.survey, range(len(job.survey.images)), job.options)
     with progress.task("joining chunks", len(plan.chunks)) as task:
         for chunk in plan.chunks:

@@ -2,7 +2,8 @@
 
 Reads `ingest/survey.json` and the photographs. Writes `sfm/sparse/` (a COLMAP model that COLMAP itself opens) and
 `sfm/database.db` (features and matches). The model's frame is `local`: similar to the scene, with an arbitrary
-place, rotation and scale. The positions measured by GNSS select the pairs to match, and have no other use here.
+place, rotation and scale. The positions measured by GNSS select the pairs to match, and remove the drift of a large
+model before its last adjustment. Features and matches of a large survey are computed in chunks (`chunked.py`).
 """
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ def run(stage: StageRun, options: SfmOptions) -> Summary:
     try:
         document = run_in_child(task, arguments, remedy, stage.progress, writes=stage.out)
     except (CrashError, RuntimeError) as error:
-        if stage.resumed:
+        if stage.resumed and plan is None:
             cause = str(error).strip().splitlines()[-1]
             raise DamagedPartialError(f"COLMAP cannot continue it: {cause}", path=stage.out) from error
         raise
@@ -90,10 +91,10 @@ def write_model(arguments: Mapping[str, Any], progress: Progress) -> dict[str, A
         if options.import_model is not None:
             model = import_model(options.import_model, survey)
         else:
-            require_sound(out / "database.db")
             job = SfmJob(survey, Path(arguments["images"]), out / "database.db", options)
             plan = arguments["chunks"]
             if plan is None:
+                require_sound(job.database)
                 model = reconstruct(colmap, job, progress)
             else:
                 join_chunks(colmap, job, ChunkPlan.model_validate(plan), out, progress)

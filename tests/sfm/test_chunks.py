@@ -116,6 +116,7 @@ def rows(database: Path, table: str) -> list[tuple[object, ...]]:
 def test_the_same_database_and_model_as_in_one_process(mapped: Workspace, flight: StageRun, worked: Path) -> None:
     """COLMAP draws its random samples pair by pair, from the seed: chunks change nothing."""
     shutil.copytree(worked, flight.out, dirs_exist_ok=True)
+    (flight.out / "database.db").write_bytes(b"half of an earlier one")
     engine = InThisProcess()
     with chosen_engine(engine):
         summary = run(flight, CHUNKED)
