@@ -11,6 +11,8 @@ those of a flight are local, and memory and time depend on that.
 
 `center_rms_m` has the RMS errors of the camera centres after a similarity: of the mapper, of the adjustment with
 positions of 3 cm, and of the last adjustment by the photographs alone, with and without that one before it.
+
+`--mappers memory` runs the global mapper with three iterations an adjustment, for its peak memory alone.
 """
 
 from __future__ import annotations
@@ -45,6 +47,7 @@ FORWARD_OVERLAP, SIDE_OVERLAP = 0.8, 0.6
 HILLS_M, NOISE_PX, DETECTED, ROTATION_NOISE_DEG = 8.0, 0.5, 0.5, 0.1
 NEIGHBOURS = 16
 FIX_M = 0.03
+FEW_ITERATIONS = 3
 FEW = 500  # photographs up to which the last adjustment is also run without the positions
 
 
@@ -200,6 +203,23 @@ def map_flight(mapper: str, database: Path, count: int, seed: int, threads: int)
     }
 
 
+def peak_of_global(database: Path, threads: int, seed: int) -> dict[str, Any]:
+    """Run the global mapper with few iterations in this process, and return its peak memory.
+
+    Memory depends on the sizes of the adjustments, and not on the number of their iterations.
+    """
+    with quiet_colmap() as colmap, tempfile.TemporaryDirectory() as scratch:
+        options = colmap.GlobalPipelineOptions()
+        options.num_threads, options.random_seed = threads, seed
+        options.mapper.ba_num_iterations = 1
+        options.mapper.bundle_adjustment.ceres.solver_options.max_num_iterations = FEW_ITERATIONS
+        before, clock = _peak_bytes(), time.monotonic()
+        colmap.global_mapping(database, Path(scratch), Path(scratch), options)
+        seconds = time.monotonic() - clock
+    peaks = {"before_mib": before >> 20, "peak_mapping_mib": _peak_bytes() >> 20}
+    return {"mapper": "global, memory only", "mapping_s": round(seconds, 1), **peaks}
+
+
 def _largest(colmap: Any, mapper: Any, run: MapperRun) -> Any:
     models = run_mapper(colmap, mapper, run, lambda: None)
     return models[0] if models else None
@@ -237,8 +257,11 @@ def main() -> None:
     parser.add_argument("--child", nargs=2, metavar=("MAPPER", "DATABASE"), help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.child is not None:
-        mapper, database = given.child
-        print(json.dumps(map_flight(mapper, Path(database), given.photographs[0], given.seed, given.threads)))
+        mapper, database = given.child[0], Path(given.child[1])
+        if mapper == "memory":
+            print(json.dumps(peak_of_global(database, given.threads, given.seed)))
+        else:
+            print(json.dumps(map_flight(mapper, database, given.photographs[0], given.seed, given.threads)))
         return
     for count in given.photographs:
         with tempfile.TemporaryDirectory() as folder, quiet_colmap() as colmap:
