@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,6 +19,7 @@ from pipelines.sfm.options import SfmOptions
 from pipelines.train.options import TrainOptions
 
 if TYPE_CHECKING:
+    from pipelines.sfm.forecast import ReconstructionForecast
     from pipelines.train.forecast import TrainingForecast
 
 
@@ -45,12 +46,14 @@ class RunForecast:
         planned: what each stage would do.
         photographs: of the survey; None: in a bag that was not read yet.
         seconds: about, by stage, of those that take long.
+        reconstruction: None where none would run, or before a bag is read.
         training: None where none would run, or before a bag is read.
     """
 
     planned: Sequence[PlannedStage]
     photographs: Photographs | None
     seconds: Mapping[str, float | None]
+    reconstruction: ReconstructionForecast | None
     training: TrainingForecast | None
 
 
@@ -70,7 +73,31 @@ def forecast_run(
     """
     planned = plan(workspace, stages, flags, force=force)
     photographs = _photographs(workspace, planned)
-    return RunForecast(planned, photographs, _seconds(planned, photographs), _training(planned, photographs))
+    reconstruction = _reconstruction(planned, photographs)
+    if reconstruction is not None and reconstruction.refusal:
+        planned = [_refused(row, reconstruction) if row.stage == "sfm" else row for row in planned]
+    seconds = _seconds(planned, photographs, reconstruction)
+    return RunForecast(planned, photographs, seconds, reconstruction, _training(planned, photographs))
+
+
+def _refused(row: PlannedStage, reconstruction: ReconstructionForecast) -> PlannedStage:
+    return replace(row, action="refuse", reason=reconstruction.refusal)
+
+
+def _reconstruction(
+    planned: Sequence[PlannedStage], photographs: Photographs | None
+) -> ReconstructionForecast | None:
+    """Return the forecast of the reconstruction; None where none would run, or before a bag is read."""
+    from pipelines.sfm.forecast import forecast
+
+    for row in planned:
+        if (
+            isinstance(row.resolved, SfmOptions)
+            and row.action not in ("keep", "refuse")
+            and photographs is not None
+        ):
+            return forecast(photographs.count, photographs.size_px, row.resolved)
+    return None
 
 
 def _photographs(workspace: Workspace, planned: list[PlannedStage]) -> Photographs | None:
@@ -95,16 +122,16 @@ def _in_folder(folder: Path) -> Photographs:
     return Photographs(count, size_px, total_bytes)
 
 
-def _seconds(planned: list[PlannedStage], photographs: Photographs | None) -> dict[str, float | None]:
+def _seconds(
+    planned: list[PlannedStage], photographs: Photographs | None, reconstruction: ReconstructionForecast | None
+) -> dict[str, float | None]:
     """Return the seconds of the stages that take long."""
-    from pipelines.sfm.pace import reconstruction_seconds
-
     seconds: dict[str, float | None] = {}
     for row in planned:
         if photographs is None or row.action in ("keep", "refuse"):
             continue
         if isinstance(row.resolved, SfmOptions):
-            seconds[row.stage] = reconstruction_seconds(photographs.count, photographs.size_px, row.resolved)
+            seconds[row.stage] = 0.0 if reconstruction is None else reconstruction.seconds
         elif isinstance(row.resolved, TrainOptions):
             forecast = _training([row], photographs)
             seconds[row.stage] = None if forecast is None else forecast.seconds
