@@ -17,7 +17,8 @@ from pipelines.core.photograph_folder import photograph_folder
 from pipelines.core.stages import SPARSE
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.core.workspace import Workspace
-from pipelines.geometry.bundle import CorrectionBasis, Network, correction_basis
+from pipelines.geometry.bundle import Network
+from pipelines.geometry.correction_basis import CorrectionBasis, correction_basis
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.georef.cameras import CameraPoses
