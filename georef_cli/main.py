@@ -49,6 +49,7 @@ COMMANDS: dict[str, HelpLine] = {
     ),
     "run": HelpLine("run", "Pipeline", "Run all stages, or some, skipping what is current."),
     "batch": HelpLine("batch", "Pipeline", "Run many missions, and put their results into one table."),
+    "blocks": HelpLine("blocks", "Pipeline", "Train a large survey in blocks, and merge them."),
     "status": HelpLine("status", "Pipeline", "Show the state of every stage."),
     "info": HelpLine("info", "Pipeline", "Show where on Earth the result is, and what each file is for."),
     "view": HelpLine("view", "Pipeline", "See the trained model in a browser, and measure in it."),

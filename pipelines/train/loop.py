@@ -207,6 +207,8 @@ def _metrics_row(trainer: JointTrainer, report: StepReport, seconds: float) -> d
         "photometric": float(report.photometric),
         "psnr": -10.0 * math.log10(max(float(report.mean_square_error), 1e-10)),
         "gaussians": len(trainer.optimizer.gaussians),
+        "visible": report.visible,
+        "pixels": report.pixels,
         "geo_weight": report.weight,
     }
     row |= {name: float(value) for name, value in losses.items()}
