@@ -14,7 +14,16 @@ from georef_cli.display import is_told, progress_for
 from georef_cli.dry_run import announce_training
 from georef_cli.output import print_json, print_outcome, print_rich
 from pipelines.core import runner
-from pipelines.core.stages import BY_NAME, PLAN_BLOCKS, SOLVE, TRAIN_BLOCK, TRAIN_SCAFFOLD, StageSpec
+from pipelines.core.stages import (
+    BLOCK_RECORD,
+    BY_NAME,
+    PLAN_BLOCKS,
+    SOLVE,
+    TRAIN_BLOCK,
+    TRAIN_SCAFFOLD,
+    TRAIN_SEAMS,
+    StageSpec,
+)
 from pipelines.core.staleness import must_exist, stage_config
 from pipelines.core.workspace import Workspace
 
@@ -22,7 +31,7 @@ if TYPE_CHECKING:
     from pipelines.blocks.parts import Parts
 
 TRAIN = BY_NAME["train"]
-ACTIONS = ("plan", "scaffold", "train", "merge")
+ACTIONS = ("plan", "scaffold", "train", "seams", "merge")
 
 
 def _blocks(ctx: click.Context, **values: Any) -> None:
@@ -32,12 +41,14 @@ def _blocks(ctx: click.Context, **values: Any) -> None:
     number = values["number"]
     if number is not None and action != "train":
         raise click.UsageError("--id is for `georef blocks train`.")
-    if given and (action in ("scaffold", "merge") or number is not None):
+    if given and (action in ("scaffold", "seams", "merge") or number is not None):
         raise click.UsageError("options of the training are given to `georef blocks` or `georef blocks plan`.")
     if action == "plan":
         _plan(ctx, workspace, given, values)
     elif action == "scaffold":
         _run_part(ctx, workspace, TRAIN_SCAFFOLD, None, values)
+    elif action == "seams":
+        _run_part(ctx, workspace, TRAIN_SEAMS, None, values)
     elif action == "train" and number is not None:
         _run_part(ctx, workspace, TRAIN_BLOCK, number, values)
     elif action == "train":
@@ -96,7 +107,7 @@ def _run_part(
     progress = progress_for(ctx.obj)
     if number is not None:
         parts.plan().block(number)
-    elif values["force"] or parts.why_missing(SOLVE):
+    elif spec is TRAIN_SCAFFOLD and (values["force"] or parts.why_missing(SOLVE)):
         parts.run(SOLVE, force=values["force"], progress=progress)
     variant = parts.place(spec, number)
     with boundary.logged_to_file(variant, spec):
@@ -132,7 +143,8 @@ def _all(
             workspace,
             TRAIN,
             flags,
-            force=values["force"],
+            force=values["force"] and not only_merge,
+            renew=not parts.is_merged() and (workspace.root / BLOCK_RECORD).exists(),
             resume="if-same",
             progress=progress_for(ctx.obj),
         )
@@ -142,7 +154,7 @@ def _all(
 command = Command(
     "blocks",
     params=[
-        click.Argument(["place"], nargs=-1, required=True, metavar="[plan|scaffold|train|merge] WS"),
+        click.Argument(["place"], nargs=-1, required=True, metavar="[plan|scaffold|train|seams|merge] WS"),
         click.Option(["--id", "number"], type=click.IntRange(min=0), help="Train this block only."),
         *options.stage_options(TRAIN.options),
         options.force_option("Run even what is current, and start afresh."),

@@ -8,14 +8,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from pipelines.blocks.parts import Parts
 from pipelines.blocks.seams import compare_neighbours
 from pipelines.core.files import file_size
 from pipelines.core.products import load_json, save_json
 from pipelines.core.progress import Progress
-from pipelines.core.stages import BLOCK_GAUSSIANS, SOLUTION
+from pipelines.core.stages import SOLUTION, TRAIN_SEAMS
 from pipelines.core.workspace import Summary
 from pipelines.scene.block_plan import BlockPlan
 from pipelines.scene.block_record import BlockRecord, BlockTraining, MergedBlock, Seam
@@ -39,7 +38,7 @@ def merge_blocks(parts: Parts, plan: BlockPlan, folder: Path, progress: Progress
         InputError: a block cannot be read.
     """
     trainings = [parts.training(block) for block in plan.blocks]
-    merged = Gaussians.concatenate([gaussians_in_cell(parts, plan, block.id) for block in plan.blocks])
+    merged = Gaussians.concatenate([gaussians_in_cell(parts, block.id) for block in plan.blocks])
     write_gaussians(folder / "gaussians.ply", merged)
     count, degree = len(merged), merged.sh_degree
     del merged  # before the neighbours are loaded
@@ -64,15 +63,13 @@ def merge_blocks(parts: Parts, plan: BlockPlan, folder: Path, progress: Progress
     return _summary(model, trainings, seams)
 
 
-def gaussians_in_cell(parts: Parts, plan: BlockPlan, number: int) -> Gaussians:
-    """Return the Gaussians of a trained block whose centres lie in its cell.
+def gaussians_in_cell(parts: Parts, number: int) -> Gaussians:
+    """Return the Gaussians of a cell, adapted to those of its neighbours.
 
     Raises:
         InputError: the block cannot be read.
     """
-    gaussians = read_gaussians(parts.of_block(number).path(BLOCK_GAUSSIANS))
-    inside = plan.block(number).cell.contains(gaussians.means.double().numpy())
-    return gaussians.select(torch.from_numpy(inside))
+    return read_gaussians(parts.whole.root / TRAIN_SEAMS.folder / f"{number}.ply")
 
 
 def _write_metrics(parts: Parts, plan: BlockPlan, path: Path) -> None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal, Protocol
 
 from pipelines.core.errors import InputError, MissingProductError
@@ -14,19 +15,22 @@ from pipelines.core.products import load_json
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.runner import Outcome, run_stage
 from pipelines.core.stages import (
+    BLOCK_GAUSSIANS,
     BLOCK_PLAN,
+    BLOCK_RECORD,
     BLOCK_TRAINING,
     PLAN_BLOCKS,
     SOLVE,
     TRAIN_BLOCK,
     TRAIN_SCAFFOLD,
+    TRAIN_SEAMS,
     StageSpec,
     stage_slice,
 )
 from pipelines.core.staleness import request, why_damaged, why_stale
 from pipelines.core.workspace import Workspace
 from pipelines.scene.block_plan import BlockPlan, PlannedBlock
-from pipelines.scene.block_record import BlockTraining
+from pipelines.scene.block_record import BlockRecord, BlockTraining
 from pipelines.scene.scaffold import scaffold_image_px
 from pipelines.splat.rasterizer.backends import rasterizer
 
@@ -132,10 +136,24 @@ class Parts:
             "max_gaussians": effort.max_gaussians,
             "id": number,
         }
+        if spec is TRAIN_SEAMS:
+            given["trained"] = [self._hash_of(block.id) for block in self.plan().blocks]
         if spec is SOLVE:
             given["max_image_size"] = scaffold_image_px(effort.max_image_size)
         left_out = () if spec is PLAN_BLOCKS else _OF_PLAN
         return {name: given[name] for name in spec.options.model_fields if name in given and name not in left_out}
+
+    def _hash_of(self, number: int) -> str:
+        """Return the hash of a block's Gaussians.
+
+        Raises:
+            MissingProductError: the block is not trained.
+        """
+        manifest = self.of_block(number).manifest(TRAIN_BLOCK)
+        if manifest is None:
+            command = f"georef blocks train {self.workspace.root} --id {number}"
+            raise MissingProductError(f"{FOLDER}/{number}/{BLOCK_GAUSSIANS}", command)
+        return manifest.files[Path(BLOCK_GAUSSIANS).name].sha256
 
     def run(
         self, spec: StageSpec, number: int | None = None, *, force: bool = False, progress: Progress = SILENT
@@ -177,6 +195,17 @@ class Parts:
     def waiting(self, plan: BlockPlan) -> Iterator[PlannedBlock]:
         """Yield the blocks of a plan that are not current."""
         return (block for block in plan.blocks if self.why_missing(TRAIN_BLOCK, block.id))
+
+    def is_merged(self) -> bool:
+        """Return whether the merged model holds the blocks as they were last trained."""
+        record = self.workspace.root / BLOCK_RECORD
+        if not record.is_file():
+            return False
+        try:
+            merged = load_json(BlockRecord, record).blocks
+            return [part.training for part in merged] == [self.training(block) for block in self.plan().blocks]
+        except (MissingProductError, InputError):
+            return False
 
     def states(self, plan: BlockPlan) -> dict[int, str]:
         """Return by number of a block `trained`, or why it must be trained."""

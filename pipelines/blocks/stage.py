@@ -14,7 +14,7 @@ from pipelines.blocks.merge import merge_blocks
 from pipelines.blocks.parts import Parts, TrainingRequest
 from pipelines.core.errors import GeorefError, MissingProductError
 from pipelines.core.progress import Progress
-from pipelines.core.stages import PLAN_BLOCKS, SOLVE, TRAIN_BLOCK, TRAIN_SCAFFOLD
+from pipelines.core.stages import PLAN_BLOCKS, SOLVE, TRAIN_BLOCK, TRAIN_SCAFFOLD, TRAIN_SEAMS
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.engine.chosen import engine_in_use
 from pipelines.engine.job import Job, JobEnd
@@ -35,6 +35,7 @@ def run(stage: StageRun, options: TrainingRequest) -> Summary:
     """
     parts = Parts(stage.workspace, options)
     plan = train_blocks(parts, stage.progress, force=stage.afresh, note=stage.record_progress)
+    _run_jobs("seams", seam_jobs(parts, plan, force=stage.afresh), stage.progress, stage.record_progress)
     return merge_blocks(parts, plan, stage.out, stage.progress)
 
 
@@ -83,6 +84,14 @@ def block_jobs(parts: Parts, plan: BlockPlan, *, force: bool = False) -> list[Jo
         _job(parts, f"block {b.id}", ("train",), ("--id", str(b.id)), BASE_BYTES + b.peak_bytes, force=force)
         for b in sorted(blocks, key=lambda block: -block.gaussians)
     ]
+
+
+def seam_jobs(parts: Parts, plan: BlockPlan, *, force: bool = False) -> list[Job]:
+    """Return the job that trains across the seams; none if that is current."""
+    if not force and not parts.why_missing(TRAIN_SEAMS):
+        return []
+    peak = BASE_BYTES + max(block.peak_bytes for block in plan.blocks)
+    return [_job(parts, "seams", ("seams",), (), peak, force=force)]
 
 
 def require_trained(parts: Parts, plan: BlockPlan) -> None:

@@ -88,6 +88,7 @@ def run_stage(
     flags: Flags,
     *,
     force: bool = False,
+    renew: bool = False,
     resume: Resume = "never",
     progress: Progress = SILENT,
     place: str = "",
@@ -101,6 +102,7 @@ def run_stage(
         spec: the stage.
         flags: only the options that the user gave, by field.
         force: run even if the product is current, and start afresh.
+        renew: run even if the product is current, with all that its parts have left.
         resume: whether to continue an interrupted run (see `Workspace.begin`), or to extend a finished product.
         progress: shows the stage's tasks.
         place: place of the stage in a longer run, for the log: `stage 2 of 8`.
@@ -118,7 +120,7 @@ def run_stage(
         refuse_damaged_inputs(workspace, spec, memo)
         before = workspace.requests().get(spec.name, {})
         workspace.remember({spec.name: flags})
-        previous = None if force else _current(workspace, asked, memo)
+        previous = None if force or renew else _current(workspace, asked, memo)
         if previous is not None:
             return Outcome(spec.name, False, _with_present_files(workspace, asked, previous))
         try:

@@ -37,6 +37,7 @@ SOLUTION = "solution/solution.json"
 SCAFFOLD = "scaffold/gaussians.ply"
 BLOCK_GAUSSIANS = "block/gaussians.ply"
 BLOCK_TRAINING = "block/record.json"
+FIRST_CELL = "seams/0.ply"
 
 
 @dataclass(frozen=True)
@@ -293,7 +294,7 @@ ADJUST = StageSpec(
     also=("adjust/geo_from_local.json",),
 )
 
-# Parts of a training in blocks, in variants of the workspace: the first three once, the last for each block.
+# Parts of a training in blocks, in variants of the workspace: all once, but for those of each block.
 PLAN_BLOCKS = StageSpec(
     name="plan",
     module="pipelines.blocks.plan",
@@ -336,7 +337,17 @@ TRAIN_BLOCK = StageSpec(
     also=(BLOCK_TRAINING,),
     working=("checkpoint.npz",),
 )
-BLOCK_PARTS = (PLAN_BLOCKS, SOLVE, TRAIN_SCAFFOLD, TRAIN_BLOCK)
+TRAIN_SEAMS = StageSpec(
+    name="seams",
+    module="pipelines.train.seams",
+    options_place="pipelines.train.options:SeamOptions",
+    folder="seams",
+    reads=(MEASURED, *whole(SPARSE, SIM3, BLOCK_PLAN, SOLUTION, SCAFFOLD), APPLIED_RIG),
+    product=FIRST_CELL,
+    title="Adapt the Gaussians along the seams of the blocks to each other.",
+    resumable=True,
+)
+BLOCK_PARTS = (PLAN_BLOCKS, SOLVE, TRAIN_SCAFFOLD, TRAIN_BLOCK, TRAIN_SEAMS)
 
 STAGES = (*PIPELINE, *DELIVERABLES, ADJUST, *BLOCK_PARTS)
 BY_NAME = {spec.name: spec for spec in (*PIPELINE, *DELIVERABLES)}

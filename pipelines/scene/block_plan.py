@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
@@ -49,6 +50,14 @@ class BlockCell(Product):
         return BlockCell(low=self.low, high=(below[0], below[1])), BlockCell(
             low=(above[0], above[1]), high=self.high
         )
+
+    def common(self, other: BlockCell) -> BlockCell | None:
+        """Return the part that two cells have in common; None: they have none."""
+        if not self.meets(other):
+            return None
+        low = [_outermost(self.low[axis], other.low[axis], max) for axis in (0, 1)]
+        high = [_outermost(self.high[axis], other.high[axis], min) for axis in (0, 1)]
+        return BlockCell(low=(low[0], low[1]), high=(high[0], high[1]))
 
     def meets(self, other: BlockCell) -> bool:
         """Return whether the cells have points in common."""
@@ -120,6 +129,13 @@ class BlockPlan(Product):
             if block.id == number:
                 return block
         raise InputError(f"there is no block {number}: the plan has 0 … {len(self.blocks) - 1}", field="--id")
+
+
+def _outermost(one: float | None, other: float | None, choose: Callable[[float, float], float]) -> float | None:
+    """Return one of two bounds; None has no end."""
+    if one is None or other is None:
+        return other if one is None else one
+    return choose(one, other)
 
 
 def _moved(bound: Bound, by: FloatArray) -> Bound:

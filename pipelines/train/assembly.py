@@ -11,6 +11,7 @@ from pipelines.splat.densify import DefaultSettings, DefaultStrategy, Strategy
 from pipelines.splat.densify_fast import FastSettings, FastStrategy
 from pipelines.splat.densify_mcmc import McmcSettings, McmcStrategy
 from pipelines.splat.exposure import Exposures, HeldExposures
+from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.initialise import InitialisationOptions, scene_extent
 from pipelines.splat.memory import TrainingSize
 from pipelines.splat.optimizer import GaussianAdam
@@ -21,6 +22,8 @@ from pipelines.train.initial_gaussians import TrainingScene, initial_gaussians, 
 from pipelines.train.options import TrainOptions
 from pipelines.train.schedule import COARSE, JointOptions
 from pipelines.train.trainer import JointTrainer, TrainingViews
+
+_FINISHING_RATE = 0.3  # of the rates at which a training starts
 
 
 def training_size(scene: Scene, images: ImageCache, options: TrainOptions, beside: int = 0) -> TrainingSize:
@@ -82,6 +85,49 @@ def make_trainer(
             surface=SurfaceSettings() if options.faithful_surface else None,
         ),
         exposures=exposures or fitted,
+        region=training.region,
+    )
+
+
+def make_finisher(
+    training: TrainingScene,
+    gaussians: Gaussians,
+    problem: GeoProblem,
+    *,
+    backend: Rasterizer,
+    options: TrainOptions,
+    exposures: HeldExposures | None,
+) -> JointTrainer:
+    """Return a trainer that goes on with trained Gaussians, at a low rate, and neither adds nor removes any.
+
+    Args:
+        training: cameras, photographs and region.
+        gaussians: on the backend's device.
+        problem: holds the cameras.
+        backend: the rasteriser.
+        options: of the training.
+        exposures: of the photographs; None: none.
+    """
+    device = device_of(backend)
+    extent_m = scene_extent(training.scene.poses.cam_center_in_model[training.scene.train])
+    iterations = options.effort.iterations
+    optimizer = GaussianAdam(gaussians, extent_m, iterations)
+    optimizer.rate_factor = _FINISHING_RATE
+    hold = points_to_hold(training, device) if options.faithful_surface else None
+    return JointTrainer(
+        optimizer,
+        DefaultStrategy(DefaultSettings(stop=0, reset_every=0), extent_m, len(gaussians), options.seed),
+        problem.to(device),
+        TrainingViews(training.scene.train, training.images, hold, training.scene.sparse.lenses),
+        rasterizer=backend,
+        options=JointOptions(
+            iterations,
+            gaussians.sh_degree,
+            seed=options.seed,
+            surface=SurfaceSettings() if options.faithful_surface else None,
+            finishing=True,
+        ),
+        exposures=exposures,
         region=training.region,
     )
 

@@ -82,6 +82,16 @@ class SolutionOptions(GeographicOptions):
     seed: int = Field(0, ge=0)
 
 
+class SeamOptions(TrainOptions):
+    """Options of the training across the seams.
+
+    Attributes:
+        trained: SHA-256 of the Gaussians of each block, in the order of their numbers.
+    """
+
+    trained: tuple[str, ...] = ()
+
+
 class BlockTrainOptions(TrainOptions):
     """Options of the training of one block.
 
