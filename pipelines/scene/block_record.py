@@ -20,8 +20,9 @@ class BlockTraining(Product):
         gaussians_in_cell: those that the merged model takes.
         photographs: trained on.
         seconds: of the iterations.
+        processor_s: of all processors together, for one iteration; None: unknown.
         mean_gaussians: mean number during the training.
-        mean_visible: mean number in a view.
+        mean_visible: mean number in a view, those that stood in for the rest among them.
         mean_px: mean number of the pixels of a view that were rendered.
         surroundings: Gaussians that stood in for the rest.
         peak_bytes: peak of the process's memory; None: not measured on this system.
@@ -36,6 +37,7 @@ class BlockTraining(Product):
     gaussians_in_cell: int
     photographs: int
     seconds: float
+    processor_s: float | None
     mean_gaussians: float
     mean_visible: float
     mean_px: float

@@ -8,6 +8,7 @@ checkpoint. The command is idempotent, and continues from the checkpoint.
 from __future__ import annotations
 
 import json
+import math
 
 import numpy as np
 import torch
@@ -174,6 +175,7 @@ def _measured(stage: StageRun, trainer: JointTrainer, block: PlannedBlock, recor
         gaussians_in_cell=int(in_cell.sum()),
         photographs=len(trainer.views.camera),
         seconds=record.seconds,
+        processor_s=None if math.isnan(record.processor_s) else record.processor_s,
         mean_gaussians=means["gaussians"],
         mean_visible=means["visible"],
         mean_px=means["pixels"],
