@@ -33,7 +33,8 @@ from pipelines.georef.cameras import CameraCorrections, CameraPoses
 from pipelines.georef.estimate import Estimate
 from pipelines.georef.problem import GeoProblem
 from pipelines.georef.similarity import LearnableSimilarity
-from pipelines.georef.sparse_adjustment import minimise_sparse, prior_of_poses
+from pipelines.georef.sparse_adjustment import minimise_sparse
+from pipelines.georef.sparse_equations import prior_of_poses
 from pipelines.georef.sparse_observations import State
 from pipelines.georef.sparse_posterior import SparsePosterior
 from pipelines.georef.terms import ControlTerm, FixTerm
@@ -210,7 +211,7 @@ def measure(count: int, points_per_camera: int, controls: int, seed: int) -> Non
         problem = problem_of(network, truth, control, rng)
         by_lens = intersection_jacobian(of_control(control, network), np.full(len(control.point), _MARK_PX)).by_lens
     with timed("minimum"):
-        state = minimise_sparse(problem, bundle)
+        state = minimise_sparse(problem, bundle).state
     with timed("posterior"):
         posterior = SparsePosterior(problem, bundle, state, by_lens)
     with timed("covariances of all cameras"):

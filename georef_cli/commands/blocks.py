@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +13,7 @@ from georef_cli import block_tables, boundary, options
 from georef_cli.command import Command
 from georef_cli.display import is_told, progress_for
 from georef_cli.dry_run import announce_training
+from georef_cli.engines import engine_for, engine_options
 from georef_cli.output import print_json, print_outcome, print_rich
 from pipelines.core import runner
 from pipelines.core.stages import (
@@ -26,6 +28,7 @@ from pipelines.core.stages import (
 )
 from pipelines.core.staleness import must_exist, stage_config
 from pipelines.core.workspace import Workspace
+from pipelines.engine.chosen import chosen_engine
 
 if TYPE_CHECKING:
     from pipelines.blocks.parts import Parts
@@ -43,6 +46,16 @@ def _blocks(ctx: click.Context, **values: Any) -> None:
         raise click.UsageError("--id is for `georef blocks train`.")
     if given and (action in ("scaffold", "seams", "merge") or number is not None):
         raise click.UsageError("options of the training are given to `georef blocks` or `georef blocks plan`.")
+    engine = engine_for(values)
+    # Without a cluster the engine is that of the context, and by default this machine.
+    with nullcontext() if values["cluster"] is None else chosen_engine(engine):
+        _act(ctx, action, workspace, given, values)
+
+
+def _act(
+    ctx: click.Context, action: str, workspace: Workspace, given: dict[str, Any], values: dict[str, Any]
+) -> None:
+    number = values["number"]
     if action == "plan":
         _plan(ctx, workspace, given, values)
     elif action == "scaffold":
@@ -157,6 +170,7 @@ command = Command(
         click.Argument(["place"], nargs=-1, required=True, metavar="[plan|scaffold|train|seams|merge] WS"),
         click.Option(["--id", "number"], type=click.IntRange(min=0), help="Train this block only."),
         *options.stage_options(TRAIN.options),
+        *engine_options(),
         options.force_option("Run even what is current, and start afresh."),
         options.json_option(),
     ],
@@ -178,6 +192,7 @@ command = Command(
           georef blocks plan town --preset high --max-gaussians 20000000
           georef blocks plan town --block-memory 16
           georef blocks train town --id 7
+          georef blocks town --cluster tls://10.0.0.1:8786 --certificates ~/.georef/cluster
           georef blocks merge town
         """,
 )

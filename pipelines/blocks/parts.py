@@ -36,7 +36,7 @@ from pipelines.splat.rasterizer.backends import rasterizer
 
 FOLDER = "blocks"
 _COMMAND = "blocks"
-_UPSTREAM = stage_slice(None, "init-sim3")
+UPSTREAM = stage_slice(None, "init-sim3")
 # The plan applies these, and a block is stale with the plan.
 _OF_PLAN = ("preset", "blocks", "block_overlap", "block_memory")
 
@@ -212,4 +212,4 @@ class Parts:
         return {block.id: self.why_missing(TRAIN_BLOCK, block.id) or "trained" for block in plan.blocks}
 
     def _lent(self) -> dict[str, Any]:
-        return {spec.folder: self.workspace.root / spec.folder for spec in _UPSTREAM}
+        return {spec.folder: self.workspace.root / spec.folder for spec in UPSTREAM}

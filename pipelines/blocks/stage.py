@@ -9,11 +9,14 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 from pipelines.blocks.merge import merge_blocks
-from pipelines.blocks.parts import Parts, TrainingRequest
+from pipelines.blocks.parts import UPSTREAM, Parts, TrainingRequest
 from pipelines.core.errors import GeorefError, MissingProductError
+from pipelines.core.options import CONFIG_FILE
 from pipelines.core.progress import Progress
+from pipelines.core.requests import REQUESTS
 from pipelines.core.stages import PLAN_BLOCKS, SOLVE, TRAIN_BLOCK, TRAIN_SCAFFOLD, TRAIN_SEAMS
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.engine.chosen import engine_in_use
@@ -67,8 +70,8 @@ def scaffold_jobs(parts: Parts, plan: BlockPlan, *, force: bool = False) -> list
     """Return the job that trains the scaffold; none if it is current."""
     if not force and not parts.why_missing(TRAIN_SCAFFOLD):
         return []
-    peak = BASE_BYTES + min(block.peak_bytes for block in plan.blocks)
-    return [_job(parts, "scaffold", ("scaffold",), (), peak, force=force)]
+    job = Job("scaffold", ("blocks", "scaffold"), BASE_BYTES + min(block.peak_bytes for block in plan.blocks))
+    return [_placed(job, parts, "scaffold", force=force)]
 
 
 def block_jobs(parts: Parts, plan: BlockPlan, *, force: bool = False) -> list[Job]:
@@ -81,7 +84,12 @@ def block_jobs(parts: Parts, plan: BlockPlan, *, force: bool = False) -> list[Jo
     """
     blocks = plan.blocks if force else tuple(parts.waiting(plan))
     return [
-        _job(parts, f"block {b.id}", ("train",), ("--id", str(b.id)), BASE_BYTES + b.peak_bytes, force=force)
+        _placed(
+            Job(f"block {b.id}", ("blocks", "train", "--id", str(b.id)), BASE_BYTES + b.peak_bytes),
+            parts,
+            str(b.id),
+            force=force,
+        )
         for b in sorted(blocks, key=lambda block: -block.gaussians)
     ]
 
@@ -90,8 +98,8 @@ def seam_jobs(parts: Parts, plan: BlockPlan, *, force: bool = False) -> list[Job
     """Return the job that trains across the seams; none if that is current."""
     if not force and not parts.why_missing(TRAIN_SEAMS):
         return []
-    peak = BASE_BYTES + max(block.peak_bytes for block in plan.blocks)
-    return [_job(parts, "seams", ("seams",), (), peak, force=force)]
+    job = Job("seams", ("blocks", "seams"), BASE_BYTES + max(block.peak_bytes for block in plan.blocks))
+    return [_placed(job, parts, "seams", force=force)]
 
 
 def require_trained(parts: Parts, plan: BlockPlan) -> None:
@@ -106,12 +114,29 @@ def require_trained(parts: Parts, plan: BlockPlan) -> None:
             raise MissingProductError(f"blocks/{block.id}", command)
 
 
-def _job(
-    parts: Parts, name: str, action: tuple[str, ...], more: tuple[str, ...], peak_bytes: int, *, force: bool
-) -> Job:
-    place = str(parts.workspace.root.absolute())
-    arguments = ("blocks", *action, place, *more, *(("--force",) if force else ()))
-    return Job(name, arguments, peak_bytes, uses_gpu=parts.on_gpu())
+def _placed(job: Job, parts: Parts, place: str, *, force: bool) -> Job:
+    """Return a job with its place in the workspace.
+
+    Args:
+        job: its arguments are those behind `georef`, without the workspace.
+        parts: of the training.
+        place: folder of its product, in `blocks/`.
+        force: start afresh.
+    """
+    root, shared = parts.workspace.root.absolute(), parts.whole.root.absolute()
+    command, action, *more = job.arguments
+    read = [root / name for name in (*(spec.folder for spec in UPSTREAM), REQUESTS, CONFIG_FILE)]
+    read += [shared / spec.folder for spec in (PLAN_BLOCKS, SOLVE, TRAIN_SCAFFOLD)]
+    if place == TRAIN_SEAMS.folder:
+        read += [shared / str(block.id) for block in parts.plan().blocks]
+    return replace(
+        job,
+        arguments=(command, action, str(root), *more, *(("--force",) if force else ())),
+        uses_gpu=parts.on_gpu(),
+        folder=root,
+        writes=shared / place,
+        reads=tuple(path for path in read if path.exists() and path != shared / place),
+    )
 
 
 def _run_jobs(title: str, jobs: Sequence[Job], progress: Progress, note: Callable[[str], None]) -> None:

@@ -31,6 +31,7 @@ from pipelines.robust.kernels import CAUCHY_SCALE2, cauchy_weight
 from pipelines.robust.statistics import rayleigh_sigma
 
 _CHUNK = 2**19  # observations that are linearised together
+_RIDGE = 1e-9
 # A camera with few observations is held to a tenth of its distance from the scene.
 _LOOSEST_RELATIVE_SIGMA = 0.1
 # Means of the weight w and of w r²/2 under Gaussian noise of σ = 1, where r²/2 is exponentially distributed. Robust
@@ -98,7 +99,7 @@ def bundle_information(network: Network, *, lens_follows: bool = True) -> Bundle
     residual = projection_residuals(network)
     weight = _robust_weights(residual)
     variance = float((weight[:, None] * residual**2).sum() / (_MEAN_WEIGHTED_SQUARE * redundancy))
-    sums = _eliminated_points(network, np.sqrt(weight / (_MEAN_WEIGHT * variance)))
+    sums = eliminate_points(network, np.sqrt(weight / (_MEAN_WEIGHT * variance)))
     follows, lens, lens_cov = _lens_elimination(sums)
     pull = sums.pose_pull + follows.T @ sums.lens_pull if lens_follows else sums.pose_pull
     return BundleInformation(
@@ -121,18 +122,27 @@ def _robust_weights(residual: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class _Sums:
-    """Normal equations of poses and lens, with the points eliminated; sums over chunks of points."""
+class EliminatedPoints:
+    """Normal equations of n poses and L lens parameters, with the points eliminated.
 
-    poses: bsr_matrix  # (6 n, 6 n)
-    cross: FloatArray  # (6 n, L)
-    lens: FloatArray  # (L, L)
-    pose_pull: FloatArray  # (6 n, 7) of the poses on the points' similarity
-    lens_pull: FloatArray  # (L, 7)
-    modes: FloatArray  # (7, 7) information on the points' similarity
+    Attributes:
+        poses: (6 n, 6 n) sparse, in blocks (6, 6).
+        cross: (6 n, L).
+        lens: (L, L).
+        pose_pull: (6 n, 7) of the poses on the points' similarity.
+        lens_pull: (L, 7) of the lens on it.
+        modes: (7, 7) information on it.
+    """
 
-    def __add__(self, other: _Sums) -> _Sums:
-        return _Sums(
+    poses: bsr_matrix
+    cross: FloatArray
+    lens: FloatArray
+    pose_pull: FloatArray
+    lens_pull: FloatArray
+    modes: FloatArray
+
+    def __add__(self, other: EliminatedPoints) -> EliminatedPoints:
+        return EliminatedPoints(
             self.poses + other.poses,
             self.cross + other.cross,
             self.lens + other.lens,
@@ -142,17 +152,27 @@ class _Sums:
         )
 
 
-def _eliminated_points(network: Network, root_weight: FloatArray) -> _Sums:
-    total: _Sums | None = None
-    for part, rows in _chunks_of_points(network):
-        sums = _eliminated(part, root_weight[rows])
+def eliminate_points(
+    network: Network, root_weight: FloatArray, surveyed: FloatArray | None = None, *, ridge: float = _RIDGE
+) -> EliminatedPoints:
+    """Return the normal equations of poses and lens of a network, chunk by chunk of its points.
+
+    Args:
+        network: N points and M observations, each in front of its camera; at least one.
+        root_weight: (M,) inverse σ of the observations, 1/px.
+        surveyed: (N, 3, 3) information on the points beyond their observations, 1/m²; None: there is none.
+        ridge: added to the information on a point, relative to its trace, for a point that its rays leave open.
+    """
+    total: EliminatedPoints | None = None
+    for part, points, rows in _chunks_of_points(network):
+        sums = _eliminated(part, root_weight[rows], None if surveyed is None else surveyed[points], ridge)
         total = sums if total is None else total + sums
-    assert total is not None  # there are more observations than unknowns
+    assert total is not None
     return total
 
 
-def _chunks_of_points(network: Network) -> Iterator[tuple[Network, IntArray]]:
-    """Yield networks with a part of the points each, and the rows of their observations."""
+def _chunks_of_points(network: Network) -> Iterator[tuple[Network, slice, IntArray]]:
+    """Yield networks with a part of the points each, with the rows of these points and of their observations."""
     order = np.argsort(network.obs_point, kind="stable")
     last = np.cumsum(np.bincount(network.obs_point, minlength=len(network.point_in_world)))
     first_point = first = 0
@@ -167,12 +187,15 @@ def _chunks_of_points(network: Network) -> Iterator[tuple[Network, IntArray]]:
                 obs_image=network.obs_image[rows],
                 obs_xy_px=network.obs_xy_px[rows],
             ),
+            slice(first_point, next_point),
             rows,
         )
         first_point, first = next_point, int(last[next_point - 1])
 
 
-def _eliminated(network: Network, root_weight: FloatArray) -> _Sums:
+def _eliminated(
+    network: Network, root_weight: FloatArray, surveyed: FloatArray | None, ridge: float
+) -> EliminatedPoints:
     """Eliminate the points of a chunk."""
     n, points = len(network.camera_id), len(network.point_in_world)
     linearised, scaled = linearise_bundle(network), root_weight[:, None, None]
@@ -180,7 +203,9 @@ def _eliminated(network: Network, root_weight: FloatArray) -> _Sums:
     intrinsics = sparse_jacobian(linearised.jacobian_intrinsics * scaled, lens_slots(network), len(network.cameras))
     normal = np.zeros((points, 3, 3))
     np.add.at(normal, network.obs_point, np.swapaxes(by_point, 1, 2) @ by_point)
-    normal += 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3) + 1e-12 * np.eye(3)
+    if surveyed is not None:
+        normal += surveyed
+    normal += ridge * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3) + 1e-12 * np.eye(3)
     root = np.linalg.cholesky(normal)
     inverse_root = np.swapaxes(np.linalg.inv(root), 1, 2)
     white = by_point @ inverse_root[network.obs_point]
@@ -190,7 +215,7 @@ def _eliminated(network: Network, root_weight: FloatArray) -> _Sums:
     pose = sparse_jacobian(by_pose, network.obs_image, n)
     intrinsics_point = intrinsics.T @ sparse_jacobian(white, network.obs_point, points)
     moved = (np.swapaxes(root, 1, 2) @ _point_similarity_modes(network)).reshape(3 * points, 7)
-    return _Sums(
+    return EliminatedPoints(
         own - pose_point @ pose_point.T,
         (pose.T @ intrinsics - pose_point.tocsr() @ intrinsics_point.T).toarray(),
         (intrinsics.T @ intrinsics - intrinsics_point @ intrinsics_point.T).toarray(),
@@ -211,7 +236,7 @@ def _blocks(blocks: FloatArray, row: IntArray, column: IntArray, shape: tuple[in
     return matrix
 
 
-def _lens_elimination(sums: _Sums) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _lens_elimination(sums: EliminatedPoints) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return how the lens follows the poses (L, 6 n), its information about that (L, L), and the covariance."""
     diagonal = np.diag(sums.lens)
     used = np.flatnonzero(diagonal > 0)  # shorter parameter lists leave empty columns

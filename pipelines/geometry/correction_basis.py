@@ -17,6 +17,13 @@ from pipelines.core.types import FloatArray
 from pipelines.geometry.bundle import Network
 from pipelines.geometry.bundle_information import BundleInformation, bundle_information
 
+_COPIES = 4  # information, its factor, the basis, and a Jacobian or a normal matrix of the same size
+
+
+def predicted_basis_bytes(cameras: int) -> int:
+    """Return the peak of memory of a dense basis and of the normal equations in it."""
+    return _COPIES * 8 * (6 * cameras) ** 2
+
 
 @dataclass(frozen=True)
 class CorrectionBasis:
@@ -58,7 +65,11 @@ def correction_basis(network: Network, *, lens_follows: bool = True) -> Correcti
     Raises:
         DegenerateGeometryError: fewer observations than unknowns.
     """
-    bundle = bundle_information(network, lens_follows=lens_follows)
+    return basis_of(bundle_information(network, lens_follows=lens_follows))
+
+
+def basis_of(bundle: BundleInformation) -> CorrectionBasis:
+    """Return the basis of `correction_basis` from the information of the bundle."""
     flat = _whitened_basis(bundle)
     held = flat - bundle.similarity_modes @ (bundle.points_follow @ flat)
     return CorrectionBasis(

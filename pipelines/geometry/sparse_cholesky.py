@@ -66,6 +66,13 @@ class SparseCholesky:
         """Number of stored entries of the factor."""
         return sum(pivot.diagonal.size + pivot.below.size for pivot in self._pivots)
 
+    @property
+    def least_pivot(self) -> float:
+        """Smallest entry on the diagonal of the factor."""
+        return float(
+            min((np.diag(pivot.diagonal).min() for pivot in self._pivots if pivot.diagonal.size), default=0.0)
+        )
+
     def solve(self, right: FloatArray) -> FloatArray:
         """Return the product (n · w, m) of the inverse matrix and vectors (n · w, m)."""
         solution = np.array(right, dtype=np.float64).reshape(-1, self._width, right.shape[1])

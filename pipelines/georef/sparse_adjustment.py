@@ -1,56 +1,31 @@
 """Joint adjustment of similarity, constant errors and many cameras, in sparse normal equations.
 
-`georef.posterior` takes the corrections of the cameras in a dense, whitened basis, whose memory grows with the
-square of the number of cameras. This module takes the corrections x' themselves, with the sparse information of
-the bundle as their prior. Both have the same minimum and the same posterior:
-
-1. The basis is free of similarities of the whole: x = x' − M g, with the movements M of a similarity and the mean
-   similarity g = F x' of the points that follow the cameras.
-2. The lens follows the cameras: ℓ = K x'.
-3. F and K are dense, but have few rows. g and ℓ are therefore unknowns of their own, with g = F x' and ℓ = K x' as
-   constraints. With Lagrange multipliers λ, the normal equations consist of a sparse matrix of the cameras and a
-   dense border of (y, v, g, ℓ, λ):
-
-       | N   Bᵀ | | x'     |
-       | B   E  | | border | ,   Schur complement of N: S = E − B N⁻¹ Bᵀ.
-
-4. N is the bundle's information plus that of the measurements plus a weak hold. It is positive definite, because
-   the hold also stiffens the similarity of the cameras, which step 1 takes out again. S is small and indefinite.
-
-N is factorised by nested dissection (`geometry.sparse_cholesky`). A quasi-Newton step takes the gradient at the
-present state and a factor that may be older: the minimum is exact, and only few factorisations are needed.
+`georef.sparse_equations` has the equations. A quasi-Newton step takes the gradient at the present state and a
+factor that may be older: the minimum is exact, and only few factorisations are needed. A step that raises the cost
+is halved.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.linalg import block_diag, lu_factor, lu_solve
-from scipy.sparse import bsr_matrix, diags
+from scipy.sparse import bsr_matrix
 
-from pipelines.core.errors import ConvergenceError, DegenerateGeometryError
+from pipelines.core.errors import ConvergenceError
 from pipelines.core.types import FloatArray
 from pipelines.geometry.bundle_information import BundleInformation
-from pipelines.geometry.sparse_cholesky import SparseCholesky
-from pipelines.georef.normal_equations import Weights, robust_weights
+from pipelines.georef.normal_equations import Residuals, robust_cost, robust_weights
 from pipelines.georef.problem import GeoProblem
-from pipelines.georef.sparse_observations import (
-    SparseObservations,
-    State,
-    colours_of_cameras,
-    observed,
-    residuals_and_slope,
-)
+from pipelines.georef.sparse_equations import SparseEquations, followers, prior_of_border, prior_of_poses
+from pipelines.georef.sparse_observations import State, colours_of_cameras, observed, residuals_and_slope
 
-_ROUNDS = 60
-_STILL = 1e-6  # change of a whitened residual that ends the descent
+_ROUNDS = 150
+_STILL = 5e-6  # change of a whitened residual that ends the descent
+_NOISE = 1e-10  # relative rise of the cost that rounding causes
+_HALVINGS = 12  # of a step that raises the cost
 _NEW_FACTOR = 0.6  # a step that leaves more of the last change of the residuals asks for a new factor
-_EQUILIBRATIONS = 8
-_OPEN = 1e-13  # singular value of the equilibrated Schur complement over the largest
-_ADVICE = "fixes and control points leave the similarity open: add control points, at least 3"
 
 
 @dataclass(frozen=True)
@@ -66,106 +41,107 @@ class Unknowns:
     border: FloatArray
 
 
-class SparseEquations:
-    """Factorised normal equations of a problem.
-
-    Args:
-        problem: similarity, constant errors and terms. The corrections of its cameras are not used.
-        bundle: information of the image observations on the cameras.
-        observations: by the name of their kind, linearised about a state.
-        weights: of the observations.
+@dataclass(frozen=True)
+class SparseMinimum:
+    """Minimum of a problem.
 
     Attributes:
-        factor: of N.
-        response: (6 n, b) N⁻¹ Bᵀ.
-
-    Raises:
-        DegenerateGeometryError: the measurements leave the similarity open.
+        state: values of all unknowns.
+        cost: −2 ln likelihood, with the priors.
+        equations: factorised near the minimum, with robust weights.
     """
 
-    def __init__(
-        self,
-        problem: GeoProblem,
-        bundle: BundleInformation,
-        observations: Mapping[str, SparseObservations],
-        weights: Weights,
-    ) -> None:
-        self._observations, self._weights, self._bundle = observations, weights, bundle
-        among, matrix = _prior_of_border(problem, bundle), prior_of_poses(bundle)
-        across = np.zeros((len(among), matrix.shape[0]))
-        for kind, rows in observations.items():
-            weight = np.repeat(weights[kind], rows.residual.shape[1])
-            weighted, by_border = rows.by_poses.T @ diags(weight), _by_border(rows, bundle)
-            matrix = matrix + (weighted @ rows.by_poses).tobsr((6, 6))
-            across += (weighted @ by_border).T
-            among += by_border.T @ (weight[:, None] * by_border)
-        followers = _followers(bundle)
-        select = np.eye(len(among))[:, -len(followers) :]
-        corner = np.block([[among, select], [select.T, np.zeros((len(followers), len(followers)))]])
-        self._border = np.concatenate([across, -followers])
-        self.factor = SparseCholesky(matrix.tobsr((6, 6)), problem.cameras.center.cpu().numpy())
-        self.response = self.factor.solve(np.ascontiguousarray(self._border.T))
-        self._schur = _EquilibratedLU(corner - self._border @ self.response)
-
-    def solve(self, poses: FloatArray, border: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the unknowns (6 n, m) and (b, m) for right sides of the same shapes."""
-        inner = self.factor.solve(poses)
-        outer = self._schur.solve(border - self._border @ inner)
-        return inner - self.response @ outer, outer
-
-    def border_form(self, left: FloatArray) -> FloatArray:
-        """Return the products left S⁻¹ leftᵀ (…, m, m) of border vectors (…, m, b)."""
-        solved = self._schur.solve(left.reshape(-1, left.shape[-1]).T).T.reshape(left.shape)
-        return np.asarray(left @ np.swapaxes(solved, -1, -2))
-
-    def response_to(self, kind: str, change: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the change (6 n, c) and (b, c) of the unknowns by changes (M d, c) of whitened measurements."""
-        rows = self._observations[kind]
-        weighted = np.repeat(self._weights[kind], rows.residual.shape[1])[:, None] * change
-        by_border = _by_border(rows, self._bundle)
-        border = np.zeros((len(self._border), change.shape[1]))
-        border[: by_border.shape[1]] = by_border.T @ weighted
-        return self.solve(np.asarray(rows.by_poses.T @ weighted), border)
+    state: State
+    cost: float
+    equations: SparseEquations
 
 
-def minimise_sparse(problem: GeoProblem, bundle: BundleInformation, *, lens_follows: bool = True) -> State:
+def minimise_sparse(
+    problem: GeoProblem,
+    bundle: BundleInformation,
+    *,
+    lens_follows: bool = True,
+    equations: SparseEquations | None = None,
+) -> SparseMinimum:
     """Return the minimum of a problem's whitened loss over similarity, constant errors, and all cameras with lens.
 
-    The minimum is that of `georef.posterior.minimise` with the basis of `geometry.correction_basis`. Similarity and
-    constant errors start from the state of the problem, which is left as it is; cameras and lens start uncorrected.
+    The minimum is that of `georef.posterior.minimise` with the basis of `geometry.correction_basis`. All unknowns
+    start from the state of the problem, which is left as it is.
 
     Args:
-        problem: the measurements. The corrections of its cameras are not used.
-        bundle: information of the image observations, at the poses of the problem's cameras.
+        problem: the measurements.
+        bundle: information of the image observations, at the uncorrected poses of the problem's cameras.
         lens_follows: whether the lens follows the cameras, as `bundle` was made with.
+        equations: of a state near by, whose factor the first steps take; None: there are none.
 
     Raises:
         ConvergenceError: the steps do not end.
         DegenerateGeometryError: the measurements leave the similarity open.
     """
-    unknowns, prior = _start(problem, bundle), (prior_of_poses(bundle), _prior_of_border(problem, bundle))
-    colours, equations, before, last = colours_of_cameras(problem), None, None, np.inf
+    unknowns, prior = _start(problem, bundle), (prior_of_poses(bundle), prior_of_border(problem, bundle))
+    colours, last, halved = colours_of_cameras(problem), np.inf, 0
+    accepted: _Evaluated | None = None
     for _ in range(_ROUNDS):
         state = _state(problem, bundle, unknowns, lens_follows)
         residuals, slope = residuals_and_slope(problem, state, robust_weights)
-        if before is not None:
-            change = max((float(np.abs(residuals[kind] - before[kind]).max()) for kind in residuals), default=0.0)
-            if change < _STILL:
-                return state
-            equations, last = (None if change > _NEW_FACTOR * last else equations), change
+        cost = _cost(prior, residuals, unknowns)
+        if accepted is not None:
+            change = _largest_change(accepted.residuals, residuals)
+            if cost > accepted.cost + _NOISE * (1 + abs(cost)) and change >= _STILL:
+                halved += 1
+                if halved > _HALVINGS:
+                    break
+                unknowns, equations = _halfway(accepted.unknowns, unknowns), None if halved == 1 else equations
+                continue
+            if change < _STILL and equations is not None:
+                return SparseMinimum(state, cost, equations)
+            equations, last, halved = (None if change > _NEW_FACTOR * last else equations), change, 0
         if equations is None:
             rows = observed(problem, state, colours)
             equations = SparseEquations(problem, bundle, rows, robust_weights(residuals))
         by_poses, by_border = _slope_by_unknowns(prior, bundle, slope, unknowns)
         poses, border = equations.solve(-by_poses[:, None], -by_border[:, None])
-        unknowns, before = Unknowns(unknowns.poses + poses[:, 0], unknowns.border + border[:, 0]), residuals
-    raise ConvergenceError(f"cameras still move after {_ROUNDS} steps: a residual changes by {last:.1e} σ in one")
+        accepted = _Evaluated(unknowns, residuals, cost)
+        unknowns = Unknowns(unknowns.poses + poses[:, 0], unknowns.border + border[:, 0])
+    raise ConvergenceError(f"the cameras do not settle: the last step changed a residual by {last:.1e} σ")
+
+
+@dataclass(frozen=True)
+class _Evaluated:
+    unknowns: Unknowns
+    residuals: Residuals
+    cost: float
+
+
+def _halfway(start: Unknowns, end: Unknowns) -> Unknowns:
+    """Return the middle of a step."""
+    return Unknowns((start.poses + end.poses) / 2, (start.border + end.border) / 2)
+
+
+def _largest_change(before: Residuals, after: Residuals) -> float:
+    return max((float(np.abs(after[kind] - before[kind]).max()) for kind in after), default=0.0)
+
+
+def state_of(problem: GeoProblem) -> State:
+    """Return the present state of a problem."""
+    cameras = problem.cameras
+    with torch.no_grad():
+        parts = cameras.corrections(), cameras.lens(), problem.similarity.y, problem.errors.vector()
+        return State(*(part.detach().cpu().numpy().copy() for part in parts))
 
 
 def _start(problem: GeoProblem, bundle: BundleInformation) -> Unknowns:
-    with torch.no_grad():
-        known = [problem.similarity.y.cpu().numpy(), problem.errors.vector().cpu().numpy()]
-    return Unknowns(np.zeros(len(bundle.unit)), np.concatenate([*known, np.zeros(2 * len(_followers(bundle)))]))
+    state, follow = state_of(problem), followers(bundle)
+    poses = state.correction.ravel()
+    values = [state.similarity, state.errors, follow @ poses, np.zeros(len(follow))]
+    return Unknowns(poses, np.concatenate(values))
+
+
+def _cost(prior: tuple[bsr_matrix, FloatArray], residuals: Residuals, unknowns: Unknowns) -> float:
+    of_poses, of_border = prior
+    values = unknowns.border[: len(of_border)]
+    from_prior = unknowns.poses @ (of_poses @ unknowns.poses) + values @ of_border @ values
+    return robust_cost(residuals) + float(from_prior)
 
 
 def _state(problem: GeoProblem, bundle: BundleInformation, unknowns: Unknowns, lens_follows: bool) -> State:
@@ -188,61 +164,13 @@ def _slope_by_unknowns(
         unknowns: where the gradient is taken.
     """
     of_poses, of_border = prior
-    followers, count = _followers(bundle), len(of_border)
+    follow, count = followers(bundle), len(of_border)
     values, multipliers = unknowns.border[:count], unknowns.border[count:]
     by_correction, by_lens = slope.correction.ravel(), np.zeros(len(bundle.lens))
     by_lens[: len(slope.lens)] = slope.lens
     by_similarity = -(by_correction @ bundle.similarity_modes)
     by_values = of_border @ values + np.concatenate([slope.similarity, slope.errors, by_similarity, by_lens])
-    by_values[-len(followers) :] += multipliers
-    violated = values[-len(followers) :] - followers @ unknowns.poses
-    by_poses = by_correction + of_poses @ unknowns.poses - followers.T @ multipliers
+    by_values[-len(follow) :] += multipliers
+    violated = values[-len(follow) :] - follow @ unknowns.poses
+    by_poses = by_correction + of_poses @ unknowns.poses - follow.T @ multipliers
     return by_poses, np.concatenate([by_values, violated])
-
-
-def _followers(bundle: BundleInformation) -> FloatArray:
-    """Return F and K (7 + L, 6 n): how the similarity of the points and the lens follow x'."""
-    return np.concatenate([bundle.points_follow, bundle.lens_follows])
-
-
-def prior_of_poses(bundle: BundleInformation) -> bsr_matrix:
-    """Return the information (6 n, 6 n) on x', the lens held, with the hold of weak cameras."""
-    hold = diags((bundle.unit * bundle.loosest_sigma_m) ** -2).tobsr((6, 6))
-    return (bundle.by_poses + hold).tobsr((6, 6))
-
-
-def _prior_of_border(problem: GeoProblem, bundle: BundleInformation) -> FloatArray:
-    """Return the information (q, q) on y, v, g and ℓ.
-
-    That of the lens is negative: with ℓ = K x', it takes out of the poses' information what the unknown lens costs.
-    """
-    held = float(problem.hold_prior) * problem.similarity.held.cpu().numpy()
-    precise = problem.errors.sigma.detach().cpu().numpy() ** -2.0
-    return np.asarray(block_diag(np.diag(held), np.diag(precise), np.zeros((7, 7)), -bundle.lens))
-
-
-def _by_border(rows: SparseObservations, bundle: BundleInformation) -> FloatArray:
-    """Return the derivatives (M d, q) of observations by y, v, g and ℓ."""
-    by_lens = np.zeros((len(rows.by_parameters), len(bundle.lens)))
-    by_lens[:, : rows.by_lens.shape[1]] = rows.by_lens
-    by_similarity = -(rows.by_poses @ bundle.similarity_modes)
-    return np.concatenate([rows.by_parameters, by_similarity, by_lens], axis=1)
-
-
-class _EquilibratedLU:
-    """LU factors of a symmetric, indefinite matrix, its rows and columns scaled to a largest entry of 1."""
-
-    def __init__(self, matrix: FloatArray) -> None:
-        self._scale = np.ones(len(matrix))
-        for _ in range(_EQUILIBRATIONS):
-            largest = np.abs(matrix * self._scale[:, None] * self._scale).max(axis=1)
-            self._scale /= np.sqrt(np.where(largest > 0, largest, 1.0))
-        scaled = matrix * self._scale[:, None] * self._scale
-        size = np.linalg.svd(scaled, compute_uv=False)
-        if size[-1] <= _OPEN * size[0]:
-            raise DegenerateGeometryError(_ADVICE)
-        self._factors = lu_factor(scaled)
-
-    def solve(self, right: FloatArray) -> FloatArray:
-        """Return the solution (b, m) for right sides (b, m)."""
-        return np.asarray(lu_solve(self._factors, right * self._scale[:, None]) * self._scale[:, None])

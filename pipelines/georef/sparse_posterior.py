@@ -2,7 +2,7 @@
 
 The joint covariance of `georef.posterior.Posterior` is dense. Here each covariance is computed where it is asked
 for, from the factor of the normal equations. With derivatives q of a wanted quantity by the cameras' x' and c by
-the border unknowns (`georef.sparse_adjustment`), the covariance is
+the border unknowns (`georef.sparse_equations`), the covariance is
 
     q N⁻¹ qᵀ + (c − q N⁻¹ Bᵀ) S⁻¹ (c − q N⁻¹ Bᵀ)ᵀ.
 """
@@ -14,10 +14,10 @@ from scipy.sparse import csr_matrix
 
 from pipelines.core.types import FloatArray
 from pipelines.geometry.bundle_information import BundleInformation
-from pipelines.geometry.similarity import Similarity, jacobian_at
+from pipelines.geometry.similarity import Similarity, jacobian_at, second_moment_at
 from pipelines.georef.normal_equations import posterior_weights
 from pipelines.georef.problem import GeoProblem
-from pipelines.georef.sparse_adjustment import SparseEquations
+from pipelines.georef.sparse_equations import SparseEquations
 from pipelines.georef.sparse_observations import State, colours_of_cameras, observed
 
 _CHUNK = 32  # points whose covariances are computed together
@@ -76,13 +76,29 @@ class SparsePosterior:
         covariance = np.empty((len(point_in_geo), 3, 3))
         for first in range(0, len(point_in_geo), _CHUNK):
             rows = slice(first, first + _CHUNK)
-            joint = self.jointly_at(point_in_geo[rows], by_poses[3 * first : 3 * first + 3 * _CHUNK], by_lens[rows])
+            joint = self._to_first_order(
+                point_in_geo[rows], by_poses[3 * first : 3 * first + 3 * _CHUNK], by_lens[rows]
+            )
             among = np.arange(len(joint) // 3)
             covariance[rows] = joint.reshape(len(among), 3, -1, 3)[among, :, among]
         return covariance
 
     def jointly_at(self, point_in_geo: FloatArray, by_poses: csr_matrix, by_lens: FloatArray) -> FloatArray:
-        """Return the joint covariance (3 J, 3 J) in m² of points to first order, with the arguments of `at`."""
+        """Return the joint covariance (3 J, 3 J) in m² of points; the arguments are those of `at`.
+
+        The second-order error of the similarity is included, as in `georef.posterior.Posterior`.
+        """
+        of_similarity = second_moment_at(point_in_geo, self.of_similarity(), self._pivot)
+        return self._to_first_order(point_in_geo, by_poses, by_lens) + of_similarity
+
+    def of_lens(self) -> FloatArray:
+        """Return the covariance (L, L) of the lens parameters, in the order of `geometry.lens.Lenses`."""
+        lens = np.eye(len(self._bundle.lens))
+        by_border = self._by_border(np.zeros((len(lens), 7)), np.zeros((len(lens), 7)), lens)
+        rest = lens if self._pull is None else lens - by_border @ self._pull[1]
+        return np.asarray(self._equations.border_form(by_border) + rest @ self._bundle.lens_cov @ rest.T)
+
+    def _to_first_order(self, point_in_geo: FloatArray, by_poses: csr_matrix, by_lens: FloatArray) -> FloatArray:
         by_poses, lens = csr_matrix(by_poses), by_lens.reshape(-1, by_lens.shape[2])
         by_similarity = np.concatenate(jacobian_at(point_in_geo, self._pivot))
         by_border = self._by_border(by_similarity, by_poses @ self._bundle.similarity_modes, lens)

@@ -42,10 +42,25 @@ def solve_once(
         DegenerateGeometryError: the measurements leave the similarity open.
         InputError: a constant error is to be estimated, but its measurements were not recorded.
     """
-    problem = geo_problem(scene, survey, initial, options.model_copy(update={"rel_loss": False}))
+    solving = options.model_copy(update={"rel_loss": False}).without_photographs(len(scene.sparse.image_name))
+    problem = geo_problem(scene, survey, initial, solving)
     if problem.terms:
         minimise(problem)
     return solution_of(problem, scene, initial)
+
+
+def solve_and_hold(problem: GeoProblem) -> None:
+    """Move a problem with the information of its bundle to its minimum, and let training learn nothing of it.
+
+    A problem whose cameras training refines stays as it is.
+
+    Raises:
+        ConvergenceError: the cameras do not settle.
+        DegenerateGeometryError: the measurements leave the similarity open.
+    """
+    if problem.bundle is not None:
+        minimise(problem)
+        problem.requires_grad_(requires_grad=False)
 
 
 def solution_of(problem: GeoProblem, scene: Scene, initial: InitialSimilarity) -> FrozenSolution:

@@ -78,7 +78,7 @@ def _colours_at(photograph: ByteArray, mask: BoolArray, xy_px: FloatArray) -> Fl
     mean = cv2.blur(np.asarray(photograph), (_AROUND_PX, _AROUND_PX)).astype(np.float32) / 255
     height, width = mask.shape
     place = np.nan_to_num(xy_px - 0.5, nan=-1.0)  # arrays count from the centre of the first pixel
-    inside: BoolArray = ((place >= 0) & (place < [width - 1, height - 1])).all(axis=1)
+    inside = np.asarray(((place >= 0) & (place < [width - 1, height - 1])).all(axis=1))
     column, row = np.where(inside[:, None], place, 0.0).astype(np.int64).T
     inside &= np.asarray(mask[row, column], dtype=bool)
     right, down = (place - np.column_stack([column, row])).T[:, :, None]

@@ -9,12 +9,14 @@ the same options continues. A finished training with fewer iterations is extende
 from __future__ import annotations
 
 import json
+import logging
 
 from pipelines.core.products import load_json, save_json
 from pipelines.core.stages import POINTS, SIM3, SPARSE
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.formats.colmap import read_sparse
 from pipelines.scene.calibrated import load_survey
+from pipelines.scene.frozen_solution import solve_and_hold
 from pipelines.scene.geographic import geo_problem
 from pipelines.scene.geolocated import GeolocatedPoints
 from pipelines.scene.initial_similarity import InitialSimilarity
@@ -32,6 +34,8 @@ from pipelines.train.result import summary_of, trained_model
 from pipelines.train.surface import SceneSurface
 from pipelines.train.training_files import METRICS, train_in_folder
 
+log = logging.getLogger(__name__)
+
 
 def run(stage: StageRun, options: TrainOptions) -> Summary:
     """Train the model, write products and checkpoints, and return the summary.
@@ -48,6 +52,7 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     initial = load_json(InitialSimilarity, workspace.path(SIM3))
     survey = initial.weighted(load_survey(workspace))
     scene = initial_scene(read_sparse(workspace.path(SPARSE)), survey, initial)
+    options.require_trainable(len(scene.sparse.image_name))
     images = photographs(scene.sparse, survey, workspace, options.effort.max_image_size)
     require_memory(training_size(scene, images, options), free_memory_bytes(device_of(backend)))
     images.build(stage.progress)
@@ -58,6 +63,9 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
         surface = SceneSurface(maps)
     points = GeolocatedPoints.load(workspace.path(POINTS))
     problem = geo_problem(scene, survey, initial, options, points=points, seed=options.seed)
+    if problem.bundle is not None:
+        log.info("the %d cameras are solved once, before the training, and held", len(images))
+    solve_and_hold(problem)
     trainer = make_trainer(TrainingScene(scene, images, surface), problem, backend, options)
     record = train_in_folder(stage, trainer, options, _iterations(stage))
     model = trained_model(trainer, scene, initial)

@@ -38,6 +38,9 @@ class OneByOne:
     def __init__(self) -> None:
         self.ran: list[str] = []
 
+    def together(self, jobs: Sequence[Job]) -> int:
+        return 1
+
     def run(self, title: str, jobs: Sequence[Job], ended: Callable[[JobEnd], None], progress: Progress) -> None:
         for job in jobs:
             self.ran.append(job.name)

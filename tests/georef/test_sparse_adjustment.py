@@ -106,19 +106,21 @@ CASES = {
 }
 
 
-def solved(survey: Survey, follows: bool) -> tuple[GeoProblem, CorrectionBasis, BundleInformation]:
+def solved(survey: Survey, follows: bool) -> tuple[GeoProblem, CorrectionBasis, BundleInformation, float]:
     basis = correction_basis(survey.network, lens_follows=follows)
     problem = survey.problem(basis, follows=follows)
-    minimise(problem)
-    return problem, basis, bundle_information(survey.network, lens_follows=follows)
+    cost = minimise(problem)
+    return problem, basis, bundle_information(survey.network, lens_follows=follows), cost
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_sparse_minimum_and_covariances_are_those_of_the_dense_solver(case: str) -> None:
     survey, follows = CASES[case]
-    dense, basis, bundle = solved(survey, follows)
+    dense, basis, bundle, cost = solved(survey, follows)
     problem = survey.problem(None, follows=follows)
-    state = minimise_sparse(problem, bundle, lens_follows=follows)
+    minimum = minimise_sparse(problem, bundle, lens_follows=follows)
+    state = minimum.state
+    assert minimum.cost == pytest.approx(cost, abs=1e-4)
     with torch.no_grad():
         corrections, lens = dense.cameras.corrections().numpy(), dense.cameras.lens().numpy()
     sigma = np.sqrt(np.diag(posterior(dense).covariance)[:7])
