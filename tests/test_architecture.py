@@ -38,6 +38,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     ),
     (
         "pipelines.batch",
+        "pipelines.blocks",
         "pipelines.calibrate",
         "pipelines.compare",
         "pipelines.deliver",

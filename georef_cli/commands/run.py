@@ -41,6 +41,7 @@ LATER: dict[str, tuple[str, ...]] = {
     "iterations": ("train",),
     "max_image_size": ("train",),
     "max_gaussians": ("train",),
+    "blocks": ("train",),
     "backend": ("train", "evaluate"),
     "seed": ("sfm", "init-sim3", "train"),
 }

@@ -54,6 +54,12 @@ class Scene:
             self.model_from_local.apply(self.sparse.cam_center_in_local),
         )
 
+    def of_images(self, images: IntArray) -> Scene:
+        """Return the scene of some cameras (K,), in ascending order, in the same frame."""
+        rows = np.unique(images)
+        train, test = (np.searchsorted(rows, np.intersect1d(split, rows)) for split in (self.train, self.test))
+        return replace(self, sparse=self.sparse.of_images(rows), train=train, test=test)
+
     @cached_property
     def point_in_model(self) -> FloatArray:
         """Points of the SfM model (N, 3), metres in `model`."""

@@ -96,8 +96,9 @@ def compactness_loss(depth_m: Tensor, variance_m2: Tensor, alpha: Tensor) -> Ten
 
 
 def flatness_loss(gaussians: Gaussians, visible: Tensor, extent_m: float) -> Tensor:
-    """Return the mean smallest standard deviation of the visible Gaussians, in scene extents."""
-    return gaussians.log_scales[visible].amin(dim=1).exp().mean() / extent_m
+    """Return the mean smallest standard deviation of the visible Gaussians, in scene extents; 0 if none is."""
+    smallest = gaussians.log_scales[visible].amin(dim=1).exp()
+    return smallest.sum() / (max(len(visible), 1) * extent_m)
 
 
 def disc_normals(gaussians: Gaussians, center_in_model: Tensor) -> Tensor:

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pipelines.core.sentences import about
 from pipelines.core.threads import thread_count
 from pipelines.geometry.cameras import Pinhole
-from pipelines.splat.memory import TrainingSize, free_memory_bytes, predicted_peak_bytes
+from pipelines.scene.survey import Survey
+from pipelines.splat.memory import USABLE, TrainingSize, free_memory_bytes, predicted_peak_bytes
 from pipelines.splat.rasterizer.backends import device_of, rasterizer
 from pipelines.train.options import TrainOptions
 from pipelines.train.pace import MEASURED_CORES, iteration_seconds
@@ -36,6 +37,7 @@ class TrainingForecast:
         seconds: about; None on a GPU, where nothing was measured.
         peak_bytes: predicted peak of the memory.
         free_bytes: memory that is free; None: unknown.
+        blocks: number of blocks that was asked for; None: as many as fit.
     """
 
     preset: str
@@ -49,6 +51,14 @@ class TrainingForecast:
     seconds: float | None
     peak_bytes: int
     free_bytes: int | None
+    blocks: int | None = None
+
+    @property
+    def in_blocks(self) -> bool:
+        """Whether the survey is trained in blocks."""
+        if self.blocks is not None:
+            return self.blocks > 1
+        return self.free_bytes is not None and self.peak_bytes > USABLE * self.free_bytes
 
     @property
     def reduction(self) -> float:
@@ -66,7 +76,11 @@ class TrainingForecast:
         if self.seconds is not None:
             took = f"about {about(self.seconds)} on {self.threads} threads of this machine"
         free = "" if self.free_bytes is None else f" of {self.free_bytes / 2**30:.1f} GiB free"
-        return [effort, size, f"{took}; memory about {self.peak_bytes / 2**30:.1f} GiB{free}"]
+        memory = f"memory about {self.peak_bytes / 2**30:.1f} GiB{free}"
+        if not self.in_blocks:
+            return [effort, size, f"{took}; {memory}"]
+        many = "as many blocks as fit" if self.blocks is None else f"{self.blocks} blocks"
+        return [effort, size, f"in {many}; one run would take {took.removeprefix('about ')}, {memory}"]
 
 
 def forecast(photographs: int, photo_px: tuple[int, int], options: TrainOptions) -> TrainingForecast:
@@ -99,7 +113,18 @@ def forecast(photographs: int, photo_px: tuple[int, int], options: TrainOptions)
         seconds=_seconds(photographs, camera, options) if device.type == "cpu" else None,
         peak_bytes=predicted_peak_bytes(size),
         free_bytes=free_memory_bytes(device),
+        blocks=options.blocks,
     )
+
+
+def forecast_of(survey: Survey, options: TrainOptions) -> TrainingForecast:
+    """Return the forecast of a training of a survey.
+
+    Raises:
+        BackendUnavailableError: `--backend cuda` without a GPU or without gsplat.
+    """
+    largest = max(survey.cameras, key=lambda camera: camera.width * camera.height)
+    return forecast(len(survey.images), (largest.width, largest.height), options)
 
 
 def _seconds(photographs: int, camera: Pinhole, options: TrainOptions) -> float:

@@ -10,11 +10,10 @@ from __future__ import annotations
 
 import json
 import logging
-import shutil
 
 from pipelines.core.products import load_json, save_json
 from pipelines.core.stages import POINTS, SIM3, SPARSE
-from pipelines.core.workspace import StageRun, Summary
+from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.formats.colmap import read_sparse
 from pipelines.scene.calibrated import load_survey
 from pipelines.scene.frozen_solution import solve_and_hold
@@ -28,13 +27,12 @@ from pipelines.splat.rasterizer.backends import device_of, rasterizer
 from pipelines.splat.storage import write_gaussians
 from pipelines.train.assembly import make_trainer, training_size
 from pipelines.train.depth_maps import DepthMaps
+from pipelines.train.forecast import forecast_of
 from pipelines.train.initial_gaussians import TrainingScene
-from pipelines.train.loop import LoopOptions, optimise
 from pipelines.train.options import TrainOptions
 from pipelines.train.result import summary_of, trained_model
 from pipelines.train.surface import SceneSurface
-
-CHECKPOINT, METRICS = "checkpoint.npz", "metrics.jsonl"
+from pipelines.train.training_files import METRICS, train_in_folder
 
 log = logging.getLogger(__name__)
 
@@ -69,36 +67,25 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
         log.info("the %d cameras are solved once, before the training, and held", len(images))
     solve_and_hold(problem)
     trainer = make_trainer(TrainingScene(scene, images, surface), problem, backend, options)
-    extend = not stage.resumed and _take_over(stage, options.effort.iterations)
-    files = LoopOptions(
-        stage.out / CHECKPOINT,
-        stage.out / METRICS,
-        options.checkpoint_every,
-        options.log_every,
-        resume=stage.resumed or extend,
-        extend=extend,
-        note=stage.record_progress,
-    )
-    record = optimise(trainer, files, stage.progress)
+    record = train_in_folder(stage, trainer, options, _iterations(stage))
     model = trained_model(trainer, scene, initial)
     write_gaussians(stage.out / "gaussians.ply", trainer.optimizer.gaussians.detached())
     save_json(model, stage.out / "model.json")
-    metrics = [json.loads(row) for row in files.metrics.read_text(encoding="utf-8").splitlines()]
+    metrics = [json.loads(row) for row in (stage.out / METRICS).read_text(encoding="utf-8").splitlines()]
     return summary_of(model, metrics, record)
 
 
-def _take_over(stage: StageRun, iterations: int) -> bool:
-    """Copy the last state of a finished training of fewer iterations, and return whether there is one.
+def made_in_parts(workspace: Workspace, options: TrainOptions) -> bool:
+    """Return whether the survey is trained in blocks: as asked, or because one training would not fit into memory.
 
     Raises:
-        StorageError: the state cannot be copied.
+        BackendUnavailableError: `--backend cuda` without a GPU or without gsplat.
+        GeorefError: the survey cannot be read.
     """
-    if stage.extends is None or not all((stage.extends / name).is_file() for name in (CHECKPOINT, METRICS)):
-        return False
-    done = load_json(TrainedModel, stage.extends / "model.json").iterations
-    if done >= iterations:
-        return False
-    log.info("the training of %d iterations is extended to %d; --force trains afresh", done, iterations)
-    for name in (CHECKPOINT, METRICS):
-        shutil.copyfile(stage.extends / name, stage.out / name)
-    return True
+    return forecast_of(load_survey(workspace), options).in_blocks
+
+
+def _iterations(stage: StageRun) -> int:
+    """Return the iterations of the finished training that this one may extend; 0: there is none."""
+    model = None if stage.extends is None else stage.extends / "model.json"
+    return 0 if model is None else load_json(TrainedModel, model).iterations
