@@ -120,8 +120,11 @@ class JointTrainer:
             "x": options.similarity_rate,
             "u": options.variance_rate,
         }
+        # One kernel for each of these short vectors on a GPU, in place of a dozen whose launches take longer than
+        # their work.
         self._geo_adam = torch.optim.Adam(
-            [{"params": [parameter], "rate": rates[name]} for name, parameter in problem.learned().items()]
+            [{"params": [parameter], "rate": rates[name]} for name, parameter in problem.learned().items()],
+            fused=self.device.type == "cuda",
         )
 
     def step(self) -> StepReport:
@@ -225,7 +228,10 @@ class JointTrainer:
     def _render(self, pose: Tensor, camera: Pinhole, *, depth: bool = False) -> Render:
         depth = depth or self.options.surface is not None
         settings = RasterSettings(
-            sh_degree=self.schedule.sh_degree(self.iteration), background=self.options.background, depth=depth
+            sh_degree=self.schedule.sh_degree(self.iteration),
+            background=self.options.background,
+            depth=depth,
+            median=False,
         )
         return self.rasterizer.render(self.optimizer.gaussians, pose, camera, settings)
 
@@ -315,9 +321,9 @@ class JointTrainer:
         for name, parameter in self.problem.learned().items():
             with torch.no_grad():
                 parameter.copy_(geo[name])
-            # Adam keeps its count of steps on the CPU, for parameters on any device.
+            # A fused Adam keeps its count of steps on the device.
             self._geo_adam.state[parameter] = {
-                key: geo[f"{name}_{key}"].to("cpu" if key == "step" else self.device)
+                key: geo[f"{name}_{key}"].to(self.device)
                 for key in ("step", "exp_avg", "exp_avg_sq")
                 if f"{name}_{key}" in geo
             }

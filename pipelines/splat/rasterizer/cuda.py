@@ -62,7 +62,7 @@ class CudaRasterizer:
         if settings.depth:
             slope = _depth_slope(gaussians, cam_from_model, camera, meta)
             view.expected_depth, view.depth_variance = self._depth_moments(meta, slope, camera, view.alpha)
-            view.median_depth = self._median_depth(meta, slope, camera)
+            view.median_depth = self._median_depth(meta, slope, camera) if settings.median else None
         return view if settings.window is None else settings.window.cut(view)
 
     def _depth_moments(
