@@ -1,4 +1,4 @@
-"""Measure a rasteriser backend in one command, by default that of a GPU: python examples/benchmarks/gpu.py OUT.json.
+"""Measure the backend of a GPU in one command: python examples/benchmarks/gpu.py OUT.json.
 
 1. kernels: seconds to compile and load gsplat (0 where it was compiled before).
 2. parity: images and gradients against the reference in float64, which the CPU computes.
@@ -7,10 +7,10 @@
 5. geographic: the share of an iteration that the geographic terms take.
 6. quality: PSNR of the test views against seconds of training.
 
-The last three need a workspace with init-sim3 done (`--workspace`), such as that of `orbit_dev`; a workspace that was
-trained before brings its depth maps along. Each part runs in a process of its own, within its own time and eight
-minutes in all. A part that fails is an entry of the file: the others go on. Without a GPU, `--backend cpu` with small
-sizes shows that the benchmark itself works.
+The last three need a workspace with init-sim3 done (`--workspace`), such as that of `orbit_dev`; a workspace that
+was trained before brings its depth maps along. Each part runs in a process of its own, within its own time and
+eight minutes in all. A part that fails is an entry of the file: the others go on. Without a GPU, `--backend cpu`
+with small sizes shows that the benchmark itself works.
 """
 
 from __future__ import annotations
@@ -169,8 +169,8 @@ def geographic(arguments: argparse.Namespace) -> dict[str, Any]:
 
 def quality(arguments: argparse.Namespace) -> dict[str, Any]:
     """PSNR of the test views against seconds of training; the time of rendering the test views does not count."""
-    trainer, device, options = _trainer(arguments), arguments.backend, _options(arguments)
-    _, scene, images = trainer_on(arguments.workspace, options)
+    device, options = arguments.backend, _options(arguments)
+    trainer, scene, images = trainer_on(arguments.workspace, options)
     rows, seconds, total = [], 0.0, options.effort.iterations
     while trainer.iteration < total:
         start = now(device)
