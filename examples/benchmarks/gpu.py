@@ -285,11 +285,12 @@ def main() -> None:
     if arguments.part:
         print(json.dumps(PARTS[arguments.part][0](arguments)))
         return
-    start, report = time.perf_counter(), {"hardware": hardware(arguments)}
+    start = time.perf_counter()
+    report: dict[str, Any] = {"hardware": hardware(arguments)}
     for name in PARTS:
         report[name] = measured(name, arguments, TOTAL_S - _REST_S - (time.perf_counter() - start))
         print(f"{name}: {json.dumps(report[name])[:300]}", flush=True)
-        report["seconds"] = round(time.perf_counter() - start, 1)  # type: ignore[assignment]
+        report["seconds"] = round(time.perf_counter() - start, 1)
         draft = arguments.out.with_suffix(".tmp")
         draft.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
         draft.replace(arguments.out)
