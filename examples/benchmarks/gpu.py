@@ -236,7 +236,8 @@ def hardware(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def _options(arguments: argparse.Namespace) -> TrainOptions:
-    given = {"preset": arguments.preset, "backend": arguments.backend, "iterations": arguments.iterations}
+    names = ("preset", "backend", "iterations", "max_image_size")
+    given = {name: getattr(arguments, name) for name in names}
     return TrainOptions.model_validate({name: value for name, value in given.items() if value is not None})
 
 
@@ -274,6 +275,7 @@ def main() -> None:
     parser.add_argument("--workspace", type=Path, help="with init-sim3 done; a copy of it, for caches are written")
     parser.add_argument("--preset", default="fast", help="of the trainings")
     parser.add_argument("--iterations", type=int, help="of the trainings (default: the preset's)")
+    parser.add_argument("--max-image-size", type=int, help="in pixels (default: the preset's)")
     parser.add_argument("--scenes", type=int, default=8, help="for the parity")
     parser.add_argument("--gaussians", type=int, nargs="+", default=[100_000, 300_000, 1_000_000, 3_000_000])
     parser.add_argument("--size", nargs="+", default=["600x450", "1280x960", "2000x1500"], help="WIDTHxHEIGHT …")
