@@ -67,7 +67,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     "pyproj": ("pipelines.geodesy",),
     "pycolmap": ("pipelines.sfm", "pipelines.formats"),
     "numba": ("pipelines.splat", "pipelines.geometry", "pipelines.robust"),
-    "gsplat": ("pipelines.splat.rasterizer.cuda",),
+    "gsplat": ("pipelines.splat.rasterizer.cuda_kernels",),
     "torch": ("pipelines.splat", "pipelines.georef", "pipelines.scene", *STAGE_ROOMS),
     "filelock": ("pipelines.core",),
     "laspy": ("pipelines.formats",),

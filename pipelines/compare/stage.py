@@ -194,6 +194,8 @@ def _row(configuration: Configuration, plan: Sequence[PlannedStage], runner: _Pl
         title=configuration.title,
         note=configuration.note,
         test_psnr=report.photometric.test.psnr,
+        test_psnr_covered=report.photometric.test.psnr_covered,
+        test_covered_share=report.photometric.test.covered_share,
         test_ssim=report.photometric.test.ssim,
         camera=point_accuracy(report.checkpoints.camera),
         model=point_accuracy(report.checkpoints.model),

@@ -141,7 +141,8 @@ def normal_loss(
         gaussians.logit_opacities,
         sh_from_rgb(0.5 + 0.5 * normal)[:, None],
     )
-    render = rasterizer.render(painted, cam_from_model.detach(), camera, RasterSettings(sh_degree=0, depth=True))
+    settings = RasterSettings(sh_degree=0, depth=True, median=False)
+    render = rasterizer.render(painted, cam_from_model.detach(), camera, settings)
     assert render.expected_depth is not None
     depth, alpha = render.expected_depth, render.alpha
     blended = (2 * render.colour - alpha[..., None])[:-1, :-1]

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
+
 from pipelines.core.sentences import about
 from pipelines.core.threads import thread_count
 from pipelines.geometry.cameras import Pinhole
 from pipelines.scene.survey import Survey
 from pipelines.splat.memory import USABLE, TrainingSize, free_memory_bytes, predicted_peak_bytes
-from pipelines.splat.rasterizer.backends import device_of, rasterizer
+from pipelines.splat.rasterizer.backends import chosen_backend
 from pipelines.train.options import TrainOptions
 from pipelines.train.pace import MEASURED_CORES, iteration_seconds
 from pipelines.train.schedule import COARSE
@@ -94,12 +96,12 @@ def forecast(photographs: int, photo_px: tuple[int, int], options: TrainOptions)
         options: of the training.
 
     Raises:
-        BackendUnavailableError: `--backend cuda` without a GPU or without gsplat.
+        BackendUnavailableError: `--backend cuda`, and a part that it needs is missing; names each.
     """
     effort, (width, height) = options.effort, photo_px
     camera = Pinhole(width, height, width, width, width / 2, height / 2).limited(effort.max_image_size)
-    backend = rasterizer(options.backend)
-    device = device_of(backend)
+    backend = chosen_backend(options.backend)
+    device = torch.device(backend)
     size = TrainingSize(effort.max_gaussians, camera, options.sh_degree, options.refined_cameras(photographs))
     return TrainingForecast(
         preset=options.preset,
@@ -108,7 +110,7 @@ def forecast(photographs: int, photo_px: tuple[int, int], options: TrainOptions)
         training_px=(camera.width, camera.height),
         iterations=effort.iterations,
         max_gaussians=effort.max_gaussians,
-        backend=backend.name,
+        backend=backend,
         threads=thread_count(),
         seconds=_seconds(photographs, camera, options) if device.type == "cpu" else None,
         peak_bytes=predicted_peak_bytes(size),

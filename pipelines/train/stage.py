@@ -41,13 +41,15 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     """Train the model, write products and checkpoints, and return the summary.
 
     Raises:
-        BackendUnavailableError: `--backend cuda` without a GPU or without gsplat.
+        BackendUnavailableError: `--backend cuda`, and a part that it needs is missing; names each.
         ResourceError: the training would not fit into memory.
         ConvergenceError: the training diverged twice.
         KeyboardInterrupt: the user asked to stop; a checkpoint was written.
         GeorefError: a product or a photograph cannot be read, or the scene has too few points.
     """
-    backend = rasterizer(options.backend)  # first, so that `--backend cuda` without a GPU fails at once
+    backend = rasterizer(
+        options.backend, stage.progress
+    )  # first, so that `--backend cuda` without a GPU fails at once
     workspace = stage.workspace
     initial = load_json(InitialSimilarity, workspace.path(SIM3))
     survey = initial.weighted(load_survey(workspace))

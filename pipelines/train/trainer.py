@@ -129,8 +129,11 @@ class JointTrainer:
             "x": options.similarity_rate,
             "u": options.variance_rate,
         }
+        # One kernel for each of these short vectors on a GPU, in place of a dozen whose launches take longer than
+        # their work.
         self._geo_adam = torch.optim.Adam(
-            [{"params": [parameter], "rate": rates[name]} for name, parameter in problem.learned().items()]
+            [{"params": [parameter], "rate": rates[name]} for name, parameter in problem.learned().items()],
+            fused=self.device.type == "cuda",
         )
 
     def step(self) -> StepReport:
@@ -240,6 +243,7 @@ class JointTrainer:
             sh_degree=self.schedule.sh_degree(self.iteration),
             background=self.options.background,
             depth=depth or self.options.surface is not None,
+            median=False,
             window=target.window,
         )
         gaussians = self.optimizer.gaussians
@@ -345,9 +349,9 @@ class JointTrainer:
         for name, parameter in self.problem.learned().items():
             with torch.no_grad():
                 parameter.copy_(geo[name])
-            # Adam keeps its count of steps on the CPU, for parameters on any device.
+            # A fused Adam keeps its count of steps on the device.
             self._geo_adam.state[parameter] = {
-                key: geo[f"{name}_{key}"].to("cpu" if key == "step" else self.device)
+                key: geo[f"{name}_{key}"].to(self.device)
                 for key in ("step", "exp_avg", "exp_avg_sq")
                 if f"{name}_{key}" in geo
             }

@@ -80,6 +80,8 @@ class RasterSettings:
         near_m: Gaussians with a nearer centre are left out.
         dilation_px2: added to the diagonal of the screen covariance, in px².
         depth: whether to compute depths (colour and alpha always are).
+        median: whether the median depth is one of them. Training does not need it, and on a GPU it costs more than
+            all the rest.
         window: part of the camera's image to render, which is then the image; None: all of it.
     """
 
@@ -88,6 +90,7 @@ class RasterSettings:
     near_m: float = 0.05
     dilation_px2: float = 0.3
     depth: bool = False
+    median: bool = True
     window: Window | None = None
 
     def image_of(self, camera: Pinhole) -> Pinhole:
