@@ -24,7 +24,8 @@ from pipelines.stereo.agreement import AgreementSettings, DepthEstimate, agreed_
 from pipelines.stereo.matching import UNSEEN, MatchSettings
 from pipelines.stereo.neighbours import PointVisibility, best_neighbours, planes_for
 from pipelines.stereo.refinement import refine, surface_prior
-from pipelines.stereo.sweep import NormalMap, Planes, StereoCamera, StereoView, SweepResult, plane_sweep
+from pipelines.stereo.sweep import NormalMap, Planes, SweepResult, plane_sweep
+from pipelines.stereo.views import StereoCamera, StereoView
 
 # Form of the cached arrays, a part of their key: files of another form lie in another folder.
 _FORM = b"coarse, fine: direction, offset, score, step, sharpness"
