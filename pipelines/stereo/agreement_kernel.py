@@ -1,4 +1,4 @@
-"""Numba kernel of the agreement between depths of several views; it holds no GIL, so that threads can share views."""
+"""Numba kernel that compares the depths of views; it holds no GIL, so that threads share the views."""
 
 # ruff: noqa: PLR0917  (kernels take arrays, not objects)
 
@@ -30,7 +30,7 @@ def compare_depths(
 
     Args:
         depth: (H, W) float64 along the optical axis of the view; 0: no point.
-        ray_from_pixel: (3, 3) `world` ray of (column, row, 1), pixel centres at halves, of length one along the axis.
+        ray_from_pixel: (3, 3), from pixel (column, row, 1) to a ray of length one along the axis.
         center: (3,) of the view in `world`.
         other_center: (3,) of the other view.
         pixel_from_world: (3, 3) homogeneous pixel in the other view of a place relative to its centre.

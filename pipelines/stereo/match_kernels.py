@@ -151,7 +151,7 @@ def match_rows(
     starts: Any,
     out: Any,
 ) -> None:
-    """Write the mean of the best correlations with n neighbours of some rows of a view, under a hypothesis of depth.
+    """Write the best correlations of some rows of a view with n neighbours, under a hypothesis of depth.
 
     Args:
         depth: (H, W) hypothesis, finite.
