@@ -18,22 +18,9 @@ from pipelines.stereo.matching import UNSEEN, Matcher, MatchSettings, WinnerTake
 from pipelines.stereo.sweep import NormalMap, SweepResult, sweep_result
 from pipelines.stereo.views import StereoCamera, StereoView
 
+_REACH = 4  # steps on either side of the prior
+_STEPS = 3  # for one step of the sweep that the prior is from
 _SPECKLE_PX = 5  # parts smaller than half of this are chance where one view alone has depths
-
-
-@dataclass(frozen=True)
-class RefineSettings:
-    """Settings of a refinement.
-
-    Attributes:
-        matching: comparison of the photographs.
-        steps: number of steps for one step of the search that the prior is from.
-        reach: number of steps on either side of the prior.
-    """
-
-    matching: MatchSettings
-    steps: int = 3
-    reach: int = 4
 
 
 @dataclass(frozen=True)
@@ -51,14 +38,13 @@ class SurfacePrior:
     step_m: Float32Array
 
 
-def surface_prior(estimate: DepthEstimate, agreed: Float32Array, camera: StereoCamera, steps: int) -> SurfacePrior:
+def surface_prior(estimate: DepthEstimate, agreed: Float32Array, camera: StereoCamera) -> SurfacePrior:
     """Return the prior at the pixels of a finer camera: depths that views agree on, elsewhere the view's own.
 
     Args:
         estimate: the view's own depths, on coarse pixels.
         agreed: (H, W) depths that views agree on, on the same pixels; 0 elsewhere.
         camera: the finer camera.
-        steps: number of steps for one step of the estimate.
     """
     normals, own = estimate.sweep.normals, estimate.depth()
     own = np.where(np.isfinite(own) & (own > 0), own, 0).astype(np.float32)
@@ -68,7 +54,7 @@ def surface_prior(estimate: DepthEstimate, agreed: Float32Array, camera: StereoC
     finer = [
         # Interpolation between roof and ground would make offsets at which nothing lies.
         cv2.resize(image, size, interpolation=cv2.INTER_NEAREST)
-        for image in (normals.index, offset.astype(np.float32), estimate.sweep.step_m / np.float32(steps))
+        for image in (normals.index, offset.astype(np.float32), estimate.sweep.step_m / np.float32(_STEPS))
     ]
     which = np.asarray(finer[0], np.uint8)
     return SurfacePrior(
@@ -79,7 +65,7 @@ def surface_prior(estimate: DepthEstimate, agreed: Float32Array, camera: StereoC
 
 
 def refine(
-    reference: StereoView, neighbours: list[StereoView], prior: SurfacePrior, settings: RefineSettings
+    reference: StereoView, neighbours: list[StereoView], prior: SurfacePrior, settings: MatchSettings
 ) -> SweepResult:
     """Compare a view with its neighbours at offsets around a prior, and keep the best.
 
@@ -89,20 +75,20 @@ def refine(
         reference: view whose surface is wanted.
         neighbours: one or more views of the same place from elsewhere.
         prior: rough surface at the pixels of `reference`.
-        settings: of the refinement.
+        settings: of the comparison.
 
     Raises:
         ValueError: no neighbours.
     """
     if not neighbours:
         raise ValueError("no neighbours to compare with")
-    matcher, search = Matcher(reference, neighbours, settings.matching), WinnerTakesAll(reference.grey.shape)
+    matcher, search = Matcher(reference, neighbours, settings), WinnerTakesAll(reference.grey.shape)
     middle = prior.normals.depth(reference.camera, prior.offset_m).astype(np.float32)
     with np.errstate(divide="ignore"):
         step = (prior.step_m / prior.normals.offset_per_metre(reference.camera)).astype(np.float32)
-    for number in range(-settings.reach, settings.reach + 1):
+    for number in range(-_REACH, _REACH + 1):
         search.add(matcher(middle + np.float32(number) * step))
     winner = search.winner()
-    offset = prior.offset_m + (winner.hypothesis - settings.reach) * prior.step_m
+    offset = prior.offset_m + (winner.hypothesis - _REACH) * prior.step_m
     refined = sweep_result(winner, prior.normals, offset, prior.step_m)
     return replace(refined, score=np.where(winner.inner, refined.score, np.float32(UNSEEN)))

@@ -1,7 +1,7 @@
 """Depth maps of the training photographs by multi-view stereo, cached on disk: depths on which views agree.
 
 1. A plane sweep gives each view's depths on coarse pixels.
-2. Two refinements on ever finer pixels start from the depths on which views agree, elsewhere from the view's own.
+2. The refinement on finer pixels starts from the depths on which views agree, elsewhere from the view's own.
 3. The depth map keeps the refined depths on which views agree.
 """
 
@@ -11,7 +11,7 @@ import hashlib
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -26,13 +26,12 @@ from pipelines.scene.scene import Scene
 from pipelines.stereo.agreement import AgreementSettings, DepthEstimate, agreed_depth, without_rims
 from pipelines.stereo.matching import UNSEEN, MatchSettings
 from pipelines.stereo.neighbours import PointVisibility, best_neighbours, planes_for
-from pipelines.stereo.refinement import RefineSettings, refine, surface_prior
+from pipelines.stereo.refinement import refine, surface_prior
 from pipelines.stereo.sweep import NormalMap, Planes, SweepResult, plane_sweep
 from pipelines.stereo.views import StereoCamera, StereoView
 
 # Form of the cached arrays, a part of their key: files of another form lie in another folder.
-_FORM = b"coarse, middle, fine: direction, offset, score, step, sharpness"
-_BEFORE = {"middle": "coarse", "fine": "middle"}
+_FORM = b"coarse, fine: direction, offset, score, step, sharpness, by kernels"
 
 
 @dataclass(frozen=True)
@@ -41,25 +40,19 @@ class StereoOptions:
 
     Attributes:
         coarse_px: longest side of the photographs in the plane sweep, whose time grows with its cube.
-        middle_px: likewise in the first refinement.
-        fine_px: likewise in the second refinement, and of the depth maps.
+        fine_px: longest side of the photographs in the refinement, and of the depth maps.
         neighbours: number of views that each view is compared with.
         matching: comparison in the plane sweep; a wide window finds the surface where there is little texture.
-        middle: first refinement, with the same comparison; far enough for what the sweep was too coarse for.
-        fine: second refinement, where the surface is nearly known; a small window does not extend it across the
-            foot of a wall.
+        refining: comparison in the refinement, where the surface is nearly known; a small window does not extend it
+            across the foot of a wall.
         agreement: thresholds of agreement.
     """
 
-    coarse_px: int = 200
-    middle_px: int = 320
+    coarse_px: int = 320
     fine_px: int = 640
     neighbours: int = 10
     matching: MatchSettings = field(default_factory=MatchSettings)
-    middle: RefineSettings = field(default_factory=lambda: RefineSettings(MatchSettings(), steps=2, reach=6))
-    fine: RefineSettings = field(
-        default_factory=lambda: RefineSettings(MatchSettings(window_px=3, reach_px=2), steps=3, reach=4)
-    )
+    refining: MatchSettings = field(default_factory=lambda: MatchSettings(window_px=3, reach_px=2))
     agreement: AgreementSettings = field(default_factory=AgreementSettings)
 
 
@@ -99,12 +92,7 @@ class DepthMaps:
             InputError: a photograph cannot be read, or has another size than its camera.
         """
         train = [int(index) for index in self.scene.train]
-        steps = (
-            ("coarse", self._sweep),
-            ("middle", partial(self._refine, kind="middle")),
-            ("fine", partial(self._refine, kind="fine")),
-            ("depth", self._agree),
-        )
+        steps = (("coarse", self._sweep), ("fine", self._refine), ("depth", self._agree))
         if not all(self._path(index, "depth").exists() for index in train):
             for index in train:  # Photographs share masks, which two threads must not write at once.
                 self.images.mask(index)
@@ -155,15 +143,13 @@ class DepthMaps:
         reference, *views = (self._view(self._pinhole(j, "coarse"), j) for j in (index, *others))
         return _packed(plane_sweep(reference, views, sweeps, self._options.matching))
 
-    def _refine(self, index: int, *, kind: str) -> Float32Array:
-        own = self._surface(index, _BEFORE[kind])
+    def _refine(self, index: int) -> Float32Array:
+        own = self._surface(index, "coarse")
         if own is None:
-            return _empty_maps(self._pinhole(index, kind))
-        settings = self._options.middle if kind == "middle" else self._options.fine
-        reference = self._view(self._pinhole(index, kind), index)
-        prior = surface_prior(own, self._agreed(own, index, _BEFORE[kind]), reference.camera, settings.steps)
-        views = [self._view(self._pinhole(j, kind), j) for j in self._neighbours(index)]
-        return _packed(refine(reference, views, prior, settings))
+            return _empty_maps(self.camera(index))
+        reference, *views = (self._view(self.camera(j), j) for j in (index, *self._neighbours(index)))
+        prior = surface_prior(own, self._agreed(own, index, "coarse"), reference.camera)
+        return _packed(refine(reference, views, prior, self._options.refining))
 
     def _agree(self, index: int) -> Float32Array:
         own = self._surface(index, "fine")
@@ -175,9 +161,8 @@ class DepthMaps:
         """Return the depths (H, W) on which views agree; 0 elsewhere."""
         others, options = [self._surface(j, kind) for j in self._neighbours(index)], self._options
         depth = agreed_depth(own, [other for other in others if other is not None], options.agreement)
-        # Fine depths started from wider windows, which set the width of a rim on fine pixels too.
-        wide = self._pinhole(index, "coarse" if kind == "coarse" else "middle")
-        window_px = options.matching.window_px * own.camera.pinhole.width / wide.width
+        # Refined depths started from the sweep: its window sets the width of a rim on fine pixels too.
+        window_px = options.matching.window_px * own.camera.pinhole.width / self._pinhole(index, "coarse").width
         return without_rims(depth, int(window_px / 2), options.agreement.rim)
 
     def _surface(self, index: int, kind: str) -> DepthEstimate | None:
@@ -201,9 +186,8 @@ class DepthMaps:
         return best_neighbours(self._visibility, index, self.scene.train, self._options.neighbours)
 
     def _pinhole(self, index: int, kind: str) -> Pinhole:
-        options = self._options
-        longest_px = {"coarse": options.coarse_px, "middle": options.middle_px, "fine": options.fine_px}
-        return self.images.pinhole(index).limited(longest_px[kind])
+        longest_px = self._options.coarse_px if kind == "coarse" else self._options.fine_px
+        return self.images.pinhole(index).limited(longest_px)
 
     def _camera(self, pinhole: Pinhole, index: int) -> StereoCamera:
         poses = self.scene.poses

@@ -10,7 +10,7 @@ from pipelines.core.types import Float32Array
 from pipelines.geometry.cameras import Pinhole
 from pipelines.stereo.agreement import AgreementSettings, DepthEstimate, agreed_depth
 from pipelines.stereo.matching import UNSEEN, MatchSettings
-from pipelines.stereo.refinement import RefineSettings, SurfacePrior, refine, surface_prior
+from pipelines.stereo.refinement import SurfacePrior, refine, surface_prior
 from pipelines.stereo.sweep import NormalMap, plane_sweep
 from pipelines.stereo.views import StereoCamera, StereoView
 from pipelines.train.depth_maps import StereoOptions
@@ -32,7 +32,6 @@ from tests.stereo_scenes import (
 FINE = Pinhole(240, 180, 220.0, 220.0, 120.0, 90.0)  # pixels of half the width
 INNER = np.s_[16:-16, 16:-16]
 STEP_M = 0.25
-REFINEMENT = RefineSettings(MatchSettings())
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +68,7 @@ def test_offsets_are_the_inverse_of_depths(fine: list[StereoView]) -> None:
 
 @pytest.mark.parametrize("off_m", [0.0, 0.6, -0.6])
 def test_a_guess_within_reach_is_corrected(fine: list[StereoView], off_m: float) -> None:
-    refined = refine(fine[2], neighbours_of(fine, 2), shifted_truth(fine[2].camera, off_m), REFINEMENT)
+    refined = refine(fine[2], neighbours_of(fine, 2), shifted_truth(fine[2].camera, off_m), MatchSettings())
     error = height_error(fine[2].camera, refined.offset_m)[INNER]
     trusted = refined.score[INNER] > AgreementSettings().least_score
     assert trusted.mean() > 0.9
@@ -78,7 +77,7 @@ def test_a_guess_within_reach_is_corrected(fine: list[StereoView], off_m: float)
 
 
 def test_a_guess_out_of_reach_has_no_score(fine: list[StereoView]) -> None:
-    refined = refine(fine[2], neighbours_of(fine, 2), shifted_truth(fine[2].camera, 3.0), REFINEMENT)
+    refined = refine(fine[2], neighbours_of(fine, 2), shifted_truth(fine[2].camera, 3.0), MatchSettings())
     # By chance some texture fits itself elsewhere: less than half, and not well.
     assert (refined.score[INNER] > AgreementSettings().least_score).mean() < 0.25
     assert (refined.score[INNER] == UNSEEN).any()
@@ -94,8 +93,7 @@ def test_the_ground_beside_a_roof_is_not_taken_for_roof(
     roof = (height > GROUND_M + 3).astype(np.uint8)
     beside = (cv2.dilate(roof, np.ones((9, 9), np.uint8)) > roof)[INNER]
     agreed = agreed_depth(coarse[2], [coarse[index] for index in (0, 1, 3, 4)], AgreementSettings())
-    prior = surface_prior(coarse[2], agreed, camera, REFINEMENT.steps)
-    refined = refine(fine[2], neighbours_of(fine, 2), prior, REFINEMENT)
+    refined = refine(fine[2], neighbours_of(fine, 2), surface_prior(coarse[2], agreed, camera), MatchSettings())
     planes = plane_sweep(fine[2], neighbours_of(fine, 2), [LEVEL], MatchSettings())
     trusted = AgreementSettings().least_score
     wrong = [
@@ -131,7 +129,7 @@ def test_small_windows_leave_the_foot_of_a_wall_where_it_is() -> None:
     prior = SurfacePrior(normals, offset, np.full(offset.shape, STEP_M, np.float32))
     edge = cv2.morphologyEx(upright.astype(np.uint8), cv2.MORPH_GRADIENT, np.ones((9, 9), np.uint8)) > 0
     wrong = []
-    for settings in (StereoOptions().fine, RefineSettings(StereoOptions().matching)):
+    for settings in (StereoOptions().refining, StereoOptions().matching):
         refined = refine(view, [other[0] for other in others], prior, settings)
         error = np.abs(normals.depth(view.camera, refined.offset_m) - depth)
         wrong.append(np.median(error[INNER][edge[INNER]]))
@@ -143,7 +141,7 @@ def test_guesses_are_what_views_agree_on(fine: list[StereoView], coarse: list[De
     own = coarse[2]
     agreed = np.zeros((CAMERA.height, CAMERA.width), np.float32)
     agreed[10:20, 10:20] = level_normals().depth(own.camera, np.full(agreed.shape, 7.0, np.float32))[10:20, 10:20]
-    prior = surface_prior(own, agreed, fine[2].camera, 3)
+    prior = surface_prior(own, agreed, fine[2].camera)
     assert prior.offset_m.shape == (FINE.height, FINE.width)
     np.testing.assert_allclose(prior.offset_m[20:40, 20:40], 7.0, atol=1e-4)
     # Elsewhere it is the view's own.
@@ -156,10 +154,9 @@ def test_guesses_are_what_views_agree_on(fine: list[StereoView], coarse: list[De
 def test_pixels_that_nothing_fits_find_nothing(fine: list[StereoView], coarse: list[DepthEstimate]) -> None:
     empty = DepthEstimate(coarse[2].camera, plane_sweep(*_nothing_to_see(), [LEVEL], MatchSettings()))
     assert np.isnan(empty.sweep.offset_m).all()
-    nowhere = np.zeros((CAMERA.height, CAMERA.width), np.float32)
-    prior = surface_prior(empty, nowhere, fine[2].camera, REFINEMENT.steps)
+    prior = surface_prior(empty, np.zeros((CAMERA.height, CAMERA.width), np.float32), fine[2].camera)
     assert np.isfinite(prior.offset_m).all()
-    refined = refine(fine[2], neighbours_of(fine, 2), prior, REFINEMENT)
+    refined = refine(fine[2], neighbours_of(fine, 2), prior, MatchSettings())
     assert (refined.score[INNER] > AgreementSettings().least_score).mean() < 0.05
 
 
@@ -170,4 +167,4 @@ def _nothing_to_see() -> tuple[StereoView, list[StereoView]]:
 
 def test_refinement_needs_neighbours(fine: list[StereoView]) -> None:
     with pytest.raises(ValueError, match="no neighbours"):
-        refine(fine[2], [], shifted_truth(fine[2].camera, 0.0), REFINEMENT)
+        refine(fine[2], [], shifted_truth(fine[2].camera, 0.0), MatchSettings())
