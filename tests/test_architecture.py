@@ -66,7 +66,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     "rich": ("georef_cli",),
     "pyproj": ("pipelines.geodesy",),
     "pycolmap": ("pipelines.sfm", "pipelines.formats"),
-    "numba": ("pipelines.splat", "pipelines.geometry", "pipelines.robust"),
+    "numba": ("pipelines.splat", "pipelines.stereo", "pipelines.geometry", "pipelines.robust"),
     "gsplat": ("pipelines.splat.rasterizer.cuda_kernels",),
     "torch": ("pipelines.splat", "pipelines.georef", "pipelines.scene", *STAGE_ROOMS),
     "filelock": ("pipelines.core",),

@@ -12,13 +12,14 @@ from pipelines.geometry.cameras import Pinhole
 from pipelines.scene.survey import Survey
 from pipelines.splat.memory import USABLE, TrainingSize, free_memory_bytes, predicted_peak_bytes
 from pipelines.splat.rasterizer.backends import chosen_backend
+from pipelines.train.depth_maps import StereoOptions
 from pipelines.train.options import TrainOptions
 from pipelines.train.pace import MEASURED_CORES, iteration_seconds
 from pipelines.train.schedule import COARSE
 
-# Stereo of all photographs, by megapixels at training size: seven runs on the machine of `MEASURED_ON`, 2026-11-22,
-# took 5 … 12 s a megapixel beside other programs.
-_STEREO_MEGAPIXEL_S = 8.0
+# Stereo, by photographs (the sweep has one size) and by megapixels of the depth maps: half of the processor time of
+# one thread on an Intel Xeon (AVX-512), 2026-11-22. Two threads on two idle cores were not measured.
+_STEREO_PHOTOGRAPH_S, _STEREO_MEGAPIXEL_S = 0.75, 0.6
 # Beyond so many cores the kernels gain little; not measured beyond two.
 _MOST_CORES = 16
 
@@ -138,5 +139,7 @@ def _seconds(photographs: int, camera: Pinhole, options: TrainOptions) -> float:
         seconds += (until - begun) * effort.iterations * one
         begun = until
     if options.dense:
-        seconds += _STEREO_MEGAPIXEL_S * photographs * pixels / 1e6
+        maps = camera.limited(StereoOptions().fine_px)
+        megapixels = maps.width * maps.height / 1e6
+        seconds += photographs * (_STEREO_PHOTOGRAPH_S + _STEREO_MEGAPIXEL_S * megapixels)
     return seconds * MEASURED_CORES / min(thread_count(), _MOST_CORES)
