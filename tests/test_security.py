@@ -32,13 +32,14 @@ FORBIDDEN = {
     "eval", "exec", "compile", "pickle", "marshal", "shelve", "yaml", "subprocess", "os.system", "os.popen",
     "torch.load", "torch.save",
 }  # fmt: skip
-# The files that start a process: this program again, for native code and for jobs; the user's browser; and Python
-# with the name of the library whose kernels it compiles.
+# The files that start a process: this program again, for native code and for jobs; the user's browser; the
+# compilers of the CUDA kernels, which are asked for their versions; and Python, which calls them.
 STARTS_ITSELF = REPOSITORY / "pipelines/core/child.py"
 STARTS_JOBS = REPOSITORY / "pipelines/engine/process.py"
 STARTS_A_BROWSER = REPOSITORY / "pipelines/pages/chromium.py"
 STARTS_A_COMPILER = REPOSITORY / "pipelines/splat/rasterizer/cuda_kernels.py"
-STARTERS = (STARTS_ITSELF, STARTS_JOBS, STARTS_A_BROWSER, STARTS_A_COMPILER)
+ASKS_COMPILERS = REPOSITORY / "pipelines/splat/rasterizer/cuda_parts.py"
+STARTERS = (STARTS_ITSELF, STARTS_JOBS, STARTS_A_BROWSER, STARTS_A_COMPILER, ASKS_COMPILERS)
 ESCAPES = ["../secret.jpg", "/etc/passwd", "a/../../secret.jpg", "", "a\nb.jpg", "a\x00b.jpg"]
 
 
