@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pipelines.core.options import StageOptions
 from pipelines.core.photograph_folder import photograph_folder
 from pipelines.core.plan import PlannedStage, plan
 from pipelines.core.products import load_json
@@ -73,11 +74,21 @@ def forecast_run(
     """
     planned = plan(workspace, stages, flags, force=force)
     photographs = _photographs(workspace, planned)
-    reconstruction = _reconstruction(planned, photographs)
+    reconstruction, training = _reconstruction(planned, photographs), _training(planned, photographs)
     if reconstruction is not None and reconstruction.refusal:
         planned = [_refused(row, reconstruction) if row.stage == "sfm" else row for row in planned]
-    seconds = _seconds(planned, photographs, reconstruction)
-    return RunForecast(planned, photographs, seconds, reconstruction, _training(planned, photographs))
+    seconds: dict[str, float | None] = {}
+    for options, forecast in ((SfmOptions, reconstruction), (TrainOptions, training)):
+        row = _to_run(planned, options)
+        if row is not None and forecast is not None:
+            seconds[row.stage] = forecast.seconds
+    return RunForecast(planned, photographs, seconds, reconstruction, training)
+
+
+def _to_run(planned: Sequence[PlannedStage], options: type[StageOptions]) -> PlannedStage | None:
+    """Return the stage with such options that will run; None: it will not."""
+    going = (row for row in planned if row.action not in ("keep", "refuse"))
+    return next((row for row in going if isinstance(row.resolved, options)), None)
 
 
 def _refused(row: PlannedStage, reconstruction: ReconstructionForecast) -> PlannedStage:
@@ -90,14 +101,11 @@ def _reconstruction(
     """Return the forecast of the reconstruction; None where none would run, or before a bag is read."""
     from pipelines.sfm.forecast import forecast
 
-    for row in planned:
-        if (
-            isinstance(row.resolved, SfmOptions)
-            and row.action not in ("keep", "refuse")
-            and photographs is not None
-        ):
-            return forecast(photographs.count, photographs.size_px, row.resolved)
-    return None
+    row = _to_run(planned, SfmOptions)
+    if row is None or photographs is None:
+        return None
+    assert isinstance(row.resolved, SfmOptions)
+    return forecast(photographs.count, photographs.size_px, row.resolved)
 
 
 def _photographs(workspace: Workspace, planned: list[PlannedStage]) -> Photographs | None:
@@ -107,10 +115,9 @@ def _photographs(workspace: Workspace, planned: list[PlannedStage]) -> Photograp
         if not (workspace.root / SURVEY).is_file():
             return None
         survey = load_json(Survey, workspace.path(SURVEY))
-        largest = max(survey.cameras, key=lambda camera: camera.width * camera.height)
         folder = photograph_folder(workspace, survey.image_dir)
         sizes = [path.stat().st_size for image in survey.images if (path := folder / image.name).is_file()]
-        return Photographs(len(survey.images), (largest.width, largest.height), sum(sizes) or None)
+        return Photographs(len(survey.images), survey.largest_photograph_px, sum(sizes) or None)
     assert isinstance(ingest.resolved, IngestOptions)
     return None if ingest.resolved.images is None else _in_folder(ingest.resolved.images)
 
@@ -122,31 +129,12 @@ def _in_folder(folder: Path) -> Photographs:
     return Photographs(count, size_px, total_bytes)
 
 
-def _seconds(
-    planned: list[PlannedStage], photographs: Photographs | None, reconstruction: ReconstructionForecast | None
-) -> dict[str, float | None]:
-    """Return the seconds of the stages that take long."""
-    seconds: dict[str, float | None] = {}
-    for row in planned:
-        if photographs is None or row.action in ("keep", "refuse"):
-            continue
-        if isinstance(row.resolved, SfmOptions):
-            seconds[row.stage] = 0.0 if reconstruction is None else reconstruction.seconds
-        elif isinstance(row.resolved, TrainOptions):
-            forecast = _training([row], photographs)
-            seconds[row.stage] = None if forecast is None else forecast.seconds
-    return seconds
-
-
-def _training(planned: list[PlannedStage], photographs: Photographs | None) -> TrainingForecast | None:
+def _training(planned: Sequence[PlannedStage], photographs: Photographs | None) -> TrainingForecast | None:
     """Return the forecast of the training; None where none would run, or before a bag is read."""
     from pipelines.train.forecast import forecast
 
-    for row in planned:
-        if (
-            isinstance(row.resolved, TrainOptions)
-            and row.action not in ("keep", "refuse")
-            and photographs is not None
-        ):
-            return forecast(photographs.count, photographs.size_px, row.resolved)
-    return None
+    row = _to_run(planned, TrainOptions)
+    if row is None or photographs is None:
+        return None
+    assert isinstance(row.resolved, TrainOptions)
+    return forecast(photographs.count, photographs.size_px, row.resolved)

@@ -79,9 +79,7 @@ def squared_errors(place: Path, record: BlockRecord, half_width_m: float) -> dic
         error = (render - photo).square().mean(dim=-1).numpy()
         mask = np.array(images.mask(index))
         depth, pose = renderer.depth_m(index), renderer.pose(index)
-        row, column = np.divmod(np.arange(depth.size), pose.pinhole.width)
-        in_cam = depth.reshape(-1, 1) * pose.pinhole.rays(np.stack([column, row], axis=1) + 0.5)
-        points = in_cam @ pose.cam_from_model + pose.center_in_model
+        points = pose.pinhole.points_at(depth) @ pose.cam_from_model + pose.center_in_model
         cells = [block.cell for block in record.blocks]
         band = near_seams(points, cells, half_width_m).reshape(depth.shape) & mask & (depth > 0)
         errors["whole"].append(float(error[mask].mean()))

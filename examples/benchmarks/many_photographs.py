@@ -21,7 +21,6 @@ import argparse
 import json
 import math
 import os
-import resource
 import subprocess
 import sys
 import tempfile
@@ -34,6 +33,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from pipelines.core.free_memory import peak_memory_bytes
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.formats.colmap import flatten, quiet_colmap
 from pipelines.geometry.similarity import umeyama
@@ -242,7 +242,7 @@ def _center_rms_m(model: Any, flown: Flight) -> float:
 
 
 def _peak_bytes() -> int:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+    return peak_memory_bytes() or 0
 
 
 def main() -> None:

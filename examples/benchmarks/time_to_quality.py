@@ -27,22 +27,18 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 import numpy as np
 
 from pipelines.accuracy.error_propagation import NoErrorPropagation
-from pipelines.core.products import load_json
 from pipelines.core.progress import SILENT
-from pipelines.core.stages import PIPELINE, POINTS, SIM3, SPARSE
+from pipelines.core.stages import PIPELINE, POINTS
 from pipelines.core.workspace import Workspace
 from pipelines.evaluate.check_points import measure_check_points
 from pipelines.evaluate.photometric import compare_test_views
-from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.georef.cameras import CameraPoses
 from pipelines.machine.inspection import inspect_machine
-from pipelines.scene.calibrated import load_survey
 from pipelines.scene.geographic import geo_problem
 from pipelines.scene.geolocated import GeolocatedPoints
-from pipelines.scene.initial_similarity import InitialSimilarity
 from pipelines.scene.renderer import ModelRenderer
-from pipelines.scene.scene import initial_scene, photographs
+from pipelines.scene.scene import load_initial_scene, photographs
 from pipelines.scene.trained_survey import TrainedSurvey
 from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.train.assembly import make_trainer
@@ -132,9 +128,7 @@ def measured(workspace: Workspace, age_s: dict[Path, float]) -> list[Row]:
     assert manifest is not None
     # Gaussians come from the checkpoints: the stereo that only places the first ones is not repeated.
     options = TrainOptions.model_validate({**manifest.config, "dense": False})
-    initial = load_json(InitialSimilarity, workspace.path(SIM3))
-    survey = initial.weighted(load_survey(workspace))
-    scene = initial_scene(read_sparse(workspace.path(SPARSE)), survey, initial)
+    initial, survey, scene = load_initial_scene(workspace)
     images = photographs(scene.sparse, survey, workspace, options.effort.max_image_size)
     points, backend = GeolocatedPoints.load(workspace.path(POINTS)), rasterizer(options.backend)
     problem = geo_problem(scene, survey, initial, options, points=points, seed=options.seed)

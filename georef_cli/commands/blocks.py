@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +12,7 @@ from georef_cli import block_tables, boundary, options
 from georef_cli.command import Command
 from georef_cli.display import is_told, progress_for
 from georef_cli.dry_run import announce_training
-from georef_cli.engines import engine_for, engine_options
+from georef_cli.engines import asked_engine, engine_options
 from georef_cli.output import print_json, print_outcome, print_rich
 from pipelines.core import runner
 from pipelines.core.stages import (
@@ -28,7 +27,6 @@ from pipelines.core.stages import (
 )
 from pipelines.core.staleness import must_exist, stage_config
 from pipelines.core.workspace import Workspace
-from pipelines.engine.chosen import chosen_engine
 
 if TYPE_CHECKING:
     from pipelines.blocks.parts import Parts
@@ -46,9 +44,7 @@ def _blocks(ctx: click.Context, **values: Any) -> None:
         raise click.UsageError("--id is for `georef blocks train`.")
     if given and (action in ("scaffold", "seams", "merge") or number is not None):
         raise click.UsageError("options of the training are given to `georef blocks` or `georef blocks plan`.")
-    engine = engine_for(values)
-    # Without a cluster the engine is that of the context, and by default this machine.
-    with nullcontext() if values["cluster"] is None else chosen_engine(engine):
+    with asked_engine(values):
         _act(ctx, action, workspace, given, values)
 
 

@@ -7,10 +7,9 @@ from typing import Any
 import click
 
 from georef_cli.display import progress_for
-from georef_cli.engines import engine_for, engine_options
+from georef_cli.engines import asked_engine, engine_options
 from georef_cli.output import print_json
 from georef_cli.stage import StageCommand
-from pipelines.engine.chosen import chosen_engine
 
 _CHUNK = click.Option(
     ["--chunk"],
@@ -24,7 +23,7 @@ class _SfmCommand(StageCommand):
         """Run the stage, or work on one of its chunks."""
         name = values.pop("chunk")
         if name is None:
-            with chosen_engine(engine_for(values)):
+            with asked_engine(values):
                 super().act(ctx, **values)
             return
         from pipelines.sfm.chunk_work import work_chunk

@@ -32,7 +32,7 @@ from pipelines.core.workspace import Workspace
 from pipelines.scene.block_plan import BlockPlan, PlannedBlock
 from pipelines.scene.block_record import BlockRecord, BlockTraining
 from pipelines.scene.scaffold import scaffold_image_px
-from pipelines.splat.rasterizer.backends import rasterizer
+from pipelines.splat.rasterizer.backends import chosen_backend
 
 FOLDER = "blocks"
 _COMMAND = "blocks"
@@ -100,7 +100,7 @@ class Parts:
         Raises:
             BackendUnavailableError: the backend is not available here.
         """
-        return rasterizer(self.options.backend).name == "cuda"
+        return chosen_backend(self.options.backend) == "cuda"
 
     def plan(self) -> BlockPlan:
         """Return the plan.

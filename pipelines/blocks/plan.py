@@ -15,19 +15,15 @@ from pipelines.blocks.options import PlanOptions
 from pipelines.blocks.partition import cells_of_number, cells_that_fit, extent_of
 from pipelines.core.errors import ResourceError
 from pipelines.core.free_memory import free_main_memory_bytes
-from pipelines.core.products import load_json, save_json
+from pipelines.core.products import save_json
 from pipelines.core.progress import SILENT, Progress
-from pipelines.core.stages import SIM3, SPARSE
 from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.core.workspace import StageRun, Summary
-from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.cameras import Pinhole, project
 from pipelines.scene.block_plan import BlockCell, BlockPlan, PlannedBlock
-from pipelines.scene.calibrated import load_survey
-from pipelines.scene.initial_similarity import InitialSimilarity
 from pipelines.scene.photographs import pinhole_of
 from pipelines.scene.scaffold import scaffold_gaussians
-from pipelines.scene.scene import Scene, initial_scene
+from pipelines.scene.scene import Scene, load_initial_scene
 from pipelines.splat.memory import USABLE, TrainingSize, predicted_peak_bytes
 
 _LEAST_SHARE = 0.1  # of a photograph that shows a block which it is to train
@@ -44,8 +40,7 @@ def run(stage: StageRun, options: PlanOptions) -> Summary:
         GeorefError: a product cannot be read.
     """
     workspace = stage.workspace
-    initial = load_json(InitialSimilarity, workspace.path(SIM3))
-    scene = initial_scene(read_sparse(workspace.path(SPARSE)), load_survey(workspace), initial)
+    _, _, scene = load_initial_scene(workspace)
     plan = plan_blocks(scene, options, stage.progress)
     save_json(plan, stage.out / "plan.json")
     shares = [block.share for block in plan.blocks]

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import combinations
 
 import numpy as np
 import torch
@@ -68,10 +69,9 @@ def compare_neighbours(
 
 def neighbours(plan: BlockPlan) -> Iterator[tuple[PlannedBlock, PlannedBlock]]:
     """Yield the pairs of blocks whose regions have points in common."""
-    for place, first in enumerate(plan.blocks):
-        for second in plan.blocks[place + 1 :]:
-            if first.region.meets(second.region):
-                yield first, second
+    for first, second in combinations(plan.blocks, 2):
+        if first.region.meets(second.region):
+            yield first, second
 
 
 @dataclass(frozen=True)
@@ -138,9 +138,7 @@ class SeamViews:
     def _view(self, block: PlannedBlock, name: str, size_px: int, pair: tuple[PlannedBlock, PlannedBlock]) -> _View:
         index = self._index[name]
         pinhole = pinhole_of(self._sfm.camera_of(index), min(size_px, self._parts.options.effort.max_image_size))
-        matrix = np.eye(4)
-        matrix[:3, :3] = self._poses.cam_from_model[index]
-        matrix[:3, 3] = -self._poses.cam_from_model[index] @ self._poses.cam_center_in_model[index]
+        matrix = self._poses.matrix(index)
         pose = torch.as_tensor(matrix, dtype=torch.float32, device=self._device)
         gaussians = self.model_of(block.id)
         with torch.no_grad():
@@ -168,8 +166,6 @@ def _in_all(depth_m: FloatArray, pose: FloatArray, pinhole: Pinhole, cells: list
         pinhole: of H × W pixels.
         cells: in `model`.
     """
-    row, column = np.divmod(np.arange(depth_m.size), pinhole.width)
-    in_cam = depth_m.reshape(-1, 1) * pinhole.rays(np.stack([column, row], axis=1) + 0.5)
-    points = (in_cam - pose[:3, 3]) @ pose[:3, :3]
+    points = (pinhole.points_at(depth_m) - pose[:3, 3]) @ pose[:3, :3]
     inside = np.all([cell.contains(points) for cell in cells], axis=0)
     return np.asarray(inside.reshape(depth_m.shape))

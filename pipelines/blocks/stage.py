@@ -19,7 +19,7 @@ from pipelines.core.progress import Progress
 from pipelines.core.requests import REQUESTS
 from pipelines.core.stages import PLAN_BLOCKS, SOLVE, TRAIN_BLOCK, TRAIN_SCAFFOLD, TRAIN_SEAMS
 from pipelines.core.workspace import StageRun, Summary
-from pipelines.engine.chosen import engine_in_use
+from pipelines.engine.chosen import failed_of
 from pipelines.engine.job import Job, JobEnd
 from pipelines.scene.block_plan import BlockPlan
 
@@ -145,7 +145,6 @@ def _run_jobs(title: str, jobs: Sequence[Job], progress: Progress, note: Callabl
     Raises:
         GeorefError: jobs have failed; names them.
     """
-    failed: list[JobEnd] = []
     done = 0
 
     def ended(end: JobEnd) -> None:
@@ -153,12 +152,8 @@ def _run_jobs(title: str, jobs: Sequence[Job], progress: Progress, note: Callabl
         if end.is_done:
             done += 1
             note(f"{done} of {len(jobs)} {title}")
-        elif not end.is_interrupted:
-            failed.append(end)
 
-    if jobs:
-        engine_in_use().run(title, jobs, ended, progress)
-    if failed:
+    if failed := failed_of(title, jobs, ended, progress):
         reasons = "; ".join(f"{end.job.name}: {end.error}" for end in failed)
         raise GeorefError(
             f"{len(failed)} of {len(jobs)} {title} failed ({reasons}): the same command trains what is missing"

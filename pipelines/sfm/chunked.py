@@ -13,7 +13,7 @@ from pipelines.core.progress import Progress
 from pipelines.core.sentences import listed
 from pipelines.core.stages import SURVEY
 from pipelines.core.workspace import StageRun
-from pipelines.engine.chosen import engine_in_use
+from pipelines.engine.chosen import failed_of
 from pipelines.engine.job import Job, JobEnd
 from pipelines.scene.survey import Survey
 from pipelines.sfm.chunk_work import copy_finished
@@ -50,32 +50,21 @@ def work_in_chunks(stage: StageRun, survey: Survey, options: SfmOptions) -> Chun
     return plan
 
 
-def largest_photograph_px(survey: Survey) -> tuple[int, int]:
-    """Return width and height of the largest photographs of a survey."""
-    largest = max(survey.cameras, key=lambda camera: camera.width * camera.height)
-    return largest.width, largest.height
-
-
 def _work(stage: StageRun, survey: Survey, plan: ChunkPlan, kind: Kind) -> None:
     """Run those chunks of a kind that are not finished.
 
     Raises:
         GeorefError: at least one has failed.
     """
-    failed: list[JobEnd] = []
 
-    def ended(end: JobEnd) -> None:
-        if not (end.is_done or end.is_interrupted):
-            failed.append(end)
+    def ended(_: JobEnd) -> None:
         finished = sum(chunk.is_finished(stage.out) for chunk in plan.chunks)
         stage.record_progress(f"{finished} of {len(plan.chunks)} chunks")
 
     title = _TITLES[kind]
     waiting = [chunk for chunk in plan.of_kind(kind) if not chunk.is_finished(stage.out)]
     jobs = [_job(stage, survey, plan, chunk) for chunk in waiting]
-    if jobs:
-        engine_in_use().run(title, jobs, ended, stage.progress)
-    if failed:
+    if failed := failed_of(title, jobs, ended, stage.progress):
         names = listed([end.job.name for end in failed])
         raise GeorefError(
             f"{len(failed)} of {len(jobs)} {title} failed ({names}): {failed[0].error}; the same command works on "
@@ -99,7 +88,7 @@ def _job(stage: StageRun, survey: Survey, plan: ChunkPlan, chunk: Chunk) -> Job:
     return Job(
         chunk.name,
         ("sfm", str(root), "--chunk", chunk.name),
-        chunk_peak_bytes(largest_photograph_px(survey), plan.options),
+        chunk_peak_bytes(survey.largest_photograph_px, plan.options),
         folder=root,
         writes=chunk.folder(stage.out),
         reads=(stage.workspace.path(SURVEY), stage.out / PLAN, *reads),

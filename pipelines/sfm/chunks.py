@@ -78,10 +78,6 @@ class ChunkPlan(Product):
         """Return the chunks of a kind."""
         return tuple(chunk for chunk in self.chunks if chunk.kind == kind)
 
-    def databases(self, kind: Kind, partial: Path) -> list[Path]:
-        """Return the databases of the chunks of a kind."""
-        return [chunk.database(partial) for chunk in self.of_kind(kind)]
-
 
 def is_chunked(photographs: int, options: SfmOptions) -> bool:
     """Return whether a survey of so many photographs is worked in chunks."""

@@ -18,8 +18,9 @@ import numpy as np
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import FloatArray, Vector3
 from pipelines.geometry.similarity import umeyama
-from pipelines.robust.kernels import CAUCHY_SCALE2, cauchy_weight
+from pipelines.robust.kernels import cauchy_weight
 from pipelines.robust.statistics import median_chi2
+from pipelines.sfm.position_priors import PriorAdjustment, position_prior
 
 log = logging.getLogger(__name__)
 
@@ -61,21 +62,11 @@ def remove_drift(
     sigma_m = max(_sigma_m(center, position), _LEAST_SIGMA * float(extent[0]))
     covariance = sigma_m**2 * np.eye(3)
     priors = [
-        colmap.PosePrior(
-            corr_data_id=image.data_id,
-            position=place,
-            position_covariance=covariance,
-            coordinate_system=colmap.PosePriorCoordinateSystem.CARTESIAN,
-        )
-        for image, place in zip(images, position, strict=True)
+        position_prior(colmap, image, place, covariance) for image, place in zip(images, position, strict=True)
     ]
-    bundle = colmap.BundleAdjustmentConfig()
-    for image_id in model.reg_image_ids():
-        bundle.add_image(image_id)
+    adjustment = PriorAdjustment(_MOST_ITERATIONS, _ALIGNMENT_GATE * sigma_m, threads)
     with progress.task("adjustment with positions", 1) as task:
-        adjuster = colmap.create_pose_prior_bundle_adjuster(
-            _image_options(colmap, threads), _prior_options(colmap, sigma_m), bundle, priors, model
-        )
+        adjuster = adjustment.adjuster(colmap, model, priors)
         if not adjuster.solve().is_solution_usable():
             log.warning("the adjustment with the measured positions found no solution: the model may have drifted")
         task.advance(note=f"σ {sigma_m:.2f} m")
@@ -93,20 +84,3 @@ def _sigma_m(center: FloatArray, position: FloatArray) -> float:
             break
         weights = cauchy_weight(squared / sigma_m**2, 3)
     return sigma_m
-
-
-def _image_options(colmap: Any, threads: int) -> Any:
-    options = colmap.BundleAdjustmentOptions()
-    options.print_summary = False
-    options.ceres.solver_options.max_num_iterations = _MOST_ITERATIONS
-    options.ceres.solver_options.num_threads = threads
-    return options
-
-
-def _prior_options(colmap: Any, sigma_m: float) -> Any:
-    options = colmap.PosePriorBundleAdjustmentOptions()
-    options.ceres.prior_position_loss_function_type = colmap.LossFunctionType.CAUCHY
-    options.ceres.prior_position_loss_scale = math.sqrt(CAUCHY_SCALE2[3])
-    options.alignment_ransac.max_error = _ALIGNMENT_GATE * sigma_m
-    options.alignment_ransac.random_seed = 0
-    return options

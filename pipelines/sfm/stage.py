@@ -25,7 +25,7 @@ from pipelines.core.stages import SURVEY
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.formats.colmap import quiet_colmap, write_reconstruction
 from pipelines.scene.survey import Survey
-from pipelines.sfm.chunked import join_chunks, largest_photograph_px, remove_chunks, work_in_chunks
+from pipelines.sfm.chunked import join_chunks, remove_chunks, work_in_chunks
 from pipelines.sfm.chunks import ChunkPlan, is_chunked
 from pipelines.sfm.colmap_database import require_sound
 from pipelines.sfm.features import SfmJob
@@ -50,7 +50,7 @@ def run(stage: StageRun, options: SfmOptions) -> Summary:
     """
     path = stage.workspace.path(SURVEY)
     survey = load_json(Survey, path)
-    require_memory(len(survey.images), largest_photograph_px(survey), options, free_main_memory_bytes())
+    require_memory(len(survey.images), survey.largest_photograph_px, options, free_main_memory_bytes())
     plan = work_in_chunks(stage, survey, options) if is_chunked(len(survey.images), options) else None
     arguments = {
         "survey": str(path),

@@ -16,19 +16,15 @@ import torch
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.free_memory import peak_memory_bytes
 from pipelines.core.products import load_json, save_json
-from pipelines.core.progress import Progress
 from pipelines.core.stages import BLOCK_PLAN, SCAFFOLD
 from pipelines.core.threads import thread_count
-from pipelines.core.types import BoolArray
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.scene.block_plan import BlockPlan, PlannedBlock
 from pipelines.scene.block_record import BlockTraining
 from pipelines.scene.photographs import ImageCache
-from pipelines.scene.pinholes import Pinholes
 from pipelines.scene.scene import photographs
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.memory import free_memory_bytes, require_memory
-from pipelines.splat.rasterizer.api import Rasterizer
 from pipelines.splat.rasterizer.backends import device_of, rasterizer
 from pipelines.splat.storage import read_gaussians, write_gaussians
 from pipelines.train.assembly import make_trainer, training_size
@@ -37,7 +33,7 @@ from pipelines.train.frozen_training import SolvedScene, load_solved_scene
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.loop import TrainingRecord
 from pipelines.train.options import BlockTrainOptions
-from pipelines.train.region import RegionMasks, SceneBox, TrainingRegion, pose_matrix, region_mask, stand_in_depth
+from pipelines.train.region import RegionMasks, SceneBox, TrainingRegion
 from pipelines.train.surface import SceneSurface
 from pipelines.train.trainer import JointTrainer
 from pipelines.train.training_files import METRICS, train_in_folder
@@ -69,15 +65,8 @@ def run(stage: StageRun, options: BlockTrainOptions) -> Summary:
     require_memory(size, free_memory_bytes(device_of(backend)))
     images.build(stage.progress)
     surface = _surface(stage, solved, images) if options.dense else None
-    masks = _masks(
-        solved,
-        images=images,
-        block=block,
-        scaffold=scaffold,
-        backend=backend,
-        surface=surface,
-        progress=stage.progress,
-    )
+    views = solved.views(images, solved.scene.train, backend)
+    masks = views.masks(block.region, scaffold, surface, stage.progress)
     region = _region(block, box, scaffold, masks)
     training = TrainingScene(_seeing(solved, masks).scene, images, surface, region)
     trainer = make_trainer(training, solved.problem(), backend, options, solved.exposures(device_of(backend)))
@@ -108,30 +97,6 @@ def _surface(stage: StageRun, solved: SolvedScene, images: ImageCache) -> SceneS
     maps = DepthMaps(stage.workspace.cache / "surface", solved.scene, images)
     maps.build(stage.progress)
     return SceneSurface(maps)
-
-
-def _masks(
-    solved: SolvedScene,
-    *,
-    images: ImageCache,
-    block: PlannedBlock,
-    scaffold: Gaussians,
-    backend: Rasterizer,
-    surface: SceneSurface | None,
-    progress: Progress,
-) -> RegionMasks:
-    """Return the pixels of the training views that show the block."""
-    pinholes = Pinholes(images, solved.scene.sparse.lenses)
-    pinholes.renew(solved.solution.with_lenses(solved.scene.sparse).lenses)
-    masks: dict[int, BoolArray] = {}
-    with progress.task("masks", len(solved.scene.train)) as task:
-        for index in map(int, solved.scene.train):
-            pose, pinhole = pose_matrix(solved.solution.poses, index), pinholes.of(index)
-            stand_in = stand_in_depth(scaffold, pose, pinhole, backend)
-            known = None if surface is None else surface.depth(index)
-            masks[index] = region_mask(pose, pinhole, block.region, known, stand_in)
-            task.advance()
-    return RegionMasks(masks)
 
 
 def _region(block: PlannedBlock, box: SceneBox, scaffold: Gaussians, masks: RegionMasks) -> TrainingRegion:

@@ -126,8 +126,7 @@ def forecast_of(survey: Survey, options: TrainOptions) -> TrainingForecast:
     Raises:
         BackendUnavailableError: `--backend cuda` without a GPU or without gsplat.
     """
-    largest = max(survey.cameras, key=lambda camera: camera.width * camera.height)
-    return forecast(len(survey.images), (largest.width, largest.height), options)
+    return forecast(len(survey.images), survey.largest_photograph_px, options)
 
 
 def _seconds(photographs: int, camera: Pinhole, options: TrainOptions) -> float:

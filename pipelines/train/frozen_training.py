@@ -7,18 +7,19 @@ from dataclasses import dataclass, replace
 import torch
 
 from pipelines.core.products import load_json
-from pipelines.core.stages import SIM3, SOLUTION, SPARSE
+from pipelines.core.stages import SOLUTION
 from pipelines.core.types import IntArray
 from pipelines.core.workspace import Workspace
-from pipelines.formats.colmap import read_sparse
 from pipelines.georef.problem import GeoProblem
-from pipelines.scene.calibrated import load_survey
 from pipelines.scene.frozen_solution import exposures_of, held_problem
-from pipelines.scene.initial_similarity import InitialSimilarity
-from pipelines.scene.scene import Scene, initial_scene
+from pipelines.scene.photographs import ImageCache
+from pipelines.scene.pinholes import Pinholes
+from pipelines.scene.scene import Scene, load_initial_scene
 from pipelines.scene.survey import Survey
 from pipelines.scene.trained_model import FrozenSolution
 from pipelines.splat.exposure import HeldExposures
+from pipelines.splat.rasterizer.api import Rasterizer
+from pipelines.train.region import RegionViews
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,12 @@ class SolvedScene:
         """Return the problem that holds the solution."""
         return held_problem(self.scene, self.solution)
 
+    def views(self, images: ImageCache, indices: IntArray, rasterizer: Rasterizer) -> RegionViews:
+        """Return views (T,), under the lenses of the solution, in which a region can be looked for."""
+        pinholes = Pinholes(images, self.scene.sparse.lenses)
+        pinholes.renew(self.solution.with_lenses(self.scene.sparse).lenses)
+        return RegionViews(indices, self.solution.poses, pinholes, rasterizer)
+
     def exposures(self, device: torch.device) -> HeldExposures | None:
         """Return the exposures of the solution; None: it has none."""
         exposures = exposures_of(self.solution)
@@ -61,7 +68,5 @@ def load_solved_scene(workspace: Workspace) -> SolvedScene:
     Raises:
         GeorefError: a product does not exist or cannot be read.
     """
-    initial = load_json(InitialSimilarity, workspace.path(SIM3))
-    survey = initial.weighted(load_survey(workspace))
-    scene = initial_scene(read_sparse(workspace.path(SPARSE)), survey, initial)
+    _, survey, scene = load_initial_scene(workspace)
     return SolvedScene(survey, scene, load_json(FrozenSolution, workspace.path(SOLUTION)))

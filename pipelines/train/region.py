@@ -13,12 +13,15 @@ import cv2
 import numpy as np
 import torch
 
+from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
 from pipelines.geometry.cameras import Pinhole
 from pipelines.georef.cameras import CameraPoses
 from pipelines.scene.block_plan import BlockCell
+from pipelines.scene.pinholes import Pinholes
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings, Window
+from pipelines.train.surface import SceneSurface
 
 _STAND_IN_PX = 160  # longest side of the stand-in's renders
 _LEAST_ALPHA = 0.5  # of a surface: rays that meet less end in the sky
@@ -100,6 +103,48 @@ class SceneBox:
 
 
 @dataclass(frozen=True)
+class RegionViews:
+    """Views in which a region is looked for.
+
+    Attributes:
+        indices: (T,) of the cameras.
+        poses: of all cameras.
+        pinholes: of their images.
+        rasterizer: renders the stand-in.
+    """
+
+    indices: IntArray
+    poses: CameraPoses
+    pinholes: Pinholes
+    rasterizer: Rasterizer
+
+    def masks(
+        self,
+        cell: BlockCell,
+        stand_in: Gaussians,
+        surface: SceneSurface | None = None,
+        progress: Progress = SILENT,
+    ) -> RegionMasks:
+        """Return the pixels of each view whose surface lies in a region.
+
+        Args:
+            cell: the region.
+            stand_in: whose depth counts where the surface is not known.
+            surface: known depths; None: there are none.
+            progress: counts the views.
+        """
+        masks: dict[int, BoolArray] = {}
+        with progress.task("masks", len(self.indices)) as task:
+            for index in self.indices.tolist():
+                pose, pinhole = self.poses.matrix(index), self.pinholes.of(index)
+                depth = stand_in_depth(stand_in, pose, pinhole, self.rasterizer)
+                known = None if surface is None else surface.depth(index)
+                masks[index] = region_mask(pose, pinhole, cell, known, depth)
+                task.advance()
+        return RegionMasks(masks)
+
+
+@dataclass(frozen=True)
 class TrainingRegion:
     """Region of a training.
 
@@ -135,10 +180,7 @@ def region_mask(
     if known is not None:
         own = cv2.resize(np.array(known), size, interpolation=cv2.INTER_NEAREST)
         depth = np.where(own > 0, own, depth)
-    row, column = np.divmod(np.arange(depth.size), pinhole.width)
-    ray = pinhole.rays(np.stack([column, row], axis=1) + 0.5)
-    in_cam = depth.reshape(-1, 1).astype(np.float64) * ray
-    points = (in_cam - pose[:3, 3]) @ pose[:3, :3]
+    points = (pinhole.points_at(depth) - pose[:3, 3]) @ pose[:3, :3]
     return cell.contains(points).reshape(depth.shape)
 
 
@@ -154,11 +196,3 @@ def stand_in_depth(
     depth = torch.where(view.median_depth > 0, view.median_depth, view.expected_depth)
     seen = view.alpha >= _LEAST_ALPHA
     return np.asarray(torch.where(seen, depth, torch.full_like(depth, _SKY_M)).cpu().numpy())
-
-
-def pose_matrix(poses: CameraPoses, index: int) -> FloatArray:
-    """Return the pose (4, 4) cam ← model of a camera."""
-    matrix = np.eye(4)
-    matrix[:3, :3] = poses.cam_from_model[index]
-    matrix[:3, 3] = -poses.cam_from_model[index] @ poses.cam_center_in_model[index]
-    return matrix

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -22,11 +23,9 @@ from pipelines.core.durable import replace_text
 from pipelines.core.interrupts import deferred_interrupts
 from pipelines.core.products import load_json
 from pipelines.core.stages import BLOCK_GAUSSIANS, BLOCK_PLAN, SCAFFOLD
-from pipelines.core.types import BoolArray
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.scene.block_plan import BlockCell, BlockPlan, PlannedBlock
 from pipelines.scene.photographs import ImageCache
-from pipelines.scene.pinholes import Pinholes
 from pipelines.scene.scene import photographs
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.rasterizer.api import Rasterizer
@@ -36,7 +35,7 @@ from pipelines.train.assembly import make_finisher
 from pipelines.train.frozen_training import SolvedScene, load_solved_scene
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.options import SeamOptions
-from pipelines.train.region import RegionMasks, SceneBox, TrainingRegion, pose_matrix, region_mask, stand_in_depth
+from pipelines.train.region import SceneBox, TrainingRegion
 
 _SHARE = 0.2  # of a block's iterations
 _WIDTH = 0.5  # of the blocks' overlap, on each side of a seam
@@ -61,9 +60,9 @@ def run(stage: StageRun, options: SeamOptions) -> Summary:
     strips = _SeamTrainer(solved, images, scaffold, backend, options)
     seams = list(seams_of(plan))
     with stage.progress.task("seams", len(seams)) as task, deferred_interrupts() as stop:
-        for number, (first, second) in enumerate(seams):
+        for number, (first, second, strip) in enumerate(seams):
             if number >= model.done():
-                strips.train(model, first, second, strip_of(first, second))
+                strips.train(model, first, second, strip)
                 model.end(number + 1)
                 stage.record_progress(f"{number + 1} of {len(seams)} seams")
             task.advance()
@@ -74,12 +73,11 @@ def run(stage: StageRun, options: SeamOptions) -> Summary:
     return Summary(f"{len(seams)} seams of {len(plan.blocks)} blocks, {count} Gaussians", values)
 
 
-def seams_of(plan: BlockPlan) -> Iterable[tuple[PlannedBlock, PlannedBlock]]:
-    """Yield the pairs of blocks that have a strip along their common side."""
-    for place, first in enumerate(plan.blocks):
-        for second in plan.blocks[place + 1 :]:
-            if strip_of(first, second) is not None:
-                yield first, second
+def seams_of(plan: BlockPlan) -> Iterable[tuple[PlannedBlock, PlannedBlock, BlockCell]]:
+    """Yield the pairs of blocks that have a strip along their common side, and the strip."""
+    for first, second in combinations(plan.blocks, 2):
+        if (strip := strip_of(first, second)) is not None:
+            yield first, second, strip
 
 
 def strip_of(first: PlannedBlock, second: PlannedBlock) -> BlockCell | None:
@@ -151,10 +149,8 @@ class _SeamTrainer:
     backend: Rasterizer
     options: SeamOptions
 
-    def train(self, model: _CellFiles, first: PlannedBlock, second: PlannedBlock, strip: BlockCell | None) -> None:
+    def train(self, model: _CellFiles, first: PlannedBlock, second: PlannedBlock, strip: BlockCell) -> None:
         """Train the Gaussians of a strip, and put them back."""
-        if strip is None:
-            return
         around = strip.widened(_WIDTH * np.minimum(first.margin_m, second.margin_m))
         parts = model.near(around)
         together = Gaussians.concatenate(list(parts.values()))
@@ -187,7 +183,7 @@ class _SeamTrainer:
         device, index = device_of(self.backend), self.solved.scene.sparse.image_index()
         train = np.array([index[name] for name in names if name in index], dtype=np.int64)
         everything = Gaussians.concatenate([start, surroundings]).to(device)
-        masks = self._masks(train, strip, everything)
+        masks = self.solved.views(self.images, train, self.backend).masks(strip, everything)
         seeing = masks.seeing()
         if len(seeing) < _LEAST_VIEWS:
             return None
@@ -208,13 +204,3 @@ class _SeamTrainer:
             trainer.step()
         trainer.check_finite()
         return trainer.optimizer.gaussians.detached().to(torch.device("cpu"))
-
-    def _masks(self, train: np.ndarray, strip: BlockCell, everything: Gaussians) -> RegionMasks:
-        pinholes = Pinholes(self.images, self.solved.scene.sparse.lenses)
-        pinholes.renew(self.solved.solution.with_lenses(self.solved.scene.sparse).lenses)
-        masks: dict[int, BoolArray] = {}
-        for index in train.tolist():
-            pose, pinhole = pose_matrix(self.solved.solution.poses, index), pinholes.of(index)
-            depth = stand_in_depth(everything, pose, pinhole, self.backend)
-            masks[index] = region_mask(pose, pinhole, strip, None, depth)
-        return RegionMasks(masks)

@@ -5,14 +5,10 @@ Reads the survey, the SfM model, the geolocated points and the initial similarit
 
 from __future__ import annotations
 
-from pipelines.core.products import load_json, save_json
-from pipelines.core.stages import SIM3, SPARSE
+from pipelines.core.products import save_json
 from pipelines.core.workspace import StageRun, Summary
-from pipelines.formats.colmap import read_sparse
-from pipelines.scene.calibrated import load_survey
 from pipelines.scene.frozen_solution import solve_once, with_exposures
-from pipelines.scene.initial_similarity import InitialSimilarity
-from pipelines.scene.scene import initial_scene, photographs
+from pipelines.scene.scene import load_initial_scene, photographs
 from pipelines.scene.track_exposures import exposures_from_tracks
 from pipelines.train.options import SolutionOptions
 
@@ -25,9 +21,7 @@ def run(stage: StageRun, options: SolutionOptions) -> Summary:
         GeorefError: a product or a photograph cannot be read.
     """
     workspace = stage.workspace
-    initial = load_json(InitialSimilarity, workspace.path(SIM3))
-    survey = initial.weighted(load_survey(workspace))
-    scene = initial_scene(read_sparse(workspace.path(SPARSE)), survey, initial)
+    initial, survey, scene = load_initial_scene(workspace)
     solution = solve_once(scene, survey, initial, options)
     if options.exposure:
         images = photographs(scene.sparse, survey, workspace, options.max_image_size)

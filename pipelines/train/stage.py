@@ -12,15 +12,13 @@ import json
 import logging
 
 from pipelines.core.products import load_json, save_json
-from pipelines.core.stages import POINTS, SIM3, SPARSE
+from pipelines.core.stages import POINTS
 from pipelines.core.workspace import StageRun, Summary, Workspace
-from pipelines.formats.colmap import read_sparse
 from pipelines.scene.calibrated import load_survey
 from pipelines.scene.frozen_solution import solve_and_hold
 from pipelines.scene.geographic import geo_problem
 from pipelines.scene.geolocated import GeolocatedPoints
-from pipelines.scene.initial_similarity import InitialSimilarity
-from pipelines.scene.scene import initial_scene, photographs
+from pipelines.scene.scene import load_initial_scene, photographs
 from pipelines.scene.trained_model import TrainedModel
 from pipelines.splat.memory import free_memory_bytes, require_memory
 from pipelines.splat.rasterizer.backends import device_of, rasterizer
@@ -47,13 +45,10 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
         KeyboardInterrupt: the user asked to stop; a checkpoint was written.
         GeorefError: a product or a photograph cannot be read, or the scene has too few points.
     """
-    backend = rasterizer(
-        options.backend, stage.progress
-    )  # first, so that `--backend cuda` without a GPU fails at once
+    # First, so that `--backend cuda` without a GPU fails at once.
+    backend = rasterizer(options.backend, stage.progress)
     workspace = stage.workspace
-    initial = load_json(InitialSimilarity, workspace.path(SIM3))
-    survey = initial.weighted(load_survey(workspace))
-    scene = initial_scene(read_sparse(workspace.path(SPARSE)), survey, initial)
+    initial, survey, scene = load_initial_scene(workspace)
     options.require_trainable(len(scene.sparse.image_name))
     images = photographs(scene.sparse, survey, workspace, options.effort.max_image_size)
     require_memory(training_size(scene, images, options), free_memory_bytes(device_of(backend)))

@@ -13,7 +13,7 @@ import torch
 from pipelines.scene.block_plan import BlockCell
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
-from pipelines.train.region import RegionMasks, SceneBox, TrainingRegion, pose_matrix, region_mask, stand_in_depth
+from pipelines.train.region import RegionMasks, SceneBox, TrainingRegion, region_mask, stand_in_depth
 from pipelines.train.schedule import JointOptions
 from pipelines.train.trainer import JointTrainer
 from tests import tiny_training as tiny
@@ -31,7 +31,7 @@ def wall_depth() -> np.ndarray:
 
 @pytest.mark.parametrize("index", [0, 2, 5])
 def test_mask_ends_where_the_cell_does(index: int) -> None:
-    pose = pose_matrix(tiny.poses(), index)
+    pose = tiny.poses().matrix(index)
     x = tiny.poses().cam_center_in_model[index, 0]
     mask = region_mask(pose, tiny.PINHOLE, WEST, None, wall_depth())
     column = tiny.PINHOLE.cx - tiny.PINHOLE.fx * x / WALL_M  # of the plane x = 0 on the wall
@@ -41,7 +41,7 @@ def test_mask_ends_where_the_cell_does(index: int) -> None:
 
 def test_known_depth_comes_before_the_stand_in() -> None:
     """The camera at x = −1 sees the plane x = 0 further to the right, the nearer the surface is."""
-    pose, known = pose_matrix(tiny.poses(), 0), np.zeros((24, 32), dtype=np.float32)
+    pose, known = tiny.poses().matrix(0), np.zeros((24, 32), dtype=np.float32)
     known[12:] = 1.0  # half the size of the image; the upper half is unknown
     mask = region_mask(pose, tiny.PINHOLE, WEST, known, wall_depth())
     assert mask[:24].sum(axis=1).tolist() == [47] * 24
@@ -51,7 +51,7 @@ def test_known_depth_comes_before_the_stand_in() -> None:
 def test_sky_belongs_to_the_cell_in_its_direction() -> None:
     empty = Gaussians.concatenate([tiny.true_gaussians(1)])
     empty.logit_opacities[:] = -9.0
-    pose = pose_matrix(tiny.poses(), 3)
+    pose = tiny.poses().matrix(3)
     depth = stand_in_depth(empty, pose, tiny.PINHOLE, CpuRasterizer())
     mask = region_mask(pose, tiny.PINHOLE, WEST, None, depth)
     np.testing.assert_array_equal(mask, np.tile(np.arange(64) < 32, (48, 1)))
@@ -77,7 +77,7 @@ def confined(folder: Path, *, spoiled: bool) -> JointTrainer:
     images = tiny.photographs(folder, truth)
     masks = {}
     for index in range(6):
-        masks[index] = region_mask(pose_matrix(tiny.poses(), index), tiny.PINHOLE, WEST, None, wall_depth())
+        masks[index] = region_mask(tiny.poses().matrix(index), tiny.PINHOLE, WEST, None, wall_depth())
         if spoiled:
             file = folder / f"{index}.png"
             pixels = cv2.imread(str(file))
