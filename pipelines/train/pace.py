@@ -57,11 +57,11 @@ class BlockCost:
             visible: number of the Gaussians in a view.
             gaussians: number of all Gaussians, those that stand in for the rest among them.
         """
-        return float(_design(np.array([[pixels, visible, gaussians]])) @ self.seconds)
+        return _at(self.seconds, pixels, visible, gaussians)
 
     def peak_bytes(self, pixels: float, visible: float, gaussians: float) -> float:
         """Return the peak of the process's memory; arguments as for `iteration_s`, with the limit of Gaussians."""
-        return float(_design(np.array([[pixels, visible, gaussians]])) @ self.bytes)
+        return _at(self.bytes, pixels, visible, gaussians)
 
     @staticmethod
     def fitted(sizes: FloatArray, seconds: FloatArray, peak_bytes: FloatArray) -> BlockCost:
@@ -76,6 +76,10 @@ class BlockCost:
         return BlockCost(
             *(nnls(design / values[:, None], np.ones(len(values)))[0] for values in (seconds, peak_bytes))
         )
+
+
+def _at(coefficients: FloatArray, pixels: float, visible: float, gaussians: float) -> float:
+    return float((_design(np.array([[pixels, visible, gaussians]])) @ coefficients).item())
 
 
 def _design(sizes: FloatArray) -> FloatArray:
