@@ -14,7 +14,7 @@ PHOTO_PX = (640, 480)
 
 
 def test_the_model_is_found_again() -> None:
-    """From 16 blocks measured to 3 %, all predictions are right to 5 %: four unknowns take a quarter of the noise."""
+    """From 16 blocks measured to 3 %, predictions are right to 5 %: four unknowns take a quarter of the noise."""
     rng = np.random.default_rng(0)
     truth = BlockCost(np.array([0.004, 0.2, 1.2, 0.3]), np.array([6e8, 1e9, 0.0, 2e9]))
     sizes = rng.uniform([3e4, 5e2, 5e3], [3e5, 2e4, 1e5], (16, 3))
