@@ -10,7 +10,8 @@ import pytest
 
 from pipelines.formats.trajectory_csv import read_trajectory
 from pipelines.geodesy.enu import Origin
-from pipelines.scene.measured_cloud import CloudCrs, CloudFiles
+from pipelines.scene.cloud_options import CloudCrs
+from pipelines.scene.measured_cloud import CloudFiles
 from pipelines.simulate.lidar import NOISE, LidarFlight
 from pipelines.simulate.lidar_files import LidarFiles
 from pipelines.simulate.lidar_options import LidarFlightOptions
