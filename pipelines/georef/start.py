@@ -10,6 +10,7 @@ from pipelines.georef.adjustment import BIAS_COST
 from pipelines.georef.normal_equations import RobustMinimum, posterior_weights
 from pipelines.georef.posterior import GeoEquations, equations_of
 from pipelines.georef.problem import GeoProblem
+from pipelines.georef.systematic import SystematicErrors
 
 # Rotations of similarity and boresight are not linear: four linearisations are enough from 20°.
 _ROUNDS, _NEAR = 4, 0.1  # a step below a tenth of a σ ends them earlier
@@ -50,13 +51,13 @@ def begin(problem: GeoProblem) -> float:
     return without.cost - with_errors.cost
 
 
-def bias_pays(problem: GeoProblem, saved: float) -> bool:
+def bias_pays(errors: SystematicErrors, saved: float) -> bool:
     """Return whether biases are accepted that lower −2 ln likelihood by `saved`.
 
     A bias that does not exist costs accuracy, since the fixes then have no information on the position: with RTK
     and a few control points, σ doubles at least. The bias has to be evident, as for the initial similarity.
     """
-    return saved > BIAS_COST * problem.errors.flights
+    return saved > BIAS_COST * errors.flights
 
 
 def _best(problem: GeoProblem, equations: GeoEquations, *, with_errors: bool) -> RobustMinimum:

@@ -25,6 +25,7 @@ _CAUSES = {
     "bias": "Check the base station, the vertical datum and the antenna offset",
     "lever-arm": "`georef ingest --lever-arm` can apply it, in the axes of the body",
     "boresight": "`georef ingest --boresight` can apply it",
+    "lidar-shift": "Check the LiDAR's CRS, datum and flight",
 }
 
 
@@ -109,10 +110,6 @@ def _warnings(model: TrainedModel, record: TrainingRecord) -> list[str]:
 
 def _lidar_warnings(lidar: LidarReport) -> list[str]:
     warnings = list(lidar.assumptions)
-    if lidar.registration.removed:
-        shift, sigma = lidar.registration.shift_m, lidar.registration.sigma_m
-        text = ", ".join(f"{value:+.3f} ± {one:.3f}" for value, one in zip(shift, sigma, strict=True))
-        warnings.append(f"the LiDAR was shifted by ({text}) m east, north, up: it is taken out here")
     if lidar.areas:
         area_m2 = sum(area.area_m2 for area in lidar.areas)
         warnings.append(
@@ -124,7 +121,7 @@ def _lidar_warnings(lidar: LidarReport) -> list[str]:
 
 def _warning_of(error: EstimatedError) -> str | None:
     """Return a warning if the error exceeds 3 σ or is not observable along every axis, else None."""
-    axes = "east, north, up" if error.name == "bias" else "right, down, forward"
+    axes = "east, north, up" if error.name in {"bias", "lidar-shift"} else "right, down, forward"
     flight = "" if error.flight is None else f" of flight {error.flight + 1}"
     subject = f"{error.name}{flight}"
     values = ", ".join(f"{value:+.3f} ± {sigma:.3f}" for value, sigma in zip(error.value, error.sigma, strict=True))

@@ -29,7 +29,7 @@ from pipelines.splat.storage import write_gaussians
 from pipelines.train.assembly import make_trainer, training_size
 from pipelines.train.depth_maps import DepthMaps
 from pipelines.train.initial_gaussians import TrainingScene
-from pipelines.train.lidar.prepare import draw_changes, lidar_surface
+from pipelines.train.lidar.prepare import compared_lidar, draw_changes, lidar_surface
 from pipelines.train.loop import LoopOptions, optimise
 from pipelines.train.options import TrainOptions
 from pipelines.train.result import summary_of, trained_model
@@ -59,21 +59,26 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     images = photographs(scene.sparse, survey, workspace, options.effort.max_image_size)
     require_memory(training_size(scene, images, options), free_memory_bytes(device_of(backend)))
     images.build(stage.progress)
-    surface, lidar = None, None
-    if options.dense:
-        maps = DepthMaps(workspace.cache / "surface", scene, images)
+    maps = DepthMaps(workspace.cache / "surface", scene, images) if options.dense else None
+    if maps is not None:
         maps.build(stage.progress)
-        surface = SceneSurface(maps)
-        if clouds is not None:
-            lidar = lidar_surface(
-                options, clouds, maps, survey,
-                georeference=initial.geo_from_local, seed=options.seed, progress=stage.progress,
-            )  # fmt: skip
-            surface = lidar.surface
-            save_json(lidar.report, stage.out / "lidar.json")
-            draw_changes(stage.out / "lidar.png", lidar, scene)
+    compared = None
+    if clouds is not None and maps is not None:
+        compared = compared_lidar(
+            options, clouds, maps, survey,
+            georeference=initial.geo_from_local, seed=options.seed, progress=stage.progress,
+        )  # fmt: skip
     points = GeolocatedPoints.load(workspace.path(POINTS))
-    problem = geo_problem(scene, survey, initial, options, points=points, seed=options.seed)
+    planes = compared.planes() if compared is not None and options.lidar_register else None
+    problem = geo_problem(scene, survey, initial, options, points=points, planes=planes, seed=options.seed)
+    surface, lidar = None if maps is None else SceneSurface(maps), None
+    if compared is not None and clouds is not None:
+        shift = problem.estimate().errors.lidar_m
+        shift_m = None if shift is None else shift.detach().cpu().numpy()
+        lidar = lidar_surface(compared, clouds, survey, sigma_m=options.lidar_sigma, shift_m=shift_m)
+        surface = lidar.surface
+        save_json(lidar.report, stage.out / "lidar.json")
+        draw_changes(stage.out / "lidar.png", lidar, scene)
     trainer = make_trainer(TrainingScene(scene, images, surface), problem, backend, options)
     extend = not stage.resumed and _take_over(stage, options.effort.iterations)
     files = LoopOptions(

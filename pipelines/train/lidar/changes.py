@@ -27,7 +27,9 @@ _TOLERANCE = 0.005  # of the distance: photographs that differ by less agree
 _LEAST_LOOKS = 2  # through a point, that contradict it
 _NEIGHBOURS = 16
 _ADDED_M = 1.0  # height of a surface that the cloud lacks
-CELL_M, _CELL_PX = 0.5, 2.0  # side of the cells in plan: the larger of both
+_CELL_M = 0.5  # least side of cells in plan
+_CELL_PX = 2.0  # least side in pixels, where the photographs decide
+_CELL_POINTS = 1.5  # least side in distances between points, where the cloud decides
 _LEAST_AREA_M2 = 4.0  # that is listed
 _STEREO_PX = 0.3  # σ of stereo, in pixels of the depth maps
 _GRAZING = 0.2  # cosine of incidence below which a beam's footprint blurs the surface
@@ -43,6 +45,7 @@ class ChangedArea:
         area_m2: in plan.
         points: of the cloud.
         center_in_model: (3,) mean of these points.
+        cell_m: side of its cells in plan.
         cells: (C, 2) south-western corners of its cells in `model`, for maps.
     """
 
@@ -50,6 +53,7 @@ class ChangedArea:
     area_m2: float
     points: int
     center_in_model: FloatArray
+    cell_m: float
     cells: FloatArray
 
 
@@ -120,7 +124,7 @@ def _majority(mark: BoolArray, votes: BoolArray, nearest: IntArray) -> BoolArray
 
 def _below_surface(cloud: LidarCloud, surface: FloatArray, pixel_m: float) -> BoolArray:
     """Return whether the photographs show a surface well above all points of the cloud in a point's cell (P,)."""
-    side_m = max(CELL_M, _CELL_PX * pixel_m)
+    side_m = max(_CELL_M, _CELL_PX * pixel_m)
     low = np.minimum(cloud.position_in_model.min(axis=0), surface.min(axis=0))[:2]
     mine, theirs = (
         np.floor((points[:, :2] - low) / side_m).astype(np.int64) for points in (cloud.position_in_model, surface)
@@ -152,7 +156,8 @@ def _areas(cloud: LidarCloud, marked: BoolArray, kind: Literal["removed", "added
     points = cloud.position_in_model[marked]
     if not len(points):
         return []
-    cell = np.floor(points[:, :2] / CELL_M).astype(np.int64)
+    side_m = max(_CELL_M, _CELL_POINTS * cloud.voxel_m)
+    cell = np.floor(points[:, :2] / side_m).astype(np.int64)
     low = cell.min(axis=0) - 1
     grid = np.zeros(cell.max(axis=0) - low + 2, dtype=bool)
     place = cell - low
@@ -160,12 +165,12 @@ def _areas(cloud: LidarCloud, marked: BoolArray, kind: Literal["removed", "added
     closed = ndimage.binary_closing(grid)
     labels, count = ndimage.label(closed | grid, structure=np.ones((3, 3)))
     of_point = labels[place[:, 0], place[:, 1]]
-    size = np.bincount(labels.ravel(), minlength=count + 1) * CELL_M**2
+    size = np.bincount(labels.ravel(), minlength=count + 1) * side_m**2
     areas = []
     for label in np.flatnonzero(size >= _LEAST_AREA_M2):
         mine = points[of_point == label]
         if label == 0 or not len(mine):
             continue
-        cells = (np.argwhere(labels == label) + low) * CELL_M
-        areas.append(ChangedArea(kind, float(size[label]), len(mine), mine.mean(axis=0), cells))
+        cells = (np.argwhere(labels == label) + low) * side_m
+        areas.append(ChangedArea(kind, float(size[label]), len(mine), mine.mean(axis=0), side_m, cells))
     return areas
