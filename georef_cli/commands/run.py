@@ -42,6 +42,11 @@ LATER: dict[str, tuple[str, ...]] = {
     "max_image_size": ("train",),
     "max_gaussians": ("train",),
     "backend": ("train", "evaluate"),
+    "lidar": ("train",),
+    "lidar_crs": ("train",),
+    "lidar_vertical": ("train",),
+    "lidar_sigma": ("train",),
+    "lidar_register": ("train",),
     "seed": ("sfm", "init-sim3", "train"),
 }
 _DELIVERABLE_NAMES = ", ".join(spec.name.removeprefix("export-") for spec in DELIVERABLES)

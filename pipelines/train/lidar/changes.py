@@ -6,7 +6,7 @@
    scanner would have met it.
 3. The neighbours of a point decide with it. A single contradiction is noise, of stereo or cloud.
 4. The confidence of the other points is a product of factors from 0 to 1: stated accuracy against that of stereo,
-   flatness and density of the neighbours, incidence of the beam, and agreement with the photographs.
+   flatness and density of the neighbours, and agreement with the photographs.
 """
 
 from __future__ import annotations
@@ -32,7 +32,6 @@ _CELL_PX = 2.0  # least side in pixels, where the photographs decide
 _CELL_POINTS = 1.5  # least side in distances between points, where the cloud decides
 _LEAST_AREA_M2 = 4.0  # that is listed
 _STEREO_PX = 0.3  # σ of stereo, in pixels of the depth maps
-_GRAZING = 0.2  # cosine of incidence below which a beam's footprint blurs the surface
 _SPARSE = 4.0  # distances between points, to the furthest neighbour on a well-scanned surface
 
 
@@ -87,7 +86,6 @@ def verdict(
     *,
     sigma_m: float,
     pixel_m: float,
-    beam_in_model: FloatArray | None = None,
 ) -> CloudVerdict:
     """Return confidence and contradictions of a cloud's points.
 
@@ -97,7 +95,6 @@ def verdict(
         surface_in_model: (S, 3) surface that the photographs show together.
         sigma_m: stated σ of the points.
         pixel_m: size of a pixel of the depth maps on the surface.
-        beam_in_model: (P, 3) unit vectors of the beams; None: not known.
     """
     found = support(cloud.position_in_model, views, UP, _TOLERANCE, cloud.normal_in_model)
     _, nearest = cKDTree(cloud.position_in_model).query(cloud.position_in_model, k=min(_NEIGHBOURS, len(cloud)))
@@ -107,9 +104,6 @@ def verdict(
     below = _below_surface(cloud, surface_in_model, pixel_m) & (found.views == 0)
     added = _majority(below, np.ones_like(votes), nearest) & ~removed
     confidence = _confidence(cloud, found, sigma_m, pixel_m)
-    if beam_in_model is not None:
-        incidence = np.abs(np.einsum("pi,pi->p", cloud.normal_in_model, beam_in_model))
-        confidence *= np.minimum(incidence / _GRAZING, 1.0)
     confidence[removed | added] = 0.0
     areas = (*_areas(cloud, removed, "removed"), *_areas(cloud, added, "added"))
     ordered = tuple(sorted(areas, key=lambda area: -area.area_m2))
