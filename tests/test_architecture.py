@@ -83,6 +83,9 @@ HOMES: dict[str, tuple[str, ...]] = {
     "ezdxf": ("pipelines.formats",),
     "viser": ("pipelines.view",),
     "websockets": ("pipelines.view",),
+    "dask": ("pipelines.engine",),
+    "distributed": ("pipelines.engine",),
+    "fsspec": ("pipelines.engine",),
 }
 # The entry point of a process whose log records go to its parent.
 CHILD = "pipelines.core.child"

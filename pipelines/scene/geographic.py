@@ -7,10 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipelines.core.errors import InputError
+from pipelines.geometry.bundle_information import BundleInformation
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.similarity import moved_pivot
 from pipelines.georef.adjustment import RotationPrior
-from pipelines.georef.cameras import CameraCorrections
+from pipelines.georef.cameras import CameraCorrections, HeldCorrections
 from pipelines.georef.control_by_depth import ControlByDepth
 from pipelines.georef.problem import GeoProblem
 from pipelines.georef.similarity import LearnableSimilarity
@@ -52,7 +53,9 @@ def geo_problem(
     Raises:
         InputError: a constant error is to be estimated, but its measurements were not recorded; or `points` belongs
             to another model.
+        ConvergenceError: sparse equations do not settle.
     """
+    bundle = scene.bundle if options.solves_once(len(scene.sparse.image_name)) else None
     record = initial.geo_from_local
     pivot = scene.geo_from_model.apply(scene.poses.cam_center_in_model[scene.train]).mean(axis=0)
     covariance = moved_pivot(np.array(record.covariance), record.pivot, pivot)
@@ -60,13 +63,14 @@ def geo_problem(
     terms = replace(terms, planes=planes)
     problem = GeoProblem(
         LearnableSimilarity(scene.geo_from_model, covariance, pivot, _attitude(scene, initial)),
-        _corrections(scene, options),
+        _corrections(scene, options, bundle),
         terms.present,
         weighting=options.weighting,
         hold_prior=_leaves_open(terms, initial),
         errors=_errors(terms, options) if options.geo_loss else SystematicErrors(lidar=planes is not None),
         learned_weights=options.loss_weights == "learned",
         control_by_depth=terms.control_by_depth,
+        bundle=bundle,
     )
     if len(problem.errors):
         saved = begin(problem)
@@ -84,17 +88,20 @@ def _drop_idle_bias(problem: GeoProblem, saved: float) -> None:
         problem.errors = with_bias
 
 
-def _corrections(scene: Scene, options: GeographicOptions) -> CameraCorrections:
+def _corrections(scene: Scene, options: GeographicOptions, bundle: BundleInformation | None) -> CameraCorrections:
     """Return the corrections that the options allow to cameras and lens.
 
     With `paper` the lens stays, because plain mean squares hold no lens to the photographs.
     """
+    count = len(scene.sparse.image_name)
+    if bundle is not None:
+        return CameraCorrections.held(
+            scene.poses, HeldCorrections(np.zeros((count, 6)), np.zeros(len(bundle.lens)))
+        )
+    if not options.optimize_cameras:
+        return CameraCorrections(scene.poses, np.zeros((count, 6, 0)))
     follows = options.weighting == "whitened"
-    basis = None
-    if options.optimize_cameras:
-        basis = scene.correction_basis if follows else scene.correction_basis_through_sfm_lens
-    if basis is None:
-        return CameraCorrections(scene.poses, np.zeros((len(scene.sparse.image_name), 6, 0)))
+    basis = scene.correction_basis if follows else scene.correction_basis_through_sfm_lens
     return CameraCorrections(scene.poses, basis.matrix, basis.lens_matrix if follows else None)
 
 

@@ -17,16 +17,15 @@ from pipelines.core.photograph_folder import photograph_folder
 from pipelines.core.stages import SPARSE
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.core.workspace import Workspace
-from pipelines.geometry.bundle import CorrectionBasis, Network, correction_basis
+from pipelines.geometry.bundle import Network
+from pipelines.geometry.bundle_information import BundleInformation, bundle_information
+from pipelines.geometry.correction_basis import CorrectionBasis, basis_of, correction_basis
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.georef.cameras import CameraPoses
 from pipelines.scene.initial_similarity import InitialSimilarity
 from pipelines.scene.photographs import ImageCache, Photograph
 from pipelines.scene.survey import Survey
-
-# Beyond this number the dense normal matrix of the cameras exceeds the memory of a laptop.
-_MOST_CORRECTED_CAMERAS = 1200
 
 
 @dataclass(frozen=True)
@@ -76,19 +75,19 @@ class Scene:
         )
 
     @cached_property
-    def correction_basis(self) -> CorrectionBasis | None:
-        """Whitened corrections of the cameras, which the lens follows; None for more than 1200 cameras."""
-        return self._basis(lens_follows=True)
+    def bundle(self) -> BundleInformation:
+        """Information of the image observations on the cameras, which the lens follows."""
+        return bundle_information(self.network)
 
     @cached_property
-    def correction_basis_through_sfm_lens(self) -> CorrectionBasis | None:
-        """Whitened corrections of the cameras under a lens that stays; None for more than 1200 cameras."""
-        return self._basis(lens_follows=False)
+    def correction_basis(self) -> CorrectionBasis:
+        """Whitened corrections of the cameras, which the lens follows. Memory is quadratic in their number."""
+        return basis_of(self.bundle)
 
-    def _basis(self, lens_follows: bool) -> CorrectionBasis | None:
-        if len(self.sparse.image_name) > _MOST_CORRECTED_CAMERAS:
-            return None
-        return correction_basis(self.network, lens_follows=lens_follows)
+    @cached_property
+    def correction_basis_through_sfm_lens(self) -> CorrectionBasis:
+        """Whitened corrections of the cameras under a lens that stays."""
+        return correction_basis(self.network, lens_follows=False)
 
 
 def make_scene(sparse: SparseModel, survey: Survey, model_from_local: Similarity, shift: FloatArray) -> Scene:

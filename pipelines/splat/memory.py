@@ -9,6 +9,7 @@ import torch
 from pipelines.core.errors import ResourceError
 from pipelines.core.free_memory import free_main_memory_bytes
 from pipelines.geometry.cameras import Pinhole
+from pipelines.geometry.correction_basis import predicted_basis_bytes
 from pipelines.splat.sh import coefficient_count
 
 _FLOAT = 4
@@ -31,7 +32,7 @@ class TrainingSize:
         gaussians: largest number of Gaussians.
         camera: of the largest image.
         sh_degree: of the stored spherical harmonics.
-        cameras: number of cameras whose poses are corrected together.
+        cameras: number of cameras whose poses training refines together.
     """
 
     gaussians: int
@@ -43,8 +44,7 @@ class TrainingSize:
 def predicted_peak_bytes(size: TrainingSize) -> int:
     """Return the bytes that training adds to the process at its peak, assuming that a view sees all Gaussians."""
     width = 11 + 3 * coefficient_count(size.sh_degree)
-    # The dense normal matrix of the cameras, its factor, the basis, and a Jacobian of the same size.
-    poses = 4 * 8 * (6 * size.cameras) ** 2
+    poses = predicted_basis_bytes(size.cameras)
     images = size.camera.width * size.camera.height * _IMAGE_FLOATS * _FLOAT
     per_gaussian = max(_COPIES * width * _FLOAT, 4 * width * _FLOAT + _raster_bytes()) + _ROW_BYTES
     return size.gaussians * per_gaussian + images + poses + _FIXED_BYTES

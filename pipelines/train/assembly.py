@@ -27,8 +27,8 @@ def training_size(scene: Scene, images: ImageCache, options: TrainOptions) -> Tr
     """Return the quantities that determine the memory of a training."""
     cameras = [images.pinhole(index) for index in map(int, scene.train)]
     largest = max(cameras, key=lambda camera: camera.width * camera.height)
-    corrected = len(images) if options.optimize_cameras else 0
-    return TrainingSize(options.effort.max_gaussians, largest, options.sh_degree, corrected)
+    refined = options.refined_cameras(len(images))
+    return TrainingSize(options.effort.max_gaussians, largest, options.sh_degree, refined)
 
 
 def make_trainer(

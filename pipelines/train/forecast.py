@@ -86,9 +86,7 @@ def forecast(photographs: int, photo_px: tuple[int, int], options: TrainOptions)
     camera = Pinhole(width, height, width, width, width / 2, height / 2).limited(effort.max_image_size)
     backend = rasterizer(options.backend)
     device = device_of(backend)
-    size = TrainingSize(
-        effort.max_gaussians, camera, options.sh_degree, photographs if options.optimize_cameras else 0
-    )
+    size = TrainingSize(effort.max_gaussians, camera, options.sh_degree, options.refined_cameras(photographs))
     return TrainingForecast(
         preset=options.preset,
         photographs=photographs,

@@ -17,6 +17,7 @@ from pipelines.core.stages import POINTS, SIM3, SPARSE
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.formats.colmap import read_sparse
 from pipelines.scene.calibrated import load_survey
+from pipelines.scene.frozen_solution import solve_and_hold
 from pipelines.scene.geographic import geo_problem
 from pipelines.scene.geolocated import GeolocatedPoints
 from pipelines.scene.initial_similarity import InitialSimilarity
@@ -56,6 +57,7 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     initial = load_json(InitialSimilarity, workspace.path(SIM3))
     survey = initial.weighted(load_survey(workspace))
     scene = initial_scene(read_sparse(workspace.path(SPARSE)), survey, initial)
+    options.require_trainable(len(scene.sparse.image_name))
     images = photographs(scene.sparse, survey, workspace, options.effort.max_image_size)
     require_memory(training_size(scene, images, options), free_memory_bytes(device_of(backend)))
     images.build(stage.progress)
@@ -71,6 +73,9 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     points = GeolocatedPoints.load(workspace.path(POINTS))
     planes = compared.planes() if compared is not None and options.lidar_register else None
     problem = geo_problem(scene, survey, initial, options, points=points, planes=planes, seed=options.seed)
+    if problem.bundle is not None:
+        log.info("the %d cameras are solved once, before the training, and held", len(images))
+    solve_and_hold(problem)
     surface, lidar = None if maps is None else SceneSurface(maps), None
     if compared is not None and clouds is not None:
         shift = problem.estimate().errors.lidar_m

@@ -17,7 +17,7 @@ from pipelines.scene.photographs import ImageCache
 from pipelines.scene.pinholes import Pinholes
 from pipelines.splat.contributions import ViewContributions, view_contributions
 from pipelines.splat.densify import Strategy
-from pipelines.splat.exposure import Exposures
+from pipelines.splat.exposure import Exposures, HeldExposures
 from pipelines.splat.finiteness import FinitenessMonitor
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.losses import photometric_loss
@@ -89,7 +89,8 @@ class JointTrainer:
         views: training views.
         rasterizer: backend.
         options: settings, with the schedule.
-        exposures: exposures of the photographs, optimised as well; None: all photographs have the same exposure.
+        exposures: exposures of the photographs, optimised as well or held; None: all photographs have the same
+            exposure.
     """
 
     def __init__(
@@ -101,7 +102,7 @@ class JointTrainer:
         *,
         rasterizer: Rasterizer,
         options: JointOptions,
-        exposures: Exposures | None = None,
+        exposures: Exposures | HeldExposures | None = None,
     ) -> None:
         self.optimizer, self.strategy, self.problem = optimizer, strategy, problem
         self.views, self.rasterizer, self.options = views, rasterizer, options
@@ -110,7 +111,7 @@ class JointTrainer:
         self.schedule = TrainingSchedule(options, views.camera)
         self.device = optimizer.gaussians.means.device
         self._pinholes = Pinholes(views.images, views.lenses)
-        self._lens = np.zeros(len(problem.cameras.lens_basis))
+        self._lens = np.zeros(len(problem.cameras.lens()))
         self._targets = TargetImages(views.images, self._pinholes, self.device)
         names = ("photometric loss", "geographic loss", *(f"gradient of {name}" for name in self._watched()))
         self._watch = FinitenessMonitor(names, self.device)

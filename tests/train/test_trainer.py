@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from pipelines.core.workspace import Workspace
+from pipelines.scene.frozen_solution import solve_and_hold
 from pipelines.scene.geographic import geo_problem
 from pipelines.scene.scene import initial_scene, photographs
 from pipelines.splat.rasterizer.backends import rasterizer
@@ -52,6 +53,7 @@ def trainer_of(rendered: Rendered, workspace: Workspace, config: TrainOptions = 
     scene = initial_scene(rendered.sparse, rendered.survey, initial)  # type: ignore[arg-type]
     images = photographs(scene.sparse, rendered.survey, workspace, 640)
     problem = geo_problem(scene, rendered.survey, initial, config)  # type: ignore[arg-type]
+    solve_and_hold(problem)
     return make_trainer(TrainingScene(scene, images), problem, rasterizer("cpu"), config)
 
 
@@ -108,3 +110,21 @@ def test_views_are_seen_through_the_lens_that_follows(rendered: Rendered, worksp
     one.iteration = 100
     one.step()
     assert one.pinhole(0).fx == pytest.approx(before.fx, abs=0.1)
+
+
+def test_cameras_that_were_solved_once_do_not_move(rendered: Rendered, workspace: Workspace) -> None:
+    trainer = trainer_of(rendered, workspace, CONFIG.model_copy(update={"solve": "once"}))
+    problem = trainer.problem
+    poses, similarity = problem.cameras.current(), problem.similarity.current()
+    lens, affine = problem.cameras.lens().clone(), trainer.exposures.affine.clone()  # type: ignore[union-attr]
+    sh = trainer.optimizer.gaussians.sh.detach().clone()
+    for _ in range(3):
+        report = trainer.step()
+    assert float(report.geographic) > 0  # the fit of the held solution
+    np.testing.assert_array_equal(problem.cameras.current().cam_center_in_model, poses.cam_center_in_model)
+    np.testing.assert_array_equal(problem.similarity.current().translation, similarity.translation)
+    assert torch.equal(problem.cameras.lens(), lens)
+    assert not torch.equal(trainer.exposures.affine, affine)  # type: ignore[union-attr]
+    assert not torch.equal(trainer.optimizer.gaussians.sh.detach(), sh)
+    # SfM's cameras differ from the solution, and training renders from the solution.
+    assert np.abs(poses.cam_center_in_model - problem.cameras.center.numpy()).max() > 1e-4
