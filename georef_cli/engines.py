@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +11,7 @@ import click
 
 from pipelines.core.free_memory import free_main_memory_bytes
 from pipelines.core.threads import thread_count
+from pipelines.engine.chosen import chosen_engine
 from pipelines.engine.job import Engine
 from pipelines.engine.local import LocalEngine
 
@@ -66,6 +68,18 @@ def engine_for(values: Mapping[str, Any], at_a_time: int | None = None) -> Engin
 
     address = cluster_address(values["cluster"], values["certificates"], "--cluster")
     return DaskEngine(address, at_a_time, None if values["storage"] is None else Storage(values["storage"]))
+
+
+@contextmanager
+def asked_engine(values: Mapping[str, Any]) -> Iterator[None]:
+    """Let stages share their work with the engine that the options choose; without `--cluster`, with that in use.
+
+    Raises:
+        click.UsageError: as `engine_for`.
+    """
+    engine = engine_for(values)
+    with nullcontext() if values["cluster"] is None else chosen_engine(engine):
+        yield
 
 
 def cluster_address(text: str, certificates: Path | None, option: str) -> ClusterAddress:

@@ -49,6 +49,7 @@ COMMANDS: dict[str, HelpLine] = {
     ),
     "run": HelpLine("run", "Pipeline", "Run all stages, or some, skipping what is current."),
     "batch": HelpLine("batch", "Pipeline", "Run many missions, and put their results into one table."),
+    "blocks": HelpLine("blocks", "Pipeline", "Train a large survey in blocks, and merge them."),
     "cluster certificates": HelpLine(
         "cluster_certificates", "Cluster", "Make the certificate that the machines of a cluster share."
     ),

@@ -26,7 +26,7 @@ REPOSITORY = Path(__file__).parents[2]
 GEOREF = (sys.executable, "-m", "georef_cli")
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
 PORT = 18_790
-LAYOUT = ("--flight", "grid", "--images", "9", "--size", "240x180", "--height", "60", "--samples", "1", "-q")
+LAYOUT = ("--images", "16", "--size", "320x240", "--samples", "1", "-q")
 
 
 def make_flights(folder: Path, count: int) -> None:
@@ -67,7 +67,8 @@ def measured_s(folder: Path, workers: int, iterations: int) -> float:
     shutil.copytree(folder / "flights", missions)
     with cluster(folder, workers) as address:
         words = ("--cluster", address.url, "--certificates", str(address.certificates), "--json", "-q")
-        settings = ("--set", "train.preset=smoke", "--set", f"train.iterations={iterations}")
+        options = ("train.preset=smoke", f"train.iterations={iterations}", "ingest.vertical=ellipsoidal")
+        settings = [word for option in options for word in ("--set", option)]
         started = time.perf_counter()
         done = subprocess.run(
             [*GEOREF, "batch", missions, *words, *settings], check=True, stdout=subprocess.PIPE, env=ENVIRONMENT

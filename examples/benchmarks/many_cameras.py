@@ -10,8 +10,7 @@ over their predicted σ have a root mean square of 1 where the covariances are r
 from __future__ import annotations
 
 import argparse
-import resource
-import sys
+import math
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,6 +20,7 @@ import numpy as np
 import torch
 
 from pipelines.accuracy.intersection_jacobian import intersection_jacobian
+from pipelines.core.free_memory import peak_memory_bytes
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.geometry.bundle import Network
 from pipelines.geometry.bundle_information import BundleInformation, bundle_information
@@ -54,8 +54,7 @@ def timed(name: str) -> Iterator[None]:
     """Print the seconds that a step takes, and the most memory so far."""
     clock = time.perf_counter()
     yield
-    per_gb = 1e9 if sys.platform == "darwin" else 1e6
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / per_gb
+    peak = (peak_memory_bytes() or math.nan) / 1e9
     print(f"  {name:34s} {time.perf_counter() - clock:7.1f} s   peak {peak:5.2f} GB", flush=True)
 
 

@@ -121,8 +121,9 @@ def worker_exchange(parcel: Parcel, scratch: Path) -> Iterator[None]:
 
 
 def arguments_in(parcel: Parcel, arguments: Sequence[str], scratch: Path) -> list[str]:
-    """Return the arguments of a job with paths in the scratch folder in place of the engine's folder."""
-    return [argument.replace(f"{parcel['folder']}/", f"{scratch}/") for argument in arguments]
+    """Return the arguments of a job with the scratch folder in place of the engine's folder."""
+    here, there = f"{parcel['folder']}/", f"{scratch}/"
+    return [f"{argument}/".replace(here, there).removesuffix("/") for argument in arguments]
 
 
 def _part(folder: Path, path: Path) -> str:

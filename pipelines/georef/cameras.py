@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from pipelines.core.types import FloatArray
+from pipelines.geometry.cameras import pose_matrix
 from pipelines.georef.so3 import exp_so3
 
 
@@ -23,6 +24,10 @@ class CameraPoses:
 
     cam_from_model: FloatArray
     cam_center_in_model: FloatArray
+
+    def matrix(self, index: int) -> FloatArray:
+        """Return the pose (4, 4) cam ← model of a camera."""
+        return pose_matrix(self.cam_from_model[index], self.cam_center_in_model[index])
 
 
 @dataclass(frozen=True)

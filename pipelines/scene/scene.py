@@ -14,15 +14,18 @@ import numpy as np
 
 from pipelines.core.errors import DegenerateGeometryError, InputError
 from pipelines.core.photograph_folder import photograph_folder
-from pipelines.core.stages import SPARSE
+from pipelines.core.products import load_json
+from pipelines.core.stages import SIM3, SPARSE
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.core.workspace import Workspace
+from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.bundle import Network
 from pipelines.geometry.bundle_information import BundleInformation, bundle_information
 from pipelines.geometry.correction_basis import CorrectionBasis, basis_of, correction_basis
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.georef.cameras import CameraPoses
+from pipelines.scene.calibrated import load_survey
 from pipelines.scene.initial_similarity import InitialSimilarity
 from pipelines.scene.photographs import ImageCache, Photograph
 from pipelines.scene.survey import Survey
@@ -53,6 +56,12 @@ class Scene:
             self.sparse.rotation_cam_from_local @ turn.T,
             self.model_from_local.apply(self.sparse.cam_center_in_local),
         )
+
+    def of_images(self, images: IntArray) -> Scene:
+        """Return the scene of some cameras (K,), in ascending order, in the same frame."""
+        rows = np.unique(images)
+        train, test = (np.searchsorted(rows, np.intersect1d(split, rows)) for split in (self.train, self.test))
+        return replace(self, sparse=self.sparse.of_images(rows), train=train, test=test)
 
     @cached_property
     def point_in_model(self) -> FloatArray:
@@ -120,6 +129,17 @@ def initial_scene(sparse: SparseModel, survey: Survey, initial: InitialSimilarit
     shift = np.round(np.median(geo_from_local.apply(sparse.point_in_local), axis=0))
     model_from_local = replace(geo_from_local, translation=geo_from_local.translation - shift)
     return make_scene(sparse, survey, model_from_local, shift)
+
+
+def load_initial_scene(workspace: Workspace) -> tuple[InitialSimilarity, Survey, Scene]:
+    """Read the initial similarity, the survey with its variance factors, and the scene at the start of training.
+
+    Raises:
+        GeorefError: a product does not exist, is damaged, or has too few images.
+    """
+    initial = load_json(InitialSimilarity, workspace.path(SIM3))
+    survey = initial.weighted(load_survey(workspace))
+    return initial, survey, initial_scene(read_sparse(workspace.path(SPARSE)), survey, initial)
 
 
 def photographs(sparse: SparseModel, survey: Survey, workspace: Workspace, max_size_px: int) -> ImageCache:

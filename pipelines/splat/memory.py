@@ -21,7 +21,7 @@ _COPIES = 10
 _IMAGE_FLOATS = 45
 _ROW_BYTES = 40  # counters, keys of the spatial order
 _FIXED_BYTES = 150 * 2**20  # compiled kernels and reserves of the allocators
-_USABLE = 0.9  # of the free memory: other programs grow, too
+USABLE = 0.9  # of the free memory: other programs grow, too
 
 
 @dataclass(frozen=True)
@@ -61,11 +61,11 @@ def require_memory(size: TrainingSize, free_bytes: int | None) -> None:
         ResourceError: states the memory needed, and a number of Gaussians that would fit.
     """
     needed = predicted_peak_bytes(size)
-    if free_bytes is None or needed <= _USABLE * free_bytes:
+    if free_bytes is None or needed <= USABLE * free_bytes:
         return
     without_gaussians = predicted_peak_bytes(TrainingSize(0, size.camera, size.sh_degree, size.cameras))
     per_gaussian = (needed - without_gaussians) / max(size.gaussians, 1)
-    fitting = int((_USABLE * free_bytes - without_gaussians) / per_gaussian) // 1000 * 1000
+    fitting = int((USABLE * free_bytes - without_gaussians) / per_gaussian) // 1000 * 1000
     advice = (
         f"--max-gaussians {fitting}"
         if fitting >= 1000

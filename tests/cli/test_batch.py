@@ -91,7 +91,7 @@ def test_a_broken_one_is_told_and_the_others_finish(real_georef: Georef, with_fa
     assert {
         name: made_by and (made_by.config["seed"], made_by.config["mapper"]) for name, made_by in made.items()
     } == {
-        **dict.fromkeys(NAMES, (7, "incremental")),
+        **dict.fromkeys(NAMES, (7, "auto")),
         "mill": (9, "global"),
         "broken": None,
     }

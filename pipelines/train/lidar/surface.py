@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from scipy.spatial import cKDTree
 
-from pipelines.core.types import ByteArray, Float32Array, FloatArray
+from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray
 from pipelines.train.depth_maps import DepthMaps
 from pipelines.train.lidar.cloud import LidarCloud
 from pipelines.train.surface import SceneSurface, SurfacePoints
@@ -73,9 +75,11 @@ class FusedSurface(SceneSurface):
         weight = np.concatenate([1.0 + (_WEIGHT - 1.0) * confidence, _WEIGHT * self.confidence[alone]])
         return np.concatenate([points, self.cloud.position_in_model[alone]]), weight.astype(np.float32)
 
-    def sample(self, count: int, seed: int) -> SurfacePoints:
+    def sample(
+        self, count: int, seed: int, inside: Callable[[FloatArray], BoolArray] | None = None
+    ) -> SurfacePoints:
         """Return points of the whole surface as `SceneSurface.sample`, with LiDAR where stereo found none."""
-        drawn = super().sample(count, seed)
+        drawn = super().sample(count, seed, inside)
         points, normal, confidence = self.planes.onto(drawn.point_in_model)
         normals = np.where((confidence > 0)[:, None], normal, drawn.normal_in_model)
         stereo = SurfacePoints(points, drawn.rgb, normals)
