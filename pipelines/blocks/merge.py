@@ -16,11 +16,11 @@ from pipelines.core.products import load_json, save_json
 from pipelines.core.progress import Progress
 from pipelines.core.stages import SOLUTION, TRAIN_SEAMS
 from pipelines.core.workspace import Summary
+from pipelines.formats.splat_ply import join_splat_plys
 from pipelines.scene.block_plan import BlockPlan
 from pipelines.scene.block_record import BlockRecord, BlockTraining, MergedBlock, Seam
 from pipelines.scene.trained_model import FrozenSolution, TrainedModel
-from pipelines.splat.gaussians import Gaussians
-from pipelines.splat.storage import read_gaussians, write_gaussians
+from pipelines.splat.storage import read_gaussians
 
 _BLACK = (0.0, 0.0, 0.0)
 
@@ -38,16 +38,14 @@ def merge_blocks(parts: Parts, plan: BlockPlan, folder: Path, progress: Progress
         InputError: a block cannot be read.
     """
     trainings = [parts.training(block) for block in plan.blocks]
-    merged = Gaussians.concatenate([gaussians_in_cell(parts, block.id) for block in plan.blocks])
-    write_gaussians(folder / "gaussians.ply", merged)
-    count, degree = len(merged), merged.sh_degree
-    del merged  # before the neighbours are loaded
+    cells = [_gaussians_in_cell(parts, block.id) for block in plan.blocks]
+    count = join_splat_plys(cells, folder / "gaussians.ply")
     solution = load_json(FrozenSolution, parts.whole.path(SOLUTION))
     model = TrainedModel(
         **dict(solution),
         max_image_size=parts.options.effort.max_image_size,
         background=_BLACK,
-        sh_degree=degree,
+        sh_degree=read_gaussians(cells[0], slice(0, 1)).sh_degree,
         iterations=max(training.iterations for training in trainings),
         gaussians=count,
         backend=trainings[0].backend,
@@ -63,13 +61,9 @@ def merge_blocks(parts: Parts, plan: BlockPlan, folder: Path, progress: Progress
     return _summary(model, trainings, seams)
 
 
-def gaussians_in_cell(parts: Parts, number: int) -> Gaussians:
-    """Return the Gaussians of a cell, adapted to those of its neighbours.
-
-    Raises:
-        InputError: the block cannot be read.
-    """
-    return read_gaussians(parts.whole.root / TRAIN_SEAMS.folder / f"{number}.ply")
+def _gaussians_in_cell(parts: Parts, number: int) -> Path:
+    """Return the file of the Gaussians of a cell, adapted to those of its neighbours."""
+    return parts.whole.root / TRAIN_SEAMS.folder / f"{number}.ply"
 
 
 def _write_metrics(parts: Parts, plan: BlockPlan, path: Path) -> None:
