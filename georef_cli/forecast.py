@@ -75,13 +75,14 @@ def forecast_run(
     planned = plan(workspace, stages, flags, force=force)
     photographs = _photographs(workspace, planned)
     reconstruction, training = _reconstruction(planned, photographs), _training(planned, photographs)
-    if reconstruction is not None and reconstruction.refusal:
-        planned = [_refused(row, reconstruction) if row.stage == "sfm" else row for row in planned]
+    for name, forecast in (("sfm", reconstruction), ("train", training)):
+        if forecast is not None and forecast.refusal:
+            planned = [_refused(row, forecast.refusal) if row.stage == name else row for row in planned]
     seconds: dict[str, float | None] = {}
-    for options, forecast in ((SfmOptions, reconstruction), (TrainOptions, training)):
+    for options, known in ((SfmOptions, reconstruction), (TrainOptions, training)):
         row = _to_run(planned, options)
-        if row is not None and forecast is not None:
-            seconds[row.stage] = forecast.seconds
+        if row is not None and known is not None:
+            seconds[row.stage] = known.seconds
     return RunForecast(planned, photographs, seconds, reconstruction, training)
 
 
@@ -91,8 +92,8 @@ def _to_run(planned: Sequence[PlannedStage], options: type[StageOptions]) -> Pla
     return next((row for row in going if isinstance(row.resolved, options)), None)
 
 
-def _refused(row: PlannedStage, reconstruction: ReconstructionForecast) -> PlannedStage:
-    return replace(row, action="refuse", reason=reconstruction.refusal)
+def _refused(row: PlannedStage, reason: str) -> PlannedStage:
+    return replace(row, action="refuse", reason=reason)
 
 
 def _reconstruction(

@@ -46,6 +46,11 @@ LATER: dict[str, tuple[str, ...]] = {
     "max_gaussians": ("train",),
     "blocks": ("train",),
     "backend": ("train", "evaluate"),
+    "lidar": ("train",),
+    "lidar_crs": ("train",),
+    "lidar_vertical": ("train",),
+    "lidar_sigma": ("train",),
+    "lidar_register": ("train",),
     "seed": ("sfm", "init-sim3", "train"),
 }
 _DELIVERABLE_NAMES = ", ".join(spec.name.removeprefix("export-") for spec in DELIVERABLES)

@@ -31,6 +31,7 @@ from pipelines.core.staleness import request, why_damaged, why_stale
 from pipelines.core.workspace import Workspace
 from pipelines.scene.block_plan import BlockPlan, PlannedBlock
 from pipelines.scene.block_record import BlockRecord, BlockTraining
+from pipelines.scene.cloud_options import NOT_IN_BLOCKS
 from pipelines.scene.scaffold import scaffold_image_px
 from pipelines.splat.rasterizer.backends import chosen_backend
 
@@ -68,6 +69,10 @@ class TrainingRequest(Protocol):
     def backend(self) -> Literal["auto", "cpu", "cuda"]:
         """Rasteriser of the training."""
 
+    @property
+    def lidar(self) -> Path | None:
+        """LiDAR to hold the surface to."""
+
     def model_dump(self, *, mode: str) -> dict[str, Any]:
         """Return all options by field."""
 
@@ -79,10 +84,18 @@ class Parts:
     Attributes:
         workspace: of the survey.
         options: of its training.
+
+    Raises:
+        InputError: the training is to use LiDAR.
     """
 
     workspace: Workspace
     options: TrainingRequest
+
+    def __post_init__(self) -> None:
+        """Refuse LiDAR."""
+        if self.options.lidar is not None:
+            raise InputError(NOT_IN_BLOCKS, field="--lidar")
 
     @property
     def whole(self) -> Workspace:

@@ -16,6 +16,7 @@ from pipelines.georef.posterior import GeoEquations, equations_of, linearised, p
 from pipelines.georef.problem import GeoProblem
 from pipelines.georef.sparse_adjustment import SparseMinimum, minimise_sparse, state_of
 from pipelines.georef.sparse_observations import State
+from pipelines.georef.systematic import SystematicErrors
 
 # Rotations of similarity and boresight are not linear: four linearisations are enough from 20°.
 _ROUNDS, _NEAR = 4, 0.1  # a step below a tenth of a σ ends them earlier
@@ -94,13 +95,13 @@ def _at_control(problem: GeoProblem, here: State) -> State:
     return replace(here, similarity=here.similarity + similarity, errors=here.errors + constant)
 
 
-def bias_pays(problem: GeoProblem, saved: float) -> bool:
+def bias_pays(errors: SystematicErrors, saved: float) -> bool:
     """Return whether biases are accepted that lower −2 ln likelihood by `saved`.
 
     A bias that does not exist costs accuracy, since the fixes then have no information on the position: with RTK
     and a few control points, σ doubles at least. The bias has to be evident, as for the initial similarity.
     """
-    return saved > BIAS_COST * problem.errors.flights
+    return saved > BIAS_COST * errors.flights
 
 
 def _best(problem: GeoProblem, equations: GeoEquations, *, with_errors: bool) -> RobustMinimum:

@@ -211,6 +211,40 @@ class AttitudeTerm(Term):
 
 
 @dataclass(frozen=True)
+class PlaneTerm(Term):
+    """Planes of a LiDAR against the surface that the photographs show: the term L_lidar.
+
+    The LiDAR may be shifted as a whole: that shift is a constant error.
+
+    Attributes:
+        point_in_model: (M, 3) float64 metres, on the surface of the photographs.
+        position_in_geo: (M, 3) float64 metres, on the plane of the LiDAR.
+        normal_in_geo: (M, 3) float64 unit normals of the planes.
+        root_information: (M, 1, 1) float64, in 1/m, of the distance between both along the normal.
+    """
+
+    kind: ClassVar[str] = "lidar"
+    dimension: ClassVar[int] = 1
+
+    point_in_model: Tensor
+    position_in_geo: Tensor
+    normal_in_geo: Tensor
+    root_information: Tensor
+
+    def incidence(self) -> tuple[Tensor, Tensor]:
+        """Return no pair: the surface of the photographs stays where it is in `model`."""
+        none = torch.zeros(0, dtype=torch.int64, device=self.position_in_geo.device)
+        return none, none
+
+    def residuals(self, at: Estimate) -> Tensor:
+        """Return n · (T(x) + shift − p) (M, 1) in metres."""
+        apart = at.geo_from_model.apply(self.point_in_model) - self.position_in_geo
+        if at.errors.lidar_m is not None:
+            apart = apart + at.errors.lidar_m
+        return (self.normal_in_geo * apart).sum(dim=1, keepdim=True)
+
+
+@dataclass(frozen=True)
 class DistanceTerm(Term):
     """Distances between P pairs of geolocated points, or of cameras with fixes: the term L_rel.
 

@@ -11,6 +11,7 @@ from pipelines.core.sentences import about
 from pipelines.core.threads import thread_count
 from pipelines.geometry.cameras import Pinhole
 from pipelines.scene.block_plan import BlockPlan
+from pipelines.scene.cloud_options import NOT_IN_BLOCKS
 from pipelines.scene.survey import Survey
 from pipelines.splat.memory import USABLE, TrainingSize, free_memory_bytes, predicted_peak_bytes
 from pipelines.splat.rasterizer.backends import chosen_backend
@@ -43,6 +44,7 @@ class TrainingForecast:
         peak_bytes: predicted peak of the memory.
         free_bytes: memory that is free; None: unknown.
         blocks: number of blocks that was asked for; None: as many as fit.
+        lidar: whether LiDAR is to be used.
     """
 
     preset: str
@@ -57,6 +59,7 @@ class TrainingForecast:
     peak_bytes: int
     free_bytes: int | None
     blocks: int | None = None
+    lidar: bool = False
 
     @property
     def in_blocks(self) -> bool:
@@ -64,6 +67,11 @@ class TrainingForecast:
         if self.blocks is not None:
             return self.blocks > 1
         return self.free_bytes is not None and self.peak_bytes > USABLE * self.free_bytes
+
+    @property
+    def refusal(self) -> str:
+        """Reason why the training would be refused; empty: it would not."""
+        return NOT_IN_BLOCKS if self.lidar and self.in_blocks else ""
 
     @property
     def reduction(self) -> float:
@@ -118,6 +126,7 @@ def forecast(photographs: int, photo_px: tuple[int, int], options: TrainOptions)
         peak_bytes=predicted_peak_bytes(size),
         free_bytes=free_memory_bytes(device),
         blocks=options.blocks,
+        lidar=options.lidar is not None,
     )
 
 

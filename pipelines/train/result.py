@@ -10,6 +10,7 @@ from pipelines.core.workspace import Summary
 from pipelines.georef.estimated_error import EstimatedError
 from pipelines.scene.frozen_solution import solution_of, with_exposures
 from pipelines.scene.initial_similarity import InitialSimilarity
+from pipelines.scene.lidar_report import LidarReport
 from pipelines.scene.scene import Scene
 from pipelines.scene.trained_model import TrainedModel
 from pipelines.train.loop import TrainingRecord
@@ -20,6 +21,7 @@ _CAUSES = {
     "bias": "Check the base station, the vertical datum and the antenna offset",
     "lever-arm": "`georef ingest --lever-arm` can apply it, in the axes of the body",
     "boresight": "`georef ingest --boresight` can apply it",
+    "lidar-shift": "Check the LiDAR's CRS, datum and flight",
 }
 
 
@@ -50,13 +52,16 @@ def trained_model(trainer: JointTrainer, scene: Scene, initial: InitialSimilarit
     )
 
 
-def summary_of(model: TrainedModel, metrics: list[dict[str, Any]], record: TrainingRecord) -> Summary:
+def summary_of(
+    model: TrainedModel, metrics: list[dict[str, Any]], record: TrainingRecord, lidar: LidarReport | None = None
+) -> Summary:
     """Return headline, values and warnings of a training.
 
     Args:
         model: product of the training.
         metrics: rows of `metrics.jsonl`.
         record: time and incidents of the training.
+        lidar: LiDAR that the training has used; None: none.
     """
     psnr = float(np.mean([row["psnr"] for row in metrics[-20:]]))
     sigma = np.sqrt(np.diag(np.array(model.geo_from_model.covariance)))
@@ -71,8 +76,11 @@ def summary_of(model: TrainedModel, metrics: list[dict[str, Any]], record: Train
         "control_outliers": list(model.control_outliers),
         "estimated_errors": [error.model_dump() for error in model.estimated_errors],
     }
+    if lidar is not None:
+        values["lidar"] = lidar.model_dump(mode="json")
     key_figure = f"{model.gaussians} gaussians, train PSNR {psnr:.2f} dB"
-    return Summary(key_figure, values, tuple(_warnings(model, record)), model.cautions)
+    warnings = [*_warnings(model, record), *(() if lidar is None else _lidar_warnings(lidar))]
+    return Summary(key_figure, values, tuple(warnings), model.cautions)
 
 
 def _warnings(model: TrainedModel, record: TrainingRecord) -> list[str]:
@@ -84,9 +92,20 @@ def _warnings(model: TrainedModel, record: TrainingRecord) -> list[str]:
     return warnings if record.recovery is None else [*warnings, record.recovery]
 
 
+def _lidar_warnings(lidar: LidarReport) -> list[str]:
+    warnings = list(lidar.assumptions)
+    if lidar.areas:
+        area_m2 = sum(area.area_m2 for area in lidar.areas)
+        warnings.append(
+            f"LiDAR and photographs contradict each other on {area_m2:.0f} m² in {len(lidar.areas)} places, which "
+            "train/lidar.json lists and train/lidar.png shows: the LiDAR is not used there"
+        )
+    return warnings
+
+
 def _warning_of(error: EstimatedError) -> str | None:
     """Return a warning if the error exceeds 3 σ or is not observable along every axis, else None."""
-    axes = "east, north, up" if error.name == "bias" else "right, down, forward"
+    axes = "east, north, up" if error.name in {"bias", "lidar-shift"} else "right, down, forward"
     flight = "" if error.flight is None else f" of flight {error.flight + 1}"
     subject = f"{error.name}{flight}"
     values = ", ".join(f"{value:+.3f} ± {sigma:.3f}" for value, sigma in zip(error.value, error.sigma, strict=True))

@@ -18,6 +18,7 @@ from pipelines.scene.calibrated import load_survey
 from pipelines.scene.frozen_solution import solve_and_hold
 from pipelines.scene.geographic import geo_problem
 from pipelines.scene.geolocated import GeolocatedPoints
+from pipelines.scene.measured_cloud import CloudFiles
 from pipelines.scene.scene import load_initial_scene, photographs
 from pipelines.scene.trained_model import TrainedModel
 from pipelines.splat.memory import free_memory_bytes, require_memory
@@ -27,6 +28,7 @@ from pipelines.train.assembly import make_trainer, training_size
 from pipelines.train.depth_maps import DepthMaps
 from pipelines.train.forecast import forecast_of
 from pipelines.train.initial_gaussians import TrainingScene
+from pipelines.train.lidar.prepare import compared_lidar, draw_changes, lidar_surface
 from pipelines.train.options import TrainOptions
 from pipelines.train.result import summary_of, trained_model
 from pipelines.train.surface import SceneSurface
@@ -48,28 +50,42 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     # First, so that `--backend cuda` without a GPU fails at once.
     backend = rasterizer(options.backend, stage.progress)
     workspace = stage.workspace
+    clouds = None if options.lidar is None else CloudFiles(options.lidar, options.lidar_stated)
     initial, survey, scene = load_initial_scene(workspace)
     options.require_trainable(len(scene.sparse.image_name))
     images = photographs(scene.sparse, survey, workspace, options.effort.max_image_size)
     require_memory(training_size(scene, images, options), free_memory_bytes(device_of(backend)))
     images.build(stage.progress)
-    surface = None
-    if options.dense:
-        maps = DepthMaps(workspace.cache / "surface", scene, images)
+    maps = DepthMaps(workspace.cache / "surface", scene, images) if options.dense else None
+    if maps is not None:
         maps.build(stage.progress)
-        surface = SceneSurface(maps)
+    compared = None
+    if clouds is not None and maps is not None:
+        compared = compared_lidar(
+            options, clouds, maps, survey,
+            georeference=initial.geo_from_local, seed=options.seed, progress=stage.progress,
+        )  # fmt: skip
     points = GeolocatedPoints.load(workspace.path(POINTS))
-    problem = geo_problem(scene, survey, initial, options, points=points, seed=options.seed)
+    planes = compared.planes() if compared is not None and options.lidar_register else None
+    problem = geo_problem(scene, survey, initial, options, points=points, planes=planes, seed=options.seed)
     if problem.bundle is not None:
         log.info("the %d cameras are solved once, before the training, and held", len(images))
     solve_and_hold(problem)
+    surface, lidar = None if maps is None else SceneSurface(maps), None
+    if compared is not None and clouds is not None:
+        shift = problem.estimate().errors.lidar_m
+        shift_m = None if shift is None else shift.detach().cpu().numpy()
+        lidar = lidar_surface(compared, clouds, survey, sigma_m=options.lidar_sigma, shift_m=shift_m)
+        surface = lidar.surface
+        save_json(lidar.report, stage.out / "lidar.json")
+        draw_changes(stage.out / "lidar.png", lidar, scene)
     trainer = make_trainer(TrainingScene(scene, images, surface), problem, backend, options)
     record = train_in_folder(stage, trainer, options, _iterations(stage))
     model = trained_model(trainer, scene, initial)
     write_gaussians(stage.out / "gaussians.ply", trainer.optimizer.gaussians.detached())
     save_json(model, stage.out / "model.json")
     metrics = [json.loads(row) for row in (stage.out / METRICS).read_text(encoding="utf-8").splitlines()]
-    return summary_of(model, metrics, record)
+    return summary_of(model, metrics, record, None if lidar is None else lidar.report)
 
 
 def made_in_parts(workspace: Workspace, options: TrainOptions) -> bool:

@@ -25,6 +25,8 @@ from pipelines.scene.block_record import BlockRecord
 from pipelines.scene.trained_model import TrainedModel
 from pipelines.scene.trained_survey import load_trained
 from pipelines.splat.storage import read_gaussians
+from pipelines.train.forecast import forecast
+from pipelines.train.options import TrainOptions
 from tests.block_scenes import make_field, write_field
 from tests.threads import single_thread
 
@@ -67,6 +69,18 @@ def trained(field: Workspace) -> Iterator[tuple[Workspace, list[str]]]:
     code, jobs = georef("blocks", field.root, "--blocks", 2, *SHORT)
     assert code == 0
     yield field, jobs
+
+
+def test_lidar_is_refused_before_any_work(
+    field: Workspace, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cloud = tmp_path / "cloud.ply"
+    cloud.write_bytes(b"ply\n")
+    code, jobs = georef("blocks", "plan", field.root, "--blocks", 2, "--lidar", cloud)
+    assert (code, jobs) == (2, [])
+    assert "a training in blocks does not use LiDAR" in " ".join(capsys.readouterr().err.split())
+    assert forecast(9, (96, 72), TrainOptions(blocks=2, lidar=cloud)).refusal
+    assert not forecast(9, (96, 72), TrainOptions(blocks=1, lidar=cloud)).refusal
 
 
 def test_each_gaussian_is_that_of_its_cell(trained: tuple[Workspace, list[str]]) -> None:
