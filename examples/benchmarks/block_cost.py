@@ -8,7 +8,6 @@ that were measured in training and by those that the plan had predicted before. 
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
 import numpy as np
@@ -55,26 +54,25 @@ def main() -> None:
     in_plan = np.column_stack([[planned.view_px for planned, _ in blocks], visible, sizes[:, 2]])
     seconds = np.array([row.processor_s for row in records], dtype=np.float64)
     memory = np.array([row.peak_bytes or np.nan for row in records], dtype=np.float64)
-    model = BlockCost.fitted(sizes[::2], seconds[::2], memory[::2])
+    time, peak = BlockCost.fitted(sizes[::2], seconds[::2]), BlockCost.fitted(sizes[::2], memory[::2])
     print(f"{'pixels':>9}{'visible':>9}{'all':>9}{'ms':>8}{'model':>8}{'plan':>8}{'MiB':>8}{'model':>8}")
-    for row, (size, before, took, peak) in enumerate(zip(sizes, in_plan, seconds, memory, strict=True)):
-        values = 1e3 * took, 1e3 * model.iteration_s(*size), 1e3 * model.iteration_s(*before)
+    for row, (size, before, took, held) in enumerate(zip(sizes, in_plan, seconds, memory, strict=True)):
+        values = 1e3 * took, 1e3 * time.of(*size), 1e3 * time.of(*before)
         print(
             "".join(f"{value:9.0f}" for value in size)
             + "".join(f"{value:8.1f}" for value in values)
-            + f"{peak / 2**20:8.0f}{model.peak_bytes(*size) / 2**20:8.0f}"
+            + f"{held / 2**20:8.0f}{peak.of(*size) / 2**20:8.0f}"
             + ("  held out" if row % 2 else "")
         )
-    for name, predicted, truth in (
-        ("time by measured sizes", [model.iteration_s(*size) for size in sizes], seconds),
-        ("time by the plan's sizes", [model.iteration_s(*size) for size in in_plan], seconds),
-        ("memory", [model.peak_bytes(*size) for size in sizes], memory),
+    for what, predicted, truth in (
+        ("time by measured sizes", [time.of(*size) for size in sizes], seconds),
+        ("time by the plan's sizes", [time.of(*size) for size in in_plan], seconds),
+        ("memory", [peak.of(*size) for size in sizes], memory),
     ):
         error = np.abs(np.array(predicted) / truth - 1)[1::2]
-        print(f"{name}, held out: median {100 * np.median(error):.0f} %, largest {100 * error.max():.0f} %")
-    every = BlockCost.fitted(sizes, seconds, memory)
-    document = {"seconds": every.seconds.tolist(), "bytes": every.bytes.tolist(), "blocks": len(records)}
-    print(json.dumps(document))
+        print(f"{what}, held out: median {100 * np.median(error):.0f} %, largest {100 * error.max():.0f} %")
+    print("seconds", BlockCost.fitted(sizes, seconds).coefficients.tolist())
+    print("bytes", BlockCost.fitted(sizes, memory).coefficients.tolist())
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from pipelines.splat.memory import USABLE, TrainingSize, free_memory_bytes, pred
 from pipelines.splat.rasterizer.backends import chosen_backend
 from pipelines.train.depth_maps import StereoOptions
 from pipelines.train.options import TrainOptions
-from pipelines.train.pace import BLOCK_COST, MEASURED_CORES, SURFACE_FACTOR, iteration_seconds
+from pipelines.train.pace import BLOCK_SECONDS, MEASURED_CORES, SURFACE_FACTOR, iteration_seconds
 from pipelines.train.schedule import COARSE
 
 # Stereo, by photographs (the sweep has one size) and by megapixels of the depth maps: half of the processor time of
@@ -179,7 +179,7 @@ class _Iteration:
 
     def block_processor_s(self, shrink: int) -> float:
         """Return the processor seconds of an iteration of a block."""
-        plain = BLOCK_COST.iteration_s(self.pixels / shrink**2, self.visible, self.gaussians)
+        plain = BLOCK_SECONDS.of(self.pixels / shrink**2, self.visible, self.gaussians)
         return SURFACE_FACTOR * plain if self.surface else plain
 
 
