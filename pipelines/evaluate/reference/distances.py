@@ -122,8 +122,8 @@ def compare_square(
     to_model, _ = _nearest(place[is_seen], model_rows["position"])
     covered = model_own & _covered(model_rows["position"], place, settings.cover_m)
     to_reference, nearest = _nearest(model_rows["position"][covered], place)
-    cores = first_of_voxels(place, settings.core_m)
-    cores = cores[is_seen[cores] & np.isfinite(normal[cores, 0])]
+    usable = np.flatnonzero(is_seen & np.isfinite(normal[:, 0]))
+    cores = usable[first_of_voxels(place[usable], settings.core_m)]
     clouds = [
         points[first_of_voxels(points, settings.core_m / _ACROSS)] for points in (place, model_rows["position"])
     ]
