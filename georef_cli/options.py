@@ -103,11 +103,14 @@ def stage_option(options_type: type[StageOptions], name: str) -> click.Option:
 
 
 def given(ctx: click.Context, names: Iterable[str]) -> dict[str, Any]:
-    """Return the values that the user gave; `georef.toml` and the defaults determine all others."""
+    """Return the values that the user gave; `georef.toml` and the defaults determine all others.
+
+    `--threads` took effect when it was parsed, and is no value of the command.
+    """
     return {
         name: ctx.params[name]
         for name in names
-        if ctx.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE
+        if name in ctx.params and ctx.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE
     }
 
 

@@ -23,7 +23,7 @@ def test_simulate_makes_a_survey_and_says_so(georef: Georef, tmp_path: Path) -> 
     again = georef("simulate", folder, *TINY)
     assert again.code == 1
     assert "--force" in again.err
-    replaced = georef("simulate", folder, *TINY, "--force", "--no-exif")
+    replaced = georef("simulate", folder, *TINY, "--force", "--no-exif", "-j", 1)
     assert replaced.code == 0
     assert "3 photographs" in replaced.out
 
