@@ -69,6 +69,7 @@ class Support:
         mean_normal_m, rms_normal_m: (N,) mean and RMS along the points' normals, whatever the slant of rays and
             surface; NaN without a normal.
         spread_rad: (N,) RMS angle of the agreeing rays about their mean direction: 0 without parallax.
+        mean_ray: (N, 3) mean of the agreeing rays' unit vectors, from the cameras to the point.
     """
 
     views: IntArray
@@ -80,6 +81,7 @@ class Support:
     mean_normal_m: FloatArray
     rms_normal_m: FloatArray
     spread_rad: FloatArray
+    mean_ray: FloatArray
 
     def scaled(self, scale: float) -> Support:
         """Return the support in a frame whose unit is 1/`scale` of this one's."""
@@ -136,6 +138,7 @@ def support(
             mean_normal_m=sums[:, _NORMAL] / count,
             rms_normal_m=np.sqrt(sums[:, _NORMAL2] / count),
             spread_rad=np.sqrt(np.maximum(2 * (1 - resultant), 0)),
+            mean_ray=sums[:, _DIRECTION:] / count[:, None],
         )
 
 

@@ -9,6 +9,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,32 +24,16 @@ from pipelines.formats.cloud_ply_reader import open_cloud_ply
 from pipelines.formats.las_reader import open_las
 from pipelines.geodesy.crs import PointCrs, parse_crs
 from pipelines.geodesy.enu import Origin, ecef_from_lla, enu_from_ecef
-from pipelines.geodesy.vertical import VerticalChoice
+from pipelines.scene.cloud_options import CLOUD_SUFFIXES, CloudCrs
 
 log = logging.getLogger(__name__)
 
 NOISE_CLASSES = (7, 18)  # low and high noise
-SUFFIXES = frozenset({".las", ".laz", ".ply"})
 _READERS: dict[str, Callable[[Path], CloudFile]] = {".las": open_las, ".laz": open_las, ".ply": open_cloud_ply}
 _CHUNK = 1_000_000
 _MOST_FILES = 10_000
 _KEY_SIDE = 2**21 - 1  # voxels along an axis for which a key of 63 bits is unique
 _SPACING_CHANGE = 2**0.5  # of the voxels, where the points would become too many
-
-
-@dataclass(frozen=True)
-class CloudCrs:
-    """CRS of clouds as the user states it; what the files say themselves counts first.
-
-    Attributes:
-        crs: text of the CRS, for files without one.
-        vertical: datum of the heights, where the CRS has no vertical part.
-        flag: option that named the clouds, for errors: `--lidar` has `--lidar-crs` and `--lidar-vertical`.
-    """
-
-    crs: str | None = None
-    vertical: VerticalChoice | None = None
-    flag: str = "--lidar"
 
 
 @dataclass(frozen=True)
@@ -131,7 +116,7 @@ class CloudFiles:
         self._crs = [_crs_of(file, stated) for file in self._files]
         self.count = sum(file.count for file in self._files)
         self.tally = ReadTally()
-        silent = {crs.name for crs in self._crs if not crs.vertical.stated}
+        silent = {_short_name(crs.name) for crs in self._crs if not crs.vertical.stated}
         self.assumptions = tuple(
             f"the heights of the cloud were taken as ellipsoidal: {name} has no vertical part "
             f"({stated.flag}-vertical states one)"
@@ -141,7 +126,7 @@ class CloudFiles:
     @property
     def crs_names(self) -> tuple[str, ...]:
         """Names of the CRSs of the files, without repetition."""
-        return tuple(dict.fromkeys(crs.name for crs in self._crs))
+        return tuple(dict.fromkeys(_short_name(crs.name) for crs in self._crs))
 
     def chunks(self, origin: Origin, progress: Progress = SILENT) -> Iterator[MeasuredCloud]:
         """Yield all valid points in geo, a chunk at a time and not thinned.
@@ -274,13 +259,20 @@ def _in_geo(chunk: CloudChunk, lla: FloatArray, origin: Origin) -> MeasuredCloud
     return MeasuredCloud(place, chunk.classification, np.ones(count, np.int64), time, 0.0)
 
 
+def _short_name(name: str) -> str:
+    """Return the name that a WKT gives its CRS; any other text itself."""
+    found = re.match(r'\w+\["([^"]+)"', name)
+    return found[1] if found else name
+
+
 def _paths(path: Path, stated: CloudCrs) -> list[Path]:
     """Return the files of a path in the order of their names."""
     if path.is_dir():
         files = sorted(
             file
             for file in path.rglob("*")
-            if file.suffix.lower() in SUFFIXES and not any(part[0] == "." for part in file.relative_to(path).parts)
+            if file.suffix.lower() in CLOUD_SUFFIXES
+            and not any(part[0] == "." for part in file.relative_to(path).parts)
         )
         if not files:
             raise InputError("no LAS, LAZ or PLY file in this folder", path=path, field=stated.flag)

@@ -6,10 +6,11 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator
 
-from pipelines.core.options import EFFORT, PlaceOnEarth, StageOptions, Triple
+from pipelines.core.options import EFFORT, PlaceOnEarth, Triple
+from pipelines.simulate.lidar_options import LidarFlightOptions
 
 
-class SimulateOptions(StageOptions):
+class SimulateOptions(LidarFlightOptions):
     """Options of a simulated survey. Triples are written with commas: `46.02,7.75,1620`."""
 
     scene: Literal["city", "village"] = Field("city", description="Type of town.")

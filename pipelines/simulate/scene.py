@@ -25,6 +25,7 @@ class SimulatedScene:
         sun: (3,) unit vector towards the sun.
         sites: places where a survey target can be fixed.
         complex_m: half lengths, along the town's axes, of the complex in the middle.
+        buildings: those of the complex first.
     """
 
     mesh: Mesh
@@ -33,6 +34,7 @@ class SimulatedScene:
     sun: FloatArray
     sites: tuple[TargetSite, ...]
     complex_m: tuple[float, float]
+    buildings: tuple[Building, ...]
 
 
 def build_scene(name: str, seed: np.random.SeedSequence) -> SimulatedScene:
@@ -46,12 +48,13 @@ def build_scene(name: str, seed: np.random.SeedSequence) -> SimulatedScene:
     builder = MeshBuilder()
     add_terrain(builder, terrain, axes, TextureParameters((0.1, 0.15, 0.05)))
     sites = _ground_sites(terrain, rng)
-    for plan in layout.buildings:
-        sites += add_building(builder, _building(plan, terrain, axes), rng)
+    buildings = tuple(_building(plan, terrain, axes) for plan in layout.buildings)
+    for building in buildings:
+        sites += add_building(builder, building, rng)
     _add_furniture(builder, layout, terrain, axes, rng)
     azimuth, elevation = rng.uniform(2.2, 4.1), np.radians(rng.uniform(42, 56))
     sun = np.array([np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation), np.sin(elevation)])
-    return SimulatedScene(builder.build(), layout.plan, axes, sun, tuple(sites), (17.5, 18.5))
+    return SimulatedScene(builder.build(), layout.plan, axes, sun, tuple(sites), (17.5, 18.5), buildings)
 
 
 def _on_ground(xy: tuple[float, float], terrain: Terrain, axes: FloatArray) -> FloatArray:
@@ -110,10 +113,11 @@ def with_targets(scene: SimulatedScene, sites: list[TargetSite], width_m: float)
         a, b, c, d = (middle + half * (i * u_axis + j * v_axis) for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1)))
         builder.triangles(np.array([[a, b, c], [a, c, d]]), Material.TARGET, texture, (middle, u_axis, v_axis))
     boards = builder.build()
-    return replace(scene, mesh=_join(scene.mesh, boards))
+    return replace(scene, mesh=joined(scene.mesh, boards))
 
 
-def _join(first: Mesh, second: Mesh) -> Mesh:
+def joined(first: Mesh, second: Mesh) -> Mesh:
+    """Return the triangles of two meshes in one."""
     shifted = replace(second, texture=second.texture + np.int32(len(first.texture_params)))
     names = vars(first)
     return Mesh(**{name: np.concatenate([getattr(first, name), getattr(shifted, name)]) for name in names})

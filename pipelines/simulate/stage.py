@@ -1,7 +1,8 @@
 """Simulate a survey whose truth is known exactly.
 
 Reads: nothing. Writes a survey folder, not a workspace: `images/`, `trajectory.csv`, `gnss.csv`, `imu.csv`,
-`gcp_list.txt`, `checkpoints.txt`, `truth.json`; on request `depth/` and `bag/` (docs/simulator.md).
+`gcp_list.txt`, `checkpoints.txt`, `truth.json`; on request `depth/`, `bag/`, `lidar.laz` and `lidar_trajectory.csv`
+(docs/simulator.md).
 """
 
 from __future__ import annotations
@@ -24,11 +25,14 @@ from pipelines.core.progress import SILENT, Progress
 from pipelines.core.threads import chosen_threads
 from pipelines.formats.bag.writer import BagCamera, BagFlight, write_bag
 from pipelines.formats.exif_writer import DroneTags, with_tags
+from pipelines.simulate.lidar import LidarFlight
+from pipelines.simulate.lidar_files import LidarFiles
 from pipelines.simulate.options import SimulateOptions
 from pipelines.simulate.recording import Recording, record
 from pipelines.simulate.render import Renderer, Sensor
 from pipelines.simulate.sensors import in_local_enu
 from pipelines.simulate.targets import WANTED_RAYS
+from pipelines.simulate.truth import TrueLidar
 from pipelines.simulate.world import World, check_clearance, make_world
 from pipelines.simulate.write import write_gnss, write_imu, write_points, write_trajectory
 
@@ -73,12 +77,14 @@ class RecordedFlight:
         renderer: of the photographs.
         recording: of the instruments and the surveyor.
         photo_seed: of the photographs' noise.
+        lidar_seed: of the LiDAR flight.
     """
 
     world: World
     renderer: Renderer
     recording: Recording
     photo_seed: np.random.SeedSequence
+    lidar_seed: np.random.SeedSequence
 
 
 def fly_survey(options: SimulateOptions) -> RecordedFlight:
@@ -91,11 +97,12 @@ def fly_survey(options: SimulateOptions) -> RecordedFlight:
         InputError: the options cannot be flown or photographed.
         BackendUnavailableError: the ray caster is not installed.
     """
-    world_seed, record_seed, photo_seed = np.random.SeedSequence(options.seed).spawn(3)
+    world_seed, record_seed, photo_seed, lidar_seed = np.random.SeedSequence(options.seed).spawn(4)
     world = make_world(options, world_seed)
     renderer = Renderer(world.scene, world.lens, int(options.samples))
     check_clearance(world, renderer.raycaster)
-    return RecordedFlight(world, renderer, record(options, world, renderer.raycaster, record_seed), photo_seed)
+    recording = record(options, world, renderer.raycaster, record_seed)
+    return RecordedFlight(world, renderer, recording, photo_seed, lidar_seed)
 
 
 def simulate(
@@ -114,6 +121,10 @@ def simulate(
     recording = flight.recording
     with _draft(directory) as draft:
         _PhotoWriter(options, flight, draft).run(progress)
+        truth = recording.truth
+        if options.lidar:
+            truth = truth.model_copy(update={"lidar": write_lidar_flight(options, flight, draft, progress)})
+        save_json(truth, draft / TRUTH)
         messages = _write_records(options, flight.world, recording, draft)
     summary = SimulationSummary(
         directory,
@@ -145,6 +156,19 @@ def check_folder(directory: Path, *, overwrite: bool) -> None:
             raise InputError("exists and holds something other than a simulation: choose another", path=directory)
         if not overwrite:
             raise InputError("holds a simulation already: --force replaces it", path=directory)
+
+
+def write_lidar_flight(
+    options: SimulateOptions, flight: RecordedFlight, folder: Path, progress: Progress = SILENT
+) -> TrueLidar:
+    """Write the cloud of a LiDAR flight over the world of a survey, and the scanner's track; return the truth."""
+    world = flight.world
+    lidar = LidarFlight(options, world.scene, flight.lidar_seed)
+    with LidarFiles(folder, world.origin) as files, progress.task("lidar") as task:
+        for strip in lidar.strips():
+            files.write(strip)
+            task.advance()
+    return lidar.truth()
 
 
 @contextmanager
@@ -246,7 +270,6 @@ def _write_records(options: SimulateOptions, world: World, recording: Recording,
     write_imu(folder / "imu.csv", recording.imu, enu_from_body)
     write_points(folder / "gcp_list.txt", recording.control, world.origin)
     write_points(folder / "checkpoints.txt", recording.check, world.origin)
-    save_json(recording.truth, folder / TRUTH)
     if options.bag == "none":
         return 0
     lens = world.lens

@@ -66,6 +66,30 @@ class TrueNavigation(Product):
     clock_offset_s: float
 
 
+class TrueLidar(Product):
+    """Errors of the LiDAR flight, and what has changed since.
+
+    Attributes:
+        sigma_m: white noise of the ranges.
+        drift_m: RMS of the strips' slow drift per axis.
+        shift_in_geo_m: shift of the whole cloud.
+        arm_in_body_m: part of the scanner's lever arm that the cloud lacks.
+        change: building removed or added since.
+        returns: number of points.
+        returns_of_change: number of points on what has changed.
+        changed_footprint: corners of the building in geo, east and north.
+    """
+
+    sigma_m: float
+    drift_m: float
+    shift_in_geo_m: Vector3
+    arm_in_body_m: Vector3
+    change: Literal["none", "removed", "added"]
+    returns: int
+    returns_of_change: int
+    changed_footprint: tuple[tuple[float, float], ...]
+
+
 class Truth(Product):
     """Truth of a survey. Lists run parallel to `images`; the geo frame is East-North-Up at `origin`.
 
@@ -75,6 +99,7 @@ class Truth(Product):
         stamp_ns: camera clock.
         fix_errors: recorded minus true position of the antenna at the same stamp of the navigation clock.
         sun_in_geo: towards the sun.
+        lidar: truth of the LiDAR flight; None: there is none.
     """
 
     format_version: Literal[1] = 1
@@ -93,3 +118,4 @@ class Truth(Product):
     sigma_mark_px: float
     sigma_survey_m: float
     sun_in_geo: Vector3
+    lidar: TrueLidar | None = None

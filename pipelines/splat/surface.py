@@ -50,10 +50,23 @@ class SurfaceSettings:
     edge: float = 0.05
 
 
+@dataclass(frozen=True)
+class ObservedPoints:
+    """Points that a view observes.
+
+    Attributes:
+        point_in_model: (K, 3) metres.
+        weight: (K,) of their pull; None: 1.
+    """
+
+    point_in_model: Tensor
+    weight: Tensor | None = None
+
+
 def depth_loss(
-    depth_m: Tensor, alpha: Tensor, point_in_model: Tensor, cam_from_model: Tensor, camera: Pinhole
+    depth_m: Tensor, alpha: Tensor, points: ObservedPoints, cam_from_model: Tensor, camera: Pinhole
 ) -> Tensor:
-    """Return the mean of r + F s (1 − exp(−r/s)), r = |z_rendered / z − 1|, over points that the view observes.
+    """Return the mean of w (r + F s (1 − exp(−r/s))), r = |z_rendered / z − 1|, over points that the view observes.
 
     1. Gaussians are blended in the order of their centres. On a slanted surface the nearer Gaussians hide the
        others. A surface behind the true one, by a part of the Gaussians' size, then matches the photographs best.
@@ -66,17 +79,18 @@ def depth_loss(
     Args:
         depth_m: (H, W) expected depth.
         alpha: (H, W).
-        point_in_model: (K, 3) metres.
+        points: that the view observes, with their weights w.
         cam_from_model: (4, 4) pose; without gradient, because cameras must not follow the surface.
         camera: of H × W pixels.
     """
     pose = cam_from_model.detach()
-    in_cam = point_in_model @ pose[:3, :3].T + pose[:3, 3]
+    in_cam = points.point_in_model @ pose[:3, :3].T + pose[:3, 3]
     z = in_cam[:, 2].clamp_min(1e-3)
     rendered_m, seen = depth_at(depth_m, alpha, in_cam[:, :2] / z[:, None], camera)
     counts = seen * (in_cam[:, 2] > 1e-3)
     off = (rendered_m / z - 1).abs()
     pull = off + _FIRMNESS * _NEAR * (1 - torch.exp(-off / _NEAR))
+    pull = pull if points.weight is None else points.weight * pull
     return (pull * counts).sum() / counts.sum().clamp_min(1)
 
 

@@ -9,13 +9,13 @@ from functools import lru_cache
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
-from torch import Tensor
 
 from pipelines.core.types import IntArray
 from pipelines.scene.photographs import ImageCache
 from pipelines.scene.scene import Scene
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.initialise import InitialisationOptions, gaussians_from_points, gaussians_of_size
+from pipelines.splat.surface import ObservedPoints
 from pipelines.train.background import background
 from pipelines.train.surface import SceneSurface, SurfacePoints
 
@@ -82,8 +82,8 @@ def _off_surface(points: SurfacePoints, surface: SurfacePoints) -> IntArray:
     return np.flatnonzero(distance > _OFF_SURFACE * gap[nearest, 1])
 
 
-def points_to_hold(training: TrainingScene, device: torch.device) -> Callable[[int], Tensor]:
-    """Return a function of an image's index that gives the points (K, 3) in `model`, float32, that the image shows.
+def points_to_hold(training: TrainingScene, device: torch.device) -> Callable[[int], ObservedPoints]:
+    """Return a function of an image's index that gives the points in `model`, float32, that the image shows.
 
     These are SfM points and, in training images, points of the surface.
 
@@ -95,10 +95,12 @@ def points_to_hold(training: TrainingScene, device: torch.device) -> Callable[[i
     shown = set(map(int, scene.train))
 
     @lru_cache(maxsize=_KEPT_VIEWS)
-    def points(index: int) -> Tensor:
-        shown_points = scene.point_in_model[scene.sparse.points_in(index)]
+    def points(index: int) -> ObservedPoints:
+        known = scene.point_in_model[scene.sparse.points_in(index)]
+        weight = np.ones(len(known), dtype=np.float32)
         if training.surface is not None and index in shown:
-            shown_points = np.concatenate([shown_points, training.surface.points(index, _STRIDE)])
-        return torch.from_numpy(shown_points).float().to(device)
+            of_surface, its_weight = training.surface.held(index, _STRIDE)
+            known, weight = np.concatenate([known, of_surface]), np.concatenate([weight, its_weight])
+        return ObservedPoints(torch.from_numpy(known).float().to(device), torch.from_numpy(weight).to(device))
 
     return points

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from pipelines.core.options import StageOptions
 from pipelines.scene.geographic_options import GeographicOptions
+from pipelines.train.lidar.options import LidarOptions
 from pipelines.train.presets import PRESETS, Preset
 
 
@@ -43,9 +44,17 @@ class SplatOptions(StageOptions):
         )
 
 
-class TrainOptions(GeographicOptions, SplatOptions):
+class TrainOptions(GeographicOptions, SplatOptions, LidarOptions):
     """Options of the joint optimisation of Gaussians, similarity and camera corrections."""
 
     checkpoint_every: int = Field(500, ge=1, description="Iterations between checkpoints.")
     log_every: int = Field(10, ge=1, description="Iterations between lines of metrics.jsonl.")
     seed: int = Field(0, ge=0, description="Seed of every random choice.")
+
+    @model_validator(mode="after")
+    def _lidar_needs_a_surface(self) -> TrainOptions:
+        if self.lidar is not None and not (self.dense and self.faithful_surface):
+            raise ValueError(
+                "--lidar is compared with the surface of the photographs: it needs --dense and --faithful-surface"
+            )
+        return self

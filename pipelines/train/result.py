@@ -14,6 +14,7 @@ from pipelines.georef.posterior import solution_covariances
 from pipelines.georef.problem import GeoProblem
 from pipelines.georef.terms import ControlTerm, FixTerm
 from pipelines.scene.initial_similarity import InitialSimilarity
+from pipelines.scene.lidar_report import LidarReport
 from pipelines.scene.scene import Scene
 from pipelines.scene.trained_model import TrainedCamera, TrainedLens, TrainedModel
 from pipelines.train.loop import TrainingRecord
@@ -66,13 +67,16 @@ def trained_model(trainer: JointTrainer, scene: Scene, initial: InitialSimilarit
     )
 
 
-def summary_of(model: TrainedModel, metrics: list[dict[str, Any]], record: TrainingRecord) -> Summary:
+def summary_of(
+    model: TrainedModel, metrics: list[dict[str, Any]], record: TrainingRecord, lidar: LidarReport | None = None
+) -> Summary:
     """Return headline, values and warnings of a training.
 
     Args:
         model: product of the training.
         metrics: rows of `metrics.jsonl`.
         record: time and incidents of the training.
+        lidar: LiDAR that the training has used; None: none.
     """
     psnr = float(np.mean([row["psnr"] for row in metrics[-20:]]))
     sigma = np.sqrt(np.diag(np.array(model.geo_from_model.covariance)))
@@ -87,8 +91,11 @@ def summary_of(model: TrainedModel, metrics: list[dict[str, Any]], record: Train
         "control_outliers": list(model.control_outliers),
         "estimated_errors": [error.model_dump() for error in model.estimated_errors],
     }
+    if lidar is not None:
+        values["lidar"] = lidar.model_dump(mode="json")
     key_figure = f"{model.gaussians} gaussians, train PSNR {psnr:.2f} dB"
-    return Summary(key_figure, values, tuple(_warnings(model, record)), model.cautions)
+    warnings = [*_warnings(model, record), *(() if lidar is None else _lidar_warnings(lidar))]
+    return Summary(key_figure, values, tuple(warnings), model.cautions)
 
 
 def _warnings(model: TrainedModel, record: TrainingRecord) -> list[str]:
@@ -98,6 +105,21 @@ def _warnings(model: TrainedModel, record: TrainingRecord) -> list[str]:
             warnings.append(f"{len(names)} {kind} contradict the cameras: {', '.join(names[:5])}")
     warnings += [text for error in model.estimated_errors if (text := _warning_of(error)) is not None]
     return warnings if record.recovery is None else [*warnings, record.recovery]
+
+
+def _lidar_warnings(lidar: LidarReport) -> list[str]:
+    warnings = list(lidar.assumptions)
+    if lidar.registration.removed:
+        shift, sigma = lidar.registration.shift_m, lidar.registration.sigma_m
+        text = ", ".join(f"{value:+.3f} ± {one:.3f}" for value, one in zip(shift, sigma, strict=True))
+        warnings.append(f"the LiDAR was shifted by ({text}) m east, north, up: it is taken out here")
+    if lidar.areas:
+        area_m2 = sum(area.area_m2 for area in lidar.areas)
+        warnings.append(
+            f"LiDAR and photographs contradict each other on {area_m2:.0f} m² in {len(lidar.areas)} places, which "
+            "train/lidar.json lists and train/lidar.png shows: the LiDAR is not used there"
+        )
+    return warnings
 
 
 def _warning_of(error: EstimatedError) -> str | None:

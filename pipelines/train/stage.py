@@ -20,6 +20,7 @@ from pipelines.scene.calibrated import load_survey
 from pipelines.scene.geographic import geo_problem
 from pipelines.scene.geolocated import GeolocatedPoints
 from pipelines.scene.initial_similarity import InitialSimilarity
+from pipelines.scene.measured_cloud import CloudFiles
 from pipelines.scene.scene import initial_scene, photographs
 from pipelines.scene.trained_model import TrainedModel
 from pipelines.splat.memory import free_memory_bytes, require_memory
@@ -28,6 +29,7 @@ from pipelines.splat.storage import write_gaussians
 from pipelines.train.assembly import make_trainer, training_size
 from pipelines.train.depth_maps import DepthMaps
 from pipelines.train.initial_gaussians import TrainingScene
+from pipelines.train.lidar.prepare import draw_changes, lidar_surface
 from pipelines.train.loop import LoopOptions, optimise
 from pipelines.train.options import TrainOptions
 from pipelines.train.result import summary_of, trained_model
@@ -50,17 +52,26 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     """
     backend = rasterizer(options.backend)  # first, so that `--backend cuda` without a GPU fails at once
     workspace = stage.workspace
+    clouds = None if options.lidar is None else CloudFiles(options.lidar, options.lidar_stated)
     initial = load_json(InitialSimilarity, workspace.path(SIM3))
     survey = initial.weighted(load_survey(workspace))
     scene = initial_scene(read_sparse(workspace.path(SPARSE)), survey, initial)
     images = photographs(scene.sparse, survey, workspace, options.effort.max_image_size)
     require_memory(training_size(scene, images, options), free_memory_bytes(device_of(backend)))
     images.build(stage.progress)
-    surface = None
+    surface, lidar = None, None
     if options.dense:
         maps = DepthMaps(workspace.cache / "surface", scene, images)
         maps.build(stage.progress)
         surface = SceneSurface(maps)
+        if clouds is not None:
+            lidar = lidar_surface(
+                options, clouds, maps, survey,
+                georeference=initial.geo_from_local, seed=options.seed, progress=stage.progress,
+            )  # fmt: skip
+            surface = lidar.surface
+            save_json(lidar.report, stage.out / "lidar.json")
+            draw_changes(stage.out / "lidar.png", lidar, scene)
     points = GeolocatedPoints.load(workspace.path(POINTS))
     problem = geo_problem(scene, survey, initial, options, points=points, seed=options.seed)
     trainer = make_trainer(TrainingScene(scene, images, surface), problem, backend, options)
@@ -79,7 +90,7 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     write_gaussians(stage.out / "gaussians.ply", trainer.optimizer.gaussians.detached())
     save_json(model, stage.out / "model.json")
     metrics = [json.loads(row) for row in files.metrics.read_text(encoding="utf-8").splitlines()]
-    return summary_of(model, metrics, record)
+    return summary_of(model, metrics, record, None if lidar is None else lidar.report)
 
 
 def _take_over(stage: StageRun, iterations: int) -> bool:

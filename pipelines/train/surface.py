@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.core.types import ByteArray, FloatArray, IntArray
+from pipelines.core.types import ByteArray, Float32Array, FloatArray, IntArray
 from pipelines.geometry.thinning import thin_to_voxels
 from pipelines.train.depth_maps import DepthMaps
 
@@ -67,6 +67,15 @@ class SceneSurface:
         """
         rows, columns = np.nonzero(self._maps.depth(index)[::stride, ::stride])
         return self._points(index, stride * rows, stride * columns)
+
+    def held(self, index: int, stride: int) -> tuple[FloatArray, Float32Array]:
+        """Return the points (P, 3) in `model` that a training view is held to, and the weight of each (P,)."""
+        points = self.points(index, stride)
+        return points, np.ones(len(points), dtype=np.float32)
+
+    def all_points(self, stride: int) -> FloatArray:
+        """Return the surface points (P, 3) in `model` of all training views, of every `stride`-th pixel."""
+        return np.concatenate([self.points(index, stride) for index in map(int, self._train)])
 
     def known_share(self) -> float:
         """Return the fraction of the training photographs' pixels whose depth is known, 0 … 1."""

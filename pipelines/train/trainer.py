@@ -23,7 +23,7 @@ from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.losses import photometric_loss
 from pipelines.splat.optimizer import GaussianAdam
 from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings, Render
-from pipelines.splat.surface import compactness_loss, depth_loss, flatness_loss, normal_loss
+from pipelines.splat.surface import ObservedPoints, compactness_loss, depth_loss, flatness_loss, normal_loss
 from pipelines.train.checkpoint import prefixed, unprefixed
 from pipelines.train.pace import iteration_seconds
 from pipelines.train.schedule import JointOptions, TrainingSchedule
@@ -47,13 +47,13 @@ class TrainingViews:
     Attributes:
         camera: (V,) indices of the training views, into cameras and images.
         images: all undistorted photographs.
-        surface: returns the points (K, 3) in `model`, float32, that an image shows; None: no depth loss.
+        surface: returns the points in `model`, float32, that an image shows; None: no depth loss.
         lenses: lenses with which the images were undistorted; None: the lenses never change.
     """
 
     camera: IntArray
     images: ImageCache
-    surface: Callable[[int], Tensor] | None = None
+    surface: Callable[[int], ObservedPoints] | None = None
     lenses: Lenses | None = None
 
 

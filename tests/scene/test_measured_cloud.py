@@ -21,7 +21,8 @@ from pipelines.geodesy.crs import parse_crs
 from pipelines.geodesy.enu import Origin, lla_from_enu
 from pipelines.geodesy.vertical import parse_vertical
 from pipelines.scene import measured_cloud
-from pipelines.scene.measured_cloud import CloudCrs, CloudFiles, Thinning, read_thinned
+from pipelines.scene.cloud_options import CloudCrs
+from pipelines.scene.measured_cloud import CloudFiles, Thinning, read_thinned
 
 ORIGIN = Origin(lat_deg=46.02, lon_deg=7.75, alt_m=1620.0)
 UTM = "EPSG:32632"

@@ -76,7 +76,7 @@ def survey(tmp_path_factory: pytest.TempPathFactory) -> SimulatedSurvey:
     """Return a survey of eight photographs with every file that can be written."""
     return SimulatedSurvey(
         tmp_path_factory.mktemp("simulated") / "survey", images=8, origin=ORIGIN, bag="mcap", depth=True,
-        gnss="outliers", lever_arm="0.1,-0.2,-0.3", sigma_mark=0.3,
+        gnss="outliers", lever_arm="0.1,-0.2,-0.3", sigma_mark=0.3, lidar=True, lidar_density=1, lidar_radius=40,
     )  # fmt: skip
 
 
@@ -355,6 +355,12 @@ def test_a_failed_simulation_leaves_nothing(tmp_path: Path) -> None:
 def test_bad_options_are_named(options: dict[str, Any], field: str) -> None:
     with pytest.raises(InputError, match=rf"^\[{field}\]"):
         resolve(SimulateOptions, {}, options, Path("georef.toml"))
+
+
+def test_lidar_is_written_on_request(survey: SimulatedSurvey) -> None:
+    assert survey.truth.lidar is not None and survey.truth.lidar.returns > 1000
+    assert (survey.folder / "lidar.laz").stat().st_size > 10_000
+    assert len(survey.table("lidar_trajectory.csv")) > 100
 
 
 def test_truth_is_plain_json(survey: SimulatedSurvey) -> None:

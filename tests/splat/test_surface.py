@@ -12,6 +12,7 @@ from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.rasterizer.api import RasterSettings, Render
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
 from pipelines.splat.surface import (
+    ObservedPoints,
     compactness_loss,
     depth_loss,
     depth_normals,
@@ -101,16 +102,19 @@ def test_depth_is_held_to_the_points_that_are_seen_in_it() -> None:
         [9.0, 0.0, 4.0],  # outside
         [0.0, 0.0, -4.0],  # behind
     ])  # fmt: skip
-    loss = depth_loss(depth, alpha, points, POSE, CAMERA)
+    loss = depth_loss(depth, alpha, ObservedPoints(points), POSE, CAMERA)
     # (0.25 + what being off at all costs: 9 · 0.002) / 2 that count.
     assert float(loss.detach()) == pytest.approx(0.5 * (0.25 + 0.018), rel=1e-5)
     loss.backward()
     assert depth.grad is not None
     # Only the four pixels around the middle are pulled, and nearer.
     assert (depth.grad[17:19, 23:25] > 0).all() and int((depth.grad.abs() > 1e-6).sum()) <= 8
+    fourfold = ObservedPoints(points, torch.tensor([4.0, 9, 1, 1, 1]))
+    weighted = depth_loss(depth.detach(), alpha, fourfold, POSE, CAMERA)
+    assert float(weighted) == pytest.approx(4 * float(loss.detach()), rel=1e-5)
     elsewhere = torch.eye(4)
     elsewhere[2, 3] = 1.0
-    far = depth_loss(depth.detach(), alpha, points[:1], elsewhere, CAMERA)
+    far = depth_loss(depth.detach(), alpha, ObservedPoints(points[:1]), elsewhere, CAMERA)
     assert float(far) == pytest.approx(0.0, abs=1e-6)
 
 
@@ -119,7 +123,7 @@ def test_depth_is_held_firmly_where_it_is_nearly_right() -> None:
 
     def pull(depth_m: float) -> float:
         depth = torch.full((36, 48), depth_m, requires_grad=True)
-        depth_loss(depth, alpha, point, POSE, CAMERA).backward()
+        depth_loss(depth, alpha, ObservedPoints(point), POSE, CAMERA).backward()
         assert depth.grad is not None
         return float(depth.grad.sum())
 

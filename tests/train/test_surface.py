@@ -188,8 +188,8 @@ def test_points_to_hold_are_those_of_the_view(
     hold = points_to_hold(TrainingScene(scene, images, surface), torch.device("cpu"))
     train, test = int(scene.train[0]), int(scene.test[0])
     seen = len(np.unique(scene.sparse.obs_point[scene.sparse.obs_image == train]))
-    assert len(hold(train)) > seen
-    assert len(hold(test)) == len(np.unique(scene.sparse.obs_point[scene.sparse.obs_image == test]))
+    assert len(hold(train).point_in_model) > seen
+    assert len(hold(test).point_in_model) == len(np.unique(scene.sparse.obs_point[scene.sparse.obs_image == test]))
 
 
 def test_spreading_keeps_few_enough_and_covers_all() -> None:

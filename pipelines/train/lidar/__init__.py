@@ -1,0 +1,1 @@
+"""LiDAR in training: cloud in the scene, registration, changes, and the surface that Gaussians are held to."""

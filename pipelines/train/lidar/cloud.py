@@ -1,0 +1,104 @@
+"""LiDAR cloud of the scene: points with the planes around them, in `model`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from pipelines.core.errors import InputError
+from pipelines.core.progress import Progress
+from pipelines.core.types import ByteArray, FloatArray, IntArray
+from pipelines.scene.measured_cloud import CloudFiles, MeasuredCloud, Thinning, read_thinned
+from pipelines.scene.scene import Scene
+from pipelines.scene.survey import Survey
+
+_NEIGHBOURS = 12
+_MOST_POINTS = 3_000_000
+_MARGIN = 0.1  # of the scene's size, around its points
+_SCENE_SHARE = 0.01  # of the SfM points on each side may lie outside the scene
+_BATCH = 100_000
+_ABOVE_M, _BELOW_M = 500.0, 500.0  # a wrong datum must show itself, not lie outside the box
+
+
+@dataclass(frozen=True)
+class LidarCloud:
+    """P points.
+
+    Attributes:
+        position_in_model: (P, 3) metres, moved along the normal onto the plane through the neighbours.
+        normal_in_model: (P, 3) unit vectors of the planes through their neighbours, with an arbitrary sign.
+        roughness_m: (P,) RMS of the neighbours about that plane.
+        reach_m: (P,) distance to the furthest of these neighbours.
+        classification: (P,) class of LAS.
+        voxel_m: distance between the points, about.
+    """
+
+    position_in_model: FloatArray
+    normal_in_model: FloatArray
+    roughness_m: FloatArray
+    reach_m: FloatArray
+    classification: ByteArray
+    voxel_m: float
+
+    def __len__(self) -> int:
+        """Return the number of points."""
+        return len(self.position_in_model)
+
+    def part(self, rows: IntArray | np.ndarray) -> LidarCloud:
+        """Return the points of some rows."""
+        return LidarCloud(
+            self.position_in_model[rows],
+            self.normal_in_model[rows],
+            self.roughness_m[rows],
+            self.reach_m[rows],
+            self.classification[rows],
+            self.voxel_m,
+        )
+
+    def moved(self, shift: FloatArray) -> LidarCloud:
+        """Return the cloud shifted by a vector (3,)."""
+        return replace(self, position_in_model=self.position_in_model + shift)
+
+
+def read_cloud(files: CloudFiles, scene: Scene, survey: Survey, pixel_m: float, progress: Progress) -> LidarCloud:
+    """Return the points of the clouds in the scene, as dense as the photographs resolve it.
+
+    Args:
+        files: the clouds.
+        scene: cameras and SfM points.
+        survey: has the origin of `geo`.
+        pixel_m: size of a pixel of the photographs on the surface.
+        progress: shows the points read.
+
+    Raises:
+        InputError: as `read_thinned`, or too few points in the scene.
+    """
+    in_geo = scene.geo_from_model.apply(scene.point_in_model)
+    low, high = np.quantile(in_geo, [_SCENE_SHARE, 1 - _SCENE_SHARE], axis=0)
+    margin = _MARGIN * float((high - low)[:2].max())
+    low, high = low - np.array([margin, margin, _BELOW_M]), high + np.array([margin, margin, _ABOVE_M])
+    cloud = read_thinned(files, survey.origin, Thinning(pixel_m, _MOST_POINTS, low, high), progress)
+    if len(cloud) <= 10 * _NEIGHBOURS:
+        raise InputError(f"only {len(cloud)} points lie in the scene of the photographs", field="--lidar")
+    return with_planes(cloud, scene)
+
+
+def with_planes(cloud: MeasuredCloud, scene: Scene) -> LidarCloud:
+    """Return a cloud in `model`, with the plane through the neighbours of each point."""
+    position = scene.geo_from_model.inverse().apply(cloud.position_in_geo)
+    tree = cKDTree(position)
+    normal, roughness, reach = np.empty_like(position), np.empty(len(position)), np.empty(len(position))
+    onto_plane = np.empty_like(position)
+    for first in range(0, len(position), _BATCH):
+        rows = slice(first, first + _BATCH)
+        distance, nearest = tree.query(position[rows], k=_NEIGHBOURS)
+        around = position[nearest]
+        arm = around - around.mean(axis=1, keepdims=True)
+        spread, axes = np.linalg.eigh(np.einsum("pki,pkj->pij", arm, arm) / _NEIGHBOURS)
+        off = np.einsum("pi,pi->p", position[rows] - around.mean(axis=1), axes[:, :, 0])
+        onto_plane[rows] = position[rows] - off[:, None] * axes[:, :, 0]
+        normal[rows], roughness[rows] = axes[:, :, 0], np.sqrt(np.maximum(spread[:, 0], 0))
+        reach[rows] = distance[:, -1]
+    return LidarCloud(onto_plane, normal, roughness, reach, cloud.classification, cloud.voxel_m)

@@ -1,0 +1,222 @@
+"""LiDAR of a training, from its files to the surface that Gaussians are held to.
+
+1. Cloud of the scene, in `model`.
+2. Registration against the depth maps: a shift beyond 3 σ is refused, or taken out on request. It is never taken
+   out unasked.
+3. Confidence, and places that have changed.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.core.errors import DegenerateGeometryError, InputError
+from pipelines.core.progress import Progress
+from pipelines.core.types import FloatArray, Vector3
+from pipelines.geodesy.enu import lla_from_enu
+from pipelines.geometry.depth_support import DepthViews
+from pipelines.geometry.similarity import SimilarityRecord, covariance_at
+from pipelines.plots.lidar_map import DrawnArea, write_lidar_map
+from pipelines.scene.lidar_report import LidarArea, LidarRegistration, LidarReport
+from pipelines.scene.measured_cloud import CloudFiles
+from pipelines.scene.scene import Scene
+from pipelines.scene.survey import Survey
+from pipelines.train.depth_maps import DepthMaps
+from pipelines.train.lidar.changes import CELL_M, CloudVerdict, verdict
+from pipelines.train.lidar.cloud import LidarCloud, read_cloud
+from pipelines.train.lidar.options import LidarOptions
+from pipelines.train.lidar.registration import PlaneMatches, Registration, registration
+from pipelines.train.lidar.surface import FusedSurface
+from pipelines.train.lidar.views import depth_views, pixel_size_m
+from pipelines.train.surface import SceneSurface
+
+log = logging.getLogger(__name__)
+
+_GATE_SIGMAS = 3.0
+_ANOTHER_DATUM_M = 1.0
+_CELL_M = 4.0
+_STRIDE = 3
+_MOST_LISTED = 50
+
+
+@dataclass(frozen=True)
+class LidarSurface:
+    """Surface with LiDAR, and its record.
+
+    Attributes:
+        surface: of stereo and LiDAR.
+        report: for `train/lidar.json`.
+        verdict: of the photographs on the cloud.
+        cloud: registered, in `model`.
+        matches: planes that both show, at the shift that was found.
+    """
+
+    surface: FusedSurface
+    report: LidarReport
+    verdict: CloudVerdict
+    cloud: LidarCloud
+    matches: PlaneMatches
+
+
+def lidar_surface(
+    options: LidarOptions,
+    files: CloudFiles,
+    maps: DepthMaps,
+    survey: Survey,
+    *,
+    georeference: SimilarityRecord,
+    seed: int,
+    progress: Progress,
+) -> LidarSurface:
+    """Return the surface of stereo and LiDAR.
+
+    Args:
+        options: of the LiDAR.
+        files: the clouds.
+        maps: depth maps of the training views.
+        survey: has the origin of `geo`.
+        georeference: initial similarity to `geo`, with covariance.
+        seed: of random choices.
+        progress: shows the points read.
+
+    Raises:
+        InputError: the cloud lies elsewhere, in height or plan, or is shifted beyond 3 σ.
+    """
+    scene, pixel_m, views = maps.scene, pixel_size_m(maps), depth_views(maps)
+    cloud = read_cloud(files, scene, survey, pixel_m, progress)
+    shown = SceneSurface(maps).all_points(_STRIDE)
+    compared = registration_of(cloud, shown, views, seed)
+    record = _checked(compared, cloud, scene, georeference, options)
+    if options.lidar_register:
+        cloud = cloud.moved(-compared.shift_m)
+    judged = verdict(cloud, views, shown, sigma_m=options.lidar_sigma, pixel_m=pixel_m)
+    tally = files.tally
+    report = LidarReport(
+        crs=files.crs_names,
+        read=tally.read,
+        noise=tally.noise,
+        withheld=tally.withheld,
+        overlap=tally.overlap,
+        outside=tally.outside,
+        points=len(cloud),
+        voxel_m=cloud.voxel_m,
+        registration=record,
+        rejected_share=float(judged.rejected.mean()),
+        confidence=float(np.median(judged.confidence)),
+        areas=_areas(judged, scene, survey),
+        assumptions=files.assumptions,
+    )
+    surface = FusedSurface(maps, cloud, judged.confidence, pixel_m)
+    return LidarSurface(surface, report, judged, cloud, compared.matches)
+
+
+def draw_changes(path: Path, lidar: LidarSurface, scene: Scene) -> None:
+    """Write the map of the places that have changed as PNG."""
+    shift = scene.geo_from_model.translation
+    areas = [
+        DrawnArea(area.kind, area.area_m2, area.cells + shift[:2])  # `geo_from_model` is a pure shift here
+        for area in lidar.verdict.areas
+    ]
+    write_lidar_map(path, lidar.cloud.position_in_model + shift, areas, CELL_M)
+
+
+def registration_of(cloud: LidarCloud, shown: FloatArray, views: DepthViews, seed: int) -> Registration:
+    """Return the shift of a cloud against the depth maps.
+
+    Raises:
+        InputError: the cloud lies above or below the surface of the photographs by more than the search reaches,
+            or the two have no surface in common.
+    """
+    height_m, cells = _height_difference(cloud.position_in_model, shown)
+    if cells and abs(height_m) > _ANOTHER_DATUM_M:
+        raise InputError(
+            f"the LiDAR lies {abs(height_m):.2f} m {'above' if height_m > 0 else 'below'} the surface of the "
+            f"photographs (median of {cells} places): the heights of one of them count from another vertical "
+            "datum, or are in another unit. State the LiDAR's by --lidar-vertical or --lidar-crs, and the survey's "
+            "by `georef ingest --vertical`",
+            field="--lidar",
+        )
+    try:
+        return registration(cloud, views, seed)
+    except DegenerateGeometryError as error:
+        raise InputError(f"{error}: another place, another time, or a wrong CRS", field="--lidar") from error
+
+
+def _checked(
+    compared: Registration,
+    cloud: LidarCloud,
+    scene: Scene,
+    georeference: SimilarityRecord,
+    options: LidarOptions,
+) -> LidarRegistration:
+    """Return the record of a registration.
+
+    Raises:
+        InputError: a shift beyond 3 σ, and no request to take it out.
+    """
+    middle = scene.geo_from_model.apply(np.median(cloud.position_in_model, axis=0))[None]
+    of_georeference = covariance_at(middle, georeference.covariance, georeference.pivot)[0]
+    variance = np.diag(compared.covariance_m2 + of_georeference) + options.lidar_sigma**2
+    sigma = np.sqrt(variance)
+    record = LidarRegistration(
+        shift_m=_vector(compared.shift_m),
+        sigma_m=_vector(sigma),
+        sigma_comparison_m=_vector(np.sqrt(np.diag(compared.covariance_m2))),
+        points=len(compared.matches),
+        spread_m=compared.spread_m,
+        wall_bias_m=compared.wall_bias_m,
+        removed=options.lidar_register,
+    )
+    text = ", ".join(f"{value:+.3f} ± {one:.3f}" for value, one in zip(compared.shift_m, sigma, strict=True))
+    log.info("lidar: shift east, north, up %s m against the photographs, of %d points", text, record.points)
+    if (np.abs(compared.shift_m) > _GATE_SIGMAS * sigma).any() and not options.lidar_register:
+        raise InputError(
+            f"the LiDAR is shifted by {text} m (east, north, up) against the photographs, beyond 3 σ. Check its "
+            "CRS, its datum and the survey's georeference; --lidar-register takes the shift out, --lidar-sigma "
+            "states a lower accuracy",
+            field="--lidar",
+        )
+    return record
+
+
+def _height_difference(cloud: FloatArray, shown: FloatArray) -> tuple[float, int]:
+    """Return the median height of the cloud above the photographs' surface, and the number of cells compared."""
+    low = np.minimum(cloud.min(axis=0), shown.min(axis=0))[:2]
+    medians = []
+    for points in (cloud, shown):
+        cell = np.floor((points[:, :2] - low) / _CELL_M).astype(np.int64)
+        key = cell[:, 0] * 10_000_000 + cell[:, 1]
+        order = np.lexsort((points[:, 2], key))
+        cells, first, count = np.unique(key[order], return_index=True, return_counts=True)
+        medians.append((cells, points[order, 2][first + count // 2]))
+    common, mine, theirs = np.intersect1d(medians[0][0], medians[1][0], return_indices=True)
+    if not len(common):
+        return 0.0, 0
+    return float(np.median(medians[0][1][mine] - medians[1][1][theirs])), len(common)
+
+
+def _areas(judged: CloudVerdict, scene: Scene, survey: Survey) -> tuple[LidarArea, ...]:
+    areas = []
+    for area in judged.areas[:_MOST_LISTED]:
+        center = scene.geo_from_model.apply(area.center_in_model)
+        lat, lon, _ = lla_from_enu(center, survey.origin)
+        areas.append(
+            LidarArea(
+                kind=area.kind,
+                area_m2=area.area_m2,
+                points=area.points,
+                center_in_geo=_vector(center),
+                lat_deg=float(lat),
+                lon_deg=float(lon),
+            )
+        )
+    return tuple(areas)
+
+
+def _vector(values: FloatArray) -> Vector3:
+    x, y, z = np.asarray(values).tolist()
+    return x, y, z
