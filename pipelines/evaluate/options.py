@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 from pydantic import Field
 
-from pipelines.core.options import InputMarker, InputPath, StageOptions
+from pipelines.core.options import InputPath, StageOptions
 from pipelines.geodesy.vertical import Vertical
-from pipelines.scene.measured_cloud import SUFFIXES
+from pipelines.scene.cloud_options import CloudPath
 from pipelines.scene.reference_report import Alignment
 
 
@@ -30,7 +29,7 @@ class EvaluateOptions(StageOptions):
     cross_validate: bool = Field(
         False, description="Leave out each control point in turn and measure it by a solution without it."
     )
-    reference: Annotated[Path, InputMarker(SUFFIXES)] | None = Field(
+    reference: CloudPath | None = Field(
         None,
         description="Compare the surface with this cloud (LAS, LAZ or PLY, or a folder of them), where photographs "
         "saw it.",

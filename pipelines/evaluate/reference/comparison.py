@@ -31,7 +31,8 @@ from pipelines.evaluate.reference.normals import plane_normals
 from pipelines.evaluate.reference.seen import SeenSurface, Viewpoints, seen_surface
 from pipelines.evaluate.reference.tiles import TiledPoints, first_of_voxels
 from pipelines.geometry.similarity import Similarity
-from pipelines.scene.measured_cloud import CloudCrs, CloudFiles, MeasuredCloud, Thinning, read_thinned
+from pipelines.scene.cloud_options import CloudCrs
+from pipelines.scene.measured_cloud import CloudFiles, MeasuredCloud, Thinning, read_thinned
 from pipelines.scene.reference_report import ReferenceComparison
 from pipelines.scene.renderer import ModelRenderer
 from pipelines.scene.scene_extent import scene_points
