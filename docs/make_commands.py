@@ -24,7 +24,8 @@ Results go to stdout, everything else to stderr and to `logs/<stage>.log` in the
 With `--json`, stdout is one JSON document. When the command fails, the document is
 `{"error": {"code", "message", "path", "line", "field", "hint"}}`. `code` names the kind of failure: `usage`,
 `input`, `missing-product`, `busy`, `geometry`, `contradiction`, `convergence`, `resources`, `backend`, `storage`,
-`crash`, `interrupted`, `failed`, or `defect` for an exception that nobody foresaw. Keys without a value are null.
+`crash`, `cluster`, `interrupted`, `failed`, or `defect` for an exception that nobody foresaw. Keys without a value
+are null.
 
 Every command takes these options, before or after its name:
 
@@ -44,7 +45,7 @@ def describe(name: str) -> str:
     return "\n".join(
         [
             f"## georef {name}\n",
-            f"`georef {name} {arguments} [OPTIONS]`\n",
+            f"`{' '.join(filter(None, ('georef', name, arguments)))} [OPTIONS]`\n",
             _escape(text.strip()) + "\n",
             "| option | meaning |\n|---|---|",
             *rows,

@@ -56,7 +56,7 @@ def dry_rows(missions: Iterable[tuple[PlannedMission, RunForecast | None]]) -> l
             "refusal": planned.refusal,
             "photographs": run.photographs.count if run is not None and run.photographs is not None else None,
             "seconds": None if run is None else sum(value or 0.0 for value in run.seconds.values()),
-            "peak_bytes": planned.job().peak_bytes,
+            "peak_bytes": planned.peak_bytes,
         }
         for planned, run in missions
     ]

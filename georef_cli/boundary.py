@@ -43,7 +43,8 @@ def guarded(group: click.Group, arguments: Sequence[str] | None) -> int:
         group: the commands.
         arguments: of the command line; None: those of the process.
     """
-    as_json = "--json" in (sys.argv[1:] if arguments is None else arguments)
+    words = sys.argv[1:] if arguments is None else arguments
+    as_json, tells_progress = "--json" in words, "--json-progress" in words
     try:
         _escape_on_stdout()
         with _signals_interrupt():
@@ -55,8 +56,11 @@ def guarded(group: click.Group, arguments: Sequence[str] | None) -> int:
         return FAILED
     except (Exception, KeyboardInterrupt) as error:
         ending = ending_of(error)
+        document = defect_document(error) if ending is None else ending.error
         if as_json:
-            _print_error(defect_document(error) if ending is None else ending.error)
+            _print_error(document)
+        if tells_progress:
+            _send_error(document)
         if ending is None:
             raise
         _say(ending.message)
@@ -71,6 +75,14 @@ def _print_error(document: ErrorDocument) -> None:
 
     with contextlib.suppress(OSError):
         click.echo(dump_json({"error": document}))
+
+
+def _send_error(document: ErrorDocument) -> None:
+    """Send the kind of an error to the program that started this one."""
+    from georef_cli.sender import stderr_sender
+
+    with contextlib.suppress(KeyboardInterrupt):  # nobody reads it
+        stderr_sender().send("error", code=document["code"])
 
 
 def _say(text: str) -> None:

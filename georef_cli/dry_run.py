@@ -63,6 +63,8 @@ def print_dry_run(
         width, height = run.photographs.size_px
         files = "" if run.photographs.bytes is None else f", {size(run.photographs.bytes)}"
         parts.append(f"\n[bold]Photographs[/]: {run.photographs.count} of {width}×{height} px{files}")
+    if run.reconstruction is not None:
+        parts += ["\n[bold]Reconstruction[/]", *(f"  {shown(text)}" for text in run.reconstruction.sentences())]
     if run.training is not None:
         parts += ["\n[bold]Training[/]", *(f"  {shown(text)}" for text in run.training.sentences())]
     print_rich(*parts, "\n[dim]Nothing was run. Times are estimates for an idle machine.[/]")
@@ -99,5 +101,6 @@ def _document(workspace: Workspace, run: RunForecast) -> dict[str, Any]:
         "workspace": str(workspace.root),
         "stages": stages,
         "photographs": run.photographs and dataclasses.asdict(run.photographs),
+        "reconstruction": run.reconstruction and dataclasses.asdict(run.reconstruction),
         "training": run.training and dataclasses.asdict(run.training),
     }

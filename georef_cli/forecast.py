@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pipelines.core.options import StageOptions
 from pipelines.core.photograph_folder import photograph_folder
 from pipelines.core.plan import PlannedStage, plan
 from pipelines.core.products import load_json
@@ -19,6 +20,7 @@ from pipelines.sfm.options import SfmOptions
 from pipelines.train.options import TrainOptions
 
 if TYPE_CHECKING:
+    from pipelines.sfm.forecast import ReconstructionForecast
     from pipelines.train.forecast import TrainingForecast
 
 
@@ -45,12 +47,14 @@ class RunForecast:
         planned: what each stage would do.
         photographs: of the survey; None: in a bag that was not read yet.
         seconds: about, by stage, of those that take long.
+        reconstruction: None where none would run, or before a bag is read.
         training: None where none would run, or before a bag is read.
     """
 
     planned: Sequence[PlannedStage]
     photographs: Photographs | None
     seconds: Mapping[str, float | None]
+    reconstruction: ReconstructionForecast | None
     training: TrainingForecast | None
 
 
@@ -70,7 +74,39 @@ def forecast_run(
     """
     planned = plan(workspace, stages, flags, force=force)
     photographs = _photographs(workspace, planned)
-    return RunForecast(planned, photographs, _seconds(planned, photographs), _training(planned, photographs))
+    reconstruction, training = _reconstruction(planned, photographs), _training(planned, photographs)
+    for name, forecast in (("sfm", reconstruction), ("train", training)):
+        if forecast is not None and forecast.refusal:
+            planned = [_refused(row, forecast.refusal) if row.stage == name else row for row in planned]
+    seconds: dict[str, float | None] = {}
+    for options, known in ((SfmOptions, reconstruction), (TrainOptions, training)):
+        row = _to_run(planned, options)
+        if row is not None and known is not None:
+            seconds[row.stage] = known.seconds
+    return RunForecast(planned, photographs, seconds, reconstruction, training)
+
+
+def _to_run(planned: Sequence[PlannedStage], options: type[StageOptions]) -> PlannedStage | None:
+    """Return the stage with such options that will run; None: it will not."""
+    going = (row for row in planned if row.action not in ("keep", "refuse"))
+    return next((row for row in going if isinstance(row.resolved, options)), None)
+
+
+def _refused(row: PlannedStage, reason: str) -> PlannedStage:
+    return replace(row, action="refuse", reason=reason)
+
+
+def _reconstruction(
+    planned: Sequence[PlannedStage], photographs: Photographs | None
+) -> ReconstructionForecast | None:
+    """Return the forecast of the reconstruction; None where none would run, or before a bag is read."""
+    from pipelines.sfm.forecast import forecast
+
+    row = _to_run(planned, SfmOptions)
+    if row is None or photographs is None:
+        return None
+    assert isinstance(row.resolved, SfmOptions)
+    return forecast(photographs.count, photographs.size_px, row.resolved)
 
 
 def _photographs(workspace: Workspace, planned: list[PlannedStage]) -> Photographs | None:
@@ -80,10 +116,9 @@ def _photographs(workspace: Workspace, planned: list[PlannedStage]) -> Photograp
         if not (workspace.root / SURVEY).is_file():
             return None
         survey = load_json(Survey, workspace.path(SURVEY))
-        largest = max(survey.cameras, key=lambda camera: camera.width * camera.height)
         folder = photograph_folder(workspace, survey.image_dir)
         sizes = [path.stat().st_size for image in survey.images if (path := folder / image.name).is_file()]
-        return Photographs(len(survey.images), (largest.width, largest.height), sum(sizes) or None)
+        return Photographs(len(survey.images), survey.largest_photograph_px, sum(sizes) or None)
     assert isinstance(ingest.resolved, IngestOptions)
     return None if ingest.resolved.images is None else _in_folder(ingest.resolved.images)
 
@@ -95,31 +130,12 @@ def _in_folder(folder: Path) -> Photographs:
     return Photographs(count, size_px, total_bytes)
 
 
-def _seconds(planned: list[PlannedStage], photographs: Photographs | None) -> dict[str, float | None]:
-    """Return the seconds of the stages that take long."""
-    from pipelines.sfm.pace import reconstruction_seconds
-
-    seconds: dict[str, float | None] = {}
-    for row in planned:
-        if photographs is None or row.action in ("keep", "refuse"):
-            continue
-        if isinstance(row.resolved, SfmOptions):
-            seconds[row.stage] = reconstruction_seconds(photographs.count, photographs.size_px, row.resolved)
-        elif isinstance(row.resolved, TrainOptions):
-            forecast = _training([row], photographs)
-            seconds[row.stage] = None if forecast is None else forecast.seconds
-    return seconds
-
-
-def _training(planned: list[PlannedStage], photographs: Photographs | None) -> TrainingForecast | None:
+def _training(planned: Sequence[PlannedStage], photographs: Photographs | None) -> TrainingForecast | None:
     """Return the forecast of the training; None where none would run, or before a bag is read."""
     from pipelines.train.forecast import forecast
 
-    for row in planned:
-        if (
-            isinstance(row.resolved, TrainOptions)
-            and row.action not in ("keep", "refuse")
-            and photographs is not None
-        ):
-            return forecast(photographs.count, photographs.size_px, row.resolved)
-    return None
+    row = _to_run(planned, TrainOptions)
+    if row is None or photographs is None:
+        return None
+    assert isinstance(row.resolved, TrainOptions)
+    return forecast(photographs.count, photographs.size_px, row.resolved)

@@ -49,6 +49,12 @@ COMMANDS: dict[str, HelpLine] = {
     ),
     "run": HelpLine("run", "Pipeline", "Run all stages, or some, skipping what is current."),
     "batch": HelpLine("batch", "Pipeline", "Run many missions, and put their results into one table."),
+    "blocks": HelpLine("blocks", "Pipeline", "Train a large survey in blocks, and merge them."),
+    "cluster certificates": HelpLine(
+        "cluster_certificates", "Cluster", "Make the certificate that the machines of a cluster share."
+    ),
+    "cluster scheduler": HelpLine("cluster_scheduler", "Cluster", "Start the scheduler of a cluster."),
+    "cluster worker": HelpLine("cluster_worker", "Cluster", "Lend this machine to a cluster."),
     "status": HelpLine("status", "Pipeline", "Show the state of every stage."),
     "info": HelpLine("info", "Pipeline", "Show where on Earth the result is, and what each file is for."),
     "view": HelpLine("view", "Pipeline", "See the trained model in a browser, and measure in it."),
@@ -89,6 +95,18 @@ class LazyGroup(click.Group):
         command = importlib.import_module(f"georef_cli.commands.{entry.module}").command
         assert isinstance(command, Command)
         return command
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Return the command that the first word names, or the first two, and the words behind it."""
+        pair = " ".join(args[:2])
+        if pair in COMMANDS:
+            return pair, self.get_command(ctx, pair), args[2:]
+        seconds = [name.partition(" ")[2] for name in COMMANDS if name.startswith(f"{args[0]} ")]
+        if seconds and args[0] not in COMMANDS:
+            ctx.fail(f"{PROGRAM} {args[0]} needs one of: {', '.join(seconds)}.")
+        return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run a subcommand, which inherits the verbosity of the group's options, and return its result."""

@@ -54,7 +54,14 @@ FACTOR_COLUMNS = {
     "applied": "applied",
     "sigma_source": "σ",
 }
-IMAGE_COLUMNS = {"views": "views", "psnr": "PSNR dB", "ssim": "SSIM", "lpips": "LPIPS"}
+IMAGE_COLUMNS = {
+    "views": "views",
+    "psnr": "PSNR dB",
+    "psnr_covered": "covered dB",
+    "covered_share": "covered share",
+    "ssim": "SSIM",
+    "lpips": "LPIPS",
+}
 DISTANCE_COLUMNS = {
     "measured": "places",
     "median_m": "median",
@@ -150,7 +157,7 @@ def comparison(table: Comparison) -> list[Renderable]:
         f"{way}\n{name}" for way in ("camera", "model") for name in ("mean H", "median H", "RMSE H", "RMSE V")
     ]
     del points[1]  # by camera, mean and median hardly differ
-    heads = ("test\nPSNR", "\nSSIM", *points, "check\npoints", "\ntraining")
+    heads = ("test\nPSNR", "PSNR\ncovered", "\nSSIM", *points, "check\npoints", "\ntraining")
     rows = {shown(row.configuration): [shown(cell) for cell in cells(row)] for row in table.rows}
     notes = [f"[bold]{shown(row.configuration)}[/] {shown(f'{row.title}: {row.note}')}" for row in table.rows]
     compared = {shown(row.configuration): list(reference_cells(row)) for row in table.rows if row.reference}

@@ -16,6 +16,7 @@ from pipelines.geodesy.enu import Origin, ecef_from_enu
 from pipelines.geodesy.vertical import VerticalDatum
 from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.similarity import Similarity
+from pipelines.scene.block_record import BlockTraining
 from pipelines.scene.survey import Survey
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.storage import write_gaussians
@@ -59,6 +60,27 @@ def write_trained(root: Path, splat: SplatArrays, folder: str) -> StageRun:
     out = root / f"{folder}.partial"
     out.mkdir()
     return StageRun(Workspace(root), out)
+
+
+def block_training(count: int) -> BlockTraining:
+    """Return the record of a block with so many Gaussians in its cell."""
+    return BlockTraining(
+        id=0,
+        iterations=1,
+        gaussians=count,
+        gaussians_in_cell=count,
+        photographs=1,
+        seconds=1.0,
+        processor_s=None,
+        mean_gaussians=count,
+        mean_visible=count,
+        mean_px=1.0,
+        surroundings=0,
+        peak_bytes=None,
+        threads=1,
+        backend="cpu",
+        train_psnr=20.0,
+    )
 
 
 def true_ecef(splat: SplatArrays) -> FloatArray:

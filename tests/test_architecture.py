@@ -38,6 +38,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     ),
     (
         "pipelines.batch",
+        "pipelines.blocks",
         "pipelines.calibrate",
         "pipelines.compare",
         "pipelines.deliver",
@@ -65,8 +66,8 @@ HOMES: dict[str, tuple[str, ...]] = {
     "rich": ("georef_cli",),
     "pyproj": ("pipelines.geodesy",),
     "pycolmap": ("pipelines.sfm", "pipelines.formats"),
-    "numba": ("pipelines.splat", "pipelines.geometry", "pipelines.robust"),
-    "gsplat": ("pipelines.splat.rasterizer.cuda",),
+    "numba": ("pipelines.splat", "pipelines.stereo", "pipelines.geometry", "pipelines.robust"),
+    "gsplat": ("pipelines.splat.rasterizer.cuda_kernels",),
     "torch": ("pipelines.splat", "pipelines.georef", "pipelines.scene", *STAGE_ROOMS),
     "filelock": ("pipelines.core",),
     "laspy": ("pipelines.formats",),
@@ -84,6 +85,9 @@ HOMES: dict[str, tuple[str, ...]] = {
     "ezdxf": ("pipelines.formats",),
     "viser": ("pipelines.view",),
     "websockets": ("pipelines.view",),
+    "dask": ("pipelines.engine",),
+    "distributed": ("pipelines.engine",),
+    "fsspec": ("pipelines.engine",),
 }
 # The entry point of a process whose log records go to its parent.
 CHILD = "pipelines.core.child"

@@ -32,10 +32,14 @@ FORBIDDEN = {
     "eval", "exec", "compile", "pickle", "marshal", "shelve", "yaml", "subprocess", "os.system", "os.popen",
     "torch.load", "torch.save",
 }  # fmt: skip
-# The files that start a process: this program again, for native code and for jobs; and the user's browser.
+# The files that start a process: this program again, for native code and for jobs; the user's browser; the
+# compilers of the CUDA kernels, which are asked for their versions; and Python, which calls them.
 STARTS_ITSELF = REPOSITORY / "pipelines/core/child.py"
 STARTS_JOBS = REPOSITORY / "pipelines/engine/process.py"
 STARTS_A_BROWSER = REPOSITORY / "pipelines/pages/chromium.py"
+STARTS_A_COMPILER = REPOSITORY / "pipelines/splat/rasterizer/cuda_kernels.py"
+ASKS_COMPILERS = REPOSITORY / "pipelines/splat/rasterizer/cuda_parts.py"
+STARTERS = (STARTS_ITSELF, STARTS_JOBS, STARTS_A_BROWSER, STARTS_A_COMPILER, ASKS_COMPILERS)
 ESCAPES = ["../secret.jpg", "/etc/passwd", "a/../../secret.jpg", "", "a\nb.jpg", "a\x00b.jpg"]
 
 
@@ -58,7 +62,7 @@ def test_nothing_that_is_read_can_be_executed(package: str) -> None:
     assert files
     for file in files:
         for name, node in _calls(ast.parse(file.read_text("utf-8"))):
-            if name == "subprocess" and file in (STARTS_ITSELF, STARTS_JOBS, STARTS_A_BROWSER):
+            if name == "subprocess" and file in STARTERS:
                 continue
             assert name not in FORBIDDEN, f"{file}:{node.lineno} uses {name}"  # type: ignore[attr-defined]
             if name in ("np.load", "numpy.load"):

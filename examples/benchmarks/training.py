@@ -58,14 +58,14 @@ def iterations(count: int, camera: Pinhole, visible: float, repeats: int, backen
     target = torch.rand(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(1)).to(device)
     pose = torch.eye(4, device=device, requires_grad=True)
     for iteration in range(1, repeats + 2):
-        start = _now(device)
+        start = now(device)
         adam.zero_grad()
         render = backend.render(adam.gaussians, pose, camera, RasterSettings())
         photometric_loss(render.colour, target).backward()
         adam.step(iteration, render.stats.visible)
         strategy.observe(render.stats, camera)
         if iteration > 1:
-            yield _now(device) - start
+            yield now(device) - start
 
 
 def scaling(arguments: argparse.Namespace) -> None:
@@ -86,12 +86,27 @@ def scaling(arguments: argparse.Namespace) -> None:
     print(f"peak RSS before the first: {base / 2**20:.0f} MiB; the peak of a process never falls")
 
 
-def curve(arguments: argparse.Namespace) -> None:
-    """Print PSNR on the test views against time, for each strategy."""
-    workspace = Workspace(arguments.workspace)
+def trainer_on(root: Path, options: TrainOptions) -> tuple[JointTrainer, Scene, ImageCache]:
+    """Trainer before its first iteration, on a workspace with init-sim3 done, as `georef train` makes it."""
+    workspace = Workspace(root)
     survey = load_survey(workspace)
     initial = load_json(InitialSimilarity, workspace.path(SIM3))
     scene = initial_scene(read_sparse(workspace.path(SPARSE)), survey, initial)
+    images = photographs(scene.sparse, survey, workspace, options.effort.max_image_size)
+    images.build()
+    maps = DepthMaps(workspace.cache / "surface", scene, images)
+    maps.build()
+    trainer = make_trainer(
+        TrainingScene(scene, images, SceneSurface(maps)),
+        geo_problem(scene, survey, initial, options),
+        rasterizer(options.backend),
+        options,
+    )
+    return trainer, scene, images
+
+
+def curve(arguments: argparse.Namespace) -> None:
+    """Print PSNR on the test views against time, for each strategy."""
     print("strategy   seconds  iteration  gaussians  test PSNR dB")
     for strategy in arguments.strategies:
         config = TrainOptions.model_validate(
@@ -105,30 +120,21 @@ def curve(arguments: argparse.Namespace) -> None:
                 "faithful_surface": arguments.faithful_surface,
             }
         )
-        images = photographs(scene.sparse, survey, workspace, arguments.max_image_size)
-        images.build()
-        maps = DepthMaps(workspace.cache / "surface", scene, images)
-        maps.build()
-        trainer = make_trainer(
-            TrainingScene(scene, images, SceneSurface(maps)),
-            geo_problem(scene, survey, initial, config),
-            rasterizer(config.backend),
-            config,
-        )
+        trainer, scene, images = trainer_on(arguments.workspace, config)
         seconds, device = 0.0, arguments.backend
         while trainer.iteration < arguments.iterations and seconds < arguments.seconds:
-            start = _now(device)
+            start = now(device)
             trainer.step()
-            seconds += _now(device) - start
+            seconds += now(device) - start
             if trainer.iteration % arguments.every == 0 or trainer.iteration == arguments.iterations:
-                count, quality = len(trainer.optimizer.gaussians), _test_psnr(trainer, scene, images)
+                count, quality = len(trainer.optimizer.gaussians), psnr_of_test_views(trainer, scene, images)
                 print(
                     f"{strategy:8s} {seconds:9.1f} {trainer.iteration:10d} {count:10d} {quality:13.2f}", flush=True
                 )
 
 
 @torch.no_grad()
-def _test_psnr(trainer: JointTrainer, scene: Scene, images: ImageCache) -> float:
+def psnr_of_test_views(trainer: JointTrainer, scene: Scene, images: ImageCache) -> float:
     """Mean over the test views of the renders as they are, without exposure."""
     values, settings = [], RasterSettings(sh_degree=trainer.options.sh_degree)
     for index in map(int, scene.test):
@@ -141,7 +147,8 @@ def _test_psnr(trainer: JointTrainer, scene: Scene, images: ImageCache) -> float
     return statistics.fmean(values)
 
 
-def _now(device: str) -> float:
+def now(device: str) -> float:
+    """Seconds of a clock, when the device has done all that was queued."""
     if device == "cuda":
         torch.cuda.synchronize()
     return time.perf_counter()

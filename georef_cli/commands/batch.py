@@ -12,6 +12,7 @@ from georef_cli import batch_tables, options
 from georef_cli.command import Command
 from georef_cli.commands.run import OWNERS, deliver_option, slice_option
 from georef_cli.display import progress_for
+from georef_cli.engines import engine_for, engine_options
 from georef_cli.forecast import RunForecast, forecast_run
 from georef_cli.output import print_json, print_rich
 from georef_cli.settings import set_option, settings
@@ -19,11 +20,10 @@ from pipelines.batch.missions import Mission, MissionList, load_missions
 from pipelines.batch.runner import PlannedMission
 from pipelines.core import runner
 from pipelines.core.errors import GeorefError
-from pipelines.core.free_memory import free_main_memory_bytes
+from pipelines.core.options import input_paths
 from pipelines.core.plan import plan
 from pipelines.core.stages import BY_NAME
-from pipelines.core.threads import thread_count
-from pipelines.engine.local import LocalEngine
+from pipelines.core.staleness import stage_config
 
 log = logging.getLogger(__name__)
 
@@ -37,14 +37,13 @@ def _batch(ctx: click.Context, **values: Any) -> int:
     listed = _missions(values)
     forecasts = [_planned(mission) for mission in listed.missions]
     planned = [mission for mission, _ in forecasts]
-    cores = thread_count()
-    engine = LocalEngine(values["at_a_time"] or cores, cores, free_main_memory_bytes())
+    engine = engine_for(values, values["at_a_time"])
     if values["dry_run"]:
         rows = batch_tables.dry_rows(forecasts)
         if values["as_json"]:
             print_json({"batch": listed.name, "missions": rows})
         else:
-            together = engine.together([row.job() for row in planned if not row.is_current])
+            together = engine.together([row.job(listed.folder) for row in planned if not row.is_current])
             print_rich(*batch_tables.dry_run(rows, together))
         return 0
     table = run_batch(listed, planned, engine, progress_for(ctx.obj))
@@ -77,6 +76,7 @@ def _planned(mission: Mission) -> tuple[PlannedMission, RunForecast | None]:
             for spec in mission.stages
         }
         actions = {row.stage: row.action for row in plan(mission.workspace, mission.stages, asked)}
+        configs = [stage_config(mission.workspace, spec, asked[spec.name]) for spec in mission.stages]
     except GeorefError as error:
         return PlannedMission(mission, {}, refusal=str(error)), None
     try:
@@ -84,10 +84,11 @@ def _planned(mission: Mission) -> tuple[PlannedMission, RunForecast | None]:
     except GeorefError as error:  # The run itself will tell it.
         log.debug("%s: no forecast: %s", mission.name, error)
         run = None
+    inputs = tuple(path for config in configs for path in input_paths(config).values())
     if run is None or run.training is None:
-        return PlannedMission(mission, actions), run
+        return PlannedMission(mission, actions, inputs=inputs), run
     on_gpu = run.training.backend == "cuda"
-    return PlannedMission(mission, actions, 0 if on_gpu else run.training.peak_bytes, on_gpu), run
+    return PlannedMission(mission, actions, 0 if on_gpu else run.training.peak_bytes, on_gpu, inputs), run
 
 
 command = Command(
@@ -103,6 +104,7 @@ command = Command(
         slice_option(["--to", "--end-with"], "last", "Last stage to run, of every mission."),
         deliver_option(),
         set_option(),
+        *engine_options(),
         options.dry_run_option(),
         options.json_option(),
     ],
@@ -121,5 +123,6 @@ command = Command(
           georef batch missions.toml
           georef batch flights --set train.preset=fast --deliver report
           georef batch missions.toml --at-a-time 2 --json
+          georef batch missions.toml --cluster tls://head:8786 --certificates certificates
         """,
 )

@@ -5,8 +5,11 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING
 
+import click
+
 from georef_cli import options
 from georef_cli.command import Command
+from georef_cli.display import progress_for
 from georef_cli.layout import plain_table
 from georef_cli.markup import shown
 from georef_cli.output import print_json, print_rich
@@ -17,9 +20,12 @@ if TYPE_CHECKING:
 _MOST_GRIDS = 12
 
 
-def _doctor(as_json: bool) -> None:
-    from pipelines.machine.inspection import inspect_machine
+@click.pass_context
+def _doctor(ctx: click.Context, as_json: bool, compile_cuda: bool) -> None:
+    from pipelines.machine.inspection import compile_cuda_kernels, inspect_machine
 
+    if compile_cuda:
+        compile_cuda_kernels(progress_for(ctx.obj))
     machine = inspect_machine()
     if as_json:
         print_json(dataclasses.asdict(machine))
@@ -41,8 +47,10 @@ def _lines(machine: Machine) -> list[tuple[str, str]]:
         ("GPU", "; ".join(gpus)),
     ]
     for backend in machine.backends:
-        state = "[green]available[/]" if backend.available else f"[yellow]no[/]: {shown(backend.reason)}"
+        reason = "see below" if backend.name == "cuda" else shown(backend.reason)
+        state = "[green]available[/]" if backend.available else f"[yellow]no[/]: {reason}"
         lines.append((f"backend {backend.name}", state))
+    lines += _cuda_lines(machine)
     grids = machine.grids[:_MOST_GRIDS]
     more = f" and {len(machine.grids) - len(grids)} more" if len(machine.grids) > len(grids) else ""
     none = (
@@ -57,21 +65,40 @@ def _lines(machine: Machine) -> list[tuple[str, str]]:
     return [*lines, ("versions", shown(versions))]
 
 
+def _cuda_lines(machine: Machine) -> list[tuple[str, str]]:
+    """Return what the cuda backend needs; markup."""
+    lines = [
+        (f"  {part.name}", f"[yellow]missing[/]: {shown(part.remedy)}" if part.found is None else shown(part.found))
+        for part in machine.cuda_parts
+    ]
+    none = "not compiled yet: the first use compiles them, or `georef doctor --compile-cuda` now"
+    return [*lines, ("  kernels", shown(machine.cuda_kernels or none))]
+
+
 def _gib(count: int | None) -> str:
     return "unknown" if count is None else f"{count / 2**30:.1f} GiB"
 
 
 command = Command(
     "doctor",
-    params=[options.json_option()],
+    params=[
+        options.json_option(),
+        click.Option(
+            ["--compile-cuda"],
+            is_flag=True,
+            help="First compile the kernels of the cuda backend, which its first use would; this needs no GPU.",
+        ),
+    ],
     callback=_doctor,
     help="""Show what this machine offers: cores, memory, GPU, backends, geoid grids, versions.
 
-    A backend that cannot be used is named with the reason. Nothing is written.
+    A backend that cannot be used is named with the reason: for cuda, each part that it needs and how to get it.
+    Nothing is written, except the kernels that --compile-cuda asks for.
 
     \b
     Examples:
       georef doctor
       georef doctor --json
+      TORCH_CUDA_ARCH_LIST=8.9 georef doctor --compile-cuda
     """,
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -13,14 +13,17 @@ from georef_cli import boundary, options
 from georef_cli.command import Command
 from georef_cli.display import is_told, progress_for
 from georef_cli.dry_run import announce_training, print_dry_run
+from georef_cli.forecast import forecast_run
 from georef_cli.output import print_outcomes
 from georef_cli.settings import set_option, settings
+from georef_cli.time_left import RunTimeLeft
 from pipelines.core import runner
 from pipelines.core.errors import GeorefError
 from pipelines.core.origins import names_of_flags
 from pipelines.core.progress import SILENT, ProgressTask
+from pipelines.core.sentences import about
 from pipelines.core.stages import BY_NAME, DELIVERABLES, MODEL, PIPELINE, StageSpec, named_deliverables, stage_slice
-from pipelines.core.staleness import must_exist
+from pipelines.core.staleness import Flags, must_exist
 from pipelines.core.workspace import Workspace
 from pipelines.ingest.options import IngestOptions
 from pipelines.scene.crs_options import CrsOptions
@@ -41,7 +44,13 @@ LATER: dict[str, tuple[str, ...]] = {
     "iterations": ("train",),
     "max_image_size": ("train",),
     "max_gaussians": ("train",),
+    "blocks": ("train",),
     "backend": ("train", "evaluate"),
+    "lidar": ("train",),
+    "lidar_crs": ("train",),
+    "lidar_vertical": ("train",),
+    "lidar_sigma": ("train",),
+    "lidar_register": ("train",),
     "seed": ("sfm", "init-sim3", "train"),
 }
 _DELIVERABLE_NAMES = ", ".join(spec.name.removeprefix("export-") for spec in DELIVERABLES)
@@ -66,6 +75,7 @@ def _run(ctx: click.Context, **values: Any) -> None:
         print_dry_run(workspace, stages, asked, force=force, as_json=values["as_json"])
         return
     announce_training(workspace, stages, asked, force=force)
+    left = RunTimeLeft(_forecast_seconds(workspace, stages, asked, force=force))
     progress = progress_for(ctx.obj)
     # A program that follows several runs shows how many stages of each are done; bars and lines name the stages.
     with (progress if ctx.obj.json_progress else SILENT).task("stages", len(stages)) as done:
@@ -76,18 +86,32 @@ def _run(ctx: click.Context, **values: Any) -> None:
             forget=forget,
             force=force,
             progress=progress,
-            around=lambda spec: _counted(workspace, spec, done),
+            around=lambda spec: _counted(workspace, spec, done, left),
         )
     print_outcomes(workspace, outcomes, _overview(workspace), as_json=values["as_json"], told=is_told(ctx.obj))
 
 
 @contextlib.contextmanager
-def _counted(workspace: Workspace, spec: StageSpec, done: ProgressTask) -> Iterator[None]:
-    """Log a stage to its file, and count it when it has ended."""
+def _counted(workspace: Workspace, spec: StageSpec, done: ProgressTask, left: RunTimeLeft) -> Iterator[None]:
+    """Log a stage to its file, say what time the run has left, and count the stage when it has ended."""
     with boundary.logged_to_file(workspace, spec):
-        done.advance(0, note=spec.name)
+        if left.seconds:
+            log.info("run: about %s left", about(left.seconds))
+        done.advance(0, spec.name, left.seconds)
+        left.begin()
         yield
-    done.advance()
+    left.end(spec.name)
+    done.advance(1, spec.name, left.seconds)
+
+
+def _forecast_seconds(
+    workspace: Workspace, stages: tuple[StageSpec, ...], asked: Mapping[str, Flags], *, force: bool
+) -> Mapping[str, float | None]:
+    """Return the forecast seconds of the stages that take long; none for a run that will be refused."""
+    try:
+        return forecast_run(workspace, stages, asked, force=force).seconds
+    except GeorefError:
+        return {}
 
 
 def _overview(workspace: Workspace) -> Overview | None:

@@ -2,19 +2,52 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import click
+
+from georef_cli.display import progress_for
+from georef_cli.engines import asked_engine, engine_options
+from georef_cli.output import print_json
 from georef_cli.stage import StageCommand
 
-command = StageCommand(
+_CHUNK = click.Option(
+    ["--chunk"],
+    metavar="NAME",
+    help="Work on this chunk of a large survey only, beside a `georef sfm` that has planned it.",
+)
+
+
+class _SfmCommand(StageCommand):
+    def act(self, ctx: click.Context, **values: Any) -> None:
+        """Run the stage, or work on one of its chunks."""
+        name = values.pop("chunk")
+        if name is None:
+            with asked_engine(values):
+                super().act(ctx, **values)
+            return
+        from pipelines.sfm.chunk_work import work_chunk
+
+        worked = work_chunk(values["workspace"], name, progress_for(ctx.obj))
+        if values["as_json"]:
+            print_json({"chunk": name, "ran": worked})
+
+
+command = _SfmCommand(
     "sfm",
     """Reconstruct cameras and points with COLMAP.
 
-    Which images are matched follows from their positions and view directions. The result is a COLMAP model,
-    sfm/sparse, which COLMAP itself opens; --import takes a model that was made elsewhere.
+    Which images are matched follows from their positions and view directions. Features and matches of a large
+    survey are computed in chunks, as many at a time as cores and memory allow; a finished chunk is kept when the
+    command is interrupted. The result is a COLMAP model, sfm/sparse, which COLMAP itself opens; --import takes a
+    model that was made elsewhere.
 
     \b
     Examples:
       georef sfm flight
       georef sfm flight --mapper global --max-image-size 1600
       georef sfm flight --import colmap/sparse/0
+      georef sfm flight --cluster tls://scheduler:8786 --certificates certificates
     """,
+    extra=[_CHUNK, *engine_options()],
 )

@@ -7,7 +7,7 @@ from functools import cached_property
 
 from pipelines.accuracy.accuracy_grid import AccuracyGrid, accuracy_grid
 from pipelines.accuracy.prediction import AccuracyPrediction
-from pipelines.core.errors import DegenerateGeometryError
+from pipelines.core.errors import ConvergenceError, DegenerateGeometryError
 from pipelines.core.products import load_json
 from pipelines.core.stages import SIM3
 from pipelines.core.workspace import Workspace
@@ -58,7 +58,7 @@ def propagate_errors(workspace: Workspace, trained: TrainedSurvey) -> ErrorPropa
     try:
         solved = solve_survey(trained, initial, geographic_options_of(workspace))
         return ErrorPropagation(solved, AccuracyPrediction(solved))
-    except DegenerateGeometryError as error:
+    except (ConvergenceError, DegenerateGeometryError) as error:
         return NoErrorPropagation(str(error))
 
 

@@ -22,7 +22,8 @@ class IntersectionJacobian:
     """Effect of poses, lens and marks on N intersected points, to first order.
 
     Attributes:
-        by_poses: (3 N, 6 n) sparse, metres by (δω, δc) of each camera as in `geometry.bundle.CorrectionBasis`.
+        by_poses: (3 N, 6 n) sparse, metres by (δω, δc) of each camera as in
+            `geometry.correction_basis.CorrectionBasis`.
         by_lens: (N, 3, L) metres by the lens parameters, in the order of `CorrectionBasis`.
         cov_of_marks: (N, 3, 3) m², from the σ of the marks; NaN for a point that its rays do not determine.
     """

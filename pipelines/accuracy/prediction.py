@@ -6,13 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 from scipy.linalg import block_diag
+from scipy.sparse import csr_matrix, eye, kron
 
 from pipelines.accuracy.intersection_jacobian import IntersectionJacobian, intersection_jacobian
 from pipelines.accuracy.networks import control_rays, mean_focal_px, network_of_points
 from pipelines.core.cautions import Caution
 from pipelines.core.types import FloatArray, IntArray
-from pipelines.georef.camera_covariance import camera_covariances
-from pipelines.georef.posterior import FreeLens, posterior
+from pipelines.georef.posterior import FreeLens
+from pipelines.georef.survey_posterior import survey_posterior
 from pipelines.scene.marks import MarkRays
 from pipelines.scene.solved_survey import SolvedSurvey
 
@@ -29,10 +30,8 @@ class AccuracyPrediction:
 
     def __init__(self, solved: SolvedSurvey) -> None:
         self._solved = solved
-        cameras = solved.problem.cameras
-        self._basis, self._lens_basis = cameras.basis.cpu().numpy(), cameras.lens_basis.cpu().numpy()
-        self._lens = _free_lens(solved) if len(self._lens_basis) else None
-        self._posterior = posterior(solved.problem, self._lens)
+        self._has_lens = len(solved.problem.cameras.lens()) > 0
+        self._posterior = survey_posterior(solved.problem, _free_lens(solved) if self._has_lens else None)
 
     @property
     def cautions(self) -> tuple[Caution, ...]:
@@ -109,23 +108,19 @@ class AccuracyPrediction:
         """
         trained = self._solved.trained
         center = trained.geo_from_model.apply(trained.poses.cam_center_in_model)
-        return camera_covariances(self._posterior, center, trained.geo_from_model, self._basis)
+        return self._posterior.of_cameras(center, trained.geo_from_model)
 
     def of_lens(self) -> FloatArray | None:
         """Return the covariance (L, L) of the lens parameters, in the order of `geometry.lens.Lenses`.
 
         None if the cameras were held, and the lens with them.
         """
-        if self._lens is None:
-            return None
-        follows, rest = self._lens_basis, np.eye(len(self._lens_basis))
-        jacobian = np.concatenate([np.zeros((len(rest), 7)), follows, rest], axis=1)
-        return np.asarray(jacobian @ self._posterior.covariance @ jacobian.T)
+        return self._posterior.of_lens() if self._has_lens else None
 
     @property
     def holds_cameras(self) -> bool:
         """Whether the training held the cameras, so that their own errors are not predicted."""
-        return not self._basis.shape[2]
+        return not self._solved.problem.corrects_cameras
 
     def _jacobian_of_scene(
         self, point_in_geo: FloatArray, point: IntArray, camera: IntArray
@@ -136,11 +131,11 @@ class AccuracyPrediction:
     def _covariance(self, point_in_geo: FloatArray, jacobian: IntersectionJacobian) -> FloatArray:
         return self._posterior.at(point_in_geo, *self._derivatives(jacobian))
 
-    def _derivatives(self, jacobian: IntersectionJacobian) -> tuple[FloatArray, FloatArray]:
-        """Return the derivatives of points in geo by the cameras' corrections, and by the rest of the lens."""
+    def _derivatives(self, jacobian: IntersectionJacobian) -> tuple[csr_matrix, FloatArray]:
+        """Return the derivatives of points in geo by the cameras' corrections, and by the lens."""
         axes = _geo_by_model(self._solved)
-        by_lens = axes @ jacobian.by_lens[:, :, : len(self._lens_basis)]
-        return axes @ jacobian.by_corrections(self._basis) + by_lens @ self._lens_basis, by_lens
+        turned = kron(eye(len(jacobian.by_lens)), axes, format="csr")
+        return csr_matrix(turned @ jacobian.by_poses), axes @ jacobian.by_lens
 
     def _cov_of_marks(self, jacobian: IntersectionJacobian) -> FloatArray:
         axes = _geo_by_model(self._solved)
@@ -170,16 +165,14 @@ def jacobian_of_points(
     return intersection_jacobian(marks, sigma_px)
 
 
-def _free_lens(solved: SolvedSurvey) -> FreeLens | None:
-    basis, control = solved.scene.correction_basis, solved.problem.control
-    if basis is None:
-        return None
-    by_control = np.zeros((0, 3, len(basis.lens_cov)))
+def _free_lens(solved: SolvedSurvey) -> FreeLens:
+    lens_cov, control = solved.scene.bundle.lens_cov, solved.problem.control
+    by_control = np.zeros((0, 3, len(lens_cov)))
     if control is not None:
         rays, position = control_rays(solved), control.position_in_geo.cpu().numpy()
         jacobian = jacobian_of_points(solved, position, rays.point, rays.camera, rays.sigma_px)
         by_control = _geo_by_model(solved) @ jacobian.by_lens
-    return FreeLens(basis.lens_cov, by_control)
+    return FreeLens(lens_cov, by_control)
 
 
 def _geo_by_model(solved: SolvedSurvey) -> FloatArray:

@@ -29,6 +29,7 @@ class PlannedMission:
     Attributes:
         mission: the mission.
         actions: what its run would do with each stage; none where the run will be refused.
+        inputs: files and folders that its options name.
         refusal: reason why the run will be refused, else empty.
         training_bytes: predicted peak of its training in main memory; 0 without one, or if unknown.
         uses_gpu: whether it trains on a GPU.
@@ -38,6 +39,7 @@ class PlannedMission:
     actions: Mapping[str, Action]
     training_bytes: int = 0
     uses_gpu: bool = False
+    inputs: tuple[Path, ...] = ()
     refusal: str = ""
 
     @property
@@ -45,10 +47,23 @@ class PlannedMission:
         """Whether there is nothing to do."""
         return bool(self.actions) and all(action == "keep" for action in self.actions.values())
 
-    def job(self) -> Job:
-        """Return the command that completes the mission."""
-        peak_bytes = BASE_BYTES + self.training_bytes
-        return Job(self.mission.name, run_arguments(self.mission), peak_bytes, self.uses_gpu)
+    @property
+    def peak_bytes(self) -> int:
+        """Predicted peak of the memory of its run."""
+        return BASE_BYTES + self.training_bytes
+
+    def job(self, folder: Path) -> Job:
+        """Return the command that completes the mission of a list in a folder."""
+        workspace = self.mission.workspace.root
+        return Job(
+            self.mission.name,
+            run_arguments(self.mission),
+            self.peak_bytes,
+            self.uses_gpu,
+            folder,
+            writes=workspace,
+            reads=tuple(path for path in self.inputs if not path.is_relative_to(workspace)),
+        )
 
 
 def run_batch(
@@ -82,7 +97,7 @@ def run_batch(
 
     by_name = {plan.mission.name: plan.mission for plan in planned}
     write_batch(listed.folder, table())
-    jobs = [plan.job() for plan in planned if not plan.is_current]
+    jobs = [plan.job(listed.folder) for plan in planned if not plan.is_current]
     if jobs:
         engine.run("missions", jobs, ended, progress)
     return table()

@@ -112,14 +112,14 @@ def _plan(workspace: Workspace, configuration: Configuration, asked: Flags) -> I
     seed = {"seed": asked["seed"]} if "seed" in asked else {}
     lent = dict(shared)
     if configuration.sim3 is None:
-        yield PlannedStage(workspace.variant(place, shared), ADJUST, seed)
+        yield PlannedStage(workspace.variant(place, shared, FOLDER), ADJUST, seed)
         lent |= dict.fromkeys(("sfm", _INIT.folder), root / place / ADJUST.folder)
     if configuration.trained_by is not None:
         trainer = BY_CONFIGURATION[configuration.trained_by]
         plan = _plan(workspace, trainer, asked)
         yield from (planned for planned in plan if planned.spec is not _EVALUATE)
         lent[_TRAIN.folder] = root / FOLDER / trainer.name / _TRAIN.folder
-    variant = workspace.variant(place, lent)
+    variant = workspace.variant(place, lent, FOLDER)
     if configuration.sim3 is not None:
         yield PlannedStage(variant, _INIT, {**configuration.sim3, "max_residual": None, **seed})
     if configuration.trained_by is None:
@@ -194,6 +194,8 @@ def _row(configuration: Configuration, plan: Sequence[PlannedStage], runner: _Pl
         title=configuration.title,
         note=configuration.note,
         test_psnr=report.photometric.test.psnr,
+        test_psnr_covered=report.photometric.test.psnr_covered,
+        test_covered_share=report.photometric.test.covered_share,
         test_ssim=report.photometric.test.ssim,
         camera=point_accuracy(report.checkpoints.camera),
         model=point_accuracy(report.checkpoints.model),

@@ -45,6 +45,8 @@ class ComparedRow(Product):
         configuration, title, note: as in `Configuration`.
         failure: reason why there are no figures.
         test_psnr, test_ssim: means over the test views, in dB and from 0 to 1.
+        test_psnr_covered: as test_psnr, over the pixels whose ground at least two training views show.
+        test_covered_share: share of these pixels; the same for all configurations of one SfM model.
         camera, model: errors of the check points by camera and by model.
         reference: the surface against a reference cloud; None: there is none.
         iterations, gaussians: of the training.
@@ -58,6 +60,8 @@ class ComparedRow(Product):
     note: str
     failure: str | None = None
     test_psnr: float | None = None
+    test_psnr_covered: float | None = None
+    test_covered_share: float | None = None
     test_ssim: float | None = None
     camera: PointAccuracy = PointAccuracy()
     model: PointAccuracy = PointAccuracy()
@@ -129,13 +133,14 @@ def panels(rows: Sequence[ComparedRow]) -> tuple[Panel, ...]:
 def markdown(table: Comparison) -> str:
     """Return the table as Markdown, with notes and remarks below."""
     heads = (
-        *("", "test PSNR dB", "SSIM", "camera mean H", "camera RMSE H", "camera RMSE V"),
+        *("", "test PSNR dB", "PSNR covered", "SSIM", "camera mean H", "camera RMSE H", "camera RMSE V"),
         *("model mean H", "model median H", "model RMSE H", "model RMSE V", "check points", "training"),
     )
     lines = [
         "# Comparison\n",
         "Check points, which entered no solve, in metres: by *camera* their image marks intersected with the "
-        "cameras, by *model* where the Gaussians' rendered surface lies behind the marks.\n",
+        "cameras, by *model* where the Gaussians' rendered surface lies behind the marks. *PSNR covered*: over the "
+        "pixels of the test views whose ground at least two training views show.\n",
         _line(heads),
         _line(["---", *["---:"] * (len(heads) - 1)]),
         *(_line([f"**{row.configuration}**", *cells(row)]) for row in table.rows),
@@ -154,11 +159,15 @@ def markdown(table: Comparison) -> str:
 
 
 def cells(row: ComparedRow) -> tuple[str, ...]:
-    """Return the figures of a row as text: PSNR, SSIM, check points by camera and by model, their number, time."""
+    """Return the figures of a row as text.
+
+    PSNR, that of covered pixels, SSIM; check points by camera and by model, and their number; time.
+    """
     camera, model = row.camera, row.model
     counts = str(camera.count) if camera.count == model.count else f"{camera.count}, {model.count}"
     return (
         _number(row.test_psnr, 2),
+        _number(row.test_psnr_covered, 2),
         _number(row.test_ssim, 4),
         *(_metres(value) for value in (camera.mean_h_m, camera.rmse_h_m, camera.rmse_v_m)),
         *(_metres(value) for value in (model.mean_h_m, model.median_h_m, model.rmse_h_m, model.rmse_v_m)),

@@ -138,6 +138,12 @@ class BackendUnavailableError(GeorefError):
     code = "backend"
 
 
+class ClusterError(GeorefError):
+    """Cluster of which no scheduler answers, or none of whose workers can run the jobs."""
+
+    code = "cluster"
+
+
 class StorageError(GeorefError):
     """Disk or file system that is full, fails, or may not be written; names the file."""
 

@@ -1,4 +1,4 @@
-"""Free main memory of the machine, or of the container that this process runs in."""
+"""Main memory: what is free on the machine, or in the container of this process, and what the process has held."""
 
 from __future__ import annotations
 
@@ -12,6 +12,16 @@ def free_main_memory_bytes() -> int | None:
     """Return the memory that programs may still take; None if the system does not state it."""
     known = [free for free in (_free_in_system(), _free_in_group(Path("/sys/fs/cgroup"))) if free is not None]
     return min(known) if known else None
+
+
+def peak_memory_bytes() -> int | None:
+    """Return the most main memory that this process has held so far; None if the system does not state it."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return None
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else 1024 * peak
 
 
 def _free_in_system() -> int | None:

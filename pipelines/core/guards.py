@@ -91,7 +91,7 @@ def refuse_loss_by_options(workspace: Workspace, spec: StageSpec, options: Stage
 
 def _loss(workspace: Workspace, spec: StageSpec, progress: str, reason: str) -> InputError:
     home = (workspace.base or workspace).root
-    command = f"georef {'compare' if workspace.base else spec.name} {home}"
+    command = f"georef {workspace.command or spec.name} {home}"
     how = "without other options" if reason.startswith("option") else "with the former input"
     return InputError(
         f"an interrupted {spec.name} would be lost ({progress}), because {reason}: `{command}` {how} continues "

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Collection, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -87,6 +88,7 @@ def run_stage(
     flags: Flags,
     *,
     force: bool = False,
+    renew: bool = False,
     resume: Resume = "never",
     progress: Progress = SILENT,
     place: str = "",
@@ -100,6 +102,7 @@ def run_stage(
         spec: the stage.
         flags: only the options that the user gave, by field.
         force: run even if the product is current, and start afresh.
+        renew: run even if the product is current, with all that its parts have left.
         resume: whether to continue an interrupted run (see `Workspace.begin`), or to extend a finished product.
         progress: shows the stage's tasks.
         place: place of the stage in a longer run, for the log: `stage 2 of 8`.
@@ -117,7 +120,7 @@ def run_stage(
         refuse_damaged_inputs(workspace, spec, memo)
         before = workspace.requests().get(spec.name, {})
         workspace.remember({spec.name: flags})
-        previous = None if force else _current(workspace, asked, memo)
+        previous = None if force or renew else _current(workspace, asked, memo)
         if previous is not None:
             return Outcome(spec.name, False, _with_present_files(workspace, asked, previous))
         try:
@@ -261,18 +264,21 @@ def _run(job: _Job, token: str) -> Summary:
     """
     workspace, asked, place = job.workspace, job.asked, job.place
     spec = asked.spec
-    run = importlib.import_module(spec.module).run
     out, resumed = workspace.begin(spec, token, job.resume)
     extends = None if job.resume == "never" else extendable_product(workspace, asked)
     log.info("%s: %s%s", spec.name, "resumed" if resumed else "started", f", {place}" if place else "")
     try:
         with storage_failures():
+            run = _module(workspace, asked).run
+            afresh = job.resume == "never"
             try:
-                summary: Summary = run(StageRun(workspace, out, job.progress, resumed, extends), asked.options)
+                summary: Summary = run(
+                    StageRun(workspace, out, job.progress, resumed, extends, afresh), asked.options
+                )
             except DamagedPartialError as error:
                 log.warning("%s: starts afresh; what the interrupted run left is damaged (%s)", spec.name, error)
                 out, _ = workspace.begin(spec, token, "never")
-                summary = run(StageRun(workspace, out, job.progress), asked.options)
+                summary = run(StageRun(workspace, out, job.progress, afresh=afresh), asked.options)
     except GeorefError as error:
         workspace.partial_product(spec).fail(str(error), worthless=isinstance(error, _RESULTS))
         raise
@@ -286,6 +292,15 @@ def _run(job: _Job, token: str) -> Summary:
         workspace.partial_product(spec).fail(str(degenerate), worthless=True)
         raise degenerate from error
     return summary
+
+
+def _module(workspace: Workspace, asked: Request) -> ModuleType:
+    """Return the module that makes a stage's product, whole or in parts."""
+    spec = asked.spec
+    module = importlib.import_module(spec.module)
+    if spec.in_parts and module.made_in_parts(workspace, asked.options):
+        return importlib.import_module(spec.in_parts)
+    return module
 
 
 def _current(workspace: Workspace, asked: Request, memo: Memo) -> Manifest | None:

@@ -32,6 +32,13 @@ SPZ = "spz/splat.spz"
 TILES = "tiles/tileset.json"
 TILES_GLB = "tiles/splat.glb"
 REPORT_PAGE = "report/report.html"
+BLOCK_RECORD = "train/blocks.json"  # only of a model that was trained in blocks
+BLOCK_PLAN = "plan/plan.json"
+SOLUTION = "solution/solution.json"
+SCAFFOLD = "scaffold/gaussians.ply"
+BLOCK_GAUSSIANS = "block/gaussians.ply"
+BLOCK_TRAINING = "block/record.json"
+FIRST_CELL = "seams/0.ply"
 
 
 @dataclass(frozen=True)
@@ -98,6 +105,8 @@ class StageSpec:
         also: further products in its folder, besides those that the stages of the pipeline read.
         working: files and folders in its folder that no hash guards: other programs may change them, or the survey
             has hashes of its own.
+        in_parts: module that makes the same product in parts, with the same `run`. `made_in_parts(workspace,
+            options)` of `module` decides; without it, `module` makes all products.
     """
 
     name: str
@@ -111,6 +120,7 @@ class StageSpec:
     growing: tuple[str, ...] = ()
     also: tuple[str, ...] = ()
     working: tuple[str, ...] = ()
+    in_parts: str = ""
 
     @property
     def options(self) -> type[StageOptions]:
@@ -180,6 +190,7 @@ PIPELINE: tuple[StageSpec, ...] = (
         resumable=True,
         growing=("iterations",),
         working=("checkpoint.npz",),
+        in_parts="pipelines.blocks.stage",
     ),
     StageSpec(
         name="evaluate",
@@ -292,7 +303,62 @@ ADJUST = StageSpec(
     also=("adjust/geo_from_local.json",),
 )
 
-STAGES = (*PIPELINE, *DELIVERABLES, ADJUST)
+# Parts of a training in blocks, in variants of the workspace: all once, but for those of each block.
+PLAN_BLOCKS = StageSpec(
+    name="plan",
+    module="pipelines.blocks.plan",
+    options_place="pipelines.blocks.options:PlanOptions",
+    folder="plan",
+    reads=(MEASURED, *whole(SPARSE, SIM3), APPLIED_RIG),
+    product=BLOCK_PLAN,
+    title="Divide the survey into blocks.",
+)
+SOLVE = StageSpec(
+    name="solve",
+    module="pipelines.train.solution",
+    options_place="pipelines.train.options:SolutionOptions",
+    folder="solution",
+    reads=(MEASURED, *whole(SPARSE, SIM3, POINTS), APPLIED_RIG),
+    product=SOLUTION,
+    title="Solve similarity, cameras and exposures for all blocks.",
+)
+TRAIN_SCAFFOLD = StageSpec(
+    name="scaffold",
+    module="pipelines.train.scaffold",
+    options_place="pipelines.train.options:TrainOptions",
+    folder="scaffold",
+    reads=(MEASURED, *whole(SPARSE, SIM3, SOLUTION), APPLIED_RIG),
+    product=SCAFFOLD,
+    title="Train a coarse model of the whole, which stands in for the other blocks.",
+    resumable=True,
+    working=("checkpoint.npz",),
+)
+TRAIN_BLOCK = StageSpec(
+    name="block",
+    module="pipelines.train.block",
+    options_place="pipelines.train.options:BlockTrainOptions",
+    folder="block",
+    reads=(MEASURED, *whole(SPARSE, SIM3, BLOCK_PLAN, SOLUTION, SCAFFOLD), APPLIED_RIG),
+    product=BLOCK_GAUSSIANS,
+    title="Train the Gaussians of one block.",
+    resumable=True,
+    growing=("iterations",),
+    also=(BLOCK_TRAINING,),
+    working=("checkpoint.npz",),
+)
+TRAIN_SEAMS = StageSpec(
+    name="seams",
+    module="pipelines.train.seams",
+    options_place="pipelines.train.options:SeamOptions",
+    folder="seams",
+    reads=(MEASURED, *whole(SPARSE, SIM3, BLOCK_PLAN, SOLUTION, SCAFFOLD), APPLIED_RIG),
+    product=FIRST_CELL,
+    title="Adapt the Gaussians along the seams of the blocks to each other.",
+    resumable=True,
+)
+BLOCK_PARTS = (PLAN_BLOCKS, SOLVE, TRAIN_SCAFFOLD, TRAIN_BLOCK, TRAIN_SEAMS)
+
+STAGES = (*PIPELINE, *DELIVERABLES, ADJUST, *BLOCK_PARTS)
 BY_NAME = {spec.name: spec for spec in (*PIPELINE, *DELIVERABLES)}
 
 

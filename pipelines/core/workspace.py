@@ -59,6 +59,7 @@ class StageRun:
         resumed: whether `out` holds the partial product of an interrupted run with the same inputs and options.
         extends: the stage's finished folder, made from the same inputs with smaller values of its growing options;
             the run may start from it, and does not change it. None: there is none.
+        afresh: whether nothing that earlier runs have left may be taken over.
     """
 
     workspace: Workspace
@@ -66,6 +67,7 @@ class StageRun:
     progress: Progress = SILENT
     resumed: bool = False
     extends: Path | None = None
+    afresh: bool = False
 
     def record_progress(self, text: str) -> None:
         """Record how far the run has come (`1500 of 7000 iterations`): from now on it is not dropped unasked."""
@@ -81,20 +83,23 @@ class Workspace:
         base: for a variant, the workspace that it varies; that one holds the photographs, the cache and
             `georef.toml`.
         lent: for a variant, stage folders outside it, by name. The variant reads them and never writes them.
+        command: for a variant, the command that makes its products.
     """
 
     root: Path
     base: Workspace | None = None
     lent: Mapping[str, Path] = field(default_factory=dict, hash=False)
+    command: str = ""
 
-    def variant(self, place: str, lent: Mapping[str, Path]) -> Workspace:
+    def variant(self, place: str, lent: Mapping[str, Path], command: str) -> Workspace:
         """Return a variant in the folder `place` of this workspace; some stages run in it with other options.
 
         Args:
             place: path relative to `root`.
             lent: by name, the folders of all stages that the variant reads but does not run.
+            command: that makes the variant's products: `compare`.
         """
-        return Workspace(self.root / place, self, lent)
+        return Workspace(self.root / place, self, lent, command)
 
     def path(self, product: str) -> Path:
         """Return the path of a finished product.
@@ -106,7 +111,7 @@ class Workspace:
         path = self._folder(folder) / inside
         if not path.exists():
             name, home = producer_of(product).name, self.base or self
-            raise MissingProductError(product, f"georef {'compare' if self.base else name} {home.root}")
+            raise MissingProductError(product, f"georef {self.command or name} {home.root}")
         return path
 
     def _folder(self, name: str) -> Path:

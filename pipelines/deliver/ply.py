@@ -26,4 +26,4 @@ def run(stage: StageRun, options: ExportPlyOptions) -> Summary:
     path = stage.out / SPLAT.rpartition("/")[2]
     write_gaussians(path, splat.gaussians)
     write_sidecar(splat.placement.sidecar(), path)
-    return Summary(splat.key_figure(), splat.figures(), cautions=splat.placement.cautions)
+    return Summary(splat.figures.key_figure(), splat.figures.values(), cautions=splat.placement.cautions)

@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
+import numpy as np
 import torch
+from scipy.special import expit
 
-from pipelines.core.errors import DegenerateGeometryError
+from pipelines.core.errors import DegenerateGeometryError, InputError
 from pipelines.core.products import load_json
-from pipelines.core.stages import GAUSSIANS, MODEL
+from pipelines.core.stages import BLOCK_RECORD, GAUSSIANS, MODEL
+from pipelines.core.types import BoolArray, Float32Array
 from pipelines.core.workspace import Workspace
-from pipelines.deliver.options import SplatOptions
+from pipelines.deliver.options import SplatOptions, WebSplatOptions
 from pipelines.deliver.placement import Placement, place
-from pipelines.formats.splat_ply import SplatArrays
+from pipelines.formats.splat_ply import SplatArrays, read_centres, read_logit_opacities
+from pipelines.scene.block_record import BlockRecord
 from pipelines.scene.calibrated import load_survey
 from pipelines.scene.survey import Survey
 from pipelines.scene.trained_model import TrainedModel
@@ -20,6 +27,38 @@ from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.sh import coefficient_count
 from pipelines.splat.storage import read_gaussians
 from pipelines.splat.transform import transformed
+
+
+@dataclass(frozen=True)
+class SplatFigures:
+    """What every deliverable of the splat tells.
+
+    Attributes:
+        placement: place of its frame on Earth.
+        count: number of the opaque Gaussians.
+        left_out: number of Gaussians that were too transparent.
+    """
+
+    placement: Placement
+    count: int
+    left_out: int
+
+    def values(self) -> dict[str, object]:
+        """Return counts, origin and predicted σ."""
+        accuracy = self.placement.sidecar().accuracy
+        return {
+            "gaussians": self.count,
+            "left_out": self.left_out,
+            "origin_lla": tuple(self.placement.origin_lla.tolist()),
+            "sigma_h_m": None if accuracy is None else accuracy.sigma_h_m,
+            "sigma_v_m": None if accuracy is None else accuracy.sigma_v_m,
+        }
+
+    def key_figure(self) -> str:
+        """Return the number of Gaussians and the predicted σ, in one line."""
+        accuracy = self.placement.sidecar().accuracy
+        sigma = "" if accuracy is None else f", σ {accuracy.sigma_h_m:.3f} m H, {accuracy.sigma_v_m:.3f} m V"
+        return f"{self.count} Gaussians{sigma}"
 
 
 @dataclass(frozen=True)
@@ -36,22 +75,47 @@ class PlacedSplat:
     placement: Placement
     left_out: int
 
-    def figures(self) -> dict[str, object]:
-        """Return the figures that every deliverable of the splat tells: counts, origin, predicted σ."""
-        accuracy = self.placement.sidecar().accuracy
-        return {
-            "gaussians": len(self.gaussians),
-            "left_out": self.left_out,
-            "origin_lla": tuple(self.placement.origin_lla.tolist()),
-            "sigma_h_m": None if accuracy is None else accuracy.sigma_h_m,
-            "sigma_v_m": None if accuracy is None else accuracy.sigma_v_m,
-        }
+    @property
+    def figures(self) -> SplatFigures:
+        """Counts, origin, predicted σ."""
+        return SplatFigures(self.placement, len(self.gaussians), self.left_out)
 
-    def key_figure(self) -> str:
-        """Return the number of Gaussians and the predicted σ, in one line."""
-        accuracy = self.placement.sidecar().accuracy
-        sigma = "" if accuracy is None else f", σ {accuracy.sigma_h_m:.3f} m H, {accuracy.sigma_v_m:.3f} m V"
-        return f"{len(self.gaussians)} Gaussians{sigma}"
+
+@dataclass(frozen=True)
+class SplatParts:
+    """Splat in the frame `file` of its placement, read part by part: each block of a training in blocks is one.
+
+    Attributes:
+        path: of the trained Gaussians.
+        rows: of the file, one range for each part.
+        placement: place of the frame on Earth.
+        center_in_file: (N, 3) metres, of all opaque Gaussians.
+        left_out: number of Gaussians that were too transparent.
+        sh_degree: of the harmonics to deliver.
+        options: least opacity.
+    """
+
+    path: Path
+    rows: tuple[slice, ...]
+    placement: Placement
+    center_in_file: Float32Array
+    left_out: int
+    sh_degree: int
+    options: SplatOptions
+
+    def __iter__(self) -> Iterator[SplatArrays]:
+        """Yield the opaque Gaussians of each part that has any."""
+        for rows in self.rows:
+            gaussians = read_gaussians(self.path, rows)
+            opaque = _is_opaque(gaussians.logit_opacities.numpy(), self.options)
+            if opaque.any():
+                kept = gaussians.select(torch.from_numpy(opaque))
+                yield codec_arrays(transformed(kept, self.placement.file_from_model), self.sh_degree)
+
+    @property
+    def figures(self) -> SplatFigures:
+        """Counts, origin, predicted σ."""
+        return SplatFigures(self.placement, len(self.center_in_file), self.left_out)
 
 
 def load_splat(workspace: Workspace, options: SplatOptions) -> PlacedSplat:
@@ -67,6 +131,43 @@ def load_splat(workspace: Workspace, options: SplatOptions) -> PlacedSplat:
     return placed_splat(read_gaussians(workspace.path(GAUSSIANS)), model, survey, options)
 
 
+def load_splat_parts(workspace: Workspace, options: WebSplatOptions) -> SplatParts:
+    """Return the splat of a workspace, placed on Earth, to be read part by part.
+
+    Raises:
+        MissingProductError: ingest or train has not been run.
+        InputError: a product is damaged.
+        DegenerateGeometryError: no Gaussian is opaque enough.
+    """
+    survey = load_survey(workspace)
+    model = load_json(TrainedModel, workspace.path(MODEL))
+    path = workspace.path(GAUSSIANS)
+    centers, opaque = read_centres(path), _is_opaque(read_logit_opacities(path), options)
+    _require_opaque(opaque, options)
+    placement = place(model, survey, centers)
+    center_in_file = placement.file_from_model.apply(centers[opaque]).astype(np.float32)
+    rows = _rows_of_blocks(workspace, len(centers))
+    trained = read_gaussians(path, slice(0, 1)).sh_degree
+    degree = trained if options.sh_degree is None else min(options.sh_degree, trained)
+    return SplatParts(path, rows, placement, center_in_file, int((~opaque).sum()), degree, options)
+
+
+def _rows_of_blocks(workspace: Workspace, count: int) -> tuple[slice, ...]:
+    """Return the ranges of rows that blocks have trained; of another training, one range.
+
+    Raises:
+        InputError: the record of the blocks speaks of another number of Gaussians.
+    """
+    record = workspace.root / BLOCK_RECORD
+    if not record.is_file():
+        return (slice(0, count),)
+    numbers = [block.training.gaussians_in_cell for block in load_json(BlockRecord, record).blocks]
+    ends = np.cumsum([0, *numbers]).tolist()
+    if ends[-1] != count:
+        raise InputError(f"its blocks have {ends[-1]} Gaussians, and {GAUSSIANS} has {count}", path=record)
+    return tuple(slice(first, last) for first, last in itertools.pairwise(ends))
+
+
 def placed_splat(gaussians: Gaussians, model: TrainedModel, survey: Survey, options: SplatOptions) -> PlacedSplat:
     """Return the opaque Gaussians of a model in an East-North-Up frame at the scene.
 
@@ -79,15 +180,24 @@ def placed_splat(gaussians: Gaussians, model: TrainedModel, survey: Survey, opti
     Raises:
         DegenerateGeometryError: no Gaussian is opaque enough.
     """
-    kept = gaussians.select(torch.sigmoid(gaussians.logit_opacities) >= options.min_opacity)
-    if len(kept) == 0:
-        raise DegenerateGeometryError(
-            f"none of {len(gaussians)} Gaussians has an opacity of {options.min_opacity} or more: "
-            "lower --min-opacity"
-        )
+    opaque = _is_opaque(gaussians.logit_opacities.numpy(), options)
+    _require_opaque(opaque, options)
+    kept = gaussians.select(torch.from_numpy(opaque))
     # The placement is that of the model, whatever part of it a file holds.
     placement = place(model, survey, gaussians.means.numpy())
     return PlacedSplat(transformed(kept, placement.file_from_model), placement, len(gaussians) - len(kept))
+
+
+def _is_opaque(logit_opacities: Float32Array, options: SplatOptions) -> BoolArray:
+    opaque: BoolArray = expit(logit_opacities) >= options.min_opacity
+    return opaque
+
+
+def _require_opaque(opaque: BoolArray, options: SplatOptions) -> None:
+    if not opaque.any():
+        raise DegenerateGeometryError(
+            f"none of {len(opaque)} Gaussians has an opacity of {options.min_opacity} or more: lower --min-opacity"
+        )
 
 
 def codec_arrays(gaussians: Gaussians, sh_degree: int | None = None) -> SplatArrays:

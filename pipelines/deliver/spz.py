@@ -42,6 +42,6 @@ def run(stage: StageRun, options: ExportSpzOptions) -> Summary:
     except InputError as error:
         raise InputError(f"{error}: georef export-tiles writes scenes of any size") from error
     write_sidecar(splat.placement.sidecar(ENU_FROM_RUB), path)
-    values = {**splat.figures(), "spz_version": version, "bytes": path.stat().st_size}
+    values = {**splat.figures.values(), "spz_version": version, "bytes": path.stat().st_size}
     size = f"{path.stat().st_size / 2**20:.1f} MiB"
-    return Summary(f"{splat.key_figure()}, {size}", values, cautions=splat.placement.cautions)
+    return Summary(f"{splat.figures.key_figure()}, {size}", values, cautions=splat.placement.cautions)

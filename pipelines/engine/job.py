@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol
 
 from pipelines.core.progress import Progress
@@ -22,12 +23,18 @@ class Job:
         arguments: of `georef`.
         peak_bytes: predicted peak of the memory.
         uses_gpu: whether it takes a whole GPU.
+        folder: that its command works in, such as the workspace; a machine that does not see it cannot run the job.
+        writes: file or folder in `folder` that it changes; needed where its files go through a storage.
+        reads: further files and folders in `folder` that it needs there.
     """
 
     name: str
     arguments: tuple[str, ...]
     peak_bytes: int
     uses_gpu: bool = False
+    folder: Path | None = None
+    writes: Path | None = None
+    reads: tuple[Path, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -61,6 +68,9 @@ class JobEnd:
 
 class Engine(Protocol):
     """Runner of jobs."""
+
+    def together(self, jobs: Sequence[Job]) -> int:
+        """Return how many of the jobs run at a time at the beginning; at least 1."""
 
     def run(self, title: str, jobs: Sequence[Job], ended: Callable[[JobEnd], None], progress: Progress) -> None:
         """Run jobs until all have ended; one that fails stops no other.

@@ -10,15 +10,15 @@ from dataclasses import dataclass, field
 
 from pipelines.core.interrupts import deferred_interrupts
 from pipelines.core.progress import Progress
-from pipelines.core.sentences import duration
+from pipelines.engine import process
+from pipelines.engine.display import JobDisplay, tell_end
 from pipelines.engine.job import Job, JobEnd
-from pipelines.engine.process import JobProcess
+from pipelines.engine.process import JobProcess, ProcessEnd
 
 log = logging.getLogger(__name__)
 
 _LOOK_EVERY_S = 0.2
 _USABLE = 0.9  # of the free memory: other programs grow, too
-THIS_PROGRAM = ("-m", "georef_cli")
 
 
 @dataclass(frozen=True)
@@ -35,15 +35,11 @@ class LocalEngine:
     at_a_time: int
     cores: int
     free_bytes: int | None = None
-    program: tuple[str, ...] = field(default_factory=lambda: THIS_PROGRAM)
+    program: tuple[str, ...] = field(default_factory=lambda: process.THIS_PROGRAM)
 
-    def together(self, jobs: Iterable[Job]) -> int:
-        """Return how many of the jobs run at a time at the beginning; at least 1."""
-        running: list[Job] = []
-        for job in jobs:
-            if self._admits(job, running):
-                running.append(job)
-        return max(len(running), 1)
+    def together(self, jobs: Sequence[Job]) -> int:
+        """Return how many of the jobs run at a time at the beginning; see `Engine`."""
+        return max(len(self._startable(jobs, [])), 1)
 
     def run(self, title: str, jobs: Sequence[Job], ended: Callable[[JobEnd], None], progress: Progress) -> None:
         """Run jobs until all have ended; see `Engine`.
@@ -51,51 +47,50 @@ class LocalEngine:
         A job that needs more memory than there is runs alone. Smaller jobs pass one that has to wait for memory.
         """
         threads = max(self.cores // self.together(jobs), 1)
-        waiting, running = list(jobs), dict[str, JobProcess]()
+        waiting, running = list(jobs), dict[str, _RunningJob]()
 
         def end_of(end: JobEnd) -> None:
-            _tell(end)
+            tell_end(end)
             task.advance(left_s=math.inf)
             ended(end)
 
-        finished: queue.Queue[JobProcess] = queue.Queue()
+        finished: queue.Queue[JobEnd] = queue.Queue()
         with progress.task(title, len(jobs)) as task, deferred_interrupts() as stop:
             try:
                 is_stopping = False
                 while running or (waiting and not stop.requested):
                     if not stop.requested:
-                        for job in self._startable(waiting, running.values()):
+                        for job in self._startable(waiting, [other.job for other in running.values()]):
                             log.info("%s: started with %d thread%s", job.name, threads, "" if threads == 1 else "s")
                             waiting.remove(job)
                             try:
-                                running[job.name] = JobProcess(job, self.program, threads, progress, finished)
+                                running[job.name] = _RunningJob(job, self.program, threads, progress, finished)
                             except OSError as error:  # a command line that is too long, no more processes
                                 end_of(JobEnd(job, 1, 0.0, "", f"cannot be started: {error.strerror}"))
                     elif not is_stopping:
                         is_stopping = True
                         log.warning("stopping %d %s: Ctrl-C again ends them at once", len(running), title)
-                        for process in running.values():
-                            process.interrupt()
+                        for job_process in running.values():
+                            job_process.interrupt()
                     try:
-                        end = finished.get(timeout=_LOOK_EVERY_S).end()
+                        end = finished.get(timeout=_LOOK_EVERY_S)
                     except queue.Empty:
                         continue
                     del running[end.job.name]
                     end_of(end)
             finally:
-                for process in running.values():
-                    process.kill()
+                for job_process in running.values():
+                    job_process.kill()
             if stop.requested:
                 raise KeyboardInterrupt
 
-    def _startable(self, waiting: Sequence[Job], running: Iterable[JobProcess]) -> list[Job]:
+    def _startable(self, waiting: Iterable[Job], running: Sequence[Job]) -> list[Job]:
         """Return the waiting jobs that may start beside those that run."""
-        beside = [process.job for process in running]
-        before = len(beside)
+        beside = list(running)
         for job in waiting:
             if self._admits(job, beside):
                 beside.append(job)
-        return beside[before:]
+        return beside[len(running) :]
 
     def _admits(self, job: Job, running: Sequence[Job]) -> bool:
         """Return whether a job may run beside others."""
@@ -107,10 +102,16 @@ class LocalEngine:
         return self.free_bytes is None or needed <= _USABLE * self.free_bytes
 
 
-def _tell(end: JobEnd) -> None:
-    if end.is_done:
-        log.info("%s: done (%s)", end.job.name, duration(end.seconds))
-    elif end.is_interrupted:
-        log.warning("%s: interrupted at %s", end.job.name, end.place or "its start")
-    else:
-        log.error("%s: failed%s: %s", end.job.name, f" at {end.place}" if end.place else "", end.error)
+class _RunningJob(JobProcess):
+    """Process of a job, whose messages are shown, and whose end is put into a queue."""
+
+    def __init__(
+        self, job: Job, program: Sequence[str], threads: int, progress: Progress, finished: queue.Queue[JobEnd]
+    ) -> None:
+        self.job, self._finished = job, finished
+        self._display = JobDisplay(progress, job.name)
+        super().__init__(program, job.arguments, threads, self._display.take, self._put)
+
+    def _put(self, end: ProcessEnd) -> None:
+        self._display.close()
+        self._finished.put(JobEnd(self.job, end.code, end.seconds, self._display.place, end.error))

@@ -18,7 +18,7 @@ from pipelines.evaluate.point_report import (
     cross_validation_errors,
     point_residuals,
 )
-from pipelines.georef.posterior import LeftOut, leave_one_out
+from pipelines.georef.leave_one_out import LeftOut, leave_one_out
 from pipelines.robust.statistics import residual_stats
 from pipelines.scene.fix_differences import fix_differences
 from pipelines.scene.marks import MarkRays, mark_rays

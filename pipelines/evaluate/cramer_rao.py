@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
-from scipy.sparse import csr_matrix, hstack
+from scipy.sparse import bsr_matrix, csr_matrix, diags, hstack
 
 from pipelines.accuracy.networks import control_points, control_rays, in_geo, network_of_points
 from pipelines.core.errors import DegenerateGeometryError
@@ -30,11 +30,14 @@ from pipelines.geometry.bundle import (
     sparse_jacobian,
     with_positive_depths,
 )
+from pipelines.geometry.bundle_information import EliminatedPoints, eliminate_points
+from pipelines.geometry.sparse_cholesky import SparseCholesky
 from pipelines.scene.marks import MarkRays
 from pipelines.scene.solved_survey import SolvedSurvey
 
 _WORST_SCALED = 1e-10  # least pivot of the scaled normal matrix: a smaller one leaves a direction undetermined
-_RIDGE = 1e-12  # for a point that its rays do not determine
+_RIDGE = 1e-12  # small, so that it does not hide an open direction
+_OPEN = "the observations leave cameras or lens open: there is no bound"
 
 
 @dataclass(frozen=True)
@@ -77,22 +80,37 @@ class CameraInformation:
     """
 
     def __init__(self, ties: Network, sigma_px: float, anchors: Anchors) -> None:
-        information = _eliminated(ties, np.full(len(ties.obs_point), sigma_px), None)
-        inverse = np.linalg.inv(anchors.cov_fix)
-        place = (6 * anchors.camera)[:, None] + np.arange(3, 6)
-        np.add.at(information, (place[:, :, None], place[:, None, :]), inverse)
-        if anchors.control is not None and anchors.control_sigma_px is not None:
-            information += _eliminated(anchors.control, anchors.control_sigma_px, anchors.cov_control)
-        diagonal = np.diag(information)
+        sums = _eliminated(ties, np.full(len(ties.obs_point), sigma_px), None)
+        if anchors.control is not None and anchors.control_sigma_px is not None and anchors.cov_control is not None:
+            sums = sums + _eliminated(
+                anchors.control, anchors.control_sigma_px, np.asarray(np.linalg.inv(anchors.cov_control))
+            )
+        poses = sums.poses + _information_of_fixes(anchors, len(ties.camera_id))
+        poses = (poses + diags((poses.diagonal() == 0).astype(float))).tobsr((6, 6))  # cameras without observations
+        diagonal = np.concatenate([poses.diagonal(), np.diag(sums.lens)])
         self._used = np.flatnonzero(diagonal > 0)  # shorter parameter lists leave empty columns
         self._unit = 1.0 / np.sqrt(diagonal[self._used])
-        scaled = information[np.ix_(self._used, self._used)] * self._unit[:, None] * self._unit
+        n, lens = poses.shape[0], self._used[poses.shape[0] :] - poses.shape[0]
+        of_poses, of_lens = self._unit[:n], self._unit[n:]
+        scaled = (diags(of_poses) @ poses @ diags(of_poses)).tobsr((6, 6))
+        self._cross = sums.cross[:, lens] * of_poses[:, None] * of_lens
         try:
-            self._factor = cho_factor(scaled, lower=True)
-        except np.linalg.LinAlgError:
-            self._factor = (np.zeros_like(scaled), True)
-        if np.diag(self._factor[0]).min() ** 2 < _WORST_SCALED:
-            raise DegenerateGeometryError("the observations leave cameras or lens open: there is no bound")
+            self._factor = SparseCholesky(scaled, ties.cam_center_in_world)
+            self._response = self._factor.solve(self._cross)
+            within = sums.lens[np.ix_(lens, lens)] * of_lens[:, None] * of_lens - self._cross.T @ self._response
+            self._of_lens = cho_factor(within, lower=True)
+        except (np.linalg.LinAlgError, DegenerateGeometryError) as error:
+            raise DegenerateGeometryError(_OPEN) from error
+        least = min(self._factor.least_pivot, float(np.diag(self._of_lens[0]).min(initial=1.0)))
+        if least**2 < _WORST_SCALED:
+            raise DegenerateGeometryError(_OPEN)
+
+    def _solved(self, right: FloatArray) -> FloatArray:
+        """Return the product (6 n + L, m) of the inverse scaled information and vectors of the same shape."""
+        n = len(self._cross)
+        poses = self._factor.solve(right[:n])
+        lens = cho_solve(self._of_lens, right[n:] - self._cross.T @ poses)
+        return np.concatenate([poses - self._response @ lens, lens])
 
     def bound(self, wanted: Network, sigma_px: FloatArray) -> FloatArray:
         """Return the least covariance (J, 3, 3) in m² of points that are observed only by their marks.
@@ -121,7 +139,7 @@ class CameraInformation:
         by_cameras = rows.by_cameras.toarray()[:, self._used] * self._unit
         response = (right.T / value) @ left[:, :3].T @ by_cameras  # of the point to the cameras
         free = left[:, 3:].T @ by_cameras  # combinations of the marks that do not depend on the point
-        solved = cho_solve(self._factor, np.concatenate([response, free]).T)
+        solved = self._solved(np.concatenate([response, free]).T)
         of_response, of_free = solved[:, :3], solved[:, 3:]
         gain = np.linalg.solve(np.eye(len(free)) + free @ of_free, free @ of_response)
         cov = (right.T / value**2) @ right + response @ of_response - (response @ of_free) @ gain
@@ -148,25 +166,23 @@ def _rows(network: Network, sigma_px: FloatArray) -> _Rows:
     return _Rows(hstack([poses, lens], format="csr"), lin.jacobian_point * whiten)
 
 
-def _eliminated(network: Network, sigma_px: FloatArray, cov_known: FloatArray | None) -> FloatArray:
-    """Return the information of cameras and lens (6 n + L, 6 n + L), with the points eliminated.
+def _eliminated(network: Network, sigma_px: FloatArray, surveyed: FloatArray | None) -> EliminatedPoints:
+    """Return the information of cameras and lens, with the points eliminated.
 
     Args:
         network: N points and their M observations.
         sigma_px: (M,) σ of the observations.
-        cov_known: (N, 3, 3) covariances of points that were also surveyed; None: they were not.
+        surveyed: (N, 3, 3) information on points that were also surveyed, 1/m²; None: they were not.
     """
     sigma_px, network = sigma_px[has_positive_depth(network)], with_positive_depths(network)
-    rows, count = _rows(network, sigma_px), len(network.point_in_world)
-    normal = np.zeros((count, 3, 3))
-    np.add.at(normal, network.obs_point, np.swapaxes(rows.by_point, 1, 2) @ rows.by_point)
-    if cov_known is not None:
-        normal += np.linalg.inv(cov_known)
-    normal += (_RIDGE * np.trace(normal, axis1=1, axis2=2) + _RIDGE)[:, None, None] * np.eye(3)
-    root = np.swapaxes(np.linalg.inv(np.linalg.cholesky(normal)), 1, 2)
-    point = sparse_jacobian(rows.by_point @ root[network.obs_point], network.obs_point, count)
-    cross = rows.by_cameras.T @ point
-    return np.asarray((rows.by_cameras.T @ rows.by_cameras - cross @ cross.T).toarray())
+    return eliminate_points(network, 1.0 / sigma_px, surveyed, ridge=_RIDGE)
+
+
+def _information_of_fixes(anchors: Anchors, cameras: int) -> bsr_matrix:
+    """Return the information (6 n, 6 n) of the fixes on the poses."""
+    blocks = np.zeros((cameras, 6, 6))
+    np.add.at(blocks[:, 3:, 3:], anchors.camera, np.linalg.inv(anchors.cov_fix))
+    return bsr_matrix((blocks, np.arange(cameras), np.arange(cameras + 1)), shape=(6 * cameras, 6 * cameras))
 
 
 def cramer_rao_bound(solved: SolvedSurvey, rays: MarkRays) -> FloatArray:
@@ -180,10 +196,8 @@ def cramer_rao_bound(solved: SolvedSurvey, rays: MarkRays) -> FloatArray:
         DegenerateGeometryError: too many cameras, or the measurements do not determine cameras and lens.
     """
     scene, trained = solved.scene, solved.trained
-    if scene.correction_basis is None:
-        raise DegenerateGeometryError(f"{len(scene.sparse.image_name)} cameras are too many for the bound")
     network = in_geo(scene.network, trained.geo_from_model)
-    information = CameraInformation(network, scene.correction_basis.sigma_px, _anchors(solved, network))
+    information = CameraInformation(network, scene.bundle.sigma_px, _anchors(solved, network))
     position = np.array([point.position_in_geo for point in trained.survey.check_points]).reshape(-1, 3)
     return information.bound(network_of_points(network, position, rays.point, rays.camera), rays.sigma_px)
 

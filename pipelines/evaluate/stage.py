@@ -48,7 +48,7 @@ def run(stage: StageRun, options: EvaluateOptions) -> Summary:
     """Evaluate the trained survey, write report, renders and predicted accuracy, and return the summary.
 
     Raises:
-        BackendUnavailableError: `--backend cuda` without a GPU or without gsplat; `--reference` without py4dgeo.
+        BackendUnavailableError: `--backend cuda` or `--reference`, and a part that it needs is missing; names each.
         GeorefError: a product, a photograph or the LPIPS weights cannot be read, or the CRS cannot be used.
     """
     trained = load_trained(stage.workspace, options.similarity)
@@ -56,7 +56,7 @@ def run(stage: StageRun, options: EvaluateOptions) -> Summary:
     crs = None if options.crs is None else target_crs(options.crs, trained.survey)
     images = photographs(trained.sfm, trained.survey, stage.workspace, trained.model.max_image_size)
     images.build(stage.progress)
-    renderer = ModelRenderer(trained, images, rasterizer(options.backend))
+    renderer = ModelRenderer(trained, images, rasterizer(options.backend, stage.progress))
     propagation = propagate_errors(stage.workspace, trained)
     renders = stage.out / "renders"
     renders.mkdir(parents=True, exist_ok=True)

@@ -7,17 +7,19 @@ from typing import Any
 from pipelines.core.sentences import listed
 from pipelines.core.workspace import Summary
 from pipelines.evaluate.asprs import LEAST_POINTS, few_points
-from pipelines.scene.report import CheckPointErrors, CheckPoints, EvaluationReport
+from pipelines.scene.report import CheckPointErrors, CheckPoints, EvaluationReport, PhotometricFigures
 
 
 def summarise(report: EvaluationReport) -> Summary:
     """Return headline, figures, warnings and cautions of a report, for the command line."""
     test, ways = report.photometric.test, _by_way(report.checkpoints)
-    parts = [f"test PSNR {test.psnr:.2f} dB" if test.psnr is not None else "no test views"]
+    parts = [_test_views(test)]
     parts += [f"check points by {way} {errors.mean_h_m:.3f} m H" for way, errors in ways.items() if errors.count]
     values: dict[str, Any] = {
         "views": test.views,
         "psnr": test.psnr,
+        "psnr_covered": test.psnr_covered,
+        "covered_share": test.covered_share,
         "psnr_compensated": test.psnr_compensated,
         "ssim": test.ssim,
     }
@@ -30,6 +32,14 @@ def summarise(report: EvaluationReport) -> Summary:
             f"{way}_rmse_3d_m": errors.rmse_3d_m,
         }
     return Summary(", ".join(parts), values, _warnings(report), report.cautions)
+
+
+def _test_views(test: PhotometricFigures) -> str:
+    if test.psnr is None:
+        return "no test views"
+    if test.psnr_covered is None or test.covered_share is None:
+        return f"test PSNR {test.psnr:.2f} dB"
+    return f"test PSNR {test.psnr:.2f} dB, {test.psnr_covered:.2f} dB on the {test.covered_share:.0%} covered"
 
 
 def _by_way(checkpoints: CheckPoints) -> dict[str, CheckPointErrors]:

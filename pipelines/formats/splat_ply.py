@@ -6,6 +6,7 @@ natural logarithms, the rotation is wxyz, `f_rest` is ordered by channel, the no
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -54,6 +55,11 @@ class SplatArrays:
         return SplatArrays(**{name: values[index] for name, values in vars(self).items()})
 
 
+def concatenated(parts: Sequence[SplatArrays]) -> SplatArrays:
+    """Return all rows of parts of one SH degree, in order."""
+    return SplatArrays(**{name: np.concatenate([vars(part)[name] for part in parts]) for name in vars(parts[0])})
+
+
 def write_splat_ply(path: Path, splat: SplatArrays) -> None:
     """Write Gaussians; the file appears whole or not at all.
 
@@ -78,13 +84,44 @@ def write_splat_ply(path: Path, splat: SplatArrays) -> None:
     replace_file(draft, path)
 
 
-def read_splat_ply(path: Path) -> SplatArrays:
+def join_splat_plys(parts: Sequence[Path], path: Path) -> int:
+    """Write the Gaussians of files of one SH degree into one file, and return their number.
+
+    No more than one part is in memory; the file appears whole or not at all.
+
+    Args:
+        parts: at least one, as `write_splat_ply` writes them.
+        path: of the file.
+
+    Raises:
+        InputError: a part is not a PLY of that form, or has other properties than the first one.
+        OSError: the file cannot be written.
+    """
+    tables = [_read_table(part) for part in parts]
+    for table in tables[1:]:
+        if table.names != tables[0].names:
+            raise InputError(f"has other properties than {parts[0]}: they cannot be joined", path=table.path)
+    count = sum(len(table) for table in tables)
+    draft = path.with_name(path.name + ".tmp")
+    with draft.open("wb") as stream:
+        stream.write(_header(count, tables[0].names))
+        for table in tables:
+            table.columns(table.names).astype("<f4", copy=False).tofile(stream)
+    replace_file(draft, path)
+    return count
+
+
+def read_splat_ply(path: Path, rows: slice = slice(None)) -> SplatArrays:
     """Read Gaussians of any SH degree from 0 to 3; other properties are ignored.
+
+    Args:
+        path: of the file.
+        rows: the Gaussians to read; the others stay unread.
 
     Raises:
         InputError: no such file, not a PLY of that form, cut off, or with values that are not finite.
     """
-    table = _read_table(path)
+    table = _read_table(path, rows)
     rest_count = sum(name.startswith("f_rest_") for name in table.names)
     if rest_count not in _REST_COUNTS:
         raise InputError(
@@ -113,17 +150,31 @@ def read_centres(path: Path) -> Float32Array:
     return _read_table(path).columns(_POSITION)
 
 
+def read_logit_opacities(path: Path) -> Float32Array:
+    """Read the logits (N,) of the opacities of Gaussians alone.
+
+    Raises:
+        InputError: as `read_splat_ply`.
+    """
+    return _read_table(path).columns(("opacity",))[:, 0]
+
+
+def _header(count: int, names: Sequence[str]) -> bytes:
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+    return "\n".join([*lines, *(f"property float {name}" for name in names), "end_header\n"]).encode("ascii")
+
+
 def _property_names(rest_count: int) -> list[str]:
     return [*_POSITION, *_NORMAL, *_DC, *(f"f_rest_{i}" for i in range(rest_count)), "opacity", *_SCALE, *_ROTATION]
 
 
-def _read_table(path: Path) -> _Table:
+def _read_table(path: Path, rows: slice = slice(None)) -> _Table:
     _check_header(path)
     try:
         vertices = PlyData.read(str(path), mmap="r")["vertex"].data
     except (PlyParseError, ValueError, OverflowError, KeyError) as error:
         raise InputError(f"damaged PLY file: {error}", path=path) from error
-    return _Table(path, tuple(vertices.dtype.names), vertices)
+    return _Table(path, tuple(vertices.dtype.names), vertices[rows])
 
 
 class _Table:
@@ -134,6 +185,9 @@ class _Table:
         self.names = names
         # With one type for all columns, as the format demands, this is a view; a file of mixed types is converted.
         self._rows = recfunctions.structured_to_unstructured(vertices, dtype=np.float32)
+
+    def __len__(self) -> int:
+        return len(self._rows)
 
     def columns(self, names: tuple[str, ...]) -> Float32Array:
         missing = [name for name in names if name not in self.names]

@@ -57,6 +57,20 @@ class Pinhole:
         slope = (np.asarray(xy_px, dtype=np.float64) - [self.cx, self.cy]) / [self.fx, self.fy]
         return np.concatenate([slope, np.ones((*slope.shape[:-1], 1))], axis=-1)
 
+    def points_at(self, depth_m: ArrayLike) -> FloatArray:
+        """Return the points (H W, 3) in the camera frame, row by row, of depths (H, W) in metres along z."""
+        depth = np.asarray(depth_m, dtype=np.float64)
+        row, column = np.divmod(np.arange(depth.size), self.width)
+        return depth.reshape(-1, 1) * self.rays(np.stack([column, row], axis=1) + 0.5)
+
+
+def pose_matrix(cam_from_world: FloatArray, cam_center_in_world: FloatArray) -> FloatArray:
+    """Return the pose (4, 4) cam ← world of a camera with a rotation (3, 3) and a centre (3,)."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = cam_from_world
+    matrix[:3, 3] = -cam_from_world @ cam_center_in_world
+    return matrix
+
 
 @dataclass(frozen=True)
 class Camera:

@@ -72,7 +72,7 @@ def footprint(rays: FloatArray, center: FloatArray, surface: PointSurface) -> Fo
     3. Where the relief makes the outline cross itself, the outline is that on the plane of its median height.
     """
     unit = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-    below = -unit[:, 2] - _SHALLOWEST * np.hypot(unit[:, 0], unit[:, 1])
+    below = _below_horizon(unit)
     clipped = bool((below < 0).any())
     seen = clipped_ring(unit, below)
     if len(seen) < 3 or center[2] <= surface.median:
@@ -83,6 +83,26 @@ def footprint(rays: FloatArray, center: FloatArray, surface: PointSurface) -> Fo
     if _crosses_itself(outline[:, :2]):
         outline = center + np.median(depth) * ray
     return Footprint(outline if _area(outline) > 0 else outline[::-1], clipped)
+
+
+def ground_points(rays: FloatArray, center: FloatArray, surface: PointSurface) -> FloatArray:
+    """Return the points (K, 3) at which rays (K, 3) from a centre (3,) first pass below a surface, z up.
+
+    NaN for rays that do not point at least `_SHALLOWEST` below the horizon, and for a centre below the surface. A
+    ray that never runs above the surface ends at the median height.
+    """
+    points = np.full(rays.shape, np.nan)
+    unit = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    falls = _below_horizon(unit) > 0
+    if center[2] > surface.median and falls.any():
+        ray = unit[falls] / -unit[falls, 2:]
+        points[falls] = center + _depths(ray, center, surface)[:, None] * ray
+    return points
+
+
+def _below_horizon(unit: FloatArray) -> FloatArray:
+    """Return by how much rays (K, 3) of length one point further down than the shallowest that are placed."""
+    return np.asarray(-unit[:, 2] - _SHALLOWEST * np.hypot(unit[:, 0], unit[:, 1]))
 
 
 def _depths(ray: FloatArray, center: FloatArray, surface: PointSurface) -> FloatArray:

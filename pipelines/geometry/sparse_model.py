@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -64,6 +64,33 @@ class SparseModel:
     def lenses(self) -> Lenses:
         """Cameras of the images, whose parameters may change."""
         return Lenses(self.cameras, self.image_camera_id)
+
+    def of_images(self, images: IntArray) -> SparseModel:
+        """Return the model of some images (K,), in ascending order, with the points that two of them observe."""
+        rows = np.unique(images)
+        place = np.full(len(self.image_name), -1)
+        place[rows] = np.arange(len(rows))
+        in_image = place[self.obs_image] >= 0
+        # Observations are sorted by point, then by image: an image may observe a point more than once.
+        pairs = np.unique(np.column_stack([self.obs_point, self.obs_image])[in_image], axis=0)
+        seen = np.bincount(pairs[:, 0], minlength=len(self.point_id)) >= 2
+        kept = np.flatnonzero(in_image & seen[self.obs_point])
+        points = np.flatnonzero(seen)
+        return replace(
+            self,
+            image_id=self.image_id[rows],
+            image_name=tuple(self.image_name[row] for row in rows),
+            image_camera_id=self.image_camera_id[rows],
+            rotation_cam_from_local=self.rotation_cam_from_local[rows],
+            translation_cam_from_local=self.translation_cam_from_local[rows],
+            point_id=self.point_id[points],
+            point_in_local=self.point_in_local[points],
+            point_rgb=self.point_rgb[points],
+            point_error_px=self.point_error_px[points],
+            obs_point=np.searchsorted(points, self.obs_point[kept]),
+            obs_image=place[self.obs_image[kept]],
+            obs_xy_px=self.obs_xy_px[kept],
+        )
 
     def points_in(self, image: int) -> IntArray:
         """Return ascending indices (K,) of the points that are observed in the image with that index."""

@@ -14,7 +14,7 @@ class EstimatedError(Product):
     Attributes:
         name: `bias`: fix minus truth, east, north, up, in m. `lever-arm`: antenna seen from the camera beyond the
             arm that the survey has applied, camera axes, in m. `boresight`: rotation vector from the true to the
-            nominal camera axes, in degrees.
+            nominal camera axes, in degrees. `lidar-shift`: LiDAR minus its true place, east, north, up, in m.
         flight: of a bias, counted from 0 in the order of time.
         unit: of `value` and `sigma`.
         value: the estimate.
@@ -22,7 +22,7 @@ class EstimatedError(Product):
         observed: σ is at most half of that of the prior.
     """
 
-    name: Literal["bias", "lever-arm", "boresight"]
+    name: Literal["bias", "lever-arm", "boresight", "lidar-shift"]
     flight: int | None = None
     unit: Literal["m", "deg"]
     value: Vector3

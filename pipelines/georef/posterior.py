@@ -1,6 +1,6 @@
-"""Linearised geographic half: its minimum, the joint covariance of all unknowns, and leave-one-out.
+"""Linearised geographic half: its minimum, and the joint covariance of all unknowns.
 
-All three come from the same normal equations (`georef.normal_equations`). Their unknowns are the similarity's
+Both come from the same normal equations (`georef.normal_equations`). Their unknowns are the similarity's
 coordinates y, the constant errors v, and the cameras' corrections z, whose prior of bundle adjustment is N(0, I).
 The weights are those of Cauchy's kernel at the present state.
 """
@@ -15,20 +15,24 @@ from torch import Tensor
 
 from pipelines.core.types import FloatArray
 from pipelines.geometry.similarity import jacobian_at, second_moment_at
+from pipelines.georef.cameras import HeldCorrections
+from pipelines.georef.linearisation import Linearisation
 from pipelines.georef.normal_equations import (
     NormalEquations,
     Observations,
+    Residuals,
     Weights,
     posterior_weights,
-    robust_weights,
 )
 from pipelines.georef.problem import GeoProblem
+from pipelines.georef.sparse_adjustment import minimise_sparse
+from pipelines.georef.sparse_linearisation import SparseLinearisation
+from pipelines.georef.sparse_observations import State
 from pipelines.georef.terms import ControlTerm
 
 _STEPS = 20  # linearisations
 _NEAR = 1e-4  # length of the step, in σ, that ends the descent
 _CHUNK = 64
-_OPEN = 1e-9  # redundancy below which the other observations leave a direction open
 _ADVICE = "fixes and control points leave the similarity open: add control points, at least 3"
 
 
@@ -64,26 +68,49 @@ class GeoEquations:
         """Columns of w."""
         return slice(7 + self.errors, len(self.normal.precision))
 
+    def residuals(self) -> Residuals:
+        """Return the whitened residuals (M, d) by kind."""
+        return self.normal.residuals()
+
+    def spread(self, weights: Weights, kind: str) -> FloatArray:
+        """Return the covariances (M, d, d) that the unknowns cause in the whitened observations of a kind."""
+        return self.normal.spread(weights, self.normal.observations[kind].jacobian)
+
+    def covariance_of_known(self, weights: Weights) -> FloatArray:
+        """Return the covariance (7 + p, 7 + p) of the similarity's coordinates y and the constant errors v."""
+        known = 7 + self.errors
+        return self.normal.inverse_times(weights, np.eye(len(self.normal.precision), known))[:known]
+
+
+def linearised(problem: GeoProblem) -> Linearisation:
+    """Return a problem about its present state, in the equations that it is solved with."""
+    return equations_of(problem) if problem.bundle is None else SparseLinearisation(problem, problem.bundle)
+
 
 def equations_of(problem: GeoProblem) -> GeoEquations:
-    """Return the normal equations of a problem, linearised about its present state."""
+    """Return the dense normal equations of a problem, linearised about its present state."""
     cameras, errors = problem.cameras, len(problem.errors)
     turns = 6 * len(cameras.center)
 
-    def residuals(y: Tensor, moved: Tensor, v: Tensor) -> dict[str, Tensor]:
+    def residuals(y: Tensor, v: Tensor, moved: Tensor) -> dict[str, Tensor]:
         return problem.whitened(problem.estimate_at(y, moved[:turns].view(-1, 6), moved[turns:], v))
 
     with torch.no_grad():
         basis = torch.cat([cameras.basis.flatten(0, 1), cameras.lens_basis])
         y, v, z = problem.similarity.y.detach(), problem.errors.vector(), cameras.z.detach()
         moved = torch.cat([cameras.corrections().flatten(), cameras.lens()])
-        white = residuals(y, moved, v)
-    by_z, by_x = {}, {}
-    if white:
-        slopes = torch.func.jacrev(residuals, argnums=(0, 1, 2), chunk_size=_CHUNK)(y, moved, v)
-        for kind, (by_y, by_moved, by_v) in slopes.items():
+        white = residuals(y, v, moved)
+    by_z: dict[str, FloatArray] = {}
+    by_x: dict[str, FloatArray] = {}
+    if white and basis.shape[1]:
+        slopes = torch.func.jacrev(residuals, argnums=(0, 1, 2), chunk_size=_CHUNK)(y, v, moved)
+        for kind, (by_y, by_v, by_moved) in slopes.items():
             by_x[kind] = _numpy(torch.cat([by_y, by_v], dim=2))
             by_z[kind] = _numpy(by_moved @ basis)
+    elif white:  # Derivatives by cameras that stay would take time and memory for all of them.
+        forward = torch.func.jacfwd(lambda known: residuals(known[:7], known[7:], moved))(torch.cat([y, v]))
+        by_x = {kind: _numpy(slope) for kind, slope in forward.items()}
+        by_z = {kind: np.zeros((*slope.shape[:2], 0)) for kind, slope in by_x.items()}
     seen = _seen(list(by_z.values()), basis.shape[1])
     observations = {
         kind: Observations(
@@ -99,18 +126,35 @@ def equations_of(problem: GeoProblem) -> GeoEquations:
     return GeoEquations(NormalEquations(observations, precision, offset, advice=_ADVICE), errors, seen)
 
 
-def minimise(problem: GeoProblem) -> None:
-    """Move a problem to the minimum of its whitened loss by Gauss–Newton, from its present state.
+def minimise(problem: GeoProblem) -> float:
+    """Move a problem from its present state to the minimum of its whitened loss; return −2 ln likelihood there.
+
+    A problem with the information of its bundle is solved in sparse equations (`georef.sparse_adjustment`), others
+    by Gauss–Newton in dense ones.
 
     Raises:
         DegenerateGeometryError: the measurements leave the similarity open.
+        ConvergenceError: cameras still move after many steps of the sparse solver.
     """
+    if problem.bundle is not None:
+        sparse = minimise_sparse(problem, problem.bundle)
+        place(problem, sparse.state)
+        return sparse.cost
     for _ in range(_STEPS):
         equations = equations_of(problem)
-        step = equations.normal.minimum().step
-        move(problem, equations, step)
-        if np.linalg.norm(step) < _NEAR:
-            return
+        minimum = equations.normal.minimum()
+        move(problem, equations, minimum.step)
+        if np.linalg.norm(minimum.step) < _NEAR:
+            break
+    return minimum.cost
+
+
+@torch.no_grad()
+def place(problem: GeoProblem, state: State) -> None:
+    """Set the state of a problem whose cameras no parameter moves."""
+    problem.cameras.hold(HeldCorrections(state.correction, state.lens))
+    problem.similarity.y.copy_(torch.from_numpy(state.similarity))
+    problem.errors.set_vector(torch.from_numpy(state.errors).to(problem.errors.sigma.device))
 
 
 @torch.no_grad()
@@ -135,10 +179,8 @@ def solution_covariances(problem: GeoProblem) -> tuple[FloatArray, FloatArray]:
     Raises:
         DegenerateGeometryError: the measurements leave the similarity open.
     """
-    equations = equations_of(problem)
-    normal, known = equations.normal, 7 + equations.errors
-    columns = np.eye(len(normal.precision), known)
-    marginal = normal.inverse_times(posterior_weights(normal.residuals()), columns)[:known]
+    linear = linearised(problem)
+    marginal = linear.covariance_of_known(posterior_weights(linear.residuals()))
     root = _numpy(problem.similarity.root)
     return root @ marginal[:7, :7] @ root.T, marginal[7:, 7:]
 
@@ -244,49 +286,6 @@ def _joint_from_parameters(problem: GeoProblem, equations: GeoEquations) -> Floa
     turn[:7, equations.similarity] = _numpy(problem.similarity.root)
     turn[7:, equations.cameras] = corrections
     return turn
-
-
-@dataclass(frozen=True)
-class LeftOut:
-    """J control points, each compared with the solution that does not use it.
-
-    Attributes:
-        error_in_geo: (J, 3) intersected minus surveyed, metres; NaN if the other observations leave it open.
-        cov_in_geo: (J, 3, 3) m², expected covariance of that error: solution, marks and survey; NaN likewise.
-    """
-
-    error_in_geo: FloatArray
-    cov_in_geo: FloatArray
-
-
-def leave_one_out(problem: GeoProblem) -> LeftOut:
-    """Return the error of each control point against the solution of all other observations, at a minimum.
-
-    The computation is linear and needs no second solution. With the normal matrix N of all observations, a point
-    with Jacobian A and weight w has the leverage H = w A N⁻¹ Aᵀ. Its residual without it is (I − H)⁻¹ r (Cook and
-    Weisberg 1982, section 2.2). The weights of the other observations are held.
-
-    Raises:
-        DegenerateGeometryError: the measurements leave the similarity open.
-    """
-    control = problem.control
-    if control is None:
-        return LeftOut(np.empty((0, 3)), np.empty((0, 3, 3)))
-    normal = equations_of(problem).normal
-    residuals = normal.residuals()
-    points, white = normal.observations[control.kind], residuals[control.kind]
-    weights, expected_weights = robust_weights(residuals), posterior_weights(residuals)
-    leverage = normal.spread(weights, points.jacobian) * weights[control.kind][:, None, None]
-    spread = normal.spread(expected_weights, points.jacobian)
-    expected = spread * expected_weights[control.kind][:, None, None]
-    error, cov = np.full((len(white), 3), np.nan), np.full((len(white), 3, 3), np.nan)
-    free = np.eye(3) - leverage
-    known = np.linalg.eigvalsh(free)[:, 0] > _OPEN
-    unwhiten = np.linalg.inv(_numpy(control.root_information)[known])
-    error[known] = (unwhiten @ np.linalg.solve(free[known], white[known][..., None]))[..., 0]
-    others = np.linalg.solve(np.eye(3) - expected[known], spread[known])
-    cov[known] = unwhiten @ (np.eye(3) + (others + np.swapaxes(others, 1, 2)) / 2) @ np.swapaxes(unwhiten, 1, 2)
-    return LeftOut(error, cov)
 
 
 def _seen(by_z: list[FloatArray], count: int) -> FloatArray | None:

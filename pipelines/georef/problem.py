@@ -8,6 +8,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
+from pipelines.geometry.bundle_information import BundleInformation
 from pipelines.geometry.cameras import Pinhole
 from pipelines.georef.cameras import CameraCorrections
 from pipelines.georef.control_by_depth import ControlByDepth, depth_residuals
@@ -38,6 +39,8 @@ class GeoProblem(torch.nn.Module):
         control_by_depth: marks of the control points, if training projects them onto the rendered depth. Then
             `depth_loss` takes the place of the control points' term in the loss, while the term stays in the
             posterior. None: the term is in both.
+        bundle: information of the image observations on the cameras. `georef.posterior` then solves the cameras in
+            sparse equations, and no parameter moves them. None: the basis of `cameras` corrects them.
     """
 
     def __init__(
@@ -51,11 +54,12 @@ class GeoProblem(torch.nn.Module):
         errors: SystematicErrors | None = None,
         learned_weights: bool = False,
         control_by_depth: ControlByDepth | None = None,
+        bundle: BundleInformation | None = None,
     ) -> None:
         super().__init__()
         self.similarity, self.cameras = similarity, cameras
         self.terms, self.control_by_depth = tuple(terms), control_by_depth
-        self.weighting, self.hold_prior = weighting, hold_prior
+        self.weighting, self.hold_prior, self.bundle = weighting, hold_prior, bundle
         self.errors = SystematicErrors() if errors is None else errors
         self.weights = TermWeights({term.kind: term.dimension for term in terms}, weighting, learned_weights)
 
@@ -68,6 +72,11 @@ class GeoProblem(torch.nn.Module):
     def control(self) -> ControlTerm | None:
         """Control points; None without any."""
         return self.term(ControlTerm)
+
+    @property
+    def corrects_cameras(self) -> bool:
+        """Whether the cameras are unknowns; otherwise they are held."""
+        return self.bundle is not None or len(self.cameras.z) > 0
 
     def term(self, kind: type[TermT]) -> TermT | None:
         """Return the term of a kind; None if there is none."""

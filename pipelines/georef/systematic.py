@@ -2,6 +2,7 @@
 
 - bias: fix minus true position of the antenna, one for each flight. Only control points make it observable.
 - lever-arm: l, the antenna seen from the camera, in the camera's axes: antenna = centre + geo_from_cam · l.
+- lidar-shift: the LiDAR minus its true place. Only its planes make it observable.
 - boresight: B = nominal_from_true. The attitudes are recorded of the nominal axes: geo_from_true = recorded · B.
 
 With the boresight, training estimates a rotation in the axes of geo that all attitudes share (compass, tilt of the
@@ -25,6 +26,7 @@ from pipelines.georef.estimated_error import EstimatedError
 # Weak priors: wider than the errors of any flight, and finite, so that unobservable errors show by their σ.
 SIGMA_BIAS_M = (5.0, 5.0, 10.0)
 SIGMA_ARM_M = 1.0
+SIGMA_LIDAR_M = 1.0
 SIGMA_BORESIGHT_RAD = math.radians(5.0)
 # A component counts as observed if its σ is at most this part of the prior's.
 OBSERVED_PART = 0.5
@@ -39,12 +41,14 @@ class SystematicErrorValues:
         arm_m: (3,) metres, antenna seen from the camera beyond the arm that the survey has applied, camera axes.
         boresight_rad: (3,) rotation vector from the true to the nominal camera axes.
         common_rad: (3,) rotation vector common to all recorded attitudes, axes of geo.
+        lidar_m: (3,) metres, LiDAR minus its true place, axes of geo.
     """
 
     bias_m: Tensor | None = None
     arm_m: Tensor | None = None
     boresight_rad: Tensor | None = None
     common_rad: Tensor | None = None
+    lidar_m: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -52,12 +56,12 @@ class ErrorBlock:
     """Three components of the vector of all errors.
 
     Attributes:
-        name: as in `TrainOptions.estimate`, or "common".
+        name: as in `TrainOptions.estimate`, or "common", or "lidar-shift".
         flight: of a bias, counted from 0; None: of all flights.
         sigma: (3) of the prior, in metres or radians.
     """
 
-    name: Literal["bias", "lever-arm", "boresight", "common"]
+    name: Literal["bias", "lever-arm", "boresight", "common", "lidar-shift"]
     flight: int | None
     sigma: tuple[float, float, float]
 
@@ -72,9 +76,12 @@ class SystematicErrors(torch.nn.Module):
         flights: number of flights whose biases to estimate; 0: no bias.
         arm: estimate the lever arm.
         attitude_sigma_rad: σ of one attitude, to estimate the boresight; None: no boresight.
+        lidar: estimate the shift of the LiDAR.
     """
 
-    def __init__(self, flights: int = 0, *, arm: bool = False, attitude_sigma_rad: float | None = None) -> None:
+    def __init__(
+        self, flights: int = 0, *, arm: bool = False, attitude_sigma_rad: float | None = None, lidar: bool = False
+    ) -> None:
         super().__init__()
         blocks = [ErrorBlock("bias", flight, SIGMA_BIAS_M) for flight in range(flights)]
         if arm:
@@ -82,6 +89,8 @@ class SystematicErrors(torch.nn.Module):
         if attitude_sigma_rad is not None:
             blocks.append(ErrorBlock("boresight", None, (SIGMA_BORESIGHT_RAD,) * 3))
             blocks.append(ErrorBlock("common", None, (attitude_sigma_rad,) * 3))
+        if lidar:
+            blocks.append(ErrorBlock("lidar-shift", None, (SIGMA_LIDAR_M,) * 3))
         self.blocks = tuple(blocks)
         self.flights = flights
         prior = np.array([block.sigma for block in self.blocks]).reshape(-1)
@@ -125,6 +134,7 @@ class SystematicErrors(torch.nn.Module):
             common.get("lever-arm"),
             common.get("boresight"),
             common.get("common"),
+            common.get("lidar-shift"),
         )
 
     def estimates(self, covariance: FloatArray) -> tuple[EstimatedError, ...]:

@@ -66,6 +66,10 @@ class Term(ABC):
     def residuals(self, at: Estimate) -> Tensor:
         """Return the residuals (M, d), predicted minus measured, in metres or radians."""
 
+    @abstractmethod
+    def incidence(self) -> tuple[Tensor, Tensor]:
+        """Return the observations (E,) and the cameras (E,) whose poses affect them, both int64."""
+
     def __len__(self) -> int:
         return len(self.root_information)
 
@@ -91,6 +95,10 @@ class FixTerm(Term):
     position_in_geo: Tensor
     root_information: Tensor
     flight: Tensor | None = None
+
+    def incidence(self) -> tuple[Tensor, Tensor]:
+        """Return one camera for each observation."""
+        return torch.arange(len(self), device=self.camera.device), self.camera
 
     def residuals(self, at: Estimate) -> Tensor:
         """Return T(c_i) + lever arm + bias − C_i (F, 3) in metres."""
@@ -129,6 +137,10 @@ class ControlTerm(Term):
     root_information: Tensor
     point_id: tuple[str, ...] = ()
     bearing_by_lens: Tensor | None = None
+
+    def incidence(self) -> tuple[Tensor, Tensor]:
+        """Return point and camera of each mark."""
+        return self.point, self.camera
 
     def residuals(self, at: Estimate) -> Tensor:
         """Return T(x_j) − X_j (J, 3) in metres, with x_j the intersection of the marks of point j."""
@@ -183,6 +195,10 @@ class AttitudeTerm(Term):
     geo_from_cam: Tensor
     root_information: Tensor
 
+    def incidence(self) -> tuple[Tensor, Tensor]:
+        """Return one camera for each observation."""
+        return torch.arange(len(self), device=self.camera.device), self.camera
+
     def residuals(self, at: Estimate) -> Tensor:
         """Return Log(R_iᵀ G_i B) (A, 3) in radians, from a camera to its recorded axes, with the boresight B."""
         turned = at.geo_from_cam(self.camera)
@@ -195,14 +211,49 @@ class AttitudeTerm(Term):
 
 
 @dataclass(frozen=True)
+class PlaneTerm(Term):
+    """Planes of a LiDAR against the surface that the photographs show: the term L_lidar.
+
+    The LiDAR may be shifted as a whole: that shift is a constant error.
+
+    Attributes:
+        point_in_model: (M, 3) float64 metres, on the surface of the photographs.
+        position_in_geo: (M, 3) float64 metres, on the plane of the LiDAR.
+        normal_in_geo: (M, 3) float64 unit normals of the planes.
+        root_information: (M, 1, 1) float64, in 1/m, of the distance between both along the normal.
+    """
+
+    kind: ClassVar[str] = "lidar"
+    dimension: ClassVar[int] = 1
+
+    point_in_model: Tensor
+    position_in_geo: Tensor
+    normal_in_geo: Tensor
+    root_information: Tensor
+
+    def incidence(self) -> tuple[Tensor, Tensor]:
+        """Return no pair: the surface of the photographs stays where it is in `model`."""
+        none = torch.zeros(0, dtype=torch.int64, device=self.position_in_geo.device)
+        return none, none
+
+    def residuals(self, at: Estimate) -> Tensor:
+        """Return n · (T(x) + shift − p) (M, 1) in metres."""
+        apart = at.geo_from_model.apply(self.point_in_model) - self.position_in_geo
+        if at.errors.lidar_m is not None:
+            apart = apart + at.errors.lidar_m
+        return (self.normal_in_geo * apart).sum(dim=1, keepdim=True)
+
+
+@dataclass(frozen=True)
 class DistanceTerm(Term):
     """Distances between P pairs of geolocated points, or of cameras with fixes: the term L_rel.
 
     The distances are functions of the fixes, not independent measurements.
 
     The points are fixed at their SfM positions. In the bundle, they would follow the corrections of the cameras.
-    These corrections keep the points' mean position, rotation and size (`geometry.bundle.correction_basis`). Fixed
-    points are therefore right to first order for the scale, the only quantity that the pairs determine.
+    These corrections keep the points' mean position, rotation and size
+    (`geometry.correction_basis.correction_basis`). Fixed points are therefore right to first order for the scale,
+    the only quantity that the pairs determine.
 
     Attributes:
         distance_in_model: (P,) float64; None: between the cameras below.
@@ -221,6 +272,11 @@ class DistanceTerm(Term):
     distance_in_geo: Tensor
     root_information: Tensor
     share: float = 1.0
+
+    def incidence(self) -> tuple[Tensor, Tensor]:
+        """Return both cameras of each pair; none for fixed points."""
+        camera = self.distance_in_geo.new_zeros((0, 2), dtype=torch.int64) if self.camera is None else self.camera
+        return torch.arange(len(camera), device=camera.device).repeat_interleave(2), camera.flatten()
 
     def residuals(self, at: Estimate) -> Tensor:
         """Return s |x_i − x_j| − |X_i − X_j| (P, 1) in metres."""

@@ -16,7 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipelines.core.types import BoolArray, FloatArray
-from pipelines.georef.normal_equations import NormalEquations, posterior_weights
+from pipelines.georef.linearisation import Linearisation
+from pipelines.georef.normal_equations import posterior_weights
 from pipelines.robust.statistics import chi2_probability_above, median_chi2, outlier_gate
 
 # Observations agree if so large a part of them is within the gate, and so many degrees of freedom check them.
@@ -78,13 +79,17 @@ def component_of(squared: FloatArray, free: FloatArray, dimension: int) -> Varia
     return VarianceComponent(used, agree, float(squared[used].sum()), float(free[used].sum()))
 
 
-def variance_components(normal: NormalEquations) -> dict[str, VarianceComponent]:
-    """Return the test of each kind of observation, from the normal equations at their minimum."""
-    residuals = normal.residuals()
+def variance_components(linear: Linearisation) -> dict[str, VarianceComponent]:
+    """Return the test of each kind of observation of a problem at its minimum.
+
+    Raises:
+        DegenerateGeometryError: the measurements leave the similarity open.
+    """
+    residuals = linear.residuals()
     weights = posterior_weights(residuals)
     components = {}
-    for kind, rows in normal.observations.items():
-        dimension = residuals[kind].shape[1]
-        absorbed = np.trace(normal.spread(weights, rows.jacobian), axis1=1, axis2=2) * weights[kind]
-        components[kind] = component_of((residuals[kind] ** 2).sum(axis=1), dimension - absorbed, dimension)
+    for kind, rows in residuals.items():
+        dimension = rows.shape[1]
+        absorbed = np.trace(linear.spread(weights, kind), axis1=1, axis2=2) * weights[kind]
+        components[kind] = component_of((rows**2).sum(axis=1), dimension - absorbed, dimension)
     return components

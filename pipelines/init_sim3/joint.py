@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from pipelines.core.errors import DegenerateGeometryError
+from pipelines.core.errors import ConvergenceError, DegenerateGeometryError
 from pipelines.core.types import BoolArray, FloatArray
 from pipelines.geometry.rotations import log_so3
 from pipelines.geometry.similarity import Similarity
@@ -20,12 +20,12 @@ from pipelines.geometry.sparse_model import SparseModel
 from pipelines.georef.adjustment import BIAS_COST
 from pipelines.georef.alignment import mean_rotation
 from pipelines.georef.estimated_error import EstimatedError
-from pipelines.georef.posterior import equations_of, minimise, solution_covariances
+from pipelines.georef.posterior import linearised, minimise, solution_covariances
 from pipelines.georef.problem import GeoProblem
 from pipelines.georef.terms import ControlTerm, FixTerm, Term
 from pipelines.georef.variance_components import VarianceComponent, component_of, variance_components
 from pipelines.scene.geographic import geo_problem
-from pipelines.scene.geographic_options import GeographicOptions
+from pipelines.scene.geographic_options import GeographicOptions, Solve
 from pipelines.scene.initial_similarity import InitialSimilarity
 from pipelines.scene.marks import RayErrors, intersect_marks, mark_angles, mark_rays
 from pipelines.scene.observations import recorded_rotations
@@ -39,7 +39,6 @@ from pipelines.scene.variance_factors import (
     with_variance_factors,
 )
 
-_OPTIONS = GeographicOptions(rel_loss=False)
 _ROUNDS, _SETTLED = 8, 0.02  # of the factors, and their relative change at which they are final
 # Level of the test below which a σ is refuted: a stated one, and one that nobody stated.
 _LEVEL: dict[SigmaSource, float] = {"stated": 0.001, "default": 0.01}
@@ -102,8 +101,16 @@ class JointAdjustment:
         return self.problem.errors.estimates(of_errors)[0]
 
 
-def adjust_jointly(survey: Survey, model: SparseModel, starts: Iterable[InitialSimilarity]) -> JointAdjustment:
+def adjust_jointly(
+    survey: Survey, model: SparseModel, starts: Iterable[InitialSimilarity], *, solve: Solve = "auto"
+) -> JointAdjustment:
     """Return the adjustment from the first start, or the likeliest of several where the first finds disagreement.
+
+    Args:
+        survey: the measurements with their stated σ.
+        model: the SfM model.
+        starts: similarities to start from.
+        solve: equations of the cameras, as in `GeographicOptions`; "auto": those that are faster.
 
     Raises:
         DegenerateGeometryError: the measurements leave the similarity open, from every start.
@@ -114,31 +121,30 @@ def adjust_jointly(survey: Survey, model: SparseModel, starts: Iterable[InitialS
     solutions, refusal = [], DegenerateGeometryError("no start for the joint adjustment")
     for start in starts:
         try:
-            solutions.append(_adjust(everything, model, start))
+            solutions.append(_adjust(everything, model, start, solve))
             if solutions[0].is_consistent:
                 break
-        except DegenerateGeometryError as error:
-            refusal = error
+        except (DegenerateGeometryError, ConvergenceError) as error:
+            refusal = DegenerateGeometryError(str(error))
     if not solutions:
         raise refusal
     return min(solutions, key=lambda solution: solution.cost)
 
 
-def _adjust(survey: Survey, model: SparseModel, start: InitialSimilarity) -> JointAdjustment:
+def _adjust(survey: Survey, model: SparseModel, start: InitialSimilarity, solve: Solve) -> JointAdjustment:
     """Alternate between the solution and the variance factors, from the stated σ."""
     scene = initial_scene(model, survey, start)
     fixed = {factor.group: factor for factor in (*_marks(survey, scene), *_attitudes(survey, model), *_ties(scene))}
     applied = applied_factors(tuple(fixed.values()))
-    problem = _solved(scene, with_variance_factors(survey, applied), start)
-    normal = equations_of(problem).normal
-    cost = normal.minimum().cost + BIAS_COST * problem.errors.flights
-    at_stated = components = variance_components(normal)
+    problem, cost = _solved(scene, with_variance_factors(survey, applied), start, solve)
+    cost += BIAS_COST * problem.errors.flights
+    at_stated = components = variance_components(linearised(problem))
     for _ in range(_ROUNDS):
         before, applied = applied, applied | _next_factors(survey, components, applied)
         if all(abs(applied.get(group, 1.0) / before.get(group, 1.0) - 1) < _SETTLED for group in _KIND):
             break
-        problem = _solved(scene, with_variance_factors(survey, applied), start)
-        components = variance_components(equations_of(problem).normal)
+        problem, _ = _solved(scene, with_variance_factors(survey, applied), start, solve)
+        components = variance_components(linearised(problem))
     factors = [
         _factor(survey, group, components[kind], applied.get(group, 1.0))
         for group, kind in _KIND.items()
@@ -148,12 +154,13 @@ def _adjust(survey: Survey, model: SparseModel, start: InitialSimilarity) -> Joi
     return JointAdjustment(weighted, scene, problem, at_stated, components, (*factors, *fixed.values()), cost)
 
 
-def _solved(scene: Scene, survey: Survey, start: InitialSimilarity) -> GeoProblem:
-    problem = geo_problem(scene, survey, start, _OPTIONS)
+def _solved(scene: Scene, survey: Survey, start: InitialSimilarity, solve: Solve) -> tuple[GeoProblem, float]:
+    """Return the problem at its minimum, and −2 ln likelihood there."""
+    options = GeographicOptions(rel_loss=False, solve=solve)
+    problem = geo_problem(scene, survey, start, options.without_photographs(len(scene.sparse.image_name)))
     if not problem.terms:
         raise DegenerateGeometryError("fewer than three positions of one kind take part in a joint adjustment")
-    minimise(problem)
-    return problem
+    return problem, minimise(problem)
 
 
 def _next_factors(
@@ -233,9 +240,7 @@ def _independent(survey: Survey, group: Group, component: VarianceComponent) -> 
 
 def _ties(scene: Scene) -> list[VarianceFactor]:
     """State the variance of the image observations of tie points, in square pixels: SfM knows no σ beforehand."""
-    basis, network = scene.correction_basis, scene.network
-    if basis is None:
-        return []
+    network = scene.network
     rows = len(network.obs_point)
     free = 2 * rows - 6 * len(network.camera_id) - 3 * len(network.point_in_world)
     return [
@@ -244,7 +249,7 @@ def _ties(scene: Scene) -> list[VarianceFactor]:
             count=rows,
             used=rows,
             redundancy=free,
-            estimated=basis.sigma_px**2,
+            estimated=scene.bundle.sigma_px**2,
             probability=1.0,
             applied=1.0,
             sigma_source="default",

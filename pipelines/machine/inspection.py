@@ -9,15 +9,19 @@ from dataclasses import dataclass
 import torch
 
 from pipelines.core.errors import BackendUnavailableError
+from pipelines.core.progress import Progress
 from pipelines.core.threads import available_cores, thread_count
 from pipelines.core.versions import library_versions
 from pipelines.geodesy.grids import grid_folders, installed_grids
 from pipelines.pages.chromium import named_or_installed
 from pipelines.splat.memory import free_memory_bytes
-from pipelines.splat.rasterizer.backends import BACKENDS, BackendName, rasterizer
+from pipelines.splat.rasterizer.api import BackendName
+from pipelines.splat.rasterizer.backends import BACKENDS, chosen_backend
+from pipelines.splat.rasterizer.cuda_kernels import compile_kernels, kernels_ready
+from pipelines.splat.rasterizer.cuda_parts import CudaPart, compiling_parts, running_parts
 
 _LIBRARIES = (
-    *("numpy", "scipy", "numba", "torch", "gsplat", "pycolmap", "opencv-contrib-python-headless"),
+    *("numpy", "scipy", "numba", "torch", "gsplat", "cuda-toolkit", "pycolmap", "opencv-contrib-python-headless"),
     *("pyproj", "rasterio", "laspy", "pyogrio", "rosbags", "matplotlib", "click", "rich"),
 )
 
@@ -51,6 +55,8 @@ class Machine:
         memory_bytes, free_bytes: main memory; None: the system does not state it.
         gpus: that torch sees.
         backends: of the rasteriser.
+        cuda_parts: what the cuda backend needs, and what compiles its kernels.
+        cuda_kernels: place of the compiled kernels; None: the first use compiles them.
         grid_folders: in which PROJ looks for grids.
         grids: file names of the installed geoid models and datum shifts.
         chromium: path of Chromium or Chrome; None: not found.
@@ -65,6 +71,8 @@ class Machine:
     free_bytes: int | None
     gpus: tuple[Gpu, ...]
     backends: tuple[BackendState, ...]
+    cuda_parts: tuple[CudaPart, ...]
+    cuda_kernels: str | None
     grid_folders: tuple[str, ...]
     grids: tuple[str, ...]
     chromium: str | None
@@ -82,6 +90,8 @@ def inspect_machine() -> Machine:
         free_bytes=free_memory_bytes(torch.device("cpu")),
         gpus=_gpus(),
         backends=tuple(_backend(name) for name in BACKENDS),
+        cuda_parts=(*running_parts(), *compiling_parts()),
+        cuda_kernels=kernels_ready(),
         grid_folders=tuple(map(str, grid_folders())),
         grids=tuple(installed_grids()),
         chromium=named_or_installed(),
@@ -89,9 +99,20 @@ def inspect_machine() -> Machine:
     )
 
 
+def compile_cuda_kernels(progress: Progress) -> None:
+    """Compile the kernels of the cuda backend, unless that is done.
+
+    Raises:
+        BackendUnavailableError: a part is missing (names each), or the compiler fails (names its log).
+        InputError: neither a GPU nor the variable TORCH_CUDA_ARCH_LIST tells what to compile for.
+    """
+    if kernels_ready() is None:
+        compile_kernels(progress)
+
+
 def _backend(name: BackendName) -> BackendState:
     try:
-        rasterizer(name)
+        chosen_backend(name)
     except BackendUnavailableError as error:
         return BackendState(name, False, str(error))
     return BackendState(name, True, "")

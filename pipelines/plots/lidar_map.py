@@ -27,21 +27,22 @@ class DrawnArea:
         kind: `removed`: only the LiDAR has it; `added`: only the photographs have it.
         area_m2: in plan.
         corner_in_geo: (C, 2) south-western corners of its cells, east and north in metres.
+        cell_m: side of these cells.
     """
 
     kind: Literal["removed", "added"]
     area_m2: float
     corner_in_geo: FloatArray
+    cell_m: float
 
 
-def write_lidar_map(path: Path, points_in_geo: FloatArray, areas: Sequence[DrawnArea], cell_m: float) -> None:
+def write_lidar_map(path: Path, points_in_geo: FloatArray, areas: Sequence[DrawnArea]) -> None:
     """Write the map as PNG.
 
     Args:
         path: of the picture.
         points_in_geo: (P, 3) cloud, drawn by its height.
         areas: that have changed, the largest first.
-        cell_m: side of their cells.
 
     Raises:
         OSError: the picture cannot be written.
@@ -57,18 +58,16 @@ def write_lidar_map(path: Path, points_in_geo: FloatArray, areas: Sequence[Drawn
         drawn[:, 0], drawn[:, 1], s=1.2, c=np.repeat(shade[:, None], 3, axis=1), linewidths=0, rasterized=True
     )
     axes.scatter([], [], s=12, color=GREY, label="LiDAR, dark: high")
-    square = cell_m * np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+    square = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
     for kind, meaning in _MEANING.items():
         mine = [area for area in areas if area.kind == kind]
         total_m2 = sum(area.area_m2 for area in mine)
         if mine:
-            corners = np.concatenate([area.corner_in_geo for area in mine])
-            cells = PolyCollection(
-                list(corners[:, None] + square), facecolors=_COLOUR[kind], edgecolors="none", label="", zorder=4
-            )
+            corners = np.concatenate([area.corner_in_geo[:, None] + area.cell_m * square for area in mine])
+            cells = PolyCollection(list(corners), facecolors=_COLOUR[kind], edgecolors="none", label="", zorder=4)
             axes.add_collection(cells)
         axes.scatter([], [], s=24, marker="s", color=_COLOUR[kind], label=f"{meaning}: {total_m2:.0f} m²")
-    middles = [area.corner_in_geo.mean(axis=0) + cell_m / 2 for area in areas[:_NAMED]]
+    middles = [area.corner_in_geo.mean(axis=0) + area.cell_m / 2 for area in areas[:_NAMED]]
     if middles:
         names = [f"{area.area_m2:.0f} m²" for area in areas[:_NAMED]]
         add_names(figure, axes, np.array(middles), names, np.zeros((0, 2)))

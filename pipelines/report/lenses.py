@@ -208,15 +208,13 @@ def _covariance(evaluated: EvaluatedSurvey) -> tuple[FloatArray | None, str]:
     if not isinstance(evaluated.propagation, ErrorPropagation):
         return None, evaluated.propagation.reason
     covariance = evaluated.propagation.prediction.of_lens()
-    reason = "the training held the lens, or there are too many cameras to adjust them together"
-    return covariance, "" if covariance is not None else reason
+    return covariance, "" if covariance is not None else "the training held the lens"
 
 
 def _sigma_px(evaluated: EvaluatedSurvey) -> float | None:
     if not isinstance(evaluated.propagation, ErrorPropagation):
         return None
-    basis = evaluated.propagation.solved.scene.correction_basis
-    return None if basis is None else basis.sigma_px
+    return evaluated.propagation.solved.scene.bundle.sigma_px
 
 
 def _rmse(residual_px: FloatArray) -> float | None:

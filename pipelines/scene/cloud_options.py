@@ -10,6 +10,11 @@ from pipelines.core.options import InputMarker
 from pipelines.geodesy.vertical import VerticalChoice
 
 CLOUD_SUFFIXES = frozenset({".las", ".laz", ".ply"})
+NOT_IN_BLOCKS = (
+    "a training in blocks does not use LiDAR: its shift is estimated against the depth maps of all photographs. "
+    "Omit --lidar, or train in one run: `--blocks 1`, with a smaller --max-gaussians or --max-image-size where "
+    "memory is short"
+)
 CloudPath = Annotated[Path, InputMarker(CLOUD_SUFFIXES)]
 
 

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pipelines.core.errors import InputError
+from pipelines.geometry.bundle_information import BundleInformation
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.similarity import moved_pivot
 from pipelines.georef.adjustment import RotationPrior
-from pipelines.georef.cameras import CameraCorrections
+from pipelines.georef.cameras import CameraCorrections, HeldCorrections
 from pipelines.georef.control_by_depth import ControlByDepth
 from pipelines.georef.problem import GeoProblem
 from pipelines.georef.similarity import LearnableSimilarity
 from pipelines.georef.start import begin, bias_pays
 from pipelines.georef.systematic import SystematicErrors
-from pipelines.georef.terms import AttitudeTerm, ControlTerm, DistanceTerm, FixTerm, Term
+from pipelines.georef.terms import AttitudeTerm, ControlTerm, DistanceTerm, FixTerm, PlaneTerm, Term
 from pipelines.scene.geographic_options import GeographicOptions
 from pipelines.scene.geolocated import GeolocatedPoints
 from pipelines.scene.initial_similarity import InitialSimilarity
@@ -35,6 +36,7 @@ def geo_problem(
     options: GeographicOptions,
     *,
     points: GeolocatedPoints | None = None,
+    planes: PlaneTerm | None = None,
     seed: int = 0,
 ) -> GeoProblem:
     """Return the problem of similarity, cameras and constant errors under the survey's measurements.
@@ -45,44 +47,61 @@ def geo_problem(
         initial: similarity of `init-sim3`.
         options: which measurements are used, their weights, and the constant errors to estimate.
         points: of `geolocate`, for L_rel; None: L_rel uses the cameras and their fixes.
+        planes: of a LiDAR whose shift is a constant error; None: none.
         seed: of the random pairs for L_rel.
 
     Raises:
         InputError: a constant error is to be estimated, but its measurements were not recorded; or `points` belongs
             to another model.
+        ConvergenceError: sparse equations do not settle.
     """
+    bundle = scene.bundle if options.solves_once(len(scene.sparse.image_name)) else None
     record = initial.geo_from_local
     pivot = scene.geo_from_model.apply(scene.poses.cam_center_in_model[scene.train]).mean(axis=0)
     covariance = moved_pivot(np.array(record.covariance), record.pivot, pivot)
     terms = _terms_of(scene, survey, options, points, seed) if options.geo_loss else SurveyTerms()
+    terms = replace(terms, planes=planes)
     problem = GeoProblem(
         LearnableSimilarity(scene.geo_from_model, covariance, pivot, _attitude(scene, initial)),
-        _corrections(scene, options),
+        _corrections(scene, options, bundle),
         terms.present,
         weighting=options.weighting,
         hold_prior=_leaves_open(terms, initial),
-        errors=_errors(terms, options) if options.geo_loss else None,
+        errors=_errors(terms, options) if options.geo_loss else SystematicErrors(lidar=planes is not None),
         learned_weights=options.loss_weights == "learned",
         control_by_depth=terms.control_by_depth,
+        bundle=bundle,
     )
     if len(problem.errors):
         saved = begin(problem)
-        if options.estimate == "auto" and not bias_pays(problem, saved):
-            problem.errors = SystematicErrors()
+        if options.estimate == "auto" and problem.errors.flights:
+            _drop_idle_bias(problem, saved)
     return problem
 
 
-def _corrections(scene: Scene, options: GeographicOptions) -> CameraCorrections:
+def _drop_idle_bias(problem: GeoProblem, saved: float) -> None:
+    """Leave biases that are not evident out of a problem, whose errors have lowered −2 ln likelihood by `saved`."""
+    with_bias = problem.errors
+    problem.errors = SystematicErrors(lidar=problem.term(PlaneTerm) is not None)
+    others = begin(problem) if len(problem.errors) else 0.0
+    if bias_pays(with_bias, saved - others):
+        problem.errors = with_bias
+
+
+def _corrections(scene: Scene, options: GeographicOptions, bundle: BundleInformation | None) -> CameraCorrections:
     """Return the corrections that the options allow to cameras and lens.
 
     With `paper` the lens stays, because plain mean squares hold no lens to the photographs.
     """
+    count = len(scene.sparse.image_name)
+    if bundle is not None:
+        return CameraCorrections.held(
+            scene.poses, HeldCorrections(np.zeros((count, 6)), np.zeros(len(bundle.lens)))
+        )
+    if not options.optimize_cameras:
+        return CameraCorrections(scene.poses, np.zeros((count, 6, 0)))
     follows = options.weighting == "whitened"
-    basis = None
-    if options.optimize_cameras:
-        basis = scene.correction_basis if follows else scene.correction_basis_through_sfm_lens
-    if basis is None:
-        return CameraCorrections(scene.poses, np.zeros((len(scene.sparse.image_name), 6, 0)))
+    basis = scene.correction_basis if follows else scene.correction_basis_through_sfm_lens
     return CameraCorrections(scene.poses, basis.matrix, basis.lens_matrix if follows else None)
 
 
@@ -103,11 +122,12 @@ class SurveyTerms:
     distances: DistanceTerm | None = None
     attitudes: AttitudeTerm | None = None
     control_by_depth: ControlByDepth | None = None
+    planes: PlaneTerm | None = None
 
     @property
     def present(self) -> tuple[Term, ...]:
         """Terms of the loss and the posterior."""
-        every = (self.fixes, self.control, self.distances, self.attitudes)
+        every = (self.fixes, self.control, self.distances, self.attitudes, self.planes)
         return tuple(term for term in every if term is not None)
 
 
@@ -160,4 +180,5 @@ def _errors(terms: SurveyTerms, options: GeographicOptions) -> SystematicErrors:
         attitude_sigma_rad=None
         if attitudes is None
         else float((1.0 / attitudes.root_information[:, 0, 0]).median()),
+        lidar=terms.planes is not None,
     )

@@ -7,6 +7,7 @@ import logging
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import cv2
 import numpy as np
@@ -175,7 +176,7 @@ class ImageCache:
 def save_array(path: Path, array: NDArray[Any]) -> None:
     """Write an array to a temporary file, and rename that: the file at `path` is always complete."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_suffix(".tmp")
+    draft = path.with_name(f"{path.stem}.{uuid4().hex}.tmp")  # Several processes may make the same file at once.
     with draft.open("wb") as handle:
         np.save(handle, array, allow_pickle=False)
     replace_file(draft, path)

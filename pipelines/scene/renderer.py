@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from pipelines.core.types import ByteArray, Float32Array, FloatArray
-from pipelines.geometry.cameras import Pinhole
+from pipelines.geometry.cameras import Pinhole, pose_matrix
 from pipelines.scene.photographs import ImageCache
 from pipelines.scene.trained_survey import TrainedSurvey, trained_pinholes
 from pipelines.splat.depth import measured_depth
@@ -83,9 +83,7 @@ class ModelRenderer:
             window: part of the image to render; None: all of it.
         """
         model = self.trained.model
-        matrix = np.eye(4)
-        matrix[:3, :3] = pose.cam_from_model
-        matrix[:3, 3] = -pose.cam_from_model @ pose.center_in_model
+        matrix = pose_matrix(pose.cam_from_model, pose.center_in_model)
         settings = RasterSettings(model.sh_degree, model.background, depth=depth, window=window)
         gaussians = self._gaussians
         if window is not None:  # A pass over millions of Gaussians takes longer than the window itself.

@@ -31,13 +31,20 @@ class _OptionalKeys(Product):
 
 
 class ViewFigures(Product):
-    """Photometric figures of one test view: PSNR in dB, SSIM, LPIPS."""
+    """Photometric figures of one test view: PSNR in dB, SSIM, LPIPS.
+
+    Attributes:
+        covered_share: share of the pixels whose ground at least two training views show; None: not known.
+        psnr_covered: PSNR over these pixels; None: there are none.
+    """
 
     image: ImageName
     psnr: float
     psnr_compensated: float
     ssim: float
     lpips: float | None
+    covered_share: float | None = None
+    psnr_covered: float | None = None
 
 
 class PhotometricFigures(_OptionalKeys):
@@ -47,6 +54,9 @@ class PhotometricFigures(_OptionalKeys):
         views: number of test views.
         psnr: dB.
         psnr_compensated: dB, after an affine change of colour that is fitted to each photograph.
+        psnr_covered: dB, over the pixels whose ground at least two training views show, mean over the views that
+            have any.
+        covered_share: share of these pixels, mean over the views.
         ssim: structural similarity.
         lpips: perceptual distance; None without weights of the network.
         lpips_reason: reason why there is no LPIPS.
@@ -59,6 +69,8 @@ class PhotometricFigures(_OptionalKeys):
     ssim: float | None
     lpips: float | None
     lpips_reason: str | None = None
+    psnr_covered: float | None = None
+    covered_share: float | None = None
     per_view: tuple[ViewFigures, ...]
 
 

@@ -14,19 +14,21 @@ import numpy as np
 
 from pipelines.core.errors import DegenerateGeometryError, InputError
 from pipelines.core.photograph_folder import photograph_folder
-from pipelines.core.stages import SPARSE
+from pipelines.core.products import load_json
+from pipelines.core.stages import SIM3, SPARSE
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.core.workspace import Workspace
-from pipelines.geometry.bundle import CorrectionBasis, Network, correction_basis
+from pipelines.formats.colmap import read_sparse
+from pipelines.geometry.bundle import Network
+from pipelines.geometry.bundle_information import BundleInformation, bundle_information
+from pipelines.geometry.correction_basis import CorrectionBasis, basis_of, correction_basis
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.georef.cameras import CameraPoses
+from pipelines.scene.calibrated import load_survey
 from pipelines.scene.initial_similarity import InitialSimilarity
 from pipelines.scene.photographs import ImageCache, Photograph
 from pipelines.scene.survey import Survey
-
-# Beyond this number the dense normal matrix of the cameras exceeds the memory of a laptop.
-_MOST_CORRECTED_CAMERAS = 1200
 
 
 @dataclass(frozen=True)
@@ -55,6 +57,12 @@ class Scene:
             self.model_from_local.apply(self.sparse.cam_center_in_local),
         )
 
+    def of_images(self, images: IntArray) -> Scene:
+        """Return the scene of some cameras (K,), in ascending order, in the same frame."""
+        rows = np.unique(images)
+        train, test = (np.searchsorted(rows, np.intersect1d(split, rows)) for split in (self.train, self.test))
+        return replace(self, sparse=self.sparse.of_images(rows), train=train, test=test)
+
     @cached_property
     def point_in_model(self) -> FloatArray:
         """Points of the SfM model (N, 3), metres in `model`."""
@@ -76,19 +84,19 @@ class Scene:
         )
 
     @cached_property
-    def correction_basis(self) -> CorrectionBasis | None:
-        """Whitened corrections of the cameras, which the lens follows; None for more than 1200 cameras."""
-        return self._basis(lens_follows=True)
+    def bundle(self) -> BundleInformation:
+        """Information of the image observations on the cameras, which the lens follows."""
+        return bundle_information(self.network)
 
     @cached_property
-    def correction_basis_through_sfm_lens(self) -> CorrectionBasis | None:
-        """Whitened corrections of the cameras under a lens that stays; None for more than 1200 cameras."""
-        return self._basis(lens_follows=False)
+    def correction_basis(self) -> CorrectionBasis:
+        """Whitened corrections of the cameras, which the lens follows. Memory is quadratic in their number."""
+        return basis_of(self.bundle)
 
-    def _basis(self, lens_follows: bool) -> CorrectionBasis | None:
-        if len(self.sparse.image_name) > _MOST_CORRECTED_CAMERAS:
-            return None
-        return correction_basis(self.network, lens_follows=lens_follows)
+    @cached_property
+    def correction_basis_through_sfm_lens(self) -> CorrectionBasis:
+        """Whitened corrections of the cameras under a lens that stays."""
+        return correction_basis(self.network, lens_follows=False)
 
 
 def make_scene(sparse: SparseModel, survey: Survey, model_from_local: Similarity, shift: FloatArray) -> Scene:
@@ -121,6 +129,17 @@ def initial_scene(sparse: SparseModel, survey: Survey, initial: InitialSimilarit
     shift = np.round(np.median(geo_from_local.apply(sparse.point_in_local), axis=0))
     model_from_local = replace(geo_from_local, translation=geo_from_local.translation - shift)
     return make_scene(sparse, survey, model_from_local, shift)
+
+
+def load_initial_scene(workspace: Workspace) -> tuple[InitialSimilarity, Survey, Scene]:
+    """Read the initial similarity, the survey with its variance factors, and the scene at the start of training.
+
+    Raises:
+        GeorefError: a product does not exist, is damaged, or has too few images.
+    """
+    initial = load_json(InitialSimilarity, workspace.path(SIM3))
+    survey = initial.weighted(load_survey(workspace))
+    return initial, survey, initial_scene(read_sparse(workspace.path(SPARSE)), survey, initial)
 
 
 def photographs(sparse: SparseModel, survey: Survey, workspace: Workspace, max_size_px: int) -> ImageCache:

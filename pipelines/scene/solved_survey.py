@@ -65,7 +65,10 @@ def solve_survey(trained: TrainedSurvey, initial: InitialSimilarity, options: Ge
     changed: dict[str, object] = {"rel_loss": False}
     if options.weighting != "whitened":  # A training with plain mean squares estimates no constant errors.
         changed |= {"weighting": "whitened", "estimate": ()}
-    problem = geo_problem(scene, trained.survey, initial, options.model_copy(update=changed))
+    if options.solve == "joint":  # The photographs have no part here.
+        changed["solve"] = "auto"
+    solving = options.model_copy(update=changed).without_photographs(len(scene.sparse.image_name))
+    problem = geo_problem(scene, trained.survey, initial, solving)
     problem.similarity.place(trained.geo_from_model)
     minimise(problem)
     return SolvedSurvey(trained, scene, problem, options)

@@ -196,6 +196,12 @@ class Survey(Product):
             raise ValueError(f"images: {lost.name} has camera {lost.camera_id}, which is not among the cameras")
         return self
 
+    @property
+    def largest_photograph_px(self) -> tuple[int, int]:
+        """Width and height of the largest photographs."""
+        largest = max(self.cameras, key=lambda camera: camera.width * camera.height)
+        return largest.width, largest.height
+
     def image(self, name: str) -> SurveyImage | None:
         """Return the image of that name, or None."""
         return next((image for image in self.images if image.name == name), None)

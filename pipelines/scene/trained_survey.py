@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
 
@@ -14,7 +14,6 @@ from pipelines.core.stages import GAUSSIANS, MODEL, SIM3, SPARSE
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import Workspace
 from pipelines.formats.colmap import read_sparse
-from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.similarity import Similarity, SimilarityRecord
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.georef.cameras import CameraPoses
@@ -49,11 +48,7 @@ class TrainedSurvey:
     @cached_property
     def sparse(self) -> SparseModel:
         """SfM model with the trained lenses."""
-        trained = {
-            lens.camera_id: replace(self.sfm.cameras[lens.camera_id], params=np.array(lens.params))
-            for lens in self.model.lenses
-        }
-        return replace(self.sfm, cameras=self.sfm.cameras | trained)
+        return self.model.with_lenses(self.sfm)
 
     @property
     def geo_from_model(self) -> Similarity:
@@ -94,13 +89,11 @@ def load_trained(workspace: Workspace, similarity: Literal["trained", "initial"]
     if similarity == "initial":
         record = _initially_placed(model, load_json(InitialSimilarity, workspace.path(SIM3)))
         model = model.model_copy(update={"geo_from_model": record})
-    rotation = matrix_from_quat_xyzw([camera.quat_xyzw for camera in model.cameras])
-    translation = np.array([camera.translation for camera in model.cameras])
     return TrainedSurvey(
         survey=_weighted_survey(workspace),
         sfm=sparse,
         model=model,
-        poses=CameraPoses(rotation, -np.einsum("nji,nj->ni", rotation, translation)),
+        poses=model.poses,
         gaussians=read_gaussians(workspace.path(GAUSSIANS)),
     )
 

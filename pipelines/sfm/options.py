@@ -12,7 +12,9 @@ from pipelines.core.options import EFFORT, InputPath, StageOptions
 class SfmOptions(StageOptions):
     """Options of structure from motion with COLMAP."""
 
-    mapper: Literal["incremental", "global"] = Field("incremental", description="Mapper.")
+    mapper: Literal["auto", "incremental", "global"] = Field(
+        "auto", description="Mapper; auto: global for a large survey, incremental otherwise and where it fails."
+    )
     camera_model: Literal["SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"] = Field(
         "OPENCV", description="COLMAP camera model to estimate."
     )
@@ -27,6 +29,12 @@ class SfmOptions(StageOptions):
         None,
         description="Use this COLMAP model instead of reconstructing.",
         json_schema_extra={"flag": "--import"},
+    )
+    chunk_size: Annotated[int, EFFORT] = Field(
+        200,
+        ge=4,
+        description="Photographs a chunk: features and matches of a larger survey are computed in chunks, "
+        "several at a time.",
     )
     threads: Annotated[int, EFFORT] = Field(-1, ge=-1, description="Threads (-1: all).")
     seed: int = Field(0, ge=0, description="Seed of every random choice.")

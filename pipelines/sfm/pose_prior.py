@@ -8,7 +8,6 @@ of GeoRefGS (doi 10.3390/drones10030195), and the last step of COLMAP's `pose_pr
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -32,13 +31,13 @@ from pipelines.formats.colmap import (
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.georef.alignment import Alignment, align
-from pipelines.robust.kernels import CAUCHY_SCALE2
 from pipelines.robust.statistics import residual_stats
 from pipelines.scene.calibrated import load_survey
 from pipelines.scene.initial_similarity import InitialSimilarity
 from pipelines.scene.observations import attitude_prior, fix_correspondences
 from pipelines.scene.survey import Fix, Survey
 from pipelines.sfm.options import AdjustOptions
+from pipelines.sfm.position_priors import PriorAdjustment, position_prior
 
 _MOST_ITERATIONS = 100
 _FORCE_SFM = "COLMAP cannot adjust the model: reconstruct it again (`georef sfm --force`)"
@@ -109,17 +108,18 @@ def adjust_to_fixes(model: Any, survey: Survey, alignment: Alignment, seed: int 
             "the fixes lie on one line: a bundle adjustment that knows positions only can turn the model about it"
         )
     colmap = pycolmap_module()
-    bundle = colmap.BundleAdjustmentConfig()
-    for image_id in model.reg_image_ids():
-        bundle.add_image(image_id)
-    priors = [_prior(colmap, image, fix) for image, fix in _located(model, survey)]
-    options = _prior_options(colmap, alignment, seed)
-    adjuster = colmap.create_pose_prior_bundle_adjuster(_image_options(colmap), options, bundle, priors, model)
+    priors = [
+        position_prior(colmap, image, np.array(fix.position_in_geo), np.array(fix.cov_in_geo))
+        for image, fix in _located(model, survey)
+    ]
+    solution = alignment.solution
+    furthest = np.linalg.norm(solution.residual[solution.state.inlier], axis=1).max()
+    limit_m = float(_ALIGNMENT_SLACK * max(furthest, 1e-3))
+    adjuster = PriorAdjustment(_MOST_ITERATIONS, limit_m, seed=seed).adjuster(colmap, model, priors)
     summary = adjuster.solve()
     if not summary.is_solution_usable():
         raise ConvergenceError(f"the bundle adjustment found no solution: {summary.brief_report()}")
     # If COLMAP cannot align the model with the fixes, it adjusts without them, and only its log mentions that.
-    limit_m = options.alignment_ransac.max_error
     if np.median(np.linalg.norm(_residuals(model, survey), axis=1)) > limit_m:
         raise ConvergenceError(f"the bundle adjustment left most cameras more than {limit_m:.2f} m off their fixes")
     model.update_point_3d_errors()
@@ -165,30 +165,3 @@ def _residuals(model: Any, survey: Survey) -> FloatArray:
     """Return camera centres minus fixes (F, 3) of a model in `geo`."""
     rows = [image.projection_center() - np.array(fix.position_in_geo) for image, fix in _located(model, survey)]
     return np.array(rows).reshape(-1, 3)
-
-
-def _image_options(colmap: Any) -> Any:
-    options = colmap.BundleAdjustmentOptions()
-    options.print_summary = False
-    options.ceres.solver_options.max_num_iterations = _MOST_ITERATIONS
-    return options
-
-
-def _prior_options(colmap: Any, alignment: Alignment, seed: int) -> Any:
-    options = colmap.PosePriorBundleAdjustmentOptions()
-    options.ceres.prior_position_loss_function_type = colmap.LossFunctionType.CAUCHY
-    options.ceres.prior_position_loss_scale = math.sqrt(CAUCHY_SCALE2[3])
-    solution = alignment.solution
-    furthest = np.linalg.norm(solution.residual[solution.state.inlier], axis=1).max()
-    options.alignment_ransac.max_error = float(_ALIGNMENT_SLACK * max(furthest, 1e-3))
-    options.alignment_ransac.random_seed = seed
-    return options
-
-
-def _prior(colmap: Any, image: Any, fix: Fix) -> Any:
-    return colmap.PosePrior(
-        corr_data_id=image.data_id,
-        position=np.array(fix.position_in_geo),
-        position_covariance=np.array(fix.cov_in_geo),
-        coordinate_system=colmap.PosePriorCoordinateSystem.CARTESIAN,
-    )

@@ -2,22 +2,22 @@
 
 Reads `ingest/survey.json` and the photographs. Writes `sfm/sparse/` (a COLMAP model that COLMAP itself opens) and
 `sfm/database.db` (features and matches). The model's frame is `local`: similar to the scene, with an arbitrary
-place, rotation and scale. The positions measured by GNSS select the pairs to match, and have no other use here.
+place, rotation and scale. The positions measured by GNSS select the pairs to match, and remove the drift of a large
+model before its last adjustment. Features and matches of a large survey are computed in chunks (`chunked.py`).
 """
 
 from __future__ import annotations
 
 import logging
 import shutil
-import sqlite3
 from collections.abc import Mapping
-from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from pipelines.core.child import run_in_child
-from pipelines.core.errors import CrashError, DamagedPartialError, DegenerateGeometryError, storage_error
+from pipelines.core.errors import CrashError, DamagedPartialError, DegenerateGeometryError
+from pipelines.core.free_memory import free_main_memory_bytes
 from pipelines.core.photograph_folder import photograph_folder
 from pipelines.core.products import load_json
 from pipelines.core.progress import Progress
@@ -25,9 +25,14 @@ from pipelines.core.stages import SURVEY
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.formats.colmap import quiet_colmap, write_reconstruction
 from pipelines.scene.survey import Survey
+from pipelines.sfm.chunked import join_chunks, remove_chunks, work_in_chunks
+from pipelines.sfm.chunks import ChunkPlan, is_chunked
+from pipelines.sfm.colmap_database import require_sound
+from pipelines.sfm.features import SfmJob
 from pipelines.sfm.imported import import_model
+from pipelines.sfm.memory import require_memory
 from pipelines.sfm.options import SfmOptions
-from pipelines.sfm.reconstruction import SfmJob, reconstruct
+from pipelines.sfm.reconstruction import map_matches, reconstruct
 
 log = logging.getLogger(__name__)
 
@@ -45,18 +50,21 @@ def run(stage: StageRun, options: SfmOptions) -> Summary:
     """
     path = stage.workspace.path(SURVEY)
     survey = load_json(Survey, path)
+    require_memory(len(survey.images), survey.largest_photograph_px, options, free_main_memory_bytes())
+    plan = work_in_chunks(stage, survey, options) if is_chunked(len(survey.images), options) else None
     arguments = {
         "survey": str(path),
         "images": str(photograph_folder(stage.workspace, survey.image_dir)),
         "out": str(stage.out),
         "options": options.model_dump(mode="json"),
+        "chunks": None if plan is None else plan.model_dump(mode="json"),
     }
     remedy = _EXPORT_AGAIN if options.import_model is not None else _RUN_AGAIN
     task = "pipelines.sfm.stage:write_model"
     try:
         document = run_in_child(task, arguments, remedy, stage.progress, writes=stage.out)
     except (CrashError, RuntimeError) as error:
-        if stage.resumed:
+        if stage.resumed and plan is None:
             cause = str(error).strip().splitlines()[-1]
             raise DamagedPartialError(f"COLMAP cannot continue it: {cause}", path=stage.out) from error
         raise
@@ -67,7 +75,8 @@ def write_model(arguments: Mapping[str, Any], progress: Progress) -> dict[str, A
     """Reconstruct or import the model and write it; return the summary as a document.
 
     Args:
-        arguments: paths of `survey`, `images` and `out`, and the `options` of the stage.
+        arguments: paths of `survey`, `images` and `out`, the `options` of the stage, and the plan of its `chunks`,
+            which are finished; None: there are none.
         progress: shows features, matches and mapping.
 
     Raises:
@@ -82,30 +91,17 @@ def write_model(arguments: Mapping[str, Any], progress: Progress) -> dict[str, A
         if options.import_model is not None:
             model = import_model(options.import_model, survey)
         else:
-            _require_sound(out / "database.db")
             job = SfmJob(survey, Path(arguments["images"]), out / "database.db", options)
-            model = reconstruct(colmap, job, progress)
+            plan = arguments["chunks"]
+            if plan is None:
+                require_sound(job.database)
+                model = reconstruct(colmap, job, progress)
+            else:
+                join_chunks(colmap, job, ChunkPlan.model_validate(plan), out, progress)
+                model = map_matches(colmap, job, progress)
         write_reconstruction(model, sparse)
+    remove_chunks(out)
     return asdict(_summarise(model, survey))
-
-
-def _require_sound(database: Path) -> None:
-    """Refuse a damaged database of an interrupted run; COLMAP would abort, or continue without a part of it.
-
-    Raises:
-        DamagedPartialError: SQLite finds the file damaged.
-    """
-    if not database.exists():
-        return
-    try:
-        with closing(sqlite3.connect(database)) as connection:
-            (verdict,) = connection.execute("pragma quick_check(1)").fetchone()
-    except sqlite3.DatabaseError as error:
-        if storage_error(error) is not None:
-            raise
-        verdict = str(error)
-    if verdict != "ok":
-        raise DamagedPartialError(f"the database is damaged: {verdict}", path=database)
 
 
 def _summarise(model: Any, survey: Survey) -> Summary:

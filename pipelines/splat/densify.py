@@ -189,8 +189,8 @@ class DefaultStrategy:
         source[: len(stay)] = stay
         order = morton_order(edited.means)
         optimizer.rearrange(edited.select(order), source[order])
-        self._gradient_sum = torch.zeros(len(edited))
-        self._observations = torch.zeros(len(edited))
+        self._gradient_sum = edited.means.new_zeros(len(edited))
+        self._observations = torch.zeros_like(self._gradient_sum)
         return DensityEdit(int(cloned.sum()), int(parents.sum()), int((~alive).sum()))
 
     def _alive(self, gaussians: Gaussians, iteration: int) -> Tensor:

@@ -26,6 +26,7 @@ from pipelines.splat.optimizer import GaussianAdam
 from pipelines.splat.rasterizer.api import ScreenStats
 
 _MOST_COPIES = 51  # of one Gaussian in one edit: the binomials of eq. 9 are tabulated
+_SEEDS_APART = 1_000_003  # more than there are iterations
 _SIGMOID_STEEPNESS, _SIGMOID_CENTRE = 100.0, 0.995
 
 
@@ -74,7 +75,7 @@ class McmcStrategy:
 
     def __init__(self, settings: McmcSettings, extent_m: float, seed: int = 0) -> None:
         """Start; `extent_m` is the size of the scene."""
-        self.settings, self.extent_m = settings, extent_m
+        self.settings, self.extent_m, self._seed = settings, extent_m, seed
         self._generator = torch.Generator().manual_seed(seed)
         self._visible: Tensor | None = None
 
@@ -117,12 +118,20 @@ class McmcStrategy:
         moved = optimizer.gaussians
         opacity = torch.sigmoid(moved.logit_opacities[rows])
         free = torch.sigmoid(_SIGMOID_STEEPNESS * (1 - opacity - _SIGMOID_CENTRE))
-        noise = torch.randn(len(rows), 3, generator=self._generator).to(opacity)
+        noise = self._noise(len(rows), iteration, opacity.device)
         rotation, variance = rotation_matrices(moved.quats_wxyz[rows]), (2 * moved.log_scales[rows]).exp()
         along = variance * (rotation.transpose(1, 2) @ noise[..., None])[..., 0]
         shaped = (rotation @ along[..., None])[..., 0]
         length = self.settings.noise * optimizer.means_rate(iteration) / self.extent_m
         moved.means[rows] += length * free[:, None] * shaped
+
+    def _noise(self, count: int, iteration: int, device: torch.device) -> Tensor:
+        """Return normal numbers (count, 3), made on the device: copies from the CPU would wait for all its work."""
+        if device.type == "cpu":
+            return torch.randn(count, 3, generator=self._generator)
+        # The seed follows from the iteration, so that a resumed training shakes as an uninterrupted one does.
+        generator = torch.Generator(device).manual_seed(self._seed * _SEEDS_APART + iteration)
+        return torch.randn(count, 3, generator=generator, device=device)
 
     @torch.no_grad()
     def _edit(self, optimizer: GaussianAdam) -> DensityEdit:

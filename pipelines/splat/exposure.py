@@ -73,6 +73,31 @@ class Exposures:
         self._steps = [int(count) for count in state["steps"]]
 
 
+class HeldExposures:
+    """Affine colour corrections of all images that do not move, in the place of `Exposures`.
+
+    Attributes:
+        affine: (V, 3, 4) gain matrix and offset of each image.
+    """
+
+    def __init__(self, affine: Tensor) -> None:
+        self.affine = affine
+
+    def apply(self, index: int, colour: Tensor) -> Tensor:
+        """Return the render (H, W, 3) with the exposure of photograph `index`."""
+        return with_affine(colour, self.affine[index])
+
+    def step(self, iteration: int) -> None:
+        """Leave the exposures as they are."""
+
+    def state(self) -> dict[str, Tensor]:
+        """Return no tensors: nothing changes between checkpoints."""
+        return {}
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Accept the state of `state`, which is empty."""
+
+
 def with_affine(colour: Tensor, affine: Tensor) -> Tensor:
     """Return A c + b of every colour c in (…, 3), for (A | b) in `affine` (3, 4)."""
     return colour @ affine[:, :3].T + affine[:, 3]

@@ -5,6 +5,8 @@ show, by the cells of a grid, with moments kept (`merging`). Its cells are at le
 viewer shows it from afar, and its children from near. Above the octree, further levels become coarser until a few
 hundred Gaussians show the whole.
 
+A scene may be larger than memory: it is handed over in parts, such as the blocks of a training, one after another.
+
 Gaussians far outside the scene, and those as large as it, form a tree of their own: in the scene's tree they would
 make the boxes of its tiles so large that a viewer always stands inside, and never sees a coarse level.
 """
@@ -13,7 +15,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -22,7 +24,7 @@ import torch
 from numpy.typing import ArrayLike
 
 from pipelines.core.types import BoolArray, FloatArray, IntArray
-from pipelines.formats.splat_ply import SplatArrays
+from pipelines.formats.splat_ply import SplatArrays, concatenated
 from pipelines.splat.merging import Mixture, bounds_of, drawn, merged, mixture_of
 from pipelines.splat.morton import BITS, morton_codes
 
@@ -31,6 +33,7 @@ from pipelines.splat.morton import BITS, morton_codes
 _ERROR_CELLS = 4.0
 _OVERVIEW = 256  # Gaussians of the coarsest level
 _LEAST_REDUCTION = 2
+_NEIGHBOURS = 4  # trees of parts that get a common parent: a surface in cells twice as large has a quarter of them
 _INNER = (0.01, 0.99)  # quantiles of the positions between which the scene lies
 _OUTSKIRTS = 1.0  # the scene reaches beyond them by this part of their distance
 _LEAST_EDGE_M = 1e-6
@@ -69,24 +72,30 @@ class DetailTile:
             yield from child.all()
 
 
-def build_tiles(splat: SplatArrays, largest_tile: int, write: WriteTile) -> DetailTile:
-    """Return the root of the tree of tiles, and hand the content of each tile to `write`.
+def build_tiles(parts: Iterable[SplatArrays], extent: SceneExtent, tiler: Tiler) -> DetailTile:
+    """Return the root of the tree of tiles, and write the content of each tile.
 
-    Memory: that of the Gaussians, and of the contents of a tile and its children.
+    Each part has a tree of its own; as soon as four successive trees stand, they get a common parent. Parts should
+    therefore be neighbours, and in the order of a tree themselves.
+
+    Memory: that of a part, of all Gaussians outside the scene, and of four tiles a level.
 
     Args:
-        splat: N ≥ 1 Gaussians with finite values.
-        largest_tile: largest number of Gaussians in a tile.
-        write: receives the contents.
+        parts: at least one, of at least one Gaussian each, with finite values.
+        extent: of the scene, of all parts together.
+        tiler: makes the tiles.
     """
-    outside = _outskirts(splat)
-    builder = _Builder(splat, largest_tile, write)
-    parts = [("s", np.flatnonzero(~outside)), ("f", np.flatnonzero(outside))]
-    trees = [_Tree(rows, builder).overview(name) for name, rows in parts if len(rows)]
-    if len(trees) == 1:
-        return trees[0].tile
-    both = Mixture.concatenate([tree.curve.mixture for tree in trees])
-    return builder.parent("r", trees, _Curve.through(both)).tile
+    inner, outer = _Forest(tiler), []
+    for number, part in enumerate(parts):
+        outside = extent.leaves_out(part)
+        if not outside.all():
+            inner.plant(_Tree(part.select(np.flatnonzero(~outside)), tiler).top(f"s{number}p"))
+        outer.append(part.select(np.flatnonzero(outside)))
+    trees = [("s", tree) for tree in inner.grown()]
+    if far := [part for part in outer if len(part)]:
+        trees.append(("f", _Tree(concatenated(far), tiler).top("f")))
+    tops = [tiler.overview(name, tree) for name, tree in trees]
+    return (tops[0] if len(tops) == 1 else tiler.joined("r", tops)).tile
 
 
 def best_cut(root: DetailTile, most: int) -> list[DetailTile]:
@@ -104,14 +113,25 @@ def best_cut(root: DetailTile, most: int) -> list[DetailTile]:
         shown += coarsest.children
 
 
-def _outskirts(splat: SplatArrays) -> BoolArray:
-    """Return which Gaussians (N,) are no part of the scene itself: far away, or as large as it."""
-    low, high = np.quantile(splat.means, _INNER, axis=0)
-    extent = float((high - low).max())
-    margin = _OUTSKIRTS * extent
-    away = ((splat.means < low - margin) | (splat.means > high + margin)).any(axis=1)
-    outside: BoolArray = away | (splat.log_scales.max(axis=1) > np.log(max(_GIANT * extent, _LEAST_EDGE_M)))
-    return outside if not outside.all() else np.zeros(len(splat), dtype=bool)
+@dataclass(frozen=True)
+class SceneExtent:
+    """Box (2, 3) of the scene, least and largest coordinates; what lies far around it is not part of the scene."""
+
+    box: FloatArray
+
+    @staticmethod
+    def of(centers: ArrayLike) -> SceneExtent:
+        """Return the extent of a scene of Gaussians with these centres (N, 3)."""
+        return SceneExtent(np.quantile(np.asarray(centers), _INNER, axis=0))
+
+    def leaves_out(self, splat: SplatArrays) -> BoolArray:
+        """Return which Gaussians (N,) are no part of the scene itself: far away, or as large as it."""
+        low, high = self.box
+        size_m = float((high - low).max())
+        margin = _OUTSKIRTS * size_m
+        away = ((splat.means < low - margin) | (splat.means > high + margin)).any(axis=1)
+        outside: BoolArray = away | (splat.log_scales.max(axis=1) > np.log(max(_GIANT * size_m, _LEAST_EDGE_M)))
+        return outside
 
 
 def _codes(points: ArrayLike) -> tuple[IntArray, float]:
@@ -181,22 +201,19 @@ class _Shown:
 
 
 @dataclass(frozen=True)
-class _Builder:
+class Tiler:
     """Maker of tiles.
 
     Attributes:
-        splat: all Gaussians.
         largest_tile: largest number of Gaussians in a tile.
         write: receives the contents.
     """
 
-    splat: SplatArrays
     largest_tile: int
     write: WriteTile
 
-    def leaf(self, name: str, rows: IntArray, codes: IntArray, edge_m: float) -> _Shown:
+    def leaf(self, name: str, content: SplatArrays, codes: IntArray, edge_m: float) -> _Shown:
         """Return the leaf of some of the Gaussians."""
-        content = self.splat.select(rows)
         self.write(name, content, is_leaf=True)
         mixture = mixture_of(content)
         tile = DetailTile(name, len(content), 0.0, bounds_of(mixture))
@@ -214,30 +231,69 @@ class _Builder:
         below = tuple(child.tile for child in children)
         return _Shown(DetailTile(name, len(content), _ERROR_CELLS * cell_m, bounds, below), shown, cell_m)
 
+    def joined(self, name: str, children: list[_Shown]) -> _Shown:
+        """Return the tile above tops of different trees."""
+        both = Mixture.concatenate([child.curve.mixture for child in children])
+        return self.parent(name, children, _Curve.through(both))
 
-class _Tree:
-    """Octree of some of the Gaussians, and the levels above it."""
-
-    def __init__(self, rows: IntArray, builder: _Builder) -> None:
-        codes, self._edge_m = _codes(builder.splat.means[rows])
-        order = np.argsort(codes, kind="stable")
-        self._rows, self._codes = rows[order], codes[order]
-        self._builder = builder
-
-    def overview(self, name: str) -> _Shown:
-        """Return the top of the levels above the octree."""
-        top = self._cell(name, 0, len(self._rows), BITS)
+    def overview(self, name: str, top: _Shown) -> _Shown:
+        """Return the top of the levels above a tree."""
         level = 1
         while len(top.curve.codes) >= _LEAST_REDUCTION * _OVERVIEW:
-            top = self._builder.parent(f"{name}z{level}", [top], top.curve)
+            top = self.parent(f"{name}z{level}", [top], top.curve)
             level += 1
         return top
 
+
+class _Forest:
+    """Trees of successive parts of the scene: four of a height become one of the next."""
+
+    def __init__(self, tiler: Tiler) -> None:
+        self._tiler = tiler
+        self._waiting: list[list[_Shown]] = []
+        self._joined = 0
+
+    def plant(self, tree: _Shown, height: int = 0) -> None:
+        """Add a tree."""
+        if height == len(self._waiting):
+            self._waiting.append([])
+        row = self._waiting[height]
+        row.append(tree)
+        if len(row) == _NEIGHBOURS:
+            self._waiting[height] = []
+            self.plant(self._join(row), height + 1)
+
+    def grown(self) -> list[_Shown]:
+        """Return the one tree of all; none, where none was planted."""
+        rest: list[_Shown] = []
+        for row in self._waiting:
+            rest = [self._join([*row, *rest])] if len(row) + len(rest) > 1 else [*row, *rest]
+        return rest
+
+    def _join(self, trees: list[_Shown]) -> _Shown:
+        self._joined += 1
+        return self._tiler.joined(f"s{self._joined}j", trees)
+
+
+class _Tree:
+    """Octree of Gaussians."""
+
+    def __init__(self, splat: SplatArrays, tiler: Tiler) -> None:
+        codes, self._edge_m = _codes(splat.means)
+        self._rows = np.argsort(codes, kind="stable")
+        self._codes = codes[self._rows]
+        self._splat, self._tiler = splat, tiler
+
+    def top(self, name: str) -> _Shown:
+        """Return the tile of all."""
+        return self._cell(name, 0, len(self._rows), BITS)
+
     def _cell(self, name: str, first: int, last: int, height: int) -> _Shown:
         """Return the tile of rows `first` … `last`, which lie in one cell of 2^height cells a side."""
-        if last - first <= self._builder.largest_tile:
+        if last - first <= self._tiler.largest_tile:
             rows = slice(first, last)
-            return self._builder.leaf(name, self._rows[rows], self._codes[rows], self._edge_m)
+            content = self._splat.select(self._rows[rows])
+            return self._tiler.leaf(name, content, self._codes[rows], self._edge_m)
         ends = self._split(first, last, height)
         while len(ends) == 2 and height > 0:  # a single child: look into it
             height -= 1
@@ -248,12 +304,12 @@ class _Tree:
         ]
         mixture = Mixture.concatenate([child.curve.mixture for child in children])
         codes = np.concatenate([child.curve.codes for child in children])
-        return self._builder.parent(name, children, _Curve(mixture, codes, self._edge_m))
+        return self._tiler.parent(name, children, _Curve(mixture, codes, self._edge_m))
 
     def _split(self, first: int, last: int, height: int) -> list[int]:
         """Return where the octants that are not empty begin, and `last`; equal places are cut into equal parts."""
         if height == 0:
-            parts = math.ceil((last - first) / self._builder.largest_tile)
+            parts = math.ceil((last - first) / self._tiler.largest_tile)
             return [first + (last - first) * part // parts for part in range(parts + 1)]
         octants = self._codes[first:last] >> 3 * (height - 1)
         return [first, *(first + 1 + np.flatnonzero(np.diff(octants))).tolist(), last]

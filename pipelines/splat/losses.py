@@ -10,6 +10,7 @@ neither to L1 nor to SSIM's mean, and a window that reaches over them sees the s
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numba
@@ -139,8 +140,7 @@ def _terms_by_convolution(image: Tensor, target: Tensor, mask: Tensor | None) ->
     """Return L1 and SSIM by torch operations, for devices that the kernels do not run on."""
     weight = torch.ones_like(image[..., 0]) if mask is None else mask.to(image.dtype)
     x, y = (value * weight[..., None] for value in (image, target))
-    half = torch.as_tensor(kernels.gaussian_taps(np.float64), dtype=image.dtype, device=image.device)
-    taps = torch.cat([half.flip(0), half[1:]])
+    taps = _window(image.dtype, image.device)
     planes = torch.cat([x, y, x * x, y * y, x * y], dim=-1).permute(2, 0, 1)[:, None]
     blurred = functional.conv2d(planes, taps.view(1, 1, -1, 1), padding=(kernels.RADIUS, 0))
     blurred = functional.conv2d(blurred, taps.view(1, 1, 1, -1), padding=(0, kernels.RADIUS))
@@ -150,6 +150,13 @@ def _terms_by_convolution(image: Tensor, target: Tensor, mask: Tensor | None) ->
     count = (3 * weight.sum()).clamp_min(1)
     ssim = 1 - ((1 - numerator / denominator) * weight).sum() / count
     return (x - y).abs().sum() / count, ssim
+
+
+# Made once: every copy to a GPU waits for all work that is queued there.
+@lru_cache(maxsize=8)
+def _window(dtype: torch.dtype, device: torch.device) -> Tensor:
+    half = torch.as_tensor(kernels.gaussian_taps(np.float64), dtype=dtype, device=device)
+    return torch.cat([half.flip(0), half[1:]])
 
 
 def _check(rendered: Tensor, target: Tensor, mask: Tensor | None) -> None:

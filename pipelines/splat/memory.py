@@ -9,6 +9,7 @@ import torch
 from pipelines.core.errors import ResourceError
 from pipelines.core.free_memory import free_main_memory_bytes
 from pipelines.geometry.cameras import Pinhole
+from pipelines.geometry.correction_basis import predicted_basis_bytes
 from pipelines.splat.sh import coefficient_count
 
 _FLOAT = 4
@@ -20,7 +21,7 @@ _COPIES = 10
 _IMAGE_FLOATS = 45
 _ROW_BYTES = 40  # counters, keys of the spatial order
 _FIXED_BYTES = 150 * 2**20  # compiled kernels and reserves of the allocators
-_USABLE = 0.9  # of the free memory: other programs grow, too
+USABLE = 0.9  # of the free memory: other programs grow, too
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,7 @@ class TrainingSize:
         gaussians: largest number of Gaussians.
         camera: of the largest image.
         sh_degree: of the stored spherical harmonics.
-        cameras: number of cameras whose poses are corrected together.
+        cameras: number of cameras whose poses training refines together.
     """
 
     gaussians: int
@@ -43,8 +44,7 @@ class TrainingSize:
 def predicted_peak_bytes(size: TrainingSize) -> int:
     """Return the bytes that training adds to the process at its peak, assuming that a view sees all Gaussians."""
     width = 11 + 3 * coefficient_count(size.sh_degree)
-    # The dense normal matrix of the cameras, its factor, the basis, and a Jacobian of the same size.
-    poses = 4 * 8 * (6 * size.cameras) ** 2
+    poses = predicted_basis_bytes(size.cameras)
     images = size.camera.width * size.camera.height * _IMAGE_FLOATS * _FLOAT
     per_gaussian = max(_COPIES * width * _FLOAT, 4 * width * _FLOAT + _raster_bytes()) + _ROW_BYTES
     return size.gaussians * per_gaussian + images + poses + _FIXED_BYTES
@@ -61,11 +61,11 @@ def require_memory(size: TrainingSize, free_bytes: int | None) -> None:
         ResourceError: states the memory needed, and a number of Gaussians that would fit.
     """
     needed = predicted_peak_bytes(size)
-    if free_bytes is None or needed <= _USABLE * free_bytes:
+    if free_bytes is None or needed <= USABLE * free_bytes:
         return
     without_gaussians = predicted_peak_bytes(TrainingSize(0, size.camera, size.sh_degree, size.cameras))
     per_gaussian = (needed - without_gaussians) / max(size.gaussians, 1)
-    fitting = int((_USABLE * free_bytes - without_gaussians) / per_gaussian) // 1000 * 1000
+    fitting = int((USABLE * free_bytes - without_gaussians) / per_gaussian) // 1000 * 1000
     advice = (
         f"--max-gaussians {fitting}"
         if fitting >= 1000

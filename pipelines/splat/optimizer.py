@@ -206,19 +206,22 @@ class GaussianAdam:
         )
 
     def _step_by_tensors(self, iteration: int, rows: Tensor) -> None:
-        """Take the same step by torch operations, for devices that the kernel does not run on."""
+        """Take the same step by torch operations, for devices that the kernel does not run on.
+
+        All quantities of a row are updated together: five times as few operations as one quantity after the other.
+        """
+        tensors, columns = self.gaussians.tensors(), self._columns()
         self._steps[rows] += 1
         unbias = self._corrections[self._steps[rows].long().clamp_max(len(self._corrections) - 1)]
-        rates, columns = self._column_rates(iteration), self._columns()
-        for name, tensor in self.gaussians.tensors().items():
-            if tensor.grad is None:
-                continue
-            gradient, part = tensor.grad[rows].reshape(len(rows), -1), columns[name]
-            average = self._exp_avg[rows, part].lerp_(gradient, 1 - self.rates.beta1)
-            square = self._exp_avg_sq[rows, part].lerp_(gradient * gradient, 1 - self.rates.beta2)
-            self._exp_avg[rows, part], self._exp_avg_sq[rows, part] = average, square
-            change = rates[part] * (average * unbias[:, :1]) / (square.sqrt() * unbias[:, 1:] + self.rates.eps)
-            tensor[rows] -= change.reshape(tensor[rows].shape)
+        parts = [tensor.grad[rows].reshape(len(rows), -1) for tensor in tensors.values() if tensor.grad is not None]
+        gradient = torch.cat(parts, dim=1)
+        average = self._exp_avg[rows].lerp_(gradient, 1 - self.rates.beta1)
+        square = self._exp_avg_sq[rows].lerp_(gradient * gradient, 1 - self.rates.beta2)
+        self._exp_avg[rows], self._exp_avg_sq[rows] = average, square
+        scale = square.sqrt_().mul_(unbias[:, 1:]).add_(self.rates.eps)
+        change = average.mul_(unbias[:, :1]).mul_(self._column_rates(iteration)).div_(scale)
+        for name, tensor in tensors.items():
+            tensor.index_add_(0, rows, change[:, columns[name]].reshape(len(rows), *tensor.shape[1:]), alpha=-1)
 
 
 def _leaves(gaussians: Gaussians) -> Gaussians:

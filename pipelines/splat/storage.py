@@ -17,10 +17,10 @@ def write_gaussians(path: Path, gaussians: Gaussians) -> None:
     write_splat_ply(path, SplatArrays(**gaussians.arrays()))
 
 
-def read_gaussians(path: Path) -> Gaussians:
-    """Read Gaussians from a 3DGS PLY.
+def read_gaussians(path: Path, rows: slice = slice(None)) -> Gaussians:
+    """Read Gaussians from a 3DGS PLY; of a part of its rows, nothing else comes into memory.
 
     Raises:
         InputError: no such file, not a PLY of that form, cut off, or with values that are not finite.
     """
-    return Gaussians.from_arrays(vars(read_splat_ply(path)))
+    return Gaussians.from_arrays(vars(read_splat_ply(path, rows)))

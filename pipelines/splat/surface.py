@@ -110,8 +110,9 @@ def compactness_loss(depth_m: Tensor, variance_m2: Tensor, alpha: Tensor) -> Ten
 
 
 def flatness_loss(gaussians: Gaussians, visible: Tensor, extent_m: float) -> Tensor:
-    """Return the mean smallest standard deviation of the visible Gaussians, in scene extents."""
-    return gaussians.log_scales[visible].amin(dim=1).exp().mean() / extent_m
+    """Return the mean smallest standard deviation of the visible Gaussians, in scene extents; 0 if none is."""
+    smallest = gaussians.log_scales[visible].amin(dim=1).exp()
+    return smallest.sum() / (max(len(visible), 1) * extent_m)
 
 
 def disc_normals(gaussians: Gaussians, center_in_model: Tensor) -> Tensor:
@@ -154,7 +155,8 @@ def normal_loss(
         gaussians.logit_opacities,
         sh_from_rgb(0.5 + 0.5 * normal)[:, None],
     )
-    render = rasterizer.render(painted, cam_from_model.detach(), camera, RasterSettings(sh_degree=0, depth=True))
+    settings = RasterSettings(sh_degree=0, depth=True, median=False)
+    render = rasterizer.render(painted, cam_from_model.detach(), camera, settings)
     assert render.expected_depth is not None
     depth, alpha = render.expected_depth, render.alpha
     blended = (2 * render.colour - alpha[..., None])[:-1, :-1]

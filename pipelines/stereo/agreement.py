@@ -7,8 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.core.types import Float32Array, FloatArray, IntArray
-from pipelines.stereo.sweep import StereoCamera, SweepResult
+from pipelines.core.types import Float32Array, FloatArray
+from pipelines.geometry.cameras import Pinhole
+from pipelines.stereo.agreement_kernel import compare_depths
+from pipelines.stereo.sweep import SweepResult
+from pipelines.stereo.views import StereoCamera
 
 
 @dataclass(frozen=True)
@@ -56,75 +59,31 @@ def agreed_depth(
     3. Where too many views look through a point, the point is no surface, even if others agree: all views from one
        side of a roof take the ground beside it for roof.
     """
-    rays = reference.camera.rays()
-    depth = reference.depth()
-    good = (reference.sweep.score > settings.least_score) & np.isfinite(depth) & (depth > 0)
-    rows, columns = np.nonzero(good)
-    length, ray = depth[rows, columns], rays[rows, columns]
-    point = reference.camera.center_in_world + length[:, None] * ray
-    own = reference.sweep.normals.offset_per_metre(reference.camera)
-    weight = (own * reference.sweep.sharpness)[rows, columns] ** 2
-    total, count, through = np.zeros(len(rows)), np.zeros(len(rows)), np.zeros(len(rows))
+    own, depth = reference.sweep, reference.depth()
+    good = (own.score > settings.least_score) & np.isfinite(depth) & (depth > 0)
+    length = np.where(good, depth, 0.0)
+    per_metre = own.normals.offset_per_metre(reference.camera)
+    sums, counts = np.zeros((2, *depth.shape)), np.zeros((2, *depth.shape), np.int32)
+    sums[1] = (per_metre * own.sharpness) ** 2
+    limits = np.array([settings.least_score, settings.steps, settings.free])
+    camera = reference.camera
     for other in others:
-        reprojection = _reproject(point, other, settings)
-        along = np.einsum("ni,ni->n", ray[reprojection.near], reprojection.normal_in_world)
-        with np.errstate(divide="ignore"):
-            longer = reprojection.residual_m / along
-        fits = np.abs(longer) < 0.1 * length[reprojection.near]  # not where the ray grazes the planes
-        place, of_view = reprojection.near[fits], ((along * reprojection.sharpness) ** 2)[fits]
-        total[place] += of_view * longer[fits]
-        weight[place] += of_view
-        count[place] += 1
-        through[reprojection.through] += 1
-    agreed = (count >= settings.least_views) & (through < settings.most_through * count)
-    agreed_m = np.zeros(depth.shape, dtype=np.float32)
-    agreed_m[rows[agreed], columns[agreed]] = length[agreed] + total[agreed] / weight[agreed]
-    return agreed_m
+        surface = other.sweep
+        compare_depths(
+            *(length, camera.cam_from_world.T @ np.linalg.inv(_camera_matrix(camera.pinhole))),
+            *(camera.center_in_world, other.camera.center_in_world),
+            _camera_matrix(other.camera.pinhole) @ other.camera.cam_from_world,
+            np.stack([surface.offset_m, surface.score, surface.step_m, surface.sharpness]),
+            *(surface.normals.index, surface.normals.normals_in_world, limits, sums, counts),
+        )
+    views, through = counts
+    agreed = good & (views >= settings.least_views) & (through < settings.most_through * views)
+    mean = length + np.divide(sums[0], sums[1], out=np.zeros_like(length), where=agreed)
+    return np.where(agreed, mean, 0.0).astype(np.float32)
 
 
-@dataclass(frozen=True)
-class _Reprojection:
-    """Points of the reference, reprojected into another view.
-
-    Attributes:
-        near: indices (N,) of the points on the surface of that view.
-        normal_in_world: (N, 3) of that surface.
-        residual_m: (N,) distance from the point to that surface, along its normal.
-        sharpness: (N,) of the match that gave the surface.
-        through: indices of the points that the view looks through.
-    """
-
-    near: IntArray
-    normal_in_world: FloatArray
-    residual_m: FloatArray
-    sharpness: Float32Array
-    through: IntArray
-
-
-def _reproject(point: FloatArray, other: DepthEstimate, settings: AgreementSettings) -> _Reprojection:
-    """Compare points (P, 3) with the surface of another view."""
-    camera, normals = other.camera.pinhole, other.sweep.normals
-    in_cam = (point - other.camera.center_in_world) @ other.camera.cam_from_world.T
-    ahead = np.flatnonzero(in_cam[:, 2] > 0)
-    column = np.floor(camera.fx * in_cam[ahead, 0] / in_cam[ahead, 2] + camera.cx)
-    row = np.floor(camera.fy * in_cam[ahead, 1] / in_cam[ahead, 2] + camera.cy)
-    inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-    ahead, place = ahead[inside], (row[inside].astype(np.int64), column[inside].astype(np.int64))
-    known = other.sweep.score[place] > settings.least_score
-    ahead, place = ahead[known], (place[0][known], place[1][known])
-    normal = normals.normals_in_world[normals.index[place]]
-    offset = np.einsum("ni,ni->n", point[ahead], normal)
-    residual = np.asarray(other.sweep.offset_m[place] - offset, np.float64)
-    near = np.abs(residual) < settings.steps * other.sweep.step_m[place]
-    with np.errstate(divide="ignore"):
-        further = residual / (offset - normal @ other.camera.center_in_world)
-    return _Reprojection(
-        ahead[near],
-        normal[near],
-        residual[near],
-        other.sweep.sharpness[place][near],
-        ahead[further > settings.free],
-    )
+def _camera_matrix(camera: Pinhole) -> FloatArray:
+    return np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
 
 
 def without_rims(depth: Float32Array, reach_px: int, rim: float) -> Float32Array:

@@ -10,17 +10,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from pipelines.core.types import BoolArray, Float32Array, FloatArray
+from pipelines.stereo import match_kernels as kernels
+from pipelines.stereo.views import StereoView, opencv_camera_matrix
 
-UNSEEN = -1.0  # correlation outside a neighbour's image
-_NOISE_VARIANCE = 0.3  # grey levels²: windows that vary less than the sensor's noise do not correlate
+UNSEEN = float(kernels.UNSEEN)
 _LEAST_CURVATURE = 1e-6
+_FURTHEST_M = 1e7  # hypotheses beyond are as good as infinite, and kernels need finite numbers
 
 
 @dataclass(frozen=True)
@@ -46,82 +47,80 @@ class MatchSettings:
 
 
 class Matcher:
-    """Compares one photograph (H, W) with its neighbours, warped under a hypothesis."""
+    """Compares a photograph (H, W) with its neighbours under hypotheses of depth.
 
-    def __init__(self, grey: Float32Array, settings: MatchSettings) -> None:
-        self._correlation = _Correlation(grey, settings.window_px)
-        self._smooth = cv2.ximgproc.createGuidedFilter(grey, settings.reach_px, settings.edge_grey**2)
-        self._top_scores = _TopScores(grey.shape, settings.views)
+    Args:
+        reference: view whose surface is wanted.
+        neighbours: one or more views of the same place from elsewhere.
+        settings: of the comparison.
+    """
 
-    def __call__(self, shown: Iterable[Float32Array]) -> Float32Array:
-        """Return the score (H, W) of a hypothesis from one or more warped neighbours (H, W), 0 where these end."""
-        self._top_scores.clear()
-        for image in shown:
-            self._top_scores.add(self._correlation(image))
-        return np.asarray(self._smooth.filter(self._top_scores.mean()), dtype=np.float32)
+    def __init__(self, reference: StereoView, neighbours: list[StereoView], settings: MatchSettings) -> None:
+        grey, side = reference.grey, (settings.window_px, settings.window_px)
+        self._settings, self._grey = settings, grey
+        self._mean, square = (
+            np.asarray(cv2.boxFilter(image, -1, side, borderType=cv2.BORDER_REFLECT), np.float32)
+            for image in (grey, grey * grey)
+        )
+        variance = square - self._mean * self._mean
+        self._inverse_sigma = (1 / np.sqrt(np.maximum(variance, kernels.NOISE_VARIANCE))).astype(np.float32)
+        half = settings.window_px // 2
+        self._mirrored = np.pad(grey, ((0, 0), (half, half)), mode="symmetric")
+        self._greys, self._sizes = _stacked([view.grey for view in neighbours])
+        self._per_depth, self._starts = _projections(reference, neighbours)
+        height, width = grey.shape
+        self._largest = np.empty((height, min(settings.views, len(neighbours)), width), np.float32)
+        self._guided: tuple[slice, cv2.ximgproc.GuidedFilter] | None = None
+
+    def __call__(self, depth: Float32Array, rows: slice | None = None) -> Float32Array:
+        """Return the score (h, W) of a hypothesis in some rows of the view.
+
+        Args:
+            depth: (H, W) along the optical axis; not positive: no hypothesis, UNSEEN.
+            rows: first row and the row after the last; None: all. Rows within the settings' `support_px` of either
+                end are less exact.
+        """
+        part = rows or slice(0, len(self._grey))
+        seen = (depth > 0) & (depth < _FURTHEST_M)
+        kernels.match_rows(
+            *(np.where(seen, depth, np.float32(0)), np.array([part.start, part.stop]), self._mirrored),
+            *(self._mean, self._inverse_sigma, self._greys, self._sizes, self._per_depth, self._starts),
+            self._largest,
+        )
+        score = self._filter(part).filter(self._largest[part].mean(axis=1))
+        return np.where(seen[part], score, np.float32(UNSEEN))
+
+    def _filter(self, part: slice) -> cv2.ximgproc.GuidedFilter:
+        """Return the guided filter of some rows; the rows of a hypothesis are mostly those of the one before."""
+        if self._guided is None or self._guided[0] != part:
+            settings = self._settings
+            guide = np.ascontiguousarray(self._grey[part])
+            self._guided = (
+                part,
+                cv2.ximgproc.createGuidedFilter(guide, settings.reach_px, settings.edge_grey**2),
+            )
+        return self._guided[1]
 
 
-# Several hundred thousand images go through the next two classes. They write into arrays of their own: allocating
-# fresh memory takes longer than filling it.
-class _TopScores:
-    """Largest values of a sequence of images (H, W) at each pixel, `count` of them."""
-
-    def __init__(self, shape: tuple[int, ...], count: int) -> None:
-        self._largest = [np.empty(shape, np.float32) for _ in range(count)]
-        self._spare, self._leftover = np.empty(shape, np.float32), np.empty(shape, np.float32)
-        self._count = 0
-
-    def clear(self) -> None:
-        """Forget all images."""
-        self._count = 0
-
-    def add(self, image: Float32Array) -> None:
-        """Take the values of another image; the image itself is not kept."""
-        np.copyto(self._leftover, image)
-        for rank in range(self._count):
-            kept = self._largest[rank]
-            np.maximum(kept, self._leftover, out=self._spare)
-            np.minimum(kept, self._leftover, out=self._leftover)
-            self._largest[rank], self._spare = self._spare, kept
-        if self._count < len(self._largest):
-            self._largest[self._count], self._leftover = self._leftover, self._largest[self._count]
-            self._count += 1
-
-    def mean(self) -> Float32Array:
-        """Return the mean (H, W) of the largest values, or of all if fewer; the next call overwrites it."""
-        np.copyto(self._spare, self._largest[0])
-        for kept in self._largest[1 : self._count]:
-            self._spare += kept
-        self._spare /= np.float32(self._count)
-        return self._spare
+def _stacked(images: list[Float32Array]) -> tuple[Float32Array, Float32Array]:
+    """Return images in one array (n, h + 1, w + 1), and the largest column and row (n, 2) of each."""
+    height, width = (max(image.shape[axis] for image in images) for axis in (0, 1))
+    greys = np.zeros((len(images), height + 1, width + 1), np.float32)
+    for grey, image in zip(greys, images, strict=True):
+        grey[: image.shape[0], : image.shape[1]] = image
+    return greys, np.array([[image.shape[1] - 1, image.shape[0] - 1] for image in images], np.float32)
 
 
-class _Correlation:
-    """Normalised cross-correlation of one image with others, over square windows."""
-
-    def __init__(self, image: Float32Array, window_px: int) -> None:
-        self._image, self._window = image, (window_px, window_px)
-        self._mean = self._smooth(image, np.empty_like(image))
-        variance = self._smooth(image * image, np.empty_like(image)) - self._mean * self._mean
-        self._inverse_sigma = 1 / np.sqrt(np.maximum(variance, _NOISE_VARIANCE))
-        self._other_mean, self._variance, self._product, self._products = (np.empty_like(image) for _ in range(4))
-
-    def __call__(self, other: Float32Array) -> Float32Array:
-        """Return the correlation (H, W), −1 where `other` is 0; the next call overwrites it."""
-        mean, product = self._smooth(other, self._other_mean), self._product
-        variance = self._smooth(np.multiply(other, other, out=product), self._variance)
-        correlation = self._smooth(np.multiply(self._image, other, out=product), self._products)
-        variance -= np.multiply(mean, mean, out=product)
-        np.maximum(variance, _NOISE_VARIANCE, out=variance)
-        correlation -= np.multiply(self._mean, mean, out=product)
-        correlation *= self._inverse_sigma
-        correlation /= np.sqrt(variance, out=variance)
-        np.copyto(correlation, np.float32(UNSEEN), where=other == 0)
-        return correlation
-
-    def _smooth(self, image: Float32Array, out: Float32Array) -> Float32Array:
-        cv2.boxFilter(image, -1, self._window, dst=out, borderType=cv2.BORDER_REFLECT)
-        return out
+def _projections(reference: StereoView, neighbours: list[StereoView]) -> tuple[Float32Array, Float32Array]:
+    """Return matrices (n, 3, 3) and vectors (n, 3) that project pixels with depths into neighbours."""
+    camera = reference.camera
+    world_from_pixel = camera.cam_from_world.T @ np.linalg.inv(opencv_camera_matrix(camera.pinhole))
+    per_depth, starts = [], []
+    for view in neighbours:
+        pixel_from_world = opencv_camera_matrix(view.camera.pinhole) @ view.camera.cam_from_world
+        per_depth.append(pixel_from_world @ world_from_pixel)
+        starts.append(pixel_from_world @ (camera.center_in_world - view.camera.center_in_world))
+    return np.array(per_depth, np.float32), np.array(starts, np.float32)
 
 
 @dataclass(frozen=True)
@@ -146,20 +145,13 @@ class WinnerTakesAll:
 
     def __init__(self, shape: tuple[int, ...]) -> None:
         self._count = 0
-        self._hypothesis = np.zeros(shape, dtype=np.int64)
-        self._best, self._before, self._after = (np.full(shape, -2.0, dtype=np.float32) for _ in range(3))
-        self._last = np.full(shape, -2.0, dtype=np.float32)
+        self._hypothesis = np.full(shape, -2, dtype=np.int32)
+        self._best, self._before, self._after, self._last = (np.full(shape, -2.0, np.float32) for _ in range(4))
 
     def add(self, score: Float32Array) -> None:
         """Take the scores (H, W) of the next hypothesis."""
-        follows = (self._hypothesis == self._count - 1) & (self._count > 0)
-        np.copyto(self._after, score, where=follows)
-        better = score > self._best
-        np.copyto(self._before, self._last, where=better)
-        np.copyto(self._after, np.float32(-2.0), where=better)
-        np.copyto(self._best, score, where=better)
-        self._hypothesis[better] = self._count
-        self._last = score
+        images = (score, self._last, self._best, self._before, self._after, self._hypothesis)
+        kernels.keep_winner(self._count, *(image.reshape(-1) for image in images))
         self._count += 1
 
     def winner(self) -> Winner:

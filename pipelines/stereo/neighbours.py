@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipelines.core.types import FloatArray, IntArray
-from pipelines.stereo.sweep import Planes, StereoCamera
+from pipelines.stereo.sweep import Planes
+from pipelines.stereo.views import StereoCamera
 
 # Smaller angles give no depth, larger angles another picture of the same place. After Yao et al.,
 # doi 10.1007/978-3-030-01237-3_47, section 4.1, adapted to the wider angles of flights.

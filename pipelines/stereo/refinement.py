@@ -12,23 +12,15 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from pipelines.core.types import Float32Array, FloatArray
+from pipelines.core.types import Float32Array
 from pipelines.stereo.agreement import DepthEstimate
 from pipelines.stereo.matching import UNSEEN, Matcher, MatchSettings, WinnerTakesAll
-from pipelines.stereo.sweep import (
-    NormalMap,
-    StereoCamera,
-    StereoView,
-    SweepResult,
-    opencv_camera_matrix,
-    sweep_result,
-)
+from pipelines.stereo.sweep import NormalMap, SweepResult, sweep_result
+from pipelines.stereo.views import StereoCamera, StereoView
 
 _REACH = 4  # steps on either side of the prior
 _STEPS = 3  # for one step of the sweep that the prior is from
 _SPECKLE_PX = 5  # parts smaller than half of this are chance where one view alone has depths
-_LEAST_DEPTH = 1e-3
-_OUTSIDE = -10.0
 
 
 @dataclass(frozen=True)
@@ -90,45 +82,13 @@ def refine(
     """
     if not neighbours:
         raise ValueError("no neighbours to compare with")
-    matcher, search = Matcher(reference.grey, settings), WinnerTakesAll(reference.grey.shape)
-    rays = reference.camera.rays()
-    samplers = [_NeighbourSampler(rays, reference.camera.center_in_world, view) for view in neighbours]
+    matcher, search = Matcher(reference, neighbours, settings), WinnerTakesAll(reference.grey.shape)
     middle = prior.normals.depth(reference.camera, prior.offset_m).astype(np.float32)
     with np.errstate(divide="ignore"):
         step = (prior.step_m / prior.normals.offset_per_metre(reference.camera)).astype(np.float32)
     for number in range(-_REACH, _REACH + 1):
-        depth = middle + np.float32(number) * step
-        score = matcher(sampler.sample(depth) for sampler in samplers)
-        score[~(depth > 0)] = UNSEEN
-        search.add(score)
+        search.add(matcher(middle + np.float32(number) * step))
     winner = search.winner()
     offset = prior.offset_m + (winner.hypothesis - _REACH) * prior.step_m
     refined = sweep_result(winner, prior.normals, offset, prior.step_m)
     return replace(refined, score=np.where(winner.inner, refined.score, np.float32(UNSEEN)))
-
-
-class _NeighbourSampler:
-    """Samples a neighbour's image at points on rays (H, W, 3) from a centre (3,)."""
-
-    def __init__(self, rays: FloatArray, center_in_world: FloatArray, other: StereoView) -> None:
-        pixel_from_world = opencv_camera_matrix(other.camera.pinhole) @ other.camera.cam_from_world
-        per_depth = (rays @ pixel_from_world.T).astype(np.float32)
-        self._per_depth = [np.ascontiguousarray(per_depth[..., axis]) for axis in range(3)]
-        start = pixel_from_world @ (center_in_world - other.camera.center_in_world)
-        self._start = start.astype(np.float32)
-        self._grey = other.grey
-        self._in_image = [np.empty_like(per_depth) for per_depth in self._per_depth]
-
-    def sample(self, depth: Float32Array) -> Float32Array:
-        """Return the neighbour's grey levels (H, W) at depths (H, W) of the rays; 0 outside its image."""
-        for in_image, per_depth, start in zip(self._in_image, self._per_depth, self._start, strict=True):
-            np.add(np.multiply(depth, per_depth, out=in_image), start, out=in_image)
-        x, y, z = self._in_image
-        behind = ~(z > _LEAST_DEPTH)
-        z[behind] = 1.0
-        x /= z
-        y /= z
-        x[behind] = _OUTSIDE
-        y[behind] = _OUTSIDE
-        image = cv2.remap(self._grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
-        return np.asarray(image, np.float32)

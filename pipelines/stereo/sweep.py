@@ -8,60 +8,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray
-from pipelines.geometry.cameras import Pinhole
 from pipelines.stereo.matching import UNSEEN, Matcher, MatchSettings, Winner, WinnerTakesAll
+from pipelines.stereo.views import StereoCamera, StereoView
 
 _ROWS = 8  # strips begin and end at multiples of this number
 _CLEARLY = 0.05  # of the score: margin by which planes of another direction must fit better than the first
-
-
-@dataclass(frozen=True)
-class StereoCamera:
-    """Undistorted camera in a metric frame `world`.
-
-    Attributes:
-        pinhole: of H × W pixels.
-        cam_from_world: (3, 3) rotation.
-        center_in_world: (3,).
-    """
-
-    pinhole: Pinhole
-    cam_from_world: FloatArray
-    center_in_world: FloatArray
-
-    def rays(self) -> FloatArray:
-        """Return viewing rays (H, W, 3) in `world`, of length one along the optical axis."""
-        x, y = np.meshgrid(np.arange(self.pinhole.width) + 0.5, np.arange(self.pinhole.height) + 0.5)
-        return np.asarray(self.pinhole.rays(np.stack([x, y], axis=-1)) @ self.cam_from_world)
-
-    def rows(self, part: slice) -> StereoCamera:
-        """Return the camera of some rows of its images."""
-        pinhole = replace(self.pinhole, height=part.stop - part.start, cy=self.pinhole.cy - part.start)
-        return replace(self, pinhole=pinhole)
-
-
-@dataclass(frozen=True)
-class StereoView:
-    """Photograph with its camera.
-
-    Attributes:
-        camera: of H × W pixels.
-        grey: (H, W), 1 … 256; 0 outside the photograph's valid part.
-    """
-
-    camera: StereoCamera
-    grey: Float32Array
-
-    def rows(self, part: slice) -> StereoView:
-        """Return some rows of the view."""
-        return StereoView(self.camera.rows(part), self.grey[part])
 
 
 @dataclass(frozen=True)
@@ -154,7 +110,8 @@ def plane_sweep(
     fewest = min((len(planes.offset_m) for planes in sweeps), default=0)
     if not neighbours or fewest < 3:
         raise ValueError(f"{len(neighbours)} neighbours and {fewest} planes are too few to sweep")
-    results = [_sweep(reference, neighbours, planes, settings) for planes in sweeps]
+    matcher = Matcher(reference, neighbours, settings)
+    results = [_sweep(reference.camera, planes, matcher, settings.support_px) for planes in sweeps]
     best = np.argmax([result.score - (_CLEARLY if number else 0) for number, result in enumerate(results)], axis=0)
     normals = NormalMap(np.stack([planes.normal_in_world for planes in sweeps]), best.astype(np.uint8))
     offset, score, step, sharpness = (
@@ -164,23 +121,15 @@ def plane_sweep(
     return SweepResult(normals, offset, score, step, sharpness)
 
 
-def _sweep(
-    reference: StereoView, neighbours: list[StereoView], planes: Planes, settings: MatchSettings
-) -> SweepResult:
+def _sweep(camera: StereoCamera, planes: Planes, matcher: Matcher, support_px: int) -> SweepResult:
     """Return the best planes of one direction."""
-
-    @lru_cache(maxsize=1)  # the rows of a plane are mostly those of the plane before
-    def strip(first: int, last: int) -> tuple[StereoView, Matcher]:
-        view = reference.rows(slice(first, last))
-        return view, Matcher(view.grey, settings)
-
-    search = WinnerTakesAll(reference.grey.shape)
-    for offset, visible in zip(planes.offset_m, _visible_scene(planes, reference.camera), strict=True):
-        score = np.full(reference.grey.shape, UNSEEN, np.float32)
+    shape = (camera.pinhole.height, camera.pinhole.width)
+    search = WinnerTakesAll(shape)
+    for depth, visible in _scene_on_planes(planes, camera):
+        score = np.full(shape, UNSEEN, np.float32)
         if visible.any():
-            first, last = _row_range(visible, settings.support_px)
-            view, matcher = strip(first, last)
-            score[first:last] = matcher(_warp_by_plane(view, other, planes, offset) for other in neighbours)
+            rows = _row_range(visible, support_px)
+            score[rows] = matcher(depth, rows)
             score[~visible] = UNSEEN
         search.add(score)
     winner = search.winner()
@@ -191,22 +140,24 @@ def _sweep(
     return sweep_result(winner, normals, offset_m, step_m)
 
 
-def _visible_scene(planes: Planes, camera: StereoCamera) -> Iterator[BoolArray]:
-    """Yield for each plane the mask (H, W) of the pixels that see the scene on it."""
+def _scene_on_planes(planes: Planes, camera: StereoCamera) -> Iterator[tuple[Float32Array, BoolArray]]:
+    """Yield for each plane its depth (H, W), and the mask (H, W) of the pixels that see the scene on it."""
     rays, center = camera.rays(), camera.center_in_world
     along, (lowest, highest) = rays @ planes.normal_in_world, planes.height_m
-    climb = np.divide(rays[..., 2], along, out=np.zeros_like(along), where=along != 0)
+    with np.errstate(divide="ignore"):
+        per_gap = (1 / along).astype(np.float32)
+    rise = rays[..., 2].astype(np.float32)
     for gap in planes.offset_m - planes.normal_in_world @ center:
-        height = center[2] + gap * climb
-        # A ray meets a plane in front of the camera if gap and slope have one sign.
-        yield (gap * along > 0) & (height >= lowest) & (height <= highest)
+        depth = np.float32(gap) * per_gap
+        height = np.float32(center[2]) + depth * rise
+        yield depth, (depth > 0) & (height >= lowest) & (height <= highest)
 
 
-def _row_range(visible: BoolArray, around_px: int) -> tuple[int, int]:
-    """Return the first row with a visible pixel and the row after the last, widened by `around_px`."""
+def _row_range(visible: BoolArray, around_px: int) -> slice:
+    """Return the rows with a visible pixel, widened by `around_px`."""
     rows = np.flatnonzero(visible.any(axis=1))
     first, last = rows[0] - around_px, rows[-1] + 1 + around_px
-    return max(int(first) // _ROWS * _ROWS, 0), min(-int(-last // _ROWS) * _ROWS, len(visible))
+    return slice(max(int(first) // _ROWS * _ROWS, 0), min(-int(-last // _ROWS) * _ROWS, len(visible)))
 
 
 def sweep_result(
@@ -215,35 +166,3 @@ def sweep_result(
     """Return the best hypotheses as a result, given their offsets (H, W) and the steps (H, W) between them."""
     sharpness = (winner.curvature / step_m**2).astype(np.float32)
     return SweepResult(normals, offset_m.astype(np.float32), winner.score, step_m.astype(np.float32), sharpness)
-
-
-def _warp_by_plane(reference: StereoView, other: StereoView, planes: Planes, offset_m: float) -> Float32Array:
-    """Return `other`, warped by the plane's homography to the pixels of `reference`; 0 outside its image."""
-    reference_camera, other_camera, pinhole = reference.camera, other.camera, reference.camera.pinhole
-    turn = other_camera.cam_from_world @ reference_camera.cam_from_world.T
-    shift = other_camera.cam_from_world @ (reference_camera.center_in_world - other_camera.center_in_world)
-    normal_in_cam = reference_camera.cam_from_world @ planes.normal_in_world
-    distance = offset_m - planes.normal_in_world @ reference_camera.center_in_world
-    if abs(distance) < 1e-9:
-        return np.zeros_like(reference.grey)
-    by_ray = turn + np.outer(shift, normal_in_cam) / distance
-    homography = opencv_camera_matrix(other_camera.pinhole) @ by_ray @ np.linalg.inv(opencv_camera_matrix(pinhole))
-    image = cv2.warpPerspective(
-        other.grey,
-        homography,
-        (pinhole.width, pinhole.height),
-        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-        borderMode=cv2.BORDER_CONSTANT,
-        borderValue=0,
-    )
-    width, height = pinhole.width, pinhole.height
-    corners = np.array([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]])
-    if not (corners @ homography[2] > 0).all():  # part of the plane lies behind the other camera
-        x, y = np.arange(width), np.arange(height)[:, None]
-        image[homography[2, 0] * x + homography[2, 1] * y + homography[2, 2] <= 0] = 0
-    return np.asarray(image, dtype=np.float32)
-
-
-def opencv_camera_matrix(camera: Pinhole) -> FloatArray:
-    """Return the camera matrix (3, 3) with pixels counted from the centre of the first, as OpenCV does."""
-    return np.array([[camera.fx, 0, camera.cx - 0.5], [0, camera.fy, camera.cy - 0.5], [0, 0, 1]])

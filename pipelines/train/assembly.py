@@ -10,7 +10,8 @@ from pipelines.scene.scene import Scene
 from pipelines.splat.densify import DefaultSettings, DefaultStrategy, Strategy
 from pipelines.splat.densify_fast import FastSettings, FastStrategy
 from pipelines.splat.densify_mcmc import McmcSettings, McmcStrategy
-from pipelines.splat.exposure import Exposures
+from pipelines.splat.exposure import Exposures, HeldExposures
+from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.initialise import InitialisationOptions, scene_extent
 from pipelines.splat.memory import TrainingSize
 from pipelines.splat.optimizer import GaussianAdam
@@ -22,17 +23,30 @@ from pipelines.train.options import TrainOptions
 from pipelines.train.schedule import COARSE, JointOptions
 from pipelines.train.trainer import JointTrainer, TrainingViews
 
+_FINISHING_RATE = 0.3  # of the rates at which a training starts
 
-def training_size(scene: Scene, images: ImageCache, options: TrainOptions) -> TrainingSize:
-    """Return the quantities that determine the memory of a training."""
+
+def training_size(scene: Scene, images: ImageCache, options: TrainOptions, beside: int = 0) -> TrainingSize:
+    """Return the quantities that determine the memory of a training.
+
+    Args:
+        scene: cameras.
+        images: undistorted photographs.
+        options: of the training.
+        beside: number of frozen Gaussians that are rendered too.
+    """
     cameras = [images.pinhole(index) for index in map(int, scene.train)]
     largest = max(cameras, key=lambda camera: camera.width * camera.height)
-    corrected = len(images) if options.optimize_cameras else 0
-    return TrainingSize(options.effort.max_gaussians, largest, options.sh_degree, corrected)
+    refined = options.refined_cameras(len(images))
+    return TrainingSize(options.effort.max_gaussians + beside, largest, options.sh_degree, refined)
 
 
 def make_trainer(
-    training: TrainingScene, problem: GeoProblem, backend: Rasterizer, options: TrainOptions
+    training: TrainingScene,
+    problem: GeoProblem,
+    backend: Rasterizer,
+    options: TrainOptions,
+    exposures: HeldExposures | None = None,
 ) -> JointTrainer:
     """Return the trainer with its initial Gaussians, before the first iteration.
 
@@ -41,6 +55,8 @@ def make_trainer(
         problem: the geographic losses, moved to the backend's device.
         backend: the rasteriser.
         options: of the training.
+        exposures: of the photographs, to be held; None: those of the training photographs are fitted, if the
+            options say so.
 
     Raises:
         DegenerateGeometryError: fewer than two different points to start from.
@@ -51,6 +67,7 @@ def make_trainer(
     gaussians = initial_gaussians(training, start, preset.max_gaussians, options.seed).to(device)
     extent_m = scene_extent(scene.poses.cam_center_in_model)
     train = torch.from_numpy(scene.train)
+    fitted = Exposures(len(images), train, preset.iterations, device) if options.exposure else None
     hold = points_to_hold(training, device) if options.faithful_surface else None
     return JointTrainer(
         GaussianAdam(gaussians, extent_m, preset.iterations),
@@ -67,7 +84,51 @@ def make_trainer(
             coarse=COARSE if options.coarse_to_fine else (),
             surface=SurfaceSettings() if options.faithful_surface else None,
         ),
-        exposures=Exposures(len(images), train, preset.iterations, device) if options.exposure else None,
+        exposures=exposures or fitted,
+        region=training.region,
+    )
+
+
+def make_finisher(
+    training: TrainingScene,
+    gaussians: Gaussians,
+    problem: GeoProblem,
+    *,
+    backend: Rasterizer,
+    options: TrainOptions,
+    exposures: HeldExposures | None,
+) -> JointTrainer:
+    """Return a trainer that goes on with trained Gaussians, at a low rate, and neither adds nor removes any.
+
+    Args:
+        training: cameras, photographs and region.
+        gaussians: on the backend's device.
+        problem: holds the cameras.
+        backend: the rasteriser.
+        options: of the training.
+        exposures: of the photographs; None: none.
+    """
+    device = device_of(backend)
+    extent_m = scene_extent(training.scene.poses.cam_center_in_model[training.scene.train])
+    iterations = options.effort.iterations
+    optimizer = GaussianAdam(gaussians, extent_m, iterations)
+    optimizer.rate_factor = _FINISHING_RATE
+    hold = points_to_hold(training, device) if options.faithful_surface else None
+    return JointTrainer(
+        optimizer,
+        DefaultStrategy(DefaultSettings(stop=0, reset_every=0), extent_m, len(gaussians), options.seed),
+        problem.to(device),
+        TrainingViews(training.scene.train, training.images, hold, training.scene.sparse.lenses),
+        rasterizer=backend,
+        options=JointOptions(
+            iterations,
+            gaussians.sh_degree,
+            seed=options.seed,
+            surface=SurfaceSettings() if options.faithful_surface else None,
+            finishing=True,
+        ),
+        exposures=exposures,
+        region=training.region,
     )
 
 

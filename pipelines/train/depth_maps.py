@@ -8,6 +8,8 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -15,7 +17,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from pipelines.core.progress import SILENT, Progress
+from pipelines.core.progress import SILENT, Progress, ProgressTask
+from pipelines.core.threads import thread_count
 from pipelines.core.types import ByteArray, Float32Array
 from pipelines.geometry.cameras import Pinhole
 from pipelines.scene.photographs import ImageCache, save_array
@@ -24,10 +27,11 @@ from pipelines.stereo.agreement import AgreementSettings, DepthEstimate, agreed_
 from pipelines.stereo.matching import UNSEEN, MatchSettings
 from pipelines.stereo.neighbours import PointVisibility, best_neighbours, planes_for
 from pipelines.stereo.refinement import refine, surface_prior
-from pipelines.stereo.sweep import NormalMap, Planes, StereoCamera, StereoView, SweepResult, plane_sweep
+from pipelines.stereo.sweep import NormalMap, Planes, SweepResult, plane_sweep
+from pipelines.stereo.views import StereoCamera, StereoView
 
 # Form of the cached arrays, a part of their key: files of another form lie in another folder.
-_FORM = b"coarse, fine: direction, offset, score, step, sharpness"
+_FORM = b"coarse, fine: direction, offset, score, step, sharpness, by kernels"
 
 
 @dataclass(frozen=True)
@@ -35,7 +39,7 @@ class StereoOptions:
     """Options of the depth maps.
 
     Attributes:
-        coarse_px: longest side of the photographs in the plane sweep.
+        coarse_px: longest side of the photographs in the plane sweep, whose time grows with its cube.
         fine_px: longest side of the photographs in the refinement, and of the depth maps.
         neighbours: number of views that each view is compared with.
         matching: comparison in the plane sweep; a wide window finds the surface where there is little texture.
@@ -79,7 +83,7 @@ class DepthMaps:
         self.folder = folder / self._key()
 
     def build(self, progress: Progress = SILENT) -> None:
-        """Compute the depth maps that are not in the cache.
+        """Compute the depth maps that are not in the cache, several views at once.
 
         A view needs the previous step of its neighbours. Each step therefore finishes all views before the next
         step begins.
@@ -90,20 +94,38 @@ class DepthMaps:
         train = [int(index) for index in self.scene.train]
         steps = (("coarse", self._sweep), ("fine", self._refine), ("depth", self._agree))
         if not all(self._path(index, "depth").exists() for index in train):
+            for index in train:  # Photographs share masks, which two threads must not write at once.
+                self.images.mask(index)
             with progress.task("surface", len(steps) * len(train)) as task:
                 task.advance(0, "compiling kernels (a minute, once)")
                 for kind, make in steps:
-                    for index in train:
-                        if not self._path(index, kind).exists():
-                            save_array(self._path(index, kind), make(index))
-                        task.advance(1, " ")
+                    self._make_all(kind, make, train, task)
         for kind, _ in steps[:-1]:  # and the files that an interrupted run has left
             for index in train:
                 self._path(index, kind).unlink(missing_ok=True)
 
+    def _make_all(
+        self, kind: str, make: Callable[[int], Float32Array], views: list[int], task: ProgressTask
+    ) -> None:
+        """Write the arrays of one step that do not exist; the kernels let go of the interpreter."""
+
+        def write(index: int) -> None:
+            if not self._path(index, kind).exists():
+                save_array(self._path(index, kind), make(index))
+
+        with ThreadPoolExecutor(thread_count()) as pool:
+            jobs = [pool.submit(write, index) for index in views]
+            try:
+                for job in jobs:
+                    job.result()
+                    task.advance(1, " ")
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
+
     def camera(self, index: int) -> Pinhole:
         """Return the camera of a depth map."""
-        return self.images.pinhole(index).limited(self._options.fine_px)
+        return self._pinhole(index, "fine")
 
     def depth(self, index: int) -> Float32Array:
         """Return the depth (H, W) in metres along a training view's optical axis, mapped from disk; 0: unknown."""
@@ -117,17 +139,16 @@ class DepthMaps:
     def _sweep(self, index: int) -> Float32Array:
         sweeps, others = self._planes(index), self._neighbours(index)
         if not sweeps:
-            return _empty_maps(self._coarse(index))
-        views = [self._view(self._coarse(j), j) for j in others]
-        return _packed(plane_sweep(self._view(self._coarse(index), index), views, sweeps, self._options.matching))
+            return _empty_maps(self._pinhole(index, "coarse"))
+        reference, *views = (self._view(self._pinhole(j, "coarse"), j) for j in (index, *others))
+        return _packed(plane_sweep(reference, views, sweeps, self._options.matching))
 
     def _refine(self, index: int) -> Float32Array:
         own = self._surface(index, "coarse")
         if own is None:
             return _empty_maps(self.camera(index))
-        reference = self._view(self.camera(index), index)
+        reference, *views = (self._view(self.camera(j), j) for j in (index, *self._neighbours(index)))
         prior = surface_prior(own, self._agreed(own, index, "coarse"), reference.camera)
-        views = [self._view(self.camera(j), j) for j in self._neighbours(index)]
         return _packed(refine(reference, views, prior, self._options.refining))
 
     def _agree(self, index: int) -> Float32Array:
@@ -141,14 +162,14 @@ class DepthMaps:
         others, options = [self._surface(j, kind) for j in self._neighbours(index)], self._options
         depth = agreed_depth(own, [other for other in others if other is not None], options.agreement)
         # Refined depths started from the sweep: its window sets the width of a rim on fine pixels too.
-        window_px = options.matching.window_px * own.camera.pinhole.width / self._coarse(index).width
+        window_px = options.matching.window_px * own.camera.pinhole.width / self._pinhole(index, "coarse").width
         return without_rims(depth, int(window_px / 2), options.agreement.rim)
 
     def _surface(self, index: int, kind: str) -> DepthEstimate | None:
         sweeps = self._planes(index)
         if not sweeps:
             return None
-        pinhole = self._coarse(index) if kind == "coarse" else self.camera(index)
+        pinhole = self._pinhole(index, kind)
         normal_index, *rest = np.load(self._path(index, kind), mmap_mode="r", allow_pickle=False)
         normals = NormalMap(np.stack([planes.normal_in_world for planes in sweeps]), normal_index.astype(np.uint8))
         return DepthEstimate(self._camera(pinhole, index), SweepResult(normals, *rest))
@@ -158,14 +179,15 @@ class DepthMaps:
         if not others:
             return []
         points = self.scene.point_in_model[self._visibility.points_in_view(index)]
-        cameras = [self._camera(self._coarse(j), j) for j in others]
-        return planes_for(self._camera(self._coarse(index), index), cameras, points)
+        cameras = [self._camera(self._pinhole(j, "coarse"), j) for j in others]
+        return planes_for(self._camera(self._pinhole(index, "coarse"), index), cameras, points)
 
     def _find_neighbours(self, index: int) -> list[int]:
         return best_neighbours(self._visibility, index, self.scene.train, self._options.neighbours)
 
-    def _coarse(self, index: int) -> Pinhole:
-        return self.images.pinhole(index).limited(self._options.coarse_px)
+    def _pinhole(self, index: int, kind: str) -> Pinhole:
+        longest_px = self._options.coarse_px if kind == "coarse" else self._options.fine_px
+        return self.images.pinhole(index).limited(longest_px)
 
     def _camera(self, pinhole: Pinhole, index: int) -> StereoCamera:
         poses = self.scene.poses

@@ -4,18 +4,23 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
+
 from pipelines.core.sentences import about
 from pipelines.core.threads import thread_count
 from pipelines.geometry.cameras import Pinhole
-from pipelines.splat.memory import TrainingSize, free_memory_bytes, predicted_peak_bytes
-from pipelines.splat.rasterizer.backends import device_of, rasterizer
+from pipelines.scene.cloud_options import NOT_IN_BLOCKS
+from pipelines.scene.survey import Survey
+from pipelines.splat.memory import USABLE, TrainingSize, free_memory_bytes, predicted_peak_bytes
+from pipelines.splat.rasterizer.backends import chosen_backend
+from pipelines.train.depth_maps import StereoOptions
 from pipelines.train.options import TrainOptions
 from pipelines.train.pace import MEASURED_CORES, iteration_seconds
 from pipelines.train.schedule import COARSE
 
-# Stereo of all photographs, by megapixels at training size: seven runs on the machine of `MEASURED_ON`, 2026-11-22,
-# took 5 … 12 s a megapixel beside other programs.
-_STEREO_MEGAPIXEL_S = 8.0
+# Stereo, by photographs (the sweep has one size) and by megapixels of the depth maps: half of the processor time of
+# one thread on an Intel Xeon (AVX-512), 2026-11-22. Two threads on two idle cores were not measured.
+_STEREO_PHOTOGRAPH_S, _STEREO_MEGAPIXEL_S = 0.75, 0.6
 # Beyond so many cores the kernels gain little; not measured beyond two.
 _MOST_CORES = 16
 
@@ -36,6 +41,8 @@ class TrainingForecast:
         seconds: about; None on a GPU, where nothing was measured.
         peak_bytes: predicted peak of the memory.
         free_bytes: memory that is free; None: unknown.
+        blocks: number of blocks that was asked for; None: as many as fit.
+        lidar: whether LiDAR is to be used.
     """
 
     preset: str
@@ -49,6 +56,20 @@ class TrainingForecast:
     seconds: float | None
     peak_bytes: int
     free_bytes: int | None
+    blocks: int | None = None
+    lidar: bool = False
+
+    @property
+    def in_blocks(self) -> bool:
+        """Whether the survey is trained in blocks."""
+        if self.blocks is not None:
+            return self.blocks > 1
+        return self.free_bytes is not None and self.peak_bytes > USABLE * self.free_bytes
+
+    @property
+    def refusal(self) -> str:
+        """Reason why the training would be refused; empty: it would not."""
+        return NOT_IN_BLOCKS if self.lidar and self.in_blocks else ""
 
     @property
     def reduction(self) -> float:
@@ -66,7 +87,11 @@ class TrainingForecast:
         if self.seconds is not None:
             took = f"about {about(self.seconds)} on {self.threads} threads of this machine"
         free = "" if self.free_bytes is None else f" of {self.free_bytes / 2**30:.1f} GiB free"
-        return [effort, size, f"{took}; memory about {self.peak_bytes / 2**30:.1f} GiB{free}"]
+        memory = f"memory about {self.peak_bytes / 2**30:.1f} GiB{free}"
+        if not self.in_blocks:
+            return [effort, size, f"{took}; {memory}"]
+        many = "as many blocks as fit" if self.blocks is None else f"{self.blocks} blocks"
+        return [effort, size, f"in {many}; one run would take {took.removeprefix('about ')}, {memory}"]
 
 
 def forecast(photographs: int, photo_px: tuple[int, int], options: TrainOptions) -> TrainingForecast:
@@ -80,15 +105,13 @@ def forecast(photographs: int, photo_px: tuple[int, int], options: TrainOptions)
         options: of the training.
 
     Raises:
-        BackendUnavailableError: `--backend cuda` without a GPU or without gsplat.
+        BackendUnavailableError: `--backend cuda`, and a part that it needs is missing; names each.
     """
     effort, (width, height) = options.effort, photo_px
     camera = Pinhole(width, height, width, width, width / 2, height / 2).limited(effort.max_image_size)
-    backend = rasterizer(options.backend)
-    device = device_of(backend)
-    size = TrainingSize(
-        effort.max_gaussians, camera, options.sh_degree, photographs if options.optimize_cameras else 0
-    )
+    backend = chosen_backend(options.backend)
+    device = torch.device(backend)
+    size = TrainingSize(effort.max_gaussians, camera, options.sh_degree, options.refined_cameras(photographs))
     return TrainingForecast(
         preset=options.preset,
         photographs=photographs,
@@ -96,12 +119,23 @@ def forecast(photographs: int, photo_px: tuple[int, int], options: TrainOptions)
         training_px=(camera.width, camera.height),
         iterations=effort.iterations,
         max_gaussians=effort.max_gaussians,
-        backend=backend.name,
+        backend=backend,
         threads=thread_count(),
         seconds=_seconds(photographs, camera, options) if device.type == "cpu" else None,
         peak_bytes=predicted_peak_bytes(size),
         free_bytes=free_memory_bytes(device),
+        blocks=options.blocks,
+        lidar=options.lidar is not None,
     )
+
+
+def forecast_of(survey: Survey, options: TrainOptions) -> TrainingForecast:
+    """Return the forecast of a training of a survey.
+
+    Raises:
+        BackendUnavailableError: `--backend cuda` without a GPU or without gsplat.
+    """
+    return forecast(len(survey.images), survey.largest_photograph_px, options)
 
 
 def _seconds(photographs: int, camera: Pinhole, options: TrainOptions) -> float:
@@ -113,5 +147,7 @@ def _seconds(photographs: int, camera: Pinhole, options: TrainOptions) -> float:
         seconds += (until - begun) * effort.iterations * one
         begun = until
     if options.dense:
-        seconds += _STEREO_MEGAPIXEL_S * photographs * pixels / 1e6
+        maps = camera.limited(StereoOptions().fine_px)
+        megapixels = maps.width * maps.height / 1e6
+        seconds += photographs * (_STEREO_PHOTOGRAPH_S + _STEREO_MEGAPIXEL_S * megapixels)
     return seconds * MEASURED_CORES / min(thread_count(), _MOST_CORES)

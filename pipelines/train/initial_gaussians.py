@@ -10,13 +10,14 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from pipelines.core.types import IntArray
+from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.scene.photographs import ImageCache
 from pipelines.scene.scene import Scene
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.initialise import InitialisationOptions, gaussians_from_points, gaussians_of_size
 from pipelines.splat.surface import ObservedPoints
 from pipelines.train.background import background
+from pipelines.train.region import TrainingRegion
 from pipelines.train.surface import SceneSurface, SurfacePoints
 
 _SURFACE_SHARE = 0.8  # of the limit of Gaussians starts on the surface; density control places the others
@@ -34,11 +35,17 @@ class TrainingScene:
         scene: cameras and SfM points.
         images: undistorted photographs.
         surface: surface from depth maps; None: the training goes without.
+        region: part of the scene that is trained; None: all of it.
     """
 
     scene: Scene
     images: ImageCache
     surface: SceneSurface | None = None
+    region: TrainingRegion | None = None
+
+    def in_region(self, points: FloatArray) -> BoolArray:
+        """Return which of points (N, 3) in `model` are trained, as a mask (N,)."""
+        return np.ones(len(points), dtype=bool) if self.region is None else self.region.cell.contains(points)
 
 
 def initial_gaussians(training: TrainingScene, options: InitialisationOptions, most: int, seed: int) -> Gaussians:
@@ -47,7 +54,8 @@ def initial_gaussians(training: TrainingScene, options: InitialisationOptions, m
     1. Discs lie on the surface, as dense as the photographs resolve it.
     2. Balls lie at SfM points where no surface is known. On a surface discs are better: an SfM point has no normal,
        and a ball reaches as far behind a wall as the gap to the wall's next point.
-    3. Balls lie in the background, as far as the limit leaves room.
+    3. Balls lie in the background, as far as the limit leaves room. In a region, the sky is that of the model which
+       stands in for the rest: all blocks of a survey then have the same.
 
     Args:
         training: cameras, photographs and surface.
@@ -62,11 +70,15 @@ def initial_gaussians(training: TrainingScene, options: InitialisationOptions, m
     start = SurfacePoints(scene.point_in_model, scene.sparse.point_rgb, np.full_like(scene.point_in_model, np.nan))
     if training.surface is not None:
         share = _SURFACE_SHARE * min(1.0, training.surface.known_share() / _MOSTLY_KNOWN)
-        surface = training.surface.sample(int(share * most), seed)
+        surface = training.surface.sample(int(share * most), seed, training.in_region)
         start = SurfacePoints.concatenate([start.part(_off_surface(start, surface)), surface])
-    near = gaussians_from_points(start.point_in_model, start.rgb, options, start.normal_in_model)
     behind = background(scene, training.images, start.point_in_model)
+    start = start.part(np.flatnonzero(training.in_region(start.point_in_model)))
+    near = gaussians_from_points(start.point_in_model, start.rgb, options, start.normal_in_model)
     far = gaussians_of_size(behind.point_in_model, behind.rgb, behind.sigma_m, options)
+    if training.region is not None:
+        within = training.in_region(behind.point_in_model) & training.region.box.contains(behind.point_in_model)
+        far = Gaussians.concatenate([far.select(torch.from_numpy(within)), training.region.sky])
     room = max(most - len(near), 0)
     keep = torch.linspace(0, max(len(far) - 1, 0), min(room, len(far))).long()
     return Gaussians.concatenate([near, far.select(keep)])
@@ -101,6 +113,8 @@ def points_to_hold(training: TrainingScene, device: torch.device) -> Callable[[i
         if training.surface is not None and index in shown:
             of_surface, its_weight = training.surface.held(index, _STRIDE)
             known, weight = np.concatenate([known, of_surface]), np.concatenate([weight, its_weight])
+        inside = training.in_region(known)
+        known, weight = known[inside], weight[inside]
         return ObservedPoints(torch.from_numpy(known).float().to(device), torch.from_numpy(weight).to(device))
 
     return points

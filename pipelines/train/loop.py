@@ -56,10 +56,12 @@ class TrainingRecord:
     Attributes:
         seconds: duration; of an interrupted training, the sum over its runs.
         recovery: sentence on the value that was not finite, and on the recovery; None: all values were finite.
+        processor_s: of all processors together, for one iteration of this run; NaN where no second iteration ran.
     """
 
     seconds: float
     recovery: str | None
+    processor_s: float = math.nan
 
 
 def optimise(trainer: JointTrainer, options: LoopOptions, progress: Progress) -> TrainingRecord:
@@ -78,10 +80,13 @@ def optimise(trainer: JointTrainer, options: LoopOptions, progress: Progress) ->
     """
     loop, iterations = _Loop(trainer, options), trainer.options.iterations
     display = TrainingProgress(progress, trainer.iteration, iterations, TimeLeft(trainer.work, iterations))
+    worked, since = math.nan, iterations  # the first iteration compiles kernels
     with deferred_interrupts() as stop, display:
         while trainer.iteration < iterations:
             try:
                 row = loop.iterate()
+                if math.isnan(worked):
+                    worked, since = time.process_time(), trainer.iteration
                 display.iterated(trainer.iteration, None if row is None else _note(row))
                 if stop.requested:
                     loop.save()
@@ -93,7 +98,8 @@ def optimise(trainer: JointTrainer, options: LoopOptions, progress: Progress) ->
             except NonFiniteError as error:
                 loop.recover(error)
         loop.save()
-    return TrainingRecord(loop.seconds(), loop.recovery)
+    each = (time.process_time() - worked) / (iterations - since) if since < iterations else math.nan
+    return TrainingRecord(loop.seconds(), loop.recovery, each)
 
 
 class _Loop:
@@ -207,6 +213,8 @@ def _metrics_row(trainer: JointTrainer, report: StepReport, seconds: float) -> d
         "photometric": float(report.photometric),
         "psnr": -10.0 * math.log10(max(float(report.mean_square_error), 1e-10)),
         "gaussians": len(trainer.optimizer.gaussians),
+        "visible": report.visible,
+        "pixels": report.pixels,
         "geo_weight": report.weight,
     }
     row |= {name: float(value) for name, value in losses.items()}

@@ -44,7 +44,24 @@ class SplatOptions(StageOptions):
         )
 
 
-class TrainOptions(GeographicOptions, SplatOptions, LidarOptions):
+class BlockOptions(StageOptions):
+    """Options of a training in blocks."""
+
+    blocks: int | None = Field(
+        None,
+        ge=1,
+        description="Train in so many blocks (default: one run, or as many blocks as needed to fit into memory). "
+        "Iterations are those of each block, the limit of Gaussians is that of the whole.",
+    )
+    block_overlap: float = Field(
+        0.15, ge=0, le=1, description="Overlap of blocks on each side, as a share of a block's width."
+    )
+    block_memory: float | None = Field(
+        None, gt=0, description="Memory of a worker in GiB, for the number of blocks (default: what is free here)."
+    )
+
+
+class TrainOptions(GeographicOptions, SplatOptions, BlockOptions, LidarOptions):
     """Options of the joint optimisation of Gaussians, similarity and camera corrections."""
 
     checkpoint_every: int = Field(500, ge=1, description="Iterations between checkpoints.")
@@ -58,3 +75,37 @@ class TrainOptions(GeographicOptions, SplatOptions, LidarOptions):
                 "--lidar is compared with the surface of the photographs: it needs --dense and --faithful-surface"
             )
         return self
+
+
+class SolutionOptions(GeographicOptions):
+    """Options of the solution that all blocks share.
+
+    Attributes:
+        max_image_size: longest side in pixels of the photographs whose colours give the exposures.
+        exposure: whether to estimate exposures.
+        seed: seed of every random choice.
+    """
+
+    max_image_size: int = Field(ge=1)
+    exposure: bool = True
+    seed: int = Field(0, ge=0)
+
+
+class SeamOptions(TrainOptions):
+    """Options of the training across the seams.
+
+    Attributes:
+        trained: SHA-256 of the Gaussians of each block, in the order of their numbers.
+    """
+
+    trained: tuple[str, ...] = ()
+
+
+class BlockTrainOptions(TrainOptions):
+    """Options of the training of one block.
+
+    Attributes:
+        id: number of the block in the plan.
+    """
+
+    id: int = Field(ge=0)

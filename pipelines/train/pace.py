@@ -8,8 +8,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import nnls
+
+from pipelines.core.types import FloatArray
 
 # Fitted to one whole iteration of docs/benchmarks.md: 10 000 … 1 000 000 Gaussians, 0.25 … 1.2 megapixels, a third
 # of the Gaussians in view. 2 cores of an AMD EPYC (AVX-512), CPU backend, 2026-11-21.
@@ -30,6 +34,52 @@ def iteration_seconds(pixels: float, gaussians: float, *, surface: bool) -> floa
     """
     plain = _FIXED_S + _MEGAPIXEL_S * pixels / 1e6 + _MILLION_GAUSSIANS_S * gaussians / 1e6
     return (_SURFACE if surface else 1.0) * plain
+
+
+@dataclass(frozen=True)
+class BlockCost:
+    """Model of time and memory of a block's training: c₀ + c₁ · pixels + c₂ · visible + c₃ · Gaussians.
+
+    Attributes:
+        seconds: (4,) coefficients of the processor seconds of an iteration; pixels, visible Gaussians and all
+            Gaussians are counted in millions.
+        bytes: (4,) coefficients of the peak of the memory.
+    """
+
+    seconds: FloatArray
+    bytes: FloatArray
+
+    def iteration_s(self, pixels: float, visible: float, gaussians: float) -> float:
+        """Return the processor seconds of an iteration.
+
+        Args:
+            pixels: of the block in a view.
+            visible: number of the Gaussians in a view.
+            gaussians: number of all Gaussians, those that stand in for the rest among them.
+        """
+        return float(_design(np.array([[pixels, visible, gaussians]])) @ self.seconds)
+
+    def peak_bytes(self, pixels: float, visible: float, gaussians: float) -> float:
+        """Return the peak of the process's memory; arguments as for `iteration_s`, with the limit of Gaussians."""
+        return float(_design(np.array([[pixels, visible, gaussians]])) @ self.bytes)
+
+    @staticmethod
+    def fitted(sizes: FloatArray, seconds: FloatArray, peak_bytes: FloatArray) -> BlockCost:
+        """Return the model that fits measured blocks best in relative terms, with no coefficient below zero.
+
+        Args:
+            sizes: (B, 3) pixels, visible and all Gaussians of each block.
+            seconds: (B,) processor seconds of an iteration.
+            peak_bytes: (B,) peaks of the memory.
+        """
+        design = _design(sizes)
+        return BlockCost(
+            *(nnls(design / values[:, None], np.ones(len(values)))[0] for values in (seconds, peak_bytes))
+        )
+
+
+def _design(sizes: FloatArray) -> FloatArray:
+    return np.column_stack([np.ones(len(sizes)), sizes / 1e6])
 
 
 class TimeLeft:

@@ -6,17 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.core.cautions import union
 from pipelines.core.workspace import Summary
-from pipelines.geometry.rotations import quat_xyzw_from_matrix
 from pipelines.georef.estimated_error import EstimatedError
-from pipelines.georef.posterior import solution_covariances
-from pipelines.georef.problem import GeoProblem
-from pipelines.georef.terms import ControlTerm, FixTerm
+from pipelines.scene.frozen_solution import solution_of, with_exposures
 from pipelines.scene.initial_similarity import InitialSimilarity
 from pipelines.scene.lidar_report import LidarReport
 from pipelines.scene.scene import Scene
-from pipelines.scene.trained_model import TrainedCamera, TrainedLens, TrainedModel
+from pipelines.scene.trained_model import TrainedModel
 from pipelines.train.loop import TrainingRecord
 from pipelines.train.trainer import JointTrainer
 
@@ -25,6 +21,7 @@ _CAUSES = {
     "bias": "Check the base station, the vertical datum and the antenna offset",
     "lever-arm": "`georef ingest --lever-arm` can apply it, in the axes of the body",
     "boresight": "`georef ingest --boresight` can apply it",
+    "lidar-shift": "Check the LiDAR's CRS, datum and flight",
 }
 
 
@@ -39,31 +36,19 @@ def trained_model(trainer: JointTrainer, scene: Scene, initial: InitialSimilarit
     Raises:
         DegenerateGeometryError: the measurements do not determine the similarity.
     """
-    problem, gaussians = trainer.problem, trainer.optimizer.gaussians
-    similarity, control = problem.similarity, problem.control
-    measured = problem.fixes is not None or control is not None
-    covariance, of_errors = solution_covariances(problem) if measured else (similarity.prior_covariance(), None)
-    estimates = () if of_errors is None else problem.errors.estimates(of_errors)
+    exposure = None if trainer.exposures is None else trainer.exposures.affine.cpu().numpy().astype(float)
+    solution = solution_of(trainer.problem, scene, initial)
+    if exposure is not None:
+        solution = with_exposures(solution, exposure)
+    gaussians = trainer.optimizer.gaussians
     return TrainedModel(
-        geo_from_model=similarity.current().to_record(
-            "model", "geo", covariance=covariance, pivot=similarity.pivot_in_geo
-        ),
-        model_from_local=scene.model_from_local.to_record("local", "model"),
+        **dict(solution),
         max_image_size=trainer.views.images.max_size_px,
-        cameras=_cameras(trainer, scene),
-        lenses=_lenses(trainer, scene),
         background=trainer.options.background,
         sh_degree=gaussians.sh_degree,
         iterations=trainer.iteration,
         gaussians=len(gaussians),
         backend=trainer.rasterizer.name,
-        gnss_outliers=_contradicting_fixes(problem, scene),
-        control_outliers=()
-        if control is None
-        else tuple(control.point_id[row] for row in problem.contradicting(ControlTerm)),
-        estimated_errors=estimates,
-        variance_factors=initial.variance_factors,
-        cautions=union(initial.cautions),
     )
 
 
@@ -109,10 +94,6 @@ def _warnings(model: TrainedModel, record: TrainingRecord) -> list[str]:
 
 def _lidar_warnings(lidar: LidarReport) -> list[str]:
     warnings = list(lidar.assumptions)
-    if lidar.registration.removed:
-        shift, sigma = lidar.registration.shift_m, lidar.registration.sigma_m
-        text = ", ".join(f"{value:+.3f} ± {one:.3f}" for value, one in zip(shift, sigma, strict=True))
-        warnings.append(f"the LiDAR was shifted by ({text}) m east, north, up: it is taken out here")
     if lidar.areas:
         area_m2 = sum(area.area_m2 for area in lidar.areas)
         warnings.append(
@@ -124,7 +105,7 @@ def _lidar_warnings(lidar: LidarReport) -> list[str]:
 
 def _warning_of(error: EstimatedError) -> str | None:
     """Return a warning if the error exceeds 3 σ or is not observable along every axis, else None."""
-    axes = "east, north, up" if error.name == "bias" else "right, down, forward"
+    axes = "east, north, up" if error.name in {"bias", "lidar-shift"} else "right, down, forward"
     flight = "" if error.flight is None else f" of flight {error.flight + 1}"
     subject = f"{error.name}{flight}"
     values = ", ".join(f"{value:+.3f} ± {sigma:.3f}" for value, sigma in zip(error.value, error.sigma, strict=True))
@@ -139,39 +120,3 @@ def _warning_of(error: EstimatedError) -> str | None:
     if not all(error.observed):
         return f"{subject} is not observable along every axis: ({values}) {error.unit} {axes}"
     return None
-
-
-def _contradicting_fixes(problem: GeoProblem, scene: Scene) -> tuple[str, ...]:
-    fixes = problem.fixes
-    if fixes is None:
-        return ()
-    rows = problem.contradicting(FixTerm)
-    return tuple(sorted(scene.sparse.image_name[int(fixes.camera[row])] for row in rows))
-
-
-def _cameras(trainer: JointTrainer, scene: Scene) -> tuple[TrainedCamera, ...]:
-    poses, train = trainer.problem.cameras.current(), set(map(int, scene.train))
-    exposure = None if trainer.exposures is None else trainer.exposures.affine.cpu().numpy().astype(float)
-    quats = quat_xyzw_from_matrix(poses.cam_from_model)
-    translations = -np.einsum("nij,nj->ni", poses.cam_from_model, poses.cam_center_in_model)
-    return tuple(
-        TrainedCamera(
-            name=name,
-            split="train" if index in train else "test",
-            quat_xyzw=tuple(quats[index]),
-            translation=tuple(translations[index]),
-            exposure=None if exposure is None or index not in train else tuple(map(tuple, exposure[index])),
-        )
-        for index, name in enumerate(scene.sparse.image_name)
-    )
-
-
-def _lenses(trainer: JointTrainer, scene: Scene) -> tuple[TrainedLens, ...]:
-    """Return the lenses that have followed the cameras; none if the lenses were held."""
-    change = trainer.problem.cameras.lens().detach().cpu().numpy()
-    if not len(change):
-        return ()
-    return tuple(
-        TrainedLens(camera_id=key, model=camera.model, params=tuple(camera.params.tolist()))
-        for key, camera in scene.sparse.lenses.moved(change).cameras.items()
-    )

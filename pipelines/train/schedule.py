@@ -35,6 +35,7 @@ class JointOptions:
         coarse: (factor, fraction) pairs: photographs are shrunken by a factor up to a fraction of the training.
         coarse_least_px: lower limit of the longest side of a shrunken photograph.
         surface: weights of the surface losses; None: no surface losses.
+        finishing: whether the Gaussians are trained already, with all their harmonics.
     """
 
     iterations: int
@@ -50,6 +51,7 @@ class JointOptions:
     coarse: tuple[tuple[int, float], ...] = ()
     coarse_least_px: int = 160
     surface: SurfaceSettings | None = None
+    finishing: bool = False
 
 
 class TrainingSchedule:
@@ -96,7 +98,7 @@ class TrainingSchedule:
         """
         every = max(self._options.iterations // 6, 1)
         degree = min(self._options.sh_degree, iteration // every)
-        return self._options.sh_degree if self.extended_from else degree
+        return self._options.sh_degree if self.extended_from or self._options.finishing else degree
 
     def geographic_weight(self, iteration: int) -> float:
         """Return w(t) of eq. 27, or w_max if the weight is constant."""

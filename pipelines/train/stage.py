@@ -10,32 +10,29 @@ from __future__ import annotations
 
 import json
 import logging
-import shutil
 
 from pipelines.core.products import load_json, save_json
-from pipelines.core.stages import POINTS, SIM3, SPARSE
-from pipelines.core.workspace import StageRun, Summary
-from pipelines.formats.colmap import read_sparse
+from pipelines.core.stages import POINTS
+from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.scene.calibrated import load_survey
+from pipelines.scene.frozen_solution import solve_and_hold
 from pipelines.scene.geographic import geo_problem
 from pipelines.scene.geolocated import GeolocatedPoints
-from pipelines.scene.initial_similarity import InitialSimilarity
 from pipelines.scene.measured_cloud import CloudFiles
-from pipelines.scene.scene import initial_scene, photographs
+from pipelines.scene.scene import load_initial_scene, photographs
 from pipelines.scene.trained_model import TrainedModel
 from pipelines.splat.memory import free_memory_bytes, require_memory
 from pipelines.splat.rasterizer.backends import device_of, rasterizer
 from pipelines.splat.storage import write_gaussians
 from pipelines.train.assembly import make_trainer, training_size
 from pipelines.train.depth_maps import DepthMaps
+from pipelines.train.forecast import forecast_of
 from pipelines.train.initial_gaussians import TrainingScene
-from pipelines.train.lidar.prepare import draw_changes, lidar_surface
-from pipelines.train.loop import LoopOptions, optimise
+from pipelines.train.lidar.prepare import compared_lidar, draw_changes, lidar_surface
 from pipelines.train.options import TrainOptions
 from pipelines.train.result import summary_of, trained_model
 from pipelines.train.surface import SceneSurface
-
-CHECKPOINT, METRICS = "checkpoint.npz", "metrics.jsonl"
+from pipelines.train.training_files import METRICS, train_in_folder
 
 log = logging.getLogger(__name__)
 
@@ -44,67 +41,64 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     """Train the model, write products and checkpoints, and return the summary.
 
     Raises:
-        BackendUnavailableError: `--backend cuda` without a GPU or without gsplat.
+        BackendUnavailableError: `--backend cuda`, and a part that it needs is missing; names each.
         ResourceError: the training would not fit into memory.
         ConvergenceError: the training diverged twice.
         KeyboardInterrupt: the user asked to stop; a checkpoint was written.
         GeorefError: a product or a photograph cannot be read, or the scene has too few points.
     """
-    backend = rasterizer(options.backend)  # first, so that `--backend cuda` without a GPU fails at once
+    # First, so that `--backend cuda` without a GPU fails at once.
+    backend = rasterizer(options.backend, stage.progress)
     workspace = stage.workspace
     clouds = None if options.lidar is None else CloudFiles(options.lidar, options.lidar_stated)
-    initial = load_json(InitialSimilarity, workspace.path(SIM3))
-    survey = initial.weighted(load_survey(workspace))
-    scene = initial_scene(read_sparse(workspace.path(SPARSE)), survey, initial)
+    initial, survey, scene = load_initial_scene(workspace)
+    options.require_trainable(len(scene.sparse.image_name))
     images = photographs(scene.sparse, survey, workspace, options.effort.max_image_size)
     require_memory(training_size(scene, images, options), free_memory_bytes(device_of(backend)))
     images.build(stage.progress)
-    surface, lidar = None, None
-    if options.dense:
-        maps = DepthMaps(workspace.cache / "surface", scene, images)
+    maps = DepthMaps(workspace.cache / "surface", scene, images) if options.dense else None
+    if maps is not None:
         maps.build(stage.progress)
-        surface = SceneSurface(maps)
-        if clouds is not None:
-            lidar = lidar_surface(
-                options, clouds, maps, survey,
-                georeference=initial.geo_from_local, seed=options.seed, progress=stage.progress,
-            )  # fmt: skip
-            surface = lidar.surface
-            save_json(lidar.report, stage.out / "lidar.json")
-            draw_changes(stage.out / "lidar.png", lidar, scene)
+    compared = None
+    if clouds is not None and maps is not None:
+        compared = compared_lidar(
+            options, clouds, maps, survey,
+            georeference=initial.geo_from_local, seed=options.seed, progress=stage.progress,
+        )  # fmt: skip
     points = GeolocatedPoints.load(workspace.path(POINTS))
-    problem = geo_problem(scene, survey, initial, options, points=points, seed=options.seed)
+    planes = compared.planes() if compared is not None and options.lidar_register else None
+    problem = geo_problem(scene, survey, initial, options, points=points, planes=planes, seed=options.seed)
+    if problem.bundle is not None:
+        log.info("the %d cameras are solved once, before the training, and held", len(images))
+    solve_and_hold(problem)
+    surface, lidar = None if maps is None else SceneSurface(maps), None
+    if compared is not None and clouds is not None:
+        shift = problem.estimate().errors.lidar_m
+        shift_m = None if shift is None else shift.detach().cpu().numpy()
+        lidar = lidar_surface(compared, clouds, survey, sigma_m=options.lidar_sigma, shift_m=shift_m)
+        surface = lidar.surface
+        save_json(lidar.report, stage.out / "lidar.json")
+        draw_changes(stage.out / "lidar.png", lidar, scene)
     trainer = make_trainer(TrainingScene(scene, images, surface), problem, backend, options)
-    extend = not stage.resumed and _take_over(stage, options.effort.iterations)
-    files = LoopOptions(
-        stage.out / CHECKPOINT,
-        stage.out / METRICS,
-        options.checkpoint_every,
-        options.log_every,
-        resume=stage.resumed or extend,
-        extend=extend,
-        note=stage.record_progress,
-    )
-    record = optimise(trainer, files, stage.progress)
+    record = train_in_folder(stage, trainer, options, _iterations(stage))
     model = trained_model(trainer, scene, initial)
     write_gaussians(stage.out / "gaussians.ply", trainer.optimizer.gaussians.detached())
     save_json(model, stage.out / "model.json")
-    metrics = [json.loads(row) for row in files.metrics.read_text(encoding="utf-8").splitlines()]
+    metrics = [json.loads(row) for row in (stage.out / METRICS).read_text(encoding="utf-8").splitlines()]
     return summary_of(model, metrics, record, None if lidar is None else lidar.report)
 
 
-def _take_over(stage: StageRun, iterations: int) -> bool:
-    """Copy the last state of a finished training of fewer iterations, and return whether there is one.
+def made_in_parts(workspace: Workspace, options: TrainOptions) -> bool:
+    """Return whether the survey is trained in blocks: as asked, or because one training would not fit into memory.
 
     Raises:
-        StorageError: the state cannot be copied.
+        BackendUnavailableError: `--backend cuda` without a GPU or without gsplat.
+        GeorefError: the survey cannot be read.
     """
-    if stage.extends is None or not all((stage.extends / name).is_file() for name in (CHECKPOINT, METRICS)):
-        return False
-    done = load_json(TrainedModel, stage.extends / "model.json").iterations
-    if done >= iterations:
-        return False
-    log.info("the training of %d iterations is extended to %d; --force trains afresh", done, iterations)
-    for name in (CHECKPOINT, METRICS):
-        shutil.copyfile(stage.extends / name, stage.out / name)
-    return True
+    return forecast_of(load_survey(workspace), options).in_blocks
+
+
+def _iterations(stage: StageRun) -> int:
+    """Return the iterations of the finished training that this one may extend; 0: there is none."""
+    model = None if stage.extends is None else stage.extends / "model.json"
+    return 0 if model is None else load_json(TrainedModel, model).iterations

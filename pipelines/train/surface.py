@@ -6,11 +6,12 @@ otherwise float metres above the ground, and their renders would fit the photogr
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.core.types import ByteArray, Float32Array, FloatArray, IntArray
+from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
 from pipelines.geometry.thinning import thin_to_voxels
 from pipelines.train.depth_maps import DepthMaps
 
@@ -58,6 +59,10 @@ class SceneSurface:
         self._maps = maps
         self._train, self._poses = maps.scene.train, maps.scene.poses
 
+    def depth(self, index: int) -> Float32Array:
+        """Return the depth (H, W) in metres along a training view's optical axis; 0: unknown."""
+        return self._maps.depth(index)
+
     def points(self, index: int, stride: int = 1) -> FloatArray:
         """Return the surface points (P, 3) in `model` that a training view sees, in metres.
 
@@ -82,12 +87,15 @@ class SceneSurface:
         depths = (self._maps.depth(index) for index in map(int, self._train))
         return float(np.mean([np.mean(depth > 0) for depth in depths]))
 
-    def sample(self, count: int, seed: int) -> SurfacePoints:
+    def sample(
+        self, count: int, seed: int, inside: Callable[[FloatArray], BoolArray] | None = None
+    ) -> SurfacePoints:
         """Return points of the whole surface, as dense as the photographs resolve it.
 
         Args:
             count: limit of the points.
             seed: seed of their choice.
+            inside: returns which of points (N, 3) count, as a mask (N,); None: all.
         """
         rng = np.random.default_rng(seed)
         share = -(-_CANDIDATES * count // max(len(self._train), 1))
@@ -100,8 +108,11 @@ class SceneSurface:
             rgb = self._maps.rgb(index)[rows, columns]
             views.append(SurfacePoints(self._points(index, rows, columns), rgb, normals))
             sizes.append(self._maps.depth(index)[rows, columns].astype(np.float64) / self._maps.camera(index).fx)
-        candidates = SurfacePoints.concatenate(views)
-        return candidates.part(spread_evenly(candidates.point_in_model, np.concatenate(sizes), count))
+        candidates, size_m = SurfacePoints.concatenate(views), np.concatenate(sizes)
+        if inside is not None:
+            kept = np.flatnonzero(inside(candidates.point_in_model))
+            candidates, size_m = candidates.part(kept), size_m[kept]
+        return candidates.part(spread_evenly(candidates.point_in_model, size_m, count))
 
     def _normals(self, index: int, rows: IntArray, columns: IntArray) -> FloatArray:
         """Return unit normals (P, 3) of the surface at pixels of a view; NaN at the edges of surface and image."""

@@ -14,6 +14,8 @@ from torch.nn import functional
 from pipelines.geometry.cameras import Pinhole
 from pipelines.scene.photographs import ImageCache
 from pipelines.scene.pinholes import Pinholes
+from pipelines.splat.rasterizer.api import Window
+from pipelines.train.region import RegionMasks, RegionView
 
 _MASKS = 64  # limit on the device; all photographs of a camera share one
 
@@ -26,11 +28,17 @@ class TargetImage:
         colour: (H, W, 3) float32, 0 … 1.
         mask: (H, W) bool, the pixels that count; None: all.
         camera: of H × W pixels, with the lens in use.
+        whole: camera of the whole photograph at this size.
+        window: part of the whole that these pixels are; None: all of it.
+        share: of the whole photograph's pixels that count, if it is trained on in part; else 1.
     """
 
     colour: Tensor
     mask: Tensor | None
     camera: Pinhole
+    whole: Pinhole
+    window: Window | None = None
+    share: float = 1.0
 
 
 class TargetImages:
@@ -43,10 +51,13 @@ class TargetImages:
         images: undistorted photographs.
         pinholes: their cameras, with the lens in use.
         device: holds the photographs of `get`.
+        region: pixels of each photograph to train on; None: all.
     """
 
-    def __init__(self, images: ImageCache, pinholes: Pinholes, device: torch.device) -> None:
-        self._images, self._pinholes, self._device = images, pinholes, device
+    def __init__(
+        self, images: ImageCache, pinholes: Pinholes, device: torch.device, region: RegionMasks | None = None
+    ) -> None:
+        self._images, self._pinholes, self._device, self._region = images, pinholes, device, region
         self._masks: OrderedDict[tuple[str, int], Tensor | None] = OrderedDict()
         self._reader = ThreadPoolExecutor(1, "photographs") if device.type == "cuda" else None
         self._next: tuple[int, Future[Tensor]] | None = None
@@ -67,7 +78,27 @@ class TargetImages:
         if shrink > 1:
             colour = functional.avg_pool2d(colour.permute(2, 0, 1), shrink).permute(1, 2, 0).contiguous()
             camera = shrunken(camera, shrink)
-        return TargetImage(colour, self._mask(index, shrink), camera)
+        mask = self._mask(index, shrink)
+        return (
+            TargetImage(colour, mask, camera, camera)
+            if self._region is None
+            else self._part(TargetImage(colour, mask, camera, camera), self._region.view(index, shrink))
+        )
+
+    def _part(self, image: TargetImage, shown: RegionView) -> TargetImage:
+        """Return the part of a photograph that shows the region."""
+        window = shown.window
+        rows, columns = window.slices
+        mask = torch.from_numpy(shown.mask).to(self._device)
+        mask = mask if image.mask is None else mask & image.mask[rows, columns]
+        return TargetImage(
+            image.colour[rows, columns].contiguous(),
+            mask,
+            window.of(image.whole),
+            image.whole,
+            window,
+            float(shown.mask.sum()) / (image.whole.width * image.whole.height),
+        )
 
     def _pixels(self, index: int) -> Tensor:
         if self._next is not None and self._next[0] == index:

@@ -17,15 +17,16 @@ from pipelines.scene.photographs import ImageCache
 from pipelines.scene.pinholes import Pinholes
 from pipelines.splat.contributions import ViewContributions, view_contributions
 from pipelines.splat.densify import Strategy
-from pipelines.splat.exposure import Exposures
+from pipelines.splat.exposure import Exposures, HeldExposures
 from pipelines.splat.finiteness import FinitenessMonitor
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.losses import photometric_loss
 from pipelines.splat.optimizer import GaussianAdam
-from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings, Render
+from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings, Render, ScreenStats
 from pipelines.splat.surface import ObservedPoints, compactness_loss, depth_loss, flatness_loss, normal_loss
 from pipelines.train.checkpoint import prefixed, unprefixed
 from pipelines.train.pace import iteration_seconds
+from pipelines.train.region import TrainingRegion
 from pipelines.train.schedule import JointOptions, TrainingSchedule
 from pipelines.train.target_images import TargetImage, TargetImages
 
@@ -66,6 +67,8 @@ class StepReport:
         mean_square_error: of colours from 0 to 1, over the pixels that count.
         geographic: geographic losses, not yet multiplied by the weight.
         weight: w(t), the weight of the geographic losses.
+        visible: number of Gaussians in the view, those around a region among them.
+        pixels: of the render.
         by_depth: part of `geographic` from control points by rendered depth; None: the view has no such marks.
     """
 
@@ -73,6 +76,8 @@ class StepReport:
     mean_square_error: Tensor
     geographic: Tensor
     weight: float
+    visible: int
+    pixels: int
     by_depth: Tensor | None = None
 
 
@@ -89,7 +94,9 @@ class JointTrainer:
         views: training views.
         rasterizer: backend.
         options: settings, with the schedule.
-        exposures: exposures of the photographs, optimised as well; None: all photographs have the same exposure.
+        exposures: exposures of the photographs, optimised as well or held; None: all photographs have the same
+            exposure.
+        region: part of the scene that the Gaussians are to show; None: all of it.
     """
 
     def __init__(
@@ -101,17 +108,19 @@ class JointTrainer:
         *,
         rasterizer: Rasterizer,
         options: JointOptions,
-        exposures: Exposures | None = None,
+        exposures: Exposures | HeldExposures | None = None,
+        region: TrainingRegion | None = None,
     ) -> None:
         self.optimizer, self.strategy, self.problem = optimizer, strategy, problem
         self.views, self.rasterizer, self.options = views, rasterizer, options
-        self.exposures = exposures
+        self.exposures, self.region = exposures, region
         self.iteration = 0
         self.schedule = TrainingSchedule(options, views.camera)
         self.device = optimizer.gaussians.means.device
         self._pinholes = Pinholes(views.images, views.lenses)
-        self._lens = np.zeros(len(problem.cameras.lens_basis))
-        self._targets = TargetImages(views.images, self._pinholes, self.device)
+        self._lens = np.zeros(len(problem.cameras.lens()))
+        masks = None if region is None else region.masks
+        self._targets = TargetImages(views.images, self._pinholes, self.device, masks)
         names = ("photometric loss", "geographic loss", *(f"gradient of {name}" for name in self._watched()))
         self._watch = FinitenessMonitor(names, self.device)
         rates = {
@@ -120,8 +129,11 @@ class JointTrainer:
             "x": options.similarity_rate,
             "u": options.variance_rate,
         }
+        # One kernel for each of these short vectors on a GPU, in place of a dozen whose launches take longer than
+        # their work.
         self._geo_adam = torch.optim.Adam(
-            [{"params": [parameter], "rate": rates[name]} for name, parameter in problem.learned().items()]
+            [{"params": [parameter], "rate": rates[name]} for name, parameter in problem.learned().items()],
+            fused=self.device.type == "cuda",
         )
 
     def step(self) -> StepReport:
@@ -137,7 +149,7 @@ class JointTrainer:
         index = self.schedule.view(self.iteration)
         target = self._targets.get(index, self._shrink(index), self.schedule.view(self.iteration + 1))
         pose = self.problem.cameras.cam_from_model(index)
-        render = self._render(pose, target.camera, depth=self.problem.sees_by_depth(index))
+        render = self._render(pose, target, depth=self.problem.sees_by_depth(index))
         colour = render.colour if self.exposures is None else self.exposures.apply(index, render.colour)
         photometric = photometric_loss(colour, target.colour, target.mask)
         weight, by_depth = self.schedule.geographic_weight(self.iteration), self._by_depth(index, render, target)
@@ -145,19 +157,22 @@ class JointTrainer:
         self.optimizer.zero_grad()
         self._geo_adam.zero_grad()
         total = photometric + weight * geographic
-        penalty = self.strategy.penalty(self.optimizer.gaussians, render.stats)
+        penalty = self.strategy.penalty(self.optimizer.gaussians, self._own(render.stats))
         for term in (penalty, self._surface(render, pose, target, index)):
             total = total if term is None else total + term
         total.backward()
         self._note(photometric, geographic)
-        self._apply(render.stats.visible)
-        self.strategy.observe(render.stats, target.camera)
+        stats = self._own(render.stats, target.share)
+        self._apply(stats.visible)
+        self.strategy.observe(stats, target.whole)
         self.strategy.update(self.iteration, self.optimizer, self.sample_contributions)
         return StepReport(
             photometric.detach(),
             _mean_square(colour, target),
             geographic.detach(),
             weight,
+            len(render.stats.visible),
+            target.camera.width * target.camera.height,
             None if by_depth is None else by_depth.detach(),
         )
 
@@ -174,7 +189,7 @@ class JointTrainer:
             index = int(self.views.camera[place])
             shrink, pose = self._shrink(index), self.problem.cameras.cam_from_model(index)
             target = self._targets.get(index, shrink)
-            colour = self._render(pose, target.camera).colour
+            colour = self._render(pose, target).colour
             if self.exposures is not None:
                 colour = self.exposures.apply(index, colour)
             error = (colour - target.colour).abs().mean(dim=-1)
@@ -222,21 +237,40 @@ class JointTrainer:
             return None
         return self.problem.depth_loss(index, render.expected_depth, render.alpha, target.camera)
 
-    def _render(self, pose: Tensor, camera: Pinhole, *, depth: bool = False) -> Render:
-        depth = depth or self.options.surface is not None
+    def _render(self, pose: Tensor, target: TargetImage, *, depth: bool = False) -> Render:
+        """Return a render of the Gaussians, and behind their rows those that surround the region."""
         settings = RasterSettings(
-            sh_degree=self.schedule.sh_degree(self.iteration), background=self.options.background, depth=depth
+            sh_degree=self.schedule.sh_degree(self.iteration),
+            background=self.options.background,
+            depth=depth or self.options.surface is not None,
+            median=False,
+            window=target.window,
         )
-        return self.rasterizer.render(self.optimizer.gaussians, pose, camera, settings)
+        gaussians = self.optimizer.gaussians
+        if self.region is not None:
+            gaussians = Gaussians.concatenate([gaussians, self.region.surroundings])
+        return self.rasterizer.render(gaussians, pose, target.whole, settings)
+
+    def _own(self, stats: ScreenStats, share: float = 1.0) -> ScreenStats:
+        """Return the statistics of the Gaussians in training, without those that surround the region.
+
+        Args:
+            stats: of a render.
+            share: of the image that the loss is the mean of.
+        """
+        # Without a region nothing is left out: to look would make a GPU wait.
+        return stats if self.region is None else stats.of_first(len(self.optimizer.gaussians), share)
 
     def _surface(self, render: Render, pose: Tensor, target: TargetImage, index: int) -> Tensor | None:
         """Return the weighted sum of the surface losses, or None if the options have no surface losses."""
         surface, gaussians = self.options.surface, self.optimizer.gaussians
         if surface is None:
             return None
-        loss = surface.flatness * flatness_loss(gaussians, render.stats.visible, self.optimizer.extent_m)
+        visible = self._own(render.stats).visible
+        loss = surface.flatness * flatness_loss(gaussians, visible, self.optimizer.extent_m)
         if render.expected_depth is not None and render.depth_variance is not None:
-            spread = compactness_loss(render.expected_depth, render.depth_variance, render.alpha)
+            alpha = render.alpha if self.region is None or target.mask is None else render.alpha * target.mask
+            spread = compactness_loss(render.expected_depth, render.depth_variance, alpha)
             loss = loss + surface.compactness * spread
         if self.views.surface is not None and render.expected_depth is not None:
             points = self.views.surface(index)
@@ -315,9 +349,9 @@ class JointTrainer:
         for name, parameter in self.problem.learned().items():
             with torch.no_grad():
                 parameter.copy_(geo[name])
-            # Adam keeps its count of steps on the CPU, for parameters on any device.
+            # A fused Adam keeps its count of steps on the device.
             self._geo_adam.state[parameter] = {
-                key: geo[f"{name}_{key}"].to("cpu" if key == "step" else self.device)
+                key: geo[f"{name}_{key}"].to(self.device)
                 for key in ("step", "exp_avg", "exp_avg_sq")
                 if f"{name}_{key}" in geo
             }

@@ -68,7 +68,7 @@ class Viewer:
             trained = load_trained(workspace)
             task.advance()
             images = photographs(trained.sfm, trained.survey, workspace, trained.model.max_image_size)
-            self._renderer = ModelRenderer(trained, images, rasterizer(options.backend))
+            self._renderer = ModelRenderer(trained, images, rasterizer(options.backend, progress))
             self.model = MeasuringModel(workspace, self._renderer, options)
             task.advance()
         self.frame: ViewFrame = frame_of(trained)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ from playwright.sync_api import Browser
 
 from pipelines.deliver.splat import codec_arrays
 from pipelines.deliver.tiles.page import write_page
-from pipelines.deliver.tiles.stage import write_tiles
+from pipelines.deliver.tiles.stage import Tiling, write_tiles
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.level_of_detail import DetailTile
 from tests.browser import hill
@@ -36,7 +37,9 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 def write_scene(folder: Path, gaussians: Gaussians, largest_tile: int = 200_000) -> DetailTile:
     """Write tiles and page of Gaussians of the hill; return the root of the tiles."""
     splat = hill.placed(gaussians)
-    root = write_tiles(folder, codec_arrays(splat.gaussians), splat.placement.sidecar(), largest_tile)
+    arrays = codec_arrays(splat.gaussians)
+    tiling = replace(Tiling.of(arrays), largest_tile=largest_tile)
+    root = write_tiles(folder, [arrays], tiling, splat.placement.sidecar())
     write_page(hill.page(splat, "Cesium/"), folder)
     return root
 

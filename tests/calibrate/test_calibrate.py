@@ -237,7 +237,7 @@ def test_a_comparison_reads_the_calibration_where_it_is(tmp_path: Path, command:
     command("run", workspace, *arguments(inputs), "--time-offset", "auto", "--to", "geolocate")
     root = Workspace(workspace)
     variant = root.variant(
-        "compare/A", {spec.folder: workspace / spec.folder for spec in stage_slice(None, "geolocate")}
+        "compare/A", {spec.folder: workspace / spec.folder for spec in stage_slice(None, "geolocate")}, "compare"
     )
     spec = BY_NAME["geolocate"]
     before = fingerprints(variant, spec, spec.options(), {}).hashes

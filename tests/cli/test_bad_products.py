@@ -118,7 +118,8 @@ def test_cuda_without_gpu(real_georef: Georef, made: Path) -> None:
     assert real_georef("run", made, "--to", "init-sim3").code == 0
     result = real_georef("train", made, "--backend", "cuda", "--preset", "smoke")
     result.assert_failed(1)
-    assert "error: no CUDA device found: install a driver" in result.err.splitlines()[-1]
+    assert "error: the cuda backend cannot be used: no " in result.err.splitlines()[-1]
+    assert "Install NVIDIA's driver" in result.err.splitlines()[-1]
     assert not (made / "train").exists()
 
 

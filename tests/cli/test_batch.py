@@ -15,7 +15,7 @@ import pytest
 
 from pipelines.core.stages import BY_NAME
 from pipelines.core.workspace import Workspace
-from pipelines.engine import local
+from pipelines.engine import process
 from tests import fakes
 from tests.cli_runs import WITH_FAKES, Georef, start
 
@@ -39,7 +39,7 @@ main()
 @pytest.fixture
 def with_fakes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fake stages in the processes of the missions."""
-    monkeypatch.setattr(local, "THIS_PROGRAM", ("-c", WITH_FAKES))
+    monkeypatch.setattr(process, "THIS_PROGRAM", ("-c", WITH_FAKES))
 
 
 def write_missions(folder: Path) -> Path:
@@ -91,7 +91,7 @@ def test_a_broken_one_is_told_and_the_others_finish(real_georef: Georef, with_fa
     assert {
         name: made_by and (made_by.config["seed"], made_by.config["mapper"]) for name, made_by in made.items()
     } == {
-        **dict.fromkeys(NAMES, (7, "incremental")),
+        **dict.fromkeys(NAMES, (7, "auto")),
         "mill": (9, "global"),
         "broken": None,
     }
@@ -117,7 +117,7 @@ def test_ctrl_c_stops_all_and_the_same_command_goes_on(
     real_georef: Georef, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Both trainings have work to lose, which they keep: the next call would resume them."""
-    monkeypatch.setattr(local, "THIS_PROGRAM", ("-c", STUCK))
+    monkeypatch.setattr(process, "THIS_PROGRAM", ("-c", STUCK))
     names = ("a", "b")
     for name in names:
         fakes.photographs(tmp_path / name / "images")

@@ -249,7 +249,7 @@ class TestTalk:
         failing = ("sfm", done, "--max-features", 1)
         assert georef(*failing, "--traceback").err == georef("--traceback", *failing).err
 
-    @pytest.mark.parametrize("words", [("-j", 1, "status"), ("status", "--threads", 1)])
+    @pytest.mark.parametrize("words", [("-j", 1, "status"), ("status", "--threads", 1), ("sfm", "-j", 1)])
     def test_threads(
         self, georef: Georef, done: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[object, ...]
     ) -> None:

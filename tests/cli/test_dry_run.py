@@ -118,3 +118,15 @@ class TestPace:
     def test_pace_is_that_of_the_benchmarks(self, gaussians: int, pixels: int, seconds: float) -> None:
         """Within 20 %, the largest deviation of the fit over the table of docs/benchmarks.md."""
         assert iteration_seconds(pixels, gaussians, surface=False) == pytest.approx(seconds, rel=0.2)
+
+
+def test_a_reconstruction_that_does_not_fit(
+    georef: Georef, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipelines.sfm.forecast.free_main_memory_bytes", lambda: 100 << 20)
+    write_flight(tmp_path / "photos", 5, lat=46.0, lon=7.7)
+    words = ("run", tmp_path / "ws", "--images", tmp_path / "photos")
+    assert actions(georef, *words)["sfm"] == "refuse"
+    assert georef(*words, "--dry-run", "--json").document["reconstruction"]["peak_bytes"] > 100 << 20
+    assert "SfM of 5 photographs needs about" in " ".join(georef(*words, "--dry-run").out.split())
+    assert actions(georef, *words, "--import", tmp_path / "photos")["sfm"] == "run"

@@ -33,10 +33,11 @@ def examples_in(text: str) -> list[str]:
 def parse(line: str) -> None:
     """Parse a command line as click would, without running it."""
     words = shlex.split(line.partition(" | ")[0].partition(" > ")[0], comments=True)[1:]
-    position = next((index for index, word in enumerate(words) if word in COMMANDS), len(words))
-    context = cli.make_context("georef", words[: position + 1])
-    name = words[position]
-    command_of(name).make_context(name, words[position + 1 :], parent=context)
+    spans = [(start, start + count) for start in range(len(words)) for count in (2, 1)]
+    start, end = next(span for span in spans if " ".join(words[slice(*span)]) in COMMANDS)
+    name = " ".join(words[start:end])
+    context = cli.make_context("georef", words[:end])
+    command_of(name).make_context(name, words[end:], parent=context)
 
 
 @pytest.mark.parametrize("name", COMMANDS)

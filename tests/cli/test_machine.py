@@ -16,18 +16,23 @@ from pipelines.core.errors import BackendUnavailableError
 from pipelines.core.threads import available_cores
 from pipelines.core.versions import NOT_INSTALLED
 from pipelines.machine import inspection
+from pipelines.splat.rasterizer.cuda_parts import CudaPart
 from pipelines.train.presets import PRESETS
 from tests.cli.test_help import examples_in, parse
 from tests.cli_runs import REPOSITORY, Georef
 
 
 def test_doctor_tells_what_there_is_and_why_not(real_georef: Georef, monkeypatch: pytest.MonkeyPatch) -> None:
-    def rasterizer(name: str) -> object:
+    def chosen_backend(name: str) -> str:
         if name == "cuda":
             raise BackendUnavailableError("no GPU: give --backend cpu")
-        return object()
+        return name
 
-    monkeypatch.setattr(inspection, "rasterizer", rasterizer)
+    monkeypatch.setattr(inspection, "chosen_backend", chosen_backend)
+    parts = CudaPart("NVIDIA driver", None, "install it"), CudaPart("C++ compiler", "g++ 12", "")
+    monkeypatch.setattr(inspection, "running_parts", lambda: parts[:1])
+    monkeypatch.setattr(inspection, "compiling_parts", lambda: parts[1:])
+    monkeypatch.setattr(inspection, "kernels_ready", lambda: None)
     monkeypatch.setenv("CHROMIUM", "/opt/chromium")
     machine = real_georef("doctor", "--json").document
     assert machine["cores"] == available_cores()
@@ -36,10 +41,18 @@ def test_doctor_tells_what_there_is_and_why_not(real_georef: Georef, monkeypatch
         {"name": "cpu", "available": True, "reason": ""},
         {"name": "cuda", "available": False, "reason": "no GPU: give --backend cpu"},
     ]
+    assert machine["cuda_parts"] == [
+        {"name": "NVIDIA driver", "found": None, "remedy": "install it"},
+        {"name": "C++ compiler", "found": "g++ 12", "remedy": ""},
+    ]
+    assert machine["cuda_kernels"] is None
     assert machine["chromium"] == "/opt/chromium"
     assert machine["versions"]["numpy"] != NOT_INSTALLED
     text = real_georef("doctor").out
-    assert "no: no GPU: give --backend cpu" in text
+    words = " ".join(text.split())
+    assert (
+        "backend cuda no: see below NVIDIA driver missing: install it C++ compiler g++ 12 kernels not comp" in words
+    )
     assert "/opt/chromium" in text
 
 

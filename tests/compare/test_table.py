@@ -18,7 +18,8 @@ from tests.reports import check_points_with
 
 GOOD = PointAccuracy(count=3, mean_h_m=0.0123, median_h_m=0.01, rmse_h_m=0.015, rmse_v_m=25.128)
 ROW = ComparedRow(
-    configuration="E", title="full", note="everything", test_psnr=25.317, test_ssim=0.87, camera=GOOD, model=GOOD,
+    configuration="E", title="full", note="everything", test_psnr=25.317, test_psnr_covered=26.25, test_ssim=0.87,
+    camera=GOOD, model=GOOD,
     training_s=61.4, warnings=("one fix is wrong",),
 )  # fmt: skip
 FAILED = ComparedRow(configuration="A", title="plain", note="nothing", failure="it diverged")
@@ -26,8 +27,8 @@ FAILED = ComparedRow(configuration="A", title="plain", note="nothing", failure="
 
 def test_figures_are_told_to_what_they_are_worth() -> None:
     by_model = ("0.0123", "0.0100", "0.0150", "25.13")
-    assert cells(ROW) == ("25.32", "0.8700", "0.0123", "0.0150", "25.13", *by_model, "3", "61 s")
-    assert cells(FAILED) == (*["–"] * 9, "0", "–")
+    assert cells(ROW) == ("25.32", "26.25", "0.8700", "0.0123", "0.0150", "25.13", *by_model, "3", "61 s")
+    assert cells(FAILED) == (*["–"] * 10, "0", "–")
     fewer = ROW.model_copy(update={"model": GOOD.model_copy(update={"count": 2})})
     assert cells(fewer)[-2] == "3, 2"
 

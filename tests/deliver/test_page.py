@@ -16,7 +16,7 @@ from pipelines.core.cautions import NOT_CHECKED, Caution
 from pipelines.deliver.options import CESIUM, PageOptions, SplatOptions
 from pipelines.deliver.splat import placed_splat
 from pipelines.deliver.tiles.local_crs import LocalCrs, fit_local_crs
-from pipelines.deliver.tiles.page import ScenePage, scene_page, write_page
+from pipelines.deliver.tiles.page import ScenePage, ShownScene, scene_page, write_page
 from pipelines.geodesy.crs import parse_crs
 from pipelines.geodesy.enu import ecef_from_enu, ecef_from_enu_rotation, ecef_from_lla, lla_from_ecef
 from pipelines.geodesy.vertical import parse_vertical
@@ -65,9 +65,10 @@ def page_of(survey: Survey, cautions: tuple[Caution, ...] = ()) -> ScenePage:
         sh=torch.zeros(500, 1, 3),
     )
     splat = placed_splat(gaussians, model, survey, SplatOptions())
+    scene = ShownScene(HOSTILE, splat.placement, splat.gaussians.means.numpy())
     middle_in_geo = splat.placement.file_from_geo.inverse().apply(np.zeros((1, 3)))
     target = target_crs(PageOptions(), survey.origin, middle_in_geo, survey.vertical)
-    return scene_page(HOSTILE, splat, survey, target, "Cesium/")
+    return scene_page(scene, survey, target, "Cesium/")
 
 
 def test_names_cannot_leave_the_document_that_holds_them(tmp_path: Path) -> None:

@@ -13,14 +13,20 @@ import pytest
 from scipy.spatial import cKDTree
 
 from pipelines.core.errors import InputError
+from pipelines.core.products import save_json
+from pipelines.core.stages import BLOCK_RECORD, GAUSSIANS
 from pipelines.core.workspace import StageRun
 from pipelines.deliver.options import ExportTilesOptions
 from pipelines.deliver.tiles.content import read_glb, write_glb
 from pipelines.deliver.tiles.stage import run, write_whole
 from pipelines.formats.georef_sidecar import read_sidecar
 from pipelines.formats.splat_ply import SplatArrays
+from pipelines.scene.block_plan import BlockCell
+from pipelines.scene.block_record import BlockRecord, MergedBlock
+from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.level_of_detail import DetailTile
-from tests.delivered_scenes import splat_arrays, true_ecef, write_trained
+from pipelines.splat.storage import write_gaussians
+from tests.delivered_scenes import block_training, splat_arrays, true_ecef, write_trained
 
 COUNT = 2600
 Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # glTF's axes to those of 3D Tiles
@@ -79,6 +85,39 @@ def _assert_same_places(places: np.ndarray, expected: np.ndarray) -> None:
     assert distance.max() < STEP_M
 
 
+@pytest.fixture
+def in_blocks(tmp_path: Path, scene: SplatArrays) -> StageRun:
+    """Workspace whose Gaussians two blocks have trained: the first 1700, and the others."""
+    stage = write_trained(tmp_path / "ws", scene, "tiles")
+    numbers = (1700, COUNT - 1700)
+    blocks = tuple(MergedBlock(cell=BlockCell(), training=block_training(count)) for count in numbers)
+    save_json(BlockRecord(blocks=blocks, seams=()), stage.workspace.root / BLOCK_RECORD)
+    return stage
+
+
+def test_tiles_come_from_blocks(in_blocks: StageRun, scene: SplatArrays) -> None:
+    """No leaf holds Gaussians of two blocks, so that one block at a time is in memory; all are there once."""
+    run(in_blocks, ExportTilesOptions(max_tile_gaussians=1000))
+    leaves = [tile for tile in all_tiles(document(in_blocks)["root"]) if "children" not in tile]
+    places = [in_ecef(in_blocks, in_blocks.out / tile["content"]["uri"]) for tile in leaves]
+    _assert_same_places(np.concatenate(places), true_ecef(scene))
+    _assert_same_places(in_ecef(in_blocks, in_blocks.out / "splat.glb"), true_ecef(scene))
+    # Gaussians far outside the scene have leaves of their own, whichever block has trained them.
+    of_scene = [part for part, tile in zip(places, leaves, strict=True) if "/s" in tile["content"]["uri"]]
+    assert len(of_scene) > 3
+    tree = cKDTree(true_ecef(scene))
+    for part in of_scene:
+        assert len(set((tree.query(part)[1] >= 1700).tolist())) == 1
+
+
+def test_blocks_of_other_gaussians_are_refused(in_blocks: StageRun) -> None:
+    write_gaussians(
+        in_blocks.workspace.root / GAUSSIANS, Gaussians.from_arrays(vars(splat_arrays(COUNT - 1, extent_m=20.0)))
+    )
+    with pytest.raises(InputError, match=r"blocks\.json.* 2600 Gaussians, and train/gaussians\.ply has 2599"):
+        run(in_blocks, ExportTilesOptions())
+
+
 def test_tileset_says_what_a_globe_must_know(made: StageRun) -> None:
     content = document(made)
     assert content["asset"]["version"] == "1.1"
@@ -120,7 +159,7 @@ def test_a_splat_too_large_for_one_file_is_shown_by_its_tiles(made: StageRun, sc
 
     root = tile(document(made)["root"])
     whole = (made.out / "splat.glb").read_bytes()
-    count = write_whole(made.out, scene, root, read_sidecar(made.out / "tileset.json"), most=1500)
+    count = write_whole(made.out, [scene], root, read_sidecar(made.out / "tileset.json"), len(scene), most=1500)
     assert root.count < count <= 1500
     assert len(read_glb(made.out / "splat.glb")) == count
     (made.out / "splat.glb").write_bytes(whole)

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from pipelines.core.progress import ProgressTask
-from pipelines.engine.process import JobLine
+from pipelines.engine.display import JobLine
 
 
 def test_inner_tasks_are_the_note_of_the_line() -> None:

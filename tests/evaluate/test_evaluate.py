@@ -12,6 +12,7 @@ import pytest
 
 from georef_cli import boundary
 from georef_cli.main import cli
+from pipelines.accuracy.accuracy_grid import accuracy_grid
 from pipelines.accuracy.prediction import AccuracyPrediction
 from pipelines.core.cautions import Caution
 from pipelines.core.errors import InputError
@@ -176,6 +177,19 @@ def test_solution_without_photographs_is_that_of_the_training(evaluated: tuple[W
     # 150 iterations with photographs against the end of the road without: within σ of each other.
     moved = (solved.apply(center) - trained.geo_from_model.apply(center)).mean(axis=0)
     assert (np.abs(moved) < 1.5 * sigma[4:]).all()
+
+
+def test_sparse_equations_predict_the_accuracy_of_the_report(evaluated: tuple[Workspace, Outcome]) -> None:
+    workspace = evaluated[0]
+    trained, initial = load_trained(workspace), load_json(InitialSimilarity, workspace.path(SIM3))
+    solved = solve_survey(trained, initial, geographic_options_of(workspace).model_copy(update={"solve": "once"}))
+    assert solved.problem.bundle is not None
+    grid = accuracy_grid(solved, AccuracyPrediction(solved))
+    assert grid is not None
+    found, stated = grid.summary().model_dump(), report_of(workspace)["accuracy"]
+    for name in (name for name in stated if "sigma" in name):
+        # Both minima lie within 1e-3 σ of each other, and so do their weights.
+        assert found[name] == pytest.approx(stated[name], rel=1e-3), name
 
 
 def test_accuracy_is_stated_after_the_standard(evaluated: tuple[Workspace, Outcome]) -> None:

@@ -31,6 +31,10 @@ def test_test_views_are_those_held_out(evaluated: tuple[Workspace, Outcome]) -> 
     assert test["psnr"] == pytest.approx(np.mean([row["psnr"] for row in test["per_view"]]))
     assert 22.0 < test["psnr"] < 40.0
     assert 0.5 < test["ssim"] < 1.0
+    # The orbit looks at one place from all sides: its training views show all ground of the others.
+    assert test["covered_share"] == pytest.approx(np.mean([row["covered_share"] for row in test["per_view"]]))
+    assert test["covered_share"] > 0.5
+    assert abs(test["psnr_covered"] - test["psnr"]) < 3
     assert test["lpips"] is None
     assert "weights" in test["lpips_reason"]
     assert outcome.manifest.values["psnr"] == test["psnr"]

@@ -10,7 +10,14 @@ import pytest
 from plyfile import PlyData, PlyElement
 
 from pipelines.core.errors import InputError
-from pipelines.formats.splat_ply import SplatArrays, read_centres, read_splat_ply, write_splat_ply
+from pipelines.formats.splat_ply import (
+    SplatArrays,
+    concatenated,
+    join_splat_plys,
+    read_centres,
+    read_splat_ply,
+    write_splat_ply,
+)
 
 
 def splat(count: int = 3, degree: int = 3) -> SplatArrays:
@@ -44,6 +51,22 @@ def test_higher_bands_go_channel_by_channel(tmp_path: Path) -> None:
     np.testing.assert_array_equal(vertex["f_rest_23"], gaussians.sh[:, 8, 2])
     np.testing.assert_array_equal(vertex["rot_0"], gaussians.quats_wxyz[:, 0])
     assert (vertex["nx"] == 0).all()
+
+
+def test_files_are_joined_in_their_order(tmp_path: Path) -> None:
+    """The joined file is, byte by byte, the one of all Gaussians; rows of it are those of the parts."""
+    parts = [splat(3, degree=1), splat(5, degree=1)]
+    for number, part in enumerate(parts):
+        write_splat_ply(tmp_path / f"{number}.ply", part)
+    assert join_splat_plys([tmp_path / "0.ply", tmp_path / "1.ply"], tmp_path / "joined.ply") == 8
+    write_splat_ply(tmp_path / "whole.ply", concatenated(parts))
+    assert (tmp_path / "joined.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()
+    second = read_splat_ply(tmp_path / "joined.ply", slice(3, 8))
+    for name, values in vars(parts[1]).items():
+        np.testing.assert_array_equal(getattr(second, name), values)
+    write_splat_ply(tmp_path / "other.ply", splat(2, degree=0))
+    with pytest.raises(InputError, match=r"other\.ply.* other properties than .*0\.ply"):
+        join_splat_plys([tmp_path / "0.ply", tmp_path / "other.ply"], tmp_path / "x.ply")
 
 
 def test_other_order_and_types_are_read_too(tmp_path: Path) -> None:

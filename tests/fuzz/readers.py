@@ -9,7 +9,9 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import cv2
+import laspy
 import numpy as np
+from plyfile import PlyData, PlyElement
 from pydantic import BaseModel
 from pyproj import CRS
 from rosbags.rosbag1 import Writer as Writer1
@@ -39,11 +41,14 @@ from pipelines.formats.splat_ply import SplatArrays, read_splat_ply, write_splat
 from pipelines.formats.spz import read_spz, write_spz
 from pipelines.formats.trajectory_csv import read_trajectory
 from pipelines.geodesy.crs import parse_crs
+from pipelines.geodesy.enu import Origin
 from pipelines.geodesy.vertical import VerticalDatum
 from pipelines.geometry.similarity import Similarity
 from pipelines.ingest.bag.inspection import inspect_bag
+from pipelines.scene.cloud_options import CloudCrs
 from pipelines.scene.geolocated import GeolocatedPoints
 from pipelines.scene.initial_similarity import InitialSimilarity
+from pipelines.scene.measured_cloud import CloudFiles
 from pipelines.scene.navigation import NavigationTrack
 from pipelines.scene.report import EvaluationReport
 from pipelines.scene.rig import RigCalibration, RigEstimate
@@ -228,6 +233,24 @@ def _splat(folder: Path) -> None:
     write_splat_ply(folder / "a.ply", SplatArrays(**arrays))
 
 
+def _clouds(folder: Path) -> None:
+    positions = [(400_000.0, 5_100_000.0, 600.0), (400_001.5, 5_100_002.25, 601.0)]
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(CRS("EPSG:32632").to_wkt("WKT1_GDAL")))
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = np.array(positions).T
+    las.write(folder / "a.las")
+    las.write(folder / "b.laz")
+    vertex = np.array(positions, dtype=[(axis, "<f8") for axis in "xyz"])
+    PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(str(folder / "c.ply"))
+
+
+def _read_clouds(folder: Path) -> None:
+    origin = Origin(lat_deg=46.05, lon_deg=7.7, alt_m=600.0)
+    for chunk in CloudFiles(folder, CloudCrs(crs="EPSG:32632")).chunks(origin):
+        assert np.isfinite(chunk.position_in_geo).all()
+
+
 def _spz(folder: Path) -> None:
     _splat(folder)
     splat = read_splat_ply(folder / "a.ply")
@@ -385,6 +408,7 @@ READERS: dict[str, Reader] = {
     "bag-db3-zstd": Reader(_bag(StoragePlugin.SQLITE3, CompressionMode.MESSAGE), _read_bag("bag"), "bag/*"),
     "bag-ros1": Reader(_bag1, _read_bag("*.bag")),
     "spz": Reader(_spz, lambda folder: (read_spz(folder / "a.spz"), read_spz(folder / "b.spz"))),
+    "clouds": Reader(_clouds, _read_clouds),
     "splat-ply": Reader(_splat, lambda folder: read_splat_ply(folder / "a.ply")),
     "sidecar": Reader(_sidecar, _read_sidecar),
     "products": Reader(_products, _read_products),

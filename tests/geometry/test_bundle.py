@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from pipelines.core.errors import DegenerateGeometryError
-from pipelines.geometry.bundle import Network, correction_basis, similarity_modes
+from pipelines.geometry.bundle import Network, similarity_modes
+from pipelines.geometry.correction_basis import correction_basis
 from pipelines.geometry.rotations import exp_so3
 from tests.bundle_scenes import SIGMA_PX, adjuster, exact_network, jacobian, noisy, pixels, readjusted, size, units
 

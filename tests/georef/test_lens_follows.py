@@ -76,6 +76,7 @@ def test_gradient_of_the_control_term_by_the_lens_is_exact(problem: GeoProblem) 
     assert torch.autograd.gradcheck(loss, (start.requires_grad_(),), eps=1e-5, atol=1e-5, rtol=1e-4)
     (whole,) = torch.autograd.grad(loss(start), start)
     problem.cameras.lens_basis = torch.zeros((0, DIRECTIONS), dtype=torch.float64)
+    problem.cameras.held_lens = torch.zeros(0, dtype=torch.float64)
     (held,) = torch.autograd.grad(loss(start), start)
     assert float((whole - held).norm()) > 0.01 * float(whole.norm())
 

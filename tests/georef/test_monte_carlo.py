@@ -21,7 +21,8 @@ from scipy.linalg import block_diag
 from pipelines.accuracy.intersection_jacobian import intersection_jacobian
 from pipelines.evaluate.cautions import refutation
 from pipelines.evaluate.cramer_rao import Anchors, CameraInformation
-from pipelines.geometry.bundle import Network, correction_basis
+from pipelines.geometry.bundle import Network
+from pipelines.geometry.correction_basis import correction_basis
 from pipelines.geometry.lens import Lenses, bearings
 from pipelines.geometry.similarity import Similarity
 from pipelines.georef.cameras import CameraCorrections, CameraPoses

@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from pipelines.core.errors import DegenerateGeometryError
-from pipelines.georef.posterior import equations_of, leave_one_out, minimise, posterior, solution_covariances
+from pipelines.georef.leave_one_out import leave_one_out
+from pipelines.georef.posterior import equations_of, minimise, posterior, solution_covariances
 from pipelines.georef.problem import GeoProblem
 from pipelines.georef.systematic import SystematicErrors
 from pipelines.georef.terms import ControlTerm

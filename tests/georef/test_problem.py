@@ -87,7 +87,7 @@ def test_bias_is_believed_where_it_is_and_costs_nothing_where_it_is_not() -> Non
             measured = terms(replace(fixes, position_in_geo=shifted), marks_of(truth, CONTROL, 0.03, rng))
             stiff = replace(BLOCK, basis=np.zeros((12, 6, 0)))
             free, none = problem_with(stiff, measured, SystematicErrors(1)), problem_with(stiff, measured)
-            believed = bias_pays(free, begin(free))
+            believed = bias_pays(free.errors, begin(free))
             assert believed is (offset > 0)
             for problem in (free, none):
                 minimise(problem)

@@ -16,7 +16,7 @@ from pipelines.georef.problem import GeoProblem
 from pipelines.georef.so3 import log_so3 as torch_log
 from pipelines.georef.start import begin
 from pipelines.georef.systematic import SystematicErrors
-from pipelines.georef.terms import ControlTerm, FixTerm
+from pipelines.georef.terms import ControlTerm, FixTerm, PlaneTerm
 from tests.georef_scenes import (
     SHIFT,
     Block,
@@ -264,3 +264,29 @@ def test_log_of_a_rotation() -> None:
     found.sum().backward()
     assert rotation.grad is not None
     assert torch.isfinite(rotation.grad).all()
+
+
+def planes_of(truth: Truth, shift_m: np.ndarray, sigma_m: float, rng: np.random.Generator) -> PlaneTerm:
+    """120 planes of ground, two slopes and walls to two sides, of a LiDAR that is shifted."""
+    facing = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, -0.6, 0.8], [1, 0, 0], [0, 1, 0]], dtype=np.float64)
+    normal = facing[rng.integers(0, 5, 120)]
+    point = rng.uniform([-30, -30, 0], [30, 30, 8], (120, 3))
+    on_plane = truth.geo_from_model.apply(point) + sigma_m * rng.normal(size=(120, 1)) * normal + shift_m
+    root = torch.full((120, 1, 1), 1 / sigma_m, dtype=torch.float64)
+    return PlaneTerm(torch.from_numpy(point), torch.from_numpy(on_plane), torch.from_numpy(normal), root)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_shift_of_a_lidar_is_found_beside_the_fixes(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    truth, shift = Truth(Similarity(1.0, np.eye(3), SHIFT), BLOCK.poses), np.array([0.06, -0.08, 0.10])
+    measured = terms(fixes_of(truth, RTK, rng), planes_of(truth, shift, 0.01, rng))
+    problem = problem_with(STIFF, measured, SystematicErrors(lidar=True))
+    begin(problem)
+    minimise(problem)
+    _, covariance = solution_covariances(problem)
+    (found,) = problem.errors.estimates(covariance)
+    assert found.name == "lidar-shift" and all(found.observed)
+    error, sigma = np.array(found.value) - shift, np.array(found.sigma)
+    # Ten fixes of 2 and 3 cm tell where the photographs are: 1 cm.
+    assert (np.abs(error) < 4 * sigma).all() and (sigma < 0.015).all()

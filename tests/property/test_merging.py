@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipelines.formats.splat_ply import SplatArrays
-from pipelines.splat.level_of_detail import DetailTile, best_cut, build_tiles
+from pipelines.splat.level_of_detail import DetailTile, SceneExtent, Tiler, best_cut, build_tiles
 from pipelines.splat.merging import Mixture, bounds_of, drawn, merged, mixture_of
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -62,12 +62,14 @@ def test_what_fits_is_drawn_with_its_moments(seed: int, count: int) -> None:
     np.testing.assert_array_equal(after.means, gaussians.means)
 
 
-@given(seed=SEEDS, count=st.integers(1, 800), largest=st.integers(20, 200))
+@given(seed=SEEDS, count=st.integers(1, 800), largest=st.integers(20, 200), most_parts=st.integers(1, 9))
 @settings(max_examples=12, deadline=None)
-def test_tree(seed: int, count: int, largest: int) -> None:
+def test_tree(seed: int, count: int, largest: int, most_parts: int) -> None:
     gaussians = splat(seed, count, opacity=0.05)
     number = np.arange(count, dtype=np.float32)
     gaussians.sh[:, 0, 0] = number
+    rows = np.array_split(np.argsort(gaussians.means[:, 0]), min(most_parts, count))
+    parts = [gaussians.select(part) for part in rows]
     contents: dict[str, SplatArrays] = {}
     leaves: list[str] = []
 
@@ -76,7 +78,7 @@ def test_tree(seed: int, count: int, largest: int) -> None:
         contents[name] = content
         leaves.extend([name] * is_leaf)
 
-    root = build_tiles(gaussians, largest, write)
+    root = build_tiles(parts, SceneExtent.of(gaussians.means), Tiler(largest, write))
     tiles = list(root.all())
     assert sorted(tile.name for tile in tiles) == sorted(contents)
     assert sorted(tile.name for tile in tiles if not tile.children) == sorted(leaves)

@@ -208,7 +208,7 @@ class TestLoadSurvey:
     def test_a_variant_reads_what_it_is_lent(self, workspace: Workspace, survey: Survey) -> None:
         save_json(self.OFFSET, workspace.root / RIG)
         lent = {folder: workspace.root / folder for folder in ("ingest", "calibrate")}
-        assert load_survey(workspace.variant("compare/A", lent)) == load_survey(workspace) != survey
+        assert load_survey(workspace.variant("compare/A", lent, "compare")) == load_survey(workspace) != survey
 
     def test_surveys_of_earlier_versions(self, workspace: Workspace, survey: Survey) -> None:
         """A field that nothing was put into is passed over; a calibrated survey is no record of a flight."""

@@ -105,7 +105,7 @@ def test_a_folder_of_tiles_is_one_cloud(tmp_path: Path) -> None:
     np.testing.assert_allclose(all_points(tiles), points, rtol=0, atol=0.6 * STEP_M)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(voxel=st.floats(0.05, 50), most=st.integers(3, 400), seed=st.integers(0, 99))
 def test_each_voxel_keeps_one_measured_point(
     tmp_path_factory: pytest.TempPathFactory, voxel: float, most: int, seed: int
@@ -192,7 +192,7 @@ def test_headers_that_promise_too_much_are_refused(tmp_path: Path, place: int, f
         open_las(tmp_path / "c.laz")
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(
     kind=st.sampled_from(["laz", "las", "ply"]),
     edits=st.lists(st.tuples(st.floats(0, 1), st.integers(0, 255)), max_size=6),

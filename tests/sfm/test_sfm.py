@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import shutil
 import sqlite3
 from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -17,91 +15,21 @@ import pytest
 from pipelines.core.errors import DegenerateGeometryError, InputError
 from pipelines.core.products import load_json, save_json
 from pipelines.core.progress import SILENT
-from pipelines.core.runner import run_stage
 from pipelines.core.stages import BY_NAME, SPARSE, SURVEY
 from pipelines.core.staleness import status
 from pipelines.core.workspace import StageRun, Workspace
 from pipelines.formats.colmap import quiet_colmap, read_sparse
-from pipelines.geodesy.enu import Origin
-from pipelines.geodesy.vertical import VerticalDatum
 from pipelines.geometry.similarity import umeyama
-from pipelines.scene.survey import CameraPrior, Fix, Survey, SurveyedPoint, SurveyImage
+from pipelines.scene.survey import Fix, Survey, SurveyedPoint
+from pipelines.sfm.features import SfmJob, candidate_pairs
 from pipelines.sfm.imported import import_model
 from pipelines.sfm.options import SfmOptions
-from pipelines.sfm.reconstruction import SfmJob, candidate_pairs, reconstruct
+from pipelines.sfm.reconstruction import reconstruct
 from pipelines.sfm.stage import _summarise, run
-from pipelines.simulate.options import SimulateOptions
-from pipelines.simulate.stage import simulate
+from tests.sfm_scenes import CONFIG, HEIGHT, IMAGES, WIDTH, Photographs, survey_of
 
 pycolmap = pytest.importorskip("pycolmap")
 pytest.importorskip("embreex")
-
-IMAGES, WIDTH, HEIGHT = 10, 240, 180
-FOCAL = 0.85 * WIDTH
-CONFIG = SfmOptions(max_features=1000, camera_model="SIMPLE_RADIAL", threads=1)
-FLIGHT = SimulateOptions(
-    images=IMAGES,
-    size=f"{WIDTH}x{HEIGHT}",
-    flight="grid",
-    heights=(60.0,),
-    radius=20.0,
-    focal=0.85,
-    lens="pinhole",
-    noise=0.2,
-    targets=0,
-    control=0,
-)
-
-
-@dataclass(frozen=True)
-class Photographs:
-    """A folder of photographs, and where they were taken."""
-
-    folder: Path
-    center_in_geo: dict[str, list[float]]
-
-    @property
-    def names(self) -> list[str]:
-        return sorted(self.center_in_geo)
-
-
-@pytest.fixture(scope="module")
-def photographs(tmp_path_factory: pytest.TempPathFactory) -> Photographs:
-    """Nadir lines over a small town."""
-    root = tmp_path_factory.mktemp("simulated") / "survey"
-    simulate(FLIGHT, root)
-    truth = json.loads((root / "truth.json").read_text())
-    return Photographs(root / "images", dict(zip(truth["images"], truth["centers"], strict=True)))
-
-
-def survey_of(names: list[str], image_dir: str = "photos") -> Survey:
-    prior = CameraPrior(
-        camera_id=1,
-        model="SIMPLE_RADIAL",
-        width=WIDTH,
-        height=HEIGHT,
-        params=(FOCAL, WIDTH / 2, HEIGHT / 2, 0.0),
-        focal_source="calibrated",
-    )
-    return Survey(
-        origin=Origin(lat_deg=46.0, lon_deg=7.0, alt_m=400.0),
-        source_crs="EPSG:4979",
-        vertical=VerticalDatum(name="ellipsoidal", stated=True),
-        image_dir=image_dir,
-        cameras=(prior,),
-        images=tuple(SurveyImage(name=name, camera_id=1, sha256="") for name in names),
-    )
-
-
-@pytest.fixture(scope="module")
-def mapped(photographs: Photographs, tmp_path_factory: pytest.TempPathFactory) -> Workspace:
-    """A workspace whose sfm has run."""
-    root = tmp_path_factory.mktemp("flight")
-    (root / "photos").symlink_to(photographs.folder)
-    save_json(survey_of(photographs.names), root / SURVEY)
-    workspace = Workspace(root)
-    run_stage(workspace, BY_NAME["sfm"], CONFIG.model_dump(exclude_unset=True))
-    return workspace
 
 
 def test_model_is_the_scene_but_for_a_similarity(mapped: Workspace, photographs: Photographs) -> None:

@@ -11,7 +11,8 @@ from pipelines.geometry.cameras import Pinhole
 from pipelines.stereo.agreement import AgreementSettings, DepthEstimate, agreed_depth
 from pipelines.stereo.matching import UNSEEN, MatchSettings
 from pipelines.stereo.refinement import SurfacePrior, refine, surface_prior
-from pipelines.stereo.sweep import NormalMap, StereoCamera, StereoView, plane_sweep
+from pipelines.stereo.sweep import NormalMap, plane_sweep
+from pipelines.stereo.views import StereoCamera, StereoView
 from pipelines.train.depth_maps import StereoOptions
 from tests.stereo_scenes import (
     CAMERA,

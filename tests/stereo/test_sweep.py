@@ -8,7 +8,8 @@ import pytest
 from pipelines.stereo.agreement import AgreementSettings, DepthEstimate, agreed_depth
 from pipelines.stereo.matching import MatchSettings
 from pipelines.stereo.neighbours import PointVisibility, best_neighbours, planes_for
-from pipelines.stereo.sweep import Planes, StereoCamera, StereoView, SweepResult, plane_sweep
+from pipelines.stereo.sweep import Planes, SweepResult, plane_sweep
+from pipelines.stereo.views import StereoCamera, StereoView
 from tests.stereo_scenes import (
     CAMERA,
     GROUND_M,

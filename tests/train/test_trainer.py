@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import traceback
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from pipelines.core.workspace import Workspace
+from pipelines.scene.frozen_solution import solve_and_hold
 from pipelines.scene.geographic import geo_problem
 from pipelines.scene.scene import initial_scene, photographs
 from pipelines.splat.rasterizer.backends import rasterizer
@@ -52,7 +56,40 @@ def trainer_of(rendered: Rendered, workspace: Workspace, config: TrainOptions = 
     scene = initial_scene(rendered.sparse, rendered.survey, initial)  # type: ignore[arg-type]
     images = photographs(scene.sparse, rendered.survey, workspace, 640)
     problem = geo_problem(scene, rendered.survey, initial, config)  # type: ignore[arg-type]
+    solve_and_hold(problem)
     return make_trainer(TrainingScene(scene, images), problem, rasterizer("cpu"), config)
+
+
+class ReadsOfValues(TorchDispatchMode):
+    """Records where a value of a tensor is read, for which a GPU would have to finish all that is queued there."""
+
+    READING = ("_local_scalar_dense", "nonzero", "masked_select", "bincount", "_linalg_check_errors", "equal")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.places: list[str] = []
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if func.name().removeprefix("aten::").partition(".")[0] in self.READING:
+            frames = traceback.extract_stack()
+            ours = [f"{frame.filename}:{frame.lineno}" for frame in frames if "pipelines" in frame.filename]
+            # torch's Adam reads its count of steps on a CPU alone: on a GPU it is fused.
+            if not any(frame.filename.endswith("adam.py") for frame in frames):
+                self.places.append(ours[-1] if ours else "the test")
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize("strategy", ["default", "mcmc", "fast"])
+def test_an_iteration_reads_no_value(rendered: Rendered, workspace: Workspace, strategy: str) -> None:
+    """Between two edits of the Gaussians, only the rasteriser reads values of tensors."""
+    trainer = trainer_of(rendered, workspace, CONFIG.model_copy(update={"strategy": strategy}))
+    trainer.step()
+    with ReadsOfValues() as reads:
+        for _ in range(3):
+            report = trainer.step()
+        assert [place for place in reads.places if "rasterizer/cpu.py" not in place.replace("\\", "/")] == []
+        float(report.photometric)  # the probe hears this
+    assert reads.places[-1] == "the test"
 
 
 def test_a_step_moves_everything_but_test_cameras_by_themselves(rendered: Rendered, workspace: Workspace) -> None:
@@ -108,3 +145,21 @@ def test_views_are_seen_through_the_lens_that_follows(rendered: Rendered, worksp
     one.iteration = 100
     one.step()
     assert one.pinhole(0).fx == pytest.approx(before.fx, abs=0.1)
+
+
+def test_cameras_that_were_solved_once_do_not_move(rendered: Rendered, workspace: Workspace) -> None:
+    trainer = trainer_of(rendered, workspace, CONFIG.model_copy(update={"solve": "once"}))
+    problem = trainer.problem
+    poses, similarity = problem.cameras.current(), problem.similarity.current()
+    lens, affine = problem.cameras.lens().clone(), trainer.exposures.affine.clone()  # type: ignore[union-attr]
+    sh = trainer.optimizer.gaussians.sh.detach().clone()
+    for _ in range(3):
+        report = trainer.step()
+    assert float(report.geographic) > 0  # the fit of the held solution
+    np.testing.assert_array_equal(problem.cameras.current().cam_center_in_model, poses.cam_center_in_model)
+    np.testing.assert_array_equal(problem.similarity.current().translation, similarity.translation)
+    assert torch.equal(problem.cameras.lens(), lens)
+    assert not torch.equal(trainer.exposures.affine, affine)  # type: ignore[union-attr]
+    assert not torch.equal(trainer.optimizer.gaussians.sh.detach(), sh)
+    # SfM's cameras differ from the solution, and training renders from the solution.
+    assert np.abs(poses.cam_center_in_model - problem.cameras.center.numpy()).max() > 1e-4

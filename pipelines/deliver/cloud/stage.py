@@ -43,7 +43,7 @@ def run(stage: StageRun, options: ExportCloudOptions) -> Summary:
     files = CloudFiles(frame, stage.out, ply=options.ply)
     images = photographs(trained.sfm, trained.survey, stage.workspace, trained.model.max_image_size)
     images.build(stage.progress)
-    renderer = ModelRenderer(trained, images, rasterizer("auto"))
+    renderer = ModelRenderer(trained, images, rasterizer("auto", stage.progress))
     scratch = stage.out / "depth_maps"
     views = SurfaceViews(renderer, scratch, colours=True, confirmed=True, progress=stage.progress)
     settings = fusion_settings(views, geo_from_model, options.min_views, options.spacing)

@@ -54,7 +54,7 @@ def raster_source(stage: StageRun, wanted: Request) -> tuple[RasterSource, str]:
     trained, target, frame = wanted.trained, wanted.target, wanted.frame
     images = photographs(trained.sfm, trained.survey, stage.workspace, trained.model.max_image_size)
     images.build(stage.progress)
-    renderer = ModelRenderer(trained, images, rasterizer("auto"))
+    renderer = ModelRenderer(trained, images, rasterizer("auto", stage.progress))
     views = SurfaceViews(renderer, stage.out / "depth_maps", confirmed=True, progress=stage.progress)
     training_px = wanted.sampling.training_m / (frame.step_x * target.horizontal_unit_m)
     gaussians = _within(trained, trained.gaussians)

@@ -42,17 +42,22 @@ def write_glb(path: Path, splat: SplatArrays, extras: dict[str, Any] | None = No
     path.write_bytes(encode_glb(spz, len(splat), math.isqrt(splat.sh.shape[1]) - 1, (low, high), extras))
 
 
-def require_space(folder: Path, splat: SplatArrays) -> None:
+def require_space(folder: Path, count: int, coefficients: int) -> None:
     """Refuse tiles that the disk would not hold: each Gaussian is in a leaf, in splat.glb, and merged in levels.
+
+    Args:
+        folder: on the disk.
+        count: number of Gaussians.
+        coefficients: of the harmonics of each colour.
 
     Raises:
         InputError: too little space is free.
     """
-    needed = _COPIES * len(splat) * (_BYTES + 3 * splat.sh.shape[1])
+    needed = _COPIES * count * (_BYTES + 3 * coefficients)
     free = shutil.disk_usage(folder).free
     if needed > free:
         raise InputError(
-            f"tiles of {len(splat)} Gaussians may need {needed / 2**30:.1f} GiB, and {free / 2**30:.1f} GiB are "
+            f"tiles of {count} Gaussians may need {needed / 2**30:.1f} GiB, and {free / 2**30:.1f} GiB are "
             "free: give a lower --sh-degree or a larger --min-opacity, or make room on this disk",
             path=folder,
         )

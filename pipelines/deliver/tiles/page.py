@@ -7,6 +7,7 @@ tiles and CesiumJS, and loads nothing else: no account, no imagery, no terrain.
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Literal
@@ -16,9 +17,8 @@ from pydantic import Field
 
 from pipelines.core.durable import replace_file
 from pipelines.core.products import Product
-from pipelines.core.types import Vector3
+from pipelines.core.types import Float32Array, Vector3
 from pipelines.deliver.placement import Placement
-from pipelines.deliver.splat import PlacedSplat
 from pipelines.deliver.tiles.local_crs import LocalCrs, fit_local_crs
 from pipelines.deliver.tiles.tileset import TILESET
 from pipelines.geodesy.enu import ecef_from_enu
@@ -76,12 +76,26 @@ class ScenePage(Product):
     crs: LocalCrs | None = None
 
 
-def scene_page(title: str, splat: PlacedSplat, survey: Survey, target: TargetCrs, cesium: str) -> ScenePage:
+@dataclass(frozen=True)
+class ShownScene:
+    """Scene to show.
+
+    Attributes:
+        title: name of the scene.
+        placement: place on Earth of its frame `file`.
+        center_in_file: (N, 3) centres of its Gaussians, metres.
+    """
+
+    title: str
+    placement: Placement
+    center_in_file: Float32Array
+
+
+def scene_page(scene: ShownScene, survey: Survey, target: TargetCrs, cesium: str) -> ScenePage:
     """Return the content of the page of a splat.
 
     Args:
-        title: name of the scene.
-        splat: its Gaussians and its place on Earth.
+        scene: the splat.
         survey: has the control and check points.
         target: CRS in which coordinates are shown.
         cesium: address of the folder of CesiumJS.
@@ -89,13 +103,13 @@ def scene_page(title: str, splat: PlacedSplat, survey: Survey, target: TargetCrs
     Raises:
         InputError: the scene is outside the domain of the CRS, or a grid is missing.
     """
-    placement = splat.placement
-    distance_m = np.linalg.norm(splat.gaussians.means.numpy(), axis=1)
+    placement = scene.placement
+    distance_m = np.linalg.norm(scene.center_in_file, axis=1)
     radius = max(float(np.quantile(distance_m, _SHOWN)), _LEAST_RADIUS_M)
     box = float(np.clip(_CRS_BOX * radius, _LEAST_CRS_BOX_M, _MOST_CRS_BOX_M))
     lat, lon, height = placement.origin_lla.tolist()
     return ScenePage(
-        title=title,
+        title=scene.title,
         tileset=TILESET,
         cesium=cesium,
         origin_lla=(lat, lon, height),

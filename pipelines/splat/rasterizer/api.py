@@ -48,10 +48,14 @@ class Window:
         """Return the camera whose image is the window of the image of `camera`."""
         return Pinhole(self.width, self.height, camera.fx, camera.fy, camera.cx - self.left, camera.cy - self.top)
 
+    @property
+    def slices(self) -> tuple[slice, slice]:
+        """Rows and columns of the image that lie in the window."""
+        return slice(self.top, self.top + self.height), slice(self.left, self.left + self.width)
+
     def cut(self, view: Render) -> Render:
         """Return the part of a render of the whole image; its statistics stay those of the whole."""
-        rows = slice(self.top, self.top + self.height)
-        columns = slice(self.left, self.left + self.width)
+        rows, columns = self.slices
 
         def part(image: Tensor | None) -> Tensor | None:
             return None if image is None else image[rows, columns]
@@ -76,6 +80,8 @@ class RasterSettings:
         near_m: Gaussians with a nearer centre are left out.
         dilation_px2: added to the diagonal of the screen covariance, in px².
         depth: whether to compute depths (colour and alpha always are).
+        median: whether the median depth is one of them. Training does not need it, and on a GPU it costs more than
+            all the rest.
         window: part of the camera's image to render, which is then the image; None: all of it.
     """
 
@@ -84,6 +90,7 @@ class RasterSettings:
     near_m: float = 0.05
     dilation_px2: float = 0.3
     depth: bool = False
+    median: bool = True
     window: Window | None = None
 
     def image_of(self, camera: Pinhole) -> Pinhole:
@@ -104,6 +111,17 @@ class ScreenStats:
     visible: Tensor
     radius_px: Tensor
     mean_gradient: Tensor | None = field(default=None)
+
+    def of_first(self, count: int, share: float = 1.0) -> ScreenStats:
+        """Return the statistics of the first Gaussians of a render.
+
+        Args:
+            count: of the Gaussians.
+            share: factor of the gradients: of the part of an image that a loss was the mean of.
+        """
+        rows = self.visible < count
+        gradient = None if self.mean_gradient is None else share * self.mean_gradient[rows]
+        return ScreenStats(self.visible[rows], self.radius_px[rows], gradient)
 
 
 @dataclass

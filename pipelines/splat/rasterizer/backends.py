@@ -2,29 +2,59 @@
 
 from __future__ import annotations
 
+import logging
 from typing import Literal
 
 import torch
 
 from pipelines.core.errors import BackendUnavailableError
+from pipelines.core.progress import SILENT, Progress
+from pipelines.splat.rasterizer import api
 from pipelines.splat.rasterizer.api import Rasterizer
 
 BackendName = Literal["auto", "cpu", "cuda"]
-BACKENDS: tuple[BackendName, ...] = ("cpu", "cuda")
+BACKENDS: tuple[api.BackendName, ...] = ("cpu", "cuda")
+
+log = logging.getLogger(__name__)
 
 
-def rasterizer(name: BackendName) -> Rasterizer:
-    """Return the backend of that name; `auto` takes cuda if a device and gsplat are present.
+def chosen_backend(name: BackendName) -> api.BackendName:
+    """Return the backend that a name stands for, without loading it.
+
+    `auto` stands for cuda if nothing that it needs is missing. If there is a GPU, the log says what is missing.
 
     Raises:
-        BackendUnavailableError: `cuda` without a device or without gsplat.
+        BackendUnavailableError: `cuda`, and a part that it needs is missing; names each missing part.
     """
-    from pipelines.splat.rasterizer.cuda import CudaRasterizer, cuda_available
-
-    if name == "cuda" or (name == "auto" and cuda_available()):
-        return CudaRasterizer()
-    if name not in ("auto", "cpu"):
+    if name not in ("auto", *BACKENDS):
         raise BackendUnavailableError(f"no rasteriser is called {name!r}: use auto, cpu or cuda")
+    if name == "cpu" or (name == "auto" and not torch.cuda.is_available()):
+        return "cpu"
+    from pipelines.splat.rasterizer.cuda_kernels import missing_for_cuda
+
+    missing = missing_for_cuda()
+    if missing is None:
+        return "cuda"
+    if name == "cuda":
+        raise BackendUnavailableError(f"the cuda backend cannot be used: {missing}. Or use the cpu backend")
+    log.warning("the GPU is not used: %s", missing)
+    return "cpu"
+
+
+def rasterizer(name: BackendName, progress: Progress = SILENT) -> Rasterizer:
+    """Return the backend that a name stands for.
+
+    Args:
+        name: see `chosen_backend`.
+        progress: shows the compilation of the kernels of cuda, before their first use on a machine.
+
+    Raises:
+        BackendUnavailableError: `cuda`, and a part that it needs is missing, or its kernels cannot be compiled.
+    """
+    if chosen_backend(name) == "cuda":
+        from pipelines.splat.rasterizer.cuda import CudaRasterizer
+
+        return CudaRasterizer(progress)
     from pipelines.splat.rasterizer.cpu import CpuRasterizer
 
     return CpuRasterizer()

@@ -71,7 +71,7 @@ class CpuRasterizer:
         total = torch.where(opaque, alpha, 1.0)
         expected = torch.where(opaque, depth_sum / total, 0.0)
         variance = (square_sum / total - expected.square()).clamp_min(0.0)
-        return Render(colour, alpha, context.stats, expected, variance, median)
+        return Render(colour, alpha, context.stats, expected, variance, median if settings.median else None)
 
 
 def predicted_bytes(

@@ -6,41 +6,36 @@ depth comes from blending the Gaussians' planes, the median depth from gsplat's 
 
 from __future__ import annotations
 
-import contextlib
-import importlib.util
-import sys
 from functools import lru_cache
-from types import ModuleType
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from pipelines.core.errors import BackendUnavailableError
+from pipelines.core.progress import SILENT, Progress
 from pipelines.geometry.cameras import Pinhole
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.rasterizer.api import ALPHA_MAX, BackendName, RasterSettings, Render, ScreenStats
+from pipelines.splat.rasterizer.cuda_kernels import load_gsplat
 from pipelines.splat.rasterizer.reference import bounded_slope, screen_depth_covariance
 
 _EVERY_BATCH = 2**31 - 1
 
 
-def cuda_available() -> bool:
-    """Return whether a CUDA device and gsplat are both present."""
-    return torch.cuda.is_available() and importlib.util.find_spec("gsplat") is not None
-
-
 class CudaRasterizer:
     """Backend of gsplat ≥ 1.5.3. The tensors must be on the CUDA device.
 
+    Args:
+        progress: shows the compilation of gsplat's kernels, before their first use on a machine.
+
     Raises:
-        BackendUnavailableError: no CUDA device, no gsplat, or no kernels for it.
+        BackendUnavailableError: gsplat is missing, or cannot be compiled.
     """
 
     name: BackendName = "cuda"
 
-    def __init__(self) -> None:
-        self._gsplat = _import_gsplat()
+    def __init__(self, progress: Progress = SILENT) -> None:
+        self._gsplat = load_gsplat(progress)
 
     def render(
         self, gaussians: Gaussians, cam_from_model: Tensor, camera: Pinhole, settings: RasterSettings
@@ -67,7 +62,7 @@ class CudaRasterizer:
         if settings.depth:
             slope = _depth_slope(gaussians, cam_from_model, camera, meta)
             view.expected_depth, view.depth_variance = self._depth_moments(meta, slope, camera, view.alpha)
-            view.median_depth = self._median_depth(meta, slope, camera)
+            view.median_depth = self._median_depth(meta, slope, camera) if settings.median else None
         return view if settings.window is None else settings.window.cut(view)
 
     def _depth_moments(
@@ -140,30 +135,6 @@ class CudaRasterizer:
         front, to_mean_px = gaussian[at], torch.stack([dx[at], dy[at]], dim=-1)
         median[pixel[at]] = meta["depths"][front] - (slope[front] * to_mean_px).sum(dim=-1)
         return median.view(camera.height, camera.width)
-
-
-def _import_gsplat() -> ModuleType:
-    if not torch.cuda.is_available():
-        raise BackendUnavailableError(
-            "no CUDA device found: install a driver and a CUDA build of torch, or use the cpu backend"
-        )
-    try:
-        # The first import may compile for minutes. Its messages go to stdout, which belongs to results.
-        with contextlib.redirect_stdout(sys.stderr):
-            import gsplat
-            from gsplat.cuda import _backend
-    except ImportError as error:
-        raise BackendUnavailableError(
-            f"gsplat cannot be imported ({error}): install the extra cuda (in the checkout: pip install '.[cuda]'; "
-            "anywhere: pip install gsplat), or use the cpu backend"
-        ) from error
-    if _backend._C is None:
-        raise BackendUnavailableError(
-            "gsplat found no CUDA toolkit (nvcc) to compile its kernels with: install one, install a prebuilt"
-            " gsplat wheel after pip install gsplat (the extra cuda), or use the cpu backend"
-        )
-    module: ModuleType = gsplat
-    return module
 
 
 # Small constants are made once: every copy to the device waits for all work that is queued there.

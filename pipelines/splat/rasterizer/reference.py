@@ -74,7 +74,7 @@ def render_reference(
         mean = torch.where(opaque, depth_sum / total, 0.0)
         variance = (((depth - mean).square() * weight).sum(dim=0) / total).view(size)
         expected = mean.view(size)
-        median = _median_depth(depth, before, after, counted).view(size)
+        median = _median_depth(depth, before, after, counted).view(size) if settings.median else None
     stats = _screen_stats(front, mean_px, cov_px2, sorted_gaussians.logit_opacities, camera)
     view = Render(colour.view(*size, 3), (1 - final).view(size), stats, expected, variance, median)
     return view if settings.window is None else settings.window.cut(view)

@@ -6,7 +6,7 @@
    scanner would have met it.
 3. The neighbours of a point decide with it. A single contradiction is noise, of stereo or cloud.
 4. The confidence of the other points is a product of factors from 0 to 1: stated accuracy against that of stereo,
-   flatness and density of the neighbours, incidence of the beam, and agreement with the photographs.
+   flatness and density of the neighbours, and agreement with the photographs.
 """
 
 from __future__ import annotations
@@ -27,10 +27,11 @@ _TOLERANCE = 0.005  # of the distance: photographs that differ by less agree
 _LEAST_LOOKS = 2  # through a point, that contradict it
 _NEIGHBOURS = 16
 _ADDED_M = 1.0  # height of a surface that the cloud lacks
-CELL_M, _CELL_PX = 0.5, 2.0  # side of the cells in plan: the larger of both
+_CELL_M = 0.5  # least side of cells in plan
+_CELL_PX = 2.0  # least side in pixels, where the photographs decide
+_CELL_POINTS = 1.5  # least side in distances between points, where the cloud decides
 _LEAST_AREA_M2 = 4.0  # that is listed
 _STEREO_PX = 0.3  # σ of stereo, in pixels of the depth maps
-_GRAZING = 0.2  # cosine of incidence below which a beam's footprint blurs the surface
 _SPARSE = 4.0  # distances between points, to the furthest neighbour on a well-scanned surface
 
 
@@ -43,6 +44,7 @@ class ChangedArea:
         area_m2: in plan.
         points: of the cloud.
         center_in_model: (3,) mean of these points.
+        cell_m: side of its cells in plan.
         cells: (C, 2) south-western corners of its cells in `model`, for maps.
     """
 
@@ -50,6 +52,7 @@ class ChangedArea:
     area_m2: float
     points: int
     center_in_model: FloatArray
+    cell_m: float
     cells: FloatArray
 
 
@@ -83,7 +86,6 @@ def verdict(
     *,
     sigma_m: float,
     pixel_m: float,
-    beam_in_model: FloatArray | None = None,
 ) -> CloudVerdict:
     """Return confidence and contradictions of a cloud's points.
 
@@ -93,7 +95,6 @@ def verdict(
         surface_in_model: (S, 3) surface that the photographs show together.
         sigma_m: stated σ of the points.
         pixel_m: size of a pixel of the depth maps on the surface.
-        beam_in_model: (P, 3) unit vectors of the beams; None: not known.
     """
     found = support(cloud.position_in_model, views, UP, _TOLERANCE, cloud.normal_in_model)
     _, nearest = cKDTree(cloud.position_in_model).query(cloud.position_in_model, k=min(_NEIGHBOURS, len(cloud)))
@@ -103,9 +104,6 @@ def verdict(
     below = _below_surface(cloud, surface_in_model, pixel_m) & (found.views == 0)
     added = _majority(below, np.ones_like(votes), nearest) & ~removed
     confidence = _confidence(cloud, found, sigma_m, pixel_m)
-    if beam_in_model is not None:
-        incidence = np.abs(np.einsum("pi,pi->p", cloud.normal_in_model, beam_in_model))
-        confidence *= np.minimum(incidence / _GRAZING, 1.0)
     confidence[removed | added] = 0.0
     areas = (*_areas(cloud, removed, "removed"), *_areas(cloud, added, "added"))
     ordered = tuple(sorted(areas, key=lambda area: -area.area_m2))
@@ -120,7 +118,7 @@ def _majority(mark: BoolArray, votes: BoolArray, nearest: IntArray) -> BoolArray
 
 def _below_surface(cloud: LidarCloud, surface: FloatArray, pixel_m: float) -> BoolArray:
     """Return whether the photographs show a surface well above all points of the cloud in a point's cell (P,)."""
-    side_m = max(CELL_M, _CELL_PX * pixel_m)
+    side_m = max(_CELL_M, _CELL_PX * pixel_m)
     low = np.minimum(cloud.position_in_model.min(axis=0), surface.min(axis=0))[:2]
     mine, theirs = (
         np.floor((points[:, :2] - low) / side_m).astype(np.int64) for points in (cloud.position_in_model, surface)
@@ -152,7 +150,8 @@ def _areas(cloud: LidarCloud, marked: BoolArray, kind: Literal["removed", "added
     points = cloud.position_in_model[marked]
     if not len(points):
         return []
-    cell = np.floor(points[:, :2] / CELL_M).astype(np.int64)
+    side_m = max(_CELL_M, _CELL_POINTS * cloud.voxel_m)
+    cell = np.floor(points[:, :2] / side_m).astype(np.int64)
     low = cell.min(axis=0) - 1
     grid = np.zeros(cell.max(axis=0) - low + 2, dtype=bool)
     place = cell - low
@@ -160,12 +159,12 @@ def _areas(cloud: LidarCloud, marked: BoolArray, kind: Literal["removed", "added
     closed = ndimage.binary_closing(grid)
     labels, count = ndimage.label(closed | grid, structure=np.ones((3, 3)))
     of_point = labels[place[:, 0], place[:, 1]]
-    size = np.bincount(labels.ravel(), minlength=count + 1) * CELL_M**2
+    size = np.bincount(labels.ravel(), minlength=count + 1) * side_m**2
     areas = []
     for label in np.flatnonzero(size >= _LEAST_AREA_M2):
         mine = points[of_point == label]
         if label == 0 or not len(mine):
             continue
-        cells = (np.argwhere(labels == label) + low) * CELL_M
-        areas.append(ChangedArea(kind, float(size[label]), len(mine), mine.mean(axis=0), cells))
+        cells = (np.argwhere(labels == label) + low) * side_m
+        areas.append(ChangedArea(kind, float(size[label]), len(mine), mine.mean(axis=0), side_m, cells))
     return areas

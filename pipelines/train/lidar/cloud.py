@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from pipelines.core.errors import InputError
 from pipelines.core.progress import Progress
 from pipelines.core.types import ByteArray, FloatArray, IntArray
-from pipelines.scene.measured_cloud import CloudFiles, MeasuredCloud, Thinning, read_thinned
+from pipelines.scene.measured_cloud import CloudFiles, Thinning, read_thinned
 from pipelines.scene.scene import Scene
 from pipelines.scene.survey import Survey
 
@@ -82,12 +82,18 @@ def read_cloud(files: CloudFiles, scene: Scene, survey: Survey, pixel_m: float, 
     cloud = read_thinned(files, survey.origin, Thinning(pixel_m, _MOST_POINTS, low, high), progress)
     if len(cloud) <= 10 * _NEIGHBOURS:
         raise InputError(f"only {len(cloud)} points lie in the scene of the photographs", field="--lidar")
-    return with_planes(cloud, scene)
-
-
-def with_planes(cloud: MeasuredCloud, scene: Scene) -> LidarCloud:
-    """Return a cloud in `model`, with the plane through the neighbours of each point."""
     position = scene.geo_from_model.inverse().apply(cloud.position_in_geo)
+    return planes_of(position, cloud.classification, cloud.voxel_m)
+
+
+def planes_of(position: FloatArray, classification: ByteArray, voxel_m: float) -> LidarCloud:
+    """Return points (P, 3) with the plane through the neighbours of each.
+
+    Args:
+        position: (P, 3) metres in `model`, P ≥ 12.
+        classification: (P,) class of LAS.
+        voxel_m: distance between the points, about.
+    """
     tree = cKDTree(position)
     normal, roughness, reach = np.empty_like(position), np.empty(len(position)), np.empty(len(position))
     onto_plane = np.empty_like(position)
@@ -101,4 +107,4 @@ def with_planes(cloud: MeasuredCloud, scene: Scene) -> LidarCloud:
         onto_plane[rows] = position[rows] - off[:, None] * axes[:, :, 0]
         normal[rows], roughness[rows] = axes[:, :, 0], np.sqrt(np.maximum(spread[:, 0], 0))
         reach[rows] = distance[:, -1]
-    return LidarCloud(onto_plane, normal, roughness, reach, cloud.classification, cloud.voxel_m)
+    return LidarCloud(onto_plane, normal, roughness, reach, classification, voxel_m)

@@ -20,16 +20,18 @@ from pipelines.core.types import FloatArray, Vector3
 from pipelines.geodesy.enu import lla_from_enu
 from pipelines.geometry.depth_support import DepthViews
 from pipelines.geometry.similarity import SimilarityRecord, covariance_at
+from pipelines.georef.terms import PlaneTerm
 from pipelines.plots.lidar_map import DrawnArea, write_lidar_map
 from pipelines.scene.lidar_report import LidarArea, LidarRegistration, LidarReport
 from pipelines.scene.measured_cloud import CloudFiles
 from pipelines.scene.scene import Scene
 from pipelines.scene.survey import Survey
 from pipelines.train.depth_maps import DepthMaps
-from pipelines.train.lidar.changes import CELL_M, CloudVerdict, verdict
+from pipelines.train.lidar.changes import CloudVerdict, verdict
 from pipelines.train.lidar.cloud import LidarCloud, read_cloud
 from pipelines.train.lidar.options import LidarOptions
-from pipelines.train.lidar.registration import PlaneMatches, Registration, registration
+from pipelines.train.lidar.planes import plane_term
+from pipelines.train.lidar.registration import Registration, registration
 from pipelines.train.lidar.surface import FusedSurface
 from pipelines.train.lidar.views import depth_views, pixel_size_m
 from pipelines.train.surface import SceneSurface
@@ -44,6 +46,33 @@ _MOST_LISTED = 50
 
 
 @dataclass(frozen=True)
+class ComparedLidar:
+    """Cloud of the scene, compared with the photographs and not moved.
+
+    Attributes:
+        cloud: in `model`.
+        maps: depth maps of the training views.
+        views: the same as one set.
+        shown: (S, 3) surface that they show.
+        pixel_m: size of their pixels on the surface.
+        registration: shift of the cloud.
+        record: of the registration.
+    """
+
+    cloud: LidarCloud
+    maps: DepthMaps
+    views: DepthViews
+    shown: FloatArray
+    pixel_m: float
+    registration: Registration
+    record: LidarRegistration
+
+    def planes(self) -> PlaneTerm:
+        """Return the planes that the cloud shares with the photographs."""
+        return plane_term(self.registration, self.maps.scene.geo_from_model)
+
+
+@dataclass(frozen=True)
 class LidarSurface:
     """Surface with LiDAR, and its record.
 
@@ -52,17 +81,15 @@ class LidarSurface:
         report: for `train/lidar.json`.
         verdict: of the photographs on the cloud.
         cloud: registered, in `model`.
-        matches: planes that both show, at the shift that was found.
     """
 
     surface: FusedSurface
     report: LidarReport
     verdict: CloudVerdict
     cloud: LidarCloud
-    matches: PlaneMatches
 
 
-def lidar_surface(
+def compared_lidar(
     options: LidarOptions,
     files: CloudFiles,
     maps: DepthMaps,
@@ -71,8 +98,8 @@ def lidar_surface(
     georeference: SimilarityRecord,
     seed: int,
     progress: Progress,
-) -> LidarSurface:
-    """Return the surface of stereo and LiDAR.
+) -> ComparedLidar:
+    """Return the cloud of the scene, compared with the photographs.
 
     Args:
         options: of the LiDAR.
@@ -86,14 +113,28 @@ def lidar_surface(
     Raises:
         InputError: the cloud lies elsewhere, in height or plan, or is shifted beyond 3 σ.
     """
-    scene, pixel_m, views = maps.scene, pixel_size_m(maps), depth_views(maps)
-    cloud = read_cloud(files, scene, survey, pixel_m, progress)
+    pixel_m, views = pixel_size_m(maps), depth_views(maps)
+    cloud = read_cloud(files, maps.scene, survey, pixel_m, progress)
     shown = SceneSurface(maps).all_points(_STRIDE)
-    compared = registration_of(cloud, shown, views, seed)
-    record = _checked(compared, cloud, scene, georeference, options)
-    if options.lidar_register:
-        cloud = cloud.moved(-compared.shift_m)
-    judged = verdict(cloud, views, shown, sigma_m=options.lidar_sigma, pixel_m=pixel_m)
+    found = registration_of(cloud, shown, views, seed)
+    record = _checked(found, cloud, maps.scene, georeference, options)
+    return ComparedLidar(cloud, maps, views, shown, pixel_m, found, record)
+
+
+def lidar_surface(
+    compared: ComparedLidar, files: CloudFiles, survey: Survey, *, sigma_m: float, shift_m: FloatArray | None
+) -> LidarSurface:
+    """Return the surface of stereo and LiDAR.
+
+    Args:
+        compared: the cloud.
+        files: of the cloud, with the numbers of points read and dropped.
+        survey: has the origin of `geo`.
+        sigma_m: stated σ of the points.
+        shift_m: (3,) shift of the LiDAR to take out, axes of geo; None: none.
+    """
+    cloud = compared.cloud if shift_m is None else compared.cloud.moved(-shift_m)
+    judged = verdict(cloud, compared.views, compared.shown, sigma_m=sigma_m, pixel_m=compared.pixel_m)
     tally = files.tally
     report = LidarReport(
         crs=files.crs_names,
@@ -104,24 +145,26 @@ def lidar_surface(
         outside=tally.outside,
         points=len(cloud),
         voxel_m=cloud.voxel_m,
-        registration=record,
+        registration=compared.record,
         rejected_share=float(judged.rejected.mean()),
         confidence=float(np.median(judged.confidence)),
-        areas=_areas(judged, scene, survey),
+        areas=_areas(judged, compared.maps.scene, survey),
         assumptions=files.assumptions,
     )
-    surface = FusedSurface(maps, cloud, judged.confidence, pixel_m)
-    return LidarSurface(surface, report, judged, cloud, compared.matches)
+    surface = FusedSurface(compared.maps, cloud, judged.confidence, compared.pixel_m)
+    return LidarSurface(surface, report, judged, cloud)
 
 
 def draw_changes(path: Path, lidar: LidarSurface, scene: Scene) -> None:
     """Write the map of the places that have changed as PNG."""
-    shift = scene.geo_from_model.translation
+    shift = scene.geo_from_model.translation  # a pure shift at the start of the training
     areas = [
-        DrawnArea(area.kind, area.area_m2, area.cells + shift[:2])  # `geo_from_model` is a pure shift here
+        DrawnArea(
+            area.kind, area.area_m2, area.cells + shift[:2], area.cell_m
+        )  # `geo_from_model` is a pure shift here
         for area in lidar.verdict.areas
     ]
-    write_lidar_map(path, lidar.cloud.position_in_model + shift, areas, CELL_M)
+    write_lidar_map(path, lidar.cloud.position_in_model + shift, areas)
 
 
 def registration_of(cloud: LidarCloud, shown: FloatArray, views: DepthViews, seed: int) -> Registration:

@@ -23,7 +23,7 @@ from pipelines.train.lidar.cloud import LidarCloud
 
 UP = np.array([0.0, 0.0, 1.0])
 PLANTS = (3, 4, 5)
-_CAPTURES = (0.01, 0.005, 0.005, 0.003)  # largest distance along a ray, as a part of it, in each round
+_CAPTURES = (0.015, 0.005, 0.005, 0.003)  # largest distance along a ray, as a part of it, in each round
 _LEAST_VIEWS = 2
 _FLAT = 0.25  # limit of the roughness, in distances between points
 _WALL = 0.35  # limit of the normal's upward component on a wall

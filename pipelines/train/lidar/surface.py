@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from scipy.spatial import cKDTree
 
-from pipelines.core.types import ByteArray, Float32Array, FloatArray
+from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray
 from pipelines.train.depth_maps import DepthMaps
 from pipelines.train.lidar.cloud import LidarCloud
 from pipelines.train.surface import SceneSurface, SurfacePoints
@@ -18,40 +20,23 @@ _CELL_PX = 4  # cells in which the nearest LiDAR point hides the others
 _SAME = 0.01  # of the depth
 
 
-class FusedSurface(SceneSurface):
-    """Surface of stereo, corrected by LiDAR, and continued by LiDAR where stereo found none.
+class LidarPlanes:
+    """Planes of the LiDAR that is trusted.
 
     Args:
-        maps: depth maps, already built.
         cloud: registered LiDAR.
         confidence: (P,) in its points.
         pixel_m: size of a pixel of the depth maps on the surface.
     """
 
-    def __init__(self, maps: DepthMaps, cloud: LidarCloud, confidence: FloatArray, pixel_m: float) -> None:
-        super().__init__(maps)
+    def __init__(self, cloud: LidarCloud, confidence: FloatArray, pixel_m: float) -> None:
         trusted = np.flatnonzero(confidence >= _LEAST_CONFIDENCE)
         self.cloud, self.confidence = cloud.part(trusted), confidence[trusted]
         self._pixel_m = pixel_m
         self._tree = cKDTree(self.cloud.position_in_model) if len(trusted) else None
 
-    def held(self, index: int, stride: int) -> tuple[FloatArray, Float32Array]:
-        """Return the points (P, 3) that a training view is held to, and the weight of each (P,)."""
-        points, _, confidence = self._corrected(super().points(index, stride))
-        alone = self._alone_in_view(index)
-        weight = np.concatenate([1.0 + (_WEIGHT - 1.0) * confidence, _WEIGHT * self.confidence[alone]])
-        return np.concatenate([points, self.cloud.position_in_model[alone]]), weight.astype(np.float32)
-
-    def sample(self, count: int, seed: int) -> SurfacePoints:
-        """Return points of the whole surface as `SceneSurface.sample`, with LiDAR where stereo found none."""
-        drawn = super().sample(count, seed)
-        points, normal, confidence = self._corrected(drawn.point_in_model)
-        normals = np.where((confidence > 0)[:, None], normal, drawn.normal_in_model)
-        stereo = SurfacePoints(points, drawn.rgb, normals)
-        return SurfacePoints.concatenate([stereo, self._start_alone(stereo, max(count - len(stereo.rgb), 0), seed)])
-
-    def _corrected(self, points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return points (P, 3) on the planes of the LiDAR, their normals, and the confidence; 0: not moved."""
+    def onto(self, points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return points (P, 3) on the planes near them, the planes' normals, and the confidence; 0: not moved."""
         normal, confidence = np.zeros_like(points), np.zeros(len(points))
         if self._tree is None or not len(points):
             return points, normal, confidence
@@ -66,6 +51,39 @@ class FusedSurface(SceneSurface):
         moved[rows] -= off[:, None] * axis
         normal[rows], confidence[rows] = axis, self.confidence[plane]
         return moved, normal, confidence
+
+
+class FusedSurface(SceneSurface):
+    """Surface of stereo, corrected by LiDAR, and continued by LiDAR where stereo found none.
+
+    Args:
+        maps: depth maps, already built.
+        cloud: registered LiDAR.
+        confidence: (P,) in its points.
+        pixel_m: size of a pixel of the depth maps on the surface.
+    """
+
+    def __init__(self, maps: DepthMaps, cloud: LidarCloud, confidence: FloatArray, pixel_m: float) -> None:
+        super().__init__(maps)
+        self.planes = LidarPlanes(cloud, confidence, pixel_m)
+        self.cloud, self.confidence = self.planes.cloud, self.planes.confidence
+
+    def held(self, index: int, stride: int) -> tuple[FloatArray, Float32Array]:
+        """Return the points (P, 3) that a training view is held to, and the weight of each (P,)."""
+        points, _, confidence = self.planes.onto(super().points(index, stride))
+        alone = self._alone_in_view(index)
+        weight = np.concatenate([1.0 + (_WEIGHT - 1.0) * confidence, _WEIGHT * self.confidence[alone]])
+        return np.concatenate([points, self.cloud.position_in_model[alone]]), weight.astype(np.float32)
+
+    def sample(
+        self, count: int, seed: int, inside: Callable[[FloatArray], BoolArray] | None = None
+    ) -> SurfacePoints:
+        """Return points of the whole surface as `SceneSurface.sample`, with LiDAR where stereo found none."""
+        drawn = super().sample(count, seed, inside)
+        points, normal, confidence = self.planes.onto(drawn.point_in_model)
+        normals = np.where((confidence > 0)[:, None], normal, drawn.normal_in_model)
+        stereo = SurfacePoints(points, drawn.rgb, normals)
+        return SurfacePoints.concatenate([stereo, self._start_alone(stereo, max(count - len(stereo.rgb), 0), seed)])
 
     def _alone_in_view(self, index: int) -> np.ndarray:
         """Return the rows of the LiDAR points that a view sees at pixels without a depth of stereo."""

@@ -1,0 +1,173 @@
+"""Surface of a simulated flight with and without LiDAR: `python examples/benchmarks/lidar.py OUT --help`.
+
+    lidar.py OUT --seeds 0,1,2,3,4 --size 1200x900 --train "--preset fast --max-image-size 640"
+
+Of each seed, the survey is simulated and reconstructed once. Trainings in OUT/seedN are then compared with the true
+scene: without LiDAR, with a cloud of 2 cm, and with a cloud that shows a building that has been removed since. Each
+pixel of the test views is intersected with the true scene. `wall`, `roof` and `ground` are medians of the distance
+between the rendered and the true surface, perpendicular to the latter, in metres; `check walls` is the median error
+of check points on walls. What stands in OUT already is not made again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipelines.core.products import load_json
+from pipelines.core.stages import REPORT
+from pipelines.core.types import FloatArray
+from pipelines.core.workspace import Workspace
+from pipelines.geodesy.enu import ecef_from_enu, enu_from_ecef
+from pipelines.scene.renderer import ModelRenderer
+from pipelines.scene.report import read_report
+from pipelines.scene.scene import photographs
+from pipelines.scene.trained_survey import load_trained
+from pipelines.simulate.mesh import Material
+from pipelines.simulate.options import SimulateOptions
+from pipelines.simulate.raycast import MISS, Raycaster
+from pipelines.simulate.stage import RecordedFlight, fly_survey, write_lidar_flight
+from pipelines.simulate.truth import Truth
+from pipelines.splat.rasterizer.backends import rasterizer
+
+CLASSES = {
+    "wall": (Material.WALL,),
+    "roof": (Material.TILES, Material.FLAT_ROOF),
+    "ground": (Material.TERRAIN,),
+}
+# Name of the training, and the change since the LiDAR flight; None: without LiDAR.
+TRAININGS = {"photographs": None, "lidar": "none", "lidar, removed": "removed"}
+STRIDE = 4  # of the pixels
+NEAR_M = 1.0  # a larger distance is another surface
+
+
+def main() -> None:
+    """Simulate, train, measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--seeds", default="0")
+    parser.add_argument("--images", type=int, default=48)
+    parser.add_argument("--size", default="960x720")
+    parser.add_argument("--radius", default=50, type=float, help="half side of the scanned square, in metres")
+    parser.add_argument("--train", default="--preset fast", help="options of the trainings")
+    parser.add_argument("--trainings", default=";".join(TRAININGS), help="separated by ;")
+    arguments = parser.parse_args()
+    rows = []
+    for seed in arguments.seeds.split(","):
+        for name in arguments.trainings.split(";"):
+            row = measured(int(seed), name, arguments)
+            print(json.dumps(row), flush=True)
+            rows.append(row)
+    print_medians(rows)
+
+
+def measured(seed: int, name: str, arguments: argparse.Namespace) -> dict[str, Any]:
+    """The figures of one training."""
+    home, change = arguments.out / f"seed{seed}", TRAININGS[name]
+    given = {"images": arguments.images, "size": arguments.size, "seed": seed, "lidar_radius": arguments.radius}
+    flight = fly_survey(SimulateOptions.model_validate(given))
+    survey, base = home / "survey", home / "reconstruction"
+    if not survey.exists():
+        georef("simulate", survey, "--images", arguments.images, "--size", arguments.size, "--seed", seed)
+    if not (base / "sim3").exists():
+        files = ("--images", survey / "images", "--trajectory", survey / "trajectory.csv")
+        checks = ("--checkpoints", survey / "checkpoints.txt", "--sigma-mark", "0.2")
+        georef("run", base, *files, *checks, "--vertical", "ellipsoidal", "--to", "init-sim3")
+    workspace = home / name.replace(", ", "_")
+    if not (workspace / "evaluate").exists():
+        subprocess.run(["cp", "-rn", f"{base}/.", str(workspace)], check=True)
+        lidar: tuple[Any, ...] = ()
+        if change is not None:
+            lidar = ("--lidar", cloud_of(flight, given, home, change), "--lidar-sigma", "0.02")
+        georef("train", workspace, *arguments.train.split(), *lidar)
+        georef("evaluate", workspace)
+    return {"seed": seed, "training": name, **figures(Workspace(workspace), flight, survey)}
+
+
+def cloud_of(flight: RecordedFlight, given: dict[str, Any], home: Path, change: str) -> Path:
+    """The cloud of a LiDAR flight, written if it is not there yet."""
+    folder = home / f"lidar_{change}"
+    if not (folder / "lidar.laz").exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        write_lidar_flight(SimulateOptions.model_validate({**given, "lidar_change": change}), flight, folder)
+    return folder / "lidar.laz"
+
+
+def figures(workspace: Workspace, flight: RecordedFlight, survey: Path) -> dict[str, Any]:
+    """Medians of the surface's errors by class, and the figures of `evaluate`."""
+    report, truth = read_report(workspace.path(REPORT)), load_json(Truth, survey / "truth.json")
+    on_wall = {target.name for target in truth.targets if target.surface == "wall"}
+    walls = [point for point in report.checkpoints.model.points if point.name in on_wall and point.de_m is not None]
+    errors = [np.linalg.norm([point.de_m or 0.0, point.dn_m or 0.0, point.du_m or 0.0]) for point in walls]
+    distance, material = surface_errors(workspace, flight)
+    near = np.abs(distance) < NEAR_M
+    by_class = {
+        kind: round(float(np.median(np.abs(distance[near & np.isin(material, materials)]))), 4)
+        for kind, materials in CLASSES.items()
+    }
+    return {
+        **by_class,
+        "wall bias": round(float(np.median(distance[near & (material == Material.WALL)])), 4),
+        "beyond 1 m": round(float(1 - near.mean()), 4),
+        "check walls": round(float(np.median(errors)), 4) if errors else None,
+        "test PSNR": report.photometric.test.psnr,
+    }
+
+
+def surface_errors(workspace: Workspace, flight: RecordedFlight) -> tuple[FloatArray, np.ndarray]:
+    """Rendered minus true surface of the test views' pixels, along the outward normal (K,), and materials (K,)."""
+    trained = load_trained(workspace)
+    images = photographs(trained.sparse, trained.survey, workspace, trained.model.max_image_size)
+    renderer = ModelRenderer(trained, images, rasterizer("auto"))
+    mesh, origin = flight.world.scene.mesh, flight.world.origin
+    rays = Raycaster(mesh)
+    distances, materials = [], []
+    test = [index for index, camera in enumerate(trained.model.cameras) if camera.split == "test"]
+    for index in test:
+        pose = renderer.pose(index)
+        depth = renderer.depth_m(index)[::STRIDE, ::STRIDE]
+        row, column = np.nonzero(depth)
+        pixel = STRIDE * np.stack([column, row], axis=1) + 0.5
+        ray = pose.pinhole.rays(pixel) @ pose.cam_from_model
+        shown = pose.center_in_model + depth[row, column, None] * ray
+        in_model = np.concatenate([pose.center_in_model[None], shown])
+        in_geo = trained.geo_from_model.apply(in_model)
+        true_frame = enu_from_ecef(ecef_from_enu(in_geo, trained.survey.origin), origin)
+        center, place = true_frame[0], true_frame[1:]
+        direction = (place - center) / np.linalg.norm(place - center, axis=1, keepdims=True)
+        hits = rays.first_hits(center, direction)
+        true_m = rays.exact_distance(center, direction, hits)
+        slant = np.abs(np.einsum("ni,ni->n", mesh.normals[hits.triangle, 0], direction))
+        found = hits.triangle != MISS
+        off = (true_m - np.linalg.norm(place - center, axis=1)) * slant
+        distances.append(off[found])
+        materials.append(np.asarray(mesh.material)[hits.triangle[found]])
+    return np.concatenate(distances), np.concatenate(materials)
+
+
+def georef(command: str, workspace: Path, *options: Any) -> None:
+    """Run a command of georef."""
+    program = [sys.executable, "-c", "from georef_cli.main import main; main()"]
+    arguments = [command, str(workspace), *map(str, options)]
+    if subprocess.run([*program, *arguments], stdout=subprocess.DEVNULL, check=False).returncode:
+        sys.exit(f"georef {' '.join(arguments)} failed")
+
+
+def print_medians(rows: list[dict[str, Any]]) -> None:
+    """Medians over the seeds, as a Markdown table."""
+    keys = [key for key in rows[0] if key not in {"seed", "training"}]
+    print("\n| training | " + " | ".join(keys) + " |\n|---" + "|---" * len(keys) + "|")
+    for name in dict.fromkeys(row["training"] for row in rows):
+        mine = [row for row in rows if row["training"] == name]
+        cells = [f"{np.median([row[key] for row in mine if row[key] is not None]):.3f}" for key in keys]
+        print(f"| {name} | " + " | ".join(cells) + " |")
+
+
+if __name__ == "__main__":
+    main()

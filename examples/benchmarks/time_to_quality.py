@@ -1,0 +1,210 @@
+"""Quality of a splat against the time since the start of `georef run`.
+
+The first run compiles all kernels into an empty cache (cold), the others find them there (warm). While a run goes
+on, each checkpoint of its training is kept, with its age. Afterwards the checkpoints are measured: PSNR of the test
+views, and the errors of the check points by model. Their measuring is no part of the time, their writing is.
+
+    python examples/benchmarks/time_to_quality.py OUT --runs 2 -- --images photos --preset fast …
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import os
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+# As the command line does, and for the same reason: see georef_cli/main.py.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+import numpy as np
+
+from pipelines.accuracy.error_propagation import NoErrorPropagation
+from pipelines.core.progress import SILENT
+from pipelines.core.stages import PIPELINE, POINTS
+from pipelines.core.workspace import Workspace
+from pipelines.evaluate.check_points import measure_check_points
+from pipelines.evaluate.photometric import compare_test_views
+from pipelines.geometry.rotations import matrix_from_quat_xyzw
+from pipelines.georef.cameras import CameraPoses
+from pipelines.machine.inspection import inspect_machine
+from pipelines.scene.geographic import geo_problem
+from pipelines.scene.geolocated import GeolocatedPoints
+from pipelines.scene.renderer import ModelRenderer
+from pipelines.scene.scene import load_initial_scene, photographs
+from pipelines.scene.trained_survey import TrainedSurvey
+from pipelines.splat.rasterizer.backends import rasterizer
+from pipelines.train.assembly import make_trainer
+from pipelines.train.checkpoint import load_checkpoint
+from pipelines.train.initial_gaussians import TrainingScene
+from pipelines.train.options import TrainOptions
+from pipelines.train.result import trained_model
+
+_POLL_S = 0.1
+_GEOREF = (sys.executable, "-c", "from georef_cli.main import main; main()")
+
+
+@dataclass(frozen=True)
+class Row:
+    """Figures of one checkpoint.
+
+    Attributes:
+        seconds: from the start of the command until the checkpoint was written.
+        iteration: of the training.
+        gaussians: their number.
+        psnr: mean over the test views, of the renders as they are, dB.
+        model_mean_h_m: mean horizontal error of the check points by model; None: no check points.
+        model_median_h_m: likewise the median.
+        model_rmse_v_m: likewise the RMSE of the heights.
+    """
+
+    seconds: float
+    iteration: int
+    gaussians: int
+    psnr: float | None
+    model_mean_h_m: float | None
+    model_median_h_m: float | None
+    model_rmse_v_m: float | None
+
+
+class CheckpointWatch:
+    """Keeps each checkpoint of a running training: a second name for the file, which the training then replaces."""
+
+    def __init__(self, workspace: Workspace, kept: Path) -> None:
+        self._source, self._kept = workspace.root / "train.partial" / "checkpoint.npz", kept
+        self._began, self._ended = time.monotonic(), threading.Event()
+        self.age_s: dict[Path, float] = {}
+        kept.mkdir(parents=True)
+        self._thread = threading.Thread(target=self._watch, daemon=True)
+        self._thread.start()
+
+    def end(self) -> None:
+        """Stop to watch."""
+        self._ended.set()
+        self._thread.join()
+
+    def _watch(self) -> None:
+        last = 0
+        while not self._ended.wait(_POLL_S):
+            try:
+                stamp = self._source.stat().st_mtime_ns
+                if stamp != last:
+                    copy = self._kept / f"{len(self.age_s):04d}.npz"
+                    copy.hardlink_to(self._source)
+                    last, self.age_s[copy] = stamp, time.monotonic() - self._began
+            except FileNotFoundError:
+                continue
+
+
+def timed_run(workspace: Workspace, arguments: list[str], every: int, cache: Path) -> dict[str, object]:
+    """Run `georef run`, and return the seconds of the whole and of each stage, and all rows."""
+    workspace.root.parent.mkdir(parents=True, exist_ok=True)
+    command = [*_GEOREF, "run", str(workspace.root), *arguments, "--set", f"train.checkpoint_every={every}"]
+    watch = CheckpointWatch(workspace, workspace.root.with_name(f"{workspace.root.name}-checkpoints"))
+    began = time.monotonic()
+    log = workspace.root.with_name(f"{workspace.root.name}.log")
+    with log.open("wb") as output:
+        subprocess.run(
+            command, env={**os.environ, "NUMBA_CACHE_DIR": str(cache)}, stdout=output, stderr=output, check=True
+        )
+    seconds = time.monotonic() - began
+    watch.end()
+    manifests = ((spec.name, workspace.manifest(spec)) for spec in PIPELINE)
+    stages = {name: round(manifest.duration_s, 1) for name, manifest in manifests if manifest is not None}
+    rows = [asdict(row) for row in measured(workspace, watch.age_s)]
+    return {"seconds": round(seconds, 1), "stages_s": stages, "rows": rows}
+
+
+def measured(workspace: Workspace, age_s: dict[Path, float]) -> list[Row]:
+    """Return the figures of checkpoints, given their ages."""
+    manifest = workspace.manifest(next(spec for spec in PIPELINE if spec.name == "train"))
+    assert manifest is not None
+    # Gaussians come from the checkpoints: the stereo that only places the first ones is not repeated.
+    options = TrainOptions.model_validate({**manifest.config, "dense": False})
+    initial, survey, scene = load_initial_scene(workspace)
+    images = photographs(scene.sparse, survey, workspace, options.effort.max_image_size)
+    points, backend = GeolocatedPoints.load(workspace.path(POINTS)), rasterizer(options.backend)
+    problem = geo_problem(scene, survey, initial, options, points=points, seed=options.seed)
+    trainer = make_trainer(TrainingScene(scene, images), problem, backend, options)
+    rows = []
+    for path, seconds in age_s.items():
+        trainer.restore(load_checkpoint(path))
+        if trainer.iteration == 0:
+            continue
+        model = trained_model(trainer, scene, initial)
+        rotation = matrix_from_quat_xyzw([camera.quat_xyzw for camera in model.cameras])
+        translation = np.array([camera.translation for camera in model.cameras])
+        poses = CameraPoses(rotation, -np.einsum("nji,nj->ni", rotation, translation))
+        trained = TrainedSurvey(survey, scene.sparse, model, poses, trainer.optimizer.gaussians.detached())
+        renderer = ModelRenderer(trained, images, backend)
+        views = compare_test_views(renderer, None, lambda _name, _picture: None, SILENT, saved=0)
+        errors = measure_check_points(renderer, NoErrorPropagation("not asked for"), SILENT).model
+        rows.append(
+            Row(
+                round(seconds, 1), trainer.iteration, model.gaussians, views.psnr,
+                errors.mean_h_m, errors.median_h_m, errors.rmse_v_m,
+            )
+        )  # fmt: skip
+    return rows
+
+
+def time_to(rows: list[dict[str, float]], psnr: float) -> float | None:
+    """Return the seconds after which a PSNR was reached, linear between checkpoints; None: never."""
+    for before, after in itertools.pairwise(rows):
+        if before["psnr"] < psnr <= after["psnr"]:
+            share = (psnr - before["psnr"]) / (after["psnr"] - before["psnr"])
+            return round(before["seconds"] + share * (after["seconds"] - before["seconds"]), 1)
+    return rows[0]["seconds"] if rows and rows[0]["psnr"] >= psnr else None
+
+
+def print_run(name: str, run: dict[str, object]) -> None:
+    """Print the stages and the rows of a run."""
+    stages = ", ".join(f"{stage} {seconds} s" for stage, seconds in run["stages_s"].items())  # type: ignore[attr-defined]
+    print(f"\n{name}: {run['seconds']} s ({stages})\n")
+    print("| time | iteration | Gaussians | test PSNR | by model: mean H | median H | RMSE V |\n|" + "---|" * 7)
+    for row in run["rows"]:  # type: ignore[attr-defined]
+        errors = [row["model_mean_h_m"], row["model_median_h_m"], row["model_rmse_v_m"]]
+        cells = " | ".join("" if value is None else f"{value:.3f} m" for value in errors)
+        print(
+            f"| {row['seconds']:.0f} s | {row['iteration']} | {row['gaussians']} | {row['psnr']:.2f} dB | {cells} |"
+        )
+    for target in (25, 27, 29, 31):
+        print(f"{target} dB after {time_to(run['rows'], target)} s")  # type: ignore[arg-type]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=Path, help="empty folder for workspaces, caches and time_to_quality.json")
+    parser.add_argument(
+        "--runs", type=int, default=2, help="number of runs: the first is cold, the others are warm"
+    )
+    parser.add_argument("--cache", type=Path, help="folder of compiled kernels (default: an empty one)")
+    parser.add_argument("--every", type=int, default=250, help="iterations between two checkpoints")
+    parser.add_argument("arguments", nargs="+", help="arguments of `georef run` without the workspace, after --")
+    arguments = parser.parse_args()
+    cache = arguments.cache or arguments.out / "kernels"
+    runs = {}
+    for number in range(arguments.runs):
+        name = "cold" if number == 0 and arguments.cache is None else f"warm-{number}"
+        runs[name] = timed_run(
+            Workspace(arguments.out / name), arguments.arguments, arguments.every, cache.resolve()
+        )
+        print_run(name, runs[name])
+        document = {
+            "command": ["georef", "run", "WORKSPACE", *arguments.arguments],
+            "date": datetime.now(UTC).isoformat(timespec="seconds"),
+            "machine": asdict(inspect_machine()),
+            "runs": runs,
+        }
+        (arguments.out / "time_to_quality.json").write_text(json.dumps(document, indent=1), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

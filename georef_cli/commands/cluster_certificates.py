@@ -1,0 +1,47 @@
+"""Command `georef cluster certificates`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from georef_cli import options
+from georef_cli.command import Command
+from georef_cli.markup import shown
+from georef_cli.output import print_json, print_rich
+
+
+def _certificates(folder: Path, as_json: bool) -> None:
+    from pipelines.engine.cluster import CERTIFICATE, KEY
+    from pipelines.engine.nodes import make_certificates
+
+    make_certificates(folder)
+    if as_json:
+        print_json({"certificate": str(folder / CERTIFICATE), "key": str(folder / KEY)})
+    else:
+        print_rich(
+            f"{shown(str(folder))} has {CERTIFICATE} and {KEY}. Copy the folder to every machine of the cluster, "
+            "and to nobody else."
+        )
+
+
+command = Command(
+    "cluster certificates",
+    params=[
+        click.Argument(
+            ["folder"], type=click.Path(file_okay=False, resolve_path=True, path_type=Path), metavar="DIR"
+        ),
+        options.json_option(),
+    ],
+    callback=_certificates,
+    help="""Make the certificate that the machines of a cluster share: cluster.pem and cluster.key in DIR.
+
+        Scheduler, workers and the commands with --cluster refuse everybody who does not have it (mutual TLS).
+        Whoever has it can run programs on every worker: treat cluster.key as a password. It is valid for a year.
+
+        \b
+        Examples:
+          georef cluster certificates certificates
+        """,
+)

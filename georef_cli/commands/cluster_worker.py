@@ -1,0 +1,87 @@
+"""Command `georef cluster worker`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from georef_cli import options
+from georef_cli.command import Command
+from georef_cli.engines import certificates_option, cluster_address
+from georef_cli.output import print_json
+from pipelines.core.errors import ResourceError
+from pipelines.core.free_memory import free_main_memory_bytes
+from pipelines.core.threads import thread_count
+
+_USABLE = 0.9  # of the free memory: other programs grow, too
+_GIB = 1 << 30
+
+
+def _worker(
+    address: str,
+    certificates: Path | None,
+    *,
+    jobs: int,
+    memory_gib: float | None,
+    gpus: int | None,
+    name: str | None,
+    as_json: bool,
+) -> None:
+    from pipelines.engine.nodes import run_worker
+
+    scheduler = cluster_address(address, certificates, "ADDRESS")
+    free = free_main_memory_bytes()
+    if memory_gib is None and free is None:
+        raise ResourceError("the free memory is not known here: give --memory")
+    memory_bytes = int(memory_gib * _GIB) if memory_gib is not None else int(_USABLE * (free or 0))
+    count = _gpus() if gpus is None else gpus
+    run_worker(scheduler, jobs=jobs, cores=thread_count(), memory_bytes=memory_bytes, gpus=count, name=name)
+    if as_json:
+        print_json({"scheduler": scheduler.url, "jobs": jobs, "memory_bytes": memory_bytes, "gpus": count})
+
+
+def _gpus() -> int:
+    from pipelines.machine.inspection import inspect_machine
+
+    return len(inspect_machine().gpus)
+
+
+command = Command(
+    "cluster worker",
+    params=[
+        click.Argument(["address"], metavar="ADDRESS"),
+        certificates_option(),
+        click.Option(
+            ["--jobs"],
+            type=click.IntRange(min=1),
+            default=1,
+            metavar="N",
+            help="Run at most this many jobs at a time, which share the cores (default: 1).",
+        ),
+        click.Option(
+            ["--memory", "memory_gib"],
+            type=click.FloatRange(min=0.1),
+            metavar="GIB",
+            help="Memory that the jobs share (default: nine tenths of what is free now).",
+        ),
+        click.Option(
+            ["--gpus"], type=click.IntRange(min=0), metavar="N", help="Number of GPUs (default: as found)."
+        ),
+        click.Option(["--name"], metavar="NAME", help="Name for messages (default: its address)."),
+        options.json_option(),
+    ],
+    callback=_worker,
+    help="""Lend this machine to a cluster (docs/cluster.md), until Ctrl-C or the end of the scheduler.
+
+        ADDRESS is that of the scheduler. This is Dask's worker, which tells how much memory and how many GPUs the
+        machine has. Each job is a process of georef with the cores of the worker, or its share of them. Ctrl-C
+        stops the jobs, which save their work and go on elsewhere.
+
+        \b
+        Examples:
+          georef cluster worker tls://head:8786 --certificates certificates
+          georef cluster worker tls://head:8786 --certificates certificates --jobs 4 --memory 100
+          georef cluster worker 127.0.0.1:8786 -j 2
+        """,
+)

@@ -1,0 +1,96 @@
+"""Engine of the commands that run many jobs: this machine, or a cluster (`--cluster`)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from pipelines.core.free_memory import free_main_memory_bytes
+from pipelines.core.threads import thread_count
+from pipelines.engine.chosen import chosen_engine
+from pipelines.engine.job import Engine
+from pipelines.engine.local import LocalEngine
+
+if TYPE_CHECKING:
+    from pipelines.engine.cluster import ClusterAddress
+
+
+def engine_options() -> list[click.Option]:
+    """Return the options that choose the engine."""
+    return [
+        click.Option(
+            ["--cluster"],
+            metavar="ADDRESS",
+            help="Run the jobs on the workers of the Dask scheduler at this address, such as tls://host:8786 "
+            "(docs/cluster.md; default: as processes of this machine).",
+        ),
+        certificates_option(),
+        click.Option(
+            ["--storage"],
+            metavar="URL",
+            help="Object store through which files go to workers that share no folder, such as s3://bucket/prefix.",
+        ),
+    ]
+
+
+def certificates_option() -> click.Option:
+    """Return the option `--certificates`."""
+    return click.Option(
+        ["--certificates"],
+        type=click.Path(file_okay=False, resolve_path=True, path_type=Path),
+        metavar="DIR",
+        help="Folder with the certificate of the cluster, from `georef cluster certificates`.",
+    )
+
+
+def engine_for(values: Mapping[str, Any], at_a_time: int | None = None) -> Engine:
+    """Return the engine that the options choose.
+
+    Args:
+        values: of the command's options.
+        at_a_time: most jobs at a time; None: as many as there is room for.
+
+    Raises:
+        click.UsageError: a bad address, one that needs a certificate, or options of a cluster without one.
+    """
+    if values["cluster"] is None:
+        for option in ("certificates", "storage"):
+            if values[option] is not None:
+                raise click.UsageError(f"--{option} is for --cluster.")
+        cores = thread_count()
+        return LocalEngine(at_a_time or cores, cores, free_main_memory_bytes())
+    from pipelines.engine.dask_engine import DaskEngine
+    from pipelines.engine.storage import Storage
+
+    address = cluster_address(values["cluster"], values["certificates"], "--cluster")
+    return DaskEngine(address, at_a_time, None if values["storage"] is None else Storage(values["storage"]))
+
+
+@contextmanager
+def asked_engine(values: Mapping[str, Any]) -> Iterator[None]:
+    """Let stages share their work with the engine that the options choose; without `--cluster`, with that in use.
+
+    Raises:
+        click.UsageError: as `engine_for`.
+    """
+    engine = engine_for(values)
+    with nullcontext() if values["cluster"] is None else chosen_engine(engine):
+        yield
+
+
+def cluster_address(text: str, certificates: Path | None, option: str) -> ClusterAddress:
+    """Return the address that an option or argument gives.
+
+    Raises:
+        click.UsageError: a bad address, or one that needs a certificate.
+    """
+    from pipelines.engine.cluster import ClusterAddress
+
+    try:
+        return ClusterAddress(text, certificates)
+    except ValueError as error:
+        raise click.UsageError(f"{option}: {error}") from error

@@ -1,0 +1,89 @@
+"""Whitened corrections of the camera poses: a dense root of the bundle's covariance.
+
+The inverse square root of the bundle's information gives coordinates with two properties:
+
+1. A correction that costs the observations χ² = 1 has length one.
+2. The seven movements that no observation resists, those of a similarity of the whole, do not exist.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from pipelines.core.types import FloatArray
+from pipelines.geometry.bundle import Network
+from pipelines.geometry.bundle_information import BundleInformation, bundle_information
+
+_COPIES = 4  # information, its factor, the basis, and a Jacobian or a normal matrix of the same size
+
+
+def predicted_basis_bytes(cameras: int) -> int:
+    """Return the peak of memory of a dense basis and of the normal equations in it."""
+    return _COPIES * 8 * (6 * cameras) ** 2
+
+
+@dataclass(frozen=True)
+class CorrectionBasis:
+    """Whitened corrections: (δω, δc) of all cameras = matrix @ z, with z ~ N(0, I) a posteriori.
+
+    `δω` [rad] turns a camera about its centre, axes of the world: `R' = R Exp(−δω)`; `δc` [m] moves the centre.
+
+    The lens parameters correlate with the poses. Their error, (L,) in the order of `geometry.lens.Lenses`, is
+    lens_matrix @ z plus an error with covariance `lens_cov` that is independent of z.
+
+    Attributes:
+        matrix: (n, 6, k), rows (δω, δc), k = 6 n − 7.
+        sigma_px: σ of an image coordinate, estimated from the residuals.
+        lens_matrix: (L, k).
+        lens_cov: (L, L).
+    """
+
+    matrix: FloatArray
+    sigma_px: float
+    lens_matrix: FloatArray
+    lens_cov: FloatArray
+
+
+def correction_basis(network: Network, *, lens_follows: bool = True) -> CorrectionBasis:
+    """Return whitened, gauge-free coordinates of the camera corrections.
+
+    The points hold the gauge. Under each correction the points follow the cameras and their lens; the mean
+    similarity of this movement, weighted by the information of each point, is zero.
+
+    The uncertainty of the similarity is therefore that of the scene, not that of the cameras' mean. A wrong focal
+    length or principal point shows as a common shift of the cameras against a scene that stays. That shift costs
+    the images little, and fixes reveal it. Cost O((6 n)³).
+
+    Args:
+        network: the bundle at its minimum.
+        lens_follows: whether the caller moves the lens by `lens_matrix` with the cameras. Otherwise the lens is
+            held, and the points follow through it as it is.
+
+    Raises:
+        DegenerateGeometryError: fewer observations than unknowns.
+    """
+    return basis_of(bundle_information(network, lens_follows=lens_follows))
+
+
+def basis_of(bundle: BundleInformation) -> CorrectionBasis:
+    """Return the basis of `correction_basis` from the information of the bundle."""
+    flat = _whitened_basis(bundle)
+    held = flat - bundle.similarity_modes @ (bundle.points_follow @ flat)
+    return CorrectionBasis(
+        held.reshape(-1, 6, flat.shape[1]), bundle.sigma_px, bundle.lens_follows @ flat, bundle.lens_cov
+    )
+
+
+def _whitened_basis(bundle: BundleInformation) -> FloatArray:
+    """Return a root (6 n, k) of the covariance of the cameras, free of similarities of the cameras."""
+    follows, unit = bundle.lens_follows, bundle.unit
+    information = bundle.by_poses.toarray() - follows.T @ bundle.lens @ follows
+    scaled = (information + information.T) / 2 * unit[:, None] * unit
+    complement = np.linalg.qr(bundle.similarity_modes / unit[:, None], mode="complete")[0][:, 7:]
+    reduced = complement.T @ scaled @ complement
+    reduced += np.eye(len(reduced)) / bundle.loosest_sigma_m**2
+    root = np.linalg.cholesky(reduced)
+    return np.asarray(solve_triangular(root, complement.T, lower=True).T * unit[:, None])

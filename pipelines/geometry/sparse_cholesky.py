@@ -1,0 +1,238 @@
+"""Cholesky factor of a sparse matrix of square blocks, by nested dissection, with selected parts of its inverse.
+
+The matrix couples places in the plane or in space, such as cameras that see the same points. Elimination couples
+the neighbours of what it eliminates, and the order decides how far this fill-in spreads:
+
+1. A cut across the longest extent halves the places. The places of one half that are coupled to the other form the
+   separator, which is eliminated after both halves. Each half is cut in the same way (George 1973, doi
+   10.1137/0710032). A block of n cameras over a plane then takes O(n log n) memory and O(n^1.5) operations.
+2. Each separator is eliminated as a dense matrix, the front, together with the later places that it is coupled to
+   (multifrontal method; Duff and Reid 1983, doi 10.1145/356044.356047).
+3. The inverse is known on every front from that of the front above (Takahashi's equations; Erisman and Tinney 1975,
+   doi 10.1145/360680.360704). Its diagonal blocks cost about twice the factorisation, and no solution of a system.
+
+Couplings over any distance are allowed. They only enlarge the separators: a matrix without zeros becomes one front,
+which is the dense method.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cholesky, solve_triangular
+from scipy.sparse import bsr_matrix, csc_matrix
+
+from pipelines.core.errors import DegenerateGeometryError
+from pipelines.core.types import FloatArray, IntArray
+
+_LEAST_CUT = 24  # places; fewer are eliminated together
+_LARGEST_SEPARATOR = 0.5  # of the places that a cut divides; beyond it, they are eliminated together
+
+
+@dataclass(frozen=True)
+class _Front:
+    own: IntArray  # places eliminated here
+    border: IntArray  # later places that they are coupled to
+    children: tuple[int, ...]  # fronts below, whose borders lie within `own` and `border`
+
+
+@dataclass(frozen=True)
+class _Pivot:
+    diagonal: FloatArray  # (o, o) lower triangle
+    below: FloatArray  # (b, o)
+
+
+class SparseCholesky:
+    """Cholesky factor of a symmetric positive definite matrix of n × n blocks.
+
+    Args:
+        matrix: blocks (w, w), both triangles.
+        position: (n, d) place of each block row, which the cuts divide. The result does not depend on it, only the
+            cost.
+
+    Raises:
+        DegenerateGeometryError: the matrix is not positive definite.
+    """
+
+    def __init__(self, matrix: bsr_matrix, position: FloatArray) -> None:
+        self._width = matrix.blocksize[0]
+        self._fronts = _dissection(matrix, position)
+        self._pivots = self._factorised(matrix)
+
+    @property
+    def entries(self) -> int:
+        """Number of stored entries of the factor."""
+        return sum(pivot.diagonal.size + pivot.below.size for pivot in self._pivots)
+
+    @property
+    def least_pivot(self) -> float:
+        """Smallest entry on the diagonal of the factor."""
+        return float(
+            min((np.diag(pivot.diagonal).min() for pivot in self._pivots if pivot.diagonal.size), default=0.0)
+        )
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        """Return the product (n · w, m) of the inverse matrix and vectors (n · w, m)."""
+        solution = np.array(right, dtype=np.float64).reshape(-1, self._width, right.shape[1])
+        for front, pivot in zip(self._fronts, self._pivots, strict=True):
+            own = _solved(pivot.diagonal, self._taken(solution, front.own))
+            self._put(solution, front.own, own)
+            self._put(solution, front.border, self._taken(solution, front.border) - pivot.below @ own)
+        return self.coloured(solution.reshape(right.shape))
+
+    def coloured(self, white: FloatArray) -> FloatArray:
+        """Return vectors (n · w, m) with the inverse matrix as their covariance, from white noise (n · w, m)."""
+        solution = np.array(white, dtype=np.float64).reshape(-1, self._width, white.shape[1])
+        for front, pivot in zip(reversed(self._fronts), reversed(self._pivots), strict=True):
+            own = self._taken(solution, front.own) - pivot.below.T @ self._taken(solution, front.border)
+            self._put(solution, front.own, _solved(pivot.diagonal, own, transposed=True))
+        return solution.reshape(white.shape)
+
+    def inverse_form(self, right: csc_matrix) -> FloatArray:
+        """Return the symmetric product rightᵀ A⁻¹ right (m, m) of a sparse matrix (n · w, m).
+
+        Only the fronts on the way from the entries of `right` to the last separator take part.
+        """
+        reduced = np.asarray(right.toarray()).reshape(-1, self._width, right.shape[1])
+        form = np.zeros((right.shape[1], right.shape[1]))
+        for front, pivot in zip(self._fronts, self._pivots, strict=True):
+            own = self._taken(reduced, front.own)
+            if own.any():
+                own = _solved(pivot.diagonal, own)
+                self._put(reduced, front.border, self._taken(reduced, front.border) - pivot.below @ own)
+                form += own.T @ own
+        return form
+
+    def inverse_diagonal(self) -> FloatArray:
+        """Return the diagonal blocks (n, w, w) of the inverse matrix."""
+        count = sum(len(front.own) for front in self._fronts)
+        blocks, width = np.empty((count, self._width, self._width)), self._width
+        for places, inverse in self._inverse_on_fronts():
+            among = np.arange(len(places))
+            blocks[places] = inverse.reshape(len(places), width, len(places), width)[among, :, among]
+        return blocks
+
+    def _inverse_on_fronts(self) -> Iterator[tuple[IntArray, FloatArray]]:
+        """Yield the places of each front that were eliminated there, and the inverse (o · w, o · w) among them."""
+        above: dict[int, FloatArray] = {}
+        for index in reversed(range(len(self._fronts))):
+            front, pivot = self._fronts[index], self._pivots[index]
+            on_border = above.pop(index, np.zeros((len(pivot.below), len(pivot.below))))
+            root_inverse = _solved(pivot.diagonal, np.eye(len(pivot.diagonal)))
+            response = pivot.below @ root_inverse
+            across = -on_border @ response
+            among = root_inverse.T @ root_inverse - response.T @ across
+            yield front.own, among
+            whole = np.block([[among, across.T], [across, on_border]])
+            for child in front.children:
+                rows = self._rows(_places_among(self._fronts[child].border, front))
+                above[child] = whole[np.ix_(rows, rows)]
+
+    def _factorised(self, matrix: bsr_matrix) -> list[_Pivot]:
+        pivots: list[_Pivot] = []
+        updates: dict[int, FloatArray] = {}
+        place_in_front = np.full(matrix.shape[0] // self._width, -1, dtype=np.int64)
+        for index, front in enumerate(self._fronts):
+            places = np.concatenate([front.own, front.border])
+            place_in_front[places] = np.arange(len(places))
+            dense = self._assembled(matrix, front, place_in_front)
+            for child in front.children:
+                rows = self._rows(place_in_front[self._fronts[child].border])
+                dense[np.ix_(rows, rows)] += updates.pop(child)
+            place_in_front[places] = -1
+            size = len(front.own) * self._width
+            try:
+                diagonal = cholesky(dense[:size, :size], lower=True, check_finite=False)
+            except np.linalg.LinAlgError:
+                raise DegenerateGeometryError("the observations do not determine all cameras") from None
+            below = np.ascontiguousarray(_solved(diagonal, dense[size:, :size].T).T)
+            updates[index] = dense[size:, size:] - below @ below.T
+            pivots.append(_Pivot(diagonal, below))
+        return pivots
+
+    def _assembled(self, matrix: bsr_matrix, front: _Front, place_in_front: IntArray) -> FloatArray:
+        """Return the front (f · w, f · w) with the matrix's blocks in the columns of its own places."""
+        width, count = self._width, len(front.own) + len(front.border)
+        dense = np.zeros((count, width, count, width))
+        slots = _slots(matrix, front.own)
+        row = place_in_front[matrix.indices[slots]]
+        column = place_in_front[np.repeat(front.own, np.diff(matrix.indptr)[front.own])]
+        kept = row >= 0
+        dense[row[kept], :, column[kept]] = np.swapaxes(matrix.data[slots[kept]], 1, 2)
+        return dense.reshape(count * width, count * width)
+
+    def _rows(self, places: IntArray) -> IntArray:
+        return np.asarray((places[:, None] * self._width + np.arange(self._width)).ravel(), dtype=np.int64)
+
+    @staticmethod
+    def _taken(vectors: FloatArray, places: IntArray) -> FloatArray:
+        return vectors[places].reshape(-1, vectors.shape[2])
+
+    @staticmethod
+    def _put(vectors: FloatArray, places: IntArray, values: FloatArray) -> None:
+        vectors[places] = values.reshape(len(places), *vectors.shape[1:])
+
+
+def _dissection(matrix: bsr_matrix, position: FloatArray) -> list[_Front]:
+    """Return the fronts, each after those below it."""
+    fronts: list[_Front] = []
+    eliminated = np.zeros(len(position), dtype=bool)
+
+    def append(own: IntArray, children: tuple[int, ...]) -> int:
+        eliminated[own] = True
+        coupled = np.concatenate(
+            [matrix.indices[_slots(matrix, own)], *(fronts[child].border for child in children)]
+        )
+        border = np.unique(coupled).astype(np.int64)
+        fronts.append(_Front(own, border[~eliminated[border]], children))
+        return len(fronts) - 1
+
+    def dissect(places: IntArray) -> int:
+        divided = _cut(matrix, position, places) if len(places) > _LEAST_CUT else None
+        if divided is None:
+            return append(places, ())
+        *halves, separator = divided
+        below = tuple(dissect(half) for half in halves if len(half))
+        return append(separator, below)
+
+    dissect(np.arange(len(position)))
+    return fronts
+
+
+def _cut(matrix: bsr_matrix, position: FloatArray, places: IntArray) -> tuple[IntArray, IntArray, IntArray] | None:
+    """Return two halves of places without a coupling, and the separator between them; None: no cut pays."""
+    along = position[places] @ np.linalg.svd(np.cov(position[places].T))[0][:, 0]
+    order = places[np.argsort(along, kind="stable")]
+    side = np.zeros(len(position), dtype=np.int8)
+    halves = order[: len(order) // 2], order[len(order) // 2 :]
+    side[halves[0]], side[halves[1]] = 1, 2
+    facing = []
+    for half, other in ((0, 2), (1, 1)):
+        slots = _slots(matrix, halves[half])
+        owner = np.repeat(halves[half], np.diff(matrix.indptr)[halves[half]])
+        facing.append(np.unique(owner[side[matrix.indices[slots]] == other]))
+    thinner = int(len(facing[1]) < len(facing[0]))
+    if len(facing[thinner]) > _LARGEST_SEPARATOR * len(places) / 2:
+        return None
+    separator = facing[thinner]
+    return np.setdiff1d(halves[0], separator), np.setdiff1d(halves[1], separator), separator
+
+
+def _slots(matrix: bsr_matrix, rows: IntArray) -> IntArray:
+    """Return the places in `matrix.data` of the blocks of block rows, one row after the other."""
+    count = np.diff(matrix.indptr)[rows]
+    start = np.repeat(matrix.indptr[rows] - np.concatenate([[0], np.cumsum(count)[:-1]]), count)
+    return np.asarray(start + np.arange(int(count.sum())), dtype=np.int64)
+
+
+def _places_among(wanted: IntArray, front: _Front) -> IntArray:
+    """Return where places lie in a front."""
+    places = np.concatenate([front.own, front.border])
+    order = np.argsort(places)
+    return order[np.searchsorted(places[order], wanted)]
+
+
+def _solved(triangle: FloatArray, right: FloatArray, *, transposed: bool = False) -> FloatArray:
+    return np.asarray(solve_triangular(triangle, right, lower=True, trans=int(transposed), check_finite=False))

@@ -1,0 +1,176 @@
+"""COLMAP's database of a survey or a part of it: cameras and images, and copies of features and matches.
+
+An image has the same number in every database of a survey: its place in the survey, counted from 1. Rows of
+features and matches are therefore copied as they are. COLMAP's own `Database.merge` renumbers images and refuses
+databases that share one, as those of matches do.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterable
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+from pipelines.core.durable import remove, replace_file
+from pipelines.core.errors import DamagedPartialError, InputError, storage_error
+from pipelines.core.stages import SURVEY
+from pipelines.scene.survey import CameraPrior, Survey
+from pipelines.sfm.options import SfmOptions
+
+FEATURES = ("keypoints", "descriptors")
+MATCHES = ("matches", "two_view_geometries")
+
+
+def write_frame(colmap: Any, database: Path, survey: Survey, images: Iterable[int], options: SfmOptions) -> None:
+    """Write cameras and images into a database, unless an interrupted run has already done so.
+
+    Args:
+        colmap: the pycolmap module.
+        database: path; made if missing.
+        survey: has the images and the priors of their cameras.
+        images: indices into the images of the survey.
+        options: have the camera model.
+
+    Raises:
+        InputError: a camera prior is none of COLMAP's cameras.
+    """
+    priors = {prior.camera_id: prior for prior in survey.cameras}
+    with colmap.Database.open(database) as opened, colmap.DatabaseTransaction(opened):
+        known = {image.image_id for image in opened.read_all_images()}
+        for index in images:
+            image_id = index + 1
+            if image_id in known:
+                continue
+            image = survey.images[index]
+            if not opened.exists_camera(image.camera_id):
+                _write_camera(colmap, opened, priors[image.camera_id], options)
+            row = colmap.Image(name=image.name, camera_id=image.camera_id, image_id=image_id)
+            opened.write_image(row, use_image_id=True)
+            frame = colmap.Frame(frame_id=image_id, rig_id=image.camera_id)
+            frame.add_data_id(row.data_id)
+            opened.write_frame(frame, use_frame_id=True)
+
+
+def rename_images(colmap: Any, path: Path, names: dict[str, str]) -> None:
+    """Rename those images of a database whose names are keys of `names`."""
+    with colmap.Database.open(path) as database, colmap.DatabaseTransaction(database):
+        for image in database.read_all_images():
+            if image.name in names:
+                image.name = names[image.name]
+                database.update_image(image)
+
+
+def copy_rows(source: Path, target: Path, tables: Iterable[str], images: Iterable[int] | None = None) -> None:
+    """Copy rows of features or matches from one database of a survey into another; present rows stay.
+
+    Args:
+        source: finished database, which is not changed.
+        target: database with the same numbers of images.
+        tables: `FEATURES` or `MATCHES`.
+        images: indices of the images whose features are copied; None: all rows.
+
+    Raises:
+        DamagedPartialError: the source is no whole database, or one of another version of COLMAP.
+        sqlite3.Error: the target cannot be written.
+    """
+    with closing(sqlite3.connect(target, isolation_level=None, uri=True)) as connection:
+        try:
+            # Immutable: a finished database needs no lock, which network file systems may not grant.
+            connection.execute("attach database ? as source", (f"{source.absolute().as_uri()}?immutable=1",))
+            versions = {connection.execute(f"pragma {name}.user_version").fetchone() for name in ("main", "source")}
+            if len(versions) > 1:
+                raise DamagedPartialError("was made by another version of COLMAP", path=source)
+            connection.execute("begin immediate")
+            wanted = "" if images is None else "where image_id in (select image_id from temp.wanted)"
+            if images is not None:
+                connection.execute("create temp table wanted (image_id integer primary key)")
+                connection.executemany("insert into wanted values (?)", ((index + 1,) for index in images))
+            for table in tables:
+                connection.execute(f"insert or ignore into main.{table} select * from source.{table} {wanted}")
+            connection.execute("commit")
+        except sqlite3.DatabaseError as error:
+            if storage_error(error) is not None:
+                raise
+            raise DamagedPartialError(f"cannot be copied: {error}", path=source) from error
+
+
+def finish_database(draft: Path, final: Path, *, without: Iterable[str] = ()) -> None:
+    """Make a draft the final database: one whole file, on the disk.
+
+    Args:
+        draft: path of a database that is no longer written.
+        final: its new path.
+        without: tables whose rows are dropped.
+    """
+    with closing(sqlite3.connect(draft, isolation_level=None)) as connection:
+        for table in without:
+            connection.execute(f"delete from {table}")
+        connection.execute("pragma journal_mode = delete")  # COLMAP's journal is a second file.
+        connection.execute("vacuum")
+    replace_file(draft, final)
+
+
+def remove_database(path: Path) -> None:
+    """Remove a database and its journals."""
+    for suffix in ("", "-wal", "-shm", "-journal"):
+        remove(path.with_name(path.name + suffix))
+
+
+def require_sound(database: Path) -> None:
+    """Refuse a damaged database of an interrupted run; COLMAP would abort, or continue without a part of it.
+
+    Raises:
+        DamagedPartialError: SQLite finds the file damaged.
+    """
+    if not database.exists():
+        return
+    try:
+        with closing(sqlite3.connect(database)) as connection:
+            (verdict,) = connection.execute("pragma quick_check(1)").fetchone()
+    except sqlite3.DatabaseError as error:
+        if storage_error(error) is not None:
+            raise
+        verdict = str(error)
+    if verdict != "ok":
+        raise DamagedPartialError(f"the database is damaged: {verdict}", path=database)
+
+
+def _write_camera(colmap: Any, database: Any, prior: CameraPrior, options: SfmOptions) -> None:
+    """Write a camera, and the rig that consists of it alone and has its number."""
+    # No perspective model approximates a fisheye: its own model is kept.
+    model = prior.model if prior.model == "OPENCV_FISHEYE" else options.camera_model
+    camera = colmap.Camera.create_from_model_name(
+        prior.camera_id, model, prior.params[0], prior.width, prior.height
+    )
+    _copy_shared_params(colmap, prior, camera)
+    camera.has_prior_focal_length = prior.focal_source != "assumed"
+    database.write_camera(camera, use_camera_id=True)
+    rig = colmap.Rig(rig_id=prior.camera_id)
+    rig.add_ref_sensor(camera.sensor_id)
+    database.write_rig(rig, use_rig_id=True)
+
+
+def _copy_shared_params(colmap: Any, prior: CameraPrior, camera: Any) -> None:
+    """Copy the parameters of the prior that both camera models have: focal length, centre, distortion.
+
+    Raises:
+        InputError: COLMAP has no camera of that model with that number of parameters.
+    """
+    try:
+        original = colmap.Camera(
+            model=prior.model, width=prior.width, height=prior.height, params=list(prior.params)
+        )
+        names = [name.strip() for name in original.params_info.split(",")]
+        by_name = dict(zip(names, prior.params, strict=True))
+    except ValueError as error:
+        raise InputError(
+            f"{prior.model} is no camera of COLMAP with {len(prior.params)} parameters", field=SURVEY
+        ) from error
+    f = by_name.get("f", by_name.get("fx", 0.0))
+    by_name = {"f": f, "fx": f, "fy": f, "k": by_name.get("k1", 0.0), "k1": by_name.get("k", 0.0), **by_name}
+    params = camera.params
+    for index, name in enumerate(part.strip() for part in camera.params_info.split(",")):
+        params[index] = by_name.get(name, params[index])
+    camera.params = params

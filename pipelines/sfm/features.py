@@ -1,0 +1,148 @@
+"""Features of photographs, and matches of pairs, in a database of COLMAP: for a whole survey, or for a chunk of it.
+
+Both work in small steps, which survive an interruption.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipelines.core.progress import Progress
+from pipelines.core.threads import chosen_threads
+from pipelines.core.types import IntArray
+from pipelines.formats.image_file import read_bytes, require_unchanged
+from pipelines.geometry.rotations import matrix_from_quat_xyzw
+from pipelines.scene.survey import Survey
+from pipelines.sfm.colmap_database import rename_images, write_frame
+from pipelines.sfm.options import SfmOptions
+from pipelines.sfm.pairs import CameraDirections, all_pairs, select_pairs
+
+_EXHAUSTIVE_UP_TO = 20
+_IMAGES_PER_STEP = 4
+_PAIRS_PER_STEP = 48
+
+
+@dataclass(frozen=True)
+class SfmJob:
+    """Inputs of a reconstruction, or of a part of one.
+
+    Attributes:
+        survey: photographs with priors of their cameras, positions and attitudes.
+        images: folder of the photographs.
+        database: path of COLMAP's database; an existing one is continued.
+        options: of the stage.
+    """
+
+    survey: Survey
+    images: Path
+    database: Path
+    options: SfmOptions
+
+
+def candidate_pairs(survey: Survey, options: SfmOptions) -> IntArray:
+    """Return the pairs to match as indices (P, 2) into `survey.images`.
+
+    All pairs are matched if there are up to 20 images, or if no image has a fix. Otherwise position and viewing
+    direction decide.
+    """
+    count = len(survey.images)
+    located = any(image.fix for image in survey.images)
+    if options.pairs == "exhaustive" or count <= _EXHAUSTIVE_UP_TO or not located:
+        return all_pairs(count)
+    unknown = (np.nan, np.nan, np.nan)
+    position = np.array([image.fix.position_in_geo if image.fix else unknown for image in survey.images])
+    axis = np.array(
+        [
+            matrix_from_quat_xyzw(image.attitude.quat_xyzw)[:, 2] if image.attitude else unknown
+            for image in survey.images
+        ]
+    )
+    return select_pairs(CameraDirections(position, axis), options.max_neighbors)
+
+
+def extract_features(colmap: Any, job: SfmJob, images: Sequence[int], progress: Progress) -> None:
+    """Detect the features of photographs, and write them into the database.
+
+    Args:
+        colmap: the pycolmap module.
+        job: inputs.
+        images: indices into the images of the survey.
+        progress: shows the photographs.
+
+    Raises:
+        InputError: a photograph is not that of the survey, or a camera prior is none of COLMAP's cameras.
+    """
+    options = colmap.FeatureExtractionOptions()
+    options.max_image_size = job.options.max_image_size
+    options.num_threads = chosen_threads(job.options.threads)
+    options.sift.max_num_features = job.options.max_features
+    _restore_names(colmap, job)
+    write_frame(colmap, job.database, job.survey, images, job.options)
+    with progress.task("features", len(images)) as task:
+        for camera_id in sorted({job.survey.images[index].camera_id for index in images}):
+            reader = colmap.ImageReaderOptions()
+            reader.existing_camera_id = camera_id
+            of_camera = [job.survey.images[index] for index in images]
+            of_camera = [image for image in of_camera if image.camera_id == camera_id]
+            for step in _steps(of_camera, _IMAGES_PER_STEP):
+                for image in step:
+                    path = job.images / image.name
+                    require_unchanged(read_bytes(path), image.sha256, path)
+                colmap.extract_features(
+                    job.database,
+                    job.images,
+                    image_names=[image.name for image in step],
+                    reader_options=reader,
+                    extraction_options=options,
+                )
+                task.advance(len(step))
+
+
+def match_features(colmap: Any, job: SfmJob, pairs: IntArray, progress: Progress) -> None:
+    """Match pairs of photographs whose features are in the database, and verify the matches.
+
+    Args:
+        colmap: the pycolmap module.
+        job: inputs.
+        pairs: (P, 2) indices into the images of the survey.
+        progress: shows the pairs.
+    """
+    matching, pairing = colmap.FeatureMatchingOptions(), colmap.ImportedPairingOptions()
+    matching.num_threads = chosen_threads(job.options.threads)
+    verification = colmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = job.options.seed
+    listing = job.database.with_name("pairs.txt")
+    # COLMAP reads pairs from a text in which a blank ends a name: numbers replace the names while it matches.
+    names = [image.name for image in job.survey.images]
+    rename_images(colmap, job.database, {name: _number(index) for index, name in enumerate(names)})
+    try:
+        with progress.task("matching", len(pairs)) as task:
+            for step in _steps(pairs, _PAIRS_PER_STEP):
+                lines = (f"{_number(a)} {_number(b)}\n" for a, b in step)
+                listing.write_text("".join(lines), encoding="utf-8")
+                pairing.match_list_path = listing
+                colmap.match_image_pairs(job.database, matching, pairing, verification)
+                task.advance(len(step))
+    finally:
+        _restore_names(colmap, job)
+    listing.unlink(missing_ok=True)
+
+
+def _restore_names(colmap: Any, job: SfmJob) -> None:
+    """Give images their names again: a run that was killed while it matched has left the numbers."""
+    names = [image.name for image in job.survey.images]
+    rename_images(colmap, job.database, {_number(index): name for index, name in enumerate(names)})
+
+
+def _number(index: int) -> str:
+    return f"{index:06d}"
+
+
+def _steps(items: Any, size: int) -> Iterator[Any]:
+    for begin in range(0, len(items), size):
+        yield items[begin : begin + size]

@@ -1,0 +1,211 @@
+"""Numba kernels of photometric matching; they hold no GIL, so that threads match several views at once.
+
+All loops run along image rows and without branches: LLVM makes vector instructions of them. Floating-point flags
+exclude NaN and infinity, which callers therefore keep out.
+"""
+
+# ruff: noqa: PLR0917  (kernels take arrays, not objects)
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+_FAST = {"contract", "nsz", "arcp", "reassoc", "nnan", "ninf"}
+UNSEEN = np.float32(-1.0)  # correlation outside a neighbour's image
+NOISE_VARIANCE = np.float32(0.3)  # grey levels²: windows that vary less than the sensor's noise do not correlate
+_LEAST_DEPTH = np.float32(1e-3)
+_ZERO, _ONE = np.float32(0.0), np.float32(1.0)
+
+
+@njit(nogil=True, fastmath=_FAST, error_model="numpy", inline="always")
+def _reflected(row: int, height: int) -> int:
+    """Return the row that a row beyond the image mirrors."""
+    inside = -row - 1 if row < 0 else row
+    return 2 * height - inside - 1 if inside >= height else inside
+
+
+@njit(nogil=True, fastmath=_FAST, error_model="numpy")
+def _project_row(
+    depth: Any, row: int, per_depth: Any, start: Any, size: Any, stride: int, place: Any, fraction: Any, miss: Any
+) -> None:
+    """Project the pixels of a row at their depths (W,) into a neighbour, clamped to its image.
+
+    Writes the index of the upper left of four pixels into `place` (W,), the position between them into `fraction`
+    (2, W), and into `miss` (W,) 0 where nothing was clamped.
+    """
+    y = np.float32(row)
+    x0 = per_depth[0, 1] * y + per_depth[0, 2]
+    y0 = per_depth[1, 1] * y + per_depth[1, 2]
+    z0 = per_depth[2, 1] * y + per_depth[2, 2]
+    x_step, y_step, z_step = per_depth[0, 0], per_depth[1, 0], per_depth[2, 0]
+    x_start, y_start, z_start, right, bottom = start[0], start[1], start[2], size[0], size[1]
+    for i in range(depth.shape[0]):
+        column, d = np.float32(i), depth[i]
+        z = d * (z_step * column + z0) + z_start
+        ahead = max(z, _LEAST_DEPTH)
+        inverse = _ONE / ahead
+        u = (d * (x_step * column + x0) + x_start) * inverse
+        v = (d * (y_step * column + y0) + y_start) * inverse
+        inner_u, inner_v = min(max(u, _ZERO), right), min(max(v, _ZERO), bottom)
+        whole_u, whole_v = np.int32(inner_u), np.int32(inner_v)
+        place[i] = whole_v * stride + whole_u
+        fraction[0, i] = inner_u - np.float32(whole_u)
+        fraction[1, i] = inner_v - np.float32(whole_v)
+        miss[i] = abs(inner_u - u) + abs(inner_v - v) + (ahead - z)
+
+
+@njit(nogil=True, fastmath=_FAST, error_model="numpy")
+def _sample_row(grey: Any, stride: int, place: Any, fraction: Any, miss: Any, shown: Any) -> None:
+    """Write the interpolated grey levels at places into `shown` (W,); 0 where the place was missed."""
+    down = np.uint32(stride)
+    for i in range(place.shape[0]):
+        first = np.uint32(place[i])
+        a, b = grey[first], grey[first + np.uint32(1)]
+        c, d = grey[first + down], grey[first + down + np.uint32(1)]
+        above, below = a + fraction[0, i] * (b - a), c + fraction[0, i] * (d - c)
+        level = above + fraction[1, i] * (below - above)
+        shown[i] = level if miss[i] == _ZERO else _ZERO
+
+
+@njit(nogil=True, fastmath=_FAST, error_model="numpy")
+def _add_across(reference: Any, padded: Any, half: int, sums: Any) -> None:
+    """Write Σ other, Σ other², Σ reference · other over windows along a row into sums (3, W).
+
+    Args:
+        reference: (W + 2 half,) row of the reference, mirrored at its ends.
+        padded: (W + 2 half,) likewise of the neighbour, as the reference sees it.
+        half: of the window.
+        sums: output.
+    """
+    width = sums.shape[1]
+    for k in range(2 * half + 1):
+        for i in range(width):
+            level = padded[i + k]
+            product = reference[i + k] * level
+            if k == 0:
+                sums[0, i], sums[1, i], sums[2, i] = level, level * level, product
+            else:
+                sums[0, i] += level
+                sums[1, i] += level * level
+                sums[2, i] += product
+
+
+@njit(nogil=True, fastmath=_FAST, error_model="numpy")
+def _mirror_ends(padded: Any, half: int) -> None:
+    width = padded.shape[0] - 2 * half
+    for k in range(half):
+        padded[half - 1 - k] = padded[half + k]
+        padded[half + width + k] = padded[half + width - 1 - k]
+
+
+@njit(nogil=True, fastmath=_FAST, error_model="numpy")
+def _correlate_row(ring: Any, shown: Any, mean: Any, inverse_sigma: Any, total: Any, score: Any) -> None:
+    """Write the correlation of a row with a neighbour into score (W,).
+
+    Args:
+        ring: (window, 3, W) sums along the rows of the window.
+        shown: (W,) the neighbour's grey levels at the row itself.
+        mean: (W,) of the reference's windows.
+        inverse_sigma: (W,) of the reference's windows.
+        total: (3, W) scratch.
+        score: output.
+    """
+    window, width = ring.shape[0], shown.shape[0]
+    share = np.float32(1.0 / (window * window))
+    for q in range(3):
+        for i in range(width):
+            total[q, i] = ring[0, q, i]
+        for k in range(1, window):
+            for i in range(width):
+                total[q, i] += ring[k, q, i]
+    for i in range(width):
+        other = total[0, i] * share
+        variance = max(total[1, i] * share - other * other, NOISE_VARIANCE)
+        level = (total[2, i] * share - mean[i] * other) * inverse_sigma[i] / np.sqrt(variance)
+        score[i] = UNSEEN if shown[i] == _ZERO else level
+
+
+@njit(nogil=True, fastmath=_FAST, error_model="numpy")
+def _keep_largest(score: Any, largest: Any) -> None:
+    """Insert scores (W,) into the sorted largest (k, W) so far; overwrites them."""
+    for rank in range(largest.shape[0]):
+        for i in range(score.shape[0]):
+            kept, new = largest[rank, i], score[i]
+            largest[rank, i] = max(kept, new)
+            score[i] = min(kept, new)
+
+
+@njit(nogil=True, cache=True, fastmath=_FAST, error_model="numpy")
+def match_rows(
+    depth: Any,
+    rows: Any,
+    reference: Any,
+    mean: Any,
+    inverse_sigma: Any,
+    greys: Any,
+    sizes: Any,
+    per_depth: Any,
+    starts: Any,
+    out: Any,
+) -> None:
+    """Write the best correlations of some rows of a view with n neighbours, under a hypothesis of depth.
+
+    Args:
+        depth: (H, W) hypothesis, finite.
+        rows: (2,) first row and the row after the last.
+        reference: (H, W + 2 half) grey levels, mirrored at the ends of rows; half = window // 2.
+        mean: (H, W) of the reference's windows.
+        inverse_sigma: (H, W) of the reference's windows.
+        greys: (n, h + 1, w + 1) grey levels of the neighbours; the last row and column are not read with weight.
+        sizes: (n, 2) largest column and row of each neighbour, float32.
+        per_depth: (n, 3, 3) float32, starts: (n, 3) float32: of a pixel (column, row) at depth d, the neighbour's
+            homogeneous pixel is d · per_depth · (column, row, 1) + start.
+        out: (H, k, W) the largest correlations, largest first, k at most n.
+    """
+    count, height, width = len(greys), depth.shape[0], depth.shape[1]
+    half = (reference.shape[1] - width) // 2
+    window, stride = 2 * half + 1, greys.shape[2]
+    flat = greys.reshape(count, -1)
+    ring = np.empty((count, window, 3, width), np.float32)
+    shown = np.zeros((count, window, width + 2 * half), np.float32)
+    place, fraction = np.empty(width, np.int32), np.empty((2, width), np.float32)
+    miss, score, total = np.empty(width, np.float32), np.empty(width, np.float32), np.empty((3, width), np.float32)
+    for pushed in range(rows[0] - half, rows[1] + half):
+        row, slot = _reflected(pushed, height), (pushed + window) % window
+        done = pushed - half
+        if done >= rows[0]:
+            out[done] = np.float32(-2.0)
+        for k in range(count):
+            _project_row(depth[row], row, per_depth[k], starts[k], sizes[k], stride, place, fraction, miss)
+            _sample_row(flat[k], stride, place, fraction, miss, shown[k, slot, half : half + width])
+            _mirror_ends(shown[k, slot], half)
+            _add_across(reference[row], shown[k, slot], half, ring[k, slot])
+            if done >= rows[0]:
+                middle = shown[k, (done + window) % window, half : half + width]
+                _correlate_row(ring[k], middle, mean[done], inverse_sigma[done], total, score)
+                _keep_largest(score, out[done])
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def keep_winner(number: int, score: Any, last: Any, best: Any, before: Any, after: Any, hypothesis: Any) -> None:
+    """Compare the scores of hypothesis `number` with the best so far, pixel by pixel.
+
+    Args:
+        number: of the hypothesis, from 0.
+        score: (P,) its scores.
+        last: (P,) scores of the hypothesis before; receives `score`.
+        best: (P,) largest scores so far.
+        before: (P,) scores of the hypotheses before the best ones.
+        after: (P,) scores of those after the best ones.
+        hypothesis: (P,) numbers of the best, int32.
+    """
+    for i in range(score.shape[0]):
+        new = score[i]
+        if new > best[i]:
+            best[i], before[i], after[i], hypothesis[i] = new, last[i], np.float32(-2.0), number
+        elif hypothesis[i] == number - 1:
+            after[i] = new
+        last[i] = new

@@ -1,0 +1,198 @@
+"""Region that a training is confined to: a block of a survey, with a frozen model that stands in for the rest.
+
+Losses count at the pixels that show the region. The depth that decides comes from stereo where views agree, and
+elsewhere from the stand-in.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+import torch
+
+from pipelines.core.progress import SILENT, Progress
+from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
+from pipelines.geometry.cameras import Pinhole
+from pipelines.georef.cameras import CameraPoses
+from pipelines.scene.block_plan import BlockCell
+from pipelines.scene.pinholes import Pinholes
+from pipelines.splat.gaussians import Gaussians
+from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings, Window
+from pipelines.train.surface import SceneSurface
+
+_STAND_IN_PX = 160  # longest side of the stand-in's renders
+_LEAST_ALPHA = 0.5  # of a surface: rays that meet less end in the sky
+_SKY_M = 1e6
+_KEPT = 64  # masks in memory unpacked
+_STRAY = 0.002  # of the points at either end of an axis
+_ROOM = 0.2  # of the longest side of their box
+
+
+@dataclass(frozen=True)
+class RegionView:
+    """Part of an image that shows the region.
+
+    Attributes:
+        window: smallest part of the image that holds all of it.
+        mask: pixels of the window that show the region.
+    """
+
+    window: Window
+    mask: BoolArray
+
+
+class RegionMasks:
+    """Pixels of each view that show a region; a byte for eight of them.
+
+    Args:
+        masks: (H, W) of each view by index.
+    """
+
+    def __init__(self, masks: dict[int, BoolArray]) -> None:
+        self._shape = {index: mask.shape for index, mask in masks.items()}
+        self._packed: dict[int, ByteArray] = {index: np.packbits(mask) for index, mask in masks.items()}
+        self.view = lru_cache(_KEPT)(self._view)
+
+    def share(self, index: int) -> float:
+        """Return the share of a view's pixels that show the region, 0 … 1."""
+        return float(self._whole(index).mean())
+
+    def seeing(self) -> IntArray:
+        """Return the indices of the views that show the region, ascending."""
+        return np.array(sorted(index for index, packed in self._packed.items() if packed.any()), dtype=np.int64)
+
+    def _whole(self, index: int) -> BoolArray:
+        height, width = self._shape[index]
+        return np.unpackbits(self._packed[index], count=height * width).reshape(height, width).astype(bool)
+
+    def _view(self, index: int, shrink: int = 1) -> RegionView:
+        """Return the part of a view, at 1/`shrink` of its size, that shows the region; at least one pixel."""
+        whole = self._whole(index)
+        height, width = (side // shrink for side in whole.shape)
+        cells = whole[: height * shrink, : width * shrink].reshape(height, shrink, width, shrink)
+        mask = cells.mean(axis=(1, 3)) >= 0.5
+        if not mask.any():
+            return RegionView(Window(0, 0, 1, 1), np.zeros((1, 1), dtype=bool))
+        rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+        top, left = int(rows[0]), int(columns[0])
+        window = Window(left, top, int(columns[-1]) - left + 1, int(rows[-1]) - top + 1)
+        cut = mask[top : top + window.height, left : left + window.width]
+        return RegionView(window, np.ascontiguousarray(cut))
+
+
+@dataclass(frozen=True)
+class SceneBox:
+    """Box (3,) … (3,) in `model` around the survey's points, with room for what none of them shows."""
+
+    low: FloatArray
+    high: FloatArray
+
+    @staticmethod
+    def around(points: FloatArray) -> SceneBox:
+        """Return the box of points (N, 3), which a few wrong ones do not extend."""
+        low, high = np.quantile(points, [_STRAY, 1 - _STRAY], axis=0)
+        room = _ROOM * (high - low).max()
+        return SceneBox(low - room, high + room)
+
+    def contains(self, points: FloatArray) -> BoolArray:
+        """Return which of points (N, 3) lie inside, as a mask (N,)."""
+        return np.asarray(((points >= self.low) & (points <= self.high)).all(axis=1))
+
+
+@dataclass(frozen=True)
+class RegionViews:
+    """Views in which a region is looked for.
+
+    Attributes:
+        indices: (T,) of the cameras.
+        poses: of all cameras.
+        pinholes: of their images.
+        rasterizer: renders the stand-in.
+    """
+
+    indices: IntArray
+    poses: CameraPoses
+    pinholes: Pinholes
+    rasterizer: Rasterizer
+
+    def masks(
+        self,
+        cell: BlockCell,
+        stand_in: Gaussians,
+        surface: SceneSurface | None = None,
+        progress: Progress = SILENT,
+    ) -> RegionMasks:
+        """Return the pixels of each view whose surface lies in a region.
+
+        Args:
+            cell: the region.
+            stand_in: whose depth counts where the surface is not known.
+            surface: known depths; None: there are none.
+            progress: counts the views.
+        """
+        masks: dict[int, BoolArray] = {}
+        with progress.task("masks", len(self.indices)) as task:
+            for index in self.indices.tolist():
+                pose, pinhole = self.poses.matrix(index), self.pinholes.of(index)
+                depth = stand_in_depth(stand_in, pose, pinhole, self.rasterizer)
+                known = None if surface is None else surface.depth(index)
+                masks[index] = region_mask(pose, pinhole, cell, known, depth)
+                task.advance()
+        return RegionMasks(masks)
+
+
+@dataclass(frozen=True)
+class TrainingRegion:
+    """Region of a training.
+
+    Attributes:
+        cell: where the Gaussians are trained, in `model`.
+        box: of the survey; far beyond it lie sky and horizon.
+        surroundings: frozen Gaussians outside the cell, on the device of the training.
+        sky: Gaussians of the cell beyond the box, to start from.
+        masks: of the training views.
+    """
+
+    cell: BlockCell
+    box: SceneBox
+    surroundings: Gaussians
+    sky: Gaussians
+    masks: RegionMasks
+
+
+def region_mask(
+    pose: FloatArray, pinhole: Pinhole, cell: BlockCell, known: Float32Array | None, stand_in: Float32Array
+) -> BoolArray:
+    """Return the pixels (H, W) of a view whose surface lies in a region.
+
+    Args:
+        pose: (4, 4) cam ← model.
+        pinhole: of H × W pixels.
+        cell: the region.
+        known: depth in metres along z at any resolution, 0 where unknown; None: unknown everywhere.
+        stand_in: depth in metres along z at any resolution, for the pixels without a known one.
+    """
+    size = pinhole.width, pinhole.height
+    depth = cv2.resize(np.array(stand_in), size, interpolation=cv2.INTER_NEAREST)
+    if known is not None:
+        own = cv2.resize(np.array(known), size, interpolation=cv2.INTER_NEAREST)
+        depth = np.where(own > 0, own, depth)
+    points = (pinhole.points_at(depth) - pose[:3, 3]) @ pose[:3, :3]
+    return cell.contains(points).reshape(depth.shape)
+
+
+def stand_in_depth(
+    gaussians: Gaussians, pose: FloatArray, pinhole: Pinhole, rasterizer: Rasterizer
+) -> Float32Array:
+    """Return the depth (h, w) in metres of a frozen model in a small image of a view; the sky is very far."""
+    small = pinhole.limited(_STAND_IN_PX)
+    cam_from_model = torch.as_tensor(pose, dtype=torch.float32, device=gaussians.means.device)
+    with torch.no_grad():
+        view = rasterizer.render(gaussians, cam_from_model, small, RasterSettings(sh_degree=0, depth=True))
+    assert view.median_depth is not None and view.expected_depth is not None
+    depth = torch.where(view.median_depth > 0, view.median_depth, view.expected_depth)
+    seen = view.alpha >= _LEAST_ALPHA
+    return np.asarray(torch.where(seen, depth, torch.full_like(depth, _SKY_M)).cpu().numpy())

@@ -1,0 +1,180 @@
+"""LiDAR against depth maps of a town of boxes, rendered exactly: shift and changes are known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+
+from pipelines.core.errors import InputError
+from pipelines.geometry.depth_support import DepthViews
+from pipelines.geometry.rotations import geo_from_cam
+from pipelines.geometry.similarity import Similarity
+from pipelines.georef.estimate import Estimate
+from pipelines.georef.similarity import LearnableSimilarity
+from pipelines.georef.systematic import SystematicErrorValues
+from pipelines.train.lidar.changes import verdict
+from pipelines.train.lidar.cloud import LidarCloud, planes_of
+from pipelines.train.lidar.planes import plane_term
+from pipelines.train.lidar.prepare import registration_of
+from pipelines.train.lidar.registration import registration
+from pipelines.train.lidar.surface import LidarPlanes
+
+SIZE, FOCAL_PX = (96, 72), 80.0
+SIGMA_M, SPACING_M = 0.02, 0.5
+PIXEL_M = 60.0 / FOCAL_PX
+# Boxes: low and high corner.
+HOUSES = (
+    (np.array([-14.0, -10.0, 0.0]), np.array([-2.0, 2.0, 8.0])),
+    (np.array([6.0, 4.0, 0.0]), np.array([16.0, 18.0, 11.0])),
+)
+EXTRA = (np.array([4.0, -18.0, 0.0]), np.array([18.0, -6.0, 9.0]))
+
+
+V, U = np.mgrid[: SIZE[1], : SIZE[0]] + 0.5
+RAYS = np.stack([U - SIZE[0] / 2, V - SIZE[1] / 2, np.full_like(U, FOCAL_PX)], axis=-1).reshape(-1, 3) / FOCAL_PX
+
+
+@dataclass(frozen=True, eq=False)
+class Town:
+    """Ground at zero height and boxes."""
+
+    boxes: tuple[tuple[np.ndarray, np.ndarray], ...]
+
+    def distance(self, origin: np.ndarray, ray: np.ndarray) -> np.ndarray:
+        """Distances (N,) along rays (N, 3) to the first surface; infinite: none."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            nearest = np.where(ray[:, 2] < 0, -origin[..., 2] / ray[:, 2], np.inf)
+            for low, high in self.boxes:
+                near = np.minimum((low - origin) / ray, (high - origin) / ray).max(axis=1)
+                far = np.maximum((low - origin) / ray, (high - origin) / ray).min(axis=1)
+                nearest = np.where((near <= far) & (near > 0), np.minimum(nearest, near), nearest)
+        return nearest
+
+
+@cache
+def views_of(town: Town) -> DepthViews:
+    """Depth maps of twelve photographs on a circle, 45° down."""
+    turns = np.arange(12) * np.pi / 6
+    centers = np.stack([45 * np.cos(turns), 45 * np.sin(turns), np.full(12, 42.0)], axis=1)
+    yaw = np.degrees(np.arctan2(-centers[:, 0], -centers[:, 1]))
+    rotations = geo_from_cam(np.stack([yaw, np.full(12, -43.0), np.zeros(12)], axis=1)).transpose(0, 2, 1)
+    depths = [town.distance(center, RAYS @ rotation) for center, rotation in zip(centers, rotations, strict=True)]
+    depth = np.concatenate(depths)
+    return DepthViews(
+        rotations, centers, np.tile([FOCAL_PX, FOCAL_PX, SIZE[0] / 2, SIZE[1] / 2], (12, 1)),
+        np.tile(SIZE, (12, 1)),
+        np.arange(12) * len(RAYS), np.where(np.isfinite(depth), depth, 0.0).astype(np.float32),
+    )  # fmt: skip
+
+
+@cache
+def surface_of(town: Town) -> np.ndarray:
+    """Points of the depth maps."""
+    views = views_of(town)
+    depth = views.depth_m.reshape(12, -1)
+    points = [views.center_in_world[i] + depth[i][:, None] * RAYS @ views.cam_from_world[i] for i in range(12)]
+    return np.concatenate(points)[depth.ravel() > 0]
+
+
+def scanned(town: Town, shift: tuple[float, float, float] = (0.0, 0.0, 0.0), seed: int = 0) -> LidarCloud:
+    """Cloud of strips at 60 m height, beams up to 40° to all sides."""
+    rng = np.random.default_rng(seed)
+    scanner = np.concatenate([rng.uniform(-40, 40, (24_000, 2)), np.full((24_000, 1), 60.0)], axis=1)
+    slope, turn = np.sqrt(rng.random(24_000)) * np.tan(np.radians(40)), rng.uniform(0, 2 * np.pi, 24_000)
+    beam = np.stack([slope * np.cos(turn), slope * np.sin(turn), -np.ones(24_000)], axis=1)
+    beam /= np.linalg.norm(beam, axis=1, keepdims=True)
+    range_m = town.distance(scanner, beam) + rng.normal(0, SIGMA_M, len(beam))
+    place = scanner + range_m[:, None] * beam
+    place = place[(np.abs(place[:, :2]) < 24).all(axis=1)] + shift
+    return planes_of(place, np.ones(len(place), np.uint8), SPACING_M)
+
+
+TOWN, WITH_EXTRA = Town(HOUSES), Town((*HOUSES, EXTRA))
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0.0, 0.0), (0.06, -0.08, 0.10), (-0.3, 0.2, 0.4)])
+def test_shift_is_found_to_a_centimetre_and_within_its_sigma(shift: tuple[float, float, float]) -> None:
+    found = registration(scanned(TOWN, shift), views_of(TOWN), 0)
+    error, sigma = found.shift_m - shift, np.sqrt(np.diag(found.covariance_m2))
+    assert (np.abs(error) < 0.01).all()
+    assert (np.abs(error) < 4 * sigma).all() and (sigma < 0.01).all()
+
+
+def test_shift_is_found_beside_a_building_that_is_gone() -> None:
+    found = registration(scanned(WITH_EXTRA, (0.1, 0.0, 0.0)), views_of(TOWN), 0)
+    np.testing.assert_allclose(found.shift_m, (0.1, 0.0, 0.0), atol=0.01)
+
+
+def on(box: tuple[np.ndarray, np.ndarray], points: np.ndarray, *, above_m: float) -> np.ndarray:
+    inside = ((points[:, :2] > box[0][:2] - 0.1) & (points[:, :2] < box[1][:2] + 0.1)).all(axis=1)
+    return np.asarray(inside & (points[:, 2] > above_m))
+
+
+@pytest.mark.parametrize(("then", "now", "kind"), [(WITH_EXTRA, TOWN, "removed"), (TOWN, WITH_EXTRA, "added")])
+def test_what_has_changed_is_rejected_and_nothing_else(then: Town, now: Town, kind: str) -> None:
+    cloud = scanned(then)
+    judged = verdict(cloud, views_of(now), surface_of(now), sigma_m=SIGMA_M, pixel_m=PIXEL_M)
+    # The lowest metre of a wall lies too near the ground that the photographs show.
+    changed = on(EXTRA, cloud.position_in_model, above_m=1.0 if kind == "removed" else -1.0)
+    assert changed.mean() > 0.03
+    assert judged.rejected[changed].mean() >= 0.9
+    away = ~on((EXTRA[0] - 2, EXTRA[1] + 2), cloud.position_in_model, above_m=-1.0)
+    assert judged.rejected[away].mean() < 0.01
+    assert (judged.confidence[judged.rejected] == 0).all() and np.median(judged.confidence[away]) > 0.5
+    largest = judged.areas[0]
+    assert largest.kind == kind and largest.area_m2 == pytest.approx(14 * 12, rel=0.2)
+    np.testing.assert_allclose(largest.center_in_model[:2], (EXTRA[0] + EXTRA[1])[:2] / 2, atol=2)
+
+
+def test_unchanged_town_is_confirmed() -> None:
+    cloud = scanned(TOWN)
+    judged = verdict(cloud, views_of(TOWN), surface_of(TOWN), sigma_m=SIGMA_M, pixel_m=PIXEL_M)
+    assert judged.rejected.mean() < 0.01 and not judged.areas
+    coarse = verdict(cloud, views_of(TOWN), surface_of(TOWN), sigma_m=1.0, pixel_m=PIXEL_M)
+    # A cloud that is less accurate than stereo has little to say.
+    assert np.median(coarse.confidence) < 0.1
+    assert np.median(judged.confidence) > 0.5
+
+
+@pytest.mark.parametrize("height_m", [52.3, -47.0])
+def test_another_datum_is_refused_with_the_reason(height_m: float) -> None:
+    cloud = scanned(TOWN, (0.0, 0.0, height_m))
+    side = "above" if height_m > 0 else "below"
+    with pytest.raises(InputError, match=f"{abs(height_m):.1f}.* m {side}.*vertical datum"):
+        registration_of(cloud, surface_of(TOWN), views_of(TOWN), 0)
+
+
+def test_another_place_is_refused() -> None:
+    cloud = scanned(TOWN).moved(np.array([5000.0, 0.0, 0.0]))
+    with pytest.raises(InputError, match="another place"):
+        registration_of(cloud, surface_of(TOWN), views_of(TOWN), 0)
+
+
+def test_planes_agree_with_the_shift_that_was_found() -> None:
+    found = registration(scanned(TOWN, (0.06, -0.08, 0.10)), views_of(TOWN), 0)
+    similarity = LearnableSimilarity(Similarity(translation=np.array([9.0, 5.0, 1.0])), np.eye(7), np.zeros(3))
+    planes = plane_term(found, similarity.current())
+    errors = SystematicErrorValues(lidar_m=torch.from_numpy(found.shift_m))
+    none = torch.zeros(0, dtype=torch.float64)
+    at = Estimate(none, none, similarity.at(similarity.y), errors, none)
+    white = planes.whitened(at).detach().numpy()
+    assert len(planes) > 30
+    # The medians of clusters, in units of their robust spread.
+    assert abs(np.median(white)) < 0.5 and np.median(np.abs(white)) == pytest.approx(0.6745, rel=0.1)
+
+
+def test_surface_takes_the_planes_of_trusted_lidar() -> None:
+    cloud = scanned(TOWN)
+    surface = LidarPlanes(cloud, np.full(len(cloud), 0.9), PIXEL_M)
+    on_roof = np.column_stack([np.random.default_rng(0).uniform(-13, -3, (50, 2)) * [1, 0.8], np.full(50, 8.4)])
+    far = on_roof + np.array([0.0, 0.0, 5.0])
+    points, normal, confidence = surface.onto(np.concatenate([on_roof, far]))
+    # 0.4 m above the roof: moved onto a plane through twelve points of 0.02 m.
+    assert np.median(np.abs(points[:50, 2] - 8.0)) < 0.01
+    assert (np.abs(normal[:50, 2]) > 0.95).mean() > 0.9 and (confidence[:50] == 0.9).mean() > 0.9
+    np.testing.assert_array_equal(points[50:], far)
+    assert (confidence[50:] == 0).all()
