@@ -18,6 +18,7 @@ _FIRST_TRIM_M, _SHRINK = 50.0, 0.8  # farthest neighbours, and what becomes of t
 _LEAST_TRIM_SPACINGS = 2.0
 _PART_M = 10.0  # side of the parts of the scene whose errors are taken as independent
 _LEAST_POINTS = 100
+_MOST_CONDITION = 1e10  # of the normal matrix: beyond, nothing fixes an axis, as on a plane
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,9 @@ class Fit:
 def fit_alignment(
     model: FloatArray, reference: FloatArray, normal: FloatArray, spacing_m: float, kind: Alignment
 ) -> Fit | None:
-    """Return the placement of the model on the reference; None: the clouds have too little in common.
+    """Return the placement of the model on the reference.
+
+    None: the clouds have too little in common, or nothing fixes an axis.
 
     Args:
         model: (M, 3) points.
@@ -63,6 +66,8 @@ def fit_alignment(
         weight = cauchy_weight((residual / max(float(mad_sigma(residual)), 1e-4)) ** 2, 1)
         design = np.einsum("ni,nij->nj", n, jacobian_at(points[near], pivot))[:, free]
         normal_matrix = (design * weight[:, None]).T @ design
+        if np.linalg.cond(normal_matrix) > _MOST_CONDITION:
+            return None
         delta = np.zeros(7)
         delta[free] = np.linalg.solve(normal_matrix, design.T @ (weight * residual))
         placed = perturbation(delta, pivot) @ placed
@@ -80,11 +85,15 @@ def _shift(
     scores: FloatArray,
     points: FloatArray,
 ) -> ReferenceShift:
-    """Return the figures of a placement, with σ from the spread of the scores between parts of the scene."""
+    """Return the figures of a placement.
+
+    Its σ is that of the spread of the scores between parts of the scene, and never less than that of their spread
+    between points: if one part alone fixes an axis, as with a single wall, its scores sum up to zero.
+    """
     _, part = np.unique(np.floor(points[:, :2] / _PART_M), axis=0, return_inverse=True)
     sums = np.stack([np.bincount(part.ravel(), column) for column in scores.T], axis=1)
-    half = np.linalg.solve(normal_matrix, sums.T)
-    sigma = np.sqrt((half**2).sum(axis=1))[-3:]
+    spreads = [np.linalg.norm(np.linalg.solve(normal_matrix, each.T), axis=1) for each in (sums, scores)]
+    sigma = np.maximum(*spreads)[-3:]
     east, north, up = (placed.apply(pivot) - pivot).tolist()
     cosine = (np.trace(placed.rotation) - 1) / 2
     return ReferenceShift(

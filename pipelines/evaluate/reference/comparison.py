@@ -101,7 +101,7 @@ def compare_with_reference(
 
     Raises:
         InputError: a damaged file, a missing grid, a reference of another place, or no room on the disk.
-        DegenerateGeometryError: the views agree on no point of a surface.
+        DegenerateGeometryError: the views agree on no point of a surface, or nothing tells how to move the model.
     """
     assert options.reference is not None  # the caller opened its files
     trained = renderer.trained
@@ -177,8 +177,13 @@ def _model(
     sparse = overview.position_in_geo[first_of_voxels(overview.position_in_geo, 2 * _OVERVIEW_M)]
     normal, kind = plane_normals(sparse, 2 * _OVERVIEW_M), options.reference_align
     fit = fit_alignment(np.concatenate(sample), sparse, normal, 2 * _OVERVIEW_M, kind)
-    if fit is None or kind == "none":
+    if kind == "none":
         return _Model(delivered, settings, fit, None)
+    if fit is None:
+        raise DegenerateGeometryError(
+            f"--reference-align {kind}: the surface and the reference have too little in common to move one onto "
+            "the other, or nothing in them fixes all axes: compare without it"
+        )
     similarity = fit.reference_from_model
     return _Model(_moved(delivered, similarity, scratch / "moved"), settings, fit, similarity)
 
