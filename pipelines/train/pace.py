@@ -21,7 +21,7 @@ MEASURED_ON = "2 cores of an AMD EPYC"
 MEASURED_CORES = 2
 _FIXED_S, _MEGAPIXEL_S, _MILLION_GAUSSIANS_S = 0.003, 0.092, 0.367
 # Surface losses render depth and normals too. Ratio of seven trainings with them to the fit, 1.5 … 2.0, 2026-11-22.
-_SURFACE = 1.9
+SURFACE_FACTOR = 1.9
 
 
 def iteration_seconds(pixels: float, gaussians: float, *, surface: bool) -> float:
@@ -33,7 +33,7 @@ def iteration_seconds(pixels: float, gaussians: float, *, surface: bool) -> floa
         surface: whether surface losses hold the Gaussians.
     """
     plain = _FIXED_S + _MEGAPIXEL_S * pixels / 1e6 + _MILLION_GAUSSIANS_S * gaussians / 1e6
-    return (_SURFACE if surface else 1.0) * plain
+    return (SURFACE_FACTOR if surface else 1.0) * plain
 
 
 @dataclass(frozen=True)
@@ -57,11 +57,11 @@ class BlockCost:
             visible: number of the Gaussians in a view.
             gaussians: number of all Gaussians, those that stand in for the rest among them.
         """
-        return float(_design(np.array([[pixels, visible, gaussians]])) @ self.seconds)
+        return _at(self.seconds, pixels, visible, gaussians)
 
     def peak_bytes(self, pixels: float, visible: float, gaussians: float) -> float:
         """Return the peak of the process's memory; arguments as for `iteration_s`, with the limit of Gaussians."""
-        return float(_design(np.array([[pixels, visible, gaussians]])) @ self.bytes)
+        return _at(self.bytes, pixels, visible, gaussians)
 
     @staticmethod
     def fitted(sizes: FloatArray, seconds: FloatArray, peak_bytes: FloatArray) -> BlockCost:
@@ -76,6 +76,18 @@ class BlockCost:
         return BlockCost(
             *(nnls(design / values[:, None], np.ones(len(values)))[0] for values in (seconds, peak_bytes))
         )
+
+
+# Fitted by examples/benchmarks/block_cost.py to 16 blocks of 7 000 … 51 000 Gaussians and 35 000 … 141 000 pixels a
+# view: one thread of an AMD EPYC, 2026-11-22.
+BLOCK_COST = BlockCost(
+    seconds=np.array([0.0046, 0.202, 1.20, 0.353]),
+    bytes=np.array([700e6, 0.0, 0.0, 2000.0e6]),
+)
+
+
+def _at(coefficients: FloatArray, pixels: float, visible: float, gaussians: float) -> float:
+    return float((_design(np.array([[pixels, visible, gaussians]])) @ coefficients).item())
 
 
 def _design(sizes: FloatArray) -> FloatArray:
