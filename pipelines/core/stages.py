@@ -22,6 +22,7 @@ METRICS = "train/metrics.jsonl"
 GAUSSIANS = "train/gaussians.ply"
 REPORT = "evaluate/report.json"
 RENDERS = "evaluate/renders"
+REFERENCE_MAP, REFERENCE_HISTOGRAM = "evaluate/reference_map.png", "evaluate/reference_histogram.png"
 ACCURACY_MAP = "evaluate/accuracy.png"  # only where the measurements determine the scene
 SPLAT = "export/splat.ply"
 ORTHOPHOTO_PREVIEW = "raster/preview.png"
@@ -273,7 +274,15 @@ DELIVERABLES: tuple[StageSpec, ...] = (
             APPLIED_RIG,
             *(
                 ProductPart(product, optional=True)
-                for product in (RENDERS, ACCURACY_MAP, METRICS, ORTHOPHOTO_PREVIEW, HILLSHADE)
+                for product in (
+                    RENDERS,
+                    ACCURACY_MAP,
+                    REFERENCE_MAP,
+                    REFERENCE_HISTOGRAM,
+                    METRICS,
+                    ORTHOPHOTO_PREVIEW,
+                    HILLSHADE,
+                )
             ),
         ),
         product=REPORT_PAGE,

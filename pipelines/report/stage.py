@@ -24,6 +24,7 @@ from pipelines.report.overlap import overlap_facts
 from pipelines.report.place import place_facts
 from pipelines.report.points import points_facts
 from pipelines.report.record import record_facts
+from pipelines.report.reference import reference_facts
 from pipelines.report.summary import SummaryFacts, summary_facts
 from pipelines.report.views import previews_facts, training_facts, views_facts
 
@@ -104,6 +105,7 @@ def report_page(evaluated: EvaluatedSurvey, options: ReportOptions, stage: Stage
             Section("summary", "Summary", "summary.html", summary),
             Section("place", "Place on Earth", "place.html", place),
             Section("accuracy", "Accuracy", "accuracy.html", accuracy),
+            Section("reference", "Surface against a reference", "reference.html", reference_facts(evaluated)),
             Section("check-points", "Check points", "points.html", check),
             Section("control-points", "Control points", "points.html", control),
             Section("positions", "Positions of the photographs", "positions.html", cameras),
