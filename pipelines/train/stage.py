@@ -75,7 +75,7 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     if compared is not None and clouds is not None:
         shift = problem.estimate().errors.lidar_m
         shift_m = None if shift is None else shift.detach().cpu().numpy()
-        lidar = lidar_surface(compared, clouds, survey, sigma_m=options.lidar_sigma, shift_m=shift_m)
+        lidar = lidar_surface(compared, clouds, survey, options, shift_m)
         surface = lidar.surface
         save_json(lidar.report, stage.out / "lidar.json")
         draw_changes(stage.out / "lidar.png", lidar, scene)
