@@ -31,6 +31,7 @@ SPZ = "spz/splat.spz"
 TILES = "tiles/tileset.json"
 TILES_GLB = "tiles/splat.glb"
 REPORT_PAGE = "report/report.html"
+LIDAR, LIDAR_MAP = "train/lidar.json", "train/lidar.png"  # only of a training with LiDAR
 BLOCK_RECORD = "train/blocks.json"  # only of a model that was trained in blocks
 BLOCK_PLAN = "plan/plan.json"
 SOLUTION = "solution/solution.json"
@@ -273,7 +274,7 @@ DELIVERABLES: tuple[StageSpec, ...] = (
             APPLIED_RIG,
             *(
                 ProductPart(product, optional=True)
-                for product in (RENDERS, ACCURACY_MAP, METRICS, ORTHOPHOTO_PREVIEW, HILLSHADE)
+                for product in (RENDERS, ACCURACY_MAP, METRICS, LIDAR, LIDAR_MAP, ORTHOPHOTO_PREVIEW, HILLSHADE)
             ),
         ),
         product=REPORT_PAGE,

@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import json
 import logging
+from pathlib import Path
 
 from pipelines.core.products import load_json, save_json
-from pipelines.core.stages import POINTS
+from pipelines.core.stages import LIDAR, LIDAR_MAP, POINTS
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.scene.calibrated import load_survey
 from pipelines.scene.frozen_solution import solve_and_hold
@@ -77,8 +78,8 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
         shift_m = None if shift is None else shift.detach().cpu().numpy()
         lidar = lidar_surface(compared, clouds, survey, options, shift_m)
         surface = lidar.surface
-        save_json(lidar.report, stage.out / "lidar.json")
-        draw_changes(stage.out / "lidar.png", lidar, scene)
+        save_json(lidar.report, stage.out / Path(LIDAR).name)
+        draw_changes(stage.out / Path(LIDAR_MAP).name, lidar, scene)
     trainer = make_trainer(TrainingScene(scene, images, surface), problem, backend, options)
     record = train_in_folder(stage, trainer, options, _iterations(stage))
     model = trained_model(trainer, scene, initial)
