@@ -11,7 +11,7 @@ from rich.table import Table
 
 from georef_cli.layout import ByWidth, FirstThatFits, figures, plain_table
 from georef_cli.markup import shown
-from pipelines.compare.table import Comparison, cells, remarks_on
+from pipelines.compare.table import REFERENCE_HEADS, Comparison, cells, reference_cells, remarks_on
 from pipelines.core.cautions import Caution
 from pipelines.core.options import notation
 from pipelines.core.origins import OptionOrigin
@@ -20,6 +20,7 @@ from pipelines.core.sentences import duration
 from pipelines.core.stages import REPORT
 from pipelines.core.staleness import StageState
 from pipelines.core.workspace import Workspace
+from pipelines.scene.reference_report import ReferenceComparison
 from pipelines.scene.report import CheckPointErrors, EvaluationReport, NoCrossValidation, read_report
 
 STATE_STYLE = {
@@ -60,6 +61,17 @@ IMAGE_COLUMNS = {
     "covered_share": "covered share",
     "ssim": "SSIM",
     "lpips": "LPIPS",
+}
+DISTANCE_COLUMNS = {
+    "measured": "places",
+    "median_m": "median",
+    "nmad_m": "NMAD",
+    "rmse_m": "RMSE",
+    "abs_95_m": "95 %",
+    "median_lod_m": "LoD",
+    "significant": "beyond LoD",
+    "c2c_m": "C2C",
+    "c2c_95_m": "C2C 95 %",
 }
 _CROSSED = "Control points, each left out in turn (cross-validation)"
 # Columns of a terminal from which tables show all that they have.
@@ -148,10 +160,23 @@ def comparison(table: Comparison) -> list[Renderable]:
     heads = ("test\nPSNR", "PSNR\ncovered", "\nSSIM", *points, "check\npoints", "\ntraining")
     rows = {shown(row.configuration): [shown(cell) for cell in cells(row)] for row in table.rows}
     notes = [f"[bold]{shown(row.configuration)}[/] {shown(f'{row.title}: {row.note}')}" for row in table.rows]
+    compared = {shown(row.configuration): list(reference_cells(row)) for row in table.rows if row.reference}
+    reference: list[Renderable] = [
+        "",
+        "[bold]Surface against the reference, metres[/]",
+        figures(REFERENCE_HEADS, compared),
+    ]
     remarks = [
         f"[yellow]{shown(row.configuration)}:[/] {shown(text)}" for row in table.rows for text in remarks_on(row)
     ]
-    return ["[bold]Test views in dB, check points in metres[/]", figures(heads, rows), "", *notes, *remarks]
+    return [
+        "[bold]Test views in dB, check points in metres[/]",
+        figures(heads, rows),
+        *(reference if compared else []),
+        "",
+        *notes,
+        *remarks,
+    ]
 
 
 def topics(rows: Iterable[Mapping[str, Any]]) -> ByWidth:
@@ -200,10 +225,30 @@ def report(document: EvaluationReport) -> list[Renderable]:
         _accuracy(ways),
         _rows(f"{_CROSSED}, metres", {} if crossed is None else {"left out": dict(crossed)}, POINT_COLUMNS),
         _impossible(crossed) if isinstance(crossed, NoCrossValidation) else None,
+        *_against_reference(document.reference),
         _rows("Residuals of the fit (not an accuracy), metres", fit, POINT_COLUMNS),
         _rows("Variance factors: estimated over stated variance (tie points: in px²)", factors, FACTOR_COLUMNS),
     )
     return [table for table in tables if table is not None]
+
+
+def _against_reference(reference: ReferenceComparison | None) -> list[Group | None]:
+    """Return the tables of the comparison with a reference cloud; none without it."""
+    if reference is None:
+        return []
+    distances, scores = {}, {}
+    for group in reference.groups:
+        m3c2, c2c = group.m3c2, group.c2c
+        distances[group.name] = {**dict(m3c2), "c2c_m": c2c.median_m, "c2c_95_m": c2c.abs_95_m}
+        scores[group.name] = {
+            f"{key} {score.threshold_m:g}": value for score in group.scores for key, value in score
+        }
+    moved = "" if reference.aligned == "none" else f" after moving it ({reference.aligned})"
+    columns = {key: key.replace(" ", "\n") for row in scores.values() for key in row if "threshold" not in key}
+    return [
+        _rows(f"Model minus {shown(reference.name)}{moved} (M3C2, C2C), metres", distances, DISTANCE_COLUMNS),
+        _rows("Shares within 0.05, 0.1, 0.3 m", scores, columns),
+    ]
 
 
 def _impossible(crossed: NoCrossValidation) -> Group:

@@ -71,6 +71,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     "torch": ("pipelines.splat", "pipelines.georef", "pipelines.scene", *STAGE_ROOMS),
     "filelock": ("pipelines.core",),
     "laspy": ("pipelines.formats",),
+    "py4dgeo": ("pipelines.evaluate.reference.m3c2",),
     "plyfile": ("pipelines.formats",),
     "exifread": ("pipelines.formats",),
     "defusedxml": ("pipelines.formats",),

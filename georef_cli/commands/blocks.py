@@ -15,11 +15,13 @@ from georef_cli.dry_run import announce_training
 from georef_cli.engines import asked_engine, engine_options
 from georef_cli.output import print_json, print_outcome, print_rich
 from pipelines.core import runner
+from pipelines.core.products import load_json
 from pipelines.core.stages import (
     BLOCK_RECORD,
     BY_NAME,
     PLAN_BLOCKS,
     SOLVE,
+    SURVEY,
     TRAIN_BLOCK,
     TRAIN_SCAFFOLD,
     TRAIN_SEAMS,
@@ -27,9 +29,11 @@ from pipelines.core.stages import (
 )
 from pipelines.core.staleness import must_exist, stage_config
 from pipelines.core.workspace import Workspace
+from pipelines.scene.survey import Survey
 
 if TYPE_CHECKING:
     from pipelines.blocks.parts import Parts
+    from pipelines.scene.block_plan import BlockPlan
 
 TRAIN = BY_NAME["train"]
 ACTIONS = ("plan", "scaffold", "train", "seams", "merge")
@@ -105,7 +109,17 @@ def _print_plan(parts: Parts, outcome: runner.Outcome, values: dict[str, Any]) -
     if values["as_json"]:
         print_json({"stage": outcome.stage, "ran": outcome.ran, **plan.model_dump(mode="json")})
     else:
-        print_rich(*block_tables.plan(plan, parts.states(plan)))
+        print_rich(*block_tables.plan(plan, parts.states(plan), _processor_s(parts, plan)))
+
+
+def _processor_s(parts: Parts, plan: BlockPlan) -> dict[int, float] | None:
+    """Return the predicted time of one core for each block; None on a GPU, where nothing was measured."""
+    from pipelines.train.forecast import block_processor_s
+    from pipelines.train.options import TrainOptions
+
+    assert isinstance(parts.options, TrainOptions)
+    survey = load_json(Survey, parts.workspace.path(SURVEY))
+    return None if parts.on_gpu() else block_processor_s(plan, survey.largest_photograph_px, parts.options)
 
 
 def _run_part(

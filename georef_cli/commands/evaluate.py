@@ -42,6 +42,7 @@ command = EvaluateCommand(
       georef evaluate flight --renders 2 --json
       georef evaluate flight --points --crs EPSG:32632
       georef evaluate flight --cross-validate
+      georef evaluate flight --reference scan.laz --reference-sigma 0.02
     """,
     extra=[click.Option(["--points"], is_flag=True, help="Print the errors of every check and control point.")],
 )

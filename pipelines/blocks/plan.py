@@ -28,6 +28,8 @@ from pipelines.splat.memory import USABLE, TrainingSize, predicted_peak_bytes
 
 _LEAST_SHARE = 0.1  # of a photograph that shows a block which it is to train
 _LEAST_CAMERAS = 8
+_PROCESS_BYTES = 400 * 2**20  # of a process with its libraries, before it reads the survey
+_OBSERVATION_BYTES = 240  # of the SfM model, which each block reads whole
 _SAMPLED_CAMERAS = 24  # of a block, in which its Gaussians are counted
 
 
@@ -184,11 +186,13 @@ class _Planner:
         return max(round(self.options.max_gaussians * self.surface.share_of(region)), 1)
 
     def _peak_bytes(self, gaussians: int) -> int:
-        """Return the predicted peak of the memory of a training, with the scaffold around the block."""
+        """Return the predicted peak of the memory of a block's process, with the scaffold around the block."""
+        observations = len(self.scene.sparse.obs_point)
+        scene = _PROCESS_BYTES + _OBSERVATION_BYTES * observations
         count = gaussians + scaffold_gaussians(self.options.max_gaussians)
         cameras = [self._pinhole(index) for index in self._one_of_each_camera()]
         largest = max(cameras, key=lambda camera: camera.width * camera.height)
-        return predicted_peak_bytes(TrainingSize(count, largest, self.options.sh_degree, cameras=0))
+        return scene + predicted_peak_bytes(TrainingSize(count, largest, self.options.sh_degree, cameras=0))
 
     def _one_of_each_camera(self) -> Sequence[int]:
         _, first = np.unique(self.scene.sparse.image_camera_id, return_index=True)

@@ -25,9 +25,6 @@ from pipelines.scene.block_plan import BlockPlan
 
 log = logging.getLogger(__name__)
 
-# Of a process before its training begins: interpreter and libraries.
-BASE_BYTES = 500 * 2**20
-
 
 def run(stage: StageRun, options: TrainingRequest) -> Summary:
     """Train what is not trained, write the merged model, and return its key figures.
@@ -70,7 +67,7 @@ def scaffold_jobs(parts: Parts, plan: BlockPlan, *, force: bool = False) -> list
     """Return the job that trains the scaffold; none if it is current."""
     if not force and not parts.why_missing(TRAIN_SCAFFOLD):
         return []
-    job = Job("scaffold", ("blocks", "scaffold"), BASE_BYTES + min(block.peak_bytes for block in plan.blocks))
+    job = Job("scaffold", ("blocks", "scaffold"), min(block.peak_bytes for block in plan.blocks))
     return [_placed(job, parts, "scaffold", force=force)]
 
 
@@ -85,7 +82,7 @@ def block_jobs(parts: Parts, plan: BlockPlan, *, force: bool = False) -> list[Jo
     blocks = plan.blocks if force else tuple(parts.waiting(plan))
     return [
         _placed(
-            Job(f"block {b.id}", ("blocks", "train", "--id", str(b.id)), BASE_BYTES + b.peak_bytes),
+            Job(f"block {b.id}", ("blocks", "train", "--id", str(b.id)), b.peak_bytes),
             parts,
             str(b.id),
             force=force,
@@ -98,7 +95,7 @@ def seam_jobs(parts: Parts, plan: BlockPlan, *, force: bool = False) -> list[Job
     """Return the job that trains across the seams; none if that is current."""
     if not force and not parts.why_missing(TRAIN_SEAMS):
         return []
-    job = Job("seams", ("blocks", "seams"), BASE_BYTES + max(block.peak_bytes for block in plan.blocks))
+    job = Job("seams", ("blocks", "seams"), max(block.peak_bytes for block in plan.blocks))
     return [_placed(job, parts, "seams", force=force)]
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 
 from pipelines.compare.configurations import BY_CONFIGURATION, COMMON_TRAIN_OPTIONS, Configuration
 from pipelines.compare.files import write_comparison
-from pipelines.compare.table import ComparedRow, Comparison, JsonScalar, point_accuracy
+from pipelines.compare.table import ComparedRow, Comparison, JsonScalar, point_accuracy, surface_accuracy
 from pipelines.core.cautions import union
 from pipelines.core.errors import ConvergenceError, DegenerateGeometryError, GeorefError
 from pipelines.core.progress import SILENT, Progress
@@ -199,6 +199,7 @@ def _row(configuration: Configuration, plan: Sequence[PlannedStage], runner: _Pl
         test_ssim=report.photometric.test.ssim,
         camera=point_accuracy(report.checkpoints.camera),
         model=point_accuracy(report.checkpoints.model),
+        reference=surface_accuracy(report.reference),
         iterations=training.get("iterations"),
         gaussians=training.get("gaussians"),
         training_s=training.get("seconds") if configuration.trained_by is None else None,

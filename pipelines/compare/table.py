@@ -8,8 +8,10 @@ from typing import Literal
 from pipelines.core.cautions import Caution
 from pipelines.core.products import Product
 from pipelines.plots.bars import Panel
+from pipelines.scene.reference_report import ReferenceComparison
 from pipelines.scene.report import CheckPointErrors
 
+REFERENCE_HEADS = ("M3C2 median", "NMAD", "F1 0.05 m", "F1 0.1 m", "F1 0.3 m")
 JsonScalar = bool | int | float | str
 
 
@@ -23,6 +25,19 @@ class PointAccuracy(Product):
     rmse_v_m: float | None = None
 
 
+class SurfaceAccuracy(Product):
+    """Surface against the reference cloud of `evaluate`.
+
+    Attributes:
+        median_m, nmad_m: of the distances along the normals (M3C2); None: not measured.
+        f1: by threshold in metres, in the order of the report; None: no points.
+    """
+
+    median_m: float | None
+    nmad_m: float | None
+    f1: tuple[tuple[float, float | None], ...]
+
+
 class ComparedRow(Product):
     """Row of the table: the figures of one configuration.
 
@@ -33,6 +48,7 @@ class ComparedRow(Product):
         test_psnr_covered: as test_psnr, over the pixels whose ground at least two training views show.
         test_covered_share: share of these pixels; the same for all configurations of one SfM model.
         camera, model: errors of the check points by camera and by model.
+        reference: the surface against a reference cloud; None: there is none.
         iterations, gaussians: of the training.
         training_s: duration; None if the training is that of another configuration.
         warnings: of its stages.
@@ -49,6 +65,7 @@ class ComparedRow(Product):
     test_ssim: float | None = None
     camera: PointAccuracy = PointAccuracy()
     model: PointAccuracy = PointAccuracy()
+    reference: SurfaceAccuracy | None = None
     iterations: int | None = None
     gaussians: int | None = None
     training_s: float | None = None
@@ -78,6 +95,18 @@ def point_accuracy(errors: CheckPointErrors) -> PointAccuracy:
         median_h_m=errors.median_h_m,
         rmse_h_m=errors.rmse_h_m,
         rmse_v_m=errors.rmse_v_m,
+    )
+
+
+def surface_accuracy(reference: ReferenceComparison | None) -> SurfaceAccuracy | None:
+    """Return the figures of a comparison with a reference that the table shows."""
+    if reference is None:
+        return None
+    everywhere = reference.group("all")
+    return SurfaceAccuracy(
+        median_m=everywhere.m3c2.median_m,
+        nmad_m=everywhere.m3c2.nmad_m,
+        f1=tuple((score.threshold_m, score.f1) for score in everywhere.scores),
     )
 
 
@@ -118,6 +147,10 @@ def markdown(table: Comparison) -> str:
         "",
         *(f"- **{row.configuration}** {row.title}: {row.note}." for row in table.rows),
     ]
+    if any(row.reference for row in table.rows):
+        lines += ["", "Surface against the reference cloud, in metres:", "", _line(["", *REFERENCE_HEADS])]
+        lines += [_line(["---", *["---:"] * len(REFERENCE_HEADS)])]
+        lines += [_line([f"**{row.configuration}**", *reference_cells(row)]) for row in table.rows]
     remarks = [(row.configuration, text) for row in table.rows for text in remarks_on(row)]
     if remarks:
         lines += ["", "Remarks:", "", *(f"- {name}: {text}" for name, text in remarks)]
@@ -141,6 +174,14 @@ def cells(row: ComparedRow) -> tuple[str, ...]:
         counts,
         "–" if row.training_s is None else f"{row.training_s:.0f} s",
     )
+
+
+def reference_cells(row: ComparedRow) -> tuple[str, ...]:
+    """Return the figures of a row against the reference as text, in the order of `REFERENCE_HEADS`."""
+    found = row.reference
+    if found is None:
+        return ("–",) * len(REFERENCE_HEADS)
+    return (_metres(found.median_m), _metres(found.nmad_m), *(_number(value, 3) for _, value in found.f1))
 
 
 def remarks_on(row: ComparedRow) -> tuple[str, ...]:

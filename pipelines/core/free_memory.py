@@ -16,6 +16,9 @@ def free_main_memory_bytes() -> int | None:
 
 def peak_memory_bytes() -> int | None:
     """Return the most main memory that this process has held so far; None if the system does not state it."""
+    # First Linux's own line: `ru_maxrss` of a new process starts there at what its parent had.
+    if (kib := _kib_of(Path("/proc/self/status"), "VmHWM:")) is not None:
+        return 1024 * kib
     try:
         import resource
     except ImportError:  # Windows
@@ -24,16 +27,21 @@ def peak_memory_bytes() -> int | None:
     return peak if sys.platform == "darwin" else 1024 * peak
 
 
+def _kib_of(table: Path, name: str) -> int | None:
+    """Return a value of a table of the system; None if it is not there."""
+    try:
+        lines = table.read_text(encoding="utf-8", errors="replace").splitlines()
+        return next((int(line.split()[1]) for line in lines if line.startswith(name)), None)
+    except (OSError, ValueError):
+        return None
+
+
 def _free_in_system() -> int | None:
     if sys.platform == "win32":
         status = _WindowsMemory(length=ctypes.sizeof(_WindowsMemory))
         return status.free_bytes if ctypes.windll.kernel32.GlobalMemoryStatusEx(ctypes.byref(status)) else None
-    try:
-        for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
-            if line.startswith("MemAvailable:"):
-                return int(line.split()[1]) * 1024
-    except (OSError, ValueError):
-        pass
+    if (kib := _kib_of(Path("/proc/meminfo"), "MemAvailable:")) is not None:
+        return 1024 * kib
     try:
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, ValueError, OSError):

@@ -22,6 +22,7 @@ METRICS = "train/metrics.jsonl"
 GAUSSIANS = "train/gaussians.ply"
 REPORT = "evaluate/report.json"
 RENDERS = "evaluate/renders"
+REFERENCE_MAP, REFERENCE_HISTOGRAM = "evaluate/reference_map.png", "evaluate/reference_histogram.png"
 ACCURACY_MAP = "evaluate/accuracy.png"  # only where the measurements determine the scene
 SPLAT = "export/splat.ply"
 ORTHOPHOTO_PREVIEW = "raster/preview.png"
@@ -274,7 +275,17 @@ DELIVERABLES: tuple[StageSpec, ...] = (
             APPLIED_RIG,
             *(
                 ProductPart(product, optional=True)
-                for product in (RENDERS, ACCURACY_MAP, METRICS, LIDAR, LIDAR_MAP, ORTHOPHOTO_PREVIEW, HILLSHADE)
+                for product in (
+                    RENDERS,
+                    ACCURACY_MAP,
+                    REFERENCE_MAP,
+                    REFERENCE_HISTOGRAM,
+                    METRICS,
+                    LIDAR,
+                    LIDAR_MAP,
+                    ORTHOPHOTO_PREVIEW,
+                    HILLSHADE,
+                )
             ),
         ),
         product=REPORT_PAGE,

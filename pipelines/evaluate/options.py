@@ -7,6 +7,9 @@ from typing import Literal
 from pydantic import Field
 
 from pipelines.core.options import InputPath, StageOptions
+from pipelines.geodesy.vertical import Vertical
+from pipelines.scene.cloud_options import CloudPath
+from pipelines.scene.reference_report import Alignment
 
 
 class EvaluateOptions(StageOptions):
@@ -25,4 +28,26 @@ class EvaluateOptions(StageOptions):
     )
     cross_validate: bool = Field(
         False, description="Leave out each control point in turn and measure it by a solution without it."
+    )
+    reference: CloudPath | None = Field(
+        None,
+        description="Compare the surface with this cloud (LAS, LAZ or PLY, or a folder of them), where photographs "
+        "saw it.",
+    )
+    reference_crs: str | None = Field(
+        None, description="CRS of a reference that states none: EPSG:32632, or EPSG:32632+5773 for heights."
+    )
+    reference_vertical: Vertical | None = Field(
+        None, description="Datum of the reference's heights where its CRS is silent: ellipsoidal, EGM96 or EPSG:n."
+    )
+    reference_sigma: float = Field(
+        0.0,
+        ge=0,
+        le=100,
+        description="Standard deviation of the reference's place in metres: enters the level of detection.",
+    )
+    reference_align: Alignment = Field(
+        "none",
+        description="Move the model onto the reference before the comparison, to judge its shape alone. The shift "
+        "is measured and stated in any case.",
     )

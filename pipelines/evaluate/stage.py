@@ -2,8 +2,9 @@
 
 Reads the trained model, the survey and the initial similarity. Writes `evaluate/report.json`, the errors point by
 point as `points.csv`, side-by-side renders, and the predicted accuracy over the scene as `accuracy.csv` and
-`accuracy.png`. Check points enter no solution. Residuals of observations that entered one are reported as a fit,
-not as an accuracy (docs/accuracy.md).
+`accuracy.png`. With `--reference`, the surface is compared with a cloud; `reference_map.png` and
+`reference_histogram.png` show the distances. Check points enter no solution. Residuals of observations that entered
+one are reported as a fit, not as an accuracy (docs/accuracy.md).
 """
 
 from __future__ import annotations
@@ -29,6 +30,9 @@ from pipelines.evaluate.coordinates import coordinates_in, target_crs
 from pipelines.evaluate.options import EvaluateOptions
 from pipelines.evaluate.photometric import SaveRender, compare_test_views
 from pipelines.evaluate.point_table import write_point_table
+from pipelines.evaluate.reference.cautions import cautions_of_reference
+from pipelines.evaluate.reference.comparison import ComparedReference, compare_with_reference, open_reference
+from pipelines.evaluate.reference.pictures import draw_reference
 from pipelines.evaluate.summary import summarise
 from pipelines.geodesy.crs import PointCrs
 from pipelines.geometry.similarity import SimilarityRecord
@@ -44,10 +48,11 @@ def run(stage: StageRun, options: EvaluateOptions) -> Summary:
     """Evaluate the trained survey, write report, renders and predicted accuracy, and return the summary.
 
     Raises:
-        BackendUnavailableError: `--backend cuda`, and a part that it needs is missing; names each.
+        BackendUnavailableError: `--backend cuda` or `--reference`, and a part that it needs is missing; names each.
         GeorefError: a product, a photograph or the LPIPS weights cannot be read, or the CRS cannot be used.
     """
     trained = load_trained(stage.workspace, options.similarity)
+    reference_files = open_reference(options)
     crs = None if options.crs is None else target_crs(options.crs, trained.survey)
     images = photographs(trained.sfm, trained.survey, stage.workspace, trained.model.max_image_size)
     images.build(stage.progress)
@@ -56,7 +61,22 @@ def run(stage: StageRun, options: EvaluateOptions) -> Summary:
     renders = stage.out / "renders"
     renders.mkdir(parents=True, exist_ok=True)
     save_render = partial(write_render, renders)
-    report = evaluate(renderer, propagation, options, crs=crs, save_render=save_render, progress=stage.progress)
+    reference = None
+    if reference_files is not None:
+        scratch = stage.out / "reference"
+        reference = compare_with_reference(
+            renderer, reference_files, propagation, options, scratch=scratch, progress=stage.progress
+        )
+        draw_reference(reference, stage.out)
+    report = evaluate(
+        renderer,
+        propagation,
+        options,
+        crs=crs,
+        reference=reference,
+        save_render=save_render,
+        progress=stage.progress,
+    )
     if isinstance(propagation, ErrorPropagation) and propagation.grid is not None:
         write_csv(propagation.grid, trained.survey.origin, stage.out / "accuracy.csv")
         draw_accuracy(propagation.grid, trained, report, crs, stage.out / "accuracy.png")
@@ -71,6 +91,7 @@ def evaluate(
     options: EvaluateOptions,
     *,
     crs: PointCrs | None,
+    reference: ComparedReference | None,
     save_render: SaveRender,
     progress: Progress,
 ) -> EvaluationReport:
@@ -81,6 +102,7 @@ def evaluate(
         propagation: covariances from the measurements, or the reason why there are none.
         options: of the stage.
         crs: CRS in which the report lists the check points too; None: none.
+        reference: comparison with a reference cloud; None: none.
         save_render: saves the first test views side by side with their photographs.
         progress: shows depth maps and test views.
 
@@ -98,6 +120,7 @@ def evaluate(
         fit=fit_residuals(trained),
         similarity=_similarity_sigma(trained.model.geo_from_model),
         coordinates=None if crs is None else coordinates_in(crs, checkpoints, trained.survey),
+        reference=None if reference is None else reference.comparison,
         variance_factors=trained.model.variance_factors,
         cautions=union(
             trained.model.cautions,
@@ -105,6 +128,7 @@ def evaluate(
                 trained, propagation, checkpoints.camera, of_initial=options.similarity == "initial"
             ),
             dependent_check_points(trained.survey),
+            () if reference is None else cautions_of_reference(reference),
         ),
     )
 

@@ -25,6 +25,7 @@ from pipelines.report.overlap import overlap_facts
 from pipelines.report.place import place_facts
 from pipelines.report.points import points_facts
 from pipelines.report.record import record_facts
+from pipelines.report.reference import reference_facts
 from pipelines.report.summary import SummaryFacts, summary_facts
 from pipelines.report.views import previews_facts, training_facts, views_facts
 
@@ -91,7 +92,6 @@ def report_page(evaluated: EvaluatedSurvey, options: ReportOptions, stage: Stage
         task.advance(note="views")
         record = record_facts(workspace, survey)
         task.advance(note="record")
-    lidar = lidar_facts(workspace)
     summary = summary_facts(evaluated, _cautions(evaluated), overlap, lenses, record)
     page = Page(
         title=f"Survey report: {workspace.root.name}",
@@ -106,6 +106,7 @@ def report_page(evaluated: EvaluatedSurvey, options: ReportOptions, stage: Stage
             Section("summary", "Summary", "summary.html", summary),
             Section("place", "Place on Earth", "place.html", place),
             Section("accuracy", "Accuracy", "accuracy.html", accuracy),
+            Section("reference", "Surface against a reference", "reference.html", reference_facts(evaluated)),
             Section("check-points", "Check points", "points.html", check),
             Section("control-points", "Control points", "points.html", control),
             Section("positions", "Positions of the photographs", "positions.html", cameras),
@@ -113,7 +114,7 @@ def report_page(evaluated: EvaluatedSurvey, options: ReportOptions, stage: Stage
             Section("lenses", "Residuals in the image, and lenses", "lenses.html", lenses),
             Section("test-views", "Test views", "views.html", views),
             Section("training", "Training", "training.html", training),
-            *(() if lidar is None else (Section("lidar", "LiDAR", "lidar.html", lidar),)),
+            Section("lidar", "LiDAR in the training", "lidar.html", lidar_facts(workspace)),
             Section("rasters", "Orthophoto and surface model", "rasters.html", previews_facts(workspace)),
             Section("processing", "Processing", "record.html", record),
             Section("photographs", "Photographs", "photographs.html", cameras),

@@ -81,7 +81,7 @@ class PlannedBlock(Product):
         gaussians: limit of the Gaussians in training, those of the overlap among them.
         visible: predicted number of the block's Gaussians in a view.
         view_px: predicted number of the block's pixels in a view.
-        peak_bytes: predicted peak of the memory.
+        peak_bytes: predicted peak of the memory of the process that trains it.
     """
 
     id: int = Field(ge=0)

@@ -16,6 +16,7 @@ from pipelines.core.errors import InputError
 from pipelines.core.products import ImageName, Product, dump_json, load_json
 from pipelines.core.types import Vector3
 from pipelines.robust.statistics import ResidualStats
+from pipelines.scene.reference_report import ReferenceComparison
 from pipelines.scene.variance_factors import VarianceFactor
 
 
@@ -361,6 +362,7 @@ class EvaluationReport(_OptionalKeys):
         fit: residuals of the solution.
         similarity: σ of the similarity.
         coordinates: check points in the CRS of `--crs`; absent without it.
+        reference: comparison of the surface with a reference cloud; absent without `--reference`.
         variance_factors: tests of the stated σ.
         cautions: limits of the result: those of the model, then those that `evaluate` found.
     """
@@ -373,6 +375,7 @@ class EvaluationReport(_OptionalKeys):
     fit: Fit
     similarity: SimilaritySigma
     coordinates: Coordinates | None = None
+    reference: ReferenceComparison | None = None
     variance_factors: tuple[VarianceFactor, ...] = ()
     cautions: tuple[Caution, ...] = ()
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from pipelines.core.threads import thread_count
 from pipelines.sfm.options import SfmOptions
 
@@ -9,6 +11,15 @@ from pipelines.sfm.options import SfmOptions
 # beside other programs, 2026-11-22. This model says 49, 147, 125 and 103 s.
 _MEASURED_CORES = 2
 _FEATURES_MEGAPIXEL_S, _PAIR_S, _MAPPING_S = 1.2, 0.12, 0.8
+
+
+@dataclass(frozen=True)
+class ReconstructionPace:
+    """Seconds of one core for the steps of a reconstruction."""
+
+    features_s: float
+    matching_s: float
+    mapping_s: float
 
 
 def reconstruction_seconds(photographs: int, photo_px: tuple[int, int], options: SfmOptions) -> float:
@@ -21,10 +32,19 @@ def reconstruction_seconds(photographs: int, photo_px: tuple[int, int], options:
     """
     if options.import_model is not None:
         return 0.0
+    pace = reconstruction_pace(photographs, photo_px, options)
+    return (pace.features_s + pace.matching_s + pace.mapping_s) / thread_count()
+
+
+def reconstruction_pace(photographs: int, photo_px: tuple[int, int], options: SfmOptions) -> ReconstructionPace:
+    """Return about how many seconds one core needs for each step; arguments as for `reconstruction_seconds`."""
     shrink = max(max(photo_px) / options.max_image_size, 1.0)
     megapixels = photo_px[0] * photo_px[1] / shrink**2 / 1e6
     every = photographs * (photographs - 1) / 2
     # Half of the largest number of neighbours: most pairs are chosen by both of their images.
     pairs = every if options.pairs == "exhaustive" else min(every, photographs * options.max_neighbors / 2)
-    seconds = photographs * (_FEATURES_MEGAPIXEL_S * megapixels + _MAPPING_S) + _PAIR_S * pairs
-    return seconds * _MEASURED_CORES / thread_count()
+    return ReconstructionPace(
+        features_s=_MEASURED_CORES * photographs * _FEATURES_MEGAPIXEL_S * megapixels,
+        matching_s=_MEASURED_CORES * _PAIR_S * pairs,
+        mapping_s=_MEASURED_CORES * photographs * _MAPPING_S,
+    )

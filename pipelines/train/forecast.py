@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -9,13 +10,14 @@ import torch
 from pipelines.core.sentences import about
 from pipelines.core.threads import thread_count
 from pipelines.geometry.cameras import Pinhole
+from pipelines.scene.block_plan import BlockPlan
 from pipelines.scene.cloud_options import NOT_IN_BLOCKS
 from pipelines.scene.survey import Survey
 from pipelines.splat.memory import USABLE, TrainingSize, free_memory_bytes, predicted_peak_bytes
 from pipelines.splat.rasterizer.backends import chosen_backend
 from pipelines.train.depth_maps import StereoOptions
 from pipelines.train.options import TrainOptions
-from pipelines.train.pace import MEASURED_CORES, iteration_seconds
+from pipelines.train.pace import BLOCK_SECONDS, MEASURED_CORES, SURFACE_FACTOR, iteration_seconds
 from pipelines.train.schedule import COARSE
 
 # Stereo, by photographs (the sweep has one size) and by megapixels of the depth maps: half of the processor time of
@@ -107,8 +109,7 @@ def forecast(photographs: int, photo_px: tuple[int, int], options: TrainOptions)
     Raises:
         BackendUnavailableError: `--backend cuda`, and a part that it needs is missing; names each.
     """
-    effort, (width, height) = options.effort, photo_px
-    camera = Pinhole(width, height, width, width, width / 2, height / 2).limited(effort.max_image_size)
+    effort, camera = options.effort, camera_of(photo_px, options)
     backend = chosen_backend(options.backend)
     device = torch.device(backend)
     size = TrainingSize(effort.max_gaussians, camera, options.sh_degree, options.refined_cameras(photographs))
@@ -138,16 +139,68 @@ def forecast_of(survey: Survey, options: TrainOptions) -> TrainingForecast:
     return forecast(len(survey.images), survey.largest_photograph_px, options)
 
 
+def block_processor_s(plan: BlockPlan, photo_px: tuple[int, int], options: TrainOptions) -> dict[int, float]:
+    """Return the processor seconds that the CPU backend needs for each block of a plan, by number, on one core.
+
+    Args:
+        plan: of the blocks.
+        photo_px: width and height of the photographs.
+        options: of the training.
+    """
+    seconds = {}
+    for block in plan.blocks:
+        count = block.gaussians + plan.scaffold_gaussians
+        size = _Iteration(block.view_px, block.visible, count, options.faithful_surface)
+        iterating = _iterating_s(size.block_processor_s, options)
+        stereo = MEASURED_CORES * _stereo_s(len(block.cameras), camera_of(photo_px, options))
+        seconds[block.id] = iterating + (stereo if options.dense else 0.0)
+    return seconds
+
+
+def camera_of(photo_px: tuple[int, int], options: TrainOptions) -> Pinhole:
+    """Return the camera of training photographs, with a lens as wide as many."""
+    width, height = photo_px
+    whole = Pinhole(width, height, width, width, width / 2, height / 2)
+    return whole.limited(options.effort.max_image_size)
+
+
+@dataclass(frozen=True)
+class _Iteration:
+    """Size of an iteration with whole photographs."""
+
+    pixels: float
+    visible: float
+    gaussians: float
+    surface: bool
+
+    def seconds(self, shrink: int) -> float:
+        """Return the seconds on the machine of `MEASURED_ON`."""
+        return iteration_seconds(self.pixels / shrink**2, self.gaussians, surface=self.surface)
+
+    def block_processor_s(self, shrink: int) -> float:
+        """Return the processor seconds of an iteration of a block."""
+        plain = BLOCK_SECONDS.of(self.pixels / shrink**2, self.visible, self.gaussians)
+        return SURFACE_FACTOR * plain if self.surface else plain
+
+
 def _seconds(photographs: int, camera: Pinhole, options: TrainOptions) -> float:
     """Return the seconds of stereo and of all iterations on this machine."""
-    pixels, effort = camera.width * camera.height, options.effort
+    pixels, count = camera.width * camera.height, options.effort.max_gaussians
+    seconds = _iterating_s(_Iteration(pixels, count, count, options.faithful_surface).seconds, options)
+    if options.dense:
+        seconds += _stereo_s(photographs, camera)
+    return seconds * MEASURED_CORES / min(thread_count(), _MOST_CORES)
+
+
+def _iterating_s(one: Callable[[int], float], options: TrainOptions) -> float:
+    """Return the seconds of all iterations; `one`: of one with photographs that are shrunken by a factor."""
     seconds, begun = 0.0, 0.0
     for shrink, until in (*(COARSE if options.coarse_to_fine else ()), (1, 1.0)):
-        one = iteration_seconds(pixels / shrink**2, effort.max_gaussians, surface=options.faithful_surface)
-        seconds += (until - begun) * effort.iterations * one
+        seconds += (until - begun) * options.effort.iterations * one(shrink)
         begun = until
-    if options.dense:
-        maps = camera.limited(StereoOptions().fine_px)
-        megapixels = maps.width * maps.height / 1e6
-        seconds += photographs * (_STEREO_PHOTOGRAPH_S + _STEREO_MEGAPIXEL_S * megapixels)
-    return seconds * MEASURED_CORES / min(thread_count(), _MOST_CORES)
+    return seconds
+
+
+def _stereo_s(photographs: int, camera: Pinhole) -> float:
+    maps = camera.limited(StereoOptions().fine_px)
+    return photographs * (_STEREO_PHOTOGRAPH_S + _STEREO_MEGAPIXEL_S * maps.width * maps.height / 1e6)

@@ -21,7 +21,7 @@ MEASURED_ON = "2 cores of an AMD EPYC"
 MEASURED_CORES = 2
 _FIXED_S, _MEGAPIXEL_S, _MILLION_GAUSSIANS_S = 0.003, 0.092, 0.367
 # Surface losses render depth and normals too. Ratio of seven trainings with them to the fit, 1.5 … 2.0, 2026-11-22.
-_SURFACE = 1.9
+SURFACE_FACTOR = 1.9
 
 
 def iteration_seconds(pixels: float, gaussians: float, *, surface: bool) -> float:
@@ -33,49 +33,44 @@ def iteration_seconds(pixels: float, gaussians: float, *, surface: bool) -> floa
         surface: whether surface losses hold the Gaussians.
     """
     plain = _FIXED_S + _MEGAPIXEL_S * pixels / 1e6 + _MILLION_GAUSSIANS_S * gaussians / 1e6
-    return (_SURFACE if surface else 1.0) * plain
+    return (SURFACE_FACTOR if surface else 1.0) * plain
 
 
 @dataclass(frozen=True)
 class BlockCost:
-    """Model of time and memory of a block's training: c₀ + c₁ · pixels + c₂ · visible + c₃ · Gaussians.
+    """Cost of a block's training: c₀ + c₁ · pixels + c₂ · visible Gaussians + c₃ · all of them, each in millions.
 
     Attributes:
-        seconds: (4,) coefficients of the processor seconds of an iteration; pixels, visible Gaussians and all
-            Gaussians are counted in millions.
-        bytes: (4,) coefficients of the peak of the memory.
+        coefficients: (4,) c₀ … c₃: processor seconds of an iteration, or bytes of the process at its peak.
     """
 
-    seconds: FloatArray
-    bytes: FloatArray
+    coefficients: FloatArray
 
-    def iteration_s(self, pixels: float, visible: float, gaussians: float) -> float:
-        """Return the processor seconds of an iteration.
+    def of(self, pixels: float, visible: float, gaussians: float) -> float:
+        """Return the cost.
 
         Args:
             pixels: of the block in a view.
             visible: number of the Gaussians in a view.
             gaussians: number of all Gaussians, those that stand in for the rest among them.
         """
-        return float(_design(np.array([[pixels, visible, gaussians]])) @ self.seconds)
-
-    def peak_bytes(self, pixels: float, visible: float, gaussians: float) -> float:
-        """Return the peak of the process's memory; arguments as for `iteration_s`, with the limit of Gaussians."""
-        return float(_design(np.array([[pixels, visible, gaussians]])) @ self.bytes)
+        return float((_design(np.array([[pixels, visible, gaussians]])) @ self.coefficients).item())
 
     @staticmethod
-    def fitted(sizes: FloatArray, seconds: FloatArray, peak_bytes: FloatArray) -> BlockCost:
+    def fitted(sizes: FloatArray, measured: FloatArray) -> BlockCost:
         """Return the model that fits measured blocks best in relative terms, with no coefficient below zero.
 
         Args:
             sizes: (B, 3) pixels, visible and all Gaussians of each block.
-            seconds: (B,) processor seconds of an iteration.
-            peak_bytes: (B,) peaks of the memory.
+            measured: (B,) their cost.
         """
-        design = _design(sizes)
-        return BlockCost(
-            *(nnls(design / values[:, None], np.ones(len(values)))[0] for values in (seconds, peak_bytes))
-        )
+        return BlockCost(nnls(_design(sizes) / measured[:, None], np.ones(len(measured)))[0])
+
+
+# Processor seconds of an iteration, fitted by examples/benchmarks/block_cost.py to 16 blocks of 7 000 … 51 000
+# Gaussians and 35 000 … 141 000 pixels a view, on one thread of an AMD EPYC, 2026-11-22. For a million Gaussians in
+# 1.2 megapixels it gives 1.0 s, and the measurements above 0.96 s.
+BLOCK_SECONDS = BlockCost(np.array([0.0046, 0.202, 1.20, 0.353]))
 
 
 def _design(sizes: FloatArray) -> FloatArray:

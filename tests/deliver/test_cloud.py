@@ -16,14 +16,14 @@ from pipelines.core.products import load_json
 from pipelines.core.runner import run_stage
 from pipelines.core.stages import BY_NAME, CLOUD
 from pipelines.core.workspace import Workspace
-from pipelines.deliver.cloud import plan
-from pipelines.deliver.cloud.fusion import FusionSettings, SurfaceCloud, fused_squares
-from pipelines.deliver.cloud.plan import pixel_on_surface_m
 from pipelines.formats.georef_sidecar import CrsSidecar, sidecar_path
 from pipelines.geodesy.enu import enu_from_ecef
 from pipelines.geometry.similarity import Similarity
 from pipelines.georef.cameras import CameraPoses
 from pipelines.scene.calibrated import load_survey
+from pipelines.scene.surface_cloud import plan
+from pipelines.scene.surface_cloud.fusion import FusionSettings, SurfaceCloud, fused_squares
+from pipelines.scene.surface_cloud.plan import pixel_on_surface_m
 from pipelines.scene.surface_views import SurfaceViews
 from tests.depth_scenes import BOX_M, CAMERA, DOWN, depth_map, looking_down
 from tests.splat_scenes import ground_height

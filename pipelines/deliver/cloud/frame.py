@@ -8,8 +8,8 @@ import numpy as np
 
 from pipelines.accuracy.accuracy_grid import AccuracyGrid
 from pipelines.core.types import FloatArray
-from pipelines.deliver.cloud.fusion import SurfaceCloud
 from pipelines.formats.cloud_points import CloudPoints
+from pipelines.scene.surface_cloud.fusion import SurfaceCloud
 from pipelines.scene.target_crs import TargetCrs
 
 _STEP_M = 10.0  # of the differences that tell the axes of a CRS

@@ -14,21 +14,18 @@ from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.deliver.cloud.files import SIGMA_COUNTS, CloudFiles
 from pipelines.deliver.cloud.frame import cloud_frame
-from pipelines.deliver.cloud.fusion import FusionSettings, fused_squares
-from pipelines.deliver.cloud.plan import pixel_on_surface_m
 from pipelines.deliver.cloud.tally import Tally
 from pipelines.deliver.options import ExportCloudOptions
 from pipelines.deliver.predicted_sigma import predicted_sigma
-from pipelines.deliver.scene_extent import corners, scene_points
 from pipelines.formats.georef_sidecar import CrsSidecar, write_sidecar
 from pipelines.scene.renderer import ModelRenderer
 from pipelines.scene.scene import photographs
+from pipelines.scene.scene_extent import corners, scene_points
+from pipelines.scene.surface_cloud.fusion import fused_squares, fusion_settings
 from pipelines.scene.surface_views import SurfaceViews
 from pipelines.scene.target_crs import target_crs
 from pipelines.scene.trained_survey import load_trained
 from pipelines.splat.rasterizer.backends import rasterizer
-
-_COARSEST = 2.0  # width of the pixels that are used, in medians: beyond lies the background, which few rays fix
 
 
 def run(stage: StageRun, options: ExportCloudOptions) -> Summary:
@@ -49,10 +46,8 @@ def run(stage: StageRun, options: ExportCloudOptions) -> Summary:
     renderer = ModelRenderer(trained, images, rasterizer("auto", stage.progress))
     scratch = stage.out / "depth_maps"
     views = SurfaceViews(renderer, scratch, colours=True, confirmed=True, progress=stage.progress)
-    pixel_m = pixel_on_surface_m(views, geo_from_model)
-    spacing_m = options.spacing or pixel_m
+    settings = fusion_settings(views, geo_from_model, options.min_views, options.spacing)
     sigma = predicted_sigma(stage.workspace, trained)
-    settings = FusionSettings(spacing_m, _COARSEST * pixel_m, options.min_views)
     squares = fused_squares(views, geo_from_model, settings, stage.progress)
     tally = files.write(frame.points(square, sigma.grid) for square in squares)
     if not tally.count:
@@ -65,7 +60,7 @@ def run(stage: StageRun, options: ExportCloudOptions) -> Summary:
     for path in files.paths:
         write_sidecar(sidecar, path)
     views.close()
-    return _summary(tally, sidecar, spacing_m)
+    return _summary(tally, sidecar, settings.spacing_m)
 
 
 def _no_sigma(reason: str) -> tuple[Caution, ...]:

@@ -14,10 +14,10 @@ from pipelines.deliver.predicted_sigma import predicted_sigma
 from pipelines.deliver.raster.extent import GroundSampling
 from pipelines.deliver.raster.plan import PlanScene
 from pipelines.deliver.raster.window import RasterSource
-from pipelines.deliver.scene_extent import scene_points
 from pipelines.formats.geotiff import RasterFrame
 from pipelines.scene.renderer import ModelRenderer
 from pipelines.scene.scene import photographs
+from pipelines.scene.scene_extent import scene_points
 from pipelines.scene.surface_views import SurfaceViews
 from pipelines.scene.target_crs import TargetCrs
 from pipelines.scene.trained_survey import TrainedSurvey

@@ -25,9 +25,9 @@ from pipelines.deliver.raster.extent import (
 from pipelines.deliver.raster.mosaic import Mosaic
 from pipelines.deliver.raster.pictures import write_pictures
 from pipelines.deliver.raster.source import Request, raster_source
-from pipelines.deliver.scene_extent import corners, scene_points
 from pipelines.formats.georef_sidecar import SceneSigma, write_sidecar
 from pipelines.formats.geotiff import RasterFrame
+from pipelines.scene.scene_extent import corners, scene_points
 from pipelines.scene.target_crs import TargetCrs, target_crs
 from pipelines.scene.trained_survey import load_trained
 

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import ByteArray, FloatArray
-from pipelines.deliver.cloud.candidates import Candidates, Look, Square, candidates_in
-from pipelines.deliver.cloud.plan import pixel_on_surface_m, plan_squares
 from pipelines.geometry.depth_support import Support
 from pipelines.geometry.similarity import Similarity
+from pipelines.scene.surface_cloud.candidates import Candidates, Look, Square, candidates_in
+from pipelines.scene.surface_cloud.plan import pixel_on_surface_m, plan_squares
 from pipelines.scene.surface_views import SurfaceViews
 
 _MARGIN = 4  # spacings around a square: fusion moves points by less, mostly
@@ -25,6 +25,7 @@ _SIGMA_PX = 0.25
 # A point is left out if its σ exceeds this part of the pixel: beyond, one point in five was a floater on simulated
 # flights.
 _RESOLVED = 1.0
+_COARSEST = 2.0  # width of the pixels that are used, in medians: beyond lies the background, which few rays fix
 
 
 @dataclass(frozen=True)
@@ -61,6 +62,21 @@ class SurfaceCloud:
     def __len__(self) -> int:
         """Return the number of points."""
         return len(self.position)
+
+
+def fusion_settings(
+    views: SurfaceViews, geo_from_model: Similarity, min_views: int, spacing_m: float | None = None
+) -> FusionSettings:
+    """Return the settings for a cloud.
+
+    Args:
+        views: surface of the training views.
+        geo_from_model: similarity.
+        min_views: least number of views that agree on a point.
+        spacing_m: side of the voxels; None: the width of a pixel on the surface.
+    """
+    pixel_m = pixel_on_surface_m(views, geo_from_model)
+    return FusionSettings(spacing_m or pixel_m, _COARSEST * pixel_m, min_views)
 
 
 def fused_squares(

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipelines.core.types import FloatArray, IntArray
-from pipelines.deliver.cloud.candidates import Square
 from pipelines.geometry.similarity import Similarity
+from pipelines.scene.surface_cloud.candidates import Square
 from pipelines.scene.surface_views import SurfaceView, SurfaceViews
 
 # Memory: candidates of one square, of about 100 bytes each, with the copies that sorting them makes.

@@ -1,0 +1,1 @@
+"""Comparison of the model's surface with a reference cloud."""

@@ -1,0 +1,245 @@
+"""Comparison of the surface of a trained survey with a reference cloud, square by square in bounded memory.
+
+1. The model's cloud is the one that `export-cloud` writes: fused depth maps, and not the centres of Gaussians.
+2. The reference is read twice. A first pass keeps one point a voxel of 0.25 m, for what photographs saw and for the
+   shift between the clouds. A second pass sorts all points into squares on the disk.
+3. In each square, distances are measured both ways and along the reference's normals (`distances`).
+4. Recall counts points that three photographs saw, and precision the model's points where the reference covers the
+   plan.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from pipelines.accuracy.error_propagation import ErrorPropagation, NoErrorPropagation
+from pipelines.core.cautions import is_checked
+from pipelines.core.durable import remove
+from pipelines.core.errors import DegenerateGeometryError
+from pipelines.core.progress import Progress
+from pipelines.core.types import FloatArray
+from pipelines.evaluate.options import EvaluateOptions
+from pipelines.evaluate.reference.alignment import Fit, fit_alignment
+from pipelines.evaluate.reference.distances import ComparisonSettings, compare_square
+from pipelines.evaluate.reference.figures import THRESHOLDS_M, CoreTable, DistanceTally, level_of_detection
+from pipelines.evaluate.reference.m3c2 import require_m3c2
+from pipelines.evaluate.reference.normals import plane_normals
+from pipelines.evaluate.reference.seen import SeenSurface, Viewpoints, seen_surface
+from pipelines.evaluate.reference.tiles import TiledPoints, first_of_voxels
+from pipelines.geometry.similarity import Similarity
+from pipelines.scene.cloud_options import CloudCrs
+from pipelines.scene.measured_cloud import CloudFiles, MeasuredCloud, Thinning, read_thinned
+from pipelines.scene.reference_report import ReferenceComparison
+from pipelines.scene.renderer import ModelRenderer
+from pipelines.scene.scene_extent import scene_points
+from pipelines.scene.surface_cloud.fusion import FusionSettings, fused_squares, fusion_settings
+from pipelines.scene.surface_views import SurfaceViews
+from pipelines.scene.trained_survey import TrainedSurvey
+
+_SQUARE_M = 32.0  # two million points of the reference at the most, in voxels of 0.025 m
+_OVERVIEW_M, _MOST_OVERVIEW = 0.25, 10_000_000
+_MARGIN_M, _MARGIN_UP_M = 10.0, 100.0  # around the SfM points: heights of a wrong datum are off by up to 100 m
+_LEAST_VIEWS = 3  # that agree on a point of the model, as in `export-cloud`
+_SAMPLE = 20_000  # points of the reference that tell its spacing
+
+
+@dataclass(frozen=True)
+class ComparedReference:
+    """Figures of the comparison, and the core points for map and histogram."""
+
+    comparison: ReferenceComparison
+    table: CoreTable
+    assumptions: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Model:
+    """The model's cloud, and the similarity by which it was moved; None: it was not."""
+
+    points: TiledPoints
+    settings: FusionSettings
+    fit: Fit | None
+    moved: Similarity | None
+
+
+def open_reference(options: EvaluateOptions) -> CloudFiles | None:
+    """Return the reference of `--reference`, its headers and CRS checked; None without that option.
+
+    Raises:
+        BackendUnavailableError: py4dgeo is not installed.
+        InputError: an unreadable file, or no CRS.
+    """
+    if options.reference is None:
+        return None
+    require_m3c2()
+    stated = CloudCrs(options.reference_crs, options.reference_vertical, "--reference")
+    return CloudFiles(options.reference, stated)
+
+
+def compare_with_reference(
+    renderer: ModelRenderer,
+    files: CloudFiles,
+    propagation: ErrorPropagation | NoErrorPropagation,
+    options: EvaluateOptions,
+    *,
+    scratch: Path,
+    progress: Progress,
+) -> ComparedReference:
+    """Return the comparison of a trained survey with a reference.
+
+    Args:
+        renderer: of the trained model.
+        files: the reference.
+        propagation: σ of the georeference, or the reason why there is none.
+        options: of the stage, with `reference`.
+        scratch: folder for depth maps and sorted points; removed at the end.
+        progress: shows depth maps, points and squares.
+
+    Raises:
+        InputError: a damaged file, a missing grid, a reference of another place, or no room on the disk.
+        DegenerateGeometryError: the views agree on no point of a surface, or nothing tells how to move the model.
+    """
+    assert options.reference is not None  # the caller opened its files
+    trained = renderer.trained
+    thinning = Thinning(_OVERVIEW_M, _MOST_OVERVIEW, *_bounds(trained))
+    overview = read_thinned(files, trained.survey.origin, thinning, progress)
+    model = _model(renderer, overview, options, scratch, progress)
+    seen = seen_surface(_viewpoints(renderer, model.moved), overview.position_in_geo, overview.voxel_m, progress)
+    reference = _sorted_reference(files, trained, scratch / "reference", progress)
+    spacing_m = _spacing(reference)
+    settings = ComparisonSettings.of_spacings(spacing_m, model.settings.spacing_m, min(THRESHOLDS_M))
+    tally = _compare(reference, model.points, seen, settings, progress)
+    cores = tally.cores()
+    sigma_m = _georeference_sigma(cores.position, cores.normal, trained, propagation)
+    known = np.zeros(len(cores.position)) if sigma_m is None or model.moved is not None else sigma_m
+    lod_m = level_of_detection(cores.noise_m, np.hypot(known, options.reference_sigma))
+    table = CoreTable(cores, lod_m)
+    comparison = ReferenceComparison(
+        name=options.reference.name,
+        crs=files.crs_names,
+        points=tally.points,
+        seen=tally.seen / max(tally.points, 1),
+        spacing_m=spacing_m,
+        model_points=len(model.points),
+        model_spacing_m=model.settings.spacing_m,
+        sigma_m=options.reference_sigma,
+        georeference_sigma_m=None if sigma_m is None or not len(sigma_m) else float(np.median(sigma_m)),
+        shift=None if model.fit is None else model.fit.shift,
+        aligned="none" if model.moved is None else options.reference_align,
+        cylinder_m=settings.core_m,
+        groups=tally.groups(table),
+    )
+    remove(scratch)
+    return ComparedReference(comparison, table, files.assumptions)
+
+
+def _compare(
+    reference: TiledPoints,
+    model: TiledPoints,
+    seen: SeenSurface,
+    settings: ComparisonSettings,
+    progress: Progress,
+) -> DistanceTally:
+    tally, squares = DistanceTally(), sorted(reference.squares | model.squares)
+    with progress.task("squares of the reference", len(squares)) as task:
+        for square in squares:
+            tally.add(compare_square(square, reference, model, seen, settings))
+            task.advance()
+    return tally
+
+
+def _bounds(trained: TrainedSurvey) -> tuple[FloatArray, FloatArray]:
+    """Return the corners (3,) of the box around the scene; a reference may lie above or below it."""
+    points = scene_points(trained)
+    margin = np.array([_MARGIN_M, _MARGIN_M, _MARGIN_UP_M])
+    return points.min(axis=0) - margin, points.max(axis=0) + margin
+
+
+def _model(
+    renderer: ModelRenderer, overview: MeasuredCloud, options: EvaluateOptions, scratch: Path, progress: Progress
+) -> _Model:
+    """Return the model's cloud in squares, and its shift against the reference."""
+    geo_from_model = renderer.trained.geo_from_model
+    views = SurfaceViews(renderer, scratch / "depth_maps", colours=True, confirmed=True, progress=progress)
+    settings = fusion_settings(views, geo_from_model, _LEAST_VIEWS)
+    delivered = TiledPoints(scratch / "delivered", _SQUARE_M)
+    sample = []
+    for square in fused_squares(views, geo_from_model, settings, progress):
+        delivered.append(square.position, square.normal, None)
+        sample.append(square.position[first_of_voxels(square.position, 2 * _OVERVIEW_M)])
+    views.close()
+    if not len(delivered):
+        raise DegenerateGeometryError("no point of the surface is seen alike by three training views: train longer")
+    sparse = overview.position_in_geo[first_of_voxels(overview.position_in_geo, 2 * _OVERVIEW_M)]
+    normal, kind = plane_normals(sparse, 2 * _OVERVIEW_M), options.reference_align
+    fit = fit_alignment(np.concatenate(sample), sparse, normal, 2 * _OVERVIEW_M, kind)
+    if kind == "none":
+        return _Model(delivered, settings, fit, None)
+    if fit is None:
+        raise DegenerateGeometryError(
+            f"--reference-align {kind}: the surface and the reference have too little in common to move one onto "
+            "the other, or nothing in them fixes all axes: compare without it"
+        )
+    similarity = fit.reference_from_model
+    return _Model(_moved(delivered, similarity, scratch / "moved"), settings, fit, similarity)
+
+
+def _moved(points: TiledPoints, similarity: Similarity, folder: Path) -> TiledPoints:
+    """Return points in the place that a similarity gives them."""
+    moved = TiledPoints(folder, points.side_m)
+    for square in sorted(points.squares):
+        rows, own = points.around(square, 0.0)
+        normal = rows["normal"][own] @ similarity.rotation.T
+        moved.append(similarity.apply(rows["position"][own]), normal, None)
+    return moved
+
+
+def _viewpoints(renderer: ModelRenderer, moved: Similarity | None) -> Viewpoints:
+    """Return the training cameras in geo, moved as the model's cloud was."""
+    trained = renderer.trained
+    cameras, poses = trained.indices("train"), trained.poses
+    similarity = trained.geo_from_model if moved is None else moved @ trained.geo_from_model
+    return Viewpoints(
+        poses.cam_from_model[cameras] @ similarity.rotation.T,
+        similarity.apply(poses.cam_center_in_model[cameras]),
+        tuple(renderer.pinhole(index) for index in cameras),
+    )
+
+
+def _sorted_reference(files: CloudFiles, trained: TrainedSurvey, folder: Path, progress: Progress) -> TiledPoints:
+    """Return the points of the reference within the scene, in squares."""
+    (low, high), reference = _bounds(trained), TiledPoints(folder, _SQUARE_M)
+    for chunk in files.chunks(trained.survey.origin, progress):
+        place = chunk.position_in_geo
+        inside = ((place >= low) & (place <= high)).all(axis=1)
+        reference.append(place[inside], None, chunk.classification[inside])
+    return reference
+
+
+def _spacing(reference: TiledPoints) -> float:
+    """Return the median distance between neighbours, in the square with the most points."""
+    rows, own = max((reference.around(square, 0.0) for square in reference.squares), key=lambda part: len(part[0]))
+    place = rows["position"][own]
+    place = place[first_of_voxels(place, min(THRESHOLDS_M) / 2)]
+    chosen = np.random.default_rng(0).permutation(len(place))[:_SAMPLE]
+    if len(place) < 2:
+        return _SQUARE_M
+    return float(np.median(cKDTree(place).query(place[chosen], k=2)[0][:, 1]))
+
+
+def _georeference_sigma(
+    position: FloatArray,
+    normal: FloatArray,
+    trained: TrainedSurvey,
+    propagation: ErrorPropagation | NoErrorPropagation,
+) -> FloatArray | None:
+    """Return the predicted σ (C,) of the georeference along normals; None: not known."""
+    if isinstance(propagation, NoErrorPropagation) or propagation.grid is None or not len(position):
+        return None
+    if not is_checked(trained.model.cautions):
+        return None
+    return np.asarray(np.linalg.norm(propagation.grid.sigma_at(position) * normal, axis=1))

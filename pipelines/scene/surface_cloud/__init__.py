@@ -1,0 +1,1 @@
+"""Point cloud of the fused surface of the trained model, in `geo`."""
