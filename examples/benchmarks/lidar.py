@@ -3,9 +3,8 @@
     lidar.py OUT --seeds 0,1,2,3,4 --size 1200x900 --train "--preset fast --max-image-size 640"
 
 Of each seed, the survey is simulated and reconstructed once. Trainings in OUT/seedN are then compared with the true
-scene: without LiDAR; with a cloud of 2 cm; with the scanner's track, too; with Gaussians held instead of rendered
-depths, each with a confidence of its own; with both held; and with a cloud that shows a building that has been
-removed since.
+scene: without LiDAR; with a cloud of 2 cm; with the scanner's track, too; with Gaussians held, or rendered depths,
+instead of both; and with a cloud that shows a building that has been removed since.
 
 Pixels of the test views, and of every fourth training view, are intersected with the true scene. They count if the
 unchanged cloud has a point within 0.3 m of that place. `wall`, `roof` and `ground` are medians of the distance
@@ -55,7 +54,7 @@ TRAININGS: dict[str, tuple[str | None, tuple[str, ...]]] = {
     "lidar": ("none", ()),
     "lidar, track": ("none", ("--lidar-trajectory",)),
     "lidar, gaussians": ("none", ("--lidar-pull", "gaussians")),
-    "lidar, both": ("none", ("--lidar-pull", "both")),
+    "lidar, depth": ("none", ("--lidar-pull", "depth")),
     "lidar, removed": ("removed", ()),
 }
 STRIDE, EVERY = 2, 4  # of the pixels, and of the training views

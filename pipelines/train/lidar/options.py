@@ -30,7 +30,8 @@ class LidarOptions(StageOptions):
     )
     lidar_sigma: float = Field(0.03, gt=0, le=10, description="Stated σ of the LiDAR's points in metres.")
     lidar_pull: LidarPull = Field(
-        "depth", description="Hold rendered depths to the LiDAR, or Gaussians, each with a confidence of its own."
+        "both",
+        description="Hold rendered depths to the LiDAR, Gaussians, each with a confidence of its own, or both.",
     )
     lidar_register: bool = Field(False, description="Estimate a shift of the LiDAR, and take it out.")
 

@@ -23,7 +23,7 @@ _LEAST_CONFIDENCE = 0.1
 _REACH = 2.0  # distances between points, from a point of stereo to the LiDAR
 _OFF_PIXELS = 2.0  # of the depth maps: a point of stereo further from the plane lies on another surface
 _WEIGHT = 4.0  # of a trusted LiDAR point's pull, relative to that of stereo
-_WEIGHT_ALONE = 1.0
+_WEIGHT_ALONE = 1.0  # the same where stereo found nothing: what a view sees there is less certain
 _MOST_ALONE = 0.15  # of the points to start from: LiDAR where stereo found none
 _FREE_SPACE = 0.1  # weight of the mean opacity of Gaussians in free space
 _ATTRACTION = 0.01  # weight of the loss of Gaussians beside their planes
@@ -86,7 +86,7 @@ class FusedSurface(SceneSurface):
         judged: CloudVerdict,
         pixel_m: float,
         *,
-        pull: LidarPull = "depth",
+        pull: LidarPull = "both",
         free: FreeSpace | None = None,
     ) -> None:
         super().__init__(maps)
@@ -97,7 +97,6 @@ class FusedSurface(SceneSurface):
         self._cloud, self._confidence = cloud.part(standing), judged.confidence[standing]
         radius_m = np.clip(_GAP * self._cloud.reach_m, _LEAST_GAP * cloud.voxel_m, _MOST_GAP * cloud.voxel_m)
         self._surfels = Surfels(self._cloud.position_in_model, self._cloud.normal_in_model, radius_m)
-        self._alone: dict[int, SeenSurfels] = {}
 
     def held(self, index: int, stride: int) -> tuple[FloatArray, Float32Array]:
         """Return the points (P, 3) that a training view is held to, and the weight of each (P,)."""
@@ -140,16 +139,14 @@ class FusedSurface(SceneSurface):
 
     def _alone_in_view(self, index: int) -> SeenSurfels:
         """Return the trusted LiDAR points that a view sees at pixels without a depth of stereo."""
-        if index not in self._alone:
-            poses, depth = self._poses, np.asarray(self._maps.depth(index))
-            rotation, center = poses.cam_from_model[index], poses.cam_center_in_model[index]
-            seen = seen_surfels(self._surfels, rotation, center, self._maps.camera(index))
-            nearest = ndimage.minimum_filter(np.where(depth > 0, depth, np.inf), size=2 * _RIM_PX + 1)
-            unknown = depth[seen.row, seen.column] == 0
-            before = seen.depth_m < (1 + _SAME) * nearest[seen.row, seen.column]
-            trusted = self._confidence[seen.rows] >= _LEAST_CONFIDENCE
-            self._alone[index] = seen.part(unknown & before & trusted & self._faces(seen.rows, center))
-        return self._alone[index]
+        poses, depth = self._poses, np.asarray(self._maps.depth(index))
+        rotation, center = poses.cam_from_model[index], poses.cam_center_in_model[index]
+        seen = seen_surfels(self._surfels, rotation, center, self._maps.camera(index))
+        nearest = ndimage.minimum_filter(np.where(depth > 0, depth, np.inf), size=2 * _RIM_PX + 1)
+        unknown = depth[seen.row, seen.column] == 0
+        before = seen.depth_m < (1 + _SAME) * nearest[seen.row, seen.column]
+        trusted = self._confidence[seen.rows] >= _LEAST_CONFIDENCE
+        return seen.part(unknown & before & trusted & self._faces(seen.rows, center))
 
     def _faces(self, rows: IntArray, center: FloatArray) -> BoolArray:
         """Return whether a camera looks on the side of planes (K,) that the scanner saw; True where unknown."""
@@ -171,17 +168,17 @@ class FusedSurface(SceneSurface):
             inside: as of `sample`.
         """
         colours = np.zeros((len(self._cloud), 3), dtype=np.uint8)
-        nearest_m = np.full(len(self._cloud), np.inf)
+        size_m = np.full(len(self._cloud), np.inf)  # of a pixel of the nearest view
         for index in map(int, self._train):
-            seen = self._alone_in_view(index)
-            seen = seen.part(seen.depth_m < nearest_m[seen.rows])
-            nearest_m[seen.rows] = seen.depth_m
+            seen, focal_px = self._alone_in_view(index), self._maps.camera(index).fx
+            seen = seen.part(seen.depth_m < focal_px * size_m[seen.rows])
+            size_m[seen.rows] = seen.depth_m / focal_px
             colours[seen.rows] = self._maps.rgb(index)[seen.row, seen.column]
-        rows = np.flatnonzero(np.isfinite(nearest_m))
+        rows = np.flatnonzero(np.isfinite(size_m))
         if len(stereo) and len(rows):
             gap, _ = cKDTree(stereo).query(self._cloud.position_in_model[rows])
             rows = rows[gap > _REACH * self._cloud.voxel_m]
         if inside is not None:
             rows = rows[inside(self._cloud.position_in_model[rows])]
-        rows = rows[spread_evenly(self._cloud.position_in_model[rows], nearest_m[rows], most)]
+        rows = rows[spread_evenly(self._cloud.position_in_model[rows], size_m[rows], most)]
         return SurfacePoints(self._cloud.position_in_model[rows], colours[rows], self._cloud.normal_in_model[rows])
