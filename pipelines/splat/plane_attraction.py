@@ -49,14 +49,12 @@ class PlaneAttraction:
     """
 
     def __init__(self, planes: MeasuredPlanes, device: torch.device) -> None:
-        self._low = planes.position.min(axis=0) - planes.cell_m
-        cell = np.floor((planes.position - self._low) / planes.cell_m).astype(np.int64)
-        cells = np.unique(cell, axis=0)
-        key, first = np.unique(_keys((cells[:, None] + _AROUND).reshape(-1, 3)), return_index=True)
-        near = (cells[:, None] + _AROUND).reshape(-1, 3)[first]
-        _, plane = cKDTree(planes.position).query(self._low + (near + 0.5) * planes.cell_m)
+        low = planes.position.min(axis=0) - planes.cell_m  # no cell around a plane has a negative number
+        cell = np.floor((planes.position - low) / planes.cell_m).astype(np.int64)
+        key = np.unique((np.unique(_keys(cell))[:, None] + _keys(_AROUND)).ravel())
+        _, plane = cKDTree(planes.position).query(low + (_cells(key) + 0.5) * planes.cell_m)
         self._key = torch.from_numpy(key).to(device)
-        tensors = (self._low, planes.position[plane], planes.normal[plane], planes.confidence[plane])
+        tensors = (low, planes.position[plane], planes.normal[plane], planes.confidence[plane])
         self._corner, self._place, self._normal, self._confidence = (
             torch.from_numpy(values).float().to(device) for values in tensors
         )
@@ -78,4 +76,10 @@ class PlaneAttraction:
 
 
 def _keys(cell: IntArray) -> IntArray:
+    """Return the keys of cells (N, 3); sums of keys are those of the sums."""
     return np.asarray((cell[:, 0] << 2 * _SIDE_BITS) + (cell[:, 1] << _SIDE_BITS) + cell[:, 2])
+
+
+def _cells(key: IntArray) -> IntArray:
+    side = (1 << _SIDE_BITS) - 1
+    return np.stack([key >> 2 * _SIDE_BITS, (key >> _SIDE_BITS) & side, key & side], axis=1)
