@@ -94,7 +94,7 @@ def measured(seed: int, name: str, arguments: argparse.Namespace) -> dict[str, A
         georef("simulate", survey, "--images", arguments.images, "--size", arguments.size, "--seed", seed)
     if not (base / "sim3").exists():
         files = ("--images", survey / "images", "--trajectory", survey / "trajectory.csv")
-        checks = ("--checkpoints", survey / "checkpoints.txt", "--sigma-mark", "0.2")
+        checks = ("--gcp", survey / "gcp_list.txt", "--checkpoints", survey / "checkpoints.txt")
         georef("run", base, *files, *checks, "--vertical", "ellipsoidal", "--to", "init-sim3")
     workspace = home / name.replace(", ", "_")
     if not (workspace / "evaluate").exists():
