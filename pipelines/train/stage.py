@@ -30,6 +30,7 @@ from pipelines.train.depth_maps import DepthMaps
 from pipelines.train.forecast import forecast_of
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.lidar.prepare import compared_lidar, draw_changes, lidar_surface
+from pipelines.train.lidar.track import ScannerTrack
 from pipelines.train.options import TrainOptions
 from pipelines.train.result import summary_of, trained_model
 from pipelines.train.surface import SceneSurface
@@ -53,6 +54,9 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     workspace = stage.workspace
     clouds = None if options.lidar is None else CloudFiles(options.lidar, options.lidar_stated)
     initial, survey, scene = load_initial_scene(workspace)
+    track = None
+    if options.lidar_trajectory is not None:
+        track = ScannerTrack.read(options.lidar_trajectory, options.lidar_stated, survey.origin)
     options.require_trainable(len(scene.sparse.image_name))
     images = photographs(scene.sparse, survey, workspace, options.effort.max_image_size)
     require_memory(training_size(scene, images, options), free_memory_bytes(device_of(backend)))
@@ -63,7 +67,7 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     compared = None
     if clouds is not None and maps is not None:
         compared = compared_lidar(
-            options, clouds, maps, survey,
+            options, clouds, maps, survey, track=track,
             georeference=initial.geo_from_local, seed=options.seed, progress=stage.progress,
         )  # fmt: skip
     points = GeolocatedPoints.load(workspace.path(POINTS))

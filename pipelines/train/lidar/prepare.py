@@ -97,6 +97,7 @@ def compared_lidar(
     maps: DepthMaps,
     survey: Survey,
     *,
+    track: ScannerTrack | None,
     georeference: SimilarityRecord,
     seed: int,
     progress: Progress,
@@ -108,6 +109,7 @@ def compared_lidar(
         files: the clouds.
         maps: depth maps of the training views.
         survey: has the origin of `geo`.
+        track: of the scanner; None: not known.
         georeference: initial similarity to `geo`, with covariance.
         seed: of random choices.
         progress: shows the points read.
@@ -116,8 +118,6 @@ def compared_lidar(
         InputError: the cloud lies elsewhere, in height or plan, or is shifted beyond 3 σ.
     """
     pixel_m, views = pixel_size_m(maps), depth_views(maps)
-    path, stated = options.lidar_trajectory, options.lidar_stated
-    track = None if path is None else ScannerTrack.read(path, stated, survey.origin)
     cloud = read_cloud(files, maps.scene, survey, pixel_m, progress=progress, track=track)
     shown = SceneSurface(maps).all_points(_STRIDE)
     found = registration_of(cloud, shown, views, seed)
