@@ -13,6 +13,7 @@ from pipelines.scene.scene import Scene
 from pipelines.splat.exposure_adjustment import PointColours, adjusted_exposures
 
 _TRACKS = 300  # of a photograph, the longest: twelve numbers of an exposure need no more
+_PHOTOGRAPHS = 16  # of a track
 _AROUND_PX = 5  # side of the square whose mean colour counts: a pixel at a corner is not repeatable
 _DARKEST, _BRIGHTEST = 4 / 255, 250 / 255  # a clipped channel does not show its exposure
 
@@ -58,7 +59,7 @@ def _observations_in_use(scene: Scene) -> IntArray:
     """Return the rows of the training photographs' observations of the points that count, ascending.
 
     These are the longest tracks, each taken as long as one of its photographs has too few. The pairs of photographs
-    that a track couples grow with the square of its length: not more tracks than needed may count.
+    that a track couples grow with the square of its length: of a track, those photographs count that have the fewest.
     """
     sparse = scene.sparse
     in_training = np.zeros(len(sparse.image_name), dtype=bool)
@@ -68,13 +69,14 @@ def _observations_in_use(scene: Scene) -> IntArray:
     first = np.searchsorted(point, np.arange(len(sparse.point_id) + 1))
     length = np.diff(first)
     taken = np.zeros(len(sparse.image_name), dtype=np.int64)
-    chosen = np.zeros(len(sparse.point_id), dtype=bool)
+    chosen = np.zeros(len(rows), dtype=bool)
     for index in np.argsort(-length, kind="stable")[: np.count_nonzero(length >= 2)].tolist():
         seen_in = image[first[index] : first[index + 1]]
-        if taken[seen_in].min() < _TRACKS:
-            chosen[index] = True
-            taken[seen_in] += 1
-    return rows[chosen[point]]
+        neediest = np.argsort(taken[seen_in], kind="stable")[:_PHOTOGRAPHS]
+        if taken[seen_in[neediest[0]]] < _TRACKS:
+            chosen[first[index] + neediest] = True
+            taken[seen_in[neediest]] += 1
+    return rows[chosen]
 
 
 def _colours_at(photograph: ByteArray, mask: BoolArray, xy_px: FloatArray) -> FloatArray:
