@@ -59,7 +59,7 @@ def _observations_in_use(scene: Scene) -> IntArray:
     """Return the rows of the training photographs' observations of the points that count, ascending.
 
     These are the longest tracks, each taken as long as one of its photographs has too few. The pairs of photographs
-    that a track couples grow with the square of its length: of a track, those photographs count that have the fewest.
+    that a track couples grow with the square of its length: of a track, those photographs count that need it most.
     """
     sparse = scene.sparse
     in_training = np.zeros(len(sparse.image_name), dtype=bool)
