@@ -5,7 +5,8 @@
 
 - `front`: the frontmost centre of an opaque Gaussian within `--reach` pixels of the mark;
 - `nearest`: the centre next to the mark among the opaque ones that lie at most 1 % behind the frontmost;
-- `render`: the centre of the Gaussian at which half of the light of the mark's ray is stopped.
+- `render`: the centre of the Gaussian at which half of the light of the mark's ray is stopped, in a window whose
+  pixels are `--coarser` times as wide as those of the photograph.
 
 `depth` is the difference, along the camera's z axis, between the centre and the surveyed point. H and V are the
 horizontal and vertical distances between the two. `surface` is that of the trained model, rendered at the
@@ -55,8 +56,8 @@ class Look:
         off_px: (N,) distances from the mark, in pixels of the photograph.
         opaque: (M,) rows of the opaque ones before the camera, within the reach.
         cam_from_model: (4, 4) pose.
-        camera: with the photograph's pixels.
-        xy_px: (2,) the mark.
+        camera: of the viewer's window.
+        xy_px: (2,) the mark in the window.
     """
 
     gaussians: Gaussians
@@ -97,7 +98,11 @@ def render(look: Look) -> int | None:
 
 
 def picked_errors_m(
-    trained: TrainedSurvey, gaussians: Gaussians, rules: list[Callable[[Look], int | None]], reach_px: float
+    trained: TrainedSurvey,
+    gaussians: Gaussians,
+    rules: list[Callable[[Look], int | None]],
+    reach_px: float,
+    coarser: float,
 ) -> FloatArray:
     """Return errors (rules, K, 3) in depth, horizontally and vertically at all K marks; NaN: nothing is picked."""
     rays, points = mark_rays(trained.survey.check_points, trained.sparse), trained.survey.check_points
@@ -109,13 +114,14 @@ def picked_errors_m(
         turn, center = trained.poses.cam_from_model[camera], trained.poses.cam_center_in_model[camera]
         in_cam = (centres - center) @ turn.T
         focal_px = trained.sparse.camera_of(int(camera)).mean_focal_px
-        pinhole = Pinhole(1, 1, focal_px, focal_px, 0.0, 0.0)
+        window_px = focal_px / coarser
+        pinhole = Pinhole(1, 1, window_px, window_px, 0.0, 0.0)
         for mark in np.flatnonzero(rays.camera == camera):
             off_px = focal_px * np.linalg.norm(
                 in_cam[:, :2] / np.maximum(in_cam[:, 2:], 1e-6) - rays.xy[mark], axis=1
             )
             rows = np.flatnonzero(opaque & (in_cam[:, 2] > 0) & (off_px <= reach_px))
-            pose, xy_px = pose_matrix(turn, center), focal_px * rays.xy[mark]
+            pose, xy_px = pose_matrix(turn, center), window_px * rays.xy[mark]
             look = Look(gaussians, in_cam, off_px, rows, pose, pinhole, xy_px)
             true_in_model = geo_from_model.inverse().apply(true_in_geo[mark][None])[0]
             for number, rule in enumerate(rules):
@@ -148,6 +154,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("workspace", type=Path)
     parser.add_argument("--reach", type=float, default=2.0, help="pixels of the photograph")
+    parser.add_argument(
+        "--coarser", type=float, default=1.0, help="width of a pixel of the window in the photograph's"
+    )
     arguments = parser.parse_args()
     workspace = Workspace(arguments.workspace)
     trained = load_trained(workspace)
@@ -155,7 +164,8 @@ def main() -> None:
     splat = transformed(read_gaussians(workspace.path(SPLAT)), placement.file_from_model.inverse())
     rules: list[Callable[[Look], int | None]] = [front, nearest, render]
     print(f"{len(splat)} Gaussians\n{'':8}  marks  depth      H      V  (medians, m)")
-    for rule, errors in zip(rules, picked_errors_m(trained, splat, rules, arguments.reach), strict=True):
+    picked_m = picked_errors_m(trained, splat, rules, arguments.reach, arguments.coarser)
+    for rule, errors in zip(rules, picked_m, strict=True):
         known = np.isfinite(errors[:, 0])
         depth_m, horizontal_m, vertical_m = np.median(errors[known], axis=0)
         print(f"{rule.__name__:8}  {known.sum():5}  {depth_m:.3f}  {horizontal_m:.3f}  {vertical_m:.3f}")
