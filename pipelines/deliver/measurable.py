@@ -166,7 +166,8 @@ def _collected(squares: Iterable[SurfaceCloud], views: SurfaceViews, trained: Tr
 
 def _no_surface() -> DegenerateGeometryError:
     return DegenerateGeometryError(
-        f"no point of the surface is seen alike by {_MIN_VIEWS} training views: train longer, or leave out --measurable"
+        f"no point of the surface is seen alike by {_MIN_VIEWS} training views: train longer, or "
+        "leave out --measurable"
     )
 
 
