@@ -49,6 +49,7 @@ LATER: dict[str, tuple[str, ...]] = {
     "lidar": ("train",),
     "lidar_crs": ("train",),
     "lidar_vertical": ("train",),
+    "lidar_trajectory": ("train",),
     "lidar_sigma": ("train",),
     "lidar_register": ("train",),
     "seed": ("sfm", "init-sim3", "train"),

@@ -32,6 +32,7 @@ SPZ = "spz/splat.spz"
 TILES = "tiles/tileset.json"
 TILES_GLB = "tiles/splat.glb"
 REPORT_PAGE = "report/report.html"
+LIDAR, LIDAR_MAP = "train/lidar.json", "train/lidar.png"  # only of a training with LiDAR
 BLOCK_RECORD = "train/blocks.json"  # only of a model that was trained in blocks
 BLOCK_PLAN = "plan/plan.json"
 SOLUTION = "solution/solution.json"
@@ -280,6 +281,8 @@ DELIVERABLES: tuple[StageSpec, ...] = (
                     REFERENCE_MAP,
                     REFERENCE_HISTOGRAM,
                     METRICS,
+                    LIDAR,
+                    LIDAR_MAP,
                     ORTHOPHOTO_PREVIEW,
                     HILLSHADE,
                 )

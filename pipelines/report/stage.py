@@ -1,7 +1,7 @@
 """Report of a survey: one page with all that is known of it, for its client and for the record.
 
-Reads survey, SfM model, trained model and the report of `evaluate`; test views, accuracy map, metrics of the
-training and previews of the rasters where there are any. Writes `report/report.html` and, on request,
+Reads survey, SfM model, trained model and the report of `evaluate`; test views, accuracy map, metrics and LiDAR of
+the training, and previews of the rasters where there are any. Writes `report/report.html` and, on request,
 `report/report.pdf`.
 """
 
@@ -19,6 +19,7 @@ from pipelines.report.accuracy import accuracy_facts
 from pipelines.report.cameras import cameras_facts
 from pipelines.report.evaluated import EvaluatedSurvey, load_evaluated
 from pipelines.report.lenses import lenses_facts
+from pipelines.report.lidar import lidar_facts
 from pipelines.report.options import ReportOptions
 from pipelines.report.overlap import overlap_facts
 from pipelines.report.place import place_facts
@@ -113,6 +114,7 @@ def report_page(evaluated: EvaluatedSurvey, options: ReportOptions, stage: Stage
             Section("lenses", "Residuals in the image, and lenses", "lenses.html", lenses),
             Section("test-views", "Test views", "views.html", views),
             Section("training", "Training", "training.html", training),
+            Section("lidar", "LiDAR in the training", "lidar.html", lidar_facts(workspace)),
             Section("rasters", "Orthophoto and surface model", "rasters.html", previews_facts(workspace)),
             Section("processing", "Processing", "record.html", record),
             Section("photographs", "Photographs", "photographs.html", cameras),

@@ -57,20 +57,24 @@ def _undistorted_px(scene: Scene, pinhole: Pinhole, image: int, xy_px: FloatArra
 def _observations_in_use(scene: Scene) -> IntArray:
     """Return the rows of the training photographs' observations of the points that count, ascending.
 
-    These are the points with the longest tracks in any photograph.
+    These are the longest tracks, each taken as long as one of its photographs has too few. The pairs of photographs
+    that a track couples grow with the square of its length: not more tracks than needed may count.
     """
     sparse = scene.sparse
     in_training = np.zeros(len(sparse.image_name), dtype=bool)
     in_training[scene.train] = True
     rows = np.flatnonzero(in_training[sparse.obs_image])
     point, image = sparse.obs_point[rows], sparse.obs_image[rows]
-    length = np.bincount(point, minlength=len(sparse.point_id))
-    order = np.lexsort((-length[point], image))
-    start = np.searchsorted(image[order], np.arange(len(sparse.image_name)))
-    place = np.arange(len(order)) - start[image[order]]
+    first = np.searchsorted(point, np.arange(len(sparse.point_id) + 1))
+    length = np.diff(first)
+    taken = np.zeros(len(sparse.image_name), dtype=np.int64)
     chosen = np.zeros(len(sparse.point_id), dtype=bool)
-    chosen[point[order[place < _TRACKS]]] = True
-    return rows[chosen[point] & (length[point] >= 2)]
+    for index in np.argsort(-length, kind="stable")[: np.count_nonzero(length >= 2)].tolist():
+        seen_in = image[first[index] : first[index + 1]]
+        if taken[seen_in].min() < _TRACKS:
+            chosen[index] = True
+            taken[seen_in] += 1
+    return rows[chosen[point]]
 
 
 def _colours_at(photograph: ByteArray, mask: BoolArray, xy_px: FloatArray) -> FloatArray:

@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 _FEWEST_FOR_PRINCIPAL_POINT = 10
 _FURTHEST_PRINCIPAL_POINT = 0.05  # of the longer side: beyond, the principal point has absorbed other errors
 _ROBUST_ROUNDS = 3
-_STEPS_A_TIME, _MOST_STEPS = 5, 100  # of a round, in short calls: the solver blocks signals while it works
+_MOST_STEPS = 100  # of a round
 _SETTLED = 0.01  # relative change of the residuals' scale
 _LEAST_SCALE_PX = 1e-3  # for observations without noise, which have no tails either
 # Least gain of a step, as a fraction of the cost and times the number of observations; a smaller gain ends the
@@ -77,7 +77,7 @@ def adjust_finally(colmap: Any, model: Any, options: LastAdjustment, progress: P
     least_gain = min(_LEAST_GAIN / model.compute_num_observations(), _LEAST_GAIN_OF_FEW)
     adjustment.ceres.solver_options.function_tolerance = _COARSE * least_gain
     adjustment.ceres.solver_options.num_threads = options.threads
-    adjustment.ceres.solver_options.max_num_iterations = _STEPS_A_TIME
+    adjustment.ceres.solver_options.max_num_iterations = _MOST_STEPS
     with progress.task("last adjustment", _ROBUST_ROUNDS + int(free)) as task:
         if free:
             adjustment.refine_principal_point = _free_principal_point(colmap, model, adjustment)
@@ -91,12 +91,9 @@ def _adjust(colmap: Any, model: Any, adjustment: Any) -> None:
     for image_id in model.reg_image_ids():
         bundle.add_image(image_id)
     bundle.fix_gauge(colmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    for _ in range(_MOST_STEPS // _STEPS_A_TIME):
-        summary = colmap.create_default_bundle_adjuster(adjustment, bundle, model).solve()
-        if not summary.is_solution_usable():
-            raise ConvergenceError(f"the last bundle adjustment found no solution: {summary.brief_report()}")
-        if summary.termination_type != colmap.BundleAdjustmentTerminationType.NO_CONVERGENCE:
-            return
+    summary = colmap.create_default_bundle_adjuster(adjustment, bundle, model).solve()
+    if not summary.is_solution_usable():
+        raise ConvergenceError(f"the last bundle adjustment found no solution: {summary.brief_report()}")
 
 
 def _free_principal_point(colmap: Any, model: Any, adjustment: Any) -> bool:

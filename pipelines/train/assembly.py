@@ -69,11 +69,12 @@ def make_trainer(
     train = torch.from_numpy(scene.train)
     fitted = Exposures(len(images), train, preset.iterations, device) if options.exposure else None
     hold = points_to_hold(training, device) if options.faithful_surface else None
+    beside = None if training.surface is None else training.surface.gaussian_loss(device)
     return JointTrainer(
         GaussianAdam(gaussians, extent_m, preset.iterations),
         _strategy(options, extent_m, len(gaussians)),
         problem.to(device),
-        TrainingViews(scene.train, images, hold, scene.sparse.lenses),
+        TrainingViews(scene.train, images, hold, scene.sparse.lenses, beside),
         rasterizer=backend,
         options=JointOptions(
             preset.iterations,

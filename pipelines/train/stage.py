@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import json
 import logging
+from pathlib import Path
 
 from pipelines.core.products import load_json, save_json
-from pipelines.core.stages import POINTS
+from pipelines.core.stages import LIDAR, LIDAR_MAP, POINTS
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.scene.calibrated import load_survey
 from pipelines.scene.frozen_solution import solve_and_hold
@@ -29,6 +30,7 @@ from pipelines.train.depth_maps import DepthMaps
 from pipelines.train.forecast import forecast_of
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.lidar.prepare import compared_lidar, draw_changes, lidar_surface
+from pipelines.train.lidar.track import ScannerTrack
 from pipelines.train.options import TrainOptions
 from pipelines.train.result import summary_of, trained_model
 from pipelines.train.surface import SceneSurface
@@ -52,6 +54,9 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     workspace = stage.workspace
     clouds = None if options.lidar is None else CloudFiles(options.lidar, options.lidar_stated)
     initial, survey, scene = load_initial_scene(workspace)
+    track = None
+    if options.lidar_trajectory is not None:
+        track = ScannerTrack.read(options.lidar_trajectory, options.lidar_stated, survey.origin)
     options.require_trainable(len(scene.sparse.image_name))
     images = photographs(scene.sparse, survey, workspace, options.effort.max_image_size)
     require_memory(training_size(scene, images, options), free_memory_bytes(device_of(backend)))
@@ -62,7 +67,7 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     compared = None
     if clouds is not None and maps is not None:
         compared = compared_lidar(
-            options, clouds, maps, survey,
+            options, clouds, maps, survey, track=track,
             georeference=initial.geo_from_local, seed=options.seed, progress=stage.progress,
         )  # fmt: skip
     points = GeolocatedPoints.load(workspace.path(POINTS))
@@ -75,10 +80,10 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     if compared is not None and clouds is not None:
         shift = problem.estimate().errors.lidar_m
         shift_m = None if shift is None else shift.detach().cpu().numpy()
-        lidar = lidar_surface(compared, clouds, survey, sigma_m=options.lidar_sigma, shift_m=shift_m)
+        lidar = lidar_surface(compared, clouds, survey, options, shift_m)
         surface = lidar.surface
-        save_json(lidar.report, stage.out / "lidar.json")
-        draw_changes(stage.out / "lidar.png", lidar, scene)
+        save_json(lidar.report, stage.out / Path(LIDAR).name)
+        draw_changes(stage.out / Path(LIDAR_MAP).name, lidar, scene)
     trainer = make_trainer(TrainingScene(scene, images, surface), problem, backend, options)
     record = train_in_folder(stage, trainer, options, _iterations(stage))
     model = trained_model(trainer, scene, initial)

@@ -10,9 +10,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
 from pipelines.geometry.thinning import thin_to_voxels
+from pipelines.splat.gaussians import Gaussians
 from pipelines.train.depth_maps import DepthMaps
 
 _NORMAL_REACH_PX = 3
@@ -48,6 +51,10 @@ class SurfacePoints:
         return SurfacePoints(self.point_in_model[rows], self.rgb[rows], self.normal_in_model[rows])
 
 
+# Returns the loss of Gaussians, of which the visible ones (K,) count.
+GaussianLoss = Callable[[Gaussians, Tensor], Tensor]
+
+
 class SceneSurface:
     """Surface that the depth maps of all training views show together.
 
@@ -81,6 +88,10 @@ class SceneSurface:
     def all_points(self, stride: int) -> FloatArray:
         """Return the surface points (P, 3) in `model` of all training views, of every `stride`-th pixel."""
         return np.concatenate([self.points(index, stride) for index in map(int, self._train)])
+
+    def gaussian_loss(self, device: torch.device) -> GaussianLoss | None:
+        """Return the loss of Gaussians by their places alone, on their device; None: there is none."""
+        return None
 
     def known_share(self) -> float:
         """Return the fraction of the training photographs' pixels whose depth is known, 0 … 1."""

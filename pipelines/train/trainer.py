@@ -28,6 +28,7 @@ from pipelines.train.checkpoint import prefixed, unprefixed
 from pipelines.train.pace import iteration_seconds
 from pipelines.train.region import TrainingRegion
 from pipelines.train.schedule import JointOptions, TrainingSchedule
+from pipelines.train.surface import GaussianLoss
 from pipelines.train.target_images import TargetImage, TargetImages
 
 _UNKNOWNS = {
@@ -50,12 +51,14 @@ class TrainingViews:
         images: all undistorted photographs.
         surface: returns the points in `model`, float32, that an image shows; None: no depth loss.
         lenses: lenses with which the images were undistorted; None: the lenses never change.
+        gaussian_loss: further loss of the visible Gaussians; None: none.
     """
 
     camera: IntArray
     images: ImageCache
     surface: Callable[[int], ObservedPoints] | None = None
     lenses: Lenses | None = None
+    gaussian_loss: GaussianLoss | None = None
 
 
 @dataclass(frozen=True)
@@ -276,6 +279,8 @@ class JointTrainer:
             points = self.views.surface(index)
             depth = depth_loss(render.expected_depth, render.alpha, points, pose, target.camera)
             loss = loss + surface.depth * depth
+        if self.views.gaussian_loss is not None:
+            loss = loss + self.views.gaussian_loss(gaussians, visible)
         late = self.iteration > surface.normals_from * self.options.iterations
         if late and self.iteration % surface.normals_every == 0:
             normals = normal_loss(gaussians, pose, target.camera, self.rasterizer, surface.edge)

@@ -135,6 +135,7 @@ def test_what_is_missing_is_said_with_what_to_do(tmp_path: Path) -> None:
         "georef ingest --test-every 8",
         "train/metrics.jsonl is not there",
         "georef export-raster writes orthophoto",
+        "No LiDAR was used: georef train --lidar",
         "The prediction cannot be compared",
         "There is no map of the predicted σ: the scene has too few points.",
     ):

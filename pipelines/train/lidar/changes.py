@@ -6,7 +6,7 @@
    scanner would have met it.
 3. The neighbours of a point decide with it. A single contradiction is noise, of stereo or cloud.
 4. The confidence of the other points is a product of factors from 0 to 1: stated accuracy against that of stereo,
-   flatness and density of the neighbours, and agreement with the photographs.
+   flatness and density of the neighbours, incidence of the beam, and agreement with the photographs.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ _CELL_PX = 2.0  # least side in pixels, where the photographs decide
 _CELL_POINTS = 1.5  # least side in distances between points, where the cloud decides
 _LEAST_AREA_M2 = 4.0  # that is listed
 _STEREO_PX = 0.3  # σ of stereo, in pixels of the depth maps
+_GRAZING = 0.1  # cosine of incidence: beams that graze a surface mix it with what lies behind
 _SPARSE = 4.0  # distances between points, to the furthest neighbour on a well-scanned surface
 
 
@@ -135,14 +136,15 @@ def _below_surface(cloud: LidarCloud, surface: FloatArray, pixel_m: float) -> Bo
 
 
 def _confidence(cloud: LidarCloud, found: Support, sigma_m: float, pixel_m: float) -> FloatArray:
-    views, through = found.views, found.seen_through
+    views, through, incidence = found.views, found.seen_through, cloud.incidence()
     stereo2, own2 = (_STEREO_PX * pixel_m) ** 2, sigma_m**2
     stated = stereo2 / (stereo2 + own2)
     flat = np.exp(-0.5 * (cloud.roughness_m**2 / (own2 + (0.1 * cloud.voxel_m) ** 2)) / 4)
     dense = np.minimum(1.0, _SPARSE * cloud.voxel_m / np.maximum(cloud.reach_m, 1e-9))
+    beam = np.where(np.isfinite(incidence), 1 - np.exp(-incidence / _GRAZING), 1.0)
     agreement = np.where(views + through > 0, (views + 0.5) / (views + through + 1.0), 0.5)
     off2 = np.nan_to_num(found.mean_normal_m) ** 2 / (9 * (stereo2 + own2))
-    return np.asarray(stated * flat * dense * agreement / (1.0 + off2))
+    return np.asarray(stated * flat * dense * beam * agreement / (1.0 + off2))
 
 
 def _areas(cloud: LidarCloud, marked: BoolArray, kind: Literal["removed", "added"]) -> list[ChangedArea]:

@@ -8,11 +8,12 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from pipelines.core.errors import InputError
-from pipelines.core.progress import Progress
+from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import ByteArray, FloatArray, IntArray
 from pipelines.scene.measured_cloud import CloudFiles, Thinning, read_thinned
 from pipelines.scene.scene import Scene
 from pipelines.scene.survey import Survey
+from pipelines.train.lidar.track import ScannerTrack
 
 _NEIGHBOURS = 12
 _MOST_POINTS = 3_000_000
@@ -33,6 +34,7 @@ class LidarCloud:
         reach_m: (P,) distance to the furthest of these neighbours.
         classification: (P,) class of LAS.
         voxel_m: distance between the points, about.
+        scanner_in_model: (P, 3) the scanner's place at the time of each point; NaN where unknown. None: unknown.
     """
 
     position_in_model: FloatArray
@@ -41,6 +43,7 @@ class LidarCloud:
     reach_m: FloatArray
     classification: ByteArray
     voxel_m: float
+    scanner_in_model: FloatArray | None = None
 
     def __len__(self) -> int:
         """Return the number of points."""
@@ -55,14 +58,32 @@ class LidarCloud:
             self.reach_m[rows],
             self.classification[rows],
             self.voxel_m,
+            None if self.scanner_in_model is None else self.scanner_in_model[rows],
         )
 
     def moved(self, shift: FloatArray) -> LidarCloud:
         """Return the cloud shifted by a vector (3,)."""
-        return replace(self, position_in_model=self.position_in_model + shift)
+        scanner = None if self.scanner_in_model is None else self.scanner_in_model + shift
+        return replace(self, position_in_model=self.position_in_model + shift, scanner_in_model=scanner)
+
+    def incidence(self) -> FloatArray:
+        """Return the cosine of the angle between beam and normal (P,), from 0: grazing; NaN where unknown."""
+        if self.scanner_in_model is None:
+            return np.full(len(self), np.nan)
+        beam = self.scanner_in_model - self.position_in_model
+        along = np.abs(np.einsum("pi,pi->p", beam, self.normal_in_model))
+        return np.asarray(along / np.linalg.norm(beam, axis=1))
 
 
-def read_cloud(files: CloudFiles, scene: Scene, survey: Survey, pixel_m: float, progress: Progress) -> LidarCloud:
+def read_cloud(
+    files: CloudFiles,
+    scene: Scene,
+    survey: Survey,
+    pixel_m: float,
+    *,
+    progress: Progress = SILENT,
+    track: ScannerTrack | None = None,
+) -> LidarCloud:
     """Return the points of the clouds in the scene, as dense as the photographs resolve it.
 
     Args:
@@ -71,9 +92,10 @@ def read_cloud(files: CloudFiles, scene: Scene, survey: Survey, pixel_m: float, 
         survey: has the origin of `geo`.
         pixel_m: size of a pixel of the photographs on the surface.
         progress: shows the points read.
+        track: of the scanner; None: not known.
 
     Raises:
-        InputError: as `read_thinned`, or too few points in the scene.
+        InputError: as `read_thinned` and `ScannerTrack.at`, or too few points in the scene.
     """
     in_geo = scene.geo_from_model.apply(scene.point_in_model)
     low, high = np.quantile(in_geo, [_SCENE_SHARE, 1 - _SCENE_SHARE], axis=0)
@@ -82,8 +104,10 @@ def read_cloud(files: CloudFiles, scene: Scene, survey: Survey, pixel_m: float, 
     cloud = read_thinned(files, survey.origin, Thinning(pixel_m, _MOST_POINTS, low, high), progress)
     if len(cloud) <= 10 * _NEIGHBOURS:
         raise InputError(f"only {len(cloud)} points lie in the scene of the photographs", field="--lidar")
-    position = scene.geo_from_model.inverse().apply(cloud.position_in_geo)
-    return planes_of(position, cloud.classification, cloud.voxel_m)
+    model_from_geo = scene.geo_from_model.inverse()
+    scanner = None if track is None else model_from_geo.apply(track.at(cloud.gps_time_s))
+    planes = planes_of(model_from_geo.apply(cloud.position_in_geo), cloud.classification, cloud.voxel_m)
+    return replace(planes, scanner_in_model=scanner)
 
 
 def planes_of(position: FloatArray, classification: ByteArray, voxel_m: float) -> LidarCloud:

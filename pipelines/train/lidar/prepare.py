@@ -29,10 +29,12 @@ from pipelines.scene.survey import Survey
 from pipelines.train.depth_maps import DepthMaps
 from pipelines.train.lidar.changes import CloudVerdict, verdict
 from pipelines.train.lidar.cloud import LidarCloud, read_cloud
+from pipelines.train.lidar.free_space import free_space
 from pipelines.train.lidar.options import LidarOptions
 from pipelines.train.lidar.planes import plane_term
 from pipelines.train.lidar.registration import Registration, registration
 from pipelines.train.lidar.surface import FusedSurface
+from pipelines.train.lidar.track import ScannerTrack
 from pipelines.train.lidar.views import depth_views, pixel_size_m
 from pipelines.train.surface import SceneSurface
 
@@ -95,6 +97,7 @@ def compared_lidar(
     maps: DepthMaps,
     survey: Survey,
     *,
+    track: ScannerTrack | None,
     georeference: SimilarityRecord,
     seed: int,
     progress: Progress,
@@ -106,6 +109,7 @@ def compared_lidar(
         files: the clouds.
         maps: depth maps of the training views.
         survey: has the origin of `geo`.
+        track: of the scanner; None: not known.
         georeference: initial similarity to `geo`, with covariance.
         seed: of random choices.
         progress: shows the points read.
@@ -114,7 +118,7 @@ def compared_lidar(
         InputError: the cloud lies elsewhere, in height or plan, or is shifted beyond 3 σ.
     """
     pixel_m, views = pixel_size_m(maps), depth_views(maps)
-    cloud = read_cloud(files, maps.scene, survey, pixel_m, progress)
+    cloud = read_cloud(files, maps.scene, survey, pixel_m, progress=progress, track=track)
     shown = SceneSurface(maps).all_points(_STRIDE)
     found = registration_of(cloud, shown, views, seed)
     record = _checked(found, cloud, maps.scene, georeference, options)
@@ -122,7 +126,7 @@ def compared_lidar(
 
 
 def lidar_surface(
-    compared: ComparedLidar, files: CloudFiles, survey: Survey, *, sigma_m: float, shift_m: FloatArray | None
+    compared: ComparedLidar, files: CloudFiles, survey: Survey, options: LidarOptions, shift_m: FloatArray | None
 ) -> LidarSurface:
     """Return the surface of stereo and LiDAR.
 
@@ -130,11 +134,11 @@ def lidar_surface(
         compared: the cloud.
         files: of the cloud, with the numbers of points read and dropped.
         survey: has the origin of `geo`.
-        sigma_m: stated σ of the points.
+        options: of the LiDAR.
         shift_m: (3,) shift of the LiDAR to take out, axes of geo; None: none.
     """
     cloud = compared.cloud if shift_m is None else compared.cloud.moved(-shift_m)
-    judged = verdict(cloud, compared.views, compared.shown, sigma_m=sigma_m, pixel_m=compared.pixel_m)
+    judged = verdict(cloud, compared.views, compared.shown, sigma_m=options.lidar_sigma, pixel_m=compared.pixel_m)
     tally = files.tally
     report = LidarReport(
         crs=files.crs_names,
@@ -151,7 +155,8 @@ def lidar_surface(
         areas=_areas(judged, compared.maps.scene, survey),
         assumptions=files.assumptions,
     )
-    surface = FusedSurface(compared.maps, cloud, judged.confidence, compared.pixel_m)
+    free = free_space(cloud, judged.rejected, compared.shown)
+    surface = FusedSurface(compared.maps, cloud, judged, compared.pixel_m, pull=options.lidar_pull, free=free)
     return LidarSurface(surface, report, judged, cloud)
 
 

@@ -1,0 +1,127 @@
+"""Visibility of surfels: which points of a cloud a camera sees, when each hides what lies behind its disc.
+
+1. A point covers a disc on its plane. The disc is drawn into a depth buffer, pixel by pixel, at the depth of the
+   plane. For discs seen at a grazing angle, the distance from the point's depth is limited to `_SLANT` times the
+   sum of radius and pixel.
+2. A point is seen if no disc at its own pixel is nearer than its own by more than its radius.
+
+Discs grow over silhouettes by their radius: a point close behind an edge counts as hidden.
+"""
+
+# ruff: noqa: PLR0917  (kernels take arrays, not objects)
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from pipelines.core.types import FloatArray, IntArray
+from pipelines.geometry.cameras import Pinhole
+
+_NEAR = 1e-3  # least depth
+_SLANT = 4.0
+_MOST_PX = 12  # limit of a disc's radius
+
+
+@dataclass(frozen=True)
+class Surfels:
+    """P discs.
+
+    Attributes:
+        position: (P, 3) metres.
+        normal: (P, 3) unit vectors with an arbitrary sign.
+        radius_m: (P,).
+    """
+
+    position: FloatArray
+    normal: FloatArray
+    radius_m: FloatArray
+
+
+@dataclass(frozen=True)
+class SeenSurfels:
+    """K discs that a camera sees.
+
+    Attributes:
+        rows: (K,) among all.
+        row, column: (K,) pixels.
+        depth_m: (K,) along the camera's z axis.
+    """
+
+    rows: IntArray
+    row: IntArray
+    column: IntArray
+    depth_m: FloatArray
+
+    def part(self, kept: np.ndarray) -> SeenSurfels:
+        """Return the discs of a mask (K,)."""
+        return SeenSurfels(self.rows[kept], self.row[kept], self.column[kept], self.depth_m[kept])
+
+
+def seen_surfels(surfels: Surfels, cam_from_world: FloatArray, center: FloatArray, camera: Pinhole) -> SeenSurfels:
+    """Return the discs that a camera sees.
+
+    Args:
+        surfels: the discs, in the world.
+        cam_from_world: (3, 3) rotation.
+        center: (3,) camera centre, in the world.
+        camera: the pinhole.
+    """
+    in_cam = (surfels.position - center) @ cam_from_world.T
+    normal = surfels.normal @ cam_from_world.T
+    intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+    pixel, own = np.full(len(in_cam), -1, dtype=np.int64), np.zeros(len(in_cam))
+    nearest = np.full(camera.width * camera.height, np.inf)
+    _draw(in_cam, normal, surfels.radius_m, intrinsics, camera.width, camera.height, nearest, pixel, own)
+    inside = np.flatnonzero(pixel >= 0)
+    rows = inside[own[inside] <= nearest[pixel[inside]] + surfels.radius_m[inside]]
+    row, column = np.divmod(pixel[rows], camera.width)
+    return SeenSurfels(rows, row, column, in_cam[rows, 2])
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _draw(
+    points: Any,
+    normals: Any,
+    radii: Any,
+    intrinsics: Any,
+    width: int,
+    height: int,
+    nearest: Any,
+    pixel: Any,
+    depth_at_pixel: Any,
+) -> None:
+    """Draw discs in camera coordinates into a depth buffer.
+
+    The pixel of each centre inside the image is noted, and the depth of its disc there.
+    """
+    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
+    for p in range(len(points)):
+        x, y, z, radius = points[p, 0], points[p, 1], points[p, 2], radii[p]
+        if z < _NEAR:
+            continue
+        u, v = fx * x / z + cx, fy * y / z + cy
+        reach = min(radius * max(fx, fy) / z, _MOST_PX)
+        if not (u > -reach and u < width + reach and v > -reach and v < height + reach):
+            continue
+        if u >= 0 and u < width and v >= 0 and v < height:
+            pixel[p] = int(v) * width + int(u)
+        limit = _SLANT * (radius + z / min(fx, fy))
+        offset = normals[p, 0] * x + normals[p, 1] * y + normals[p, 2] * z
+        for row in range(max(int(v - reach), 0), min(int(v + reach), height - 1) + 1):
+            for column in range(max(int(u - reach), 0), min(int(u + reach), width - 1) + 1):
+                right, down = column + 0.5 - u, row + 0.5 - v
+                own = row == int(v) and column == int(u)
+                if right * right + down * down > reach * reach and not own:
+                    continue
+                slope_x, slope_y = (column + 0.5 - cx) / fx, (row + 0.5 - cy) / fy
+                along = normals[p, 0] * slope_x + normals[p, 1] * slope_y + normals[p, 2]
+                depth = z if along == 0 else offset / along
+                depth = min(max(depth, z - limit), z + limit)
+                if own:
+                    depth_at_pixel[p] = depth
+                place = row * width + column
+                nearest[place] = min(nearest[place], depth)
