@@ -1,44 +1,152 @@
 """Distance of Gaussians' centres from the points that a user picks, beside that of the rendered surface.
 
-`python examples/benchmarks/centre_picking.py WS` reads an evaluated survey with check points. In each image, the
-centre that is picked is that of the frontmost visible Gaussian within `--reach` pixels of the mark, as in a viewer
-that snaps to centres. Its distance from the surveyed point is compared with the error by model of the report.
+`python examples/benchmarks/centre_picking.py WS` reads an evaluated survey with check points, and its
+`export/splat.ply`. At each mark, a centre is picked as viewers do it:
+
+- `front`: the frontmost centre of an opaque Gaussian within `--reach` pixels of the mark;
+- `nearest`: the centre next to the mark among the opaque ones that lie at most 1 % behind the frontmost;
+- `render`: the centre of the Gaussian at which half of the light of the mark's ray is stopped, in a window whose
+  pixels are `--coarser` times as wide as those of the photograph.
+
+`depth` is the difference, along the camera's z axis, between the centre and the surveyed point. H and V are the
+horizontal and vertical distances between the two. `surface` is that of the trained model, rendered at the
+same marks; the last line is the error by model of the report. All are medians.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from pipelines.core.stages import REPORT
+from pipelines.core.stages import REPORT, SPLAT
+from pipelines.core.types import FloatArray, IntArray
 from pipelines.core.workspace import Workspace
-from pipelines.scene.marks import mark_rays
+from pipelines.deliver.placement import place
+from pipelines.geometry.cameras import Pinhole, pose_matrix
+from pipelines.scene.marks import MarkRays, mark_rays
+from pipelines.scene.points_by_model import depth_around
+from pipelines.scene.renderer import ModelRenderer
 from pipelines.scene.report import read_report
+from pipelines.scene.scene import photographs
 from pipelines.scene.trained_survey import TrainedSurvey, load_trained
+from pipelines.splat.gaussians import Gaussians
+from pipelines.splat.rasterizer.api import ALPHA_MAX, ALPHA_MIN, RasterSettings
+from pipelines.splat.rasterizer.backends import rasterizer
+from pipelines.splat.rasterizer.reference import project_gaussians
+from pipelines.splat.storage import read_gaussians
+from pipelines.splat.transform import transformed
 
 LEAST_OPACITY = 0.5
+NOT_HIDDEN = 1.01  # of the depth of the frontmost centre
+AROUND_PX = 80.0  # Gaussians with their centre further from a mark do not reach it
 
 
-def picked_errors_m(trained: TrainedSurvey, reach_px: float) -> np.ndarray:
-    """Return the distances (K, 2), horizontal and vertical, of the picked centres from the points of all marks."""
-    opaque = torch.sigmoid(trained.gaussians.logit_opacities) >= LEAST_OPACITY
-    centres = trained.gaussians.select(opaque).means.numpy().astype(np.float64)
-    points = trained.survey.check_points
-    rays = mark_rays(points, trained.sparse)
-    errors = []
-    for point, camera, xy in zip(rays.point, rays.camera, rays.xy, strict=True):
-        in_cam = (centres - trained.poses.cam_center_in_model[camera]) @ trained.poses.cam_from_model[camera].T
+@dataclass(frozen=True)
+class Look:
+    """Gaussians as one camera sees them around a mark.
+
+    Attributes:
+        gaussians: all of N.
+        in_cam: (N, 3) their centres.
+        off_px: (N,) distances from the mark, in pixels of the photograph.
+        opaque: (M,) rows of the opaque ones before the camera, within the reach.
+        cam_from_model: (4, 4) pose.
+        camera: of the viewer's window.
+        xy_px: (2,) the mark in the window.
+    """
+
+    gaussians: Gaussians
+    in_cam: FloatArray
+    off_px: FloatArray
+    opaque: IntArray
+    cam_from_model: FloatArray
+    camera: Pinhole
+    xy_px: FloatArray
+
+
+def front(look: Look) -> int | None:
+    """Return the row of the centre that is picked; None: no centre is."""
+    rows = look.opaque
+    return int(rows[np.argmin(look.in_cam[rows, 2])]) if len(rows) else None
+
+
+def nearest(look: Look) -> int | None:
+    """Return the row of the centre that is picked; None: no centre is."""
+    rows, depth = look.opaque, look.in_cam[look.opaque, 2]
+    shown = rows[depth <= NOT_HIDDEN * depth.min()] if len(rows) else rows
+    return int(shown[np.argmin(look.off_px[shown])]) if len(shown) else None
+
+
+def render(look: Look) -> int | None:
+    """Return the row of the centre that is picked; None: the ray meets too few Gaussians."""
+    rows = np.flatnonzero((look.in_cam[:, 2] > RasterSettings().near_m) & (look.off_px < AROUND_PX))
+    rows = rows[np.argsort(look.in_cam[rows, 2])]
+    part = Gaussians(**{name: values[rows].double() for name, values in look.gaussians.tensors().items()})
+    in_cam, pose = torch.from_numpy(look.in_cam[rows]), torch.from_numpy(look.cam_from_model)
+    mean_px, cov_px2 = project_gaussians(part, in_cam, pose, look.camera, RasterSettings().dilation_px2)
+    offset = torch.from_numpy(look.xy_px) - mean_px
+    squared = (offset * torch.linalg.solve(cov_px2, offset)).sum(dim=1)
+    alpha = torch.sigmoid(part.logit_opacities) * torch.exp(-0.5 * squared)
+    light = torch.cumprod(1 - torch.where(alpha < ALPHA_MIN, 0.0, alpha.clamp_max(ALPHA_MAX)), dim=0)
+    stopped = np.flatnonzero(light.numpy() <= 0.5)
+    return int(rows[stopped[0]]) if len(stopped) else None
+
+
+def picked_errors_m(
+    trained: TrainedSurvey,
+    gaussians: Gaussians,
+    rules: list[Callable[[Look], int | None]],
+    reach_px: float,
+    coarser: float,
+) -> FloatArray:
+    """Return errors (rules, K, 3) in depth, horizontally and vertically at all K marks; NaN: nothing is picked."""
+    rays, points = mark_rays(trained.survey.check_points, trained.sparse), trained.survey.check_points
+    true_in_geo = np.array([point.position_in_geo for point in points])[rays.point]
+    centres, geo_from_model = gaussians.means.numpy().astype(np.float64), trained.geo_from_model
+    opaque = torch.sigmoid(gaussians.logit_opacities).numpy() >= LEAST_OPACITY
+    errors = np.full((len(rules), len(rays), 3), np.nan)
+    for camera in np.unique(rays.camera):
+        turn, center = trained.poses.cam_from_model[camera], trained.poses.cam_center_in_model[camera]
+        in_cam = (centres - center) @ turn.T
         focal_px = trained.sparse.camera_of(int(camera)).mean_focal_px
-        off_px = np.linalg.norm(in_cam[:, :2] / np.maximum(in_cam[:, 2:], 1e-6) - xy, axis=1) * focal_px
-        near = np.flatnonzero((in_cam[:, 2] > 0) & (off_px <= reach_px))
-        if len(near):
-            picked = trained.geo_from_model.apply(centres[near[np.argmin(in_cam[near, 2])]][None])[0]
-            away = picked - np.array(points[point].position_in_geo)
-            errors.append([np.hypot(away[0], away[1]), abs(away[2])])
-    return np.array(errors).reshape(-1, 2)
+        window_px = focal_px / coarser
+        pinhole = Pinhole(1, 1, window_px, window_px, 0.0, 0.0)
+        for mark in np.flatnonzero(rays.camera == camera):
+            off_px = focal_px * np.linalg.norm(
+                in_cam[:, :2] / np.maximum(in_cam[:, 2:], 1e-6) - rays.xy[mark], axis=1
+            )
+            rows = np.flatnonzero(opaque & (in_cam[:, 2] > 0) & (off_px <= reach_px))
+            pose, xy_px = pose_matrix(turn, center), window_px * rays.xy[mark]
+            look = Look(gaussians, in_cam, off_px, rows, pose, pinhole, xy_px)
+            true_in_model = geo_from_model.inverse().apply(true_in_geo[mark][None])[0]
+            for number, rule in enumerate(rules):
+                row = rule(look)
+                if row is not None:
+                    away = geo_from_model.apply(centres[row][None])[0] - true_in_geo[mark]
+                    depth_m = geo_from_model.scale * (turn @ (centres[row] - true_in_model))[2]
+                    errors[number, mark] = abs(depth_m), np.hypot(away[0], away[1]), abs(away[2])
+    return errors
+
+
+def surface_errors_m(trained: TrainedSurvey, rays: MarkRays, workspace: Workspace) -> FloatArray:
+    """Return the errors (K,) in depth of the trained model's rendered surface at the marks; NaN: no surface."""
+    images = photographs(trained.sfm, trained.survey, workspace, trained.model.max_image_size)
+    images.build()
+    renderer, poses = ModelRenderer(trained, images, rasterizer("auto")), trained.poses
+    true_in_geo = np.array([point.position_in_geo for point in trained.survey.check_points])[rays.point]
+    true_in_model = trained.geo_from_model.inverse().apply(true_in_geo)
+    errors = np.full(len(rays), np.nan)
+    for mark, (camera, xy) in enumerate(zip(rays.camera, rays.xy, strict=True)):
+        depth_m = depth_around(renderer, int(camera), xy).depth_at(xy)
+        true_m = (poses.cam_from_model[camera] @ (true_in_model[mark] - poses.cam_center_in_model[camera]))[2]
+        if depth_m > 0:
+            errors[mark] = trained.geo_from_model.scale * abs(depth_m - true_m)
+    return errors
 
 
 def main() -> None:
@@ -46,13 +154,26 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("workspace", type=Path)
     parser.add_argument("--reach", type=float, default=2.0, help="pixels of the photograph")
+    parser.add_argument(
+        "--coarser", type=float, default=1.0, help="width of a pixel of the window in the photograph's"
+    )
     arguments = parser.parse_args()
     workspace = Workspace(arguments.workspace)
+    trained = load_trained(workspace)
+    placement = place(trained.model, trained.survey, trained.gaussians.means.numpy())
+    splat = transformed(read_gaussians(workspace.path(SPLAT)), placement.file_from_model.inverse())
+    rules: list[Callable[[Look], int | None]] = [front, nearest, render]
+    print(f"{len(splat)} Gaussians\n{'':8}  marks  depth      H      V  (medians, m)")
+    picked_m = picked_errors_m(trained, splat, rules, arguments.reach, arguments.coarser)
+    for rule, errors in zip(rules, picked_m, strict=True):
+        known = np.isfinite(errors[:, 0])
+        depth_m, horizontal_m, vertical_m = np.median(errors[known], axis=0)
+        print(f"{rule.__name__:8}  {known.sum():5}  {depth_m:.3f}  {horizontal_m:.3f}  {vertical_m:.3f}")
+    rays = mark_rays(trained.survey.check_points, trained.sparse)
+    surface_m = surface_errors_m(trained, rays, workspace)
+    print(f"surface   {np.isfinite(surface_m).sum():5}  {np.nanmedian(surface_m):.3f}")
     by_model = read_report(workspace.path(REPORT)).checkpoints.model
-    picked = picked_errors_m(load_trained(workspace), arguments.reach)
-    print(f"rendered surface: {by_model.count} points, median {by_model.median_h_m:.3f} m H")
-    median_h_m, median_v_m = np.median(picked, axis=0)
-    print(f"picked centres: {len(picked)} marks, median {median_h_m:.3f} m H, {median_v_m:.3f} m V")
+    print(f"by model: {by_model.count} points, median {by_model.median_h_m:.3f} m H")
 
 
 if __name__ == "__main__":

@@ -15,5 +15,6 @@ command = DeliverableCommand(
     Examples:
       georef export-ply flight
       georef export-ply flight --to splat.ply --min-opacity 0.02
+      georef export-ply flight --measurable
     """,
 )

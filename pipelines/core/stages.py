@@ -207,7 +207,7 @@ PIPELINE: tuple[StageSpec, ...] = (
         module="pipelines.deliver.ply",
         options_place="pipelines.deliver.options:ExportPlyOptions",
         folder="export",
-        reads=(MEASURED, *whole(MODEL, GAUSSIANS), APPLIED_RIG),
+        reads=(MEASURED, *whole(MODEL, GAUSSIANS), ProductPart(SPARSE, optional=True), APPLIED_RIG),
         product=SPLAT,
         title="Write the splat as a PLY with its place on Earth.",
     ),

@@ -23,6 +23,24 @@ class SplatOptions(StageOptions):
 class ExportPlyOptions(SplatOptions):
     """Options of the export of the splat as a 3DGS PLY with its sidecar."""
 
+    measurable: bool = Field(
+        False,
+        description="Replace Gaussians on the surface by small discs whose centres lie on it, for viewers that "
+        "measure by centres. The file grows several times.",
+    )
+    disc_spacing: float | None = Field(
+        None,
+        ge=0.001,
+        description="With --measurable: metres between discs (default: 0.7 of the width of a pixel of the training "
+        "photographs on the ground).",
+    )
+    repaint_passes: int = Field(
+        7,
+        ge=0,
+        le=1000,
+        description="With --measurable: how often each training view is shown to the discs, for their colours.",
+    )
+
 
 class WebSplatOptions(SplatOptions):
     """Options of the compressed forms of the splat."""

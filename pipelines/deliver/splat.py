@@ -168,24 +168,32 @@ def _rows_of_blocks(workspace: Workspace, count: int) -> tuple[slice, ...]:
     return tuple(slice(first, last) for first, last in itertools.pairwise(ends))
 
 
-def placed_splat(gaussians: Gaussians, model: TrainedModel, survey: Survey, options: SplatOptions) -> PlacedSplat:
+def placed_splat(
+    gaussians: Gaussians,
+    model: TrainedModel,
+    survey: Survey,
+    options: SplatOptions,
+    replacement: Gaussians | None = None,
+) -> PlacedSplat:
     """Return the opaque Gaussians of a model in an East-North-Up frame at the scene.
 
     Args:
-        gaussians: in the frame `model`.
+        gaussians: of the model, in the frame `model`.
         model: has the similarity geo ← model and its covariance.
         survey: has the origin of geo and the vertical datum.
         options: the least opacity.
+        replacement: other Gaussians of the same scene, in the frame `model`, to be delivered in their place.
 
     Raises:
         DegenerateGeometryError: no Gaussian is opaque enough.
     """
-    opaque = _is_opaque(gaussians.logit_opacities.numpy(), options)
+    delivered = gaussians if replacement is None else replacement
+    opaque = _is_opaque(delivered.logit_opacities.numpy(), options)
     _require_opaque(opaque, options)
-    kept = gaussians.select(torch.from_numpy(opaque))
+    kept = delivered.select(torch.from_numpy(opaque))
     # The placement is that of the model, whatever part of it a file holds.
     placement = place(model, survey, gaussians.means.numpy())
-    return PlacedSplat(transformed(kept, placement.file_from_model), placement, len(gaussians) - len(kept))
+    return PlacedSplat(transformed(kept, placement.file_from_model), placement, len(delivered) - len(kept))
 
 
 def _is_opaque(logit_opacities: Float32Array, options: SplatOptions) -> BoolArray:

@@ -1,0 +1,193 @@
+"""The splat for viewers that measure by the centres of Gaussians: discs on its surface.
+
+A trained Gaussian shows the surface by its front side, far from its centre. A viewer that takes the centre for the
+surface is wrong by a part of the Gaussian's size. So:
+
+1. The surface of the training views is fused to points, as for the point cloud (`scene.surface_cloud`).
+2. A disc lies at each point. Its colour is that of the trained renders.
+3. Gaussians with their centre beside a disc are left out. Others stay: what no surface explains, and what too few
+   views confirm.
+4. Colours and opacities are fitted to the trained renders of the training views; no centre moves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from scipy.spatial import KDTree
+
+from pipelines.core.errors import DegenerateGeometryError, ResourceError
+from pipelines.core.progress import Progress
+from pipelines.core.workspace import StageRun
+from pipelines.deliver.options import ExportPlyOptions
+from pipelines.deliver.splat import SplatFigures
+from pipelines.geometry.cameras import pose_matrix
+from pipelines.geometry.similarity import Similarity
+from pipelines.scene.renderer import ModelRenderer
+from pipelines.scene.scene import photographs
+from pipelines.scene.surface_cloud.fusion import SurfaceCloud, fused_squares, fusion_settings
+from pipelines.scene.surface_cloud.plan import pixel_on_surface_m
+from pipelines.scene.surface_views import SurfaceView, SurfaceViews
+from pipelines.scene.trained_survey import TrainedSurvey, load_trained
+from pipelines.splat.gaussians import Gaussians
+from pipelines.splat.memory import USABLE, TrainingSize, free_memory_bytes, predicted_peak_bytes
+from pipelines.splat.metrics import psnr
+from pipelines.splat.rasterizer.api import RasterSettings
+from pipelines.splat.rasterizer.backends import rasterizer
+from pipelines.splat.repainting import ShownView, repainted, shuffled_passes
+from pipelines.splat.surface_discs import surface_discs
+
+_SPACING_PX = 0.7
+_MIN_VIEWS = 3  # that agree on a point of the surface, as in the point cloud
+_BESIDE = 1.0  # spacings between the centre of a Gaussian and the disc that replaces it
+
+
+@dataclass(frozen=True)
+class MeasurableSplat:
+    """Trained splat for measuring by centres.
+
+    Attributes:
+        gaussians: in `model`: those of the trained model that stay, then the discs.
+        trained: the trained model, with its own Gaussians.
+        discs: number of discs.
+        spacing_m: between neighbouring discs.
+        psnr_change_db: mean over the test views, against the trained model; None without test views.
+    """
+
+    gaussians: Gaussians
+    trained: TrainedSurvey
+    discs: int
+    spacing_m: float
+    psnr_change_db: float | None
+
+    def figures(self, splat: SplatFigures) -> tuple[str, dict[str, object]]:
+        """Return the key figure and the values of the deliverable, from those of every deliverable of the splat."""
+        psnr_text = "" if self.psnr_change_db is None else f", PSNR {self.psnr_change_db:+.2f} dB"
+        values = {
+            **splat.values(),
+            "discs": self.discs,
+            "spacing_m": self.spacing_m,
+            "psnr_change_db": self.psnr_change_db,
+        }
+        return f"{splat.key_figure()}; {self.discs} discs {self.spacing_m:.3f} m apart{psnr_text}", values
+
+
+def measurable_splat(stage: StageRun, options: ExportPlyOptions) -> MeasurableSplat:
+    """Return the trained splat with discs on its surface.
+
+    Args:
+        stage: the run; its folder holds the depth maps meanwhile.
+        options: spacing and passes.
+
+    Raises:
+        MissingProductError: a stage has not been run.
+        InputError: a product or photograph cannot be read, or the disk is too small for the depth maps.
+        ResourceError: the discs do not fit into the memory.
+        DegenerateGeometryError: the views agree on no point.
+    """
+    trained, progress = load_trained(stage.workspace), stage.progress
+    images = photographs(trained.sfm, trained.survey, stage.workspace, trained.model.max_image_size)
+    images.build(progress)
+    backend = rasterizer("auto", progress)
+    renderer = ModelRenderer(trained, images, backend)
+    views = SurfaceViews(renderer, stage.out / "depth_maps", colours=True, confirmed=True, progress=progress)
+    pixel_m = pixel_on_surface_m(views, trained.geo_from_model)
+    if not np.isfinite(pixel_m):
+        raise _no_surface()
+    spacing_m = options.disc_spacing or _SPACING_PX * pixel_m
+    settings = fusion_settings(views, trained.geo_from_model, _MIN_VIEWS, spacing_m)
+    surface = _collected(fused_squares(views, trained.geo_from_model, settings, progress), views, trained)
+    replaced, discs = with_discs(trained.gaussians, surface, trained.geo_from_model, spacing_m)
+    painted = repainted(
+        replaced,
+        lambda number: _shown(views.view(number)),
+        shuffled_passes(len(views), options.repaint_passes, np.random.default_rng(0)),
+        backend,
+        RasterSettings(trained.model.sh_degree, trained.model.background),
+        progress=progress,
+    )
+    views.close()
+    change = _psnr_change_db(
+        renderer, ModelRenderer(replace(trained, gaussians=painted), images, backend), progress
+    )
+    return MeasurableSplat(painted, trained, discs, spacing_m, change)
+
+
+def with_discs(
+    gaussians: Gaussians, surface: SurfaceCloud, geo_from_model: Similarity, spacing_m: float
+) -> tuple[Gaussians, int]:
+    """Return the Gaussians that lie beside no disc, then the discs, and the number of the discs.
+
+    Args:
+        gaussians: in `model`.
+        surface: its points in `geo`.
+        geo_from_model: similarity.
+        spacing_m: between neighbouring points of the surface.
+    """
+    center_in_model = geo_from_model.inverse().apply(surface.position)
+    spacing_in_model = spacing_m / geo_from_model.scale
+    normal_in_model = surface.normal @ geo_from_model.rotation
+    discs = surface_discs(center_in_model, normal_in_model, surface.rgb, spacing_in_model, gaussians.sh_degree)
+    away, _ = KDTree(center_in_model).query(
+        gaussians.means.numpy().astype(np.float64), distance_upper_bound=_BESIDE * spacing_in_model
+    )
+    kept = gaussians.select(torch.from_numpy(np.isinf(away)))
+    return Gaussians.concatenate([kept, discs]), len(discs)
+
+
+def _collected(squares: Iterable[SurfaceCloud], views: SurfaceViews, trained: TrainedSurvey) -> SurfaceCloud:
+    """Return all points with a normal.
+
+    Raises:
+        ResourceError: discs at these points would not fit into the memory.
+        DegenerateGeometryError: there is none.
+    """
+    free_bytes = free_memory_bytes(torch.device("cpu"))
+    largest = max(views.pinholes, key=lambda pinhole: pinhole.width * pinhole.height)
+    parts, count = [], 0
+    for square in squares:
+        known = np.isfinite(square.normal).all(axis=1)
+        parts.append(SurfaceCloud(*(values[known] for values in vars(square).values())))
+        count += len(parts[-1])
+        size = TrainingSize(len(trained.gaussians) + count, largest, trained.gaussians.sh_degree, 0)
+        if free_bytes is not None and predicted_peak_bytes(size) > USABLE * free_bytes:
+            raise ResourceError(
+                f"the memory has no room for the discs on the surface: {count} and more of them need over "
+                f"{USABLE * free_bytes / 2**30:.1f} GiB. Choose a larger --disc-spacing"
+            )
+    if not count:
+        raise _no_surface()
+    names = vars(parts[0])
+    return SurfaceCloud(*(np.concatenate([vars(part)[name] for part in parts]) for name in names))
+
+
+def _no_surface() -> DegenerateGeometryError:
+    return DegenerateGeometryError(
+        f"no point of the surface is seen alike by {_MIN_VIEWS} training views: train longer, or "
+        "leave out --measurable"
+    )
+
+
+def _shown(view: SurfaceView) -> ShownView:
+    assert view.rgb is not None
+    matrix = pose_matrix(view.cam_from_model, view.cam_center_in_model)
+    colour = torch.from_numpy(np.array(view.rgb)).float() / 255
+    return ShownView(torch.as_tensor(matrix, dtype=torch.float32), view.pinhole, colour)
+
+
+def _psnr_change_db(before: ModelRenderer, after: ModelRenderer, progress: Progress) -> float | None:
+    """Return the mean change of PSNR over the test views, masks applied; None without any."""
+    indices, changes = before.trained.indices("test"), []
+    with progress.task("test views", len(indices)) as task:
+        for index in indices:
+            photo = torch.from_numpy(np.array(before.images.image(index))).float() / 255
+            mask = torch.from_numpy(np.array(before.images.mask(index)))
+            was, now = (
+                psnr(renderer.render(index).colour.clamp(0, 1).cpu(), photo, mask) for renderer in (before, after)
+            )
+            changes.append(now - was)
+            task.advance()
+    return float(np.mean(changes)) if changes else None

@@ -1,0 +1,76 @@
+"""Repainting: colours and opacities of Gaussians such that they show given images, while their geometry stays."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pipelines.core.progress import SILENT, Progress
+from pipelines.geometry.cameras import Pinhole
+from pipelines.splat.gaussians import Gaussians
+from pipelines.splat.losses import photometric_loss
+from pipelines.splat.optimizer import GaussianAdam, LearningRates
+from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings
+
+# Rates of a short fit of linear quantities. Gaussians without a rate for their geometry keep it to the last bit.
+_RATES = LearningRates(
+    means=0.0, means_final=0.0, quats_wxyz=0.0, log_scales=0.0, logit_opacities=0.05, sh_dc=0.01, sh_rest=0.002
+)
+_FALLS = ((0.8, 0.1), (0.5, 0.3), (0.0, 1.0))  # from this part of the work on, the rates have this factor
+
+
+@dataclass(frozen=True)
+class ShownView:
+    """Image that the Gaussians should show.
+
+    Attributes:
+        cam_from_model: (4, 4) pose.
+        camera: of H × W pixels.
+        colour: (H, W, 3), 0 … 1.
+    """
+
+    cam_from_model: Tensor
+    camera: Pinhole
+    colour: Tensor
+
+
+def repainted(
+    gaussians: Gaussians,
+    views: Callable[[int], ShownView],
+    order: list[int],
+    rasterizer: Rasterizer,
+    settings: RasterSettings,
+    *,
+    progress: Progress = SILENT,
+) -> Gaussians:
+    """Return the Gaussians with colours and opacities that show the views.
+
+    Args:
+        gaussians: N of them; copied.
+        views: returns a view by its number.
+        order: numbers of the views, one an iteration.
+        rasterizer: backend.
+        settings: degree of the harmonics and background.
+        progress: shows the iterations.
+    """
+    device = torch.device("cuda" if rasterizer.name == "cuda" else "cpu")
+    adam = GaussianAdam(gaussians.to(device), 1.0, len(order), _RATES)
+    with progress.task("repainting", len(order)) as task:
+        for iteration, number in enumerate(order):
+            view = views(number)
+            adam.rate_factor = next(factor for begin, factor in _FALLS if iteration >= begin * len(order))
+            adam.zero_grad()
+            render = rasterizer.render(adam.gaussians, view.cam_from_model.to(device), view.camera, settings)
+            photometric_loss(render.colour, view.colour.to(device)).backward()
+            adam.step(iteration, render.stats.visible)
+            task.advance()
+    return adam.gaussians.detached().to(gaussians.means.device)
+
+
+def shuffled_passes(views: int, passes: int, rng: np.random.Generator) -> list[int]:
+    """Return the numbers of views for a number of passes, each in a random order of its own."""
+    return [int(number) for _ in range(passes) for number in rng.permutation(views)]
