@@ -29,7 +29,7 @@ from pipelines.robust.statistics import median_chi2
 _CHUNK = 2**17  # observations whose points are eliminated together
 _ROUNDS = 15
 _STILL = 5e-4  # change of an exposure that ends the adjustment: an eighth of a grey level
-_ACCURATE = 1e-5  # of a step, relative
+_ACCURATE = 1e-3  # of a step, relative: the next one makes up for it
 _LEAST_SIGMA = 1e-3  # of a colour: rounding to 256 levels
 # σ of the prior: gain of a channel, leak from one channel to another, offset. A colour runs from 0 to 1.
 _GAIN, _LEAK, _OFFSET = 0.5, 0.1, 0.2
