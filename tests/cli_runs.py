@@ -55,9 +55,9 @@ def start(*arguments: object, code: str = WITH_FAKES) -> subprocess.Popen[str]:
     )
 
 
-def finish(process: subprocess.Popen[str]) -> Result:
+def finish(process: subprocess.Popen[str], patience_s: float = 60.0) -> Result:
     """Wait for a process."""
-    out, err = process.communicate(timeout=60)
+    out, err = process.communicate(timeout=patience_s)
     return Result(process.returncode, out, err)
 
 

@@ -9,16 +9,29 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from pipelines.engine.cluster import ClusterAddress, connected
 from pipelines.engine.nodes import make_certificates
-from tests.cli_runs import REPOSITORY
+from tests.cli_runs import REPOSITORY, Result, finish
 
 PATIENCE_S = 180.0
 # Jobs of these clusters are this program in place of `georef`.
 _PRELOAD = "from pipelines.engine import process\nprocess.THIS_PROGRAM = ('-c', {program!r})\n"
+
+
+def finish_patiently(process: subprocess.Popen[str]) -> Result:
+    """Wait for a command on a cluster."""
+    return finish(process, 5 * PATIENCE_S)
+
+
+def wait_until(happened: Callable[[], bool], what: str) -> None:
+    """Wait for something that another process does."""
+    deadline = time.monotonic() + PATIENCE_S
+    while not happened():
+        assert time.monotonic() < deadline, what
+        time.sleep(0.02)
 
 
 class RunningCluster:

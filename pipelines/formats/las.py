@@ -8,10 +8,11 @@ from __future__ import annotations
 from datetime import date
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
+from pipelines.core.types import FloatArray
 from pipelines.formats.cloud_points import CloudPoints
 
 if TYPE_CHECKING:
@@ -30,8 +31,65 @@ _EXTRA = {
 }
 
 
-class LazWriter:
-    """Writer of a LAZ file in chunks; a context manager.
+def laz_header(
+    point_format: int, *, wkt1: str, angular: bool, near: Any, software: str, system: str, written: date
+) -> laspy.LasHeader:
+    """Return the header of a LAZ file (LAS 1.4).
+
+    Args:
+        point_format: number of the format of its points.
+        wkt1: CRS as WKT1.
+        angular: whether the first two coordinates are angles.
+        near: (3,) coordinates near the points; the file counts from these, rounded to integers.
+        software: program that writes.
+        system: origin of the points.
+        written: date.
+    """
+    import laspy
+
+    header = laspy.LasHeader(version="1.4", point_format=point_format)
+    header.scales = np.array([DEGREE_STEP, DEGREE_STEP, METRE_STEP] if angular else [METRE_STEP] * 3)
+    header.offsets = np.round(np.asarray(near, dtype=np.float64))
+    header.generating_software, header.system_identifier = software, system
+    header.creation_date = written
+    header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(wkt1))
+    header.global_encoding.wkt = True
+    return header
+
+
+class LazFile:
+    """LAZ file of single returns that is written in chunks; a context manager."""
+
+    def __init__(self, path: Path, header: laspy.LasHeader) -> None:
+        import laspy
+
+        self._header = header
+        self._writer: laspy.LasWriter = laspy.open(path, mode="w", header=header, do_compress=True)
+
+    def __enter__(self) -> Self:
+        """Return the writer."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Complete the file."""
+        self._writer.close()
+
+    def _record(self, position: FloatArray) -> laspy.ScaleAwarePointRecord:
+        """Return a record of points (P, 3), each of them the only return of its beam."""
+        import laspy
+
+        record = laspy.ScaleAwarePointRecord.zeros(len(position), header=self._header)
+        for column, name in enumerate(("x", "y", "z")):
+            setattr(record, name, position[:, column])
+        record["return_number"][:] = 1
+        record["number_of_returns"][:] = 1
+        return record
+
+
+class LazWriter(LazFile):
+    """Writer of a LAZ file of a surface.
 
     Args:
         path: of the file.
@@ -45,29 +103,15 @@ class LazWriter:
     def __init__(self, path: Path, *, wkt1: str, angular: bool, near: Any, software: str, text: str) -> None:
         import laspy
 
-        header = laspy.LasHeader(version="1.4", point_format=_POINT_FORMAT)
-        header.scales = np.array([DEGREE_STEP, DEGREE_STEP, METRE_STEP] if angular else [METRE_STEP] * 3)
-        header.offsets = np.round(np.asarray(near, dtype=np.float64))
-        header.generating_software, header.system_identifier = software, "photogrammetry"
-        header.creation_date = date.today()
-        header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(wkt1))
-        header.global_encoding.wkt = True
+        system, today = "photogrammetry", date.today()
+        header = laz_header(
+            _POINT_FORMAT, wkt1=wkt1, angular=angular, near=near, software=software, system=system, written=today
+        )
         header.vlrs.append(laspy.VLR(*_TEXT_AREA, "Text Area Description", text.encode("utf-8") + b"\0"))
         header.add_extra_dims(
             [laspy.ExtraBytesParams(name, "f4", description=meaning) for name, meaning in _EXTRA.items()]
         )
-        self._header = header
-        self._writer: laspy.LasWriter = laspy.open(path, mode="w", header=header, do_compress=True)
-
-    def __enter__(self) -> LazWriter:
-        """Return the writer."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Complete the file."""
-        self._writer.close()
+        super().__init__(path, header)
 
     def write(self, points: CloudPoints) -> None:
         """Append points.
@@ -75,16 +119,10 @@ class LazWriter:
         Raises:
             OverflowError: a coordinate is further from `near` than the file's integers reach (2147 km or 2.1°).
         """
-        import laspy
-
-        record = laspy.ScaleAwarePointRecord.zeros(len(points), header=self._header)
-        for column, name in enumerate(("x", "y", "z")):
-            setattr(record, name, points.position[:, column])
+        record = self._record(points.position)
         for column, name in enumerate(("red", "green", "blue")):
             setattr(record, name, points.rgb[:, column].astype(np.uint16) * _RGB16)
         for column, name in enumerate(("nx", "ny", "nz")):
             record[name] = points.normal[:, column]
         record["sigma_h"], record["sigma_v"] = points.sigma_h_m, points.sigma_v_m
-        record["return_number"][:] = 1
-        record["number_of_returns"][:] = 1
         self._writer.write_points(record)

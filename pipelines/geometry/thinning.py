@@ -1,4 +1,4 @@
-"""Thinning of points on a voxel grid whose voxel size varies from point to point."""
+"""Thinning of points on a grid of voxels of one size, or of a size that varies from point to point."""
 
 from __future__ import annotations
 
@@ -7,6 +7,26 @@ import numpy as np
 from pipelines.core.types import FloatArray, IntArray
 
 _SMALLEST_M = 1e-6
+
+
+def voxel_keys(points: FloatArray, side_m: float) -> IntArray:
+    """Return a number (P,) for the voxel of each point, the same for points of one voxel.
+
+    Args:
+        points: (P, 3) metres, P ≥ 1; no axis spans more than 2²¹ voxels.
+        side_m: side of the voxels.
+    """
+    voxel = np.floor(points / side_m).astype(np.int64)
+    voxel -= voxel.min(axis=0)
+    extent = voxel.max(axis=0) + 1
+    return np.asarray((voxel[:, 0] * extent[1] + voxel[:, 1]) * extent[2] + voxel[:, 2])
+
+
+def first_of_voxels(points: FloatArray, side_m: float) -> IntArray:
+    """Return ascending rows of the first point in each voxel; arguments as for `voxel_keys`, or no points."""
+    if not len(points):
+        return np.zeros(0, dtype=np.int64)
+    return np.sort(np.unique(voxel_keys(points, side_m), return_index=True)[1])
 
 
 def thin_to_voxels(points: FloatArray, side_m: FloatArray) -> IntArray:

@@ -24,6 +24,7 @@ from pipelines.formats.cloud_ply_reader import open_cloud_ply
 from pipelines.formats.las_reader import open_las
 from pipelines.geodesy.crs import PointCrs, parse_crs
 from pipelines.geodesy.enu import Origin, ecef_from_lla, enu_from_ecef
+from pipelines.geometry.thinning import voxel_keys
 from pipelines.scene.cloud_options import CLOUD_SUFFIXES, CloudCrs
 
 log = logging.getLogger(__name__)
@@ -227,10 +228,8 @@ def _thinned(parts: list[MeasuredCloud], voxel_m: float) -> MeasuredCloud:
     if not (high - low < _KEY_SIDE * voxel_m).all():
         reach_m = float((high - low).max())
         raise InputError(f"points {reach_m / 1000:.0f} km apart do not fit into voxels of {voxel_m:g} m")
-    voxel = np.floor(position / voxel_m).astype(np.int64)
-    voxel -= voxel.min(axis=0)
-    key = (voxel[:, 0] << 42) | (voxel[:, 1] << 21) | voxel[:, 2]
-    _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
+    keys = voxel_keys(position, voxel_m)
+    _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
     weight = np.bincount(inverse, np.concatenate([part.weight for part in parts])).astype(np.int64)
     order = np.argsort(first)
     rows = first[order]

@@ -8,8 +8,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -17,7 +15,7 @@ import pytest
 from pipelines.core.workspace import Workspace
 from tests import fakes
 from tests.cli_runs import Result, start
-from tests.clusters import PATIENCE_S, RunningCluster, running_cluster
+from tests.clusters import RunningCluster, finish_patiently, running_cluster, wait_until
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")]
 
@@ -61,19 +59,6 @@ def batch(cluster: RunningCluster, missions: Path, *more: str) -> subprocess.Pop
     return start("batch", missions, "--to", "train", "--json", *cluster.words, *more, code=PLAIN)
 
 
-def finish(process: subprocess.Popen[str]) -> Result:
-    """Wait for a batch."""
-    out, err = process.communicate(timeout=5 * PATIENCE_S)
-    return Result(process.returncode, out, err)
-
-
-def wait_until(happened: Callable[[], bool], what: str) -> None:
-    deadline = time.monotonic() + PATIENCE_S
-    while not happened():
-        assert time.monotonic() < deadline, what
-        time.sleep(0.05)
-
-
 def assert_complete(ended: Result, missions: Path, *names: str, again: int) -> None:
     """Each mission has taken every step, and at most `again` of them twice."""
     assert ended.code == 0, ended.err
@@ -92,7 +77,7 @@ def test_killed_workers(tmp_path: Path) -> None:
         wait_until(lambda: all(len(steps_of(missions / name)) > 3 for name in "ab"), "two begin")
         for worker in cluster.worker_processes():
             os.kill(worker, signal.SIGKILL)
-        ended = finish(process)
+        ended = finish_patiently(process)
     assert_complete(ended, missions, "a", "b", "c", again=1)
     assert ended.err.count("its worker was lost") == 2
 
@@ -108,7 +93,7 @@ def test_killed_engine(tmp_path: Path) -> None:
         wait_until(lambda: all(Workspace(missions / name).writer() is None for name in "abc"), "the jobs stop")
         missing = [name for name in "abc" if len(steps_of(missions / name)) < STEPS]
         assert "c" in missing and len(missing) < 3
-        ended = finish(batch(cluster, missions))
+        ended = finish_patiently(batch(cluster, missions))
     assert_complete(ended, missions, "a", "b", "c", again=1)
     states = {row["mission"]: row["state"] for row in ended.document["missions"]}
     assert [name for name in "abc" if states[name] == "done"] == missing
@@ -121,14 +106,14 @@ def test_killed_scheduler(tmp_path: Path) -> None:
         process = batch(cluster, missions)
         wait_until(lambda: len(steps_of(missions / "c")) > 3, "the third begins when one has ended")
         cluster.scheduler.kill()
-        lost = finish(process)
+        lost = finish_patiently(process)
         lost.assert_failed(1)
         assert lost.document["error"]["code"] == "cluster" and "the scheduler is lost" in lost.err
         table = json.loads((missions / "missions.batch.json").read_text("utf-8"))
         assert {row["state"] for row in table["missions"]} == {"done", "interrupted"}
         wait_until(lambda: all(Workspace(missions / name).writer() is None for name in "abc"), "the jobs stop")
         cluster.restart()
-        ended = finish(batch(cluster, missions))
+        ended = finish_patiently(batch(cluster, missions))
     assert_complete(ended, missions, "a", "b", "c", again=1)
 
 
@@ -141,7 +126,7 @@ def test_a_worker_that_closes_hands_its_job_on(tmp_path: Path) -> None:
         cluster.start_worker("late")
         cluster.wait_for_workers(2)
         cluster.workers[0].send_signal(signal.SIGTERM)
-        ended = finish(process)
+        ended = finish_patiently(process)
     assert_complete(ended, missions, "a", again=0)
 
 
@@ -153,7 +138,7 @@ def test_a_mission_that_always_crashes_is_named(tmp_path: Path) -> None:
     )
     missions = write_missions(tmp_path / "missions", "a", "b", "c")
     with running_cluster(tmp_path, crashing) as cluster:
-        ended = finish(batch(cluster, missions))
+        ended = finish_patiently(batch(cluster, missions))
     assert ended.code == 1
     rows = {row["mission"]: row for row in ended.document["missions"]}
     assert {name: row["state"] for name, row in rows.items()} == {"a": "done", "b": "failed", "c": "done"}
@@ -166,11 +151,11 @@ def test_ctrl_c_keeps_the_work(tmp_path: Path) -> None:
         process = batch(cluster, missions)
         wait_until(lambda: all(len(steps_of(missions / name)) > 3 for name in "ab"), "both begin")
         process.send_signal(signal.SIGINT)
-        stopped = finish(process)
+        stopped = finish_patiently(process)
         assert stopped.code == 130, stopped.err
         table = json.loads((missions / "missions.batch.json").read_text("utf-8"))
         assert [row["state"] for row in table["missions"]] == ["interrupted"] * 2
-        ended = finish(batch(cluster, missions))
+        ended = finish_patiently(batch(cluster, missions))
     assert_complete(ended, missions, "a", "b", again=1)
     with contextlib.suppress(FileNotFoundError):
         assert not [path for path in missions.iterdir() if path.name.startswith(".georef")]
@@ -189,10 +174,10 @@ def test_files_go_through_a_storage(tmp_path: Path) -> None:
         process.communicate()
         wait_until(lambda: not list(scratch.glob("**/train.partial")), "the jobs stop")
         assert not (missions / "one").exists()
-        ended = finish(batch(cluster, listed, *store))
+        ended = finish_patiently(batch(cluster, listed, *store))
         assert not list(scratch.glob("**/ingest")), "nothing is left on the workers"
     assert_complete(ended, missions, "one", "two", again=0)
     made = Workspace(missions / "one")
     assert made.requests()["ingest"]["images"] == str(missions / "a/images"), "paths of this machine"
-    planned = finish(start("batch", listed, "--to", "train", "--dry-run", "--json", code=PLAIN)).document
+    planned = finish_patiently(start("batch", listed, "--to", "train", "--dry-run", "--json", code=PLAIN)).document
     assert all(set(row["stages"].values()) == {"keep"} for row in planned["missions"])

@@ -7,8 +7,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -19,7 +17,7 @@ from pipelines.core.workspace import Workspace
 from pipelines.scene.block_record import BlockRecord
 from tests.block_scenes import make_field, write_field
 from tests.cli_runs import Result, start
-from tests.clusters import PATIENCE_S, RunningCluster, running_cluster
+from tests.clusters import RunningCluster, finish_patiently, running_cluster, wait_until
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")]
 
@@ -38,18 +36,6 @@ def field(tmp_path: Path) -> Workspace:
 
 def blocks(cluster: RunningCluster, field: Workspace) -> subprocess.Popen[str]:
     return start("blocks", field.root, *OPTIONS, *cluster.words, code=PLAIN)
-
-
-def finish(process: subprocess.Popen[str]) -> Result:
-    out, err = process.communicate(timeout=5 * PATIENCE_S)
-    return Result(process.returncode, out, err)
-
-
-def wait_until(happened: Callable[[], bool], what: str) -> None:
-    deadline = time.monotonic() + PATIENCE_S
-    while not happened():
-        assert time.monotonic() < deadline, what
-        time.sleep(0.02)
 
 
 def begun(field: Workspace) -> dict[int, int]:
@@ -88,7 +74,7 @@ def test_a_killed_worker_loses_no_more_than_a_checkpoint(tmp_path: Path, field: 
         for worker in cluster.worker_processes():
             os.kill(worker, signal.SIGKILL)
         done = begun(field)
-        ended = finish(process)
+        ended = finish_patiently(process)
     assert_complete(ended, field)
     assert ended.err.count("its worker was lost") == 2
     for number, iteration in done.items():
@@ -105,7 +91,7 @@ def test_a_killed_driver_leaves_only_what_is_missing(tmp_path: Path, field: Work
         in_training = [Workspace(field.root / f"blocks/{number}") for number in begun(field)]
         wait_until(lambda: all(block.writer() is None for block in in_training), "the jobs stop")
         kept, stopped = finished(field), begun(field)
-        ended = finish(blocks(cluster, field))
+        ended = finish_patiently(blocks(cluster, field))
     assert_complete(ended, field)
     assert kept.items() <= finished(field).items(), "a finished block was trained again"
     assert all(len(resumed(field, number)) == 1 for number in stopped)
@@ -115,7 +101,7 @@ def test_a_block_that_always_crashes_is_named(tmp_path: Path, field: Workspace) 
     """The others finish, and the exit code is 1."""
     crashing = f"import os, sys\nif '--id 2' in ' '.join(sys.argv): os.abort()\n{PLAIN}"
     with running_cluster(tmp_path, crashing) as cluster:
-        ended = finish(blocks(cluster, field))
+        ended = finish_patiently(blocks(cluster, field))
     ended.assert_failed(1)
     assert "block 2" in ended.err and "failed 3 times" in ended.err and "SIGABRT" in ended.err
     assert sorted(finished(field)) == [0, 1, 3]

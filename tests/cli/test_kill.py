@@ -155,8 +155,7 @@ def _asked(survey: Path) -> tuple[str, ...]:
 
 def _finish(process: subprocess.Popen[str]) -> Result:
     """Wait for a process that may have to compile kernels first."""
-    out, err = process.communicate(timeout=240)
-    return Result(process.returncode, out, err)
+    return finish(process, 240.0)
 
 
 def _wait_for(process: subprocess.Popen[str], workspace: Workspace, pattern: str) -> None:

@@ -29,8 +29,9 @@ from pipelines.evaluate.reference.figures import THRESHOLDS_M, CoreTable, Distan
 from pipelines.evaluate.reference.m3c2 import require_m3c2
 from pipelines.evaluate.reference.normals import plane_normals
 from pipelines.evaluate.reference.seen import SeenSurface, Viewpoints, seen_surface
-from pipelines.evaluate.reference.tiles import TiledPoints, first_of_voxels
+from pipelines.evaluate.reference.tiles import TiledPoints
 from pipelines.geometry.similarity import Similarity
+from pipelines.geometry.thinning import first_of_voxels
 from pipelines.scene.cloud_options import CloudCrs
 from pipelines.scene.measured_cloud import CloudFiles, MeasuredCloud, Thinning, read_thinned
 from pipelines.scene.reference_report import ReferenceComparison

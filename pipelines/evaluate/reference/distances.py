@@ -12,7 +12,8 @@ from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.evaluate.reference.m3c2 import m3c2
 from pipelines.evaluate.reference.normals import plane_normals
 from pipelines.evaluate.reference.seen import SeenSurface
-from pipelines.evaluate.reference.tiles import Square, TiledPoints, first_of_voxels
+from pipelines.evaluate.reference.tiles import Square, TiledPoints
+from pipelines.geometry.thinning import first_of_voxels
 
 CLASSES = ("other", "ground", "roof", "wall", "vegetation")
 SLOPES = ("0–15°", "15–45°", "45–75°", "75–90°")

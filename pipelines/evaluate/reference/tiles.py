@@ -86,14 +86,3 @@ class TiledPoints:
 
     def _path(self, square: Square) -> Path:
         return self._folder / f"{square[0]}_{square[1]}.points"
-
-
-def first_of_voxels(position: FloatArray, side_m: float) -> NDArray[np.intp]:
-    """Return the rows of the first point in each voxel, ascending."""
-    if not len(position):
-        return np.zeros(0, dtype=np.intp)
-    voxel = np.floor(position / side_m).astype(np.int64)
-    voxel -= voxel.min(axis=0)
-    extent = voxel.max(axis=0) + 1
-    key = (voxel[:, 0] * extent[1] + voxel[:, 1]) * extent[2] + voxel[:, 2]
-    return np.sort(np.unique(key, return_index=True)[1])

@@ -13,6 +13,7 @@ from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import ByteArray, FloatArray
 from pipelines.geometry.depth_support import Support
 from pipelines.geometry.similarity import Similarity
+from pipelines.geometry.thinning import voxel_keys
 from pipelines.scene.surface_cloud.candidates import Candidates, Look, Square, candidates_in
 from pipelines.scene.surface_cloud.plan import pixel_on_surface_m, plan_squares
 from pipelines.scene.surface_views import SurfaceViews
@@ -157,10 +158,7 @@ def _voxel_means(side_m: float, position: FloatArray, *values: NDArray[Any]) -> 
     """Return the means of values (P, …) over the voxels that hold points (P, 3): (V, …) each."""
     if not len(position):
         return [np.zeros(value.shape) for value in values]
-    voxel = np.floor(position / side_m).astype(np.int64)
-    voxel -= voxel.min(axis=0)
-    extent = voxel.max(axis=0) + 1
-    key = (voxel[:, 0] * extent[1] + voxel[:, 1]) * extent[2] + voxel[:, 2]
+    key = voxel_keys(position, side_m)
     order = np.argsort(key, kind="stable")
     first = np.flatnonzero(np.diff(key[order], prepend=-1))
     count = np.diff(first, append=len(key))
