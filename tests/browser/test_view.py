@@ -46,10 +46,16 @@ class Opened:
         assert camera is not None
         return camera
 
+    @property
+    def shown(self) -> tuple[int, int]:
+        """Width and height of the picture on the page: viser draws it coarser while the machine is busy."""
+        camera = self.camera
+        return round(camera.width * SIZE["height"] / camera.height), SIZE["height"]
+
     def pixel(self, point_in_geo: np.ndarray) -> tuple[float, float]:
         """Return where a point is on the page."""
-        camera = self.camera
-        pinhole = camera.pinhole(camera.width, camera.height)
+        camera, (width, height) = self.camera, self.shown
+        pinhole = camera.pinhole(width, height)
         x, y, z = camera.rotation.T @ (self.viewer.signs.place(point_in_geo) - camera.position)
         return pinhole.fx * x / z + pinhole.cx, pinhole.fy * y / z + pinhole.cy
 
@@ -119,14 +125,14 @@ def test_picture_is_the_render(hill: Opened) -> None:
     for kind in ("cameras", "points", "errors", "tie points"):
         hill.viewer.signs.show(kind, visible=False)  # type: ignore[arg-type]
     time.sleep(2.0)
-    camera = hill.camera
-    expected = hill.viewer.painter.paint(camera, camera.width, camera.height).rgb
-    png = hill.page.screenshot(clip={"x": 0, "y": 0, "width": camera.width, "height": camera.height})
+    width, height = hill.shown
+    expected = hill.viewer.painter.paint(hill.camera, width, height).rgb
+    png = hill.page.screenshot(clip={"x": 0, "y": 0, "width": width, "height": height})
     shown = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)[..., ::-1] / 255.0
     for kind in ("cameras", "points", "errors"):
         hill.viewer.signs.show(kind, visible=True)  # type: ignore[arg-type]
     # The lower half: viser's messages lie over the upper one.
-    ours, theirs = expected[camera.height // 2 :] / 255.0, shown[camera.height // 2 :]
+    ours, theirs = expected[height // 2 :] / 255.0, shown[height // 2 :]
     exposure = float((ours * theirs).sum() / (theirs * theirs).sum())
     assert ours.std() > 0.05
     assert -10 * np.log10(np.mean((exposure * theirs - ours) ** 2)) > 25  # of a JPEG; 20 are asked for
