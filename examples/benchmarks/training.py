@@ -2,8 +2,8 @@
 
 `scaling` prints time and memory of an iteration (projection, harmonics, binning, blending, loss with SSIM,
 backward, optimiser, density statistics) against Gaussians and pixels, over the made-up scene of raster.py. `curve`
-trains on a workspace with each strategy and prints PSNR on its test views against wall-clock time; the time that
-measuring takes does not count.
+trains on a workspace with each strategy and limit of Gaussians, and prints PSNR of training views (exposures
+applied) and test views against time; the time that measuring takes does not count.
 """
 
 from __future__ import annotations
@@ -14,17 +14,21 @@ import statistics
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 # As the command line does, and for the same reason: see georef_cli/main.py.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
+import cv2
 import numpy as np
 import torch
 from raster import make_scene
 
 from pipelines.core.products import load_json
 from pipelines.core.stages import SIM3, SPARSE
+from pipelines.core.types import IntArray
 from pipelines.core.workspace import Workspace
 from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.cameras import Pinhole
@@ -106,45 +110,67 @@ def trainer_on(root: Path, options: TrainOptions) -> tuple[JointTrainer, Scene, 
 
 
 def curve(arguments: argparse.Namespace) -> None:
-    """Print PSNR on the test views against time, for each strategy."""
-    print("strategy   seconds  iteration  gaussians  test PSNR dB")
-    for strategy in arguments.strategies:
+    """Print PSNR on training and test views against time, for each strategy and limit of Gaussians."""
+    print("strategy   processor s  seconds  iteration  gaussians  train PSNR dB  test PSNR dB")
+    for strategy, most in product(arguments.strategies, arguments.max_gaussians):
         config = TrainOptions.model_validate(
             {
                 "preset": "standard",
                 "strategy": strategy,
                 "iterations": arguments.iterations,
                 "max_image_size": arguments.max_image_size,
-                "max_gaussians": arguments.max_gaussians,
+                "max_gaussians": most,
                 "backend": arguments.backend,
                 "faithful_surface": arguments.faithful_surface,
             }
         )
         trainer, scene, images = trainer_on(arguments.workspace, config)
-        seconds, device = 0.0, arguments.backend
+        seconds, processor_s, device = 0.0, 0.0, arguments.backend
         while trainer.iteration < arguments.iterations and seconds < arguments.seconds:
-            start = now(device)
+            start, worked = now(device), time.process_time()
             trainer.step()
-            seconds += now(device) - start
+            seconds, processor_s = seconds + now(device) - start, processor_s + time.process_time() - worked
             if trainer.iteration % arguments.every == 0 or trainer.iteration == arguments.iterations:
-                count, quality = len(trainer.optimizer.gaussians), psnr_of_test_views(trainer, scene, images)
+                views = ViewQuality(trainer, images, arguments.look)
                 print(
-                    f"{strategy:8s} {seconds:9.1f} {trainer.iteration:10d} {count:10d} {quality:13.2f}", flush=True
+                    f"{strategy:8s} {processor_s:13.1f} {seconds:8.1f} {trainer.iteration:10d}"
+                    f" {len(trainer.optimizer.gaussians):10d} {views.psnr(scene.train, exposed=True):14.2f}"
+                    f" {views.psnr(scene.test):13.2f}",
+                    flush=True,
                 )
 
 
-@torch.no_grad()
 def psnr_of_test_views(trainer: JointTrainer, scene: Scene, images: ImageCache) -> float:
     """Mean over the test views of the renders as they are, without exposure."""
-    values, settings = [], RasterSettings(sh_degree=trainer.options.sh_degree)
-    for index in map(int, scene.test):
-        pose = trainer.problem.cameras.cam_from_model(index)
-        colour = trainer.rasterizer.render(
-            trainer.optimizer.gaussians, pose, trainer.pinhole(index), settings
-        ).colour
-        photo = torch.from_numpy(np.array(images.image(index))).float() / 255.0
-        values.append(psnr(colour.cpu(), photo, torch.from_numpy(np.array(images.mask(index)))))
-    return statistics.fmean(values)
+    return ViewQuality(trainer, images).psnr(scene.test)
+
+
+@dataclass(frozen=True)
+class ViewQuality:
+    """Renders of whole photographs against them; pairs of both are drawn into a folder, if there is one."""
+
+    trainer: JointTrainer
+    images: ImageCache
+    look: Path | None = None
+
+    @torch.no_grad()
+    def psnr(self, views: IntArray, *, exposed: bool = False) -> float:
+        """Mean over views (V,) of the renders, with the exposure of their photographs or as they are."""
+        return statistics.fmean(self._psnr(index, exposed=exposed) for index in map(int, views))
+
+    def _psnr(self, index: int, *, exposed: bool) -> float:
+        trainer, settings = self.trainer, RasterSettings(sh_degree=self.trainer.options.sh_degree)
+        pose, pinhole = trainer.problem.cameras.cam_from_model(index), trainer.pinhole(index)
+        colour = trainer.rasterizer.render(trainer.optimizer.gaussians, pose, pinhole, settings).colour
+        if exposed and trainer.exposures is not None:
+            colour = trainer.exposures.apply(index, colour)
+        photo = torch.from_numpy(np.array(self.images.image(index))).float() / 255.0
+        colour = colour.cpu().clamp(0, 1)
+        if self.look is not None:
+            self.look.mkdir(parents=True, exist_ok=True)
+            pair = torch.cat([photo, colour], dim=1).mul(255).round().byte().numpy()
+            cv2.imwrite(str(self.look / f"{index:04d}.png"), pair[..., ::-1])
+        return psnr(colour, photo, torch.from_numpy(np.array(self.images.mask(index))))
 
 
 def now(device: str) -> float:
@@ -173,14 +199,15 @@ def main() -> None:
     table.add_argument("--visible", type=float, default=1 / 3, help="fraction within the image")
     table.add_argument("--repeats", type=int, default=7)
     table.set_defaults(run=scaling)
-    time_line = modes.add_parser("curve", help="PSNR against wall-clock time for each strategy")
+    time_line = modes.add_parser("curve", help="PSNR against time for each strategy and limit of Gaussians")
     time_line.add_argument("workspace", type=Path, help="with init-sim3 done")
     time_line.add_argument("--strategies", nargs="+", default=["default", "mcmc", "fast"])
     time_line.add_argument("--iterations", type=int, default=4000, help="length of the schedule")
     time_line.add_argument("--seconds", type=float, default=600.0, help="stop each training after so long")
     time_line.add_argument("--every", type=int, default=500, help="iterations between measurements")
     time_line.add_argument("--max-image-size", type=int, default=600)
-    time_line.add_argument("--max-gaussians", type=int, default=80_000)
+    time_line.add_argument("--max-gaussians", type=int, nargs="+", default=[80_000])
+    time_line.add_argument("--look", type=Path, help="folder for photographs beside their renders")
     time_line.add_argument("--faithful-surface", action=argparse.BooleanOptionalAction, default=True)
     time_line.set_defaults(run=curve)
     arguments = parser.parse_args()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from pipelines.core.durable import replace_file
 from pipelines.core.errors import InputError
 from pipelines.core.progress import SILENT, Progress
-from pipelines.core.types import BoolArray, ByteArray, Float32Array
+from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray
 from pipelines.formats.image_file import read_bytes, require_unchanged
 from pipelines.geometry.cameras import Camera, Pinhole, distort, undistort
 
@@ -25,6 +26,7 @@ log = logging.getLogger(__name__)
 # Width of the edge that the mask leaves out: interpolation there needs pixels from beyond the photograph.
 _EDGE_PX = 0.5
 _SAME_RAY = 1e-6  # of normalised coordinates
+_BAND_PX = 1_000_000  # pixels whose distortion is computed at once, in two hundred bytes each
 
 
 @dataclass(frozen=True)
@@ -54,8 +56,8 @@ def _focal_and_centre(camera: Camera) -> tuple[float, float, float, float]:
 class ImageCache:
     """Undistorted images on disk: uint8 RGB arrays, made once and mapped into memory on access.
 
-    Memory does not grow with their number. Only the last distortion map stays in memory; the masks, one for each
-    camera, are stored beside the images.
+    Memory does not grow with their number. Only the last distortion map stays in memory, until all images are
+    built. Masks, one for each camera, and shrunken images are stored beside the images.
 
     Args:
         folder: folder of the arrays.
@@ -87,6 +89,7 @@ class ImageCache:
                 if not self._path(index).exists():
                     self._write(index)
                 task.advance()
+        self._last_map = None
 
     def image(self, index: int) -> ByteArray:
         """Return the RGB values (H, W, 3) of an image, mapped from disk; a missing or damaged file is made again.
@@ -94,14 +97,38 @@ class ImageCache:
         Raises:
             InputError: the photograph cannot be read, or has another size than its camera.
         """
-        path = self._path(index)
+        return self._mapped(self._path(index), lambda: self._write(index))
+
+    def shrunken(self, index: int, shrink: int) -> ByteArray:
+        """Return the RGB values (H // s, W // s, 3) of a shrunken image, mapped from disk; each is made once.
+
+        Args:
+            index: of the image.
+            shrink: s: each pixel is the mean of s × s pixels.
+
+        Raises:
+            InputError: the photograph cannot be read, or has another size than its camera.
+        """
+        if shrink == 1:
+            return self.image(index)
+
+        def write() -> None:
+            image = self.image(index)
+            height, width = (side // shrink for side in image.shape[:2])
+            blocks = image[: height * shrink, : width * shrink]
+            save_array(path, cv2.resize(blocks, (width, height), interpolation=cv2.INTER_AREA))
+
+        path = self._folder / f"{self.key(index)}.{shrink}.npy"
+        return self._mapped(path, write)
+
+    def _mapped(self, path: Path, write: Callable[[], None]) -> ByteArray:
         if not path.exists():
-            self._write(index)
+            write()
         try:
             return self._open(path)
         except (ValueError, EOFError):  # truncated by a full disk or a power failure
             log.warning("%s is damaged and made again", path)
-            self._write(index)
+            write()
             return self._open(path)
 
     def mask(self, index: int) -> BoolArray:
@@ -183,7 +210,17 @@ def save_array(path: Path, array: NDArray[Any]) -> None:
 
 
 def _distortion_map(camera: Camera, pinhole: Pinhole) -> tuple[Float32Array, BoolArray]:
-    u, v = np.meshgrid(np.arange(pinhole.width) + 0.5, np.arange(pinhole.height) + 0.5)
+    source = np.empty((pinhole.height, pinhole.width, 2), dtype=np.float32)
+    inside = np.empty((pinhole.height, pinhole.width), dtype=bool)
+    rows = max(1, _BAND_PX // pinhole.width)
+    for top in range(0, pinhole.height, rows):
+        band = slice(top, min(top + rows, pinhole.height))
+        source[band], inside[band] = _distortion_of_rows(camera, pinhole, band)
+    return source, inside
+
+
+def _distortion_of_rows(camera: Camera, pinhole: Pinhole, rows: slice) -> tuple[FloatArray, BoolArray]:
+    u, v = np.meshgrid(np.arange(pinhole.width) + 0.5, np.arange(rows.start, rows.stop) + 0.5)
     ray = np.stack([(u - pinhole.cx) / pinhole.fx, (v - pinhole.cy) / pinhole.fy], axis=-1)
     full = distort(camera, ray)
     # Beyond its fold a lens polynomial leads back into the picture, to the pixel of another ray.
@@ -194,5 +231,4 @@ def _distortion_map(camera: Camera, pinhole: Pinhole) -> tuple[Float32Array, Boo
     limit = np.array([pinhole.width, pinhole.height]) - _EDGE_PX
     inside = own & ((small >= _EDGE_PX) & (small <= limit)).all(axis=-1)
     # cv2 counts from the centre of the first pixel, and is slow to reflect pixels far outside.
-    source = np.clip(np.nan_to_num(small - 0.5), -limit, 2 * limit)
-    return source.astype(np.float32), inside
+    return np.clip(np.nan_to_num(small - 0.5), -limit, 2 * limit), inside

@@ -147,7 +147,8 @@ class DefaultStrategy:
         self._gradient_sum = self._gradient_sum.to(length.device)
         self._observations = self._observations.to(length.device)
         self._gradient_sum.index_add_(0, stats.visible, length)
-        self._observations.index_add_(0, stats.visible, torch.ones_like(length))
+        counted = torch.ones_like(length) if stats.counted is None else stats.counted.to(length)
+        self._observations.index_add_(0, stats.visible, counted)
 
     def update(self, iteration: int, optimizer: GaussianAdam, probe: Probe | None = None) -> DensityEdit:
         """See `Strategy.update`."""

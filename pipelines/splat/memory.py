@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -19,6 +19,8 @@ _FLOAT = 4
 _COPIES = 10
 # Photograph, mask, render, loss, their gradients and the exposure's: floats a pixel.
 _IMAGE_FLOATS = 45
+# A photograph before the training: decoded, shrunken, undistorted, its mask and the place of each pixel.
+_UNDISTORTED_BYTES = 24
 _ROW_BYTES = 40  # counters, keys of the spatial order
 _FIXED_BYTES = 150 * 2**20  # compiled kernels and reserves of the allocators
 USABLE = 0.9  # of the free memory: other programs grow, too
@@ -30,15 +32,17 @@ class TrainingSize:
 
     Attributes:
         gaussians: largest number of Gaussians.
-        camera: of the largest image.
+        camera: of the largest image that is rendered: a photograph, or a window of it.
         sh_degree: of the stored spherical harmonics.
         cameras: number of cameras whose poses training refines together.
+        photograph_px: pixels of the largest photograph at its training size; 0: no larger than `camera`.
     """
 
     gaussians: int
     camera: Pinhole
     sh_degree: int
     cameras: int
+    photograph_px: int = 0
 
 
 def predicted_peak_bytes(size: TrainingSize) -> int:
@@ -47,7 +51,8 @@ def predicted_peak_bytes(size: TrainingSize) -> int:
     poses = predicted_basis_bytes(size.cameras)
     images = size.camera.width * size.camera.height * _IMAGE_FLOATS * _FLOAT
     per_gaussian = max(_COPIES * width * _FLOAT, 4 * width * _FLOAT + _raster_bytes()) + _ROW_BYTES
-    return size.gaussians * per_gaussian + images + poses + _FIXED_BYTES
+    training = size.gaussians * per_gaussian + images + poses
+    return max(training, size.photograph_px * _UNDISTORTED_BYTES) + _FIXED_BYTES
 
 
 def require_memory(size: TrainingSize, free_bytes: int | None) -> None:
@@ -63,7 +68,7 @@ def require_memory(size: TrainingSize, free_bytes: int | None) -> None:
     needed = predicted_peak_bytes(size)
     if free_bytes is None or needed <= USABLE * free_bytes:
         return
-    without_gaussians = predicted_peak_bytes(TrainingSize(0, size.camera, size.sh_degree, size.cameras))
+    without_gaussians = predicted_peak_bytes(replace(size, gaussians=0))
     per_gaussian = (needed - without_gaussians) / max(size.gaussians, 1)
     fitting = int((USABLE * free_bytes - without_gaussians) / per_gaussian) // 1000 * 1000
     advice = (

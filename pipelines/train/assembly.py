@@ -38,7 +38,10 @@ def training_size(scene: Scene, images: ImageCache, options: TrainOptions, besid
     cameras = [images.pinhole(index) for index in map(int, scene.train)]
     largest = max(cameras, key=lambda camera: camera.width * camera.height)
     refined = options.refined_cameras(len(images))
-    return TrainingSize(options.effort.max_gaussians + beside, largest, options.sh_degree, refined)
+    window = options.crops.largest_of(largest)
+    return TrainingSize(
+        options.effort.max_gaussians + beside, window, options.sh_degree, refined, largest.width * largest.height
+    )
 
 
 def make_trainer(
@@ -83,6 +86,7 @@ def make_trainer(
             geo_schedule=options.geo_schedule,
             seed=options.seed,
             coarse=COARSE if options.coarse_to_fine else (),
+            crops=options.crops,
             surface=SurfaceSettings() if options.faithful_surface else None,
         ),
         exposures=exposures or fitted,
@@ -125,6 +129,7 @@ def make_finisher(
             iterations,
             gaussians.sh_degree,
             seed=options.seed,
+            crops=options.crops,
             surface=SurfaceSettings() if options.faithful_surface else None,
             finishing=True,
         ),

@@ -18,7 +18,7 @@ from pipelines.splat.rasterizer.backends import chosen_backend
 from pipelines.train.depth_maps import StereoOptions
 from pipelines.train.options import TrainOptions
 from pipelines.train.pace import BLOCK_SECONDS, MEASURED_CORES, SURFACE_FACTOR, iteration_seconds
-from pipelines.train.schedule import COARSE
+from pipelines.train.schedule import COARSE, pyramid
 
 # Stereo, by photographs (the sweep has one size) and by megapixels of the depth maps: half of the processor time of
 # one thread on an Intel Xeon (AVX-512), 2026-11-22. Two threads on two idle cores were not measured.
@@ -112,7 +112,8 @@ def forecast(photographs: int, photo_px: tuple[int, int], options: TrainOptions)
     effort, camera = options.effort, camera_of(photo_px, options)
     backend = chosen_backend(options.backend)
     device = torch.device(backend)
-    size = TrainingSize(effort.max_gaussians, camera, options.sh_degree, options.refined_cameras(photographs))
+    refined, window = options.refined_cameras(photographs), options.crops.largest_of(camera)
+    size = TrainingSize(effort.max_gaussians, window, options.sh_degree, refined, camera.width * camera.height)
     return TrainingForecast(
         preset=options.preset,
         photographs=photographs,
@@ -147,12 +148,12 @@ def block_processor_s(plan: BlockPlan, photo_px: tuple[int, int], options: Train
         photo_px: width and height of the photographs.
         options: of the training.
     """
-    seconds = {}
+    seconds, camera = {}, camera_of(photo_px, options)
     for block in plan.blocks:
         count = block.gaussians + plan.scaffold_gaussians
-        size = _Iteration(block.view_px, block.visible, count, options.faithful_surface)
-        iterating = _iterating_s(size.block_processor_s, options)
-        stereo = MEASURED_CORES * _stereo_s(len(block.cameras), camera_of(photo_px, options))
+        size = _Iteration(camera, block.view_px, block.visible, count, options)
+        iterating = size.of_all(size.block_processor_s)
+        stereo = MEASURED_CORES * _stereo_s(len(block.cameras), camera)
         seconds[block.id] = iterating + (stereo if options.dense else 0.0)
     return seconds
 
@@ -166,39 +167,58 @@ def camera_of(photo_px: tuple[int, int], options: TrainOptions) -> Pinhole:
 
 @dataclass(frozen=True)
 class _Iteration:
-    """Size of an iteration with whole photographs."""
+    """Size of an iteration with photographs that are not shrunken.
 
+    Attributes:
+        camera: of the photographs.
+        pixels: of a photograph that count.
+        visible: number of Gaussians in a photograph.
+        gaussians: number of all.
+        options: of the training.
+    """
+
+    camera: Pinhole
     pixels: float
     visible: float
     gaussians: float
-    surface: bool
+    options: TrainOptions
+
+    def windows(self, shrink: int) -> int:
+        """Return the number of windows of a photograph that is shrunken by a factor."""
+        side = (self.pixels / (self.camera.width * self.camera.height)) ** 0.5 / shrink
+        return self.options.crops.count(
+            max(int(side * self.camera.width), 1), max(int(side * self.camera.height), 1)
+        )
 
     def seconds(self, shrink: int) -> float:
         """Return the seconds on the machine of `MEASURED_ON`."""
-        return iteration_seconds(self.pixels / shrink**2, self.gaussians, surface=self.surface)
+        surface, windows = self.options.faithful_surface, self.windows(shrink)
+        return iteration_seconds(self.pixels / shrink**2, self.gaussians, surface=surface, windows=windows)
 
     def block_processor_s(self, shrink: int) -> float:
         """Return the processor seconds of an iteration of a block."""
-        plain = BLOCK_SECONDS.of(self.pixels / shrink**2, self.visible, self.gaussians)
-        return SURFACE_FACTOR * plain if self.surface else plain
+        windows = self.windows(shrink)
+        plain = BLOCK_SECONDS.of(self.pixels / shrink**2 / windows, self.visible / windows, self.gaussians)
+        return SURFACE_FACTOR * plain if self.options.faithful_surface else plain
+
+    def of_all(self, one: Callable[[int], float]) -> float:
+        """Return the seconds of all iterations; `one`: of one with photographs that are shrunken by a factor."""
+        seconds, begun, options = 0.0, 0.0, self.options
+        coarse = COARSE if options.coarse_to_fine else ()
+        for shrink, until in pyramid(self.camera.width, self.camera.height, coarse, options.crops):
+            seconds += (until - begun) * options.effort.iterations * one(shrink)
+            begun = until
+        return seconds
 
 
 def _seconds(photographs: int, camera: Pinhole, options: TrainOptions) -> float:
     """Return the seconds of stereo and of all iterations on this machine."""
     pixels, count = camera.width * camera.height, options.effort.max_gaussians
-    seconds = _iterating_s(_Iteration(pixels, count, count, options.faithful_surface).seconds, options)
+    size = _Iteration(camera, pixels, count, count, options)
+    seconds = size.of_all(size.seconds)
     if options.dense:
         seconds += _stereo_s(photographs, camera)
     return seconds * MEASURED_CORES / min(thread_count(), _MOST_CORES)
-
-
-def _iterating_s(one: Callable[[int], float], options: TrainOptions) -> float:
-    """Return the seconds of all iterations; `one`: of one with photographs that are shrunken by a factor."""
-    seconds, begun = 0.0, 0.0
-    for shrink, until in (*(COARSE if options.coarse_to_fine else ()), (1, 1.0)):
-        seconds += (until - begun) * options.effort.iterations * one(shrink)
-        begun = until
-    return seconds
 
 
 def _stereo_s(photographs: int, camera: Pinhole) -> float:

@@ -8,6 +8,7 @@ from pydantic import Field, model_validator
 
 from pipelines.core.options import StageOptions
 from pipelines.scene.geographic_options import GeographicOptions
+from pipelines.train.crops import Crops
 from pipelines.train.lidar.options import LidarOptions
 from pipelines.train.presets import PRESETS, Preset
 
@@ -21,6 +22,11 @@ class SplatOptions(StageOptions):
     iterations: int | None = Field(None, ge=1, description="Iterations (default: the preset's).")
     max_image_size: int | None = Field(
         None, ge=32, description="Longest image side for training in pixels (default: the preset's)."
+    )
+    crop_size: int = Field(
+        1024,
+        ge=32,
+        description="Side in pixels: a photograph larger than this square is trained in windows of its area.",
     )
     max_gaussians: int | None = Field(None, ge=100, description="Limit of Gaussians (default: the preset's).")
     backend: Literal["auto", "cpu", "cuda"] = Field("auto", description="Rasteriser.")
@@ -67,6 +73,11 @@ class TrainOptions(GeographicOptions, SplatOptions, BlockOptions, LidarOptions):
     checkpoint_every: int = Field(500, ge=1, description="Iterations between checkpoints.")
     log_every: int = Field(10, ge=1, description="Iterations between lines of metrics.jsonl.")
     seed: int = Field(0, ge=0, description="Seed of every random choice.")
+
+    @property
+    def crops(self) -> Crops:
+        """Windows of large photographs."""
+        return Crops(self.crop_size, self.seed)
 
     @model_validator(mode="after")
     def _lidar_needs_a_surface(self) -> TrainOptions:

@@ -9,11 +9,13 @@ import numpy as np
 from pipelines.core.types import IntArray
 from pipelines.georef.weights import WeightSchedule, rising_weight
 from pipelines.splat.surface import SurfaceSettings
+from pipelines.train.crops import Crops
 
 _FINAL_RATE = 0.05  # of the geographic unknowns, relative to their first learning rate
 # Factor by which photographs are shrunken, and the fraction of the training up to which they are. A larger factor
 # would make the Gaussians smaller than a pixel, and push them off the surface that they start on.
 COARSE = ((2, 0.3),)
+_DENSITY_UNTIL = 0.5  # of the training
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,7 @@ class JointOptions:
         seed: seed of the order of views.
         coarse: (factor, fraction) pairs: photographs are shrunken by a factor up to a fraction of the training.
         coarse_least_px: lower limit of the longest side of a shrunken photograph.
+        crops: windows of large photographs; None: all are trained as wholes.
         surface: weights of the surface losses; None: no surface losses.
         finishing: whether the Gaussians are trained already, with all their harmonics.
     """
@@ -50,8 +53,29 @@ class JointOptions:
     seed: int = 0
     coarse: tuple[tuple[int, float], ...] = ()
     coarse_least_px: int = 160
+    crops: Crops | None = None
     surface: SurfaceSettings | None = None
     finishing: bool = False
+
+
+def pyramid(
+    width: int, height: int, coarse: tuple[tuple[int, float], ...], crops: Crops | None
+) -> list[tuple[int, float]]:
+    """Return factors by which a photograph is shrunken, and the fraction of the training up to which it is.
+
+    A photograph that is trained in windows is first shrunken until it is seen as a whole, and then by half of that
+    factor until density control ends.
+
+    Args:
+        width, height: of the photograph in pixels.
+        coarse: factors and fractions of photographs that are trained as wholes; empty: none is shrunken.
+        crops: windows of large photographs; None: there are none.
+    """
+    if not coarse:
+        return [(1, 1.0)]
+    whole = 1 if crops is None else crops.shrink(width, height)
+    levels = [(max(shrink, whole), until) for shrink, until in coarse]
+    return [*levels, (max(whole // 2, 1), max(_DENSITY_UNTIL, levels[-1][1])), (1, 1.0)]
 
 
 class TrainingSchedule:
@@ -82,13 +106,23 @@ class TrainingSchedule:
         order = np.random.default_rng([self._options.seed, epoch]).permutation(len(self._views))
         return int(self._views[order[place]])
 
-    def shrink(self, iteration: int, longest_side_px: int) -> int:
-        """Return the factor by which a photograph of that size is shrunken."""
+    def visit(self, iteration: int) -> int:
+        """Return how often the training image of an iteration was seen before."""
+        return (iteration - 1) // len(self._views)
+
+    def shrink(self, iteration: int, width: int, height: int) -> int:
+        """Return the factor by which a photograph of that size is shrunken; see `pyramid`."""
         if self.extended_from:
             return 1
-        most = max(longest_side_px // self._options.coarse_least_px, 1)
-        progress = self.progress(iteration)
-        return min(next((shrink for shrink, until in self._options.coarse if progress <= until), 1), most)
+        most = max(max(width, height) // self._options.coarse_least_px, 1)
+        progress, levels = (
+            self.progress(iteration),
+            pyramid(width, height, self._options.coarse, self._options.crops),
+        )
+        return min(next((shrink for shrink, until in levels if progress <= until), 1), most)
+
+    def _levels(self, width: int, height: int) -> list[tuple[int, float]]:
+        return pyramid(width, height, self._options.coarse, self._options.crops)
 
     def sh_degree(self, iteration: int) -> int:
         """Return the degree of the harmonics.

@@ -1,23 +1,64 @@
-"""Photographs on the device: shrunken as the schedule demands, and read ahead on a GPU."""
+"""Photographs on the device: shrunken and cut as the schedule demands, and read ahead on a GPU."""
 
 from __future__ import annotations
 
 from collections import OrderedDict
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import lru_cache
+from math import inf
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn import functional
 
+from pipelines.core.types import BoolArray
 from pipelines.geometry.cameras import Pinhole
 from pipelines.scene.photographs import ImageCache
 from pipelines.scene.pinholes import Pinholes
 from pipelines.splat.rasterizer.api import Window
-from pipelines.train.region import RegionMasks, RegionView
+from pipelines.train.crops import Crops
+from pipelines.train.region import RegionMasks
 
 _MASKS = 64  # limit on the device; all photographs of a camera share one
+_PARTS = 256  # windows kept: density control samples others between an iteration and the next
+
+
+@dataclass(frozen=True)
+class Look:
+    """Look at a photograph.
+
+    Attributes:
+        index: of the photograph.
+        shrink: every pixel is the mean of shrink × shrink pixels.
+        visit: number of the visit, from 0, for the choice of a window of a large photograph; None: all of it.
+    """
+
+    index: int
+    shrink: int = 1
+    visit: int | None = None
+
+
+@dataclass(frozen=True)
+class ImagePart:
+    """Part of a photograph to train on.
+
+    Attributes:
+        window: in pixels of the whole photograph at its size; None: all of it.
+        windows: number of windows in which all that is trained of the photograph is seen, one at a visit.
+        weight: of a mean over the pixels that count in this window: the mean of weighted means over all windows is
+            the mean over all pixels that count.
+        share: of the whole photograph's pixels that count in all windows, if a region is trained; else 1.
+        low, high: corners (x, y) of the window in pixels, infinite on the sides where no other window follows. The
+            centre of each Gaussian lies between the corners of one window.
+    """
+
+    window: Window | None = None
+    windows: int = 1
+    weight: float = 1.0
+    share: float = 1.0
+    low: tuple[float, float] = (-inf, -inf)
+    high: tuple[float, float] = (inf, inf)
 
 
 @dataclass(frozen=True)
@@ -29,16 +70,19 @@ class TargetImage:
         mask: (H, W) bool, the pixels that count; None: all.
         camera: of H × W pixels, with the lens in use.
         whole: camera of the whole photograph at this size.
-        window: part of the whole that these pixels are; None: all of it.
-        share: of the whole photograph's pixels that count, if it is trained on in part; else 1.
+        part: of the whole that these pixels are.
     """
 
     colour: Tensor
     mask: Tensor | None
     camera: Pinhole
     whole: Pinhole
-    window: Window | None = None
-    share: float = 1.0
+    part: ImagePart = ImagePart()
+
+    @property
+    def window(self) -> Window | None:
+        """Window of the whole photograph; None: all of it."""
+        return self.part.window
 
 
 class TargetImages:
@@ -52,78 +96,121 @@ class TargetImages:
         pinholes: their cameras, with the lens in use.
         device: holds the photographs of `get`.
         region: pixels of each photograph to train on; None: all.
+        crops: windows of large photographs; None: all are seen as wholes.
     """
 
     def __init__(
-        self, images: ImageCache, pinholes: Pinholes, device: torch.device, region: RegionMasks | None = None
+        self,
+        images: ImageCache,
+        pinholes: Pinholes,
+        device: torch.device,
+        region: RegionMasks | None = None,
+        crops: Crops | None = None,
     ) -> None:
-        self._images, self._pinholes, self._device, self._region = images, pinholes, device, region
+        self._images, self._pinholes, self._device = images, pinholes, device
+        self._region, self._crops = region, crops
         self._masks: OrderedDict[tuple[str, int], Tensor | None] = OrderedDict()
+        self._complete: dict[str, bool] = {}
+        self._part = lru_cache(_PARTS)(self._find_part)
         self._reader = ThreadPoolExecutor(1, "photographs") if device.type == "cuda" else None
-        self._next: tuple[int, Future[Tensor]] | None = None
+        self._next: tuple[Look, Future[Tensor]] | None = None
 
-    def get(self, index: int, shrink: int = 1, upcoming: int | None = None) -> TargetImage:
-        """Return a photograph at 1/`shrink` of its size.
+    def get(self, look: Look, upcoming: Look | None = None) -> TargetImage:
+        """Return a photograph, or a window of it.
 
         Args:
-            index: of the photograph.
-            shrink: every pixel is the mean of shrink × shrink pixels.
-            upcoming: index of the next photograph, to read ahead; None: unknown.
+            look: at the photograph.
+            upcoming: next look, to read ahead; None: unknown.
         """
-        pixels = self._pixels(index)
+        pixels, part = self._pixels(look), self._part(look)
         if self._reader is not None and upcoming is not None:
             self._next = (upcoming, self._reader.submit(self._read, upcoming))
         colour = pixels.to(self._device, non_blocking=True).float() / 255.0
-        camera = self._pinholes.of(index)
-        if shrink > 1:
-            colour = functional.avg_pool2d(colour.permute(2, 0, 1), shrink).permute(1, 2, 0).contiguous()
-            camera = shrunken(camera, shrink)
-        mask = self._mask(index, shrink)
-        return (
-            TargetImage(colour, mask, camera, camera)
-            if self._region is None
-            else self._part(TargetImage(colour, mask, camera, camera), self._region.view(index, shrink))
-        )
+        whole = shrunken(self._pinholes.of(look.index), look.shrink)
+        if part.window is None:
+            return TargetImage(colour, self._whole_mask(look), whole, whole, part)
+        mask = self._counting(look, part.window)
+        on_device = None if mask.all() else torch.from_numpy(mask).to(self._device)
+        return TargetImage(colour, on_device, part.window.of(whole), whole, part)
 
-    def _part(self, image: TargetImage, shown: RegionView) -> TargetImage:
-        """Return the part of a photograph that shows the region."""
-        window = shown.window
-        rows, columns = window.slices
-        mask = torch.from_numpy(shown.mask).to(self._device)
-        mask = mask if image.mask is None else mask & image.mask[rows, columns]
-        return TargetImage(
-            image.colour[rows, columns].contiguous(),
-            mask,
-            window.of(image.whole),
-            image.whole,
-            window,
-            float(shown.mask.sum()) / (image.whole.width * image.whole.height),
-        )
+    def _find_part(self, look: Look) -> ImagePart:
+        camera = shrunken(self._images.pinhole(look.index), look.shrink)
+        image = Window(0, 0, camera.width, camera.height)
+        shown = None if self._region is None else self._region.view(look.index, look.shrink)
+        trained = image if shown is None else shown.window
+        count = 0 if shown is None else int(shown.mask.sum())
+        share = 1.0 if shown is None else count / (camera.width * camera.height)
+        if self._crops is None or look.visit is None or self._crops.count(trained.width, trained.height) == 1:
+            return ImagePart(None if shown is None else trained, share=share)
+        turn, place = divmod(look.visit, self._crops.count(trained.width, trained.height))
+        windows = self._crops.windows(look.index, trained, turn)
+        counts = [self._count(look, window) for window in windows]
+        seen = [place for place, count in enumerate(counts) if count]
+        window = windows[seen[place % len(seen)]] if seen else windows[0]
+        weight = len(seen) * counts[windows.index(window)] / max(sum(counts), 1)
+        return _part_of(trained, window, len(seen) or 1, weight, share)
 
-    def _pixels(self, index: int) -> Tensor:
-        if self._next is not None and self._next[0] == index:
+    def _count(self, look: Look, window: Window) -> int:
+        """Return the number of pixels that count in a window."""
+        if self._region is None and self._all_count(look):
+            return window.width * window.height
+        return int(self._counting(look, window).sum())
+
+    def _all_count(self, look: Look) -> bool:
+        """Return whether all pixels of a photograph count."""
+        key = self._images.mask_key(look.index)
+        if key not in self._complete:
+            self._complete[key] = bool(self._images.mask(look.index).all())
+        return self._complete[key]
+
+    def _counting(self, look: Look, window: Window) -> BoolArray:
+        """Return the pixels (H, W) of a window that count: of the photograph, and of the region if there is one."""
+        s = look.shrink
+        covered = self._images.mask(look.index)[
+            window.top * s : (window.top + window.height) * s, window.left * s : (window.left + window.width) * s
+        ]
+        blocks = np.array(covered).reshape(window.height, s, window.width, s)
+        mask = np.asarray(blocks.all(axis=(1, 3)), dtype=bool)
+        if self._region is None:
+            return mask
+        shown = self._region.view(look.index, s)
+        top, left = window.top - shown.window.top, window.left - shown.window.left
+        return np.asarray(mask & shown.mask[top : top + window.height, left : left + window.width])
+
+    def _pixels(self, look: Look) -> Tensor:
+        if self._next is not None and self._next[0] == look:
             return self._next[1].result()
-        return self._read(index)
+        return self._read(look)
 
-    def _read(self, index: int) -> Tensor:
-        pixels = torch.from_numpy(np.array(self._images.image(index)))
+    def _read(self, look: Look) -> Tensor:
+        image, window = self._images.shrunken(look.index, look.shrink), self._part(look).window
+        pixels = torch.from_numpy(np.array(image if window is None else image[window.slices]))
         return pixels.pin_memory() if self._reader is not None else pixels
 
-    def _mask(self, index: int, shrink: int) -> Tensor | None:
-        key = (self._images.mask_key(index), shrink)
+    def _whole_mask(self, look: Look) -> Tensor | None:
+        key = (self._images.mask_key(look.index), look.shrink)
         if key not in self._masks:
-            self._masks[key] = self._load_mask(index, shrink)
+            camera = shrunken(self._images.pinhole(look.index), look.shrink)
+            mask = self._counting(look, Window(0, 0, camera.width, camera.height))
+            self._masks[key] = None if mask.all() else torch.from_numpy(mask).to(self._device)
             if len(self._masks) > _MASKS:
                 self._masks.popitem(last=False)
         self._masks.move_to_end(key)
         return self._masks[key]
 
-    def _load_mask(self, index: int, shrink: int) -> Tensor | None:
-        covered = np.array(self._images.mask(index))
-        height, width = (side // shrink for side in covered.shape)
-        blocks = covered[: height * shrink, : width * shrink].reshape(height, shrink, width, shrink)
-        whole = blocks.all(axis=(1, 3))
-        return None if whole.all() else torch.from_numpy(np.ascontiguousarray(whole)).to(self._device)
+
+def _part_of(trained: Window, window: Window, windows: int, weight: float, share: float) -> ImagePart:
+    """Return a window of all that is trained of a photograph; see `ImagePart`."""
+    right, bottom = window.left + window.width, window.top + window.height
+    low = (
+        -inf if window.left == trained.left else float(window.left),
+        -inf if window.top == trained.top else float(window.top),
+    )
+    high = (
+        inf if right == trained.left + trained.width else float(right),
+        inf if bottom == trained.top + trained.height else float(bottom),
+    )
+    return ImagePart(window, windows, weight, share, low, high)
 
 
 def shrunken(camera: Pinhole, shrink: int) -> Pinhole:

@@ -23,13 +23,14 @@ from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.losses import photometric_loss
 from pipelines.splat.optimizer import GaussianAdam
 from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings, Render, ScreenStats
-from pipelines.splat.surface import ObservedPoints, compactness_loss, depth_loss, flatness_loss, normal_loss
+from pipelines.splat.surface import ObservedPoints
 from pipelines.train.checkpoint import prefixed, unprefixed
 from pipelines.train.pace import iteration_seconds
 from pipelines.train.region import TrainingRegion
 from pipelines.train.schedule import JointOptions, TrainingSchedule
 from pipelines.train.surface import GaussianLoss
-from pipelines.train.target_images import TargetImage, TargetImages
+from pipelines.train.surface_losses import RenderedView, SurfaceLosses
+from pipelines.train.target_images import Look, TargetImage, TargetImages
 
 _UNKNOWNS = {
     "y": "the similarity",
@@ -123,7 +124,8 @@ class JointTrainer:
         self._pinholes = Pinholes(views.images, views.lenses)
         self._lens = np.zeros(len(problem.cameras.lens()))
         masks = None if region is None else region.masks
-        self._targets = TargetImages(views.images, self._pinholes, self.device, masks)
+        self._targets = TargetImages(views.images, self._pinholes, self.device, masks, options.crops)
+        self._surface_losses = self._made_surface_losses()
         names = ("photometric loss", "geographic loss", *(f"gradient of {name}" for name in self._watched()))
         self._watch = FinitenessMonitor(names, self.device)
         rates = {
@@ -142,7 +144,7 @@ class JointTrainer:
     def step(self) -> StepReport:
         """Run one iteration and return its figures.
 
-        1. One training view is rendered and compared with its photograph.
+        1. One training view, or a window of it, is rendered and compared with its photograph.
         2. The gradient of all losses moves Gaussians, similarity, cameras, constant errors, weights and exposures.
         3. Density control records the render, and edits the Gaussians if its schedule says so.
         """
@@ -150,7 +152,7 @@ class JointTrainer:
         if self.iteration % _LENS_EVERY == 1:
             self._look_through(self.problem.cameras.lens().detach().cpu().numpy())
         index = self.schedule.view(self.iteration)
-        target = self._targets.get(index, self._shrink(index), self.schedule.view(self.iteration + 1))
+        target = self._targets.get(self._look(self.iteration), self._look(self.iteration + 1))
         pose = self.problem.cameras.cam_from_model(index)
         render = self._render(pose, target, depth=self.problem.sees_by_depth(index))
         colour = render.colour if self.exposures is None else self.exposures.apply(index, render.colour)
@@ -159,13 +161,13 @@ class JointTrainer:
         geographic = self.problem.loss() if by_depth is None else self.problem.loss() + by_depth
         self.optimizer.zero_grad()
         self._geo_adam.zero_grad()
-        total = photometric + weight * geographic
+        total = target.part.weight * photometric + weight * geographic
         penalty = self.strategy.penalty(self.optimizer.gaussians, self._own(render.stats))
         for term in (penalty, self._surface(render, pose, target, index)):
             total = total if term is None else total + term
         total.backward()
         self._note(photometric, geographic)
-        stats = self._own(render.stats, target.share)
+        stats = self._of_whole(self._own(render.stats), pose, target)
         self._apply(stats.visible)
         self.strategy.observe(stats, target.whole)
         self.strategy.update(self.iteration, self.optimizer, self.sample_contributions)
@@ -190,8 +192,8 @@ class JointTrainer:
         contributions = []
         for place in torch.randperm(len(self.views.camera), generator=generator)[:count].tolist():
             index = int(self.views.camera[place])
-            shrink, pose = self._shrink(index), self.problem.cameras.cam_from_model(index)
-            target = self._targets.get(index, shrink)
+            shrink, pose = self._shrink_to_whole(index), self.problem.cameras.cam_from_model(index)
+            target = self._targets.get(Look(index, shrink))
             colour = self._render(pose, target).colour
             if self.exposures is not None:
                 colour = self.exposures.apply(index, colour)
@@ -207,9 +209,11 @@ class JointTrainer:
     def work(self, iteration: int) -> float:
         """Return the work of an iteration at the present number of Gaussians, relative to others' work."""
         camera = self.views.images.pinhole(int(self.views.camera[0]))
-        shrink = self.schedule.shrink(iteration, max(camera.width, camera.height))
-        pixels, surface = camera.width * camera.height / shrink**2, self.options.surface is not None
-        return iteration_seconds(pixels, len(self.optimizer.gaussians), surface=surface)
+        shrink = self.schedule.shrink(iteration, camera.width, camera.height)
+        width, height = camera.width // shrink, camera.height // shrink
+        windows = 1 if self.options.crops is None else self.options.crops.count(width, height)
+        surface = self.options.surface is not None
+        return iteration_seconds(width * height, len(self.optimizer.gaussians), surface=surface, windows=windows)
 
     def pinhole(self, index: int) -> Pinhole:
         """Return the camera of an undistorted photograph, with the lens in use."""
@@ -238,7 +242,9 @@ class JointTrainer:
         """Return the loss of the view's control points by rendered depth, or None if the view has no such marks."""
         if render.expected_depth is None:
             return None
-        return self.problem.depth_loss(index, render.expected_depth, render.alpha, target.camera)
+        loss = self.problem.depth_loss(index, render.expected_depth, render.alpha, target.camera)
+        # Marks outside the window do not count: each is seen in one of the windows.
+        return None if loss is None else target.part.windows * loss
 
     def _render(self, pose: Tensor, target: TargetImage, *, depth: bool = False) -> Render:
         """Return a render of the Gaussians, and behind their rows those that surround the region."""
@@ -254,38 +260,40 @@ class JointTrainer:
             gaussians = Gaussians.concatenate([gaussians, self.region.surroundings])
         return self.rasterizer.render(gaussians, pose, target.whole, settings)
 
-    def _own(self, stats: ScreenStats, share: float = 1.0) -> ScreenStats:
-        """Return the statistics of the Gaussians in training, without those that surround the region.
-
-        Args:
-            stats: of a render.
-            share: of the image that the loss is the mean of.
-        """
+    def _own(self, stats: ScreenStats) -> ScreenStats:
+        """Return the statistics of the Gaussians in training, without those that surround the region."""
         # Without a region nothing is left out: to look would make a GPU wait.
-        return stats if self.region is None else stats.of_first(len(self.optimizer.gaussians), share)
+        return stats if self.region is None else stats.of_first(len(self.optimizer.gaussians))
+
+    @torch.no_grad()
+    def _of_whole(self, stats: ScreenStats, pose: Tensor, target: TargetImage) -> ScreenStats:
+        """Return the statistics as a part of those of the whole photograph."""
+        part = target.part
+        if part.windows == 1:
+            return stats if part.share == 1.0 else stats.of_part(part.share)
+        means = self.optimizer.gaussians.means[stats.visible]
+        in_cam, camera = means @ pose[:3, :3].to(means).T + pose[:3, 3].to(means), target.whole
+        x, y, z = in_cam.unbind(dim=1)
+        x, y = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+        here = (x >= part.low[0]) & (x < part.high[0]) & (y >= part.low[1]) & (y < part.high[1])
+        return stats.of_part(part.share / part.windows, here)
+
+    def _made_surface_losses(self) -> SurfaceLosses | None:
+        if self.options.surface is None:
+            return None
+        extent_m, confined = self.optimizer.extent_m, self.region is not None
+        return SurfaceLosses(
+            self.options.surface, extent_m, self.rasterizer, self.views.gaussian_loss, confined=confined
+        )
 
     def _surface(self, render: Render, pose: Tensor, target: TargetImage, index: int) -> Tensor | None:
         """Return the weighted sum of the surface losses, or None if the options have no surface losses."""
-        surface, gaussians = self.options.surface, self.optimizer.gaussians
-        if surface is None:
+        if self._surface_losses is None:
             return None
-        visible = self._own(render.stats).visible
-        loss = surface.flatness * flatness_loss(gaussians, visible, self.optimizer.extent_m)
-        if render.expected_depth is not None and render.depth_variance is not None:
-            alpha = render.alpha if self.region is None or target.mask is None else render.alpha * target.mask
-            spread = compactness_loss(render.expected_depth, render.depth_variance, alpha)
-            loss = loss + surface.compactness * spread
-        if self.views.surface is not None and render.expected_depth is not None:
-            points = self.views.surface(index)
-            depth = depth_loss(render.expected_depth, render.alpha, points, pose, target.camera)
-            loss = loss + surface.depth * depth
-        if self.views.gaussian_loss is not None:
-            loss = loss + self.views.gaussian_loss(gaussians, visible)
-        late = self.iteration > surface.normals_from * self.options.iterations
-        if late and self.iteration % surface.normals_every == 0:
-            normals = normal_loss(gaussians, pose, target.camera, self.rasterizer, surface.edge)
-            loss = loss + surface.normals_every * surface.normals * normals
-        return loss
+        points = None if self.views.surface is None else self.views.surface(index)
+        view = RenderedView(render, target, pose, self._own(render.stats).visible, points)
+        gaussians = self.optimizer.gaussians
+        return self._surface_losses.of(gaussians, view, self.iteration, self.options.iterations)
 
     def _watched(self) -> dict[str, Tensor]:
         tensors = self.optimizer.gaussians.tensors()
@@ -309,10 +317,18 @@ class JointTrainer:
         if self.exposures is not None:
             self.exposures.step(self.iteration)
 
-    def _shrink(self, index: int) -> int:
-        """Return the factor by which a photograph is shrunken at this iteration."""
+    def _look(self, iteration: int) -> Look:
+        """Return the look at a photograph in an iteration."""
+        index = self.schedule.view(iteration)
         camera = self.views.images.pinhole(index)
-        return self.schedule.shrink(self.iteration, max(camera.width, camera.height))
+        shrink = self.schedule.shrink(iteration, camera.width, camera.height)
+        return Look(index, shrink, self.schedule.visit(iteration))
+
+    def _shrink_to_whole(self, index: int) -> int:
+        """Return the factor by which a photograph is shrunken at this iteration, to be seen as a whole."""
+        camera = self.views.images.pinhole(index)
+        least = 1 if self.options.crops is None else self.options.crops.shrink(camera.width, camera.height)
+        return max(self.schedule.shrink(self.iteration, camera.width, camera.height), least)
 
     def state(self) -> dict[str, Tensor]:
         """Return all tensors that the next iteration depends on, by name, for a checkpoint."""

@@ -7,6 +7,7 @@ from collections import Counter
 import numpy as np
 import pytest
 
+from pipelines.train.crops import Crops
 from pipelines.train.schedule import JointOptions, TrainingSchedule
 
 VIEWS = np.array([0, 1, 2, 4, 5, 6, 7, 8, 10, 11, 12, 13])
@@ -29,8 +30,17 @@ def test_harmonics_grow_up_to_half_of_the_training() -> None:
 
 def test_photographs_are_shrunken_early_and_never_below_their_least_size() -> None:
     schedule = TrainingSchedule(JointOptions(100, coarse=((4, 0.1), (2, 0.3)), coarse_least_px=160), VIEWS)
-    assert [schedule.shrink(iteration, 640) for iteration in (1, 10, 11, 30, 31, 100)] == [4, 4, 2, 2, 1, 1]
-    assert [schedule.shrink(1, side) for side in (639, 320, 319, 100)] == [3, 2, 1, 1]
+    assert [schedule.shrink(iteration, 640, 480) for iteration in (1, 10, 11, 30, 31, 100)] == [4, 4, 2, 2, 1, 1]
+    assert [schedule.shrink(1, side, side) for side in (639, 320, 319, 100)] == [3, 2, 1, 1]
+
+
+def test_large_photographs_are_pyramids() -> None:
+    """20 megapixels are seen as a whole, then at half of that factor, then as they are."""
+    options = JointOptions(100, coarse=((2, 0.3),), crops=Crops(1024))
+    schedule = TrainingSchedule(options, VIEWS)
+    at = [schedule.shrink(iteration, 5472, 3648) for iteration in (1, 30, 31, 50, 51, 100)]
+    assert at == [5, 5, 2, 2, 1, 1]
+    assert [schedule.shrink(iteration, 1024, 768) for iteration in (30, 31)] == [2, 1]
 
 
 def test_weight_rises_or_stays_and_rates_fall() -> None:
@@ -49,7 +59,7 @@ def test_weight_rises_or_stays_and_rates_fall() -> None:
 def test_extended_training_neither_shrinks_photographs_again_nor_drops_harmonics() -> None:
     """Where it goes on, the longer schedule has shrunken photographs and degree 0: a step back."""
     schedule = TrainingSchedule(JointOptions(1000, sh_degree=3, coarse=((2, 0.3),)), VIEWS)
-    assert (schedule.shrink(120, 640), schedule.sh_degree(120)) == (2, 0)
+    assert (schedule.shrink(120, 640, 480), schedule.sh_degree(120)) == (2, 0)
     schedule.extended_from = 100
-    assert (schedule.shrink(120, 640), schedule.sh_degree(120)) == (1, 3)
+    assert (schedule.shrink(120, 640, 480), schedule.sh_degree(120)) == (1, 3)
     assert schedule.geographic_rate(120) == pytest.approx(0.05**0.12), "rates are those of the longer training"

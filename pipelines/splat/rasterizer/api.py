@@ -106,22 +106,30 @@ class ScreenStats:
         visible: (M,) int64 rows of the Gaussians that touched the image.
         radius_px: (M,) float32, three standard deviations along the longer axis, on the screen.
         mean_gradient: (M, 2) float32, ∂L/∂(projected centre) in 1/pixel; filled by the backward pass.
+        counted: (M,) bool, False for Gaussians that other parts of the same image count; None: all are True.
     """
 
     visible: Tensor
     radius_px: Tensor
     mean_gradient: Tensor | None = field(default=None)
+    counted: Tensor | None = None
 
-    def of_first(self, count: int, share: float = 1.0) -> ScreenStats:
-        """Return the statistics of the first Gaussians of a render.
+    def of_first(self, count: int) -> ScreenStats:
+        """Return the statistics of the first `count` Gaussians of a render."""
+        rows = self.visible < count
+        gradient = None if self.mean_gradient is None else self.mean_gradient[rows]
+        counted = None if self.counted is None else self.counted[rows]
+        return ScreenStats(self.visible[rows], self.radius_px[rows], gradient, counted)
+
+    def of_part(self, share: float, counted: Tensor | None = None) -> ScreenStats:
+        """Return the statistics of a part of an image, as what it adds to those of the whole image.
 
         Args:
-            count: of the Gaussians.
-            share: factor of the gradients: of the part of an image that a loss was the mean of.
+            share: factor of the gradients: of the part in the loss of the whole.
+            counted: (M,) of the Gaussians that the part counts for the whole; None: all.
         """
-        rows = self.visible < count
-        gradient = None if self.mean_gradient is None else share * self.mean_gradient[rows]
-        return ScreenStats(self.visible[rows], self.radius_px[rows], gradient)
+        gradient = None if self.mean_gradient is None else share * self.mean_gradient
+        return ScreenStats(self.visible, self.radius_px, gradient, counted)
 
 
 @dataclass

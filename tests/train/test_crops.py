@@ -1,0 +1,159 @@
+"""Training in windows: each photograph is covered evenly, and the windows together are the photograph."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from pipelines.scene.photographs import ImageCache
+from pipelines.scene.pinholes import Pinholes
+from pipelines.splat.densify import DefaultStrategy
+from pipelines.splat.gaussians import Gaussians
+from pipelines.splat.losses import photometric_loss
+from pipelines.splat.rasterizer.api import RasterSettings, ScreenStats, Window
+from pipelines.splat.rasterizer.cpu import CpuRasterizer
+from pipelines.train.crops import Crops
+from pipelines.train.region import RegionMasks
+from pipelines.train.schedule import JointOptions
+from pipelines.train.target_images import Look, TargetImage, TargetImages
+from pipelines.train.trainer import JointTrainer
+from tests import tiny_training as tiny
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+CROPS = Crops(32)
+WINDOWS = CROPS.count(64, 48)
+
+
+@pytest.fixture(scope="module")
+def images(tmp_path_factory: pytest.TempPathFactory) -> ImageCache:
+    return tiny.photographs(tmp_path_factory.mktemp("photos"), tiny.true_gaussians())
+
+
+@pytest.mark.parametrize(
+    ("size", "size_px"),
+    [((64, 48), 32), ((640, 480), 100), ((5472, 3648), 1024), ((3000, 1), 32), ((1, 3000), 32), ((7, 900), 32)],
+)
+def test_windows_cover_each_pixel_once_and_are_small_enough(size: tuple[int, int], size_px: int) -> None:
+    width, height = size
+    crops = Crops(size_px, seed=3)
+    whole = Window(5, 9, width, height)
+    for turn in range(3):
+        seen = np.zeros((height + 9, width + 5), dtype=np.uint8)
+        windows = crops.windows(7, whole, turn)
+        assert len(windows) == crops.count(width, height)
+        for window in windows:
+            seen[window.slices] += 1
+            # Cuts are shifted by an eighth of a cell.
+            assert window.width * window.height <= 1.35 * size_px**2 or size_px**2 > width * height
+        assert (seen[9:, 5:] == 1).all() and seen.sum() == width * height
+    largest = crops.largest_of(tiny.PINHOLE)
+    for turn in range(20):
+        for window in crops.windows(0, Window(0, 0, tiny.PINHOLE.width, tiny.PINHOLE.height), turn):
+            assert window.width <= largest.width and window.height <= largest.height
+
+
+def test_each_round_of_visits_shows_each_pixel_once(images: ImageCache) -> None:
+    targets = TargetImages(images, Pinholes(images), torch.device("cpu"), crops=CROPS)
+    whole = TargetImages(images, Pinholes(images), torch.device("cpu")).get(Look(2))
+    places = []
+    for turn in range(2):
+        shown = torch.full_like(whole.colour, torch.nan)
+        for visit in range(WINDOWS):
+            target = targets.get(Look(2, visit=WINDOWS * turn + visit))
+            assert target.window is not None and target.part.windows == WINDOWS
+            assert torch.isnan(shown[target.window.slices]).all()
+            shown[target.window.slices] = target.colour
+            places.append(target.window)
+        assert torch.equal(shown, whole.colour)
+    assert len(set(places)) > WINDOWS, "cuts move from round to round"
+
+
+def losses(targets: TargetImages, looks: list[Look], gaussians: Gaussians, ssim: float) -> Iterator[tuple]:
+    """Target, weighted loss and statistics of each look, with gradients added to the Gaussians."""
+    for look in looks:
+        target = targets.get(look)
+        pose = torch.eye(4)
+        pose[0, 3] = -float(tiny.poses().cam_center_in_model[look.index, 0])
+        render = CpuRasterizer().render(
+            gaussians, pose, target.whole, RasterSettings(sh_degree=0, window=target.window)
+        )
+        loss = photometric_loss(render.colour, target.colour, target.mask, ssim_weight=ssim)
+        (target.part.weight * loss / target.part.windows).backward()
+        yield target, float(target.part.weight * loss.detach() / target.part.windows), render.stats
+
+
+def leaves() -> Gaussians:
+    truth = tiny.true_gaussians()
+    long = truth.log_scales + torch.tensor([0.3, 0.0, -0.3])
+    moved = replace(truth, means=truth.means + 0.05, sh=0.5 * truth.sh, log_scales=long)
+    return Gaussians(**{name: value.clone().requires_grad_() for name, value in moved.tensors().items()})
+
+
+@pytest.mark.parametrize("region", [False, True])
+def test_windows_add_up_to_the_loss_of_the_photograph(images: ImageCache, region: bool) -> None:
+    """Without SSIM exactly; SSIM sees zeros beyond a cut, as beyond the photograph's edge.
+
+    A third of these small windows lies within the five pixels from a cut that SSIM reaches.
+    """
+    mask = np.zeros((48, 64), dtype=bool)
+    mask[4:44, 10:60] = True
+    mask[30:, 40:] = False
+    masks = RegionMasks({1: mask}) if region else None
+    parts, whole = (
+        TargetImages(images, Pinholes(images), torch.device("cpu"), masks, crops) for crops in (Crops(30), None)
+    )
+    count = parts.get(Look(1, visit=0)).part.windows
+    assert count > 2
+    for ssim, tolerance in ((0.0, 1e-5), (0.2, 0.3)):
+        one, many = leaves(), leaves()
+        ((_, expected, _),) = losses(whole, [Look(1)], one, ssim)
+        values = [loss for _, loss, _ in losses(parts, [Look(1, visit=visit) for visit in range(count)], many, ssim)]
+        assert sum(values) == pytest.approx(expected, rel=tolerance / 2)
+        for name, tensor in one.tensors().items():
+            gradient, other = tensor.grad, many.tensors()[name].grad
+            assert gradient is not None and other is not None
+            assert float((gradient - other).norm() / gradient.norm()) <= tolerance, name
+
+
+def recorded(images: ImageCache, crops: Crops | None, iterations: int) -> tuple[Tensor, Tensor]:
+    """Gradients and observations that density control has recorded in a training in which nothing moves."""
+    options = JointOptions(10_000, sh_degree=0, crops=crops, camera_rate=0, similarity_rate=0)
+    trainer = tiny.trainer(images, options)
+    trainer.optimizer.rate_factor = 0.0
+    trainer.strategy = DefaultStrategy(replace(tiny.SETTINGS, stop=0), tiny.EXTENT_M, len(trainer.optimizer.gaussians))
+    for _ in range(iterations):
+        trainer.step()
+    state = trainer.strategy.state()
+    return state["gradient_sum"], state["observations"]
+
+
+def test_density_control_sees_what_it_sees_of_whole_photographs(images: ImageCache) -> None:
+    """After a round of all windows: as many observations, and gradients of the photographs' losses.
+
+    The gradient of a Gaussian on a cut comes in parts, whose lengths add up to more than the length of their sum.
+    """
+    views = len(images)
+    gradient, observations = recorded(images, None, views)
+    in_parts, observed = recorded(images, CROPS, WINDOWS * views)
+    assert torch.equal(observations, observed)
+    ratio = (in_parts / gradient)[gradient > 0.1 * gradient.median()]
+    low, middle, high = ratio.quantile(torch.tensor([0.05, 0.5, 0.95])).tolist()
+    assert 0.95 < low and 0.99 < middle < 1.1 and high < 2.5, (low, middle, high)
+
+
+def test_each_place_belongs_to_one_window_of_a_round(images: ImageCache) -> None:
+    targets = TargetImages(images, Pinholes(images), torch.device("cpu"), crops=CROPS)
+    for turn in range(3):
+        seen = 0
+        for visit in range(WINDOWS):
+            target = targets.get(Look(0, visit=WINDOWS * turn + visit))
+            place = torch.tensor([[20.3, 31.8], [50.1, 7.2], [-9.0, 60.0]])  # the last beyond a corner
+            low, high = torch.tensor(target.part.low), torch.tensor(target.part.high)
+            seen += int(((place >= low) & (place < high)).all(dim=1).sum())
+        assert seen == len(place)
