@@ -19,6 +19,7 @@ from pipelines.splat.densify import DefaultSettings, DefaultStrategy, Strategy
 from pipelines.splat.exposure import Exposures
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.optimizer import GaussianAdam
+from pipelines.splat.outlier_pixels import OutlierPixels
 from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
 from pipelines.train.schedule import JointOptions
@@ -68,6 +69,7 @@ def trainer(
     *,
     strategy: Strategy | None = None,
     with_exposures: bool = False,
+    outliers: OutlierPixels | None = None,
     count: int = 200,
 ) -> JointTrainer:
     """Return a trainer that starts from the true places, grey and small."""
@@ -85,4 +87,5 @@ def trainer(
         rasterizer=CpuRasterizer(),
         options=options,
         exposures=exposures if with_exposures else None,
+        outliers=outliers,
     )

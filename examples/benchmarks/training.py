@@ -37,6 +37,7 @@ from pipelines.scene.geographic import geo_problem
 from pipelines.scene.initial_similarity import InitialSimilarity
 from pipelines.scene.photographs import ImageCache
 from pipelines.scene.scene import Scene, initial_scene, photographs
+from pipelines.scene.survey import Survey
 from pipelines.splat.densify import DefaultSettings, DefaultStrategy
 from pipelines.splat.losses import photometric_loss
 from pipelines.splat.memory import TrainingSize, predicted_peak_bytes
@@ -90,15 +91,21 @@ def scaling(arguments: argparse.Namespace) -> None:
     print(f"peak RSS before the first: {base / 2**20:.0f} MiB; the peak of a process never falls")
 
 
-def trainer_on(root: Path, options: TrainOptions) -> tuple[JointTrainer, Scene, ImageCache]:
-    """Trainer before its first iteration, on a workspace with init-sim3 done, as `georef train` makes it."""
+def scene_of(root: Path, options: TrainOptions) -> tuple[Survey, InitialSimilarity, Scene, ImageCache]:
+    """Products of a workspace with init-sim3 done, and its undistorted photographs."""
     workspace = Workspace(root)
     survey = load_survey(workspace)
     initial = load_json(InitialSimilarity, workspace.path(SIM3))
     scene = initial_scene(read_sparse(workspace.path(SPARSE)), survey, initial)
     images = photographs(scene.sparse, survey, workspace, options.effort.max_image_size)
     images.build()
-    maps = DepthMaps(workspace.cache / "surface", scene, images)
+    return survey, initial, scene, images
+
+
+def trainer_on(root: Path, options: TrainOptions) -> tuple[JointTrainer, Scene, ImageCache]:
+    """Trainer before its first iteration, on a workspace with init-sim3 done, as `georef train` makes it."""
+    survey, initial, scene, images = scene_of(root, options)
+    maps = DepthMaps(Workspace(root).cache / "surface", scene, images)
     maps.build()
     trainer = make_trainer(
         TrainingScene(scene, images, SceneSurface(maps)),

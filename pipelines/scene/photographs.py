@@ -78,6 +78,11 @@ class ImageCache:
         """Return the camera of an undistorted image."""
         return pinhole_of(self._photographs[index].camera, self.max_size_px)
 
+    def largest(self) -> Pinhole:
+        """Return the camera of the image with the most pixels."""
+        cameras = (self.pinhole(index) for index in range(len(self)))
+        return max(cameras, key=lambda camera: camera.width * camera.height)
+
     def build(self, progress: Progress = SILENT) -> None:
         """Make all images that are not yet in the cache.
 

@@ -68,9 +68,7 @@ def require_memory(size: TrainingSize, free_bytes: int | None) -> None:
     needed = predicted_peak_bytes(size)
     if free_bytes is None or needed <= USABLE * free_bytes:
         return
-    without_gaussians = predicted_peak_bytes(replace(size, gaussians=0))
-    per_gaussian = (needed - without_gaussians) / max(size.gaussians, 1)
-    fitting = int((USABLE * free_bytes - without_gaussians) / per_gaussian) // 1000 * 1000
+    fitting = fitting_gaussians(size, free_bytes)
     advice = (
         f"--max-gaussians {fitting}"
         if fitting >= 1000
@@ -81,6 +79,18 @@ def require_memory(size: TrainingSize, free_bytes: int | None) -> None:
         f"{size.camera.width}×{size.camera.height} pixels) and {_gib(free_bytes)} are free: use {advice}"
         f"{', or a smaller --max-image-size' if fitting >= 1000 else ''}, or close other programs"
     )
+
+
+def fitting_gaussians(size: TrainingSize, free_bytes: int) -> int:
+    """Return a number of Gaussians, in thousands, that fits into the free memory at a training of another number.
+
+    Args:
+        size: of the training, with at least one Gaussian.
+        free_bytes: from `free_memory_bytes`.
+    """
+    fixed = predicted_peak_bytes(replace(size, gaussians=0, photograph_px=0))
+    each = (predicted_peak_bytes(replace(size, photograph_px=0)) - fixed) / max(size.gaussians, 1)
+    return max(int((USABLE * free_bytes - fixed) / each), 0) // 1000 * 1000
 
 
 def free_memory_bytes(device: torch.device) -> int | None:

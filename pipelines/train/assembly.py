@@ -5,43 +5,24 @@ from __future__ import annotations
 import torch
 
 from pipelines.georef.problem import GeoProblem
-from pipelines.scene.photographs import ImageCache
-from pipelines.scene.scene import Scene
 from pipelines.splat.densify import DefaultSettings, DefaultStrategy, Strategy
 from pipelines.splat.densify_fast import FastSettings, FastStrategy
 from pipelines.splat.densify_mcmc import McmcSettings, McmcStrategy
 from pipelines.splat.exposure import Exposures, HeldExposures
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.initialise import InitialisationOptions, scene_extent
-from pipelines.splat.memory import TrainingSize
 from pipelines.splat.optimizer import GaussianAdam
+from pipelines.splat.outlier_pixels import OutlierPixels
 from pipelines.splat.rasterizer.api import Rasterizer
 from pipelines.splat.rasterizer.backends import device_of
 from pipelines.splat.surface import SurfaceSettings
+from pipelines.train.crops import Crops
 from pipelines.train.initial_gaussians import TrainingScene, initial_gaussians, points_to_hold
 from pipelines.train.options import TrainOptions
 from pipelines.train.schedule import COARSE, JointOptions
 from pipelines.train.trainer import JointTrainer, TrainingViews
 
 _FINISHING_RATE = 0.3  # of the rates at which a training starts
-
-
-def training_size(scene: Scene, images: ImageCache, options: TrainOptions, beside: int = 0) -> TrainingSize:
-    """Return the quantities that determine the memory of a training.
-
-    Args:
-        scene: cameras.
-        images: undistorted photographs.
-        options: of the training.
-        beside: number of frozen Gaussians that are rendered too.
-    """
-    cameras = [images.pinhole(index) for index in map(int, scene.train)]
-    largest = max(cameras, key=lambda camera: camera.width * camera.height)
-    refined = options.refined_cameras(len(images))
-    window = options.crops.largest_of(largest)
-    return TrainingSize(
-        options.effort.max_gaussians + beside, window, options.sh_degree, refined, largest.width * largest.height
-    )
 
 
 def make_trainer(
@@ -86,10 +67,11 @@ def make_trainer(
             geo_schedule=options.geo_schedule,
             seed=options.seed,
             coarse=COARSE if options.coarse_to_fine else (),
-            crops=options.crops,
+            crops=Crops(options.crop_size, options.seed),
             surface=SurfaceSettings() if options.faithful_surface else None,
         ),
         exposures=exposures or fitted,
+        outliers=OutlierPixels(device) if options.robust_photometric else None,
         region=training.region,
     )
 
@@ -129,7 +111,7 @@ def make_finisher(
             iterations,
             gaussians.sh_degree,
             seed=options.seed,
-            crops=options.crops,
+            crops=Crops(options.crop_size, options.seed),
             surface=SurfaceSettings() if options.faithful_surface else None,
             finishing=True,
         ),

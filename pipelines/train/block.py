@@ -27,9 +27,10 @@ from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.memory import free_memory_bytes, require_memory
 from pipelines.splat.rasterizer.backends import device_of, rasterizer
 from pipelines.splat.storage import read_gaussians, write_gaussians
-from pipelines.train.assembly import make_trainer, training_size
+from pipelines.train.assembly import make_trainer
 from pipelines.train.depth_maps import DepthMaps
 from pipelines.train.frozen_training import SolvedScene, load_solved_scene
+from pipelines.train.gaussian_limit import training_size
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.loop import TrainingRecord
 from pipelines.train.options import BlockTrainOptions
@@ -61,7 +62,7 @@ def run(stage: StageRun, options: BlockTrainOptions) -> Summary:
     options = options.model_copy(update={"max_gaussians": block.gaussians, "optimize_cameras": False})
     images = photographs(solved.scene.sparse, solved.survey, workspace, options.effort.max_image_size)
     scaffold = read_gaussians(workspace.path(SCAFFOLD)).to(device_of(backend))
-    size = training_size(solved.scene, images, options, beside=len(scaffold))
+    size = training_size(options, len(images), images.largest(), beside=len(scaffold))
     require_memory(size, free_memory_bytes(device_of(backend)))
     images.build(stage.progress)
     surface = _surface(stage, solved, images) if options.dense else None

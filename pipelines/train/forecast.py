@@ -13,9 +13,11 @@ from pipelines.geometry.cameras import Pinhole
 from pipelines.scene.block_plan import BlockPlan
 from pipelines.scene.cloud_options import NOT_IN_BLOCKS
 from pipelines.scene.survey import Survey
-from pipelines.splat.memory import USABLE, TrainingSize, free_memory_bytes, predicted_peak_bytes
+from pipelines.splat.memory import USABLE, free_memory_bytes, predicted_peak_bytes
 from pipelines.splat.rasterizer.backends import chosen_backend
+from pipelines.train.crops import Crops
 from pipelines.train.depth_maps import StereoOptions
+from pipelines.train.gaussian_limit import training_size, with_gaussian_limit
 from pipelines.train.options import TrainOptions
 from pipelines.train.pace import BLOCK_SECONDS, MEASURED_CORES, SURFACE_FACTOR, iteration_seconds
 from pipelines.train.schedule import COARSE, pyramid
@@ -109,11 +111,11 @@ def forecast(photographs: int, photo_px: tuple[int, int], options: TrainOptions)
     Raises:
         BackendUnavailableError: `--backend cuda`, and a part that it needs is missing; names each.
     """
-    effort, camera = options.effort, camera_of(photo_px, options)
-    backend = chosen_backend(options.backend)
+    camera, backend = camera_of(photo_px, options), chosen_backend(options.backend)
     device = torch.device(backend)
-    refined, window = options.refined_cameras(photographs), options.crops.largest_of(camera)
-    size = TrainingSize(effort.max_gaussians, window, options.sh_degree, refined, camera.width * camera.height)
+    free_bytes = free_memory_bytes(device)
+    options = with_gaussian_limit(options, photographs, camera, free_bytes)
+    effort, size = options.effort, training_size(options, photographs, camera)
     return TrainingForecast(
         preset=options.preset,
         photographs=photographs,
@@ -125,7 +127,7 @@ def forecast(photographs: int, photo_px: tuple[int, int], options: TrainOptions)
         threads=thread_count(),
         seconds=_seconds(photographs, camera, options) if device.type == "cpu" else None,
         peak_bytes=predicted_peak_bytes(size),
-        free_bytes=free_memory_bytes(device),
+        free_bytes=free_bytes,
         blocks=options.blocks,
         lidar=options.lidar is not None,
     )
@@ -186,7 +188,7 @@ class _Iteration:
     def windows(self, shrink: int) -> int:
         """Return the number of windows of a photograph that is shrunken by a factor."""
         side = (self.pixels / (self.camera.width * self.camera.height)) ** 0.5 / shrink
-        return self.options.crops.count(
+        return Crops(self.options.crop_size).count(
             max(int(side * self.camera.width), 1), max(int(side * self.camera.height), 1)
         )
 
@@ -204,8 +206,8 @@ class _Iteration:
     def of_all(self, one: Callable[[int], float]) -> float:
         """Return the seconds of all iterations; `one`: of one with photographs that are shrunken by a factor."""
         seconds, begun, options = 0.0, 0.0, self.options
-        coarse = COARSE if options.coarse_to_fine else ()
-        for shrink, until in pyramid(self.camera.width, self.camera.height, coarse, options.crops):
+        coarse, crops = COARSE if options.coarse_to_fine else (), Crops(options.crop_size)
+        for shrink, until in pyramid(self.camera.width, self.camera.height, coarse, crops):
             seconds += (until - begun) * options.effort.iterations * one(shrink)
             begun = until
         return seconds

@@ -8,7 +8,6 @@ from pydantic import Field, model_validator
 
 from pipelines.core.options import StageOptions
 from pipelines.scene.geographic_options import GeographicOptions
-from pipelines.train.crops import Crops
 from pipelines.train.lidar.options import LidarOptions
 from pipelines.train.presets import PRESETS, Preset
 
@@ -36,6 +35,9 @@ class SplatOptions(StageOptions):
     )
     coarse_to_fine: bool = Field(True, description="Start with shrunken photographs.")
     exposure: bool = Field(True, description="Fit the exposure of each training photograph.")
+    robust_photometric: bool = Field(
+        False, description="Leave out parts of photographs that contradict the others: moved cars, shadows."
+    )
     dense: bool = Field(True, description="Find the scene's surface by multi-view stereo first, to start from.")
     faithful_surface: bool = Field(True, description="Hold the Gaussians to the surface, for depths to measure in.")
 
@@ -73,11 +75,6 @@ class TrainOptions(GeographicOptions, SplatOptions, BlockOptions, LidarOptions):
     checkpoint_every: int = Field(500, ge=1, description="Iterations between checkpoints.")
     log_every: int = Field(10, ge=1, description="Iterations between lines of metrics.jsonl.")
     seed: int = Field(0, ge=0, description="Seed of every random choice.")
-
-    @property
-    def crops(self) -> Crops:
-        """Windows of large photographs."""
-        return Crops(self.crop_size, self.seed)
 
     @model_validator(mode="after")
     def _lidar_needs_a_surface(self) -> TrainOptions:

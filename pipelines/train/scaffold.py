@@ -12,8 +12,9 @@ from pipelines.scene.scene import photographs
 from pipelines.splat.memory import free_memory_bytes, require_memory
 from pipelines.splat.rasterizer.backends import device_of, rasterizer
 from pipelines.splat.storage import write_gaussians
-from pipelines.train.assembly import make_trainer, training_size
+from pipelines.train.assembly import make_trainer
 from pipelines.train.frozen_training import load_solved_scene
+from pipelines.train.gaussian_limit import training_size
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.options import TrainOptions
 from pipelines.train.training_files import train_in_folder
@@ -35,7 +36,7 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     solved = load_solved_scene(workspace)
     coarse = coarse_options(options, len(solved.scene.train))
     images = photographs(solved.scene.sparse, solved.survey, workspace, coarse.effort.max_image_size)
-    require_memory(training_size(solved.scene, images, coarse), free_memory_bytes(device_of(backend)))
+    require_memory(training_size(coarse, len(images), images.largest()), free_memory_bytes(device_of(backend)))
     images.build(stage.progress)
     exposures = solved.exposures(device_of(backend))
     trainer = make_trainer(TrainingScene(solved.scene, images), solved.problem(), backend, coarse, exposures)

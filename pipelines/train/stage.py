@@ -25,9 +25,10 @@ from pipelines.scene.trained_model import TrainedModel
 from pipelines.splat.memory import free_memory_bytes, require_memory
 from pipelines.splat.rasterizer.backends import device_of, rasterizer
 from pipelines.splat.storage import write_gaussians
-from pipelines.train.assembly import make_trainer, training_size
+from pipelines.train.assembly import make_trainer
 from pipelines.train.depth_maps import DepthMaps
 from pipelines.train.forecast import forecast_of
+from pipelines.train.gaussian_limit import training_size, with_gaussian_limit
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.lidar.prepare import compared_lidar, draw_changes, lidar_surface
 from pipelines.train.lidar.track import ScannerTrack
@@ -59,7 +60,9 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
         track = ScannerTrack.read(options.lidar_trajectory, options.lidar_stated, survey.origin)
     options.require_trainable(len(scene.sparse.image_name))
     images = photographs(scene.sparse, survey, workspace, options.effort.max_image_size)
-    require_memory(training_size(scene, images, options), free_memory_bytes(device_of(backend)))
+    free_bytes = free_memory_bytes(device_of(backend))
+    options = with_gaussian_limit(options, len(images), images.largest(), free_bytes)
+    require_memory(training_size(options, len(images), images.largest()), free_bytes)
     images.build(stage.progress)
     maps = DepthMaps(workspace.cache / "surface", scene, images) if options.dense else None
     if maps is not None:

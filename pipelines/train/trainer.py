@@ -22,6 +22,7 @@ from pipelines.splat.finiteness import FinitenessMonitor
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.losses import photometric_loss
 from pipelines.splat.optimizer import GaussianAdam
+from pipelines.splat.outlier_pixels import OutlierPixels
 from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings, Render, ScreenStats
 from pipelines.splat.surface import ObservedPoints
 from pipelines.train.checkpoint import prefixed, unprefixed
@@ -100,6 +101,7 @@ class JointTrainer:
         options: settings, with the schedule.
         exposures: exposures of the photographs, optimised as well or held; None: all photographs have the same
             exposure.
+        outliers: finds pixels that contradict the model, which do not count; None: all do.
         region: part of the scene that the Gaussians are to show; None: all of it.
     """
 
@@ -113,11 +115,12 @@ class JointTrainer:
         rasterizer: Rasterizer,
         options: JointOptions,
         exposures: Exposures | HeldExposures | None = None,
+        outliers: OutlierPixels | None = None,
         region: TrainingRegion | None = None,
     ) -> None:
         self.optimizer, self.strategy, self.problem = optimizer, strategy, problem
         self.views, self.rasterizer, self.options = views, rasterizer, options
-        self.exposures, self.region = exposures, region
+        self.exposures, self.outliers, self.region = exposures, outliers, region
         self.iteration = 0
         self.schedule = TrainingSchedule(options, views.camera)
         self.device = optimizer.gaussians.means.device
@@ -156,7 +159,12 @@ class JointTrainer:
         pose = self.problem.cameras.cam_from_model(index)
         render = self._render(pose, target, depth=self.problem.sees_by_depth(index))
         colour = render.colour if self.exposures is None else self.exposures.apply(index, render.colour)
-        photometric = photometric_loss(colour, target.colour, target.mask)
+        counting = target.mask
+        if self.outliers is not None:
+            counting = self.outliers.inliers(
+                colour, target.colour, counting, max(target.whole.width, target.whole.height)
+            )
+        photometric = photometric_loss(colour, target.colour, counting)
         weight, by_depth = self.schedule.geographic_weight(self.iteration), self._by_depth(index, render, target)
         geographic = self.problem.loss() if by_depth is None else self.problem.loss() + by_depth
         self.optimizer.zero_grad()
@@ -338,6 +346,7 @@ class JointTrainer:
             moments = self._geo_adam.state[parameter]
             geo |= {f"{name}_{key}": torch.as_tensor(value) for key, value in moments.items()}
         exposures = {} if self.exposures is None else self.exposures.state()
+        outliers = {} if self.outliers is None else self.outliers.state()
         return {
             "iteration": torch.tensor(self.iteration),
             "extended_from": torch.tensor(self.schedule.extended_from),
@@ -348,6 +357,7 @@ class JointTrainer:
             **prefixed("strategy", self.strategy.state()),
             **prefixed("geo", geo),
             **prefixed("exposures", exposures),
+            **prefixed("outliers", outliers),
         }
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
@@ -366,6 +376,8 @@ class JointTrainer:
         self.strategy.restore(unprefixed("strategy", state))
         if self.exposures is not None:
             self.exposures.restore(unprefixed("exposures", state))
+        if self.outliers is not None:
+            self.outliers.restore(unprefixed("outliers", state))
         geo = unprefixed("geo", state)
         for name, parameter in self.problem.learned().items():
             with torch.no_grad():

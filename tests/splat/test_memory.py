@@ -107,3 +107,13 @@ def test_a_containers_limit_counts_without_its_file_cache(tmp_path: Path) -> Non
     assert _free_in_group(tmp_path) == 500
     (tmp_path / "memory.max").write_text("max\n")
     assert _free_in_group(tmp_path) is None
+
+
+def test_memory_is_bounded_by_the_window_and_not_by_the_photograph() -> None:
+    """Undistortion takes a few bytes for each pixel of a photograph, an iteration two hundred in its window."""
+    window, photograph_px = Pinhole(1232, 1026, 1e3, 1e3, 616.0, 513.0), 5472 * 3648
+    whole = predicted_peak_bytes(TrainingSize(100_000, Pinhole(5472, 3648, 4e3, 4e3, 2736.0, 1824.0), 3, 0))
+    cropped = predicted_peak_bytes(TrainingSize(100_000, window, 3, 0, photograph_px))
+    assert cropped < 0.2 * whole
+    # A photograph with nearly no Gaussians: the undistortion decides.
+    assert predicted_peak_bytes(TrainingSize(100, window, 3, 0, photograph_px)) > 20 * photograph_px

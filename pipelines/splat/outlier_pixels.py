@@ -1,0 +1,102 @@
+"""Pixels of photographs that contradict the model: cars and shadows that have moved between the photographs.
+
+Trimming by residuals, as in RobustNeRF (doi 10.48550/arXiv.2302.00833) and SpotLessSplats
+(doi 10.48550/arXiv.2406.20055), without a network:
+
+1. The signed difference of photograph and render is averaged over cells of the image, colour by colour. Leaves in
+   wind and edges that are not yet sharp differ by as much to either side, and cancel out. An object that has moved
+   leaves its colour.
+2. A cell is an outlier if its difference is several times a high quantile of all cells, which runs through the
+   training: while the model is still coarse, no cell is an outlier.
+3. Outliers and the cells around them do not count in the photometric loss.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+
+@dataclass(frozen=True)
+class OutlierSettings:
+    """Settings of `OutlierPixels`.
+
+    Attributes:
+        cell: side of a cell, as a share of the photograph's longer side,
+        least_px: and its lower limit in pixels.
+        quantile: of the differences of the cells of a view,
+        times: its multiple from which a cell is an outlier,
+        least: and the lower limit of that, of colours 0 … 1.
+        memory: weight of the earlier views in the running quantile.
+        views: number of views before the first outlier.
+    """
+
+    cell: float = 1 / 80
+    least_px: int = 4
+    quantile: float = 0.9
+    times: float = 3.0
+    least: float = 0.05
+    memory: float = 0.95
+    views: int = 50
+
+
+class OutlierPixels:
+    """Running quantile of the differences, and the pixels beyond it.
+
+    Args:
+        device: of the images.
+        settings: of the rule.
+    """
+
+    def __init__(self, device: torch.device, settings: OutlierSettings | None = None) -> None:
+        self.settings = settings or OutlierSettings()
+        self._quantile = torch.zeros((), device=device)
+        self._views = 0
+
+    @torch.no_grad()
+    def inliers(self, rendered: Tensor, target: Tensor, mask: Tensor | None, longest_px: int) -> Tensor | None:
+        """Return the pixels (H, W) of the mask that are no outliers, and add the view to the running quantile.
+
+        Args:
+            rendered: (H, W, 3).
+            target: (H, W, 3).
+            mask: (H, W) bool, the pixels that count; None: all.
+            longest_px: longer side of the photograph that these pixels are a part of.
+
+        Returns:
+            None if all pixels count.
+        """
+        settings = self.settings
+        cell = max(settings.least_px, round(settings.cell * longest_px))
+        difference = _cell_differences(rendered - target, mask, cell)
+        kept = settings.memory if self._views else 0.0
+        self._quantile.lerp_(difference.flatten().quantile(settings.quantile), 1 - kept)
+        self._views += 1
+        if self._views <= settings.views:
+            return mask
+        limit = (settings.times * self._quantile).clamp_min(settings.least)
+        outlier = functional.max_pool2d((difference > limit).float()[None, None], 3, stride=1, padding=1)
+        height, width = target.shape[:2]
+        outside = outlier[0, 0].repeat_interleave(cell, 0).repeat_interleave(cell, 1)[:height, :width] > 0
+        return ~outside if mask is None else mask & ~outside
+
+    def state(self) -> dict[str, Tensor]:
+        """Return copies of the running state, for a checkpoint."""
+        return {"quantile": self._quantile.clone(), "views": torch.tensor(self._views)}
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Restore a state."""
+        self._quantile.copy_(state["quantile"])
+        self._views = int(state["views"])
+
+
+def _cell_differences(difference: Tensor, mask: Tensor | None, cell: int) -> Tensor:
+    """Return the largest absolute mean of the three colours in each cell; 0 where no pixel counts."""
+    counts = torch.ones_like(difference[..., 0]) if mask is None else mask.to(difference)
+    planes = torch.cat([difference * counts[..., None], counts[..., None]], dim=-1).permute(2, 0, 1)[None]
+    means = functional.avg_pool2d(planes, cell, ceil_mode=True, count_include_pad=False)[0]
+    # Of a cell that counts in part, the part decides by its share.
+    return means[:3].abs().amax(dim=0)
