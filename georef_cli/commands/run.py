@@ -44,6 +44,7 @@ LATER: dict[str, tuple[str, ...]] = {
     "iterations": ("train",),
     "max_image_size": ("train",),
     "max_gaussians": ("train",),
+    "crop_size": ("train",),
     "blocks": ("train",),
     "backend": ("train", "evaluate"),
     "lidar": ("train",),

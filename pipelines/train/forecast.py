@@ -38,6 +38,7 @@ class TrainingForecast:
         photographs: number of photographs.
         photo_px: width and height of the largest photograph.
         training_px: width and height at which it is trained.
+        windows: number of windows in which it is seen, one at an iteration, when it is not shrunken further.
         iterations: length of the training.
         max_gaussians: limit of the Gaussians.
         backend: `cpu` or `cuda`.
@@ -53,6 +54,7 @@ class TrainingForecast:
     photographs: int
     photo_px: tuple[int, int]
     training_px: tuple[int, int]
+    windows: int
     iterations: int
     max_gaussians: int
     backend: str
@@ -87,6 +89,8 @@ class TrainingForecast:
         size = f"{self.photographs} photographs of {width}×{height} px are trained at {small_width}×{small_height}"
         if self.reduction > 1.05:
             size += f", 1/{self.reduction:.1f} of their side (--max-image-size)"
+        if self.windows > 1:
+            size += f", each in {self.windows} windows (--crop-size)"
         took = "time not measured on a GPU"
         if self.seconds is not None:
             took = f"about {about(self.seconds)} on {self.threads} threads of this machine"
@@ -121,6 +125,7 @@ def forecast(photographs: int, photo_px: tuple[int, int], options: TrainOptions)
         photographs=photographs,
         photo_px=photo_px,
         training_px=(camera.width, camera.height),
+        windows=Crops(options.crop_size).count(camera.width, camera.height),
         iterations=effort.iterations,
         max_gaussians=effort.max_gaussians,
         backend=backend,

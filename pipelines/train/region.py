@@ -26,7 +26,8 @@ from pipelines.train.surface import SceneSurface
 _STAND_IN_PX = 160  # longest side of the stand-in's renders
 _LEAST_ALPHA = 0.5  # of a surface: rays that meet less end in the sky
 _SKY_M = 1e6
-_KEPT = 64  # masks in memory unpacked
+_KEPT = 16  # masks in memory unpacked
+_BAND_PX = 1_000_000  # pixels whose points are computed at once, in some hundred bytes each
 _STRAY = 0.002  # of the points at either end of an axis
 _ROOM = 0.2  # of the longest side of their box
 
@@ -73,7 +74,7 @@ class RegionMasks:
         whole = self._whole(index)
         height, width = (side // shrink for side in whole.shape)
         cells = whole[: height * shrink, : width * shrink].reshape(height, shrink, width, shrink)
-        mask = cells.mean(axis=(1, 3)) >= 0.5
+        mask = whole if shrink == 1 else cells.mean(axis=(1, 3)) >= 0.5
         if not mask.any():
             return RegionView(Window(0, 0, 1, 1), np.zeros((1, 1), dtype=bool))
         rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
@@ -180,8 +181,12 @@ def region_mask(
     if known is not None:
         own = cv2.resize(np.array(known), size, interpolation=cv2.INTER_NEAREST)
         depth = np.where(own > 0, own, depth)
-    points = (pinhole.points_at(depth) - pose[:3, 3]) @ pose[:3, :3]
-    return cell.contains(points).reshape(depth.shape)
+    mask, rows = np.empty(depth.shape, dtype=bool), max(1, _BAND_PX // pinhole.width)
+    for top in range(0, pinhole.height, rows):
+        band = Window(0, top, pinhole.width, min(rows, pinhole.height - top))
+        points = (band.of(pinhole).points_at(depth[band.slices]) - pose[:3, 3]) @ pose[:3, :3]
+        mask[band.slices] = cell.contains(points).reshape(band.height, band.width)
+    return mask
 
 
 def stand_in_depth(
