@@ -200,7 +200,11 @@ class DepthMaps:
         return StereoView(self._camera(pinhole, index), grey)
 
     def _rgb(self, pinhole: Pinhole, index: int) -> ByteArray:
-        image = np.array(self.images.image(index))
+        whole = self.images.pinhole(index)
+        # A view is read by all of its neighbours: large photographs are shrunken once. Nothing must be cut off.
+        most = max(max(whole.width, whole.height) // (2 * self._options.fine_px), 1)
+        shrink = max(s for s in range(1, most + 1) if whole.width % s == 0 == whole.height % s)
+        image = np.array(self.images.shrunken(index, shrink))
         small = cv2.resize(image, (pinhole.width, pinhole.height), interpolation=cv2.INTER_AREA)
         return np.asarray(small, np.uint8)
 

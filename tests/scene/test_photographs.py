@@ -147,3 +147,25 @@ def test_photograph_that_was_replaced_after_ingest_is_refused(tmp_path: Path) ->
     shot.file.write_bytes(shot.file.read_bytes() + b"\0")  # decodes as before
     with pytest.raises(InputError, match=r"a\.png: the photograph has changed since `georef ingest` read it"):
         ImageCache(tmp_path / "cache", [recorded], WIDTH).build()
+
+
+def test_bands_of_rows_give_the_same_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shot = photograph(BARREL, tmp_path / "a.png")
+    one = ImageCache(tmp_path / "one", [shot], WIDTH)
+    expected = np.array(one.image(0)), np.array(one.mask(0))
+    monkeypatch.setattr("pipelines.scene.photographs._BAND_PX", 7 * WIDTH)
+    bands = ImageCache(tmp_path / "bands", [shot], WIDTH)
+    np.testing.assert_array_equal(bands.image(0), expected[0])
+    np.testing.assert_array_equal(bands.mask(0), expected[1])
+
+
+def test_a_shrunken_image_is_made_once_and_again_if_damaged(tmp_path: Path) -> None:
+    images = ImageCache(tmp_path / "cache", [photograph(BARREL, tmp_path / "a.png")], WIDTH)
+    blocks = images.image(0)[:175, :].astype(np.float64).reshape(35, 5, 48, 5, 3).mean(axis=(1, 3))
+    assert np.abs(images.shrunken(0, 5)[:35] - blocks).max() <= 0.5 + 1e-9
+    (file,) = (tmp_path / "cache").glob("*.5.npy")
+    before = file.stat().st_mtime_ns
+    images.shrunken(0, 5)
+    assert file.stat().st_mtime_ns == before
+    file.write_bytes(file.read_bytes()[:200])
+    assert np.abs(images.shrunken(0, 5)[:35] - blocks).max() <= 0.5 + 1e-9

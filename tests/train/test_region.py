@@ -48,6 +48,14 @@ def test_known_depth_comes_before_the_stand_in() -> None:
     assert mask[24:].all()
 
 
+def test_bands_of_rows_give_the_same_mask(monkeypatch: pytest.MonkeyPatch) -> None:
+    pose, depth = tiny.poses().matrix(1), wall_depth() + np.arange(48, dtype=np.float32)[:, None] / 50
+    expected = region_mask(pose, tiny.PINHOLE, WEST, None, depth)
+    monkeypatch.setattr("pipelines.train.region._BAND_PX", 5 * tiny.PINHOLE.width)
+    np.testing.assert_array_equal(region_mask(pose, tiny.PINHOLE, WEST, None, depth), expected)
+    assert expected.any() and not expected.all()
+
+
 def test_sky_belongs_to_the_cell_in_its_direction() -> None:
     empty = Gaussians.concatenate([tiny.true_gaussians(1)])
     empty.logit_opacities[:] = -9.0
