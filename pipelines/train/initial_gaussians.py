@@ -17,6 +17,7 @@ from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.initialise import InitialisationOptions, gaussians_from_points, gaussians_of_size
 from pipelines.splat.surface import ObservedPoints
 from pipelines.train.background import background
+from pipelines.train.guessed_surface import guessed_points
 from pipelines.train.region import TrainingRegion
 from pipelines.train.surface import SceneSurface, SurfacePoints
 
@@ -54,7 +55,8 @@ def initial_gaussians(training: TrainingScene, options: InitialisationOptions, m
     1. Discs lie on the surface, as dense as the photographs resolve it.
     2. Balls lie at SfM points where no surface is known. On a surface discs are better: an SfM point has no normal,
        and a ball reaches as far behind a wall as the gap to the wall's next point.
-    3. Balls lie in the background, as far as the limit leaves room. In a region, the sky is that of the model which
+    3. Where the surface of much of the photographs is not known, balls lie at the height of the SfM points.
+    4. Balls lie in the background, as far as the limit leaves room. In a region, the sky is that of the model which
        stands in for the rest: all blocks of a survey then have the same.
 
     Args:
@@ -72,6 +74,9 @@ def initial_gaussians(training: TrainingScene, options: InitialisationOptions, m
         share = _SURFACE_SHARE * min(1.0, training.surface.known_share() / _MOSTLY_KNOWN)
         surface = training.surface.sample(int(share * most), seed, training.in_region)
         start = SurfacePoints.concatenate([start.part(_off_surface(start, surface)), surface])
+        unknown = int((_SURFACE_SHARE - share) * most)
+        guessed = guessed_points(scene, training.surface, unknown, seed, training.in_region)
+        start = SurfacePoints.concatenate([start, guessed])
     behind = background(scene, training.images, start.point_in_model)
     start = start.part(np.flatnonzero(training.in_region(start.point_in_model)))
     near = gaussians_from_points(start.point_in_model, start.rgb, options, start.normal_in_model)

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
+from pipelines.geometry.cameras import Pinhole
 from pipelines.geometry.thinning import thin_to_voxels
 from pipelines.splat.gaussians import Gaussians
 from pipelines.train.depth_maps import DepthMaps
@@ -69,6 +70,14 @@ class SceneSurface:
     def depth(self, index: int) -> Float32Array:
         """Return the depth (H, W) in metres along a training view's optical axis; 0: unknown."""
         return self._maps.depth(index)
+
+    def camera(self, index: int) -> Pinhole:
+        """Return the camera of a training view's depths."""
+        return self._maps.camera(index)
+
+    def rgb(self, index: int) -> ByteArray:
+        """Return the photograph (H, W, 3) at the pixels of its depths."""
+        return self._maps.rgb(index)
 
     def points(self, index: int, stride: int = 1) -> FloatArray:
         """Return the surface points (P, 3) in `model` that a training view sees, in metres.

@@ -14,6 +14,7 @@ from pipelines.scene.photographs import ImageCache, save_array
 from pipelines.scene.scene import Scene, make_scene, photographs
 from pipelines.splat.initialise import InitialisationOptions
 from pipelines.train.depth_maps import DepthMaps
+from pipelines.train.guessed_surface import guessed_points
 from pipelines.train.initial_gaussians import TrainingScene, initial_gaussians, points_to_hold
 from pipelines.train.surface import SceneSurface, spread_evenly
 from tests.scenes import write_workspace
@@ -104,6 +105,20 @@ def test_sample_knows_the_slope_of_the_hill(surface: SceneSurface) -> None:
     angle = np.degrees(np.arccos(np.clip(np.abs((true * some.normal_in_model[near]).sum(axis=1)), 0, 1)))
     # A quarter of a pixel of height against four pixels across is 3.6°.
     assert np.median(angle) < 2 * 3.6
+
+
+def test_guessed_points_lie_at_the_height_of_the_sfm_points(
+    surface: SceneSurface, material: tuple[Rendered, Scene, ImageCache]
+) -> None:
+    scene = material[1]
+    east = guessed_points(scene, surface, 300, 0, lambda points: points[:, 0] > 0)
+    assert 150 < len(east.rgb) <= 300 and east.rgb.std() > 20
+    assert (east.point_in_model[:, 0] > 0).all() and np.isnan(east.normal_in_model).all()
+    near = east.point_in_model[(np.abs(east.point_in_model[:, :2]) < 26).all(axis=1)]
+    # Heights are those of the nine nearest of some hundred points, metres apart on slopes of up to a half.
+    assert np.median(np.abs(near[:, 2] - ground_height(near[:, 0], near[:, 1]))) < 4 * QUARTER_PX_M
+    nothing = guessed_points(scene, surface, 0, 0, lambda points: points[:, 0] > 0)
+    assert len(nothing.rgb) == 0
 
 
 def test_maps_are_kept_and_continued(maps: DepthMaps, material: tuple[Rendered, Scene, ImageCache]) -> None:
