@@ -17,9 +17,11 @@ from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.losses import photometric_loss
 from pipelines.splat.rasterizer.api import RasterSettings, Window
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
+from pipelines.splat.surface import ObservedPoints, SurfaceSettings
 from pipelines.train.crops import Crops
 from pipelines.train.region import RegionMasks
 from pipelines.train.schedule import JointOptions
+from pipelines.train.surface_losses import RenderedView, SurfaceLosses
 from pipelines.train.target_images import Look, TargetImages
 from tests import tiny_training as tiny
 
@@ -159,3 +161,23 @@ def test_each_place_belongs_to_one_window_of_a_round(images: ImageCache) -> None
             low, high = torch.tensor(target.part.low), torch.tensor(target.part.high)
             seen += int(((place >= low) & (place < high)).all(dim=1).sum())
         assert seen == len(place)
+
+
+def test_windows_add_up_to_the_surface_losses_of_the_photograph(images: ImageCache) -> None:
+    """By its points and its pixels; depths are interpolated among fewer pixels beside a cut."""
+    parts, whole = (TargetImages(images, Pinholes(images), torch.device("cpu"), crops=c) for c in (CROPS, None))
+    random = torch.Generator().manual_seed(1)
+    near = torch.rand(400, 3, generator=random) * torch.tensor([2.0, 3.0, 0.4]) + torch.tensor([-1.9, -1.5, 4.1])
+    points = ObservedPoints(near)  # most of them in the left half
+    gaussians, pose = tiny.true_gaussians(), torch.eye(4)
+    for settings in (SurfaceSettings(1.0, 0, 0, 0), SurfaceSettings(0, 1.0, 0, 0)):
+        losses = SurfaceLosses(settings, tiny.EXTENT_M, CpuRasterizer())
+        values = []
+        for targets, looks in ((whole, [Look(1)]), (parts, [Look(1, visit=visit) for visit in range(WINDOWS)])):
+            for target in map(targets.get, looks):
+                raster = RasterSettings(sh_degree=0, depth=True, median=False, window=target.window)
+                render = CpuRasterizer().render(gaussians, pose, target.whole, raster)
+                view = RenderedView(render, target, pose, render.stats.visible, points)
+                values.append(float(losses.of(gaussians, view, 1, 10)))
+        assert np.mean(values[1:]) == pytest.approx(values[0], rel=0.02)
+        assert max(values[1:]) > 1.1 * values[0], "windows differ"
