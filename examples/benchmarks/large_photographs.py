@@ -102,7 +102,9 @@ def main() -> None:
     cameras = CameraCorrections(scene.poses, np.zeros((len(shots), 6, 0)))
     problem = GeoProblem(geometry, cameras, ())
     trainer = make_trainer(TrainingScene(scene, images, SceneSurface(maps)), problem, backend, options)
+    print(f"initial: peak {peak_mib() - before:.0f} MiB more", flush=True)
     trainer.step()
+    print(f"first iteration: peak {peak_mib() - before:.0f} MiB more", flush=True)
     worked, pixels = time.process_time(), 0
     for _ in range(arguments.iterations - 1):
         pixels += trainer.step().pixels

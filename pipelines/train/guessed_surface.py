@@ -8,14 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import cv2
 import numpy as np
 
-from pipelines.core.types import BoolArray, ByteArray, FloatArray
+from pipelines.core.types import BoolArray, FloatArray
+from pipelines.geometry.cameras import Pinhole
 from pipelines.geometry.footprints import PointSurface, ground_points
 from pipelines.scene.scene import Scene
 from pipelines.train.surface import SceneSurface, SurfacePoints, spread_evenly
 
 _CANDIDATES = 4  # drawn for each wanted point
+_COLUMNS = 64  # along the longer side of a view: neighbouring rays meet neighbouring ground
 
 
 def guessed_points(
@@ -42,26 +45,27 @@ def guessed_points(
     each = -(-_CANDIDATES * count // max(len(scene.train), 1))
     points, colours, sizes = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)], [np.zeros(0)]
     for index in map(int, scene.train):
-        rows, columns = np.nonzero(surface.depth(index) == 0)
+        camera = surface.camera(index)
+        depth = _ground_depth(scene, index, camera, ground)
+        rows, columns = np.nonzero((surface.depth(index) == 0) & np.isfinite(depth))
         chosen = random.permutation(len(rows))[:each]
-        place, rgb, size_m = _on_ground(scene, surface, index, np.stack([rows[chosen], columns[chosen]]), ground)
-        points.append(place)
-        colours.append(rgb)
-        sizes.append(size_m)
+        rows, columns = rows[chosen], columns[chosen]
+        in_cam = depth[rows, columns, None] * camera.rays(np.stack([columns, rows], axis=1) + 0.5)
+        points.append(in_cam @ scene.poses.cam_from_model[index] + scene.poses.cam_center_in_model[index])
+        colours.append(surface.rgb(index)[rows, columns])
+        sizes.append(depth[rows, columns] / camera.fx)
     place, rgb, size_m = np.concatenate(points), np.concatenate(colours), np.concatenate(sizes)
     counted = np.flatnonzero(inside(place))
     kept = counted[spread_evenly(place[counted], size_m[counted], count)]
     return SurfacePoints(place[kept], rgb[kept], np.full((len(kept), 3), np.nan))
 
 
-def _on_ground(
-    scene: Scene, surface: SceneSurface, index: int, pixels: np.ndarray, ground: PointSurface
-) -> tuple[FloatArray, ByteArray, FloatArray]:
-    """Return points (P, 3) of pixels (2, K) of a view, their colours, and the width of a pixel there in metres."""
-    camera, center = surface.camera(index), scene.poses.cam_center_in_model[index]
-    rows, columns = pixels
-    rays = camera.rays(np.stack([columns, rows], axis=1) + 0.5) @ scene.poses.cam_from_model[index]
+def _ground_depth(scene: Scene, index: int, camera: Pinhole, ground: PointSurface) -> FloatArray:
+    """Return the depth (H, W) of the ground in a view, in metres, from a few rays; NaN where it has none."""
+    center, coarse = scene.poses.cam_center_in_model[index], camera.limited(_COLUMNS)
+    depth = np.ones((coarse.height, coarse.width))
+    rays = coarse.points_at(depth) @ scene.poses.cam_from_model[index]
     place = ground_points(rays, center, ground)
-    met = np.isfinite(place).all(axis=1)
     along = np.linalg.norm(place - center, axis=1) / np.linalg.norm(rays, axis=1)
-    return place[met], surface.rgb(index)[rows[met], columns[met]], along[met] / camera.fx
+    size = camera.width, camera.height
+    return np.asarray(cv2.resize(along.reshape(depth.shape), size, interpolation=cv2.INTER_LINEAR))
