@@ -2,7 +2,7 @@
 
 Discs of one colour are painted into the training photographs of a workspace, in each at other places. The workspace
 is trained with and without them, and with and without `--robust-photometric`. The table has the PSNR of the clean
-test views, and the PSNR of the training views against the clean photographs at the painted pixels.
+test views, and the PSNR of the training views against the clean photographs at the pixels of the discs.
 """
 
 from __future__ import annotations
@@ -35,16 +35,17 @@ def discs(shape: tuple[int, int], count: int, share: float, random: np.random.Ge
 
 
 def paint(
-    scene: Scene, images: ImageCache, arguments: argparse.Namespace
+    scene: Scene, images: ImageCache, arguments: argparse.Namespace, *, write: bool
 ) -> dict[int, tuple[BoolArray, ByteArray]]:
-    """Paint the undistorted training photographs; returns the mask and the clean photograph of each."""
+    """Paint the undistorted training photographs, if `write`; returns mask and clean photograph of each."""
     random, painted = np.random.default_rng(arguments.seed), {}
     for index in map(int, scene.train):
         clean = np.array(images.image(index))
         mask = discs(clean.shape[:2], arguments.objects, arguments.size, random)
         changed = clean.copy()
         changed[mask] = random.integers(0, 256, 3)
-        save_array(Path(images.image(index).filename), changed)  # type: ignore[attr-defined]
+        if write:
+            save_array(Path(images.image(index).filename), changed)  # type: ignore[attr-defined]
         painted[index] = (mask, clean)
     return painted
 
@@ -91,15 +92,15 @@ def main() -> None:
             )
             if painted is None:
                 _, _, scene, images = scene_of(root, options)
-                painted = paint(scene, images, arguments) if objects else {}
+                painted = paint(scene, images, arguments, write=objects)
             trainer, scene, images = trainer_on(root, options)
             worked = time.process_time()
             for _ in range(arguments.iterations):
                 trainer.step()
             worked = time.process_time() - worked
             quality = ViewQuality(trainer, images).psnr(scene.test)
-            at = f"{psnr_at(trainer, painted):10.2f}" if painted else "         –"
-            print(f"{objects!s:7}  {robust!s:6}  {worked:11.0f}  {quality:12.2f}  {at}", flush=True)
+            at_objects = psnr_at(trainer, painted)
+            print(f"{objects!s:7}  {robust!s:6}  {worked:11.0f}  {quality:12.2f}  {at_objects:10.2f}", flush=True)
 
 
 if __name__ == "__main__":

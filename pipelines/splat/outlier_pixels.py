@@ -8,7 +8,8 @@ Trimming by residuals, as in RobustNeRF (doi 10.48550/arXiv.2302.00833) and Spot
    leaves its colour.
 2. A cell is an outlier if its difference is several times a high quantile of all cells, which runs through the
    training: while the model is still coarse, no cell is an outlier.
-3. Outliers and the cells around them do not count in the photometric loss.
+3. Outliers and the cells around them do not count in the photometric loss, but for every fifth view: parts that are
+   only late to converge could not come back otherwise.
 """
 
 from __future__ import annotations
@@ -30,17 +31,21 @@ class OutlierSettings:
         quantile: of the differences of the cells of a view,
         times: its multiple from which a cell is an outlier,
         least: and the lower limit of that, of colours 0 … 1.
+        most: share of the cells of a view that are outliers at most, before those around them are added.
         memory: weight of the earlier views in the running quantile.
         views: number of views before the first outlier.
+        amnesty: all pixels count in every view with such a number.
     """
 
-    cell: float = 1 / 80
-    least_px: int = 4
+    cell: float = 1 / 40
+    least_px: int = 8
     quantile: float = 0.9
-    times: float = 3.0
+    times: float = 8.0
     least: float = 0.05
+    most: float = 0.01
     memory: float = 0.95
     views: int = 50
+    amnesty: int = 5
 
 
 class OutlierPixels:
@@ -73,11 +78,12 @@ class OutlierPixels:
         cell = max(settings.least_px, round(settings.cell * longest_px))
         difference = _cell_differences(rendered - target, mask, cell)
         kept = settings.memory if self._views else 0.0
-        self._quantile.lerp_(difference.flatten().quantile(settings.quantile), 1 - kept)
+        high, highest = difference.flatten().quantile(difference.new_tensor([settings.quantile, 1 - settings.most]))
+        self._quantile.lerp_(high, 1 - kept)
         self._views += 1
-        if self._views <= settings.views:
+        if self._views <= settings.views or self._views % settings.amnesty == 0:
             return mask
-        limit = (settings.times * self._quantile).clamp_min(settings.least)
+        limit = torch.maximum(settings.times * self._quantile, highest).clamp_min(settings.least)
         outlier = functional.max_pool2d((difference > limit).float()[None, None], 3, stride=1, padding=1)
         height, width = target.shape[:2]
         outside = outlier[0, 0].repeat_interleave(cell, 0).repeat_interleave(cell, 1)[:height, :width] > 0

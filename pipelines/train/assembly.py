@@ -12,7 +12,7 @@ from pipelines.splat.exposure import Exposures, HeldExposures
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.initialise import InitialisationOptions, scene_extent
 from pipelines.splat.optimizer import GaussianAdam
-from pipelines.splat.outlier_pixels import OutlierPixels
+from pipelines.splat.outlier_pixels import OutlierPixels, OutlierSettings
 from pipelines.splat.rasterizer.api import Rasterizer
 from pipelines.splat.rasterizer.backends import device_of
 from pipelines.splat.surface import SurfaceSettings
@@ -22,6 +22,7 @@ from pipelines.train.options import TrainOptions
 from pipelines.train.schedule import COARSE, JointOptions
 from pipelines.train.trainer import JointTrainer, TrainingViews
 
+_OUTLIERS_FROM = 0.5  # of the iterations: before, the model is too coarse to tell what has moved
 _FINISHING_RATE = 0.3  # of the rates at which a training starts
 
 
@@ -71,7 +72,7 @@ def make_trainer(
             surface=SurfaceSettings() if options.faithful_surface else None,
         ),
         exposures=exposures or fitted,
-        outliers=OutlierPixels(device) if options.robust_photometric else None,
+        outliers=_outliers(options, device) if options.robust_photometric else None,
         region=training.region,
     )
 
@@ -118,6 +119,10 @@ def make_finisher(
         exposures=exposures,
         region=training.region,
     )
+
+
+def _outliers(options: TrainOptions, device: torch.device) -> OutlierPixels:
+    return OutlierPixels(device, OutlierSettings(views=int(_OUTLIERS_FROM * options.effort.iterations)))
 
 
 def _strategy(options: TrainOptions, extent_m: float, count: int) -> Strategy:
