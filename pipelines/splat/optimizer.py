@@ -2,8 +2,10 @@
 
 Rates are those of 3D Gaussian Splatting (doi 10.1145/3592433); the rate of the centres is in scene extents and
 falls exponentially over the training. Unlike there, the other rates fall too, in the last part of the training: the
-Gaussians come to rest where the photographs have them, instead of moving about it. Rows are added, and seen, at different times. Every row therefore counts its
-own updates, for the bias correction that its moments need. With all rows in every step the result is plain Adam.
+Gaussians come to rest, instead of moving about the place where the photographs have them.
+
+Rows are added, and seen, at different times. Every row therefore counts its own updates, for the bias correction
+that its moments need. With all rows in every step the result is plain Adam.
 """
 
 from __future__ import annotations

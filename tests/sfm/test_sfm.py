@@ -261,7 +261,7 @@ def test_features_of_large_photographs_are_looked_for_at_their_own_size(
         with closing(sqlite3.connect(job.database)) as database:
             rows, columns, data = database.execute("select rows, cols, data from keypoints").fetchone()
         points = np.frombuffer(data, np.float32).reshape(rows, columns)
-        found[doubled] = np.hypot(points[:, 2], points[:, 3]) if columns == 4 else np.hypot(points[:, 2], points[:, 4])
+        found[doubled] = np.hypot(points[:, 2], points[:, 4])  # x, y, and the affine shape, row by row
     # The smallest scales, of one to two pixels, are those that a doubled photograph adds: most of all features.
     assert found["yes"].min() < 1.6 < found["no"].min()
     assert len(found["no"]) < 0.6 * len(found["yes"])
