@@ -50,8 +50,8 @@ def ghost(folder: Path, outliers: OutlierPixels | None) -> float:
     pixels = cv2.imread(str(file))
     pixels[SQUARE] = (0, 0, 255)
     cv2.imwrite(str(file), pixels)
-    trainer = tiny.trainer(images, JointOptions(150, sh_degree=1), outliers=outliers)
-    for _ in range(150):
+    trainer = tiny.trainer(images, JointOptions(300, sh_degree=1), outliers=outliers)
+    for _ in range(200):
         trainer.step()
     settings = RasterSettings(sh_degree=1)
     colour = CpuRasterizer().render(trainer.optimizer.gaussians, torch.eye(4), tiny.PINHOLE, settings).colour
@@ -59,10 +59,10 @@ def ghost(folder: Path, outliers: OutlierPixels | None) -> float:
 
 
 def test_a_moving_object_does_not_remain_in_the_splat(tmp_path: Path) -> None:
-    """Where no photograph differs, the error is 0.013: most of the remainder disappears."""
+    """Where no photograph differs, the error is 0.010: most of the remainder disappears."""
     plain = ghost(tmp_path / "plain", None)
     robust = ghost(tmp_path / "robust", OutlierPixels(CPU, OutlierSettings(views=30, most=0.2)))
-    assert robust < 0.021 and plain > 0.027, (robust, plain)
+    assert robust < 0.018 and plain > 0.026, (robust, plain)
 
 
 def test_state_goes_on_where_it_was() -> None:
