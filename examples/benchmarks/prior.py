@@ -38,7 +38,7 @@ def main() -> None:
     parser.add_argument("cloud", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("--train", default="--preset fast", help="options of both trainings")
-    parser.add_argument("--sigma", default="0.1", help="stated σ of the cloud in metres")
+    parser.add_argument("--sigma", default="0.03", help="stated σ of the cloud in metres")
     arguments = parser.parse_args()
     without = trained(arguments, "without", ())
     moved = arguments.out / "moved.ply"
