@@ -72,8 +72,10 @@ def write_moved(workspace: Workspace, cloud: Path, path: Path) -> None:
     chunks = CloudFiles(cloud, CloudCrs()).chunks(origin)
     points = np.concatenate([chunk.position_in_geo for chunk in chunks])
     moved = ecef_from_enu(points @ model_from_reference[:3, :3].T + model_from_reference[:3, 3], origin)
-    rows = np.rec.fromarrays(moved.T, names="x,y,z")
-    PlyData([PlyElement.describe(np.asarray(rows), "vertex")]).write(path)
+    rows = np.empty(len(moved), [("x", "f8"), ("y", "f8"), ("z", "f8")])
+    for axis, name in enumerate("xyz"):
+        rows[name] = moved[:, axis]
+    PlyData([PlyElement.describe(rows, "vertex")]).write(path)
 
 
 def figures(workspace: Workspace) -> dict[str, Any]:

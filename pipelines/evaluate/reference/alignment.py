@@ -107,5 +107,6 @@ def _shift(
 
 
 def _rows(placed: Similarity) -> Matrix34:
-    first, second, third, _ = (tuple(map(float, row)) for row in placed.matrix())
-    return first, second, third  # type: ignore[return-value]
+    """Return the rows of [sR | t]."""
+    first, second, third = ((a, b, c, d) for a, b, c, d in placed.matrix()[:3].tolist())
+    return first, second, third
