@@ -21,7 +21,7 @@ class SplatOptions(StageOptions):
         None, ge=32, description="Longest image side for training in pixels (default: the preset's)."
     )
     crop_size: int = Field(
-        1024,
+        1400,
         ge=32,
         description="Side in pixels: a photograph larger than this square is trained in windows of its area.",
     )
