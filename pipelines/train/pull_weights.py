@@ -8,19 +8,20 @@ import numpy as np
 from pipelines.core.types import BoolArray, ByteArray, Float32Array
 
 _WINDOW_PX = 5  # side of the window that contrast is averaged over
-_MEDIAN_WEIGHT = 1.5  # at the median contrast of the known surface
-_MOST = 10.0
+_MEDIAN_WEIGHT = 2.5  # at the median contrast of the known surface
+_MOST = 12.0
+_BROKEN = 0.5  # weight where the surface bends or ends
 _REACH_PX = 3  # of the test for an unbroken surface
 _BEND = 0.005  # limit of |z/z₁ + z/z₂ − 2| for a depth z between opposite neighbours z₁, z₂
 
 
 def pull_weights(rgb: ByteArray, depth_m: Float32Array) -> Float32Array:
-    """Return the weight (H, W) of each depth's pull, 1 … 10, proportional to the contrast of the photograph.
+    """Return the weight (H, W) of each depth's pull, ½ … 12, proportional to the contrast of the photograph.
 
     Gaussians are blended in the order of their centres. The photometric loss therefore draws the Gaussians of a
     slanted surface behind it, with a force that grows with the contrast: most of all those of small details, such
     as windows and survey targets. Stereo is most exact at these places. Where the surface bends, or ends within
-    `_REACH_PX`, stereo is not, and the weight is 1.
+    `_REACH_PX`, stereo is least exact, and the weight is smallest.
 
     Args:
         rgb: (H, W, 3) photograph.
@@ -32,7 +33,7 @@ def pull_weights(rgb: ByteArray, depth_m: Float32Array) -> Float32Array:
         return np.ones(depth_m.shape, np.float32)
     typical = max(float(np.median(contrast[known])), 1e-3)
     weight = np.clip(_MEDIAN_WEIGHT / typical * contrast, 1.0, _MOST)
-    return np.where(_unbroken(depth_m), weight, 1.0).astype(np.float32)
+    return np.where(_unbroken(depth_m), weight, _BROKEN).astype(np.float32)
 
 
 def _contrast(rgb: ByteArray) -> Float32Array:

@@ -23,7 +23,7 @@ def pictures() -> tuple[np.ndarray, np.ndarray]:
 def test_details_pull_more_than_the_wall_around_them() -> None:
     rgb, depth = pictures()
     weight = pull_weights(rgb, depth)
-    assert weight.min() >= 1.0
+    assert weight[:, 10:40].min() >= 1.0
     assert weight[20, 20] > 3 * np.median(weight[:, 10:40])
 
 
@@ -35,9 +35,10 @@ def test_photographs_of_any_exposure_pull_alike() -> None:
     assert np.abs(dark / bright - 1)[:, 10:40].mean() < 0.1
 
 
-def test_edges_and_gaps_of_the_surface_pull_as_before() -> None:
+def test_edges_and_gaps_of_the_surface_pull_least() -> None:
     rgb, depth = pictures()
-    assert (pull_weights(rgb, depth)[:, 47:53] == 1).all()
+    weight = pull_weights(rgb, depth)
+    assert (weight[:, 47:53] == weight.min()).all() and weight.min() < 1
     depth[17:19, 17:19] = 0
-    assert pull_weights(rgb, depth)[20, 20] == 1
-    assert (pull_weights(rgb, np.zeros_like(depth)) == 1).all()
+    assert pull_weights(rgb, depth)[20, 20] == weight.min()
+    assert (pull_weights(rgb, np.zeros_like(depth)) == 1).all()  # nothing to compare with
