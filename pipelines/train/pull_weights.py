@@ -11,6 +11,7 @@ _WINDOW_PX = 5  # side of the window that contrast is averaged over
 _MEDIAN_WEIGHT = 2.5  # at the median contrast of the known surface
 _MOST = 12.0
 _BROKEN = 0.5  # weight where the surface bends or ends
+_SAMPLE = 4  # of rows and columns, for the median
 _REACH_PX = 3  # of the test for an unbroken surface
 _BEND = 0.005  # limit of |z/z₁ + z/z₂ − 2| for a depth z between opposite neighbours z₁, z₂
 
@@ -28,10 +29,10 @@ def pull_weights(rgb: ByteArray, depth_m: Float32Array) -> Float32Array:
         depth_m: (H, W) along the optical axis; 0: unknown.
     """
     contrast = _contrast(rgb)
-    known = depth_m > 0
-    if not known.any():
+    sample = contrast[::_SAMPLE, ::_SAMPLE][depth_m[::_SAMPLE, ::_SAMPLE] > 0]
+    if len(sample) == 0:
         return np.ones(depth_m.shape, np.float32)
-    typical = max(float(np.median(contrast[known])), 1e-3)
+    typical = max(float(np.median(sample)), 1e-3)
     weight = np.clip(_MEDIAN_WEIGHT / typical * contrast, 1.0, _MOST)
     return np.where(_unbroken(depth_m), weight, _BROKEN).astype(np.float32)
 
@@ -48,7 +49,7 @@ def _unbroken(depth_m: Float32Array) -> BoolArray:
     """Return whether the surface goes on as a plane (H, W) in all directions around each pixel."""
     height, width = depth_m.shape
     # The inverse depth of a plane is linear on the image, at any angle of view.
-    inverse = np.where(depth_m > 0, 1 / np.maximum(depth_m, 1e-9), np.nan)
+    inverse = np.where(depth_m > 0, 1 / np.maximum(depth_m, np.float32(1e-9)), np.float32(np.nan))
     around = np.pad(inverse, _REACH_PX, constant_values=np.nan)
     plane = np.ones(depth_m.shape, dtype=np.bool_)
     for down, right in ((0, _REACH_PX), (_REACH_PX, 0), (_REACH_PX, _REACH_PX), (_REACH_PX, -_REACH_PX)):
