@@ -23,7 +23,6 @@ from pipelines.train.surface import SceneSurface, SurfacePoints
 _SURFACE_SHARE = 0.8  # of the limit of Gaussians starts on the surface; density control places the others
 _MOSTLY_KNOWN = 0.6  # of the pixels: with fewer known depths, more Gaussians are needed off the surface
 _STRIDE = 3  # of rows and columns of a depth map: Gaussians are wider than its pixels
-_TIE_POINT_WEIGHT = 4.0  # of an SfM point, which is more exact than a point of stereo
 _KEPT_VIEWS = 128  # views whose points stay on the device
 _OFF_SURFACE = 3.0  # gaps between points of the surface: an SfM point nearer than that lies on it
 
@@ -110,7 +109,7 @@ def points_to_hold(training: TrainingScene, device: torch.device) -> Callable[[i
     @lru_cache(maxsize=_KEPT_VIEWS)
     def points(index: int) -> ObservedPoints:
         known = scene.point_in_model[scene.sparse.points_in(index)]
-        weight = np.full(len(known), _TIE_POINT_WEIGHT, dtype=np.float32)
+        weight = np.ones(len(known), dtype=np.float32)
         if training.surface is not None and index in shown:
             of_surface, its_weight = training.surface.held(index, _STRIDE)
             known, weight = np.concatenate([known, of_surface]), np.concatenate([weight, its_weight])

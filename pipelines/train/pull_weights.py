@@ -10,14 +10,14 @@ from pipelines.core.types import BoolArray, ByteArray, Float32Array
 _WINDOW_PX = 5  # side of the window that contrast is averaged over
 _MEDIAN_WEIGHT = 2.5  # at the median contrast of the known surface
 _MOST = 12.0
-_BROKEN = 0.5  # weight where the surface bends or ends
+_BROKEN = 0.3  # weight where the surface bends or ends
 _SAMPLE = 4  # of rows and columns, for the median
 _REACH_PX = 3  # of the test for an unbroken surface
 _BEND = 0.005  # limit of |z/z₁ + z/z₂ − 2| for a depth z between opposite neighbours z₁, z₂
 
 
 def pull_weights(rgb: ByteArray, depth_m: Float32Array) -> Float32Array:
-    """Return the weight (H, W) of each depth's pull, ½ … 12, proportional to the contrast of the photograph.
+    """Return the weight (H, W) of each depth's pull, 0.3 … 12, proportional to the contrast of the photograph.
 
     Gaussians are blended in the order of their centres. The photometric loss therefore draws the Gaussians of a
     slanted surface behind it, with a force that grows with the contrast: most of all those of small details, such
