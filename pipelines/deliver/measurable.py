@@ -95,8 +95,6 @@ def measurable_splat(stage: StageRun, options: ExportPlyOptions) -> MeasurableSp
     renderer = ModelRenderer(trained, images, backend)
     views = SurfaceViews(renderer, stage.out / "depth_maps", colours=True, confirmed=True, progress=progress)
     pixel_m = pixel_on_surface_m(views, trained.geo_from_model)
-    if not np.isfinite(pixel_m):
-        raise _no_surface()
     spacing_m = options.disc_spacing or _SPACING_PX * pixel_m
     settings = fusion_settings(views, trained.geo_from_model, _MIN_VIEWS, spacing_m)
     surface = _collected(fused_squares(views, trained.geo_from_model, settings, progress), views, trained)
@@ -159,16 +157,12 @@ def _collected(squares: Iterable[SurfaceCloud], views: SurfaceViews, trained: Tr
                 f"{USABLE * free_bytes / 2**30:.1f} GiB. Choose a larger --disc-spacing"
             )
     if not count:
-        raise _no_surface()
+        raise DegenerateGeometryError(
+            f"no point of the surface is seen alike by {_MIN_VIEWS} training views: train longer, or "
+            "leave out --measurable"
+        )
     names = vars(parts[0])
     return SurfaceCloud(*(np.concatenate([vars(part)[name] for part in parts]) for name in names))
-
-
-def _no_surface() -> DegenerateGeometryError:
-    return DegenerateGeometryError(
-        f"no point of the surface is seen alike by {_MIN_VIEWS} training views: train longer, or "
-        "leave out --measurable"
-    )
 
 
 def _shown(view: SurfaceView) -> ShownView:

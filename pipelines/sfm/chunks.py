@@ -99,7 +99,7 @@ def plan_chunks(survey: Survey, pairs: IntArray, options: SfmOptions) -> ChunkPl
     matches = _cut(pairs, options.chunk_size * _PAIRS_PER_PHOTOGRAPH)
     common = _digest(
         [prior.model_dump(mode="json") for prior in survey.cameras],
-        options.model_dump(include={"camera_model", "max_image_size", "max_features"}),
+        options.model_dump(include={"camera_model", "max_image_size", "max_features", "doubled"}),
         library_versions(("pycolmap",))["pycolmap"],
     )
     photographs = [[image.name, image.camera_id, image.sha256] for image in survey.images]

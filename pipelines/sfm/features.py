@@ -83,10 +83,12 @@ def extract_features(colmap: Any, job: SfmJob, images: Sequence[int], progress: 
     options.sift.max_num_features = job.options.max_features
     _restore_names(colmap, job)
     write_frame(colmap, job.database, job.survey, images, job.options)
+    size = {prior.camera_id: (prior.width, prior.height) for prior in job.survey.cameras}
     with progress.task("features", len(images)) as task:
         for camera_id in sorted({job.survey.images[index].camera_id for index in images}):
             reader = colmap.ImageReaderOptions()
             reader.existing_camera_id = camera_id
+            options.sift.first_octave = -1 if job.options.doubles(size[camera_id]) else 0
             of_camera = [job.survey.images[index] for index in images]
             of_camera = [image for image in of_camera if image.camera_id == camera_id]
             for step in _steps(of_camera, _IMAGES_PER_STEP):

@@ -12,7 +12,8 @@ _FIXED_BYTES = 300 << 20  # interpreter, libraries, reserves of the allocator
 
 # Bytes a pixel of the photograph, and of the image that features are detected in, by thread: measured with
 # photographs of 2.3 and 20.9 megapixels at 600, 1200 and 2400 px, where they are 1.04 to 1.28 times the growth.
-_PHOTO_BYTES_PX, _DETECTION_BYTES_PX = 4.0, 310.0
+# Photographs that are not doubled: 79 to 91 bytes at 1200, 1600 and 3200 px.
+_PHOTO_BYTES_PX, _DETECTION_BYTES_PX, _OWN_SIZE_DETECTION_BYTES_PX = 4.0, 310.0, 95.0
 
 # Mapping and the adjustments after it, of the global mapper, which needs more than the incremental one
 # (`examples/benchmarks/many_photographs.py`; docs/benchmarks.md has the runs).
@@ -33,7 +34,8 @@ def chunk_peak_bytes(photo_px: tuple[int, int], options: SfmOptions, threads: in
     """
     pixels = photo_px[0] * photo_px[1]
     shrink = max(max(photo_px) / options.max_image_size, 1.0)
-    a_thread = _PHOTO_BYTES_PX * pixels + _DETECTION_BYTES_PX * pixels / shrink**2
+    detection = _DETECTION_BYTES_PX if options.doubles(photo_px) else _OWN_SIZE_DETECTION_BYTES_PX
+    a_thread = _PHOTO_BYTES_PX * pixels + detection * pixels / shrink**2
     return int(_FIXED_BYTES + threads * a_thread)
 
 

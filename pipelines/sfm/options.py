@@ -8,6 +8,8 @@ from pydantic import Field
 
 from pipelines.core.options import EFFORT, InputPath, StageOptions
 
+_DOUBLED_BELOW_PX = 1000
+
 
 class SfmOptions(StageOptions):
     """Options of structure from motion with COLMAP."""
@@ -23,7 +25,12 @@ class SfmOptions(StageOptions):
         "auto", description="Image pairs to match: from positions and view directions, or all."
     )
     max_neighbors: int = Field(16, ge=2, description="Neighbours that an image is matched with at the most.")
-    max_image_size: int = Field(1200, ge=128, description="Longest image side for features, in pixels.")
+    max_image_size: int = Field(1600, ge=128, description="Longest image side for features, in pixels.")
+    doubled: Literal["auto", "yes", "no"] = Field(
+        "auto",
+        description="Look for features on photographs of twice their size, too; auto: on those below "
+        f"{_DOUBLED_BELOW_PX} pixels.",
+    )
     max_features: int = Field(5000, ge=200, description="Features an image at the most.")
     import_model: InputPath | None = Field(
         None,
@@ -38,6 +45,15 @@ class SfmOptions(StageOptions):
     )
     threads: Annotated[int, EFFORT] = Field(-1, ge=-1, description="Threads (-1: all).")
     seed: int = Field(0, ge=0, description="Seed of every random choice.")
+
+    def doubles(self, photo_px: tuple[int, int]) -> bool:
+        """Return whether features are detected on photographs of this size doubled.
+
+        Larger photographs have features enough. Without the doubling, detection takes a third of the time; up to
+        a megapixel matching takes a quarter, because half as many features are found.
+        """
+        longest_px = min(max(photo_px), self.max_image_size)
+        return self.doubled == "yes" or (self.doubled == "auto" and longest_px < _DOUBLED_BELOW_PX)
 
 
 class AdjustOptions(StageOptions):

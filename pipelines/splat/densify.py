@@ -74,7 +74,8 @@ class DefaultSettings:
             is cloned or split.
         split_scale: largest standard deviation to clone, in scene extents; larger Gaussians are split.
         prune_opacity: Gaussians below this opacity are removed.
-        prune_scale: Gaussians above this standard deviation in scene extents are removed,
+        prune_scale: Gaussians are removed whose standard deviation is above this share of the scene extent plus
+            their distance from the middle of the scene,
         prune_scale_from: after this iteration.
         reset_opacity: largest opacity after a reset.
         max_gaussians: limit of their number.
@@ -196,8 +197,11 @@ class DefaultStrategy:
     def _alive(self, gaussians: Gaussians, iteration: int) -> Tensor:
         alive = torch.sigmoid(gaussians.logit_opacities) >= self.settings.prune_opacity
         if iteration > self.settings.prune_scale_from:
+            # Sky and horizon are far away. 3DGS compares with the extent alone, and so removes them with each edit;
+            # the photographs then have a black background until other Gaussians have grown over it.
+            distance = (gaussians.means - gaussians.means.median(dim=0).values).norm(dim=1)
             scale = gaussians.log_scales.amax(dim=1).exp()
-            alive &= scale <= self.settings.prune_scale * self.extent_m
+            alive &= scale <= self.settings.prune_scale * (self.extent_m + distance)
         return alive
 
     def _chosen(self, alive: Tensor) -> Tensor:

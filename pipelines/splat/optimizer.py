@@ -1,8 +1,11 @@
 """Adam over the Gaussians: a learning rate for each quantity, updates of visible rows only, editable rows.
 
 Rates are those of 3D Gaussian Splatting (doi 10.1145/3592433); the rate of the centres is in scene extents and
-falls exponentially over the training. Rows are added, and seen, at different times. Every row therefore counts its
-own updates, for the bias correction that its moments need. With all rows in every step the result is plain Adam.
+falls exponentially over the training. Unlike there, the other rates fall too, in the last part of the training: the
+Gaussians come to rest, instead of moving about the place where the photographs have them.
+
+Rows are added, and seen, at different times. Every row therefore counts its own updates, for the bias correction
+that its moments need. With all rows in every step the result is plain Adam.
 """
 
 from __future__ import annotations
@@ -33,6 +36,8 @@ class LearningRates:
         logit_opacities: rate of the opacities' logits.
         sh_dc: rate of the constant colour.
         sh_rest: rate of the direction-dependent colour.
+        settling_from: fraction of the training from which all rates but the centres' fall exponentially,
+        settled: and the share of them that is left at the end.
         beta1: decay of the first moment.
         beta2: decay of the second moment.
         eps: added to the denominator; tiny, because these gradients are tiny.
@@ -45,6 +50,8 @@ class LearningRates:
     logit_opacities: float = 5e-2
     sh_dc: float = 2.5e-3
     sh_rest: float = 1.25e-4
+    settling_from: float = 0.6
+    settled: float = 0.1
     beta1: float = 0.9
     beta2: float = 0.999
     eps: float = 1e-15
@@ -64,6 +71,10 @@ class LearningRates:
     def means_at(self, progress: float) -> float:
         """Return the rate of the centres, in scene extents, after the fraction `progress` of the training."""
         return float(self.means ** (1 - progress) * self.means_final**progress)
+
+    def settling(self, progress: float) -> float:
+        """Return the factor on all other rates after the fraction `progress` of the training."""
+        return float(self.settled ** (max(progress - self.settling_from, 0.0) / (1 - self.settling_from)))
 
 
 class GaussianAdam:
@@ -125,8 +136,7 @@ class GaussianAdam:
 
     def means_rate(self, iteration: int) -> float:
         """Return the learning rate of the centres, in metres."""
-        progress = min(max(iteration / max(self.iterations, 1), 0.0), 1.0)
-        return self.rate_factor * self.rates.means_at(progress) * self.extent_m
+        return self.rate_factor * self.rates.means_at(self._progress(iteration)) * self.extent_m
 
     def rearrange(self, gaussians: Gaussians, source: Tensor) -> None:
         """Replace all rows: surviving rows keep their moments, new rows start without.
@@ -165,6 +175,9 @@ class GaussianAdam:
                 raise ValueError(f"{name}: expected a tensor of shape {tuple(tensor.shape)}")
             tensor.copy_(state[name])
 
+    def _progress(self, iteration: int) -> float:
+        return min(max(iteration / max(self.iterations, 1), 0.0), 1.0)
+
     def _moments(self) -> dict[str, Tensor]:
         return {"exp_avg": self._exp_avg, "exp_avg_sq": self._exp_avg_sq, "steps": self._steps}
 
@@ -182,7 +195,7 @@ class GaussianAdam:
         rates[columns["logit_opacities"]] = self.rates.logit_opacities
         rates[columns["sh"]] = self.rates.sh_rest
         rates[columns["sh"]][:3] = self.rates.sh_dc
-        rates *= self.rate_factor
+        rates *= self.rate_factor * self.rates.settling(self._progress(iteration))
         rates[columns["means"]] = self.means_rate(iteration)
         return rates
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from plyfile import PlyData
 
+from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.products import load_json
 from pipelines.core.runner import run_stage
 from pipelines.core.stages import BY_NAME, CLOUD
@@ -126,6 +127,11 @@ def test_what_few_views_show_is_left_out(tmp_path: Path) -> None:
 
 def test_pixel_on_the_ground_is_depth_over_focal_length(tmp_path: Path) -> None:
     assert pixel_on_surface_m(surface_views(tmp_path), GEO_FROM_MODEL) == pytest.approx(PIXEL_M, rel=1e-6)
+
+
+def test_a_model_without_surface_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DegenerateGeometryError, match="none of 8 training views shows a surface"):
+        pixel_on_surface_m(surface_views(tmp_path, -1e9), GEO_FROM_MODEL)
 
 
 def test_cloud_of_a_trained_survey_lies_on_its_ground(

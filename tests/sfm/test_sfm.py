@@ -21,7 +21,7 @@ from pipelines.core.workspace import StageRun, Workspace
 from pipelines.formats.colmap import quiet_colmap, read_sparse
 from pipelines.geometry.similarity import umeyama
 from pipelines.scene.survey import Fix, Survey, SurveyedPoint
-from pipelines.sfm.features import SfmJob, candidate_pairs
+from pipelines.sfm.features import SfmJob, candidate_pairs, extract_features
 from pipelines.sfm.imported import import_model
 from pipelines.sfm.options import SfmOptions
 from pipelines.sfm.reconstruction import reconstruct
@@ -245,3 +245,23 @@ def test_pairs_of_a_small_or_unlocated_survey_are_all() -> None:
     survey = survey_of([f"{index}.jpg" for index in range(30)])
     assert len(candidate_pairs(survey, CONFIG)) == 435
     assert len(candidate_pairs(survey.model_copy(update={"images": survey.images[:5]}), CONFIG)) == 10
+
+
+def test_features_of_large_photographs_are_looked_for_at_their_own_size(
+    photographs: Photographs, tmp_path: Path
+) -> None:
+    assert not SfmOptions().doubles((5472, 3648))
+    assert SfmOptions().doubles((640, 480)) and SfmOptions(max_image_size=900).doubles((5472, 3648))
+    found = {}
+    for doubled in ("yes", "no"):
+        survey = survey_of(photographs.names[:1])
+        options = SfmOptions(doubled=doubled, threads=1)  # type: ignore[arg-type]
+        job = SfmJob(survey, photographs.folder, tmp_path / f"{doubled}.db", options)
+        extract_features(pycolmap, job, [0], SILENT)
+        with closing(sqlite3.connect(job.database)) as database:
+            rows, columns, data = database.execute("select rows, cols, data from keypoints").fetchone()
+        points = np.frombuffer(data, np.float32).reshape(rows, columns)
+        found[doubled] = np.hypot(points[:, 2], points[:, 4])  # x, y, and the affine shape, row by row
+    # The smallest scales, of one to two pixels, are those that a doubled photograph adds: most of all features.
+    assert found["yes"].min() < 1.6 < found["no"].min()
+    assert len(found["no"]) < 0.6 * len(found["yes"])

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.geometry.similarity import Similarity
 from pipelines.scene.surface_cloud.candidates import Square
@@ -26,13 +27,22 @@ class PlannedSquare:
 
 
 def pixel_on_surface_m(views: SurfaceViews, geo_from_model: Similarity) -> float:
-    """Return the median width of a pixel on the surface in metres, over the views' medians; NaN: no surface."""
+    """Return the median width of a pixel on the surface in metres, over the views' medians.
+
+    Raises:
+        DegenerateGeometryError: no view shows a surface.
+    """
     medians = []
     for view in map(views.view, range(len(views))):
         depth = view.depth_m[::_LOOK_PX, ::_LOOK_PX]
         if (depth > 0).any():
             medians.append(geo_from_model.scale * float(np.median(depth[depth > 0])) / view.pinhole.fx)
-    return float(np.median(medians)) if medians else float("nan")
+    if not medians:
+        raise DegenerateGeometryError(
+            f"none of {len(views)} training views shows a surface on which the others agree: train longer, or with "
+            "--dense"
+        )
+    return float(np.median(medians))
 
 
 def plan_squares(

@@ -106,28 +106,37 @@ def read_cloud(
         raise InputError(f"only {len(cloud)} points lie in the scene of the photographs", field="--lidar")
     model_from_geo = scene.geo_from_model.inverse()
     scanner = None if track is None else model_from_geo.apply(track.at(cloud.gps_time_s))
-    planes = planes_of(model_from_geo.apply(cloud.position_in_geo), cloud.classification, cloud.voxel_m)
+    planes = planes_of(
+        model_from_geo.apply(cloud.position_in_geo), cloud.classification, cloud.voxel_m, cloud.weight
+    )
     return replace(planes, scanner_in_model=scanner)
 
 
-def planes_of(position: FloatArray, classification: ByteArray, voxel_m: float) -> LidarCloud:
+def planes_of(
+    position: FloatArray, classification: ByteArray, voxel_m: float, weight: IntArray | None = None
+) -> LidarCloud:
     """Return points (P, 3) with the plane through the neighbours of each.
 
     Args:
         position: (P, 3) metres in `model`, P ≥ 12.
         classification: (P,) class of LAS.
         voxel_m: distance between the points, about.
+        weight: (P,) number of measured points that each stands for; None: 1. Where a noisy surface lies near a
+            border of voxels, the few points beyond the border have as many voxels as the many before it: with
+            equal weights the plane would lie beside the surface, by up to a third of the noise's σ.
     """
+    count = np.ones(len(position)) if weight is None else weight.astype(np.float64)
     tree = cKDTree(position)
     normal, roughness, reach = np.empty_like(position), np.empty(len(position)), np.empty(len(position))
     onto_plane = np.empty_like(position)
     for first in range(0, len(position), _BATCH):
         rows = slice(first, first + _BATCH)
         distance, nearest = tree.query(position[rows], k=_NEIGHBOURS)
-        around = position[nearest]
-        arm = around - around.mean(axis=1, keepdims=True)
-        spread, axes = np.linalg.eigh(np.einsum("pki,pkj->pij", arm, arm) / _NEIGHBOURS)
-        off = np.einsum("pi,pi->p", position[rows] - around.mean(axis=1), axes[:, :, 0])
+        around, share = position[nearest], count[nearest] / count[nearest].sum(axis=1, keepdims=True)
+        middle = np.einsum("pk,pki->pi", share, around)
+        arm = around - middle[:, None]
+        spread, axes = np.linalg.eigh(np.einsum("pk,pki,pkj->pij", share, arm, arm))
+        off = np.einsum("pi,pi->p", position[rows] - middle, axes[:, :, 0])
         onto_plane[rows] = position[rows] - off[:, None] * axes[:, :, 0]
         normal[rows], roughness[rows] = axes[:, :, 0], np.sqrt(np.maximum(spread[:, 0], 0))
         reach[rows] = distance[:, -1]
