@@ -29,9 +29,10 @@ def topic_text(name: str) -> str:
 
 
 def _presets() -> str:
-    from pipelines.train.presets import PRESETS
+    from pipelines.train.presets import PRESETS, RUN_MINUTES
 
-    rows = [f"  {'':10}{'iterations':>10}{'longest side':>15}{'Gaussians':>12}"]
+    rows = [f"  {'':10}{'iterations':>10}{'longest side':>15}{'Gaussians':>12}{'time':>12}"]
     for name, preset in PRESETS.items():
-        rows.append(f"  {name:10}{preset.iterations:>10}{preset.max_image_size:>12} px{preset.max_gaussians:>12}")
+        effort = f"{preset.iterations:>10}{preset.max_image_size:>12} px{preset.max_gaussians:>12}"
+        rows.append(f"  {name:10}{effort}{RUN_MINUTES[name]:>8} min")
     return "\n".join(rows)

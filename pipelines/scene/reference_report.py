@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 from pipelines.core.products import Product
-from pipelines.core.types import Vector3
+from pipelines.core.types import Matrix34, Vector3
 
 Alignment = Literal["none", "shift", "similarity"]
 
@@ -90,6 +90,7 @@ class ReferenceShift(Product):
         enu_m: east, north, up.
         sigma_m: their σ, from the spread between parts of the scene.
         scale_ppm, turn_deg: of the similarity; 0 for a shift.
+        reference_from_model: rows of the matrix [sR | t] in geo.
         points: that decide.
     """
 
@@ -97,6 +98,7 @@ class ReferenceShift(Product):
     sigma_m: Vector3
     scale_ppm: float
     turn_deg: float
+    reference_from_model: Matrix34
     points: int
 
 

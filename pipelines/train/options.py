@@ -9,15 +9,13 @@ from pydantic import Field, model_validator
 from pipelines.core.options import StageOptions
 from pipelines.scene.geographic_options import GeographicOptions
 from pipelines.train.lidar.options import LidarOptions
-from pipelines.train.presets import PRESETS, Preset
+from pipelines.train.presets import PRESETS, Preset, described
 
 
 class SplatOptions(StageOptions):
     """Options of the splat: effort, backend, density control, exposure and surface."""
 
-    preset: Literal["smoke", "fast", "standard", "high"] = Field(
-        "standard", description=f"Effort: {'; '.join(f'{name}: {preset}' for name, preset in PRESETS.items())}."
-    )
+    preset: Literal["smoke", "fast", "standard", "high"] = Field("standard", description=f"Effort. {described()}")
     iterations: int | None = Field(None, ge=1, description="Iterations (default: the preset's).")
     max_image_size: int | None = Field(
         None, ge=32, description="Longest image side for training in pixels (default: the preset's)."

@@ -20,13 +20,21 @@ class Preset:
     max_gaussians: int
 
     def __str__(self) -> str:
-        """Return the effort as `2000 iterations, 480 px, 60000 Gaussians`."""
+        """Return the effort as `1200 iterations, 480 px, 80000 Gaussians`."""
         return f"{self.iterations} iterations, {self.max_image_size} px, {self.max_gaussians} Gaussians"
 
 
 PRESETS = {
     "smoke": Preset(200, 320, 20_000),
-    "fast": Preset(2_000, 480, 60_000),
-    "standard": Preset(7_000, 640, 120_000),
-    "high": Preset(30_000, 1_600, 1_000_000),
+    "fast": Preset(1_200, 480, 80_000),
+    "standard": Preset(4_000, 800, 200_000),
+    "high": Preset(8_000, 1_600, 500_000),
 }
+# Of `georef run` with 48 photographs of a megapixel, kernels compiled, 2 cores (docs/benchmarks.md).
+RUN_MINUTES = {"smoke": 2, "fast": 3, "standard": 15, "high": 60}
+
+
+def described() -> str:
+    """Return all presets, each with its effort and the time of a run."""
+    efforts = (f"{name}: {preset}, about {RUN_MINUTES[name]} min" for name, preset in PRESETS.items())
+    return f"{'; '.join(efforts)} (for 48 photographs on 2 cores)."

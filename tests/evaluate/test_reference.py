@@ -254,6 +254,7 @@ def test_similarity_between_clouds_is_found() -> None:
     # each of 36 parts of 10 m are 5 mm in their mean. At 30 m, 1 cm is 300 ppm of scale.
     np.testing.assert_allclose(fit.reference_from_model.apply(model), hills[::4], atol=0.01)
     assert fit.shift.scale_ppm == pytest.approx(1e6 * np.expm1(0.01), abs=300)
+    np.testing.assert_array_equal(fit.shift.reference_from_model, fit.reference_from_model.matrix()[:3])
 
 
 def test_classes_are_ground_roof_wall_and_vegetation() -> None:

@@ -12,7 +12,7 @@ from pipelines.geometry.thinning import voxel_keys
 from pipelines.georef.estimate import Estimate
 from pipelines.georef.similarity import LearnableSimilarity
 from pipelines.georef.systematic import SystematicErrorValues
-from pipelines.train.lidar.changes import verdict
+from pipelines.train.lidar.changes import _areas, verdict
 from pipelines.train.lidar.cloud import planes_of
 from pipelines.train.lidar.planes import plane_term
 from pipelines.train.lidar.prepare import registration_of
@@ -64,6 +64,18 @@ def test_what_has_changed_is_rejected_and_nothing_else(then: Town, now: Town, ki
     largest = judged.areas[0]
     assert largest.kind == kind and largest.area_m2 == pytest.approx(14 * 12, rel=0.2)
     np.testing.assert_allclose(largest.center_in_model[:2], (EXTRA[0] + EXTRA[1])[:2] / 2, atol=2)
+
+
+def test_places_where_half_of_the_cloud_agrees_are_not_listed() -> None:
+    # Ground with two patches of 6 m by 6 m: in one all points contradict, in the other every second one.
+    east, north = (axis.ravel() for axis in np.meshgrid(np.arange(0, 40, 0.5), np.arange(0, 20, 0.5)))
+    points = np.column_stack([east, north, np.zeros(len(east))])
+    cloud = planes_of(points, np.ones(len(points), np.uint8), 0.5)
+    inside = (north > 5) & (north < 11)
+    whole, half = inside & (east > 5) & (east < 11), inside & (east > 25) & (east < 31)
+    listed = _areas(cloud, whole | (half & ((2 * (east + north)) % 2 == 0)), "removed")
+    assert len(listed) == 1
+    np.testing.assert_allclose(listed[0].center_in_model[:2], (8, 8), atol=0.3)
 
 
 def test_unchanged_town_is_confirmed() -> None:

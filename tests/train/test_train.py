@@ -332,4 +332,4 @@ def test_presets_can_be_changed_in_part() -> None:
     assert TrainOptions(preset="fast").effort == PRESETS["fast"]
     changed = TrainOptions(preset="smoke", iterations=7, max_image_size=64).effort
     assert changed == replace(PRESETS["smoke"], iterations=7, max_image_size=64)
-    assert PRESETS["high"] == Preset(30_000, 1_600, 1_000_000)
+    assert PRESETS["high"] == Preset(8_000, 1_600, 500_000)

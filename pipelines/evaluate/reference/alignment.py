@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from pipelines.core.types import FloatArray
+from pipelines.core.types import FloatArray, Matrix34
 from pipelines.geometry.similarity import Similarity, jacobian_at, perturbation
 from pipelines.robust.kernels import cauchy_weight
 from pipelines.robust.statistics import mad_sigma
@@ -101,5 +101,12 @@ def _shift(
         sigma_m=tuple(sigma.tolist()),
         scale_ppm=1e6 * (placed.scale - 1) if kind == "similarity" else 0.0,
         turn_deg=float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))) if kind == "similarity" else 0.0,
+        reference_from_model=_rows(placed),
         points=len(points),
     )
+
+
+def _rows(placed: Similarity) -> Matrix34:
+    """Return the rows of [sR | t]."""
+    first, second, third = ((a, b, c, d) for a, b, c, d in placed.matrix()[:3].tolist())
+    return first, second, third

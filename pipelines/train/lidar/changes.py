@@ -31,6 +31,7 @@ _CELL_M = 0.5  # least side of cells in plan
 _CELL_PX = 2.0  # least side in pixels, where the photographs decide
 _CELL_POINTS = 1.5  # least side in distances between points, where the cloud decides
 _LEAST_AREA_M2 = 4.0  # that is listed
+_MOSTLY = 0.6  # share of its points: at edges of roofs and in front of walls, about half of the points agree
 _STEREO_PX = 0.3  # σ of stereo, in pixels of the depth maps
 _GRAZING = 0.1  # cosine of incidence: beams that graze a surface mix it with what lies behind
 _SPARSE = 4.0  # distances between points, to the furthest neighbour on a well-scanned surface
@@ -148,7 +149,10 @@ def _confidence(cloud: LidarCloud, found: Support, sigma_m: float, pixel_m: floa
 
 
 def _areas(cloud: LidarCloud, marked: BoolArray, kind: Literal["removed", "added"]) -> list[ChangedArea]:
-    """Return the connected areas of marked points in plan that are large enough to be listed."""
+    """Return the connected areas of marked points in plan that are large enough to be listed.
+
+    An area is not listed if the photographs agree with much of the cloud in its cells.
+    """
     points = cloud.position_in_model[marked]
     if not len(points):
         return []
@@ -162,10 +166,13 @@ def _areas(cloud: LidarCloud, marked: BoolArray, kind: Literal["removed", "added
     labels, count = ndimage.label(closed | grid, structure=np.ones((3, 3)))
     of_point = labels[place[:, 0], place[:, 1]]
     size = np.bincount(labels.ravel(), minlength=count + 1) * side_m**2
+    every = np.floor(cloud.position_in_model[:, :2] / side_m).astype(np.int64) - low
+    every = every[((every >= 0) & (every < grid.shape)).all(axis=1)]
+    all_points = np.bincount(labels[every[:, 0], every[:, 1]], minlength=count + 1)
     areas = []
     for label in np.flatnonzero(size >= _LEAST_AREA_M2):
         mine = points[of_point == label]
-        if label == 0 or not len(mine):
+        if label == 0 or len(mine) < max(_MOSTLY * all_points[label], 1):
             continue
         cells = (np.argwhere(labels == label) + low) * side_m
         areas.append(ChangedArea(kind, float(size[label]), len(mine), mine.mean(axis=0), side_m, cells))
