@@ -18,6 +18,7 @@ from pipelines.geometry.cameras import Pinhole
 from pipelines.geometry.thinning import thin_to_voxels
 from pipelines.splat.gaussians import Gaussians
 from pipelines.train.depth_maps import DepthMaps
+from pipelines.train.pull_weights import pull_weights
 
 _NORMAL_REACH_PX = 3
 _BEND = 0.02  # limit of |z/z₁ + z/z₂ − 2| for a depth z between opposite neighbours z₁, z₂ on a smooth surface
@@ -90,9 +91,14 @@ class SceneSurface:
         return self._points(index, stride * rows, stride * columns)
 
     def held(self, index: int, stride: int) -> tuple[FloatArray, Float32Array]:
-        """Return the points (P, 3) in `model` that a training view is held to, and the weight of each (P,)."""
-        points = self.points(index, stride)
-        return points, np.ones(len(points), dtype=np.float32)
+        """Return the points (P, 3) in `model` that a training view is held to, and the weight of each (P,).
+
+        The points are those of `points`, with the weights of `pull_weights`.
+        """
+        depth = self._maps.depth(index)
+        rows, columns = np.nonzero(depth[::stride, ::stride])
+        weight = pull_weights(self._maps.rgb(index), depth)[stride * rows, stride * columns]
+        return self._points(index, stride * rows, stride * columns), weight
 
     def all_points(self, stride: int) -> FloatArray:
         """Return the surface points (P, 3) in `model` of all training views, of every `stride`-th pixel."""

@@ -13,8 +13,11 @@ The depth of a Gaussian is the depth of its plane at the pixel, not of its centr
 1. The depth is the conditional mean of z given the pixel, z + q · (p − µ) with q = C⁻¹ c. C is the screen
    covariance, and c the covariance of the screen position with z (RaDe-GS, doi 10.48550/arXiv.2406.01467, in the
    local affine approximation of the perspective).
-2. Down to α = 1/255 this depth departs from that of the centre by at most 3.33 standard deviations along z.
-3. If that were more than `DEPTH_REACH` of the centre's depth, q is shortened, so that z stays positive.
+2. C is dilated by `SLOPE_DILATION` of the image's dilation only. With all of it, a disc on a slanted wall that is
+   narrower than a pixel would keep the depth of its centre. Nearer discs hide those behind them, so that the wall
+   would seem too near.
+3. If the depth departed from that of the centre by more than `DEPTH_REACH` of it, anywhere down to α = 1/255, q is
+   shortened, so that z stays positive.
 """
 
 from __future__ import annotations
@@ -31,6 +34,7 @@ ALPHA_MIN = 1.0 / 255.0
 ALPHA_MAX = 0.999
 TRANSMITTANCE_MIN = 1e-4
 DEPTH_REACH = 0.75
+SLOPE_DILATION = 0.1  # not 0: the slope of a disc seen from its edge is infinite
 
 BackendName = Literal["cpu", "cuda"]
 

@@ -59,7 +59,9 @@ def _covariance_gradients(axes: Any, variance: Any, view: View, depth: float, su
     if g_depth == 0.0 and g_slope[0] == 0.0 and g_slope[1] == 0.0:
         # True of every render without depth.
         return (gu, gv), 0.0, (xx, xy, yy), (0.0, 0.0)
-    slope, g_c, (s_xx, s_xy, s_yy), g_reach = depth_slope_gradient(axes, variance, cov, depth, g_slope)
+    slope, g_c, (s_xx, s_xy, s_yy), g_reach = depth_slope_gradient(
+        axes, variance, cov, view.dilation, depth, g_slope
+    )
     g_mean = (gu - slope[0] * g_depth, gv - slope[1] * g_depth)
     return g_mean, g_depth + g_reach, (xx + s_xx, xy + s_xy, yy + s_yy), g_c
 

@@ -51,7 +51,7 @@ def _ellipse(means: Any, quats: Any, log_scales: Any, pose: Any, view: View, i: 
     axes = times_rotation(screen_from_model(jacobian(view, point), pose), rotation(quat))
     variance = variances(log_scales, i)
     cov = screen_covariance(axes, variance, view.dilation)
-    return point, cov, depth_slope(axes, variance, cov, point[2])
+    return point, cov, depth_slope(axes, variance, cov, view.dilation, point[2])
 
 
 @jit

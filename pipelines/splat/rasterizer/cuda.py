@@ -17,7 +17,7 @@ from pipelines.geometry.cameras import Pinhole
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.rasterizer.api import ALPHA_MAX, BackendName, RasterSettings, Render, ScreenStats
 from pipelines.splat.rasterizer.cuda_kernels import load_gsplat
-from pipelines.splat.rasterizer.reference import bounded_slope, screen_depth_covariance
+from pipelines.splat.rasterizer.reference import depth_slopes, projected_axes
 
 _EVERY_BATCH = 2**31 - 1
 
@@ -60,7 +60,7 @@ class CudaRasterizer:
         )
         view = Render(image[0], alpha[0, ..., 0], _screen_stats(meta))
         if settings.depth:
-            slope = _depth_slope(gaussians, cam_from_model, camera, meta)
+            slope = _depth_slope(gaussians, cam_from_model, camera, meta, settings.dilation_px2)
             view.expected_depth, view.depth_variance = self._depth_moments(meta, slope, camera, view.alpha)
             view.median_depth = self._median_depth(meta, slope, camera) if settings.median else None
         return view if settings.window is None else settings.window.cut(view)
@@ -148,20 +148,14 @@ def _intrinsics(camera: Pinhole, device: torch.device) -> Tensor:
     return torch.tensor([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]], device=device)
 
 
-def _depth_slope(gaussians: Gaussians, cam_from_model: Tensor, camera: Pinhole, meta: dict[str, Any]) -> Tensor:
-    """Return ∂z/∂(u, v) of the M visible Gaussians (M, 2), in m/px.
-
-    The conics are gsplat's own: they limit how far from its centre a Gaussian is seen, hence the reach of its
-    plane.
-    """
+def _depth_slope(
+    gaussians: Gaussians, cam_from_model: Tensor, camera: Pinhole, meta: dict[str, Any], dilation_px2: float
+) -> Tensor:
+    """Return ∂z/∂(u, v) of the M visible Gaussians (M, 2), in m/px."""
     rows, pose = meta["gaussian_ids"].long(), cam_from_model.to(gaussians.means.dtype)
     mean_in_cam = gaussians.means[rows] @ pose[:3, :3].T + pose[:3, 3]
-    quats_wxyz, log_scales = gaussians.quats_wxyz[rows], gaussians.log_scales[rows]
-    cov_px_m = screen_depth_covariance(quats_wxyz, log_scales, mean_in_cam, pose, camera)
-    xx, xy, yy = meta["conics"].unbind(-1)
-    x, y = cov_px_m.unbind(-1)
-    slope = torch.stack([xx * x + xy * y, xy * x + yy * y], dim=-1)
-    return bounded_slope(slope, cov_px_m, meta["depths"])
+    axes = projected_axes(gaussians.quats_wxyz[rows], gaussians.log_scales[rows], mean_in_cam, pose, camera)
+    return depth_slopes(axes, meta["depths"], dilation_px2)
 
 
 def _screen_stats(meta: dict[str, Any]) -> ScreenStats:

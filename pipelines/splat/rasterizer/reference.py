@@ -18,6 +18,7 @@ from pipelines.splat.rasterizer.api import (
     ALPHA_MAX,
     ALPHA_MIN,
     DEPTH_REACH,
+    SLOPE_DILATION,
     TRANSMITTANCE_MIN,
     RasterSettings,
     Render,
@@ -65,8 +66,8 @@ def render_reference(
     expected, variance, median = None, None, None
     if settings.depth:
         quats_wxyz, log_scales = sorted_gaussians.quats_wxyz, sorted_gaussians.log_scales
-        cov_px_m = screen_depth_covariance(quats_wxyz, log_scales, mean_in_cam, pose, camera)
-        slope = bounded_slope(torch.linalg.solve(cov_px2, cov_px_m), cov_px_m, mean_in_cam[:, 2])
+        axes = projected_axes(quats_wxyz, log_scales, mean_in_cam, pose, camera)
+        slope = depth_slopes(axes, mean_in_cam[:, 2], settings.dilation_px2)
         depth = mean_in_cam[:, 2:] + (slope[:, None] * offset_px).sum(dim=-1)
         opaque = final < 1
         depth_sum = (depth * weight).sum(dim=0)
@@ -85,7 +86,7 @@ def project_gaussians(
 ) -> tuple[Tensor, Tensor]:
     """Return screen means (N, 2) in px and dilated screen covariances (N, 2, 2) in px²."""
     x, y, z = mean_in_cam.unbind(-1)
-    screen_axes = _projected_axes(gaussians.quats_wxyz, gaussians.log_scales, mean_in_cam, cam_from_model, camera)[
+    screen_axes = projected_axes(gaussians.quats_wxyz, gaussians.log_scales, mean_in_cam, cam_from_model, camera)[
         :, :2
     ]
     cov_px2 = screen_axes @ screen_axes.mT + dilation_px2 * torch.eye(2, dtype=z.dtype)
@@ -93,28 +94,29 @@ def project_gaussians(
     return mean_px, cov_px2
 
 
-def screen_depth_covariance(
-    quats_wxyz: Tensor, log_scales: Tensor, mean_in_cam: Tensor, cam_from_model: Tensor, camera: Pinhole
-) -> Tensor:
-    """Return covariances (N, 2) of the screen position (u, v) with z, in px · m, of Gaussians at (N, 3)."""
-    axes = _projected_axes(quats_wxyz, log_scales, mean_in_cam, cam_from_model, camera)
-    return (axes[:, :2] @ axes[:, 2, :, None])[..., 0]
-
-
-def bounded_slope(slope: Tensor, cov_px_m: Tensor, depth: Tensor) -> Tensor:
+def depth_slopes(axes: Tensor, depth: Tensor, dilation_px2: float) -> Tensor:
     """Return ∂z/∂(u, v) of Gaussians (N, 2) in m/px, shortened if z would leave `DEPTH_REACH` of the centre's.
 
+    By Cauchy and Schwarz |q · d| ≤ √(q · C q) √(d · C⁻¹ d), with C as the image dilates it.
+
     Args:
-        slope: (N, 2) q = C⁻¹ c.
-        cov_px_m: (N, 2) c. By Cauchy and Schwarz |q · d| ≤ √(c · q) √(dᵀ C⁻¹ d).
+        axes: (N, 3, 3) of `projected_axes`.
         depth: (N,) z of the centres.
+        dilation_px2: of the image.
     """
-    spread_m = torch.sqrt((cov_px_m * slope).sum(dim=-1).clamp_min(torch.finfo(slope.dtype).tiny))
+    u, v, z = axes.unbind(dim=1)
+    xx, xy, yy, xz, yz = (u * u).sum(-1), (u * v).sum(-1), (v * v).sum(-1), (u * z).sum(-1), (v * z).sum(-1)
+    narrow_xx, narrow_yy = xx + SLOPE_DILATION * dilation_px2, yy + SLOPE_DILATION * dilation_px2
+    free = torch.stack([narrow_yy * xz - xy * yz, narrow_xx * yz - xy * xz], dim=-1)
+    free = free / (narrow_xx * narrow_yy - xy * xy)[:, None]
+    x, y = free.unbind(-1)
+    spread2 = (xx + dilation_px2) * x * x + 2 * xy * x * y + (yy + dilation_px2) * y * y
+    spread_m = torch.sqrt(spread2.clamp_min(torch.finfo(spread2.dtype).tiny))
     most_m = DEPTH_REACH / math.sqrt(-2 * math.log(ALPHA_MIN)) * depth
-    return slope * (most_m / torch.maximum(spread_m, most_m))[:, None]
+    return free * (most_m / torch.maximum(spread_m, most_m))[:, None]
 
 
-def _projected_axes(
+def projected_axes(
     quats_wxyz: Tensor, log_scales: Tensor, mean_in_cam: Tensor, cam_from_model: Tensor, camera: Pinhole
 ) -> Tensor:
     """Return principal axes (N, 3, 3), a standard deviation long, along (u, v, z): an axis a column; px, px and m.

@@ -102,11 +102,13 @@ class FusedSurface(SceneSurface):
         """Return the points (P, 3) that a training view is held to, and the weight of each (P,)."""
         if self._pull == "gaussians":
             return super().held(index, stride)
-        points, _, confidence = self.planes.onto(super().points(index, stride))
+        stereo, by_contrast = super().held(index, stride)
+        points, _, confidence = self.planes.onto(stereo)
         seen = self._alone_in_view(index)
         _, first = np.unique(np.stack([seen.row, seen.column]) // stride, axis=1, return_index=True)
         alone = seen.rows[first]
-        weight = np.concatenate([1.0 + (_WEIGHT - 1.0) * confidence, _WEIGHT_ALONE * self._confidence[alone]])
+        by_lidar = 1.0 + (_WEIGHT - 1.0) * confidence
+        weight = np.concatenate([np.maximum(by_contrast, by_lidar), _WEIGHT_ALONE * self._confidence[alone]])
         return np.concatenate([points, self._cloud.position_in_model[alone]]), weight.astype(np.float32)
 
     def sample(
