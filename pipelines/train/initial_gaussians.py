@@ -23,6 +23,7 @@ from pipelines.train.surface import SceneSurface, SurfacePoints
 
 _SURFACE_SHARE = 0.8  # of the limit of Gaussians starts on the surface; density control places the others
 _MOSTLY_KNOWN = 0.6  # of the pixels: with fewer known depths, more Gaussians are needed off the surface
+_UNKNOWN_SHARE = 0.05  # of the limit starts where no depth is known, at least: density control finds corners late
 _STRIDE = 3  # of rows and columns of a depth map: Gaussians are wider than its pixels
 _KEPT_VIEWS = 128  # views whose points stay on the device
 _OFF_SURFACE = 3.0  # gaps between points of the surface: an SfM point nearer than that lies on it
@@ -55,7 +56,7 @@ def initial_gaussians(training: TrainingScene, options: InitialisationOptions, m
     1. Discs lie on the surface, as dense as the photographs resolve it.
     2. Balls lie at SfM points where no surface is known. On a surface discs are better: an SfM point has no normal,
        and a ball reaches as far behind a wall as the gap to the wall's next point.
-    3. Where the surface of much of the photographs is not known, balls lie at the height of the SfM points.
+    3. Balls lie at the height of the SfM points where the photographs show no known surface: the more of it, the more.
     4. Balls lie in the background, as far as the limit leaves room. In a region, the sky is that of the model which
        stands in for the rest: all blocks of a survey then have the same.
 
@@ -74,7 +75,7 @@ def initial_gaussians(training: TrainingScene, options: InitialisationOptions, m
         share = _SURFACE_SHARE * min(1.0, training.surface.known_share() / _MOSTLY_KNOWN)
         surface = training.surface.sample(int(share * most), seed, training.in_region)
         start = SurfacePoints.concatenate([start.part(_off_surface(start, surface)), surface])
-        unknown = int((_SURFACE_SHARE - share) * most)
+        unknown = int(max(_SURFACE_SHARE - share, _UNKNOWN_SHARE) * most)
         guessed = guessed_points(scene, training.surface, unknown, seed, training.in_region)
         start = SurfacePoints.concatenate([start, guessed])
     behind = background(scene, training.images, start.point_in_model)
