@@ -56,7 +56,7 @@ def initial_gaussians(training: TrainingScene, options: InitialisationOptions, m
     1. Discs lie on the surface, as dense as the photographs resolve it.
     2. Balls lie at SfM points where no surface is known. On a surface discs are better: an SfM point has no normal,
        and a ball reaches as far behind a wall as the gap to the wall's next point.
-    3. Balls lie at the height of the SfM points where the photographs show no known surface: the more of it, the more.
+    3. Balls lie at the height of the SfM points where photographs show no known surface: the more of it, the more.
     4. Balls lie in the background, as far as the limit leaves room. In a region, the sky is that of the model which
        stands in for the rest: all blocks of a survey then have the same.
 
