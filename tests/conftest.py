@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import shutil
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+from filelock import FileLock, Timeout
 
 from pipelines.core.stages import BY_NAME, STAGES
 from pipelines.core.workspace import Workspace
@@ -64,32 +68,66 @@ def one_thread() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
-def flights(tmp_path_factory: pytest.TempPathFactory) -> list[RenderedFlight]:
+def between_processes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder that all processes of this run of the tests share."""
+    own = tmp_path_factory.getbasetemp()
+    folder = (own.parent if "PYTEST_XDIST_WORKER" in os.environ else own) / "shared"
+    folder.mkdir(exist_ok=True)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def flights(between_processes: Path, tmp_path_factory: pytest.TempPathFactory) -> list[RenderedFlight]:
     """Rendered surveys that differ in everything random, made once for the tests of training and evaluation."""
     from tests.splat_scenes import RenderedFlight, make_rendered, write_photographs
     from tests.threads import single_thread
 
     made = []
     for seed in range(SEEDS):
-        rendered, root = make_rendered(seed), tmp_path_factory.mktemp(f"rendered{seed}")
+        rendered, shared = make_rendered(seed), between_processes / f"rendered{seed}"
         with single_thread():
-            write_photographs(rendered, root / "photos")
+            make_once({shared / "photos": partial(write_photographs, rendered)})
+        (shared / "cache").mkdir(exist_ok=True)
+        root = tmp_path_factory.mktemp(f"rendered{seed}")
+        for name in ("photos", "cache"):
+            (root / name).symlink_to(shared / name)
         made.append(RenderedFlight(rendered, root, seed))
     return made
 
 
 @pytest.fixture(scope="session")
-def trained(flights: list[RenderedFlight]) -> list[tuple[Workspace, Workspace]]:
+def trained(flights: list[RenderedFlight], between_processes: Path) -> list[tuple[Workspace, Workspace]]:
     """Each survey trained with the geographic losses and without."""
     from pipelines.core.runner import run_stage
     from tests.splat_scenes import TRAINING
     from tests.threads import single_thread
 
-    pairs = []
-    for flight in flights:
-        pair = flight.workspace("with"), flight.workspace("without")
-        with single_thread():
-            run_stage(pair[0], BY_NAME["train"], TRAINING)
-            run_stage(pair[1], BY_NAME["train"], {**TRAINING, "geo_loss": False})
-        pairs.append(pair)
-    return pairs
+    def train(flight: RenderedFlight, geo_loss: bool, made: Path) -> None:
+        workspace = flight.workspace(made.name)
+        run_stage(workspace, BY_NAME["train"], {**TRAINING, "geo_loss": geo_loss})
+        shutil.copytree(workspace.root, made, symlinks=True)
+
+    tasks = {
+        between_processes / f"trained{flight.seed}" / name: partial(train, flight, name == "with")
+        for name in ("with", "without")
+        for flight in flights
+    }
+    with single_thread():
+        make_once(tasks)
+    for made in tasks:
+        own = flights[int(made.parent.name[-1])].root / made.name
+        if not own.exists():
+            shutil.copytree(made, own, symlinks=True)
+    return [(Workspace(flight.root / "with"), Workspace(flight.root / "without")) for flight in flights]
+
+
+def make_once(tasks: Mapping[Path, Callable[[Path], None]]) -> None:
+    """Call each function with the path of what it makes, unless another process of this run has, or does."""
+    for wait in (False, True):  # first what nobody has begun
+        for made, make in tasks.items():
+            made.parent.mkdir(exist_ok=True)
+            done = made.with_name(f"{made.name}.done")
+            with contextlib.suppress(Timeout), FileLock(f"{made}.lock", blocking=wait):
+                if not done.exists():
+                    make(made)
+                    done.touch()

@@ -104,22 +104,26 @@ class CheckpointWatch:
 
 
 def timed_run(workspace: Workspace, arguments: list[str], every: int, cache: Path) -> dict[str, object]:
-    """Run `georef run`, and return the seconds of the whole and of each stage, and all rows."""
+    """Run `georef run`, and return the seconds of the whole and of each stage, the memory, and all rows."""
     workspace.root.parent.mkdir(parents=True, exist_ok=True)
     command = [*_GEOREF, "run", str(workspace.root), *arguments, "--set", f"train.checkpoint_every={every}"]
     watch = CheckpointWatch(workspace, workspace.root.with_name(f"{workspace.root.name}-checkpoints"))
     began = time.monotonic()
     log = workspace.root.with_name(f"{workspace.root.name}.log")
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache)}
     with log.open("wb") as output:
-        subprocess.run(
-            command, env={**os.environ, "NUMBA_CACHE_DIR": str(cache)}, stdout=output, stderr=output, check=True
-        )
+        process = subprocess.Popen(command, env=environment, stdout=output, stderr=output)
+        _, status, usage = os.wait4(process.pid, 0)  # with those of the processes that it has waited for
+        process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode != 0:
+        sys.exit(f"{' '.join(command)} failed: see {log}")
     seconds = time.monotonic() - began
     watch.end()
     manifests = ((spec.name, workspace.manifest(spec)) for spec in PIPELINE)
     stages = {name: round(manifest.duration_s, 1) for name, manifest in manifests if manifest is not None}
     rows = [asdict(row) for row in measured(workspace, watch.age_s)]
-    return {"seconds": round(seconds, 1), "stages_s": stages, "rows": rows}
+    peak_mib = usage.ru_maxrss // 1024  # of the largest process, Linux counts in KiB
+    return {"seconds": round(seconds, 1), "peak_mib": peak_mib, "stages_s": stages, "rows": rows}
 
 
 def measured(workspace: Workspace, age_s: dict[Path, float]) -> list[Row]:
@@ -167,7 +171,7 @@ def time_to(rows: list[dict[str, float]], psnr: float) -> float | None:
 def print_run(name: str, run: dict[str, object]) -> None:
     """Print the stages and the rows of a run."""
     stages = ", ".join(f"{stage} {seconds} s" for stage, seconds in run["stages_s"].items())  # type: ignore[attr-defined]
-    print(f"\n{name}: {run['seconds']} s ({stages})\n")
+    print(f"\n{name}: {run['seconds']} s ({stages}), {run['peak_mib']} MiB\n")
     print("| time | iteration | Gaussians | test PSNR | by model: mean H | median H | RMSE V |\n|" + "---|" * 7)
     for row in run["rows"]:  # type: ignore[attr-defined]
         errors = [row["model_mean_h_m"], row["model_median_h_m"], row["model_rmse_v_m"]]

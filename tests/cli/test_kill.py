@@ -41,25 +41,20 @@ sys.addaudithook(kill_at)
 from georef_cli.main import main
 main()
 """
-# One moment of each kind in stages with native code, and some of the other stages, whose every change to the disk
-# is tried in tests/core and tests/faults. Each run goes on from where the last was killed. Native code tells nobody
-# where it is: there the kill comes from outside, a moment after a file has appeared.
+# Moments in native code, which tells nobody where it is: the kill comes from outside, a moment after a file has
+# appeared. Of the changes to the disk there is one: all are tried in tests/core and tests/faults. Each run goes on from
+# where the last was killed.
 MOMENTS: tuple[tuple[str, float | None], ...] = (
-    ("open {ws}/ingest.partial/survey.json", None),
     ("sfm.partial/database.db", 0.1),  # features
     ("sfm.partial/pairs.txt", 0.05),  # matching
     ("sfm.partial/mapping", 0.02),  # mapping
-    ("os.rename {ws}/sfm.partial", None),
     ("train.partial/metrics.jsonl", 0.0),  # iterations
     ("os.rename {ws}/train.partial/checkpoint.tmp", None),
-    ("open {ws}/train.partial/model.json", None),
-    ("open {ws}/export.partial/splat.ply.tmp", None),
 )
 STOPS = (
-    ("sfm.partial/database.db", signal.SIGTERM),
     ("sfm.partial/mapping", signal.SIGINT),
     ("train.partial/metrics.jsonl", signal.SIGTERM),
-    ("train.partial/metrics.jsonl", signal.SIGINT),
+    ("train.partial/metrics.jsonl", signal.SIGINT),  # when it has grown: some iterations later
 )
 EFFORT = ("--preset", "smoke", "--iterations", "40")
 NOISE_OF_LIBRARIES = ("Traceback", "***", "@ ", "terminate called", "Aborted", "Segmentation")
