@@ -42,8 +42,8 @@ from georef_cli.main import main
 main()
 """
 # Moments in native code, which tells nobody where it is: the kill comes from outside, a moment after a file has
-# appeared. Of the changes to the disk there is one: all are tried in tests/core and tests/faults. Each run goes on from
-# where the last was killed.
+# appeared. Of the changes to the disk there is one: all are tried in tests/core and tests/faults. Each run goes on
+# from where the last was killed.
 MOMENTS: tuple[tuple[str, float | None], ...] = (
     ("sfm.partial/database.db", 0.1),  # features
     ("sfm.partial/pairs.txt", 0.05),  # matching
