@@ -30,8 +30,8 @@ PRESETS = {
     "standard": Preset(4_000, 800, 200_000),
     "high": Preset(8_000, 1_600, 500_000),
 }
-# Of `georef run` with 48 photographs of a megapixel, kernels compiled, 2 cores: `fast` as in docs/benchmarks.md, the
-# others as `georef run --dry-run` forecasts.
+# Of `georef run` with 48 photographs of a megapixel, kernels compiled, 2 cores: `fast` as in docs/benchmarks.md,
+# the others as `georef run --dry-run` forecasts.
 RUN_MINUTES = {"smoke": 2, "fast": 4, "standard": 17, "high": 75}
 
 
