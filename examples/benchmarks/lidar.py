@@ -10,7 +10,12 @@ Pixels of the test views, and of every fourth training view, are intersected wit
 unchanged cloud has a point within 0.3 m of that place. `wall`, `roof` and `ground` are medians of the distance
 between the rendered and the true surface, perpendicular to the latter, in metres; `wall > 1 m` is the share of the
 walls' pixels beyond one metre, which the medians leave out; `check walls` is the median error of check points on
-walls. What stands in OUT already is not made again.
+walls.
+
+The registration is measured on the unchanged cloud: `shift error` is the largest component of what it finds for
+that cloud, and `of 0.1 m` the largest difference between 0.1 m and what is found for it, added along each axis.
+`building rejected` is the share of rejected points on the removed building, which are those further than 0.5 m from
+the unchanged cloud, and `others rejected` that of all others. What stands in OUT already is not made again.
 """
 
 from __future__ import annotations
@@ -26,7 +31,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from pipelines.core.products import load_json
-from pipelines.core.stages import REPORT
+from pipelines.core.progress import SILENT
+from pipelines.core.stages import BY_NAME, REPORT
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import Workspace
 from pipelines.geodesy.enu import ecef_from_enu, enu_from_ecef
@@ -34,7 +40,7 @@ from pipelines.scene.cloud_options import CloudCrs
 from pipelines.scene.measured_cloud import CloudFiles
 from pipelines.scene.renderer import ModelRenderer
 from pipelines.scene.report import read_report
-from pipelines.scene.scene import photographs
+from pipelines.scene.scene import load_initial_scene, photographs
 from pipelines.scene.trained_survey import load_trained
 from pipelines.simulate.mesh import Material
 from pipelines.simulate.options import SimulateOptions
@@ -42,6 +48,9 @@ from pipelines.simulate.raycast import MISS, Raycaster
 from pipelines.simulate.stage import RecordedFlight, fly_survey, write_lidar_flight
 from pipelines.simulate.truth import Truth
 from pipelines.splat.rasterizer.backends import rasterizer
+from pipelines.train.depth_maps import DepthMaps
+from pipelines.train.lidar.prepare import compared_lidar, lidar_surface, registration_of
+from pipelines.train.options import TrainOptions
 
 CLASSES = {
     "wall": (Material.WALL,),
@@ -60,6 +69,7 @@ TRAININGS: dict[str, tuple[str | None, tuple[str, ...]]] = {
 STRIDE, EVERY = 2, 4  # of the pixels, and of the training views
 COVERED_M = 0.3
 NEAR_M = 1.0  # a larger distance is another surface
+BUILDING_M = 0.5
 
 
 def main() -> None:
@@ -107,12 +117,15 @@ def measured(seed: int, name: str, arguments: argparse.Namespace) -> dict[str, A
         georef("train", workspace, *arguments.train.split(), *lidar)
         georef("evaluate", workspace)
     cloud = cloud_of(flight, given, home, "none")
-    return {"seed": seed, "training": name, **figures(Workspace(workspace), flight, survey, cloud)}
+    row = {"seed": seed, "training": name, **figures(Workspace(workspace), flight, survey, cloud)}
+    if change is not None:
+        row |= comparison(Workspace(workspace), flight, cloud, cloud_of(flight, given, home, change))
+    return row
 
 
 def cloud_of(flight: RecordedFlight, given: dict[str, Any], home: Path, change: str) -> Path:
     """The cloud of a LiDAR flight, written if it is not there yet."""
-    folder = home / f"lidar_{change}"
+    folder = home / f"cloud_{change}"
     if not (folder / "lidar.laz").exists():
         folder.mkdir(parents=True, exist_ok=True)
         write_lidar_flight(SimulateOptions.model_validate({**given, "lidar_change": change}), flight, folder)
@@ -140,11 +153,45 @@ def figures(workspace: Workspace, flight: RecordedFlight, survey: Path, cloud: P
     }
 
 
+def comparison(workspace: Workspace, flight: RecordedFlight, unchanged: Path, used: Path) -> dict[str, Any]:
+    """Errors of the registration, and shares of rejected points, by the stage's own functions."""
+    manifest = workspace.manifest(BY_NAME["train"])
+    assert manifest is not None
+    options = TrainOptions.model_validate(manifest.config)
+    initial, survey, scene = load_initial_scene(workspace)
+    images = photographs(scene.sparse, survey, workspace, options.effort.max_image_size)
+    images.build(SILENT)
+    maps, files = DepthMaps(workspace.cache / "surface", scene, images), CloudFiles(used, options.lidar_stated)
+    maps.build(SILENT)
+    compared = compared_lidar(
+        options, files, maps, survey,
+        track=None, georeference=initial.geo_from_local, seed=options.seed, progress=SILENT,
+    )  # fmt: skip
+    if used == unchanged:
+        found = compared.registration.shift_m
+        off = []
+        for axis in 0.1 * np.eye(3):
+            again = registration_of(compared.cloud.moved(axis), compared.shown, compared.views, options.seed)
+            off.append(np.abs(again.shift_m - found - axis).max())
+        return {"shift error": round(float(np.abs(found).max()), 4), "of 0.1 m": round(float(max(off)), 4)}
+    judged = lidar_surface(compared, files, survey, options, None)
+    in_geo = scene.geo_from_model.apply(judged.cloud.position_in_model)
+    place = enu_from_ecef(ecef_from_enu(in_geo, survey.origin), flight.world.origin)
+    gap, _ = points_of(unchanged, flight).query(place, distance_upper_bound=BUILDING_M)
+    building, rejected = np.isinf(gap), judged.verdict.rejected
+    shares = {"building rejected": rejected[building], "others rejected": rejected[~building]}
+    return {name: round(float(mask.mean()), 4) for name, mask in shares.items()}
+
+
+def points_of(cloud: Path, flight: RecordedFlight) -> cKDTree:
+    """Points of a cloud, in the frame of the flight's world."""
+    chunks = CloudFiles(cloud, CloudCrs()).chunks(flight.world.origin)
+    return cKDTree(np.concatenate([chunk.position_in_geo for chunk in chunks]))
+
+
 def surface_errors(workspace: Workspace, flight: RecordedFlight, cloud: Path) -> tuple[FloatArray, np.ndarray]:
     """Rendered minus true surface where the cloud covers it, along the outward normal (K,), and materials (K,)."""
-    chunks = CloudFiles(cloud, CloudCrs()).chunks(flight.world.origin)
-    covered = cKDTree(np.concatenate([chunk.position_in_geo for chunk in chunks]))
-    trained = load_trained(workspace)
+    covered, trained = points_of(cloud, flight), load_trained(workspace)
     images = photographs(trained.sparse, trained.survey, workspace, trained.model.max_image_size)
     renderer = ModelRenderer(trained, images, rasterizer("auto"))
     mesh, origin = flight.world.scene.mesh, flight.world.origin
@@ -187,11 +234,12 @@ def georef(command: str, workspace: Path, *options: Any) -> None:
 
 def print_medians(rows: list[dict[str, Any]]) -> None:
     """Medians over the seeds, as a Markdown table."""
-    keys = [key for key in rows[0] if key not in {"seed", "training"}]
+    keys = [key for key in dict.fromkeys(key for row in rows for key in row) if key not in {"seed", "training"}]
     print("\n| training | " + " | ".join(keys) + " |\n|---" + "|---" * len(keys) + "|")
     for name in dict.fromkeys(row["training"] for row in rows):
         mine = [row for row in rows if row["training"] == name]
-        cells = [f"{np.median([row[key] for row in mine if row[key] is not None]):.3f}" for key in keys]
+        known = [[row[key] for row in mine if row.get(key) is not None] for key in keys]
+        cells = [f"{np.median(values):.3f}" if values else "–" for values in known]
         print(f"| {name} | " + " | ".join(cells) + " |")
 
 

@@ -164,10 +164,7 @@ def draw_changes(path: Path, lidar: LidarSurface, scene: Scene) -> None:
     """Write the map of the places that have changed as PNG."""
     shift = scene.geo_from_model.translation  # a pure shift at the start of the training
     areas = [
-        DrawnArea(
-            area.kind, area.area_m2, area.cells + shift[:2], area.cell_m
-        )  # `geo_from_model` is a pure shift here
-        for area in lidar.verdict.areas
+        DrawnArea(area.kind, area.area_m2, area.cells + shift[:2], area.cell_m) for area in lidar.verdict.areas
     ]
     write_lidar_map(path, lidar.cloud.position_in_model + shift, areas)
 
