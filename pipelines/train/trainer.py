@@ -26,6 +26,7 @@ from pipelines.splat.outlier_pixels import OutlierPixels
 from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings, Render, ScreenStats
 from pipelines.splat.surface import ObservedPoints
 from pipelines.train.checkpoint import prefixed, unprefixed
+from pipelines.train.geographic_adam import GeographicAdam
 from pipelines.train.pace import iteration_seconds
 from pipelines.train.region import TrainingRegion
 from pipelines.train.schedule import JointOptions, TrainingSchedule
@@ -33,12 +34,6 @@ from pipelines.train.surface import GaussianLoss
 from pipelines.train.surface_losses import RenderedView, SurfaceLosses
 from pipelines.train.target_images import Look, TargetImage, TargetImages
 
-_UNKNOWNS = {
-    "y": "the similarity",
-    "z": "the cameras",
-    "x": "the constant errors",
-    "u": "the weights of the losses",
-}
 _LENS_EVERY = 100  # iterations between two reads of the lens: each read waits for the device
 # Each non-finite gradient shows in one of these: colours pass it on to the opacities.
 _WATCHED = ("means", "quats_wxyz", "log_scales", "logit_opacities")
@@ -129,20 +124,9 @@ class JointTrainer:
         masks = None if region is None else region.masks
         self._targets = TargetImages(views.images, self._pinholes, self.device, masks, options.crops)
         self._surface_losses = self._made_surface_losses()
+        self._unknowns = GeographicAdam(problem, options, self.device)
         names = ("photometric loss", "geographic loss", *(f"gradient of {name}" for name in self._watched()))
         self._watch = FinitenessMonitor(names, self.device)
-        rates = {
-            "y": options.similarity_rate,
-            "z": options.camera_rate,
-            "x": options.similarity_rate,
-            "u": options.variance_rate,
-        }
-        # One kernel for each of these short vectors on a GPU, in place of a dozen whose launches take longer than
-        # their work.
-        self._geo_adam = torch.optim.Adam(
-            [{"params": [parameter], "rate": rates[name]} for name, parameter in problem.learned().items()],
-            fused=self.device.type == "cuda",
-        )
 
     def step(self) -> StepReport:
         """Run one iteration and return its figures.
@@ -168,7 +152,7 @@ class JointTrainer:
         weight, by_depth = self.schedule.geographic_weight(self.iteration), self._by_depth(index, render, target)
         geographic = self.problem.loss() if by_depth is None else self.problem.loss() + by_depth
         self.optimizer.zero_grad()
-        self._geo_adam.zero_grad()
+        self._unknowns.zero_grad()
         total = target.part.weight * photometric + weight * geographic
         penalty = self.strategy.penalty(self.optimizer.gaussians, self._own(render.stats))
         for term in (penalty, self._surface(render, pose, target, index)):
@@ -305,8 +289,7 @@ class JointTrainer:
 
     def _watched(self) -> dict[str, Tensor]:
         tensors = self.optimizer.gaussians.tensors()
-        geo = {_UNKNOWNS[name]: parameter for name, parameter in self.problem.learned().items()}
-        return {name: tensors[name] for name in _WATCHED} | geo
+        return {name: tensors[name] for name in _WATCHED} | self._unknowns.named()
 
     def _note(self, photometric: Tensor, geographic: Tensor) -> None:
         losses = {"photometric loss": photometric, "geographic loss": geographic}
@@ -317,10 +300,7 @@ class JointTrainer:
         self._watch.note(self.iteration, losses | gradients)
 
     def _apply(self, visible: Tensor) -> None:
-        rate = self.schedule.geographic_rate(self.iteration)
-        for group in self._geo_adam.param_groups:
-            group["lr"] = self.optimizer.rate_factor * group["rate"] * rate
-        self._geo_adam.step()
+        self._unknowns.step(self.optimizer.rate_factor * self.schedule.geographic_rate(self.iteration))
         self.optimizer.step(self.iteration, visible)
         if self.exposures is not None:
             self.exposures.step(self.iteration)
@@ -340,11 +320,6 @@ class JointTrainer:
 
     def state(self) -> dict[str, Tensor]:
         """Return all tensors that the next iteration depends on, by name, for a checkpoint."""
-        parameters = self.problem.learned()
-        geo: dict[str, Tensor] = {**parameters}
-        for name, parameter in parameters.items():
-            moments = self._geo_adam.state[parameter]
-            geo |= {f"{name}_{key}": torch.as_tensor(value) for key, value in moments.items()}
         exposures = {} if self.exposures is None else self.exposures.state()
         outliers = {} if self.outliers is None else self.outliers.state()
         return {
@@ -355,7 +330,7 @@ class JointTrainer:
             **prefixed("gaussians", self.optimizer.gaussians.tensors()),
             **prefixed("optimizer", self.optimizer.state()),
             **prefixed("strategy", self.strategy.state()),
-            **prefixed("geo", geo),
+            **prefixed("geo", self._unknowns.state()),
             **prefixed("exposures", exposures),
             **prefixed("outliers", outliers),
         }
@@ -378,16 +353,7 @@ class JointTrainer:
             self.exposures.restore(unprefixed("exposures", state))
         if self.outliers is not None:
             self.outliers.restore(unprefixed("outliers", state))
-        geo = unprefixed("geo", state)
-        for name, parameter in self.problem.learned().items():
-            with torch.no_grad():
-                parameter.copy_(geo[name])
-            # A fused Adam keeps its count of steps on the device.
-            self._geo_adam.state[parameter] = {
-                key: geo[f"{name}_{key}"].to(self.device)
-                for key in ("step", "exp_avg", "exp_avg_sq")
-                if f"{name}_{key}" in geo
-            }
+        self._unknowns.restore(unprefixed("geo", state))
 
 
 @torch.no_grad()
