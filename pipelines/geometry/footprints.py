@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from pipelines.core.threads import thread_count
 from pipelines.core.types import FloatArray
 from pipelines.geometry.cameras import Camera, undistort
 
@@ -32,7 +33,7 @@ class PointSurface:
 
     def heights(self, places: FloatArray) -> FloatArray:
         """Return the heights (…,) at places (…, 2)."""
-        _, near = self._tree.query(places, k=self._neighbours)
+        _, near = self._tree.query(places, k=self._neighbours, workers=thread_count())
         return np.asarray(np.median(self._height[np.reshape(near, (*places.shape[:-1], -1))], axis=-1))
 
 

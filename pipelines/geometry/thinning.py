@@ -7,19 +7,17 @@ import numpy as np
 from pipelines.core.types import FloatArray, IntArray
 
 _SMALLEST_M = 1e-6
+_LARGEST_NUMBER = 2**62
 
 
 def voxel_keys(points: FloatArray, side_m: float) -> IntArray:
     """Return a number (P,) for the voxel of each point, the same for points of one voxel.
 
     Args:
-        points: (P, 3) metres, P ≥ 1; no axis spans more than 2²¹ voxels.
+        points: (P, 3) metres, P ≥ 1.
         side_m: side of the voxels.
     """
-    voxel = np.floor(points / side_m).astype(np.int64)
-    voxel -= voxel.min(axis=0)
-    extent = voxel.max(axis=0) + 1
-    return np.asarray((voxel[:, 0] * extent[1] + voxel[:, 1]) * extent[2] + voxel[:, 2])
+    return _row_numbers(np.floor(points / side_m).astype(np.int64))
 
 
 def first_of_voxels(points: FloatArray, side_m: float) -> IntArray:
@@ -36,7 +34,20 @@ def thin_to_voxels(points: FloatArray, side_m: FloatArray) -> IntArray:
         points: (P, 3) metres.
         side_m: (P,) wanted side of each point's voxel; rounded to a power of two, so that equal sides share a grid.
     """
+    if not len(points):
+        return np.zeros(0, dtype=np.int64)
     level = np.round(np.log2(np.maximum(side_m, _SMALLEST_M)))
     voxel = np.floor(points / (2.0**level)[:, None])
-    _, first = np.unique(np.column_stack([level, voxel]), axis=0, return_index=True)
+    _, first = np.unique(_row_numbers(np.column_stack([level, voxel]).astype(np.int64)), return_index=True)
     return np.sort(first)
+
+
+def _row_numbers(rows: IntArray) -> IntArray:
+    """Return a number (P,) for each of P ≥ 1 rows, the same for equal rows; numbers sort ten times as fast."""
+    number = np.zeros(len(rows), dtype=np.int64)
+    for column in (rows - rows.min(axis=0)).T:
+        extent = int(column.max()) + 1
+        if int(number.max()) >= _LARGEST_NUMBER // extent:
+            _, number = np.unique(number, return_inverse=True)
+        number = number * extent + column
+    return number

@@ -46,8 +46,9 @@ def guessed_points(
     points, colours, sizes = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)], [np.zeros(0)]
     for index in map(int, scene.train):
         camera = surface.camera(index)
-        depth = _ground_depth(scene, index, camera, ground)
-        rows, columns = np.nonzero((surface.depth(index) == 0) & np.isfinite(depth))
+        unknown = surface.depth(index) == 0
+        depth = _ground_depth(scene, index, camera, ground, unknown)
+        rows, columns = np.nonzero(unknown & np.isfinite(depth))
         chosen = random.permutation(len(rows))[:each]
         rows, columns = rows[chosen], columns[chosen]
         in_cam = depth[rows, columns, None] * camera.rays(np.stack([columns, rows], axis=1) + 0.5)
@@ -60,12 +61,17 @@ def guessed_points(
     return SurfacePoints(place[kept], rgb[kept], np.full((len(kept), 3), np.nan))
 
 
-def _ground_depth(scene: Scene, index: int, camera: Pinhole, ground: PointSurface) -> FloatArray:
-    """Return the depth (H, W) of the ground in a view, in metres, from a few rays; NaN where it has none."""
+def _ground_depth(scene: Scene, index: int, camera: Pinhole, ground: PointSurface, wanted: BoolArray) -> FloatArray:
+    """Return the depth (H, W) of the ground in a view, in metres, from a few rays around the wanted pixels.
+
+    It is NaN where a ray meets no ground, and away from the wanted pixels.
+    """
     center, coarse = scene.poses.cam_center_in_model[index], camera.limited(_COLUMNS)
-    depth = np.ones((coarse.height, coarse.width))
-    rays = coarse.points_at(depth) @ scene.poses.cam_from_model[index]
+    around = cv2.resize(wanted.astype(np.float32), (coarse.width, coarse.height), interpolation=cv2.INTER_AREA) > 0
+    near = cv2.dilate(around.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0  # pixels are between four rays
+    rays = coarse.points_at(np.ones(near.shape))[near.ravel()] @ scene.poses.cam_from_model[index]
     place = ground_points(rays, center, ground)
-    along = np.linalg.norm(place - center, axis=1) / np.linalg.norm(rays, axis=1)
+    along = np.full(near.shape, np.nan)
+    along[near] = np.linalg.norm(place - center, axis=1) / np.linalg.norm(rays, axis=1)
     size = camera.width, camera.height
-    return np.asarray(cv2.resize(along.reshape(depth.shape), size, interpolation=cv2.INTER_LINEAR))
+    return np.asarray(cv2.resize(along, size, interpolation=cv2.INTER_LINEAR))
