@@ -61,10 +61,6 @@ class TrainingCoverage:
             if index == apart_from:
                 continue
             pose = self._renderer.pose(index)
-            camera, in_cam = pose.pinhole, (points - pose.center_in_model) @ pose.cam_from_model.T
-            with np.errstate(invalid="ignore", divide="ignore"):
-                u = camera.fx * in_cam[:, 0] / in_cam[:, 2] + camera.cx
-                v = camera.fy * in_cam[:, 1] / in_cam[:, 2] + camera.cy
-                inside = (in_cam[:, 2] > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-            count += inside
+            in_cam = (points - pose.center_in_model) @ pose.cam_from_model.T
+            count += pose.pinhole.holds(pose.pinhole.project(in_cam))
         return count

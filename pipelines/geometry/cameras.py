@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pipelines.core.errors import InputError
-from pipelines.core.types import FloatArray, IntArray
+from pipelines.core.types import BoolArray, FloatArray, IntArray
 
 # Slots of each of COLMAP's parameters: fx fy cx cy | k1 k2 p1 p2 k3 k4 k5 k6 (fisheye: k1 k2 k3 k4).
 _LAYOUT: dict[str, tuple[tuple[int, ...], ...]] = {
@@ -56,6 +56,17 @@ class Pinhole:
         """Return viewing rays (…, 3) of pixels (…, 2) in the camera frame, of length one along the optical axis."""
         slope = (np.asarray(xy_px, dtype=np.float64) - [self.cx, self.cy]) / [self.fx, self.fy]
         return np.concatenate([slope, np.ones((*slope.shape[:-1], 1))], axis=-1)
+
+    def project(self, in_cam: ArrayLike) -> FloatArray:
+        """Return the pixels (…, 2) of points (…, 3) in the camera frame; NaN for points that are not before it."""
+        point = np.asarray(in_cam, dtype=np.float64)
+        depth = np.where(point[..., 2:] > 0, point[..., 2:], np.nan)
+        return np.asarray(point[..., :2] / depth * [self.fx, self.fy] + [self.cx, self.cy])
+
+    def holds(self, xy_px: ArrayLike) -> BoolArray:
+        """Return whether pixels (…, 2) lie within the image, as (…,); NaN does not."""
+        xy = np.asarray(xy_px, dtype=np.float64)
+        return np.asarray(((xy >= 0) & (xy < (self.width, self.height))).all(axis=-1))
 
     def points_at(self, depth_m: ArrayLike) -> FloatArray:
         """Return the points (H W, 3) in the camera frame, row by row, of depths (H, W) in metres along z."""

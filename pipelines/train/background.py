@@ -71,12 +71,10 @@ def _empty_cells(scene: Scene, index: int, camera: Pinhole, points: FloatArray) 
     """Return the cells (E, 2), as column and row, that have no point in them or in a cell beside them."""
     rows = max(1, round(_COLUMNS * camera.height / camera.width))
     in_cam = (points - scene.poses.cam_center_in_model[index]) @ scene.poses.cam_from_model[index].T
-    in_cam = in_cam[in_cam[:, 2] > 0]
-    x = (camera.fx * in_cam[:, 0] / in_cam[:, 2] + camera.cx) * _COLUMNS / camera.width
-    y = (camera.fy * in_cam[:, 1] / in_cam[:, 2] + camera.cy) * rows / camera.height
-    inside = (x >= 0) & (x < _COLUMNS) & (y >= 0) & (y < rows)
+    xy = camera.project(in_cam)
+    shown = xy[camera.holds(xy)]
     occupied = np.zeros((rows + 2, _COLUMNS + 2), dtype=bool)
-    column, row = x[inside].astype(int), y[inside].astype(int)
+    column, row = (shown * [_COLUMNS / camera.width, rows / camera.height]).astype(int).T
     for shift_row in (0, 1, 2):
         for shift_column in (0, 1, 2):
             occupied[row + shift_row, column + shift_column] = True
@@ -127,7 +125,5 @@ def _colours(image: ByteArray, pixel: FloatArray) -> ByteArray:
 
 def _thinned(all_points: Background) -> Background:
     """Return one point in each cube of its own size, because neighbouring views see the same places."""
-    if not len(all_points.sigma_m):
-        return all_points
     first = thin_to_voxels(all_points.point_in_model, 2 * all_points.sigma_m)
     return Background(all_points.point_in_model[first], all_points.rgb[first], all_points.sigma_m[first])

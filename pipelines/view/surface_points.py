@@ -157,11 +157,9 @@ class SurfaceReader:
         detail = []
         for camera in self._train:
             pinhole = self.renderer.pinhole(camera)
-            x, y, z = self._in_cam(camera, place)
-            if z > 0:
-                column, row = pinhole.fx * x / z + pinhole.cx, pinhole.fy * y / z + pinhole.cy
-                if 0 <= column < pinhole.width and 0 <= row < pinhole.height:
-                    detail.append((z / pinhole.fx, camera))
+            in_cam = self._in_cam(camera, place)
+            if pinhole.holds(pinhole.project(in_cam)):
+                detail.append((float(in_cam[2]) / pinhole.fx, camera))
         return [camera for _, camera in sorted(detail)[:_MOST_VIEWS]]
 
     def _in_cam(self, camera: int, place: FloatArray) -> FloatArray:

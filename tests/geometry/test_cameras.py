@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipelines.core.errors import InputError
-from pipelines.geometry.cameras import MODELS, Camera, distort, project, undistort
+from pipelines.geometry.cameras import MODELS, Camera, Pinhole, distort, project, undistort
 
 pycolmap = pytest.importorskip("pycolmap")
 
@@ -76,3 +76,20 @@ def test_unknown_model_and_wrong_parameter_count_are_named() -> None:
         undistort(Camera("OPENCV", 10, 10, np.ones(4)), [[1.0, 2.0]])
     with pytest.raises(InputError, match="not positive"):
         project(Camera("SIMPLE_PINHOLE", 10, 10, np.array([0.0, 5.0, 5.0])), [[1.0, 2.0, 3.0]])
+
+
+def test_pinhole_shows_a_point_where_its_ray_leaves() -> None:
+    camera, random = Pinhole(1200, 900, 900.0, 905.0, 610.0, 455.0), np.random.default_rng(0)
+    xy = random.uniform([-300, -300], [1500, 1200], (200, 2))
+    in_cam = camera.rays(xy) * random.uniform(0.1, 1e4, (200, 1))
+    np.testing.assert_allclose(camera.project(in_cam), xy, atol=1e-9)
+    within = (xy[:, 0] >= 0) & (xy[:, 0] < 1200) & (xy[:, 1] >= 0) & (xy[:, 1] < 900)
+    assert 0 < within.sum() < 200
+    np.testing.assert_array_equal(camera.holds(xy), within)
+    # The image ends where the next pixel would begin.
+    np.testing.assert_array_equal(
+        camera.holds([[0, 0], [1200, 0], [0, 900], [-1e-9, 0]]), [True, False, False, False]
+    )
+    behind = camera.project(-in_cam)
+    assert np.isnan(behind).all()
+    assert not camera.holds(behind).any()

@@ -126,10 +126,8 @@ def _in_view(
             near.append(part)
     in_cam = (np.concatenate(near) - center) @ rotation.T if near else np.zeros((0, 3))
     in_cam = in_cam[in_cam[:, 2] > _NEAR_M]
-    x = pinhole.fx * in_cam[:, 0] / in_cam[:, 2] + pinhole.cx
-    y = pinhole.fy * in_cam[:, 1] / in_cam[:, 2] + pinhole.cy
-    inside = (x >= 0) & (x < pinhole.width) & (y >= 0) & (y < pinhole.height)
-    return np.column_stack([x, y, in_cam[:, 2]])[inside]
+    xy = pinhole.project(in_cam)
+    return np.column_stack([xy, in_cam[:, 2]])[pinhole.holds(xy)]
 
 
 def _coarse(pinhole: Pinhole, shrink: float) -> Pinhole:
