@@ -24,12 +24,13 @@ from pipelines.core.progress import Progress
 from pipelines.core.types import FloatArray
 from pipelines.evaluate.options import EvaluateOptions
 from pipelines.evaluate.reference.alignment import Fit, fit_alignment
-from pipelines.evaluate.reference.distances import ComparisonSettings, compare_square
+from pipelines.evaluate.reference.distances import Box, ComparisonSettings, compare_square
 from pipelines.evaluate.reference.figures import THRESHOLDS_M, CoreTable, DistanceTally, level_of_detection
 from pipelines.evaluate.reference.m3c2 import require_m3c2
 from pipelines.evaluate.reference.normals import plane_normals
 from pipelines.evaluate.reference.seen import SeenSurface, Viewpoints, seen_surface
 from pipelines.evaluate.reference.tiles import TiledPoints
+from pipelines.geodesy.enu import Origin
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.thinning import first_of_voxels
 from pipelines.scene.cloud_options import CloudCrs
@@ -106,13 +107,14 @@ def compare_with_reference(
     """
     assert options.reference is not None  # the caller opened its files
     trained = renderer.trained
-    thinning = Thinning(_OVERVIEW_M, _MOST_OVERVIEW, *_bounds(trained))
+    box = _bounds(trained)
+    thinning = Thinning(_OVERVIEW_M, _MOST_OVERVIEW, *box)
     overview = read_thinned(files, trained.survey.origin, thinning, progress)
     model = _model(renderer, overview, options, scratch, progress)
     seen = seen_surface(_viewpoints(renderer, model.moved), overview.position_in_geo, overview.voxel_m, progress)
-    reference = _sorted_reference(files, trained, scratch / "reference", progress)
+    reference = _sorted_reference(files, trained.survey.origin, box, scratch / "reference", progress)
     spacing_m = _spacing(reference)
-    settings = ComparisonSettings.of_spacings(spacing_m, model.settings.spacing_m, min(THRESHOLDS_M))
+    settings = ComparisonSettings.of_spacings(spacing_m, model.settings.spacing_m, min(THRESHOLDS_M), box)
     tally = _compare(reference, model.points, seen, settings, progress)
     cores = tally.cores()
     sigma_m = _georeference_sigma(cores.position, cores.normal, trained, propagation)
@@ -153,7 +155,7 @@ def _compare(
     return tally
 
 
-def _bounds(trained: TrainedSurvey) -> tuple[FloatArray, FloatArray]:
+def _bounds(trained: TrainedSurvey) -> Box:
     """Return the corners (3,) of the box around the scene; a reference may lie above or below it."""
     points = scene_points(trained)
     margin = np.array([_MARGIN_M, _MARGIN_M, _MARGIN_UP_M])
@@ -211,10 +213,10 @@ def _viewpoints(renderer: ModelRenderer, moved: Similarity | None) -> Viewpoints
     )
 
 
-def _sorted_reference(files: CloudFiles, trained: TrainedSurvey, folder: Path, progress: Progress) -> TiledPoints:
-    """Return the points of the reference within the scene, in squares."""
-    (low, high), reference = _bounds(trained), TiledPoints(folder, _SQUARE_M)
-    for chunk in files.chunks(trained.survey.origin, progress):
+def _sorted_reference(files: CloudFiles, origin: Origin, box: Box, folder: Path, progress: Progress) -> TiledPoints:
+    """Return the points of the reference within the box of the scene, in squares."""
+    (low, high), reference = box, TiledPoints(folder, _SQUARE_M)
+    for chunk in files.chunks(origin, progress):
         place = chunk.position_in_geo
         inside = ((place >= low) & (place <= high)).all(axis=1)
         reference.append(place[inside], None, chunk.classification[inside])

@@ -23,6 +23,7 @@ _GROUND, _BUILDING, _VEGETATION = (2,), (6,), (3, 4, 5)  # classes of LAS
 FARTHEST_M = 2.0  # of the nearest points that are looked for
 _REACH_M = 1.0  # of the cylinders
 _MOST_POINTS = 2_000_000  # of a cloud in a square, for M3C2: seconds
+Box = tuple[FloatArray, FloatArray]
 _CORE_SPACINGS = 3.0  # between core points: a cylinder of this radius holds about 28 points of a surface
 
 
@@ -34,17 +35,32 @@ class ComparisonSettings:
         voxel_m: side of the voxels of which one point of the reference counts.
         core_m: between core points, and radius of the cylinders.
         cover_m: side of the cells of the plan that the reference covers if they hold one of its points.
+        cut: corners (3,) of the box outside of which the reference was left out; None: all of it is there.
     """
 
     voxel_m: float
     core_m: float
     cover_m: float
+    cut: Box | None = None
 
     @classmethod
-    def of_spacings(cls, reference_m: float, model_m: float, least_threshold_m: float) -> ComparisonSettings:
+    def of_spacings(
+        cls, reference_m: float, model_m: float, least_threshold_m: float, cut: Box | None
+    ) -> ComparisonSettings:
         """Return the settings for clouds with a distance between neighbours, and for a least threshold."""
         spacing_m = max(reference_m, model_m, least_threshold_m / 2)
-        return cls(least_threshold_m / 2, _CORE_SPACINGS * spacing_m, max(1.0, 4 * reference_m))
+        return cls(least_threshold_m / 2, _CORE_SPACINGS * spacing_m, max(1.0, 4 * reference_m), cut)
+
+    def uncut(self, place: FloatArray) -> BoolArray:
+        """Return at which of places (P, 3) a cylinder is not cut in the plan.
+
+        A cut one holds points of the model alone on its outer side, whose mean height is another on uneven ground.
+        """
+        if self.cut is None:
+            return np.ones(len(place), dtype=bool)
+        low, high = self.cut
+        inside = (place[:, :2] >= low[:2] + self.core_m) & (place[:, :2] <= high[:2] - self.core_m)
+        return np.asarray(inside.all(axis=1))
 
 
 @dataclass(frozen=True)
@@ -124,7 +140,7 @@ def compare_square(
     to_model, _ = _nearest(place[is_seen], model_rows["position"])
     covered = model_own & _covered(model_rows["position"], place, settings.cover_m)
     to_reference, nearest = _nearest(model_rows["position"][covered], place)
-    usable = np.flatnonzero(is_seen & np.isfinite(normal[:, 0]))
+    usable = np.flatnonzero(is_seen & np.isfinite(normal[:, 0]) & settings.uncut(place))
     cores = usable[first_of_voxels(place[usable], settings.core_m)]
     model_every = _at_random(model_rows["position"])
     measured = m3c2(every, model_every, place[cores], normal[cores], radius_m=settings.core_m, reach_m=_REACH_M)
