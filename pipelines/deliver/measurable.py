@@ -5,8 +5,8 @@ surface is wrong by a part of the Gaussian's size. So:
 
 1. The surface of the training views is fused to points, as for the point cloud (`scene.surface_cloud`).
 2. A disc lies at each point. Its colour is that of the trained renders.
-3. Gaussians with their centre beside a disc are left out. Others stay: what no surface explains, and what too few
-   views confirm.
+3. Gaussians with their centre beside a disc are left out, and those that no training view shows, such as the sheet
+   beneath the scene. Others stay: what no surface explains, and what too few views confirm.
 4. Colours and opacities are fitted to the trained renders of the training views; no centre moves.
 """
 
@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from scipy.spatial import KDTree
+from torch import Tensor
 
 from pipelines.core.errors import DegenerateGeometryError, ResourceError
 from pipelines.core.progress import Progress
@@ -32,16 +33,18 @@ from pipelines.scene.surface_cloud.fusion import SurfaceCloud, fused_squares, fu
 from pipelines.scene.surface_cloud.plan import pixel_on_surface_m
 from pipelines.scene.surface_views import SurfaceView, SurfaceViews
 from pipelines.scene.trained_survey import TrainedSurvey, load_trained
+from pipelines.splat.contributions import view_contributions
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.memory import USABLE, TrainingSize, free_memory_bytes, predicted_peak_bytes
 from pipelines.splat.metrics import psnr
-from pipelines.splat.rasterizer.api import RasterSettings
+from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings
 from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.splat.repainting import ShownView, repainted, shuffled_passes
 from pipelines.splat.surface_discs import surface_discs
 
 _SPACING_PX = 0.7
 _MIN_VIEWS = 3  # that agree on a point of the surface, as in the point cloud
+_LEAST_SHOWN_PX = 0.05  # of a Gaussian that a view shows
 _BESIDE = 1.0  # spacings between the centre of a Gaussian and the disc that replaces it
 
 
@@ -98,7 +101,8 @@ def measurable_splat(stage: StageRun, options: ExportPlyOptions) -> MeasurableSp
     spacing_m = options.disc_spacing or _SPACING_PX * pixel_m
     settings = fusion_settings(views, trained.geo_from_model, _MIN_VIEWS, spacing_m)
     surface = _collected(fused_squares(views, trained.geo_from_model, settings, progress), views, trained)
-    replaced, discs = with_discs(trained.gaussians, surface, trained.geo_from_model, spacing_m)
+    shown = trained.gaussians.select(_in_views(trained.gaussians, views, backend, progress).nonzero()[:, 0])
+    replaced, discs = with_discs(shown, surface, trained.geo_from_model, spacing_m)
     painted = repainted(
         replaced,
         lambda number: _shown(views.view(number)),
@@ -136,6 +140,19 @@ def with_discs(
     return Gaussians.concatenate([kept, discs]), len(discs)
 
 
+def _in_views(gaussians: Gaussians, views: SurfaceViews, backend: Rasterizer, progress: Progress) -> Tensor:
+    """Return the mask (N,) of the Gaussians that make up a part of a pixel in at least one view."""
+    most_px = torch.zeros(len(gaussians))
+    with progress.task("Gaussians in view", len(views)) as task:
+        for number in range(len(views)):
+            view = views.view(number)
+            no_error = torch.zeros(view.pinhole.height, view.pinhole.width)
+            shown = view_contributions(gaussians, _pose(view), view.pinhole, no_error, backend)
+            most_px = torch.maximum(most_px, shown.weight_px.cpu())
+            task.advance()
+    return most_px >= _LEAST_SHOWN_PX
+
+
 def _collected(squares: Iterable[SurfaceCloud], views: SurfaceViews, trained: TrainedSurvey) -> SurfaceCloud:
     """Return all points with a normal.
 
@@ -167,9 +184,13 @@ def _collected(squares: Iterable[SurfaceCloud], views: SurfaceViews, trained: Tr
 
 def _shown(view: SurfaceView) -> ShownView:
     assert view.rgb is not None
-    matrix = pose_matrix(view.cam_from_model, view.cam_center_in_model)
     colour = torch.from_numpy(np.array(view.rgb)).float() / 255
-    return ShownView(torch.as_tensor(matrix, dtype=torch.float32), view.pinhole, colour)
+    return ShownView(_pose(view), view.pinhole, colour)
+
+
+def _pose(view: SurfaceView) -> Tensor:
+    """Return the pose (4, 4) of a view, float32."""
+    return torch.as_tensor(pose_matrix(view.cam_from_model, view.cam_center_in_model), dtype=torch.float32)
 
 
 def _psnr_change_db(before: ModelRenderer, after: ModelRenderer, progress: Progress) -> float | None:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -20,10 +21,15 @@ from pipelines.train.background import background
 from pipelines.train.guessed_surface import guessed_points
 from pipelines.train.region import TrainingRegion
 from pipelines.train.surface import SceneSurface, SurfacePoints
+from pipelines.train.underlay import hidden, underlay
 
 _SURFACE_SHARE = 0.8  # of the limit of Gaussians starts on the surface; density control places the others
 _MOSTLY_KNOWN = 0.6  # of the pixels: with fewer known depths, more Gaussians are needed off the surface
 _UNKNOWN_SHARE = 0.05  # of the limit starts where no depth is known, at least: density control finds corners late
+_BENEATH_SHARE = 0.02  # of the limit lies beneath the scene
+_BENEATH_SIGMA = 0.6  # in cells of the sheet: it has no gaps
+_BENEATH_THICKNESS = 0.2
+_BENEATH_OPACITY = 0.7
 _STRIDE = 3  # of rows and columns of a depth map: Gaussians are wider than its pixels
 _KEPT_VIEWS = 128  # views whose points stay on the device
 _OFF_SURFACE = 3.0  # gaps between points of the surface: an SfM point nearer than that lies on it
@@ -57,7 +63,8 @@ def initial_gaussians(training: TrainingScene, options: InitialisationOptions, m
     2. Balls lie at SfM points where no surface is known. On a surface discs are better: an SfM point has no normal,
        and a ball reaches as far behind a wall as the gap to the wall's next point.
     3. Balls lie at the height of the SfM points where photographs show no known surface: the more of it, the more.
-    4. Balls lie in the background, as far as the limit leaves room. In a region, the sky is that of the model which
+    4. A sheet lies beneath the surface: what photographs do not show is no hole.
+    5. Balls lie in the background, as far as the limit leaves room. In a region, the sky is that of the model which
        stands in for the rest: all blocks of a survey then have the same.
 
     Args:
@@ -79,15 +86,34 @@ def initial_gaussians(training: TrainingScene, options: InitialisationOptions, m
         guessed = guessed_points(scene, training.surface, unknown, seed, training.in_region)
         start = SurfacePoints.concatenate([start, guessed])
     behind = background(scene, training.images, start.point_in_model)
+    beneath = _sheet(training, start, options, int(_BENEATH_SHARE * most), seed)
     start = start.part(np.flatnonzero(training.in_region(start.point_in_model)))
     near = gaussians_from_points(start.point_in_model, start.rgb, options, start.normal_in_model)
     far = gaussians_of_size(behind.point_in_model, behind.rgb, behind.sigma_m, options)
     if training.region is not None:
         within = training.in_region(behind.point_in_model) & training.region.box.contains(behind.point_in_model)
         far = Gaussians.concatenate([far.select(torch.from_numpy(within)), training.region.sky])
+    if len(near) + len(beneath) <= most:
+        near = Gaussians.concatenate([near, beneath])
     room = max(most - len(near), 0)
     keep = torch.linspace(0, max(len(far) - 1, 0), min(room, len(far))).long()
     return Gaussians.concatenate([near, far.select(keep)])
+
+
+def _sheet(
+    training: TrainingScene, start: SurfacePoints, options: InitialisationOptions, count: int, seed: int
+) -> Gaussians:
+    """Return flat Gaussians beneath the points that a training starts from; none where no surface hides them."""
+    sheet, side_m = underlay(start, count, seed)
+    kept = np.zeros(len(sheet.rgb), dtype=bool)
+    if training.surface is not None:
+        place = sheet.point_in_model
+        kept = training.in_region(place) & hidden(place, training.scene, training.surface)
+    sheet = sheet.part(np.flatnonzero(kept))
+    sigma_m = np.full(len(sheet.rgb), _BENEATH_SIGMA * side_m)
+    discs = gaussians_of_size(sheet.point_in_model, sheet.rgb, sigma_m, replace(options, opacity=_BENEATH_OPACITY))
+    discs.log_scales[:, 2] += math.log(_BENEATH_THICKNESS)
+    return discs
 
 
 def _off_surface(points: SurfacePoints, surface: SurfacePoints) -> IntArray:
