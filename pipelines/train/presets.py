@@ -27,12 +27,12 @@ class Preset:
 PRESETS = {
     "smoke": Preset(200, 320, 20_000),
     "fast": Preset(1_200, 480, 80_000),
-    "standard": Preset(4_000, 800, 200_000),
-    "high": Preset(8_000, 1_600, 500_000),
+    "standard": Preset(2_500, 800, 150_000),
+    "high": Preset(3_500, 2_000, 300_000),
 }
-# Of `georef run` with 48 photographs of a megapixel, kernels compiled, 2 cores: `fast` as in docs/benchmarks.md,
-# the others as `georef run --dry-run` forecasts.
-RUN_MINUTES = {"smoke": 2, "fast": 4, "standard": 17, "high": 75}
+# Of `georef run` with 48 photographs of a megapixel, kernels compiled, 2 cores: `fast` as measured, the others two
+# thirds of what one core took (docs/benchmarks.md, Presets).
+RUN_MINUTES = {"smoke": 1, "fast": 3, "standard": 9, "high": 23}
 
 
 def described() -> str:

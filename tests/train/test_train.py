@@ -6,7 +6,8 @@ import json
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import astuple, replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -30,7 +31,7 @@ from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
 from pipelines.splat.storage import read_gaussians
 from pipelines.train.options import TrainOptions
-from pipelines.train.presets import PRESETS, Preset
+from pipelines.train.presets import PRESETS, RUN_MINUTES, Preset
 from tests.georef_scenes import squared_error
 from tests.scenes import GEO_FROM_LOCAL, without_fixes
 from tests.splat_scenes import TRAINING, RenderedFlight
@@ -332,4 +333,10 @@ def test_presets_can_be_changed_in_part() -> None:
     assert TrainOptions(preset="fast").effort == PRESETS["fast"]
     changed = TrainOptions(preset="smoke", iterations=7, max_image_size=64).effort
     assert changed == replace(PRESETS["smoke"], iterations=7, max_image_size=64)
-    assert PRESETS["high"] == Preset(8_000, 1_600, 500_000)
+    assert PRESETS["high"] == Preset(3_500, 2_000, 300_000)
+
+
+def test_each_preset_asks_for_more_than_the_one_before() -> None:
+    efforts, minutes = [astuple(preset) for preset in PRESETS.values()], list(RUN_MINUTES.values())
+    assert all(less < more for before, after in pairwise(efforts) for less, more in zip(before, after, strict=True))
+    assert minutes == sorted(minutes)
