@@ -2,7 +2,7 @@
 
 The first run compiles all kernels into an empty cache (cold), the others find them there (warm). While a run goes
 on, each checkpoint of its training is kept, with its age. Afterwards the checkpoints are measured: PSNR of the test
-views, and the errors of the check points by model. Their measuring is no part of the time, their writing is.
+and training views, and the errors of the check points by model. Their measuring is no part of the time, writing is.
 
     python examples/benchmarks/time_to_quality.py OUT --runs 2 -- --images photos --preset fast …
 """
@@ -17,6 +17,7 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -25,6 +26,7 @@ from pathlib import Path
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import numpy as np
+from training import ViewQuality
 
 from pipelines.accuracy.error_propagation import NoErrorPropagation
 from pipelines.core.progress import SILENT
@@ -60,6 +62,7 @@ class Row:
         iteration: of the training.
         gaussians: their number.
         psnr: mean over the test views, of the renders as they are, dB.
+        train_psnr: mean over the training views, of the renders with the exposures of their photographs, dB.
         model_mean_h_m: mean horizontal error of the check points by model; None: no check points.
         model_median_h_m: likewise the median.
         model_rmse_v_m: likewise the RMSE of the heights.
@@ -69,6 +72,7 @@ class Row:
     iteration: int
     gaussians: int
     psnr: float | None
+    train_psnr: float
     model_mean_h_m: float | None
     model_median_h_m: float | None
     model_rmse_v_m: float | None
@@ -81,26 +85,28 @@ class CheckpointWatch:
         self._source, self._kept = workspace.root / "train.partial" / "checkpoint.npz", kept
         self._began, self._ended = time.monotonic(), threading.Event()
         self.age_s: dict[Path, float] = {}
+        self._seen: set[int] = set()
         kept.mkdir(parents=True)
         self._thread = threading.Thread(target=self._watch, daemon=True)
         self._thread.start()
 
-    def end(self) -> None:
-        """Stop to watch."""
+    def end(self, last: Path) -> None:
+        """Stop to watch; the `last` checkpoint is kept, too, if it was moved away before it was seen."""
         self._ended.set()
         self._thread.join()
+        self._keep(last)
 
     def _watch(self) -> None:
-        last = 0
         while not self._ended.wait(_POLL_S):
-            try:
-                stamp = self._source.stat().st_mtime_ns
-                if stamp != last:
-                    copy = self._kept / f"{len(self.age_s):04d}.npz"
-                    copy.hardlink_to(self._source)
-                    last, self.age_s[copy] = stamp, time.monotonic() - self._began
-            except FileNotFoundError:
-                continue
+            with suppress(FileNotFoundError):
+                self._keep(self._source)
+
+    def _keep(self, checkpoint: Path) -> None:
+        if checkpoint.stat().st_ino not in self._seen:
+            copy = self._kept / f"{len(self.age_s):04d}.npz"
+            copy.hardlink_to(checkpoint)
+            self._seen.add(copy.stat().st_ino)  # no other file has it as long as the copy exists
+            self.age_s[copy] = time.monotonic() - self._began
 
 
 def timed_run(workspace: Workspace, arguments: list[str], every: int, cache: Path) -> dict[str, object]:
@@ -118,7 +124,7 @@ def timed_run(workspace: Workspace, arguments: list[str], every: int, cache: Pat
     if process.returncode != 0:
         sys.exit(f"{' '.join(command)} failed: see {log}")
     seconds = time.monotonic() - began
-    watch.end()
+    watch.end(workspace.root / "train" / "checkpoint.npz")
     manifests = ((spec.name, workspace.manifest(spec)) for spec in PIPELINE)
     stages = {name: round(manifest.duration_s, 1) for name, manifest in manifests if manifest is not None}
     rows = [asdict(row) for row in measured(workspace, watch.age_s)]
@@ -150,9 +156,10 @@ def measured(workspace: Workspace, age_s: dict[Path, float]) -> list[Row]:
         renderer = ModelRenderer(trained, images, backend)
         views = compare_test_views(renderer, None, lambda _name, _picture: None, SILENT, saved=0)
         errors = measure_check_points(renderer, NoErrorPropagation("not asked for"), SILENT).model
+        train_psnr = ViewQuality(trainer, images).psnr(scene.train, exposed=True)
         rows.append(
             Row(
-                round(seconds, 1), trainer.iteration, model.gaussians, views.psnr,
+                round(seconds, 1), trainer.iteration, model.gaussians, views.psnr, train_psnr,
                 errors.mean_h_m, errors.median_h_m, errors.rmse_v_m,
             )
         )  # fmt: skip
@@ -172,13 +179,15 @@ def print_run(name: str, run: dict[str, object]) -> None:
     """Print the stages and the rows of a run."""
     stages = ", ".join(f"{stage} {seconds} s" for stage, seconds in run["stages_s"].items())  # type: ignore[attr-defined]
     print(f"\n{name}: {run['seconds']} s ({stages}), {run['peak_mib']} MiB\n")
-    print("| time | iteration | Gaussians | test PSNR | by model: mean H | median H | RMSE V |\n|" + "---|" * 7)
+    print(
+        "| time | iteration | Gaussians | test PSNR | train PSNR | by model: mean H | median H | RMSE V |\n|"
+        + "---|" * 8
+    )
     for row in run["rows"]:  # type: ignore[attr-defined]
         errors = [row["model_mean_h_m"], row["model_median_h_m"], row["model_rmse_v_m"]]
         cells = " | ".join("" if value is None else f"{value:.3f} m" for value in errors)
-        print(
-            f"| {row['seconds']:.0f} s | {row['iteration']} | {row['gaussians']} | {row['psnr']:.2f} dB | {cells} |"
-        )
+        quality = f"{row['psnr']:.2f} dB | {row['train_psnr']:.2f} dB"
+        print(f"| {row['seconds']:.0f} s | {row['iteration']} | {row['gaussians']} | {quality} | {cells} |")
     for target in (25, 27, 29, 31):
         print(f"{target} dB after {time_to(run['rows'], target)} s")  # type: ignore[arg-type]
 
