@@ -20,15 +20,15 @@ class Preset:
     max_gaussians: int
 
     def __str__(self) -> str:
-        """Return the effort as `1200 iterations, 480 px, 80000 Gaussians`."""
+        """Return the effort as `800 iterations, 480 px, 80000 Gaussians`."""
         return f"{self.iterations} iterations, {self.max_image_size} px, {self.max_gaussians} Gaussians"
 
 
 PRESETS = {
     "smoke": Preset(200, 320, 20_000),
-    "fast": Preset(1_200, 480, 80_000),
-    "standard": Preset(2_500, 800, 150_000),
-    "high": Preset(3_500, 2_000, 300_000),
+    "fast": Preset(800, 480, 80_000),
+    "standard": Preset(2_000, 800, 150_000),
+    "high": Preset(3_000, 2_000, 300_000),
 }
 # Of `georef run` with 48 photographs of a megapixel, kernels compiled, 2 cores: `fast` as measured, the others two
 # thirds of what one core took (docs/benchmarks.md, Presets).

@@ -167,7 +167,10 @@ def test_short_trainings_have_higher_rates() -> None:
     assert LearningRates.for_iterations(30_000) == LearningRates()
     assert LearningRates.for_iterations(100_000) == LearningRates()
     short = LearningRates.for_iterations(3_750)
-    assert short.log_scales == pytest.approx(2 * 5e-3)
+    assert short.sh_dc == pytest.approx(2 * 2.5e-3)
+    assert short.log_scales == pytest.approx(8**0.6 * 5e-3)
+    assert short.sh_rest == pytest.approx(8 * 1.25e-4)
     assert short.means_final / short.means == pytest.approx(0.01)
     assert short.eps == LearningRates().eps
     assert LearningRates.for_iterations(1).sh_dc == pytest.approx(4 * 2.5e-3)
+    assert LearningRates.for_iterations(1).sh_rest == pytest.approx(12 * 1.25e-4)
