@@ -143,11 +143,11 @@ def measured(workspace: Workspace, age_s: dict[Path, float]) -> list[Row]:
     points, backend = GeolocatedPoints.load(workspace.path(POINTS)), rasterizer(options.backend)
     problem = geo_problem(scene, survey, initial, options, points=points, seed=options.seed)
     trainer = make_trainer(TrainingScene(scene, images), problem, backend, options)
-    rows = []
+    rows: list[Row] = []
     for path, seconds in age_s.items():
         trainer.restore(load_checkpoint(path))
-        if trainer.iteration == 0:
-            continue
+        if trainer.iteration == 0 or (rows and rows[-1].iteration == trainer.iteration):
+            continue  # the last one is written twice
         model = trained_model(trainer, scene, initial)
         rotation = matrix_from_quat_xyzw([camera.quat_xyzw for camera in model.cameras])
         translation = np.array([camera.translation for camera in model.cameras])
