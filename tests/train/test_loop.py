@@ -153,8 +153,8 @@ def test_damaged_checkpoint_is_recognised(images: ImageCache, tmp_path: Path, da
 def test_extended_training_is_as_good_as_an_uninterrupted_one(images: ImageCache, tmp_path: Path) -> None:
     """Mean PSNR of the last epoch against the photographs, which are renders of known Gaussians.
 
-    The extension must close most of the way from the short training to the long one; what is left is within the
-    spread of 0.5 dB that two seeds show at this length.
+    The extension must close most of the way from the short training to the long one: it begins with Gaussians that
+    have come to rest. With five seeds it closed 88 to 92 % of it.
     """
 
     def quality(folder: Path) -> float:
@@ -176,7 +176,7 @@ def test_extended_training_is_as_good_as_an_uninterrupted_one(images: ImageCache
     assert (extended.iteration, extended.schedule.extended_from) == (60, 20)
     assert notes[-1].startswith("60 of 60 iterations")
     assert long > short + 1.0, "otherwise there is nothing to gain"
-    assert better > long - 0.5
+    assert better - short > 0.8 * (long - short)
     resumed = tiny.trainer(images, replace(OPTIONS, iterations=60), with_exposures=True)
     optimise(resumed, files(tmp_path / "short", resume=True), SILENT)
     assert resumed.schedule.extended_from == 20, "also through an interruption"
