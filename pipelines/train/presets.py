@@ -27,12 +27,12 @@ class Preset:
 PRESETS = {
     "smoke": Preset(200, 320, 20_000),
     "fast": Preset(800, 480, 80_000),
-    "standard": Preset(2_000, 800, 150_000),
-    "high": Preset(3_000, 2_000, 300_000),
+    "standard": Preset(1_500, 800, 150_000),
+    "high": Preset(2_000, 2_000, 300_000),
 }
 # Of `georef run` with 48 photographs of a megapixel, kernels compiled, 2 cores: `fast` as measured, the others two
 # thirds of what one core took (docs/benchmarks.md, Presets).
-RUN_MINUTES = {"smoke": 1, "fast": 3, "standard": 9, "high": 23}
+RUN_MINUTES = {"smoke": 2, "fast": 3, "standard": 7, "high": 18}
 
 
 def described() -> str:

@@ -45,7 +45,7 @@ def test_a_run_begins_with_the_forecast(georef: Georef, tmp_path: Path) -> None:
     """Ahead of the first stage, and once."""
     write_flight(tmp_path / "photos", 5, lat=46.0, lon=7.7)
     lines = georef("run", tmp_path / "ws", "--images", tmp_path / "photos", "--max-image-size", 40).err.splitlines()
-    assert lines[0] == "train: standard: 2000 iterations, at most 150000 Gaussians"
+    assert lines[0] == "train: standard: 1500 iterations, at most 150000 Gaussians"
     assert (
         lines[1] == "train: 5 photographs of 64×48 px are trained at 40×30, 1/1.6 of their side (--max-image-size)"
     )

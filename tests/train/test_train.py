@@ -333,7 +333,7 @@ def test_presets_can_be_changed_in_part() -> None:
     assert TrainOptions(preset="fast").effort == PRESETS["fast"]
     changed = TrainOptions(preset="smoke", iterations=7, max_image_size=64).effort
     assert changed == replace(PRESETS["smoke"], iterations=7, max_image_size=64)
-    assert PRESETS["high"] == Preset(3_000, 2_000, 300_000)
+    assert PRESETS["high"] == Preset(2_000, 2_000, 300_000)
 
 
 def test_each_preset_asks_for_more_than_the_one_before() -> None:
