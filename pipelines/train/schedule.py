@@ -115,14 +115,9 @@ class TrainingSchedule:
         if self.extended_from:
             return 1
         most = max(max(width, height) // self._options.coarse_least_px, 1)
-        progress, levels = (
-            self.progress(iteration),
-            pyramid(width, height, self._options.coarse, self._options.crops),
-        )
+        progress = self.progress(iteration)
+        levels = pyramid(width, height, self._options.coarse, self._options.crops)
         return min(next((shrink for shrink, until in levels if progress <= until), 1), most)
-
-    def _levels(self, width: int, height: int) -> list[tuple[int, float]]:
-        return pyramid(width, height, self._options.coarse, self._options.crops)
 
     def sh_degree(self, iteration: int) -> int:
         """Return the degree of the harmonics.
