@@ -19,22 +19,25 @@ _BISECTIONS = 16
 
 
 class PointSurface:
-    """Surface through a cloud of points: at each place, the median height of the nearest points.
+    """Surface through a cloud of points: at each place, the height of the nearest point, freed of outliers.
+
+    That height is the median of the nearest points, the point itself among them.
 
     Args:
         points: (N, 3) with z up, metres; N ≥ 1.
     """
 
     def __init__(self, points: FloatArray) -> None:
-        self._height = points[:, 2]
+        height = points[:, 2]
         self._tree = cKDTree(points[:, :2])
-        self._neighbours = min(_NEIGHBOURS, len(points))
-        self.median, self.lowest = float(np.median(self._height)), float(self._height.min())
+        _, near = self._tree.query(points[:, :2], k=min(_NEIGHBOURS, len(points)), workers=thread_count())
+        self._height = np.median(height[np.reshape(near, (len(points), -1))], axis=1)
+        self.median, self.lowest = float(np.median(height)), float(height.min())
 
     def heights(self, places: FloatArray) -> FloatArray:
         """Return the heights (…,) at places (…, 2)."""
-        _, near = self._tree.query(places, k=self._neighbours, workers=thread_count())
-        return np.asarray(np.median(self._height[np.reshape(near, (*places.shape[:-1], -1))], axis=-1))
+        _, nearest = self._tree.query(places, workers=thread_count())
+        return np.asarray(self._height[nearest])
 
 
 @dataclass(frozen=True)
