@@ -30,9 +30,9 @@ PRESETS = {
     "standard": Preset(1_500, 800, 150_000),
     "high": Preset(2_000, 2_000, 300_000),
 }
-# Of `georef run` with 48 photographs of a megapixel, kernels compiled, 2 cores: `fast` as measured, the others two
-# thirds of what one core took (docs/benchmarks.md, Presets).
-RUN_MINUTES = {"smoke": 2, "fast": 3, "standard": 7, "high": 18}
+# Of `georef run` with 48 photographs of a megapixel, kernels compiled, on 2 idle cores of an AMD EPYC
+# (docs/benchmarks.md, Presets).
+RUN_MINUTES = {"smoke": 1, "fast": 2, "standard": 4, "high": 10}
 
 
 def described() -> str:

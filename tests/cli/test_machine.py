@@ -78,7 +78,7 @@ def test_help_lists_topics_and_explains_commands(real_georef: Georef) -> None:
 def test_presets_are_explained_where_they_are_chosen(real_georef: Georef) -> None:
     for command in ("train", "run", "compare"):
         text = " ".join(real_georef(command, "--help").out.split())
-        assert "fast: 800 iterations, 480 px, 80000 Gaussians, about 3 min" in text, command
+        assert "fast: 800 iterations, 480 px, 80000 Gaussians, about 2 min" in text, command
 
 
 @pytest.mark.parametrize(
