@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import Literal
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from tests.bundle_scenes import adjuster, pixels, readjusted, size
 from tests.scenes import Layout, Noise, TrueScene, looking_at, make_scene, sparse_model
 
 _STEPS = 3
+Flight = Layout | Literal["lines", "circle"]
 
 
 @dataclass(frozen=True)
@@ -25,11 +27,11 @@ class Block:
 
 
 @cache
-def block(layout: Layout, images: int, points: int = 70, control: int = 8, checks: int = 6) -> Block:
+def block(layout: Flight, images: int, points: int = 70, control: int = 8, checks: int = 6) -> Block:
     """Return a block; `control` control points, then `checks` check points, are the scene's ground points."""
     scene = make_scene("orbit", images=images, points=points, gcps=control + checks)
-    if layout == "grid":
-        scene = _over_a_grid(scene)
+    if layout != "orbit":
+        scene = {"grid": _over_a_grid, "lines": _in_lines, "circle": _on_a_circle}[layout](scene)
     owner, image, xy = scene.pixels(scene.point_in_geo)
     seen = np.bincount(owner, minlength=points)[owner] >= 2
     kept = np.unique(owner[seen])
@@ -55,6 +57,23 @@ def _over_a_grid(scene: TrueScene) -> TrueScene:
     center = np.column_stack([east.ravel(), north.ravel(), height])[:images]
     target = center * [0.6, 0.6, 0.0] + [0.0, 1e-3, 0.0]
     return replace(scene, center_in_geo=center, geo_from_cam=looking_at(center, target))
+
+
+def _in_lines(scene: TrueScene) -> TrueScene:
+    """Return the scene seen from lines of eight photographs, to and fro at two heights, looking inward a little."""
+    line, along = np.divmod(np.arange(len(scene.center_in_geo)), 8)
+    east = np.where(line % 2, 7 - along, along) * 12.0 - 42.0
+    north = (line - line.max() / 2) * 18.0
+    center = np.column_stack([east, north, np.where(line % 2, 75.0, 100.0)])
+    target = center * [0.6, 0.6, 0.0] + [0.0, 1e-3, 0.0]
+    return replace(scene, center_in_geo=center, geo_from_cam=looking_at(center, target))
+
+
+def _on_a_circle(scene: TrueScene) -> TrueScene:
+    """Return the scene seen from one circle, flown once at constant speed."""
+    angle = np.linspace(0, 2 * np.pi, len(scene.center_in_geo), endpoint=False)
+    center = np.column_stack([88 * np.cos(angle), 88 * np.sin(angle), 60.0 + 8.0 * np.sin(2 * angle)])
+    return replace(scene, center_in_geo=center, geo_from_cam=looking_at(center, np.zeros_like(center)))
 
 
 def adjusted_model(of: Block, noise: Noise, rng: np.random.Generator) -> SparseModel:

@@ -15,6 +15,7 @@ from pipelines.georef.problem import GeoProblem
 from pipelines.georef.similarity import LearnableSimilarity
 from pipelines.georef.systematic import SystematicErrors
 from pipelines.georef.terms import AttitudeTerm, ControlTerm, DistanceTerm, FixTerm, Term, Weighting
+from pipelines.robust.statistics import outlier_gate
 from tests.scenes import looking_at
 
 SHIFT = np.array([100.0, 50.0, 20.0])
@@ -167,3 +168,10 @@ def squared_error(truth: Similarity, found: Similarity, covariance: np.ndarray, 
     away = truth @ found.inverse()
     error = np.array([np.log(away.scale), *log_so3(away.rotation), *(away.apply(about) - about)])
     return float(error @ np.linalg.solve(covariance, error))
+
+
+def contradicting(problem: GeoProblem, kind: type[Term]) -> list[int]:
+    """Rows of a term that contradict the present estimate at the 99.9 % level."""
+    (term,) = (term for term in problem.terms if isinstance(term, kind))
+    chi2 = problem.whitened(problem.estimate())[term.kind].detach().square().sum(dim=1)
+    return torch.nonzero(chi2 > outlier_gate(term.dimension))[:, 0].tolist()

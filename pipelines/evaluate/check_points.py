@@ -145,8 +145,9 @@ def _control_residuals(trained: TrainedSurvey) -> ControlResiduals:
     points = trained.survey.control_points
     rays = mark_rays(points, trained.sparse)
     measured = _compared(points, points_by_camera(trained, rays), rays)
-    stats = residual_stats(measured.error_in_geo[measured.is_measured])
-    return ControlResiduals(**stats.model_dump(), points=point_residuals(measured))
+    rejected = np.isin([point.name for point in points], trained.model.control_outliers)
+    stats = residual_stats(measured.error_in_geo[measured.is_measured & ~rejected])
+    return ControlResiduals(**stats.model_dump(), outliers=int(rejected.sum()), points=point_residuals(measured))
 
 
 def _fix_residuals(trained: TrainedSurvey) -> FixResiduals:

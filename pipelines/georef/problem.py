@@ -17,7 +17,6 @@ from pipelines.georef.similarity import LearnableSimilarity
 from pipelines.georef.systematic import SystematicErrors
 from pipelines.georef.terms import ControlTerm, FixTerm, Term, Weighting, cauchy, moved_tensors
 from pipelines.georef.weights import TermWeights
-from pipelines.robust.statistics import outlier_gate
 from pipelines.splat.depth import depth_at
 
 TermT = TypeVar("TermT", bound=Term)
@@ -180,15 +179,6 @@ class GeoProblem(torch.nn.Module):
         if self.weighting == "paper":  # learned are variances in m² then, not factors of the stated ones
             return {term.kind: term.whitened(at) for term in measuring}
         return {term.kind: self._scaled(term, term.whitened(at)) for term in measuring}
-
-    @torch.no_grad()
-    def contradicting(self, kind: type[Term]) -> list[int]:
-        """Return the rows of a term's observations that contradict the estimate at the 99.9 % level."""
-        term = self.term(kind)
-        if term is None:
-            return []
-        chi2 = self.whitened(self.estimate())[term.kind].square().sum(dim=1)
-        return [int(row) for row in torch.nonzero(chi2 > outlier_gate(term.dimension))[:, 0]]
 
     def _prior(self) -> Tensor:
         prior = self.cameras.z.square().sum()

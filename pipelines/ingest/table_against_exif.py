@@ -7,12 +7,15 @@ contradiction that nothing later would notice: heights in feet, another zone, ex
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from pipelines.core.cautions import Caution
 from pipelines.core.errors import ContradictionError
+from pipelines.core.sentences import listed
 from pipelines.core.types import FloatArray
 from pipelines.geodesy.enu import ecef_from_enu_rotation, lla_from_ecef
 from pipelines.geodesy.vertical import FOOT_M, MOST_GEOID_M
@@ -21,6 +24,7 @@ from pipelines.ingest.notes import Notes
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import Photo
 from pipelines.ingest.photo_poses import poses_from_tags
+from pipelines.robust.patterns import blunders_among, scatter_about_median, two_groups
 from pipelines.robust.statistics import mad_sigma
 
 _SIGMAS, _LEAST_M = 4.0, 1.0
@@ -28,6 +32,7 @@ _MOST_CONTRADICTING = 1 / 3
 # Another unit shows if heights differ by this many times what σ allow, and that unit leaves this part of a height.
 _EVIDENT, _UNIT_PART = 2.0, 0.05
 _KILOMETRES_M = 2_000.0
+_LEAST_TIMED = 6  # photographs, for a velocity
 
 
 def compare_with_exif(
@@ -56,8 +61,17 @@ def compare_with_exif(
     apart = np.einsum("nij,nj->ni", enu_from_ecef, poses.position_in_ecef[both] - exif.position_in_ecef[both])
     sigma = np.hypot(poses.sigma_enu_m[both], exif.sigma_enu_m[both])
     in_table = lla_from_ecef(poses.position_in_ecef[both])[:, 2]
+    from_ecef, origin = enu_from_ecef[len(both) // 2], exif.position_in_ecef[both[len(both) // 2]]
+    in_enu = [(each.position_in_ecef[both] - origin) @ from_ecef.T for each in (exif, poses)]
+    places = _Places(
+        name=tuple(photos[int(row)].name for row in both),
+        exif=in_enu[0][:, :2],
+        table=in_enu[1][:, :2],
+        sigma_m=sigma[:, :2],
+        time_s=exif.time_s[both],
+    )
     heights = _heights(np.column_stack([in_table, lla[:, 2]]), apart[:, 2], sigma[:, 2], path)
-    found = [*_horizontal(apart, sigma, path), *heights]
+    found = [*_horizontal(places, path), *heights]
     for fatal, caution in found:
         if fatal and not options.accept_contradiction:
             raise ContradictionError(
@@ -66,29 +80,88 @@ def compare_with_exif(
         notes.caution(caution)
 
 
-def _horizontal(apart: FloatArray, sigma: FloatArray, path: Path) -> list[tuple[bool, Caution]]:
-    distance = np.hypot(apart[:, 0], apart[:, 1])
-    allowed = np.maximum(_SIGMAS * np.hypot(sigma[:, 0], sigma[:, 1]), _LEAST_M)
+@dataclass(frozen=True)
+class _Places:
+    """Horizontal positions of n photographs by EXIF and by the table, metres east and north, with the σ of both."""
+
+    name: tuple[str, ...]
+    exif: FloatArray  # (n, 2)
+    table: FloatArray  # (n, 2)
+    sigma_m: FloatArray  # (n, 2)
+    time_s: FloatArray  # (n,) NaN where unknown
+
+    @property
+    def apart(self) -> FloatArray:
+        return self.table - self.exif
+
+
+def _horizontal(places: _Places, path: Path) -> list[tuple[bool, Caution]]:
+    distance = np.hypot(*places.apart.T)
+    allowed = np.maximum(_SIGMAS * np.hypot(*places.sigma_m.T), _LEAST_M)
     contradicting = distance > allowed
     if contradicting.mean() <= _MOST_CONTRADICTING:
         return []
-    typical = float(np.median(distance))
-    scatter = float(np.hypot(mad_sigma(apart[:, 0]), mad_sigma(apart[:, 1])))
-    if typical > _KILOMETRES_M:
-        cause = f"are {typical / 1000:.0f} km from those in EXIF: another CRS or zone, or exchanged axes?"
-    elif scatter < 0.2 * typical:
-        east, north = np.median(apart[:, :2], axis=0)
-        cause = (
+    cause = _cause(places, float(np.median(distance)), float(np.median(allowed)) / _SIGMAS)
+    sentence = f"{int(contradicting.sum())} of {len(distance)} positions in {path.name} {cause}"
+    return [(True, Caution(code="table-against-exif", sentence=sentence))]
+
+
+def _cause(places: _Places, typical_m: float, sigma_m: float) -> str:
+    """Return how most positions differ, by the first pattern that leaves less than half of the difference.
+
+    Args:
+        places: of table and EXIF.
+        typical_m: median distance between both.
+        sigma_m: σ of that distance.
+    """
+    apart, names = places.apart, places.name
+    if typical_m > _KILOMETRES_M:
+        return f"are {typical_m / 1000:.0f} km from those in EXIF: another CRS or zone, or exchanged axes?"
+    if scatter_about_median(apart) < 0.2 * typical_m:
+        east, north = np.median(apart, axis=0)
+        return (
             f"are shifted by {east:+.1f} m east and {north:+.1f} m north against EXIF: another datum, or a base "
             "station in a wrong place?"
         )
-    else:
-        cause = (
-            f"differ from those in EXIF by {typical:.1f} m, in changing directions: times that are off, exchanged "
-            "axes, or rows of other images?"
+    swapped = (places.table - places.table.mean(axis=0))[:, ::-1] - (places.exif - places.exif.mean(axis=0))
+    if scatter_about_median(swapped) < 0.5 * scatter_about_median(apart):
+        return "differ from those in EXIF as mirrored ones do: east and north are exchanged"
+    if (groups := two_groups(apart)) is not None:
+        second = listed([names[row] for row in np.flatnonzero(groups.second)])
+        return (
+            f"differ from those in EXIF: {int(groups.second.sum())} are shifted by {groups.apart[0]:+.1f} m east "
+            f"and {groups.apart[1]:+.1f} m north against the others: another base station? ({second})"
         )
-    sentence = f"{int(contradicting.sum())} of {len(apart)} positions in {path.name} {cause}"
-    return [(True, Caution(code="table-against-exif", sentence=sentence))]
+    if (bad := blunders_among(apart, sigma_m)) is not None and bad.mean() < 0.5:
+        off = np.hypot(*(apart - np.median(apart, axis=0)).T)
+        rows = np.flatnonzero(bad)[np.argsort(-off[bad], kind="stable")]
+        return (
+            "differ from those in EXIF, and the others agree: these are blunders, in the table or in EXIF: "
+            f"{listed([f'{names[row]} {off[row]:.1f} m' for row in rows])}"
+        )
+    differ = f"differ from those in EXIF by {typical_m:.1f} m"
+    nearest, at = KDTree(places.exif).query(places.table)
+    if (offset := _clock_offset(places)) is not None:
+        return f"{differ}, along the track: the times are off by about {offset:+.1f} s"
+    if float(np.median(nearest)) < max(2.0 * sigma_m, 0.2 * typical_m) and (at != np.arange(len(at))).mean() > 0.5:
+        return f"{differ}, but lie where other photographs were taken: rows of other images, or times that are off?"
+    spacing = float(np.median(KDTree(places.exif).query(places.exif, k=2)[0][:, 1]))
+    if typical_m < spacing / 2:
+        return f"{differ}, without any pattern: noise, so that σ of the table or of EXIF is too small"
+    return f"{differ}, in changing directions: times that are off, or rows of other images?"
+
+
+def _clock_offset(places: _Places) -> float | None:
+    """Return the time in s by which the table's positions are later, if that explains half of the difference."""
+    order = np.argsort(places.time_s, kind="stable")
+    time_s = places.time_s[order]
+    if len(order) < _LEAST_TIMED or not np.isfinite(time_s).all() or np.diff(time_s).min() <= 0.0:
+        return None
+    velocity = np.gradient(places.exif[order], time_s, axis=0)
+    apart = places.apart[order]
+    offset = float((velocity * apart).sum() / max((velocity**2).sum(), 1e-9))
+    left = scatter_about_median(apart - offset * velocity)
+    return offset if left < 0.5 * scatter_about_median(apart) else None
 
 
 def _heights(

@@ -3,14 +3,16 @@
 Single outliers are rejected in the adjustment. Where more than a third of a group would have to be rejected, or σ
 would have to be ten times the stated one, one side is wrong as a whole. The known mistakes are tried, and the one
 that fits is named. One contradiction is everyday work: a constant shift of all fixes by up to five metres, of an
-autonomous base station. There the control points decide.
+autonomous base station, or by what σ of one fix allow. There the control points decide.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from pipelines.core.cautions import Caution
 from pipelines.core.errors import DegenerateGeometryError
@@ -20,30 +22,37 @@ from pipelines.geometry.rotations import log_so3
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.georef.terms import ControlTerm, FixTerm
+from pipelines.init_sim3.control_mistakes import EVERYDAY_SHIFT_M, mistake_in_map, shift_sentence
 from pipelines.init_sim3.hypotheses import (
     Hypothesis,
-    explanations_of_fixes,
+    clock_that_turns,
+    explanation_of_fixes,
     fit,
-    mirrored,
-    shift_sentence,
 )
 from pipelines.init_sim3.joint import JointAdjustment
 from pipelines.init_sim3.plausibility import hangs_upside_down, looks_at_sky
 from pipelines.robust.statistics import outlier_gate
-from pipelines.scene.observations import attitude_prior, fix_correspondences
+from pipelines.scene.observations import (
+    UnusedControlPoint,
+    attitude_prior,
+    control_correspondences,
+    fix_correspondences,
+)
 from pipelines.scene.survey import Survey
 from pipelines.scene.variance_factors import Group, VarianceFactor
 
 _SIGMA_REFUTED = "sigma-refuted"
 # A stated σ that is too small by this factor is a contradiction, if the scatter is so many metres or is explained.
 _WRONG_SIGMA, _WRONG_SCATTER_M = 10.0, 0.3
-_EVERYDAY_SHIFT_M = 5.0
 # A variance factor up to this, of σ that are half as large again, is applied without blame.
 _QUIET_FACTOR = 2.25
 _LEAST_FIXES = 4
 # Residuals share a shift that is so many times as large as what is left without it.
 _SHIFT_SPREADS = 5.0
 _ATTITUDE_SIGMAS, _ATTITUDE_RAD = 4.0, np.radians(8.0)
+# A turn is explained by a clock if so little is left of it.
+_CLOCK_SIGMAS, _EXPLAINED_SIGMAS = 3.0, 1.0
+_NAMED = 5  # control points in a caution
 
 
 @dataclass(frozen=True)
@@ -82,10 +91,12 @@ def judge(survey: Survey, model: SparseModel, joint: JointAdjustment) -> Verdict
     """
     fixes = _Fixes(survey, model)
     findings = _upside_down(fixes, joint.geo_from_local)
+    of_map = _map_of_control(fixes, joint)
     if not findings:
-        findings = [*_fixes_against_model(fixes, joint), *_view(model, joint.geo_from_local)]
-    findings += [*_shift_of_fixes(joint), *_control_points(joint)]
-    findings += [*_attitudes(survey, model, joint), *_weak_checks(joint), *_guesses(joint)]
+        against_model = [] if of_map else _fixes_against_model(fixes, joint)
+        findings = [*against_model, *_view(model, joint.geo_from_local)]
+    findings += of_map or [*_shift_of_fixes(joint), *_control_points(joint)]
+    findings += [*_attitudes(fixes, joint), *_weak_checks(joint), *_guesses(joint)]
     return Verdict(
         tuple(finding.caution for finding in findings if finding.ends),
         tuple(finding.caution for finding in findings if not finding.ends),
@@ -116,6 +127,24 @@ def unadjustable(survey: Survey, model: SparseModel, geo_from_local: Similarity 
     return (Caution(code=_SIGMA_REFUTED if best is None else best.code, sentence=sentence),)
 
 
+def marks_that_do_not_meet(unused: Sequence[UnusedControlPoint], mistake: str | None) -> tuple[Caution, ...]:
+    """Return the caution that marks of control points do not meet in one point; none if they do.
+
+    Args:
+        unused: control points that their marks do not determine.
+        mistake: without which most of them would meet; then no control point is used.
+    """
+    missed = [point for point in unused if len(point.residual_px) >= 2]
+    if not missed:
+        return ()
+    worst = sorted(missed, key=lambda point: -max(point.residual_px))[:_NAMED]
+    named = listed([f"{point.name} ({max(point.residual_px):.0f} px)" for point in worst])
+    more = "" if len(missed) <= _NAMED else f" and {len(missed) - _NAMED} more"
+    sentence = f"the marks of {len(missed)} control points do not meet in one point: {named}{more}; "
+    sentence += "these are not used" if mistake is None else f"no control point is used. Probably {mistake}"
+    return (Caution(code="control-marks", sentence=sentence),)
+
+
 class _Fixes:
     """Fixes of a survey as stated, against its SfM model."""
 
@@ -133,13 +162,28 @@ class _Fixes:
         """Scatter about the SfM model beyond which the fixes contradict it."""
         return max(_WRONG_SIGMA * self.sigma_m, _WRONG_SCATTER_M)
 
+    @property
+    def times_s(self) -> FloatArray:
+        """Times (n,) of the photographs of the fixes, NaN where unknown."""
+        times = {image.name: image.timestamp_s for image in self.survey.images}
+        return np.array([times[name] for name in self.positions.name], dtype=np.float64)
+
+    @property
+    def spacing_m(self) -> float:
+        """Median distance of a fix from the nearest other one."""
+        return float(np.median(KDTree(self.positions.in_geo).query(self.positions.in_geo, k=2)[0][:, 1]))
+
     def explanation(self) -> Hypothesis | None:
         """Return the known mistake that explains why the fixes do not fit the SfM model, if one does."""
-        times = {image.name: image.timestamp_s for image in self.survey.images}
-        times_s = np.array([times[name] for name in self.positions.name], dtype=np.float64)
-        found = explanations_of_fixes(self.positions.in_local, self.positions.in_geo, times_s, self.survey.origin)
-        upright = (one for one in found if not hangs_upside_down(self.model, one.geo_from_local))
-        return next(upright, None)
+        return explanation_of_fixes(
+            self.positions.name,
+            self.positions.in_local,
+            self.positions.in_geo,
+            self.times_s,
+            origin=self.survey.origin,
+            sigma_m=self.sigma_m,
+            plausible=lambda similarity: not hangs_upside_down(self.model, similarity),
+        )
 
 
 def _factor(joint: JointAdjustment, group: Group) -> VarianceFactor | None:
@@ -155,15 +199,9 @@ def _upside_down(fixes: _Fixes, geo_from_local: Similarity) -> list[_Finding]:
     if not hangs_upside_down(fixes.model, geo_from_local):
         return []
     sentence = "the cameras hang upside down in this solution: the positions contradict the SfM model"
-    try:
-        similarity, scatter = fit(fixes.positions.in_local, mirrored(fixes.positions.in_geo))
-        if scatter < fixes.tolerance_m and not hangs_upside_down(fixes.model, similarity):
-            sentence += (
-                f"; the mirrored track fits upright (scatter {scatter:.2f} m): east and north, or the axes of the "
-                "CRS, are exchanged"
-            )
-    except DegenerateGeometryError:
-        pass
+    best = fixes.explanation()
+    if best is not None:
+        sentence += f"; with this they fit upright to {best.scatter_m:.2f} m: {best.sentence}"
     return [_Finding(Caution(code="upside-down", sentence=sentence), ends=True)]
 
 
@@ -191,15 +229,34 @@ def _fixes_against_model(fixes: _Fixes, joint: JointAdjustment) -> list[_Finding
     if best is not None:
         sentence = f"{sides}; with this they fit to {best.scatter_m:.2f} m: {best.sentence}"
         return [_Finding(Caution(code=best.code, sentence=sentence), ends=is_wrong)]
-    remedy = "σ is optimistic, or the fixes or the SfM model are bent; every σ of the result is widened"
+    if scatter_m > fixes.spacing_m / 2:
+        remedy = "they are farther off than photographs are apart: are they those of these photographs?"
+    else:
+        remedy = (
+            "no offset, time, axis or group of them explains that: it is noise, and σ is optimistic, or the SfM "
+            "model is bent; every σ of the result is widened"
+        )
     caution = Caution(code=_SIGMA_REFUTED, sentence=f"{sides}: {remedy}")
     return [_Finding(caution, ends=is_wrong and scatter_m > _WRONG_SCATTER_M)]
 
 
+def _map_of_control(fixes: _Fixes, joint: JointAdjustment) -> list[_Finding]:
+    """Return the finding that the control points' map has another size or other axes than the fixes."""
+    control = control_correspondences(joint.survey, fixes.model)[0]
+    mistake = mistake_in_map(fixes.positions, control, fixes.survey.origin.lat_deg)
+    if mistake is None:
+        return []
+    caution = Caution(code="control-map", sentence=f"control points and fixes contradict each other: {mistake}")
+    return [_Finding(caution, ends=True)]
+
+
 def _shift_of_fixes(joint: JointAdjustment) -> list[_Finding]:
-    """Return the finding that all fixes are shifted against the control points, beyond the σ of one fix."""
+    """Return the finding that all fixes are shifted against the control points, beyond the σ of one fix or 5 m."""
     bias = joint.bias
-    if bias is None or _within_sigma(joint, np.array(bias.value)):
+    if bias is None:
+        return []
+    within, everyday = _within_sigma(joint, np.array(bias.value)), np.linalg.norm(bias.value) <= EVERYDAY_SHIFT_M
+    if within and everyday:
         return []
     values = ", ".join(f"{value:+.3f} ± {sigma:.3f}" for value, sigma in zip(bias.value, bias.sigma, strict=True))
     sentence = (
@@ -207,7 +264,7 @@ def _shift_of_fixes(joint: JointAdjustment) -> list[_Finding]:
         f"position. Either side may be wrong: {shift_sentence(np.array(bias.value), _height_of_control(joint))}"
     )
     caution = Caution(code="fixes-shifted", sentence=sentence)
-    return [_Finding(caution, ends=float(np.linalg.norm(bias.value)) > _EVERYDAY_SHIFT_M)]
+    return [_Finding(caution, ends=not (within or everyday))]
 
 
 def _control_points(joint: JointAdjustment) -> list[_Finding]:
@@ -272,19 +329,39 @@ def _within_sigma(joint: JointAdjustment, shift_m: FloatArray) -> bool:
     return bool(shift_m @ information @ shift_m <= outlier_gate(3))
 
 
-def _attitudes(survey: Survey, model: SparseModel, joint: JointAdjustment) -> list[_Finding]:
-    prior = attitude_prior(survey, model)
+def _attitudes(fixes: _Fixes, joint: JointAdjustment) -> list[_Finding]:
+    """Return the finding that the attitudes contradict the solution.
+
+    A compass is often off by degrees, whatever its σ. A small turn is therefore heard only if a clock offset
+    explains it: then the whole flight may lie in a wrong place.
+    """
+    prior = attitude_prior(fixes.survey, fixes.model)
     if prior is None:
         return []
-    turn = log_so3(prior.rotation @ joint.geo_from_local.rotation.T)
-    sigma = float(np.sqrt(prior.cov_rad2[0, 0]))
-    angle = float(np.linalg.norm(turn))
-    if angle <= max(_ATTITUDE_SIGMAS * sigma, _ATTITUDE_RAD):
+    attitude = prior.rotation
+
+    def turn_of(similarity: Similarity) -> float:
+        return float(np.linalg.norm(log_so3(attitude @ similarity.rotation.T)))
+
+    sigma, angle = float(np.sqrt(prior.cov_rad2[0, 0])), turn_of(joint.geo_from_local)
+    if angle <= _CLOCK_SIGMAS * sigma:
+        return []
+    positions = fixes.positions
+    clock = clock_that_turns(positions.in_local, positions.in_geo, fixes.times_s, turn_of)
+    explains = clock is not None and clock[1] < _EXPLAINED_SIGMAS * sigma
+    if angle <= max(_ATTITUDE_SIGMAS * sigma, _ATTITUDE_RAD) and not explains:
         return []
     sentence = (
         f"the recorded attitudes are turned by {np.degrees(angle):.1f}° against this solution "
-        f"(σ {np.degrees(sigma):.1f}°): compass, mount, or the positions (their times, their axes) are wrong"
+        f"(σ {np.degrees(sigma):.1f}°): "
     )
+    if explains and clock is not None:
+        sentence += (
+            f"a clock offset of {clock[0]:+.2f} s between positions and photographs would explain it, and the "
+            "whole flight lies in a wrong place then; or the compass is off. Check the times, or add control points"
+        )
+    else:
+        sentence += "compass, mount, or the positions (their times, their axes) are wrong"
     return [_Finding(Caution(code="attitudes-contradict", sentence=sentence))]
 
 

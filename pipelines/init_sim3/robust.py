@@ -18,7 +18,8 @@ from pipelines.georef.alignment import Alignment, align
 from pipelines.georef.posterior import solution_covariances
 from pipelines.georef.terms import ControlTerm, FixTerm
 from pipelines.georef.variance_components import component_of
-from pipelines.init_sim3.contradictions import judge, unadjustable
+from pipelines.init_sim3.contradictions import judge, marks_that_do_not_meet, unadjustable
+from pipelines.init_sim3.control_mistakes import mistake_in_marks
 from pipelines.init_sim3.figures import agreeing_points, counts_of, residuals_of, residuals_of_points
 from pipelines.init_sim3.joint import JointAdjustment, adjust_jointly
 from pipelines.init_sim3.options import InitSim3Options
@@ -56,6 +57,10 @@ def robust_similarity(inputs: Inputs, options: InitSim3Options) -> tuple[Initial
     """
     survey, model = inputs.survey, inputs.model
     control, unused = control_correspondences(survey, model)
+    mistake = mistake_in_marks(survey, model) if unused else None
+    if mistake is not None:  # What meets all the same meets in a wrong place.
+        control = control.part(np.zeros(len(control), dtype=bool))
+    of_marks = marks_that_do_not_meet(unused, mistake)
     data = fix_correspondences(survey, model).joined(control)
     guess = _guess(model, inputs.points, np.random.default_rng(options.seed))
     try:
@@ -67,8 +72,11 @@ def robust_similarity(inputs: Inputs, options: InitSim3Options) -> tuple[Initial
         )
     except DegenerateGeometryError as error:
         _refuse(unadjustable(survey, model, None), options)
-        raise DegenerateGeometryError(f"{error}. {positions_in_use(survey, model, data, unused)}") from error
-    aligned = _aligned_product(inputs, data, alignment)
+        reasons = [positions_in_use(survey, model, data, unused), *(caution.sentence for caution in of_marks)]
+        raise DegenerateGeometryError(f"{error}. {'; '.join(reasons)}") from error
+    aligned = _aligned_product(inputs, data, alignment).model_copy(
+        update={"control_outliers": tuple(p.name for p in survey.control_points if p.name not in control.name)}
+    )
     warnings = tuple(point.sentence for point in unused)
     used = tuple(point for point in survey.control_points if point.name in control.name)
     survey = survey.model_copy(update={"control_points": used})
@@ -78,12 +86,13 @@ def robust_similarity(inputs: Inputs, options: InitSim3Options) -> tuple[Initial
         contradictions = unadjustable(survey, model, alignment.geo_from_local)
         _refuse(contradictions, options)
         unchecked = Caution(code=NOT_CHECKED, sentence=f"nothing checks the stated σ: {error}")
-        cautions = union(survey.cautions, contradictions, (unchecked,))
+        cautions = union(survey.cautions, contradictions, of_marks, (unchecked,))
         return _without_joint(aligned, alignment.solution, cautions), warnings
     verdict = judge(survey, model, joint)
     _refuse(verdict.contradictions, options)
     initial, more = _joint_product(inputs, aligned, joint)
-    return initial.model_copy(update={"cautions": union(survey.cautions, verdict.all)}), warnings + more
+    cautions = union(survey.cautions, verdict.contradictions, of_marks, verdict.cautions)
+    return initial.model_copy(update={"cautions": cautions}), warnings + more
 
 
 def _refuse(contradictions: tuple[Caution, ...], options: InitSim3Options) -> None:
@@ -144,7 +153,11 @@ def _attitude(prior: RotationPrior | None) -> AttitudeRecord | None:
 
 
 def _starts(data: Correspondences, aligned: InitialSimilarity, seed: int) -> Iterator[InitialSimilarity]:
-    """Yield the alignment, then, if they are needed, those of the fixes and of the control points alone."""
+    """Yield the alignment, then, if they are needed, those of the fixes and of the control points alone.
+
+    Which fixes are outliers is for the joint adjustment to find.
+    """
+    aligned = aligned.model_copy(update={"gnss_outliers": ()})
     yield aligned
     for members in (~data.control, data.control):
         if not 3 <= members.sum() < len(data):
@@ -184,7 +197,8 @@ def _joint_product(
     agreeing = agreeing_points(inputs.model, inputs.points, similarity)
     inliers = aligned.inliers | {"points": int(agreeing.sum())}
     residuals = dict(aligned.residuals) | {"points": residuals_of_points(inputs.model, inputs.points, similarity)}
-    outliers, warnings = aligned.gnss_outliers, []
+    rejected: dict[str, tuple[str, ...]] = {"gnss": aligned.gnss_outliers, "gcp": ()}
+    warnings = []
     for kind, term, group in (("gnss", FixTerm, "fixes"), ("gcp", ControlTerm, "control points")):
         names, missed, used = joint.residuals(term)
         if not names:
@@ -194,8 +208,7 @@ def _joint_product(
         if bad:
             sizes = [f"{name} ({np.linalg.norm(miss):.2f} m)" for name, miss in bad]
             warnings.append(f"{len(bad)} of {len(names)} {group} are outliers: {listed(sizes)}")
-        if kind == "gnss":
-            outliers = tuple(name for name, _ in bad)
+        rejected[kind] = tuple(name for name, _ in bad)
     record = similarity.to_record(
         "local",
         "geo",
@@ -206,7 +219,8 @@ def _joint_product(
         update={
             "geo_from_local": record,
             "inliers": inliers,
-            "gnss_outliers": outliers,
+            "gnss_outliers": rejected["gnss"],
+            "control_outliers": aligned.control_outliers + rejected["gcp"],
             "residuals": residuals,
             "variance_factors": joint.factors,
         }

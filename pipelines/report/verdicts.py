@@ -57,7 +57,8 @@ class Measured:
         parts: groups of photographs that nothing ties to each other.
         rmse_px: of the reprojection residuals; None: no observations.
         fixes, fix_outliers: numbers, of the training photographs.
-        control_points, check_points: numbers in the survey.
+        control_points, control_outliers: numbers of used and of rejected ones.
+        check_points: number in the survey.
         stale: stages whose product is not current.
         workspace: path, for commands.
     """
@@ -71,6 +72,7 @@ class Measured:
     fixes: int
     fix_outliers: int
     control_points: int
+    control_outliers: int
     check_points: int
     stale: tuple[str, ...]
     workspace: str
@@ -180,7 +182,8 @@ def _control(measured: Measured) -> Verdict:
         else f"{CONTROL_POINTS[0]} well spread points also reveal a mistake in one of them"
     )
     rule = f"good from {CONTROL_POINTS[0]}, fair from {CONTROL_POINTS[1]} or with none (positions only)"
-    return Verdict("Control points", level, str(count), reason, rule)
+    reading = f"{count} used, {measured.control_outliers} rejected" if measured.control_outliers else str(count)
+    return Verdict("Control points", level, reading, reason, rule)
 
 
 def _stated_sigma(factors: tuple[VarianceFactor, ...]) -> Verdict:

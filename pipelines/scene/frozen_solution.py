@@ -16,7 +16,6 @@ from pipelines.georef.cameras import CameraCorrections, HeldCorrections
 from pipelines.georef.posterior import minimise, solution_covariances
 from pipelines.georef.problem import GeoProblem
 from pipelines.georef.similarity import LearnableSimilarity
-from pipelines.georef.terms import ControlTerm, FixTerm
 from pipelines.scene.geographic import geo_problem
 from pipelines.scene.geographic_options import GeographicOptions
 from pipelines.scene.initial_similarity import InitialSimilarity
@@ -69,7 +68,8 @@ def solution_of(problem: GeoProblem, scene: Scene, initial: InitialSimilarity) -
     Args:
         problem: similarity, cameras and constant errors with their measurements.
         scene: cameras at the start of the training.
-        initial: similarity at the start of the training; its cautions are carried on.
+        initial: similarity at the start of the training. Its verdict on each measurement stands: a training that
+            is not at its minimum yet would blame good measurements. Its cautions are carried on.
 
     Raises:
         DegenerateGeometryError: the measurements do not determine the similarity.
@@ -84,10 +84,8 @@ def solution_of(problem: GeoProblem, scene: Scene, initial: InitialSimilarity) -
         model_from_local=scene.model_from_local.to_record("local", "model"),
         cameras=_cameras(problem, scene),
         lenses=_lenses(problem, scene),
-        gnss_outliers=_contradicting_fixes(problem, scene),
-        control_outliers=()
-        if control is None
-        else tuple(control.point_id[row] for row in problem.contradicting(ControlTerm)),
+        gnss_outliers=initial.gnss_outliers,
+        control_outliers=initial.control_outliers,
         estimated_errors=() if of_errors is None else problem.errors.estimates(of_errors),
         variance_factors=initial.variance_factors,
         cautions=union(initial.cautions),
@@ -151,11 +149,3 @@ def _lenses(problem: GeoProblem, scene: Scene) -> tuple[TrainedLens, ...]:
         TrainedLens(camera_id=key, model=camera.model, params=tuple(camera.params.tolist()))
         for key, camera in scene.sparse.lenses.moved(change).cameras.items()
     )
-
-
-def _contradicting_fixes(problem: GeoProblem, scene: Scene) -> tuple[str, ...]:
-    fixes = problem.fixes
-    if fixes is None:
-        return ()
-    rows = problem.contradicting(FixTerm)
-    return tuple(sorted(scene.sparse.image_name[int(fixes.camera[row])] for row in rows))

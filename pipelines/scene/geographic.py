@@ -44,7 +44,7 @@ def geo_problem(
     Args:
         scene: cameras and points at the start of the training.
         survey: the measurements.
-        initial: similarity of `init-sim3`.
+        initial: similarity of `init-sim3`; the measurements that it has rejected stay out.
         options: which measurements are used, their weights, and the constant errors to estimate.
         points: of `geolocate`, for L_rel; None: L_rel uses the cameras and their fixes.
         planes: of a LiDAR whose shift is a constant error; None: none.
@@ -59,7 +59,9 @@ def geo_problem(
     record = initial.geo_from_local
     pivot = scene.geo_from_model.apply(scene.poses.cam_center_in_model[scene.train]).mean(axis=0)
     covariance = moved_pivot(np.array(record.covariance), record.pivot, pivot)
-    terms = _terms_of(scene, survey, options, points, seed) if options.geo_loss else SurveyTerms()
+    terms = SurveyTerms()
+    if options.geo_loss:
+        terms = _terms_of(scene, _without_rejected(survey, initial), options, points, seed)
     terms = replace(terms, planes=planes)
     problem = GeoProblem(
         LearnableSimilarity(scene.geo_from_model, covariance, pivot, _attitude(scene, initial)),
@@ -129,6 +131,20 @@ class SurveyTerms:
         """Terms of the loss and the posterior."""
         every = (self.fixes, self.control, self.distances, self.attitudes, self.planes)
         return tuple(term for term in every if term is not None)
+
+
+def _without_rejected(survey: Survey, initial: InitialSimilarity) -> Survey:
+    """Return the survey without the measurements that `init-sim3` has rejected."""
+    bad_fixes, bad_points = set(initial.gnss_outliers), set(initial.control_outliers)
+    return survey.model_copy(
+        update={
+            "images": tuple(
+                image.model_copy(update={"fix": None}) if image.name in bad_fixes else image
+                for image in survey.images
+            ),
+            "control_points": tuple(point for point in survey.control_points if point.name not in bad_points),
+        }
+    )
 
 
 def _leaves_open(terms: SurveyTerms, initial: InitialSimilarity) -> bool:

@@ -34,7 +34,9 @@ class InitialSimilarity(Product):
         correspondences: number by kind: `gnss` (camera centres with fixes), `gcp` (control points), `points`
             (geolocated points).
         inliers: number by kind that agrees with the similarity.
-        gnss_outliers: names of the images whose fixes were rejected.
+        gnss_outliers: names of the images whose fixes were rejected: they enter no later solution.
+        control_outliers: names of the control points that were rejected, or that their marks do not determine:
+            they enter no later solution.
         residuals: figures by kind.
         condition_number: of the normal matrix, with angles and ln s scaled by the size of the layout.
         layout: extent of the correspondences: they fill a volume, lie in a plane, or on a line.
@@ -50,6 +52,7 @@ class InitialSimilarity(Product):
     correspondences: dict[str, int]
     inliers: dict[str, int]
     gnss_outliers: tuple[str, ...] = ()
+    control_outliers: tuple[str, ...] = ()
     residuals: dict[str, ResidualStats]
     condition_number: float
     layout: Literal["volume", "plane", "line"]

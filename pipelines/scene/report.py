@@ -290,8 +290,9 @@ class FixResiduals(ResidualStats):
 
 
 class ControlResiduals(ResidualStats):
-    """Residuals of the control points."""
+    """Residuals of the control points: figures of the used ones; `outliers` is the number of the others."""
 
+    outliers: int = 0
     points: tuple[PointResidual, ...]
 
 

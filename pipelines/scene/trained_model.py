@@ -56,8 +56,8 @@ class FrozenSolution(Product):
         model_from_local: fixed similarity from the SfM frame.
         cameras: corrected cameras, in the order of the SfM model's images.
         lenses: corrected lenses; a camera of the SfM model without one keeps SfM's lens.
-        gnss_outliers: names of the images whose fixes contradict the solution.
-        control_outliers: names of the control points that contradict the solution.
+        gnss_outliers, control_outliers: names of the images whose fixes, and of the control points that `init-sim3`
+            has rejected: they entered no solution.
         estimated_errors: constant errors of the measurements.
         variance_factors: tests of the stated σ, of the initial similarity.
         cautions: limits: those of the initial similarity, then the solution's own.

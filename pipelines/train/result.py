@@ -84,11 +84,7 @@ def summary_of(
 
 
 def _warnings(model: TrainedModel, record: TrainingRecord) -> list[str]:
-    warnings = []
-    for names, kind in ((model.gnss_outliers, "fixes"), (model.control_outliers, "control points")):
-        if names:
-            warnings.append(f"{len(names)} {kind} contradict the cameras: {', '.join(names[:5])}")
-    warnings += [text for error in model.estimated_errors if (text := _warning_of(error)) is not None]
+    warnings = [text for error in model.estimated_errors if (text := _warning_of(error)) is not None]
     return warnings if record.recovery is None else [*warnings, record.recovery]
 
 

@@ -23,6 +23,7 @@ from pipelines.georef.terms import FixTerm
 from tests.georef_scenes import (
     SHIFT,
     Block,
+    contradicting,
     draw_truth,
     fixes_of,
     make_block,
@@ -132,8 +133,8 @@ def test_one_outlier_moves_nothing() -> None:
     moved = hit.similarity.current().apply(center) - clean.similarity.current().apply(center)
     # Losing one fix of twelve moves the block by a fraction of its σ, 1 cm; 15 m in the mean would be 1.25 m.
     assert np.abs(moved).max() < 0.02
-    assert hit.contradicting(FixTerm) == [3]
-    assert clean.contradicting(FixTerm) == []
+    assert contradicting(hit, FixTerm) == [3]
+    assert contradicting(clean, FixTerm) == []
     assert (
         squared_error(truth.geo_from_model, hit.similarity.current(), solution_covariances(hit)[0], pivot(BLOCK))
         < FAR

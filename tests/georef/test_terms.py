@@ -22,6 +22,7 @@ from tests.georef_scenes import (
     Block,
     Truth,
     attitudes_of,
+    contradicting,
     descend,
     draw_truth,
     fixes_of,
@@ -151,7 +152,7 @@ def test_bias_of_a_flight_is_told_by_control_points() -> None:
     assert (np.abs(value - bias) < 4 * sigma).all()
     assert sigma.max() < 0.02  # 2 cm over √5, 3 cm over √10
     assert observed == (True, True, True)
-    assert problem.contradicting(ControlTerm) == problem.contradicting(FixTerm) == []
+    assert contradicting(problem, ControlTerm) == contradicting(problem, FixTerm) == []
 
 
 def test_two_flights_have_a_bias_each() -> None:
@@ -238,8 +239,8 @@ def test_a_moved_control_point_is_named() -> None:
     position[2] += torch.tensor([0.5, 0.0, -0.4])
     problem = problem_with(STIFF, terms(fixes_of(truth, RTK, rng), replace(marks, position_in_geo=position)))
     minimise(problem)
-    assert problem.contradicting(ControlTerm) == [2]
-    assert problem.contradicting(FixTerm) == []
+    assert contradicting(problem, ControlTerm) == [2]
+    assert contradicting(problem, FixTerm) == []
 
 
 def test_observations_move_with_the_parameters() -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 
 from pipelines.core.errors import ContradictionError
 from pipelines.formats.exif import GpsTag, PhotoTags
@@ -22,6 +24,9 @@ ORIGIN = Origin(lat_deg=46.0, lon_deg=7.75, alt_m=1600.0)
 PATH = Path("t.csv")
 _ANGLE = np.linspace(0, 2 * np.pi, 12, endpoint=False)
 TRACK = np.column_stack([90 * np.cos(_ANGLE), 60 * np.sin(_ANGLE), 80 + 5 * np.cos(3 * _ANGLE)])
+HALF = np.array([1, 0, 0, 1, 0, 1, 1, 0, 1, 0, 0, 1])  # of the photographs, in no order
+SCATTERED = np.random.default_rng(3).normal(0, [60.0, 60.0, 0.0], TRACK.shape)
+BLUNDERS = np.isin(np.arange(12), [1, 4, 5, 8, 10])  # 42 %
 
 
 def photos_at(positions: np.ndarray) -> list[Photo]:
@@ -69,13 +74,17 @@ def test_sigma_stated_for_the_table_is_not_that_of_exif() -> None:
 @pytest.mark.parametrize(
     ("positions", "says"),
     [
-        (TRACK[:, [1, 0, 2]], "in changing directions"),
-        (np.roll(TRACK, 1, axis=0), "times that are off"),
+        (TRACK[:, [1, 0, 2]], "east and north are exchanged"),
+        (np.roll(TRACK, 1, axis=0), "lie where other photographs were taken"),
+        (np.random.default_rng(1).permutation(TRACK), "lie where other photographs were taken"),
+        (TRACK + HALF[:, None] * [30.0, 0.0, 0.0], r"6 are shifted by [+-]30.0 m east and [+-]0.0 m north against"),
+        (TRACK + BLUNDERS[:, None] * SCATTERED, "and the others agree.*1.jpg"),
+        (TRACK + np.random.default_rng(2).normal(0, [17, 17, 0], TRACK.shape), "without any pattern: noise"),
         (TRACK + np.array([60.0, 80.0, 0.0]), r"shifted by \+60.0 m east and \+80.0 m north"),
         (TRACK + np.array([30_000.0, 0.0, 0.0]), "30 km from those in EXIF: another CRS or zone"),
         (TRACK - [0.0, 0.0, 1600.0], r"differ from those in EXIF by -1600.0 m"),
     ],
-    ids=["mirrored", "late", "shifted", "zone", "take-off"],
+    ids=["mirrored", "late", "others", "half", "blunders", "noise", "shifted", "zone", "take-off"],
 )
 def test_contradictions_are_named_and_can_be_accepted(positions: np.ndarray, says: str) -> None:
     with pytest.raises(ContradictionError, match=says):
@@ -89,6 +98,17 @@ def test_heights_in_feet_are_recognised(factor: float, says: str) -> None:
     lla = lla_from_ecef(ecef_from_enu(TRACK, ORIGIN)) * [1.0, 1.0, factor]
     with pytest.raises(ContradictionError, match=says):
         compare_with_exif(table_of(ecef_from_lla(lla)), photos_at(TRACK), PATH, IngestOptions(), Notes())
+
+
+def test_a_clock_offset_is_named_with_its_size() -> None:
+    time_s, late_s = np.arange(12) * 8.0, 6.0
+    late = CubicSpline([*time_s, 96.0], np.vstack([TRACK, TRACK[:1]]), bc_type="periodic")(time_s + late_s)
+    photos = [
+        replace(photo, tags=replace(photo.tags, timestamp_s=float(when)))
+        for photo, when in zip(photos_at(TRACK), time_s, strict=True)
+    ]
+    with pytest.raises(ContradictionError, match=r"the times are off by about \+(5|6)\.\d s"):
+        compare_with_exif(table_of(ecef_from_enu(late, ORIGIN)), photos, PATH, IngestOptions(), Notes())
 
 
 def test_a_geoid_between_the_heights_is_a_caution() -> None:

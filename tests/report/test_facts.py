@@ -169,7 +169,7 @@ def test_ninety_percent_factors_are_those_of_the_normal_distribution() -> None:
 
 MEASURED = Measured(
     photographs=20, registered=20, enough_share=1.0, enough=5, parts=1, rmse_px=0.5, fixes=20, fix_outliers=0,
-    control_points=5, check_points=0, stale=(), workspace="flight",
+    control_points=5, control_outliers=0, check_points=0, stale=(), workspace="flight",
 )  # fmt: skip
 
 

@@ -16,6 +16,7 @@ from pipelines.georef.control_by_depth import depth_residuals
 from pipelines.georef.posterior import solution_covariances
 from pipelines.georef.problem import GeoProblem
 from pipelines.georef.terms import AttitudeTerm
+from pipelines.scene.frozen_solution import solution_of
 from pipelines.scene.geographic import geo_problem
 from pipelines.scene.initial_similarity import AttitudeRecord
 from pipelines.scene.measurements import SURFACE_SIGMA
@@ -128,6 +129,38 @@ def test_nothing_to_optimise_when_switched_off() -> None:
     assert problem.fixes is None
     assert problem.control is None
     assert len(problem.cameras.z) == 0
+
+
+def test_what_init_sim3_has_rejected_stays_out_and_nothing_else_is_blamed() -> None:
+    _, sparse, survey = material()
+    start = initial().model_copy(update={"gnss_outliers": ("image_003.jpg",), "control_outliers": ("gcp0", "gcp4")})
+    scene = initial_scene(sparse, survey, start)
+    problem = geo_problem(scene, survey, start, CONFIG)
+    assert problem.fixes is not None
+    assert problem.control is not None
+    assert 3 not in problem.fixes.camera.tolist()
+    assert problem.control.point_id == ("gcp1", "gcp2", "gcp3", "gcp5")
+    # A training that ends far from the minimum, as a short one does, contradicts every good measurement.
+    with torch.no_grad():
+        problem.similarity.y.add_(3.0)
+    solution = solution_of(problem, scene, start)
+    assert solution.gnss_outliers == ("image_003.jpg",)
+    assert solution.control_outliers == ("gcp0", "gcp4")
+
+
+def test_a_bias_that_only_rejected_control_points_show_is_none() -> None:
+    _, sparse, survey = material()
+    moved = tuple(
+        point.model_copy(update={"position_in_geo": (point.position_in_geo[0] + 28.0, *point.position_in_geo[1:])})
+        for point in survey.control_points
+    )
+    wrong = survey.model_copy(update={"control_points": moved})
+    names = tuple(point.name for point in moved)
+    rejecting = initial().model_copy(update={"control_outliers": names})
+    for solve in ("joint", "once"):
+        config = TrainOptions(solve=solve)
+        assert geo_problem(initial_scene(sparse, wrong, initial()), wrong, initial(), config).errors.flights == 1
+        assert geo_problem(initial_scene(sparse, wrong, rejecting), wrong, rejecting, config).errors.flights == 0
 
 
 def biased(survey: Survey, offset_m: tuple[float, float, float]) -> Survey:
