@@ -41,6 +41,8 @@ LIMIT_OFFSET_S, LIMIT_BORESIGHT_DEG, LIMIT_ARM_M = 0.05, 0.5, 0.1
 _PRIOR_BORESIGHT_RAD, _PRIOR_ARM_M = np.radians(10.0), 2.0
 _ROUNDS, _STEPS = 4, 12
 _SCAN_STEP_S = 0.1
+_INNER = 0.9  # part of the search whose end is no answer: beyond, the best may be the edge of a better one
+_FURTHER_S = 30.0  # more than the 18 s between GPS time and UTC
 _LEAST_SIGMA_M, _LEAST_SIGMA_RAD = 1e-3, 1e-5
 
 
@@ -92,7 +94,8 @@ def fit_rig(data: RigData, start_offset_s: float, start_boresight: FloatArray, o
         options: free parameters.
 
     Raises:
-        DegenerateGeometryError: fewer than six images within the track, or all on one line or in one place.
+        DegenerateGeometryError: fewer than six images within the track, or all on one line or in one place; or the
+            time offset lies at the end of its search.
     """
     data = replace(data, attitudes=smoothed(data.attitudes))
     offsets = np.array([start_offset_s])
@@ -115,6 +118,11 @@ def fit_rig(data: RigData, start_offset_s: float, start_boresight: FloatArray, o
         sigma_m = max(mad_sigma(np.concatenate([position, -position]).ravel()), _LEAST_SIGMA_M)
         if len(attitude):
             sigma_rad = max(mad_sigma(np.concatenate([attitude, -attitude]).ravel()), _LEAST_SIGMA_RAD)
+    if options.offset and abs(state.offset_s - start_offset_s) > _INNER * options.max_offset_s:
+        raise DegenerateGeometryError(
+            f"the time offset that fits best lies at the end of the search, {options.max_offset_s:g} s from the "
+            f"present one, where others may fit better: search further with --max-offset {_FURTHER_S:g}"
+        )
     equations, _ = _equations(data, state, (sigma_m, sigma_rad), start, options)
     covariance = equations.covariance(robust_weights(equations.residuals()), free)
     sigma = np.where(free, np.sqrt(np.diag(covariance)), np.inf)
