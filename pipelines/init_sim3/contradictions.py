@@ -91,7 +91,7 @@ def judge(survey: Survey, model: SparseModel, joint: JointAdjustment) -> Verdict
     """
     fixes = _Fixes(survey, model)
     findings = _upside_down(fixes, joint.geo_from_local)
-    of_map = _map_of_control(fixes, joint)
+    of_map = _map_of_control(fixes)
     if not findings:
         against_model = [] if of_map else _fixes_against_model(fixes, joint)
         findings = [*against_model, *_view(model, joint.geo_from_local)]
@@ -240,9 +240,9 @@ def _fixes_against_model(fixes: _Fixes, joint: JointAdjustment) -> list[_Finding
     return [_Finding(caution, ends=is_wrong and scatter_m > _WRONG_SCATTER_M)]
 
 
-def _map_of_control(fixes: _Fixes, joint: JointAdjustment) -> list[_Finding]:
+def _map_of_control(fixes: _Fixes) -> list[_Finding]:
     """Return the finding that the control points' map has another size or other axes than the fixes."""
-    control = control_correspondences(joint.survey, fixes.model)[0]
+    control = control_correspondences(fixes.survey, fixes.model)[0]
     mistake = mistake_in_map(fixes.positions, control, fixes.survey.origin.lat_deg)
     if mistake is None:
         return []

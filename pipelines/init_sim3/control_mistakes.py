@@ -85,7 +85,7 @@ def mistake_in_map(fixes: Correspondences, control: Correspondences, lat_deg: fl
     if mirrored_m < control_m / 10.0:
         return "their map is mirrored: east and north are exchanged; check the order of the columns and the CRS"
     ratio = by_control.scale / by_fixes.scale
-    sigma = float(np.hypot(fix_m / _size_m(fixes), control_m / _size_m(control)))
+    sigma = float(np.hypot(_sigma_of_scale(fixes, fix_m), _sigma_of_scale(control, control_m)))
     if abs(np.log(ratio)) < max(_SIGMAS * sigma, _LEAST_SCALE):
         return None
     causes = {
@@ -99,9 +99,11 @@ def mistake_in_map(fixes: Correspondences, control: Correspondences, lat_deg: fl
     return f"their map is {ratio:.4g} times as large as that of the fixes: {cause}"
 
 
-def _size_m(positions: Correspondences) -> float:
-    """Return the root of the sum of squared distances from the middle."""
-    return float(np.sqrt(((positions.in_geo - positions.in_geo.mean(axis=0)) ** 2).sum()))
+def _sigma_of_scale(positions: Correspondences, scatter_m: float) -> float:
+    """Return the σ of ln(scale): of the scatter, or of errors as large as stated that drift over the flight."""
+    size_m = float(np.sqrt(((positions.in_geo - positions.in_geo.mean(axis=0)) ** 2).sum(axis=1).mean()))
+    stated_m = float(np.sqrt(np.median(np.trace(positions.cov_in_geo, axis1=1, axis2=2)) / 3.0))
+    return float(max(scatter_m / len(positions) ** 0.5, stated_m) / size_m)
 
 
 def shift_sentence(shift_m: FloatArray, height_m: float) -> str:

@@ -201,7 +201,7 @@ def test_hover_and_straight_line_are_refused(speed_m_s: float) -> None:
 def test_the_end_of_the_search_is_no_offset() -> None:
     data = _data(_flight("grid"))
     data = replace(data, time_s=data.time_s - 18.0)  # as GPS time and UTC differ
-    with pytest.raises(DegenerateGeometryError, match="lies at the end of the search.*--max-offset 30"):
+    with pytest.raises(DegenerateGeometryError, match=r"lies at the end of the search.*--max-offset 30"):
         fit_rig(data, 0.0, np.eye(3), FitOptions())
     found = fit_rig(data, 0.0, np.eye(3), FitOptions(max_offset_s=30.0))
     assert found.state.offset_s == pytest.approx(18.0 + OFFSET_S, abs=0.02)
