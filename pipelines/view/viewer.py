@@ -306,7 +306,7 @@ def serve(
     Args:
         workspace: has a trained model.
         options: of the viewer.
-        ready: called with the address when the pages can be opened.
+        ready: called with the address, its key included, when the pages can be opened.
         ended: ends the viewer.
         progress: shows the reading.
 
@@ -315,10 +315,10 @@ def serve(
         GeorefError: a product is damaged, no port is free, or the CRS cannot be used.
     """
     model_stamp(workspace)
-    server = start_server(options.port, f"georef view {workspace.root.name}", dark=options.dark)
+    server, address = start_server(options.port, f"georef view {workspace.root.name}", dark=options.dark)
     try:
         viewer = Viewer(server, workspace, options, progress)
-        ready(f"http://{server.get_host()}:{server.get_port()}")
+        ready(address)
         again = threading.Event()
         told = False
         while not ended.wait(_WATCH_S):

@@ -82,7 +82,7 @@ def wait(holds: Callable[[], bool]) -> None:
 
 
 def opened(workspace: Workspace, browser: Browser) -> Opened:
-    server = start_server(8700, "hill")
+    server, address = start_server(8700, "hill")
     viewer = Viewer(server, workspace, ViewOptions())
     viewer.wait_for_sigma()
     page, outside = browser.new_page(viewport=SIZE), []
@@ -95,7 +95,7 @@ def opened(workspace: Workspace, browser: Browser) -> Opened:
         route.abort()
 
     page.route("**/*", loopback_only)
-    page.goto(f"http://127.0.0.1:{server.get_port()}/")
+    page.goto(address)
     wait(lambda: bool(server.get_clients()) and any(loop.drawn for loop in viewer.loops))
     before = 0
     while before != (before := viewer.drawn):  # the panel takes a part of the page when it is laid out
