@@ -2,8 +2,8 @@
 
 viser serves its own page and speaks with it through a websocket. A page from elsewhere that is open in the same
 browser could speak with it as well, unless its Origin is looked at, and could pretend to come from here by a name
-that resolves to 127.0.0.1, unless Host is looked at. Another program of this machine could send both: so the address
-has a key for its path, which viser's page hands on to its websocket. viser looks at none of the three.
+that resolves to 127.0.0.1, unless Host is looked at. Another program of this machine could send both, and lacks the
+key that is the path of the address; viser's page hands it on to its websocket. viser looks at none of the three.
 """
 
 from __future__ import annotations

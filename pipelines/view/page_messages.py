@@ -33,7 +33,7 @@ class _Message(msgspec.Struct, tag_field="type", forbid_unknown_fields=True, fro
     """Message of a page, as viser 1.1 names its fields."""
 
 
-class _Camera(_Message, tag="ViewerCameraMessage"):
+class _Camera(_Message, tag="ViewerCameraMessage", frozen=True):
     wxyz: tuple[Number, Number, Number, Number]
     position: Triple
     fov: Annotated[float, msgspec.Meta(gt=0, le=math.pi)]
@@ -45,7 +45,7 @@ class _Camera(_Message, tag="ViewerCameraMessage"):
     up_direction: Triple
 
 
-class _Click(_Message, tag="ScenePointerMessage"):
+class _Click(_Message, tag="ScenePointerMessage", frozen=True):
     event_type: Literal["click"]
     ray_origin: Triple
     ray_direction: Triple
@@ -57,12 +57,12 @@ class _Value(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     value: bool | float | Annotated[str, msgspec.Meta(max_length=_MOST_CHARACTERS)]
 
 
-class _Update(_Message, tag="GuiUpdateMessage"):
+class _Update(_Message, tag="GuiUpdateMessage", frozen=True):
     uuid: str
     updates: _Value
 
 
-class _Command(_Message, tag="CommandTriggerMessage"):
+class _Command(_Message, tag="CommandTriggerMessage", frozen=True):
     uuid: str
 
 

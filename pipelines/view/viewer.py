@@ -30,6 +30,7 @@ from pipelines.view.photo_view import PhotoView
 from pipelines.view.picture_loop import PictureLoop, camera_of
 from pipelines.view.pictures import Painter, Photographs
 from pipelines.view.signs import Kind, PointColour, PointError, Signs
+from pipelines.view.store import FOLDER
 from pipelines.view.tables import paragraph
 from pipelines.view.view_frame import ViewFrame, frame_of
 
@@ -38,7 +39,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-FOLDER = "view"  # of the workspace: what the user saves in the viewer
 _WATCH_S = 2.0
 _FIRST_S = 20.0  # in which a page is expected to be opened
 _FOV_RAD = 0.9

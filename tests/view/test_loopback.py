@@ -60,7 +60,16 @@ def test_without_its_key_nothing_is_answered(server: viser.ViserServer, path: st
     key, port = path.strip("/"), server.get_port()
     assert len(key) >= 22  # 128 bits
     other = ("A" if key[0] != "A" else "B") + key[1:]
-    for wrong in ("/", "/index.html", f"/{other}/", f"/{key[:-1]}/", f"/{key}x", f"/x/{key}/", f"/?{key}", "/%C3%A9/"):
+    for wrong in (
+        "/",
+        "/index.html",
+        f"/{other}/",
+        f"/{key[:-1]}/",
+        f"/{key}x",
+        f"/x/{key}/",
+        f"/?{key}",
+        "/%C3%A9/",
+    ):
         assert status(port, wrong) == 403, wrong
         assert refusal(port, wrong) == 403, wrong
     second, address = start_server(8660, "second")
@@ -84,9 +93,7 @@ def test_other_hosts_are_refused(server: viser.ViserServer, path: str, host: str
         "http://localhost:{port}",
     ],
 )
-def test_other_origins_are_refused_also_by_the_websocket(
-    server: viser.ViserServer, path: str, origin: str
-) -> None:
+def test_other_origins_are_refused_also_by_the_websocket(server: viser.ViserServer, path: str, origin: str) -> None:
     port = server.get_port()
     text = origin.format(port=port, other=port + 1)
     assert status(port, path, Origin=text) == 403

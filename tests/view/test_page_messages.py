@@ -130,7 +130,11 @@ def test_forged_messages_change_nothing_and_leave_a_line_a_kind(
         # What a person does works as before, from both pages.
         for number, each in enumerate((page, person), start=1):
             send(each, update(panel.button, value=True), update(panel.list, value="area"), CLICK)
-            send(each, update(panel.list, value="point"), {"type": "CommandTriggerMessage", "uuid": panel.command_id()})
+            send(
+                each,
+                update(panel.list, value="point"),
+                {"type": "CommandTriggerMessage", "uuid": panel.command_id()},
+            )
             wait(lambda: len(panel.called) == 5 * number)  # noqa: B023
         assert sorted(set(panel.called)) == ["button", "click", "command", "list"]
         send(person, update(panel.slider, value=1), update(panel.box, value=False))
