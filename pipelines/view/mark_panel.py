@@ -229,7 +229,7 @@ class MarkPanel(Panel):
         return [
             *([note] if note else []),
             *([] if camera is None else [f"Shown: {self.names[camera]}"]),
-            *([] if self._kept.is_written else ["Changes of marks are kept, and not written yet."]),
+            *([] if self._kept.is_written else ["Changes of marks are kept; gcp_list.txt is not written yet."]),
         ]
 
     def _crosses(self, point: MarkedPoint | None) -> tuple[FloatArray | None, FloatArray | None, list[FloatArray]]:

@@ -28,8 +28,8 @@ class Panel:
         try:
             act()
         except GeorefError as error:
-            stays = "; what is on this page stays: mend that, and try again"
-            self._failed.content = failure(f"{error}{stays if isinstance(error, StorageError) else ''}")
+            stays = " The page keeps what it shows: make room on the disk, then try again."
+            self._failed.content = failure(f"Not done: {error}.{stays if isinstance(error, StorageError) else ''}")
         else:
             self._failed.content = ""
 

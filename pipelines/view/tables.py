@@ -29,10 +29,9 @@ def paragraph(text: str, mark: str = "note") -> str:
     return f'<p data-{mark}="yes" style="{_TEXT}">{html.escape(text)}</p>'
 
 
-def failure(reason: str) -> str:
-    """Return a paragraph that says why nothing was done."""
-    text = html.escape(f"Not done: {reason}.")
-    return f'<p data-failed="yes" role="alert" style="{_TEXT};{_ALARM}">{text}</p>'
+def failure(text: str) -> str:
+    """Return a paragraph that stands out."""
+    return f'<p data-failed="yes" role="alert" style="{_TEXT};{_ALARM}">{html.escape(text)}</p>'
 
 
 def place_table(target: TargetCrs, rows: Sequence[PlaceRow], marked: str = "place") -> str:
