@@ -93,13 +93,13 @@ def measuring(workspace: Workspace) -> np.ndarray:
     """Return the viewer's page with a measured polygon, BGR."""
     from playwright.sync_api import sync_playwright
 
-    server = start_server(8080, f"georef view {workspace.root.name}")
+    server, address = start_server(8080, f"georef view {workspace.root.name}")
     viewer = Viewer(server, workspace, ViewOptions())
     viewer.wait_for_sigma()
     with sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=chromium_path(), args=list(DRAWING))
         page = browser.new_page(viewport={"width": 1280, "height": 720})
-        page.goto(f"http://{server.get_host()}:{server.get_port()}")
+        page.goto(address)
         page.get_by_role("tab", name="Measure").click()
         viewer.measuring.choose("area")
         for point in viewer.model.trained.survey.check_points[:4]:

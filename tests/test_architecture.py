@@ -85,6 +85,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     "ezdxf": ("pipelines.formats",),
     "viser": ("pipelines.view",),
     "websockets": ("pipelines.view",),
+    "msgspec": ("pipelines.view",),
     "dask": ("pipelines.engine",),
     "distributed": ("pipelines.engine",),
     "fsspec": ("pipelines.engine",),

@@ -81,7 +81,7 @@ def clicked_s(page: Page, x: float, y: float) -> float | None:
 def time_server(workspace: Workspace, clicks: int) -> None:
     """Print the times of the viewer's own work, without a browser."""
     began = time.perf_counter()
-    server = start_server(8080, "benchmark")
+    server, _ = start_server(8080, "benchmark")
     viewer = Viewer(server, workspace, ViewOptions())
     camera = ViewerCamera(_SOUTH_WXYZ, np.array([0.0, -14.0, 12.0]), 0.9, _SIZE["width"], _SIZE["height"])
     times = [time.perf_counter()]

@@ -51,7 +51,8 @@ command = Command(
 
         Points, distances, heights, areas and volumes are read from the model's own surface, as `georef evaluate`
         reads it, with σ from the joint covariance. Control points are marked in photographs, and written for --gcp.
-        The page is served to this machine alone; what is saved lies in the workspace's folder view/.
+        The page is served to this machine alone, at an address with a key. What is saved lies in the workspace's
+        folder view/, at once, and several viewers may show one workspace.
 
         \b
         Examples:

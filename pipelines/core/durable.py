@@ -7,6 +7,7 @@ import os
 import shutil
 import sys
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 
 from pipelines.core.errors import StorageError, storage_error
@@ -31,14 +32,31 @@ def replace_text(path: Path, text: str) -> None:
     Raises:
         OSError: the file cannot be written; the existing one stays.
     """
-    draft = path.with_suffix(".tmp")
+    replace_texts({path: text})
+
+
+def replace_texts(texts: Mapping[Path, str]) -> None:
+    """Write text files; existing ones are replaced when all new ones are complete.
+
+    Raises:
+        OSError: a file cannot be written; the existing ones stay, and no draft is left.
+    """
+    drafts = {path: path.with_name(f"{path.name}.tmp") for path in texts}
+    path = None
     try:
-        draft.write_text(text, encoding="utf-8")
-        replace_file(draft, path)
-    except OSError:
-        with contextlib.suppress(OSError):
-            draft.unlink()
+        for path, text in texts.items():
+            drafts[path].write_text(text, encoding="utf-8")
+            sync_file(drafts[path])
+        for path, draft in drafts.items():
+            draft.replace(path)
+    except OSError as error:
+        for draft in drafts.values():
+            with contextlib.suppress(OSError):
+                draft.unlink()
+        error.filename = str(path)  # a full disk is noticed by `write`, which knows no name
         raise
+    for folder in {path.parent for path in texts}:
+        sync_folder(folder)
 
 
 def replace_folder(draft: Path, folder: Path, aside: Path) -> None:

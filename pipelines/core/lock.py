@@ -23,7 +23,7 @@ from pipelines.core.validators import require_text
 LOCK = ".lock"
 HOLDER = ".lock.holder"
 # `activity` takes the lock for an instant. That must neither refuse a writer nor be reported as a writer.
-_ATTEMPTS, _PAUSE_S = 3, 0.05
+_PATIENCE_S, _PAUSE_S = 0.1, 0.05
 _IN_PROCESS = " in process "
 
 
@@ -38,18 +38,19 @@ class WriteLock:
     folder: Path
 
     @contextmanager
-    def hold(self, activity: str) -> Iterator[None]:
+    def hold(self, activity: str, patience_s: float = _PATIENCE_S) -> Iterator[None]:
         """Hold the lock while the context lasts.
 
         Args:
             activity: the command that writes, for the error message of other processes.
+            patience_s: so long another process may still hold the lock.
 
         Raises:
             WorkspaceBusyError: another process holds the lock; names that process and its activity.
             InputError: the folder cannot be made, written or locked.
         """
         require_text(self.folder)
-        with self._locked_file() as handle:
+        with self._locked_file(patience_s) as handle:
             try:
                 (self.folder / HOLDER).write_text(f"{activity}{_IN_PROCESS}{os.getpid()}", encoding="utf-8")
                 yield
@@ -62,7 +63,7 @@ class WriteLock:
             with contextlib.suppress(OSError):  # Windows deletes no open file.
                 (self.folder / name).unlink(missing_ok=True)
 
-    def _locked_file(self) -> BinaryIO:
+    def _locked_file(self, patience_s: float) -> BinaryIO:
         """Return the open and locked file.
 
         Raises:
@@ -76,7 +77,7 @@ class WriteLock:
             except OSError as error:
                 raise InputError(f"cannot be used as a workspace: {error.strerror}", path=self.folder) from error
             try:
-                locked = _lock(handle, _ATTEMPTS)
+                locked = _lock(handle, patience_s)
             except OSError as error:
                 handle.close()
                 raise InputError(f"cannot be locked: {error.strerror}", path=self.folder) from error
@@ -103,7 +104,7 @@ class WriteLock:
             with path.open("r+b" if os.access(path, os.W_OK) else "rb") as handle:
                 # A running stage asks as well, and must not wait for its own lock.
                 own = self._holder().endswith(f"{_IN_PROCESS}{os.getpid()}")
-                if not _lock(handle, attempts=1 if own else _ATTEMPTS):
+                if not _lock(handle, 0.0 if own else _PATIENCE_S):
                     return self._holder().partition(_IN_PROCESS)[0]
                 unlock_descriptor(handle.fileno())
         except OSError:
@@ -119,11 +120,11 @@ class WriteLock:
         return text or "another process"
 
 
-def _lock(handle: BinaryIO, attempts: int) -> bool:
-    """Return whether one of the attempts locked the open file."""
-    for attempt in range(attempts):
-        if attempt:
-            time.sleep(_PAUSE_S)
-        if lock_descriptor(handle.fileno(), blocking=False):
-            return True
-    return False
+def _lock(handle: BinaryIO, patience_s: float) -> bool:
+    """Return whether the open file could be locked in time."""
+    end = time.monotonic() + patience_s
+    while not lock_descriptor(handle.fileno(), blocking=False):
+        if time.monotonic() >= end:
+            return False
+        time.sleep(_PAUSE_S)
+    return True

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pipelines.core.durable import replace_file
+from pipelines.core.durable import replace_text
 from pipelines.core.types import FloatArray
 from pipelines.geometry.footprints import clipped_ring
 
@@ -52,10 +52,13 @@ def write_features(path: Path, features: Sequence[Json]) -> None:
     Raises:
         OSError: the file cannot be written.
     """
-    draft = path.with_name(path.name + ".tmp")
+    replace_text(path, features_text(features))
+
+
+def features_text(features: Sequence[Json]) -> str:
+    """Return a FeatureCollection as text, one feature a line."""
     lines = ",\n".join(json.dumps(one, allow_nan=False, ensure_ascii=False) for one in features)
-    draft.write_text(f'{{"type": "FeatureCollection", "features": [\n{lines}\n]}}\n', encoding="utf-8")
-    replace_file(draft, path)
+    return f'{{"type": "FeatureCollection", "features": [\n{lines}\n]}}\n'
 
 
 def _between_date_lines(ring: FloatArray) -> FloatArray:

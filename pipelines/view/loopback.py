@@ -1,22 +1,27 @@
-"""The viewer's server: viser on loopback, for pages of this machine alone.
+"""The viewer's server: viser on loopback, for whoever knows the address that was printed.
 
 viser serves its own page and speaks with it through a websocket. A page from elsewhere that is open in the same
 browser could speak with it as well, unless its Origin is looked at, and could pretend to come from here by a name
-that resolves to 127.0.0.1, unless Host is looked at. viser looks at neither.
+that resolves to 127.0.0.1, unless Host is looked at. Another program of this machine could send both, and lacks the
+key that is the path of the address; viser's page hands it on to its websocket. viser looks at none of the three.
 """
 
 from __future__ import annotations
 
 import contextlib
 import functools
+import hmac
 import http.client
 import io
 import logging
-from collections.abc import Iterator
+import secrets
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from http import HTTPStatus
 from typing import TYPE_CHECKING, Any
 
 from pipelines.core.errors import BackendUnavailableError, GeorefError
+from pipelines.view.page_messages import MOST_BYTES, CheckedConnection
 
 if TYPE_CHECKING:
     import viser
@@ -28,8 +33,30 @@ _FOREIGN = "georef.invalid"
 _TIMEOUT_S = 5.0
 
 
-def start_server(port: int, title: str, *, dark: bool = False) -> viser.ViserServer:
-    """Start a server on loopback, at a port or, if that is taken, the next free one.
+@dataclass
+class Doorkeeper:
+    """Whom the server answers, and what it hears from them.
+
+    Attributes:
+        key: first part of the path of every address.
+        elements: handles of viser's elements with a value, by id.
+        commands: handles of the keyboard's commands, by id.
+    """
+
+    key: str = field(default_factory=lambda: secrets.token_urlsafe(16), repr=False)
+    elements: Mapping[str, Any] = field(default_factory=dict)
+    commands: Mapping[str, Any] = field(default_factory=dict)
+
+    def path_of(self, request: Any, port: int) -> str | None:
+        """Return the path of a request behind the key; None: the server must not answer it."""
+        bare = request.path.partition("?")[0]
+        given, _, path = bare.removeprefix("/").partition("/")
+        has_key = hmac.compare_digest(given.encode(errors="replace"), self.key.encode())
+        return f"/{path}" if has_key and _is_from_here(request.headers, port) else None
+
+
+def start_server(port: int, title: str, *, dark: bool = False) -> tuple[viser.ViserServer, str]:
+    """Start a server on loopback, at a port or, if that is taken, the next free one; return it with its address.
 
     Args:
         port: the wanted port.
@@ -38,20 +65,22 @@ def start_server(port: int, title: str, *, dark: bool = False) -> viser.ViserSer
 
     Raises:
         BackendUnavailableError: viser is not installed.
-        GeorefError: no port is free, or the server would answer pages from elsewhere.
+        GeorefError: no port is free, or the server would answer strangers.
     """
-    server = _start(port, title)
+    keeper = Doorkeeper()
+    server = _start(port, title, keeper)
+    keeper.elements, keeper.commands = server.gui._gui_input_handle_from_uuid, server.gui._command_handle_from_uuid
     server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large", dark_mode=dark)
     server.gui.main_panel.dock_right()
-    if not _refuses_strangers(server.get_port()):
+    if not _refuses_strangers(server.get_port(), keeper.key):
         stop_server(server)
         raise GeorefError(
-            "this version of viser cannot be kept from answering pages of other sites: install viser 1.1 "
+            "this version of viser cannot be kept from answering strangers: install viser 1.1 "
             "(pip install --constraint constraints.txt georefgs)"
         )
     if server.get_port() != port:
         log.warning("port %d is taken: the viewer is at port %d", port, server.get_port())
-    return server
+    return server, f"http://{HOST}:{server.get_port()}/{keeper.key}/"
 
 
 def stop_server(server: viser.ViserServer) -> None:
@@ -60,7 +89,7 @@ def stop_server(server: viser.ViserServer) -> None:
         server.stop()
 
 
-def _start(port: int, title: str) -> viser.ViserServer:
+def _start(port: int, title: str, keeper: Doorkeeper) -> viser.ViserServer:
     try:
         import viser
     except ImportError as error:
@@ -73,25 +102,32 @@ def _start(port: int, title: str) -> viser.ViserServer:
             """Return None."""
             return None
 
-    with _checked_connections(), contextlib.redirect_stdout(io.StringIO()):  # viser prints a banner
+    with _checked_connections(keeper), contextlib.redirect_stdout(io.StringIO()):  # viser prints a banner
         return Server(host=HOST, port=port, label=title, verbose=False)
 
 
 @contextlib.contextmanager
-def _checked_connections() -> Iterator[None]:
-    """Let servers that start meanwhile answer nothing but pages of this machine."""
+def _checked_connections(keeper: Doorkeeper) -> Iterator[None]:
+    """Let servers that start meanwhile answer whom the doorkeeper admits, and hear what a page may send."""
+    import viser
     from websockets.asyncio import server
 
-    original = server.serve
+    original, protocol = server.serve, f"viser-v{viser.__version__}"
 
     @functools.wraps(original)
     def serve(handler: Any, host: str, port: int, *, process_request: Any, **settings: Any) -> Any:
-        def checked(connection: Any, request: Any) -> Any:
-            if not _is_from_here(request.headers, port):
-                return connection.respond(HTTPStatus.FORBIDDEN, "this server answers pages of this machine only\n")
-            return process_request(connection, request)
+        def admitted(connection: Any, request: Any) -> Any:
+            path = keeper.path_of(request, port)
+            if path is None:
+                return connection.respond(HTTPStatus.FORBIDDEN, "open the address that georef view printed\n")
+            return process_request(connection, replace(request, path=path))
 
-        return original(handler, host, port, process_request=checked, **settings)
+        async def heard(connection: Any) -> None:
+            if connection.subprotocol == protocol:  # viser prints a line about every other one
+                await handler(CheckedConnection(connection, keeper.elements, keeper.commands))
+
+        limited = {**settings, "max_size": MOST_BYTES}
+        return original(heard, host, port, process_request=admitted, **limited)
 
     server.serve = serve  # type: ignore[assignment,misc]
     try:
@@ -107,19 +143,23 @@ def _is_from_here(headers: Any, port: int) -> bool:
     return len(hosts) == 1 and hosts[0] in own and all(origin == f"http://{hosts[0]}" for origin in origins)
 
 
-def _refuses_strangers(port: int) -> bool:
-    """Return whether the server refuses a request for another host, and one of a page from elsewhere."""
-    own = f"{HOST}:{port}"
-    strangers = ({"Host": _FOREIGN}, {"Host": own, "Origin": f"http://{_FOREIGN}"})
-    return all(_status(port, headers) == HTTPStatus.FORBIDDEN for headers in strangers) and (
-        _status(port, {"Host": own}) == HTTPStatus.OK
+def _refuses_strangers(port: int, key: str) -> bool:
+    """Return whether the server refuses another host, a page from elsewhere and an address without its key."""
+    own, page = f"{HOST}:{port}", f"/{key}/"
+    strangers = (
+        (page, {"Host": _FOREIGN}),
+        (page, {"Host": own, "Origin": f"http://{_FOREIGN}"}),
+        ("/", {"Host": own}),
+    )
+    return all(_status(port, path, headers) == HTTPStatus.FORBIDDEN for path, headers in strangers) and (
+        _status(port, page, {"Host": own}) == HTTPStatus.OK
     )
 
 
-def _status(port: int, headers: dict[str, str]) -> int:
+def _status(port: int, path: str, headers: dict[str, str]) -> int:
     connection = http.client.HTTPConnection(HOST, port, timeout=_TIMEOUT_S)
     try:
-        connection.request("GET", "/", headers=headers)
+        connection.request("GET", path, headers=headers)
         return connection.getresponse().status
     finally:
         connection.close()

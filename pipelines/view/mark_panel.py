@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,14 +12,8 @@ from pipelines.core.types import FloatArray
 from pipelines.geometry.cameras import distort
 from pipelines.geometry.lens import bearings
 from pipelines.scene.survey import SurveyedPoint
-from pipelines.view.marking import (
-    MarkedPoint,
-    appears_in,
-    points_to_mark,
-    rays_of,
-    residuals_px,
-    write_marks,
-)
+from pipelines.view.kept_marks import KeptMarks
+from pipelines.view.marking import MarkedPoint, appears_in, points_to_mark, rays_of, residuals_px
 from pipelines.view.measuring import MeasuringModel
 from pipelines.view.panel import Panel
 from pipelines.view.photo_view import PhotoView
@@ -48,10 +41,10 @@ class MarkPanel(Panel):
     def __init__(
         self, server: viser.ViserServer, model: MeasuringModel, signs: Signs, photo: PhotoView, folder: Path
     ) -> None:
-        self._model, self._signs, self._photo, self._folder = model, signs, photo, folder
-        survey = model.trained.survey
+        self._model, self._signs, self._photo = model, signs, photo
+        survey, crs = model.trained.survey, model.target.crs
         self.names = model.trained.sparse.image_name
-        self._points = points_to_mark(survey, self._xyz)
+        self._kept = KeptMarks(folder, points_to_mark(survey, self._xyz), crs.lla_from_xyz, crs.xyz_from_lla)
         self._lock = threading.RLock()
         self._build(server.gui)
         self._show()
@@ -62,16 +55,18 @@ class MarkPanel(Panel):
 
     def _build(self, gui: viser.GuiApi) -> None:
         self._chosen = gui.add_dropdown("Point", self._options(), hint="Point that the clicks mark")
-        self._result = gui.add_html("")
+        self._add_results(gui)
         self._button(gui, "Next photograph (N)", lambda: self.turn(1))
         self._button(gui, "Previous photograph (B)", lambda: self.turn(-1))
         self._button(gui, "Whole photograph (M)", self._photo.whole)
         self._button(gui, "Remove the mark here", self._remove)
+        self._button(gui, "Undo", self.undo, hint="Takes back the last mark, removal or point, step by step")
         with gui.add_folder("New point, or its coordinates", expand_by_default=False):
             self._new_name = gui.add_text("Name", "")
             self._coordinates = gui.add_text("x y z", "", hint="In the CRS of the viewer; empty: not surveyed")
             self._is_check = gui.add_checkbox("Check point", False)
             self._button(gui, "Set", self._set)
+            self._button(gui, "Remove the chosen point", self._remove_point)
         self._button(gui, "Write gcp_list.txt", self._write)
         self._chosen.on_update(lambda _: self._show())
         gui.add_command("Next photograph", hotkey="N").on_trigger(lambda _: self.turn(1))
@@ -79,12 +74,12 @@ class MarkPanel(Panel):
         gui.add_command("Whole photograph", hotkey="M").on_trigger(lambda _: self._photo.whole())
 
     def _options(self) -> tuple[str, ...]:
-        return tuple(point.name for point in self._points) or (_NONE,)
+        return tuple(point.name for point in self._kept.points) or (_NONE,)
 
     @property
     def point(self) -> MarkedPoint | None:
         """The chosen point."""
-        return next((point for point in self._points if point.name == self._chosen.value), None)
+        return next((point for point in self._kept.points if point.name == self._chosen.value), None)
 
     def choose(self, name: str) -> None:
         """Choose the point that clicks mark."""
@@ -107,7 +102,7 @@ class MarkPanel(Panel):
             self._show()
 
     def add(self, camera: int, direction_in_cam: FloatArray) -> None:
-        """Mark the chosen point where a line of sight leaves a camera.
+        """Mark the chosen point where a line of sight leaves a camera; a failure is told.
 
         Args:
             camera: whose photograph is shown.
@@ -123,7 +118,7 @@ class MarkPanel(Panel):
             if not (0 <= x_px <= lens.width and 0 <= y_px <= lens.height):
                 self._tell("This place is outside the photograph.")
                 return
-            self._replace(point.with_mark(self.names[camera], (x_px, y_px)))
+            self._safely(lambda: self._set_mark(point.name, self.names[camera], (x_px, y_px)))
 
     def measured(self) -> SurfacePoint | None:
         """Return the chosen point by camera; None with fewer than two marks."""
@@ -136,23 +131,43 @@ class MarkPanel(Panel):
             return None
         return SurfacePoint(place, np.zeros((3, 3)) if cov is None else cov, rays.camera)
 
+    def _set_mark(self, name: str, image: str, place_px: tuple[float, float] | None) -> None:
+        self._kept.set_mark(name, image, place_px)
+        self._show_points(name)
+
     def _remove(self) -> None:
         with self._lock:
-            if self.point is not None and self._photo.camera is not None:
-                self._replace(self.point.with_mark(self.names[self._photo.camera], None))
+            point, camera = self.point, self._photo.camera
+            if point is not None and camera is not None and self.names[camera] in point.marks:
+                self._set_mark(point.name, self.names[camera], None)
 
-    def _replace(self, point: MarkedPoint) -> None:
-        names = [each.name for each in self._points]
-        if point.name in names:
-            self._points[names.index(point.name)] = point
-        else:
-            self._points.append(point)
-            self._chosen.options = self._options()
-        self._chosen.value = point.name  # type: ignore[misc]
-        self._show()
+    def _remove_point(self) -> None:
+        with self._lock:
+            if self.point is not None:
+                self._kept.remove_point(self.point.name)
+                self._show_points()
+
+    def undo(self) -> None:
+        """Undo the last change of marks or points.
+
+        Raises:
+            GeorefError: the change could not be kept, and why.
+        """
+        with self._lock:
+            step = self._kept.undo()
+            self._show_points(note=f"Undone: {step}." if step else "Nothing to undo.")
+
+    def _show_points(self, name: str | None = None, note: str = "") -> None:
+        """Show the points as they are now, and choose one of them; None: leave the choice, if it is still there."""
+        options = self._options()
+        if options != self._chosen.options:
+            self._chosen.options = options
+        if name is not None:
+            self._chosen.value = name  # type: ignore[misc]
+        self._show(note)
 
     def _set(self) -> None:
-        name = self._new_name.value.strip()
+        name = self._new_name.value.strip()[:200]
         if not name:
             self._tell("A point needs a name.")
             return
@@ -160,14 +175,15 @@ class MarkPanel(Panel):
         if texts := self._coordinates.value.replace(",", " ").split():
             try:
                 x, y, z = (float(text) for text in texts)
+                if not np.isfinite([x, y, z]).all():
+                    raise ValueError
             except ValueError:
                 self._tell("Coordinates are three numbers: x y z in the CRS of the viewer.")
                 return
             xyz = (x, y, z)
-            self._model.target.geo_from_xyz(np.array([xyz]))  # outside the domain of the CRS: an error
         with self._lock:
-            old = next((point for point in self._points if point.name == name), MarkedPoint(name, xyz))
-            self._replace(replace(old, xyz=xyz or old.xyz, is_check=self._is_check.value))
+            self._kept.set_point(name, xyz, is_check=self._is_check.value)
+            self._show_points(name)
 
     def _expected(self, point: MarkedPoint) -> FloatArray | None:
         """Return where a point must be (3,) in `geo`: by its marks, or by its survey."""
@@ -177,20 +193,22 @@ class MarkPanel(Panel):
         return None if point.xyz is None else self._model.target.geo_from_xyz(np.array([point.xyz]))[0]
 
     def _write(self) -> None:
-        files = write_marks(self._folder, self._model.target.crs.name, self._points)
+        with self._lock:
+            files = self._kept.write(self._model.target.crs.name)
+            self._show_points()
         if not files:
             self._tell("No point has both coordinates and marks: nothing to write.")
             return
         names, heights = ", ".join(map(str, files)), self._model.target.crs.vertical.name
         self._result.content = paragraph(f"Written: {names}. Heights: {heights}.", mark="written")
 
-    def _show(self) -> None:
+    def _show(self, note: str = "") -> None:
         """Show the chosen point: its marks, what they give, and where it must appear in the photograph."""
         with self._lock:
             point = self.point
             self._photo.draw(*self._crosses(point))
             if point is None:
-                self._tell("No point yet: make one below.")
+                self._tell(f"{note} No point yet: make one below.".lstrip())
                 return
             rays = rays_of(point, self._model.trained)
             place, cov = self._model.by_camera(rays)
@@ -202,10 +220,17 @@ class MarkPanel(Panel):
                 rows.append(PlaceRow("by camera", place, None if cov is None else np.sqrt(np.diag(cov))))
                 errors = residuals_px(place, rays, self._model.trained)
                 residuals = {self.names[camera]: error for camera, error in zip(rays.camera, errors, strict=True)}
-            camera = self._photo.camera
-            shown = "" if camera is None else paragraph(f"Shown: {self.names[camera]}")
+            shown = "".join(map(paragraph, self._state(note)))
             places = place_table(self._model.target, rows, marked="marked") if rows else ""
             self._result.content = shown + places + mark_table(point.marks, residuals)
+
+    def _state(self, note: str) -> list[str]:
+        camera = self._photo.camera
+        return [
+            *([note] if note else []),
+            *([] if camera is None else [f"Shown: {self.names[camera]}"]),
+            *([] if self._kept.is_written else ["Changes of marks are kept; gcp_list.txt is not written yet."]),
+        ]
 
     def _crosses(self, point: MarkedPoint | None) -> tuple[FloatArray | None, FloatArray | None, list[FloatArray]]:
         """Return, in the shown camera: the direction of the mark, that of the expected place, and epipolar lines.

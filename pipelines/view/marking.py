@@ -1,14 +1,12 @@
-"""Marking of points in photographs: where a point must appear, what its marks give, and the file of marks."""
+"""Marking of points in photographs: where a point must appear, what its marks give, and the files for `--gcp`."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import numpy as np
 
-from pipelines.core.durable import replace_text
 from pipelines.core.errors import InputError
 from pipelines.core.types import FloatArray
 from pipelines.geometry.cameras import project
@@ -101,17 +99,16 @@ def appears_in(point_in_geo: FloatArray, trained: TrainedSurvey) -> list[tuple[i
     return [(camera, pixel) for _, camera, pixel in sorted(shown, key=lambda each: each[0])]
 
 
-def write_marks(folder: Path, crs: str, points: Sequence[MarkedPoint]) -> list[Path]:
-    """Write the surveyed points with their marks as `gcp_list.txt` and `checkpoints.txt`; return the files written.
+def mark_texts(crs: str, points: Sequence[MarkedPoint]) -> dict[str, str]:
+    """Return the surveyed points with their marks as `gcp_list.txt` and `checkpoints.txt`, by name of the file.
 
-    A point without coordinates or without marks is left out: the format has no place for it.
+    A point without coordinates or without marks is left out: the format has no place for it. A file without points
+    is left out, too.
 
     Raises:
         InputError: a name or an image contains a space, which the format cannot hold.
-        OSError: a file cannot be written.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    written = []
+    texts = {}
     for file, is_check in ((CONTROL, False), (CHECK, True)):
         lines = [crs]
         for point in points:
@@ -120,13 +117,12 @@ def write_marks(folder: Path, crs: str, points: Sequence[MarkedPoint]) -> list[P
             for image, (x_px, y_px) in point.marks.items():
                 bad = next((text for text in (point.name, image) if len(text.split()) != 1), None)
                 if bad is not None:
-                    raise InputError(f"{file} has no place for a space: rename {bad!r}", path=folder / file)
+                    raise InputError(f"{file} has no place for a space: rename {bad!r}")
                 x, y, z = point.xyz
                 lines.append(f"{x:.12g}\t{y:.12g}\t{z:.4f}\t{x_px:.3f}\t{y_px:.3f}\t{image}\t{point.name}")
         if len(lines) > 1:
-            replace_text(folder / file, "\n".join(lines) + "\n")
-            written.append(folder / file)
-    return written
+            texts[file] = "\n".join(lines) + "\n"
+    return texts
 
 
 _IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))

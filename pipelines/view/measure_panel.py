@@ -9,21 +9,15 @@ from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 
-from pipelines.geodesy.enu import ecef_from_enu, lla_from_ecef
+from pipelines.geodesy.enu import lla_from_enu
 from pipelines.scene.marks import mark_rays
 from pipelines.scene.survey import SurveyedPoint
 from pipelines.view.measuring import MeasuringModel
 from pipelines.view.panel import Panel
 from pipelines.view.quantities import BaseKind, BasePlane, Quantity
-from pipelines.view.saved import (
-    Kind,
-    Measurement,
-    SavedPoint,
-    SavedQuantity,
-    read_measurements,
-    write_measurements,
-)
+from pipelines.view.saved import Kind, Measurement, SavedMeasurements, SavedPoint, SavedQuantity, new_id
 from pipelines.view.signs import Signs
+from pipelines.view.store import History
 from pipelines.view.surface_points import NoSurface, Sight, SurfacePoint
 from pipelines.view.tables import PlaceRow, paragraph, place_table, quantity_table, quantity_text, saved_table
 
@@ -50,24 +44,25 @@ class MeasurePanel(Panel):
     def __init__(
         self, server: viser.ViserServer, model: MeasuringModel, signs: Signs, folder: Path, model_hash: str
     ) -> None:
-        self._model, self._signs, self._folder, self._hash = model, signs, folder, model_hash
+        self._model, self._signs, self._hash = model, signs, model_hash
         self._names = model.trained.sparse.image_name
         self._index = model.trained.sparse.image_index()
         survey = model.trained.survey
         self._surveyed = {point.name: point for point in (*survey.control_points, *survey.check_points)}
-        self._points: list[SurfacePoint] = []
+        self._points: tuple[SurfacePoint, ...] = ()
+        self._kind: Kind = "point"
         self._quantities: tuple[Quantity, ...] = ()
+        self._id = new_id()
         self._lock = threading.RLock()
-        self._saved = read_measurements(folder)
+        self._saved, self._drawn = SavedMeasurements(folder), 0
+        self._history = History()
         self._build(server)
-        for number, measurement in enumerate(self._saved):
-            self._draw_saved(number, measurement)
         self._show_saved()
 
     @property
     def points(self) -> Sequence[SurfacePoint]:
         """Points of the present measurement."""
-        return tuple(self._points)
+        return self._points
 
     @property
     def quantities(self) -> Sequence[Quantity]:
@@ -77,28 +72,30 @@ class MeasurePanel(Panel):
     @property
     def saved(self) -> Sequence[Measurement]:
         """Saved measurements."""
-        return tuple(self._saved)
+        return self._saved.all
 
     def choose(self, kind: Kind) -> None:
         """Begin a measurement of a kind."""
-        self.kind.value = kind  # type: ignore[misc]
-        self.clear()
+        with self._lock:
+            self.kind.value = kind  # type: ignore[misc]
+            self.clear()
 
     def _build(self, server: viser.ViserServer) -> None:
         gui = server.gui
         self.kind = gui.add_dropdown("Measure", get_args(Kind), hint="What the clicks in the scene make up")
         self._base = gui.add_dropdown("Base of a volume", _BASES)
-        self._result = gui.add_html("")
+        self._add_results(gui)
         self._name = gui.add_text("Name", "")
         self._button(gui, "Save", self.save)
         self._button(gui, "Take the last point back", self.take_back)
         self._button(gui, "Clear", self.clear)
+        self._button(gui, "Undo", self.undo, hint="Brings back what was removed, cleared or deleted, step by step")
         self._list = gui.add_html("")
         self._chosen = gui.add_dropdown("Saved", ("—",))
         self._button(gui, "Delete the saved one", self._delete)
-        self.kind.on_update(lambda _: self.clear())
+        self.kind.on_update(lambda _: self._change_kind())
         self._base.on_update(lambda _: self._compute())
-        self.clear()
+        self._result.content = self._hint()
 
     def add_sight(self, sight: Sight) -> None:
         """Measure the surface under a line of sight."""
@@ -126,14 +123,30 @@ class MeasurePanel(Panel):
         if isinstance(point, NoSurface):
             self._tell(f"Nothing measured: {point.reason}.")
             return
-        kind: Kind = self.kind.value
-        if len(self._points) >= _MOST.get(kind, 10_000):
-            self._points = []
-        self._points.append(point)
+        kept = () if len(self._points) >= _MOST.get(self._kind, 10_000) else self._points
+        self._replace("point", self._kind, (*kept, point), note)
+
+    def _replace(self, step: str, kind: Kind, points: tuple[SurfacePoint, ...], note: str = "") -> None:
+        """Measure with other points, as a step that can be undone."""
+        former_kind, former = self._kind, self._points
+        if points or former:
+            self._history.add(step, lambda: self._show(former_kind, former))
+        self._show(kind, points, note)
+
+    def _show(self, kind: Kind, points: tuple[SurfacePoint, ...], note: str = "") -> None:
+        self._kind, self._points = kind, points
+        self.kind.value = kind  # type: ignore[misc]
+        if not points:
+            self._signs.remove_measured("now")
         self._compute(note)
 
+    def _change_kind(self) -> None:
+        with self._lock:
+            if self.kind.value != self._kind:
+                self._replace("points of another kind", self.kind.value, ())
+
     def _compute(self, note: str = "") -> None:
-        kind: Kind = self.kind.value
+        kind = self._kind
         self._quantities = ()
         if len(self._points) >= _LEAST[kind]:
             if kind in _CLOSED:
@@ -171,7 +184,7 @@ class MeasurePanel(Panel):
     def _described(self, note: str) -> str:
         """Return the present measurement as HTML."""
         if not self._points:
-            return self._hint()
+            return note + self._hint()
         placed = [self._model.place(point) for point in self._points]
         rows = [
             PlaceRow(str(number), point.surface.position_in_geo, point.sigma_m)
@@ -202,47 +215,58 @@ class MeasurePanel(Panel):
     def take_back(self) -> None:
         """Take the last point of the measurement back."""
         with self._lock:
-            self._points = self._points[:-1]
-            if not self._points:
-                self._signs.remove_measured("now")
-            self._compute()
+            self._replace("removal of a point", self._kind, self._points[:-1])
 
     def clear(self) -> None:
         """Begin a new measurement."""
         with self._lock:
-            self._points, self._quantities = [], ()
-            self._signs.remove_measured("now")
-            self._result.content = self._hint()
+            self._replace("clearing", self._kind, ())
+
+    def undo(self) -> None:
+        """Undo the last step: a point, its removal, clearing, saving or deleting.
+
+        Raises:
+            GeorefError: the file of saved measurements could not be changed, and why.
+        """
+        with self._lock:
+            step = self._history.undo()
+            self._result.content = self._described(paragraph(f"Undone: {step}." if step else "Nothing to undo."))
 
     def save(self) -> None:
         """Save the present measurement under its name.
 
         Raises:
-            GeorefError: the file cannot be written.
+            GeorefError: it was not saved, and why.
         """
         with self._lock:
-            kind: Kind = self.kind.value
-            if len(self._points) < _LEAST[kind]:
+            kind, points = self._kind, self._points
+            if len(points) < _LEAST[kind]:
                 self._tell(f"A {kind} needs {_LEAST[kind]} points before it can be saved.")
                 return
             measurement = Measurement(
-                name=self._name.value.strip()[:200] or f"{kind} {len(self._saved) + 1}",
+                id=self._id,
+                name=self._name.value.strip()[:200] or f"{kind} {len(self._saved.all) + 1}",
                 kind=kind,
                 crs=self._model.target.crs.name,
                 model=self._hash,
-                points=tuple(self._saved_point(point) for point in self._points),
+                points=tuple(self._saved_point(point) for point in points),
                 quantities=tuple(SavedQuantity(**vars(each)) for each in self._quantities),
             )
-            self._saved.append(measurement)
-            write_measurements(self._folder, self._saved)
-            self._draw_saved(len(self._saved) - 1, measurement)
+            self._saved.put(measurement)
+            self._history.add(f"saving of {measurement.name}", lambda: self._unsave(measurement, points))
+            self._id = new_id()
             self._name.value = ""  # type: ignore[misc]
-            self.clear()
+            self._show(kind, ())
             self._show_saved()
+
+    def _unsave(self, measurement: Measurement, points: tuple[SurfacePoint, ...]) -> None:
+        self._saved.remove(measurement)
+        self._show_saved()
+        self._show(measurement.kind, points)
 
     def _saved_point(self, point: SurfacePoint) -> SavedPoint:
         placed, origin = self._model.place(point), self._model.trained.survey.origin
-        lla = lla_from_ecef(ecef_from_enu(point.position_in_geo[None], origin))[0]
+        lla = lla_from_enu(point.position_in_geo[None], origin)[0]
         rows = [tuple(map(float, row)) for row in point.cov_of_surface]
         return SavedPoint.model_validate(
             {
@@ -257,29 +281,35 @@ class MeasurePanel(Panel):
 
     def _delete(self) -> None:
         with self._lock:
-            options = [_title(number, each) for number, each in enumerate(self._saved)]
-            if self._chosen.value not in options:
+            titles = [_title(number, each) for number, each in enumerate(self._saved.all)]
+            if self._chosen.value not in titles:
                 return
-            for number in range(len(self._saved)):
-                self._signs.remove_measured(f"saved{number}")
-            del self._saved[options.index(self._chosen.value)]
-            write_measurements(self._folder, self._saved)
-            for number, measurement in enumerate(self._saved):
-                self._draw_saved(number, measurement)
+            row = titles.index(self._chosen.value)
+            measurement = self._saved.all[row]
+            self._saved.remove(measurement)
+            self._history.add(f"deletion of {measurement.name}", lambda: self._put_back(measurement, row))
             self._show_saved()
+
+    def _put_back(self, measurement: Measurement, row: int) -> None:
+        self._saved.put(measurement, row)
+        self._show_saved()
 
     def _draw_saved(self, number: int, measurement: Measurement) -> None:
         points = [point.surface_point(self._index).position_in_geo for point in measurement.points]
         self._signs.add_measured(f"saved{number}", np.array(points), closed=measurement.kind in _CLOSED)
 
     def _show_saved(self) -> None:
+        for number in range(self._drawn):
+            self._signs.remove_measured(f"saved{number}")
         rows = []
-        for measurement in self._saved:
+        for number, measurement in enumerate(self._saved.all):
+            self._draw_saved(number, measurement)
             values = "; ".join(quantity_text(Quantity(**each.model_dump())) for each in measurement.quantities[:3])
             older = "" if measurement.model == self._hash else " (measured in an earlier model)"
             rows.append((measurement.name, measurement.name + older, values))
+        self._drawn = len(rows)
         self._list.content = saved_table(rows)
-        self._chosen.options = tuple(_title(number, each) for number, each in enumerate(self._saved)) or ("—",)
+        self._chosen.options = tuple(_title(number, each) for number, each in enumerate(self._saved.all)) or ("—",)
 
 
 def _title(number: int, measurement: Measurement) -> str:

@@ -7,25 +7,33 @@ what is made of several measurements is again the joint one.
 from __future__ import annotations
 
 import csv
+import io
 import json
-from collections.abc import Sequence
+import uuid
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field, ValidationError
 
-from pipelines.core.durable import replace_file
+from pipelines.core.durable import replace_texts
 from pipelines.core.errors import InputError
 from pipelines.core.products import ImageName, Product
 from pipelines.core.types import Matrix3, Vector3
-from pipelines.formats.geojson import Json, feature, write_features
+from pipelines.formats.geojson import Json, feature, features_text
+from pipelines.view.store import changing
 from pipelines.view.surface_points import SurfacePoint
 
 MEASUREMENTS, TABLE = "measurements.geojson", "measurements.csv"
 Kind = Literal["point", "distance", "polyline", "area", "volume"]
 _MOST_BYTES = 64 << 20
 _COLUMNS = ("name", "kind", "vertex", "x", "y", "z", "crs", "sigma_e_m", "sigma_n_m", "sigma_u_m")
+
+
+def new_id() -> str:
+    """Return the id of a new measurement."""
+    return uuid.uuid4().hex
 
 
 class SavedQuantity(Product):
@@ -66,6 +74,7 @@ class Measurement(Product):
     """Saved measurement.
 
     Attributes:
+        id: by which viewers know it, whatever its name.
         name: given by the user.
         kind: of the measurement.
         crs: name of the CRS of `xyz`.
@@ -75,6 +84,7 @@ class Measurement(Product):
     """
 
     format_version: Literal[1] = 1
+    id: str = Field(default_factory=new_id, pattern="^[0-9a-f]{32}$")
     name: str = Field(min_length=1, max_length=200)
     kind: Kind
     crs: str
@@ -83,30 +93,73 @@ class Measurement(Product):
     quantities: tuple[SavedQuantity, ...] = ()
 
 
-def write_measurements(folder: Path, measurements: Sequence[Measurement]) -> None:
-    """Write measurements as GeoJSON and CSV; each file appears whole or not at all.
+class SavedMeasurements:
+    """Measurements that the viewers of a workspace have saved, in the order of the file.
+
+    Args:
+        folder: of the files.
 
     Raises:
-        OSError: a file cannot be written.
+        InputError: the file cannot be read, or holds no measurements of the viewer.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    write_features(folder / MEASUREMENTS, [_feature(each) for each in measurements])
-    draft = folder / (TABLE + ".tmp")
-    with draft.open("w", encoding="utf-8", newline="") as handle:
-        writer = csv.writer(handle)
-        writer.writerow(_COLUMNS)
-        for each in measurements:
-            for vertex, point in enumerate(each.points, start=1):
-                sigma = point.sigma_m or ("", "", "")
-                writer.writerow([each.name, each.kind, vertex, *point.xyz, each.crs, *sigma])
-        writer.writerow([])
-        writer.writerow(["name", "kind", "quantity", "value", "unit", "sigma"])
-        for each in measurements:
-            for quantity in each.quantities:
-                sigma_text = "" if quantity.sigma is None else quantity.sigma
-                row = [each.name, each.kind, quantity.name, quantity.value, quantity.unit, sigma_text]
-                writer.writerow(row)
-    replace_file(draft, folder / TABLE)
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self.all: tuple[Measurement, ...] = tuple(read_measurements(folder))
+
+    def put(self, measurement: Measurement, row: int | None = None) -> None:
+        """Save a measurement: in the place of the one with its id, else in a row, else as the last one.
+
+        Raises:
+            GeorefError: nothing was saved, and why.
+        """
+
+        def with_it(found: list[Measurement]) -> list[Measurement]:
+            ids = [each.id for each in found]
+            if measurement.id in ids:
+                found[ids.index(measurement.id)] = measurement
+            else:
+                found.insert(len(found) if row is None else row, measurement)
+            return found
+
+        self._change(with_it)
+
+    def remove(self, measurement: Measurement) -> None:
+        """Remove a measurement.
+
+        Raises:
+            GeorefError: nothing was removed, and why.
+        """
+        self._change(lambda found: [each for each in found if each.id != measurement.id])
+
+    def _change(self, changed: Callable[[list[Measurement]], list[Measurement]]) -> None:
+        with changing(self._folder):
+            measurements = changed(read_measurements(self._folder))
+            replace_texts(
+                {
+                    self._folder / MEASUREMENTS: features_text([_feature(each) for each in measurements]),
+                    self._folder / TABLE: _table(measurements),
+                }
+            )
+        self.all = tuple(measurements)
+
+
+def _table(measurements: Sequence[Measurement]) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(_COLUMNS)
+    for each in measurements:
+        for vertex, point in enumerate(each.points, start=1):
+            sigma = point.sigma_m or ("", "", "")
+            writer.writerow([each.name, each.kind, vertex, *point.xyz, each.crs, *sigma])
+    writer.writerow([])
+    writer.writerow(["name", "kind", "quantity", "value", "unit", "sigma"])
+    for each in measurements:
+        for quantity in each.quantities:
+            sigma_text = "" if quantity.sigma is None else quantity.sigma
+            row = [each.name, each.kind, quantity.name, quantity.value, quantity.unit, sigma_text]
+            writer.writerow(row)
+    return text.getvalue()
 
 
 def read_measurements(folder: Path) -> list[Measurement]:

@@ -11,6 +11,7 @@ from pipelines.scene.target_crs import TargetCrs
 from pipelines.view.quantities import Quantity
 
 _TEXT = "font-size:0.85em;margin:0.4em 0.8em"
+_ALARM = "padding:0.4em 0.6em;border-left:0.3em solid #d33;background:rgba(221,51,51,0.12);font-weight:600"
 _TABLE = "width:100%;font-size:0.8em;border-spacing:0.3em 0.1em;font-variant-numeric:tabular-nums;text-align:right"
 
 
@@ -26,6 +27,11 @@ class PlaceRow:
 def paragraph(text: str, mark: str = "note") -> str:
     """Return a paragraph; `data-…` of the name `mark` lets scripts find it."""
     return f'<p data-{mark}="yes" style="{_TEXT}">{html.escape(text)}</p>'
+
+
+def failure(text: str) -> str:
+    """Return a paragraph that stands out."""
+    return f'<p data-failed="yes" role="alert" style="{_TEXT};{_ALARM}">{html.escape(text)}</p>'
 
 
 def place_table(target: TargetCrs, rows: Sequence[PlaceRow], marked: str = "place") -> str:

@@ -30,6 +30,7 @@ from pipelines.view.photo_view import PhotoView
 from pipelines.view.picture_loop import PictureLoop, camera_of
 from pipelines.view.pictures import Painter, Photographs
 from pipelines.view.signs import Kind, PointColour, PointError, Signs
+from pipelines.view.store import FOLDER
 from pipelines.view.tables import paragraph
 from pipelines.view.view_frame import ViewFrame, frame_of
 
@@ -38,7 +39,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-FOLDER = "view"  # of the workspace: what the user saves in the viewer
 _WATCH_S = 2.0
 _FIRST_S = 20.0  # in which a page is expected to be opened
 _FOV_RAD = 0.9
@@ -306,7 +306,7 @@ def serve(
     Args:
         workspace: has a trained model.
         options: of the viewer.
-        ready: called with the address when the pages can be opened.
+        ready: called with the address, its key included, when the pages can be opened.
         ended: ends the viewer.
         progress: shows the reading.
 
@@ -315,10 +315,10 @@ def serve(
         GeorefError: a product is damaged, no port is free, or the CRS cannot be used.
     """
     model_stamp(workspace)
-    server = start_server(options.port, f"georef view {workspace.root.name}", dark=options.dark)
+    server, address = start_server(options.port, f"georef view {workspace.root.name}", dark=options.dark)
     try:
         viewer = Viewer(server, workspace, options, progress)
-        ready(f"http://{server.get_host()}:{server.get_port()}")
+        ready(address)
         again = threading.Event()
         told = False
         while not ended.wait(_WATCH_S):

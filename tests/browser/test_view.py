@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import shutil
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -15,12 +17,18 @@ from playwright.sync_api import Browser, Page, Route
 from pipelines.core.runner import run_stage
 from pipelines.core.stages import BY_NAME, REPORT
 from pipelines.core.workspace import Workspace
+from pipelines.formats.odm import read_ground_points
 from pipelines.scene.report import read_report
+from pipelines.scene.survey import SurveyedPoint
 from pipelines.view.loopback import start_server
+from pipelines.view.marking import CHECK
 from pipelines.view.options import ViewOptions
 from pipelines.view.picture_loop import camera_of
+from pipelines.view.saved import read_measurements
+from pipelines.view.store import FOLDER
 from pipelines.view.view_frame import ViewerCamera
 from pipelines.view.viewer import Viewer
+from tests.faults.injection import filled, mounted
 from tests.splat_scenes import make_rendered
 from tests.view_scenes import smooth, viewed_workspace
 
@@ -67,6 +75,49 @@ class Opened:
         """Click on a point."""
         self.page.mouse.click(*self.pixel(point_in_geo))
 
+    def press(self, label: str) -> None:
+        """Press the visible button."""
+        self.page.locator("button:visible").get_by_text(label, exact=True).click()
+
+    def failures(self) -> list[str]:
+        """Return what the page says that failed."""
+        return self.page.locator("[data-failed]").all_text_contents()
+
+    def measure(self, point_in_geo: np.ndarray) -> None:
+        """Measure a point with a click."""
+        self.viewer.click_mode = "measures"
+        self.viewer.measuring.choose("point")
+        self.tab("Measure")
+        wait(lambda: self.page.locator("[data-measured]").count() == 0)
+        self.click(point_in_geo)
+        wait(lambda: self.page.locator("[data-measured]").count() == 1)
+
+    def come_to_mark(self, point: SurveyedPoint) -> str:
+        """Look closely at a point in the next photograph that shows it; return the photograph's name."""
+        self.viewer.click_mode = "marks in the photograph"
+        self.tab("Mark")
+        self.viewer.marking.choose(point.name)
+        self.press("Next photograph (N)")
+        wait(lambda: self.viewer.photo.camera is not None)
+        client = next(iter(self.server.get_clients().values()))
+        wait(lambda: self.viewer.photo.is_at(client))
+        time.sleep(1.5)
+        self.click(np.array(point.position_in_geo))  # comes closer
+        wait(lambda: self.camera.fov_rad < 0.3)
+        time.sleep(1.5)
+        return self.viewer.marking.names[self.viewer.photo.camera]
+
+    def marks(self) -> dict[str, tuple[float, float]]:
+        """Return the marks of the chosen point."""
+        assert self.viewer.marking.point is not None
+        return dict(self.viewer.marking.point.marks)
+
+    def close(self) -> None:
+        """Close the page and end the viewer."""
+        self.page.close()
+        self.viewer.close()
+        self.server.stop()
+
     def measured(self) -> np.ndarray:
         """Return the last measured point (3,) in `geo`, as the page shows it."""
         rows = self.page.locator("[data-measured]")
@@ -82,7 +133,7 @@ def wait(holds: Callable[[], bool]) -> None:
 
 
 def opened(workspace: Workspace, browser: Browser) -> Opened:
-    server = start_server(8700, "hill")
+    server, address = start_server(8700, "hill")
     viewer = Viewer(server, workspace, ViewOptions())
     viewer.wait_for_sigma()
     page, outside = browser.new_page(viewport=SIZE), []
@@ -95,7 +146,7 @@ def opened(workspace: Workspace, browser: Browser) -> Opened:
         route.abort()
 
     page.route("**/*", loopback_only)
-    page.goto(f"http://127.0.0.1:{server.get_port()}/")
+    page.goto(address)
     wait(lambda: bool(server.get_clients()) and any(loop.drawn for loop in viewer.loops))
     before = 0
     while before != (before := viewer.drawn):  # the panel takes a part of the page when it is laid out
@@ -116,9 +167,7 @@ def hill(workspace: Workspace, browser: Browser) -> Iterator[Opened]:
     """The hill in a page."""
     view = opened(workspace, browser)
     yield view
-    view.page.close()
-    view.viewer.close()
-    view.server.stop()
+    view.close()
 
 
 def test_picture_is_the_render(hill: Opened) -> None:
@@ -184,17 +233,13 @@ def test_a_distance_states_its_sigma(hill: Opened) -> None:
     hill.viewer.measuring.choose("point")
 
 
-def test_saved_points_come_back_after_a_restart(hill: Opened, workspace: Workspace, browser: Browser) -> None:
-    hill.viewer.click_mode = "measures"
-    hill.viewer.measuring.choose("point")
-    hill.tab("Measure")
-    wait(lambda: hill.page.locator("[data-measured]").count() == 0)
-    hill.click(np.array(hill.viewer.model.trained.survey.check_points[2].position_in_geo))
-    wait(lambda: hill.page.locator("[data-measured]").count() == 1)
+def test_two_viewers_save_beside_each_other(hill: Opened, workspace: Workspace, browser: Browser) -> None:
+    points = hill.viewer.model.trained.survey.check_points
+    hill.measure(np.array(points[2].position_in_geo))
     place = hill.measured()
     name = '<script>document.title = "run"</script> corner'
     hill.page.locator("input:visible:not([aria-haspopup])").last.fill(name)
-    hill.page.get_by_role("button", name="Save", exact=True).click()
+    hill.press("Save")
     wait(lambda: hill.page.locator("[data-saved]").count() == 1)
     again = opened(workspace, browser)
     try:
@@ -205,36 +250,104 @@ def test_saved_points_come_back_after_a_restart(hill: Opened, workspace: Workspa
         saved = again.viewer.measuring.saved[0]
         np.testing.assert_allclose(saved.points[0].position_in_geo, place, atol=1e-6)
         assert saved.points[0].sigma_m is not None
+        for view, count in ((again, 2), (hill, 3)):
+            view.measure(np.array(points[count].position_in_geo))
+            view.press("Save")
+            wait(lambda: view.page.locator("[data-saved]").count() == count)  # noqa: B023
+        assert len(read_measurements(workspace.root / FOLDER)) == 3
+        again.press("Undo")  # of its saving, and of nobody else's
+        wait(lambda: again.page.locator("[data-saved]").count() == 2)
+        again.press("Save")
+        wait(lambda: again.page.locator("[data-saved]").count() == 3)
+        again.press("Delete the saved one")
+        wait(lambda: again.page.locator("[data-saved]").count() == 2)
+        again.press("Undo")
+        wait(lambda: again.page.locator("[data-saved]").count() == 3)
+        assert len(read_measurements(workspace.root / FOLDER)) == 3
     finally:
-        again.page.close()
-        again.viewer.close()
-        again.server.stop()
+        again.close()
 
 
-def test_marks_are_set_in_photographs(hill: Opened, workspace: Workspace) -> None:
-    point = hill.viewer.model.trained.survey.check_points[3]
-    hill.viewer.click_mode = "marks in the photograph"
-    hill.tab("Mark")
-    hill.viewer.marking.choose(point.name)
-    hill.page.get_by_role("button", name="Next photograph (N)").click()
-    wait(lambda: hill.viewer.photo.camera is not None)
-    client = next(iter(hill.server.get_clients().values()))
-    wait(lambda: hill.viewer.photo.is_at(client))
-    time.sleep(1.5)
-    place = np.array(point.position_in_geo)
-    hill.click(place)  # comes closer
-    wait(lambda: hill.camera.fov_rad < 0.3)
-    time.sleep(1.5)
+def test_marks_are_set_in_photographs(hill: Opened, workspace: Workspace, browser: Browser) -> None:
+    point, other = hill.viewer.model.trained.survey.check_points[3:5]
+    image, place = hill.come_to_mark(point), np.array(point.position_in_geo)
+    before = hill.marks()[image]  # of the survey
     hill.click(place)
-    image = hill.viewer.marking.names[hill.viewer.photo.camera]
-    true = next(mark for mark in point.marks if mark.image == image)
+    wait(lambda: hill.marks()[image] != before)
+    mark = hill.marks()[image]
     # From close by, a pixel of the page is a seventh of the photograph's.
-    wait(lambda: abs(hill.viewer.marking.point.marks[image][0] - true.x_px) < 0.5)
-    assert abs(hill.viewer.marking.point.marks[image][1] - true.y_px) < 0.5
-    hill.page.get_by_role("button", name="Write gcp_list.txt").click()
-    wait((workspace.root / "view/checkpoints.txt").exists)
+    assert mark == pytest.approx(before, abs=0.5)
+    hill.press("Remove the mark here")
+    wait(lambda: image not in hill.marks())
+    hill.press("Undo")
+    wait(lambda: hill.marks().get(image) == mark)
+    again = opened(workspace, browser)  # before anything is written
+    try:
+        again.tab("Mark")
+        again.viewer.marking.choose(point.name)
+        wait(lambda: again.page.get_by_text("not written yet").count() == 1)
+        assert again.marks()[image] == pytest.approx(mark, abs=1e-9)
+        second = again.come_to_mark(other)
+        of_survey = again.marks()[second]
+        again.click(np.array(other.position_in_geo))
+        wait(lambda: again.marks()[second] != of_survey)
+        set_by_it = again.marks()[second]
+        for view in (again, hill):
+            (workspace.root / FOLDER / CHECK).unlink(missing_ok=True)
+            view.press("Write gcp_list.txt")
+            wait((workspace.root / FOLDER / CHECK).exists)
+            listed = read_ground_points(workspace.root / FOLDER / CHECK).marks
+            written = {(each.name, each.image): (each.x_px, each.y_px) for each in listed}
+            assert written[point.name, image] == pytest.approx(mark, abs=1e-3)
+            assert written[other.name, second] == pytest.approx(set_by_it, abs=1e-3)
+    finally:
+        again.close()
     hill.viewer.photo.leave()
     hill.viewer.click_mode = "looks"
+
+
+def test_a_full_disk_is_told_and_nothing_is_stored_twice(
+    workspace: Workspace, browser: Browser, tmp_path: Path
+) -> None:
+    shutil.copytree(workspace.root, tmp_path / "ws", ignore=shutil.ignore_patterns(FOLDER))
+    folder = tmp_path / "ws" / FOLDER
+    with mounted(folder, "200k"):
+        view = opened(Workspace(tmp_path / "ws"), browser)
+        try:
+            point = view.viewer.model.trained.survey.check_points[1]
+            view.measure(np.array(point.position_in_geo))
+            with filled(folder):
+                refused(view, folder, lambda: view.press("Save"))
+                assert view.page.locator("[data-measured]").count() == 1
+                assert read_measurements(folder) == []
+            view.press("Save")
+            wait(lambda: view.page.locator("[data-saved]").count() == 1)
+            assert (view.failures(), len(read_measurements(folder))) == ([], 1)
+            image = view.come_to_mark(point)
+            before, place = view.marks()[image], np.array(point.position_in_geo) + np.array([0.5, 0.0, 0.0])
+            with filled(folder):
+                refused(view, folder, lambda: view.click(place))
+                assert view.marks()[image] == before
+            view.click(place)
+            wait(lambda: view.marks()[image] != before)
+            wait(lambda: view.failures() == [])
+            with filled(folder):
+                refused(view, folder, lambda: view.press("Write gcp_list.txt"))
+                assert not (folder / CHECK).exists()
+            view.press("Write gcp_list.txt")
+            wait((folder / CHECK).exists)
+            wait(lambda: view.failures() == [])
+        finally:
+            view.close()
+
+
+def refused(view: Opened, folder: Path, act: Callable[[], None]) -> None:
+    """Do what the full disk refuses: the page says so, and nothing half-written is left."""
+    act()
+    wait(lambda: view.failures() != [])
+    assert "the disk is full" in view.failures()[0]
+    assert view.page.locator("[data-failed]").is_visible()
+    assert not list(folder.glob("*.tmp"))
 
 
 def test_no_request_leaves_this_machine(hill: Opened) -> None:

@@ -1,4 +1,4 @@
-"""Faults of the disk at a chosen moment: the n-th change below a folder fails."""
+"""Faults of the disk: the n-th change below a folder fails, or a folder is a small disk of its own."""
 
 from __future__ import annotations
 
@@ -6,12 +6,16 @@ import builtins
 import errno
 import io
 import os
+import shutil
+import subprocess
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 from unittest import mock
+
+import pytest
 
 Kind = Literal["full", "failing"]
 _NEEDS_ROOM = ("open", "write", "mkdir")  # A full disk can still rename, flush and delete.
@@ -103,3 +107,29 @@ def _opened(
         return raw
     buffered = io.BufferedRandom(raw) if "+" in mode else io.BufferedWriter(raw)
     return buffered if "b" in mode else io.TextIOWrapper(buffered, encoding, errors, newline)
+
+
+@contextmanager
+def mounted(folder: Path, size: str) -> Iterator[None]:
+    """Mount a small memory disk, if this process may."""
+    folder.mkdir()
+    command = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)]
+    if shutil.which("mount") is None or subprocess.run(command, check=False, capture_output=True).returncode:
+        pytest.skip("this process may not mount a disk")
+    try:
+        yield
+    finally:
+        subprocess.run(["umount", "-l", str(folder)], check=True)
+
+
+@contextmanager
+def filled(folder: Path) -> Iterator[None]:
+    """Fill the disk of a folder to the last byte while the context lasts."""
+    ballast = folder / "ballast"
+    try:
+        with suppress(OSError), ballast.open("wb", buffering=0) as handle:
+            while True:
+                handle.write(bytes(4096))
+        yield
+    finally:
+        ballast.unlink()

@@ -7,8 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,7 +26,7 @@ from pipelines.simulate.options import SimulateOptions
 from pipelines.simulate.stage import simulate
 from pipelines.splat.storage import write_gaussians
 from tests.cli_runs import REPOSITORY, WITH_FAKES
-from tests.faults.injection import Disk, Kind
+from tests.faults.injection import Disk, Kind, mounted
 from tests.photos import write_flight
 from tests.scenes import Measured, Noise, make_scene, sparse_model, survey_of, trained_model, write_workspace
 from tests.splat_scenes import RenderedFlight
@@ -152,19 +151,6 @@ def test_changes_of_the_simulator(tmp_path: Path) -> None:
 
 def _content(folder: Path) -> dict[str, bytes]:
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
-@contextmanager
-def mounted(folder: Path, size: str) -> Iterator[None]:
-    """Mount a small memory disk, if this process may."""
-    folder.mkdir()
-    command = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)]
-    if shutil.which("mount") is None or subprocess.run(command, check=False, capture_output=True).returncode:
-        pytest.skip("this process may not mount a disk")
-    try:
-        yield
-    finally:
-        subprocess.run(["umount", "-l", str(folder)], check=True)
 
 
 def georef(*arguments: object, code: str = "from georef_cli.main import main; main()") -> tuple[int, list[str]]:

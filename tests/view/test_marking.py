@@ -17,10 +17,10 @@ from pipelines.view.marking import (
     CONTROL,
     MarkedPoint,
     appears_in,
+    mark_texts,
     points_to_mark,
     rays_of,
     residuals_px,
-    write_marks,
 )
 from pipelines.view.measuring import MeasuringModel
 
@@ -59,7 +59,10 @@ def test_files_of_marks_are_read_again(tmp_path: Path, model: MeasuringModel) ->
     points = points_to_mark(survey, xyz_of)
     new = MarkedPoint("new", (404000.123, 5097000.25, 1650.5), marks={"a.jpg": (12.25, 700.5), "b.jpg": (1.0, 2.0)})
     bare = MarkedPoint("bare", (1.0, 2.0, 3.0))
-    assert write_marks(tmp_path, "EPSG:32632", [*points, new, bare]) == [tmp_path / CONTROL, tmp_path / CHECK]
+    texts = mark_texts("EPSG:32632", [*points, new, bare])
+    assert list(texts) == [CONTROL, CHECK]
+    for name, text in texts.items():
+        (tmp_path / name).write_text(text, "utf-8")
     control = read_ground_points(tmp_path / CONTROL)
     assert control.crs_text == "EPSG:32632"
     assert [(point.name, tuple(point.xyz)) for point in control.points] == [("new", new.xyz)]
@@ -76,11 +79,10 @@ def test_files_of_marks_are_read_again(tmp_path: Path, model: MeasuringModel) ->
         np.testing.assert_allclose(listed.xyz, point.xyz, atol=1e-4)
 
 
-def test_names_that_the_format_cannot_hold_are_refused(tmp_path: Path) -> None:
+def test_names_that_the_format_cannot_hold_are_refused() -> None:
     point = MarkedPoint("two words", (1.0, 2.0, 3.0), marks={"a.jpg": (1.0, 1.0)})
     with pytest.raises(InputError, match="'two words'"):
-        write_marks(tmp_path, "EPSG:4326", [point])
-    assert not (tmp_path / CONTROL).exists()
+        mark_texts("EPSG:4326", [point])
 
 
 def test_a_mark_is_replaced_and_taken_away() -> None:

@@ -17,10 +17,10 @@ from pipelines.view.saved import (
     TABLE,
     Kind,
     Measurement,
+    SavedMeasurements,
     SavedPoint,
     SavedQuantity,
     read_measurements,
-    write_measurements,
 )
 
 NAMES = st.text(st.characters(codec="utf-8", exclude_categories=("Cs", "Cc")), min_size=1, max_size=8)
@@ -60,8 +60,15 @@ MEASUREMENT = st.builds(
 @settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(measurements=st.lists(MEASUREMENT, max_size=3))
 def test_what_is_saved_comes_back(tmp_path: Path, measurements: list[Measurement]) -> None:
-    write_measurements(tmp_path, measurements)
-    assert read_measurements(tmp_path) == measurements
+    saved = SavedMeasurements(tmp_path)
+    for old in saved.all:  # of the example before
+        saved.remove(old)
+    assert read_measurements(tmp_path) == []
+    for measurement in measurements:
+        saved.put(measurement)
+    assert read_measurements(tmp_path) == measurements == list(saved.all)
+    if not measurements:
+        return
     document = json.loads((tmp_path / MEASUREMENTS).read_text("utf-8"))
     for feature, measurement in zip(document["features"], measurements, strict=True):
         assert feature["properties"]["name"] == measurement.name
@@ -90,6 +97,36 @@ def test_other_files_are_refused(tmp_path: Path, text: str, field: str | None) -
         read_measurements(tmp_path)
     assert caught.value.field == field
     assert str(tmp_path / MEASUREMENTS) in str(caught.value)
+
+
+def measurement(name: str) -> Measurement:
+    return Measurement(
+        name=name, kind="point", crs="C", model="m", points=(saved_point((1, 2, 3), (1, 2, 3), None),)
+    )
+
+
+def names(folder: Path) -> list[str]:
+    return [each.name for each in read_measurements(folder)]
+
+
+def test_two_viewers_keep_what_the_other_saves(tmp_path: Path) -> None:
+    one, two = SavedMeasurements(tmp_path), SavedMeasurements(tmp_path)
+    first, second, third = map(measurement, ("first", "second", "third"))
+    one.put(first)
+    two.put(second)
+    one.put(third)
+    assert names(tmp_path) == ["first", "second", "third"] == [each.name for each in one.all]
+    two.remove(first)
+    two.remove(first)  # somebody else was faster
+    assert names(tmp_path) == ["second", "third"]
+    one.put(first, row=0)  # undone
+    one.put(first.model_copy(update={"name": "again"}))
+    assert names(tmp_path) == ["again", "second", "third"]
+    # A file that somebody damages meanwhile stays as it is, and so does what the viewer has.
+    (tmp_path / MEASUREMENTS).write_text("{", "utf-8")
+    with pytest.raises(InputError, match="move it away"):
+        one.put(measurement("fourth"))
+    assert ((tmp_path / MEASUREMENTS).read_text("utf-8"), len(one.all)) == ("{", 3)
 
 
 def test_kinds_are_those_of_the_panel() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from pipelines.formats.odm import read_ground_points
 from pipelines.scene.survey import Survey, SurveyedPoint
-from pipelines.view.marking import points_to_mark, write_marks
+from pipelines.view.marking import mark_texts, points_to_mark
 from tests.scenes import material
 
 
@@ -31,5 +31,6 @@ def test_unmarked_points_are_offered_and_written_once_marked(tmp_path: Path) -> 
         ("C1", True, (1001.0, 1002.0, 1003.0)),
     ]
     marked = [point.with_mark("a.jpg", (1.5, 2.5)) for point in points if point.name == "G2"]
-    (path,) = write_marks(tmp_path, "EPSG:32632", marked)
+    path = tmp_path / "gcp_list.txt"
+    path.write_text(mark_texts("EPSG:32632", marked)[path.name], "utf-8")
     assert [(mark.name, mark.image, mark.x_px) for mark in read_ground_points(path).marks] == [("G2", "a.jpg", 1.5)]

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+import re
 import threading
 import time
 from pathlib import Path
 
 import pytest
 
+from georef_cli.main import main
 from pipelines.core.errors import MissingProductError
 from pipelines.core.stages import GAUSSIANS
 from pipelines.core.workspace import Workspace
@@ -22,6 +24,18 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 def test_without_a_model_the_command_that_makes_it_is_named(tmp_path: Path) -> None:
     with pytest.raises(MissingProductError, match="georef train"):
         serve(Workspace(tmp_path), ViewOptions(), print, threading.Event())
+
+
+def test_what_is_printed_and_opened_is_the_address_with_its_key(
+    viewed: Workspace, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    address, opened = "http://127.0.0.1:8080/key/", []
+    monkeypatch.setattr(viewer, "serve", lambda _workspace, _options, ready, *_: ready(address))
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    with pytest.raises(SystemExit) as ended:
+        main(["view", str(viewed.root), "--open"])
+    assert (ended.value.code, opened) == (0, [address])
+    assert capsys.readouterr().out.startswith(address + " ")
 
 
 def test_a_changed_model_is_noticed(
@@ -39,7 +53,7 @@ def test_a_changed_model_is_noticed(
     thread.start()
     try:
         assert ready.wait(60)
-        assert addresses[0].startswith("http://127.0.0.1:")
+        assert re.fullmatch(r"http://127\.0\.0\.1:\d+/[\w-]{22}/", addresses[0])
         time.sleep(0.3)
         assert "has changed" not in caplog.text
         os.utime(viewed.path(GAUSSIANS))
