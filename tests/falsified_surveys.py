@@ -199,7 +199,7 @@ FALSIFIED = {
         flights=("orbit", "grid"), named=True,
     ),
     "marks with x and y exchanged": Falsified(
-        as_they_are, 8, marks=lambda x, y: (y, x), codes=("control-marks",), named=True
+        as_they_are, 8, marks=lambda x, y: (y, x), codes=("control-marks",), says=("lies outside",), named=True
     ),
     "marks of photographs of half the size": Falsified(
         as_they_are, 8, marks=lambda x, y: (x / 2, y / 2), codes=("control-marks",), flights=("orbit", "grid"),

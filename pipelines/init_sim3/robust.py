@@ -77,7 +77,7 @@ def robust_similarity(inputs: Inputs, options: InitSim3Options) -> tuple[Initial
     aligned = _aligned_product(inputs, data, alignment).model_copy(
         update={"control_outliers": tuple(p.name for p in survey.control_points if p.name not in control.name)}
     )
-    warnings = tuple(point.sentence for point in unused)
+    warnings = () if mistake else tuple(point.sentence for point in unused)  # else the caution says why
     used = tuple(point for point in survey.control_points if point.name in control.name)
     survey = survey.model_copy(update={"control_points": used})
     try:
