@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pipelines.core.errors import BackendUnavailableError, InputError
+from pipelines.core.restart import python_environment
 from pipelines.engine.cluster import CERTIFICATE, CORES, GPU, KEY, MEMORY, ClusterAddress, import_distributed
 
 # The pages of the status servers are not encrypted and ask for no certificate.
@@ -82,6 +83,7 @@ def _call(main: object, arguments: Sequence[str]) -> None:
     """Run a program of Dask with encryption demanded where it has a certificate."""
     import dask
 
+    os.environ.update(python_environment())  # Nannies spawn the processes of their workers by this environment.
     is_encrypted = "--tls-cert" in arguments
     with dask.config.set({"distributed.comm.require-encryption": is_encrypted}):
         main(args=list(arguments), standalone_mode=False)  # type: ignore[operator]

@@ -15,10 +15,10 @@ from pathlib import Path
 import pytest
 from distributed import LocalCluster, Security
 
+from pipelines.core import restart
 from pipelines.core.errors import ClusterError
 from pipelines.core.progress import SILENT, ProgressTask
 from pipelines.engine import cluster as cluster_access
-from pipelines.engine import process
 from pipelines.engine.cluster import ClusterAddress, Place, place_for
 from pipelines.engine.dask_engine import DaskEngine
 from pipelines.engine.job import Job, JobEnd
@@ -78,7 +78,7 @@ def threads(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ClusterAddress
 @pytest.fixture
 def cluster(threads: ClusterAddress, monkeypatch: pytest.MonkeyPatch) -> ClusterAddress:
     """The same with jobs of these tests."""
-    monkeypatch.setattr(process, "THIS_PROGRAM", ("-c", PROGRAM))
+    monkeypatch.setattr(restart, "THIS_PROGRAM", ("-c", PROGRAM))
     return threads
 
 
