@@ -50,7 +50,7 @@ def start_in(folder: Path, *arguments: object, way: Sequence[str] = ()) -> subpr
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        env={**os.environ, "PYTHONPATH": str(REPOSITORY)},
+        env={**os.environ, "PYTHONPATH": str(REPOSITORY), "HOME": str(folder.parent)},
     )
 
 
