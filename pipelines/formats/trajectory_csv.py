@@ -110,7 +110,7 @@ class _Cells:
                 if len(row) > width and any(cell.strip() for cell in row[width:]):
                     hint = "; decimal commas need ; as separator" if separator == "," else ""
                     raise InputError(f"has {len(row)} cells, the header has {width}{hint}", path=path, line=line)
-                rows.append(row + [""] * (width - len(row)))
+                rows.append(row)
                 numbers.append(line)
         except csv.Error as error:
             raise InputError(f"is no CSV: {error}", path=path, line=first + 1 + reader.line_num) from error
@@ -120,7 +120,7 @@ class _Cells:
 
     def texts(self, column: str) -> list[str]:
         at = self.columns[column]
-        return [row[at].strip() for row in self.rows]
+        return [row[at].strip() if at < len(row) else "" for row in self.rows]
 
     def numbers(self, column: str) -> FloatArray:
         """Return the numbers of a column (N,); NaN where empty."""
