@@ -15,6 +15,7 @@ import numpy as np
 
 from pipelines.core.errors import InputError
 from pipelines.core.types import FloatArray
+from pipelines.formats.csv_writer import plain_text
 from pipelines.formats.pose_table import PoseTable, complete
 from pipelines.formats.text import number, read_lines
 from pipelines.geometry.rotations import geo_from_cam, quat_xyzw_from_matrix
@@ -64,7 +65,7 @@ def read_trajectory(path: Path) -> PoseTable:
         path=path,
         source="csv",
         lines=np.array(cells.lines, dtype=np.int64),
-        names=tuple(cells.texts("image")) if "image" in cells.columns else None,
+        names=tuple(map(plain_text, cells.texts("image"))) if "image" in cells.columns else None,
         time_s=None if moments is None else moments[0],
         xyz=xyz,
         geographic=geographic,

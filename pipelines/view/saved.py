@@ -6,7 +6,6 @@ what is made of several measurements is again the joint one.
 
 from __future__ import annotations
 
-import csv
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,10 +14,10 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field, ValidationError
 
-from pipelines.core.durable import replace_file
 from pipelines.core.errors import InputError
 from pipelines.core.products import ImageName, Product
 from pipelines.core.types import Matrix3, Vector3
+from pipelines.formats.csv_writer import write_table
 from pipelines.formats.geojson import Json, feature, write_features
 from pipelines.view.surface_points import SurfacePoint
 
@@ -91,22 +90,18 @@ def write_measurements(folder: Path, measurements: Sequence[Measurement]) -> Non
     """
     folder.mkdir(parents=True, exist_ok=True)
     write_features(folder / MEASUREMENTS, [_feature(each) for each in measurements])
-    draft = folder / (TABLE + ".tmp")
-    with draft.open("w", encoding="utf-8", newline="") as handle:
-        writer = csv.writer(handle)
-        writer.writerow(_COLUMNS)
-        for each in measurements:
-            for vertex, point in enumerate(each.points, start=1):
-                sigma = point.sigma_m or ("", "", "")
-                writer.writerow([each.name, each.kind, vertex, *point.xyz, each.crs, *sigma])
-        writer.writerow([])
-        writer.writerow(["name", "kind", "quantity", "value", "unit", "sigma"])
-        for each in measurements:
-            for quantity in each.quantities:
-                sigma_text = "" if quantity.sigma is None else quantity.sigma
-                row = [each.name, each.kind, quantity.name, quantity.value, quantity.unit, sigma_text]
-                writer.writerow(row)
-    replace_file(draft, folder / TABLE)
+    points = (
+        (each.name, each.kind, vertex, *point.xyz, each.crs, *(point.sigma_m or ("", "", "")))
+        for each in measurements
+        for vertex, point in enumerate(each.points, start=1)
+    )
+    quantities = (
+        (each.name, each.kind, found.name, found.value, found.unit, "" if found.sigma is None else found.sigma)
+        for each in measurements
+        for found in each.quantities
+    )
+    named = ("name", "kind", "quantity", "value", "unit", "sigma")
+    write_table(folder / TABLE, (_COLUMNS, *points, (), named, *quantities))
 
 
 def read_measurements(folder: Path) -> list[Measurement]:
