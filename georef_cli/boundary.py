@@ -21,10 +21,10 @@ from typing import IO, TYPE_CHECKING, TextIO
 import click
 
 from georef_cli.endings import FAILED, ErrorDocument, defect_document, ending_of
-from georef_cli.printable import printable_lines
 from georef_cli.verbosity import LineFormatter, SafeFormatter, Verbosity
 from pipelines.core.errors import GeorefError
 from pipelines.core.interrupts import SIGNALS
+from pipelines.core.printable import printable_lines
 
 if TYPE_CHECKING:
     from pipelines.core.stages import StageSpec

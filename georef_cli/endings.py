@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import click
 
-from georef_cli.printable import printable, printable_lines
 from pipelines.core.errors import GeorefError, InputError, storage_error
+from pipelines.core.printable import printable, printable_lines
 
 FAILED, USAGE, INTERRUPTED = 1, 2, 130
 ErrorDocument = dict[str, str | int | None]

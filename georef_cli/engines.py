@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
@@ -18,6 +19,8 @@ from pipelines.engine.local import LocalEngine
 if TYPE_CHECKING:
     from pipelines.engine.cluster import ClusterAddress
 
+log = logging.getLogger(__name__)
+
 
 def engine_options() -> list[click.Option]:
     """Return the options that choose the engine."""
@@ -28,7 +31,7 @@ def engine_options() -> list[click.Option]:
             help="Run the jobs on the workers of the Dask scheduler at this address, such as tls://host:8786 "
             "(docs/cluster.md; default: as processes of this machine).",
         ),
-        certificates_option(),
+        *certificates_options(),
         click.Option(
             ["--storage"],
             metavar="URL",
@@ -37,14 +40,22 @@ def engine_options() -> list[click.Option]:
     ]
 
 
-def certificates_option() -> click.Option:
-    """Return the option `--certificates`."""
-    return click.Option(
-        ["--certificates"],
-        type=click.Path(file_okay=False, resolve_path=True, path_type=Path),
-        metavar="DIR",
-        help="Folder with the certificate of the cluster, from `georef cluster certificates`.",
-    )
+def certificates_options() -> list[click.Option]:
+    """Return the options `--certificates` and `--insecure`."""
+    return [
+        click.Option(
+            ["--certificates"],
+            type=click.Path(file_okay=False, resolve_path=True, path_type=Path),
+            metavar="DIR",
+            help="Folder with the certificate of the cluster, from `georef cluster certificates` (default: yours, "
+            "which the first scheduler or worker on 127.0.0.1 makes).",
+        ),
+        click.Option(
+            ["--insecure"],
+            is_flag=True,
+            help="Use no certificate. Every program of this machine, of any user, can then run programs as you.",
+        ),
+    ]
 
 
 def engine_for(values: Mapping[str, Any], at_a_time: int | None = None) -> Engine:
@@ -58,15 +69,15 @@ def engine_for(values: Mapping[str, Any], at_a_time: int | None = None) -> Engin
         click.UsageError: a bad address, one that needs a certificate, or options of a cluster without one.
     """
     if values["cluster"] is None:
-        for option in ("certificates", "storage"):
-            if values[option] is not None:
+        for option in ("certificates", "insecure", "storage"):
+            if values[option]:
                 raise click.UsageError(f"--{option} is for --cluster.")
         cores = thread_count()
         return LocalEngine(at_a_time or cores, cores, free_main_memory_bytes())
     from pipelines.engine.dask_engine import DaskEngine
     from pipelines.engine.storage import Storage
 
-    address = cluster_address(values["cluster"], values["certificates"], "--cluster")
+    address = cluster_address(values["cluster"], values, "--cluster")
     return DaskEngine(address, at_a_time, None if values["storage"] is None else Storage(values["storage"]))
 
 
@@ -82,15 +93,37 @@ def asked_engine(values: Mapping[str, Any]) -> Iterator[None]:
         yield
 
 
-def cluster_address(text: str, certificates: Path | None, option: str) -> ClusterAddress:
-    """Return the address that an option or argument gives.
+def cluster_address(text: str, values: Mapping[str, Any], option: str, *, is_node: bool = False) -> ClusterAddress:
+    """Return the address that an option or argument gives, with the certificate that the other options choose.
+
+    Args:
+        text: the address.
+        values: of the options of `certificates_options`.
+        option: for messages.
+        is_node: the program is a part of the cluster; on this machine, makes a missing certificate.
 
     Raises:
         click.UsageError: a bad address, or one that needs a certificate.
+        InputError: the certificate is missing, not valid now, or open to others.
     """
-    from pipelines.engine.cluster import ClusterAddress
+    from pipelines.engine.certificates import check_own_certificates, make_own_certificates
+    from pipelines.engine.cluster import ClusterAddress, is_on_this_machine
 
+    certificates: Path | None = values["certificates"]
+    if values["insecure"] and certificates is not None:
+        raise click.UsageError("--insecure uses no certificate: leave out --certificates.")
+    if values["insecure"]:
+        log.warning(
+            "--insecure: no certificate protects the cluster at %s. Every program of this machine, of any user, "
+            "can run programs as you through it",
+            text,
+        )
     try:
+        if certificates is None and not values["insecure"]:
+            certificates = Path(click.get_app_dir("georef")).absolute() / "cluster"
+            if is_node and is_on_this_machine(text):
+                make_own_certificates(certificates)
+            check_own_certificates(certificates)
         return ClusterAddress(text, certificates)
     except ValueError as error:
         raise click.UsageError(f"{option}: {error}") from error

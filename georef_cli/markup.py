@@ -8,7 +8,7 @@ from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 from rich.markup import escape
 from rich.segment import Segment
 
-from georef_cli.printable import printable, printable_lines
+from pipelines.core.printable import printable, printable_lines
 
 
 def shown(text: str) -> str:

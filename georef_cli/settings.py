@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import click
 
-from pipelines.core.options import input_markers
+from pipelines.core.options import input_markers, parse_toml
 from pipelines.core.stages import StageSpec
 
 
@@ -56,7 +55,7 @@ def settings(texts: Iterable[str], stages: Iterable[StageSpec]) -> dict[str, dic
 def _value(text: str) -> Any:
     """Return a value of TOML; a text that is none, or more than one, as it is."""
     try:
-        document = tomllib.loads(f"value = {text}")
-    except tomllib.TOMLDecodeError:
+        document = parse_toml(f"value = {text}")
+    except ValueError:
         return text
     return document["value"] if len(document) == 1 else text

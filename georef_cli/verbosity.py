@@ -6,7 +6,7 @@ import logging
 from dataclasses import dataclass
 from typing import Any
 
-from georef_cli.printable import printable, printable_lines
+from pipelines.core.printable import printable, printable_lines
 
 
 @dataclass(frozen=True)

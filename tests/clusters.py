@@ -6,24 +6,41 @@ import contextlib
 import os
 import signal
 import socket
+import ssl
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from pipelines.engine.certificates import make_certificates
 from pipelines.engine.cluster import ClusterAddress, connected
-from pipelines.engine.nodes import make_certificates
 from tests.cli_runs import REPOSITORY, Result, finish
 
 PATIENCE_S = 180.0
 # Jobs of these clusters are this program in place of `georef`.
-_PRELOAD = "from pipelines.engine import process\nprocess.THIS_PROGRAM = ('-c', {program!r})\n"
+_PRELOAD = "from pipelines.core import restart\nrestart.THIS_PROGRAM = ('-c', {program!r})\n"
 
 
 def finish_patiently(process: subprocess.Popen[str]) -> Result:
     """Wait for a command on a cluster."""
     return finish(process, 5 * PATIENCE_S)
+
+
+def greeting(port: int, certificates: Path | None) -> bytes:
+    """First bytes that a scheduler of this machine says to one who trusts everybody."""
+    context = ssl.create_default_context()
+    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    if certificates is not None:
+        context.load_cert_chain(certificates / "cluster.pem", certificates / "cluster.key")
+    try:
+        with (
+            socket.create_connection(("127.0.0.1", port), timeout=10) as plain,
+            context.wrap_socket(plain) as connection,
+        ):
+            return connection.recv(8)
+    except (ssl.SSLError, ConnectionError):
+        return b""
 
 
 def wait_until(happened: Callable[[], bool], what: str) -> None:
@@ -37,17 +54,15 @@ def wait_until(happened: Callable[[], bool], what: str) -> None:
 class RunningCluster:
     """Cluster with one-job workers, which are restarted by their nannies when they are killed."""
 
-    def __init__(self, folder: Path, program: str, *, has_certificates: bool = True) -> None:
+    def __init__(self, folder: Path, program: str) -> None:
         self.folder = folder
-        certificates = folder / "certificates" if has_certificates else None
-        if certificates is not None:
-            make_certificates(certificates)
+        certificates = folder / "certificates"
+        make_certificates(certificates)
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             self.port = free.getsockname()[1]
-        scheme = "tcp" if certificates is None else "tls"
-        self.address = ClusterAddress(f"{scheme}://127.0.0.1:{self.port}", certificates)
-        self._options = () if certificates is None else ("--certificates", str(certificates))
+        self.address = ClusterAddress(f"tls://127.0.0.1:{self.port}", certificates)
+        self._options = ("--certificates", str(certificates))
         (folder / "preload.py").write_text(_PRELOAD.format(program=program), "utf-8")
         self.scheduler = self.start_scheduler()
         self.workers: list[subprocess.Popen[bytes]] = []

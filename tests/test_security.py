@@ -6,6 +6,7 @@ import ast
 import json
 import os
 import struct
+import sys
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ import pytest
 
 from pipelines.core.errors import InputError
 from pipelines.core.products import load_json
+from pipelines.core.restart import python_command, python_environment
 from pipelines.core.stages import POINTS, SPARSE, SURVEY
 from pipelines.core.workspace import Workspace
 from pipelines.formats.colmap import read_sparse
@@ -39,6 +41,7 @@ STARTS_JOBS = REPOSITORY / "pipelines/engine/process.py"
 STARTS_A_BROWSER = REPOSITORY / "pipelines/pages/chromium.py"
 STARTS_A_COMPILER = REPOSITORY / "pipelines/splat/rasterizer/cuda_kernels.py"
 ASKS_COMPILERS = REPOSITORY / "pipelines/splat/rasterizer/cuda_parts.py"
+STARTS_WORKERS = REPOSITORY / "pipelines/engine/nodes.py"  # by Dask
 STARTERS = (STARTS_ITSELF, STARTS_JOBS, STARTS_A_BROWSER, STARTS_A_COMPILER, ASKS_COMPILERS)
 ESCAPES = ["../secret.jpg", "/etc/passwd", "a/../../secret.jpg", "", "a\nb.jpg", "a\x00b.jpg"]
 
@@ -72,18 +75,35 @@ def test_nothing_that_is_read_can_be_executed(package: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("file", "arguments"),
+    ("file", "arguments", "environment"),
     [
-        (STARTS_ITSELF, "[sys.executable, '-m', __name__,"),
-        (STARTS_JOBS, "[sys.executable, *program,"),
-        (STARTS_A_BROWSER, "[*command, page.absolute().as_uri()]"),
+        (STARTS_ITSELF, "python_command(['-m', __name__,", "python_environment()"),
+        (STARTS_JOBS, "python_command([*program,", "python_environment()"),
+        (STARTS_A_COMPILER, "python_command(['-c', _COMPILE])", "_environment(draft)"),
+        (ASKS_COMPILERS, "[program, '--version']", None),
+        (STARTS_A_BROWSER, "[*command, page.absolute().as_uri()]", None),
     ],
 )
-def test_only_this_python_and_the_browser_are_started(file: Path, arguments: str) -> None:
+def test_only_this_python_and_named_programs_are_started(
+    file: Path, arguments: str, environment: str | None
+) -> None:
+    """No module of the current folder is imported by a Python that is started: `pipelines.core.restart`."""
     calls = [node for name, node in _calls(ast.parse(file.read_text("utf-8"))) if "subprocess" in name]
     (call,) = [node for node in calls if isinstance(node, ast.Call)]
     assert ast.unparse(call.args[0]).startswith(arguments)
-    assert "shell" not in {keyword.arg for keyword in call.keywords}
+    options = {str(keyword.arg): ast.unparse(keyword.value) for keyword in call.keywords}
+    assert "shell" not in options and options.get("env") == environment
+
+
+def test_one_module_knows_how_python_is_started_without_the_current_folder() -> None:
+    """The compilers' environment and that of Dask's nannies are made of its own."""
+    assert python_command(["-m", "x"]) == [sys.executable, "-P", "-m", "x"]
+    assert python_environment()["PYTHONSAFEPATH"] == "1"
+    assert "**python_environment()," in STARTS_A_COMPILER.read_text("utf-8")
+    assert "os.environ.update(python_environment())" in STARTS_WORKERS.read_text("utf-8")
+    files = [file for package in ("georef_cli", "pipelines") for file in (REPOSITORY / package).rglob("*.py")]
+    named = {file for file in files if "sys.executable" in file.read_text("utf-8")}
+    assert named == {REPOSITORY / "pipelines/core/restart.py", ASKS_COMPILERS}  # which looks beside it for ninja
 
 
 @pytest.fixture

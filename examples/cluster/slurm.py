@@ -15,6 +15,8 @@ from pathlib import Path
 from dask_jobqueue import SLURMCluster
 from distributed import Security
 
+from pipelines.core.restart import THIS_PROGRAM, python_command
+
 # Of each worker. Dask's own threads are jobs at a time; the cores belong to the job.
 CORES, MEMORY_GB, GPUS = 16, 64, 0
 
@@ -34,6 +36,7 @@ def cluster_with(certificates: Path) -> SLURMCluster:
         job_cpu=CORES,
         memory=f"{MEMORY_GB}GB",
         walltime="12:00:00",
+        job_script_prologue=["export PYTHONSAFEPATH=1"],  # No module comes from the folder of the submission.
         job_extra_directives=[f"--gpus={GPUS}"] if GPUS else [],
         protocol="tls://",
         security=Security(tls_ca_file=certificate, require_encryption=True, **roles),
@@ -57,7 +60,7 @@ def main() -> int:
             return 0
         cluster.scale(asked.most)
         words = ("--cluster", cluster.scheduler_address, "--certificates", str(certificates))
-        return subprocess.call([sys.executable, "-m", "georef_cli", "batch", asked.missions, *words])
+        return subprocess.call(python_command([*THIS_PROGRAM, "batch", str(asked.missions), *words]))
 
 
 if __name__ == "__main__":

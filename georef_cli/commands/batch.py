@@ -62,8 +62,9 @@ def _missions(values: dict[str, Any]) -> MissionList:
         click.UsageError: a bad option.
     """
     flags = settings(values["settings"], BY_NAME.values())
+    listed = load_missions(values["missions"], OWNERS)
     try:
-        return load_missions(values["missions"], OWNERS).overridden(values["last"], values["deliver"], flags)
+        return listed.overridden(values["last"], values["deliver"], flags)
     except ValueError as error:
         raise click.UsageError(f"--deliver: {error}") from error
 

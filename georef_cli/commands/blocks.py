@@ -202,7 +202,7 @@ command = Command(
           georef blocks plan town --preset high --max-gaussians 20000000
           georef blocks plan town --block-memory 16
           georef blocks train town --id 7
-          georef blocks town --cluster tls://10.0.0.1:8786 --certificates ~/.georef/cluster
+          georef blocks town --cluster tls://10.0.0.1:8786 --certificates certificates
           georef blocks merge town
         """,
 )

@@ -13,8 +13,7 @@ from georef_cli.output import print_json, print_rich
 
 
 def _certificates(folder: Path, as_json: bool) -> None:
-    from pipelines.engine.cluster import CERTIFICATE, KEY
-    from pipelines.engine.nodes import make_certificates
+    from pipelines.engine.certificates import CERTIFICATE, KEY, make_certificates
 
     make_certificates(folder)
     if as_json:

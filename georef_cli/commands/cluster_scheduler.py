@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from typing import Any
 
 import click
 
 from georef_cli import options
 from georef_cli.command import Command
-from georef_cli.engines import certificates_option, cluster_address
+from georef_cli.engines import certificates_options, cluster_address
 from georef_cli.output import print_json
 
 
-def _scheduler(listen: str | None, certificates: Path | None, as_json: bool) -> None:
+def _scheduler(listen: str | None, as_json: bool, **values: Any) -> None:
     from pipelines.engine.nodes import run_scheduler
 
-    everywhere = "127.0.0.1" if certificates is None else "0.0.0.0"
-    address = cluster_address(listen or everywhere, certificates, "--listen")
+    everywhere = "127.0.0.1" if values["certificates"] is None else "0.0.0.0"
+    address = cluster_address(listen or everywhere, values, "--listen", is_node=True)
     run_scheduler(address)
     if as_json:
         print_json({"scheduler": address.url})
@@ -30,14 +30,15 @@ command = Command(
             metavar="HOST:PORT",
             help="Where to listen (default: port 8786 of every network with --certificates, else of 127.0.0.1).",
         ),
-        certificates_option(),
+        *certificates_options(),
         options.json_option(),
     ],
     callback=_scheduler,
     help="""Start the scheduler of a cluster (docs/cluster.md). It runs until Ctrl-C.
 
         This is Dask's scheduler, with encryption demanded and its unprotected pages kept on this machine. Without
-        --certificates it listens on 127.0.0.1 only.
+        --certificates it listens on 127.0.0.1 only, and hears nobody but you: it makes a certificate in your
+        settings, where your workers and commands find it.
 
         \b
         Examples:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from typing import Any
 
 import click
 
 from georef_cli import options
 from georef_cli.command import Command
-from georef_cli.engines import certificates_option, cluster_address
+from georef_cli.engines import certificates_options, cluster_address
 from georef_cli.output import print_json
 from pipelines.core.errors import ResourceError
 from pipelines.core.free_memory import free_main_memory_bytes
@@ -20,17 +20,17 @@ _GIB = 1 << 30
 
 def _worker(
     address: str,
-    certificates: Path | None,
     *,
     jobs: int,
     memory_gib: float | None,
     gpus: int | None,
     name: str | None,
     as_json: bool,
+    **values: Any,
 ) -> None:
     from pipelines.engine.nodes import run_worker
 
-    scheduler = cluster_address(address, certificates, "ADDRESS")
+    scheduler = cluster_address(address, values, "ADDRESS", is_node=True)
     free = free_main_memory_bytes()
     if memory_gib is None and free is None:
         raise ResourceError("the free memory is not known here: give --memory")
@@ -51,7 +51,7 @@ command = Command(
     "cluster worker",
     params=[
         click.Argument(["address"], metavar="ADDRESS"),
-        certificates_option(),
+        *certificates_options(),
         click.Option(
             ["--jobs"],
             type=click.IntRange(min=1),

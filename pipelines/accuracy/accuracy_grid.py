@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import csv
+import itertools
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from pipelines.accuracy.prediction import AccuracyPrediction
 from pipelines.core.types import FloatArray, IntArray
+from pipelines.formats.csv_writer import write_table
 from pipelines.geodesy.enu import Origin, ecef_from_enu, lla_from_ecef
 from pipelines.scene.report import AccuracySummary
 from pipelines.scene.solved_survey import SolvedSurvey
@@ -153,12 +154,10 @@ def write_csv(grid: AccuracyGrid, origin: Origin, path: Path) -> None:
     """
     lla = lla_from_ecef(ecef_from_enu(grid.position_in_geo, origin))
     values = np.column_stack([grid.sigma_m, grid.sigma_h_m, grid.sigma_v_m])
-    with path.open("w", encoding="utf-8", newline="") as handle:
-        writer = csv.writer(handle)
-        writer.writerow(_PLACE + _SIGMA)
-        for place, geodetic, sigma in zip(grid.position_in_geo, lla, values, strict=True):
-            writer.writerow(
-                [f"{value:.3f}" for value in place]
-                + [f"{geodetic[0]:.8f}", f"{geodetic[1]:.8f}", f"{geodetic[2]:.3f}"]
-                + [f"{value:.5f}" for value in sigma]
-            )
+    rows = (
+        [f"{value:.3f}" for value in place]
+        + [f"{geodetic[0]:.8f}", f"{geodetic[1]:.8f}", f"{geodetic[2]:.3f}"]
+        + [f"{value:.5f}" for value in sigma]
+        for place, geodetic, sigma in zip(grid.position_in_geo, lla, values, strict=True)
+    )
+    write_table(path, itertools.chain([_PLACE + _SIGMA], rows))

@@ -34,6 +34,7 @@ from pipelines.core.errors import (
 )
 from pipelines.core.messages import MessageReceiver, MessageSender, SentRecords
 from pipelines.core.progress import SILENT, Progress
+from pipelines.core.restart import python_command, python_environment
 
 log = logging.getLogger(__name__)
 
@@ -70,12 +71,12 @@ def run_in_child(
     """
     with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as native_log:
         process = subprocess.Popen(
-            [sys.executable, "-m", __name__, task, str(os.getpid())],
+            python_command(["-m", __name__, task, str(os.getpid())]),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=native_log,
             encoding="utf-8",
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+            env=python_environment(),
         )
         try:
             return _follow(process, arguments, progress)

@@ -45,7 +45,7 @@ def replace_texts(texts: Mapping[Path, str]) -> None:
     path = None
     try:
         for path, text in texts.items():
-            drafts[path].write_text(text, encoding="utf-8")
+            drafts[path].write_text(text, encoding="utf-8", newline="")
             sync_file(drafts[path])
         for path, draft in drafts.items():
             draft.replace(path)

@@ -11,6 +11,7 @@ marks the flag as text for the command line.
 
 from __future__ import annotations
 
+import re
 import tomllib
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
@@ -27,6 +28,9 @@ from pipelines.core.validators import require_text
 
 CONFIG_FILE = "georef.toml"
 _MAX_TOML_BYTES = 1024 * 1024
+# A mission's option has four parts: missions.NAME.STAGE.OPTION.
+_MOST_PARTS, _INTEGERS = 16, 1 << 63
+_LONG_KEY = re.compile(rf"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){{{_MOST_PARTS}}}""")
 
 
 @dataclass(frozen=True)
@@ -197,11 +201,48 @@ def read_toml(path: Path) -> dict[str, Any]:
         InputError: the file cannot be read or is not TOML.
     """
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        return parse_toml(path.read_text(encoding="utf-8-sig"))
+    except ValueError as error:
         raise InputError(f"not valid TOML: {error}", path=path) from error
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}", path=path) from error
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """Return a document of TOML.
+
+    Keys with dots cost the square of their parts in time and memory, and are bounded first.
+
+    Raises:
+        ValueError: no TOML, a key of more than 16 parts, or an integer of more than 64 bits.
+    """
+    key = _LONG_KEY.search(text)
+    if key is not None:
+        line = text.count("\n", 0, key.start()) + 1
+        raise ValueError(f"a key of more than {_MOST_PARTS} parts, the limit (at line {line})")
+    try:
+        document = tomllib.loads(text)
+        _require_integers(document)
+    except tomllib.TOMLDecodeError:
+        raise
+    except RecursionError as error:
+        raise ValueError("values are nested too deeply") from error
+    except ValueError as error:  # Python refuses to read more digits than a few thousand.
+        raise ValueError("an integer is beyond 64 bits") from error
+    return document
+
+
+def _require_integers(value: Any) -> None:
+    """Refuse integers beyond 64 bits, which TOML does not have.
+
+    Raises:
+        ValueError: there is one.
+    """
+    if isinstance(value, int) and not -_INTEGERS <= value < _INTEGERS:
+        raise ValueError
+    parts = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    for part in parts:
+        _require_integers(part)
 
 
 def load_toml(path: Path, stages: Collection[str]) -> dict[str, dict[str, Any]]:

@@ -15,13 +15,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import SplitResult, urlsplit
 
-from pipelines.core.errors import BackendUnavailableError, ClusterError
+from pipelines.core.errors import ClusterError
+from pipelines.engine.certificates import CERTIFICATE, KEY, check_certificates, import_distributed
 from pipelines.engine.job import Job
 
 if TYPE_CHECKING:
     from distributed import Client
 
-CERTIFICATE, KEY = "cluster.pem", "cluster.key"
 PORT = 8786
 # Names of Dask's resources; cores are told, not taken.
 MEMORY, GPU, CORES = "MEMORY", "GPU", "CORES"
@@ -37,7 +37,9 @@ class ClusterAddress:
         certificates: folder with `cluster.pem` and `cluster.key`; None: no encryption, on this machine only.
 
     Raises:
-        ValueError: no such address or certificate, or an address of another machine without a certificate.
+        ValueError: no such address, or one of another machine without a certificate.
+        InputError: the certificate is missing or not valid now.
+        BackendUnavailableError: the extra is not installed.
     """
 
     address: str
@@ -50,15 +52,13 @@ class ClusterAddress:
         if self.certificates is None:
             if scheme == "tls" or not is_loopback(self.host):
                 raise ValueError(
-                    f"{self.address} needs --certificates: without them only 127.0.0.1 is used, because everybody "
-                    "who reaches a scheduler can run programs on its workers"
+                    f"{self.address} needs certificates: without them only tcp://127.0.0.1 is used, because "
+                    "everybody who reaches a scheduler can run programs on its workers"
                 )
             return
         if scheme == "tcp":
-            raise ValueError(f"{self.address} is not encrypted: write tls://")
-        for name in (CERTIFICATE, KEY):
-            if not (self.certificates / name).is_file():
-                raise ValueError(f"{self.certificates} has no {name}: `georef cluster certificates DIR` makes it")
+            raise ValueError(f"{self.address} is not encrypted: write tls://, or add --insecure")
+        check_certificates(self.certificates)
 
     @property
     def host(self) -> str:
@@ -85,10 +85,23 @@ class ClusterAddress:
 
     @property
     def _parts(self) -> SplitResult:
-        default = "tcp" if self.certificates is None else "tls"
-        parts = urlsplit(self.address if "://" in self.address else f"{default}://{self.address}")
-        _ = parts.port  # raises if it is none
-        return parts
+        return _parts(self.address, "tcp" if self.certificates is None else "tls")
+
+
+def is_on_this_machine(address: str) -> bool:
+    """Return whether an address is that of this machine, seen by itself only."""
+    return is_loopback(_parts(address, "tls").hostname or "")
+
+
+def _parts(address: str, scheme: str) -> SplitResult:
+    """Return the parts of an address, with this scheme if it has none.
+
+    Raises:
+        ValueError: it is none.
+    """
+    parts = urlsplit(address if "://" in address else f"{scheme}://{address}")
+    _ = parts.port  # raises if it is none
+    return parts
 
 
 @contextmanager
@@ -121,21 +134,6 @@ def connected(cluster: ClusterAddress) -> Iterator[Client]:
     finally:
         with suppress(OSError, TimeoutError, RuntimeError):
             client.close(timeout=5)
-
-
-def import_distributed() -> Any:
-    """Return the library.
-
-    Raises:
-        BackendUnavailableError: it is not installed; names the extra.
-    """
-    try:
-        import distributed
-    except ImportError as error:
-        raise BackendUnavailableError(
-            "a cluster needs Dask: install it with `pip install 'georefgs[cluster]'`"
-        ) from error
-    return distributed
 
 
 def is_loopback(host: str) -> bool:

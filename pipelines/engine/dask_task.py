@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any, TypedDict
 
 from pipelines import __version__
+from pipelines.core import restart
 from pipelines.core.errors import GeorefError
 from pipelines.core.threads import available_cores
-from pipelines.engine import process
 from pipelines.engine.cluster import CORES
 from pipelines.engine.exchange import Parcel, arguments_in, worker_exchange
 from pipelines.engine.process import JobProcess, ProcessEnd
@@ -90,7 +90,7 @@ def _run(worker: Any, arguments: Sequence[str], events: _Events) -> ProcessEnd:
     cores = int(worker.state.total_resources.get(CORES, available_cores()))
     threads = max(cores // worker.state.nthreads, 1)
     try:
-        running = JobProcess(process.THIS_PROGRAM, arguments, threads, events.take, ends.put)
+        running = JobProcess(restart.THIS_PROGRAM, arguments, threads, events.take, ends.put)
     except OSError as error:
         return ProcessEnd(1, 0.0, f"cannot be started: {error.strerror}")
     is_wanted = True

@@ -60,7 +60,7 @@ class _InnerTask:
         """Add steps, and show their count as the note of the line."""
         self._done, self._note = self._done + steps, note.strip() or self._note
         count = f"{self._name} {self._done}" + ("" if self._total is None else f"/{self._total}")
-        left = "" if not left_s else f"{duration(left_s)} left"
+        left = "" if not left_s or math.isinf(left_s) else f"{duration(left_s)} left"
         place = "" if self._name == self._line.place else self._line.place
         self._line.show(0, " · ".join(filter(None, (place, count, self._note, left))))
 

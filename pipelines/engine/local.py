@@ -8,9 +8,9 @@ import queue
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
+from pipelines.core import restart
 from pipelines.core.interrupts import deferred_interrupts
 from pipelines.core.progress import Progress
-from pipelines.engine import process
 from pipelines.engine.display import JobDisplay, tell_end
 from pipelines.engine.job import Job, JobEnd
 from pipelines.engine.process import JobProcess, ProcessEnd
@@ -35,7 +35,7 @@ class LocalEngine:
     at_a_time: int
     cores: int
     free_bytes: int | None = None
-    program: tuple[str, ...] = field(default_factory=lambda: process.THIS_PROGRAM)
+    program: tuple[str, ...] = field(default_factory=lambda: restart.THIS_PROGRAM)
 
     def together(self, jobs: Sequence[Job]) -> int:
         """Return how many of the jobs run at a time at the beginning; see `Engine`."""

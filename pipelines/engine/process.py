@@ -7,7 +7,6 @@ A crash of the process is the end of its job, and of no other. The process stops
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -17,12 +16,11 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
+from pipelines.core.restart import python_command, python_environment
 from pipelines.engine.job import INTERRUPTED
 
-THIS_PROGRAM = ("-m", "georef_cli")
 _TAIL_LINES = 20
 _KILLED = "the system killed it, as it does when memory is short: run fewer at a time"
 
@@ -51,7 +49,6 @@ class JobProcess:
         program: arguments of Python that start this program.
         arguments: of the program.
         threads: that the job computes with.
-        folder: where it runs; None: here.
         take: gets the messages in a thread; false: it was none of progress or log.
         ended: called at the end of the process, in the same thread.
 
@@ -66,8 +63,6 @@ class JobProcess:
         threads: int,
         take: Callable[[Mapping[str, Any]], bool],
         ended: Callable[[ProcessEnd], None],
-        *,
-        folder: Path | None = None,
     ) -> None:
         self._take, self._ended = take, ended
         self._kind = ""
@@ -76,14 +71,13 @@ class JobProcess:
         self._is_interrupted = False
         # A group of its own: Ctrl-C on the terminal reaches the parent alone, which passes it on once.
         self._process = subprocess.Popen(
-            [sys.executable, *program, *arguments, "--json-progress", "--threads", str(threads)],
-            cwd=folder,
+            python_command([*program, *arguments, "--json-progress", "--threads", str(threads)]),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
             encoding="utf-8",
             errors="replace",
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+            env=python_environment(),
             **_OWN_GROUP,
         )
         self._reader = threading.Thread(target=self._read, daemon=True)

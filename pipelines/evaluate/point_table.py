@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from pathlib import Path
 
 import numpy as np
 
+from pipelines.formats.csv_writer import write_table
 from pipelines.geodesy.enu import ecef_from_enu, lla_from_ecef
 from pipelines.scene.report import Coordinates, EvaluationReport
 from pipelines.scene.report_points import PointLine, point_lines
@@ -31,12 +31,13 @@ def write_point_table(path: Path, report: EvaluationReport, survey: Survey) -> N
     """
     place = _places(survey)
     in_crs = report.coordinates
-    with path.open("w", encoding="utf-8", newline="") as handle:
-        writer = csv.writer(handle)
-        writer.writerow([*_NAME, *_PLACE, *_ERROR, *(_IN_CRS if in_crs is not None else ())])
-        for line in point_lines(report):
-            name = [line.row.name, line.use, line.way, line.row.rays]
-            writer.writerow([*name, *place[line.row.name], *_error(line), *_crs_cells(in_crs, line)])
+    header = (*_NAME, *_PLACE, *_ERROR, *(_IN_CRS if in_crs is not None else ()))
+    rows = (
+        (row.name, line.use, line.way, row.rays, *place[row.name], *_error(line), *_crs_cells(in_crs, line))
+        for line in point_lines(report)
+        for row in (line.row,)
+    )
+    write_table(path, (header, *rows))
 
 
 def _places(survey: Survey) -> dict[str, list[str]]:

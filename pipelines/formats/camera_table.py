@@ -6,14 +6,13 @@ of another survey. A σ that is not known is an empty cell.
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from pipelines.core.durable import replace_file
 from pipelines.core.types import FloatArray
+from pipelines.formats.csv_writer import write_table
 
 _METRES, _DEGREES, _ANGLE = "%.4f", "%.9f", "%.6f"  # 0.1 mm; 0.1 mm on the ground; 1 cm at 500 km
 _GRID = ("x", "y", "z")
@@ -67,12 +66,10 @@ def write_camera_table(path: Path, table: CameraTable) -> None:
         ],
         axis=1,
     )
-    draft = path.with_name(path.name + ".tmp")
-    with draft.open("w", encoding="utf-8", newline="") as handle:
-        writer = csv.writer(handle)
-        position = _GEOGRAPHIC if table.geographic else _GRID
-        writer.writerow(["name", "split", *position, *_MAP_ANGLES, *_GIMBAL, *_SIGMA, *_SIGMA_ANGLES])
-        for name, split, row in zip(table.name, table.split, numbers, strict=True):
-            cells = [form % value if np.isfinite(value) else "" for form, value in zip(forms, row, strict=True)]
-            writer.writerow([name, split, *cells])
-    replace_file(draft, path)
+    position = _GEOGRAPHIC if table.geographic else _GRID
+    header = ("name", "split", *position, *_MAP_ANGLES, *_GIMBAL, *_SIGMA, *_SIGMA_ANGLES)
+    rows = (
+        (name, split, *(form % value if np.isfinite(value) else "" for form, value in zip(forms, row, strict=True)))
+        for name, split, row in zip(table.name, table.split, numbers, strict=True)
+    )
+    write_table(path, (header, *rows))

@@ -16,7 +16,7 @@ _SEPARATORS = ";\t,"
 _LONGEST_NAME = 100  # of a column that means something
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Row:
     """Line of a table: its cells by position, with the names of the columns that are known."""
 

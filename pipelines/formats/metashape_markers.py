@@ -7,7 +7,6 @@ check point. defusedxml refuses entities and document type definitions.
 
 from __future__ import annotations
 
-import io
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -22,7 +21,8 @@ if TYPE_CHECKING:
 
 KIND = "Metashape's markers"
 _MAX_BYTES = 64 * 1024 * 1024
-_MAX_DEPTH = 100
+_LONGEST_TAG = 1 << 20  # The parser begins an unfinished tag again with every part of the file.
+_LONGEST_CRS, _MAX_DEPTH = 1 << 16, 100
 _OFF = frozenset({"0", "false"})
 
 
@@ -41,8 +41,16 @@ def read_markers_xml(path: Path) -> GroundPoints:
     parser = make_parser()
     parser.forbid_dtd = True
     parser.setContentHandler(reader)
+    reader.setDocumentLocator(parser)
     try:
-        parser.parse(io.BytesIO(path.read_bytes()))
+        with path.open("rb") as stream:
+            while data := stream.read(_LONGEST_TAG):
+                before = reader.events
+                parser.feed(data)
+                if len(data) == _LONGEST_TAG and reader.events == before:
+                    message = f"a tag or comment is longer than {_LONGEST_TAG >> 20} MiB, the limit"
+                    raise InputError(message, path=path, line=reader.line)
+        parser.close()
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}", path=path) from error
     except (SAXException, DefusedXmlException, ValueError, LookupError) as error:
@@ -58,14 +66,16 @@ class _Reader(ContentHandler):
         super().__init__()
         self._path = path
         self._place: Locator | None = None
+        self.events = 0
         self._open: list[str] = []
         self._chunks = 0
         self._marker: tuple[str, str] | None = None  # id and label
         self._projected: str | None = None  # id
-        self._crs: list[str] = []
+        self._crs = ""
         self._crs_line = 1
         self._labels: dict[str, str] = {}  # of cameras, by id
         self._names: dict[str, str] = {}  # of markers, by id
+        self._ids: dict[str, str] = {}  # of markers, by name
         self._points: list[ListedPoint] = []
         self._projections: list[tuple[int, str, str, float, float]] = []  # line, marker, camera, x, y
         self._left_out: list[str] = []
@@ -76,15 +86,16 @@ class _Reader(ContentHandler):
 
     def startElement(self, name: str, attrs: AttributesImpl) -> None:
         """Read an element that begins."""
+        self.events += 1
         values = {str(key): str(value) for key, value in attrs.items()}
         parent = self._open[-1] if self._open else ""
         self._open.append(name)
         if len(self._open) > _MAX_DEPTH:
-            raise InputError("is nested too deeply", path=self._path, line=self._line)
+            raise InputError("is nested too deeply", path=self._path, line=self.line)
         if name == "chunk":
             self._chunks += 1
             if self._chunks > 1:
-                raise InputError("has several chunks: export the markers of one", path=self._path, line=self._line)
+                raise InputError("has several chunks: export the markers of one", path=self._path, line=self.line)
         elif name == "camera" and "id" in values and "label" in values:
             self._labels[values["id"]] = values["label"]
         elif name == "marker" and "marker_id" in values:
@@ -94,20 +105,25 @@ class _Reader(ContentHandler):
         elif name == "reference" and parent == "marker" and self._marker is not None:
             self._read_point(values)
         elif name == "reference":
-            self._crs_line = self._line
+            self._crs_line = self.line
         elif name == "location" and parent == "marker" and self._projected is not None:
             self._read_projection(values)
 
     def endElement(self, name: str) -> None:
         """Close an element."""
+        self.events += 1
         self._open.pop()
         if name == "marker":
             self._marker = self._projected = None
 
     def characters(self, content: str) -> None:
         """Gather the text of the CRS."""
+        self.events += 1
         if self._open and self._open[-1] == "reference":
-            self._crs.append(content)
+            self._crs += content
+            if len(self._crs) > _LONGEST_CRS:
+                message = f"the CRS is longer than {_LONGEST_CRS} characters, the limit"
+                raise InputError(message, path=self._path, line=self.line)
 
     def result(self) -> GroundPoints:
         """Return the points and marks that were read."""
@@ -119,7 +135,7 @@ class _Reader(ContentHandler):
             for line, marker, camera, x, y in self._projections
             if self._names.get(marker) in known
         ]
-        crs = "".join(self._crs).strip()
+        crs = self._crs.strip()
         return GroundPoints(
             path=self._path,
             kind=KIND,
@@ -131,7 +147,8 @@ class _Reader(ContentHandler):
         )
 
     @property
-    def _line(self) -> int:
+    def line(self) -> int:
+        """Line that is being read."""
         return 1 if self._place is None else int(self._place.getLineNumber() or 1)
 
     def _read_point(self, values: dict[str, str]) -> None:
@@ -139,15 +156,15 @@ class _Reader(ContentHandler):
         if not {"x", "y", "z"} <= set(values):
             return
         if not name:
-            raise InputError("has no name", path=self._path, line=self._line, field="label")
-        if name in self._names.values() and self._names.get(marker) != name:
-            raise InputError(f"two markers have the name {name}", path=self._path, line=self._line)
+            raise InputError("has no name", path=self._path, line=self.line, field="label")
+        if self._ids.setdefault(name, marker) != marker:
+            raise InputError(f"two markers have the name {name}", path=self._path, line=self.line)
         self._names[marker] = name
         both = self._sigma(values, "sxyz")
         horizontal = [sigma for axis in ("sx", "sy") if (sigma := self._sigma(values, axis)) is not None]
         self._points.append(
             ListedPoint(
-                line=self._line,
+                line=self.line,
                 name=name,
                 xyz=(self._number(values, "x"), self._number(values, "y"), self._number(values, "z")),
                 sigma_h_m=max(horizontal) if horizontal else both,
@@ -161,9 +178,9 @@ class _Reader(ContentHandler):
         if not {"x", "y"} <= set(values) or values.get("valid", "true").lower() in _OFF:
             return
         if values.get("pinned", "true").lower() in _OFF:
-            self._left_out.append(f"{self._path.name}:{self._line}")
+            self._left_out.append(f"{self._path.name}:{self.line}")
             return
-        self._projections.append((self._line, marker, camera, self._number(values, "x"), self._number(values, "y")))
+        self._projections.append((self.line, marker, camera, self._number(values, "x"), self._number(values, "y")))
 
     def _number(self, values: dict[str, str], key: str) -> float:
         try:
@@ -172,7 +189,7 @@ class _Reader(ContentHandler):
             value = math.nan
         if not math.isfinite(value):
             message = f"{values[key][:40]!r} is no number"
-            raise InputError(message, path=self._path, line=self._line, field=key)
+            raise InputError(message, path=self._path, line=self.line, field=key)
         return value
 
     def _sigma(self, values: dict[str, str], key: str) -> float | None:

@@ -35,7 +35,7 @@ _HAS_EXTENSIONS = 0x2
 _POSITION_LIMIT = 1 << 23
 _GZIP_LEVEL, _ZSTD_LEVEL = 6, 12
 # Real splats compress by a factor of two or three; more is a forgery, or a small file.
-_MOST_UNPACKED, _SMALL_BYTES = 16, 256 * 1024 * 1024
+_MOST_UNPACKED, _SMALL_BYTES = 16, 16 * 1024 * 1024
 
 
 def write_spz(path: Path, splat: SplatArrays, version: SpzVersion = 3) -> None:
@@ -57,14 +57,14 @@ def read_spz(path: Path) -> SplatArrays:
 
     Raises:
         InputError: no such file, not an SPZ file of that form, cut off, with extensions, or a file that would
-            unpack to more than sixteen times its size (and 256 MiB).
+            unpack to more than sixteen times its size (and 16 MiB).
     """
-    limit = max(_SMALL_BYTES, _MOST_UNPACKED * file_size(path))
+    file_size(path)
     try:
         data = path.read_bytes()
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}", path=path) from error
-    return decode_spz(data, limit_bytes=limit, path=path)
+    return decode_spz(data, path)
 
 
 def encode_spz(splat: SplatArrays, version: SpzVersion = 3, fractional_bits: int = FRACTIONAL_BITS) -> bytes:
@@ -99,17 +99,17 @@ def encode_spz(splat: SplatArrays, version: SpzVersion = 3, fractional_bits: int
     return b"".join((head, *table, *packed))
 
 
-def decode_spz(data: bytes, *, limit_bytes: int, path: Path | None = None) -> SplatArrays:
+def decode_spz(data: bytes, path: Path | None = None) -> SplatArrays:
     """Return the Gaussians in the bytes of an SPZ file.
 
     Args:
         data: the file.
-        limit_bytes: most bytes that the sections may unpack to.
         path: of the file, for errors.
 
     Raises:
         InputError: as `read_spz`.
     """
+    limit_bytes = max(_SMALL_BYTES, _MOST_UNPACKED * len(data))
     try:
         if data[:2] == b"\x1f\x8b":
             layout, body = _unpacked_gzip(data, limit_bytes)

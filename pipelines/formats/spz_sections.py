@@ -24,7 +24,7 @@ from pipelines.formats.splat_ply import SplatArrays
 
 _COLOUR_STEPS = 0.15 * 255
 _LARGEST_COMPONENT = 511 / np.sqrt(0.5)  # of the components that are not the largest, √½ is the bound
-_CHUNK = 1 << 18  # Gaussians that are quantised at once: bounds the memory of the intermediate values
+_CHUNK = 1 << 18  # Gaussians that are converted at once: bounds the memory of the intermediate values
 
 
 @dataclass(frozen=True)
@@ -117,21 +117,28 @@ def dequantised(layout: SpzLayout, body: ByteArray) -> SplatArrays:
     """
     ends = np.cumsum([layout.count * width for width in layout.widths])
     sections = [part.reshape(layout.count, -1) for part in np.split(body, ends[:-1])]
-    words = np.zeros((layout.count, 3, 4), np.uint8)
-    words[:, :, 1:] = sections[0].reshape(-1, 3, 3)
-    fixed = words.view("<i4")[:, :, 0] >> 8  # an arithmetic shift extends the sign
-    opacity = np.clip(sections[1][:, 0].astype(np.float64), 0.25, 254.75) / 255
-    sh = np.empty((layout.count, 1 + layout.higher, 3), np.float32)
-    sh[:, 0] = (sections[2] - 127.5) / _COLOUR_STEPS
-    if layout.higher:
-        sh[:, 1:] = sections[5].reshape(layout.count, layout.higher, 3) / np.float32(128) - 1
-    return SplatArrays(
-        means=(fixed / 2.0**layout.fractional_bits).astype(np.float32),
-        quats_wxyz=_unpacked_rotations(sections[4]),
-        log_scales=(sections[3] / 16 - 10).astype(np.float32),
-        logit_opacities=np.log(opacity / (1 - opacity)).astype(np.float32),
-        sh=sh,
-    )
+    widths = {
+        "means": (3,),
+        "quats_wxyz": (4,),
+        "log_scales": (3,),
+        "logit_opacities": (),
+        "sh": (1 + layout.higher, 3),
+    }
+    splat = SplatArrays(**{name: np.empty((layout.count, *width), np.float32) for name, width in widths.items()})
+    for rows in _chunks(layout.count):
+        positions, opacities, colours, scales, rotations, *higher = (section[rows] for section in sections)
+        words = np.zeros((len(positions), 3, 4), np.uint8)
+        words[:, :, 1:] = positions.reshape(-1, 3, 3)
+        fixed = words.view("<i4")[:, :, 0] >> 8  # an arithmetic shift extends the sign
+        splat.means[rows] = fixed / 2.0**layout.fractional_bits
+        splat.quats_wxyz[rows] = _unpacked_rotations(rotations)
+        splat.log_scales[rows] = scales / 16 - 10
+        opacity = np.clip(opacities[:, 0].astype(np.float64), 0.25, 254.75) / 255
+        splat.logit_opacities[rows] = np.log(opacity / (1 - opacity))
+        splat.sh[rows, 0] = (colours - 127.5) / _COLOUR_STEPS
+        for section in higher:
+            splat.sh[rows, 1:] = section.reshape(-1, layout.higher, 3) / np.float32(128) - 1
+    return splat
 
 
 def _unpacked_rotations(section: ByteArray) -> Float32Array:

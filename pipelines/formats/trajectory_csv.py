@@ -15,6 +15,7 @@ import numpy as np
 
 from pipelines.core.errors import InputError
 from pipelines.core.types import FloatArray
+from pipelines.formats.csv_writer import plain_text
 from pipelines.formats.pose_table import PoseTable, complete
 from pipelines.formats.text import number, read_lines
 from pipelines.geometry.rotations import geo_from_cam, quat_xyzw_from_matrix
@@ -64,7 +65,7 @@ def read_trajectory(path: Path) -> PoseTable:
         path=path,
         source="csv",
         lines=np.array(cells.lines, dtype=np.int64),
-        names=tuple(cells.texts("image")) if "image" in cells.columns else None,
+        names=tuple(map(plain_text, cells.texts("image"))) if "image" in cells.columns else None,
         time_s=None if moments is None else moments[0],
         xyz=xyz,
         geographic=geographic,
@@ -110,7 +111,7 @@ class _Cells:
                 if len(row) > width and any(cell.strip() for cell in row[width:]):
                     hint = "; decimal commas need ; as separator" if separator == "," else ""
                     raise InputError(f"has {len(row)} cells, the header has {width}{hint}", path=path, line=line)
-                rows.append(row + [""] * (width - len(row)))
+                rows.append(row)
                 numbers.append(line)
         except csv.Error as error:
             raise InputError(f"is no CSV: {error}", path=path, line=first + 1 + reader.line_num) from error
@@ -120,7 +121,7 @@ class _Cells:
 
     def texts(self, column: str) -> list[str]:
         at = self.columns[column]
-        return [row[at].strip() for row in self.rows]
+        return [row[at].strip() if at < len(row) else "" for row in self.rows]
 
     def numbers(self, column: str) -> FloatArray:
         """Return the numbers of a column (N,); NaN where empty."""

@@ -1,7 +1,8 @@
 """Pages for people: a frame with style, contents and sections, which every report of the package shares.
 
 A page is one file. It holds its style and its pictures, has no script, and loads nothing: its own policy forbids
-both. Texts of users (names of points, of photographs, of workspaces) enter through the escaping of jinja2 only.
+both. Texts of users (names of points, of photographs, of workspaces) enter through the escaping of jinja2 only, and
+their control characters are written as escapes.
 
 A room that makes a page has a folder `templates/` with one template a section. The templates hold all HTML; Python
 gives them typed facts.
@@ -15,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipelines.core.durable import replace_text
+from pipelines.core.printable import printable_lines
 from pipelines.pages.text import FORMS, formatted
 
 if TYPE_CHECKING:
@@ -102,6 +104,7 @@ def _environment(room: str) -> Environment:
     environment = Environment(
         loader=ChoiceLoader([PackageLoader(room), PackageLoader("pipelines.pages")]),
         autoescape=True,
+        finalize=lambda value: printable_lines(value) if type(value) is str else value,  # not of markup
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,

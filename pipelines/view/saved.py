@@ -6,8 +6,6 @@ what is made of several measurements is again the joint one.
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import uuid
 from collections.abc import Callable, Sequence
@@ -21,6 +19,7 @@ from pipelines.core.durable import replace_texts
 from pipelines.core.errors import InputError
 from pipelines.core.products import ImageName, Product
 from pipelines.core.types import Matrix3, Vector3
+from pipelines.formats.csv_writer import table_text
 from pipelines.formats.geojson import Json, feature, features_text
 from pipelines.view.store import changing
 from pipelines.view.surface_points import SurfacePoint
@@ -145,21 +144,18 @@ class SavedMeasurements:
 
 
 def _table(measurements: Sequence[Measurement]) -> str:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(_COLUMNS)
-    for each in measurements:
-        for vertex, point in enumerate(each.points, start=1):
-            sigma = point.sigma_m or ("", "", "")
-            writer.writerow([each.name, each.kind, vertex, *point.xyz, each.crs, *sigma])
-    writer.writerow([])
-    writer.writerow(["name", "kind", "quantity", "value", "unit", "sigma"])
-    for each in measurements:
-        for quantity in each.quantities:
-            sigma_text = "" if quantity.sigma is None else quantity.sigma
-            row = [each.name, each.kind, quantity.name, quantity.value, quantity.unit, sigma_text]
-            writer.writerow(row)
-    return text.getvalue()
+    points = (
+        (each.name, each.kind, vertex, *point.xyz, each.crs, *(point.sigma_m or ("", "", "")))
+        for each in measurements
+        for vertex, point in enumerate(each.points, start=1)
+    )
+    quantities = (
+        (each.name, each.kind, found.name, found.value, found.unit, "" if found.sigma is None else found.sigma)
+        for each in measurements
+        for found in each.quantities
+    )
+    named = ("name", "kind", "quantity", "value", "unit", "sigma")
+    return table_text((_COLUMNS, *points, (), named, *quantities))
 
 
 def read_measurements(folder: Path) -> list[Measurement]:

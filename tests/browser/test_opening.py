@@ -56,3 +56,24 @@ def test_page_says_which_tile_is_missing(browser: Browser, tmp_path: Path) -> No
         message.wait_for()
         assert re.search(r"content/.*glb could not be loaded", message.inner_text())
     viewer.page.close()
+
+
+def test_page_runs_no_other_script_and_asks_nobody_else(browser: Browser, address: str) -> None:
+    """By its own policy: a script in a name that came through, a script of another server, an answer sent away."""
+    viewer = new_viewer(browser)
+    viewer.page.goto(address)
+    refused = viewer.page.evaluate(
+        """async () => {
+            const refused = [];
+            document.addEventListener("securitypolicyviolation", (event) => refused.push(event.effectiveDirective));
+            document.body.insertAdjacentHTML("beforeend", "<img src=x onerror='injected = 1'>");
+            for (const change of [{ textContent: "injected = 1" }, { src: "https://elsewhere.example/a.js" }]) {
+                document.head.append(Object.assign(document.createElement("script"), change));
+            }
+            await fetch("https://elsewhere.example/").catch(() => 0);
+            await new Promise((done) => setTimeout(done, 500));
+            return [typeof injected, ...refused.sort()];
+        }"""
+    )
+    viewer.page.close()
+    assert refused == ["undefined", "connect-src", "script-src-attr", "script-src-elem", "script-src-elem"]

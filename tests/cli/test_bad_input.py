@@ -340,3 +340,15 @@ def test_as_a_process(flight: Path) -> None:
     result.assert_failed(1)
     assert result.err == f"error: {flight}/t.csv:5 [latitude]: 96.02 is out of range -90 … 90\n"
     assert not (flight / "ws/ingest").exists()
+
+
+def test_a_number_without_end_is_told_where_it_stands(tmp_path: Path, real_georef: Georef) -> None:
+    """In a list of missions, where `--deliver` was blamed, and in `--set`."""
+    path = tmp_path / "missions.toml"
+    path.write_text(f"[missions.a]\nseed = {'9' * 5000}\n", "utf-8")
+    ended = real_georef("batch", path)
+    ended.assert_failed(1)
+    assert "missions.toml: not valid TOML: an integer is beyond 64 bits" in ended.err
+    ended = real_georef("run", tmp_path / "ws", "--set", f"sfm.seed={'9' * 5000}")
+    ended.assert_failed(2)
+    assert "sfm.seed" in ended.err or "--seed" in ended.err

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import json
 from html.parser import HTMLParser
 from pathlib import Path
@@ -13,6 +15,7 @@ import torch
 from pydantic import ValidationError
 
 from pipelines.core.cautions import NOT_CHECKED, Caution
+from pipelines.core.printable import printable
 from pipelines.deliver.options import CESIUM, PageOptions, SplatOptions
 from pipelines.deliver.splat import placed_splat
 from pipelines.deliver.tiles.local_crs import LocalCrs, fit_local_crs
@@ -26,7 +29,7 @@ from pipelines.scene.target_crs import target_crs
 from pipelines.splat.gaussians import Gaussians
 from tests.scenes import Measured, Noise, make_scene, survey_of, trained_model
 
-HOSTILE = "</script><script>alert(1)</script><!-- & \u2028 \" ' ` ${1} \\u003c Ω"
+HOSTILE = "</script><script>alert(1)</script><!-- & \u2028 \x1b[2J\u202e \" ' ` ${1} \\u003c Ω"
 
 
 class Scripts(HTMLParser):
@@ -79,10 +82,48 @@ def test_names_cannot_leave_the_document_that_holds_them(tmp_path: Path) -> None
     assert attributes == {"type": "application/json", "id": "scene"}
     assert "<" not in data and ">" not in data and "\u2028" not in data
     assert ScenePage.model_validate(json.loads(data)) == page
-    assert page.title == page.points[0].name == page.cautions[0] == HOSTILE
+    assert page.title == page.points[0].name == page.cautions[0] == printable(HOSTILE)
+    assert "\\x1b[2J\\u202e" in page.title and "\u202e" not in data
     # Text enters the page by textContent alone.
     for way in ("innerHTML", "outerHTML", "insertAdjacentHTML", "document.write", "eval("):
         assert way not in program
+
+
+class Policies(HTMLParser):
+    """Content security policies of a page, by directive."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.found: dict[str, str] = {}
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: Any) -> None:
+        named = dict(attrs)
+        if tag == "meta" and named.get("http-equiv") == "Content-Security-Policy":
+            self.found |= dict(directive.split(" ", 1) for directive in named["content"].split("; "))
+
+
+@pytest.mark.parametrize(
+    ("cesium", "library", "files"),
+    [
+        (CESIUM, CESIUM, f"'self' {CESIUM}"),
+        ("Cesium/", "'self'", "'self'"),
+        ("https://host/a;script-src*,'x\"/", "https://host/a%3Bscript-src%2A%2C%27x%22/", None),
+    ],
+)
+def test_page_runs_its_own_script_and_cesium_alone(
+    tmp_path: Path, cesium: str, library: str, files: str | None
+) -> None:
+    page = page_of(surveyed()).model_copy(update={"cesium": cesium})
+    write_page(page, tmp_path)
+    text = (tmp_path / "index.html").read_text(encoding="utf-8")
+    policy, program = Policies(text).found, text.partition("<script>")[2].partition("</script>")[0]
+    own = base64.b64encode(hashlib.sha256(program.encode()).digest()).decode()
+    assert policy["default-src"] == policy["base-uri"] == policy["form-action"] == "'none'"
+    assert policy["script-src"] == f"'sha256-{own}' 'unsafe-eval' blob: {library}"
+    assert policy["worker-src"] == f"blob: {library}" and policy["style-src"] == f"{library} 'unsafe-inline'"
+    if files is not None:
+        assert policy["connect-src"] == policy["img-src"] == f"{files} blob: data:"
 
 
 def test_points_are_labelled_where_they_were_surveyed() -> None:
@@ -90,7 +131,7 @@ def test_points_are_labelled_where_they_were_surveyed() -> None:
     page = page_of(survey)
     assert [point.kind for point in page.points] == ["control", "control", "check", "check"]
     for shown, point in zip(page.points, (*survey.control_points, *survey.check_points), strict=True):
-        assert shown.name == point.name
+        assert shown.name == printable(point.name)
         np.testing.assert_allclose(
             shown.ecef, ecef_from_enu(point.position_in_geo, survey.origin), rtol=0, atol=1e-8
         )

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import socket
-import ssl
 import threading
 import time
 from collections.abc import Iterator
@@ -15,15 +13,15 @@ from pathlib import Path
 import pytest
 from distributed import LocalCluster, Security
 
-from pipelines.core.errors import ClusterError
+from pipelines.core import restart
+from pipelines.core.errors import ClusterError, InputError
 from pipelines.core.progress import SILENT, ProgressTask
 from pipelines.engine import cluster as cluster_access
-from pipelines.engine import process
+from pipelines.engine.certificates import make_certificates
 from pipelines.engine.cluster import ClusterAddress, Place, place_for
 from pipelines.engine.dask_engine import DaskEngine
 from pipelines.engine.job import Job, JobEnd
-from pipelines.engine.nodes import make_certificates
-from tests.clusters import PATIENCE_S, RunningCluster, running_cluster
+from tests.clusters import PATIENCE_S, RunningCluster, greeting, running_cluster
 
 PROGRAM = "import sys; exec(sys.argv[1])"
 GIB = 1 << 30
@@ -78,7 +76,7 @@ def threads(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ClusterAddress
 @pytest.fixture
 def cluster(threads: ClusterAddress, monkeypatch: pytest.MonkeyPatch) -> ClusterAddress:
     """The same with jobs of these tests."""
-    monkeypatch.setattr(process, "THIS_PROGRAM", ("-c", PROGRAM))
+    monkeypatch.setattr(restart, "THIS_PROGRAM", ("-c", PROGRAM))
     return threads
 
 
@@ -105,22 +103,6 @@ def wait_for(path: Path) -> str:
         assert time.monotonic() < deadline
         time.sleep(0.02)
     return path.read_text()
-
-
-def greeting(cluster: ClusterAddress, certificates: Path | None) -> bytes:
-    """First bytes that a scheduler says to one who trusts everybody."""
-    context = ssl.create_default_context()
-    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
-    if certificates is not None:
-        context.load_cert_chain(certificates / "cluster.pem", certificates / "cluster.key")
-    try:
-        with (
-            socket.create_connection((cluster.host, cluster.port), timeout=10) as plain,
-            context.wrap_socket(plain) as connection,
-        ):
-            return connection.recv(8)
-    except (ssl.SSLError, ConnectionError):
-        return b""
 
 
 class TestCluster:
@@ -239,9 +221,9 @@ class TestCluster:
         """One who accepts every scheduler hears nothing from it, with another certificate or with none."""
         assert cluster.certificates is not None
         make_certificates(tmp_path)
-        assert greeting(cluster, cluster.certificates)
-        assert greeting(cluster, tmp_path) == b""
-        assert greeting(cluster, None) == b""
+        assert greeting(cluster.port, cluster.certificates)
+        assert greeting(cluster.port, tmp_path) == b""
+        assert greeting(cluster.port, None) == b""
 
 
 @pytest.mark.slow
@@ -279,9 +261,9 @@ class TestKills:
 @pytest.mark.parametrize(
     ("address", "has_certificate", "fault"),
     [
-        ("tcp://10.0.0.7:8786", False, "needs --certificates"),
-        ("head", False, "needs --certificates"),
-        ("tls://127.0.0.1", False, "needs --certificates"),
+        ("tcp://10.0.0.7:8786", False, "needs certificates"),
+        ("head", False, "needs certificates"),
+        ("tls://127.0.0.1", False, "needs certificates"),
         ("tcp://head:8786", True, "is not encrypted"),
         ("ucx://head", True, "is no address"),
         ("tls://", True, "is no address"),
@@ -308,8 +290,11 @@ def test_the_key_is_for_its_owner(tmp_path: Path) -> None:
     make_certificates(tmp_path)
     if os.name == "posix":
         assert (tmp_path / "cluster.key").stat().st_mode & 0o077 == 0
-    with pytest.raises(ValueError, match=r"has no cluster\.pem"):
-        (tmp_path / "cluster.pem").unlink()
+        (tmp_path / "cluster.key").chmod(0o644)
+        with pytest.raises(InputError, match=r"cluster\.key: can be read by every user"):
+            ClusterAddress("tls://head", tmp_path)
+    (tmp_path / "cluster.pem").unlink()
+    with pytest.raises(InputError, match=r"has no cluster\.pem"):
         ClusterAddress("tls://head", tmp_path)
 
 

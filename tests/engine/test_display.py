@@ -27,10 +27,12 @@ def test_inner_tasks_are_the_note_of_the_line() -> None:
         stages.advance(0, note="train")
         with line.task("training", 900) as training:
             training.advance(300, note="20.1 dB", left_s=125.0)
+            training.advance(300, left_s=math.inf)  # jobs of the job, whose time is not known
         stages.advance()
     assert seen == [
         ("north of 8", 0, "train", math.inf),
         ("north of 8", 0, "train · training 300/900 · 20.1 dB · 2 min 05 s left", math.inf),
+        ("north of 8", 0, "train · training 600/900 · 20.1 dB", math.inf),
         ("north of 8", 1, "train", math.inf),
     ]
     assert line.place == "train"

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipelines.pages.page import value_at
+from pipelines.pages.page import Page, render_page, value_at
 from pipelines.pages.text import duration, metres, number, parts_per_million, share, signed, whole
 
 
@@ -40,3 +40,11 @@ def test_value_at_a_path() -> None:
     assert value_at(document, "points.1.de_m") is None
     with pytest.raises(KeyError):
         value_at(document, "points.0.dn_m")
+
+
+def test_control_characters_of_names_are_shown() -> None:
+    """C0 with ESC and DEL, C1, marks that turn the direction of writing, and signs that end lines."""
+    unsafe = "\x00\x07\x1b\x7f\x9b\u202e\u2066\u200f\u2028"
+    page = render_page(Page(f"a{unsafe}b<i>", unsafe, {unsafe: unsafe}, ()), "pipelines.report")
+    assert not set(unsafe) & set(page)
+    assert "a\\x00\\x07\\x1b\\x7f\\x9b\\u202e\\u2066\\u200f\\u2028b&lt;i&gt;" in page

@@ -14,8 +14,6 @@ from pipelines.core.errors import InputError
 from pipelines.formats.splat_ply import SplatArrays
 from pipelines.formats.spz import SpzVersion, decode_spz, encode_spz
 
-LIMIT = 1 << 28
-
 
 @st.composite
 def splats(draw: st.DrawFn) -> SplatArrays:
@@ -33,7 +31,7 @@ def splats(draw: st.DrawFn) -> SplatArrays:
 @given(splat=splats(), version=st.sampled_from([3, 4]))
 @settings(max_examples=40, deadline=None)
 def test_round_trip_within_the_bounds_of_the_format(splat: SplatArrays, version: SpzVersion) -> None:
-    again = decode_spz(encode_spz(splat, version), limit_bytes=LIMIT)
+    again = decode_spz(encode_spz(splat, version))
     rounding = 1e-6
     np.testing.assert_allclose(again.means, splat.means, rtol=1e-7, atol=0.5 / 4096 + rounding)
     scales = np.clip(splat.log_scales, -10, 255 / 16 - 10)
@@ -61,7 +59,7 @@ def test_damaged_files_are_refused_with_a_message(noise: bytes, cut: int, versio
     whole = encode_spz(SplatArrays(ones, np.ones((2, 4), np.float32), ones, ones[:, 0], ones[:, None]), version)
     data = whole[: cut % len(whole)]
     with pytest.raises(InputError):
-        decode_spz(data, limit_bytes=LIMIT)
+        decode_spz(data)
     # Damage to bytes that mean nothing, such as the time in the gzip header, is none.
     with contextlib.suppress(InputError):
-        decode_spz(data + noise + whole[len(data) + len(noise) :], limit_bytes=LIMIT)
+        decode_spz(data + noise + whole[len(data) + len(noise) :])

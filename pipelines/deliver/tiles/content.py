@@ -17,7 +17,6 @@ from pipelines.formats.spz import FRACTIONAL_BITS, decode_spz, encode_spz
 
 _REACH_M = 2.0 ** (23 - FRACTIONAL_BITS)
 _COPIES, _BYTES = 3, 17  # bytes of a Gaussian in SPZ before its compression, without harmonics above the constant
-_LEAST_LIMIT_BYTES = 256 * 1024 * 1024
 
 
 def write_glb(path: Path, splat: SplatArrays, extras: dict[str, Any] | None = None) -> None:
@@ -69,5 +68,5 @@ def read_glb(path: Path) -> SplatArrays:
     Raises:
         InputError: the file cannot be read, or is damaged.
     """
-    limit = max(_LEAST_LIMIT_BYTES, 16 * file_size(path))
-    return decode_spz(spz_in_glb(path.read_bytes()), limit_bytes=limit, path=path)
+    file_size(path)
+    return decode_spz(spz_in_glb(path.read_bytes()), path)

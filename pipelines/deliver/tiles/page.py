@@ -1,21 +1,27 @@
 """The page `index.html` beside a tileset: CesiumJS shows it with coordinates, scale bar and surveyed points.
 
 The page's program is the package's `index.html`; a scene enters it as one JSON document. It needs a web server, the
-tiles and CesiumJS, and loads nothing else: no account, no imagery, no terrain.
+tiles and CesiumJS, and loads nothing else: no account, no imagery, no terrain. Its own policy enforces that: it
+runs its own script, by its hash, and CesiumJS.
 """
 
 from __future__ import annotations
 
+import base64
+import hashlib
+import html
 import re
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
+from urllib.parse import quote, urlsplit
 
 import numpy as np
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from pipelines.core.durable import replace_file
+from pipelines.core.printable import printable
 from pipelines.core.products import Product
 from pipelines.core.types import Float32Array, Vector3
 from pipelines.deliver.placement import Placement
@@ -26,7 +32,8 @@ from pipelines.scene.survey import Survey, SurveyedPoint
 from pipelines.scene.target_crs import TargetCrs
 
 PAGE = "index.html"
-_PLACEHOLDER = '{"to be filled": "page.py"}'
+_PLACEHOLDER, _POLICY = '{"to be filled": "page.py"}', "to be filled: page.py"
+_SCRIPT = re.compile(r"<script>(.*?)</script>", re.DOTALL)
 # The first view shows these of the Gaussians: single ones of the sky or of a far background lie kilometres away.
 _SHOWN = 0.75
 _LEAST_RADIUS_M = 1.0
@@ -35,17 +42,21 @@ _LEAST_CRS_BOX_M = 300.0
 _MOST_CRS_BOX_M = 10_000.0
 
 
+# Names come from files of other people: control characters are shown, and none turns the direction of writing.
+ShownText = Annotated[str, AfterValidator(printable)]
+
+
 class Fact(Product):
     """Line of the page: what it tells, and the value."""
 
-    name: str
-    value: str
+    name: ShownText
+    value: ShownText
 
 
 class PagePoint(Product):
     """Control or check point with its surveyed place in EPSG:4978."""
 
-    name: str
+    name: ShownText
     kind: Literal["control", "check"]
     ecef: Vector3
 
@@ -65,13 +76,13 @@ class ScenePage(Product):
         crs: coordinates to show beside longitude, latitude and ellipsoidal height; None: no others.
     """
 
-    title: str
+    title: ShownText
     tileset: str
     cesium: str
     origin_lla: Vector3
     radius_m: float = Field(gt=0)
     facts: tuple[Fact, ...]
-    cautions: tuple[str, ...]
+    cautions: tuple[ShownText, ...]
     points: tuple[PagePoint, ...]
     crs: LocalCrs | None = None
 
@@ -132,8 +143,34 @@ def write_page(page: ScenePage, folder: Path) -> None:
     """
     program = resources.files(__package__).joinpath(PAGE).read_text(encoding="utf-8")
     draft = folder / f"{PAGE}.tmp"
+    program = program.replace(_POLICY, html.escape(_policy(program, page.cesium)), 1)
     draft.write_text(program.replace(_PLACEHOLDER, _script_json(page), 1), encoding="utf-8")
     replace_file(draft, folder / PAGE)
+
+
+def _policy(program: str, cesium: str) -> str:
+    """Return the content security policy of the page.
+
+    CesiumJS starts workers from blobs, which load scripts from blobs, and decodes textures from blobs. Its decoder
+    of SPZ is WebAssembly whose calls are made from text (`unsafe-eval`): else CesiumJS 1.145 does not start.
+    """
+    found = _SCRIPT.search(program)
+    assert found is not None
+    own = base64.b64encode(hashlib.sha256(found[1].encode()).digest()).decode()
+    library = quote(cesium, safe="/:@[]%") if urlsplit(cesium).netloc else "'self'"
+    files = "'self'" if library == "'self'" else f"'self' {library}"
+    return "; ".join(
+        (
+            "default-src 'none'",
+            f"script-src 'sha256-{own}' 'unsafe-eval' blob: {library}",
+            f"worker-src blob: {library}",
+            f"connect-src {files} blob: data:",
+            f"img-src {files} blob: data:",
+            f"style-src {library} 'unsafe-inline'",
+            "base-uri 'none'",
+            "form-action 'none'",
+        )
+    )
 
 
 def _script_json(page: ScenePage) -> str:

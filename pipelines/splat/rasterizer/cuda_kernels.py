@@ -29,6 +29,7 @@ from pipelines.core.errors import BackendUnavailableError, InputError, Workspace
 from pipelines.core.free_memory import free_main_memory_bytes
 from pipelines.core.lock import WriteLock
 from pipelines.core.progress import SILENT, Progress
+from pipelines.core.restart import python_command, python_environment
 from pipelines.core.threads import thread_count
 from pipelines.splat.rasterizer.cuda_parts import (
     compiling_parts,
@@ -190,7 +191,7 @@ def _compile(draft: Path, log: Path, progress: Progress) -> None:
     sources = _sources()
     with log.open("wb") as output, progress.task("compiling CUDA kernels, once", sources + 1) as task:
         process = subprocess.Popen(
-            [sys.executable, "-c", _COMPILE],
+            python_command(["-c", _COMPILE]),
             stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT, env=_environment(draft),
             start_new_session=True,
         )  # fmt: skip
@@ -218,11 +219,10 @@ def _environment(draft: Path) -> dict[str, str]:
     libraries = [str(_link_library(home, draft)), *filter(None, [os.environ.get("LIBRARY_PATH")])]
     return {
         "MAX_JOBS": str(jobs),
-        **os.environ,
+        **python_environment(),
         "CUDA_HOME": str(home),
         "LIBRARY_PATH": os.pathsep.join(libraries),
         "PATH": os.pathsep.join([*map(str, tool_folders()), os.environ.get("PATH", "")]),
-        "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
         "TORCH_CUDA_ARCH_LIST": os.environ.get("TORCH_CUDA_ARCH_LIST") or ";".join(_architectures()),
         "TORCH_EXTENSIONS_DIR": str(draft),
         "VERBOSE": "1",

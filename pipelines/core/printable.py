@@ -1,4 +1,7 @@
-"""Text made safe for a terminal: names and records of others hold escape sequences, and may not use them."""
+"""Text made safe for terminals and pages: names and records of others hold control characters without effect.
+
+A terminal obeys escape sequences, and marks that turn the direction of writing show another name than there is.
+"""
 
 from __future__ import annotations
 
