@@ -54,9 +54,19 @@ def size(count: int) -> str:
 
 
 def _headline(result: Overview) -> str:
+    """Return the first line: whether the result is that of the present inputs and options, its size, its place."""
     lat, lon, _ = result.center_lla
     place = f"{abs(lat):.6f}° {'S' if lat < 0 else 'N'}, {abs(lon):.6f}° {'W' if lon < 0 else 'E'}"
-    return f"[bold]{shown(str(result.workspace))}[/]: {result.gaussians} Gaussians at {place}"
+    gaussians = f"{result.gaussians} Gaussians at {place}"
+    if not result.outdated:
+        return f"[bold]{shown(str(result.workspace))}[/]: {gaussians}"
+    first, *others = result.outdated
+    style, more = (
+        tables.STATE_STYLE[first.state],
+        f"; and {', '.join(row.stage for row in others)}" if others else "",
+    )
+    why = f"{first.stage}: {first.reason}{more}"
+    return f"[bold]{shown(str(result.workspace))}[/] is [{style}]{first.state}[/] ({shown(why)}): {gaussians}"
 
 
 def _place(result: Overview, *, brief: bool = False) -> Table:

@@ -118,6 +118,7 @@ class Overview:
         bounds: of the scene.
         quality: predicted and measured accuracy.
         files: those that there are, with their use.
+        outdated: stages whose product is stale or damaged, in the order of the work.
         further: commands of the deliverables that were not made, with what each makes.
         cautions: limits of the result, by stage.
     """
@@ -128,6 +129,7 @@ class Overview:
     bounds: Bounds
     quality: Quality
     files: tuple[MadeFile, ...]
+    outdated: tuple[StageState, ...]
     further: dict[str, str]
     cautions: dict[str, tuple[Caution, ...]]
 
@@ -137,6 +139,7 @@ class Overview:
         lat, lon, height = self.center_lla
         properties = {
             "workspace": str(self.workspace),
+            "outdated": [{"stage": row.stage, "state": row.state, "reason": row.reason} for row in self.outdated],
             "gaussians": self.gaussians,
             "center": {"longitude": lon, "latitude": lat, "ellipsoidal_height_m": height},
             "ellipsoidal_height_m": bounds.height_m,
@@ -175,7 +178,8 @@ def overview(workspace: Workspace, options: CrsOptions) -> Overview:
     survey = load_survey(workspace)
     means = read_centres(workspace.path(GAUSSIANS)).astype(np.float64)
     placement = place(model, survey, means)
-    states = {BY_NAME[row.stage].folder: row for row in status(workspace)}
+    rows = status(workspace)
+    states = {BY_NAME[row.stage].folder: row for row in rows}
     x, y, z = placement.origin_lla.tolist()
     return Overview(
         workspace=workspace.root,
@@ -184,6 +188,7 @@ def overview(workspace: Workspace, options: CrsOptions) -> Overview:
         bounds=_bounds(placement.geo_from_model.apply(means[:: max(1, len(means) // _MOST)]), survey, options),
         quality=_quality(workspace, placement),
         files=_files(workspace, states),
+        outdated=tuple(row for row in rows if row.state in ("stale", "damaged")),
         further={
             f"georef {spec.name} {workspace.root}": spec.title
             for spec in DELIVERABLES

@@ -8,8 +8,10 @@ import pytest
 
 from georef_cli.output import print_outcomes
 from georef_cli.overview import size
+from pipelines.core.manifest import MANIFEST, Manifest
+from pipelines.core.products import save_json
 from pipelines.core.stages import MODEL, SPLAT
-from pipelines.core.workspace import Workspace
+from pipelines.core.workspace import Workspace, now
 from pipelines.deliver.overview import overview
 from pipelines.scene.crs_options import CrsOptions
 from tests.cli_runs import Georef
@@ -33,6 +35,26 @@ def test_command_tells_place_files_and_what_can_be_made(real_georef: Georef, fli
     document = real_georef("info", flight.root, "--json").document
     assert document["type"] == "Feature"
     assert document["properties"]["files"][0]["path"] == SPLAT
+    assert document["properties"]["outdated"] == []
+
+
+def test_a_stale_result_is_told_in_the_first_line(real_georef: Georef, flight: Workspace) -> None:
+    """The splat was made of another model: what follows in the text is not of the present inputs."""
+    made = Manifest.model_validate(
+        {
+            "stage": "export-ply",
+            "config": {},
+            "inputs": {MODEL: "of another model"},
+            "versions": {},
+            "started": now(),
+        }
+        | {"duration_s": 1.0, "key_figure": "80 Gaussians", "values": {}, "warnings": []}
+    )
+    save_json(made, flight.root / "export" / MANIFEST)
+    first, *_ = real_georef("info", flight.root).out.splitlines()
+    assert first.startswith(f"{flight.root} is stale (export-ply: ")
+    (row,) = real_georef("info", flight.root, "--json").document["properties"]["outdated"]
+    assert (row["stage"], row["state"]) == ("export-ply", "stale") and MODEL in row["reason"]
 
 
 def test_command_names_what_is_missing(real_georef: Georef, flight: Workspace, tmp_path: Path) -> None:
