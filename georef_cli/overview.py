@@ -19,7 +19,7 @@ _UNITS = ("B", "kB", "MB", "GB", "TB")
 
 def whole(result: Overview) -> list[Renderable]:
     """Return the text of `georef info`: place, accuracy, files with their use, further deliverables, cautions."""
-    parts: list[Renderable] = [_headline(result), _place(result), _files(result)]
+    parts: list[Renderable] = [_headline(result), *_interrupted(result), _place(result), _files(result)]
     if result.further:
         parts.append("\n[bold]Not made yet[/]")
         parts += [f"  {shown(command)}  [dim]{shown(title)}[/]" for command, title in result.further.items()]
@@ -43,7 +43,7 @@ def short(result: Overview) -> list[Renderable]:
         **({f"georef run {workspace} --deliver {names}": "further deliverables"} if names else {}),
     }
     steps = [f"  {shown(command)}  [dim]{use}[/]" for command, use in further.items()]
-    parts: list[Renderable] = ["", _headline(result), _place(result, brief=True)]
+    parts: list[Renderable] = ["", _headline(result), *_interrupted(result), _place(result, brief=True)]
     return [*parts, f"\n[bold]Files[/] in {shown(str(workspace))}", files, "\n[bold]Next[/]", *steps]
 
 
@@ -67,6 +67,11 @@ def _headline(result: Overview) -> str:
     )
     why = f"{first.stage}: {first.reason}{more}"
     return f"[bold]{shown(str(result.workspace))}[/] is [{style}]{first.state}[/] ({shown(why)}): {gaussians}"
+
+
+def _interrupted(result: Overview) -> list[str]:
+    """Return a line for each stage beside whose product an interrupted run lies."""
+    return [f"[yellow]{stage}[/]: {shown(found)}" for stage, found in result.interrupted.items()]
 
 
 def _place(result: Overview, *, brief: bool = False) -> Table:

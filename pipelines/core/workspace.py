@@ -209,7 +209,7 @@ class Workspace:
 
         Args:
             spec: the stage; only a resumable one can be continued.
-            token: text of the request, from `request_token`.
+            token: text of the request, from `Request.token`.
             resume: `never` begins afresh; `if-same` continues an interrupted run with the same token, and otherwise
                 begins afresh; `always` does the same, but refuses an interrupted run with another token.
 

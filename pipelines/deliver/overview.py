@@ -119,6 +119,7 @@ class Overview:
         quality: predicted and measured accuracy.
         files: those that there are, with their use.
         outdated: stages whose product is stale or damaged, in the order of the work.
+        interrupted: by stage, what an interrupted run has left beside the product.
         further: commands of the deliverables that were not made, with what each makes.
         cautions: limits of the result, by stage.
     """
@@ -130,6 +131,7 @@ class Overview:
     quality: Quality
     files: tuple[MadeFile, ...]
     outdated: tuple[StageState, ...]
+    interrupted: dict[str, str]
     further: dict[str, str]
     cautions: dict[str, tuple[Caution, ...]]
 
@@ -140,6 +142,7 @@ class Overview:
         properties = {
             "workspace": str(self.workspace),
             "outdated": [{"stage": row.stage, "state": row.state, "reason": row.reason} for row in self.outdated],
+            "interrupted": self.interrupted,
             "gaussians": self.gaussians,
             "center": {"longitude": lon, "latitude": lat, "ellipsoidal_height_m": height},
             "ellipsoidal_height_m": bounds.height_m,
@@ -189,6 +192,7 @@ def overview(workspace: Workspace, options: CrsOptions) -> Overview:
         quality=_quality(workspace, placement),
         files=_files(workspace, states),
         outdated=tuple(row for row in rows if row.state in ("stale", "damaged")),
+        interrupted={row.stage: row.interrupted for row in rows if row.interrupted},
         further={
             f"georef {spec.name} {workspace.root}": spec.title
             for spec in DELIVERABLES
