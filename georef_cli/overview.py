@@ -22,7 +22,9 @@ def whole(result: Overview) -> list[Renderable]:
     parts: list[Renderable] = [_headline(result), *_interrupted(result), _place(result), _files(result)]
     if result.further:
         parts.append("\n[bold]Not made yet[/]")
-        parts += [f"  {shown(command)}  [dim]{shown(title)}[/]" for command, title in result.further.items()]
+        parts += [
+            f"  {shown(spec.command(result.workspace))}  [dim]{shown(spec.title)}[/]" for spec in result.further
+        ]
     return [*parts, *tables.cautions(result.cautions)]
 
 
@@ -35,7 +37,7 @@ def short(result: Overview) -> list[Renderable]:
         style = tables.STATE_STYLE.get(file.state, "dim")
         state = "" if file.state == "current" else f"[{style}]{file.state}[/] "
         files.add_row(f"  {shown(file.path)}", f"{state}[dim]{shown(file.purpose)}[/]")
-    names = ",".join(command.split()[1].removeprefix("export-") for command in result.further)
+    names = ",".join(spec.name.removeprefix("export-") for spec in result.further)
     further = {
         f"georef view {workspace}": "see it in a browser, and measure in it",
         f"georef info {workspace}": "sizes and states of the files",

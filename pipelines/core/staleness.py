@@ -137,7 +137,7 @@ def found_interrupted(workspace: Workspace, spec: StageSpec) -> str:
 
 def continuing_command(workspace: Workspace, spec: StageSpec) -> str:
     """Return the command that goes on with an interrupted run, as long as the inputs are those of that run."""
-    command = f"georef {workspace.command or spec.name} {(workspace.base or workspace).root}"
+    command = workspace.command_of(spec)
     before = _options_of_partial(workspace, spec)
     if before is None or workspace.base is not None:
         return command

@@ -110,9 +110,13 @@ class Workspace:
         folder, _, inside = product.partition("/")
         path = self._folder(folder) / inside
         if not path.exists():
-            name, home = producer_of(product).name, self.base or self
-            raise MissingProductError(product, f"georef {self.command or name} {home.root}")
+            raise MissingProductError(product, self.command_of(producer_of(product)))
         return path
+
+    def command_of(self, spec: StageSpec) -> str:
+        """Return the command that makes the product of a stage here."""
+        home = (self.base or self).root
+        return f"georef {self.command} {home}" if self.command else spec.command(home)
 
     def _folder(self, name: str) -> Path:
         return self.lent.get(name, self.root / name)

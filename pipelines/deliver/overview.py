@@ -14,7 +14,7 @@ import numpy as np
 from pipelines.core.cautions import Caution
 from pipelines.core.errors import GeorefError
 from pipelines.core.products import load_json
-from pipelines.core.stages import BY_NAME, DELIVERABLES, GAUSSIANS, MODEL, REPORT
+from pipelines.core.stages import BY_NAME, DELIVERABLES, GAUSSIANS, MODEL, REPORT, StageSpec
 from pipelines.core.staleness import StageState, cautions_by_stage, status
 from pipelines.core.types import FloatArray, Vector3
 from pipelines.core.workspace import Workspace
@@ -120,7 +120,7 @@ class Overview:
         files: those that there are, with their use.
         outdated: stages whose product is stale or damaged, in the order of the work.
         interrupted: by stage, what an interrupted run has left beside the product.
-        further: commands of the deliverables that were not made, with what each makes.
+        further: deliverables that were not made.
         cautions: limits of the result, by stage.
     """
 
@@ -132,7 +132,7 @@ class Overview:
     files: tuple[MadeFile, ...]
     outdated: tuple[StageState, ...]
     interrupted: dict[str, str]
-    further: dict[str, str]
+    further: tuple[StageSpec, ...]
     cautions: dict[str, tuple[Caution, ...]]
 
     def feature(self) -> Json:
@@ -156,7 +156,7 @@ class Overview:
             },
             "quality": asdict(self.quality),
             "files": [{**asdict(file), "made": file.made and file.made.isoformat()} for file in self.files],
-            "further": self.further,
+            "further": {spec.command(self.workspace): spec.title for spec in self.further},
             "cautions": [
                 {"stage": stage, **caution.model_dump()}
                 for stage, cautions in self.cautions.items()
@@ -193,11 +193,7 @@ def overview(workspace: Workspace, options: CrsOptions) -> Overview:
         files=_files(workspace, states),
         outdated=tuple(row for row in rows if row.state in ("stale", "damaged")),
         interrupted={row.stage: row.interrupted for row in rows if row.interrupted},
-        further={
-            f"georef {spec.name} {workspace.root}": spec.title
-            for spec in DELIVERABLES
-            if not (workspace.root / spec.product).exists()
-        },
+        further=tuple(spec for spec in DELIVERABLES if not (workspace.root / spec.product).exists()),
         cautions=cautions_by_stage(workspace),
     )
 
