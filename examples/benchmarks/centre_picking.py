@@ -1,7 +1,8 @@
 """Distance of Gaussians' centres from the points that a user picks, beside that of the rendered surface.
 
 `python examples/benchmarks/centre_picking.py WS` reads an evaluated survey with check points, and its
-`export/splat.ply`, or with `--measurable` its `measurable/splat.measurable.ply`. At each mark, a centre is picked as viewers do it:
+`export/splat.ply`, or with `--measurable` its `measurable/splat.measurable.ply`. At each mark, a centre is picked
+as viewers do it:
 
 - `front`: the frontmost centre of an opaque Gaussian within `--reach` pixels of the mark;
 - `nearest`: the centre next to the mark among the opaque ones that lie at most 1 % behind the frontmost;
