@@ -7,6 +7,8 @@ import os
 import shutil
 import sys
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from pipelines.core.errors import StorageError, storage_error
@@ -25,6 +27,22 @@ def replace_file(draft: Path, path: Path) -> None:
     sync_folder(path.parent)
 
 
+@contextmanager
+def replacing(path: Path, draft: Path) -> Iterator[None]:
+    """Rename a draft to `path` when it was written; one that cannot be completed keeps no room on a full disk.
+
+    Raises:
+        OSError: the file cannot be written; an existing one stays.
+    """
+    try:
+        yield
+        replace_file(draft, path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            draft.unlink()
+        raise
+
+
 def replace_text(path: Path, text: str) -> None:
     """Write a text file; an existing file is replaced when the new one is complete.
 
@@ -32,13 +50,8 @@ def replace_text(path: Path, text: str) -> None:
         OSError: the file cannot be written; the existing one stays.
     """
     draft = path.with_suffix(".tmp")
-    try:
+    with replacing(path, draft):
         draft.write_text(text, encoding="utf-8")
-        replace_file(draft, path)
-    except OSError:
-        with contextlib.suppress(OSError):
-            draft.unlink()
-        raise
 
 
 def replace_folder(draft: Path, folder: Path, aside: Path) -> None:

@@ -64,8 +64,8 @@ class PartialProduct:
         replace_text(self.folder / PROGRESS, text)
 
     def failure(self) -> str | None:
-        """Return the message with which the run failed, or None."""
-        return _text(self.folder / FAILURE)
+        """Return the message with which the run failed, or None; a full disk leaves an empty file."""
+        return _text(self.folder / FAILURE) or None
 
     def fail(self, message: str, *, worthless: bool = False) -> None:
         """Record the message with which the run failed; a full disk has no room even for that.

@@ -306,7 +306,7 @@ def _run(job: _Job) -> Summary:
     extends = None if job.resume == "never" else extendable_product(workspace, asked)
     log.info("%s: %s%s", spec.name, "resumed" if resumed else "started", f", {place}" if place else "")
     try:
-        with storage_failures():
+        with storage_failures(out):
             run = _module(workspace, asked).run
             afresh = job.resume == "never"
             try:

@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 from pipelines.core.cautions import Caution
 from pipelines.core.durable import remove, replace_file, replace_folder, replace_text, sync_tree
-from pipelines.core.errors import InputError, MissingProductError
+from pipelines.core.errors import InputError, MissingProductError, storage_failures
 from pipelines.core.lock import WriteLock
 from pipelines.core.manifest import MANIFEST, Manifest, Memo, damaged_files
 from pipelines.core.options import CONFIG_FILE
@@ -174,8 +174,9 @@ class Workspace:
         Raises:
             WorkspaceBusyError: another process holds the lock.
             InputError: the directory cannot be made or written.
+            StorageError: the disk failed while the lock was held.
         """
-        with WriteLock(self.root).hold(activity):
+        with storage_failures(self.root), WriteLock(self.root).hold(activity):
             for spec in STAGES:
                 self._recover(spec)
             yield
