@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from georef_cli import tables
-from georef_cli.forecast import RunForecast, forecast_run
+from georef_cli.forecast import RunForecast, checked_inputs, forecast_run
 from georef_cli.layout import plain_table
 from georef_cli.markup import shown
 from georef_cli.output import print_json, print_rich
@@ -17,10 +17,11 @@ from georef_cli.overview import size
 from georef_cli.tables import Renderable
 from pipelines.core.errors import GeorefError
 from pipelines.core.options import notation
+from pipelines.core.progress import Progress
 from pipelines.core.sentences import about
 from pipelines.core.stages import StageSpec
 from pipelines.core.staleness import Flags
-from pipelines.core.workspace import Workspace
+from pipelines.core.workspace import Summary, Workspace
 from pipelines.train.options import TrainOptions
 
 log = logging.getLogger(__name__)
@@ -36,9 +37,15 @@ _STYLE = {
 
 
 def print_dry_run(
-    workspace: Workspace, stages: tuple[StageSpec, ...], flags: Mapping[str, Flags], *, force: bool, as_json: bool
+    workspace: Workspace,
+    stages: tuple[StageSpec, ...],
+    flags: Mapping[str, Flags],
+    *,
+    force: bool,
+    as_json: bool,
+    progress: Progress,
 ) -> None:
-    """Print what a run of the stages would do; nothing is written.
+    """Print what a run of the stages would do, and what `ingest` would find; nothing is written.
 
     Args:
         workspace: may not exist yet.
@@ -46,13 +53,17 @@ def print_dry_run(
         flags: all options by stage, the remembered ones among them.
         force: as of the run.
         as_json: print one document.
+        progress: shows the reading of the photographs' tags.
 
     Raises:
-        GeorefError: the run would be refused for its options, or for a missing file.
+        GeorefError: the run would be refused for its options or its input.
     """
     run = forecast_run(workspace, stages, flags, force=force)
+    survey = checked_inputs(workspace, run.planned, progress)
+    for warning in () if survey is None else survey.warnings:
+        log.warning("ingest: %s", warning)
     if as_json:
-        print_json(_document(workspace, run))
+        print_json(_document(workspace, run, survey))
         return
     table = plain_table("stage", "", "about", "why", right=[2])
     for row in run.planned:
@@ -63,6 +74,8 @@ def print_dry_run(
         width, height = run.photographs.size_px
         files = "" if run.photographs.bytes is None else f", {size(run.photographs.bytes)}"
         parts.append(f"\n[bold]Photographs[/]: {run.photographs.count} of {width}×{height} px{files}")
+    if survey is not None:
+        parts.append(f"\n[bold]Survey[/]: {shown(survey.key_figure)}")
     if run.reconstruction is not None:
         parts += ["\n[bold]Reconstruction[/]", *(f"  {shown(text)}" for text in run.reconstruction.sentences())]
     if run.training is not None:
@@ -86,7 +99,7 @@ def announce_training(
             log.info("train: %s", sentence)
 
 
-def _document(workspace: Workspace, run: RunForecast) -> dict[str, Any]:
+def _document(workspace: Workspace, run: RunForecast, survey: Summary | None) -> dict[str, Any]:
     stages = [
         {
             "stage": row.stage,
@@ -100,6 +113,7 @@ def _document(workspace: Workspace, run: RunForecast) -> dict[str, Any]:
     return {
         "workspace": str(workspace.root),
         "stages": stages,
+        "survey": survey and {name: getattr(survey, name) for name in ("key_figure", "values", "warnings")},
         "photographs": run.photographs and dataclasses.asdict(run.photographs),
         "reconstruction": run.reconstruction and dataclasses.asdict(run.reconstruction),
         "training": run.training and dataclasses.asdict(run.training),

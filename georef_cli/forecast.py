@@ -11,9 +11,10 @@ from pipelines.core.options import StageOptions
 from pipelines.core.photograph_folder import photograph_folder
 from pipelines.core.plan import PlannedStage, plan
 from pipelines.core.products import load_json
+from pipelines.core.progress import SILENT, Progress
 from pipelines.core.stages import SURVEY, StageSpec
 from pipelines.core.staleness import Flags
-from pipelines.core.workspace import Workspace
+from pipelines.core.workspace import Summary, Workspace
 from pipelines.ingest.options import IngestOptions
 from pipelines.scene.survey import Survey
 from pipelines.sfm.options import SfmOptions
@@ -84,6 +85,23 @@ def forecast_run(
         if row is not None and known is not None:
             seconds[row.stage] = known.seconds
     return RunForecast(planned, photographs, seconds, reconstruction, training)
+
+
+def checked_inputs(
+    workspace: Workspace, planned: Sequence[PlannedStage], progress: Progress = SILENT
+) -> Summary | None:
+    """Return the summary of the survey that `ingest` would make; None where it would not run. Nothing is written.
+
+    Raises:
+        InputError: as `ingest` itself would.
+    """
+    row = _to_run(planned, IngestOptions)
+    if row is None:
+        return None
+    from pipelines.ingest.stage import check_inputs
+
+    assert isinstance(row.resolved, IngestOptions)
+    return check_inputs(workspace, row.resolved, progress)
 
 
 def _to_run(planned: Sequence[PlannedStage], options: type[StageOptions]) -> PlannedStage | None:

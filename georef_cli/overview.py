@@ -19,10 +19,12 @@ _UNITS = ("B", "kB", "MB", "GB", "TB")
 
 def whole(result: Overview) -> list[Renderable]:
     """Return the text of `georef info`: place, accuracy, files with their use, further deliverables, cautions."""
-    parts: list[Renderable] = [_headline(result), _place(result), _files(result)]
+    parts: list[Renderable] = [_headline(result), *_interrupted(result), _place(result), _files(result)]
     if result.further:
         parts.append("\n[bold]Not made yet[/]")
-        parts += [f"  {shown(command)}  [dim]{shown(title)}[/]" for command, title in result.further.items()]
+        parts += [
+            f"  {shown(spec.command(result.workspace))}  [dim]{shown(spec.title)}[/]" for spec in result.further
+        ]
     return [*parts, *tables.cautions(result.cautions)]
 
 
@@ -35,7 +37,7 @@ def short(result: Overview) -> list[Renderable]:
         style = tables.STATE_STYLE.get(file.state, "dim")
         state = "" if file.state == "current" else f"[{style}]{file.state}[/] "
         files.add_row(f"  {shown(file.path)}", f"{state}[dim]{shown(file.purpose)}[/]")
-    names = ",".join(command.split()[1].removeprefix("export-") for command in result.further)
+    names = ",".join(spec.name.removeprefix("export-") for spec in result.further)
     further = {
         f"georef view {workspace}": "see it in a browser, and measure in it",
         f"georef info {workspace}": "sizes and states of the files",
@@ -43,7 +45,7 @@ def short(result: Overview) -> list[Renderable]:
         **({f"georef run {workspace} --deliver {names}": "further deliverables"} if names else {}),
     }
     steps = [f"  {shown(command)}  [dim]{use}[/]" for command, use in further.items()]
-    parts: list[Renderable] = ["", _headline(result), _place(result, brief=True)]
+    parts: list[Renderable] = ["", _headline(result), *_interrupted(result), _place(result, brief=True)]
     return [*parts, f"\n[bold]Files[/] in {shown(str(workspace))}", files, "\n[bold]Next[/]", *steps]
 
 
@@ -54,9 +56,24 @@ def size(count: int) -> str:
 
 
 def _headline(result: Overview) -> str:
+    """Return the first line: whether the result is that of the present inputs and options, its size, its place."""
     lat, lon, _ = result.center_lla
     place = f"{abs(lat):.6f}° {'S' if lat < 0 else 'N'}, {abs(lon):.6f}° {'W' if lon < 0 else 'E'}"
-    return f"[bold]{shown(str(result.workspace))}[/]: {result.gaussians} Gaussians at {place}"
+    gaussians = f"{result.gaussians} Gaussians at {place}"
+    if not result.outdated:
+        return f"[bold]{shown(str(result.workspace))}[/]: {gaussians}"
+    first, *others = result.outdated
+    style, more = (
+        tables.STATE_STYLE[first.state],
+        f"; and {', '.join(row.stage for row in others)}" if others else "",
+    )
+    why = f"{first.stage}: {first.reason}{more}"
+    return f"[bold]{shown(str(result.workspace))}[/] is [{style}]{first.state}[/] ({shown(why)}): {gaussians}"
+
+
+def _interrupted(result: Overview) -> list[str]:
+    """Return a line for each stage beside whose product an interrupted run lies."""
+    return [f"[yellow]{stage}[/]: {shown(found)}" for stage, found in result.interrupted.items()]
 
 
 def _place(result: Overview, *, brief: bool = False) -> Table:

@@ -59,7 +59,14 @@ class StageCommand(Command):
         if self.spec.reads:
             must_exist(workspace)
         flags = {self.spec.name: self.flags(ctx, values)}
-        print_dry_run(workspace, (self.spec,), flags, force=values["force"], as_json=values["as_json"])
+        print_dry_run(
+            workspace,
+            (self.spec,),
+            flags,
+            force=values["force"],
+            as_json=values["as_json"],
+            progress=progress_for(ctx.obj),
+        )
 
     def flags(self, ctx: click.Context, values: Mapping[str, Any]) -> dict[str, Any]:
         """Return the options of this and earlier commands."""

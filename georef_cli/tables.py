@@ -89,7 +89,7 @@ def states(rows: Iterable[StageState], cautions: Mapping[str, Sequence[Caution]]
     heads = ("stage", "state", "finished", "took", *(["cautions"] if cautions else []), "result")
     wide = plain_table(*heads, right=range(3, len(heads) - 1))
     for row in rows:
-        remarks = " · ".join(shown(text) for text in (row.key_figure, row.reason) if text)
+        remarks = " · ".join(shown(text) for text in (row.key_figure, row.reason, row.interrupted) if text)
         state, took = f"[{STATE_STYLE[row.state]}]{row.state}[/]", duration(row.duration_s)
         count = [str(len(cautions.get(row.stage, ())) or "")] if cautions else []
         wide.add_row(row.stage, state, when(row.finished), took, *count, remarks)

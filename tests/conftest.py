@@ -121,6 +121,16 @@ def trained(flights: list[RenderedFlight], between_processes: Path) -> list[tupl
     return [(Workspace(flight.root / "with"), Workspace(flight.root / "without")) for flight in flights]
 
 
+@pytest.fixture(scope="session")
+def finished(between_processes: Path) -> Workspace:
+    """A workspace with every product of 40 iterations on nine tiny photographs, which nobody changes."""
+    from tests.killed import make_finished
+
+    root = between_processes / "finished" / "ws"
+    make_once({root: make_finished})
+    return Workspace(root)
+
+
 def make_once(tasks: Mapping[Path, Callable[[Path], None]]) -> None:
     """Call each function with the path of what it makes, unless another process of this run has, or does."""
     for wait in (False, True):  # first what nobody has begun

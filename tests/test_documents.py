@@ -65,3 +65,19 @@ def test_code_named_by_the_conventions_exists() -> None:
         thing: object = importlib.import_module(f"pipelines.{room}.{module}")
         for attribute in attributes:
             thing = getattr(thing, attribute)
+
+
+def test_no_time_is_stated_for_a_gpu() -> None:
+    """Nothing was timed on one: no cell of a table whose head or row names a GPU is a duration."""
+    stated = []
+    for document in DOCUMENTS:
+        heads: list[str] = []
+        for line in text_of(document).splitlines():
+            cells = [cell.strip() for cell in line.strip("|").split("|")] if line.startswith("|") else []
+            heads = (heads or cells) if cells else []
+            stated += [
+                f"{document.name}: {line}"
+                for head, cell in zip(heads, cells, strict=False)
+                if ("GPU" in head or "GPU" in cells[0]) and re.fullmatch(r"[\d.]+ (s|min|h)", cell)
+            ]
+    assert stated == []

@@ -1,7 +1,8 @@
 """Distance of Gaussians' centres from the points that a user picks, beside that of the rendered surface.
 
 `python examples/benchmarks/centre_picking.py WS` reads an evaluated survey with check points, and its
-`export/splat.ply`. At each mark, a centre is picked as viewers do it:
+`export/splat.ply`, or with `--measurable` its `measurable/splat.measurable.ply`. At each mark, a centre is picked
+as viewers do it:
 
 - `front`: the frontmost centre of an opaque Gaussian within `--reach` pixels of the mark;
 - `nearest`: the centre next to the mark among the opaque ones that lie at most 1 % behind the frontmost;
@@ -23,7 +24,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from pipelines.core.stages import REPORT, SPLAT
+from pipelines.core.stages import MEASURABLE_SPLAT, REPORT, SPLAT
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.core.workspace import Workspace
 from pipelines.deliver.placement import place
@@ -157,11 +158,13 @@ def main() -> None:
     parser.add_argument(
         "--coarser", type=float, default=1.0, help="width of a pixel of the window in the photograph's"
     )
+    parser.add_argument("--measurable", action="store_true", help="pick in the measurable splat")
     arguments = parser.parse_args()
     workspace = Workspace(arguments.workspace)
     trained = load_trained(workspace)
     placement = place(trained.model, trained.survey, trained.gaussians.means.numpy())
-    splat = transformed(read_gaussians(workspace.path(SPLAT)), placement.file_from_model.inverse())
+    path = workspace.path(MEASURABLE_SPLAT if arguments.measurable else SPLAT)
+    splat = transformed(read_gaussians(path), placement.file_from_model.inverse())
     rules: list[Callable[[Look], int | None]] = [front, nearest, render]
     print(f"{len(splat)} Gaussians\n{'':8}  marks  depth      H      V  (medians, m)")
     picked_m = picked_errors_m(trained, splat, rules, arguments.reach, arguments.coarser)

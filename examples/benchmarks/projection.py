@@ -2,7 +2,7 @@
 
 Nothing is reconstructed or trained: surveys are made up, divided into blocks, and the models that were fitted to
 small surveys (pipelines/sfm/pace.py, pipelines/train/pace.py) are evaluated at their sizes. What is printed is a
-projection.
+projection, for processors only: nothing was measured on a GPU.
 """
 
 from __future__ import annotations
@@ -26,32 +26,26 @@ TRAINED_PX = 1600
 GAUSSIANS_A_PHOTOGRAPH = 2000
 # Two one-thread workers do 1.88 times the work of one (examples/benchmarks/cluster.py); more were not measured.
 SHARING = 0.94
-# Not measured: published are 4 min 31 s for 30 000 iterations of a megapixel and some million Gaussians (Faster-GS,
-# RTX 4090), 9 ms each. The model of blocks gives 1.0 s of one core for a million Gaussians.
-GPU_CORES = 100.0
 
 
 @dataclass(frozen=True)
 class Machines:
-    """Machines for one survey: their cores, and what one worker of the training has.
+    """Machines for one survey: their cores, and what one worker of the training has; none with a GPU.
 
     Attributes:
         cores: of all machines.
         workers: that train at the same time.
         memory_gib: of a worker.
-        speed: of a worker, in cores.
     """
 
     cores: int
     workers: int
     memory_gib: float
-    speed: float = 1.0
 
 
 COLUMNS = {
     "2 cores": Machines(2, 2, 8.0),
     "32 cores": Machines(32, 32, 8.0),
-    "8 GPUs with 32 cores": Machines(32, 8, 40.0, GPU_CORES),
 }
 
 
@@ -80,7 +74,7 @@ def projected(count: int, scene: Scene, machines: Machines) -> list[str]:
     stereo = (sum(whole.values()) - sum(blocks.values())) / machines.cores / SHARING
     # The longest block is the least time, however many workers there are.
     together = sum(blocks.values()) / machines.workers / SHARING
-    training = max(together, *blocks.values()) / machines.speed
+    training = max(together, *blocks.values())
     peak_gib = max(block.peak_bytes for block in plan.blocks) / 2**30
     size = f"{len(plan.blocks)} of {peak_gib:.1f} GiB"
     times = (sfm, pace.mapping_s, stereo, training)

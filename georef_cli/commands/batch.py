@@ -13,7 +13,7 @@ from georef_cli.command import Command
 from georef_cli.commands.run import OWNERS, deliver_option, slice_option
 from georef_cli.display import progress_for
 from georef_cli.engines import engine_for, engine_options
-from georef_cli.forecast import RunForecast, forecast_run
+from georef_cli.forecast import RunForecast, checked_inputs, forecast_run
 from georef_cli.output import print_json, print_rich
 from georef_cli.settings import set_option, settings
 from pipelines.batch.missions import Mission, MissionList, load_missions
@@ -22,6 +22,7 @@ from pipelines.core import runner
 from pipelines.core.errors import GeorefError
 from pipelines.core.options import input_paths
 from pipelines.core.plan import plan
+from pipelines.core.progress import Progress
 from pipelines.core.stages import BY_NAME
 from pipelines.core.staleness import stage_config
 
@@ -35,7 +36,8 @@ def _batch(ctx: click.Context, **values: Any) -> int:
     from pipelines.batch.runner import run_batch
 
     listed = _missions(values)
-    forecasts = [_planned(mission) for mission in listed.missions]
+    progress = progress_for(ctx.obj)
+    forecasts = [_planned(mission, check=values["dry_run"], progress=progress) for mission in listed.missions]
     planned = [mission for mission, _ in forecasts]
     engine = engine_for(values, values["at_a_time"])
     if values["dry_run"]:
@@ -45,8 +47,8 @@ def _batch(ctx: click.Context, **values: Any) -> int:
         else:
             together = engine.together([row.job(listed.folder) for row in planned if not row.is_current])
             print_rich(*batch_tables.dry_run(rows, together))
-        return 0
-    table = run_batch(listed, planned, engine, progress_for(ctx.obj))
+        return FAILED if any(row.refusal for row in planned) else 0
+    table = run_batch(listed, planned, engine, progress)
     if values["as_json"]:
         print_json(table.model_dump(mode="json"))
     else:
@@ -69,14 +71,23 @@ def _missions(values: dict[str, Any]) -> MissionList:
         raise click.UsageError(f"--deliver: {error}") from error
 
 
-def _planned(mission: Mission) -> tuple[PlannedMission, RunForecast | None]:
-    """Return a mission with what its run needs; the forecast is None where the run will be refused, or unknown."""
+def _planned(mission: Mission, *, check: bool, progress: Progress) -> tuple[PlannedMission, RunForecast | None]:
+    """Return a mission with what its run needs; the forecast is None where the run will be refused, or unknown.
+
+    Args:
+        mission: the mission.
+        check: whether to read its inputs as `ingest` would.
+        progress: shows that reading.
+    """
     try:
         asked = {
             spec.name: runner.remembered(mission.workspace, spec, mission.flags.get(spec.name, {}))
             for spec in mission.stages
         }
-        actions = {row.stage: row.action for row in plan(mission.workspace, mission.stages, asked)}
+        rows = plan(mission.workspace, mission.stages, asked)
+        actions = {row.stage: row.action for row in rows}
+        if check:
+            checked_inputs(mission.workspace, rows, progress)
         configs = [stage_config(mission.workspace, spec, asked[spec.name]) for spec in mission.stages]
     except GeorefError as error:
         return PlannedMission(mission, {}, refusal=str(error)), None

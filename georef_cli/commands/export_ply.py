@@ -1,20 +1,60 @@
-"""Command `georef export-ply`."""
+"""Command `georef export-ply`: the splat as trained, or with --measurable a second file to measure in."""
 
 from __future__ import annotations
 
-from georef_cli.deliverable import DeliverableCommand
+from typing import Any
 
-command = DeliverableCommand(
-    "export-ply",
-    """Write the splat as a PLY with its place on Earth.
+import click
+
+from georef_cli import options
+from georef_cli.deliverable import DeliverableCommand
+from pipelines.deliver.options import MeasurableOptions
+
+_DOC = """Write the splat as a PLY with its place on Earth.
 
     The PLY is in an East-North-Up frame in metres. FILE.georef.json beside it states the place of that frame on
     Earth, and its accuracy.
+
+    --measurable writes a second file beside the first, measurable/splat.measurable.ply, for viewers that measure by
+    the centres of Gaussians: small discs on the surface replace the Gaussians about it. It is several times larger
+    and looks a little worse. Its options in georef.toml are those of [export-measurable].
 
     \b
     Examples:
       georef export-ply flight
       georef export-ply flight --to splat.ply --min-opacity 0.02
       georef export-ply flight --measurable
-    """,
+    """
+_OF_MEASURABLE = ("disc_spacing", "repaint_passes")
+_MEASURABLE = DeliverableCommand("export-measurable", _DOC)
+
+
+class PlyCommand(DeliverableCommand):
+    """Command of the stage `export-ply`, or with --measurable of `export-measurable`."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the command of one of the two stages.
+
+        Raises:
+            click.UsageError: an option of --measurable without it.
+        """
+        if ctx.params.pop("measurable"):
+            return _MEASURABLE.invoke(ctx)
+        if given := options.given(ctx, _OF_MEASURABLE):
+            flag = options.stage_option(MeasurableOptions, next(iter(given))).opts[0]
+            raise click.UsageError(f"{flag} is for --measurable, which is not given.")
+        return super().invoke(ctx)
+
+
+command = PlyCommand(
+    "export-ply",
+    _DOC,
+    extra=[
+        click.Option(
+            ["--measurable"],
+            is_flag=True,
+            help="Write splat.measurable.ply, with discs on the surface, for viewers that measure by centres.",
+        ),
+        *options.stage_options(MeasurableOptions, _OF_MEASURABLE),
+    ],
 )

@@ -74,7 +74,9 @@ def _run(ctx: click.Context, **values: Any) -> None:
         for spec in stages
     }
     if values["dry_run"]:
-        print_dry_run(workspace, stages, asked, force=force, as_json=values["as_json"])
+        print_dry_run(
+            workspace, stages, asked, force=force, as_json=values["as_json"], progress=progress_for(ctx.obj)
+        )
         return
     announce_training(workspace, stages, asked, force=force)
     left = RunTimeLeft(_forecast_seconds(workspace, stages, asked, force=force))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 from collections.abc import Mapping, Sequence
@@ -12,6 +13,7 @@ from typing import Any
 from pipelines.batch.files import write_batch
 from pipelines.batch.missions import Mission, MissionList
 from pipelines.batch.table import BatchTable, mission_row, state_of
+from pipelines.core.errors import StorageError, storage_failures
 from pipelines.core.plan import Action
 from pipelines.core.progress import Progress
 from pipelines.engine.job import Engine, Job, JobEnd
@@ -81,7 +83,7 @@ def run_batch(
 
     Raises:
         KeyboardInterrupt: the user stopped the batch; the missions that ran have saved their work.
-        OSError: the table cannot be written.
+        StorageError: the table cannot be written.
     """
     rows = {
         plan.mission.name: mission_row(plan.mission, "current" if plan.is_current else "waiting")
@@ -93,14 +95,32 @@ def run_batch(
 
     def ended(end: JobEnd) -> None:
         rows[end.job.name] = mission_row(by_name[end.job.name], state_of(end), end)
-        write_batch(listed.folder, table())
+        with contextlib.suppress(OSError):  # It stops no mission; the last writing tells.
+            write_batch(listed.folder, table())
 
     by_name = {plan.mission.name: plan.mission for plan in planned}
-    write_batch(listed.folder, table())
+    with storage_failures(listed.folder):
+        write_batch(listed.folder, table())
     jobs = [plan.job(listed.folder) for plan in planned if not plan.is_current]
     if jobs:
         engine.run("missions", jobs, ended, progress)
+        _write_last(listed, table())
     return table()
+
+
+def _write_last(listed: MissionList, table: BatchTable) -> None:
+    """Write the table; where missions have failed, which tell why, a table that cannot be written is a warning.
+
+    Raises:
+        StorageError: all missions are complete, and the table cannot be written.
+    """
+    try:
+        with storage_failures(listed.folder):
+            write_batch(listed.folder, table)
+    except StorageError as error:
+        if table.is_complete:
+            raise
+        log.warning("the table of the batch is not that of now: %s", error)
 
 
 def run_arguments(mission: Mission) -> tuple[str, ...]:

@@ -7,7 +7,8 @@ import os
 import shutil
 import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 
 from pipelines.core.errors import StorageError, storage_error
@@ -24,6 +25,22 @@ def replace_file(draft: Path, path: Path) -> None:
     sync_file(draft)
     draft.replace(path)
     sync_folder(path.parent)
+
+
+@contextmanager
+def replacing(path: Path, draft: Path) -> Iterator[None]:
+    """Rename a draft to `path` when it was written; one that cannot be completed keeps no room on a full disk.
+
+    Raises:
+        OSError: the file cannot be written; an existing one stays.
+    """
+    try:
+        yield
+        replace_file(draft, path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            draft.unlink()
+        raise
 
 
 def replace_text(path: Path, text: str) -> None:

@@ -185,11 +185,15 @@ _STORAGE_REASONS = {
 }
 
 
-def storage_error(error: BaseException) -> StorageError | None:
+def storage_error(error: BaseException, place: Path | None = None) -> StorageError | None:
     """Return the storage failure behind an exception, or None.
 
     Libraries replace an OSError by an error of their own while they close a half-written file. Failures
     of the disk count also if the exception arose in their handling.
+
+    Args:
+        error: the exception.
+        place: file or folder that was written, for failures that name none: those of a full disk, mostly.
     """
     seen: set[int] = set()
     cause: BaseException | None = error
@@ -200,7 +204,7 @@ def storage_error(error: BaseException) -> StorageError | None:
         code = _SQLITE_ERRNO.get(getattr(cause, "sqlite_errorcode", 0) & 0xFF, code)
         if code in _STORAGE_REASONS and (cause is error or code in _DISK_FAILURES):
             path = getattr(cause, "filename", None)
-            return StorageError(f"{'workspace or output' if path is None else path}: {_STORAGE_REASONS[code]}")
+            return StorageError(f"{path or place or 'workspace or output'}: {_STORAGE_REASONS[code]}")
         cause = cause.__cause__ or cause.__context__
     return None
 
@@ -217,8 +221,11 @@ def storage_error_in(text: str, path: Path) -> StorageError | None:
 
 
 @contextmanager
-def storage_failures() -> Iterator[None]:
+def storage_failures(place: Path | None = None) -> Iterator[None]:
     """Turn storage failures of any library into `StorageError` while the context lasts.
+
+    Args:
+        place: as of `storage_error`.
 
     Raises:
         StorageError: a disk or file system failed.
@@ -228,7 +235,7 @@ def storage_failures() -> Iterator[None]:
     except GeorefError:
         raise
     except Exception as error:
-        storage = storage_error(error)
+        storage = storage_error(error, place)
         if storage is None:
             raise
         raise storage from error

@@ -150,6 +150,20 @@ def decisive_fields(options_type: type[StageOptions]) -> list[str]:
     return [name for name, info in fields.items() if not any(isinstance(mark, no_value) for mark in _marks(info))]
 
 
+def as_flags(options: StageOptions, names: Collection[str]) -> str:
+    """Return options as the words of a command line: `--preset fast --no-dense`, `--forget crop-size` for none."""
+    words = []
+    for name in names:
+        flag, value = flag_name(type(options), name), getattr(options, name)
+        if value is None:
+            words += ["--forget", flag.removeprefix("--")]
+        elif isinstance(value, bool):
+            words.append(flag if value else f"--no-{flag.removeprefix('--')}")
+        else:
+            words += [flag, notation(value)]
+    return " ".join(words)
+
+
 def is_written(info: FieldInfo) -> bool:
     """Return whether users write an option as text."""
     return any(isinstance(mark, WrittenMarker) for mark in _marks(info))

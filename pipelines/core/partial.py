@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -49,13 +50,22 @@ class PartialProduct:
         """Return how far an interrupted run came; None if nothing of it is worth keeping."""
         return _text(self.folder / PROGRESS)
 
+    def found(self) -> str:
+        """Return how far the run came, and when (`1500 of 7000 iterations, 12 min, saved 2026-05-01 14:30`)."""
+        progress = self.progress()
+        verb, note = ("begun", TOKEN) if progress is None else (f"{progress}, saved", PROGRESS)
+        with contextlib.suppress(OSError):
+            moment = datetime.fromtimestamp((self.folder / note).stat().st_mtime).astimezone()
+            return f"{verb} {moment:%Y-%m-%d %H:%M}"
+        return progress or "half deleted"
+
     def record_progress(self, text: str) -> None:
         """Record how far the run has come (`1500 of 7000 iterations`): from now on it is not dropped unasked."""
         replace_text(self.folder / PROGRESS, text)
 
     def failure(self) -> str | None:
-        """Return the message with which the run failed, or None."""
-        return _text(self.folder / FAILURE)
+        """Return the message with which the run failed, or None; a full disk leaves an empty file."""
+        return _text(self.folder / FAILURE) or None
 
     def fail(self, message: str, *, worthless: bool = False) -> None:
         """Record the message with which the run failed; a full disk has no room even for that.
@@ -99,11 +109,6 @@ class PartialProduct:
         """Delete the notes on the run, which is complete."""
         for name in (TOKEN, PROGRESS):
             (self.folder / name).unlink(missing_ok=True)
-
-
-def request_token(config: dict[str, Any], inputs: dict[str, str]) -> str:
-    """Return the text of a request: equal texts mean equal options and inputs."""
-    return json.dumps([config, inputs], sort_keys=True)
 
 
 def _text(path: Path) -> str | None:

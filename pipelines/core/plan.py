@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from pipelines.core.errors import InputError
-from pipelines.core.guards import damaged_product, refuse_loss, refuse_loss_by_options
+from pipelines.core.guards import damaged_product, is_unfinished, refuse_loss, refuse_loss_by_options
 from pipelines.core.manifest import Memo
 from pipelines.core.options import StageOptions, flag_name, input_paths
 from pipelines.core.origins import OptionOrigin, option_origins
@@ -17,6 +17,7 @@ from pipelines.core.staleness import (
     Flags,
     changed_inputs,
     changed_options,
+    found_interrupted,
     request,
     stage_config,
     why_damaged,
@@ -77,8 +78,10 @@ def plan(
 def _action(
     workspace: Workspace, spec: StageSpec, asked: Flags, running: Collection[str], memo: Memo, *, force: bool
 ) -> tuple[Action, str]:
+    partial, found = workspace.partial_product(spec), found_interrupted(workspace, spec)
     if force:
-        return "run", "--force"
+        loses = spec.resumable and partial.progress() is not None
+        return "run", f"--force; drops an interrupted run: {found}" if loses else "--force"
     options = stage_config(workspace, spec, asked)
     try:
         refuse_loss_by_options(workspace, spec, options)
@@ -90,11 +93,11 @@ def _action(
         manifest = workspace.manifest(spec)
     except InputError as error:
         return "run", str(error)
-    partial = workspace.partial_product(spec)
     ahead = [name for part in spec.reads if (name := producer_of(part.product).name) in running]
     if manifest is None:
         _require_inputs(options)  # not their hashes, which take minutes for photographs that no run has read
-        return ("resume", "interrupted") if spec.resumable and partial.exists() else ("run", "never run")
+        resumes = spec.resumable and partial.exists()
+        return ("resume", f"interrupted: {found}") if resumes else ("run", "never run")
     damage = why_damaged(damaged_product(workspace, spec, memo, by_content=False))
     if damage:
         return "run", damage
@@ -104,15 +107,15 @@ def _action(
     if ahead:
         return "run", changed
     present = request(workspace, spec, asked, memo)
+    reason = why_stale(workspace, present, manifest)
+    if is_unfinished(workspace, present):
+        return "resume", f"interrupted beside the finished product: {found}"
+    if not reason:
+        return "keep", manifest.key_figure
     try:
         refuse_loss(workspace, present)
     except InputError as error:
         return "refuse", str(error)
-    reason = why_stale(workspace, present, manifest)
-    if not reason:
-        return "keep", manifest.key_figure
-    if spec.resumable and partial.exists():
-        return "resume", reason
     inputs = changed_inputs(present.inputs.hashes, manifest.inputs)
     grown = spec.growing and not inputs and not changed_options(options, manifest.config, but=spec.growing)
     return ("extend" if grown else "run"), reason

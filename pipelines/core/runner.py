@@ -15,6 +15,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from pipelines.core.cautions import AT_END, union
+from pipelines.core.durable import remove
 from pipelines.core.errors import (
     ConvergenceError,
     DamagedPartialError,
@@ -27,14 +28,13 @@ from pipelines.core.errors import (
 from pipelines.core.guards import (
     damaged_product,
     extendable_product,
+    is_unfinished,
     refuse_damaged_inputs,
     refuse_loss,
     refuse_loss_by_options,
     warn_of_stale_inputs,
 )
 from pipelines.core.manifest import Manifest, Memo, record_files
-from pipelines.core.options import decisive_fields
-from pipelines.core.partial import request_token
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.sentences import duration
 from pipelines.core.stages import StageSpec, products_of
@@ -43,6 +43,8 @@ from pipelines.core.staleness import (
     Flags,
     Request,
     cautions_by_stage,
+    continuing_command,
+    found_interrupted,
     must_exist,
     request,
     stage_config,
@@ -118,14 +120,16 @@ def run_stage(
         asked = request(workspace, spec, flags, memo, progress)
         warn_of_stale_inputs(workspace, spec, memo)
         refuse_damaged_inputs(workspace, spec, memo)
+        previous = None if force or renew else _current(workspace, asked, memo)
+        if previous is not None and resume != "never" and _goes_on(workspace, asked):
+            previous = None
+        if previous is None and not force:
+            refuse_loss(workspace, asked)
         before = workspace.requests().get(spec.name, {})
         workspace.remember({spec.name: flags})
-        previous = None if force or renew else _current(workspace, asked, memo)
         if previous is not None:
             return Outcome(spec.name, False, _with_present_files(workspace, asked, previous))
         try:
-            if not force:
-                refuse_loss(workspace, asked)
             manifest = _execute(_Job(workspace, asked, "never" if force else resume, progress, place))
         except InputError:
             workspace.remember({spec.name: before})
@@ -205,15 +209,37 @@ def remembered(workspace: Workspace, spec: StageSpec, flags: Flags, forget: Coll
     return {**{name: value for name, value in before.items() if name not in forget}, **flags}
 
 
+def _goes_on(workspace: Workspace, asked: Request) -> bool:
+    """Return whether to go on with an interrupted run beside a current product, and tell what lies there.
+
+    Such runs are those of `--force`, or of other options that were tried in between. What cannot be continued is
+    deleted; what another request can continue stays.
+    """
+    spec, partial = asked.spec, workspace.partial_product(asked.spec)
+    if not partial.exists() or workspace.placed_by_hand(spec):
+        return False
+    found = found_interrupted(workspace, spec)
+    if is_unfinished(workspace, asked):
+        log.info("%s: an interrupted run lies beside the finished product: %s", spec.name, found)
+        return True
+    if spec.resumable and partial.progress() is not None:
+        command = continuing_command(workspace, spec)
+        log.warning(
+            "%s: beside this product lies an interrupted run: %s; `%s` goes on with it, --force drops it",
+            spec.name, found, command,
+        )  # fmt: skip
+        return False
+    log.info("%s: a run that did not end left nothing to go on with, and is dropped: %s", spec.name, found)
+    remove(partial.folder)
+    return False
+
+
 def _execute(job: _Job) -> Manifest:
     workspace, asked = job.workspace, job.asked
     spec, resolved = asked.spec, asked.options.model_dump(mode="json")
-    token = request_token({name: resolved[name] for name in decisive_fields(spec.options)}, asked.inputs.hashes)
-    partial = workspace.partial_product(spec)
-    if spec.resumable and partial.exists() and (job.resume == "never" or not partial.is_of(token)):
-        log.warning("%s: starts afresh; what an interrupted run had done is dropped", spec.name)
+    _tell_interrupted(job)
     started, clock = now(), time.monotonic()
-    summary = _run(job, token)
+    summary = _run(job)
     out = workspace.partial(spec)
     for product in products_of(spec):
         if not (out / product.removeprefix(f"{spec.folder}/")).exists():
@@ -244,6 +270,18 @@ def _execute(job: _Job) -> Manifest:
     return manifest
 
 
+def _tell_interrupted(job: _Job) -> None:
+    """Log what an interrupted run has left, and whether this one goes on with it."""
+    spec, partial = job.asked.spec, job.workspace.partial_product(job.asked.spec)
+    if not spec.resumable or not partial.exists():
+        return
+    found = found_interrupted(job.workspace, spec)
+    if job.resume != "never" and partial.is_of(job.asked.token):
+        log.info("%s: goes on with an interrupted run: %s", spec.name, found)
+    else:
+        log.warning("%s: starts afresh; what an interrupted run had done is dropped: %s", spec.name, found)
+
+
 def _with_present_files(workspace: Workspace, asked: Request, manifest: Manifest) -> Manifest:
     """Return the manifest of a current product with its input files as they are now, saved if they were moved.
 
@@ -256,19 +294,19 @@ def _with_present_files(workspace: Workspace, asked: Request, manifest: Manifest
     return renewed
 
 
-def _run(job: _Job, token: str) -> Summary:
+def _run(job: _Job) -> Summary:
     """Run the module of a stage; afresh, if the partial product to be continued is damaged.
 
     Raises:
         GeorefError: a known failure, which is recorded.
     """
     workspace, asked, place = job.workspace, job.asked, job.place
-    spec = asked.spec
+    spec, token = asked.spec, asked.token
     out, resumed = workspace.begin(spec, token, job.resume)
     extends = None if job.resume == "never" else extendable_product(workspace, asked)
     log.info("%s: %s%s", spec.name, "resumed" if resumed else "started", f", {place}" if place else "")
     try:
-        with storage_failures():
+        with storage_failures(out):
             run = _module(workspace, asked).run
             afresh = job.resume == "never"
             try:

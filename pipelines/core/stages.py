@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib
 from dataclasses import dataclass
+from pathlib import Path
 
 from pipelines.core.errors import GeorefError
 from pipelines.core.options import StageOptions, listed_names
@@ -28,6 +29,7 @@ SPLAT = "export/splat.ply"
 ORTHOPHOTO_PREVIEW = "raster/preview.png"
 HILLSHADE = "raster/hillshade.png"
 CLOUD = "cloud/cloud.laz"
+MEASURABLE_SPLAT = "measurable/splat.measurable.ply"
 SPZ = "spz/splat.spz"
 TILES = "tiles/tileset.json"
 TILES_GLB = "tiles/splat.glb"
@@ -94,7 +96,7 @@ class StageSpec:
     """Row of the table: one stage.
 
     Attributes:
-        name: the subcommand.
+        name: the subcommand; in tables, `georef.toml` and logs, also where `called` is another.
         module: module that defines `run(stage, options) -> Summary`.
         options_place: `module:class` of its options.
         folder: its folder in the workspace.
@@ -108,6 +110,7 @@ class StageSpec:
             has hashes of its own.
         in_parts: module that makes the same product in parts, with the same `run`. `made_in_parts(workspace,
             options)` of `module` decides; without it, `module` makes all products.
+        called: words of its command, where they are not its name.
     """
 
     name: str
@@ -122,6 +125,11 @@ class StageSpec:
     also: tuple[str, ...] = ()
     working: tuple[str, ...] = ()
     in_parts: str = ""
+    called: str = ""
+
+    def command(self, workspace: Path) -> str:
+        """Return the command that makes its product in a workspace."""
+        return f"georef {self.called or self.name} {workspace}"
 
     @property
     def options(self) -> type[StageOptions]:
@@ -207,7 +215,7 @@ PIPELINE: tuple[StageSpec, ...] = (
         module="pipelines.deliver.ply",
         options_place="pipelines.deliver.options:ExportPlyOptions",
         folder="export",
-        reads=(MEASURED, *whole(MODEL, GAUSSIANS), ProductPart(SPARSE, optional=True), APPLIED_RIG),
+        reads=(MEASURED, *whole(MODEL, GAUSSIANS), APPLIED_RIG),
         product=SPLAT,
         title="Write the splat as a PLY with its place on Earth.",
     ),
@@ -215,6 +223,17 @@ PIPELINE: tuple[StageSpec, ...] = (
 
 # What a survey hands over besides the PLY: each is made on request, and none is read by another stage.
 DELIVERABLES: tuple[StageSpec, ...] = (
+    StageSpec(
+        name="export-measurable",
+        module="pipelines.deliver.measurable",
+        options_place="pipelines.deliver.options:MeasurableOptions",
+        folder="measurable",
+        reads=(MEASURED, *whole(SPARSE, MODEL, GAUSSIANS), APPLIED_RIG),
+        product=MEASURABLE_SPLAT,
+        title="Write a second PLY whose centres lie on the surface, for viewers that measure by them.",
+        resumable=True,
+        called="export-ply --measurable",
+    ),
     StageSpec(
         name="export-raster",
         module="pipelines.deliver.raster.stage",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import datetime
@@ -11,7 +12,7 @@ from pipelines.core.cautions import Caution, union
 from pipelines.core.errors import InputError, MissingProductError
 from pipelines.core.fingerprints import Fingerprints, Records, fingerprints
 from pipelines.core.manifest import Manifest, Memo
-from pipelines.core.options import StageOptions, decisive_fields, load_toml, resolve
+from pipelines.core.options import StageOptions, as_flags, decisive_fields, load_toml, resolve
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.stages import BY_NAME, DELIVERABLES, PIPELINE, StageSpec, producer_of, products_of
 from pipelines.core.validators import require_text
@@ -24,7 +25,17 @@ Flags = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class StageState:
-    """Row of `georef status`."""
+    """Row of `georef status`.
+
+    Attributes:
+        stage: the subcommand.
+        state: of its product.
+        reason: why the product is not current, or why the latest run failed.
+        finished: end of the run that made the product.
+        duration_s: of that run.
+        key_figure: of the product.
+        interrupted: what an interrupted run has left, and what goes on with it; empty without one.
+    """
 
     stage: str
     state: State
@@ -32,6 +43,7 @@ class StageState:
     finished: datetime | None = None
     duration_s: float | None = None
     key_figure: str = ""
+    interrupted: str = ""
 
 
 @dataclass(frozen=True)
@@ -41,6 +53,13 @@ class Request:
     spec: StageSpec
     options: StageOptions
     inputs: Fingerprints
+
+    @property
+    def token(self) -> str:
+        """Text of the request: equal texts mean equal options and inputs."""
+        values = self.options.model_dump(mode="json")
+        decisive = {name: values[name] for name in decisive_fields(type(self.options))}
+        return json.dumps([decisive, self.inputs.hashes], sort_keys=True)
 
 
 def request(
@@ -104,6 +123,36 @@ def changed_options(options: StageOptions, config: Mapping[str, Any], but: Colle
     decisive = [name for name in decisive_fields(type(options)) if name not in but]
     names = [name for name in decisive if getattr(before, name) != getattr(options, name)]
     return f"option {', '.join(names)} changed" if names else ""
+
+
+def found_interrupted(workspace: Workspace, spec: StageSpec) -> str:
+    """Return what an interrupted run has left: how far it came, when, and with which options."""
+    partial = workspace.partial_product(spec)
+    options = _options_of_partial(workspace, spec)
+    fields = () if options is None else decisive_fields(spec.options)
+    changed = [name for name in fields if getattr(options, name) != spec.options.model_fields[name].default]
+    words = "" if options is None or not changed else f", with {as_flags(options, changed)}"
+    return partial.found() + words
+
+
+def continuing_command(workspace: Workspace, spec: StageSpec) -> str:
+    """Return the command that goes on with an interrupted run, as long as the inputs are those of that run."""
+    command = workspace.command_of(spec)
+    before = _options_of_partial(workspace, spec)
+    if before is None or workspace.base is not None:
+        return command
+    now = stage_config(workspace, spec, workspace.requests().get(spec.name, {}))
+    other = [name for name in decisive_fields(spec.options) if getattr(now, name) != getattr(before, name)]
+    return f"{command} {as_flags(before, other)}".rstrip()
+
+
+def _options_of_partial(workspace: Workspace, spec: StageSpec) -> StageOptions | None:
+    """Return the options of an interrupted run; None if they cannot be read, or are of another version."""
+    before = workspace.partial_product(spec).request()
+    try:
+        return None if before is None else spec.options.model_validate(before[0])
+    except ValueError:
+        return None
 
 
 def changed_inputs(inputs: Mapping[str, str], recorded: Mapping[str, str]) -> str:
@@ -209,18 +258,17 @@ class _Look:
         if self.workspace.placed_by_hand(spec):
             return StageState(spec.name, "current", BY_HAND)
         failure = self.workspace.failure(spec)
-        interrupted = self.workspace.partial(spec).exists()
+        interrupted = self._interrupted(spec)
         try:
             manifest = self.workspace.manifest(spec)
         except InputError as error:
             return StageState(spec.name, "stale", str(error))
         if manifest is None:
             state: State = "failed" if failure else "interrupted" if interrupted else "missing"
-            return StageState(spec.name, state, failure or "")
+            return StageState(spec.name, state, failure or "", interrupted=interrupted)
         damage = why_damaged(self.workspace.damaged(spec, manifest, self.memo, by_content=False))
         reason = damage or self._reason(spec, manifest)
-        later = "a later run was interrupted" if interrupted else ""
-        later = f"a later run failed: {failure}" if failure else later
+        later = f"a later run failed: {failure}" if failure else ""
         return StageState(
             spec.name,
             "damaged" if damage else "stale" if reason else "current",
@@ -228,7 +276,17 @@ class _Look:
             manifest.finished,
             manifest.duration_s,
             manifest.key_figure,
+            interrupted,
         )
+
+    def _interrupted(self, spec: StageSpec) -> str:
+        """Return what an interrupted run has left, and what goes on with it; empty without one, or if it failed."""
+        partial = self.workspace.partial_product(spec)
+        if not partial.exists() or (partial.failure() is not None and partial.progress() is None):
+            return ""
+        found = f"an interrupted run: {found_interrupted(self.workspace, spec)}"
+        command = f"; `{continuing_command(self.workspace, spec)}` goes on with it" if spec.resumable else ""
+        return found + command
 
     def _reason(self, spec: StageSpec, manifest: Manifest) -> str:
         """Return the reason why a product is stale: its own inputs and options, or a stale stage upstream."""

@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 from pipelines.core.cautions import Caution
 from pipelines.core.durable import remove, replace_file, replace_folder, replace_text, sync_tree
-from pipelines.core.errors import InputError, MissingProductError
+from pipelines.core.errors import InputError, MissingProductError, storage_failures
 from pipelines.core.lock import WriteLock
 from pipelines.core.manifest import MANIFEST, Manifest, Memo, damaged_files
 from pipelines.core.options import CONFIG_FILE
@@ -110,9 +110,13 @@ class Workspace:
         folder, _, inside = product.partition("/")
         path = self._folder(folder) / inside
         if not path.exists():
-            name, home = producer_of(product).name, self.base or self
-            raise MissingProductError(product, f"georef {self.command or name} {home.root}")
+            raise MissingProductError(product, self.command_of(producer_of(product)))
         return path
+
+    def command_of(self, spec: StageSpec) -> str:
+        """Return the command that makes the product of a stage here."""
+        home = (self.base or self).root
+        return f"georef {self.command} {home}" if self.command else spec.command(home)
 
     def _folder(self, name: str) -> Path:
         return self.lent.get(name, self.root / name)
@@ -170,8 +174,9 @@ class Workspace:
         Raises:
             WorkspaceBusyError: another process holds the lock.
             InputError: the directory cannot be made or written.
+            StorageError: the disk failed while the lock was held.
         """
-        with WriteLock(self.root).hold(activity):
+        with storage_failures(self.root), WriteLock(self.root).hold(activity):
             for spec in STAGES:
                 self._recover(spec)
             yield
@@ -209,7 +214,7 @@ class Workspace:
 
         Args:
             spec: the stage; only a resumable one can be continued.
-            token: text of the request, from `request_token`.
+            token: text of the request, from `Request.token`.
             resume: `never` begins afresh; `if-same` continues an interrupted run with the same token, and otherwise
                 begins afresh; `always` does the same, but refuses an interrupted run with another token.
 

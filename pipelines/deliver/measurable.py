@@ -8,23 +8,31 @@ surface is wrong by a part of the Gaussian's size. So:
 3. Gaussians with their centre beside a disc are left out, and those that no training view shows, such as the sheet
    beneath the scene. Others stay: what no surface explains, and what too few views confirm.
 4. Colours and opacities are fitted to the trained renders of the training views; no centre moves.
+
+Reads `ingest/survey.json`, the photographs, `sfm/sparse`, `train/model.json` and `train/gaussians.ply`. Writes
+`measurable/splat.measurable.ply` and its sidecar, beside `export/splat.ply` of `export-ply`.
 """
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import torch
-from scipy.spatial import KDTree
+from scipy.spatial import ConvexHull, KDTree
 from torch import Tensor
 
 from pipelines.core.errors import DegenerateGeometryError, ResourceError
 from pipelines.core.progress import Progress
-from pipelines.core.workspace import StageRun
-from pipelines.deliver.options import ExportPlyOptions
-from pipelines.deliver.splat import SplatFigures
+from pipelines.core.sentences import about
+from pipelines.core.stages import MEASURABLE_SPLAT
+from pipelines.core.workspace import StageRun, Summary
+from pipelines.deliver.options import MeasurableOptions
+from pipelines.deliver.ply import write_ply
+from pipelines.deliver.splat import SplatFigures, placed_splat
 from pipelines.geometry.cameras import pose_matrix
 from pipelines.geometry.similarity import Similarity
 from pipelines.scene.renderer import ModelRenderer
@@ -40,11 +48,20 @@ from pipelines.splat.metrics import psnr
 from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings
 from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.splat.repainting import ShownView, repainted, shuffled_passes
+from pipelines.splat.sh import coefficient_count
 from pipelines.splat.surface_discs import surface_discs
+
+log = logging.getLogger(__name__)
 
 _SPACING_PX = 0.7
 _MIN_VIEWS = 3  # that agree on a point of the surface, as in the point cloud
 _LEAST_SHOWN_PX = 0.05  # of a Gaussian that a view shows
+_LOOKED_AT, _LEAST_POINTS = 5000, 10  # SfM points of the estimate
+_KEPT = 0.12  # of the trained Gaussians lie beside no disc: share on a simulated flight
+_PLY_VALUES = 14  # of a Gaussian, without harmonics
+# One pass over one view: fixed, by its megapixels, by millions of Gaussians.
+_FIXED_S, _MEGAPIXEL_S, _MILLION_GAUSSIANS_S = 0.003, 0.092, 0.367
+_OTHER_PASSES = 5  # depth maps, their comparison and the choice of the Gaussians, in passes of repainting
 _BESIDE = 1.0  # spacings between the centre of a Gaussian and the disc that replaces it
 
 
@@ -78,7 +95,76 @@ class MeasurableSplat:
         return f"{splat.key_figure()}; {self.discs} discs {self.spacing_m:.3f} m apart{psnr_text}", values
 
 
-def measurable_splat(stage: StageRun, options: ExportPlyOptions) -> MeasurableSplat:
+def run(stage: StageRun, options: MeasurableOptions) -> Summary:
+    """Write the PLY and its sidecar, and return their key figures.
+
+    Raises:
+        GeorefError: as `measurable_splat`; or no Gaussian is opaque enough.
+    """
+    made = measurable_splat(stage, options)
+    trained = made.trained
+    splat = placed_splat(trained.gaussians, trained.model, trained.survey, options, made.gaussians)
+    write_ply(splat, stage.out / Path(MEASURABLE_SPLAT).name)
+    key_figure, values = made.figures(splat.figures)
+    return Summary(key_figure, values, cautions=splat.placement.cautions)
+
+
+@dataclass(frozen=True)
+class MeasurableEstimate:
+    """Estimate of the file and of the time that it takes, from SfM points and cameras, before anything is rendered.
+
+    Attributes:
+        discs: number of discs.
+        spacing_m: between them.
+        bytes: of the PLY.
+        seconds: on the machine of docs/benchmarks.md.
+    """
+
+    discs: int
+    spacing_m: float
+    bytes: int
+    seconds: float
+
+    def __str__(self) -> str:
+        """Return the estimate as a sentence."""
+        return (
+            f"about {self.discs} discs {self.spacing_m:.3f} m apart, {self.bytes / 1e6:.3g} MB and "
+            f"{about(self.seconds)}; a larger --disc-spacing makes it smaller"
+        )
+
+
+def estimate(renderer: ModelRenderer, options: MeasurableOptions) -> MeasurableEstimate | None:
+    """Return the estimate for a trained model; None where too few SfM points tell the extent of the surface."""
+    trained = renderer.trained
+    points = trained.point_in_model[:: max(1, len(trained.point_in_model) // _LOOKED_AT)]
+    cameras, shown, pixels_m = trained.indices("train"), np.zeros(len(points), int), []
+    for pose in map(renderer.pose, cameras):
+        in_cam = (points - pose.center_in_model) @ pose.cam_from_model.T
+        inside = pose.pinhole.holds(pose.pinhole.project(in_cam))
+        shown += inside
+        if inside.any():
+            pixels_m.append(np.median(in_cam[inside, 2]) / pose.pinhole.fx)
+    seen = trained.geo_from_model.apply(points[shown >= _MIN_VIEWS])[:, :2]
+    low, high = np.quantile(seen, [0.01, 0.99], axis=0) if len(seen) else (0.0, 0.0)
+    ground = seen[((seen >= low) & (seen <= high)).all(axis=1)]
+    if len(ground) < _LEAST_POINTS:
+        return None
+    spacing_m = options.disc_spacing or _SPACING_PX * trained.geo_from_model.scale * float(np.median(pixels_m))
+    discs = round(ConvexHull(ground).volume / spacing_m**2)
+    gaussians = discs + round(_KEPT * len(trained.gaussians))
+    megapixels = (
+        float(np.mean([pinhole.width * pinhole.height for pinhole in map(renderer.pinhole, cameras)])) / 1e6
+    )
+    pass_s = _FIXED_S + _MEGAPIXEL_S * megapixels + _MILLION_GAUSSIANS_S * gaussians / 1e6
+    return MeasurableEstimate(
+        discs,
+        spacing_m,
+        gaussians * 4 * (_PLY_VALUES + 3 * coefficient_count(trained.gaussians.sh_degree)),
+        (options.repaint_passes + _OTHER_PASSES) * len(cameras) * pass_s,
+    )
+
+
+def measurable_splat(stage: StageRun, options: MeasurableOptions) -> MeasurableSplat:
     """Return the trained splat with discs on its surface.
 
     Args:
@@ -93,9 +179,10 @@ def measurable_splat(stage: StageRun, options: ExportPlyOptions) -> MeasurableSp
     """
     trained, progress = load_trained(stage.workspace), stage.progress
     images = photographs(trained.sfm, trained.survey, stage.workspace, trained.model.max_image_size)
-    images.build(progress)
     backend = rasterizer("auto", progress)
     renderer = ModelRenderer(trained, images, backend)
+    log.info("export-ply --measurable: %s", estimate(renderer, options) or "time and size cannot be estimated")
+    images.build(progress)
     views = SurfaceViews(renderer, stage.out / "depth_maps", colours=True, confirmed=True, progress=progress)
     pixel_m = pixel_on_surface_m(views, trained.geo_from_model)
     spacing_m = options.disc_spacing or _SPACING_PX * pixel_m
@@ -176,7 +263,7 @@ def _collected(squares: Iterable[SurfaceCloud], views: SurfaceViews, trained: Tr
     if not count:
         raise DegenerateGeometryError(
             f"no point of the surface is seen alike by {_MIN_VIEWS} training views: train longer, or "
-            "leave out --measurable"
+            "hand over export/splat.ply alone"
         )
     names = vars(parts[0])
     return SurfaceCloud(*(np.concatenate([vars(part)[name] for part in parts]) for name in names))

@@ -23,11 +23,10 @@ class SplatOptions(StageOptions):
 class ExportPlyOptions(SplatOptions):
     """Options of the export of the splat as a 3DGS PLY with its sidecar."""
 
-    measurable: bool = Field(
-        False,
-        description="Replace Gaussians on the surface by small discs whose centres lie on it, for viewers that "
-        "measure by centres. The file grows several times.",
-    )
+
+class MeasurableOptions(SplatOptions):
+    """Options of the export of the splat with discs on its surface, as a PLY of its own."""
+
     disc_spacing: float | None = Field(
         None,
         ge=0.001,

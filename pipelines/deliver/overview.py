@@ -14,7 +14,7 @@ import numpy as np
 from pipelines.core.cautions import Caution
 from pipelines.core.errors import GeorefError
 from pipelines.core.products import load_json
-from pipelines.core.stages import BY_NAME, DELIVERABLES, GAUSSIANS, MODEL, REPORT
+from pipelines.core.stages import BY_NAME, DELIVERABLES, GAUSSIANS, MODEL, REPORT, StageSpec
 from pipelines.core.staleness import StageState, cautions_by_stage, status
 from pipelines.core.types import FloatArray, Vector3
 from pipelines.core.workspace import Workspace
@@ -118,7 +118,9 @@ class Overview:
         bounds: of the scene.
         quality: predicted and measured accuracy.
         files: those that there are, with their use.
-        further: commands of the deliverables that were not made, with what each makes.
+        outdated: stages whose product is stale or damaged, in the order of the work.
+        interrupted: by stage, what an interrupted run has left beside the product.
+        further: deliverables that were not made.
         cautions: limits of the result, by stage.
     """
 
@@ -128,7 +130,9 @@ class Overview:
     bounds: Bounds
     quality: Quality
     files: tuple[MadeFile, ...]
-    further: dict[str, str]
+    outdated: tuple[StageState, ...]
+    interrupted: dict[str, str]
+    further: tuple[StageSpec, ...]
     cautions: dict[str, tuple[Caution, ...]]
 
     def feature(self) -> Json:
@@ -137,6 +141,8 @@ class Overview:
         lat, lon, height = self.center_lla
         properties = {
             "workspace": str(self.workspace),
+            "outdated": [{"stage": row.stage, "state": row.state, "reason": row.reason} for row in self.outdated],
+            "interrupted": self.interrupted,
             "gaussians": self.gaussians,
             "center": {"longitude": lon, "latitude": lat, "ellipsoidal_height_m": height},
             "ellipsoidal_height_m": bounds.height_m,
@@ -150,7 +156,7 @@ class Overview:
             },
             "quality": asdict(self.quality),
             "files": [{**asdict(file), "made": file.made and file.made.isoformat()} for file in self.files],
-            "further": self.further,
+            "further": {spec.command(self.workspace): spec.title for spec in self.further},
             "cautions": [
                 {"stage": stage, **caution.model_dump()}
                 for stage, cautions in self.cautions.items()
@@ -175,7 +181,8 @@ def overview(workspace: Workspace, options: CrsOptions) -> Overview:
     survey = load_survey(workspace)
     means = read_centres(workspace.path(GAUSSIANS)).astype(np.float64)
     placement = place(model, survey, means)
-    states = {BY_NAME[row.stage].folder: row for row in status(workspace)}
+    rows = status(workspace)
+    states = {BY_NAME[row.stage].folder: row for row in rows}
     x, y, z = placement.origin_lla.tolist()
     return Overview(
         workspace=workspace.root,
@@ -184,11 +191,9 @@ def overview(workspace: Workspace, options: CrsOptions) -> Overview:
         bounds=_bounds(placement.geo_from_model.apply(means[:: max(1, len(means) // _MOST)]), survey, options),
         quality=_quality(workspace, placement),
         files=_files(workspace, states),
-        further={
-            f"georef {spec.name} {workspace.root}": spec.title
-            for spec in DELIVERABLES
-            if not (workspace.root / spec.product).exists()
-        },
+        outdated=tuple(row for row in rows if row.state in ("stale", "damaged")),
+        interrupted={row.stage: row.interrupted for row in rows if row.interrupted},
+        further=tuple(spec for spec in DELIVERABLES if not (workspace.root / spec.product).exists()),
         cautions=cautions_by_stage(workspace),
     )
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 # By workspace path; a path without a suffix is a folder. In the order in which people look for them.
 PURPOSES: dict[str, str] = {
-    "export/splat.ply": "the splat, for viewers and editors of Gaussians (SuperSplat, Blender)",
+    "export/splat.ply": "the splat as trained, to look at and to edit (SuperSplat, Blender)",
+    "measurable/splat.measurable.ply": "the splat to measure in, for viewers that pick centres; many times larger",
     "raster/orthophoto.tif": "orthophoto, for GIS and CAD",
     "raster/dsm.tif": "surface model, for volumes, profiles and GIS",
     "raster/sigma_h.tif": "horizontal σ of each cell",

@@ -18,7 +18,10 @@ from pipelines.core.files import file_size
 SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff"})
 MAX_BYTES = 512 * 1024 * 1024
 MAX_PIXELS = 400_000_000
+# EXIF and XMP of a JPEG lie in its first segments of 64 KiB.
+_HEAD_BYTES = 256 * 1024
 _FRAME_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+_JPEG = b"\xff\xd8"
 _TIFF_WIDTH, _TIFF_HEIGHT = 256, 257
 
 
@@ -50,6 +53,20 @@ def read_bytes(path: Path) -> bytes:
         raise InputError(f"cannot be read: {error.strerror}", path=path) from error
 
 
+def read_head(path: Path) -> bytes:
+    """Return the beginning of a photograph, with its tags and its size; the whole file where that says neither.
+
+    Raises:
+        InputError: as `read_bytes`.
+    """
+    try:
+        with path.open("rb") as file:
+            head = file.read(_HEAD_BYTES)
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror}", path=path) from error
+    return head if head[:2] == _JPEG and header_size(head) is not None else read_bytes(path)
+
+
 def require_unchanged(data: bytes, sha256: str, path: Path) -> None:
     """Refuse a photograph that is not the recorded one.
 
@@ -68,12 +85,13 @@ def require_unchanged(data: bytes, sha256: str, path: Path) -> None:
         )
 
 
-def inspect_image(data: bytes, path: Path) -> ImageFile:
+def inspect_image(data: bytes, path: Path, *, decode: bool = True) -> ImageFile:
     """Return size and hash of a JPEG, PNG or TIFF file, after decoding it to its end.
 
     Args:
         data: the file.
         path: its name, for errors.
+        decode: whether `data` is the whole file, to be decoded; otherwise it is the head, and so is what is hashed.
 
     Raises:
         InputError: no such image, more than 400 million pixels, or it does not decode.
@@ -84,7 +102,7 @@ def inspect_image(data: bytes, path: Path) -> ImageFile:
     width, height = size
     if not (0 < width * height <= MAX_PIXELS):
         raise InputError(f"claims {width}×{height} pixels (limit {MAX_PIXELS // 10**6} million)", path=path)
-    if not _decodes(data):
+    if decode and not _decodes(data):
         raise InputError("is damaged: it does not decode to its end", path=path)
     return ImageFile(width, height, hashlib.sha256(data).hexdigest())
 
@@ -92,7 +110,7 @@ def inspect_image(data: bytes, path: Path) -> ImageFile:
 def header_size(data: bytes) -> tuple[int, int] | None:
     """Return width and height that a JPEG, PNG or TIFF header states, or None."""
     try:
-        if data[:2] == b"\xff\xd8":
+        if data[:2] == _JPEG:
             return _jpeg_size(data)
         if data[:8] == b"\x89PNG\r\n\x1a\n" and data[12:16] == b"IHDR":
             return struct.unpack(">II", data[16:24])

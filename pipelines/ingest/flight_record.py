@@ -38,13 +38,16 @@ class FlightRecord:
 
 
 def require_enough(photos: Sequence[Photo], source: Path, field: str, notes: Notes) -> None:
-    """Refuse fewer photographs than a survey needs, with everything that was noted on the way.
+    """Refuse fewer photographs than a survey needs.
 
     Raises:
         InputError: fewer than three.
     """
     if len(photos) < LEAST_IMAGES:
-        reasons = "".join(f"; {warning}" for warning in notes.warnings)
-        raise InputError(
-            f"{len(photos)} usable images, a survey needs {LEAST_IMAGES}{reasons}", path=source, field=field
-        )
+        raise too_few(len(photos), source, field, notes)
+
+
+def too_few(count: int, source: Path, field: str, notes: Notes) -> InputError:
+    """Return the error of fewer photographs than a survey needs, with everything that was noted on the way."""
+    reasons = "".join(f"; {warning}" for warning in notes.warnings)
+    return InputError(f"{count} usable images, a survey needs {LEAST_IMAGES}{reasons}", path=source, field=field)

@@ -28,13 +28,22 @@ from pipelines.ingest.table_poses import poses_from_table
 from pipelines.ingest.trajectory_files import read_positions
 
 
-def read_folder(folder: Path, options: IngestOptions, notes: Notes, progress: Progress = SILENT) -> FlightRecord:
+def read_folder(
+    folder: Path, options: IngestOptions, notes: Notes, progress: Progress = SILENT, *, decode: bool = True
+) -> FlightRecord:
     """Read photographs, and the trajectory or `geo.txt` that the options name.
+
+    Args:
+        folder: of the photographs.
+        options: of `ingest`.
+        notes: what is assumed and doubtful.
+        progress: a step a photograph.
+        decode: as of `scan_folder`.
 
     Raises:
         InputError: anything wrong with the files, or too few photographs.
     """
-    photos = _usable_photos(folder, notes, progress)
+    photos = _usable_photos(folder, notes, progress, decode=decode)
     poses = _poses(photos, options, notes)
     if options.time_offset_s and poses.recorded is None:
         raise InputError(
@@ -50,8 +59,8 @@ def read_folder(folder: Path, options: IngestOptions, notes: Notes, progress: Pr
     return FlightRecord(folder.resolve(), photos, cameras, camera_of, poses, navigation)
 
 
-def _usable_photos(folder: Path, notes: Notes, progress: Progress) -> list[Photo]:
-    photos = scan_folder(folder, notes, progress)
+def _usable_photos(folder: Path, notes: Notes, progress: Progress, *, decode: bool) -> list[Photo]:
+    photos = scan_folder(folder, notes, progress, decode=decode)
     require_enough(photos, folder, "--images", notes)
     for problem in sorted({problem for photo in photos for problem in photo.tags.problems}):
         names = [photo.name for photo in photos if problem in photo.tags.problems]

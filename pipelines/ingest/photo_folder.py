@@ -6,13 +6,14 @@ import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from pipelines.core.errors import InputError
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.validators import stays_inside
 from pipelines.formats.exif import PhotoTags, read_tags
-from pipelines.formats.image_file import SUFFIXES, ImageFile, header_size, inspect_image, read_bytes
+from pipelines.formats.image_file import SUFFIXES, ImageFile, header_size, inspect_image, read_bytes, read_head
 from pipelines.ingest.notes import Notes
 
 
@@ -25,11 +26,17 @@ class Photo:
     tags: PhotoTags
 
 
-def scan_folder(root: Path, notes: Notes, progress: Progress = SILENT) -> list[Photo]:
+def scan_folder(root: Path, notes: Notes, progress: Progress = SILENT, *, decode: bool = True) -> list[Photo]:
     """Return every usable photograph below `root`, sorted by name; files that are left out are noted.
 
     Left out are files that are empty, damaged or too large, links that lead out of the folder, and all but the
     first of identical files. Hidden files and folders are not looked at.
+
+    Args:
+        root: the folder.
+        notes: files that are left out.
+        progress: a step a file.
+        decode: whether to decode each file to its end; otherwise its head alone is read, in about a millisecond.
 
     Raises:
         InputError: no such folder, or no JPEG, PNG or TIFF file in it.
@@ -54,8 +61,9 @@ def scan_folder(root: Path, notes: Notes, progress: Progress = SILENT) -> list[P
         raise InputError("holds no JPEG, PNG or TIFF image", path=root, field="--images")
     photos: list[Photo] = []
     damaged: list[str] = []
+    inspected = partial(_inspect, root=root, decode=decode)
     with progress.task("images", len(inside)) as task, ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
-        for path, photo in zip(inside, pool.map(lambda path: _inspect(path, root), inside), strict=True):
+        for path, photo in zip(inside, pool.map(inspected, inside), strict=True):
             task.advance()
             if isinstance(photo, Photo):
                 photos.append(photo)
@@ -66,21 +74,19 @@ def scan_folder(root: Path, notes: Notes, progress: Progress = SILENT) -> list[P
 
 
 def glance(root: Path) -> tuple[int, int, tuple[int, int]]:
-    """Return number and bytes of the image files below `root`, and width and height of the first by name.
+    """Return number and bytes of the image files below `root`, and width and height of the first that is an image.
 
-    Only the first is read: a folder of hundreds is answered at once.
+    No other is read: a folder of hundreds is answered at once.
 
     Raises:
-        InputError: no such folder, no image in it, or the first is none.
+        InputError: no such folder, or no image in it.
     """
     if not root.is_dir():
         raise InputError("no such folder of photographs", path=root, field="--images")
     paths = sorted(_candidates(root))
-    if not paths:
-        raise InputError("holds no JPEG, PNG or TIFF image", path=root, field="--images")
-    size_px = header_size(read_bytes(paths[0]))
+    size_px = next(filter(None, (header_size(data) for data in map(_beginning, paths))), None)
     if size_px is None:
-        raise InputError("is no JPEG, PNG or TIFF image", path=paths[0])
+        raise InputError("holds no JPEG, PNG or TIFF image", path=root, field="--images")
     return len(paths), sum(path.stat().st_size for path in paths), size_px
 
 
@@ -92,13 +98,21 @@ def _candidates(root: Path) -> Iterator[Path]:
                 yield Path(folder) / name
 
 
-def _inspect(path: Path, root: Path) -> Photo | str:
+def _inspect(path: Path, root: Path, *, decode: bool) -> Photo | str:
     """Return the photograph, or the reason why it is none."""
     try:
-        data = read_bytes(path)
-        return Photo(_name(path, root), inspect_image(data, path), read_tags(data))
+        data = read_bytes(path) if decode else read_head(path)
+        return Photo(_name(path, root), inspect_image(data, path, decode=decode), read_tags(data))
     except InputError as error:
         return str(error).removeprefix(f"{path}: ")
+
+
+def _beginning(path: Path) -> bytes:
+    """Return the head of a file; nothing of one that cannot be read."""
+    try:
+        return read_head(path)
+    except InputError:
+        return b""
 
 
 def _name(path: Path, root: Path) -> str:

@@ -14,15 +14,15 @@ from pathlib import Path
 from pipelines.core.errors import InputError
 from pipelines.core.products import save_json
 from pipelines.core.progress import SILENT, Progress
-from pipelines.core.workspace import StageRun, Summary
-from pipelines.ingest.bag.flight import read_bag
+from pipelines.core.workspace import StageRun, Summary, Workspace
+from pipelines.ingest.bag.flight import count_frames, read_bag
 from pipelines.ingest.flight_record import FlightRecord
 from pipelines.ingest.folder_flight import read_folder
 from pipelines.ingest.ground_points import list_ground_points, tie_ground_points
 from pipelines.ingest.notes import Notes
 from pipelines.ingest.option_checks import check_options
 from pipelines.ingest.options import IngestOptions
-from pipelines.ingest.survey_assembly import SurveyInputs, assemble_survey
+from pipelines.ingest.survey_assembly import SurveyInputs, assemble_survey, nowhere
 from pipelines.scene.navigation import NavigationTrack
 from pipelines.scene.survey import Survey
 
@@ -35,9 +35,7 @@ def run(stage: StageRun, options: IngestOptions) -> Summary:
     Raises:
         InputError: anything wrong with the inputs; names file, line and field.
     """
-    if options.images is not None and stage.workspace.root.resolve().is_relative_to(options.images.resolve()):
-        message = "the workspace lies inside the folder of photographs: put it elsewhere"
-        raise InputError(message, path=stage.workspace.root)
+    _refuse_inside_photographs(stage.workspace, options)
     survey, track = survey_and_track(options, stage.out / "images", stage.progress)
     if options.copy_images and options.bag is None:
         _copy_images(survey, stage)
@@ -51,8 +49,39 @@ def run(stage: StageRun, options: IngestOptions) -> Summary:
     return _summary(survey)
 
 
+def check_inputs(workspace: Workspace, options: IngestOptions, progress: Progress = SILENT) -> Summary:
+    """Return the summary of what `run` would make; nothing is written.
+
+    Of photographs, sizes and tags are read: damage behind them is found by `run`. Of a bag, all but the pixels.
+
+    Raises:
+        InputError: as `run`.
+    """
+    _refuse_inside_photographs(workspace, options)
+    if options.bag is None:
+        return _summary(survey_and_track(options, None, progress, decode=False)[0])
+    notes = Notes()
+    check_options(options, workspace.root)
+    list_ground_points(options, notes)
+    frames, located = count_frames(options.bag, options, notes, progress)
+    if not located and options.gcp is None:
+        raise nowhere()
+    return Summary(f"a bag with {frames} frames, {located} of them with a position", {}, tuple(notes.warnings))
+
+
+def _refuse_inside_photographs(workspace: Workspace, options: IngestOptions) -> None:
+    """Refuse a workspace whose files would count as photographs.
+
+    Raises:
+        InputError: the workspace lies inside the folder of photographs.
+    """
+    if options.images is not None and workspace.root.resolve().is_relative_to(options.images.resolve()):
+        message = "the workspace lies inside the folder of photographs: put it elsewhere"
+        raise InputError(message, path=workspace.root)
+
+
 def survey_and_track(
-    options: IngestOptions, frames: Path | None, progress: Progress = SILENT
+    options: IngestOptions, frames: Path | None, progress: Progress = SILENT, *, decode: bool = True
 ) -> tuple[Survey, NavigationTrack | None]:
     """Return the survey, and the navigation in the same frame where it was recorded by time.
 
@@ -60,16 +89,19 @@ def survey_and_track(
         options: of `ingest`.
         frames: where the photographs of a bag are written; without a bag, nothing is.
         progress: whom to tell.
+        decode: whether to decode photographs to their end, as their hashes need; otherwise their heads are read.
 
     Raises:
         InputError: as `run`.
     """
     notes = Notes()
-    inputs = _read_inputs(options, frames, notes, progress)
+    inputs = _read_inputs(options, frames, notes, progress, decode=decode)
     return assemble_survey(inputs, options, notes)
 
 
-def _read_inputs(options: IngestOptions, frames: Path | None, notes: Notes, progress: Progress) -> SurveyInputs:
+def _read_inputs(
+    options: IngestOptions, frames: Path | None, notes: Notes, progress: Progress, *, decode: bool
+) -> SurveyInputs:
     check_options(options, frames)
     if options.estimated:
         notes.assume(
@@ -77,17 +109,19 @@ def _read_inputs(options: IngestOptions, frames: Path | None, notes: Notes, prog
             "after sfm"
         )
     ground = list_ground_points(options, notes)  # ahead of the photographs, which take minutes
-    flight = _read_flight(options, frames, notes, progress)
+    flight = _read_flight(options, frames, notes, progress, decode=decode)
     sizes = {photo.name: (photo.file.width, photo.file.height) for photo in flight.photos}
     control, check = tie_ground_points(ground, sizes, options, notes)
     return SurveyInputs(flight, control, check)
 
 
-def _read_flight(options: IngestOptions, frames: Path | None, notes: Notes, progress: Progress) -> FlightRecord:
+def _read_flight(
+    options: IngestOptions, frames: Path | None, notes: Notes, progress: Progress, *, decode: bool
+) -> FlightRecord:
     if options.bag is not None and frames is not None:
         return read_bag(options.bag, options, frames, notes, progress)
     if options.images is not None:
-        return read_folder(options.images, options, notes, progress)
+        return read_folder(options.images, options, notes, progress, decode=decode)
     raise InputError("give the folder of photographs, or a --bag", field="--images")
 
 

@@ -117,11 +117,16 @@ def _origin(poses: ImagePoses, control: Sequence[GroundPoint]) -> Origin:
     if not len(places) and control:
         places = lla_from_ecef([point.position_in_ecef for point in control])
     if not len(places):
-        raise InputError(
-            "no image has a position, and there are no ground control points: give --trajectory, --geo or --gcp"
-        )
+        raise nowhere()
     lat, lon, alt = median_lla(places)
     return Origin(lat_deg=round(float(lat), 5), lon_deg=round(float(lon), 5), alt_m=round(float(alt)))
+
+
+def nowhere() -> InputError:
+    """Return the error of a survey that nothing places on Earth."""
+    return InputError(
+        "no image has a position, and there are no ground control points: give --trajectory, --geo or --gcp"
+    )
 
 
 def _note_coverage(flight: FlightRecord, points: int, notes: Notes) -> None:

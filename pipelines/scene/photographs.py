@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.core.durable import replace_file
+from pipelines.core.durable import replacing
 from pipelines.core.errors import InputError
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray
@@ -209,9 +209,8 @@ def save_array(path: Path, array: NDArray[Any]) -> None:
     """Write an array to a temporary file, and rename that: the file at `path` is always complete."""
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_name(f"{path.stem}.{uuid4().hex}.tmp")  # Several processes may make the same file at once.
-    with draft.open("wb") as handle:
+    with replacing(path, draft), draft.open("wb") as handle:
         np.save(handle, array, allow_pickle=False)
-    replace_file(draft, path)
 
 
 def _distortion_map(camera: Camera, pinhole: Pinhole) -> tuple[Float32Array, BoolArray]:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pipelines.core.durable import replace_file
+from pipelines.core.durable import replacing
 from pipelines.core.errors import InputError
 from pipelines.core.files import read_npz
 
@@ -17,10 +17,9 @@ from pipelines.core.files import read_npz
 def save_checkpoint(path: Path, state: Mapping[str, Tensor]) -> None:
     """Write tensors to an NPZ file, which replaces an existing file only when complete."""
     draft = path.with_suffix(".tmp")
-    with draft.open("wb") as handle:
+    with replacing(path, draft), draft.open("wb") as handle:
         arrays = {name: tensor.detach().cpu().numpy() for name, tensor in state.items()}
         np.savez(handle, **arrays)  # type: ignore[arg-type]
-    replace_file(draft, path)
 
 
 def load_checkpoint(path: Path) -> dict[str, Tensor]:

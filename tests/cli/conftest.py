@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from georef_cli import boundary
 from georef_cli.main import cli
 from tests.cli_runs import Georef, Result
+from tests.killed import make_survey
 
 
 @pytest.fixture
@@ -19,6 +22,14 @@ def georef(capsys: pytest.CaptureFixture[str], fake_stages: None) -> Georef:
 def real_georef(capsys: pytest.CaptureFixture[str]) -> Georef:
     """`georef` in this process, as it is."""
     return _in_this_process(capsys)
+
+
+@pytest.fixture(scope="session")
+def survey(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small survey for real runs."""
+    folder = tmp_path_factory.mktemp("real") / "survey"
+    make_survey(folder)
+    return folder
 
 
 def _in_this_process(capsys: pytest.CaptureFixture[str]) -> Georef:

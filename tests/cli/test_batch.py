@@ -18,6 +18,7 @@ from pipelines.core.stages import BY_NAME
 from pipelines.core.workspace import Workspace
 from tests import fakes
 from tests.cli_runs import WITH_FAKES, Georef, start
+from tests.photos import write_flight
 
 NAMES = ("north", "south", "east", "west", "mill", "broken")
 LAST = "sfm"
@@ -46,7 +47,7 @@ def write_missions(folder: Path) -> Path:
     """Six missions: `broken` names photographs that there are not, and `mill` differs from the others."""
     for name in NAMES:
         if name != "broken":
-            fakes.photographs(folder / "photos" / name)
+            write_flight(folder / "photos" / name, 3)
     tables = {name: f'[missions.{name}]\nimages = "photos/{name}"\n' for name in NAMES}
     tables["mill"] += 'workspace = "more/mill"\nseed = 9\n[missions.mill.sfm]\nmapper = "global"\n'
     path = folder / "valley.toml"
@@ -76,9 +77,9 @@ class Rows(HTMLParser):
 
 def test_a_broken_one_is_told_and_the_others_finish(real_georef: Georef, with_fakes: None, tmp_path: Path) -> None:
     path = write_missions(tmp_path)
-    planned = {
-        row["mission"]: row for row in real_georef("batch", path, "--dry-run", "--json").document["missions"]
-    }
+    dry = real_georef("batch", path, "--dry-run", "--json")
+    assert dry.code == 1, "the dry run ends as the run does"
+    planned = {row["mission"]: row for row in dry.document["missions"]}
     assert set(planned["north"]["stages"].values()) == {"run"} and not (tmp_path / "north").exists()
     assert "photos/broken" in planned["broken"]["refusal"]
     first = real_georef("batch", path, "--json", "--at-a-time", 3)

@@ -56,7 +56,7 @@ def test_status(georef: Georef, done: Path, photos: Path) -> None:
     assert "--images changed" in lines[1]
     rows = georef("status", done, "--json").document["stages"]
     assert [row["stage"] for row in rows] == STAGES
-    assert set(rows[0]) == {"stage", "state", "reason", "finished", "duration_s", "key_figure"}
+    assert set(rows[0]) == {"stage", "state", "reason", "finished", "duration_s", "key_figure", "interrupted"}
     assert [row["state"] for row in rows] == ["stale"] * len(STAGES)
 
 
@@ -194,6 +194,18 @@ class TestExport:
         expected = f"error: {target}: export-ply writes .ply, not a .spz file: end the name with .ply\n"
         assert (result.code, result.err) == (1, expected)
         assert not target.exists()
+
+    def test_the_measurable_splat_is_a_file_of_its_own(self, georef: Georef, done: Path, tmp_path: Path) -> None:
+        target = tmp_path / "site.ply"
+        words = ("export-ply", done, "--measurable", "--disc-spacing", 0.5, "--to", target, "--json")
+        assert georef(*words).document["stage"] == "export-measurable"
+        assert '"disc_spacing":0.5' in target.read_text()
+        assert (done / "measurable/splat.measurable.ply").exists() and (done / "export/splat.ply").exists()
+        rows = georef("status", done, "--json").document["stages"]
+        states = {row["stage"]: row["state"] for row in rows if row["stage"].startswith("export")}
+        assert states == {"export-ply": "current", "export-measurable": "current"}
+        assert not georef("export-ply", done, "--measurable", "--json").document["ran"], "the spacing is remembered"
+        assert georef("export-ply", done, "--disc-spacing", 1).code == 2
 
     def test_missing_folder(self, georef: Georef, done: Path, tmp_path: Path) -> None:
         result = georef("export-ply", done, "-o", tmp_path / "out" / "site.ply")

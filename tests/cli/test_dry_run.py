@@ -8,7 +8,7 @@ import pytest
 
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.train.pace import TimeLeft, iteration_seconds
-from tests import fakes
+from tests import bags, fakes
 from tests.cli_runs import Georef
 from tests.photos import write_flight
 
@@ -66,6 +66,76 @@ def test_large_photographs_are_trained_in_windows(georef: Georef, tmp_path: Path
 def test_a_missing_file_is_told(georef: Georef, tmp_path: Path) -> None:
     georef("run", tmp_path / "ws", "--images", tmp_path / "phots", "--dry-run").assert_failed(1)
     georef("train", tmp_path / "ws", "--dry-run").assert_failed(1)
+
+
+class TestInputs:
+    """`--dry-run` reads what ingest reads: same message, same exit code, nothing written."""
+
+    @pytest.fixture
+    def photos(self, tmp_path: Path) -> Path:
+        write_flight(tmp_path / "photos", 4, positions=False)
+        return tmp_path / "photos"
+
+    @pytest.mark.parametrize(
+        ("more", "reason"),
+        [
+            ((), "no image has a position"),
+            (("--geo", "photos/IMG_0000.JPG"), "IMG_0000.JPG"),
+            (("--gcp", "gcp_list.txt"), "gcp_list.txt:2"),
+        ],
+    )
+    def test_are_refused_as_by_the_run(
+        self, real_georef: Georef, tmp_path: Path, photos: Path, more: tuple[str, ...], reason: str
+    ) -> None:
+        (tmp_path / "gcp_list.txt").write_text("EPSG:32632\nno numbers here\n", "utf-8")
+        paths = [word if word.startswith("--") else tmp_path / word for word in more]
+        words, before = ("run", tmp_path / "ws", "--images", photos, *paths), listing(tmp_path)
+        dry = real_georef(*words, "--dry-run")
+        dry.assert_failed(1)
+        assert reason in dry.err
+        assert listing(tmp_path) == before
+        assert real_georef(*words, "--to", "ingest").err.splitlines()[-1] == dry.err.splitlines()[-1]
+
+    def test_of_too_few_photographs(self, real_georef: Georef, tmp_path: Path) -> None:
+        write_flight(tmp_path / "photos", 2)
+        dry = real_georef("ingest", tmp_path / "ws", "--images", tmp_path / "photos", "--dry-run", "--json")
+        dry.assert_failed(1)
+        assert "2 usable images, a survey needs 3" in dry.err
+
+    def test_of_a_batch(self, real_georef: Georef, tmp_path: Path, photos: Path) -> None:
+        write_flight(tmp_path / "located", 3)
+        folders = {"nowhere": "photos", "placed": "located"}
+        missions = "".join(f'[missions.{name}]\nimages = "{folder}"\n' for name, folder in folders.items())
+        (tmp_path / "valley.toml").write_text(missions, "utf-8")
+        dry = real_georef("batch", tmp_path / "valley.toml", "--dry-run", "--json")
+        assert dry.code == 1
+        refusals = {row["mission"]: row["refusal"] for row in dry.document["missions"]}
+        assert "no image has a position" in refusals["nowhere"] and refusals["placed"] == ""
+
+    def test_are_told_where_they_will_do(self, real_georef: Georef, tmp_path: Path) -> None:
+        """Heads alone are read, so damage behind them is not seen: 10 000 photographs take seconds."""
+        names = write_flight(tmp_path / "photos", 4)
+        whole = (tmp_path / "photos" / names[0]).read_bytes()
+        (tmp_path / "photos" / names[0]).write_bytes(whole[:-700])
+        (tmp_path / "photos/a.jpg").write_text("no image")
+        words = ("run", tmp_path / "ws", "--images", tmp_path / "photos", "--dry-run")
+        dry = real_georef(*words)
+        assert dry.code == 0, dry.err
+        assert "Survey: 4 images, 4 positions, 0 control and 0 check points" in dry.out
+        assert "warning: ingest: 1 image was left out: a.jpg (is no JPEG, PNG or TIFF image)" in dry.err
+        assert real_georef(*words, "--json").document["survey"]["values"]["fixes"] == 4
+
+    def test_of_a_bag(self, real_georef: Georef, tmp_path: Path) -> None:
+        flight = bags.Flight()
+        bags.write(tmp_path / "bag", bags.usual(flight))
+        bags.write(tmp_path / "blind", bags.images(flight))
+        dry = real_georef("run", tmp_path / "ws", "--bag", tmp_path / "bag", "--dry-run", "--json")
+        assert f"a bag with {len(flight.image_ns)} frames" in dry.document["survey"]["key_figure"]
+        words = ("run", tmp_path / "ws", "--bag", tmp_path / "blind", "--to", "ingest")
+        dry = real_georef(*words, "--dry-run")
+        dry.assert_failed(1)
+        assert not (tmp_path / "ws").exists()
+        assert dry.err.splitlines()[-1] == real_georef(*words).err.splitlines()[-1]
 
 
 class TestOfAWorkspace:

@@ -8,8 +8,10 @@ import pytest
 
 from georef_cli.output import print_outcomes
 from georef_cli.overview import size
-from pipelines.core.stages import MODEL, SPLAT
-from pipelines.core.workspace import Workspace
+from pipelines.core.manifest import MANIFEST, Manifest
+from pipelines.core.products import save_json
+from pipelines.core.stages import BY_NAME, MODEL, SPLAT
+from pipelines.core.workspace import Workspace, now
 from pipelines.deliver.overview import overview
 from pipelines.scene.crs_options import CrsOptions
 from tests.cli_runs import Georef
@@ -25,6 +27,22 @@ def flight(tmp_path: Path) -> Workspace:
     return workspace
 
 
+def record_stage(workspace: Workspace, stage: str) -> None:
+    """Put a manifest beside the product of a stage, as if it had been made of another model."""
+    made = Manifest(
+        stage=stage,
+        config={},
+        inputs={MODEL: "another"},
+        versions={},
+        started=now(),
+        duration_s=1.0,
+        key_figure="80 Gaussians",
+        values={},
+        warnings=[],
+    )
+    save_json(made, workspace.root / BY_NAME[stage].folder / MANIFEST)
+
+
 def test_command_tells_place_files_and_what_can_be_made(real_georef: Georef, flight: Workspace) -> None:
     result = real_georef("info", flight.root, "--crs", "EPSG:4326")
     assert result.code == 0
@@ -33,6 +51,26 @@ def test_command_tells_place_files_and_what_can_be_made(real_georef: Georef, fli
     document = real_georef("info", flight.root, "--json").document
     assert document["type"] == "Feature"
     assert document["properties"]["files"][0]["path"] == SPLAT
+    assert document["properties"]["outdated"] == []
+
+
+def test_a_stale_result_is_told_in_the_first_line(real_georef: Georef, flight: Workspace) -> None:
+    """The splat was made of another model: what follows in the text is not of the present inputs."""
+    record_stage(flight, "export-ply")
+    first, *_ = real_georef("info", flight.root).out.splitlines()
+    assert first.startswith(f"{flight.root} is stale (export-ply: ")
+    (row,) = real_georef("info", flight.root, "--json").document["properties"]["outdated"]
+    assert (row["stage"], row["state"]) == ("export-ply", "stale") and MODEL in row["reason"]
+
+
+def test_an_interrupted_run_beside_the_result_is_told(real_georef: Georef, flight: Workspace) -> None:
+    record_stage(flight, "train")
+    partial = flight.partial_product(BY_NAME["train"])
+    partial.begin("")
+    partial.record_progress("20 of 40 iterations")
+    assert "train: an interrupted run: 20 of 40 iterations, saved 20" in real_georef("info", flight.root).out
+    document = real_georef("info", flight.root, "--json").document
+    assert f"`georef train {flight.root}` goes on with it" in document["properties"]["interrupted"]["train"]
 
 
 def test_command_names_what_is_missing(real_georef: Georef, flight: Workspace, tmp_path: Path) -> None:

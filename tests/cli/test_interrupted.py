@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ from tests import fakes
 from tests.cli_runs import Georef, Result
 
 CHECKPOINT = "train.partial/checkpoint"
+FOUND = r"1500 of 7000 iterations, 12 min, saved 20\d\d-\d\d-\d\d \d\d:\d\d"
 
 
 def stop(stage: StageRun, options: object) -> Summary:
@@ -38,7 +40,7 @@ def training(root: Path) -> tuple[bool, str]:
 
 def assert_refused(result: Result, root: Path, reason: str) -> None:
     result.assert_failed(1)
-    assert "an interrupted train would be lost (1500 of 7000 iterations, 12 min)" in result.err
+    assert re.search(rf"an interrupted train would be lost \({FOUND}, with --preset fast\), because", result.err)
     assert f"because {reason}" in result.err
     assert f"`georef train {root}`" in result.err
     assert "--force drops it" in result.err
@@ -91,6 +93,70 @@ def test_a_diverged_training_is_worth_nothing(georef: Georef, interrupted: Path)
     assert georef("train", interrupted).code == 1
     fakes.install()
     assert georef("train", interrupted, "--seed", 3).code == 0
+
+
+class TestBesideAFinishedProduct:
+    """`train --force` was killed: the old product is current, and the work beside it is told and gone on with."""
+
+    @pytest.fixture
+    def forced(self, georef: Georef, workspace: Workspace, photos: Path) -> Path:
+        assert georef("run", workspace.root, "--images", photos, "--preset", "fast").code == 0
+        fakes.install(train=stop)
+        assert georef("train", workspace.root, "--force").code == 130
+        fakes.install()
+        return workspace.root
+
+    @pytest.mark.parametrize("words", [("train",), ("run",), ("train", "--resume")])
+    def test_the_next_command_goes_on(self, georef: Georef, forced: Path, words: tuple[str, ...]) -> None:
+        command, *options = words
+        done = georef(command, forced, *options)
+        assert done.code == 0
+        assert re.search(f"train: goes on with an interrupted run: {FOUND}, with --preset fast", done.err)
+        assert "beside the finished product" in done.err
+        assert training(forced) == (True, "fast")
+        assert not (forced / "train.partial").exists()
+
+    def test_force_drops_it_and_says_so(self, georef: Georef, forced: Path) -> None:
+        done = georef("train", forced, "--force")
+        assert re.search(f"starts afresh; what an interrupted run had done is dropped: {FOUND}", done.err)
+        assert training(forced) == (False, "fast")
+
+    def test_it_is_told_before(self, georef: Georef, forced: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr("georef_cli.forecast._photographs", lambda *_: None)  # fake surveys have none
+        state = " ".join(georef("status", forced).out.split())
+        assert re.search(f"an interrupted run: {FOUND}, with --preset fast; `georef train", state)
+        row = next(row for row in georef("status", forced, "--json").document["stages"] if row["stage"] == "train")
+        assert row["state"] == "current" and re.search(FOUND, row["interrupted"])
+        planned = {
+            force: georef("train", forced, "--dry-run", "--json", *force).document["stages"][0]
+            for force in ((), ("--force",))
+        }
+        assert planned[()]["action"] == "resume" and re.search(FOUND, planned[()]["reason"])
+        assert re.search(f"drops an interrupted run: {FOUND}", planned["--force",]["reason"])
+        assert (forced / CHECKPOINT).exists()
+
+    def test_work_of_other_options_stays_and_the_right_command_is_named(self, georef: Georef, forced: Path) -> None:
+        assert georef("train", forced).code == 0
+        fakes.install(train=stop)
+        assert georef("train", forced, "--iterations", 900).code == 130
+        fakes.install()
+        command = f"`georef train {forced} --iterations 900`"
+        current = georef("run", forced, "--forget", "iterations")
+        assert current.code == 0, "the product of these options is there, and nothing is lost"
+        assert f"{command} goes on with it" in current.err
+        refused = georef("train", forced, "--seed", 5)
+        refused.assert_failed(1)
+        assert f"{command} continues it" in refused.err
+        assert georef(*command.strip("`").split()[1:]).code == 0
+        assert training(forced)[0]
+
+    def test_what_cannot_be_continued_is_dropped(self, georef: Georef, forced: Path) -> None:
+        fakes.install(evaluate=stop)
+        assert georef("evaluate", forced, "--force").code == 130
+        fakes.install()
+        again = georef("evaluate", forced)
+        assert "evaluate: a run that did not end left nothing to go on with, and is dropped" in again.err
+        assert "evaluate: current" in again.err and not (forced / "evaluate.partial").exists()
 
 
 class TestExtension:

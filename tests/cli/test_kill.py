@@ -25,10 +25,9 @@ from pipelines.scene.survey import Survey
 from pipelines.splat.storage import read_gaussians
 from pipelines.train.checkpoint import load_checkpoint
 from tests.cli_runs import Result, finish, start
+from tests.killed import GEOREF, PATIENCE_S, asked, georef
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="no process can be sent SIGTERM or SIGKILL")
-
-GEOREF = "from georef_cli.main import main; main()"
 
 # The process ends itself by SIGKILL just ahead of a system call: `mkdir <workspace>/sfm.partial`.
 ENDING_ITSELF = """
@@ -56,34 +55,20 @@ STOPS = (
     ("train.partial/metrics.jsonl", signal.SIGTERM),
     ("train.partial/metrics.jsonl", signal.SIGINT),  # when it has grown: some iterations later
 )
-EFFORT = ("--preset", "smoke", "--iterations", "40")
 NOISE_OF_LIBRARIES = ("Traceback", "***", "@ ", "terminate called", "Aborted", "Segmentation")
-
-
-@pytest.fixture(scope="session")
-def survey(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Nine photographs of 200 × 150 pixels in nadir lines, with control and check points."""
-    folder = tmp_path_factory.mktemp("kill") / "survey"
-    layout = ("--flight", "grid", "--height", 60, "--radius", 10, "--targets", 12, "--control", 4)
-    made = finish(
-        start("simulate", folder, "--images", 9, "--size", "200x150", "--samples", 1, *layout, code=GEOREF)
-    )
-    assert made.code == 0, made.err
-    return folder
 
 
 @pytest.fixture(scope="session")
 def whole(survey: Path) -> Workspace:
     """A workspace that nobody disturbed."""
     workspace = Workspace(survey.parent / "whole")
-    done = _finish(start("run", workspace.root, *_asked(survey), code=GEOREF))
-    assert done.code == 0, done.err
+    georef("run", workspace.root, *asked(survey))
     return workspace
 
 
 def test_killed_at_every_stage_and_completed(survey: Path, whole: Workspace) -> None:
     workspace = Workspace(survey.parent / "killed")
-    arguments = _asked(survey)
+    arguments = asked(survey)
     for moment, delay_s in MOMENTS:
         if delay_s is None:
             code = ENDING_ITSELF
@@ -103,7 +88,7 @@ def test_killed_at_every_stage_and_completed(survey: Path, whole: Workspace) -> 
 
 def test_stopped_by_the_user_and_resumed(survey: Path, whole: Workspace) -> None:
     workspace = Workspace(survey.parent / "stopped")
-    command: tuple[object, ...] = ("run", workspace.root, *_asked(survey)[:-1], "100")
+    command: tuple[object, ...] = ("run", workspace.root, *asked(survey)[:-1], "100")
     for watched, number in STOPS:
         process = start(*command, code=GEOREF)
         _wait_for(process, workspace, watched)
@@ -130,27 +115,18 @@ def test_thirty_kills_at_random(survey: Path, whole: Workspace) -> None:
     rng = np.random.default_rng(7)
     for kill in range(30):
         force = ("--force",) if kill % 5 == 4 else ()
-        process = start("run", workspace.root, *_asked(survey), *force, code=GEOREF)
+        process = start("run", workspace.root, *asked(survey), *force, code=GEOREF)
         try:
             process.wait(timeout=float(rng.uniform(0.3, 7.0)))
         except subprocess.TimeoutExpired:
             process.kill()
         assert _finish(process).code in (-signal.SIGKILL, 0)
         states.status(workspace)
-    _assert_completes(workspace, whole, _asked(survey))
-
-
-def _asked(survey: Path) -> tuple[str, ...]:
-    return (
-        *("--images", str(survey / "images"), "--trajectory", str(survey / "trajectory.csv")),
-        *("--gcp", str(survey / "gcp_list.txt"), "--checkpoints", str(survey / "checkpoints.txt")),
-        *EFFORT,
-    )
+    _assert_completes(workspace, whole, asked(survey))
 
 
 def _finish(process: subprocess.Popen[str]) -> Result:
-    """Wait for a process that may have to compile kernels first."""
-    return finish(process, 240.0)
+    return finish(process, PATIENCE_S)
 
 
 def _wait_for(process: subprocess.Popen[str], workspace: Workspace, pattern: str) -> None:

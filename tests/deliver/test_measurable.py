@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
 
@@ -11,7 +12,8 @@ import torch
 
 from pipelines.core.errors import DegenerateGeometryError, ResourceError
 from pipelines.core.runner import run_stage
-from pipelines.core.stages import BY_NAME, GAUSSIANS, SPLAT
+from pipelines.core.stages import BY_NAME, GAUSSIANS, MEASURABLE_SPLAT, SPLAT
+from pipelines.core.staleness import status
 from pipelines.core.workspace import Workspace
 from pipelines.deliver import measurable
 from pipelines.deliver.measurable import with_discs
@@ -130,24 +132,39 @@ def test_repainting_finds_the_colours_and_moves_nothing() -> None:
     assert error[1] < 0.1 * error[0]
 
 
-def test_command_puts_centres_on_the_surface(trained: list[tuple[Workspace, Workspace]], tmp_path: Path) -> None:
+def test_command_puts_centres_on_the_surface(
+    trained: list[tuple[Workspace, Workspace]], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """In a file of its own, which leaves the ordinary one as it is, and is stale by itself."""
+    caplog.set_level("INFO")
     root = tmp_path / "ws"
     shutil.copytree(trained[0][0].root, root, symlinks=True)
     workspace = Workspace(root)
     origin = load_survey(workspace).origin
     run_stage(workspace, BY_NAME["export-ply"], {})
-    plain = read_sidecar(workspace.path(SPLAT))
+    plain, plain_bytes = read_sidecar(workspace.path(SPLAT)), workspace.path(SPLAT).read_bytes()
     unpainted, values = (
-        run_stage(workspace, BY_NAME["export-ply"], {"measurable": True, "repaint_passes": passes}).manifest.values
+        run_stage(workspace, BY_NAME["export-measurable"], {"repaint_passes": passes}).manifest.values
         for passes in (0, 2)
     )
-    sidecar, after = read_sidecar(workspace.path(SPLAT)), read_gaussians(workspace.path(SPLAT))
+    told = re.search(r"about (\d+) discs [\d.]+ m apart, ([\d.]+) MB and ", caplog.text)
+    assert told is not None
+    assert int(told[1]) == pytest.approx(values["discs"], rel=0.3)
+    made = workspace.path(MEASURABLE_SPLAT)
+    sidecar, after = read_sidecar(made), read_gaussians(made)
+    assert float(told[2]) == pytest.approx(made.stat().st_size / 1e6, rel=0.3)
     assert sidecar == plain  # The same frame, whatever is in it.
+    assert workspace.path(SPLAT).read_bytes() == plain_bytes
+    states = {row.stage: row.state for row in status(workspace)}
+    assert (states["export-ply"], states["export-measurable"]) == ("current", "current")
+    run_stage(workspace, BY_NAME["export-ply"], {"min_opacity": 0.1})
+    assert made.exists()
+    assert {row.stage: row.state for row in status(workspace)}["export-measurable"] == "current"
     assert len(after) == values["gaussians"] > values["discs"] > 1000
-    assert sorted(path.name for path in (root / "export").iterdir()) == [
+    assert sorted(path.name for path in (root / "measurable").iterdir()) == [
         "manifest.json",
-        "splat.ply",
-        "splat.ply.georef.json",
+        "splat.measurable.ply",
+        "splat.measurable.ply.georef.json",
     ]
     in_geo = enu_from_ecef(sidecar.ecef_from_file().apply(after.means.numpy()), origin)
     inner = np.hypot(in_geo[:, 0], in_geo[:, 1]) < 20
@@ -164,8 +181,8 @@ def test_too_many_discs_are_refused(
     shutil.copytree(trained[0][0].root, root, symlinks=True)
     monkeypatch.setattr(measurable, "free_memory_bytes", lambda _device: 2**27)
     with pytest.raises(ResourceError, match="--disc-spacing"):
-        run_stage(Workspace(root), BY_NAME["export-ply"], {"measurable": True})
-    assert not (root / SPLAT).exists()
+        run_stage(Workspace(root), BY_NAME["export-measurable"], {})
+    assert not (root / MEASURABLE_SPLAT).exists()
 
 
 def test_a_model_without_a_surface_is_refused(trained: list[tuple[Workspace, Workspace]], tmp_path: Path) -> None:
@@ -176,4 +193,4 @@ def test_a_model_without_a_surface_is_refused(trained: list[tuple[Workspace, Wor
     write_gaussians(root / GAUSSIANS, haze)
     (root / "train" / "manifest.json").unlink()  # A model put there by hand.
     with pytest.raises(DegenerateGeometryError, match="none of 12 training views shows a surface"):
-        run_stage(Workspace(root), BY_NAME["export-ply"], {"measurable": True})
+        run_stage(Workspace(root), BY_NAME["export-measurable"], {})

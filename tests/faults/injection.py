@@ -51,9 +51,9 @@ class Disk:
         self.changes.append(f"{action} {place.relative_to(self.folder)}")
         count = len(self.changes)
         if self.kind == "full" and self.at and count >= self.at and action in _NEEDS_ROOM:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(place))
+            raise _error(errno.ENOSPC, action, place)
         if self.kind == "failing" and count == self.at:
-            raise OSError(errno.EIO, os.strerror(errno.EIO), str(place))
+            raise _error(errno.EIO, action, place)
 
     @contextmanager
     def mounted(self) -> Iterator[Disk]:
@@ -84,6 +84,11 @@ class Disk:
             counted("fsync"),
         ):
             yield self
+
+
+def _error(number: int, action: str, place: Path) -> OSError:
+    """Return the error of the system: that of a write names no file."""
+    return OSError(number, os.strerror(number), *(() if action == "write" else (str(place),)))
 
 
 class _File(io.FileIO):

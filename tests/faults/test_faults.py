@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,12 +16,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pipelines.batch.missions import Mission, MissionList
+from pipelines.batch.runner import PlannedMission, run_batch
 from pipelines.core import staleness as states
 from pipelines.core.errors import InputError, StorageError
 from pipelines.core.products import save_json
+from pipelines.core.progress import SILENT, Progress
 from pipelines.core.runner import run_stage
 from pipelines.core.stages import BY_NAME, GAUSSIANS, MODEL
 from pipelines.core.workspace import Workspace
+from pipelines.engine.job import Job, JobEnd
 from pipelines.geometry.similarity import Similarity
 from pipelines.simulate.options import SimulateOptions
 from pipelines.simulate.stage import simulate
@@ -80,7 +85,7 @@ class Trial:
                 with fault.mounted():
                     self.run()
             except (StorageError, InputError) as error:
-                assert re.search(DISK, str(error))
+                assert re.search(DISK, str(error)) and str(self.workspace.root) in str(error)
                 assert "\n" not in str(error)
             moment = fault.changes[min(at, len(fault.changes)) - 1]
             assert self.state in (STATES_OF_A_FIRST_RUN if first else ("current",)), moment
@@ -133,6 +138,40 @@ def test_changes_of_training_and_evaluation(flights: list[RenderedFlight], one_t
     short = {"iterations": 2, "sh_degree": 0, "dense": False, "log_every": 1, "checkpoint_every": 1}
     Trial(workspace, "train", short).survives("full", most=4)
     Trial(workspace, "evaluate", {"renders": 1}).survives("failing", most=2)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_changes_of_the_table_of_a_batch(tmp_path: Path, kind: Kind) -> None:
+    """The first table is written before any mission begins; a later one that cannot be written stops none."""
+    mission = Mission("north", Workspace(tmp_path / "north"), "north")
+    listed = MissionList("valley", tmp_path, (mission,))
+    with Disk(tmp_path).mounted() as disk:
+        run_batch(listed, [PlannedMission(mission, {})], Ending(), SILENT)
+    begun = len(disk.changes) // 3  # of the tables at the beginning, after the mission, and at the end
+    for at in (1, begun + 1, 2 * begun + 1):
+        engine, told = Ending(), ""
+        try:
+            with Disk(tmp_path, kind, at).mounted():
+                run_batch(listed, [PlannedMission(mission, {})], engine, SILENT)
+        except StorageError as error:
+            told = str(error)
+        assert engine.ended == (at > 1)
+        assert str(tmp_path) in told or (kind == "failing" and at == begun + 1), "the last table is whole again"
+        assert list(tmp_path.glob("*.tmp")) == []
+
+
+class Ending:
+    """Engine whose jobs end at once."""
+
+    ended = 0
+
+    def together(self, jobs: Sequence[Job]) -> int:
+        return len(jobs)
+
+    def run(self, title: str, jobs: Sequence[Job], ended: Callable[[JobEnd], None], progress: Progress) -> None:
+        for job in jobs:
+            self.ended += 1
+            ended(JobEnd(job, 0, 1.0, "", ""))
 
 
 def test_changes_of_the_simulator(tmp_path: Path) -> None:

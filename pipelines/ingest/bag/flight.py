@@ -9,7 +9,7 @@ import numpy as np
 from pipelines.core.errors import InputError
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import FloatArray
-from pipelines.formats.bag.reader import open_bag
+from pipelines.formats.bag.reader import Bag, open_bag
 from pipelines.formats.pose_table import complete
 from pipelines.geodesy.operations import WGS84
 from pipelines.geometry.rig import Rig
@@ -19,7 +19,7 @@ from pipelines.ingest.bag.photos import write_photos
 from pipelines.ingest.bag.streams import read_streams
 from pipelines.ingest.bag.topics import RequestedTopics, SelectedTopics, select_topics
 from pipelines.ingest.bag.trajectories import BagNavigation, navigation_of
-from pipelines.ingest.flight_record import FlightRecord, require_enough
+from pipelines.ingest.flight_record import LEAST_IMAGES, FlightRecord, require_enough, too_few
 from pipelines.ingest.image_poses import ImagePoses
 from pipelines.ingest.notes import Notes
 from pipelines.ingest.options import IngestOptions
@@ -40,19 +40,13 @@ def read_bag(
             local frame without `--origin`.
     """
     with open_bag(path) as bag:
-        requested = RequestedTopics(options.image_topic, options.fix_topic, options.attitude_topic)
-        topics = select_topics(bag, requested)
-        if topics.image is None:
-            raise InputError(
-                "has no topic of sensor_msgs/Image or CompressedImage: see `georef inspect`", path=path
-            )
-        _note_topics(topics, notes)
+        image, topics = _topics(bag, path, options, notes)
         streams = read_streams(bag, topics, notes, progress)
         navigation = navigation_of(streams, options, notes)
-        clock = streams.clocks[topics.image]
+        clock = streams.clocks[image]
         place = navigation.positions.at(clock.time_s + options.time_offset_s).position
         photos, numbers = write_photos(
-            bag, topics.image, clock, place, options=options, folder=folder, notes=notes, progress=progress
+            bag, image, clock, place, options=options, folder=folder, notes=notes, progress=progress
         )
     if len(photos) > _MANY_FRAMES and options.every is None:
         notes.warn(f"all {len(photos)} frames were taken: --every 2s or --every 5m takes fewer")
@@ -71,6 +65,37 @@ def read_bag(
     )
     poses = _poses(time_s, navigation, rig, options, notes)
     return FlightRecord(folder.resolve(), photos, cameras, camera_of, poses, recorded)
+
+
+def count_frames(path: Path, options: IngestOptions, notes: Notes, progress: Progress = SILENT) -> tuple[int, int]:
+    """Return the number of frames with a usable stamp, and of those with a position; nothing is written.
+
+    Raises:
+        InputError: as `read_bag`, but for frames that are damaged, blurred or passed over.
+    """
+    with open_bag(path) as bag:
+        image, topics = _topics(bag, path, options, notes)
+        streams = read_streams(bag, topics, notes, progress)
+    clock, navigation = streams.clocks[image], navigation_of(streams, options, notes)
+    located = complete(navigation.positions.at(clock.time_s + options.time_offset_s).position) & clock.usable
+    count = int(clock.usable.sum())
+    if count < LEAST_IMAGES:
+        raise too_few(count, path, "--bag", notes)
+    return count, int(located.sum())
+
+
+def _topics(bag: Bag, path: Path, options: IngestOptions, notes: Notes) -> tuple[str, SelectedTopics]:
+    """Return the topic of the photographs, and all that are read.
+
+    Raises:
+        InputError: no photographs, or a named topic that does not fit.
+    """
+    requested = RequestedTopics(options.image_topic, options.fix_topic, options.attitude_topic)
+    topics = select_topics(bag, requested)
+    if topics.image is None:
+        raise InputError("has no topic of sensor_msgs/Image or CompressedImage: see `georef inspect`", path=path)
+    _note_topics(topics, notes)
+    return topics.image, topics
 
 
 def _note_topics(topics: SelectedTopics, notes: Notes) -> None:
