@@ -16,6 +16,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from pipelines.engine.certificates import CERTIFICATE, KEY, make_certificates, make_own_certificates
 from tests.cli_runs import Georef, finish, start
 from tests.clusters import greeting
+from tests.photos import write_flight
 
 NOW = datetime.now(UTC)
 PLAIN = "from georef_cli.main import main; main()"
@@ -64,7 +65,8 @@ def test_strangers_are_refused_by_default(own: Path, tmp_path: Path, port: int) 
         assert greeting(port, None) == b""
         make_certificates(tmp_path / "other")
         assert greeting(port, tmp_path / "other") == b""
-        (tmp_path / "missions.toml").write_text('[missions.a]\nimages = "nowhere"\n', "utf-8")
+        write_flight(tmp_path / "photos", 4)
+        (tmp_path / "missions.toml").write_text('[missions.a]\nimages = "photos"\n', "utf-8")
         address = ("--cluster", f"127.0.0.1:{port}")
         ended = finish(start("batch", tmp_path / "missions.toml", *address, "--dry-run", code=PLAIN))
         assert ended.code == 0, ended.err
