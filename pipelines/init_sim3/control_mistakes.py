@@ -21,7 +21,8 @@ EVERYDAY_SHIFT_M = 5.0
 _LEAST_FEET_M = 50.0
 _FEET_PART = 0.05  # of a height, by which cameras are higher than control points
 _SCALES = (2.0, 3.0, 4.0, 0.5, 1 / 3, 0.25)  # of photographs that were made smaller or larger
-_LEAST, _SIGMAS, _LEAST_SCALE, _NEAR_SCALE = 4, 5.0, 0.01, 0.01
+_MIRRORED_M = 0.3  # scatter about the SfM model, below which control points fit as they are
+_LEAST, _SIGMAS, _NEAR_SIGMAS, _LEAST_SCALE = 5, 5.0, 2.0, 0.01
 Change = Callable[[Mark], tuple[float, float]]
 
 
@@ -72,7 +73,7 @@ def mistake_in_map(fixes: Correspondences, control: Correspondences, lat_deg: fl
     """Return the mistake of a map of control points that has another size or other axes than the fixes, or None.
 
     Args:
-        fixes, control: both in local and in geo, at least four of each; fewer show nothing.
+        fixes, control: both in local and in geo, at least five of each; the scatter of fewer shows too little.
         lat_deg: latitude of the survey.
     """
     if min(len(fixes), len(control)) < _LEAST:
@@ -82,20 +83,21 @@ def mistake_in_map(fixes: Correspondences, control: Correspondences, lat_deg: fl
         mirrored_m = fit(control.in_local, mirrored(control.in_geo))[1]
     except DegenerateGeometryError:
         return None
-    if mirrored_m < control_m / 10.0:
+    if control_m > _MIRRORED_M and mirrored_m < control_m / 10.0:
         return "their map is mirrored: east and north are exchanged; check the order of the columns and the CRS"
     ratio = by_control.scale / by_fixes.scale
     sigma = float(np.hypot(_sigma_of_scale(fixes, fix_m), _sigma_of_scale(control, control_m)))
-    if abs(np.log(ratio)) < max(_SIGMAS * sigma, _LEAST_SCALE):
-        return None
     causes = {
         1.0 / np.cos(np.radians(lat_deg)): "Web Mercator (EPSG:3857) has this scale at this latitude",
         FOOT_M: "the coordinates are in metres, although their CRS has feet",
         1.0 / FOOT_M: "the coordinates are in feet, although their CRS has metres",
     }
     near = min(causes, key=lambda scale: abs(np.log(ratio / scale)))
-    known = abs(np.log(ratio / near)) < max(_SIGMAS * sigma, _NEAR_SCALE)
-    cause = causes[near] if known else "another unit or map projection"
+    is_known = abs(np.log(ratio / near)) < _NEAR_SIGMAS * sigma + _LEAST_SCALE
+    # Poor coordinates have any scale: one without a known cause has to be twice as evident.
+    if abs(np.log(ratio)) < (_SIGMAS if is_known else 2.0 * _SIGMAS) * sigma + _LEAST_SCALE:
+        return None
+    cause = causes[near] if is_known else "another unit or map projection"
     return f"their map is {ratio:.4g} times as large as that of the fixes: {cause}"
 
 
