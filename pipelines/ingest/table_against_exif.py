@@ -24,7 +24,7 @@ from pipelines.ingest.notes import Notes
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import Photo
 from pipelines.ingest.photo_poses import poses_from_tags
-from pipelines.robust.patterns import blunders_among, scatter_about_median, two_groups
+from pipelines.robust.patterns import blunders_among, median_spacing, scatter_about_median, two_groups
 from pipelines.robust.statistics import mad_sigma
 
 _SIGMAS, _LEAST_M = 4.0, 1.0
@@ -145,8 +145,7 @@ def _cause(places: _Places, typical_m: float, sigma_m: float) -> str:
         return f"{differ}, along the track: the times are off by about {offset:+.1f} s"
     if float(np.median(nearest)) < max(2.0 * sigma_m, 0.2 * typical_m) and (at != np.arange(len(at))).mean() > 0.5:
         return f"{differ}, but lie where other photographs were taken: rows of other images, or times that are off?"
-    spacing = float(np.median(KDTree(places.exif).query(places.exif, k=2)[0][:, 1]))
-    if typical_m < spacing / 2:
+    if typical_m < median_spacing(places.exif) / 2:
         return f"{differ}, without any pattern: noise, so that σ of the table or of EXIF is too small"
     return f"{differ}, in changing directions: times that are off, or rows of other images?"
 

@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from pipelines.core.cautions import Caution
 from pipelines.core.errors import DegenerateGeometryError
@@ -31,7 +30,8 @@ from pipelines.init_sim3.hypotheses import (
 )
 from pipelines.init_sim3.joint import JointAdjustment
 from pipelines.init_sim3.plausibility import hangs_upside_down, looks_at_sky
-from pipelines.robust.statistics import outlier_gate
+from pipelines.robust.patterns import median_spacing
+from pipelines.robust.statistics import outlier_gate, typical_sigma
 from pipelines.scene.observations import (
     UnusedControlPoint,
     attitude_prior,
@@ -155,7 +155,7 @@ class _Fixes:
     @property
     def sigma_m(self) -> float:
         """Typical σ per axis."""
-        return _sigma_m(self.positions.cov_in_geo)
+        return typical_sigma(self.positions.cov_in_geo)
 
     @property
     def tolerance_m(self) -> float:
@@ -171,7 +171,7 @@ class _Fixes:
     @property
     def spacing_m(self) -> float:
         """Median distance of a fix from the nearest other one."""
-        return float(np.median(KDTree(self.positions.in_geo).query(self.positions.in_geo, k=2)[0][:, 1]))
+        return median_spacing(self.positions.in_geo)
 
     def explanation(self) -> Hypothesis | None:
         """Return the known mistake that explains why the fixes do not fit the SfM model, if one does."""
@@ -278,7 +278,7 @@ def _control_points(joint: JointAdjustment) -> list[_Finding]:
         return [_Finding(_apart(shift, _height_of_control(joint)), ends=True)]
     if factor.applied > _QUIET_FACTOR:
         scatter_m = float(np.sqrt((residual**2).mean()))
-        weighted_m = _sigma_m(np.array([point.cov_in_geo for point in joint.survey.control_points]))
+        weighted_m = typical_sigma(np.array([point.cov_in_geo for point in joint.survey.control_points]))
         who = "which nobody stated" if factor.sigma_source == "default" else "as stated"
         sentence = (
             f"the control points miss by {scatter_m:.2f} m RMS an axis, their σ is "
@@ -377,7 +377,9 @@ def _weak_checks(joint: JointAdjustment) -> list[_Finding]:
         findings.append(_Finding(Caution(code="hardly-checked", sentence=sentence)))
     fixes = joint.problem.term(FixTerm)
     if fixes is not None and not any(factor.group == "control points" for factor in tested):
-        sigma = _sigma_m(np.array([image.fix.cov_in_geo for image in joint.survey.images if image.fix is not None]))
+        sigma = typical_sigma(
+            np.array([image.fix.cov_in_geo for image in joint.survey.images if image.fix is not None])
+        )
         sentence = (
             "no control point checks an error that all fixes share, of the base station or of a receiver without "
             f"corrections: σ count the fixes, of {sigma:.2g} m, as independent"
@@ -399,8 +401,3 @@ def _guesses(joint: JointAdjustment) -> list[_Finding]:
         f"nobody stated the σ of {', '.join(guessed)}: defaults stand in, and every σ of the result hangs on them"
     )
     return [_Finding(Caution(code="default-sigma", sentence=sentence))]
-
-
-def _sigma_m(covariances: FloatArray) -> float:
-    """Return the typical σ per axis of covariances (n, 3, 3)."""
-    return float(np.sqrt(np.median(np.trace(covariances, axis1=1, axis2=2)) / 3))

@@ -13,6 +13,7 @@ from pipelines.geodesy.vertical import FOOT_M, MOST_GEOID_M
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.georef.adjustment import Correspondences
 from pipelines.init_sim3.hypotheses import fit, mirrored
+from pipelines.robust.statistics import typical_sigma
 from pipelines.scene.observations import control_correspondences
 from pipelines.scene.survey import Mark, Survey
 
@@ -104,8 +105,7 @@ def mistake_in_map(fixes: Correspondences, control: Correspondences, lat_deg: fl
 def _sigma_of_scale(positions: Correspondences, scatter_m: float) -> float:
     """Return the σ of ln(scale): of the scatter, or of errors as large as stated that drift over the flight."""
     size_m = float(np.sqrt(((positions.in_geo - positions.in_geo.mean(axis=0)) ** 2).sum(axis=1).mean()))
-    stated_m = float(np.sqrt(np.median(np.trace(positions.cov_in_geo, axis1=1, axis2=2)) / 3.0))
-    return float(max(scatter_m / len(positions) ** 0.5, stated_m) / size_m)
+    return float(max(scatter_m / len(positions) ** 0.5, typical_sigma(positions.cov_in_geo)) / size_m)
 
 
 def shift_sentence(shift_m: FloatArray, height_m: float) -> str:

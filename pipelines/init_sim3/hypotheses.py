@@ -144,7 +144,7 @@ def clock_that_turns(
     track = _Track.of(center_in_local, position_in_geo, time_s)
     if track is None:
         return None
-    limit = _EXPLAINS * max(track.at(1e-6)[1], 1e-6)
+    limit = _EXPLAINS * max(track.at(0.0)[1], 1e-6)
 
     def turn(offset_s: float) -> float:
         similarity, scatter, _ = track.at(offset_s)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial import KDTree
 
 from pipelines.core.types import BoolArray, FloatArray
 from pipelines.robust.statistics import median_chi2, outlier_gate
@@ -36,6 +37,12 @@ def scatter_about_median(offsets: ArrayLike) -> float:
     array = np.asarray(offsets, dtype=np.float64)
     squared = ((array - np.median(array, axis=0)) ** 2).sum(axis=1)
     return float(np.sqrt(np.median(squared) / median_chi2(array.shape[1])))
+
+
+def median_spacing(places: ArrayLike) -> float:
+    """Return the median distance of n ≥ 2 places (n, d) from the nearest other one."""
+    array = np.asarray(places, dtype=np.float64)
+    return float(np.median(KDTree(array).query(array, k=2)[0][:, 1]))
 
 
 def two_groups(offsets: ArrayLike) -> TwoGroups | None:

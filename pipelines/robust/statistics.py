@@ -77,6 +77,11 @@ def squared_mahalanobis(residuals: ArrayLike, covariances: ArrayLike) -> FloatAr
     return np.asarray((r * solved).sum(axis=-1))
 
 
+def typical_sigma(covariances: ArrayLike) -> float:
+    """Return the typical σ per axis of covariances (N, 3, 3)."""
+    return float(np.sqrt(np.median(np.trace(np.asarray(covariances), axis1=1, axis2=2)) / 3))
+
+
 def residual_stats(residuals_in_geo: ArrayLike) -> ResidualStats:
     """Return the figures of residuals (N, 3), East-North-Up in metres; all but the count are None if N is 0."""
     r = np.asarray(residuals_in_geo, dtype=np.float64).reshape(-1, 3)
