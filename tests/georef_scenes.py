@@ -7,14 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from pipelines.adjust.cameras import CameraCorrections
+from pipelines.adjust.problem import GeoProblem
+from pipelines.adjust.similarity import LearnableSimilarity
+from pipelines.adjust.systematic import SystematicErrors
+from pipelines.adjust.terms import AttitudeTerm, ControlTerm, DistanceTerm, FixTerm, Term, Weighting
 from pipelines.geometry.bundle import similarity_modes
+from pipelines.geometry.cameras import CameraPoses
 from pipelines.geometry.rotations import exp_so3, log_so3
 from pipelines.geometry.similarity import Similarity
-from pipelines.georef.cameras import CameraCorrections, CameraPoses
-from pipelines.georef.problem import GeoProblem
-from pipelines.georef.similarity import LearnableSimilarity
-from pipelines.georef.systematic import SystematicErrors
-from pipelines.georef.terms import AttitudeTerm, ControlTerm, DistanceTerm, FixTerm, Term, Weighting
 from pipelines.robust.statistics import outlier_gate
 from tests.scenes import looking_at
 

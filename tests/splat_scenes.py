@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import torch
 
+from pipelines.adjust.geolocate import geolocate
+from pipelines.adjust.options import GeolocateOptions
 from pipelines.core.products import save_json
 from pipelines.core.stages import POINTS, SIM3
 from pipelines.core.workspace import Workspace
-from pipelines.geolocate.options import GeolocateOptions
-from pipelines.geolocate.stage import geolocate
 from pipelines.geometry.cameras import Camera, Pinhole
 from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.similarity import Similarity

@@ -6,23 +6,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.accuracy.prediction import AccuracyPrediction
+from pipelines.adjust.geographic import geo_problem
+from pipelines.adjust.geolocate import geolocate
+from pipelines.adjust.init_sim3 import estimate_similarity
+from pipelines.adjust.options import GeolocateOptions, InitSim3Options
+from pipelines.adjust.posterior import minimise
+from pipelines.adjust.prediction import AccuracyPrediction
+from pipelines.adjust.solved_survey import solve_survey
 from pipelines.core.cautions import Caution
-from pipelines.geolocate.options import GeolocateOptions
-from pipelines.geolocate.stage import geolocate
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.georef.posterior import minimise
-from pipelines.init_sim3.options import InitSim3Options
-from pipelines.init_sim3.stage import estimate_similarity
-from pipelines.scene.geographic import geo_problem
 from pipelines.scene.geographic_options import GeographicOptions
 from pipelines.scene.initial_similarity import InitialSimilarity
 from pipelines.scene.marks import mark_rays
 from pipelines.scene.points_by_camera import points_by_camera
 from pipelines.scene.scene import initial_scene
-from pipelines.scene.solved_survey import solve_survey
 from pipelines.scene.survey import Survey
 from pipelines.scene.trained_model import TrainedCamera, TrainedLens
 from pipelines.scene.trained_survey import TrainedSurvey

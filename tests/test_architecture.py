@@ -27,25 +27,22 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     ("pipelines.geodesy", "pipelines.geometry", "pipelines.robust"),
     ("pipelines.formats",),
     (
-        "pipelines.accuracy",
         "pipelines.engine",
-        "pipelines.georef",
         "pipelines.pages",
         "pipelines.plots",
         "pipelines.scene",
         "pipelines.splat",
         "pipelines.stereo",
     ),
+    # The adjustment, with calibrate, geolocate and init-sim3, which are its steps.
+    ("pipelines.adjust",),
     (
         "pipelines.batch",
         "pipelines.blocks",
-        "pipelines.calibrate",
         "pipelines.compare",
         "pipelines.deliver",
         "pipelines.evaluate",
-        "pipelines.geolocate",
         "pipelines.ingest",
-        "pipelines.init_sim3",
         "pipelines.machine",
         "pipelines.report",
         "pipelines.sfm",
@@ -55,11 +52,18 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     ),
     ("georef_cli",),
 )
-STAGE_FLOOR = 4
+STAGE_FLOOR = 5
 STAGE_ROOMS = FLOORS[STAGE_FLOOR]
 # The command line starts stages through the runner, chooses the engine, and shows products; what makes them is none
 # of its business.
-SEEN_BY_CLI = ("pipelines.core", "pipelines.engine", "pipelines.scene", "georef_cli", *STAGE_ROOMS)
+SEEN_BY_CLI = (
+    "pipelines.core",
+    "pipelines.adjust",
+    "pipelines.engine",
+    "pipelines.scene",
+    "georef_cli",
+    *STAGE_ROOMS,
+)
 
 HOMES: dict[str, tuple[str, ...]] = {
     "click": ("georef_cli",),
@@ -68,7 +72,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     "pycolmap": ("pipelines.sfm", "pipelines.formats"),
     "numba": ("pipelines.splat", "pipelines.stereo", "pipelines.geometry", "pipelines.robust"),
     "gsplat": ("pipelines.splat.rasterizer.cuda_kernels",),
-    "torch": ("pipelines.splat", "pipelines.georef", "pipelines.scene", *STAGE_ROOMS),
+    "torch": ("pipelines.splat", "pipelines.adjust", "pipelines.scene", *STAGE_ROOMS),
     "filelock": ("pipelines.core",),
     "laspy": ("pipelines.formats",),
     "py4dgeo": ("pipelines.evaluate.reference.m3c2",),

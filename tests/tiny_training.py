@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import torch
 
-from pipelines.geometry.cameras import Camera, Pinhole
+from pipelines.adjust.cameras import CameraCorrections
+from pipelines.adjust.problem import GeoProblem
+from pipelines.adjust.similarity import LearnableSimilarity
+from pipelines.geometry.cameras import Camera, CameraPoses, Pinhole
 from pipelines.geometry.similarity import Similarity
-from pipelines.georef.cameras import CameraCorrections, CameraPoses
-from pipelines.georef.problem import GeoProblem
-from pipelines.georef.similarity import LearnableSimilarity
 from pipelines.scene.photographs import ImageCache, Photograph
 from pipelines.splat.densify import DefaultSettings, DefaultStrategy, Strategy
 from pipelines.splat.exposure import Exposures

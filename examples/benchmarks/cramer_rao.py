@@ -18,25 +18,25 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from pipelines.accuracy.intersection_jacobian import IntersectionJacobian
-from pipelines.accuracy.networks import control_rays
-from pipelines.accuracy.prediction import jacobian_of_points
+from pipelines.adjust.alignment import align
+from pipelines.adjust.cameras import CameraCorrections
+from pipelines.adjust.intersection_jacobian import IntersectionJacobian
+from pipelines.adjust.networks import control_rays
+from pipelines.adjust.posterior import minimise
+from pipelines.adjust.prediction import jacobian_of_points
+from pipelines.adjust.problem import GeoProblem
+from pipelines.adjust.similarity import LearnableSimilarity
+from pipelines.adjust.similarity_fit import Correspondences
+from pipelines.adjust.solved_survey import SolvedSurvey, geographic_options_of, solve_survey
+from pipelines.adjust.terms import ControlTerm, FixTerm
 from pipelines.core.products import load_json
 from pipelines.core.stages import SIM3
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import Workspace
 from pipelines.evaluate.cramer_rao import cramer_rao_bound
-from pipelines.georef.adjustment import Correspondences
-from pipelines.georef.alignment import align
-from pipelines.georef.cameras import CameraCorrections
-from pipelines.georef.posterior import minimise
-from pipelines.georef.problem import GeoProblem
-from pipelines.georef.similarity import LearnableSimilarity
-from pipelines.georef.terms import ControlTerm, FixTerm
 from pipelines.scene.initial_similarity import InitialSimilarity
 from pipelines.scene.marks import MarkRays, mark_rays
 from pipelines.scene.points_by_camera import points_by_camera
-from pipelines.scene.solved_survey import SolvedSurvey, geographic_options_of, solve_survey
 from pipelines.scene.trained_survey import load_trained
 
 

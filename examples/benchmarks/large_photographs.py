@@ -15,13 +15,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from pipelines.adjust.cameras import CameraCorrections
+from pipelines.adjust.problem import GeoProblem
+from pipelines.adjust.similarity import LearnableSimilarity
 from pipelines.core.free_memory import peak_memory_bytes
 from pipelines.core.photograph_folder import photograph_folder
 from pipelines.core.workspace import Workspace
 from pipelines.geometry.cameras import Camera
-from pipelines.georef.cameras import CameraCorrections
-from pipelines.georef.problem import GeoProblem
-from pipelines.georef.similarity import LearnableSimilarity
 from pipelines.scene.photographs import ImageCache, Photograph
 from pipelines.scene.scene import Scene, load_initial_scene
 from pipelines.splat.memory import predicted_peak_bytes

@@ -19,25 +19,25 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from pipelines.accuracy.intersection_jacobian import intersection_jacobian
+from pipelines.adjust.cameras import CameraCorrections
+from pipelines.adjust.estimate import Estimate
+from pipelines.adjust.intersection_jacobian import intersection_jacobian
+from pipelines.adjust.problem import GeoProblem
+from pipelines.adjust.similarity import LearnableSimilarity
+from pipelines.adjust.sparse_adjustment import minimise_sparse
+from pipelines.adjust.sparse_equations import prior_of_poses
+from pipelines.adjust.sparse_observations import State
+from pipelines.adjust.sparse_posterior import SparsePosterior
+from pipelines.adjust.terms import ControlTerm, FixTerm
 from pipelines.core.free_memory import peak_memory_bytes
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.geometry.bundle import Network
 from pipelines.geometry.bundle_information import BundleInformation, bundle_information
-from pipelines.geometry.cameras import Camera, project_each
+from pipelines.geometry.cameras import Camera, CameraPoses, project_each
 from pipelines.geometry.lens import Lenses, bearings
 from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_cholesky import SparseCholesky
-from pipelines.georef.cameras import CameraCorrections, CameraPoses
-from pipelines.georef.estimate import Estimate
-from pipelines.georef.problem import GeoProblem
-from pipelines.georef.similarity import LearnableSimilarity
-from pipelines.georef.sparse_adjustment import minimise_sparse
-from pipelines.georef.sparse_equations import prior_of_poses
-from pipelines.georef.sparse_observations import State
-from pipelines.georef.sparse_posterior import SparsePosterior
-from pipelines.georef.terms import ControlTerm, FixTerm
 
 _HEIGHT_M, _RELIEF_M, _TILT_RAD = 100.0, 8.0, 0.03
 _LENS = Camera("OPENCV", 6000, 4000, np.array([4200.0, 4200.0, 3000.0, 2000.0, -0.05, 0.01, 1e-4, -1e-4]))

@@ -28,16 +28,16 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 import numpy as np
 from training import ViewQuality
 
-from pipelines.accuracy.error_propagation import NoErrorPropagation
+from pipelines.adjust.error_propagation import NoErrorPropagation
+from pipelines.adjust.geographic import geo_problem
 from pipelines.core.progress import SILENT
 from pipelines.core.stages import PIPELINE, POINTS
 from pipelines.core.workspace import Workspace
 from pipelines.evaluate.check_points import measure_check_points
 from pipelines.evaluate.photometric import compare_test_views
+from pipelines.geometry.cameras import CameraPoses
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
-from pipelines.georef.cameras import CameraPoses
 from pipelines.machine.inspection import inspect_machine
-from pipelines.scene.geographic import geo_problem
 from pipelines.scene.geolocated import GeolocatedPoints
 from pipelines.scene.renderer import ModelRenderer
 from pipelines.scene.scene import load_initial_scene, photographs

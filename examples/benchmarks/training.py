@@ -26,6 +26,7 @@ import numpy as np
 import torch
 from raster import make_scene
 
+from pipelines.adjust.geographic import geo_problem
 from pipelines.core.products import load_json
 from pipelines.core.stages import SIM3, SPARSE
 from pipelines.core.types import IntArray
@@ -33,7 +34,6 @@ from pipelines.core.workspace import Workspace
 from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.cameras import Pinhole
 from pipelines.scene.calibrated import load_survey
-from pipelines.scene.geographic import geo_problem
 from pipelines.scene.initial_similarity import InitialSimilarity
 from pipelines.scene.photographs import ImageCache
 from pipelines.scene.scene import Scene, initial_scene, photographs

@@ -163,8 +163,8 @@ PIPELINE: tuple[StageSpec, ...] = (
     ),
     StageSpec(
         name="calibrate",
-        module="pipelines.calibrate.stage",
-        options_place="pipelines.calibrate.options:CalibrateOptions",
+        module="pipelines.adjust.calibrate",
+        options_place="pipelines.adjust.options:CalibrateOptions",
         folder="calibrate",
         reads=(MEASURED, *whole(SPARSE), ProductPart(TRACK, optional=True)),
         product=RIG,
@@ -172,8 +172,8 @@ PIPELINE: tuple[StageSpec, ...] = (
     ),
     StageSpec(
         name="geolocate",
-        module="pipelines.geolocate.stage",
-        options_place="pipelines.geolocate.options:GeolocateOptions",
+        module="pipelines.adjust.geolocate",
+        options_place="pipelines.adjust.options:GeolocateOptions",
         folder="geolocate",
         reads=(MEASURED, *whole(SPARSE), APPLIED_RIG),
         product=POINTS,
@@ -181,8 +181,8 @@ PIPELINE: tuple[StageSpec, ...] = (
     ),
     StageSpec(
         name="init-sim3",
-        module="pipelines.init_sim3.stage",
-        options_place="pipelines.init_sim3.options:InitSim3Options",
+        module="pipelines.adjust.init_sim3",
+        options_place="pipelines.adjust.options:InitSim3Options",
         folder="sim3",
         reads=(MEASURED, *whole(SPARSE, POINTS), APPLIED_RIG),
         product=SIM3,

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from pipelines.accuracy.accuracy_grid import AccuracyGrid
-from pipelines.accuracy.error_propagation import NoErrorPropagation, propagate_errors
+from pipelines.adjust.accuracy_grid import AccuracyGrid
+from pipelines.adjust.error_propagation import NoErrorPropagation, propagate_errors
 from pipelines.core.cautions import is_checked
 from pipelines.core.workspace import Workspace
 from pipelines.scene.trained_survey import TrainedSurvey

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.accuracy.accuracy_grid import AccuracyGrid
+from pipelines.adjust.accuracy_grid import AccuracyGrid
 from pipelines.core.types import FloatArray
 from pipelines.geodesy.crs import PointCrs
 from pipelines.geodesy.enu import Origin, ecef_from_enu, lla_from_ecef

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import block_diag
 
-from pipelines.accuracy.error_propagation import ErrorPropagation, NoErrorPropagation
-from pipelines.accuracy.prediction import AccuracyPrediction
+from pipelines.adjust.error_propagation import ErrorPropagation, NoErrorPropagation
+from pipelines.adjust.prediction import AccuracyPrediction
 from pipelines.core.cautions import Caution
 from pipelines.core.sentences import listed
 from pipelines.core.types import FloatArray

@@ -7,7 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipelines.accuracy.error_propagation import ErrorPropagation, NoErrorPropagation
+from pipelines.adjust.error_propagation import ErrorPropagation, NoErrorPropagation
+from pipelines.adjust.leave_one_out import LeftOut, leave_one_out
+from pipelines.adjust.solved_survey import SolvedSurvey
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.progress import Progress
 from pipelines.core.types import FloatArray
@@ -18,7 +20,6 @@ from pipelines.evaluate.point_report import (
     cross_validation_errors,
     point_residuals,
 )
-from pipelines.georef.leave_one_out import LeftOut, leave_one_out
 from pipelines.robust.statistics import residual_stats
 from pipelines.scene.fix_differences import fix_differences
 from pipelines.scene.marks import MarkRays, mark_rays
@@ -34,7 +35,6 @@ from pipelines.scene.report import (
     FixResiduals,
     NoCrossValidation,
 )
-from pipelines.scene.solved_survey import SolvedSurvey
 from pipelines.scene.survey import SurveyedPoint
 from pipelines.scene.trained_survey import TrainedSurvey
 

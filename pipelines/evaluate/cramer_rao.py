@@ -19,7 +19,8 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import bsr_matrix, csr_matrix, diags, hstack
 
-from pipelines.accuracy.networks import control_points, control_rays, in_geo, network_of_points
+from pipelines.adjust.networks import control_points, control_rays, in_geo, network_of_points
+from pipelines.adjust.solved_survey import SolvedSurvey
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.geometry.bundle import (
@@ -33,7 +34,6 @@ from pipelines.geometry.bundle import (
 from pipelines.geometry.bundle_information import EliminatedPoints, eliminate_points
 from pipelines.geometry.sparse_cholesky import SparseCholesky
 from pipelines.scene.marks import MarkRays
-from pipelines.scene.solved_survey import SolvedSurvey
 
 _WORST_SCALED = 1e-10  # least pivot of the scaled normal matrix: a smaller one leaves a direction undetermined
 _RIDGE = 1e-12  # small, so that it does not hide an open direction

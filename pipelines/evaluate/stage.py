@@ -13,8 +13,8 @@ from functools import partial
 
 import numpy as np
 
-from pipelines.accuracy.accuracy_grid import write_csv
-from pipelines.accuracy.error_propagation import (
+from pipelines.adjust.accuracy_grid import write_csv
+from pipelines.adjust.error_propagation import (
     ErrorPropagation,
     NoErrorPropagation,
     accuracy_summary,

@@ -272,3 +272,20 @@ def _undistort_fisheye(target: FloatArray, lens: FloatArray) -> FloatArray:
         solved = (np.abs(value - bent) <= 10 * _TOLERANCE) & (slope > 0) & (theta >= 0) & (theta < np.pi / 2)
         stretch = np.where(bent > 1e-12, np.tan(theta) / np.maximum(bent, 1e-12), 1.0)
     return np.where(solved[:, None], target * stretch[:, None], np.nan)
+
+
+@dataclass(frozen=True)
+class CameraPoses:
+    """Poses of n cameras in the frame `model`.
+
+    Attributes:
+        cam_from_model: (n, 3, 3) rotations.
+        cam_center_in_model: (n, 3) metres.
+    """
+
+    cam_from_model: FloatArray
+    cam_center_in_model: FloatArray
+
+    def matrix(self, index: int) -> FloatArray:
+        """Return the pose (4, 4) cam ← model of a camera."""
+        return pose_matrix(self.cam_from_model[index], self.cam_center_in_model[index])

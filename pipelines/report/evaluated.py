@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from pipelines.accuracy.error_propagation import ErrorPropagation, NoErrorPropagation, propagate_errors
+from pipelines.adjust.error_propagation import ErrorPropagation, NoErrorPropagation, propagate_errors
 from pipelines.core.cautions import is_checked
 from pipelines.core.stages import BY_NAME, REPORT
 from pipelines.core.types import FloatArray

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.accuracy.error_propagation import ErrorPropagation
+from pipelines.adjust.error_propagation import ErrorPropagation
 from pipelines.core.types import FloatArray
 from pipelines.geometry.cameras import LENGTHS, Camera, parameter_names, parameters_in
 from pipelines.pages.pictures import Picture, picture_of_png

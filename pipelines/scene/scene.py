@@ -21,10 +21,10 @@ from pipelines.core.workspace import Workspace
 from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.bundle import Network
 from pipelines.geometry.bundle_information import BundleInformation, bundle_information
+from pipelines.geometry.cameras import CameraPoses
 from pipelines.geometry.correction_basis import CorrectionBasis, basis_of, correction_basis
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.georef.cameras import CameraPoses
 from pipelines.scene.calibrated import load_survey
 from pipelines.scene.initial_similarity import InitialSimilarity
 from pipelines.scene.photographs import ImageCache, Photograph

@@ -13,11 +13,11 @@ from pydantic import Field
 from pipelines.core.cautions import Caution
 from pipelines.core.products import ImageName, Product, Rotation
 from pipelines.core.types import Matrix34, Vector3
+from pipelines.geometry.cameras import CameraPoses
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.similarity import SimilarityRecord
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.georef.cameras import CameraPoses
-from pipelines.georef.estimated_error import EstimatedError
+from pipelines.scene.estimated_error import EstimatedError
 from pipelines.scene.variance_factors import VarianceFactor
 
 

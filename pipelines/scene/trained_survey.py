@@ -14,9 +14,9 @@ from pipelines.core.stages import GAUSSIANS, MODEL, SIM3, SPARSE
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import Workspace
 from pipelines.formats.colmap import read_sparse
+from pipelines.geometry.cameras import CameraPoses
 from pipelines.geometry.similarity import Similarity, SimilarityRecord
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.georef.cameras import CameraPoses
 from pipelines.scene.calibrated import load_survey
 from pipelines.scene.initial_similarity import InitialSimilarity
 from pipelines.scene.photographs import ImageCache

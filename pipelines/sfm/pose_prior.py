@@ -14,6 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from pipelines.adjust.alignment import Alignment, align
+from pipelines.adjust.observations import attitude_prior, fix_correspondences
 from pipelines.core.child import run_in_child
 from pipelines.core.errors import ConvergenceError, DegenerateGeometryError
 from pipelines.core.products import save_json
@@ -30,11 +32,9 @@ from pipelines.formats.colmap import (
 )
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.georef.alignment import Alignment, align
 from pipelines.robust.statistics import residual_stats
 from pipelines.scene.calibrated import load_survey
 from pipelines.scene.initial_similarity import InitialSimilarity
-from pipelines.scene.observations import attitude_prior, fix_correspondences
 from pipelines.scene.survey import Fix, Survey
 from pipelines.sfm.options import AdjustOptions
 from pipelines.sfm.position_priors import PriorAdjustment, position_prior

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from pipelines.georef.problem import GeoProblem
+from pipelines.adjust.problem import GeoProblem
 from pipelines.splat.densify import DefaultSettings, DefaultStrategy, Strategy
 from pipelines.splat.densify_fast import FastSettings, FastStrategy
 from pipelines.splat.densify_mcmc import McmcSettings, McmcStrategy

@@ -6,12 +6,12 @@ from dataclasses import dataclass, replace
 
 import torch
 
+from pipelines.adjust.frozen_solution import exposures_of, held_problem
+from pipelines.adjust.problem import GeoProblem
 from pipelines.core.products import load_json
 from pipelines.core.stages import SOLUTION
 from pipelines.core.types import IntArray
 from pipelines.core.workspace import Workspace
-from pipelines.georef.problem import GeoProblem
-from pipelines.scene.frozen_solution import exposures_of, held_problem
 from pipelines.scene.photographs import ImageCache
 from pipelines.scene.pinholes import Pinholes
 from pipelines.scene.scene import Scene, load_initial_scene

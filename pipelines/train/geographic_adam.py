@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from pipelines.georef.problem import GeoProblem
+from pipelines.adjust.problem import GeoProblem
 from pipelines.train.schedule import JointOptions
 
 _NAMES = {

@@ -15,8 +15,7 @@ import torch
 
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
-from pipelines.geometry.cameras import Pinhole
-from pipelines.georef.cameras import CameraPoses
+from pipelines.geometry.cameras import CameraPoses, Pinhole
 from pipelines.scene.block_plan import BlockCell
 from pipelines.scene.pinholes import Pinholes
 from pipelines.splat.gaussians import Gaussians

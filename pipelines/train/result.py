@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from pipelines.adjust.frozen_solution import solution_of, with_exposures
 from pipelines.core.workspace import Summary
-from pipelines.georef.estimated_error import EstimatedError
-from pipelines.scene.frozen_solution import solution_of, with_exposures
+from pipelines.scene.estimated_error import EstimatedError
 from pipelines.scene.initial_similarity import InitialSimilarity
 from pipelines.scene.lidar_report import LidarReport
 from pipelines.scene.scene import Scene

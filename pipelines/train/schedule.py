@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipelines.adjust.weights import WeightSchedule, rising_weight
 from pipelines.core.types import IntArray
-from pipelines.georef.weights import WeightSchedule, rising_weight
 from pipelines.splat.surface import SurfaceSettings
 from pipelines.train.crops import Crops
 

@@ -5,9 +5,9 @@ Reads the survey, the SfM model, the geolocated points and the initial similarit
 
 from __future__ import annotations
 
+from pipelines.adjust.frozen_solution import solve_once, with_exposures
 from pipelines.core.products import save_json
 from pipelines.core.workspace import StageRun, Summary
-from pipelines.scene.frozen_solution import solve_once, with_exposures
 from pipelines.scene.scene import load_initial_scene, photographs
 from pipelines.scene.track_exposures import exposures_from_tracks
 from pipelines.train.options import SolutionOptions

@@ -12,12 +12,12 @@ import json
 import logging
 from pathlib import Path
 
+from pipelines.adjust.frozen_solution import solve_and_hold
+from pipelines.adjust.geographic import geo_problem
 from pipelines.core.products import load_json, save_json
 from pipelines.core.stages import LIDAR, LIDAR_MAP, POINTS
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.scene.calibrated import load_survey
-from pipelines.scene.frozen_solution import solve_and_hold
-from pipelines.scene.geographic import geo_problem
 from pipelines.scene.geolocated import GeolocatedPoints
 from pipelines.scene.measured_cloud import CloudFiles
 from pipelines.scene.scene import load_initial_scene, photographs

@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pipelines.adjust.problem import GeoProblem
 from pipelines.core.types import IntArray
 from pipelines.geometry.cameras import Pinhole
 from pipelines.geometry.lens import Lenses
-from pipelines.georef.problem import GeoProblem
 from pipelines.scene.photographs import ImageCache
 from pipelines.scene.pinholes import Pinholes
 from pipelines.splat.contributions import ViewContributions, view_contributions

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import block_diag
 
-from pipelines.accuracy.error_propagation import ErrorPropagation, NoErrorPropagation, propagate_errors
+from pipelines.adjust.error_propagation import ErrorPropagation, NoErrorPropagation, propagate_errors
 from pipelines.core.cautions import is_checked
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import FloatArray

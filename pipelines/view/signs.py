@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from pipelines.accuracy.accuracy_grid import AccuracyGrid
+from pipelines.adjust.accuracy_grid import AccuracyGrid
 from pipelines.core.types import FloatArray
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
 from pipelines.plots.style import BLUE, DARK, ORANGE, colours_of

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
-from pipelines.accuracy.accuracy_grid import AccuracyGrid
+from pipelines.adjust.accuracy_grid import AccuracyGrid
 from pipelines.core.errors import GeorefError
 from pipelines.core.manifest import hash_file
 from pipelines.core.progress import SILENT, Progress

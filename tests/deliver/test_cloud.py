@@ -19,8 +19,8 @@ from pipelines.core.stages import BY_NAME, CLOUD
 from pipelines.core.workspace import Workspace
 from pipelines.formats.georef_sidecar import CrsSidecar, sidecar_path
 from pipelines.geodesy.enu import enu_from_ecef
+from pipelines.geometry.cameras import CameraPoses
 from pipelines.geometry.similarity import Similarity
-from pipelines.georef.cameras import CameraPoses
 from pipelines.scene.calibrated import load_survey
 from pipelines.scene.surface_cloud import plan
 from pipelines.scene.surface_cloud.fusion import FusionSettings, SurfaceCloud, fused_squares

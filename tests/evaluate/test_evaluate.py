@@ -12,8 +12,9 @@ import pytest
 
 from georef_cli import boundary
 from georef_cli.main import cli
-from pipelines.accuracy.accuracy_grid import accuracy_grid
-from pipelines.accuracy.prediction import AccuracyPrediction
+from pipelines.adjust.accuracy_grid import accuracy_grid
+from pipelines.adjust.prediction import AccuracyPrediction
+from pipelines.adjust.solved_survey import geographic_options_of, solve_survey
 from pipelines.core.cautions import Caution
 from pipelines.core.errors import InputError
 from pipelines.core.products import load_json, save_json
@@ -22,7 +23,6 @@ from pipelines.core.stages import BY_NAME, MODEL, SIM3, SURVEY
 from pipelines.core.workspace import Workspace
 from pipelines.evaluate.asprs import few_points
 from pipelines.scene.initial_similarity import InitialSimilarity
-from pipelines.scene.solved_survey import geographic_options_of, solve_survey
 from pipelines.scene.survey import Mark, Survey
 from pipelines.scene.trained_model import TrainedModel
 from pipelines.scene.trained_survey import load_trained

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, norm
 
-from pipelines.accuracy.error_propagation import ErrorPropagation
+from pipelines.adjust.error_propagation import ErrorPropagation
 from pipelines.core.errors import InputError
 from pipelines.core.products import load_json
 from pipelines.core.progress import SILENT

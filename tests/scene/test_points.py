@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipelines.geometry.cameras import Pinhole
+from pipelines.geometry.cameras import CameraPoses, Pinhole
 from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.similarity import Similarity
-from pipelines.georef.cameras import CameraPoses
 from pipelines.scene.marks import MarkRays, mark_rays
 from pipelines.scene.points_by_camera import points_by_camera
 from pipelines.scene.points_by_model import DepthMap, points_by_model

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pipelines.geometry.cameras import CameraPoses
 from pipelines.geometry.similarity import Similarity
-from pipelines.georef.cameras import CameraPoses
 from pipelines.scene.renderer import ModelRenderer
 from pipelines.scene.scene import photographs
 from pipelines.scene.trained_survey import TrainedSurvey

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from pipelines.core.errors import InputError
+from pipelines.geometry.cameras import CameraPoses
 from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.similarity import Similarity
-from pipelines.georef.cameras import CameraPoses
 from pipelines.scene.surface_views import SurfaceViews
 from tests.depth_scenes import BOX_M, CAMERA, DOWN, depth_map, looking_down
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
+from pipelines.adjust.estimate import Estimate
+from pipelines.adjust.similarity import LearnableSimilarity
+from pipelines.adjust.systematic import SystematicErrorValues
 from pipelines.core.errors import InputError
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.thinning import voxel_keys
-from pipelines.georef.estimate import Estimate
-from pipelines.georef.similarity import LearnableSimilarity
-from pipelines.georef.systematic import SystematicErrorValues
 from pipelines.train.lidar.changes import _areas, verdict
 from pipelines.train.lidar.cloud import planes_of
 from pipelines.train.lidar.planes import plane_term

@@ -11,8 +11,7 @@ import pytest
 
 from pipelines.core.errors import InputError
 from pipelines.geodesy.enu import Origin, lla_from_enu
-from pipelines.geometry.cameras import Pinhole
-from pipelines.georef.cameras import CameraPoses
+from pipelines.geometry.cameras import CameraPoses, Pinhole
 from pipelines.scene.cloud_options import CloudCrs
 from pipelines.train.lidar.changes import CloudVerdict
 from pipelines.train.lidar.free_space import free_space

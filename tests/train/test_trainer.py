@@ -11,9 +11,9 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from pipelines.adjust.frozen_solution import solve_and_hold
+from pipelines.adjust.geographic import geo_problem
 from pipelines.core.workspace import Workspace
-from pipelines.scene.frozen_solution import solve_and_hold
-from pipelines.scene.geographic import geo_problem
 from pipelines.scene.scene import initial_scene, photographs
 from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.train.assembly import make_trainer

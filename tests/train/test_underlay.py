@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from pipelines.core.types import FloatArray
-from pipelines.geometry.cameras import Pinhole
-from pipelines.georef.cameras import CameraPoses
+from pipelines.geometry.cameras import CameraPoses, Pinhole
 from pipelines.train.surface import SurfacePoints
 from pipelines.train.underlay import hidden, underlay
 

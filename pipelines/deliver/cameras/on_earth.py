@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.accuracy.error_propagation import NoErrorPropagation, propagate_errors
+from pipelines.adjust.error_propagation import NoErrorPropagation, propagate_errors
 from pipelines.core.cautions import Caution
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import Workspace

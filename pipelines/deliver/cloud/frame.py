@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.accuracy.accuracy_grid import AccuracyGrid
+from pipelines.adjust.accuracy_grid import AccuracyGrid
 from pipelines.core.types import FloatArray
 from pipelines.formats.cloud_points import CloudPoints
 from pipelines.scene.surface_cloud.fusion import SurfaceCloud

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import binary_closing, binary_opening, uniform_filter
 
-from pipelines.accuracy.accuracy_grid import AccuracyGrid
+from pipelines.adjust.accuracy_grid import AccuracyGrid
 from pipelines.core.types import BoolArray, ByteArray, FloatArray, IntArray
 from pipelines.deliver.raster.plan import PlanScene, dilation_cells2, samples_per_cell
 from pipelines.formats.geotiff import RasterFrame

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from pipelines.accuracy.error_propagation import ErrorPropagation, NoErrorPropagation
+from pipelines.adjust.error_propagation import ErrorPropagation, NoErrorPropagation
 from pipelines.core.cautions import is_checked
 from pipelines.core.durable import remove
 from pipelines.core.errors import DegenerateGeometryError

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from pipelines.adjust.terms import PlaneTerm
 from pipelines.geometry.similarity import Similarity
-from pipelines.georef.terms import PlaneTerm
 from pipelines.robust.statistics import mad_sigma
 from pipelines.train.lidar.registration import Registration
 

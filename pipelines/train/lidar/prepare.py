@@ -14,13 +14,13 @@ from pathlib import Path
 
 import numpy as np
 
+from pipelines.adjust.terms import PlaneTerm
 from pipelines.core.errors import DegenerateGeometryError, InputError
 from pipelines.core.progress import Progress
 from pipelines.core.types import FloatArray, Vector3
 from pipelines.geodesy.enu import lla_from_enu
 from pipelines.geometry.depth_support import DepthViews
 from pipelines.geometry.similarity import SimilarityRecord, covariance_at
-from pipelines.georef.terms import PlaneTerm
 from pipelines.plots.lidar_map import DrawnArea, write_lidar_map
 from pipelines.scene.lidar_report import LidarArea, LidarRegistration, LidarReport
 from pipelines.scene.measured_cloud import CloudFiles

@@ -16,7 +16,9 @@ import rasterio
 import torch
 from rio_cogeo.cogeo import cog_validate
 
-from pipelines.accuracy.error_propagation import ErrorPropagation, propagate_errors
+from pipelines.adjust.error_propagation import ErrorPropagation, propagate_errors
+from pipelines.adjust.geolocate import geolocate
+from pipelines.adjust.options import GeolocateOptions
 from pipelines.core.errors import InputError
 from pipelines.core.products import load_json, save_json
 from pipelines.core.runner import run_stage
@@ -24,8 +26,6 @@ from pipelines.core.stages import BY_NAME, GAUSSIANS, MODEL, POINTS, SIM3
 from pipelines.core.workspace import Workspace
 from pipelines.formats.georef_sidecar import CrsSidecar, sidecar_path
 from pipelines.geodesy.enu import lla_from_enu
-from pipelines.geolocate.options import GeolocateOptions
-from pipelines.geolocate.stage import geolocate
 from pipelines.geometry.cameras import Camera, Pinhole
 from pipelines.geometry.rotations import exp_so3, quat_xyzw_from_matrix
 from pipelines.geometry.similarity import Similarity

@@ -1,0 +1,1 @@
+"""The adjustment: where things are, and how well that is known."""

@@ -1,0 +1,163 @@
+"""Predicted accuracy over the scene: σ on a grid, and the grid as a table for other programs."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from pipelines.adjust.prediction import AccuracyPrediction
+from pipelines.adjust.solved_survey import SolvedSurvey
+from pipelines.core.types import FloatArray, IntArray
+from pipelines.formats.csv_writer import write_table
+from pipelines.geodesy.enu import Origin, ecef_from_enu, lla_from_ecef
+from pipelines.scene.report import AccuracySummary
+
+_CELLS = 48  # along the longer side of the grid
+_LEAST_RAYS = 3  # of an SfM point that counts as a part of the scene
+_NEIGHBOURS = 3  # nearest SfM points, which give a cell its height and its cameras
+_FARTHEST_CELLS = 1.5  # distance from an SfM point beyond which there is no scene
+_NEAR = 0.1  # of a cell: a nearer cell's middle has no larger weight
+_RIM = 0.01  # fraction of the SfM points outside the grid on each side
+_CHUNK = 256
+_PLACE = ("east_m", "north_m", "up_m", "latitude_deg", "longitude_deg", "ellipsoidal_height_m")
+_SIGMA = ("sigma_e_m", "sigma_n_m", "sigma_u_m", "sigma_h_m", "sigma_v_m")
+
+
+@dataclass(frozen=True)
+class AccuracyGrid:
+    """Predicted σ at C cells of a grid over the scene, in metres.
+
+    Attributes:
+        position_in_geo: (C, 3) middle of each cell, at the height of the scene there.
+        sigma_m: (C, 3) east, north, up.
+        cell: (C, 2) column from the west and row from the south.
+        size_m: side of a cell.
+        corner_in_geo: (2,) east and north of the south-western corner.
+        shape: numbers of columns and rows.
+    """
+
+    position_in_geo: FloatArray
+    sigma_m: FloatArray
+    cell: IntArray
+    size_m: float
+    corner_in_geo: FloatArray
+    shape: tuple[int, int]
+
+    @property
+    def sigma_h_m(self) -> FloatArray:
+        """Horizontal σ (C,): √(σ_E² + σ_N²)."""
+        return np.asarray(np.hypot(self.sigma_m[:, 0], self.sigma_m[:, 1]))
+
+    @property
+    def sigma_v_m(self) -> FloatArray:
+        """Vertical σ (C,)."""
+        return self.sigma_m[:, 2]
+
+    def raster(self, values: FloatArray) -> FloatArray:
+        """Return values (C,) of the cells as a raster, rows from the south, columns from the west; NaN: no cell."""
+        columns, rows = self.shape
+        raster = np.full((rows, columns), np.nan)
+        raster[self.cell[:, 1], self.cell[:, 0]] = values
+        return raster
+
+    def sigma_at(self, position_in_geo: FloatArray) -> FloatArray:
+        """Return σ (N, 3) east, north, up at points (N, 3) of the scene, in metres.
+
+        σ varies slowly over a scene: that of the nearest cells is weighted by inverse distance in plan.
+        """
+        near = min(_NEIGHBOURS, len(self.cell))
+        distance, cell = cKDTree(self.position_in_geo[:, :2]).query(position_in_geo[:, :2], k=[*range(1, near + 1)])
+        weight = 1.0 / np.maximum(distance, _NEAR * self.size_m)
+        return np.asarray(np.einsum("nk,nki->ni", weight / weight.sum(axis=1, keepdims=True), self.sigma_m[cell]))
+
+    def summary(self) -> AccuracySummary:
+        """Return least, median and largest σ."""
+        horizontal, vertical = self.sigma_h_m, self.sigma_v_m
+        return AccuracySummary(
+            cells=len(self.cell),
+            cell_m=self.size_m,
+            least_sigma_h_m=float(horizontal.min()),
+            median_sigma_h_m=float(np.median(horizontal)),
+            largest_sigma_h_m=float(horizontal.max()),
+            least_sigma_v_m=float(vertical.min()),
+            median_sigma_v_m=float(np.median(vertical)),
+            largest_sigma_v_m=float(vertical.max()),
+            reason=None,
+        )
+
+
+def accuracy_grid(solved: SolvedSurvey, prediction: AccuracyPrediction) -> AccuracyGrid | None:
+    """Return the predicted σ on a grid over the scene, at the middle of each cell; None: too few points.
+
+    The cameras that observe the nearest SfM points observe the cell.
+
+    Args:
+        solved: the survey, with its SfM points.
+        prediction: of the same survey.
+    """
+    sparse, geo_from_model = solved.scene.sparse, solved.trained.geo_from_model
+    rays = np.bincount(sparse.obs_point, minlength=len(sparse.point_id))
+    chosen = np.flatnonzero(rays >= _LEAST_RAYS)
+    if len(chosen) < _NEIGHBOURS:
+        return None
+    point = geo_from_model.apply(solved.scene.point_in_model[chosen])
+    low, high = np.quantile(point[:, :2], [_RIM, 1 - _RIM], axis=0)
+    size = float((high - low).max()) / _CELLS
+    if size <= 0:
+        return None
+    columns, rows = np.maximum(np.ceil((high - low) / size).astype(int), 1).tolist()
+    cell = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2)
+    middle = low + (cell + 0.5) * size
+    distance, near = cKDTree(point[:, :2]).query(middle, k=_NEIGHBOURS)
+    in_scene = distance[:, 0] <= _FARTHEST_CELLS * size
+    cell, near = cell[in_scene], near[in_scene]
+    position = np.column_stack([middle[in_scene], np.median(point[near, 2], axis=1)])
+    sigma = _sigma(prediction, position, *_seen_by(sparse.obs_point, sparse.obs_image, chosen[near]))
+    known = np.isfinite(sigma).all(axis=1)
+    if not known.any():
+        return None
+    return AccuracyGrid(position[known], sigma[known], cell[known], size, low, (columns, rows))
+
+
+def _seen_by(obs_point: IntArray, obs_image: IntArray, near: IntArray) -> tuple[IntArray, IntArray]:
+    """Return unique pairs (cell, camera), ordered by cell: cameras that observe any of the near points (C, k)."""
+    order = np.argsort(obs_point, kind="stable")
+    start = np.searchsorted(obs_point[order], np.arange(int(obs_point.max()) + 2))
+    cameras = [
+        np.unique(np.concatenate([obs_image[order[start[p] : start[p + 1]]] for p in points])) for points in near
+    ]
+    owner = np.repeat(np.arange(len(near)), [len(of_cell) for of_cell in cameras])
+    return owner, np.concatenate(cameras)
+
+
+def _sigma(prediction: AccuracyPrediction, position: FloatArray, owner: IntArray, camera: IntArray) -> FloatArray:
+    """Return σ (C, 3) at the cells, for pairs (cell, camera)."""
+    sigma = []
+    for first in range(0, len(position), _CHUNK):
+        in_chunk = (owner >= first) & (owner < first + _CHUNK)
+        cov = prediction.of_scene(position[first : first + _CHUNK], owner[in_chunk] - first, camera[in_chunk])
+        sigma.append(np.sqrt(np.diagonal(cov, axis1=1, axis2=2)))
+    return np.concatenate(sigma)
+
+
+def write_csv(grid: AccuracyGrid, origin: Origin, path: Path) -> None:
+    """Write the grid as a CSV table, one line a cell, with positions in `geo` and on the ellipsoid.
+
+    Args:
+        grid: σ at the cells.
+        origin: of `geo`.
+        path: of the table.
+    """
+    lla = lla_from_ecef(ecef_from_enu(grid.position_in_geo, origin))
+    values = np.column_stack([grid.sigma_m, grid.sigma_h_m, grid.sigma_v_m])
+    rows = (
+        [f"{value:.3f}" for value in place]
+        + [f"{geodetic[0]:.8f}", f"{geodetic[1]:.8f}", f"{geodetic[2]:.3f}"]
+        + [f"{value:.5f}" for value in sigma]
+        for place, geodetic, sigma in zip(grid.position_in_geo, lla, values, strict=True)
+    )
+    write_table(path, itertools.chain([_PLACE + _SIGMA], rows))

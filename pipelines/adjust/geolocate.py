@@ -1,0 +1,274 @@
+"""Stage `geolocate`: every SfM point intersected on Earth from the observed positions and attitudes.
+
+Reads `ingest/survey.json` and `sfm/sparse`; writes `geolocate/points.npz` (`GeolocatedPoints`) and `points.ply`.
+GeoRefGS section 2.3, eqs 4–15 (doi 10.3390/drones10030195). Control and check points are not used.
+
+Fixes that contradict the layout of the cameras in the SfM model give no rays. The layout of all cameras reveals a
+bad fix. The three rays of a point do not: they cannot tell one bad fix from two good ones.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from pipelines.adjust.alignment import Alignment, align
+from pipelines.adjust.observations import (
+    RecordedRotations,
+    attitude_prior,
+    fix_correspondences,
+    observation_rays,
+    recorded_rotations,
+)
+from pipelines.adjust.options import GeolocateOptions
+from pipelines.adjust.similarity_fit import Correspondences, RotationPrior
+from pipelines.core.errors import DegenerateGeometryError, InputError
+from pipelines.core.sentences import listed
+from pipelines.core.stages import SPARSE
+from pipelines.core.types import BoolArray, FloatArray
+from pipelines.core.workspace import StageRun, Summary
+from pipelines.formats.colmap import read_sparse
+from pipelines.formats.point_ply import write_point_ply
+from pipelines.geometry.intersection import intersect_rays
+from pipelines.geometry.rays import CommonRotation, Intersections, Rays, UncertainCameras
+from pipelines.geometry.rotations import log_so3
+from pipelines.geometry.sparse_model import SparseModel
+from pipelines.scene.calibrated import load_survey
+from pipelines.scene.geolocated import GeolocatedPoints
+from pipelines.scene.survey import Survey
+
+log = logging.getLogger(__name__)
+
+_LARGEST_RELATIVE_SIGMA = 0.3  # of the distance: beyond, the linear covariance is invalid
+_NO_FIXES = "no fixes: positions come from control points"
+_ALIGNMENT_SEED = 0
+
+
+@dataclass(frozen=True)
+class Geolocation:
+    """Result of `geolocate`.
+
+    Attributes:
+        points: the points on Earth.
+        sigma_m: (N,) σ along the worst axis in metres; NaN without a position.
+        key_figure: one line for tables.
+        warnings: messages that the user should read.
+    """
+
+    points: GeolocatedPoints
+    sigma_m: FloatArray
+    key_figure: str
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _CameraObservations:
+    """Fixes and attitudes of a model's cameras, with their alignment to the model."""
+
+    model: SparseModel
+    fixes: Correspondences
+    recorded: RecordedRotations
+    prior: RotationPrior | None
+    alignment: Alignment | None
+    problem: str  # reason why there is no alignment
+
+
+def run(stage: StageRun, options: GeolocateOptions) -> Summary:
+    """Intersect the points of the workspace's model and write them.
+
+    Raises:
+        GeorefError: unreadable products, or an error of `geolocate`.
+    """
+    survey = load_survey(stage.workspace)
+    model = read_sparse(stage.workspace.path(SPARSE))
+    geolocation = geolocate(survey, model, options)
+    points = geolocation.points
+    points.save(stage.out / "points.npz")
+    write_point_ply(
+        stage.out / "points.ply", points.position_in_geo, model.point_rgb, geolocation.sigma_m, points.inlier
+    )
+    return Summary(geolocation.key_figure, _values(points), geolocation.warnings)
+
+
+def geolocate(survey: Survey, model: SparseModel, options: GeolocateOptions) -> Geolocation:
+    """Return the points of a model, intersected on Earth.
+
+    Without fixes, or without any rotations, the points have no positions, so that control points alone can
+    georeference the survey.
+
+    Args:
+        survey: has the fixes and attitudes.
+        model: the SfM model.
+        options: of the stage.
+
+    Raises:
+        InputError: the options demand `recorded` attitudes, and fewer than two images have a fix and an attitude.
+    """
+    observed = _observed(survey, model)
+    if len(observed.fixes) == 0:
+        return _without_positions(model, _NO_FIXES)
+    source = _rotation_source(observed, options)
+    if source == "sfm" and observed.alignment is None:
+        # Control points may place the model nevertheless, or `init-sim3` finds what is wrong with the fixes.
+        return _without_positions(model, f"no directions for the SfM points: {observed.problem}")
+    warnings = _warnings(observed, source)
+    views, usable = _views(observed, source, options.sigma_px)
+    rays = _rays(model, usable)
+    intersections = intersect_rays(rays, views, len(model.point_id))
+    sigma, inlier = _judge(intersections, rays, views, options)
+    points = _points(model, intersections, inlier, source)
+    if inlier.sum() < 0.5 * len(inlier):
+        warnings.append(f"only {inlier.sum()} of {len(inlier)} points have rays that agree: check σ and attitudes")
+    middle = f", median σ {np.median(sigma[inlier]):.3g} m" if inlier.any() else ""
+    figure = f"{inlier.sum()} of {len(inlier)} points{middle} ({source} rotations)"
+    return Geolocation(points, sigma, figure, tuple(warnings))
+
+
+def _without_positions(model: SparseModel, why: str) -> Geolocation:
+    """Return points without positions."""
+    count = len(model.point_id)
+    points = _points(model, Intersections.none(count), np.zeros(count, dtype=bool), "sfm")
+    return Geolocation(points, np.full(count, np.nan), why, (why,))
+
+
+def _points(
+    model: SparseModel, intersections: Intersections, inlier: BoolArray, source: Literal["recorded", "sfm"]
+) -> GeolocatedPoints:
+    """Return the product, made of the intersections of a model's points."""
+    return GeolocatedPoints(
+        point_id=model.point_id,
+        position_in_geo=intersections.position_in_geo,
+        cov_in_geo=intersections.cov_in_geo,
+        ray_count=intersections.ray_count,
+        max_angle_deg=intersections.max_angle_deg,
+        condition=intersections.condition,
+        inlier=inlier,
+        rotation_source=source,
+    )
+
+
+def _observed(survey: Survey, model: SparseModel) -> _CameraObservations:
+    fixes, prior = fix_correspondences(survey, model), attitude_prior(survey, model)
+    alignment, problem = None, ""
+    try:
+        alignment = align(fixes, np.random.default_rng(_ALIGNMENT_SEED), attitude=prior)
+    except DegenerateGeometryError as error:
+        problem = str(error)
+        log.info("fixes cannot be compared with the SfM model: %s", error)
+    return _CameraObservations(model, fixes, recorded_rotations(survey, model), prior, alignment, problem)
+
+
+def _rotation_source(observed: _CameraObservations, options: GeolocateOptions) -> Literal["recorded", "sfm"]:
+    with_fix = observed.model.image_index()
+    both = int(np.isin([with_fix[name] for name in observed.fixes.name], observed.recorded.image).sum())
+    if options.attitude == "recorded" and both < 2:
+        raise InputError(
+            f"{both} images have a fix and an attitude, 2 are needed: use auto or sfm", field="--attitude"
+        )
+    complete = both == len(observed.fixes) or (observed.alignment is None and both >= 2)
+    return "recorded" if options.attitude == "recorded" or (options.attitude == "auto" and complete) else "sfm"
+
+
+def _warnings(observed: _CameraObservations, source: str) -> list[str]:
+    warnings = []
+    turned = observed.recorded.contradicting
+    if turned:
+        warnings.append(
+            f"{len(turned)} attitudes contradict the SfM model and are not used: {listed(sorted(turned))}. "
+            "Were these photographs turned in an image viewer?"
+        )
+    total, fixes, alignment = len(observed.model.image_name), observed.fixes, observed.alignment
+    if len(fixes) < total:
+        warnings.append(f"{total - len(fixes)} of {total} registered images have no fix and give no rays")
+    if alignment is None:
+        return warnings
+    rejected = [name for name, good in zip(fixes.name, alignment.solution.state.inlier, strict=True) if not good]
+    if rejected:
+        warnings.append(
+            f"{len(rejected)} of {len(fixes)} fixes contradict the SfM model and give no rays: "
+            f"{listed(sorted(rejected))}"
+        )
+    prior = observed.prior
+    if source == "recorded" and prior is not None and not alignment.attitude_used:
+        turn = float(np.linalg.norm(log_so3(prior.rotation @ alignment.geo_from_local.rotation.T)))
+        sigma = np.hypot(np.sqrt(prior.cov_rad2[0, 0]), alignment.solution.rotation_sigma_rad)
+        if turn > 4 * sigma:
+            warnings.append(
+                f"recorded attitudes are turned by {np.degrees(turn):.1f}° against the fixes "
+                f"(σ {np.degrees(sigma):.1f}°): boresight, compass, or positions at other times or in other axes?"
+            )
+    return warnings
+
+
+def _views(observed: _CameraObservations, source: str, sigma_px: float) -> tuple[UncertainCameras, BoolArray]:
+    """Return all images as views, and the mask (n,) of those that give rays; the others are placeholders."""
+    model, fixes, alignment = observed.model, observed.fixes, observed.alignment
+    count, index = len(model.image_name), model.image_index()
+    place = np.array([index[name] for name in fixes.name])
+    center, cov = np.zeros((count, 3)), np.tile(np.eye(3), (count, 1, 1))
+    center[place], cov[place] = fixes.in_geo, fixes.cov_in_geo
+    usable = np.zeros(count, dtype=bool)
+    usable[place] = True if alignment is None else alignment.solution.state.inlier
+    sigma_ray = sigma_px / np.array([model.camera_of(image).mean_focal_px for image in range(count)])
+    rotation, sigma, common = np.tile(np.eye(3), (count, 1, 1)), np.ones(count), None
+    if source == "recorded" or alignment is None:
+        recorded = observed.recorded
+        rotation[recorded.image], sigma[recorded.image] = recorded.geo_from_cam, recorded.sigma_rad
+        usable &= np.isin(np.arange(count), recorded.image)
+    else:
+        rotation = alignment.geo_from_local.rotation @ np.swapaxes(model.rotation_cam_from_local, 1, 2)
+        # Bundle adjustment has averaged the pixel errors of a whole image: rotations in the model have this σ.
+        sigma = sigma_ray / np.sqrt(np.maximum(np.bincount(model.obs_image, minlength=count), 1))
+        gain = np.zeros((count, 3, 3))
+        gain[place] = alignment.solution.response[:, 1:4]
+        common = CommonRotation(alignment.solution.covariance[1:4, 1:4], gain)
+    return UncertainCameras(center, rotation, cov, sigma, sigma_ray, common), usable
+
+
+def _rays(model: SparseModel, usable: BoolArray) -> Rays:
+    """Return the rays of the usable images.
+
+    A point that an image shows twice counts once, because both rays have the same errors of position and attitude.
+    """
+    xy = observation_rays(model)
+    again = np.zeros(len(xy), dtype=bool)
+    again[1:] = (np.diff(model.obs_point) == 0) & (np.diff(model.obs_image) == 0)
+    keep = usable[model.obs_image] & np.isfinite(xy).all(axis=1) & ~again
+    return Rays(model.obs_point[keep], model.obs_image[keep], xy[keep])
+
+
+def _judge(
+    intersections: Intersections, rays: Rays, views: UncertainCameras, options: GeolocateOptions
+) -> tuple[FloatArray, BoolArray]:
+    """Return the σ (N,) along the worst axis in metres, and the mask (N,) of the inliers."""
+    located: BoolArray = ~np.isnan(intersections.position_in_geo[:, 0])
+    sigma = np.full(len(located), np.nan)
+    sigma[located] = np.sqrt(np.linalg.eigvalsh(intersections.cov_in_geo[located])[:, 2])
+    away = np.linalg.norm(intersections.position_in_geo[rays.point] - views.center_in_geo[rays.view], axis=1)
+    count = np.bincount(rays.point, minlength=len(located))
+    distance = np.bincount(rays.point, away, minlength=len(located)) / np.maximum(count, 1)
+    limit = _LARGEST_RELATIVE_SIGMA * distance
+    if options.max_sigma is not None:
+        limit = np.minimum(limit, options.max_sigma)
+    wide = intersections.max_angle_deg >= options.min_angle
+    return sigma, intersections.consistent & wide & (np.nan_to_num(sigma, nan=np.inf) <= limit)
+
+
+def _values(points: GeolocatedPoints) -> dict[str, Any]:
+    good = points.inlier
+    values: dict[str, Any] = {
+        "points": len(good),
+        "inliers": int(good.sum()),
+        "rotation_source": points.rotation_source,
+    }
+    if good.any():
+        axes = np.sqrt(np.diagonal(points.cov_in_geo[good], axis1=1, axis2=2))
+        values |= {
+            "median_sigma_h_m": float(np.median(np.hypot(axes[:, 0], axes[:, 1]))),
+            "median_sigma_v_m": float(np.median(axes[:, 2])),
+            "mean_rays": float(points.ray_count[good].mean()),
+        }
+    return values

@@ -1,0 +1,56 @@
+"""Options of `georef calibrate`, `georef geolocate` and `georef init-sim3`."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from pipelines.core.options import StageOptions
+from pipelines.scene.rig import RigParameters
+
+
+class CalibrateOptions(StageOptions):
+    """Options of the calibration of the rig: parameters to estimate, and parameters to apply."""
+
+    estimate: RigParameters | None = Field(
+        None,
+        description="Any of time-offset, boresight and lever-arm, with commas (default: what ingest was asked to "
+        "estimate).",
+    )
+    max_offset: float = Field(
+        2.0, gt=0, le=60, description="Search the time offset so many seconds on either side of the present one."
+    )
+    apply: bool | None = Field(
+        None,
+        description="Apply the estimates that are observable, or none (default: those that ingest was asked for).",
+    )
+
+
+class GeolocateOptions(StageOptions):
+    """Options of the intersection of every SfM point in the frame `geo`."""
+
+    attitude: Literal["auto", "recorded", "sfm"] = Field(
+        "auto", description="Rotations of the rays: recorded with the images, or SfM's aligned to geo."
+    )
+    sigma_px: float = Field(0.7, gt=0, description="σ of an image observation in pixels.")
+    min_angle: float = Field(1.0, gt=0, lt=90, description="Least intersection angle of an inlier in degrees.")
+    max_sigma: float | None = Field(
+        None, gt=0, description="Largest σ along any axis of an inlier, in metres (default: no limit)."
+    )
+
+
+class InitSim3Options(StageOptions):
+    """Options of the similarity from the SfM model into the frame `geo`."""
+
+    method: Literal["robust", "paper"] = Field(
+        "robust", description="robust: RANSAC and weights from covariances; paper: plain least squares."
+    )
+    max_residual: float | None = Field(
+        None, gt=0, description="Fail if the RMS residual of the camera centres is larger, in metres."
+    )
+    control_points: bool = Field(True, description="Use the control points.")
+    seed: int = Field(0, ge=0, description="Seed of the RANSAC.")
+    accept_contradiction: bool = Field(
+        False, description="Go on where sources contradict each other, with a caution and larger σ."
+    )

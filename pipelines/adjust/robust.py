@@ -1,0 +1,227 @@
+"""The robust similarity: alignment, joint adjustment with variance factors, verdict on contradictions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipelines.adjust.alignment import Alignment, align
+from pipelines.adjust.contradictions import judge, marks_that_do_not_meet, unadjustable
+from pipelines.adjust.control_mistakes import mistake_in_marks
+from pipelines.adjust.figures import agreeing_points, counts_of, residuals_of, residuals_of_points
+from pipelines.adjust.joint import JointAdjustment, adjust_jointly
+from pipelines.adjust.observations import (
+    attitude_prior,
+    control_correspondences,
+    fix_correspondences,
+    positions_in_use,
+)
+from pipelines.adjust.options import InitSim3Options
+from pipelines.adjust.posterior import solution_covariances
+from pipelines.adjust.similarity_fit import OUTLIER_GATE, AdjustedSimilarity, Correspondences, RotationPrior
+from pipelines.adjust.terms import ControlTerm, FixTerm
+from pipelines.adjust.variance_components import component_of
+from pipelines.core.cautions import NOT_CHECKED, Caution, union
+from pipelines.core.errors import ContradictionError, DegenerateGeometryError
+from pipelines.core.sentences import listed
+from pipelines.geometry.rotations import quat_xyzw_from_matrix
+from pipelines.geometry.similarity import Similarity, SimilarityRecord, umeyama
+from pipelines.geometry.sparse_model import SparseModel
+from pipelines.robust.ransac import RansacOptions, ransac
+from pipelines.robust.statistics import residual_stats, squared_mahalanobis
+from pipelines.scene.geolocated import GeolocatedPoints
+from pipelines.scene.initial_similarity import AttitudeRecord, InitialSimilarity
+from pipelines.scene.survey import Survey
+
+_GUESS_POINTS = 1000
+_LEVEL = 0.01  # of the test that refutes σ where no joint adjustment is possible
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Products that the similarity is estimated from."""
+
+    survey: Survey
+    model: SparseModel
+    points: GeolocatedPoints
+
+
+def robust_similarity(inputs: Inputs, options: InitSim3Options) -> tuple[InitialSimilarity, tuple[str, ...]]:
+    """Return the similarity by the robust method, and warnings for the user.
+
+    Raises:
+        DegenerateGeometryError: the measurements leave the similarity open; names further measurements.
+        ContradictionError: sources contradict each other, and the options do not accept that.
+    """
+    survey, model = inputs.survey, inputs.model
+    control, unused = control_correspondences(survey, model)
+    mistake = mistake_in_marks(survey, model) if unused else None
+    if mistake is not None:  # What meets all the same meets in a wrong place.
+        control = control.part(np.zeros(len(control), dtype=bool))
+    of_marks = marks_that_do_not_meet(unused, mistake)
+    data = fix_correspondences(survey, model).joined(control)
+    guess = _guess(model, inputs.points, np.random.default_rng(options.seed))
+    try:
+        alignment = align(
+            data,
+            np.random.default_rng(options.seed),
+            attitude=attitude_prior(survey, model),
+            guesses=(guess,) if guess else (),
+        )
+    except DegenerateGeometryError as error:
+        _refuse(unadjustable(survey, model, None), options)
+        reasons = [positions_in_use(survey, model, data, unused), *(caution.sentence for caution in of_marks)]
+        raise DegenerateGeometryError(f"{error}. {'; '.join(reasons)}") from error
+    aligned = _aligned_product(inputs, data, alignment).model_copy(
+        update={"control_outliers": tuple(p.name for p in survey.control_points if p.name not in control.name)}
+    )
+    warnings = () if mistake else tuple(point.sentence for point in unused)  # else the caution says why
+    used = tuple(point for point in survey.control_points if point.name in control.name)
+    survey = survey.model_copy(update={"control_points": used})
+    try:
+        joint = adjust_jointly(survey, model, _starts(data, aligned, options.seed))
+    except DegenerateGeometryError as error:
+        contradictions = unadjustable(survey, model, alignment.geo_from_local)
+        _refuse(contradictions, options)
+        unchecked = Caution(code=NOT_CHECKED, sentence=f"nothing checks the stated σ: {error}")
+        cautions = union(survey.cautions, contradictions, of_marks, (unchecked,))
+        return _without_joint(aligned, alignment.solution, cautions), warnings
+    verdict = judge(survey, model, joint)
+    _refuse(verdict.contradictions, options)
+    initial, more = _joint_product(inputs, aligned, joint)
+    cautions = union(survey.cautions, verdict.contradictions, of_marks, verdict.cautions)
+    return initial.model_copy(update={"cautions": cautions}), warnings + more
+
+
+def _refuse(contradictions: tuple[Caution, ...], options: InitSim3Options) -> None:
+    if contradictions and not options.accept_contradiction:
+        raise ContradictionError(
+            "; ".join(caution.sentence for caution in contradictions)
+            + ". Correct what is wrong, or go on with --accept-contradiction, which widens every σ"
+        )
+
+
+def _guess(model: SparseModel, points: GeolocatedPoints, rng: np.random.Generator) -> Similarity | None:
+    """Return the similarity of the best geolocated points, by RANSAC, then weighted by covariance; or None."""
+    trace = np.trace(points.cov_in_geo, axis1=1, axis2=2)
+    best = np.flatnonzero(points.inlier)
+    best = best[np.argsort(trace[best], kind="stable")][:_GUESS_POINTS]
+    local, geo, cov = model.point_in_local[best], points.position_in_geo[best], points.cov_in_geo[best]
+    try:
+        result = ransac(
+            len(best),
+            lambda chosen: umeyama(local[chosen], geo[chosen]),
+            lambda similarity: squared_mahalanobis(geo - similarity.apply(local), cov),
+            RansacOptions(3, OUTLIER_GATE, max_draws=200),
+            rng,
+        )
+        good = result.inlier
+        return umeyama(local[good], geo[good], 1 / trace[best][good])
+    except DegenerateGeometryError:
+        return None
+
+
+def _aligned_product(inputs: Inputs, data: Correspondences, alignment: Alignment) -> InitialSimilarity:
+    solution, similarity = alignment.solution, alignment.geo_from_local
+    inlier = solution.state.inlier
+    agreeing = agreeing_points(inputs.model, inputs.points, similarity)
+    return InitialSimilarity(
+        geo_from_local=_record_of(solution),
+        method="robust",
+        correspondences=counts_of(data.control, inputs.points.inlier),
+        inliers=counts_of(data.control[inlier], agreeing),
+        gnss_outliers=tuple(name for name, bad in zip(data.name, ~inlier & ~data.control, strict=True) if bad),
+        residuals={
+            **residuals_of(data.part(inlier), solution.residual[inlier]),
+            "points": residuals_of_points(inputs.model, inputs.points, similarity),
+        },
+        condition_number=solution.condition_number,
+        layout=alignment.layout,
+        attitude_used=alignment.attitude_used,
+        attitude=_attitude(alignment.attitude),
+    )
+
+
+def _attitude(prior: RotationPrior | None) -> AttitudeRecord | None:
+    if prior is None:
+        return None
+    x, y, z, w = quat_xyzw_from_matrix(prior.rotation).tolist()
+    first, second, third = (tuple(row) for row in prior.cov_rad2.tolist())
+    return AttitudeRecord(quat_xyzw=(x, y, z, w), cov_rad2=(first, second, third))
+
+
+def _starts(data: Correspondences, aligned: InitialSimilarity, seed: int) -> Iterator[InitialSimilarity]:
+    """Yield the alignment, then, if they are needed, those of the fixes and of the control points alone.
+
+    Which fixes are outliers is for the joint adjustment to find.
+    """
+    aligned = aligned.model_copy(update={"gnss_outliers": ()})
+    yield aligned
+    for members in (~data.control, data.control):
+        if not 3 <= members.sum() < len(data):
+            continue
+        try:
+            solution = align(data.part(members), np.random.default_rng(seed)).solution
+        except DegenerateGeometryError:
+            continue
+        yield aligned.model_copy(update={"geo_from_local": _record_of(solution), "layout": "volume"})
+
+
+def _record_of(solution: AdjustedSimilarity) -> SimilarityRecord:
+    similarity = solution.state.geo_from_local
+    return similarity.to_record("local", "geo", covariance=solution.covariance, pivot=solution.pivot)
+
+
+def _without_joint(
+    aligned: InitialSimilarity, solution: AdjustedSimilarity, cautions: tuple[Caution, ...]
+) -> InitialSimilarity:
+    """Return the alignment with σ widened by what its few residuals show."""
+    count = len(solution.squared)
+    free = 3.0 - 7.0 / count
+    component = component_of(solution.squared, np.full(count, free), 3)
+    factor = component.cautious_factor if component.probability() < _LEVEL else 1.0
+    record = aligned.geo_from_local
+    covariance = tuple(tuple(max(factor, 1.0) * value for value in row) for row in record.covariance)
+    return aligned.model_copy(
+        update={"geo_from_local": record.model_copy(update={"covariance": covariance}), "cautions": cautions}
+    )
+
+
+def _joint_product(
+    inputs: Inputs, aligned: InitialSimilarity, joint: JointAdjustment
+) -> tuple[InitialSimilarity, tuple[str, ...]]:
+    """Return the result of the joint adjustment, and warnings of outliers."""
+    similarity = joint.geo_from_local
+    agreeing = agreeing_points(inputs.model, inputs.points, similarity)
+    inliers = aligned.inliers | {"points": int(agreeing.sum())}
+    residuals = dict(aligned.residuals) | {"points": residuals_of_points(inputs.model, inputs.points, similarity)}
+    rejected: dict[str, tuple[str, ...]] = {"gnss": aligned.gnss_outliers, "gcp": ()}
+    warnings = []
+    for kind, term, group in (("gnss", FixTerm, "fixes"), ("gcp", ControlTerm, "control points")):
+        names, missed, used = joint.residuals(term)
+        if not names:
+            continue
+        residuals[kind], inliers[kind] = residual_stats(missed[used]), int(used.sum())
+        bad = [(name, miss) for name, miss, good in zip(names, missed, used, strict=True) if not good]
+        if bad:
+            sizes = [f"{name} ({np.linalg.norm(miss):.2f} m)" for name, miss in bad]
+            warnings.append(f"{len(bad)} of {len(names)} {group} are outliers: {listed(sizes)}")
+        rejected[kind] = tuple(name for name, _ in bad)
+    record = similarity.to_record(
+        "local",
+        "geo",
+        covariance=solution_covariances(joint.problem)[0],
+        pivot=joint.problem.similarity.pivot_in_geo,
+    )
+    return aligned.model_copy(
+        update={
+            "geo_from_local": record,
+            "inliers": inliers,
+            "gnss_outliers": rejected["gnss"],
+            "control_outliers": aligned.control_outliers + rejected["gcp"],
+            "residuals": residuals,
+            "variance_factors": joint.factors,
+        }
+    ), tuple(warnings)

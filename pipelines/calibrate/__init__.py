@@ -1,1 +1,0 @@
-"""Stage `calibrate`: time offset, boresight and lever arm from the SfM cameras and the recorded navigation."""

@@ -1,1 +1,0 @@
-"""Stage `geolocate`: every SfM point intersected on Earth."""

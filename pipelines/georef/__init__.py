@@ -1,1 +1,0 @@
-"""Geographic losses and their weights, the learnable similarity, and the corrections of the cameras."""

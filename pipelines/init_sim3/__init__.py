@@ -1,1 +1,0 @@
-"""Stage `init-sim3`: the similarity from the SfM model to the Earth."""

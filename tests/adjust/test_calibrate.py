@@ -1,0 +1,312 @@
+"""Time offset, boresight and lever arm of flights whose rig is known, by `georef calibrate` and in `georef run`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from georef_cli import boundary
+from georef_cli.main import cli
+from pipelines.adjust.options import CalibrateOptions
+from pipelines.core.fingerprints import fingerprints
+from pipelines.core.products import load_json
+from pipelines.core.stages import BY_NAME, RIG, SURVEY, TRACK, stage_slice
+from pipelines.core.workspace import Workspace
+from pipelines.formats.colmap_writer import write_sparse
+from pipelines.geodesy.enu import lla_from_enu
+from pipelines.geometry.cameras import Camera
+from pipelines.geometry.rig import boresight
+from pipelines.geometry.rotations import log_so3, matrix_from_quat_xyzw
+from pipelines.scene.calibrated import load_survey
+from pipelines.scene.rig import RigCalibration
+from pipelines.scene.survey import Survey
+from pipelines.simulate.options import SimulateOptions
+from pipelines.simulate.stage import simulate
+from pipelines.simulate.truth import Truth
+from tests import bags
+from tests.earth import enu_from_lla
+from tests.scenes import Noise, TrueScene, sparse_model
+
+OFFSET_S, BORESIGHT_DEG = 0.2, np.array([0.7, -0.5, 0.4])
+EXACT = Noise(pixel_px=0.05)
+SIZE = (1200, 900)  # of the photographs in the bags, and of the cameras of `sparse_model`
+Command = Callable[..., Any]
+
+
+class Winding(bags.Flight):
+    """A flight that turns and changes its speed, which the base's straight line does not."""
+
+    def camera(self, time_ns: np.ndarray) -> np.ndarray:
+        t = (time_ns - bags.START) / 1e9
+        return np.stack([30 * np.sin(0.5 * t), 20 * np.sin(0.37 * t + 1), 60 + 5 * np.sin(0.8 * t)], axis=1)
+
+
+@pytest.fixture
+def command(capsys: pytest.CaptureFixture[str]) -> Command:
+    """`georef …`: its JSON document, or with `fails` what it says."""
+
+    def call(*arguments: object, fails: bool = False) -> Any:
+        code = boundary.guarded(cli, [*map(str, arguments), *([] if fails else ["--json"])])
+        captured = capsys.readouterr()
+        # An option that is at fault alone, without any file, is a usage error.
+        assert code == (0 if not fails else 2 if captured.err.rpartition("error: ")[2].startswith("[--") else 1)
+        return captured.err if fails else {**json.loads(captured.out), "err": captured.err}
+
+    return call
+
+
+def photograph(index: int) -> np.ndarray:
+    """A JPEG of one grey, which no other photograph has."""
+    return cv2.imencode(".jpg", np.full((SIZE[1], SIZE[0], 3), 5 * index + 10, np.uint8))[1].ravel()
+
+
+def write_model(
+    path: Path, names: list[str], centers: np.ndarray, geo_from_cam: np.ndarray, width: int = SIZE[0]
+) -> Path:
+    """What SfM would make of cameras (n, 3) and (n, 3, 3) above a landscape, in a frame of its own."""
+    rng = np.random.default_rng(0)
+    land = np.column_stack([rng.uniform(-150, 150, (1500, 2)), rng.uniform(0, 15, 1500)])
+    scene = TrueScene(centers, geo_from_cam, land, np.empty((0, 3)))
+    model = sparse_model(scene, EXACT, rng)
+    camera = model.cameras[1]
+    factor = width / camera.width
+    params = np.concatenate([camera.params[:4] * factor, camera.params[4:]])
+    seen = np.bincount(model.obs_point, minlength=len(land)) > 2
+    keep = seen[model.obs_point]
+    model = replace(
+        model,
+        image_name=tuple(names),
+        point_id=model.point_id[seen],
+        point_in_local=model.point_in_local[seen],
+        point_rgb=model.point_rgb[seen],
+        point_error_px=model.point_error_px[seen],
+        obs_point=(np.cumsum(seen) - 1)[model.obs_point[keep]],
+        obs_image=model.obs_image[keep],
+        obs_xy_px=model.obs_xy_px[keep] * factor,
+        cameras={1: Camera(camera.model, width, round(camera.height * factor), params)},
+    )
+    path.mkdir(parents=True)
+    write_sparse(model, path)
+    return path
+
+
+def flown(path: Path, flight: bags.Flight) -> dict[str, Path]:
+    """A bag whose photographs are stamped 0.2 s late of the navigation's clock, and the true cameras as SfM's."""
+    messages = [one for one in bags.usual(flight) if "image" not in one[0]]
+    for index, (topic, kind, ns, message) in enumerate(bags.images(flight)):
+        message.header.stamp = bags.time(ns - round(OFFSET_S * 1e9))
+        message.data = photograph(index)
+        messages.append((topic, kind, ns, message))
+    centers, nominal = bags.expected(flight, bags.ORIGIN)
+    names = [f"frame_{i:06d}.jpg" for i in range(flight.count)]
+    model = write_model(path / "model", names, centers, nominal @ boresight(BORESIGHT_DEG))
+    return {"--bag": bags.write(path / "bag", messages), "--import": model}
+
+
+def arguments(inputs: dict[str, Path]) -> list[object]:
+    return [part for pair in inputs.items() for part in pair]
+
+
+def states(command: Command, workspace: Path) -> dict[str, str]:
+    return {row["stage"]: row["state"] for row in command("status", workspace)["stages"]}
+
+
+def missed(workspace: Path, flight: bags.Flight) -> tuple[np.ndarray, np.ndarray]:
+    """Errors of a survey's positions (n, 3) in metres and of its attitudes (n,) in degrees."""
+    survey = load_survey(Workspace(workspace))
+    truth = enu_from_lla(lla_from_enu(flight.camera(flight.image_ns), bags.ORIGIN), survey.origin)
+    positions = np.array([image.fix.position_in_geo for image in survey.images if image.fix])
+    quats = [image.attitude.quat_xyzw for image in survey.images if image.attitude]
+    true_turns = bags.expected(flight, survey.origin)[1] @ boresight(BORESIGHT_DEG)
+    turned = log_so3(matrix_from_quat_xyzw(quats) @ np.swapaxes(true_turns, 1, 2))
+    return positions - truth, np.degrees(np.linalg.norm(turned, axis=1))
+
+
+def test_run_estimates_after_sfm_and_goes_on(tmp_path: Path, command: Command) -> None:
+    flight, workspace = Winding(count=24), tmp_path / "ws"
+    asked = [*arguments(flown(tmp_path, flight)), "--time-offset", "auto", "--estimate", "boresight"]
+    document = command("run", workspace, *asked, "--to", "init-sim3")
+    stages = {row["stage"]: row for row in document["stages"]}
+    assert list(stages) == ["ingest", "sfm", "calibrate", "geolocate", "init-sim3"]
+    assert all(row["ran"] for row in stages.values())
+    assert "calibrate: time-offset 0.2" in document["err"]
+    assert stages["calibrate"]["values"]["applied"] == ["time-offset", "boresight"]
+    estimates = {row["name"]: row for row in stages["calibrate"]["values"]["estimates"]}
+    assert estimates["time-offset"]["value"][0] == pytest.approx(OFFSET_S, abs=0.02)
+    np.testing.assert_allclose(estimates["boresight"]["value"], BORESIGHT_DEG, atol=0.1)
+    position, turned = missed(workspace, flight)
+    # 20 ms at 15 m/s, were it all of the offset's error; positions at the start were 3 m off.
+    assert np.abs(position).max() < 0.1
+    assert turned.max() < 0.15
+    assert stages["geolocate"]["values"]["rotation_source"] == "recorded"
+    # The survey stays as recorded: positions were 3 m off.
+    recorded, applied = load_json(Survey, workspace / SURVEY), load_survey(Workspace(workspace))
+    shift_m = [
+        float(np.linalg.norm(np.subtract(before.fix.position_in_geo, after.fix.position_in_geo)))
+        for before, after in zip(recorded.images, applied.images, strict=True)
+        if before.fix and after.fix
+    ]
+    assert max(shift_m) > 1.0
+    # What was estimated stays; nothing is done twice.
+    again = command("run", workspace, *asked, "--to", "init-sim3")
+    assert not any(row["ran"] for row in again["stages"])
+    assert (workspace / "logs/calibrate.log").exists()
+
+
+def test_ingest_made_again_keeps_sfm_and_is_calibrated_again(tmp_path: Path, command: Command) -> None:
+    flight, workspace = Winding(count=24), tmp_path / "ws"
+    inputs = flown(tmp_path, flight)
+    command("run", workspace, *arguments(inputs), "--time-offset", "auto", "--to", "geolocate")
+    before, rig = load_survey(Workspace(workspace)), load_json(RigCalibration, workspace / RIG)
+    document = command("run", workspace, "--sigma-h", 0.5, "--test-every", 5, "--to", "geolocate")
+    assert [(row["stage"], row["ran"]) for row in document["stages"]] == [
+        ("ingest", True), ("sfm", False), ("calibrate", True), ("geolocate", True),
+    ]  # fmt: skip
+    after = load_survey(Workspace(workspace))
+    assert load_json(RigCalibration, workspace / RIG) == rig
+    places = [[image.fix.position_in_geo for image in one.images if image.fix] for one in (before, after)]
+    assert places[0] == places[1]
+    # Another model is another estimate.
+    (tmp_path / "other").mkdir()
+    other = flown(tmp_path / "other", Winding(count=20))["--import"]
+    document = command("run", workspace, "--import", other, "--to", "geolocate")
+    assert [row["ran"] for row in document["stages"]] == [False, True, True, True]
+
+
+def test_flight_that_shows_nothing_is_told_and_no_failure(tmp_path: Path, command: Command) -> None:
+    flight, workspace = bags.Flight(count=24), tmp_path / "ws"  # a straight line at constant speed
+    inputs = flown(tmp_path, flight)
+    document = command("run", workspace, *arguments(inputs), "--time-offset", "auto", "--to", "geolocate")
+    assert "nothing of the rig is observable" in document["err"]
+    assert "time-offset stay as told" in document["err"]
+    rig = load_json(RigCalibration, workspace / RIG)
+    assert rig.wanted == ("time-offset",) and rig.estimates == ()
+    assert load_survey(Workspace(workspace)) == load_json(Survey, workspace / SURVEY)
+    again = command("run", workspace, "--to", "geolocate")
+    assert not any(row["ran"] for row in again["stages"])
+
+
+def test_calibrate_and_apply(tmp_path: Path, command: Command, capsys: pytest.CaptureFixture[str]) -> None:
+    flight, workspace = Winding(count=24), tmp_path / "ws"
+    inputs = flown(tmp_path, flight)
+    document = command("run", workspace, *arguments(inputs), "--to", "geolocate")
+    assert document["stages"][2]["key_figure"] == "nothing to estimate"
+    before = load_json(Survey, workspace / SURVEY)
+    both = ("--estimate", "time-offset,boresight")
+    values = command("calibrate", workspace, *both)["values"]
+    assert [row["name"] for row in values["estimates"]] == ["time-offset", "boresight"]
+    # Ingest was asked for nothing: the estimates change nothing that follows.
+    assert values["applied"] == []
+    assert load_survey(Workspace(workspace)) == before
+    assert states(command, workspace)["geolocate"] == "current"
+    values = command("calibrate", workspace, *both, "--apply")["values"]
+    assert values["applied"] == ["time-offset", "boresight"]
+    position, turned = missed(workspace, flight)
+    assert np.abs(position).max() < 0.1 and turned.max() < 0.15
+    assert load_json(Survey, workspace / SURVEY) == before
+    now = states(command, workspace)
+    assert now["ingest"] == now["sfm"] == now["calibrate"] == "current" and now["geolocate"] == "stale"
+    # `georef run` keeps to what calibrate was last asked for.
+    rows = {row["stage"]: row["ran"] for row in command("run", workspace, "--to", "geolocate")["stages"]}
+    assert rows == {"ingest": False, "sfm": False, "calibrate": False, "geolocate": True}
+    assert boundary.guarded(cli, ["calibrate", str(workspace), "--estimate", "lever-arm"]) == 0
+    table = capsys.readouterr().out
+    assert "lever-arm forward" in table and "control points" in table
+
+
+def test_what_ingest_asked_for_can_be_left_unapplied(tmp_path: Path, command: Command) -> None:
+    inputs, workspace = flown(tmp_path, Winding(count=24)), tmp_path / "ws"
+    command("run", workspace, *arguments(inputs), "--time-offset", "auto", "--to", "calibrate")
+    values = command("calibrate", workspace, "--no-apply")["values"]
+    assert [row["name"] for row in values["estimates"]] == ["time-offset"] and values["applied"] == []
+    assert load_survey(Workspace(workspace)) == load_json(Survey, workspace / SURVEY)
+    warnings = command("calibrate", workspace, "--estimate", "boresight")["warnings"]
+    assert "--estimate leaves out what ingest was asked to estimate: time-offset" in warnings
+
+
+def test_a_comparison_reads_the_calibration_where_it_is(tmp_path: Path, command: Command) -> None:
+    """Configurations share the stages up to geolocate, and are stale with what these apply."""
+    inputs, workspace = flown(tmp_path, Winding(count=24)), tmp_path / "ws"
+    command("run", workspace, *arguments(inputs), "--time-offset", "auto", "--to", "geolocate")
+    root = Workspace(workspace)
+    variant = root.variant(
+        "compare/A", {spec.folder: workspace / spec.folder for spec in stage_slice(None, "geolocate")}, "compare"
+    )
+    spec = BY_NAME["geolocate"]
+    before = fingerprints(variant, spec, spec.options(), {}).hashes
+    assert before == fingerprints(root, spec, spec.options(), {}).hashes
+    assert load_survey(variant) == load_survey(root)
+    command("calibrate", workspace, "--no-apply")
+    after = fingerprints(variant, spec, spec.options(), {}).hashes
+    assert set(before) - set(after) == {RIG, TRACK}
+
+
+def test_stages_one_by_one_are_reminded(tmp_path: Path, command: Command) -> None:
+    inputs, workspace = flown(tmp_path, Winding(count=24)), tmp_path / "ws"
+    command("ingest", workspace, "--bag", inputs["--bag"], "--time-offset", "auto")
+    command("sfm", workspace, "--import", inputs["--import"])
+    message = command("geolocate", workspace)["err"]
+    assert "time-offset were to be estimated after sfm: `georef calibrate`" in message
+
+
+def test_what_cannot_be_estimated_is_said_before_sfm(tmp_path: Path, command: Command) -> None:
+    flight = Winding(count=6)
+    path = bags.write(tmp_path / "bag", [*bags.fixes(flight), *bags.images(flight)])
+
+    def refused(*more: object) -> str:
+        return command("ingest", tmp_path / "ws", "--bag", path, *more, fails=True)
+
+    assert "[--estimate]: lever-arm needs attitudes" in refused("--estimate", "lever-arm")
+    assert "[--estimate]: boresight needs recorded attitudes" in refused("--estimate", "boresight,time-offset")
+    assert "[--estimate]: Value error, 'focus' is none of time-offset" in refused("--estimate", "focus")
+    empty = bags.write(tmp_path / "empty", bags.images(flight))
+    message = command("ingest", tmp_path / "ws", "--bag", empty, "--time-offset", "auto", fails=True)
+    assert "no image has a position" in message
+
+
+def test_workspace_without_navigation_by_time(tmp_path: Path, command: Command) -> None:
+    inputs, workspace = flown(tmp_path, Winding(count=24)), tmp_path / "ws"
+    command("run", workspace, *arguments(inputs), "--to", "sfm")
+    (workspace / "ingest/track.npz").unlink()
+    message = command("calibrate", workspace, "--estimate", "boresight", fails=True)
+    assert "only a position for each image" in message
+
+
+def test_wanted_is_checked() -> None:
+    assert CalibrateOptions(estimate="lever-arm,time-offset").estimate == ("time-offset", "lever-arm")
+    with pytest.raises(ValueError, match="none of"):
+        CalibrateOptions(estimate="")
+
+
+def test_offset_of_a_trajectory_by_time(tmp_path: Path, command: Command) -> None:
+    """The receiver's log of a simulated flight, 0.2 s ahead of the camera's clock, with true cameras as SfM's."""
+    options = {"size": "64x48", "samples": "1", "targets": 0, "images": 24, "flight": "grid"}
+    simulate(SimulateOptions(**options, clock_offset=OFFSET_S), tmp_path / "survey")
+    truth = load_json(Truth, tmp_path / "survey/truth.json")
+    turns = np.swapaxes(np.array(truth.cam_from_enu), 1, 2)
+    model = write_model(tmp_path / "model", list(truth.images), np.array(truth.centers), turns, width=64)
+    files = tmp_path / "survey"
+    table = ["--images", files / "images", "--trajectory", files / "gnss.csv", "--import", model]
+    document = command("run", tmp_path / "ws", *table, "--time-offset", "auto", "--to", "geolocate")
+    (estimate,) = next(row for row in document["stages"] if row["stage"] == "calibrate")["values"]["estimates"]
+    assert estimate["value"][0] == pytest.approx(OFFSET_S, abs=0.02)
+    assert estimate["observable"] == [True]
+    survey = load_survey(Workspace(tmp_path / "ws"))
+    places = enu_from_lla(lla_from_enu(np.array(truth.centers), truth.origin), survey.origin)
+    errors = np.array([image.fix.position_in_geo for image in survey.images if image.fix]) - places
+    # White noise of σ 0.02 and 0.03 m, and 10 ms at some 5 m/s.
+    assert np.sqrt((errors**2).mean()) < 0.06
+    assert all(image.attitude for image in survey.images)  # the gimbal's, from XMP
+    # A lever arm needs to know the body.
+    message = command("ingest", tmp_path / "new", *table[:4], "--estimate", "lever-arm", fails=True)
+    assert "lever-arm needs attitudes" in message
+    by_name = [*table[:2], "--trajectory", files / "trajectory.csv"]
+    message = command("ingest", tmp_path / "new", *by_name, "--time-offset", "auto", fails=True)
+    assert "[--time-offset]: needs the navigation recorded by time" in message

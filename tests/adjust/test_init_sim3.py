@@ -1,0 +1,219 @@
+"""Stage `init-sim3` on synthetic surveys, through the runner and as a pure function."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipelines.adjust.geolocate import geolocate
+from pipelines.adjust.init_sim3 import estimate_similarity
+from pipelines.adjust.observations import control_correspondences
+from pipelines.adjust.options import GeolocateOptions, InitSim3Options
+from pipelines.core.errors import ConvergenceError, DegenerateGeometryError, InputError
+from pipelines.core.products import load_json
+from pipelines.core.runner import run_stage
+from pipelines.core.stages import BY_NAME, SIM3
+from pipelines.geometry.rotations import log_so3
+from pipelines.geometry.similarity import Similarity
+from pipelines.geometry.sparse_model import SparseModel
+from pipelines.scene.geolocated import GeolocatedPoints
+from pipelines.scene.initial_similarity import InitialSimilarity
+from pipelines.scene.survey import Survey
+from tests.scenes import (
+    GEO_FROM_LOCAL,
+    Measured,
+    Noise,
+    make_scene,
+    sparse_model,
+    survey_of,
+    write_workspace,
+)
+
+CONFIG = InitSim3Options()
+CONSUMER = Noise(fix_m=(1.5, 1.5, 3.0))
+
+
+def material(
+    noise: Noise, measured: Measured, seed: int = 0, layout: str = "orbit"
+) -> tuple[Survey, SparseModel, GeolocatedPoints]:
+    scene, rng = make_scene(layout, points=120), np.random.default_rng(seed)
+    survey, model = survey_of(scene, noise, measured, rng), sparse_model(scene, noise, rng)
+    return survey, model, geolocate(survey, model, GeolocateOptions()).points
+
+
+def squared_error(found: InitialSimilarity) -> float:
+    record = found.geo_from_local
+    away = GEO_FROM_LOCAL @ Similarity.from_record(record).inverse()
+    pivot = np.array(record.pivot)
+    error = np.array([np.log(away.scale), *log_so3(away.rotation), *(away.apply(pivot) - pivot)])
+    return float(error @ np.linalg.solve(np.array(record.covariance), error))
+
+
+def test_stage_recovers_the_truth_with_rtk(tmp_path: Path) -> None:
+    scene, noise, rng = make_scene(points=120), Noise(), np.random.default_rng(1)
+    survey = survey_of(scene, noise, Measured(), rng)
+    workspace = write_workspace(tmp_path, survey, sparse_model(scene, noise, rng))
+    run_stage(workspace, BY_NAME["geolocate"], {})
+    outcome = run_stage(workspace, BY_NAME["init-sim3"], {})
+    found = load_json(InitialSimilarity, workspace.path(SIM3))
+    assert found.geo_from_local.scale == pytest.approx(GEO_FROM_LOCAL.scale, rel=1e-3)
+    away = Similarity.from_record(found.geo_from_local).apply(GEO_FROM_LOCAL.inverse().apply(np.eye(3) * 50))
+    assert squared_error(found) < 24.3  # χ²₇ at 0.999
+    # 2–3 cm over √24, and the lens, which moves the scene along the views: 2 cm in σ at 50 m.
+    np.testing.assert_allclose(away, np.eye(3) * 50, atol=0.06)
+    assert found.correspondences == {"gnss": 24, "gcp": 0, "points": 120}
+    assert found.residuals["gnss"].rmse_h_m == pytest.approx(0.028, rel=0.6)  # the cameras follow the fixes
+    assert found.layout == "volume"
+    assert outcome.manifest.warnings == []
+
+
+def test_outlying_fixes_are_listed() -> None:
+    noise = replace(Noise(fix_m=(0.05, 0.05, 0.08)), outliers=(2, 7, 11, 20))
+    survey, model, points = material(noise, Measured())
+    found, warnings = estimate_similarity(survey, model, points, CONFIG)
+    assert found.gnss_outliers == tuple(f"image_{index:03d}.jpg" for index in noise.outliers)
+    assert found.inliers["gnss"] == 20
+    assert squared_error(found) < 24.3  # χ²₇ at 0.999
+    assert any("4 of 24 fixes are outliers: image_002.jpg (" in text for text in warnings)
+
+
+def test_control_points_alone_carry_the_survey() -> None:
+    survey, model, points = material(Noise(), Measured(fixes=False, attitudes=False, gcps=True))
+    found, _ = estimate_similarity(survey, model, points, CONFIG)
+    assert found.inliers == {"gnss": 0, "gcp": 6, "points": 0}
+    assert found.residuals["gnss"].count == 0
+    assert squared_error(found) < 24.3
+
+
+def test_fixes_that_contradict_control_points_are_told_with_numbers() -> None:
+    noise = replace(Noise(), bias_m=(0.4, 0.0, -1.2))
+    survey, model, points = material(noise, Measured(gcps=True))
+    found, _ = estimate_similarity(survey, model, points, CONFIG)
+    assert squared_error(found) < 24.3
+    (caution,) = found.cautions
+    assert caution.code == "fixes-shifted"
+    assert "shifted by (+0.3" in caution.sentence or "shifted by (+0.4" in caution.sentence
+
+
+def test_paper_method_is_coarse_but_near() -> None:
+    survey, model, points = material(Noise(), Measured())
+    found, _ = estimate_similarity(survey, model, points, InitSim3Options(method="paper"))
+    assert found.method == "paper"
+    away = Similarity.from_record(found.geo_from_local).apply(model.point_in_local)
+    error = np.linalg.norm(away - GEO_FROM_LOCAL.apply(model.point_in_local), axis=1)
+    # 0.5° attitudes over 100 m, averaged over 24 cameras: 0.2 m.
+    assert error.mean() < 0.6
+    robust, _ = estimate_similarity(survey, model, points, CONFIG)
+    assert found.residuals["gnss"].rmse_3d_m > robust.residuals["gnss"].rmse_3d_m
+
+
+def test_paper_method_without_points_says_what_to_use() -> None:
+    survey, model, points = material(Noise(), Measured(fixes=False, gcps=True))
+    with pytest.raises(DegenerateGeometryError, match="--method robust"):
+        estimate_similarity(survey, model, points, InitSim3Options(method="paper"))
+
+
+def test_max_residual_fails_with_the_figures() -> None:
+    survey, model, points = material(CONSUMER, Measured())
+    with pytest.raises(ConvergenceError, match=r"RMS residual of 24 camera centres is \d\.\d+ m .*0\.1 m"):
+        estimate_similarity(survey, model, points, InitSim3Options(max_residual=0.1))
+    assert estimate_similarity(survey, model, points, InitSim3Options(max_residual=10.0))[0].inliers["gnss"] == 24
+
+
+def test_line_needs_attitude() -> None:
+    survey, model, points = material(Noise(), Measured(), layout="line")
+    found, _ = estimate_similarity(survey, model, points, CONFIG)
+    assert found.layout == "line"
+    assert found.attitude_used and found.attitude is not None
+    assert squared_error(found) < 24.3
+    bare = survey.model_copy(
+        update={"images": tuple(image.model_copy(update={"attitude": None}) for image in survey.images)}
+    )
+    with pytest.raises(DegenerateGeometryError, match="control points"):
+        estimate_similarity(bare, model, points, CONFIG)
+
+
+def test_nothing_measured_is_refused() -> None:
+    survey, model, points = material(Noise(), Measured(fixes=False, attitudes=False))
+    with pytest.raises(DegenerateGeometryError, match="0 positions"):
+        estimate_similarity(survey, model, points, CONFIG)
+
+
+def test_unusable_control_points_are_named() -> None:
+    survey, model, points = material(Noise(), Measured(gcps=True))
+    first, second, *rest = survey.control_points
+    lonely = first.model_copy(update={"marks": first.marks[:1]})
+    shifted = tuple(
+        mark.model_copy(update={"x_px": mark.x_px + 40.0 * index}) for index, mark in enumerate(second.marks)
+    )
+    broken = second.model_copy(update={"marks": shifted})
+    spoilt = survey.model_copy(update={"control_points": (lonely, broken, *rest)})
+    found, warnings = estimate_similarity(spoilt, model, points, CONFIG)
+    assert found.correspondences["gcp"] == 4
+    assert any("gcp0: marked in fewer than 2" in text for text in warnings)
+    assert any("gcp1: its" in text and "do not meet" in text for text in warnings)
+
+
+def test_error_carries_the_reasons_why_control_points_are_not_used() -> None:
+    survey, model, points = material(Noise(), Measured(fixes=False, attitudes=False, gcps=True))
+    two_marks = [
+        point.model_copy(update={"marks": (point.marks[0], point.marks[len(point.marks) // 3])})
+        for point in survey.control_points[:4]
+    ]
+    missing, apart = two_marks[2].marks[1], two_marks[3].marks[0]
+    two_marks[2] = two_marks[2].model_copy(
+        update={"marks": (two_marks[2].marks[0], missing.model_copy(update={"image": "kite_07.jpg"}))}
+    )
+    moved = apart.model_copy(update={"y_px": apart.y_px + 60.0, "x_px": apart.x_px + 60.0})
+    two_marks[3] = two_marks[3].model_copy(update={"marks": (moved, two_marks[3].marks[1])})
+    kite = survey.model_copy(update={"control_points": tuple(two_marks)})
+    with pytest.raises(DegenerateGeometryError) as raised:
+        estimate_similarity(kite, model, points, CONFIG)
+    message = str(raised.value)
+    assert "2 positions" in message
+    assert "24 of 24 images are registered; in use are 0 of 0 fixes and 2 of 4 control points" in message
+    assert "gcp2: marked in fewer than 2 registered images (kite_07.jpg not registered)" in message
+    found = re.search(
+        r"gcp3: its 2 marks do not meet in one point: up to ([\d.]+) px off, RMS ([\d.]+) px", message
+    )
+    assert found is not None
+    worst_px, rms_px = map(float, found.groups())
+    # 85 px of which the part across the epipolar line counts, shared between the two marks.
+    assert 5 < rms_px <= worst_px < 85
+    assert f"{apart.image} " in message
+    assert f"{two_marks[3].marks[1].image} " in message
+
+
+def test_worst_mark_of_a_control_point_is_named_first() -> None:
+    survey, model, _ = material(Noise(), Measured(gcps=True))
+    point = survey.control_points[0]
+    off = {0: 300.0, 1: -200.0, 2: 150.0}
+    marks = tuple(
+        mark.model_copy(update={"x_px": mark.x_px + off.get(index, 0.0)})
+        for index, mark in enumerate(point.marks[:5])
+    )
+    spoilt = survey.model_copy(update={"control_points": (point.model_copy(update={"marks": marks}),)})
+    _, (unused,) = control_correspondences(spoilt, model)
+    assert len(unused.residual_px) == len(unused.registered) == 5
+    worst = unused.registered[int(np.argmax(unused.residual_px))]
+    assert f"px ({worst} {max(unused.residual_px):.1f} px, " in unused.sentence
+
+
+def test_points_of_another_model_are_refused() -> None:
+    survey, model, points = material(Noise(), Measured())
+    with pytest.raises(InputError, match="another model"):
+        estimate_similarity(survey, model, replace(points, point_id=points.point_id + 1), CONFIG)
+
+
+def test_control_points_can_be_left_out() -> None:
+    survey, model, points = material(CONSUMER, Measured(gcps=True))
+    with_control, _ = estimate_similarity(survey, model, points, CONFIG)
+    without, _ = estimate_similarity(survey, model, points, InitSim3Options(control_points=False))
+    assert with_control.correspondences["gcp"] == 6
+    assert without.correspondences["gcp"] == without.residuals["gcp"].count == 0
+    alone, _ = estimate_similarity(survey.model_copy(update={"control_points": ()}), model, points, CONFIG)
+    assert without == alone
