@@ -25,7 +25,7 @@ from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.stage import survey_and_track
 from pipelines.scene.geolocated import GeolocatedPoints
 from pipelines.scene.scene import photographs
-from pipelines.scene.survey import Survey
+from pipelines.scene.survey import FixSession, Survey
 from tests.photos import Exif, gps_entries, jpeg, write_flight
 from tests.scenes import Measured, Noise, make_scene, sparse_model, survey_of, write_workspace
 
@@ -111,7 +111,8 @@ def workspace(tmp_path: Path) -> Workspace:
     """A survey and its SfM model, as the stages leave them."""
     rng = np.random.default_rng(4)
     scene = make_scene()
-    survey = survey_of(scene, Noise(), Measured(), rng)
+    session = FixSession(receiver="RTK fixed", sigma_common_m=(0.03, 0.03, 0.05), sigma_source="default")
+    survey = survey_of(scene, Noise(), Measured(), rng).model_copy(update={"sessions": (session,)})
     return write_workspace(tmp_path / "ws", survey, sparse_model(scene, Noise(), rng))
 
 
@@ -154,7 +155,10 @@ POINT = {"name": "P1", "position_in_geo": [0, 0, 0], "cov_in_geo": [[1, 0, 0], [
         ),
         (("images", 0, "fix", "position_in_geo"), [1e999, 0, 0], r"position_in_geo\.0\].*finite number"),
         (("images", 0, "attitude"), {"quat_xyzw": [0, 0, 0, 0], "sigma_deg": 1, "source": "csv"}, "length 1"),
-        (("format_version",), 2, r"\[format_version\]"),
+        (("format_version",), 3, r"\[format_version\]"),
+        (("format_version",), 1, "an earlier version of georef made this survey.*run `georef ingest` again"),
+        (("images", 1, "fix", "session"), 1, "has session 1, which is not among the sessions"),
+        (("sessions", 0, "sigma_common_m"), [0.1, -0.1, 0.1], r"sigma_common_m\.1\].*greater than or equal to 0"),
         (("surprise",), 1, r"\[surprise\].*not permitted"),
     ],
 )

@@ -33,6 +33,7 @@ class Manifest(BaseModel):
     Attributes:
         format_version: version of the manifest's format.
         stage: the subcommand.
+        product_version: of the form of the product.
         config: resolved options by field.
         inputs: SHA-256 by product or flag, from `fingerprints`.
         versions: versions of this package and its libraries.
@@ -50,6 +51,7 @@ class Manifest(BaseModel):
 
     format_version: Literal[1] = 1
     stage: str
+    product_version: int = 1
     config: dict[str, Any]
     inputs: dict[str, str]
     versions: dict[str, str]

@@ -252,6 +252,7 @@ def _execute(job: _Job) -> Manifest:
             log.warning("%s: %s", spec.name, caution.sentence, extra={AT_END: True})
     manifest = Manifest(
         stage=spec.name,
+        product_version=spec.product_version,
         config=resolved,
         inputs=asked.inputs.hashes,
         versions=library_versions(),

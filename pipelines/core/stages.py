@@ -111,6 +111,7 @@ class StageSpec:
         in_parts: module that makes the same product in parts, with the same `run`. `made_in_parts(workspace,
             options)` of `module` decides; without it, `module` makes all products.
         called: words of its command, where they are not its name.
+        product_version: of the form of its product; one of another form is made again.
     """
 
     name: str
@@ -126,6 +127,7 @@ class StageSpec:
     working: tuple[str, ...] = ()
     in_parts: str = ""
     called: str = ""
+    product_version: int = 1
 
     def command(self, workspace: Path) -> str:
         """Return the command that makes its product in a workspace."""
@@ -149,6 +151,7 @@ PIPELINE: tuple[StageSpec, ...] = (
         product=SURVEY,
         title="Read photographs, positions, attitudes and control points into one survey.",
         working=("images",),
+        product_version=2,  # as `Survey.format_version`
     ),
     StageSpec(
         name="sfm",

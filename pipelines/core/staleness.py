@@ -100,6 +100,8 @@ def why_stale(workspace: Workspace, asked: Request, manifest: Manifest) -> str:
 
     Input files count by content: a path that differs is no other option.
     """
+    if manifest.product_version != asked.spec.product_version:
+        return "made by another version of georef"
     of_inputs = changed_inputs(asked.inputs.hashes, manifest.inputs)
     changed = changed_options(asked.options, manifest.config) or of_inputs
     if changed:

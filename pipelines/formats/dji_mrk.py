@@ -12,11 +12,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipelines.core.errors import InputError
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.formats.gps_time import WEEK_S, unix_from_week
 from pipelines.formats.text import read_lines
+from pipelines.formats.xmp import RTK_FIXED, RTK_FLOAT
 
 _NUMBER = r"([-+]?\d+(?:\.\d*)?)"
 FIRST_LINE = re.compile(rf"\s*\d+\s+{_NUMBER}\s+\[\d+\]\s+{_NUMBER}\s*,\s*N\b")
@@ -27,6 +29,7 @@ _LINE = re.compile(
 )
 _LAYOUT = "number, second, [week], n,N e,E v,V, lat,Lat lon,Lon h,Ellh, three σ, flag,Q"
 _NO_POSITION = 0
+_RECEIVER = {RTK_FIXED: "RTK fixed", RTK_FLOAT: "RTK float"}
 
 
 @dataclass(frozen=True)
@@ -40,6 +43,7 @@ class CameraEvents:
         time_s: (N,) seconds since 1970 UTC.
         lon_lat_alt: (N, 3) of the camera, degrees and ellipsoidal metres; NaN without a position.
         sigma_enu_m: (N, 3); NaN where unknown.
+        receiver: (N,) kind of receiver, as of `PoseTable`.
         camera_from_antenna_enu_m: (N, 3) from the antenna to the camera.
     """
 
@@ -49,6 +53,7 @@ class CameraEvents:
     time_s: FloatArray
     lon_lat_alt: FloatArray
     sigma_enu_m: FloatArray
+    receiver: NDArray[np.str_]
     camera_from_antenna_enu_m: FloatArray
 
 
@@ -86,6 +91,7 @@ def read_mrk(path: Path) -> CameraEvents:
         time_s=unix_from_week(table[:, 2], table[:, 1]),
         lon_lat_alt=np.where(known[:, None], table[:, [7, 6, 8]], np.nan),
         sigma_enu_m=np.where((sigma > 0).all(axis=1, keepdims=True), sigma, np.nan),
+        receiver=np.array([_RECEIVER.get(int(flag), "single-frequency") for flag in table[:, 12]]),
         camera_from_antenna_enu_m=north_east_down_m[:, [1, 0, 2]] * np.array([1.0, 1.0, -1.0]),
     )
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipelines.core.types import BoolArray, FloatArray, IntArray
 
@@ -25,6 +26,8 @@ class PoseTable:
         geographic: whether the columns were called latitude and longitude; None if the CRS alone decides.
         quat_xyzw: (N, 4) rotations camera → East-North-Up at the camera.
         sigma_enu_m: (N, 3) σ east, north, up.
+        receiver: (N,) kind of receiver, as the solution has it: `RTK fixed`, `RTK float`, `single-frequency` or
+            `unknown receiver`.
         crs_text: the CRS that the file states.
         crs_line: line of the CRS.
         assumed_crs: CRS of a file that states none, where `--crs` names none either; None: WGS84 for latitude and
@@ -44,6 +47,7 @@ class PoseTable:
     geographic: bool | None
     quat_xyzw: FloatArray | None = None
     sigma_enu_m: FloatArray | None = None
+    receiver: NDArray[np.str_] | None = None
     crs_text: str | None = None
     crs_line: int = 1
     assumed_crs: str | None = None
@@ -66,6 +70,7 @@ class PoseTable:
             xyz=self.xyz[rows],
             quat_xyzw=_taken(self.quat_xyzw, rows),
             sigma_enu_m=_taken(self.sigma_enu_m, rows),
+            receiver=None if self.receiver is None else self.receiver[rows],
         )
 
 

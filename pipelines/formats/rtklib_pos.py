@@ -25,6 +25,8 @@ from pipelines.geodesy.enu import ecef_from_enu_rotation, lla_from_ecef
 
 _JST_S = 9 * 3600.0
 _EARTH_M = (5e6, 8e6)  # distances from its centre
+# By the quality Q of a solution; 3 is with SBAS, 4 with code corrections, 5 without any.
+_RECEIVER = {1: "RTK fixed", 2: "RTK float", **dict.fromkeys((3, 4, 5), "single-frequency")}
 _Form = Literal["degrees", "sexagesimal", "ecef"]
 
 
@@ -64,6 +66,9 @@ def read_pos(path: Path) -> PoseTable:
         time_s=_times(header.clock, [(at, cells[:2]) for at, cells in rows], path),
         xyz=xyz,
         geographic=header.form != "ecef",
+        receiver=np.array(
+            [_RECEIVER.get(int(quality), "unknown receiver") for quality in np.nan_to_num(table[:, 3])]
+        ),
         sigma_enu_m=sigma if np.isfinite(sigma).any() else None,
         assumed_crs="EPSG:4978" if header.form == "ecef" else "EPSG:4326" if header.above_geoid else "EPSG:4979",
         heights_above_geoid=header.above_geoid,

@@ -80,6 +80,7 @@ def positions_of_events(events: CameraEvents, photos: Sequence[Photo], notes: No
         xyz=events.lon_lat_alt[rows],
         geographic=True,
         sigma_enu_m=events.sigma_enu_m[rows],
+        receiver=events.receiver[rows],
         assumed_crs="EPSG:4979",
     )
 

@@ -24,6 +24,7 @@ class ImagePoses:
         position_in_ecef: (N, 3) metres.
         sigma_enu_m: (N, 3).
         sigma_source: (N,) who gave σ.
+        receivers: (N,) kinds of receiver, of `position_sigma.RECEIVERS`, as recorded.
         enu_from_cam: (N, 3, 3) attitude against north and up at the camera.
         attitude_source: (N,) where it is from.
         sigma_attitude_deg: (N,) σ that the attitudes state.
@@ -37,6 +38,7 @@ class ImagePoses:
     position_in_ecef: FloatArray
     sigma_enu_m: FloatArray
     sigma_source: tuple[SigmaSource, ...]
+    receivers: tuple[str, ...]
     enu_from_cam: FloatArray
     attitude_source: tuple[AttitudeSource, ...]
     sigma_attitude_deg: FloatArray

@@ -124,6 +124,15 @@ class IngestOptions(StageOptions):
     )
     sigma_h: float | None = Field(None, gt=0, description="Horizontal σ of every position in metres.")
     sigma_v: float | None = Field(None, gt=0, description="Vertical σ of every position in metres.")
+    sigma_common_h: float | None = Field(
+        None,
+        ge=0,
+        description="Horizontal σ of the error that all positions of a session share, as of their base station, in "
+        "metres; 0: none (default: by receiver).",
+    )
+    sigma_common_v: float | None = Field(
+        None, ge=0, description="Vertical σ of that error in metres; 0: none (default: by receiver)."
+    )
     sigma_attitude: float | None = Field(None, gt=0, description="σ of the attitude in degrees.")
     sigma_gcp_h: float = Field(0.02, gt=0, description="Horizontal σ of surveyed points in metres.")
     sigma_gcp_v: float = Field(0.03, gt=0, description="Vertical σ of surveyed points in metres.")

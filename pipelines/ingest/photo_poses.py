@@ -45,14 +45,14 @@ def poses_from_tags(photos: Sequence[Photo], options: IngestOptions, notes: Note
     position_in_ecef = np.full((len(photos), 3), np.nan)
     position_in_ecef[located] = ecef_from_lla(crs.lla_from_xyz(xyz[located]))
     stated = np.array([_stated_sigma(photo.tags) for photo in photos])
-    sigma, sigma_source = with_defaults(
-        stated, [_receiver(photo.tags) for photo in photos], located, options, notes
-    )
+    receivers = tuple(_receiver(photo.tags) for photo in photos)
+    sigma, sigma_source = with_defaults(stated, receivers, located, options, notes)
     gimbal: list[AttitudeSource] = ["gimbal" for _ in photos]
     return ImagePoses(
         position_in_ecef=position_in_ecef,
         sigma_enu_m=sigma,
         sigma_source=sigma_source,
+        receivers=receivers,
         enu_from_cam=gimbal_attitudes(photos),
         attitude_source=tuple(gimbal),
         sigma_attitude_deg=np.full(len(photos), np.nan),

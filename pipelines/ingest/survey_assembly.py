@@ -11,6 +11,7 @@ import numpy as np
 from pipelines.core.errors import InputError
 from pipelines.geodesy.enu import Origin, ecef_from_lla, lla_from_ecef, median_lla
 from pipelines.geodesy.vertical import VerticalDatum
+from pipelines.ingest.fix_sessions import fix_sessions
 from pipelines.ingest.flight_record import LEAST_IMAGES, FlightRecord
 from pipelines.ingest.ground_points import GroundFile, GroundPoint, require_near, split_checks
 from pipelines.ingest.image_poses import ImagePoses
@@ -60,13 +61,15 @@ def assemble_survey(
     track = None if flight.navigation is None else flight.navigation.in_geo(origin)
     if options.estimated:
         require_estimable(track, options.estimated, "--estimate" if options.estimate else "--time-offset")
+    sessions, session_of = fix_sessions(poses, options, notes)
     survey = Survey(
         origin=origin,
         source_crs=poses.crs_name if located or inputs.control is None else inputs.control.crs_name,
         vertical=_vertical(poses, files, notes),
         image_dir=str(flight.folder),
         cameras=flight.cameras,
-        images=image_records(flight, origin, options),
+        images=image_records(flight, session_of, origin, options),
+        sessions=sessions,
         control_points=point_records(control, origin, options),
         check_points=point_records(check, origin, options),
         unmarked_points=unmarked_records(points.unmarked, origin, options),

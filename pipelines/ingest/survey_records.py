@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pipelines.core.types import FloatArray, Matrix3, Vector3
+from pipelines.core.types import FloatArray, IntArray, Matrix3, Vector3
 from pipelines.geodesy.enu import Origin, enu_from_ecef, geo_from_enu_at, lla_from_ecef, lla_of
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
 from pipelines.ingest.flight_record import LEAST_IMAGES, FlightRecord
@@ -20,10 +20,19 @@ SIGMA_GIMBAL_DEG = 2.0
 SIGMA_TABLE_ATTITUDE_DEG = 1.0
 
 
-def image_records(flight: FlightRecord, origin: Origin, options: IngestOptions) -> tuple[SurveyImage, ...]:
-    """Return the photographs with fixes and attitudes in the frame at an origin, and their split."""
+def image_records(
+    flight: FlightRecord, session_of: IntArray, origin: Origin, options: IngestOptions
+) -> tuple[SurveyImage, ...]:
+    """Return the photographs with fixes and attitudes in the frame at an origin, and their split.
+
+    Args:
+        flight: photographs and their measured poses.
+        session_of: (N,) session of each fix.
+        origin: of the frame.
+        options: of `ingest`.
+    """
     poses = flight.poses
-    fixes, attitudes = _fixes(poses, origin), _attitudes(poses, origin, options)
+    fixes, attitudes = _fixes(poses, session_of, origin), _attitudes(poses, origin, options)
     test = held_out(len(flight.photos), options.test_every)
     return tuple(
         SurveyImage(
@@ -83,7 +92,7 @@ def _sigma_enu_m(point: GroundPoint, options: IngestOptions) -> Vector3:
     return horizontal, horizontal, vertical
 
 
-def _fixes(poses: ImagePoses, origin: Origin) -> list[Fix | None]:
+def _fixes(poses: ImagePoses, session_of: IntArray, origin: Origin) -> list[Fix | None]:
     position = enu_from_ecef(poses.position_in_ecef, origin)
     covariance = _turned(poses.sigma_enu_m, poses.position_in_ecef, origin)
     return [
@@ -92,6 +101,7 @@ def _fixes(poses: ImagePoses, origin: Origin) -> list[Fix | None]:
             cov_in_geo=_matrix(covariance[row]),
             source=poses.source,
             sigma_source=poses.sigma_source[row],
+            session=int(session_of[row]),
         )
         if located
         else None

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipelines.core.errors import InputError
 from pipelines.core.types import FloatArray
@@ -21,7 +22,7 @@ from pipelines.ingest.photo_folder import Photo
 from pipelines.ingest.photo_poses import altitude_m, gimbal_attitudes, photo_times
 from pipelines.ingest.pose_matching import match_by_name, match_by_time
 from pipelines.ingest.pose_tables import usable_rows
-from pipelines.ingest.position_sigma import with_defaults
+from pipelines.ingest.position_sigma import RECEIVERS, with_defaults
 from pipelines.ingest.reference_system import crs_of_table, note_operation
 from pipelines.ingest.table_against_exif import compare_with_exif
 
@@ -56,15 +57,14 @@ def poses_from_table(table: PoseTable, photos: Sequence[Photo], options: IngestO
         f"image has no position in {table.path.name}",
         f"images have no position in {table.path.name}",
     )
-    sigma, sigma_source = with_defaults(
-        placed.sigma_enu_m, ["unknown receiver"] * len(photos), located, options, notes
-    )
+    sigma, sigma_source = with_defaults(placed.sigma_enu_m, placed.receivers, located, options, notes)
     from_file = np.asarray(np.isfinite(placed.enu_from_cam).all(axis=(1, 2)))
     attitude_source: list[AttitudeSource] = [table.source if row else "gimbal" for row in from_file]
     poses = ImagePoses(
         position_in_ecef=placed.position_in_ecef,
         sigma_enu_m=sigma,
         sigma_source=sigma_source,
+        receivers=placed.receivers,
         enu_from_cam=np.where(from_file[:, None, None], placed.enu_from_cam, gimbal_attitudes(photos)),
         attitude_source=tuple(attitude_source),
         sigma_attitude_deg=np.full(len(photos), np.nan),
@@ -85,6 +85,7 @@ class _Placed:
     position_in_ecef: FloatArray
     enu_from_cam: FloatArray
     sigma_enu_m: FloatArray
+    receivers: tuple[str, ...]
     time_s: FloatArray
     recorded: Trajectory | None
 
@@ -98,10 +99,14 @@ def _by_name(table: PoseTable, position_in_ecef: FloatArray, photos: Sequence[Ph
         placed[rows] = values
         return placed
 
+    receivers = [RECEIVERS[-1]] * len(photos)
+    for row, receiver in zip(rows, _receivers(table), strict=True):
+        receivers[row] = receiver
     return _Placed(
         position_in_ecef=spread(position_in_ecef),
         enu_from_cam=spread(_attitudes(table)),
         sigma_enu_m=spread(_sigma(table)),
+        receivers=tuple(receivers),
         time_s=spread(_times(table)),
         recorded=None,
     )
@@ -123,11 +128,13 @@ def _by_time(
         max_gap_s=options.max_gap,
     )
     matched = match_by_time(recorded, photos, table.path, options, notes)
+    image_time_s = photo_times(photos)
     return _Placed(
         position_in_ecef=matched.position,
         enu_from_cam=matched.rotation,
         sigma_enu_m=matched.sigma_m,
-        time_s=photo_times(photos),
+        receivers=_worse_neighbour(_receivers(table)[order], time_s[order], image_time_s + options.time_offset_s),
+        time_s=image_time_s,
         recorded=recorded,
     )
 
@@ -158,6 +165,17 @@ def _times(table: PoseTable) -> FloatArray:
 
 def _sigma(table: PoseTable) -> FloatArray:
     return np.full((len(table), 3), np.nan) if table.sigma_enu_m is None else table.sigma_enu_m
+
+
+def _receivers(table: PoseTable) -> NDArray[np.str_]:
+    return np.full(len(table), RECEIVERS[-1]) if table.receiver is None else table.receiver
+
+
+def _worse_neighbour(receivers: NDArray[np.str_], time_s: FloatArray, at_s: FloatArray) -> tuple[str, ...]:
+    """Return the kinds of receiver (N,) at times (N,): the worse of the rows before and after, by time (K,)."""
+    rank = np.array([RECEIVERS.index(receiver) for receiver in receivers])
+    after = np.clip(np.searchsorted(time_s, at_s), 0, len(time_s) - 1)
+    return tuple(RECEIVERS[row] for row in np.maximum(rank[np.clip(after - 1, 0, None)], rank[after]))
 
 
 def _attitudes(table: PoseTable) -> FloatArray:

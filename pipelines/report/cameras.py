@@ -13,6 +13,7 @@ from pipelines.plots.survey_plans import movement_plan
 from pipelines.report.coordinates import Texts, heads_of, texts_of
 from pipelines.report.evaluated import EvaluatedSurvey
 from pipelines.scene.fix_differences import FixDifferences, fix_differences
+from pipelines.scene.survey import FixSession
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,7 @@ class CamerasFacts:
         registered: number of those in the SfM model.
         unregistered: names of the others.
         fixes: number of registered photographs with a fix.
+        sessions: of the fixes, without repeats, each with the σ of their common error.
         map: adjusted positions, with arrows and ellipses.
         arrow_factor, ellipse_factor: magnifications; None: none are drawn.
         no_sigma: reason why there are no ellipses; empty: there are.
@@ -80,6 +82,7 @@ class CamerasFacts:
     registered: int
     unregistered: tuple[str, ...]
     fixes: int
+    sessions: tuple[FixSession, ...]
     map: Picture
     arrow_factor: float | None
     ellipse_factor: float | None
@@ -116,6 +119,7 @@ def cameras_facts(evaluated: EvaluatedSurvey) -> CamerasFacts:
         registered=len(names),
         unregistered=tuple(image.name for image in trained.survey.images if image.name not in registered),
         fixes=len(fixes.camera),
+        sessions=tuple(dict.fromkeys(trained.survey.sessions)),
         map=picture_of_png(drawn.png),
         arrow_factor=drawn.arrow_factor,
         ellipse_factor=drawn.ellipse_factor,

@@ -17,6 +17,8 @@ from pipelines.geodesy.enu import Origin
 from pipelines.geodesy.vertical import VerticalDatum
 from pipelines.scene.rig import RigParameter
 
+_NotNegative = Annotated[float, Field(ge=0)]
+
 
 class CameraPrior(Product):
     """Intrinsics of a camera before SfM.
@@ -47,11 +49,27 @@ class Fix(Product):
         cov_in_geo: 3×3, m².
         source: kind of record that the position comes from.
         sigma_source: source of σ: the recording, an option, or the default.
+        session: index into the survey's `sessions`.
     """
 
     position_in_geo: Vector3
     cov_in_geo: Covariance3
     source: Literal["exif", "csv", "geo.txt", "metashape", "pos", "mrk", "bag"]
+    sigma_source: Literal["file", "option", "default"]
+    session: int = Field(0, ge=0)
+
+
+class FixSession(Product):
+    """Fixes that share one error beside their own: of the base station, the receiver, or the day.
+
+    Attributes:
+        receiver: kind of receiver, of `ingest.position_sigma.RECEIVERS`.
+        sigma_common_m: σ of the common error east, north, up in metres; 0: none along that axis.
+        sigma_source: source of that σ: the recording, an option, or the default by receiver.
+    """
+
+    receiver: str
+    sigma_common_m: tuple[_NotNegative, _NotNegative, _NotNegative]
     sigma_source: Literal["file", "option", "default"]
 
 
@@ -140,6 +158,7 @@ class Survey(Product):
         image_dir: folder of photographs, absolute or inside the workspace.
         cameras: intrinsics before SfM.
         images: the photographs.
+        sessions: groups of fixes with one common error each; empty: no common error is modelled.
         control_points: points that enter the solution.
         check_points: points that enter no solution.
         unmarked_points: points with too few marks to be measured, which enter nothing.
@@ -150,13 +169,14 @@ class Survey(Product):
         default_sigmas: groups of measurements whose σ nobody stated.
     """
 
-    format_version: Literal[1] = 1
+    format_version: Literal[2] = 2
     origin: Origin
     source_crs: str
     vertical: VerticalDatum
     image_dir: Annotated[str, AfterValidator(image_dir)]
     cameras: tuple[CameraPrior, ...]
     images: tuple[SurveyImage, ...]
+    sessions: tuple[FixSession, ...] = ()
     control_points: tuple[SurveyedPoint, ...] = ()
     check_points: tuple[SurveyedPoint, ...] = ()
     unmarked_points: tuple[UnmarkedPoint, ...] = ()
@@ -168,16 +188,13 @@ class Survey(Product):
 
     @model_validator(mode="before")
     @classmethod
-    def _as_recorded(cls, document: Any) -> Any:
-        """Return the document without `rig`, a field of earlier versions for the calibration of the rig."""
-        if not isinstance(document, dict) or "rig" not in document:
-            return document
-        if document["rig"] is not None:
+    def _is_of_this_version(cls, document: Any) -> Any:
+        if isinstance(document, dict) and document.get("format_version") == 1:
             raise ValueError(
-                "an earlier version has put a calibration of the rig into this survey: run `georef ingest` again "
-                "(`georef run WS --to ingest --force` knows its options)"
+                "an earlier version of georef made this survey, without the common errors of its positions: run "
+                "`georef ingest` again, which knows its options"
             )
-        return {name: value for name, value in document.items() if name != "rig"}
+        return document
 
     @model_validator(mode="after")
     def _belongs_together(self) -> Survey:
@@ -194,6 +211,12 @@ class Survey(Product):
         lost = next((image for image in self.images if image.camera_id not in cameras), None)
         if lost is not None:
             raise ValueError(f"images: {lost.name} has camera {lost.camera_id}, which is not among the cameras")
+        fixed = [(image, image.fix) for image in self.images if self.sessions and image.fix is not None]
+        stray = next(((image, fix) for image, fix in fixed if fix.session >= len(self.sessions)), None)
+        if stray is not None:
+            raise ValueError(
+                f"images: {stray[0].name} has session {stray[1].session}, which is not among the sessions"
+            )
         return self
 
     @property

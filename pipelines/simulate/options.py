@@ -48,6 +48,10 @@ class SimulateOptions(LidarFlightOptions):
     sigma_v: float | None = Field(None, ge=0, description="White noise of the fixes, vertical σ in metres.")
     bias: float | None = Field(None, ge=0, description="RMS of the slow bias of the fixes per axis in metres.")
     bias_period: float = Field(60.0, gt=0, description="Period of the slow bias in seconds.")
+    common_error: Triple = Field(
+        (0.0, 0.0, 0.0),
+        description="Constant error of all fixes, as of a base station, east,north,up in metres.",
+    )
     outlier_share: float | None = Field(None, ge=0, le=1, description="Share of photographs whose fixes are wrong.")
     outlier_size: float = Field(15.0, gt=0, description="Error of a wrong fix in metres.")
     sigma_attitude: float = Field(0.5, ge=0, description="White noise of the attitude per axis in degrees.")

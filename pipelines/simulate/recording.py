@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -57,11 +57,12 @@ class Recording:
 
 def receiver_of(options: SimulateOptions) -> Receiver:
     """Return the receiver's profile, with the changes that the options make."""
-    asked = {
+    asked: dict[str, Any] = {
         "sigma_h_m": options.sigma_h,
         "sigma_v_m": options.sigma_v,
         "bias_m": options.bias,
         "bias_period_s": options.bias_period,
+        "common_error_m": options.common_error,
         "outlier_share": options.outlier_share,
         "outlier_m": options.outlier_size,
     }
@@ -169,6 +170,7 @@ def _navigation(options: SimulateOptions, world: World, gnss: GnssLog, photos: P
         bias_amplitude_m=_vector(gnss.bias_amplitude_m),
         bias_phase_rad=_vector(gnss.bias_phase_rad),
         bias_period_s=receiver.bias_period_s,
+        common_error_m=receiver.common_error_m,
         outlier_m=receiver.outlier_m,
         wrong_images=tuple(photos.names[i] for i in gnss.wrong_photos),
         sigma_attitude_deg=options.sigma_attitude,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from pipelines.core.types import FloatArray, IntArray
+from pipelines.core.types import FloatArray, IntArray, Vector3
 from pipelines.geodesy.enu import Origin, geo_from_enu_at, lla_from_enu
 from pipelines.geometry.rotations import exp_so3
 from pipelines.simulate.flight import LEAD_S, TrueTrajectory
@@ -25,6 +25,7 @@ class Receiver:
         sigma_h_m, sigma_v_m: white noise, also the σ that the receiver states.
         bias_m: RMS of a slow bias per axis, which the receiver does not state.
         bias_period_s: period of the bias.
+        common_error_m: constant error of all fixes, east, north, up, which the receiver does not state.
         outlier_share: share of photographs around which the fixes are wrong.
         outlier_m: size of these errors.
     """
@@ -33,6 +34,7 @@ class Receiver:
     sigma_v_m: float
     bias_m: float = 0.0
     bias_period_s: float = 60.0
+    common_error_m: Vector3 = (0.0, 0.0, 0.0)
     outlier_share: float = 0.0
     outlier_m: float = 15.0
 
@@ -128,7 +130,8 @@ def record_gnss(
     nearest = np.searchsorted((trajectory.photo_s[1:] + trajectory.photo_s[:-1]) / 2, stamped_s)
     outlier = jumps[nearest]
     stamp_ns = START_NS + since_ns + round(mounting.clock_offset_s * 1e9)
-    return GnssLog(stamp_ns, true + bias + white + outlier, true, bias, outlier, amplitude, phase, wrong)
+    measured = true + receiver.common_error_m + bias + white + outlier
+    return GnssLog(stamp_ns, measured, true, bias, outlier, amplitude, phase, wrong)
 
 
 def _epochs(trajectory: TrueTrajectory, mounting: Mounting, step_ns: int) -> IntArray:

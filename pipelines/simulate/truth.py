@@ -45,6 +45,7 @@ class TrueNavigation(Product):
     photograph.
 
     Attributes:
+        common_error_m: constant error of all fixes, east, north, up.
         wrong_images: photographs around which the fixes are wrong.
         nominal_from_cam: boresight: true camera axes → axes that mounting and attitude suggest.
         cam_from_body: nominal mounting, the body forward-right-down.
@@ -57,6 +58,7 @@ class TrueNavigation(Product):
     bias_amplitude_m: Vector3
     bias_phase_rad: Vector3
     bias_period_s: float
+    common_error_m: Vector3
     outlier_m: float
     wrong_images: tuple[str, ...]
     sigma_attitude_deg: float

@@ -113,6 +113,15 @@ class TestStatus:
         path.write_text(path.read_text().replace('"preset"', '"old_name"'))
         assert reason_of(done, "train") == "made by a version with other options"
 
+    def test_product_of_another_form(self, done: Workspace) -> None:
+        """A survey that later stages would refuse is stale, and the options of its run are remembered."""
+        path = done.root / "ingest/manifest.json"
+        assert '"product_version": 2' in path.read_text()
+        path.write_text(path.read_text().replace('"product_version": 2', '"product_version": 1'))
+        assert reason_of(done, "ingest") == "made by another version of georef"
+        assert complete(done) == ["ingest"]
+        assert state_of(done)["sfm"] == "current"
+
     def test_failed_stage_tells_why(self, done: Workspace) -> None:
         def fail(stage: StageRun, options: object) -> Summary:
             raise ConvergenceError("residual 7 m > 5 m")

@@ -262,6 +262,24 @@ class TestDji:
             expected = antenna + np.array([east, north, -down])
             np.testing.assert_allclose(image.fix.position_in_geo, expected, rtol=0, atol=1e-3)
 
+    def test_quality_of_a_solution_tells_the_kind_of_receiver(self, dji: Path) -> None:
+        """A float solution may claim centimetres. The fourth photograph lies between a fixed and a float row."""
+        mrk, pos = dji / "flight_Timestamp.MRK", dji / "flight.pos"
+        lines = mrk.read_text().splitlines(keepends=True)
+        single = lines[5].replace("0.011000, 0.012000, 0.025000\t50,Q", "1.1, 1.2, 2.5\t16,Q")
+        mrk.write_text("".join([*lines[:4], lines[4].replace("50,Q", "34,Q"), single]))
+        survey = survey_of(dji, trajectory=mrk)
+        assert [session.receiver for session in survey.sessions] == ["RTK fixed", "RTK float", "single-frequency"]
+        assert [image.fix and image.fix.session for image in survey.images] == [0, 0, 0, 0, 1, 2]
+        rows = pos.read_text().splitlines(keepends=True)
+        first = next(row for row, text in enumerate(rows) if "12:00:24.2" in text)
+        floating = [text.replace("   1  ", "   2  ", 1) for text in rows[first:]]
+        assert floating[0] != rows[first]
+        pos.write_text("".join(rows[:first] + floating))
+        survey = survey_of(dji, trajectory=pos, events=mrk)
+        assert [session.receiver for session in survey.sessions] == ["RTK fixed", "RTK float"]
+        assert [image.fix and image.fix.session for image in survey.images] == [0, 0, 0, 1, 1, 1]
+
     def test_solution_without_events_is_told_to_miss(self, dji: Path) -> None:
         with pytest.raises(InputError, match=r"flight\.pos \[timestamp\]: covers .* none fits"):
             survey_of(dji, trajectory=dji / "flight.pos")

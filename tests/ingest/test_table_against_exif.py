@@ -43,6 +43,7 @@ def table_of(positions_in_ecef: np.ndarray) -> ImagePoses:
         position_in_ecef=positions_in_ecef,
         sigma_enu_m=np.tile([0.02, 0.02, 0.03], (count, 1)),
         sigma_source=("file",) * count,
+        receivers=("unknown receiver",) * count,
         enu_from_cam=np.full((count, 3, 3), np.nan),
         attitude_source=("csv",) * count,
         sigma_attitude_deg=np.full(count, np.nan),

@@ -54,12 +54,13 @@ def test_rates_and_cover(trajectory: TrueTrajectory) -> None:
         assert log.stamp_ns[-1] >= stamps[-1] + 1_000_000_000
 
 
-def test_slow_bias_is_the_stated_sine(trajectory: TrueTrajectory) -> None:
-    receiver = Receiver(0.0, 0.0, bias_m=0.8, bias_period_s=40.0)
+def test_bias_is_the_stated_sine_about_the_common_error(trajectory: TrueTrajectory) -> None:
+    common = (0.03, -0.02, 0.05)
+    receiver = Receiver(0.0, 0.0, bias_m=0.8, bias_period_s=40.0, common_error_m=common)
     log = record_gnss(trajectory, STRAIGHT, receiver, np.random.default_rng(4))
     time_s = (log.stamp_ns - photo_stamps(trajectory)[0]) / 1e9
     stated = log.bias_amplitude_m * np.sin(2 * np.pi * time_s[:, None] / 40.0 + log.bias_phase_rad)
-    np.testing.assert_allclose(log.position_in_geo - log.true_in_geo, stated, atol=1e-9)
+    np.testing.assert_allclose(log.position_in_geo - log.true_in_geo, stated + common, atol=1e-9)
     # Ten whole periods: the RMS is the amplitude over √2.
     np.testing.assert_allclose(np.sqrt(np.square(stated).mean(axis=0)), 0.8, rtol=0.02)
 

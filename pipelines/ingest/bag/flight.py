@@ -123,12 +123,13 @@ def _poses(
         f"frames have no position within --max-gap {options.max_gap:g} s",
     )
     position_in_ecef, enu_from_cam = camera_poses(antenna.position, body.rotation, rig, stamps, notes)
-    receivers, located = [navigation.receiver] * len(time_s), complete(position_in_ecef)
+    receivers, located = (navigation.receiver,) * len(time_s), complete(position_in_ecef)
     sigma, sigma_source = with_defaults(antenna.sigma_m, receivers, located, options, notes)
     return ImagePoses(
         position_in_ecef=position_in_ecef,
         sigma_enu_m=sigma,
         sigma_source=sigma_source,
+        receivers=receivers,
         enu_from_cam=enu_from_cam,
         attitude_source=tuple("bag" for _ in stamps),
         sigma_attitude_deg=body.sigma_deg,
