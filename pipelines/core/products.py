@@ -56,7 +56,7 @@ def load_json(product_type: type[ProductT], path: Path) -> ProductT:
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
-        raise InputError(first["msg"], path=path, field=where or None) from error
+        raise InputError(first["msg"].removeprefix("Value error, "), path=path, field=where or None) from error
     except UnicodeDecodeError as error:
         raise InputError("not a UTF-8 text file", path=path) from error
     except (np.linalg.LinAlgError, RecursionError) as error:  # of a validator that computes

@@ -211,7 +211,6 @@ class TestLoadSurvey:
         assert load_survey(workspace.variant("compare/A", lent, "compare")) == load_survey(workspace) != survey
 
 
-
 @pytest.mark.parametrize(
     ("change", "wanted", "message"),
     [
