@@ -12,29 +12,30 @@ from georef_cli.markup import shown
 from georef_cli.tables import WIDE, Renderable
 from pipelines.batch.runner import PlannedMission
 from pipelines.batch.table import BatchTable, MissionRow
+from pipelines.core.figures import ACCURACY_H, ACCURACY_V, CHECK_POINTS, MISSING, Headline
 from pipelines.core.sentences import about, duration
 
 _STYLE = {"done": "green", "current": "green", "failed": "red", "interrupted": "yellow", "waiting": "dim"}
-_DASH = "–"
+_DASH = MISSING
+_ACCURACY = ("accuracy", *(f"{figure.label} {figure.unit}" for figure in (ACCURACY_H, ACCURACY_V)))
 
 
 def batch(table: BatchTable, page: Path) -> list[Renderable]:
     """Return the table of a batch, its failures, and where the page of it is."""
     wide = plain_table(
-        *("mission", "state", "took", "photographs", "σ H", "σ V", "checks", "RMSE H", "RMSE V", "PSNR", "remarks"),
-        right=range(2, 11),
+        *("mission", "state", "took", "photographs", *_ACCURACY, CHECK_POINTS.label, "PSNR", "remarks"),
+        right=(2, 3, 5, 6, 7, 8, 9),
     )
-    narrow = plain_table("mission", "state", "took", "σ H", "σ V", "RMSE H", "RMSE V", "remarks", right=range(2, 8))
+    narrow = plain_table("mission", "state", "took", *_ACCURACY, "remarks", right=(2, 4, 5, 6))
     for row in table.missions:
         state = f"[{_STYLE[row.state]}]{row.state}[/]"
-        accuracy = [_metres(value) for value in (row.sigma_h_m, row.sigma_v_m)]
-        errors = [_metres(value) for value in (row.rmse_h_m, row.rmse_v_m)]
+        accuracy = _accuracy(row.accuracy)
         took = duration(row.processing_s if row.seconds is None else row.seconds)
         remarks = str(len(row.warnings) + len(row.cautions) or "")
-        checks = _DASH if row.check_points is None else str(row.check_points)
+        checks = CHECK_POINTS.text(None if row.accuracy is None else row.accuracy.check_points)
         psnr = _DASH if row.test_psnr is None else f"{row.test_psnr:.2f}"
-        wide.add_row(shown(row.mission), state, took, _photographs(row), *accuracy, checks, *errors, psnr, remarks)
-        narrow.add_row(shown(row.mission), state, took, *accuracy, *errors, remarks)
+        wide.add_row(shown(row.mission), state, took, _photographs(row), *accuracy, checks, psnr, remarks)
+        narrow.add_row(shown(row.mission), state, took, *accuracy, remarks)
     failures = [
         f"[red]{shown(row.mission)}[/] {shown(row.failure)}"
         + ("" if row.log is None else f" [dim]{shown(row.log)}[/]")
@@ -42,7 +43,7 @@ def batch(table: BatchTable, page: Path) -> list[Renderable]:
         if row.failure is not None
     ]
     states = ", ".join(f"{count} {state}" for state, count in table.counts.items())
-    ending = f"\n{len(table.missions)} missions: {states}. Accuracy in metres; all of it is in {shown(str(page))}"
+    ending = f"\n{len(table.missions)} missions: {states}. All of it is in {shown(str(page))}"
     return [ByWidth(WIDE, wide, narrow), *(["", *failures] if failures else []), ending]
 
 
@@ -91,5 +92,7 @@ def _photographs(row: MissionRow) -> str:
     return str(row.images) if row.registered is None else f"{row.registered} of {row.images}"
 
 
-def _metres(value: float | None) -> str:
-    return _DASH if value is None else f"{value:.3f}"
+def _accuracy(headline: Headline | None) -> tuple[str, str, str]:
+    if headline is None:
+        return _DASH, _DASH, _DASH
+    return headline.kind, ACCURACY_H.text(headline.rmse_h_m), ACCURACY_V.text(headline.rmse_v_m)

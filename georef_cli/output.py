@@ -17,6 +17,7 @@ from pipelines.core.products import dump_json
 from pipelines.core.runner import Outcome
 from pipelines.core.staleness import cautions_by_stage
 from pipelines.core.workspace import Workspace
+from pipelines.scene.headline import headline_of
 
 if TYPE_CHECKING:
     from pipelines.deliver.overview import Overview
@@ -97,6 +98,8 @@ def print_outcomes(
         print_rich(tables.outcomes(outcomes))
     if result is not None:
         print_rich(*overview.short(result))
-    elif told:
-        print_rich(f"[bold]Next[/]: georef run {shown(str(workspace.root))} completes it")
+    else:
+        print_rich(*tables.accuracy(headline_of(workspace)))
+        if told:
+            print_rich(f"[bold]Next[/]: georef run {shown(str(workspace.root))} completes it")
     print_rich(*tables.cautions(cautions))

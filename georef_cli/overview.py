@@ -90,15 +90,10 @@ def _place(result: Overview, *, brief: bool = False) -> Table:
     }
     if not brief:
         lines[""] = f"heights {bounds.heights}" + "".join(f"; {text}" for text in bounds.assumed)
-    if quality.sigma_h_m is not None and quality.sigma_v_m is not None:
-        lines["predicted σ"] = f"{quality.sigma_h_m:.3f} m H, {quality.sigma_v_m:.3f} m V, {quality.counts}"
-    else:
-        lines["predicted σ"] = "not known"
-    if quality.rmse_h_m is not None and quality.rmse_v_m is not None:
-        points = f"RMSE of {quality.check_points} check points"
-        lines["measured"] = f"{quality.rmse_h_m:.3f} m H, {quality.rmse_v_m:.3f} m V, {points}"
-    else:
-        lines["measured"] = "nothing: no check points (--checkpoints, --check)"
+    accuracy = quality.accuracy
+    lines["accuracy"] = "not known yet: georef evaluate states it" if accuracy is None else accuracy.text
+    if accuracy is not None and accuracy.kind != "measured":
+        lines["accuracy"] += "; check points measure it (--checkpoints, --check)"
     if quality.psnr is not None:
         lines["test views"] = f"PSNR {quality.psnr:.2f} dB"
     table = Table(show_header=False, box=None, pad_edge=False)

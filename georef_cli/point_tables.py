@@ -9,6 +9,7 @@ from rich.console import Group
 from rich.table import Table
 
 from georef_cli.markup import shown
+from pipelines.core.figures import SHORT_WAYS
 from pipelines.scene.report import EvaluationReport
 from pipelines.scene.report_points import PointLine, point_lines
 
@@ -47,7 +48,11 @@ def coordinate_tables(report: EvaluationReport) -> list[Group]:
         column.justify, column.no_wrap = "right", True
     table.add_row("origin", "", *listed.texts(listed.origin))
     for point in listed.points:
-        for way, xyz in (("surveyed", point.surveyed), ("camera", point.camera), ("model", point.model)):
+        for way, xyz in (
+            ("surveyed", point.surveyed),
+            (SHORT_WAYS["camera"], point.camera),
+            (SHORT_WAYS["model"], point.model),
+        ):
             name = shown(point.name) if way == "surveyed" else ""
             table.add_row(name, way, *(text or "–" for text in listed.texts(xyz)))
     units = listed.units[0] if len(set(listed.units)) == 1 else ", ".join(listed.units)
@@ -57,17 +62,19 @@ def coordinate_tables(report: EvaluationReport) -> list[Group]:
 
 def _table(lines: Sequence[PointLine], *, with_way: bool) -> Table:
     has_sigma = any(line.sigma_m is not None for line in lines)
-    heads = ["point", *(["by"] if with_way else []), "rays", "E", "N", "U", "H"]
+    heads = ["point", *(["measured"] if with_way else []), "rays", "E", "N", "U", "H"]
     table = Table(*heads, *(["σ H", "σ U"] if has_sigma else []), "", box=None, pad_edge=False)
-    for column in table.columns[1 + with_way : -1]:
+    for column in table.columns[1:-1]:
         column.justify, column.no_wrap = "right", True
+    if with_way:
+        table.columns[1].justify = "left"
     for line in lines:
         error, sigma = line.error_m, line.sigma_m
         lengths = ["–"] * 4 if error is None else [*(f"{value:+.3f}" for value in error), _length(error[:2])]
         predicted = ["–"] * 2 if sigma is None else [_length(sigma[:2]), f"{sigma[2]:.3f}"]
         table.add_row(
             shown(line.row.name),
-            *([line.way] if with_way else []),
+            *([SHORT_WAYS[line.way]] if with_way else []),
             str(line.row.rays),
             *lengths,
             *(predicted if has_sigma else []),

@@ -13,6 +13,7 @@ from georef_cli.layout import ByWidth, FirstThatFits, figures, plain_table
 from georef_cli.markup import shown
 from pipelines.compare.table import REFERENCE_HEADS, Comparison, cells, reference_cells, remarks_on
 from pipelines.core.cautions import Caution
+from pipelines.core.figures import ERRORS, SHORT_WAYS, Headline
 from pipelines.core.options import notation
 from pipelines.core.origins import OptionOrigin
 from pipelines.core.runner import Outcome
@@ -32,20 +33,7 @@ STATE_STYLE = {
     "failed": "red",
     "missing": "dim",
 }
-POINT_COLUMNS = {
-    "count": "points",
-    "mean_e_m": "mean E",
-    "mean_n_m": "mean N",
-    "mean_u_m": "mean U",
-    "mean_h_m": "mean H",
-    "median_h_m": "median H",
-    "rmse_e_m": "RMSE E",
-    "rmse_n_m": "RMSE N",
-    "rmse_h_m": "RMSE H",
-    "rmse_v_m": "RMSE V",
-    "rmse_3d_m": "RMSE 3D",
-    "max_3d_m": "max 3D",
-}
+POINT_COLUMNS = {name: figure.label for name, figure in ERRORS.items() if name not in ("max_h_m", "max_v_m")}
 FACTOR_COLUMNS = {
     "count": "count",
     "used": "used",
@@ -114,6 +102,11 @@ def origins(rows: Sequence[OptionOrigin]) -> list[Renderable]:
     ]
 
 
+def accuracy(headline: Headline | None) -> list[Renderable]:
+    """Return the line with the accuracy of the result; none before anything states it."""
+    return [] if headline is None else [f"[bold]accuracy[/] {shown(headline.text)}"]
+
+
 def cautions(by_stage: Mapping[str, Sequence[Caution]]) -> list[Renderable]:
     """Return the cautions, one line each."""
     return [
@@ -153,10 +146,9 @@ def outcomes(results: Sequence[Outcome]) -> Table:
 
 def comparison(table: Comparison) -> list[Renderable]:
     """Return the tables of `georef compare`: a line for each configuration, and its distinctive features below."""
-    points = [
-        f"{way}\n{name}" for way in ("camera", "model") for name in ("mean H", "median H", "RMSE H", "RMSE V")
-    ]
-    del points[1]  # by camera, mean and median hardly differ
+    triangulated, surface = SHORT_WAYS.values()
+    points = [f"{triangulated}\n{name}" for name in ("RMSE H", "RMSE V")]
+    points += [f"{surface}\n{name}" for name in ("median H", "RMSE H", "RMSE V")]
     heads = ("test\nPSNR", "PSNR\ncovered", "\nSSIM", *points, "check\npoints", "\ntraining")
     rows = {shown(row.configuration): [shown(cell) for cell in cells(row)] for row in table.rows}
     notes = [f"[bold]{shown(row.configuration)}[/] {shown(f'{row.title}: {row.note}')}" for row in table.rows]
@@ -215,13 +207,16 @@ def report(document: EvaluationReport) -> list[Renderable]:
 
     A residual of the fit is not an accuracy, and a control point is not a check point: they never share a table.
     """
-    ways = {"camera": document.checkpoints.camera, "model": document.checkpoints.model}
+    checked = (document.checkpoints.camera, document.checkpoints.model)
+    ways = dict(zip(SHORT_WAYS.values(), checked, strict=True))
     crossed = document.cross_validation
     fit = {"gnss": dict(document.fit.gnss), "gcp": dict(document.fit.gcp)}
     factors: dict[str, dict[str, Any]] = {factor.group: dict(factor) for factor in document.variance_factors}
     tables = (
         _rows("Test views", {"test": dict(document.photometric.test)}, IMAGE_COLUMNS),
-        _rows("Check points, metres", {way: dict(errors) for way, errors in ways.items()}, POINT_COLUMNS),
+        _rows(
+            "Errors of the check points, metres", {way: dict(errors) for way, errors in ways.items()}, POINT_COLUMNS
+        ),
         _accuracy(ways),
         _rows(f"{_CROSSED}, metres", {} if crossed is None else {"left out": dict(crossed)}, POINT_COLUMNS),
         _impossible(crossed) if isinstance(crossed, NoCrossValidation) else None,
@@ -269,7 +264,7 @@ def _accuracy(ways: Mapping[str, CheckPointErrors]) -> Group | None:
     """Return the accuracy by the check points after the standard, beside the prediction and the bound."""
     rows = {way: _accuracy_row(errors) for way, errors in ways.items() if errors.with_survey is not None}
     columns = {head: head for row in rows.values() for head in row}
-    title = "Accuracy with the check points' own survey (ASPRS, 2nd ed.), prediction and Cramér–Rao bound, metres"
+    title = "Accuracy with the check points' own survey (ASPRS), their predicted σ and Cramér–Rao bound, metres"
     return _rows(title, rows, columns)
 
 
@@ -278,10 +273,13 @@ def _accuracy_row(errors: CheckPointErrors) -> dict[str, float | str | None]:
     return {
         "RMSE H": None if total is None else total.rmse_h_m,
         "RMSE V": None if total is None else total.rmse_v_m,
+        "RMSE 3D": None if total is None else total.rmse_3d_m,
+        "vegetated V": None if errors.asprs.vegetated is None else errors.asprs.vegetated.rmse_v_m,
         "class H": errors.asprs.horizontal_class,
         "class V": errors.asprs.vertical_class,
-        "predicted H": None if predicted is None else predicted.rms_h_m,
-        "predicted V": None if predicted is None else predicted.rms_v_m,
+        "class 3D": errors.asprs.class_3d,
+        "σ H": None if predicted is None else predicted.rms_h_m,
+        "σ V": None if predicted is None else predicted.rms_v_m,
         "bound H": None if bound is None else bound.rms_h_m,
         "bound V": None if bound is None else bound.rms_v_m,
     }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -14,21 +14,18 @@ from pipelines.core.products import load_json, save_json
 from pipelines.core.stages import METRICS, RENDERS, REPORT, SURVEY
 from pipelines.core.types import Vector3
 from pipelines.core.workspace import Workspace
+from pipelines.evaluate.point_report import MeasuredPoints, check_point_errors
 from pipelines.plots.strips import labelled
 from pipelines.scene.render_files import write_render
-from pipelines.scene.report import (
-    PredictedPointError,
-    PredictedSigma,
-    ViewFigures,
-    write_report,
-)
+from pipelines.scene.report import ViewFigures, write_report
 from pipelines.scene.survey import Survey, SurveyedPoint
-from tests.reports import check_points_with, report_with
+from tests.reports import report_with
 from tests.scenes import TrueScene
 from tests.trained_workspaces import trained_workspace
 
 CHECK_POINTS = 3
 ERROR_M: Vector3 = (0.0123456789, -0.02, 0.033)
+SIGMA_M: Vector3 = (0.01, 0.02, 0.03)  # predicted
 GREY = 90
 
 
@@ -59,32 +56,18 @@ def evaluated_workspace(root: Path, rename: str = "") -> Evaluated:
     survey = survey.model_copy(update=changed)
     save_json(survey, root / SURVEY)
     _write_photographs(scene, root / "photos")
-    rows = tuple(
-        PredictedPointError(
-            name=point.name,
-            rays=len(point.marks),
-            de_m=ERROR_M[0],
-            dn_m=ERROR_M[1],
-            du_m=ERROR_M[2],
-            blunder=False,
-            sigma_e_m=0.01,
-            sigma_n_m=0.02,
-            sigma_u_m=0.03,
-        )
-        for point in survey.check_points
+    measured = MeasuredPoints(
+        survey.check_points,
+        error_in_geo=np.tile(ERROR_M, (CHECK_POINTS, 1)),
+        rays=np.array([len(point.marks) for point in survey.check_points]),
+        cov_in_geo=np.tile(np.diag(SIGMA_M) ** 2, (CHECK_POINTS, 1, 1)),
     )
-    figures = {f"rmse_{axis}_m": abs(value) for axis, value in zip(("e", "n", "v"), ERROR_M, strict=True)} | {
-        "rmse_h_m": float(np.hypot(*ERROR_M[:2])),
-        "count": CHECK_POINTS,
-    }
-    predicted = PredictedSigma(
-        count=CHECK_POINTS, rms_h_m=0.02, rms_v_m=0.03, normalised_error_squared={"e": 0.5, "n": 0.7, "u": 1.1}
-    )
+    area_km2 = 0.0123
     photometric = {"psnr": 23.456789, "psnr_compensated": 24.0, "ssim": 0.81, "lpips": None}
     views = (ViewFigures(image=scene.names[2], **photometric),)
     report = report_with(
-        camera=check_points_with(points=rows, predicted=predicted, **figures),
-        model=check_points_with(points=rows, **figures),
+        camera=check_point_errors(measured, area_km2),
+        model=check_point_errors(replace(measured, cov_in_geo=None), area_km2),
         test={**photometric, "views": 1, "lpips_reason": "none", "per_view": views},
         cautions=(Caution(code="made-up", sentence=f"Nothing is real here {rename}."),),
     )

@@ -9,6 +9,7 @@ from pipelines.core.cautions import Caution
 from pipelines.core.stages import REPORT
 from pipelines.core.workspace import Workspace
 from pipelines.robust.statistics import ResidualStats
+from pipelines.scene.headline import headline
 from pipelines.scene.report import (
     AccuracySummary,
     AsprsStatement,
@@ -27,16 +28,18 @@ from pipelines.scene.report import (
     write_report,
 )
 
-_NO_STATEMENT = AsprsStatement(
-    horizontal_class=None, vertical_class=None, least_points=30, enough_points=False, statement=None
+_NO_CLASSES = dict.fromkeys(
+    ("horizontal_class", "vertical_class", "class_3d", "vegetated", "area_km2", "statement")
 )
 
 
 def check_points_with(**figures: Any) -> CheckPointErrors:
     """Check points with the given figures and no others; none were measured if there are no figures."""
+    count = figures.get("count", 0)
+    asprs = AsprsStatement(points=count, least_points=30, enough_points=count >= 30, **_NO_CLASSES)
     unknown = {"survey": None, "with_survey": None, "predicted": None, "cramer_rao": None, "without_blunders": None}
     nothing = {**dict.fromkeys(ErrorStats.model_fields), **unknown, "count": 0, "blunders": (), "points": ()}
-    return CheckPointErrors(**{**nothing, "asprs": _NO_STATEMENT, **figures})
+    return CheckPointErrors(**{**nothing, "asprs": asprs, **figures})
 
 
 def cross_validation_with(**figures: Any) -> CrossValidation:
@@ -52,6 +55,7 @@ def report_with(
     model: CheckPointErrors | None = None,
     crossed: CrossValidation | None = None,
     gnss: dict[str, Any] | None = None,
+    scene: AccuracySummary | None = None,
     cautions: tuple[Caution, ...] = (),
 ) -> EvaluationReport:
     """A report with the given parts; nothing was measured of the others.
@@ -59,16 +63,20 @@ def report_with(
     Args:
         test: photometric figures.
         gnss: figures of the residuals of the fixes.
+        scene: predicted σ; none without it.
     """
+    camera = camera or check_points_with()
+    scene = scene or AccuracySummary(cells=0, reason="the scene has too few points")
     no_views = dict.fromkeys(("psnr", "psnr_compensated", "ssim", "lpips"))
     no_residuals = {**dict.fromkeys(ResidualStats.model_fields), "count": 0}
     return EvaluationReport(
+        headline=headline(camera, scene, cautions),
         photometric=Photometric(
             test=PhotometricFigures(**{"views": 0, **no_views, "per_view": (), **(test or {})})
         ),
-        checkpoints=CheckPoints(camera=camera or check_points_with(), model=model or check_points_with()),
+        checkpoints=CheckPoints(camera=camera, model=model or check_points_with()),
         cross_validation=crossed,
-        accuracy=AccuracySummary(cells=0, reason="the scene has too few points"),
+        accuracy=scene,
         fit=Fit(
             gnss=FixResiduals(**{**no_residuals, "outliers": 0, **(gnss or {})}),
             gcp=ControlResiduals(**no_residuals, points=()),

@@ -162,7 +162,7 @@ def main() -> None:
     arguments = parser.parse_args()
     workspace = Workspace(arguments.workspace)
     trained = load_trained(workspace)
-    placement = place(trained.model, trained.survey, trained.gaussians.means.numpy())
+    placement = place(trained.model, trained.survey, trained.gaussians.means.numpy(), None)
     path = workspace.path(MEASURABLE_SPLAT if arguments.measurable else SPLAT)
     splat = transformed(read_gaussians(path), placement.file_from_model.inverse())
     rules: list[Callable[[Look], int | None]] = [front, nearest, render]

@@ -30,7 +30,7 @@ command = EvaluateCommand(
     "evaluate",
     """Measure test views and check points.
 
-    Check points are measured by camera (their marks intersected) and by model (the rendered depth of the
+    Check points are triangulated (their marks intersected) and measured on the rendered surface (the depth of the
     Gaussians at the marks, not their centres), and stated as the ASPRS standard asks. The predicted accuracy over
     the scene is drawn in evaluate/accuracy.png. A survey without check points has --cross-validate: every control
     point measured by a solution that does not know it. The report is evaluate/report.json; evaluate/points.csv has

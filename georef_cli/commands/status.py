@@ -15,18 +15,24 @@ from pipelines.core.options import notation
 from pipelines.core.origins import option_origins
 from pipelines.core.stages import BY_NAME
 from pipelines.core.workspace import Workspace
+from pipelines.scene.headline import headline_of
 
 
 def _status(workspace: Workspace, with_options: bool, as_json: bool) -> None:
     rows, cautions = states.status(workspace), states.cautions_by_stage(workspace)
+    accuracy = headline_of(workspace)
     origins = [row for spec in BY_NAME.values() for row in option_origins(workspace, spec)] if with_options else []
     if not as_json:
-        print_rich(tables.states(rows, cautions), *tables.cautions(cautions))
+        print_rich(tables.states(rows, cautions), *tables.accuracy(accuracy), *tables.cautions(cautions))
         if with_options:
             print_rich(*tables.origins(origins))
         return
     stages = [{**dataclasses.asdict(row), "finished": row.finished and row.finished.isoformat()} for row in rows]
-    document: dict[str, Any] = {"workspace": str(workspace.root), "stages": stages}
+    document: dict[str, Any] = {
+        "workspace": str(workspace.root),
+        "stages": stages,
+        "accuracy": accuracy and accuracy.model_dump(),
+    }
     if with_options:
         document["options"] = [{**dataclasses.asdict(row), "value": notation(row.value)} for row in origins]
     print_json({**document, "cautions": document_of_cautions(cautions)})
@@ -45,7 +51,8 @@ command = Command(
     ],
     callback=_status,
     help="""Show the state of every stage: missing, current, stale (its inputs or options have changed since),
-damaged (a file is not as the stage wrote it), interrupted or failed; and the cautions, which limit the result.
+damaged (a file is not as the stage wrote it), interrupted or failed; the accuracy of the result; and the cautions,
+which limit it.
 
 \b
 Examples:

@@ -75,7 +75,7 @@ class AccuracyGrid:
         return np.asarray(np.einsum("nk,nki->ni", weight / weight.sum(axis=1, keepdims=True), self.sigma_m[cell]))
 
     def summary(self) -> AccuracySummary:
-        """Return least, median and largest σ."""
+        """Return least, median and largest σ, and their root mean square."""
         horizontal, vertical = self.sigma_h_m, self.sigma_v_m
         return AccuracySummary(
             cells=len(self.cell),
@@ -86,6 +86,8 @@ class AccuracyGrid:
             least_sigma_v_m=float(vertical.min()),
             median_sigma_v_m=float(np.median(vertical)),
             largest_sigma_v_m=float(vertical.max()),
+            rms_sigma_h_m=float(np.sqrt(np.mean(horizontal**2))),
+            rms_sigma_v_m=float(np.sqrt(np.mean(vertical**2))),
             reason=None,
         )
 

@@ -8,14 +8,16 @@ from collections.abc import Iterable
 from typing import Literal
 
 from pipelines.batch.missions import Mission
-from pipelines.core.cautions import Caution, is_checked, union
+from pipelines.core.cautions import Caution, union
 from pipelines.core.errors import GeorefError
+from pipelines.core.figures import Headline
 from pipelines.core.manifest import Manifest
 from pipelines.core.products import Product
 from pipelines.core.stages import REPORT, REPORT_PAGE
 from pipelines.core.staleness import cautions_by_stage
 from pipelines.engine.job import JobEnd
-from pipelines.scene.report import EvaluationReport, read_report
+from pipelines.scene.headline import headline_of
+from pipelines.scene.report import read_report
 
 MissionState = Literal["waiting", "current", "done", "interrupted", "failed"]
 
@@ -32,9 +34,7 @@ class MissionRow(Product):
         seconds: of this run; None: it did not run.
         processing_s: of all stages, whenever they ran.
         images, registered: number of photographs, and of those in the SfM model.
-        sigma_h_m, sigma_v_m: predicted, median over the scene.
-        check_points: number of check points.
-        rmse_h_m, rmse_v_m: of the check points by camera.
+        accuracy: headline of its result.
         test_psnr: mean over the test views, dB.
         report: page of `georef report`, relative to the folder of the batch.
         warnings: of the stages.
@@ -50,11 +50,7 @@ class MissionRow(Product):
     processing_s: float | None = None
     images: int | None = None
     registered: int | None = None
-    sigma_h_m: float | None = None
-    sigma_v_m: float | None = None
-    check_points: int | None = None
-    rmse_h_m: float | None = None
-    rmse_v_m: float | None = None
+    accuracy: Headline | None = None
     test_psnr: float | None = None
     report: str | None = None
     warnings: tuple[str, ...] = ()
@@ -120,30 +116,18 @@ def _figures(mission: Mission) -> dict[str, object]:
             manifest = workspace.manifest(spec)
             if manifest is not None:
                 manifests[spec.name] = manifest
-    cautions = union(*cautions_by_stage(workspace).values())
     figures: dict[str, object] = {
         "processing_s": round(sum(manifest.duration_s for manifest in manifests.values()), 3),
         "images": _count(manifests, "ingest", "images"),
         "registered": _count(manifests, "sfm", "registered"),
         "warnings": _unique(text for manifest in manifests.values() for text in manifest.warnings),
-        "cautions": cautions,
+        "cautions": union(*cautions_by_stage(workspace).values()),
+        "accuracy": headline_of(workspace),
         "report": f"{mission.place}/{REPORT_PAGE}" if (workspace.root / REPORT_PAGE).is_file() else None,
     }
     with contextlib.suppress(GeorefError):  # a mission may end before `evaluate`
-        figures |= _measured(read_report(workspace.path(REPORT)), is_checked=is_checked(cautions))
+        figures["test_psnr"] = read_report(workspace.path(REPORT)).photometric.test.psnr
     return figures
-
-
-def _measured(report: EvaluationReport, *, is_checked: bool) -> dict[str, object]:
-    scene, points = report.accuracy, report.checkpoints.camera
-    return {
-        "sigma_h_m": scene.median_sigma_h_m if is_checked else None,
-        "sigma_v_m": scene.median_sigma_v_m if is_checked else None,
-        "check_points": points.count,
-        "rmse_h_m": points.rmse_h_m,
-        "rmse_v_m": points.rmse_v_m,
-        "test_psnr": report.photometric.test.psnr,
-    }
 
 
 def _count(manifests: dict[str, Manifest], stage: str, name: str) -> int | None:

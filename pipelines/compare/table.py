@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from typing import Literal
 
 from pipelines.core.cautions import Caution
+from pipelines.core.figures import WAYS
 from pipelines.core.products import Product
 from pipelines.plots.bars import Panel
 from pipelines.scene.reference_report import ReferenceComparison
@@ -47,7 +48,7 @@ class ComparedRow(Product):
         test_psnr, test_ssim: means over the test views, in dB and from 0 to 1.
         test_psnr_covered: as test_psnr, over the pixels whose ground at least two training views show.
         test_covered_share: share of these pixels; the same for all configurations of one SfM model.
-        camera, model: errors of the check points by camera and by model.
+        camera, model: errors of the check points, triangulated and on the rendered surface.
         reference: the surface against a reference cloud; None: there is none.
         iterations, gaussians: of the training.
         training_s: duration; None if the training is that of another configuration.
@@ -116,7 +117,7 @@ def panels(rows: Sequence[ComparedRow]) -> tuple[Panel, ...]:
     ways = {"camera": [row.camera for row in rows], "model": [row.model for row in rows]}
     geometry = (
         Panel(
-            f"Check points by {way}",
+            f"Check points, {WAYS[way]}",
             "RMSE in m",
             members,
             {
@@ -133,14 +134,14 @@ def panels(rows: Sequence[ComparedRow]) -> tuple[Panel, ...]:
 def markdown(table: Comparison) -> str:
     """Return the table as Markdown, with notes and remarks below."""
     heads = (
-        *("", "test PSNR dB", "PSNR covered", "SSIM", "camera mean H", "camera RMSE H", "camera RMSE V"),
-        *("model mean H", "model median H", "model RMSE H", "model RMSE V", "check points", "training"),
+        *("", "test PSNR dB", "PSNR covered", "SSIM", "triangulated RMSE H", "RMSE V"),
+        *("surface median H", "RMSE H", "RMSE V", "check points", "training"),
     )
     lines = [
         "# Comparison\n",
-        "Check points, which entered no solve, in metres: by *camera* their image marks intersected with the "
-        "cameras, by *model* where the Gaussians' rendered surface lies behind the marks. *PSNR covered*: over the "
-        "pixels of the test views whose ground at least two training views show.\n",
+        "Check points, which entered no solve, in metres: *triangulated*, their image marks intersected with "
+        "the cameras, and on the rendered *surface*, where that of the Gaussians lies behind the marks. *PSNR "
+        "covered*: over the pixels of the test views whose ground at least two training views show.\n",
         _line(heads),
         _line(["---", *["---:"] * (len(heads) - 1)]),
         *(_line([f"**{row.configuration}**", *cells(row)]) for row in table.rows),
@@ -161,7 +162,7 @@ def markdown(table: Comparison) -> str:
 def cells(row: ComparedRow) -> tuple[str, ...]:
     """Return the figures of a row as text.
 
-    PSNR, that of covered pixels, SSIM; check points by camera and by model, and their number; time.
+    PSNR, that of covered pixels, SSIM; check points triangulated and on the surface, and their number; time.
     """
     camera, model = row.camera, row.model
     counts = str(camera.count) if camera.count == model.count else f"{camera.count}, {model.count}"
@@ -169,8 +170,8 @@ def cells(row: ComparedRow) -> tuple[str, ...]:
         _number(row.test_psnr, 2),
         _number(row.test_psnr_covered, 2),
         _number(row.test_ssim, 4),
-        *(_metres(value) for value in (camera.mean_h_m, camera.rmse_h_m, camera.rmse_v_m)),
-        *(_metres(value) for value in (model.mean_h_m, model.median_h_m, model.rmse_h_m, model.rmse_v_m)),
+        *(_metres(value) for value in (camera.rmse_h_m, camera.rmse_v_m)),
+        *(_metres(value) for value in (model.median_h_m, model.rmse_h_m, model.rmse_v_m)),
         counts,
         "–" if row.training_s is None else f"{row.training_s:.0f} s",
     )

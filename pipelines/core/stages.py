@@ -91,6 +91,10 @@ APPLIED_RIG = ProductPart(
 )
 
 
+# The accuracy of the result, which every file to hand over states.
+HEADLINE = ProductPart(REPORT, fields=("headline",), optional=True)
+
+
 @dataclass(frozen=True)
 class StageSpec:
     """Row of the table: one stage.
@@ -218,7 +222,7 @@ PIPELINE: tuple[StageSpec, ...] = (
         module="pipelines.deliver.ply",
         options_place="pipelines.deliver.options:ExportPlyOptions",
         folder="export",
-        reads=(MEASURED, *whole(MODEL, GAUSSIANS), APPLIED_RIG),
+        reads=(MEASURED, *whole(MODEL, GAUSSIANS), APPLIED_RIG, HEADLINE),
         product=SPLAT,
         title="Write the splat as a PLY with its place on Earth.",
     ),
@@ -231,7 +235,7 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         module="pipelines.deliver.measurable",
         options_place="pipelines.deliver.options:MeasurableOptions",
         folder="measurable",
-        reads=(MEASURED, *whole(SPARSE, MODEL, GAUSSIANS), APPLIED_RIG),
+        reads=(MEASURED, *whole(SPARSE, MODEL, GAUSSIANS), APPLIED_RIG, HEADLINE),
         product=MEASURABLE_SPLAT,
         title="Write a second PLY whose centres lie on the surface, for viewers that measure by them.",
         resumable=True,
@@ -242,7 +246,7 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         module="pipelines.deliver.raster.stage",
         options_place="pipelines.deliver.options:ExportRasterOptions",
         folder="raster",
-        reads=(MEASURED, *whole(SPARSE, MODEL, GAUSSIANS, SIM3), APPLIED_RIG),
+        reads=(MEASURED, *whole(SPARSE, MODEL, GAUSSIANS, SIM3), APPLIED_RIG, HEADLINE),
         product="raster/orthophoto.tif",
         title="Write orthophoto, surface model and their σ as rasters in a CRS.",
         resumable=True,
@@ -253,7 +257,7 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         module="pipelines.deliver.cloud.stage",
         options_place="pipelines.deliver.options:ExportCloudOptions",
         folder="cloud",
-        reads=(MEASURED, *whole(SPARSE, MODEL, GAUSSIANS, SIM3), APPLIED_RIG),
+        reads=(MEASURED, *whole(SPARSE, MODEL, GAUSSIANS, SIM3), APPLIED_RIG, HEADLINE),
         product=CLOUD,
         title="Write the surface as a georeferenced point cloud (LAZ).",
         resumable=True,
@@ -263,7 +267,7 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         module="pipelines.deliver.spz",
         options_place="pipelines.deliver.options:ExportSpzOptions",
         folder="spz",
-        reads=(MEASURED, *whole(MODEL, GAUSSIANS), APPLIED_RIG),
+        reads=(MEASURED, *whole(MODEL, GAUSSIANS), APPLIED_RIG, HEADLINE),
         product=SPZ,
         title="Write the splat as SPZ, for viewers on the web.",
     ),
@@ -272,7 +276,7 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         module="pipelines.deliver.tiles.stage",
         options_place="pipelines.deliver.options:ExportTilesOptions",
         folder="tiles",
-        reads=(MEASURED, *whole(MODEL, GAUSSIANS), APPLIED_RIG),
+        reads=(MEASURED, *whole(MODEL, GAUSSIANS), APPLIED_RIG, HEADLINE),
         product=TILES,
         title="Write the splat as 3D Tiles, for web globes.",
         also=(TILES_GLB,),
@@ -282,7 +286,7 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         module="pipelines.deliver.cameras.stage",
         options_place="pipelines.deliver.options:ExportCamerasOptions",
         folder="cameras",
-        reads=(MEASURED, *whole(SPARSE, MODEL, GAUSSIANS, SIM3), APPLIED_RIG),
+        reads=(MEASURED, *whole(SPARSE, MODEL, GAUSSIANS, SIM3), APPLIED_RIG, HEADLINE),
         product="cameras/cameras.csv",
         title="Write the trained cameras for COLMAP, nerfstudio, surveyors and maps.",
         also=("cameras/colmap", "cameras/transforms.json", "cameras/footprints.geojson"),

@@ -31,10 +31,12 @@ from pipelines.core.sentences import about
 from pipelines.core.stages import MEASURABLE_SPLAT
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.deliver.options import MeasurableOptions
+from pipelines.deliver.placement import place
 from pipelines.deliver.ply import write_ply
 from pipelines.deliver.splat import SplatFigures, placed_splat
 from pipelines.geometry.cameras import pose_matrix
 from pipelines.geometry.similarity import Similarity
+from pipelines.scene.headline import headline_of
 from pipelines.scene.renderer import ModelRenderer
 from pipelines.scene.scene import photographs
 from pipelines.scene.surface_cloud.fusion import SurfaceCloud, fused_squares, fusion_settings
@@ -103,7 +105,8 @@ def run(stage: StageRun, options: MeasurableOptions) -> Summary:
     """
     made = measurable_splat(stage, options)
     trained = made.trained
-    splat = placed_splat(trained.gaussians, trained.model, trained.survey, options, made.gaussians)
+    means, accuracy = trained.gaussians.means.numpy(), headline_of(stage.workspace)
+    splat = placed_splat(made.gaussians, place(trained.model, trained.survey, means, accuracy), options)
     write_ply(splat, stage.out / Path(MEASURABLE_SPLAT).name)
     key_figure, values = made.figures(splat.figures)
     return Summary(key_figure, values, cautions=splat.placement.cautions)

@@ -13,18 +13,20 @@ import numpy as np
 
 from pipelines.core.cautions import Caution
 from pipelines.core.errors import GeorefError
+from pipelines.core.figures import Headline
 from pipelines.core.products import load_json
 from pipelines.core.stages import BY_NAME, DELIVERABLES, GAUSSIANS, MODEL, REPORT, StageSpec
 from pipelines.core.staleness import StageState, cautions_by_stage, status
 from pipelines.core.types import FloatArray, Vector3
 from pipelines.core.workspace import Workspace
-from pipelines.deliver.placement import Placement, place
+from pipelines.deliver.placement import place
 from pipelines.deliver.purposes import PURPOSES
 from pipelines.formats.geojson import Json, feature, polygon
 from pipelines.formats.splat_ply import read_centres
 from pipelines.geodesy.enu import ecef_from_enu, lla_from_ecef
 from pipelines.scene.calibrated import load_survey
 from pipelines.scene.crs_options import CrsOptions
+from pipelines.scene.headline import headline_of
 from pipelines.scene.report import read_report
 from pipelines.scene.survey import Survey
 from pipelines.scene.target_crs import usable_crs
@@ -69,23 +71,15 @@ class Bounds:
 
 @dataclass(frozen=True)
 class Quality:
-    """Predicted σ and measured errors in metres; None: not known.
+    """Quality of the result.
 
     Attributes:
-        sigma_h_m, sigma_v_m: predicted.
-        counts: errors that σ holds, and where; empty if σ is not known.
-        check_points: number of check points.
-        rmse_h_m, rmse_v_m: of the check points by camera.
-        psnr: of the test views, dB.
+        accuracy: its headline; None: nothing states it yet.
+        psnr: of the test views, dB; None: not known.
     """
 
-    sigma_h_m: float | None
-    sigma_v_m: float | None
-    counts: str
-    check_points: int = 0
-    rmse_h_m: float | None = None
-    rmse_v_m: float | None = None
-    psnr: float | None = None
+    accuracy: Headline | None
+    psnr: float | None
 
 
 @dataclass(frozen=True)
@@ -116,7 +110,7 @@ class Overview:
         gaussians: number of Gaussians.
         center_lla: latitude, longitude and ellipsoidal height of the middle of the scene.
         bounds: of the scene.
-        quality: predicted and measured accuracy.
+        quality: accuracy, and likeness to the photographs.
         files: those that there are, with their use.
         outdated: stages whose product is stale or damaged, in the order of the work.
         interrupted: by stage, what an interrupted run has left beside the product.
@@ -154,7 +148,10 @@ class Overview:
                 "high": bounds.high,
                 "assumed": bounds.assumed,
             },
-            "quality": asdict(self.quality),
+            "quality": {
+                "accuracy": self.quality.accuracy and self.quality.accuracy.model_dump(),
+                "psnr": self.quality.psnr,
+            },
             "files": [{**asdict(file), "made": file.made and file.made.isoformat()} for file in self.files],
             "further": {spec.command(self.workspace): spec.title for spec in self.further},
             "cautions": [
@@ -180,7 +177,7 @@ def overview(workspace: Workspace, options: CrsOptions) -> Overview:
     model = load_json(TrainedModel, workspace.path(MODEL))
     survey = load_survey(workspace)
     means = read_centres(workspace.path(GAUSSIANS)).astype(np.float64)
-    placement = place(model, survey, means)
+    placement = place(model, survey, means, headline_of(workspace))
     rows = status(workspace)
     states = {BY_NAME[row.stage].folder: row for row in rows}
     x, y, z = placement.origin_lla.tolist()
@@ -189,7 +186,7 @@ def overview(workspace: Workspace, options: CrsOptions) -> Overview:
         gaussians=len(means),
         center_lla=(x, y, z),
         bounds=_bounds(placement.geo_from_model.apply(means[:: max(1, len(means) // _MOST)]), survey, options),
-        quality=_quality(workspace, placement),
+        quality=Quality(placement.accuracy, _psnr(workspace)),
         files=_files(workspace, states),
         outdated=tuple(row for row in rows if row.state in ("stale", "damaged")),
         interrupted={row.stage: row.interrupted for row in rows if row.interrupted},
@@ -220,28 +217,11 @@ def _bounds(points_in_geo: FloatArray, survey: Survey, options: CrsOptions) -> B
     )
 
 
-def _quality(workspace: Workspace, placement: Placement) -> Quality:
-    """Return the accuracy by `evaluate`, or that of the georeference alone where nothing was evaluated."""
-    accuracy = placement.sidecar().accuracy
-    quality = Quality(None, None, "")
-    if accuracy is not None:
-        counts = "of the georeference, at the middle of the scene"
-        quality = Quality(accuracy.sigma_h_m, accuracy.sigma_v_m, counts)
+def _psnr(workspace: Workspace) -> float | None:
     try:
-        report = read_report(workspace.path(REPORT))
+        return read_report(workspace.path(REPORT)).photometric.test.psnr
     except GeorefError:  # not evaluated, or damaged: `georef status` tells
-        return quality
-    scene, points = report.accuracy, report.checkpoints.camera
-    over_scene = placement.is_checked and scene.median_sigma_h_m is not None
-    return Quality(
-        sigma_h_m=scene.median_sigma_h_m if over_scene else quality.sigma_h_m,
-        sigma_v_m=scene.median_sigma_v_m if over_scene else quality.sigma_v_m,
-        counts="of georeference, cameras and lens, median over the scene" if over_scene else quality.counts,
-        check_points=points.count,
-        rmse_h_m=points.rmse_h_m,
-        rmse_v_m=points.rmse_v_m,
-        psnr=report.photometric.test.psnr,
-    )
+        return None
 
 
 def _files(workspace: Workspace, states: dict[str, StageState]) -> tuple[MadeFile, ...]:

@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pipelines.core.cautions import Caution, is_checked
+from pipelines.core.figures import Headline
 from pipelines.core.types import FloatArray, Quaternion, Row7, Vector3
-from pipelines.formats.georef_sidecar import GeorefSidecar, predicted_accuracy
+from pipelines.formats.georef_sidecar import GeoreferenceSigma, GeorefSidecar, georeference_sigma
 from pipelines.geodesy.crs import ECEF, parse_crs
 from pipelines.geodesy.enu import (
     Origin,
@@ -46,6 +47,7 @@ class Placement:
         covariance: (7, 7) of the similarity about the origin of `file`, along its axes; None if unknown.
         vertical: what the survey's input heights referred to.
         cautions: limits of the model.
+        accuracy: headline of the result, which every file states; None: nothing states it.
     """
 
     origin_lla: FloatArray
@@ -54,6 +56,7 @@ class Placement:
     covariance: FloatArray | None
     vertical: VerticalDatum
     cautions: tuple[Caution, ...]
+    accuracy: Headline | None
 
     @property
     def file_from_model(self) -> Similarity:
@@ -66,12 +69,14 @@ class Placement:
         return _enu_at(self.origin_lla)
 
     @property
-    def is_checked(self) -> bool:
-        """Whether something checks the σ of the positions; no accuracy is stated otherwise."""
-        return is_checked(self.cautions)
+    def georeference_sigma(self) -> GeoreferenceSigma | None:
+        """Predicted σ of the georeference alone, at the origin of `file`; None: not known, or nothing checks it."""
+        if self.covariance is None or not is_checked(self.cautions):
+            return None
+        return georeference_sigma(self.covariance, np.zeros(3))
 
     def sidecar(self, file_from_axes: FloatArray | None = None) -> GeorefSidecar:
-        """Return the sidecar of a file in the frame `file`, with the accuracy predicted at its origin.
+        """Return the sidecar of a file in the frame `file`.
 
         Args:
             file_from_axes: (3, 3) rotation from the axes of the file, for one whose axes are not East-North-Up. The
@@ -81,7 +86,6 @@ class Placement:
         x, y, z, w = quat_xyzw_from_matrix(self.ecef_from_file.rotation @ axes).tolist()
         quaternion: Quaternion = (x, y, z, w)
         covariance = None if self.covariance is None else _turned(self.covariance, axes.T)
-        known = self.covariance is not None and self.is_checked
         return GeorefSidecar(
             origin=_vector(self.ecef_from_file.translation),
             rotation=quaternion,
@@ -90,20 +94,20 @@ class Placement:
             vertical_datum=self.vertical,
             crs_wkt=parse_crs(ECEF).wkt,
             covariance=None if covariance is None else tuple(map(_row, covariance)),
-            accuracy=predicted_accuracy(self.covariance, np.zeros(3))
-            if known and self.covariance is not None
-            else None,
+            accuracy=self.accuracy,
+            georeference_sigma=self.georeference_sigma,
             cautions=self.cautions,
         )
 
 
-def place(model: TrainedModel, survey: Survey, means_in_model: ArrayLike) -> Placement:
+def place(model: TrainedModel, survey: Survey, means_in_model: ArrayLike, accuracy: Headline | None) -> Placement:
     """Return the placement of a trained model on Earth.
 
     Args:
         model: has the similarity geo ← model and its covariance.
         survey: has the origin of geo and the vertical datum.
         means_in_model: (N, 3) centres of all its Gaussians, N ≥ 1; their median is the middle of the scene.
+        accuracy: headline of the workspace; None: nothing states it.
     """
     geo_from_model = Similarity.from_record(model.geo_from_model)
     scene_in_geo = np.median(geo_from_model.apply(means_in_model), axis=0)
@@ -116,6 +120,7 @@ def place(model: TrainedModel, survey: Survey, means_in_model: ArrayLike) -> Pla
         covariance=_covariance_in_file(model.geo_from_model, file_from_geo),
         vertical=survey.vertical,
         cautions=model.cautions,
+        accuracy=accuracy,
     )
 
 

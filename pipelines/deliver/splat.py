@@ -21,7 +21,7 @@ from pipelines.deliver.placement import Placement, place
 from pipelines.formats.splat_ply import SplatArrays, read_centres, read_logit_opacities
 from pipelines.scene.block_record import BlockRecord
 from pipelines.scene.calibrated import load_survey
-from pipelines.scene.survey import Survey
+from pipelines.scene.headline import headline_of
 from pipelines.scene.trained_model import TrainedModel
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.sh import coefficient_count
@@ -44,21 +44,20 @@ class SplatFigures:
     left_out: int
 
     def values(self) -> dict[str, object]:
-        """Return counts, origin and predicted σ."""
-        accuracy = self.placement.sidecar().accuracy
+        """Return counts, origin, accuracy and the predicted σ of the georeference."""
+        accuracy, sigma = self.placement.accuracy, self.placement.georeference_sigma
         return {
             "gaussians": self.count,
             "left_out": self.left_out,
             "origin_lla": tuple(self.placement.origin_lla.tolist()),
-            "sigma_h_m": None if accuracy is None else accuracy.sigma_h_m,
-            "sigma_v_m": None if accuracy is None else accuracy.sigma_v_m,
+            "stated_accuracy": None if accuracy is None else accuracy.text,
+            "georeference_sigma_h_m": None if sigma is None else sigma.sigma_h_m,
+            "georeference_sigma_v_m": None if sigma is None else sigma.sigma_v_m,
         }
 
     def key_figure(self) -> str:
-        """Return the number of Gaussians and the predicted σ, in one line."""
-        accuracy = self.placement.sidecar().accuracy
-        sigma = "" if accuracy is None else f", σ {accuracy.sigma_h_m:.3f} m H, {accuracy.sigma_v_m:.3f} m V"
-        return f"{self.count} Gaussians{sigma}"
+        """Return the number of Gaussians."""
+        return f"{self.count} Gaussians"
 
 
 @dataclass(frozen=True)
@@ -77,7 +76,7 @@ class PlacedSplat:
 
     @property
     def figures(self) -> SplatFigures:
-        """Counts, origin, predicted σ."""
+        """Counts, origin, accuracy."""
         return SplatFigures(self.placement, len(self.gaussians), self.left_out)
 
 
@@ -114,7 +113,7 @@ class SplatParts:
 
     @property
     def figures(self) -> SplatFigures:
-        """Counts, origin, predicted σ."""
+        """Counts, origin, accuracy."""
         return SplatFigures(self.placement, len(self.center_in_file), self.left_out)
 
 
@@ -128,7 +127,8 @@ def load_splat(workspace: Workspace, options: SplatOptions) -> PlacedSplat:
     """
     survey = load_survey(workspace)
     model = load_json(TrainedModel, workspace.path(MODEL))
-    return placed_splat(read_gaussians(workspace.path(GAUSSIANS)), model, survey, options)
+    gaussians = read_gaussians(workspace.path(GAUSSIANS))
+    return placed_splat(gaussians, place(model, survey, gaussians.means.numpy(), headline_of(workspace)), options)
 
 
 def load_splat_parts(workspace: Workspace, options: WebSplatOptions) -> SplatParts:
@@ -144,7 +144,7 @@ def load_splat_parts(workspace: Workspace, options: WebSplatOptions) -> SplatPar
     path = workspace.path(GAUSSIANS)
     centers, opaque = read_centres(path), _is_opaque(read_logit_opacities(path), options)
     _require_opaque(opaque, options)
-    placement = place(model, survey, centers)
+    placement = place(model, survey, centers, headline_of(workspace))
     center_in_file = placement.file_from_model.apply(centers[opaque]).astype(np.float32)
     rows = _rows_of_blocks(workspace, len(centers))
     trained = read_gaussians(path, slice(0, 1)).sh_degree
@@ -170,30 +170,23 @@ def _rows_of_blocks(workspace: Workspace, count: int) -> tuple[slice, ...]:
 
 def placed_splat(
     gaussians: Gaussians,
-    model: TrainedModel,
-    survey: Survey,
+    placement: Placement,
     options: SplatOptions,
-    replacement: Gaussians | None = None,
 ) -> PlacedSplat:
-    """Return the opaque Gaussians of a model in an East-North-Up frame at the scene.
+    """Return the opaque ones of Gaussians in an East-North-Up frame at the scene.
 
     Args:
-        gaussians: of the model, in the frame `model`.
-        model: has the similarity geo ← model and its covariance.
-        survey: has the origin of geo and the vertical datum.
+        gaussians: to deliver, in the frame `model`.
+        placement: that of the model, whatever part of it is delivered.
         options: the least opacity.
-        replacement: other Gaussians of the same scene, in the frame `model`, to be delivered in their place.
 
     Raises:
         DegenerateGeometryError: no Gaussian is opaque enough.
     """
-    delivered = gaussians if replacement is None else replacement
-    opaque = _is_opaque(delivered.logit_opacities.numpy(), options)
+    opaque = _is_opaque(gaussians.logit_opacities.numpy(), options)
     _require_opaque(opaque, options)
-    kept = delivered.select(torch.from_numpy(opaque))
-    # The placement is that of the model, whatever part of it a file holds.
-    placement = place(model, survey, gaussians.means.numpy())
-    return PlacedSplat(transformed(kept, placement.file_from_model), placement, len(delivered) - len(kept))
+    kept = gaussians.select(torch.from_numpy(opaque))
+    return PlacedSplat(transformed(kept, placement.file_from_model), placement, len(gaussians) - len(kept))
 
 
 def _is_opaque(logit_opacities: Float32Array, options: SplatOptions) -> BoolArray:

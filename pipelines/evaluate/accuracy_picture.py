@@ -26,7 +26,7 @@ def draw_accuracy(
     Args:
         grid: predicted σ.
         trained: the trained survey.
-        report: errors by camera, and residuals of control points.
+        report: errors of triangulated points, and residuals of control points.
         crs: of the coordinates beside the map; None: longitude and latitude.
         path: of the picture.
     """

@@ -1,11 +1,14 @@
 """Errors at check points, stated after the ASPRS Positional Accuracy Standards for Digital Geospatial Data.
 
-Edition 2 (2023, doi 10.14358/PERS.89.10.581) demands:
+Edition 2, Version 2 (ASPRS, 2024) demands:
 
-1. The RMSE alone states the accuracy. The horizontal RMSE takes both axes together.
+1. The RMSE alone states the accuracy. The horizontal RMSE takes both axes together; the three-dimensional one is
+   RMSE_3D = √(RMSE_H² + RMSE_V²).
 2. An accuracy class is named after the RMSE in centimetres that it allows.
 3. The survey error of the check points is added to the measured error in quadrature.
-4. There are at least 30 check points.
+4. The vertical accuracy is that of points outside vegetation (NVA), and classes are theirs. The accuracy under
+   vegetation (VVA) is stated beside it, without a class.
+5. There are at least 30 check points, and more for a project beyond 1000 km².
 """
 
 from __future__ import annotations
@@ -17,9 +20,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pipelines.core.types import BoolArray, FloatArray
-from pipelines.scene.report import AsprsStatement, ErrorStats, Rmse, TotalRmse
+from pipelines.scene.report import AsprsStatement, ErrorStats, Rmse, TotalRmse, VegetatedAccuracy
 
-LEAST_POINTS = 30
+STANDARD = "ASPRS, Edition 2, Version 2, 2024"
+# Check points by the area of the project: so many up to the first area, ten more for each further one, and no more
+# than the most.
+_LEAST_POINTS, _MORE_POINTS, _MOST_POINTS, _AREA_KM2 = 30, 10, 120, 1000.0
 BLUNDER_FACTOR = 3.0
 # Ratio of RMSE to median of |error|: horizontal by a Rayleigh, vertical by a half-normal distribution.
 _RMSE_OF_MEDIAN = np.array([1.2011, 1.4826])
@@ -31,11 +37,13 @@ class Assessment:
     """Accuracy of a product at N check points.
 
     Attributes:
-        stats: figures of all errors, blunders included.
+        stats: figures of all errors, blunders and points under vegetation included.
         survey: RMSE of the check points' own survey (RMSE_H2, RMSE_V2 of the standard); None without points.
-        with_survey: errors and survey in quadrature, the accuracy after the standard; None without points.
-        asprs: classes that `with_survey` meets.
-        blunder: (N,) mask of the errors beyond three times the class that the other points meet.
+        with_survey: errors and survey in quadrature, the accuracy after the standard; None without points. Both are
+            of the points outside vegetation.
+        asprs: classes that `with_survey` meets, and the accuracy under vegetation.
+        blunder: (N,) mask of the errors beyond three times the class that the other points meet; none is under
+            vegetation.
         without_blunders: figures of the other points; None without blunders.
     """
 
@@ -47,7 +55,12 @@ class Assessment:
     without_blunders: ErrorStats | None
 
 
-def assess(error_in_geo: ArrayLike, cov_survey: ArrayLike) -> Assessment:
+def assess(
+    error_in_geo: ArrayLike,
+    cov_survey: ArrayLike,
+    vegetated: ArrayLike | None = None,
+    area_km2: float | None = None,
+) -> Assessment:
     """Return the accuracy after the standard, from the errors at check points.
 
     The errors count from the surveyed positions; the standard adds the error of these positions in the datum.
@@ -55,17 +68,25 @@ def assess(error_in_geo: ArrayLike, cov_survey: ArrayLike) -> Assessment:
     Args:
         error_in_geo: (N, 3) metres.
         cov_survey: (N, 3, 3) m², of the surveyed positions.
+        vegetated: (N,) mask of the points under vegetation; None: none is.
+        area_km2: area of the project; None: not known, and taken for a small one.
     """
     error = np.asarray(error_in_geo, dtype=np.float64).reshape(-1, 3)
     variance = np.diagonal(np.asarray(cov_survey, dtype=np.float64).reshape(-1, 3, 3), axis1=1, axis2=2)
-    stats = error_stats(error)
-    if len(error) == 0:
-        return Assessment(stats, None, None, _statement(0, None), np.zeros(0, dtype=bool), None)
-    total, blunder = _rmse(error**2 + variance), _blunders(error, variance)
-    with_survey = TotalRmse(**total.model_dump(), rmse_3d_m=math.hypot(total.rmse_h_m, total.rmse_v_m))
+    covered = np.zeros(len(error), dtype=bool) if vegetated is None else np.asarray(vegetated, dtype=bool)
+    square, stats = error**2 + variance, error_stats(error)
+    under = None
+    if covered.any():
+        under = VegetatedAccuracy(count=int(covered.sum()), rmse_v_m=_rmse(square[covered]).rmse_v_m)
+    blunder = np.zeros(len(error), dtype=bool)
+    survey, with_survey = None, None
+    if not covered.all():
+        survey, total = _rmse(variance[~covered]), _rmse(square[~covered])
+        with_survey = TotalRmse(**total.model_dump(), rmse_3d_m=math.hypot(total.rmse_h_m, total.rmse_v_m))
+        blunder[~covered] = _blunders(error[~covered], variance[~covered])
+    statement = _statement(int((~covered).sum()), with_survey, under, area_km2)
     without_blunders = error_stats(error[~blunder]) if blunder.any() else None
-    statement = _statement(len(error), with_survey)
-    return Assessment(stats, _rmse(variance), with_survey, statement, blunder, without_blunders)
+    return Assessment(stats, survey, with_survey, statement, blunder, without_blunders)
 
 
 def error_stats(error_in_geo: ArrayLike) -> ErrorStats:
@@ -95,37 +116,57 @@ def error_stats(error_in_geo: ArrayLike) -> ErrorStats:
 
 def classes_cm(rmse: Rmse) -> tuple[int, int]:
     """Return the smallest class, horizontal and vertical, in whole centimetres; the standard allows any number."""
-    horizontal, vertical = (max(math.ceil(100 * rmse_m - 1e-9), 1) for rmse_m in (rmse.rmse_h_m, rmse.rmse_v_m))
-    return horizontal, vertical
+    return _class_cm(rmse.rmse_h_m), _class_cm(rmse.rmse_v_m)
 
 
-def few_points(count: int) -> str:
+def _class_cm(rmse_m: float) -> int:
+    return max(math.ceil(100 * rmse_m - 1e-9), 1)
+
+
+def least_points(area_km2: float | None) -> int:
+    """Return the number of check points that the standard demands for a project of an area in km²."""
+    further = math.ceil((area_km2 or 0.0) / _AREA_KM2) - 1
+    return min(_LEAST_POINTS + _MORE_POINTS * max(further, 0), _MOST_POINTS)
+
+
+def few_points(asprs: AsprsStatement) -> str:
     """Return the warning of fewer check points than the standard demands."""
-    return f"{count} check points; ASPRS 2nd ed. asks for at least {LEAST_POINTS}: the class is indicative"
+    least = f"the standard ({STANDARD}) asks for at least {asprs.least_points}"
+    return f"{asprs.points} check points; {least}: the class is indicative"
 
 
-def _statement(count: int, tested: Rmse | None) -> AsprsStatement:
-    """Return the classes that check points meet, with a sentence that names their number and the minimum."""
-    enough = count >= LEAST_POINTS
-    if tested is None:
-        return AsprsStatement(
-            horizontal_class=None,
-            vertical_class=None,
-            least_points=LEAST_POINTS,
-            enough_points=enough,
-            statement=None,
-        )
-    horizontal, vertical = (f"{class_cm} cm" for class_cm in classes_cm(tested))
-    sample = f"tested on {count} check points: " if enough else f"{few_points(count)}. "
-    return AsprsStatement(
-        horizontal_class=horizontal,
-        vertical_class=vertical,
-        least_points=LEAST_POINTS,
-        enough_points=enough,
-        statement=f"{sample}RMSE_H {100 * tested.rmse_h_m:.1f} cm, RMSE_V {100 * tested.rmse_v_m:.1f} cm, "
-        f"the check points' survey included: horizontal accuracy class {horizontal}, "
-        f"vertical accuracy class {vertical} (ASPRS, 2nd ed.)",
+def _statement(
+    count: int, tested: TotalRmse | None, vegetated: VegetatedAccuracy | None, area_km2: float | None
+) -> AsprsStatement:
+    """Return the classes that `count` check points outside vegetation meet, and a sentence with their number."""
+    least = least_points(area_km2)
+    asprs = AsprsStatement(
+        points=count,
+        horizontal_class=None,
+        vertical_class=None,
+        class_3d=None,
+        vegetated=vegetated,
+        area_km2=area_km2,
+        least_points=least,
+        enough_points=count >= least,
+        statement=None,
     )
+    under = ""
+    if vegetated is not None:
+        under = f"RMSE_V {100 * vegetated.rmse_v_m:.1f} cm at {vegetated.count} points under vegetation (VVA)"
+    if tested is None:
+        return asprs.model_copy(update={"statement": under or None})
+    horizontal, vertical = (f"{class_cm} cm" for class_cm in classes_cm(tested))
+    class_3d = f"{_class_cm(tested.rmse_3d_m)} cm"
+    sample = f"tested on {count} check points: " if asprs.enough_points else f"{few_points(asprs)}. "
+    classes = {"horizontal_class": horizontal, "vertical_class": vertical, "class_3d": class_3d}
+    statement = (
+        f"{sample}RMSE_H {100 * tested.rmse_h_m:.1f} cm, RMSE_V {100 * tested.rmse_v_m:.1f} cm outside vegetation "
+        f"(NVA), RMSE_3D {100 * tested.rmse_3d_m:.1f} cm, the check points' survey included: horizontal accuracy "
+        f"class {horizontal}, vertical accuracy class {vertical}, three-dimensional accuracy class {class_3d} "
+        f"({STANDARD})" + (under and f"; {under}, without a class")
+    )
+    return asprs.model_copy(update={**classes, "statement": statement})
 
 
 def _rmse(square: FloatArray) -> Rmse:

@@ -35,7 +35,7 @@ def cautions_of_prediction(
     Args:
         trained: the trained survey.
         propagation: gives the prediction, or the reason why there is none.
-        by_camera: errors of the check points by camera.
+        by_camera: errors of the triangulated check points.
         of_initial: whether the points are measured with the initial similarity.
     """
     if isinstance(propagation, NoErrorPropagation):
@@ -69,7 +69,7 @@ def refutation(
         return None
     ratio = squared / freedom
     figures = (
-        f"normalised error² is {ratio:.2g} over {len(names)} check points by camera, "
+        f"normalised error² is {ratio:.2g} over {len(names)} triangulated check points, "
         f"and {least / freedom:.2g} to {most / freedom:.2g} was to be expected (99 %)"
     )
     if squared < least:

@@ -35,6 +35,7 @@ from pipelines.scene.report import (
     FixResiduals,
     NoCrossValidation,
 )
+from pipelines.scene.scene_extent import scene_area_km2
 from pipelines.scene.survey import SurveyedPoint
 from pipelines.scene.trained_survey import TrainedSurvey
 
@@ -44,7 +45,7 @@ log = logging.getLogger(__name__)
 def measure_check_points(
     renderer: ModelRenderer, propagation: ErrorPropagation | NoErrorPropagation, progress: Progress
 ) -> CheckPoints:
-    """Return the errors of the check points, measured by camera and by model.
+    """Return the errors of the check points, triangulated and on the rendered surface.
 
     Args:
         renderer: of the trained model.
@@ -52,8 +53,10 @@ def measure_check_points(
         progress: shows the depth maps.
     """
     trained = renderer.trained
-    rays = mark_rays(trained.survey.check_points, trained.sparse)
-    return CheckPoints(camera=_by_camera(trained, rays, propagation), model=_by_model(renderer, rays, progress))
+    rays, area_km2 = mark_rays(trained.survey.check_points, trained.sparse), scene_area_km2(trained)
+    return CheckPoints(
+        camera=_by_camera(trained, rays, propagation, area_km2), model=_by_model(renderer, rays, progress, area_km2)
+    )
 
 
 def cross_validate(
@@ -82,28 +85,33 @@ def fit_residuals(trained: TrainedSurvey) -> Fit:
 
 
 def _by_camera(
-    trained: TrainedSurvey, rays: MarkRays, propagation: ErrorPropagation | NoErrorPropagation
+    trained: TrainedSurvey,
+    rays: MarkRays,
+    propagation: ErrorPropagation | NoErrorPropagation,
+    area_km2: float | None,
 ) -> CheckPointErrors:
     """Return the errors of the intersections of the marks' rays, with prediction and bound."""
     points = trained.survey.check_points
     position = points_by_camera(trained, rays)
     measured = _compared(points, position, rays)
     if isinstance(propagation, NoErrorPropagation) or not points:
-        return check_point_errors(measured)
+        return check_point_errors(measured, area_km2)
     measured = replace(measured, cov_in_geo=propagation.prediction.of_marked_points(position, rays))
     try:
         bound = cramer_rao_bound(propagation.solved, rays)
     except DegenerateGeometryError as error:
         log.info("no Cramér–Rao bound: %s", error)
         bound = None
-    return check_point_errors(measured, bound)
+    return check_point_errors(measured, area_km2, bound)
 
 
-def _by_model(renderer: ModelRenderer, rays: MarkRays, progress: Progress) -> CheckPointErrors:
+def _by_model(
+    renderer: ModelRenderer, rays: MarkRays, progress: Progress, area_km2: float | None
+) -> CheckPointErrors:
     """Return the errors of the places of the Gaussians' surface behind the marks."""
     points, maps = renderer.trained.survey.check_points, _depth_maps(renderer, rays, progress)
     position = points_by_model(renderer.trained, rays, maps)
-    return check_point_errors(_compared(points, position, rays))
+    return check_point_errors(_compared(points, position, rays), area_km2)
 
 
 def _depth_maps(renderer: ModelRenderer, rays: MarkRays, progress: Progress) -> list[DepthMap]:

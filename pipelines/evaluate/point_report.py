@@ -49,14 +49,17 @@ class MeasuredPoints:
         return np.array([point.cov_in_geo for point in self.points]).reshape(-1, 3, 3)
 
 
-def check_point_errors(measured: MeasuredPoints, bound: FloatArray | None = None) -> CheckPointErrors:
+def check_point_errors(
+    measured: MeasuredPoints, area_km2: float | None, bound: FloatArray | None = None
+) -> CheckPointErrors:
     """Return the report's section on check points.
 
     Args:
         measured: J check points.
+        area_km2: of the scene; None: not known.
         bound: (J, 3, 3) m², Cramér–Rao bound of the covariance; None: not known.
     """
-    assessment = _assess(measured)
+    assessment = _assess(measured, area_km2)
     blunder = _among_all(assessment, measured)
     return CheckPointErrors(
         **assessment.stats.model_dump(),
@@ -100,9 +103,10 @@ def point_residuals(measured: MeasuredPoints) -> tuple[PointResidual, ...]:
     )
 
 
-def _assess(measured: MeasuredPoints) -> Assessment:
+def _assess(measured: MeasuredPoints, area_km2: float | None = None) -> Assessment:
     known = measured.is_measured
-    return assess(measured.error_in_geo[known], measured.cov_survey[known])
+    vegetated = np.array([point.land_cover == "vegetated" for point in measured.points], dtype=bool)
+    return assess(measured.error_in_geo[known], measured.cov_survey[known], vegetated[known], area_km2)
 
 
 def _among_all(assessment: Assessment, measured: MeasuredPoints) -> list[bool]:

@@ -36,6 +36,7 @@ from pipelines.evaluate.reference.pictures import draw_reference
 from pipelines.evaluate.summary import summarise
 from pipelines.geodesy.crs import PointCrs
 from pipelines.geometry.similarity import SimilarityRecord
+from pipelines.scene.headline import headline
 from pipelines.scene.render_files import write_render
 from pipelines.scene.renderer import ModelRenderer
 from pipelines.scene.report import EvaluationReport, Photometric, SimilaritySigma, write_report
@@ -112,11 +113,13 @@ def evaluate(
     trained = renderer.trained
     checkpoints = measure_check_points(renderer, propagation, progress)
     test = compare_test_views(renderer, options.lpips_weights, save_render, progress, saved=options.renders)
+    scene = accuracy_summary(propagation)
     return EvaluationReport(
+        headline=headline(checkpoints.camera, scene, trained.model.cautions),
         photometric=Photometric(test=test),
         checkpoints=checkpoints,
         cross_validation=cross_validate(trained, propagation) if options.cross_validate else None,
-        accuracy=accuracy_summary(propagation),
+        accuracy=scene,
         fit=fit_residuals(trained),
         similarity=_similarity_sigma(trained.model.geo_from_model),
         coordinates=None if crs is None else coordinates_in(crs, checkpoints, trained.survey),

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from typing import Any
 
+from pipelines.core.figures import WAYS
 from pipelines.core.sentences import listed
 from pipelines.core.workspace import Summary
-from pipelines.evaluate.asprs import LEAST_POINTS, few_points
+from pipelines.evaluate.asprs import few_points
 from pipelines.scene.report import CheckPointErrors, CheckPoints, EvaluationReport, PhotometricFigures
 
 
 def summarise(report: EvaluationReport) -> Summary:
     """Return headline, figures, warnings and cautions of a report, for the command line."""
     test, ways = report.photometric.test, _by_way(report.checkpoints)
-    parts = [_test_views(test)]
-    parts += [f"check points by {way} {errors.mean_h_m:.3f} m H" for way, errors in ways.items() if errors.count]
     values: dict[str, Any] = {
+        "accuracy": report.headline.model_dump(),
         "views": test.views,
         "psnr": test.psnr,
         "psnr_covered": test.psnr_covered,
@@ -31,7 +31,8 @@ def summarise(report: EvaluationReport) -> Summary:
             f"{way}_rmse_v_m": errors.rmse_v_m,
             f"{way}_rmse_3d_m": errors.rmse_3d_m,
         }
-    return Summary(", ".join(parts), values, _warnings(report), report.cautions)
+    key_figure = f"{report.headline.sentence}; {_test_views(test)}"
+    return Summary(key_figure, values, _warnings(report), report.cautions)
 
 
 def _test_views(test: PhotometricFigures) -> str:
@@ -48,14 +49,14 @@ def _by_way(checkpoints: CheckPoints) -> dict[str, CheckPointErrors]:
 
 def _warnings(report: EvaluationReport) -> tuple[str, ...]:
     warnings = []
-    count = report.checkpoints.camera.count
-    if 0 < count < LEAST_POINTS:
-        warnings.append(few_points(count))
+    asprs = report.checkpoints.camera.asprs
+    if asprs.points and not asprs.enough_points:
+        warnings.append(few_points(asprs))
     for way, errors in _by_way(report.checkpoints).items():
         if errors.blunders:
             warnings.append(
-                f"by {way}, {len(errors.blunders)} of {errors.count} check points are off by more than three times "
-                f"the class that the others meet: {listed(errors.blunders)}"
+                f"{WAYS[way]}, {len(errors.blunders)} of {errors.count} check points are off by more than three "
+                f"times the class that the others meet: {listed(errors.blunders)}"
             )
     crossed = report.cross_validation
     if crossed is not None and crossed.reason is not None:

@@ -18,6 +18,7 @@ from pydantic.alias_generators import to_camel
 
 from pipelines.core.cautions import Caution
 from pipelines.core.durable import replace_file
+from pipelines.core.figures import Headline
 from pipelines.core.products import Product, load_json
 from pipelines.core.types import FloatArray, Matrix4, Quaternion, Row7, Vector3
 from pipelines.geodesy.vertical import VerticalDatum
@@ -35,14 +36,12 @@ class _CamelCase(Product):
     model_config = ConfigDict(alias_generator=to_camel, populate_by_name=True)
 
 
-class PredictedAccuracy(Product):
-    """Standard deviations in metres that the covariance predicts at `at`, a point of the file's frame.
+class GeoreferenceSigma(Product):
+    """σ of the georeference alone in metres, which the covariance predicts at `at`, a point of the file's frame.
 
-    They state the uncertainty of the georeference alone, without that of the model's shape, and are no measurement
-    on check points.
+    The model's shape is not counted, so that these are no accuracy of what the file shows.
     """
 
-    kind: Literal["predicted"] = "predicted"
     at: Vector3
     sigma_e_m: float
     sigma_n_m: float
@@ -68,11 +67,12 @@ class GeorefSidecar(_CamelCase):
     """Content of the sidecar; names in the file are in camelCase.
 
     `matrix` (`ecefFromFile` in the file) is the similarity of `origin`, `rotation` and `scale` as a 4×4 matrix, row
-    by row, for columns of homogeneous coordinates.
+    by row, for columns of homogeneous coordinates. `accuracy` is the headline of the result; None: nothing stated
+    it when the file was written. `georeference_sigma` is a part of it; None: not known, or nothing checks it.
     """
 
     format: Literal["georefgs"] = "georefgs"
-    version: Literal[1] = 1
+    version: Literal[2] = 2
     crs_id: Literal["EPSG:4978"] = "EPSG:4978"
     origin: Vector3
     rotation: Quaternion
@@ -83,7 +83,8 @@ class GeorefSidecar(_CamelCase):
     vertical_datum: VerticalDatum
     crs_wkt: str
     covariance: Covariance7 | None
-    accuracy: PredictedAccuracy | None
+    accuracy: Headline | None
+    georeference_sigma: GeoreferenceSigma | None
     cautions: tuple[Caution, ...] = ()
 
     @field_validator("rotation")
@@ -117,15 +118,21 @@ class GeorefSidecar(_CamelCase):
 class SceneSigma(Product):
     """Predicted standard deviations in metres over a file's points or cells: medians, and the largest.
 
-    `counts` says which errors they hold.
+    `counts` says which errors they hold, and of what.
     """
 
-    kind: Literal["predicted"] = "predicted"
     counts: str
     median_sigma_h_m: float
     median_sigma_v_m: float
     largest_sigma_h_m: float
     largest_sigma_v_m: float
+
+
+def median_sigma(sigma: SceneSigma | None, of: str) -> str:
+    """Return the end of a line that states the median σ, and of what; empty for None."""
+    if sigma is None:
+        return ""
+    return f", median σ of the {of} {sigma.median_sigma_h_m:.3f} m H, {sigma.median_sigma_v_m:.3f} m V"
 
 
 class CrsSidecar(_CamelCase):
@@ -140,13 +147,14 @@ class CrsSidecar(_CamelCase):
         operation: published operation from WGS84.
         operation_accuracy_m: its accuracy; None: not known.
         bounds: least and largest of each coordinate.
-        accuracy: predicted σ; None: not known, or nothing checks it.
+        accuracy: headline of the result; None: nothing stated it when the file was written.
+        sigma: predicted σ of the file's points or cells; None: not known, or nothing checks it.
         assumed: what the user did not state.
         cautions: limits of the place and its accuracy.
     """
 
     format: Literal["georefgs"] = "georefgs"
-    version: Literal[1] = 1
+    version: Literal[2] = 2
     crs: str
     crs_wkt: str
     vertical_datum: VerticalDatum
@@ -155,17 +163,18 @@ class CrsSidecar(_CamelCase):
     operation: str
     operation_accuracy_m: float | None
     bounds: tuple[Vector3, Vector3]
-    accuracy: SceneSigma | None
+    accuracy: Headline | None
+    sigma: SceneSigma | None
     assumed: tuple[str, ...] = ()
     cautions: tuple[Caution, ...] = ()
 
 
-def predicted_accuracy(covariance: ArrayLike, point_in_file: ArrayLike) -> PredictedAccuracy:
-    """Return the accuracy that the sidecar's covariance (7, 7) predicts at a point (3,) of the file's frame."""
+def georeference_sigma(covariance: ArrayLike, point_in_file: ArrayLike) -> GeoreferenceSigma:
+    """Return σ of the georeference by the sidecar's covariance (7, 7), at a point (3,) of the file's frame."""
     at = np.asarray(point_in_file, dtype=np.float64)
     east, north, up = np.diagonal(covariance_at(at[None], covariance, np.zeros(3))[0]).tolist()
     x, y, z = at.tolist()
-    return PredictedAccuracy(
+    return GeoreferenceSigma(
         at=(x, y, z),
         sigma_e_m=math.sqrt(east),
         sigma_n_m=math.sqrt(north),

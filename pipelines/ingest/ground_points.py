@@ -80,6 +80,21 @@ class SortedPoints:
     check: tuple[GroundPoint, ...]
     unmarked: UnmarkedPoints
 
+    def require_checks(self, names: Sequence[str]) -> None:
+        """Refuse names of points under vegetation that are no check points.
+
+        Raises:
+            InputError: a name that no check point has.
+        """
+        checks = {point.name for point in (*self.check, *self.unmarked["check"])}
+        for name in names:
+            if name not in checks:
+                raise InputError(
+                    f"{name!r} is no check point: there are {', '.join(sorted(checks)) or 'none'} (--checkpoints, "
+                    "--check)",
+                    field="--vegetated",
+                )
+
     def note_unmarked(self, notes: Notes) -> None:
         """Note the points that enter nothing."""
         notes.warn_counted(

@@ -117,6 +117,9 @@ class IngestOptions(StageOptions):
         None, description="CRS of ground points whose file states none, e.g. EPSG:32632 or EPSG:4326+5773."
     )
     check: tuple[str, ...] = Field((), description="Name of a control point to use as a check point instead.")
+    vegetated: tuple[str, ...] = Field(
+        (), description="Name of a check point under vegetation: its height is reported apart (ASPRS VVA)."
+    )
     test_every: int = Field(8, ge=0, description="Hold out every N-th image for testing (0: none).")
     crs: str | None = Field(None, description="CRS of x,y,z columns in the trajectory, e.g. EPSG:32632+5773.")
     vertical: Vertical | None = Field(

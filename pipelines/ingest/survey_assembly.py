@@ -47,6 +47,7 @@ def assemble_survey(
     flight = replace(inputs.flight, poses=_without_far_fixes(inputs.flight, notes))
     poses, files = flight.poses, [file for file in (inputs.control, inputs.check) if file is not None]
     points = split_checks(inputs.control, inputs.check, options.check)
+    points.require_checks(options.vegetated)
     control, check = points.control, points.check
     points.note_unmarked(notes)
     located = bool(poses.located.any())

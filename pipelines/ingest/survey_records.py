@@ -70,6 +70,7 @@ def point_records(
             position_in_geo=_vector(position[row]),
             cov_in_geo=_matrix(covariance[row]),
             marks=point.marks,
+            land_cover="vegetated" if point.name in options.vegetated else "open",
         )
         for row, point in enumerate(points)
     )

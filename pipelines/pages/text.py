@@ -8,7 +8,7 @@ from datetime import datetime
 from math import isnan
 from typing import Any
 
-MISSING = "–"
+from pipelines.core.figures import ACCURACY_H, MISSING
 
 
 def number(value: float | None, decimals: int = 2) -> str:
@@ -33,6 +33,11 @@ def in_metres(value: float | None) -> str:
     return MISSING if value is None or isnan(value) else f"{metres(value)} m"
 
 
+def accuracy(value: float | None) -> str:
+    """Return a figure of the headline, given in metres, with its unit."""
+    return ACCURACY_H.with_unit(value)
+
+
 def signed(value: float | None) -> str:
     """Return millimetre-fine metres without their unit, with a sign: a column of errors."""
     text = number(value, 3)
@@ -47,6 +52,11 @@ def share(value: float | None) -> str:
 def ratio(value: float | None) -> str:
     """Return a ratio with two decimals."""
     return number(value, 2)
+
+
+def square_km(value: float | None) -> str:
+    """Return an area in square kilometres, with its unit."""
+    return MISSING if value is None else f"{number(value, 3)} km²"
 
 
 def decibel(value: float | None) -> str:
@@ -99,6 +109,7 @@ def as_json(value: object) -> str:
 
 
 FORMS: dict[str, Callable[..., str]] = {
+    "accuracy": accuracy,
     "as_json": as_json,
     "whole": whole,
     "decibel": decibel,
@@ -113,6 +124,7 @@ FORMS: dict[str, Callable[..., str]] = {
     "share": share,
     "signed": signed,
     "similarity": similarity,
+    "square_km": square_km,
 }
 
 

@@ -197,7 +197,7 @@ def _mark(axes: Axes, points: MapPoints) -> None:
     size = min(max(_LARGEST_SIGN * _LARGE_SIGNS / max(len(points.cameras), 1), _SMALLEST_SIGN), _LARGEST_SIGN)
     kinds: tuple[tuple[str, FloatArray, Mapping[str, Any]], ...] = (
         ("camera", points.cameras, {**_CAMERAS, "s": size}),
-        (_named("check point", points.check, "its error by camera"), points.check.place, _CHECK),
+        (_named("check point", points.check, "its triangulated error"), points.check.place, _CHECK),
         (_named("control point", points.control, "its residual"), points.control.place, _CONTROL),
     )
     for name, places, style in kinds:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipelines.core.errors import MissingProductError
+from pipelines.core.figures import CELLS, ERRORS, WAYS, Figure
 from pipelines.core.stages import ACCURACY_MAP
 from pipelines.core.types import FloatArray
 from pipelines.pages.pictures import Picture, picture_of_png, png_file
@@ -20,6 +21,7 @@ CE90_OF_AXIS_RMSE = 2.1460
 LE90_OF_RMSE = 1.6449
 _LEAST_FOR_QUANTILE = 10
 _LEAST_FOR_CHART = 3
+_SURVEYED = ("rmse_h_m", "rmse_v_m", "rmse_3d_m")
 
 
 @dataclass(frozen=True)
@@ -46,10 +48,12 @@ class AccuracyFacts:
     """Accuracy of an evaluated survey.
 
     Attributes:
-        ninety: CE90 and LE90 by camera and by model.
-        ways: which ways have measured points.
+        figures: of the check points: name, key in the report, form and unit.
+        ninety: CE90 and LE90, triangulated and on the rendered surface.
+        ways: words of the ways that have measured points.
         chart: predicted against measured σ; None: fewer than three points have both.
         within: share of the points within 1 σ and 2 σ of the prediction, horizontal and vertical; None likewise.
+        cells: what is told of the predicted σ over the scene, by the beginning of its fields.
         map: of the predicted σ; None: there is none.
         crossed: whether control points were cross-validated with a result.
         crossed_reason: why not; empty: they were not to be.
@@ -58,10 +62,12 @@ class AccuracyFacts:
         quantile_points: fewest points with an empirical quantile.
     """
 
+    figures: tuple[tuple[str, str, str, str], ...]
     ninety: tuple[NinetyPercent, ...]
-    ways: tuple[str, ...]
+    ways: dict[str, str]
     chart: Picture | None
     within: tuple[tuple[str, float, float], ...]
+    cells: dict[str, Figure]
     map: Picture | None
     crossed: bool
     crossed_reason: str
@@ -79,10 +85,12 @@ def accuracy_facts(evaluated: EvaluatedSurvey) -> AccuracyFacts:
     enough = len(sigma) >= _LEAST_FOR_CHART
     crossed = report.cross_validation
     return AccuracyFacts(
+        figures=_figures(),
         ninety=tuple(ninety_percent(way, errors) for way, errors in by_way.items()),
-        ways=tuple(way for way, errors in by_way.items() if errors.count),
+        ways={way: WAYS[way] for way, errors in by_way.items() if errors.count},
         chart=picture_of_png(predicted_against_measured(sigma, error)) if enough else None,
         within=_within(sigma, error) if enough else (),
+        cells=CELLS,
         map=_map(evaluated),
         crossed=crossed is not None and crossed.count > 0,
         crossed_reason="" if crossed is None or crossed.reason is None else crossed.reason,
@@ -120,6 +128,17 @@ def ninety_percent(way: str, errors: CheckPointErrors) -> NinetyPercent:
         measured_h_m=float(np.quantile(np.hypot(table[:, 0], table[:, 1]), 0.9)) if has_quantile else None,
         measured_v_m=float(np.quantile(np.abs(table[:, 2]), 0.9)) if has_quantile else None,
         count=errors.count,
+    )
+
+
+def _figures() -> tuple[tuple[str, str, str, str], ...]:
+    """Return the lines of the table of errors: all errors, then with the points' survey, then without blunders."""
+    groups = {"": ("", tuple(ERRORS)), "with_survey.": (" with the points' own survey", _SURVEYED)}
+    groups["without_blunders."] = (" without blunders", ("count", "rmse_h_m", "rmse_v_m"))
+    lines = [(group, ending, name, ERRORS[name]) for group, (ending, names) in groups.items() for name in names]
+    return tuple(
+        (figure.meaning + ending, group + name, "metres" if figure.unit else "whole", figure.unit)
+        for group, ending, name, figure in lines
     )
 
 

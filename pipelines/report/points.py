@@ -31,9 +31,9 @@ class PointRow:
         name: as in the survey.
         coordinates: surveyed, in the CRS of the report.
         field: path of its row in the report of `evaluate`; None: it has none.
-        blunder: whether it is a blunder by camera.
+        blunder: whether it is a blunder, triangulated.
         predicted: whether the row has predicted σ.
-        model_field: path of its row by model; None: it has none.
+        model_field: path of its row on the rendered surface; None: it has none.
         rmse_px: root mean square distance of its marks from the adjusted point; None: it is not measured.
         chips: of its marks.
     """

@@ -5,11 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from pipelines.core.cautions import Caution
+from pipelines.core.figures import Headline
 from pipelines.report.evaluated import EvaluatedSurvey
 from pipelines.report.lenses import LensesFacts
 from pipelines.report.overlap import OverlapFacts
 from pipelines.report.record import RecordFacts
 from pipelines.report.verdicts import Measured, Verdict, verdicts
+
+_NOTES = {
+    "measured": "RMSE of the triangulated check points, their survey's error included",
+    "predicted": "no check points: root mean square of the predicted σ over the scene",
+    "unknown": "neither measured nor predicted",
+}
 
 
 @dataclass(frozen=True)
@@ -19,15 +26,15 @@ class SummaryFacts:
     Attributes:
         verdicts: traffic lights.
         cautions: limits of the result.
-        check_points: number of check points that were measured by camera.
-        has_cells: whether σ is predicted over the scene.
-        statement: ASPRS statement, by camera; None without check points.
+        headline: accuracy of the result.
+        accuracy_note: what its figures are.
+        statement: ASPRS statement of the triangulated check points; None without any.
     """
 
     verdicts: tuple[Verdict, ...]
     cautions: tuple[Caution, ...]
-    check_points: int
-    has_cells: bool
+    headline: Headline
+    accuracy_note: str
     statement: str | None
 
 
@@ -64,7 +71,7 @@ def summary_facts(
     return SummaryFacts(
         verdicts=verdicts(report, measured, cautions),
         cautions=cautions,
-        check_points=report.checkpoints.camera.count,
-        has_cells=report.accuracy.cells > 0,
+        headline=report.headline,
+        accuracy_note=_NOTES[report.headline.kind],
         statement=report.checkpoints.camera.asprs.statement,
     )

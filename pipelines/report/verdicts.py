@@ -266,7 +266,7 @@ def _blunders(errors: CheckPointErrors) -> Verdict:
 
 
 def _surface(errors: CheckPointErrors) -> Verdict:
-    rule = "good if no check point is a blunder by model, fair up to a fifth of them, poor beyond"
+    rule = "good if no check point is a blunder on the rendered surface, fair up to a fifth of them, poor beyond"
     if not errors.count:
         return Verdict("Surface at the points", "unknown", "no check points", "nothing to compare with", rule)
     count = len(errors.blunders)

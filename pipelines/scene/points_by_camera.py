@@ -1,4 +1,4 @@
-"""Surveyed points, measured by camera: intersections of the rays of their marks."""
+"""Surveyed points, triangulated: intersections of the rays of their marks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Surveyed points, measured by model: places of the Gaussians' surface behind their marks.
+"""Surveyed points on the rendered surface: places of the Gaussians' surface behind their marks.
 
 This is the accuracy for a reader who intersects the rendered surface. A viewer that picks the centres of Gaussians
 measures other points.

@@ -13,6 +13,7 @@ from pydantic import SerializerFunctionWrapHandler, model_serializer, model_vali
 
 from pipelines.core.cautions import Caution
 from pipelines.core.errors import InputError
+from pipelines.core.figures import Headline
 from pipelines.core.products import ImageName, Product, dump_json, load_json
 from pipelines.core.types import Vector3
 from pipelines.robust.statistics import ResidualStats
@@ -112,19 +113,33 @@ class TotalRmse(Rmse):
     rmse_3d_m: float
 
 
+class VegetatedAccuracy(Product):
+    """Vertical accuracy under vegetation (VVA), the points' own survey included; the standard gives it no class."""
+
+    count: int
+    rmse_v_m: float
+
+
 class AsprsStatement(Product):
-    """Accuracy classes of the ASPRS standard, 2nd edition.
+    """Accuracy classes of the ASPRS standard, edition 2, version 2 (2024).
 
     Attributes:
-        horizontal_class, vertical_class: smallest classes of whole centimetres that the errors meet ("5 cm"); None
-            without check points.
-        least_points: number of check points that the standard demands.
+        points: number of check points outside vegetation: horizontal, vertical (NVA) and 3-D accuracy are theirs.
+        horizontal_class, vertical_class, class_3d: smallest classes of whole centimetres that the errors meet
+            ("5 cm"); None without these points.
+        vegetated: vertical accuracy under vegetation; None: no such point.
+        area_km2: of the scene, by which the standard counts; None: not known.
+        least_points: number of check points that the standard demands for this area.
         enough_points: whether there are that many.
         statement: sentence to quote; None without check points.
     """
 
+    points: int
     horizontal_class: str | None
     vertical_class: str | None
+    class_3d: str | None
+    vegetated: VegetatedAccuracy | None
+    area_km2: float | None
     least_points: int
     enough_points: bool
     statement: str | None
@@ -203,6 +218,8 @@ class StatedErrors(ErrorStats):
     Attributes:
         survey: σ of the points' own survey.
         with_survey: errors and survey in quadrature.
+
+    Points under vegetation count in the errors alone, and neither in `survey` nor in `with_survey`.
     """
 
     survey: Rmse | None
@@ -230,7 +247,7 @@ class CheckPointErrors(StatedErrors):
 
 
 class CheckPoints(Product):
-    """Check points by camera (intersection of their marks) and by model (rendered surface behind their marks)."""
+    """Check points, triangulated (`camera`) and on the rendered surface behind their marks (`model`)."""
 
     camera: CheckPointErrors
     model: CheckPointErrors
@@ -269,6 +286,7 @@ class AccuracySummary(_OptionalKeys):
         cell_m: side of a cell.
         least_sigma_h_m, median_sigma_h_m, largest_sigma_h_m: horizontal.
         least_sigma_v_m, median_sigma_v_m, largest_sigma_v_m: vertical.
+        rms_sigma_h_m, rms_sigma_v_m: root mean square, the RMSE that the prediction lets expect.
         reason: reason why there are no cells, else None.
     """
 
@@ -280,6 +298,8 @@ class AccuracySummary(_OptionalKeys):
     least_sigma_v_m: float | None = None
     median_sigma_v_m: float | None = None
     largest_sigma_v_m: float | None = None
+    rms_sigma_h_m: float | None = None
+    rms_sigma_v_m: float | None = None
     reason: str | None
 
 
@@ -356,6 +376,7 @@ class EvaluationReport(_OptionalKeys):
 
     Attributes:
         format_version: version of the format.
+        headline: accuracy of the result, as every table and file states it.
         photometric: figures of the test views.
         checkpoints: errors of the check points.
         cross_validation: errors of the control points; None without `--cross-validate`.
@@ -369,6 +390,7 @@ class EvaluationReport(_OptionalKeys):
     """
 
     format_version: Literal[1] = 1
+    headline: Headline
     photometric: Photometric
     checkpoints: CheckPoints
     cross_validation: CrossValidation | NoCrossValidation | None

@@ -22,7 +22,8 @@ class PointLine:
 
     Attributes:
         use: whether the point is a check point or entered the solution.
-        way: by camera, by model, by a solution that left the point out, or as the residual of the fit.
+        way: triangulated, on the rendered surface, by a solution that left the point out, or as the residual of
+            the fit.
         row: of the report.
     """
 
@@ -52,7 +53,7 @@ class PointLine:
 
 
 def point_lines(report: EvaluationReport) -> list[PointLine]:
-    """Return the errors of all points: check points by camera and by model, then control points.
+    """Return the errors of all points: check points triangulated and on the rendered surface, then control points.
 
     The residual of a control point is no accuracy; its error in a solution without it is.
     """

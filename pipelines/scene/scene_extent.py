@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial import ConvexHull, QhullError
 
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import FloatArray
@@ -22,6 +23,14 @@ def scene_points(trained: TrainedSurvey) -> FloatArray:
     points = trained.geo_from_model.apply(trained.point_in_model)
     low, high = np.quantile(points[:, :2], [_RIM, 1 - _RIM], axis=0)
     return np.asarray(points[((points[:, :2] >= low) & (points[:, :2] <= high)).all(axis=1)])
+
+
+def scene_area_km2(trained: TrainedSurvey) -> float | None:
+    """Return the area of the convex hull of the scene's points in plan; None: too few points, or all on a line."""
+    try:
+        return float(ConvexHull(scene_points(trained)[:, :2]).volume) / 1e6  # in the plane, the volume is the area
+    except (DegenerateGeometryError, QhullError, ValueError):
+        return None
 
 
 def corners(points: FloatArray) -> FloatArray:

@@ -119,12 +119,13 @@ class Mark(Product):
 
 
 class SurveyedPoint(Product):
-    """Control or check point: position in geo (m), 3×3 covariance (m²), and marks."""
+    """Control or check point: position in geo (m), 3×3 covariance (m²), marks, and what covers the ground there."""
 
     name: str
     position_in_geo: Vector3
     cov_in_geo: Covariance3
     marks: tuple[Mark, ...]
+    land_cover: Literal["open", "vegetated"] = "open"
 
     @model_validator(mode="after")
     def _is_marked_once_an_image(self) -> SurveyedPoint:

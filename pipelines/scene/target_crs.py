@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from pipelines.core.cautions import Caution
 from pipelines.core.errors import InputError
+from pipelines.core.figures import Headline
 from pipelines.core.types import FloatArray, Vector3
 from pipelines.formats.georef_sidecar import CrsSidecar, SceneSigma
 from pipelines.geodesy.crs import PointCrs, parse_crs
@@ -69,12 +70,19 @@ class TargetCrs:
         """
         return enu_from_ecef(ecef_from_lla(self.crs.lla_from_xyz(points)), self.origin)
 
-    def sidecar(self, bounds: ArrayLike, accuracy: SceneSigma | None, cautions: tuple[Caution, ...]) -> CrsSidecar:
+    def sidecar(
+        self,
+        bounds: ArrayLike,
+        accuracy: Headline | None,
+        sigma: SceneSigma | None,
+        cautions: tuple[Caution, ...],
+    ) -> CrsSidecar:
         """Return the sidecar of a file in this CRS.
 
         Args:
             bounds: (2, 3) least and largest coordinates.
-            accuracy: predicted σ; None: not known.
+            accuracy: of the result; None: not stated.
+            sigma: predicted, of the file's points or cells; None: not known.
             cautions: limits of the model.
         """
         operation = self.crs.operation(self.lla)
@@ -88,6 +96,7 @@ class TargetCrs:
             operation_accuracy_m=operation.accuracy_m,
             bounds=(_vector(low), _vector(high)),
             accuracy=accuracy,
+            sigma=sigma,
             assumed=self.assumed,
             cautions=cautions,
         )

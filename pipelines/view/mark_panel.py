@@ -121,7 +121,7 @@ class MarkPanel(Panel):
             self._safely(lambda: self._set_mark(point.name, self.names[camera], (x_px, y_px)))
 
     def measured(self) -> SurfacePoint | None:
-        """Return the chosen point by camera; None with fewer than two marks."""
+        """Return the chosen point, triangulated; None with fewer than two marks."""
         point = self.point
         if point is None:
             return None
@@ -217,7 +217,7 @@ class MarkPanel(Panel):
                 surveyed = self._model.target.geo_from_xyz(np.array([point.xyz]))[0]
                 rows.append(PlaceRow("surveyed", surveyed, None))
             if np.isfinite(place).all():
-                rows.append(PlaceRow("by camera", place, None if cov is None else np.sqrt(np.diag(cov))))
+                rows.append(PlaceRow("triangulated", place, None if cov is None else np.sqrt(np.diag(cov))))
                 errors = residuals_px(place, rays, self._model.trained)
                 residuals = {self.names[camera]: error for camera, error in zip(rays.camera, errors, strict=True)}
             shown = "".join(map(paragraph, self._state(note)))

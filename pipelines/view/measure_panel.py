@@ -103,7 +103,7 @@ class MeasurePanel(Panel):
             self._add(self._model.under(sight), "")
 
     def add_surveyed(self, name: str) -> None:
-        """Measure a surveyed point behind its marks, as `evaluate` does by model."""
+        """Measure a surveyed point behind its marks, as `evaluate` does on the rendered surface."""
         with self._lock:
             point = self._surveyed[name]
             rays = mark_rays((point,), self._model.trained.sparse)
@@ -172,13 +172,13 @@ class MeasurePanel(Panel):
         return np.array([point.position_in_geo for point in self._points])
 
     def _against_survey(self, point: SurveyedPoint) -> str:
-        """Return the coordinates of a surveyed point by survey and by camera, as HTML."""
+        """Return the coordinates of a surveyed point as surveyed and as triangulated, as HTML."""
         rays = mark_rays((point,), self._model.trained.sparse)
         camera, cov = self._model.by_camera(rays)
         rows = [PlaceRow("surveyed", np.array(point.position_in_geo), np.sqrt(np.diag(point.cov_in_geo)))]
         if np.isfinite(camera).all():
-            rows.append(PlaceRow("by camera", camera, None if cov is None else np.sqrt(np.diag(cov))))
-        title = paragraph(f"{point.name}: {len(rays)} marks; below, by model")
+            rows.append(PlaceRow("triangulated", camera, None if cov is None else np.sqrt(np.diag(cov))))
+        title = paragraph(f"{point.name}: {len(rays)} marks; below, on the rendered surface")
         return title + place_table(self._model.target, rows)
 
     def _described(self, note: str) -> str:

@@ -102,7 +102,7 @@ class MeasuringModel:
         return self.reader.under(sight)
 
     def behind_marks(self, rays: MarkRays) -> SurfacePoint | NoSurface:
-        """Return the surface behind the marks of one point, as `evaluate` measures it by model."""
+        """Return the surface behind the marks of one point, as `evaluate` measures it on the rendered surface."""
         return self.reader.behind_marks(rays)
 
     def by_camera(self, rays: MarkRays) -> tuple[FloatArray, FloatArray | None]:

@@ -122,7 +122,7 @@ class SurfaceReader:
         return point
 
     def behind_marks(self, rays: MarkRays) -> SurfacePoint | NoSurface:
-        """Return the surface behind the marks of one point, as `evaluate` measures it by model.
+        """Return the surface behind the marks of one point, as `evaluate` measures it on the rendered surface.
 
         σ is the RMS difference of the views.
 

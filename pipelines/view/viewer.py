@@ -16,6 +16,7 @@ from pipelines.core.manifest import hash_file
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.stages import GAUSSIANS, MODEL, REPORT
 from pipelines.core.workspace import Workspace
+from pipelines.scene.headline import headline_of
 from pipelines.scene.renderer import ModelRenderer
 from pipelines.scene.report import EvaluationReport, read_report
 from pipelines.scene.scene import photographs
@@ -105,6 +106,7 @@ class Viewer:
     def _build(self, workspace: Workspace, folder: Path) -> None:
         gui, trained = self._server.gui, self.model.trained
         self._notice = gui.add_html("")
+        gui.add_html(accuracy_line(workspace))
         self._mode = gui.add_dropdown("A click", get_args(ClickMode), hint="What a click in the scene does")
         tabs = gui.add_tab_group()
         with tabs.add_tab("See"):
@@ -157,7 +159,7 @@ class Viewer:
         if not errors:
             return paragraph("No control or check point has an error to show.")
         enlarged = self.signs.add_errors(errors)
-        return paragraph(f"Arrows: error by camera, × {enlarged:g}. Orange: control points and test views.")
+        return paragraph(f"Arrows: triangulated error, × {enlarged:g}. Orange: control points and test views.")
 
     def _colour_points(self) -> None:
         grid: AccuracyGrid | None = None
@@ -166,7 +168,9 @@ class Viewer:
         limits = self.signs.add_points(self._colour.value, grid)
         if limits is not None:
             low, high = limits
-            self._legend.content = paragraph(f"σ of the SfM points: dark {low:.3f} m, bright {high:.3f} m")
+            self._legend.content = paragraph(
+                f"predicted σ of the SfM points: dark {low:.3f} m, bright {high:.3f} m"
+            )
 
     def _blend(self, share: float) -> None:
         self.photo.share = float(share)
@@ -273,8 +277,14 @@ class Viewer:
         self._server.gui.reset()
 
 
+def accuracy_line(workspace: Workspace) -> str:
+    """Return the accuracy of the result as HTML; empty where nothing states it."""
+    headline = headline_of(workspace)
+    return "" if headline is None else paragraph(f"The {headline.sentence}.", mark="accuracy")
+
+
 def point_errors(model: MeasuringModel, report: EvaluationReport) -> list[PointError]:
-    """Return the errors by camera of control and check points."""
+    """Return the triangulated errors of control and check points."""
     survey = model.trained.survey
     place = {p.name: np.array(p.position_in_geo) for p in (*survey.control_points, *survey.check_points)}
     rows = [*report.checkpoints.camera.points, *report.fit.gcp.points]

@@ -51,7 +51,7 @@ def test_status(georef: Georef, done: Path, photos: Path) -> None:
     assert table.code == 0
     assert table.err == ""
     lines = table.out.splitlines()
-    assert [line.split()[0] for line in lines] == ["stage", *STAGES]
+    assert [line.split()[0] for line in lines] == ["stage", *STAGES, "accuracy"]
     assert "stale" in lines[1]
     assert "--images changed" in lines[1]
     rows = georef("status", done, "--json").document["stages"]

@@ -22,7 +22,14 @@ from pipelines.core.runner import Outcome
 from pipelines.core.sentences import duration
 from pipelines.core.staleness import StageState
 from pipelines.core.workspace import Manifest, Workspace
-from pipelines.scene.report import AsprsStatement, ByAxis, NoCrossValidation, PredictedSigma, TotalRmse
+from pipelines.scene.report import (
+    AsprsStatement,
+    ByAxis,
+    NoCrossValidation,
+    PredictedSigma,
+    TotalRmse,
+    VegetatedAccuracy,
+)
 from tests.reports import check_points_with, cross_validation_with, report_with
 
 REPORT = report_with(
@@ -45,7 +52,7 @@ class TestReport:
     def test_numbers_stand_under_their_names(self) -> None:
         lines = text_of(*tables.report(REPORT)).splitlines()
         head = next(line for line in lines if "RMSE H" in line)
-        camera = next(line for line in lines if line.startswith("camera"))
+        camera = next(line for line in lines if line.startswith("triangulated"))
         for name, value in [("points", "30"), ("mean H", "0.014"), ("RMSE V", "0.021"), ("RMSE 3D", "0.026")]:
             end = head.index(name) + len(name)  # figures are right-aligned under the heads
             assert camera[:end].endswith(value)
@@ -53,7 +60,7 @@ class TestReport:
     def test_fit_is_not_called_an_accuracy(self) -> None:
         checks, fit = [text_of(part) for part in tables.report(REPORT)[1:]]
         assert "gnss" not in checks
-        assert "camera" not in fit
+        assert "triangulated" not in fit
         assert "not an accuracy" in fit
 
     def test_accuracy_has_class_prediction_and_bound(self) -> None:
@@ -62,8 +69,12 @@ class TestReport:
             rmse_h_m=0.016,
             with_survey=TotalRmse(rmse_h_m=0.018, rmse_v_m=0.023, rmse_3d_m=0.0292),
             asprs=AsprsStatement(
+                points=30,
                 horizontal_class="2 cm",
                 vertical_class="3 cm",
+                class_3d="3 cm",
+                vegetated=VegetatedAccuracy(count=4, rmse_v_m=0.111),
+                area_km2=None,
                 least_points=30,
                 enough_points=True,
                 statement="tested on 30 check points",
@@ -75,8 +86,9 @@ class TestReport:
         crossed = cross_validation_with(count=8, rmse_h_m=0.044)
         parts = tables.report(report_with(camera=camera, crossed=crossed))
         check, accuracy, cross = [text_of(part) for part in parts[:3]]
-        line = next(line for line in accuracy.splitlines() if line.startswith("camera"))
-        assert line.split() == ["camera", "0.018", "0.023", "2", "cm", "3", "cm", "0.017", "0.022"]
+        line = next(line for line in accuracy.splitlines() if line.startswith("triangulated"))
+        classes = ["2", "cm", "3", "cm", "3", "cm"]
+        assert line.split() == ["triangulated", "0.018", "0.023", "0.029", "0.111", *classes, "0.017", "0.022"]
         assert "0.044" in cross
         assert "0.044" not in check
 
@@ -84,7 +96,7 @@ class TestReport:
         parts = [text_of(part) for part in tables.report(REPORT)]
         assert "–" not in "".join(parts[:2]) and "LPIPS" not in parts[0] and "max 3D" not in parts[1]
         beside = report_with(camera=check_points_with(count=3, rmse_h_m=0.1), model=check_points_with(count=2))
-        assert text_of(*tables.report(beside)).splitlines()[-1].split() == ["model", "2", "–"]
+        assert text_of(*tables.report(beside)).splitlines()[-1].split() == ["surface", "2", "–"]
 
     def test_parts_that_are_not_there_have_no_table(self) -> None:
         """No table of dashes: nothing was measured, and cross-validation is made on request only."""

@@ -42,7 +42,7 @@ def test_a_falsified_survey_is_refused_cautioned_or_right(
     if kind.named:
         assert codes & set(kind.codes), sidecar["cautions"]
     if name not in HIDDEN and codes <= EVERYDAY:
-        accuracy = sidecar["accuracy"]
+        accuracy = sidecar["georeferenceSigma"]
         assert wrong_m[0] <= SIGMAS * accuracy["sigma_h_m"] + OWN_M
         assert wrong_m[1] <= SIGMAS * accuracy["sigma_v_m"] + OWN_M
 
@@ -63,7 +63,7 @@ def test_a_clean_survey_is_right_and_blamed_for_nothing(real_georef: Georef, tmp
     assert ended.code == 0, ended.err
     sidecar, wrong_m = _statement(tmp_path / "ws")
     assert {caution["code"] for caution in sidecar["cautions"]} <= EVERYDAY | {"hardly-checked"}
-    accuracy = sidecar["accuracy"]
+    accuracy = sidecar["georeferenceSigma"]
     assert wrong_m[0] <= SIGMAS * accuracy["sigma_h_m"] + OWN_M
     assert wrong_m[1] <= SIGMAS * accuracy["sigma_v_m"] + OWN_M
     warned = [line for line in ended.err.splitlines() if line.startswith("warning:")]

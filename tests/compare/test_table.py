@@ -26,9 +26,9 @@ FAILED = ComparedRow(configuration="A", title="plain", note="nothing", failure="
 
 
 def test_figures_are_told_to_what_they_are_worth() -> None:
-    by_model = ("0.0123", "0.0100", "0.0150", "25.13")
-    assert cells(ROW) == ("25.32", "26.25", "0.8700", "0.0123", "0.0150", "25.13", *by_model, "3", "61 s")
-    assert cells(FAILED) == (*["–"] * 10, "0", "–")
+    on_surface = ("0.0100", "0.0150", "25.13")
+    assert cells(ROW) == ("25.32", "26.25", "0.8700", "0.0150", "25.13", *on_surface, "3", "61 s")
+    assert cells(FAILED) == (*["–"] * 8, "0", "–")
     fewer = ROW.model_copy(update={"model": GOOD.model_copy(update={"count": 2})})
     assert cells(fewer)[-2] == "3, 2"
 

@@ -121,7 +121,7 @@ def test_sigma_is_that_of_the_measurements(handover: Handover) -> None:
     assert (position < 0.1).all()
     assert (angles > 1e-3).all()
     assert (angles < 0.2).all()
-    assert handover.summary.values["median_sigma_v_m"] == pytest.approx(np.median(position[:, 2]), abs=1e-4)
+    assert handover.summary.values["median_camera_sigma_v_m"] == pytest.approx(np.median(position[:, 2]), abs=1e-4)
 
 
 def test_colmap_model_opens_with_small_reprojection_error_in_the_frame_of_the_splat(handover: Handover) -> None:
@@ -212,7 +212,7 @@ def test_unchecked_positions_have_no_sigma(handover: Handover, tmp_path: Path) -
     table = replace(handover, out=tmp_path / "out")
     assert {row["sigma_e_m"] + row["sigma_kappa_deg"] for row in table.rows()} == {""}
     assert {caution.code for caution in summary.cautions} == {NOT_CHECKED, "cameras-without-sigma"}
-    assert summary.values["median_sigma_h_m"] is None
+    assert summary.values["median_camera_sigma_h_m"] is None
     # Degrees with nine decimals; ω φ κ count from true north where the CRS has no grid.
     poses = read_trajectory(tmp_path / "out" / "cameras.csv")
     assert poses.geographic

@@ -149,8 +149,8 @@ def test_cloud_of_a_trained_survey_lies_on_its_ground(
     sidecar = load_json(CrsSidecar, sidecar_path(workspace.path(CLOUD)))
     position = np.asarray(las.xyz)
     np.testing.assert_allclose(sidecar.bounds, [position.min(axis=0), position.max(axis=0)], atol=1e-3)
-    assert sidecar.accuracy is not None
-    assert sidecar.accuracy.median_sigma_v_m == pytest.approx(np.median(las["sigma_v"]), rel=0.02)
+    assert sidecar.sigma is not None
+    assert sidecar.sigma.median_sigma_v_m == pytest.approx(np.median(las["sigma_v"]), rel=0.02)
     in_geo = enu_from_ecef(position, load_survey(workspace).origin)
     seen_from_all_sides = np.hypot(in_geo[:, 0], in_geo[:, 1]) < 20
     above_m = in_geo[:, 2] - ground_height(in_geo[:, 0], in_geo[:, 1])

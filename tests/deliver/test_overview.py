@@ -19,9 +19,9 @@ from pipelines.deliver.purposes import PURPOSES
 from pipelines.geodesy.enu import ecef_from_enu
 from pipelines.geodesy.vertical import VerticalDatum, parse_vertical
 from pipelines.scene.crs_options import CrsOptions
+from pipelines.scene.report import AccuracySummary
 from pipelines.scene.survey import Survey
-from pipelines.scene.trained_model import TrainedModel
-from tests.reports import check_points_with, report_with
+from tests.reports import report_with
 from tests.scenes import TrueScene
 from tests.trained_workspaces import trained_workspace
 
@@ -77,18 +77,15 @@ def test_geoid_without_its_grid_gives_way_only_where_nobody_asked_for_it(copied:
 
 
 def test_accuracy_is_that_of_the_evaluation_and_unknown_where_nothing_checks_it(copied: Workspace) -> None:
-    assert overview(copied, CrsOptions()).quality.sigma_h_m is None  # neither evaluated, nor a covariance
-    report = report_with(camera=check_points_with(count=3, rmse_h_m=0.1, rmse_v_m=0.2, rmse_3d_m=0.22))
-    accuracy = report.accuracy.model_copy(
-        update={"cells": 4, "median_sigma_h_m": 0.03, "median_sigma_v_m": 0.04, "reason": None}
-    )
-    save_json(report.model_copy(update={"accuracy": accuracy}), copied.root / "evaluate/report.json")
-    quality = overview(copied, CrsOptions()).quality
-    assert (quality.sigma_h_m, quality.sigma_v_m, quality.check_points, quality.rmse_v_m) == (0.03, 0.04, 3, 0.2)
-    model = load_json(TrainedModel, copied.path(MODEL))
+    assert overview(copied, CrsOptions()).quality.accuracy is None  # not evaluated
+    scene = AccuracySummary(cells=4, rms_sigma_h_m=0.03, rms_sigma_v_m=0.04, reason=None)
     unchecked = Caution(code=NOT_CHECKED, sentence="Nothing checks the positions.")
-    save_json(model.model_copy(update={"cautions": (unchecked,)}), copied.path(MODEL))
-    assert overview(copied, CrsOptions()).quality.sigma_h_m is None
+    for cautions, kind in (((), "predicted"), ((unchecked,), "unknown")):
+        save_json(report_with(scene=scene, cautions=cautions), copied.root / "evaluate/report.json")
+        accuracy = overview(copied, CrsOptions()).quality.accuracy
+        assert accuracy is not None
+        assert accuracy.kind == kind
+        assert (accuracy.rmse_h_m is None) == (kind == "unknown")
 
 
 def test_untrained_workspace_says_what_to_run(copied: Workspace) -> None:

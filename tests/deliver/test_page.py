@@ -14,9 +14,11 @@ import pytest
 import torch
 from pydantic import ValidationError
 
-from pipelines.core.cautions import NOT_CHECKED, Caution
+from pipelines.core.cautions import Caution
+from pipelines.core.figures import Headline
 from pipelines.core.printable import printable
 from pipelines.deliver.options import CESIUM, PageOptions, SplatOptions
+from pipelines.deliver.placement import place
 from pipelines.deliver.splat import placed_splat
 from pipelines.deliver.tiles.local_crs import LocalCrs, fit_local_crs
 from pipelines.deliver.tiles.page import ScenePage, ShownScene, scene_page, write_page
@@ -57,7 +59,7 @@ def surveyed() -> Survey:
     return survey.model_copy(update={"control_points": named, "check_points": tuple(others)})
 
 
-def page_of(survey: Survey, cautions: tuple[Caution, ...] = ()) -> ScenePage:
+def page_of(survey: Survey, cautions: tuple[Caution, ...] = (), accuracy: Headline | None = None) -> ScenePage:
     means = np.random.default_rng(3).normal(0, 20, (500, 3))
     model = trained_model(Similarity()).model_copy(update={"cautions": cautions})
     gaussians = Gaussians(
@@ -67,7 +69,7 @@ def page_of(survey: Survey, cautions: tuple[Caution, ...] = ()) -> ScenePage:
         logit_opacities=torch.zeros(500),
         sh=torch.zeros(500, 1, 3),
     )
-    splat = placed_splat(gaussians, model, survey, SplatOptions())
+    splat = placed_splat(gaussians, place(model, survey, means, accuracy), SplatOptions())
     scene = ShownScene(HOSTILE, splat.placement, splat.gaussians.means.numpy())
     middle_in_geo = splat.placement.file_from_geo.inverse().apply(np.zeros((1, 3)))
     target = target_crs(PageOptions(), survey.origin, middle_in_geo, survey.vertical)
@@ -141,10 +143,8 @@ def test_page_says_what_coordinates_and_heights_mean() -> None:
     facts = {fact.name: fact.value for fact in reversed(page_of(surveyed()).facts)}
     assert facts["CRS"] == "EPSG:32632"
     assert facts["Heights"] == "ellipsoidal; of the survey's input: ellipsoidal"
-    assert facts["Predicted σ"] == "not known"
+    assert facts["Accuracy"] == "not known: nothing states it yet (georef evaluate)"
     assert "--crs" in facts["Assumed"]
-    unchecked = page_of(surveyed(), (Caution(code=NOT_CHECKED, sentence="Nothing checks the fixes."),))
-    assert "nothing checks" in {fact.name: fact.value for fact in unchecked.facts}["Predicted σ"]
 
 
 def evaluated(fit: LocalCrs, enu: np.ndarray) -> np.ndarray:

@@ -15,6 +15,7 @@ from pipelines.core.products import save_json
 from pipelines.core.stages import GAUSSIANS, MODEL, SURVEY
 from pipelines.core.workspace import StageRun, Workspace
 from pipelines.deliver.options import ExportPlyOptions
+from pipelines.deliver.placement import Placement, place
 from pipelines.deliver.ply import run
 from pipelines.deliver.splat import placed_splat
 from pipelines.formats.georef_sidecar import read_sidecar, sidecar_path
@@ -73,6 +74,10 @@ def model(cov: np.ndarray | None = None) -> TrainedModel:
         gaussians=40,
         backend="cpu",
     )
+
+
+def placed(trained: TrainedModel) -> Placement:
+    return place(trained, survey(), gaussians().means.numpy(), None)
 
 
 @pytest.fixture
@@ -137,7 +142,7 @@ def _axes(origin: Origin) -> np.ndarray:
 
 
 def test_covariance_predicts_the_same_uncertainty_in_the_new_frame() -> None:
-    export = placed_splat(gaussians(), model(covariance()), survey(), OPTIONS)
+    export = placed_splat(gaussians(), placed(model(covariance())), OPTIONS)
     points_in_model = np.array([[0.0, 0, 0], [30, -20, 5]])
     in_geo = covariance_at(GEO_FROM_MODEL.apply(points_in_model), covariance(), PIVOT_IN_GEO)
     to_ecef, turn = export.placement.sidecar().ecef_from_file(), _axes(survey().origin)
@@ -147,38 +152,38 @@ def test_covariance_predicts_the_same_uncertainty_in_the_new_frame() -> None:
     np.testing.assert_allclose(to_ecef.rotation @ in_ply @ to_ecef.rotation.T, expected, rtol=1e-6, atol=1e-12)
 
 
-def test_predicted_accuracy_is_that_of_the_covariance_at_the_origin() -> None:
-    accuracy = placed_splat(gaussians(), model(covariance()), survey(), OPTIONS).placement.sidecar().accuracy
-    assert accuracy is not None
-    cov = np.array(placed_splat(gaussians(), model(covariance()), survey(), OPTIONS).placement.sidecar().covariance)
-    east, north, up = np.sqrt(np.diagonal(cov)[4:])
-    assert (accuracy.sigma_e_m, accuracy.sigma_n_m, accuracy.sigma_u_m) == pytest.approx((east, north, up))
-    assert accuracy.sigma_h_m == pytest.approx(np.hypot(east, north))
-    assert accuracy.sigma_3d_m == pytest.approx(np.sqrt(east**2 + north**2 + up**2))
+def test_sigma_of_the_georeference_is_that_of_the_covariance_at_the_origin() -> None:
+    sidecar = placed(model(covariance())).sidecar()
+    sigma = sidecar.georeference_sigma
+    assert sigma is not None
+    east, north, up = np.sqrt(np.diagonal(np.array(sidecar.covariance))[4:])
+    assert (sigma.sigma_e_m, sigma.sigma_n_m, sigma.sigma_u_m) == pytest.approx((east, north, up))
+    assert sigma.sigma_h_m == pytest.approx(np.hypot(east, north))
+    assert sigma.sigma_3d_m == pytest.approx(np.sqrt(east**2 + north**2 + up**2))
 
 
 def test_unknown_uncertainty_is_null_and_not_zero() -> None:
-    sidecar = placed_splat(gaussians(), model(), survey(), OPTIONS).placement.sidecar()
+    sidecar = placed(model()).sidecar()
     assert sidecar.covariance is None
-    assert sidecar.accuracy is None
+    assert (sidecar.accuracy, sidecar.georeference_sigma) == (None, None)
 
 
 def test_transparent_gaussians_are_left_out() -> None:
     start = gaussians()
     start.logit_opacities[:5] = -8.0
-    export = placed_splat(start, model(), survey(), OPTIONS)
+    export = placed_splat(start, placed(model()), OPTIONS)
     assert (len(export.gaussians), export.left_out) == (35, 5)
     start.logit_opacities[:] = -8.0
     with pytest.raises(DegenerateGeometryError, match="--min-opacity"):
-        placed_splat(start, model(), survey(), OPTIONS)
+        placed_splat(start, placed(model()), OPTIONS)
 
 
 def test_sidecar_has_the_fields_that_were_promised(stage: StageRun) -> None:
     run(stage, OPTIONS)
     document = json.loads(sidecar_path(stage.out / "splat.ply").read_text(encoding="utf-8"))
     place = "format version crsId origin rotation scale ecefFromFile epoch originLla verticalDatum crsWkt"
-    assert list(document) == [*place.split(), "covariance", "accuracy", "cautions"]
-    assert (document["format"], document["version"], document["crsId"]) == ("georefgs", 1, "EPSG:4978")
+    assert list(document) == [*place.split(), "covariance", "accuracy", "georeferenceSigma", "cautions"]
+    assert (document["format"], document["version"], document["crsId"]) == ("georefgs", 2, "EPSG:4978")
     assert document["crsWkt"].startswith("GEODCRS[")
     assert np.array(document["covariance"]).shape == (7, 7)
     assert document["verticalDatum"] == {"name": "EGM2008", "stated": True, "note": ""}

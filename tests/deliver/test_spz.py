@@ -65,8 +65,8 @@ def test_covariance_is_along_the_axes_of_the_file(tmp_path: Path) -> None:
     frame = enu_from_ecef(np.vstack([np.eye(3), np.zeros(3)]), ORIGIN)
     geo_from_file = (frame[:3] - frame[3]).T @ to_ecef.rotation
     np.testing.assert_allclose(geo_from_file @ in_file @ geo_from_file.T, in_geo, rtol=1e-5, atol=1e-12)
-    assert sidecar.accuracy is not None
-    assert sidecar.accuracy.sigma_v_m == pytest.approx(np.sqrt(np.array(sidecar.covariance)[5, 5]))
+    assert sidecar.georeference_sigma is not None
+    assert sidecar.georeference_sigma.sigma_v_m == pytest.approx(np.sqrt(np.array(sidecar.covariance)[5, 5]))
 
 
 def test_options_change_version_and_degree(tmp_path: Path) -> None:

@@ -128,7 +128,7 @@ def test_tileset_says_what_a_globe_must_know(made: StageRun) -> None:
     assert georef == json.loads((made.out / "tileset.json.georef.json").read_text(encoding="utf-8"))
     assert georef["crsId"] == "EPSG:4978"
     assert georef["verticalDatum"]["name"] == "EGM2008"
-    assert georef["accuracy"]["sigma_h_m"] > 0
+    assert georef["georeferenceSigma"]["sigma_h_m"] > 0
     assert gltf_of(made.out / "splat.glb")["asset"]["extras"]["georef"] == georef
     transform = read_sidecar(made.out / "tileset.json").ecef_from_file().matrix()
     np.testing.assert_array_equal(np.array(content["root"]["transform"]).reshape(4, 4).T, transform)

@@ -32,7 +32,10 @@ def test_survey_is_added_in_quadrature() -> None:
     assert assessment.with_survey.rmse_3d_m == pytest.approx(np.hypot(0.05, 0.13))
     assert classes_cm(assessment.with_survey) == (5, 13)
     assert assessment.stats.rmse_h_m == pytest.approx(0.03)  # the raw one stays beside it
-    assert assessment.asprs.horizontal_class == "5 cm"
+    asprs = assessment.asprs
+    assert (asprs.horizontal_class, asprs.vertical_class, asprs.class_3d) == ("5 cm", "13 cm", "14 cm")  # 3-D: 13.9
+    assert asprs.statement is not None
+    assert "RMSE_3D 13.9 cm" in asprs.statement
     assert assessment.asprs.enough_points is True
     assert assessment.without_blunders is None
 
@@ -48,12 +51,41 @@ def test_too_few_points_are_told_plainly() -> None:
     few = assess(np.full((12, 3), 0.01), np.tile(EXACT, (12, 1, 1)))
     assert few.asprs.statement is not None
     assert few.asprs.statement.startswith(
-        "12 check points; ASPRS 2nd ed. asks for at least 30: the class is indicative"
+        "12 check points; the standard (ASPRS, Edition 2, Version 2, 2024) asks for at least 30"
     )
     assert few.asprs.enough_points is False
     many = assess(np.full((30, 3), 0.01), np.tile(EXACT, (30, 1, 1)))
     assert many.asprs.statement is not None
     assert "indicative" not in many.asprs.statement
+
+
+@pytest.mark.parametrize(
+    ("area_km2", "points"), [(None, 30), (0.2, 30), (1000, 30), (1000.1, 40), (2500, 50), (9999, 120), (5e4, 120)]
+)
+def test_large_project_needs_more_points(area_km2: float | None, points: int) -> None:
+    asprs = assess(np.full((40, 3), 0.01), np.tile(EXACT, (40, 1, 1)), area_km2=area_km2).asprs
+    assert (asprs.least_points, asprs.enough_points) == (points, points <= 40)
+
+
+def test_vegetation_enters_neither_class_nor_accuracy() -> None:
+    # Two σ of height: 3 cm in the open, 20 cm under vegetation, where grass hides the ground.
+    rng = np.random.default_rng(2)
+    error, vegetated = rng.normal(0, 0.03, (400, 3)), np.arange(400) % 4 == 0
+    error[vegetated, 2] = rng.normal(0, 0.2, 100)
+    assessment = assess(error, np.tile(EXACT, (400, 1, 1)), vegetated)
+    asprs, total = assessment.asprs, assessment.with_survey
+    assert total is not None
+    assert asprs.vegetated is not None
+    # The bounds are 3 σ of the RMSE of 300 and of 100 draws: σ / √(2 N).
+    assert total.rmse_v_m == pytest.approx(0.03, abs=3 * 0.03 / np.sqrt(600))
+    assert asprs.vegetated.rmse_v_m == pytest.approx(0.2, abs=3 * 0.2 / np.sqrt(200))
+    assert (asprs.points, asprs.vegetated.count, asprs.vertical_class) == (300, 100, "3 cm")
+    assert not assessment.blunder[vegetated].any()
+    assert asprs.statement is not None
+    assert f"{100 * asprs.vegetated.rmse_v_m:.1f} cm at 100 points under vegetation (VVA)" in asprs.statement
+    alone = assess(error, np.tile(EXACT, (400, 1, 1)), np.ones(400, dtype=bool))
+    assert alone.with_survey is None
+    assert alone.asprs.vertical_class is None
 
 
 @pytest.mark.parametrize("count", [5, 9, 40])

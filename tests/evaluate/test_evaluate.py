@@ -23,6 +23,7 @@ from pipelines.core.stages import BY_NAME, MODEL, SIM3, SURVEY
 from pipelines.core.workspace import Workspace
 from pipelines.evaluate.asprs import few_points
 from pipelines.scene.initial_similarity import InitialSimilarity
+from pipelines.scene.report import AsprsStatement
 from pipelines.scene.survey import Mark, Survey
 from pipelines.scene.trained_model import TrainedModel
 from pipelines.scene.trained_survey import load_trained
@@ -100,7 +101,10 @@ def test_fit_is_that_of_the_fixes(evaluated: tuple[Workspace, Outcome]) -> None:
 
 
 def test_few_check_points_are_remarked_on(evaluated: tuple[Workspace, Outcome]) -> None:
-    assert evaluated[1].manifest.warnings == [few_points(6)]
+    asprs = AsprsStatement.model_validate(report_of(evaluated[0])["checkpoints"]["camera"]["asprs"])
+    assert evaluated[1].manifest.warnings == [few_points(asprs)]
+    # The points are on a square of 54 m, whose corners few cameras see.
+    assert asprs.area_km2 == pytest.approx(54e-3**2, rel=0.3)
 
 
 def test_control_points_are_a_fit_and_not_an_accuracy(altered: Workspace, flights: list[RenderedFlight]) -> None:
@@ -250,7 +254,7 @@ def test_check_points_that_are_off_together_refute_the_prediction(altered: Works
     run_stage(altered, EVALUATE, {"renders": 0})
     (caution,) = report_of(altered)["cautions"]
     assert caution["code"] == "prediction-refuted"
-    assert "over 6 check points by camera" in caution["sentence"]
+    assert "over 6 triangulated check points" in caution["sentence"]
     change_survey(altered, check_points=shifted[:2])
     run_stage(altered, EVALUATE, {"renders": 0})
     assert report_of(altered)["cautions"] == []
@@ -269,7 +273,7 @@ def test_a_blunder_is_named_and_kept(altered: Workspace) -> None:
     assert by_camera["count"] == 6
     assert by_camera["rmse_h_m"] > 1.0
     assert by_camera["without_blunders"]["rmse_h_m"] < 0.1
-    assert any("by camera, 1 of 6 check points" in text for text in outcome.manifest.warnings)
+    assert any("triangulated, 1 of 6 check points" in text for text in outcome.manifest.warnings)
 
 
 def test_predicted_accuracy_is_mapped(evaluated: tuple[Workspace, Outcome]) -> None:
@@ -279,6 +283,7 @@ def test_predicted_accuracy_is_mapped(evaluated: tuple[Workspace, Outcome]) -> N
     assert len(rows) == accuracy["cells"] > 500
     sigma_h = np.array([row["sigma_h_m"] for row in rows])
     assert np.median(sigma_h) == pytest.approx(accuracy["median_sigma_h_m"], abs=1e-5)
+    assert np.sqrt(np.mean(sigma_h**2)) == pytest.approx(accuracy["rms_sigma_h_m"], abs=1e-5)
     place = np.array([[row["east_m"], row["north_m"], row["up_m"]] for row in rows])
     assert np.abs(place[:, :2]).max() < 27  # where the points are
     # The height is that of points nearby, on slopes of up to a third.

@@ -116,7 +116,9 @@ def test_tables_fit_a_terminal(report: EvaluationReport, width: int) -> None:
         console.print(table)
     text = console.file.getvalue()  # type: ignore[attr-defined]
     assert max(map(len, text.splitlines())) <= width
-    (line,) = [line for line in text.splitlines() if line.startswith(FIRST) and "camera" in line]
-    assert line.split() == [*FIRST.split(), "camera", "5", "+0.030", "-0.040", "+0.120", "0.050", "0.022", "0.030"]
+    (line,) = [line for line in text.splitlines() if "triangulated  " in line and "+0.030" in line]
+    figures = ["5", "+0.030", "-0.040", "+0.120", "0.050", "0.022", "0.030"]
+    assert line.split()[-8:] == ["triangulated", *figures]  # a narrow terminal folds the long name before it
+    assert line.startswith(FIRST if width > 80 else FIRST.split(maxsplit=1)[0])
     assert "! off by more than three times the class" in text and "2600010.0300  1199979.9600  403.1200" in text
     assert "Control points one by one, each left out in turn" in text and "(not an accuracy)" in text

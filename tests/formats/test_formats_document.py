@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipelines.formats.georef_sidecar import GeorefSidecar, predicted_accuracy
+from pipelines.formats.georef_sidecar import GeorefSidecar, georeference_sigma
 from pipelines.geodesy.enu import ecef_from_enu_rotation, ecef_from_lla, lla_from_ecef
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 
@@ -37,10 +37,10 @@ def test_example_is_a_valid_sidecar_whose_frame_follows_from_its_origin() -> Non
     np.testing.assert_allclose(sidecar.origin, ecef_from_lla(sidecar.origin_lla), rtol=0, atol=1e-8)
     rotation = matrix_from_quat_xyzw(sidecar.rotation)
     np.testing.assert_allclose(rotation, ecef_from_enu_rotation(sidecar.origin_lla), rtol=0, atol=1e-14)
-    accuracy = sidecar.accuracy
-    assert accuracy is not None
-    assert accuracy.sigma_h_m == pytest.approx(np.hypot(accuracy.sigma_e_m, accuracy.sigma_n_m))
-    assert accuracy.sigma_3d_m == pytest.approx(np.hypot(accuracy.sigma_h_m, accuracy.sigma_v_m))
+    sigma = sidecar.georeference_sigma
+    assert sigma is not None
+    assert sigma.sigma_h_m == pytest.approx(np.hypot(sigma.sigma_e_m, sigma.sigma_n_m))
+    assert sigma.sigma_3d_m == pytest.approx(np.hypot(sigma.sigma_h_m, sigma.sigma_v_m))
 
 
 def test_snippet_gives_the_printed_numbers(result: dict[str, Any]) -> None:
@@ -61,9 +61,9 @@ def test_snippet_agrees_with_the_package(result: dict[str, Any]) -> None:
     assert cov is not None
     np.testing.assert_allclose(result["sigma_enu_m"], np.sqrt(np.diagonal(cov[0])), rtol=1e-12)
     assert sidecar.covariance is not None
-    accuracy = predicted_accuracy(sidecar.covariance, result["p_ply"])
-    assert accuracy.sigma_h_m == pytest.approx(np.hypot(*result["sigma_enu_m"][:2]))
-    assert predicted_accuracy(sidecar.covariance, np.zeros(3)) == sidecar.accuracy
+    sigma = georeference_sigma(sidecar.covariance, result["p_ply"])
+    assert sigma.sigma_h_m == pytest.approx(np.hypot(*result["sigma_enu_m"][:2]))
+    assert georeference_sigma(sidecar.covariance, np.zeros(3)) == sidecar.georeference_sigma
     assert sidecar.model_copy(update={"covariance": None}).covariance_at(result["p_ply"][None]) is None
 
 

@@ -264,6 +264,7 @@ def _sidecar(folder: Path) -> None:
     sidecar = GeorefSidecar(
         origin=(4e6, 6e5, 4.8e6), rotation=(0, 0, 0, 1), scale=1.0, origin_lla=(46, 7, 500), crs_wkt="",
         vertical_datum=VerticalDatum(name="ellipsoidal", stated=True), covariance=covariance, accuracy=None,
+        georeference_sigma=None,
     )  # fmt: skip
     write_sidecar(sidecar, folder / "a.ply")
 

@@ -130,9 +130,11 @@ def test_geo_txt_control_and_check_points(tmp_path: Path) -> None:
     other = np.array([[LON, LAT + 2e-4, 450.0]])
     checks = _points(tmp_path / "checkpoints.txt", "EPSG:4979", other, names)
     checks.write_text(checks.read_text().replace("P0", "C0"))
-    survey = _build(
-        tmp_path / "images", geo=tmp_path / "geo.txt", gcp=gcp, checkpoints=checks, check=("P1",), sigma_mark=0.3
-    )
+    files: dict[str, Any] = {"geo": tmp_path / "geo.txt", "gcp": gcp, "checkpoints": checks}
+    survey = _build(tmp_path / "images", **files, check=("P1",), vegetated=("P1",), sigma_mark=0.3)
+    assert [point.land_cover for point in survey.check_points] == ["open", "vegetated"]
+    with pytest.raises(InputError, match=r"\[--vegetated\]: 'P2' is no check point: there are C0 \(--checkpoints"):
+        _build(tmp_path / "images", **files, vegetated=("P2",))
     assert [point.name for point in survey.control_points] == ["P0", "P2"]
     assert [point.name for point in survey.check_points] == ["C0", "P1"]
     for point, place in zip(survey.control_points, lla[[0, 2]], strict=True):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipelines.adjust.error_propagation import NoErrorPropagation, propagate_errors
-from pipelines.core.cautions import Caution
+from pipelines.core.cautions import Caution, is_checked
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import Workspace
 from pipelines.deliver.placement import Placement
@@ -65,7 +65,7 @@ def predicted_covariance(
         MissingProductError: init-sim3 has not been run.
         InputError: a product is damaged.
     """
-    if not placement.is_checked:
+    if not is_checked(placement.cautions):
         return None, _unknown("nothing checks the σ of the positions")
     propagation = propagate_errors(workspace, trained)
     if isinstance(propagation, NoErrorPropagation):

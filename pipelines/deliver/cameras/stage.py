@@ -26,13 +26,14 @@ from pipelines.deliver.placement import Placement, place
 from pipelines.formats.camera_table import CameraTable, write_camera_table
 from pipelines.formats.colmap_writer import write_sparse
 from pipelines.formats.geojson import write_features
-from pipelines.formats.georef_sidecar import CrsSidecar, SceneSigma, write_sidecar
+from pipelines.formats.georef_sidecar import CrsSidecar, SceneSigma, median_sigma, write_sidecar
 from pipelines.formats.nerfstudio import Frame, lens_of, write_transforms
 from pipelines.geodesy.crs import parse_crs
 from pipelines.geometry.bundle import Network
 from pipelines.geometry.refined_points import refined_points
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
+from pipelines.scene.headline import headline_of
 from pipelines.scene.target_crs import TargetCrs, target_crs
 from pipelines.scene.trained_survey import TrainedSurvey, load_trained
 
@@ -47,7 +48,8 @@ def run(stage: StageRun, options: ExportCamerasOptions) -> Summary:
         InputError: a product is damaged, or the CRS cannot be used here.
     """
     trained = load_trained(stage.workspace)
-    placement = place(trained.model, trained.survey, trained.gaussians.means.numpy())
+    accuracy = headline_of(stage.workspace)
+    placement = place(trained.model, trained.survey, trained.gaussians.means.numpy(), accuracy)
     on_earth = cameras_on_earth(trained, None)
     crs = target_crs(options, trained.survey.origin, on_earth.center_in_geo, trained.survey.vertical)
     camera_table(on_earth, crs)  # a CRS that cannot hold the cameras is refused before the work begins
@@ -68,9 +70,9 @@ def run(stage: StageRun, options: ExportCamerasOptions) -> Summary:
     cautions, sigma = union(trained.model.cautions, limits), _scene_sigma(table)
     on_ellipsoid = TargetCrs(parse_crs("EPSG:4979"), crs.origin, footprints.corner_lla)
     bounds = _bounds(footprints.corner_lla[:, [1, 0, 2]])
-    write_sidecar(on_ellipsoid.sidecar(bounds, sigma, cautions), stage.out / "footprints.geojson")
+    write_sidecar(on_ellipsoid.sidecar(bounds, accuracy, sigma, cautions), stage.out / "footprints.geojson")
     write_camera_table(stage.out / "cameras.csv", table)
-    sidecar = crs.sidecar(_bounds(table.position), sigma, cautions)
+    sidecar = crs.sidecar(_bounds(table.position), accuracy, sigma, cautions)
     write_sidecar(sidecar, stage.out / "cameras.csv")
     return _summary(table, model, sidecar, union(cautions, lens_limits))
 
@@ -158,10 +160,8 @@ def _scene_sigma(table: CameraTable) -> SceneSigma | None:
 
 
 def _summary(table: CameraTable, model: SparseModel, sidecar: CrsSidecar, cautions: tuple[Caution, ...]) -> Summary:
-    sigma, count = sidecar.accuracy, len(table.name)
-    figure = f"{count} cameras, {sidecar.crs}"
-    if sigma is not None:
-        figure += f", σ {sigma.median_sigma_h_m:.3f} m H, {sigma.median_sigma_v_m:.3f} m V"
+    sigma, count = sidecar.sigma, len(table.name)
+    figure = f"{count} cameras, {sidecar.crs}{median_sigma(sigma, 'camera positions')}"
     seen = model.point_error_px[np.isfinite(model.point_error_px)]
     values = {
         "cameras": count,
@@ -171,7 +171,7 @@ def _summary(table: CameraTable, model: SparseModel, sidecar: CrsSidecar, cautio
         "crs": sidecar.crs,
         "heights": sidecar.vertical_datum.name,
         "assumed": "; ".join(sidecar.assumed) or None,
-        "median_sigma_h_m": None if sigma is None else sigma.median_sigma_h_m,
-        "median_sigma_v_m": None if sigma is None else sigma.median_sigma_v_m,
+        "median_camera_sigma_h_m": None if sigma is None else sigma.median_sigma_h_m,
+        "median_camera_sigma_v_m": None if sigma is None else sigma.median_sigma_v_m,
     }
     return Summary(figure, values, cautions=cautions)

@@ -17,7 +17,8 @@ from pipelines.deliver.cloud.frame import cloud_frame
 from pipelines.deliver.cloud.tally import Tally
 from pipelines.deliver.options import ExportCloudOptions
 from pipelines.deliver.predicted_sigma import predicted_sigma
-from pipelines.formats.georef_sidecar import CrsSidecar, write_sidecar
+from pipelines.formats.georef_sidecar import CrsSidecar, median_sigma, write_sidecar
+from pipelines.scene.headline import headline_of
 from pipelines.scene.renderer import ModelRenderer
 from pipelines.scene.scene import photographs
 from pipelines.scene.scene_extent import corners, scene_points
@@ -56,7 +57,7 @@ def run(stage: StageRun, options: ExportCloudOptions) -> Summary:
             "--min-views"
         )
     cautions = union(trained.model.cautions, _no_sigma(sigma.reason))
-    sidecar = target.sidecar(tally.bounds, tally.accuracy(SIGMA_COUNTS), cautions)
+    sidecar = target.sidecar(tally.bounds, headline_of(stage.workspace), tally.sigma(SIGMA_COUNTS), cautions)
     for path in files.paths:
         write_sidecar(sidecar, path)
     views.close()
@@ -71,21 +72,16 @@ def _no_sigma(reason: str) -> tuple[Caution, ...]:
 
 
 def _summary(tally: Tally, sidecar: CrsSidecar, spacing_m: float) -> Summary:
-    accuracy = sidecar.accuracy
-    sigma = (
-        ""
-        if accuracy is None
-        else f", σ {accuracy.median_sigma_h_m:.3f} m H, {accuracy.median_sigma_v_m:.3f} m V (medians)"
-    )
+    sigma = sidecar.sigma
     values = {
         "points": tally.count,
         "spacing_m": spacing_m,
         "crs": sidecar.crs,
         "vertical_datum": sidecar.vertical_datum.name,
         "bounds": sidecar.bounds,
-        "median_sigma_h_m": None if accuracy is None else accuracy.median_sigma_h_m,
-        "median_sigma_v_m": None if accuracy is None else accuracy.median_sigma_v_m,
+        "median_point_sigma_h_m": None if sigma is None else sigma.median_sigma_h_m,
+        "median_point_sigma_v_m": None if sigma is None else sigma.median_sigma_v_m,
         "assumed": "; ".join(sidecar.assumed),
     }
     figure = f"{tally.count} points, one in {spacing_m:.3f} m, {sidecar.crs}, heights {sidecar.vertical_datum.name}"
-    return Summary(figure + sigma, values, cautions=sidecar.cautions)
+    return Summary(figure + median_sigma(sigma, "points"), values, cautions=sidecar.cautions)

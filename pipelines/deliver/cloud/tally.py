@@ -32,7 +32,7 @@ class Tally:
         self._vertical += _classes(points.sigma_v_m)
         self._largest = np.fmax(self._largest, [np.fmax.reduce(points.sigma_h_m), np.fmax.reduce(points.sigma_v_m)])
 
-    def accuracy(self, counts: str) -> SceneSigma | None:
+    def sigma(self, counts: str) -> SceneSigma | None:
         """Return medians and largest of the known σ; None: none is known.
 
         Args:

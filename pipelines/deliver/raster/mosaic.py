@@ -15,7 +15,7 @@ from pipelines import __version__
 from pipelines.core.progress import Progress
 from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.deliver.raster.window import RasterSource, WindowCells, render_window
-from pipelines.formats.georef_sidecar import SceneSigma
+from pipelines.formats.georef_sidecar import CrsSidecar
 from pipelines.formats.geotiff import (
     NODATA,
     Band,
@@ -121,19 +121,19 @@ class Mosaic:
         alpha = [read_reduced(self._part("orthophoto", window), _SAMPLES_PX)[0][3] for window in self._windows()]
         return float(np.concatenate([part.ravel() for part in alpha]).mean() / 255)
 
-    def write(self, folder: Path, accuracy: SceneSigma | None, progress: Progress) -> Iterator[Path]:
+    def write(self, folder: Path, sidecar: CrsSidecar, progress: Progress) -> Iterator[Path]:
         """Write each raster into a folder, and yield its path.
 
         Args:
             folder: of the rasters.
-            accuracy: predicted σ, for the metadata; None: not known.
+            sidecar: of the rasters: accuracy and σ for the metadata.
             progress: shows the rasters.
         """
         with progress.task("rasters", len(self._kinds)) as task:
             for name, kind in self._kinds.items():
                 parts = [(self._part(name, window), window.column, window.row) for window in self._windows()]
                 path = folder / f"{name}.tif"
-                write_mosaic(path, parts, self.frame, kind, self._tags(accuracy))
+                write_mosaic(path, parts, self.frame, kind, self._tags(sidecar))
                 yield path
                 task.advance(note=path.name)
 
@@ -152,16 +152,18 @@ class Mosaic:
     def _part(self, name: str, window: _Window) -> Path:
         return self.folder / f"{name}_{window.row}_{window.column}.tif"
 
-    def _tags(self, accuracy: SceneSigma | None) -> dict[str, str]:
+    def _tags(self, sidecar: CrsSidecar) -> dict[str, str]:
         tags = {
             "TIFFTAG_SOFTWARE": f"GeoRefGS {__version__}",
             "GEOREF_CRS": self._target.crs.name,
             "GEOREF_VERTICAL_DATUM": self._target.crs.vertical.name,
             "GEOREF_EPOCH": "not stated",
         }
-        if accuracy is not None:
-            tags["GEOREF_SIGMA_H_M"] = f"{accuracy.median_sigma_h_m:.4f}"
-            tags["GEOREF_SIGMA_V_M"] = f"{accuracy.median_sigma_v_m:.4f}"
+        if sidecar.accuracy is not None:
+            tags["GEOREF_ACCURACY"] = sidecar.accuracy.text
+        if sidecar.sigma is not None:
+            tags["GEOREF_MEDIAN_CELL_SIGMA_H_M"] = f"{sidecar.sigma.median_sigma_h_m:.4f}"
+            tags["GEOREF_MEDIAN_CELL_SIGMA_V_M"] = f"{sidecar.sigma.median_sigma_v_m:.4f}"
         return tags
 
 

@@ -25,8 +25,9 @@ from pipelines.deliver.raster.extent import (
 from pipelines.deliver.raster.mosaic import Mosaic
 from pipelines.deliver.raster.pictures import write_pictures
 from pipelines.deliver.raster.source import Request, raster_source
-from pipelines.formats.georef_sidecar import SceneSigma, write_sidecar
+from pipelines.formats.georef_sidecar import SceneSigma, median_sigma, write_sidecar
 from pipelines.formats.geotiff import RasterFrame
+from pipelines.scene.headline import headline_of
 from pipelines.scene.scene_extent import corners, scene_points
 from pipelines.scene.target_crs import TargetCrs, target_crs
 from pipelines.scene.trained_survey import load_trained
@@ -56,12 +57,12 @@ def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
         raise DegenerateGeometryError(
             f"no cell is shown by {options.min_views} training views or more: lower --min-views"
         )
-    accuracy = None if reason else _accuracy(mosaic)
+    accuracy, sigma = headline_of(stage.workspace), None if reason else _sigma(mosaic)
     west, south, east, north = frame.bounds
     bounds = [[west, south, height.min()], [east, north, height.max()]]
     cautions = union(trained.model.cautions, _cautions(sampling, source.training_px, reason))
-    sidecar = target.sidecar(bounds, accuracy, cautions)
-    for path in mosaic.write(stage.out, accuracy, stage.progress):
+    sidecar = target.sidecar(bounds, accuracy, sigma, cautions)
+    for path in mosaic.write(stage.out, sidecar, stage.progress):
         write_sidecar(sidecar, path)
     if options.hillshade:
         write_pictures(stage.out, target.horizontal_unit_m / target.height_unit_m)
@@ -70,7 +71,7 @@ def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
     source.views.close()
     remove(mosaic.folder)
     return Summary(
-        _key_figure(frame, target, accuracy),
+        _key_figure(frame, target, sigma),
         {
             "columns": frame.columns,
             "rows": frame.rows,
@@ -82,8 +83,8 @@ def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
             "units": target.crs.units,
             "bounds": bounds,
             "covered": covered,
-            "sigma_h_m": None if accuracy is None else accuracy.median_sigma_h_m,
-            "sigma_v_m": None if accuracy is None else accuracy.median_sigma_v_m,
+            "median_cell_sigma_h_m": None if sigma is None else sigma.median_sigma_h_m,
+            "median_cell_sigma_v_m": None if sigma is None else sigma.median_sigma_v_m,
             "contour_lines": lines,
             "assumed": "; ".join(target.assumed),
         },
@@ -91,7 +92,7 @@ def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
     )
 
 
-def _accuracy(mosaic: Mosaic) -> SceneSigma:
+def _sigma(mosaic: Mosaic) -> SceneSigma:
     horizontal, vertical = mosaic.sample("sigma_h"), mosaic.sample("sigma_v")
     return SceneSigma(
         counts="georeference, cameras and lens; the surface's own noise between training views",
@@ -122,8 +123,6 @@ def _cautions(sampling: GroundSampling, training_px: float, reason: str) -> tupl
     return tuple(cautions)
 
 
-def _key_figure(frame: RasterFrame, target: TargetCrs, accuracy: SceneSigma | None) -> str:
+def _key_figure(frame: RasterFrame, target: TargetCrs, sigma: SceneSigma | None) -> str:
     cells = f"{frame.columns} × {frame.rows} cells of {frame.step_x:g} {target.crs.units[0]} in {target.crs.name}"
-    if accuracy is None:
-        return cells
-    return f"{cells}, σ {accuracy.median_sigma_h_m:.3f} m H, {accuracy.median_sigma_v_m:.3f} m V"
+    return cells + median_sigma(sigma, "cells")

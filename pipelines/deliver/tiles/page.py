@@ -184,15 +184,14 @@ def _page_point(point: SurveyedPoint, kind: Literal["control", "check"], survey:
 
 
 def _facts(placement: Placement, target: TargetCrs) -> tuple[Fact, ...]:
-    accuracy = placement.sidecar().accuracy
-    sigma = "not known" if placement.is_checked else "not stated: nothing checks the σ of the positions"
-    if accuracy is not None:
-        sigma = f"{accuracy.sigma_h_m:.3f} m horizontal, {accuracy.sigma_v_m:.3f} m vertical"
+    accuracy = "not known: nothing states it yet (georef evaluate)"
+    if placement.accuracy is not None:
+        accuracy = placement.accuracy.text
     input_heights = placement.vertical.name + ("" if placement.vertical.stated else " (assumed)")
     facts = (
         Fact(name="CRS", value=target.crs.name),
         Fact(name="Heights", value=f"{target.crs.vertical.name}; of the survey's input: {input_heights}"),
         Fact(name="h", value="height above the WGS84 ellipsoid; labels stand at it, too"),
-        Fact(name="Predicted σ", value=sigma),
+        Fact(name="Accuracy", value=accuracy),
     )
     return facts + tuple(Fact(name="Assumed", value=sentence) for sentence in target.assumed)

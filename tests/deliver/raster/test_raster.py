@@ -228,8 +228,8 @@ def test_rasters_are_valid_and_say_where_they_are(workspace: Workspace) -> None:
         with rasterio.open(path) as raster:
             assert raster.crs.to_epsg() == 32632
             assert raster.tags()["GEOREF_VERTICAL_DATUM"] == sidecar.vertical_datum.name == "ellipsoidal"
-            assert float(raster.tags()["GEOREF_SIGMA_V_M"]) == pytest.approx(
-                sidecar.accuracy.median_sigma_v_m, abs=1e-4
+            assert float(raster.tags()["GEOREF_MEDIAN_CELL_SIGMA_V_M"]) == pytest.approx(
+                sidecar.sigma.median_sigma_v_m, abs=1e-4
             )
 
 

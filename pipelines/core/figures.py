@@ -1,0 +1,106 @@
+"""Accuracy figures, each defined once (label, meaning, unit, decimals); and the headline, the accuracy of a result.
+
+Tables, pages and sentences take their words and decimals from here, so that one figure has one name and the same
+digits everywhere. `scene.headline` says which figure is the headline of a workspace.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from pipelines.core.products import Product
+
+MISSING = "–"
+_PER_METRE = {"m": 1.0, "cm": 100.0}
+# How the position of a check point was measured, by the key of the report.
+WAYS = {"camera": "triangulated", "model": "on the rendered surface"}
+SHORT_WAYS = {"camera": "triangulated", "model": "surface"}  # for narrow columns
+
+
+@dataclass(frozen=True)
+class Figure:
+    """Accuracy figure as people read it.
+
+    Attributes:
+        label: short name, as the head of a column.
+        meaning: the figure in words, as the head of a line.
+        unit: of the text; empty for a number of points.
+        decimals: of the text.
+    """
+
+    label: str
+    meaning: str
+    unit: Literal["m", "cm", ""] = "m"
+    decimals: int = 3
+
+    def text(self, value: float | None) -> str:
+        """Return a value as text without its unit; lengths are given in metres. A dash for None."""
+        return MISSING if value is None else f"{value * _PER_METRE.get(self.unit, 1.0):.{self.decimals}f}"
+
+    def with_unit(self, value: float | None) -> str:
+        """Return a value as text with its unit; a dash for None."""
+        return self.text(value) if value is None else f"{self.text(value)} {self.unit}".rstrip()
+
+
+# The headline's own: of the triangulated check points with their survey's error, else the predicted σ of the scene.
+ACCURACY_H = Figure("H", "horizontal accuracy", "cm", 1)
+ACCURACY_V = Figure("V", "vertical accuracy", "cm", 1)
+CHECK_POINTS = Figure("checks", "check points that the accuracy was measured at", "", 0)
+# Errors of surveyed points, by field of `scene.report.ErrorStats`.
+ERRORS = {
+    "count": Figure("points", "points", "", 0),
+    "mean_e_m": Figure("mean E", "mean error east (bias)"),
+    "mean_n_m": Figure("mean N", "mean error north (bias)"),
+    "mean_u_m": Figure("mean U", "mean error up (bias)"),
+    "rmse_e_m": Figure("RMSE E", "RMSE east"),
+    "rmse_n_m": Figure("RMSE N", "RMSE north"),
+    "rmse_h_m": Figure("RMSE H", "RMSE horizontal"),
+    "rmse_v_m": Figure("RMSE V", "RMSE vertical"),
+    "rmse_3d_m": Figure("RMSE 3D", "RMSE in three dimensions"),
+    "mean_h_m": Figure("mean H", "mean horizontal error"),
+    "median_h_m": Figure("median H", "median horizontal error"),
+    "max_h_m": Figure("max H", "largest horizontal error"),
+    "max_v_m": Figure("max V", "largest vertical error"),
+    "max_3d_m": Figure("max 3D", "largest error in three dimensions"),
+}
+# Predicted σ over the cells of the scene, by the beginning of the fields of `scene.report.AccuracySummary`.
+CELLS = {
+    "least": Figure("least", "σ of the best cell of the scene"),
+    "median": Figure("median", "median σ over the cells of the scene"),
+    "rms": Figure("RMS", "root mean square of σ over the cells of the scene"),
+    "largest": Figure("largest", "σ of the worst cell of the scene"),
+}
+
+
+class Headline(Product):
+    """The accuracy of a result: the one figure that every table, page and file states of it (docs/accuracy.md).
+
+    Attributes:
+        kind: `measured`: of the triangulated check points; `predicted`: of the scene; `unknown`: neither.
+        rmse_h_m, rmse_v_m: RMSE of the check points, their survey's error included, or the RMSE that the predicted
+            σ let expect: their root mean square over the scene. None: not known.
+        check_points: number of check points; 0 unless measured.
+        reason: reason why it is not known; None: it is.
+    """
+
+    kind: Literal["measured", "predicted", "unknown"]
+    rmse_h_m: float | None = None
+    rmse_v_m: float | None = None
+    check_points: int = 0
+    reason: str | None = None
+
+    @property
+    def text(self) -> str:
+        """Kind and figures, such as `measured at 9 check points: RMSE H 4.2 cm, V 5.1 cm`."""
+        if self.kind == "unknown":
+            return f"not known: {self.reason}"
+        figures = f"H {ACCURACY_H.with_unit(self.rmse_h_m)}, V {ACCURACY_V.with_unit(self.rmse_v_m)}"
+        if self.kind == "predicted":
+            return f"predicted, not measured: σ {figures}"
+        return f"measured at {self.check_points} check point{'s'[: self.check_points != 1]}: RMSE {figures}"
+
+    @property
+    def sentence(self) -> str:
+        """The same with its subject, as a part of a line."""
+        return f"accuracy {self.text}"

@@ -1,0 +1,59 @@
+"""Headline of a workspace: its accuracy as measured at check points, else as predicted.
+
+Whoever states the accuracy of a result asks `headline_of`, so that terminal, pages and sidecars state the same.
+"""
+
+from __future__ import annotations
+
+import contextlib
+
+from pipelines.core.cautions import Caution, is_checked
+from pipelines.core.errors import GeorefError
+from pipelines.core.figures import Headline
+from pipelines.core.stages import REPORT
+from pipelines.core.workspace import Workspace
+from pipelines.scene.report import AccuracySummary, CheckPointErrors, read_report
+
+_NOT_CHECKED = "nothing checks the σ of the positions"
+
+
+def headline(triangulated: CheckPointErrors, scene: AccuracySummary, cautions: tuple[Caution, ...]) -> Headline:
+    """Return the accuracy as the check points measure it, else as the σ of the scene predict it.
+
+    Args:
+        triangulated: errors of the triangulated check points; those under vegetation do not count.
+        scene: predicted σ.
+        cautions: of the result; one says whether anything checks the σ.
+    """
+    total = triangulated.with_survey
+    if total is None:
+        return predicted(scene, cautions)
+    count = triangulated.asprs.points
+    return Headline(kind="measured", rmse_h_m=total.rmse_h_m, rmse_v_m=total.rmse_v_m, check_points=count)
+
+
+def predicted(scene: AccuracySummary, cautions: tuple[Caution, ...]) -> Headline:
+    """Return the predicted accuracy: the root mean square of σ over the cells of the scene.
+
+    Without anything that checks the σ of the positions, the accuracy is not known.
+    """
+    if not is_checked(cautions):
+        return Headline(kind="unknown", reason=_NOT_CHECKED)
+    if scene.rms_sigma_h_m is None or scene.rms_sigma_v_m is None:
+        return Headline(kind="unknown", reason=scene.reason or "no σ is predicted")
+    return Headline(kind="predicted", rmse_h_m=scene.rms_sigma_h_m, rmse_v_m=scene.rms_sigma_v_m)
+
+
+def headline_of(workspace: Workspace) -> Headline | None:
+    """Return the accuracy of a workspace: that of its evaluation, else the predicted one; None: neither exists.
+
+    A damaged report states none; `georef status` names it.
+    """
+    with contextlib.suppress(GeorefError):
+        return read_report(workspace.path(REPORT)).headline
+    return predicted_headline(workspace)
+
+
+def predicted_headline(_workspace: Workspace) -> Headline | None:
+    """Return the accuracy that the adjustment predicts; None: no product states it before `evaluate`."""
+    return None

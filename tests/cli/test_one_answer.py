@@ -1,0 +1,148 @@
+"""One answer: a result has one accuracy, the same to the digit wherever it is stated."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from georef_cli import batch_tables
+from georef_cli.output import print_outcomes, print_rich
+from pipelines.batch.files import write_batch
+from pipelines.batch.missions import Mission
+from pipelines.batch.table import BatchTable, mission_row
+from pipelines.core.cautions import NOT_CHECKED, Caution
+from pipelines.core.figures import Headline
+from pipelines.core.fingerprints import fingerprints
+from pipelines.core.products import load_json, save_json
+from pipelines.core.stages import BY_NAME, DELIVERABLES, HEADLINE, PIPELINE, REPORT
+from pipelines.core.workspace import StageRun, Summary, Workspace
+from pipelines.deliver import ply, spz
+from pipelines.deliver.cameras import stage as cameras
+from pipelines.deliver.overview import overview
+from pipelines.deliver.tiles import stage as tiles
+from pipelines.report import stage as report
+from pipelines.scene.crs_options import CrsOptions
+from pipelines.scene.headline import headline, headline_of
+from pipelines.scene.report import AccuracySummary, EvaluationReport, TotalRmse
+from pipelines.scene.survey import Survey
+from pipelines.view.viewer import accuracy_line
+from tests.cli_runs import Georef
+from tests.evaluated_workspaces import CHECK_POINTS, ERROR_M, evaluated_workspace
+from tests.reports import check_points_with
+
+UNCHECKED = (Caution(code=NOT_CHECKED, sentence="Nothing checks the positions."),)
+
+
+@pytest.fixture
+def flight(tmp_path: Path) -> Workspace:
+    return evaluated_workspace(tmp_path / "flight").workspace
+
+
+def true_headline(workspace: Workspace) -> Headline:
+    """All errors are `ERROR_M`; the standard adds the variances of the points' survey."""
+    points = load_json(Survey, workspace.path("ingest/survey.json")).check_points
+    variance = np.mean([np.diag(point.cov_in_geo) for point in points], axis=0)
+    east, north, up = np.square(ERROR_M) + variance
+    return Headline(
+        kind="measured", rmse_h_m=np.sqrt(east + north), rmse_v_m=np.sqrt(up), check_points=CHECK_POINTS
+    )
+
+
+def made(workspace: Workspace, name: str, run: Callable[..., Summary]) -> Path:
+    """Run a stage in its place, and return its folder."""
+    spec = BY_NAME[name]
+    out = workspace.root / spec.folder
+    out.mkdir(exist_ok=True)
+    run(StageRun(workspace, out), spec.options())
+    return out
+
+
+def test_it_is_the_same_everywhere(
+    real_georef: Georef, flight: Workspace, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    stated = headline_of(flight)
+    assert stated is not None
+    truth = true_headline(flight)
+    assert (stated.rmse_h_m, stated.rmse_v_m) == pytest.approx((truth.rmse_h_m, truth.rmse_v_m), rel=1e-12)
+    text, figures = truth.text, stated.model_dump()
+    assert re.fullmatch(r"measured at 3 check points: RMSE H \d\.\d cm, V \d\.\d cm", text)
+
+    # In JSON, to the last digit.
+    assert real_georef("status", flight.root, "--json").document["accuracy"] == figures
+    assert real_georef("info", flight.root, "--json").document["properties"]["quality"]["accuracy"] == figures
+    runs = {"ply": ply.run, "spz": spz.run, "tiles": tiles.run, "cameras": cameras.run}
+    folders = {name: made(flight, f"export-{name}", run) for name, run in runs.items()}
+    sidecars = [path for folder in folders.values() for path in folder.rglob("*.georef.json")]
+    assert len(sidecars) == 8
+    assert [json.loads(path.read_text("utf-8"))["accuracy"] for path in sidecars] == [figures] * 8
+
+    # In text, to the digit that is shown.
+    page = (made(flight, "report", report.run) / "report.html").read_text("utf-8")
+    tiles_page = (folders["tiles"] / "index.html").read_text("utf-8")
+    print_outcomes(flight, [], overview(flight, CrsOptions()), as_json=False, told=True)
+    end_of_run = capsys.readouterr().out
+    mission = Mission("flight", flight, "flight")
+    table = BatchTable(batch="b", missions=(mission_row(mission, "done"),))
+    assert table.missions[0].accuracy == stated
+    for where in (
+        real_georef("status", flight.root).out,
+        real_georef("info", flight.root).out,
+        end_of_run,
+        page,
+        tiles_page,
+        accuracy_line(flight),
+    ):
+        assert text in " ".join(where.split())
+    write_batch(tmp_path, table)
+    print_rich(*batch_tables.batch(table, tmp_path))
+    horizontal, vertical = re.findall(r"[HV] (\d\.\d) cm", text)
+    assert re.search(rf"measured +{horizontal} +{vertical} +3", capsys.readouterr().out)
+    for html in ((tmp_path / "b.batch.html").read_text("utf-8"), page):
+        head = html.split("Errors of the check")[0]
+        shown = re.findall(r'rmse_[hv]_m" data-value="([^"]+)">([^<]+)</data>', head)
+        assert shown == [(str(stated.rmse_h_m), f"{horizontal} cm"), (str(stated.rmse_v_m), f"{vertical} cm")]
+
+
+def test_what_states_it_goes_stale_with_it_alone(flight: Workspace) -> None:
+    stating = [BY_NAME["export-ply"], *(spec for spec in DELIVERABLES if spec.name != "report")]
+    assert all(HEADLINE in spec.reads for spec in stating)
+    before = PIPELINE[: PIPELINE.index(BY_NAME["evaluate"])]
+    assert not any(part.product == REPORT for spec in before for part in spec.reads)
+
+    def hashes() -> str:
+        spec = BY_NAME["export-ply"]
+        return fingerprints(flight, spec, spec.options(), {}).hashes[REPORT]
+
+    first, found = hashes(), load_json(EvaluationReport, flight.path(REPORT))
+    save_json(found.model_copy(update={"cautions": UNCHECKED}), flight.path(REPORT))
+    assert hashes() == first
+    better = found.headline.model_copy(update={"rmse_v_m": 0.01})
+    save_json(found.model_copy(update={"headline": better}), flight.path(REPORT))
+    assert hashes() != first
+
+
+def test_without_check_points_it_is_predicted_and_called_so() -> None:
+    scene = AccuracySummary(cells=4, rms_sigma_h_m=0.0421, rms_sigma_v_m=0.0514, reason=None)
+    none = check_points_with()
+    assert headline(none, scene, ()).sentence == "accuracy predicted, not measured: σ H 4.2 cm, V 5.1 cm"
+    unchecked = headline(none, scene, UNCHECKED)
+    assert unchecked.sentence == "accuracy not known: nothing checks the σ of the positions"
+    assert (unchecked.rmse_h_m, unchecked.rmse_v_m) == (None, None)
+    few = AccuracySummary(cells=0, reason="the scene has too few points")
+    assert headline(none, few, ()).text == "not known: the scene has too few points"
+    # What is measured needs no check of the σ.
+    total = TotalRmse(rmse_h_m=0.03, rmse_v_m=0.04, rmse_3d_m=0.05)
+    points = check_points_with(count=1, with_survey=total)
+    assert headline(points, scene, UNCHECKED).text == "measured at 1 check point: RMSE H 3.0 cm, V 4.0 cm"
+
+
+def test_a_workspace_without_evaluation_states_none(real_georef: Georef, flight: Workspace) -> None:
+    flight.path(REPORT).unlink()
+    assert headline_of(flight) is None
+    assert real_georef("status", flight.root, "--json").document["accuracy"] is None
+    assert "not known yet: georef evaluate states it" in real_georef("info", flight.root).out
