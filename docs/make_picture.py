@@ -95,7 +95,6 @@ def measuring(workspace: Workspace) -> np.ndarray:
 
     server, address = start_server(8080, f"georef view {workspace.root.name}")
     viewer = Viewer(server, workspace, ViewOptions())
-    viewer.wait_for_sigma()
     with sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=chromium_path(), args=list(DRAWING))
         page = browser.new_page(viewport={"width": 1280, "height": 720})

@@ -12,7 +12,7 @@ from rich.text import Text
 
 from georef_cli import overview, tables
 from georef_cli.markup import Safe, shown
-from pipelines.core.cautions import Caution
+from pipelines.core.cautions import Caution, union
 from pipelines.core.products import dump_json
 from pipelines.core.runner import Outcome
 from pipelines.core.staleness import cautions_by_stage
@@ -21,6 +21,7 @@ from pipelines.scene.headline import headline_of
 
 if TYPE_CHECKING:
     from pipelines.deliver.overview import Overview
+    from pipelines.scene.report import EvaluationReport
 
 PIPED_WIDTH = 120
 
@@ -77,7 +78,13 @@ def print_outcome(workspace: Workspace, outcome: Outcome, *more: RenderableType,
 
 
 def print_outcomes(
-    workspace: Workspace, outcomes: Sequence[Outcome], result: Overview | None, *, as_json: bool, told: bool
+    workspace: Workspace,
+    outcomes: Sequence[Outcome],
+    result: Overview | None,
+    solved: EvaluationReport | None = None,
+    *,
+    as_json: bool,
+    told: bool,
 ) -> None:
     """Print the results of several stages, the overview of the whole if there is one, and last the cautions.
 
@@ -85,13 +92,19 @@ def print_outcomes(
         workspace: with the results.
         outcomes: of the stages.
         result: the overview.
+        solved: evaluation of cameras without training; None: no part of the result.
         as_json: print one document.
         told: the log on the same terminal has shown the stages.
     """
     cautions = cautions_by_stage(workspace)
+    if solved is not None:
+        carried = union(*cautions.values())
+        cautions["evaluation"] = tuple(caution for caution in solved.cautions if caution not in carried)
     if as_json:
         stages = [document_of(outcome) for outcome in outcomes]
         document = {"workspace": str(workspace.root), "stages": stages, "result": result and result.feature()}
+        if solved is not None:
+            document["evaluation"] = solved.model_dump(mode="json")
         print_json({**document, "cautions": document_of_cautions(cautions)})
         return
     if not told:
@@ -99,7 +112,9 @@ def print_outcomes(
     if result is not None:
         print_rich(*overview.short(result))
     else:
-        print_rich(*tables.accuracy(headline_of(workspace)))
+        if solved is not None:
+            print_rich(*tables.report(solved))
+        print_rich(*tables.accuracy(headline_of(workspace) if solved is None else solved.headline))
         if told:
             print_rich(f"[bold]Next[/]: georef run {shown(str(workspace.root))} completes it")
     print_rich(*tables.cautions(cautions))

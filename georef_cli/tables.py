@@ -22,7 +22,7 @@ from pipelines.core.stages import REPORT
 from pipelines.core.staleness import StageState
 from pipelines.core.workspace import Workspace
 from pipelines.scene.reference_report import ReferenceComparison
-from pipelines.scene.report import CheckPointErrors, EvaluationReport, NoCrossValidation, read_report
+from pipelines.scene.report import CheckPointErrors, EvaluationReport, read_report
 
 STATE_STYLE = {
     "current": "green",
@@ -34,6 +34,7 @@ STATE_STYLE = {
     "missing": "dim",
 }
 POINT_COLUMNS = {name: figure.label for name, figure in ERRORS.items() if name not in ("max_h_m", "max_v_m")}
+SIGMA_COLUMNS = {"count": "n", "rms_h_m": "RMS H", "rms_v_m": "RMS V"}
 FACTOR_COLUMNS = {
     "count": "count",
     "used": "used",
@@ -203,24 +204,24 @@ def report_of(workspace: Workspace) -> list[Renderable]:
 
 
 def report(document: EvaluationReport) -> list[Renderable]:
-    """Return the tables of a report: test views, check points, cross-validation, residuals of the fit.
+    """Return the tables of a report: test views, check points, cross-validation, σ, residuals of the fit.
 
     A residual of the fit is not an accuracy, and a control point is not a check point: they never share a table.
     """
-    checked = (document.checkpoints.camera, document.checkpoints.model)
-    ways = dict(zip(SHORT_WAYS.values(), checked, strict=True))
-    crossed = document.cross_validation
+    ways = {SHORT_WAYS[way]: errors for way, errors in document.checkpoints.by_way.items()}
+    crossed, test, cameras = document.cross_validation, document.test_views, document.cameras
     fit = {"gnss": dict(document.fit.gnss), "gcp": dict(document.fit.gcp)}
     factors: dict[str, dict[str, Any]] = {factor.group: dict(factor) for factor in document.variance_factors}
     tables = (
-        _rows("Test views", {"test": dict(document.photometric.test)}, IMAGE_COLUMNS),
+        _rows("Test views", {} if test is None else {"test": dict(test)}, IMAGE_COLUMNS),
         _rows(
             "Errors of the check points, metres", {way: dict(errors) for way, errors in ways.items()}, POINT_COLUMNS
         ),
         _accuracy(ways),
         _rows(f"{_CROSSED}, metres", {} if crossed is None else {"left out": dict(crossed)}, POINT_COLUMNS),
-        _impossible(crossed) if isinstance(crossed, NoCrossValidation) else None,
+        None if crossed is None or crossed.reason is None else _impossible(crossed.reason),
         *_against_reference(document.reference),
+        _rows("Predicted σ, metres", {} if cameras is None else {"cameras": dict(cameras)}, SIGMA_COLUMNS),
         _rows("Residuals of the fit (not an accuracy), metres", fit, POINT_COLUMNS),
         _rows("Variance factors: estimated over stated variance (tie points: in px²)", factors, FACTOR_COLUMNS),
     )
@@ -246,8 +247,8 @@ def _against_reference(reference: ReferenceComparison | None) -> list[Group | No
     ]
 
 
-def _impossible(crossed: NoCrossValidation) -> Group:
-    return Group(f"\n[bold]{_CROSSED}[/]", f"not possible: {shown(crossed.reason)}")
+def _impossible(reason: str) -> Group:
+    return Group(f"\n[bold]{_CROSSED}[/]", f"not possible: {shown(reason)}")
 
 
 def _rows(title: str, rows: Mapping[str, Mapping[str, Any]], columns: Mapping[str, str]) -> Group | None:
@@ -261,15 +262,15 @@ def _rows(title: str, rows: Mapping[str, Mapping[str, Any]], columns: Mapping[st
 
 
 def _accuracy(ways: Mapping[str, CheckPointErrors]) -> Group | None:
-    """Return the accuracy by the check points after the standard, beside the prediction and the bound."""
+    """Return the accuracy by the check points after the standard, beside the prediction."""
     rows = {way: _accuracy_row(errors) for way, errors in ways.items() if errors.with_survey is not None}
     columns = {head: head for row in rows.values() for head in row}
-    title = "Accuracy with the check points' own survey (ASPRS), their predicted σ and Cramér–Rao bound, metres"
+    title = "Accuracy with the check points' own survey (ASPRS), and their predicted σ, metres"
     return _rows(title, rows, columns)
 
 
 def _accuracy_row(errors: CheckPointErrors) -> dict[str, float | str | None]:
-    total, predicted, bound = errors.with_survey, errors.predicted, errors.cramer_rao
+    total, predicted = errors.with_survey, errors.predicted
     return {
         "RMSE H": None if total is None else total.rmse_h_m,
         "RMSE V": None if total is None else total.rmse_v_m,
@@ -280,8 +281,6 @@ def _accuracy_row(errors: CheckPointErrors) -> dict[str, float | str | None]:
         "class 3D": errors.asprs.class_3d,
         "σ H": None if predicted is None else predicted.rms_h_m,
         "σ V": None if predicted is None else predicted.rms_v_m,
-        "bound H": None if bound is None else bound.rms_h_m,
-        "bound V": None if bound is None else bound.rms_v_m,
     }
 
 

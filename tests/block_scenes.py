@@ -15,9 +15,7 @@ from tests.scenes import Measured, TrueScene, looking_at, sparse_model, survey_o
 from tests.splat_scenes import (
     CAMERA,
     NOISE,
-    START_COVARIANCE,
     Rendered,
-    initial_similarity,
     write_photographs,
     write_rendered,
 )
@@ -84,6 +82,4 @@ def make_field(
 def write_field(root: Path, rendered: Rendered) -> Workspace:
     """Return a workspace of the field as the stages before training leave it, with its photographs."""
     write_photographs(rendered, root / "photos")
-    pivot = rendered.scene.center_in_geo.mean(axis=0)
-    initial = initial_similarity(np.random.default_rng(0), START_COVARIANCE / 100, pivot)
-    return write_rendered(root, rendered, initial)
+    return write_rendered(root, rendered)

@@ -37,14 +37,14 @@ def check_points_with(**figures: Any) -> CheckPointErrors:
     """Check points with the given figures and no others; none were measured if there are no figures."""
     count = figures.get("count", 0)
     asprs = AsprsStatement(points=count, least_points=30, enough_points=count >= 30, **_NO_CLASSES)
-    unknown = {"survey": None, "with_survey": None, "predicted": None, "cramer_rao": None, "without_blunders": None}
+    unknown = {"survey": None, "with_survey": None, "predicted": None, "without_blunders": None}
     nothing = {**dict.fromkeys(ErrorStats.model_fields), **unknown, "count": 0, "blunders": (), "points": ()}
     return CheckPointErrors(**{**nothing, "asprs": asprs, **figures})
 
 
 def cross_validation_with(**figures: Any) -> CrossValidation:
     """Control points left out, with the given figures and no others."""
-    stated = check_points_with(**figures).model_dump(exclude={"asprs", "cramer_rao"})
+    stated = check_points_with(**figures).model_dump(exclude={"asprs"})
     return CrossValidation(**stated, reason=None)
 
 
@@ -81,6 +81,7 @@ def report_with(
             gnss=FixResiduals(**{**no_residuals, "outliers": 0, **(gnss or {})}),
             gcp=ControlResiduals(**no_residuals, points=()),
         ),
+        cameras=None,
         similarity=SimilaritySigma(sigma_ln_scale=1e-4, sigma_translation_m=(0.01, 0.01, 0.02)),
         cautions=cautions,
     )

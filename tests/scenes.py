@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -15,12 +16,12 @@ from pipelines.core.workspace import Workspace
 from pipelines.formats.colmap_writer import write_sparse
 from pipelines.geodesy.enu import Origin
 from pipelines.geodesy.vertical import VerticalDatum
-from pipelines.geometry.cameras import Camera, project
+from pipelines.geometry.cameras import Camera, CameraPoses, project
 from pipelines.geometry.rotations import exp_so3, quat_xyzw_from_matrix
 from pipelines.geometry.similarity import Similarity, SimilarityRecord
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.scene.initial_similarity import InitialSimilarity
-from pipelines.scene.survey import Attitude, CameraPrior, Fix, Mark, Survey, SurveyedPoint, SurveyImage
+from pipelines.scene.survey import Attitude, CameraPrior, Fix, FixSession, Mark, Survey, SurveyedPoint, SurveyImage
 from pipelines.scene.trained_model import TrainedCamera, TrainedModel
 
 CAMERA = Camera("OPENCV", 1200, 900, np.array([1020.0, 1018.0, 603.0, 447.0, -0.045, 0.012, 3e-4, -2e-4]))
@@ -181,7 +182,16 @@ def survey_of(scene: TrueScene, noise: Noise, measured: Measured, rng: np.random
         cameras=(prior,),
         images=tuple(images),
         control_points=_control(scene, noise, rng) if measured.gcps else (),
+        # Without control points nothing is drawn of the common error, and nothing stated.
+        sessions=(session_of(noise.fix_m[0]),) if measured.gcps and measured.fixes else (),
     )
+
+
+def session_of(sigma_m: float) -> FixSession:
+    """Return the session of fixes with such a σ, and the default σ of their common error."""
+    if sigma_m <= 0.1:
+        return FixSession(receiver="RTK fixed", sigma_common_m=(0.03, 0.03, 0.05), sigma_source="default")
+    return FixSession(receiver="unknown receiver", sigma_common_m=(2.0, 2.0, 4.0), sigma_source="default")
 
 
 def _control(scene: TrueScene, noise: Noise, rng: np.random.Generator) -> tuple[SurveyedPoint, ...]:
@@ -228,6 +238,23 @@ def initial_product(geo_from_local: SimilarityRecord, layout: str = "volume") ->
         condition_number=1.0,
         layout=layout,  # type: ignore[arg-type]
         attitude_used=False,
+    )
+
+
+def trained_cameras(
+    names: Sequence[str], poses: CameraPoses, test: Collection[int] = ()
+) -> tuple[TrainedCamera, ...]:
+    """Return cameras as a product, of poses in `model`."""
+    quats = quat_xyzw_from_matrix(poses.cam_from_model)
+    shift = -np.einsum("nij,nj->ni", poses.cam_from_model, poses.cam_center_in_model)
+    return tuple(
+        TrainedCamera(
+            name=name,
+            split="test" if index in test else "train",
+            quat_xyzw=tuple(quats[index].tolist()),
+            translation=tuple(shift[index].tolist()),
+        )
+        for index, name in enumerate(names)
     )
 
 

@@ -10,26 +10,24 @@ import numpy as np
 import torch
 
 from pipelines.adjust.geolocate import geolocate
-from pipelines.adjust.options import GeolocateOptions
-from pipelines.core.products import save_json
-from pipelines.core.stages import POINTS, SIM3
+from pipelines.adjust.init_sim3 import estimate_similarity
+from pipelines.adjust.options import GeolocateOptions, InitSim3Options
+from pipelines.adjust.posterior import save_posterior
+from pipelines.core.products import load_json, save_json
+from pipelines.core.stages import ADJUSTMENT, POINTS, SIM3, SIM3_POSTERIOR, SPARSE, SURVEY
 from pipelines.core.workspace import Workspace
+from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.cameras import Camera, Pinhole
-from pipelines.geometry.rotations import exp_so3
-from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.scene.initial_similarity import InitialSimilarity
 from pipelines.scene.survey import Survey
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
 from pipelines.splat.sh import sh_from_rgb
 from tests.scenes import (
-    GEO_FROM_LOCAL,
     Measured,
     Noise,
     TrueScene,
-    initial_product,
     looking_at,
     sparse_model,
     survey_of,
@@ -43,8 +41,6 @@ NOISE = Noise(fix_m=(0.05, 0.05, 0.08), pixel_px=0.1, mark_px=0.1, gcp_m=1e-4)
 TEST_VIEWS = (3, 9)
 # Too few for density control, which would turn differences of rounding into differences of tenths of a dB.
 TRAINING = {"iterations": 150, "sh_degree": 0, "log_every": 5}
-# How far off the similarity starts: half a per cent, 0.3°, 0.3 m, ten and more times what training will state.
-START_COVARIANCE = np.diag([5e-3, 5e-3, 5e-3, 5e-3, 0.3, 0.3, 0.3]) ** 2
 
 
 @dataclass(frozen=True)
@@ -132,22 +128,22 @@ def write_photographs(rendered: Rendered, folder: Path) -> None:
         (folder / name).write_bytes(cv2.imencode(".png", rgb[..., ::-1])[1].tobytes())
 
 
-def initial_similarity(
-    rng: np.random.Generator, covariance: np.ndarray, pivot: np.ndarray, truth: Similarity = GEO_FROM_LOCAL
-) -> InitialSimilarity:
-    """Return the truth, changed by one draw from `covariance` (7, 7) about `pivot`."""
-    delta = np.linalg.cholesky(covariance) @ rng.normal(size=7)
-    turn, grow = exp_so3(delta[1:4]), float(np.exp(delta[0]))
-    off = Similarity(grow, turn, pivot + delta[4:] - grow * turn @ pivot)
-    return initial_product((off @ truth).to_record("local", "geo", covariance=covariance, pivot=pivot))
-
-
-def write_rendered(root: Path, rendered: Rendered, initial: InitialSimilarity) -> Workspace:
+def write_rendered(root: Path, rendered: Rendered) -> Workspace:
     """Return a workspace as the stages before training leave it; the photographs must be in `root/photos`."""
     workspace = write_workspace(root, rendered.survey, rendered.sparse)
-    save_json(initial, root / SIM3)
-    geolocate(rendered.survey, rendered.sparse, GeolocateOptions()).points.save(root / POINTS)
+    adjust_workspace(workspace)
     return workspace
+
+
+def adjust_workspace(workspace: Workspace, options: InitSim3Options | None = None) -> None:
+    """Write what `geolocate` and `init-sim3` make of survey and model."""
+    survey, sparse = load_json(Survey, workspace.path(SURVEY)), read_sparse(workspace.path(SPARSE))
+    points = geolocate(survey, sparse, GeolocateOptions()).points
+    points.save(workspace.root / POINTS)
+    estimated = estimate_similarity(survey, sparse, points, options or InitSim3Options())
+    save_json(estimated.initial, workspace.root / SIM3)
+    save_json(estimated.posterior.solution, workspace.root / ADJUSTMENT)
+    save_posterior(estimated.posterior, workspace.root / SIM3_POSTERIOR)
 
 
 @dataclass(frozen=True)
@@ -168,6 +164,4 @@ class RenderedFlight:
         for shared in ("photos", "cache"):
             (self.root / shared).mkdir(exist_ok=True)
             (root / shared).symlink_to(self.root / shared)
-        pivot = self.rendered.scene.center_in_geo.mean(axis=0)
-        initial = initial_similarity(np.random.default_rng(self.seed), START_COVARIANCE, pivot)
-        return write_rendered(root, self.rendered, initial)
+        return write_rendered(root, self.rendered)

@@ -245,6 +245,34 @@ def test_library_stays_at_home(library: str) -> None:
     assert strangers == []
 
 
+# Names by which the adjustment is solved. Others read the solution that it has stored.
+SOLVERS = {"minimise", "linearised", "problem_of", "SparseCholesky"}
+# The baseline of the comparison adjusts on its own.
+WHERE_SOLVED = ("pipelines.adjust.", "pipelines.train.", "pipelines.geometry.", "pipelines.sfm.pose_prior")
+
+
+def solvers_in(source: str) -> set[str]:
+    """Names of the solver that a module imports or calls."""
+    found = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.ImportFrom):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.Attribute):
+            found.add(node.attr)
+    return found & SOLVERS
+
+
+def test_nobody_solves_to_read() -> None:
+    assert solvers_in("from pipelines.adjust import system\nsystem.minimise(problem)") == {"minimise"}
+    solving = {
+        ".".join(path.relative_to(REPOSITORY).parts): names
+        for package in PACKAGES
+        for path in (REPOSITORY / package).rglob("*.py")
+        if (names := solvers_in(path.read_text(encoding="utf-8")))
+    }
+    assert {name: names for name, names in solving.items() if not name.startswith(WHERE_SOLVED)} == {}
+
+
 def test_core_is_light() -> None:
     for module in sources():
         if inside(module, "pipelines.core"):

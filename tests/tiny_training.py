@@ -9,9 +9,7 @@ import cv2
 import numpy as np
 import torch
 
-from pipelines.adjust.cameras import CameraCorrections
-from pipelines.adjust.problem import GeoProblem
-from pipelines.adjust.similarity import LearnableSimilarity
+from pipelines.adjust.state import State
 from pipelines.geometry.cameras import Camera, CameraPoses, Pinhole
 from pipelines.geometry.similarity import Similarity
 from pipelines.scene.photographs import ImageCache, Photograph
@@ -22,6 +20,8 @@ from pipelines.splat.optimizer import GaussianAdam
 from pipelines.splat.outlier_pixels import OutlierPixels
 from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
+from pipelines.train.geographic.problem import GeoProblem
+from pipelines.train.geographic.unknowns import CameraCorrections, LearnableSimilarity
 from pipelines.train.schedule import JointOptions
 from pipelines.train.trainer import JointTrainer, TrainingViews
 
@@ -77,12 +77,14 @@ def trainer(
     start = replace(start, log_scales=start.log_scales - 0.5, sh=torch.zeros_like(start.sh))
     train = np.arange(len(images))
     similarity = LearnableSimilarity(Similarity(), np.eye(7) * 1e-4, np.zeros(3))
-    cameras = CameraCorrections(poses(len(images)), np.zeros((len(images), 6, 0)))
+    cameras = CameraCorrections.held(
+        poses(len(images)), State(Similarity(), np.zeros((len(images), 6)), np.zeros(0))
+    )
     exposures = Exposures(len(images), torch.from_numpy(train), options.iterations, torch.device("cpu"))
     return JointTrainer(
         GaussianAdam(start, EXTENT_M, options.iterations),
         strategy or DefaultStrategy(SETTINGS, EXTENT_M, len(start)),
-        GeoProblem(similarity, cameras, ()),
+        GeoProblem(similarity, cameras),
         TrainingViews(train, images),
         rasterizer=CpuRasterizer(),
         options=options,

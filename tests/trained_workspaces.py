@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from pipelines.core.products import save_json
-from pipelines.core.stages import GAUSSIANS, MODEL, SIM3
+from pipelines.adjust.measurements import problem_of, start_of
+from pipelines.adjust.posterior import save_posterior
+from pipelines.adjust.solution import adjusted
+from pipelines.core.products import load_json, save_json
+from pipelines.core.stages import ADJUSTMENT, GAUSSIANS, MODEL, SIM3, SIM3_POSTERIOR, SPARSE, TRAIN_POSTERIOR
 from pipelines.core.workspace import Workspace
-from pipelines.geometry.rotations import quat_xyzw_from_matrix
+from pipelines.formats.colmap import read_sparse
+from pipelines.geometry.cameras import CameraPoses
+from pipelines.geometry.rotations import log_so3
 from pipelines.geometry.similarity import Similarity
-from pipelines.scene.trained_model import TrainedCamera
+from pipelines.geometry.sparse_model import SparseModel
+from pipelines.scene.calibrated import load_survey
+from pipelines.scene.initial_similarity import InitialSimilarity
+from pipelines.scene.scene import Scene
+from pipelines.scene.trained_model import Adjustment, TrainedModel
 from pipelines.splat.initialise import gaussians_of_size
 from pipelines.splat.storage import write_gaussians
 from tests.scenes import (
@@ -23,6 +34,7 @@ from tests.scenes import (
     make_scene,
     sparse_model,
     survey_of,
+    trained_cameras,
     trained_model,
     write_workspace,
 )
@@ -42,19 +54,46 @@ def trained_workspace(root: Path) -> tuple[TrueScene, Workspace]:
     )
     workspace = write_workspace(root, survey.model_copy(update={"images": images}), sparse_model(scene, NOISE, rng))
     model_from_geo = GEO_FROM_MODEL.inverse()
-    rotation = np.swapaxes(scene.geo_from_cam, 1, 2)
-    centers = model_from_geo.apply(scene.center_in_geo)
-    cameras = tuple(
-        TrainedCamera(
-            name=name,
-            split="test" if index == 2 else "train",
-            quat_xyzw=tuple(quat_xyzw_from_matrix(rotation[index])),
-            translation=tuple(-rotation[index] @ centers[index]),
-        )
-        for index, name in enumerate(scene.names)
-    )
+    poses = CameraPoses(np.swapaxes(scene.geo_from_cam, 1, 2), model_from_geo.apply(scene.center_in_geo))
+    cameras = trained_cameras(scene.names, poses, test=(2,))
     save_json(trained_model(GEO_FROM_MODEL, model_from_geo @ GEO_FROM_LOCAL, cameras=cameras), root / MODEL)
     save_json(initial(), root / SIM3)
     means = model_from_geo.apply(scene.point_in_geo)
     write_gaussians(root / GAUSSIANS, gaussians_of_size(means, np.zeros_like(means), np.ones(len(means))))
+    write_adjustment(workspace)
     return scene, workspace
+
+
+def scene_of(model: Adjustment, sfm: SparseModel) -> Scene:
+    """Return the scene that a solution belongs to."""
+    every = np.arange(len(sfm.image_name))
+    return Scene(sfm, Similarity.from_record(model.model_from_local), model.similarity, every, every[:0])
+
+
+def write_adjustment(workspace: Workspace) -> None:
+    """Complete a trained model that was made by hand: its measurements, σ and covariances, at its own state."""
+    model, sfm = load_json(TrainedModel, workspace.path(MODEL)), read_sparse(workspace.path(SPARSE))
+    survey, made = load_survey(workspace), load_json(InitialSimilarity, workspace.path(SIM3))
+    scene = scene_of(model, sfm)
+    problem = problem_of(scene, made.in_use(survey))
+    turned = np.swapaxes(scene.poses.cam_from_model, 1, 2) @ model.poses.cam_from_model
+    moved = model.poses.cam_center_in_model - scene.poses.cam_center_in_model
+    lens = sfm.lenses.change_to(model.with_lenses(sfm).lenses) if model.lenses else start_of(scene, problem).lens
+    correction = np.column_stack([-log_so3(turned), moved])
+    state = replace(start_of(scene, problem), correction=correction, lens=lens)
+    posterior = adjusted(scene, problem, state, made)
+    solved = posterior.solution
+    update = {"measurements": solved.measurements, "sigma_px": solved.sigma_px, "accuracy": solved.accuracy}
+    save_json(model.model_copy(update=update), workspace.root / MODEL)
+    save_posterior(posterior, workspace.root / TRAIN_POSTERIOR)
+
+
+def untrained(workspace: Workspace) -> None:
+    """Leave the products of a trained model as those of init-sim3, without Gaussians."""
+    model = load_json(TrainedModel, workspace.path(MODEL))
+    save_json(
+        Adjustment.model_validate(model.model_dump(include=set(Adjustment.model_fields))),
+        workspace.root / ADJUSTMENT,
+    )
+    workspace.path(TRAIN_POSTERIOR).rename(workspace.root / SIM3_POSTERIOR)
+    shutil.rmtree(workspace.root / "train")

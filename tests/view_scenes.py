@@ -11,30 +11,28 @@ import torch
 from pipelines.core.products import save_json
 from pipelines.core.stages import GAUSSIANS, MODEL
 from pipelines.core.workspace import Workspace
-from pipelines.geometry.rotations import quat_xyzw_from_matrix
+from pipelines.geometry.cameras import CameraPoses
 from pipelines.geometry.similarity import Similarity
 from pipelines.scene.renderer import ModelRenderer
 from pipelines.scene.scene import photographs
-from pipelines.scene.trained_model import TrainedCamera
 from pipelines.scene.trained_survey import load_trained
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
 from pipelines.splat.storage import write_gaussians
-from tests.scenes import GEO_FROM_LOCAL, trained_model
+from tests.scenes import GEO_FROM_LOCAL, trained_cameras, trained_model
 from tests.splat_scenes import (
     CAMERA,
     SPACING_M,
     TEST_VIEWS,
     Rendered,
     ground_height,
-    initial_similarity,
     write_photographs,
     write_rendered,
 )
+from tests.trained_workspaces import write_adjustment
 
 FINE_M = 0.6  # between the Gaussians
 # The fixes' σ, about: what a similarity from twelve of them has.
-COVARIANCE = np.diag([1e-4, 1e-4, 1e-4, 1e-4, 0.02, 0.02, 0.03]) ** 2
 
 
 def smooth(rendered: Rendered) -> Rendered:
@@ -67,23 +65,15 @@ def viewed_workspace(root: Path, rendered: Rendered) -> Workspace:
     root.mkdir(parents=True, exist_ok=True)
     scene = rendered.scene
     write_photographs(rendered, root / "photos")
-    pivot = scene.center_in_geo.mean(axis=0)
-    workspace = write_rendered(root, rendered, initial_similarity(np.random.default_rng(1), COVARIANCE, pivot))
-    rotation = np.swapaxes(scene.geo_from_cam, 1, 2)
-    cameras = tuple(
-        TrainedCamera(
-            name=name,
-            split="test" if index in TEST_VIEWS else "train",
-            quat_xyzw=tuple(quat_xyzw_from_matrix(rotation[index])),
-            translation=tuple(-rotation[index] @ scene.center_in_geo[index]),
-        )
-        for index, name in enumerate(scene.names)
-    )
+    workspace = write_rendered(root, rendered)
+    poses = CameraPoses(np.swapaxes(scene.geo_from_cam, 1, 2), scene.center_in_geo)
+    cameras = trained_cameras(scene.names, poses, test=TEST_VIEWS)
     model = trained_model(Similarity(), GEO_FROM_LOCAL, cameras=cameras).model_copy(
         update={"sh_degree": 0, "max_image_size": CAMERA.width, "gaussians": len(rendered.gaussians)}
     )
     save_json(model, root / MODEL)
     write_gaussians(root / GAUSSIANS, rendered.gaussians)
+    write_adjustment(workspace)
     return workspace
 
 

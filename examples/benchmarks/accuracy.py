@@ -148,16 +148,12 @@ def measured(survey: Survey, profile: str, arguments: argparse.Namespace) -> lis
     table = georef("compare", workspace, "--configs", arguments.configs, *arguments.train.split(), "--json")
     rows = []
     for row in json.loads(table)["rows"]:
-        report = json.loads((workspace / "compare" / row["configuration"] / "evaluate/report.json").read_text())
-        bound = report["checkpoints"]["camera"]["cramer_rao"]
         figures = {
             "survey": survey.name,
             "profile": profile,
             "configuration": row["configuration"],
             "test_psnr": row["test_psnr"],
             **{f"{way}_{key}": row[way][key] for way in ("camera", "model") for key in row[way] if key != "count"},
-            "bound_rms_h_m": None if bound is None else bound["rms_h_m"],
-            "bound_rms_v_m": None if bound is None else bound["rms_v_m"],
         }
         print(" ".join(_short(value) for value in figures.values()), flush=True)
         rows.append(figures)

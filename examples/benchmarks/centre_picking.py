@@ -176,6 +176,7 @@ def main() -> None:
     surface_m = surface_errors_m(trained, rays, workspace)
     print(f"surface   {np.isfinite(surface_m).sum():5}  {np.nanmedian(surface_m):.3f}")
     by_model = read_report(workspace.path(REPORT)).checkpoints.model
+    assert by_model is not None
     print(f"by model: {by_model.count} points, median {by_model.median_h_m:.3f} m H")
 
 

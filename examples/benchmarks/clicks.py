@@ -63,7 +63,6 @@ def main() -> None:
     trained = load_trained(workspace)
     images = photographs(trained.sfm, trained.survey, workspace, trained.model.max_image_size)
     model = MeasuringModel(workspace, ModelRenderer(trained, images, rasterizer("cpu")), CrsOptions())
-    model.propagate_errors()
     world = fly_survey(SimulateOptions.model_validate({name: getattr(args, name) for name in _NAMES})).world
     mesh = world.scene.mesh
     rays = Raycaster(mesh)

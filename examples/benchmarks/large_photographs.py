@@ -13,32 +13,32 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
-import numpy as np
 
-from pipelines.adjust.cameras import CameraCorrections
-from pipelines.adjust.problem import GeoProblem
-from pipelines.adjust.similarity import LearnableSimilarity
 from pipelines.core.free_memory import peak_memory_bytes
 from pipelines.core.photograph_folder import photograph_folder
 from pipelines.core.workspace import Workspace
 from pipelines.geometry.cameras import Camera
 from pipelines.scene.photographs import ImageCache, Photograph
-from pipelines.scene.scene import Scene, load_initial_scene
 from pipelines.splat.memory import predicted_peak_bytes
 from pipelines.splat.rasterizer.backends import rasterizer
+from pipelines.train.adjusted_scene import AdjustedScene
 from pipelines.train.assembly import make_trainer
 from pipelines.train.depth_maps import DepthMaps
 from pipelines.train.gaussian_limit import training_size
+from pipelines.train.geographic.problem import held_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.options import TrainOptions
 from pipelines.train.surface import SceneSurface
 
 
-def enlarged(workspace: Workspace, scratch: Path, count: int, size_px: int) -> tuple[Scene, list[Photograph]]:
-    """Scene of the first training photographs, enlarged to a longer side, and their files."""
-    _, survey, whole = load_initial_scene(workspace)
-    scene = whole.of_images(whole.train[:count])
-    folder = photograph_folder(workspace, survey.image_dir)
+def enlarged(
+    workspace: Workspace, scratch: Path, count: int, size_px: int
+) -> tuple[AdjustedScene, list[Photograph]]:
+    """Scene of the first training photographs, enlarged to a longer side, under SfM's lens, and their files."""
+    whole = AdjustedScene.load(workspace)
+    adjusted = whole.of_images(whole.scene.train[:count])
+    scene, adjustment = adjusted.scene, adjusted.adjustment.model_copy(update={"lenses": ()})
+    folder = photograph_folder(workspace, adjusted.survey.image_dir)
     cameras = {}
     for key, camera in scene.sparse.cameras.items():
         factor = size_px / max(camera.width, camera.height)
@@ -53,7 +53,7 @@ def enlarged(workspace: Workspace, scratch: Path, count: int, size_px: int) -> t
         with ProcessPoolExecutor(1) as pool:  # its memory does not count
             pool.submit(write_enlarged, folder / name, file, (camera.width, camera.height)).result()
         shots.append(Photograph(name, file, camera))
-    return replace(scene, sparse=sparse), shots
+    return replace(adjusted, scene=replace(scene, sparse=sparse), adjustment=adjustment), shots
 
 
 def write_enlarged(source: Path, file: Path, size: tuple[int, int]) -> None:
@@ -79,7 +79,7 @@ def main() -> None:
     parser.add_argument("--iterations", type=int, default=40)
     arguments = parser.parse_args()
     arguments.scratch.mkdir(parents=True)
-    scene, shots = enlarged(
+    adjusted, shots = enlarged(
         Workspace(arguments.workspace), arguments.scratch, arguments.photographs, arguments.size
     )
     options = TrainOptions(
@@ -95,13 +95,11 @@ def main() -> None:
     before = peak_mib()
     images.build()
     print(f"undistorted: peak {peak_mib() - before:.0f} MiB more", flush=True)
-    maps = DepthMaps(arguments.scratch / "surface", scene, images)
+    maps = DepthMaps(arguments.scratch / "surface", adjusted.scene, images)
     maps.build()
     print(f"depth maps: peak {peak_mib() - before:.0f} MiB more", flush=True)
-    geometry = LearnableSimilarity(scene.model_from_local, np.eye(7) * 1e-4, np.zeros(3))
-    cameras = CameraCorrections(scene.poses, np.zeros((len(shots), 6, 0)))
-    problem = GeoProblem(geometry, cameras, ())
-    trainer = make_trainer(TrainingScene(scene, images, SceneSurface(maps)), problem, backend, options)
+    training = TrainingScene(adjusted.scene, images, SceneSurface(maps))
+    trainer = make_trainer(training, held_problem(adjusted), backend, options)
     print(f"initial: peak {peak_mib() - before:.0f} MiB more", flush=True)
     trainer.step()
     print(f"first iteration: peak {peak_mib() - before:.0f} MiB more", flush=True)

@@ -40,7 +40,7 @@ from pipelines.scene.cloud_options import CloudCrs
 from pipelines.scene.measured_cloud import CloudFiles
 from pipelines.scene.renderer import ModelRenderer
 from pipelines.scene.report import read_report
-from pipelines.scene.scene import load_initial_scene, photographs
+from pipelines.scene.scene import photographs
 from pipelines.scene.trained_survey import load_trained
 from pipelines.simulate.mesh import Material
 from pipelines.simulate.options import SimulateOptions
@@ -48,6 +48,7 @@ from pipelines.simulate.raycast import MISS, Raycaster
 from pipelines.simulate.stage import RecordedFlight, fly_survey, write_lidar_flight
 from pipelines.simulate.truth import Truth
 from pipelines.splat.rasterizer.backends import rasterizer
+from pipelines.train.adjusted_scene import AdjustedScene
 from pipelines.train.depth_maps import DepthMaps
 from pipelines.train.lidar.prepare import compared_lidar, lidar_surface, registration_of
 from pipelines.train.options import TrainOptions
@@ -135,8 +136,10 @@ def cloud_of(flight: RecordedFlight, given: dict[str, Any], home: Path, change: 
 def figures(workspace: Workspace, flight: RecordedFlight, survey: Path, cloud: Path) -> dict[str, Any]:
     """Medians of the surface's errors by class, and the figures of `evaluate`."""
     report, truth = read_report(workspace.path(REPORT)), load_json(Truth, survey / "truth.json")
+    on_surface, views = report.checkpoints.model, report.test_views
+    assert on_surface is not None and views is not None
     on_wall = {target.name for target in truth.targets if target.surface == "wall"}
-    walls = [point for point in report.checkpoints.model.points if point.name in on_wall and point.de_m is not None]
+    walls = [point for point in on_surface.points if point.name in on_wall and point.de_m is not None]
     errors = [np.linalg.norm([point.de_m or 0.0, point.dn_m or 0.0, point.du_m or 0.0]) for point in walls]
     distance, material = surface_errors(workspace, flight, cloud)
     near = np.abs(distance) < NEAR_M
@@ -149,7 +152,7 @@ def figures(workspace: Workspace, flight: RecordedFlight, survey: Path, cloud: P
         "wall bias": round(float(np.median(distance[near & (material == Material.WALL)])), 4),
         "wall > 1 m": round(float(1 - near[material == Material.WALL].mean()), 4),
         "check walls": round(float(np.median(errors)), 4) if errors else None,
-        "test PSNR": report.photometric.test.psnr,
+        "test PSNR": views.psnr,
     }
 
 
@@ -158,14 +161,15 @@ def comparison(workspace: Workspace, flight: RecordedFlight, unchanged: Path, us
     manifest = workspace.manifest(BY_NAME["train"])
     assert manifest is not None
     options = TrainOptions.model_validate(manifest.config)
-    initial, survey, scene = load_initial_scene(workspace)
+    adjusted = AdjustedScene.load(workspace)
+    survey, scene = adjusted.survey, adjusted.scene
     images = photographs(scene.sparse, survey, workspace, options.effort.max_image_size)
     images.build(SILENT)
     maps, files = DepthMaps(workspace.cache / "surface", scene, images), CloudFiles(used, options.lidar_stated)
     maps.build(SILENT)
     compared = compared_lidar(
         options, files, maps, survey,
-        track=None, georeference=initial.geo_from_local, seed=options.seed, progress=SILENT,
+        track=None, georeference=adjusted.adjustment.geo_from_model, seed=options.seed, progress=SILENT,
     )  # fmt: skip
     if used == unchanged:
         found = compared.registration.shift_m
@@ -192,7 +196,7 @@ def points_of(cloud: Path, flight: RecordedFlight) -> cKDTree:
 def surface_errors(workspace: Workspace, flight: RecordedFlight, cloud: Path) -> tuple[FloatArray, np.ndarray]:
     """Rendered minus true surface where the cloud covers it, along the outward normal (K,), and materials (K,)."""
     covered, trained = points_of(cloud, flight), load_trained(workspace)
-    images = photographs(trained.sparse, trained.survey, workspace, trained.model.max_image_size)
+    images = photographs(trained.sfm, trained.survey, workspace, trained.model.max_image_size)
     renderer = ModelRenderer(trained, images, rasterizer("auto"))
     mesh, origin = flight.world.scene.mesh, flight.world.origin
     rays = Raycaster(mesh)

@@ -2,9 +2,9 @@
 1000`.
 
 A flight over hilly ground is made of geometry alone: cameras on parallel lines with 80 % and 60 % overlap, tie
-points with noisy pixels, an RTK fix for each camera, control points and check points with noisy marks. True
-corrections of cameras and lens are drawn from the bundle's covariance. The solve then has to find them. The errors
-over their predicted σ have a root mean square of 1 where the covariances are right.
+points with noisy pixels, an RTK fix for each camera, all with one common error, control points and check points
+with noisy marks. True corrections of cameras and lens are drawn from the bundle's covariance. The solve then has to
+find them. The errors over their predicted σ have a root mean square of 1 where the covariances are right.
 """
 
 from __future__ import annotations
@@ -17,18 +17,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
+from scipy.sparse import diags
 
-from pipelines.adjust.cameras import CameraCorrections
-from pipelines.adjust.estimate import Estimate
 from pipelines.adjust.intersection_jacobian import intersection_jacobian
-from pipelines.adjust.problem import GeoProblem
-from pipelines.adjust.similarity import LearnableSimilarity
-from pipelines.adjust.sparse_adjustment import minimise_sparse
-from pipelines.adjust.sparse_equations import prior_of_poses
-from pipelines.adjust.sparse_observations import State
-from pipelines.adjust.sparse_posterior import SparsePosterior
-from pipelines.adjust.terms import ControlTerm, FixTerm
+from pipelines.adjust.posterior import camera_covariances
+from pipelines.adjust.state import State, SystematicError, SystematicErrors
+from pipelines.adjust.system import Problem, linearised, minimise, posterior_weights
+from pipelines.adjust.terms import ControlPoints, Fixes
 from pipelines.core.free_memory import peak_memory_bytes
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.geometry.bundle import Network
@@ -36,7 +31,7 @@ from pipelines.geometry.bundle_information import BundleInformation, bundle_info
 from pipelines.geometry.cameras import Camera, CameraPoses, project_each
 from pipelines.geometry.lens import Lenses, bearings
 from pipelines.geometry.rotations import exp_so3
-from pipelines.geometry.similarity import Similarity
+from pipelines.geometry.similarity import perturbation
 from pipelines.geometry.sparse_cholesky import SparseCholesky
 
 _HEIGHT_M, _RELIEF_M, _TILT_RAD = 100.0, 8.0, 0.03
@@ -45,17 +40,18 @@ _ALONG, _ACROSS = 0.2, 0.4  # of the footprint, between photographs and between 
 _SEEN = 0.4  # part of the photographs in which the matcher finds a point
 _CHUNK = 50_000  # points
 _TIE_PX, _MARK_PX, _SURVEY_M = 0.6, 0.4, 0.01
-_RTK_M = np.array([0.02, 0.02, 0.03])
-_START = np.diag([0.01, 0.02, 0.02, 0.02, 2.0, 2.0, 2.0]) ** 2
+_RTK_M, _COMMON_M = np.array([0.02, 0.02, 0.03]), (0.03, 0.03, 0.05)
+_START = np.array([0.001, 0.002, 0.002, 0.002, 0.3, 0.3, 0.3])  # of the similarity that the descent starts from
 
 
 @contextmanager
 def timed(name: str) -> Iterator[None]:
-    """Print the seconds that a step takes, and the most memory so far."""
-    clock = time.perf_counter()
+    """Print the seconds that a step takes, those of all processors, and the most memory so far."""
+    clock, processor = time.perf_counter(), time.process_time()
     yield
     peak = (peak_memory_bytes() or math.nan) / 1e9
-    print(f"  {name:34s} {time.perf_counter() - clock:7.1f} s   peak {peak:5.2f} GB", flush=True)
+    taken, used = time.perf_counter() - clock, time.process_time() - processor
+    print(f"  {name:34s} {taken:7.1f} s   processor {used:7.1f} s   peak {peak:5.2f} GB", flush=True)
 
 
 @dataclass(frozen=True)
@@ -131,63 +127,60 @@ def drawn_truth(
     network: Network, bundle: BundleInformation, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
     """Corrections (n, 6) of the cameras and (L,) of the lens, drawn from the bundle's covariance."""
-    factor = SparseCholesky(prior_of_poses(bundle), network.cam_center_in_world)
-    cross = bundle.lens_follows.T @ bundle.lens
-    response = factor.solve(cross)
-    of_lens = np.linalg.inv(bundle.lens - cross.T @ response)
-    white = rng.normal(size=(len(bundle.unit), 1))
-    poses = factor.coloured(white)[:, 0] + response @ rng.multivariate_normal(np.zeros(len(of_lens)), of_lens)
-    lens = bundle.lens_follows @ poses + rng.multivariate_normal(np.zeros(len(of_lens)), bundle.lens_cov)
-    return (poses - bundle.similarity_modes @ (bundle.points_follow @ poses)).reshape(-1, 6), lens
+    sums = bundle.sums
+    hold = diags((bundle.unit * bundle.loosest_sigma_m) ** -2.0).tobsr((6, 6))  # of the similarity, removed below
+    factor = SparseCholesky((sums.poses + hold).tobsr((6, 6)), network.cam_center_in_world)
+    response = factor.solve(sums.cross)
+    lens = rng.multivariate_normal(np.zeros(len(sums.lens)), np.linalg.inv(sums.lens - sums.cross.T @ response))
+    poses = factor.coloured(rng.normal(size=(len(bundle.unit), 1)))[:, 0] - response @ lens
+    common = bundle.followed @ np.concatenate([poses, lens])
+    return (poses - bundle.similarity_modes @ common).reshape(-1, 6), lens
 
 
-def marks_of(seen: Network, truth: tuple[FloatArray, FloatArray], rng: np.random.Generator) -> ControlTerm:
+def marks_of(seen: Network, truth: tuple[FloatArray, FloatArray], rng: np.random.Generator) -> ControlPoints:
     """Noisy marks of points, read through the uncorrected lens, and their noisy survey in the true cameras."""
     moved = intersection_jacobian(seen, np.full(len(seen.obs_point), _MARK_PX))
     corrections, lens = truth
     true = seen.point_in_world + (moved.by_poses @ corrections.ravel()).reshape(-1, 3) + moved.by_lens @ lens
-    surveyed = true + rng.normal(0, _SURVEY_M, true.shape)
     xy_px = seen.obs_xy_px + rng.normal(0, _MARK_PX, seen.obs_xy_px.shape)
     cov = moved.cov_of_marks + _SURVEY_M**2 * np.eye(3)
-    return ControlTerm(
-        torch.from_numpy(seen.obs_point),
-        torch.from_numpy(seen.obs_image),
-        torch.from_numpy(bearings(_LENS, xy_px)),
-        torch.full((len(xy_px),), _MARK_PX / _LENS.params[0], dtype=torch.float64),
-        torch.from_numpy(surveyed),
-        torch.from_numpy(np.linalg.inv(np.linalg.cholesky(cov))),
-        bearing_by_lens=torch.from_numpy(
-            Lenses(seen.cameras, seen.camera_id).bearing_jacobian(seen.obs_image, xy_px)
-        ),
+    return ControlPoints(
+        tuple(map(str, range(len(true)))),
+        seen.obs_point,
+        seen.obs_image,
+        bearings(_LENS, xy_px),
+        np.full(len(xy_px), _MARK_PX / _LENS.params[0]),
+        Lenses(seen.cameras, seen.camera_id).bearing_jacobian(seen.obs_image, xy_px),
+        true + rng.normal(0, _SURVEY_M, true.shape),
+        np.linalg.inv(np.linalg.cholesky(cov)),
     )
 
 
 def problem_of(
-    network: Network, truth: tuple[FloatArray, FloatArray], marks: ControlTerm, rng: np.random.Generator
-) -> GeoProblem:
-    """Fixes of all cameras and marks of control points, from a start one σ of the initial similarity off."""
-    center = network.cam_center_in_world
-    position = center + truth[0][:, 3:] + _RTK_M * rng.normal(size=center.shape)
-    fixes = FixTerm(
-        torch.arange(len(center)),
-        torch.from_numpy(position),
-        torch.from_numpy(np.tile(np.diag(1 / _RTK_M), (len(center), 1, 1))),
+    network: Network,
+    bundle: BundleInformation,
+    truth: tuple[FloatArray, FloatArray],
+    marks: ControlPoints,
+    rng: np.random.Generator,
+) -> Problem:
+    """Fixes of all cameras with a common error, and marks of control points."""
+    center, count = network.cam_center_in_world, len(network.camera_id)
+    position = center + truth[0][:, 3:] + rng.normal(0, _COMMON_M) + _RTK_M * rng.normal(size=center.shape)
+    fixes = Fixes(
+        tuple(map(str, range(count))),
+        np.arange(count),
+        position,
+        np.tile(np.diag(1 / _RTK_M), (count, 1, 1)),
+        np.zeros(count, dtype=np.int64),
     )
-    similarity = LearnableSimilarity(Similarity(), _START, center.mean(axis=0))
-    cameras = CameraCorrections(CameraPoses(network.cam_from_world, center), np.zeros((len(center), 6, 0)))
-    return GeoProblem(similarity, cameras, [fixes, marks])
+    errors = SystematicErrors((SystematicError("bias", _COMMON_M, 0),))
+    return Problem(CameraPoses(network.cam_from_world, center), bundle, (fixes, marks), errors)
 
 
 def normalised(error: FloatArray, cov: FloatArray) -> float:
     """Root mean square of errors (m, d) over their σ, all correlations of a row taken into account."""
     squared = np.einsum("mi,mi->m", error, np.linalg.solve(cov, error[:, :, None])[:, :, 0])
     return float(np.sqrt(squared.mean() / error.shape[1]))
-
-
-def estimate_of(problem: GeoProblem, state: State) -> Estimate:
-    """The estimate of a solved state."""
-    parts = state.similarity, state.correction, state.lens, state.errors
-    return problem.estimate_at(*(torch.from_numpy(np.ascontiguousarray(part)) for part in parts))
 
 
 def measure(count: int, points_per_camera: int, controls: int, seed: int) -> None:
@@ -207,24 +200,27 @@ def measure(count: int, points_per_camera: int, controls: int, seed: int) -> Non
         control = marks_of(flight.seeing(ground(flight, controls, rng), 1.0, rng), truth, rng)
         seen = flight.seeing(ground(flight, controls, rng), 1.0, rng)
         check = marks_of(seen, truth, rng)
-        problem = problem_of(network, truth, control, rng)
-        by_lens = intersection_jacobian(of_control(control, network), np.full(len(control.point), _MARK_PX)).by_lens
+        problem = problem_of(network, bundle, truth, control, rng)
+        center = network.cam_center_in_world.mean(axis=0)
+        start = perturbation(_START * rng.normal(size=7), center)
+        state = State(start, np.zeros((count, 6)), np.zeros(len(truth[1])), np.zeros(len(problem.errors)))
     with timed("minimum"):
-        state = minimise_sparse(problem, bundle).state
+        state = minimise(problem, state).state
     with timed("posterior"):
-        posterior = SparsePosterior(problem, bundle, state, by_lens)
-    with timed("covariances of all cameras"):
-        of_cameras = posterior.of_cameras(network.cam_center_in_world, Similarity())
+        near = linearised(problem, state)
+        normal = near.normal(posterior_weights(near.residuals))
+        similarity = state.geo_from_model
+        of_cameras = camera_covariances(normal, similarity.rotation, similarity.scale)
     with timed(f"covariances of {len(seen.point_in_world)} points"):
         moved = intersection_jacobian(seen, np.full(len(seen.obs_point), _MARK_PX))
-        of_points = posterior.at(seen.point_in_world, moved.by_poses, moved.by_lens)
-    at = estimate_of(problem, state)
-    with torch.no_grad():
-        centers = at.geo_from_model.apply(at.center).numpy() - network.cam_center_in_world - truth[0][:, 3:]
-        points = check.residuals(at).numpy()
+        by_border = np.zeros((moved.by_poses.shape[0], len(normal.corner)))
+        by_border[:, : len(problem.lens)] = moved.by_lens[:, :, problem.lens].reshape(len(by_border), -1)
+        of_points = normal.covariances(moved.by_poses, by_border, 3)
+    at = problem.at(state)
+    centers = similarity.apply(at.center) - network.cam_center_in_world - truth[0][:, 3:]
     of_residuals = of_points + moved.cov_of_marks + _SURVEY_M**2 * np.eye(3)
     _print_errors("cameras", centers, of_cameras[:, 3:, 3:])
-    _print_errors("check points", points, of_residuals)
+    _print_errors("check points", check.residuals(at), of_residuals)
 
 
 def _print_errors(name: str, error: FloatArray, cov: FloatArray) -> None:
@@ -232,17 +228,6 @@ def _print_errors(name: str, error: FloatArray, cov: FloatArray) -> None:
     squares = (error**2).mean(axis=0), np.diagonal(cov, axis1=1, axis2=2).mean(axis=0)
     found, predicted = (" ".join(f"{1000 * value:.1f}" for value in np.sqrt(square)) for square in squares)
     print(f"  {name}: RMS {found} mm, predicted {predicted} mm, {normalised(error, cov):.2f} of σ")
-
-
-def of_control(control: ControlTerm, network: Network) -> Network:
-    """The network of the control points' marks."""
-    return replace(
-        network,
-        point_in_world=control.position_in_geo.numpy(),
-        obs_point=control.point.numpy(),
-        obs_image=control.camera.numpy(),
-        obs_xy_px=np.zeros((len(control.point), 2)),
-    )
 
 
 def main() -> None:

@@ -91,8 +91,8 @@ def main() -> None:
                 seed=arguments.seed,
             )
             if painted is None:
-                _, _, scene, images = scene_of(root, options)
-                painted = paint(scene, images, arguments, write=objects)
+                adjusted, images = scene_of(root, options)
+                painted = paint(adjusted.scene, images, arguments, write=objects)
             trainer, scene, images = trainer_on(root, options)
             worked = time.process_time()
             for _ in range(arguments.iterations):

@@ -81,9 +81,8 @@ def write_moved(workspace: Workspace, cloud: Path, path: Path) -> None:
 def figures(workspace: Workspace) -> dict[str, Any]:
     """PSNR of the test views, and the distances to the cloud, all and by slope."""
     report = read_report(workspace.path(REPORT))
-    reference = report.reference
-    assert reference is not None
-    test = report.photometric.test
+    reference, test = report.reference, report.test_views
+    assert reference is not None and test is not None
     by_group = {
         group.name: {
             "places": group.m3c2.measured,

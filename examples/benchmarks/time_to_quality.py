@@ -25,26 +25,23 @@ from pathlib import Path
 # As the command line does, and for the same reason: see georef_cli/main.py.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
-import numpy as np
 from training import ViewQuality
 
-from pipelines.adjust.error_propagation import NoErrorPropagation
-from pipelines.adjust.geographic import geo_problem
 from pipelines.core.progress import SILENT
 from pipelines.core.stages import PIPELINE, POINTS
 from pipelines.core.workspace import Workspace
-from pipelines.evaluate.check_points import measure_check_points
+from pipelines.evaluate.check_points import check_points_on_surface
 from pipelines.evaluate.photometric import compare_test_views
-from pipelines.geometry.cameras import CameraPoses
-from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.machine.inspection import inspect_machine
 from pipelines.scene.geolocated import GeolocatedPoints
 from pipelines.scene.renderer import ModelRenderer
-from pipelines.scene.scene import load_initial_scene, photographs
+from pipelines.scene.scene import photographs
 from pipelines.scene.trained_survey import TrainedSurvey
 from pipelines.splat.rasterizer.backends import rasterizer
+from pipelines.train.adjusted_scene import AdjustedScene
 from pipelines.train.assembly import make_trainer
 from pipelines.train.checkpoint import load_checkpoint
+from pipelines.train.geographic.problem import held_problem, refining_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.options import TrainOptions
 from pipelines.train.result import trained_model
@@ -138,24 +135,26 @@ def measured(workspace: Workspace, age_s: dict[Path, float]) -> list[Row]:
     assert manifest is not None
     # Gaussians come from the checkpoints: the stereo that only places the first ones is not repeated.
     options = TrainOptions.model_validate({**manifest.config, "dense": False})
-    initial, survey, scene = load_initial_scene(workspace)
+    adjusted, backend = AdjustedScene.load(workspace), rasterizer(options.backend)
+    survey, scene = adjusted.survey, adjusted.scene
     images = photographs(scene.sparse, survey, workspace, options.effort.max_image_size)
-    points, backend = GeolocatedPoints.load(workspace.path(POINTS)), rasterizer(options.backend)
-    problem = geo_problem(scene, survey, initial, options, points=points, seed=options.seed)
+    observed = adjusted.measured(control_points=options.gcp_loss)
+    refines, points = options.refined_cameras(len(images)) > 0, GeolocatedPoints.load(workspace.path(POINTS))
+    problem = (
+        refining_problem(adjusted, observed, options, points, options.seed) if refines else held_problem(adjusted)
+    )
     trainer = make_trainer(TrainingScene(scene, images), problem, backend, options)
     rows: list[Row] = []
     for path, seconds in age_s.items():
         trainer.restore(load_checkpoint(path))
         if trainer.iteration == 0 or (rows and rows[-1].iteration == trainer.iteration):
             continue  # the last one is written twice
-        model = trained_model(trainer, scene, initial)
-        rotation = matrix_from_quat_xyzw([camera.quat_xyzw for camera in model.cameras])
-        translation = np.array([camera.translation for camera in model.cameras])
-        poses = CameraPoses(rotation, -np.einsum("nji,nj->ni", rotation, translation))
-        trained = TrainedSurvey(survey, scene.sparse, model, poses, trainer.optimizer.gaussians.detached())
+        solution = adjusted.posterior(observed, problem.state()).solution if refines else adjusted.adjustment
+        model = trained_model(trainer, solution)
+        trained = TrainedSurvey(survey, scene.sparse, model, trainer.optimizer.gaussians.detached())
         renderer = ModelRenderer(trained, images, backend)
         views = compare_test_views(renderer, None, lambda _name, _picture: None, SILENT, saved=0)
-        errors = measure_check_points(renderer, NoErrorPropagation("not asked for"), SILENT).model
+        errors = check_points_on_surface(renderer, SILENT)
         train_psnr = ViewQuality(trainer, images).psnr(scene.train, exposed=True)
         rows.append(
             Row(

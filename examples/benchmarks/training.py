@@ -26,18 +26,11 @@ import numpy as np
 import torch
 from raster import make_scene
 
-from pipelines.adjust.geographic import geo_problem
-from pipelines.core.products import load_json
-from pipelines.core.stages import SIM3, SPARSE
 from pipelines.core.types import IntArray
 from pipelines.core.workspace import Workspace
-from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.cameras import Pinhole
-from pipelines.scene.calibrated import load_survey
-from pipelines.scene.initial_similarity import InitialSimilarity
 from pipelines.scene.photographs import ImageCache
-from pipelines.scene.scene import Scene, initial_scene, photographs
-from pipelines.scene.survey import Survey
+from pipelines.scene.scene import Scene, photographs
 from pipelines.splat.densify import DefaultSettings, DefaultStrategy
 from pipelines.splat.losses import photometric_loss
 from pipelines.splat.memory import TrainingSize, predicted_peak_bytes
@@ -45,8 +38,10 @@ from pipelines.splat.metrics import psnr
 from pipelines.splat.optimizer import GaussianAdam
 from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.backends import rasterizer
+from pipelines.train.adjusted_scene import AdjustedScene
 from pipelines.train.assembly import make_trainer
 from pipelines.train.depth_maps import DepthMaps
+from pipelines.train.geographic.problem import refining_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.options import TrainOptions
 from pipelines.train.surface import SceneSurface
@@ -91,25 +86,24 @@ def scaling(arguments: argparse.Namespace) -> None:
     print(f"peak RSS before the first: {base / 2**20:.0f} MiB; the peak of a process never falls")
 
 
-def scene_of(root: Path, options: TrainOptions) -> tuple[Survey, InitialSimilarity, Scene, ImageCache]:
-    """Products of a workspace with init-sim3 done, and its undistorted photographs."""
+def scene_of(root: Path, options: TrainOptions) -> tuple[AdjustedScene, ImageCache]:
+    """Scene of a workspace with init-sim3 done, and its undistorted photographs."""
     workspace = Workspace(root)
-    survey = load_survey(workspace)
-    initial = load_json(InitialSimilarity, workspace.path(SIM3))
-    scene = initial_scene(read_sparse(workspace.path(SPARSE)), survey, initial)
-    images = photographs(scene.sparse, survey, workspace, options.effort.max_image_size)
+    adjusted = AdjustedScene.load(workspace)
+    images = photographs(adjusted.scene.sparse, adjusted.survey, workspace, options.effort.max_image_size)
     images.build()
-    return survey, initial, scene, images
+    return adjusted, images
 
 
 def trainer_on(root: Path, options: TrainOptions) -> tuple[JointTrainer, Scene, ImageCache]:
     """Trainer before its first iteration, on a workspace with init-sim3 done, as `georef train` makes it."""
-    survey, initial, scene, images = scene_of(root, options)
+    adjusted, images = scene_of(root, options)
+    scene, measured = adjusted.scene, adjusted.measured(control_points=options.gcp_loss)
     maps = DepthMaps(Workspace(root).cache / "surface", scene, images)
     maps.build()
     trainer = make_trainer(
         TrainingScene(scene, images, SceneSurface(maps)),
-        geo_problem(scene, survey, initial, options),
+        refining_problem(adjusted, measured, options, seed=options.seed),
         rasterizer(options.backend),
         options,
     )

@@ -90,7 +90,6 @@ def time_server(workspace: Workspace, clicks: int) -> None:
         times.append(time.perf_counter())
     made, coarse, full = (each - began for each in times)
     print(f"without a browser: read after {made:.1f} s, coarse picture {coarse:.1f} s, full picture {full:.1f} s")
-    viewer.wait_for_sigma()
     viewer.click_mode = "measures"
     taken = []
     pinhole = camera.pinhole(camera.width, camera.height)

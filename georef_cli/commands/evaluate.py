@@ -30,11 +30,12 @@ command = EvaluateCommand(
     "evaluate",
     """Measure test views and check points.
 
-    Check points are triangulated (their marks intersected) and measured on the rendered surface (the depth of the
-    Gaussians at the marks, not their centres), and stated as the ASPRS standard asks. The predicted accuracy over
-    the scene is drawn in evaluate/accuracy.png. A survey without check points has --cross-validate: every control
-    point measured by a solution that does not know it. The report is evaluate/report.json; evaluate/points.csv has
-    the error of every point, and --points prints them.
+    Without training, the cameras of init-sim3 are evaluated alone. Check points are triangulated (their marks
+    intersected) and measured on the rendered surface (the depth of the Gaussians at the marks, not their
+    centres), and stated as the ASPRS standard asks. The predicted accuracy over the scene is drawn in
+    evaluate/accuracy.png. A survey without check points has --cross-validate: every control point measured by a
+    solution that does not know it. The report is evaluate/report.json; evaluate/points.csv has the error of every
+    point, and --points prints them.
 
     \b
     Examples:

@@ -30,6 +30,7 @@ from pipelines.scene.crs_options import CrsOptions
 
 if TYPE_CHECKING:
     from pipelines.deliver.overview import Overview
+    from pipelines.scene.report import EvaluationReport
 
 log = logging.getLogger(__name__)
 
@@ -92,7 +93,10 @@ def _run(ctx: click.Context, **values: Any) -> None:
             progress=progress,
             around=lambda spec: _counted(workspace, spec, done, left),
         )
-    print_outcomes(workspace, outcomes, _overview(workspace), as_json=values["as_json"], told=is_told(ctx.obj))
+    solved = _evaluated_cameras(workspace) if stages[-1].name == "init-sim3" else None
+    print_outcomes(
+        workspace, outcomes, _overview(workspace), solved, as_json=values["as_json"], told=is_told(ctx.obj)
+    )
 
 
 @contextlib.contextmanager
@@ -128,6 +132,23 @@ def _overview(workspace: Workspace) -> Overview | None:
         return overview(workspace, CrsOptions())
     except GeorefError as error:  # The run has succeeded all the same.
         log.debug("no overview of the result: %s", error)
+        return None
+
+
+def _evaluated_cameras(workspace: Workspace) -> EvaluationReport | None:
+    """Return the evaluation of the cameras alone; None: a model is trained, or they cannot be evaluated."""
+    if workspace.has(MODEL):
+        return None
+    from pipelines.adjust.solution import posterior_of
+    from pipelines.evaluate.options import EvaluateOptions
+    from pipelines.evaluate.stage import evaluate
+    from pipelines.scene.trained_survey import load_solved
+
+    try:
+        solved = load_solved(workspace)
+        return evaluate(solved, posterior_of(workspace, solved.model, solved.sfm), EvaluateOptions())
+    except GeorefError as error:  # The run has succeeded all the same.
+        log.debug("no evaluation of the cameras: %s", error)
         return None
 
 

@@ -3,26 +3,28 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from pipelines.adjust.prediction import AccuracyPrediction
-from pipelines.adjust.solved_survey import SolvedSurvey
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.formats.csv_writer import write_table
 from pipelines.geodesy.enu import Origin, ecef_from_enu, lla_from_ecef
+from pipelines.geometry.sparse_model import SparseModel
 from pipelines.scene.report import AccuracySummary
 
 _CELLS = 48  # along the longer side of the grid
 _LEAST_RAYS = 3  # of an SfM point that counts as a part of the scene
+_MANY_CELLS = 400
 _NEIGHBOURS = 3  # nearest SfM points, which give a cell its height and its cameras
 _FARTHEST_CELLS = 1.5  # distance from an SfM point beyond which there is no scene
 _NEAR = 0.1  # of a cell: a nearer cell's middle has no larger weight
 _RIM = 0.01  # fraction of the SfM points outside the grid on each side
-_CHUNK = 256
 _PLACE = ("east_m", "north_m", "up_m", "latitude_deg", "longitude_deg", "ellipsoidal_height_m")
 _SIGMA = ("sigma_e_m", "sigma_n_m", "sigma_u_m", "sigma_h_m", "sigma_v_m")
 
@@ -33,19 +35,42 @@ class AccuracyGrid:
 
     Attributes:
         position_in_geo: (C, 3) middle of each cell, at the height of the scene there.
-        sigma_m: (C, 3) east, north, up.
+        cov_m2: (C, 3, 3) covariance in m², east, north, up.
         cell: (C, 2) column from the west and row from the south.
         size_m: side of a cell.
         corner_in_geo: (2,) east and north of the south-western corner.
         shape: numbers of columns and rows.
     """
 
+    NO_ARRAYS: ClassVar[Mapping[str, FloatArray]] = {
+        f"grid_{name}": np.zeros(0) for name in ("position", "cov_m2", "cell", "place")
+    }
+
     position_in_geo: FloatArray
-    sigma_m: FloatArray
+    cov_m2: FloatArray
     cell: IntArray
     size_m: float
     corner_in_geo: FloatArray
     shape: tuple[int, int]
+
+    def arrays(self) -> dict[str, FloatArray | IntArray]:
+        """Return the grid as arrays, to be stored."""
+        place = np.array([self.size_m, *self.corner_in_geo, *self.shape])
+        return dict(zip(self.NO_ARRAYS, (self.position_in_geo, self.cov_m2, self.cell, place), strict=True))
+
+    @classmethod
+    def of_arrays(cls, arrays: Mapping[str, FloatArray]) -> AccuracyGrid | None:
+        """Return the grid of stored arrays; None: it was not known."""
+        position, cov, cell, place = (arrays[name] for name in cls.NO_ARRAYS)
+        if place.shape != (5,) or cov.shape != (len(position), 3, 3) or len(cell) != len(cov):
+            return None
+        shape = (int(place[3]), int(place[4]))
+        return cls(position, cov, cell.astype(np.int64), float(place[0]), place[1:3], shape)
+
+    @cached_property
+    def sigma_m(self) -> FloatArray:
+        """σ (C, 3) east, north, up."""
+        return _sigma(self.cov_m2)
 
     @property
     def sigma_h_m(self) -> FloatArray:
@@ -65,14 +90,18 @@ class AccuracyGrid:
         return raster
 
     def sigma_at(self, position_in_geo: FloatArray) -> FloatArray:
-        """Return σ (N, 3) east, north, up at points (N, 3) of the scene, in metres.
+        """Return σ (N, 3) east, north, up at points (N, 3) of the scene, in metres."""
+        return _sigma(self.cov_at(position_in_geo))
 
-        σ varies slowly over a scene: that of the nearest cells is weighted by inverse distance in plan.
+    def cov_at(self, position_in_geo: FloatArray) -> FloatArray:
+        """Return the covariance (N, 3, 3) of each of the points (N, 3) of the scene, in m².
+
+        It varies slowly over a scene: that of the nearest cells is weighted by inverse distance in plan.
         """
         near = min(_NEIGHBOURS, len(self.cell))
         distance, cell = cKDTree(self.position_in_geo[:, :2]).query(position_in_geo[:, :2], k=[*range(1, near + 1)])
         weight = 1.0 / np.maximum(distance, _NEAR * self.size_m)
-        return np.asarray(np.einsum("nk,nki->ni", weight / weight.sum(axis=1, keepdims=True), self.sigma_m[cell]))
+        return np.asarray(np.einsum("nk,nkij->nij", weight / weight.sum(axis=1, keepdims=True), self.cov_m2[cell]))
 
     def summary(self) -> AccuracySummary:
         """Return least, median and largest σ, and their root mean square."""
@@ -92,21 +121,27 @@ class AccuracyGrid:
         )
 
 
-def accuracy_grid(solved: SolvedSurvey, prediction: AccuracyPrediction) -> AccuracyGrid | None:
+# Covariances (J, 3, 3) in m² of points (J, 3), from pairs (point, camera) of what sees them.
+CovarianceOfPoints = Callable[[FloatArray, IntArray, IntArray], FloatArray]
+
+
+def accuracy_grid(
+    sparse: SparseModel, point_in_geo: FloatArray, covariance: CovarianceOfPoints
+) -> AccuracyGrid | None:
     """Return the predicted σ on a grid over the scene, at the middle of each cell; None: too few points.
 
     The cameras that observe the nearest SfM points observe the cell.
 
     Args:
-        solved: the survey, with its SfM points.
-        prediction: of the same survey.
+        sparse: the SfM model.
+        point_in_geo: (N, 3) its points on Earth.
+        covariance: of points of the scene.
     """
-    sparse, geo_from_model = solved.scene.sparse, solved.trained.geo_from_model
     rays = np.bincount(sparse.obs_point, minlength=len(sparse.point_id))
     chosen = np.flatnonzero(rays >= _LEAST_RAYS)
     if len(chosen) < _NEIGHBOURS:
         return None
-    point = geo_from_model.apply(solved.scene.point_in_model[chosen])
+    point = point_in_geo[chosen]
     low, high = np.quantile(point[:, :2], [_RIM, 1 - _RIM], axis=0)
     size = float((high - low).max()) / _CELLS
     if size <= 0:
@@ -118,11 +153,24 @@ def accuracy_grid(solved: SolvedSurvey, prediction: AccuracyPrediction) -> Accur
     in_scene = distance[:, 0] <= _FARTHEST_CELLS * size
     cell, near = cell[in_scene], near[in_scene]
     position = np.column_stack([middle[in_scene], np.median(point[near, 2], axis=1)])
-    sigma = _sigma(prediction, position, *_seen_by(sparse.obs_point, sparse.obs_image, chosen[near]))
-    known = np.isfinite(sigma).all(axis=1)
+    # Covariances vary slowly: of many cells, every other one in both directions stands for its neighbours.
+    computed = (cell % 2 == 0).all(axis=1) if len(cell) > _MANY_CELLS else np.ones(len(cell), dtype=bool)
+    of_part = covariance(position[computed], *_seen_by(sparse.obs_point, sparse.obs_image, chosen[near[computed]]))
+    known = np.isfinite(of_part).all(axis=(1, 2))
     if not known.any():
         return None
-    return AccuracyGrid(position[known], sigma[known], cell[known], size, low, (columns, rows))
+    at, of_part, cell_of_part = position[computed][known], of_part[known], cell[computed][known]
+    part = AccuracyGrid(at, of_part, cell_of_part, size, low, (columns, rows))
+    if computed.all():
+        return part
+    cov = part.cov_at(position)
+    cov[np.flatnonzero(computed)[known]] = of_part
+    return AccuracyGrid(position, cov, cell, size, low, (columns, rows))
+
+
+def _sigma(cov: FloatArray) -> FloatArray:
+    """Return σ (N, 3) of covariances (N, 3, 3)."""
+    return np.asarray(np.sqrt(np.diagonal(cov, axis1=1, axis2=2)))
 
 
 def _seen_by(obs_point: IntArray, obs_image: IntArray, near: IntArray) -> tuple[IntArray, IntArray]:
@@ -134,16 +182,6 @@ def _seen_by(obs_point: IntArray, obs_image: IntArray, near: IntArray) -> tuple[
     ]
     owner = np.repeat(np.arange(len(near)), [len(of_cell) for of_cell in cameras])
     return owner, np.concatenate(cameras)
-
-
-def _sigma(prediction: AccuracyPrediction, position: FloatArray, owner: IntArray, camera: IntArray) -> FloatArray:
-    """Return σ (C, 3) at the cells, for pairs (cell, camera)."""
-    sigma = []
-    for first in range(0, len(position), _CHUNK):
-        in_chunk = (owner >= first) & (owner < first + _CHUNK)
-        cov = prediction.of_scene(position[first : first + _CHUNK], owner[in_chunk] - first, camera[in_chunk])
-        sigma.append(np.sqrt(np.diagonal(cov, axis1=1, axis2=2)))
-    return np.concatenate(sigma)
 
 
 def write_csv(grid: AccuracyGrid, origin: Origin, path: Path) -> None:

@@ -9,7 +9,8 @@ Sources of information:
 
 The geolocated points are *not* a third source. Each is a function of the same few fixes and attitudes: a hundred
 thousand points have no more information than the cameras. Counted as independent, they would claim σ of
-millimetres, and an error of the compass would outweigh RTK. They serve as one start of the search and as a check.
+millimetres, and an error of the compass would outweigh RTK. Nor are they a start of their own, because the same
+fixes and attitudes give starts. They serve as a check.
 
 Fixes against control points:
 
@@ -17,8 +18,8 @@ Fixes against control points:
    the fixes therefore competes by likelihood with one without. The bias costs as much as one outlier.
 2. If the fixes contradict control points that agree with each other by more than σ allow, the control points
    determine the position. The fixes still determine scale and rotation.
-3. A *single* contradicting control point is accepted only while the bias is within 5 σ of one fix. Beyond that,
-   the control point counts as a blunder.
+3. A *single* contradicting control point stays an outlier, because a bias costs no less. Only the joint
+   adjustment, with its prior of common errors, can decide between the two.
 """
 
 from __future__ import annotations
@@ -30,7 +31,6 @@ from typing import Literal
 import numpy as np
 
 from pipelines.adjust.similarity_fit import (
-    BIAS_COST,
     OUTLIER_GATE,
     AdjustedSimilarity,
     Correspondences,
@@ -49,7 +49,6 @@ from pipelines.robust.ransac import RansacOptions, ransac
 from pipelines.robust.statistics import median_chi2, squared_mahalanobis
 
 _WORST_ROTATION_RAD = np.radians(5.0)  # beyond, the linear covariance is not valid
-_LONE_BIAS_SIGMAS = 5.0
 _FLAT = 0.02  # third extent of the layout over the first
 _GATE_FACTORS = (1.0, 3.0, 10.0, 30.0, 100.0)  # of the stated σ
 
@@ -89,7 +88,6 @@ def align(
     rng: np.random.Generator,
     *,
     attitude: RotationPrior | None = None,
-    guesses: tuple[Similarity, ...] = (),
 ) -> Alignment:
     """Return the similarity that maps local onto geo.
 
@@ -97,7 +95,6 @@ def align(
         data: camera centres with fixes, and control points.
         rng: draws the samples of RANSAC.
         attitude: rotation geo ← local from recorded attitudes, for layouts that need it.
-        guesses: further starts, e.g. from geolocated points.
 
     Raises:
         DegenerateGeometryError: the correspondences leave the similarity open; the message advises measurements to
@@ -108,17 +105,17 @@ def align(
             f"{len(data)} positions (fixes of registered images and control points) do not determine where the "
             f"model lies; 3 are needed: {ADVICE}"
         )
-    candidates = _candidates(data, _starts(data, rng, guesses), None)
+    candidates = _candidates(data, _starts(data, rng), None)
     firm = [candidate for candidate in candidates if candidate.rotation_sigma_rad <= _WORST_ROTATION_RAD]
     if firm:
-        best = _choose(firm, data)
+        best = _choose(firm)
         return Alignment(best, layout_of(data.in_local[best.state.inlier]), None)
     worst = min((np.degrees(candidate.rotation_sigma_rad) for candidate in candidates), default=np.inf)
     if attitude is None:
         size = f"is known to {worst:.0f}° only" if worst < 90 else "is not determined"
         raise DegenerateGeometryError(f"the positions lie on one line: the rotation about it {size}; {ADVICE}")
     candidates = _candidates(data, [_start_with_rotation(data, attitude.rotation, rng)], attitude)
-    return Alignment(_choose(candidates, data), "line", attitude)
+    return Alignment(_choose(candidates), "line", attitude)
 
 
 def layout_of(positions: FloatArray) -> Literal["volume", "plane"]:
@@ -157,12 +154,9 @@ def _spread(rotations: FloatArray) -> FloatArray:
     return np.asarray(np.median(np.arccos(np.clip(cosine, -1, 1)), axis=1))
 
 
-def _starts(data: Correspondences, rng: np.random.Generator, guesses: tuple[Similarity, ...]) -> list[Similarity]:
-    """Return the similarities to start from: the guesses, those of the fixes, and those of the control points.
-
-    Without any of these, fixes and control points together give one start.
-    """
-    starts = list(guesses)
+def _starts(data: Correspondences, rng: np.random.Generator) -> list[Similarity]:
+    """Return the similarities to start from: of the fixes and of the control points, else of both together."""
+    starts: list[Similarity] = []
     for members in (~data.control, data.control):
         if members.sum() >= 3:
             starts += _ransac_start(data.part(members), rng)
@@ -230,17 +224,6 @@ def _with_bias(data: Correspondences, state: SimilarityState) -> SimilarityState
     return replace(state, geo_from_local=onto, fix_bias_in_geo=np.median(residual[~data.control], axis=0) - shift)
 
 
-def _choose(candidates: list[AdjustedSimilarity], data: Correspondences) -> AdjustedSimilarity:
+def _choose(candidates: list[AdjustedSimilarity]) -> AdjustedSimilarity:
     """Return the likeliest candidate; a bias of the fixes costs as much as an outlier."""
-
-    def cost(candidate: AdjustedSimilarity) -> float:
-        bias = candidate.state.fix_bias_in_geo
-        if bias is None:
-            return candidate.cost
-        lone = int((data.control & candidate.state.inlier).sum()) <= 1
-        allowed = data.cov_in_geo[~data.control].mean(axis=0)
-        if lone and squared_mahalanobis(bias[None], allowed)[0] > _LONE_BIAS_SIGMAS**2:
-            return np.inf
-        return candidate.cost + BIAS_COST
-
-    return min(candidates, key=cost)
+    return min(candidates, key=lambda one: one.cost + OUTLIER_GATE * (one.state.fix_bias_in_geo is not None))

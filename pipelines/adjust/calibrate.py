@@ -10,19 +10,21 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from pipelines.adjust.observations import control_correspondences
 from pipelines.adjust.options import CalibrateOptions
 from pipelines.adjust.rig_fit import (
+    ARM,
+    BORESIGHT,
     LIMIT_ARM_M,
     LIMIT_BORESIGHT_DEG,
     LIMIT_OFFSET_S,
+    OFFSET,
     FitOptions,
+    RigData,
     RigFit,
     fit_rig,
 )
-from pipelines.adjust.rig_model import RigData
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.products import load_json, save_json
 from pipelines.core.stages import SPARSE, SURVEY
@@ -35,11 +37,7 @@ from pipelines.scene.navigation import NavigationTrack, load_track, require_esti
 from pipelines.scene.rig import RigCalibration, RigEstimate, RigParameter
 from pipelines.scene.survey import Survey
 
-_LIMITS: dict[RigParameter, tuple[float, Literal["s", "deg", "m"]]] = {
-    "time-offset": (LIMIT_OFFSET_S, "s"),
-    "boresight": (LIMIT_BORESIGHT_DEG, "deg"),
-    "lever-arm": (LIMIT_ARM_M, "m"),
-}
+# A parameter without any information has an infinite σ, which JSON cannot hold.
 _ENDLESS = 1e6
 
 
@@ -68,12 +66,6 @@ def calibrate(
     observable estimates, or none. A flight in which no parameter is observable is no failure: `problem` states the
     reason.
 
-    Args:
-        survey: has the control points and the option of `ingest`.
-        model: the SfM model.
-        track: the recorded navigation.
-        options: of the stage.
-
     Raises:
         InputError: the navigation was not recorded by time; or attitudes, the body's axes or the mount are needed
             and unknown.
@@ -86,7 +78,8 @@ def calibrate(
         fit = fit_rig(data, start_s, track.nominal_from_cam, free)
     except DegenerateGeometryError as error:
         return RigCalibration(wanted=wanted, problem=str(error))
-    estimates = [_estimates(fit, track)[name] for name in wanted]
+    found = _estimates(fit, track)
+    estimates = [found[name] for name in wanted]
     to_apply = survey.estimate if options.apply is None else wanted if options.apply else ()
     applied = tuple(estimate for estimate in estimates if estimate.usable and estimate.name in to_apply)
     attitude = fit.rms_attitude_deg
@@ -106,30 +99,63 @@ def _wanted(survey: Survey, options: CalibrateOptions) -> tuple[RigParameter, ..
     return survey.estimate if options.estimate is None else options.estimate
 
 
+def _data(survey: Survey, model: SparseModel, track: NavigationTrack) -> RigData:
+    """Return cameras and control points; the size of a pixel is the median over images, at the points' distance."""
+    row_of = {name: row for row, name in enumerate(track.image.tolist())}
+    registered = [index for index, name in enumerate(model.image_name) if name in row_of]
+    rows = [row_of[model.image_name[index]] for index in registered]
+    control, _ = control_correspondences(survey, model)
+    focal_px = np.array([model.camera_of(image).mean_focal_px for image in range(len(model.image_name))])
+    distance = np.linalg.norm(
+        model.point_in_local[model.obs_point] - model.cam_center_in_local[model.obs_image], axis=1
+    )
+    return RigData(
+        positions=track.positions,
+        attitudes=track.attitudes,
+        time_s=track.image_time_s[rows],
+        center_in_local=model.cam_center_in_local[registered],
+        cam_from_local=model.rotation_cam_from_local[registered],
+        cam_from_body=track.cam_from_body[rows],
+        antenna_in_body=np.nan_to_num(track.antenna_in_body[rows]),
+        control_in_local=control.in_local,
+        control_in_geo=control.in_geo,
+        control_cov_in_local=control.cov_in_local,
+        control_cov_in_geo=control.cov_in_geo,
+        pixel_rad=float(1.0 / np.median(focal_px)),
+        footprint_in_local=float(np.median(distance / focal_px[model.obs_image])),
+    )
+
+
 def _estimates(fit: RigFit, track: NavigationTrack) -> dict[RigParameter, RigEstimate]:
-    arm = np.nan_to_num(track.antenna_in_body).mean(axis=0)
-    state, sigma = fit.state, fit.sigma
+    start_s, start_deg = track.time_offset_s.reshape(1), np.degrees(log_so3(track.nominal_from_cam))
+    start_m = np.nan_to_num(track.antenna_in_body).mean(axis=0)
+    value_deg, sigma_deg = np.degrees(log_so3(fit.state.boresight)), np.degrees(fit.sigma[BORESIGHT])
+    found: dict[RigParameter, tuple[Literal["s", "deg", "m"], float, FloatArray, FloatArray, FloatArray]] = {
+        "time-offset": ("s", LIMIT_OFFSET_S, np.array([fit.state.offset_s]), fit.sigma[OFFSET], start_s),
+        "boresight": ("deg", LIMIT_BORESIGHT_DEG, value_deg, sigma_deg, start_deg),
+        "lever-arm": ("m", LIMIT_ARM_M, start_m + fit.state.arm, fit.sigma[ARM], start_m),
+    }
     return {
-        "time-offset": _estimate("time-offset", [state.offset_s], sigma[7:8], [float(track.time_offset_s)]),
-        "boresight": _estimate(
-            "boresight", _degrees(state.boresight), np.degrees(sigma[8:11]), _degrees(track.nominal_from_cam)
-        ),
-        "lever-arm": _estimate("lever-arm", arm + state.arm, sigma[11:14], arm),
+        name: RigEstimate(
+            name=name,
+            unit=unit,
+            value=tuple(value.tolist()),
+            sigma=tuple(np.minimum(sigma, _ENDLESS).tolist()),
+            start=tuple(start.astype(float).tolist()),
+            observable=tuple((sigma <= limit).tolist()),
+        )
+        for name, (unit, limit, value, sigma, start) in found.items()
     }
 
 
 def _summary(calibration: RigCalibration, survey: Survey) -> Summary:
-    residuals = {
-        "images": calibration.images,
-        "control_points": calibration.control_points,
-        "rms_position_m": calibration.rms_position_m,
-        "rms_attitude_deg": calibration.rms_attitude_deg,
-    }
     values = {
         "wanted": list(calibration.wanted),
         "estimates": [estimate.model_dump(mode="json") for estimate in calibration.estimates],
         "applied": [estimate.name for estimate in calibration.applied],
-        "residuals": residuals,
+        "residuals": calibration.model_dump(
+            include={"images", "control_points", "rms_position_m", "rms_attitude_deg"}
+        ),
     }
     return Summary(_key_figure(calibration), values, _warnings(calibration, survey))
 
@@ -162,53 +188,3 @@ def _warnings(calibration: RigCalibration, survey: Survey) -> tuple[str, ...]:
     if missed:
         warnings.append(f"--estimate leaves out what ingest was asked to estimate: {', '.join(missed)}")
     return tuple(warnings)
-
-
-def _data(survey: Survey, model: SparseModel, track: NavigationTrack) -> RigData:
-    row_of = {name: row for row, name in enumerate(track.image.tolist())}
-    registered = [index for index, name in enumerate(model.image_name) if name in row_of]
-    rows = [row_of[model.image_name[index]] for index in registered]
-    control, _ = control_correspondences(survey, model)
-    pixel_rad, footprint = _pixel(model)
-    return RigData(
-        positions=track.positions,
-        attitudes=track.attitudes,
-        time_s=track.image_time_s[rows],
-        center_in_local=model.cam_center_in_local[registered],
-        cam_from_local=model.rotation_cam_from_local[registered],
-        cam_from_body=track.cam_from_body[rows],
-        antenna_in_body=np.nan_to_num(track.antenna_in_body[rows]),
-        control_in_local=control.in_local,
-        control_in_geo=control.in_geo,
-        control_cov_in_local=control.cov_in_local,
-        control_cov_in_geo=control.cov_in_geo,
-        pixel_rad=pixel_rad,
-        footprint_in_local=footprint,
-    )
-
-
-def _pixel(model: SparseModel) -> tuple[float, float]:
-    """Return the angle of a pixel in radians, and its width at the distance of the points in units of local."""
-    arm = model.point_in_local[model.obs_point] - model.cam_center_in_local[model.obs_image]
-    focal = np.array([model.camera_of(image).mean_focal_px for image in range(len(model.image_name))])
-    footprint = np.median(np.linalg.norm(arm, axis=1) / focal[model.obs_image])
-    return float(1.0 / np.median(focal)), float(footprint)
-
-
-def _estimate(name: RigParameter, value: ArrayLike, sigma: ArrayLike, start: ArrayLike) -> RigEstimate:
-    values, sigmas, starts = (tuple(float(number) for number in np.ravel(row)) for row in (value, sigma, start))
-    limit, unit = _LIMITS[name]
-    # A parameter without any information has an infinite σ, which JSON cannot hold.
-    sigmas = tuple(min(number, _ENDLESS) for number in sigmas)
-    return RigEstimate(
-        name=name,
-        unit=unit,
-        value=values,
-        sigma=sigmas,
-        start=starts,
-        observable=tuple(number <= limit for number in sigmas),
-    )
-
-
-def _degrees(rotation: FloatArray) -> FloatArray:
-    return np.degrees(log_so3(rotation))

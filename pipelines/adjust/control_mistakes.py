@@ -2,29 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
-
 import numpy as np
 
 from pipelines.adjust.hypotheses import fit, mirrored
-from pipelines.adjust.observations import control_correspondences
+from pipelines.adjust.observations import control_correspondences, fix_correspondences
 from pipelines.adjust.similarity_fit import Correspondences
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import FloatArray
 from pipelines.geodesy.vertical import FOOT_M, MOST_GEOID_M
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.robust.statistics import typical_sigma
-from pipelines.scene.survey import Mark, Survey
+from pipelines.scene.survey import Survey
 
 # A shift of all fixes up to this is everyday work with an autonomous base station.
 EVERYDAY_SHIFT_M = 5.0
 _LEAST_FEET_M = 50.0
 _FEET_PART = 0.05  # of a height, by which cameras are higher than control points
-_SCALES = (2.0, 3.0, 4.0, 0.5, 1 / 3, 0.25)  # of photographs that were made smaller or larger
+# Size of the photographs in which marks were measured, and the factor of their pixels.
+_SCALES = {"1/2": 2.0, "1/3": 3.0, "1/4": 4.0, "2 times": 0.5, "3 times": 1 / 3, "4 times": 0.25}
 _MIRRORED_M = 0.3  # scatter about the SfM model, below which control points fit as they are
 _LEAST, _SIGMAS, _NEAR_SIGMAS, _LEAST_SCALE = 5, 5.0, 2.0, 0.01
-Change = Callable[[Mark], tuple[float, float]]
+# From x, y and the height of the photograph to the pixels x, y without a mistake.
+_AS_STATED = np.eye(2, 3)
+_FROM_BELOW = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 1.0]])
+_EXCHANGED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
 
 
 def mistake_in_marks(survey: Survey, model: SparseModel) -> str | None:
@@ -34,49 +35,38 @@ def mistake_in_marks(survey: Survey, model: SparseModel) -> str | None:
         None: more than half of the points meet as they are, or no known mistake explains the others.
     """
     points = survey.control_points
-    sizes = {name: model.camera_of(index) for index, name in enumerate(model.image_name)}
+    height_px = {name: model.camera_of(index).height for index, name in enumerate(model.image_name)}
 
-    def meeting(change: Change) -> int:
-        changed = tuple(
-            point.model_copy(update={"marks": tuple(_moved(mark, change) for mark in point.marks)})
-            for point in points
-        )
-        return len(control_correspondences(survey.model_copy(update={"control_points": changed}), model)[0])
+    def meeting(change: FloatArray) -> int:
+        """Return how many points meet after a change (2, 3) of x, y, height; a missing image has no height."""
+        changed = []
+        for point in points:
+            marks = []
+            for mark in point.marks:
+                x_px, y_px = (change @ [mark.x_px, mark.y_px, height_px.get(mark.image, 0)]).tolist()
+                marks.append(mark.model_copy(update={"x_px": x_px, "y_px": y_px}))
+            changed.append(point.model_copy(update={"marks": tuple(marks)}))
+        return len(control_correspondences(survey.model_copy(update={"control_points": tuple(changed)}), model)[0])
 
-    def below(mark: Mark) -> tuple[float, float]:
-        lens = sizes.get(mark.image)
-        return mark.x_px, mark.y_px if lens is None else lens.height - mark.y_px
-
-    stated = meeting(lambda mark: (mark.x_px, mark.y_px))
-    changes: list[tuple[str, Change]] = [
-        ("their y counts from the lower edge of the photograph: count it from the upper one", below),
-        ("their x and y are exchanged", lambda mark: (mark.y_px, mark.x_px)),
-    ]
-    for scale in _SCALES:
-        size = f"1/{scale:.0f}" if scale > 1 else f"{1 / scale:.0f} times"
+    changes = {
+        "their y counts from the lower edge of the photograph: count it from the upper one": _FROM_BELOW,
+        "their x and y are exchanged": _EXCHANGED,
+    }
+    for size, scale in _SCALES.items():
         sentence = f"they were measured in photographs of {size} the size: measure in these, or scale the marks"
-        changes.append((sentence, partial(_scaled, scale)))
-    found = max(((meeting(change), sentence) for sentence, change in changes), key=lambda one: one[0])
-    explains = found[0] >= max(2, 2 * stated) and found[0] > len(points) / 2
-    return f"{found[1]}; then {found[0]} of {len(points)} meet" if explains else None
+        changes[sentence] = scale * _AS_STATED
+    stated = meeting(_AS_STATED)
+    most, sentence = max(((meeting(change), name) for name, change in changes.items()), key=lambda one: one[0])
+    explains = most >= max(2, 2 * stated) and most > len(points) / 2
+    return f"{sentence}; then {most} of {len(points)} meet" if explains else None
 
 
-def _scaled(by: float, mark: Mark) -> tuple[float, float]:
-    return mark.x_px * by, mark.y_px * by
-
-
-def _moved(mark: Mark, change: Change) -> Mark:
-    x_px, y_px = change(mark)
-    return mark.model_copy(update={"x_px": x_px, "y_px": y_px})
-
-
-def mistake_in_map(fixes: Correspondences, control: Correspondences, lat_deg: float) -> str | None:
+def mistake_in_map(survey: Survey, model: SparseModel) -> str | None:
     """Return the mistake of a map of control points that has another size or other axes than the fixes, or None.
 
-    Args:
-        fixes, control: both in local and in geo, at least five of each; the scatter of fewer shows too little.
-        lat_deg: latitude of the survey.
+    At least five fixes and five control points are needed: the scatter of fewer shows too little.
     """
+    fixes, control = fix_correspondences(survey, model), control_correspondences(survey, model)[0]
     if min(len(fixes), len(control)) < _LEAST:
         return None
     try:
@@ -89,7 +79,7 @@ def mistake_in_map(fixes: Correspondences, control: Correspondences, lat_deg: fl
     ratio = by_control.scale / by_fixes.scale
     sigma = float(np.hypot(_sigma_of_scale(fixes, fix_m), _sigma_of_scale(control, control_m)))
     causes = {
-        1.0 / np.cos(np.radians(lat_deg)): "Web Mercator (EPSG:3857) has this scale at this latitude",
+        1.0 / np.cos(np.radians(survey.origin.lat_deg)): "Web Mercator (EPSG:3857) has this scale at this latitude",
         FOOT_M: "the coordinates are in metres, although their CRS has feet",
         1.0 / FOOT_M: "the coordinates are in feet, although their CRS has metres",
     }
@@ -108,13 +98,12 @@ def _sigma_of_scale(positions: Correspondences, scatter_m: float) -> float:
     return float(max(scatter_m / len(positions) ** 0.5, typical_sigma(positions.cov_in_geo)) / size_m)
 
 
-def shift_sentence(shift_m: FloatArray, height_m: float) -> str:
-    """Return the likely cause of a constant shift between fixes and control points.
+def shift_sentence(shift_m: FloatArray, survey: Survey) -> str:
+    """Return the likely cause of a constant shift (3,) between fixes and control points: east, north, up.
 
-    Args:
-        shift_m: (3,) east, north, up; of which of the two is of no account.
-        height_m: height of the control points as stated.
+    Of which of the two it is, is of no account. The survey has control points.
     """
+    height_m = survey.origin.alt_m + np.median([point.position_in_geo[2] for point in survey.control_points])
     horizontal, vertical = float(np.hypot(shift_m[0], shift_m[1])), abs(float(shift_m[2]))
     for sign in (-1.0, 1.0):
         other_m = height_m + sign * float(shift_m[2])

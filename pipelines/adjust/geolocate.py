@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +20,6 @@ from pipelines.adjust.observations import (
     RecordedRotations,
     attitude_prior,
     fix_correspondences,
-    observation_rays,
     recorded_rotations,
 )
 from pipelines.adjust.options import GeolocateOptions
@@ -28,10 +27,11 @@ from pipelines.adjust.similarity_fit import Correspondences, RotationPrior
 from pipelines.core.errors import DegenerateGeometryError, InputError
 from pipelines.core.sentences import listed
 from pipelines.core.stages import SPARSE
-from pipelines.core.types import BoolArray, FloatArray
+from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.formats.colmap import read_sparse
 from pipelines.formats.point_ply import write_point_ply
+from pipelines.geometry.cameras import undistort
 from pipelines.geometry.intersection import intersect_rays
 from pipelines.geometry.rays import CommonRotation, Intersections, Rays, UncertainCameras
 from pipelines.geometry.rotations import log_so3
@@ -43,7 +43,6 @@ from pipelines.scene.survey import Survey
 log = logging.getLogger(__name__)
 
 _LARGEST_RELATIVE_SIGMA = 0.3  # of the distance: beyond, the linear covariance is invalid
-_NO_FIXES = "no fixes: positions come from control points"
 _ALIGNMENT_SEED = 0
 
 
@@ -62,18 +61,6 @@ class Geolocation:
     sigma_m: FloatArray
     key_figure: str
     warnings: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class _CameraObservations:
-    """Fixes and attitudes of a model's cameras, with their alignment to the model."""
-
-    model: SparseModel
-    fixes: Correspondences
-    recorded: RecordedRotations
-    prior: RotationPrior | None
-    alignment: Alignment | None
-    problem: str  # reason why there is no alignment
 
 
 def run(stage: StageRun, options: GeolocateOptions) -> Summary:
@@ -99,88 +86,78 @@ def geolocate(survey: Survey, model: SparseModel, options: GeolocateOptions) -> 
     Without fixes, or without any rotations, the points have no positions, so that control points alone can
     georeference the survey.
 
-    Args:
-        survey: has the fixes and attitudes.
-        model: the SfM model.
-        options: of the stage.
-
     Raises:
         InputError: the options demand `recorded` attitudes, and fewer than two images have a fix and an attitude.
     """
-    observed = _observed(survey, model)
-    if len(observed.fixes) == 0:
-        return _without_positions(model, _NO_FIXES)
-    source = _rotation_source(observed, options)
-    if source == "sfm" and observed.alignment is None:
-        # Control points may place the model nevertheless, or `init-sim3` finds what is wrong with the fixes.
-        return _without_positions(model, f"no directions for the SfM points: {observed.problem}")
-    warnings = _warnings(observed, source)
-    views, usable = _views(observed, source, options.sigma_px)
-    rays = _rays(model, usable)
-    intersections = intersect_rays(rays, views, len(model.point_id))
-    sigma, inlier = _judge(intersections, rays, views, options)
-    points = _points(model, intersections, inlier, source)
-    if inlier.sum() < 0.5 * len(inlier):
-        warnings.append(f"only {inlier.sum()} of {len(inlier)} points have rays that agree: check σ and attitudes")
-    middle = f", median σ {np.median(sigma[inlier]):.3g} m" if inlier.any() else ""
-    figure = f"{inlier.sum()} of {len(inlier)} points{middle} ({source} rotations)"
-    return Geolocation(points, sigma, figure, tuple(warnings))
-
-
-def _without_positions(model: SparseModel, why: str) -> Geolocation:
-    """Return points without positions."""
-    count = len(model.point_id)
-    points = _points(model, Intersections.none(count), np.zeros(count, dtype=bool), "sfm")
-    return Geolocation(points, np.full(count, np.nan), why, (why,))
-
-
-def _points(
-    model: SparseModel, intersections: Intersections, inlier: BoolArray, source: Literal["recorded", "sfm"]
-) -> GeolocatedPoints:
-    """Return the product, made of the intersections of a model's points."""
-    return GeolocatedPoints(
-        point_id=model.point_id,
-        position_in_geo=intersections.position_in_geo,
-        cov_in_geo=intersections.cov_in_geo,
-        ray_count=intersections.ray_count,
-        max_angle_deg=intersections.max_angle_deg,
-        condition=intersections.condition,
-        inlier=inlier,
-        rotation_source=source,
-    )
-
-
-def _observed(survey: Survey, model: SparseModel) -> _CameraObservations:
-    fixes, prior = fix_correspondences(survey, model), attitude_prior(survey, model)
+    fixes, index = fix_correspondences(survey, model), model.image_index()
+    if len(fixes) == 0:
+        return _without_positions(model, "no fixes: positions come from control points")
+    prior, recorded = attitude_prior(survey, model), recorded_rotations(survey, model)
     alignment, problem = None, ""
     try:
         alignment = align(fixes, np.random.default_rng(_ALIGNMENT_SEED), attitude=prior)
     except DegenerateGeometryError as error:
         problem = str(error)
         log.info("fixes cannot be compared with the SfM model: %s", error)
-    return _CameraObservations(model, fixes, recorded_rotations(survey, model), prior, alignment, problem)
-
-
-def _rotation_source(observed: _CameraObservations, options: GeolocateOptions) -> Literal["recorded", "sfm"]:
-    with_fix = observed.model.image_index()
-    both = int(np.isin([with_fix[name] for name in observed.fixes.name], observed.recorded.image).sum())
+    fixed = np.array([index[name] for name in fixes.name])
+    both = int(np.isin(fixed, recorded.image).sum())
     if options.attitude == "recorded" and both < 2:
         raise InputError(
             f"{both} images have a fix and an attitude, 2 are needed: use auto or sfm", field="--attitude"
         )
-    complete = both == len(observed.fixes) or (observed.alignment is None and both >= 2)
-    return "recorded" if options.attitude == "recorded" or (options.attitude == "auto" and complete) else "sfm"
+    complete = both == len(fixes) or (alignment is None and both >= 2)
+    use_recorded = options.attitude == "recorded" or (options.attitude == "auto" and complete)
+    if alignment is None and not use_recorded:
+        # Control points may place the model nevertheless, or `init-sim3` finds what is wrong with the fixes.
+        return _without_positions(model, f"no directions for the SfM points: {problem}")
+    warnings = _warnings(model, fixes, recorded, alignment, prior if use_recorded else None)
+    views, usable = _views(
+        model, fixes, fixed, alignment, recorded if use_recorded else None, sigma_px=options.sigma_px
+    )
+    rays = _rays(model, usable)
+    intersections = intersect_rays(rays, views, len(model.point_id))
+    sigma, inlier = _judge(intersections, rays, views, options)
+    if inlier.sum() < 0.5 * len(inlier):
+        warnings.append(f"only {inlier.sum()} of {len(inlier)} points have rays that agree: check σ and attitudes")
+    middle = f", median σ {np.median(sigma[inlier]):.3g} m" if inlier.any() else ""
+    source = "recorded" if use_recorded else "sfm"
+    figure = f"{inlier.sum()} of {len(inlier)} points{middle} ({source} rotations)"
+    return Geolocation(_points(model, intersections, inlier, source), sigma, figure, tuple(warnings))
 
 
-def _warnings(observed: _CameraObservations, source: str) -> list[str]:
-    warnings = []
-    turned = observed.recorded.contradicting
+def _without_positions(model: SparseModel, why: str) -> Geolocation:
+    count = len(model.point_id)
+    points = _points(model, Intersections.none(count), np.zeros(count, dtype=bool), "sfm")
+    return Geolocation(points, np.full(count, np.nan), why, (why,))
+
+
+def _points(model: SparseModel, found: Intersections, inlier: BoolArray, source: str) -> GeolocatedPoints:
+    return GeolocatedPoints(
+        point_id=model.point_id,
+        position_in_geo=found.position_in_geo,
+        cov_in_geo=found.cov_in_geo,
+        ray_count=found.ray_count,
+        max_angle_deg=found.max_angle_deg,
+        condition=found.condition,
+        inlier=inlier,
+        rotation_source=source,
+    )
+
+
+def _warnings(
+    model: SparseModel,
+    fixes: Correspondences,
+    recorded: RecordedRotations,
+    alignment: Alignment | None,
+    prior: RotationPrior | None,
+) -> list[str]:
+    """Return warnings of unused measurements, and of a `prior` turned against an alignment made without it."""
+    warnings, turned, total = [], recorded.contradicting, len(model.image_name)
     if turned:
         warnings.append(
             f"{len(turned)} attitudes contradict the SfM model and are not used: {listed(sorted(turned))}. "
             "Were these photographs turned in an image viewer?"
         )
-    total, fixes, alignment = len(observed.model.image_name), observed.fixes, observed.alignment
     if len(fixes) < total:
         warnings.append(f"{total - len(fixes)} of {total} registered images have no fix and give no rays")
     if alignment is None:
@@ -191,8 +168,7 @@ def _warnings(observed: _CameraObservations, source: str) -> list[str]:
             f"{len(rejected)} of {len(fixes)} fixes contradict the SfM model and give no rays: "
             f"{listed(sorted(rejected))}"
         )
-    prior = observed.prior
-    if source == "recorded" and prior is not None and not alignment.attitude_used:
+    if prior is not None and not alignment.attitude_used:
         turn = float(np.linalg.norm(log_so3(prior.rotation @ alignment.geo_from_local.rotation.T)))
         sigma = np.hypot(np.sqrt(prior.cov_rad2[0, 0]), alignment.solution.rotation_sigma_rad)
         if turn > 4 * sigma:
@@ -203,27 +179,35 @@ def _warnings(observed: _CameraObservations, source: str) -> list[str]:
     return warnings
 
 
-def _views(observed: _CameraObservations, source: str, sigma_px: float) -> tuple[UncertainCameras, BoolArray]:
-    """Return all images as views, and the mask (n,) of those that give rays; the others are placeholders."""
-    model, fixes, alignment = observed.model, observed.fixes, observed.alignment
-    count, index = len(model.image_name), model.image_index()
-    place = np.array([index[name] for name in fixes.name])
+def _views(
+    model: SparseModel,
+    fixes: Correspondences,
+    fixed: IntArray,
+    alignment: Alignment | None,
+    recorded: RecordedRotations | None,
+    *,
+    sigma_px: float,
+) -> tuple[UncertainCameras, BoolArray]:
+    """Return all images as views, and the mask (n,) of those that give rays; the others are placeholders.
+
+    Rotations are the recorded ones, or without these those of the alignment. `fixed` are the images of the fixes.
+    """
+    count = len(model.image_name)
     center, cov = np.zeros((count, 3)), np.tile(np.eye(3), (count, 1, 1))
-    center[place], cov[place] = fixes.in_geo, fixes.cov_in_geo
+    center[fixed], cov[fixed] = fixes.in_geo, fixes.cov_in_geo
     usable = np.zeros(count, dtype=bool)
-    usable[place] = True if alignment is None else alignment.solution.state.inlier
+    usable[fixed] = True if alignment is None else alignment.solution.state.inlier
     sigma_ray = sigma_px / np.array([model.camera_of(image).mean_focal_px for image in range(count)])
     rotation, sigma, common = np.tile(np.eye(3), (count, 1, 1)), np.ones(count), None
-    if source == "recorded" or alignment is None:
-        recorded = observed.recorded
+    if recorded is not None:
         rotation[recorded.image], sigma[recorded.image] = recorded.geo_from_cam, recorded.sigma_rad
         usable &= np.isin(np.arange(count), recorded.image)
-    else:
+    elif alignment is not None:
         rotation = alignment.geo_from_local.rotation @ np.swapaxes(model.rotation_cam_from_local, 1, 2)
         # Bundle adjustment has averaged the pixel errors of a whole image: rotations in the model have this σ.
         sigma = sigma_ray / np.sqrt(np.maximum(np.bincount(model.obs_image, minlength=count), 1))
         gain = np.zeros((count, 3, 3))
-        gain[place] = alignment.solution.response[:, 1:4]
+        gain[fixed] = alignment.solution.response[:, 1:4]
         common = CommonRotation(alignment.solution.covariance[1:4, 1:4], gain)
     return UncertainCameras(center, rotation, cov, sigma, sigma_ray, common), usable
 
@@ -233,9 +217,14 @@ def _rays(model: SparseModel, usable: BoolArray) -> Rays:
 
     A point that an image shows twice counts once, because both rays have the same errors of position and attitude.
     """
-    xy = observation_rays(model)
+    xy = np.empty_like(model.obs_xy_px)
+    camera_id = model.image_camera_id[model.obs_image]
+    for camera in np.unique(camera_id):
+        mine = camera_id == camera
+        xy[mine] = undistort(model.cameras[int(camera)], model.obs_xy_px[mine])
     again = np.zeros(len(xy), dtype=bool)
     again[1:] = (np.diff(model.obs_point) == 0) & (np.diff(model.obs_image) == 0)
+    # NaN: the lens model maps no ray to this pixel.
     keep = usable[model.obs_image] & np.isfinite(xy).all(axis=1) & ~again
     return Rays(model.obs_point[keep], model.obs_image[keep], xy[keep])
 
@@ -259,11 +248,8 @@ def _judge(
 
 def _values(points: GeolocatedPoints) -> dict[str, Any]:
     good = points.inlier
-    values: dict[str, Any] = {
-        "points": len(good),
-        "inliers": int(good.sum()),
-        "rotation_source": points.rotation_source,
-    }
+    values: dict[str, Any] = {"points": len(good), "inliers": int(good.sum())}
+    values["rotation_source"] = points.rotation_source
     if good.any():
         axes = np.sqrt(np.diagonal(points.cov_in_geo[good], axis1=1, axis2=2))
         values |= {

@@ -1,6 +1,7 @@
 """Stage `init-sim3`: the similarity `geo_from_local` from the SfM model to the Earth.
 
-Reads `ingest/survey.json`, `sfm/sparse`, `geolocate/points.npz`; writes `sim3/geo_from_local.json`.
+Reads `ingest/survey.json`, `sfm/sparse`, `geolocate/points.npz`; writes `sim3/geo_from_local.json`
+and the adjustment, `sim3/adjustment.json` and `.npz`.
 GeoRefGS section 2.4.1, eqs 16–21 (doi 10.3390/drones10030195), is `--method paper`. The default starts from a
 robust alignment of camera centres and control points, adjusts similarity, cameras and lens together, and tests the
 stated σ. `pipelines.adjust.alignment` explains why the geolocated points are no observations.
@@ -8,6 +9,7 @@ stated σ. `pipelines.adjust.alignment` explains why the geolocated points are n
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -15,10 +17,11 @@ import numpy as np
 from pipelines.adjust.observations import control_correspondences, fix_correspondences
 from pipelines.adjust.options import InitSim3Options
 from pipelines.adjust.paper import similarity_by_paper
-from pipelines.adjust.robust import Inputs, robust_similarity
+from pipelines.adjust.posterior import save_posterior
+from pipelines.adjust.robust import Estimated, Inputs, placed, robust_similarity
 from pipelines.core.errors import ConvergenceError, InputError
 from pipelines.core.products import save_json
-from pipelines.core.stages import POINTS, SPARSE
+from pipelines.core.stages import ADJUSTMENT, POINTS, SIM3, SIM3_POSTERIOR, SPARSE
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.sparse_model import SparseModel
@@ -37,15 +40,17 @@ def run(stage: StageRun, options: InitSim3Options) -> Summary:
     survey = load_survey(stage.workspace)
     model = read_sparse(stage.workspace.path(SPARSE))
     points = GeolocatedPoints.load(stage.workspace.path(POINTS))
-    initial, warnings = estimate_similarity(survey, model, points, options)
-    save_json(initial, stage.out / "geo_from_local.json")
-    return _summary(initial, warnings)
+    estimated = estimate_similarity(survey, model, points, options)
+    save_json(estimated.initial, stage.out / Path(SIM3).name)
+    save_json(estimated.posterior.solution, stage.out / Path(ADJUSTMENT).name)
+    save_posterior(estimated.posterior, stage.out / Path(SIM3_POSTERIOR).name)
+    return _summary(estimated)
 
 
 def estimate_similarity(
     survey: Survey, model: SparseModel, points: GeolocatedPoints, options: InitSim3Options
-) -> tuple[InitialSimilarity, tuple[str, ...]]:
-    """Return the initial similarity, and warnings for the user.
+) -> Estimated:
+    """Return the initial similarity with the adjustment, and warnings for the user.
 
     Args:
         survey: has the fixes, attitudes and control points.
@@ -66,11 +71,12 @@ def estimate_similarity(
     if options.method == "paper":
         control, unused = control_correspondences(survey, model)
         initial = similarity_by_paper(model, points, fix_correspondences(survey, model).joined(control))
-        warnings = tuple(point.sentence for point in unused)
+        inputs = Inputs(survey, model, points)
+        estimated = Estimated(initial, placed(inputs, initial, options), tuple(point.sentence for point in unused))
     else:
-        initial, warnings = robust_similarity(Inputs(survey, model, points), options)
-    _check_residual(initial, options.max_residual)
-    return initial, warnings
+        estimated = robust_similarity(Inputs(survey, model, points), options)
+    _check_residual(estimated.initial, options.max_residual)
+    return estimated
 
 
 def _check_residual(initial: InitialSimilarity, limit_m: float | None) -> None:
@@ -86,7 +92,8 @@ def _check_residual(initial: InitialSimilarity, limit_m: float | None) -> None:
     )
 
 
-def _summary(initial: InitialSimilarity, warnings: tuple[str, ...]) -> Summary:
+def _summary(estimated: Estimated) -> Summary:
+    initial = estimated.initial
     sigma = np.sqrt(np.diag(np.array(initial.geo_from_local.covariance)))
     parts = [
         f"{kind} {stats.rmse_3d_m:.3f} m RMS of {stats.count}"
@@ -108,5 +115,8 @@ def _summary(initial: InitialSimilarity, warnings: tuple[str, ...]) -> Summary:
         "residuals": {kind: stats.model_dump() for kind, stats in initial.residuals.items()},
     }
     return Summary(
-        f"σ of position {position:.3f} m; residuals {', '.join(parts)}", values, warnings, initial.cautions
+        f"σ of the georeference alone {position:.3f} m; residuals {', '.join(parts)}",
+        values,
+        estimated.warnings,
+        initial.cautions,
     )

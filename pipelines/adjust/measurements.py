@@ -1,258 +1,175 @@
-"""Terms of the geographic losses, built from the survey's measurements of the training images."""
+"""Terms of the adjustment, built from the survey's measurements of the registered images."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from pipelines.adjust.control_by_depth import ControlByDepth
 from pipelines.adjust.observations import recorded_rotations
-from pipelines.adjust.terms import AttitudeTerm, ControlTerm, DistanceTerm, FixTerm
+from pipelines.adjust.options import EstimatedErrorName
+from pipelines.adjust.state import (
+    SIGMA_ARM_M,
+    SIGMA_BORESIGHT_RAD,
+    SIGMA_LIDAR_M,
+    State,
+    SystematicError,
+    SystematicErrors,
+)
+from pipelines.adjust.system import Problem
+from pipelines.adjust.terms import Attitudes, ControlPoints, Fixes, Planes, Term, root_information
 from pipelines.core.errors import InputError
 from pipelines.core.types import FloatArray
-from pipelines.scene.geolocated import GeolocatedPoints
 from pipelines.scene.marks import mark_rays
 from pipelines.scene.scene import Scene
 from pipelines.scene.survey import Survey
 
-# Gap between two consecutive fixes beyond which the receiver may have restarted.
-FLIGHT_GAP_S = 600.0
-# σ of the rendered surface at a mark, as a fraction of its distance: 12 cm at 60 m.
-SURFACE_SIGMA = 2e-3
-_WORTH = 0.1  # share of the fixes' information on the scale that the distances may repeat
-_PAIRS = 300
-# Candidates drawn for each pair in use. The longest are used, because short pairs hardly constrain the scale.
-_DRAWN = 3
+_LEAST_SIGMA_COMMON_M = 1e-4  # of an axis without a common error, where another axis has one
 
 
-def fix_term(scene: Scene, survey: Survey) -> FixTerm | None:
-    """Return the fixes of the training cameras, or None if there are fewer than three.
+def problem_of(
+    scene: Scene,
+    survey: Survey,
+    *,
+    estimate: Iterable[EstimatedErrorName] = (),
+    with_attitudes: bool = False,
+    planes: Planes | None = None,
+) -> Problem:
+    """Return the problem of all cameras under the survey's measurements.
 
-    The fixes of test cameras stay unused, like their photographs.
+    Args:
+        scene: cameras and points as SfM left them.
+        survey: the measurements in use, with the variance factors in their covariances.
+        estimate: further systematic errors to estimate, beside the common error of the fixes.
+        with_attitudes: whether the attitudes take part, where positions leave the rotation open.
+        planes: of a LiDAR whose shift is a systematic error; None: none.
+
+    Raises:
+        InputError: an error is to be estimated whose measurements were not recorded.
     """
-    images = [(int(index), survey.image(scene.sparse.image_name[index])) for index in scene.train]
-    fixed = [(index, image, image.fix) for index, image in images if image is not None and image.fix is not None]
-    if len(fixed) < 3:
-        return None
-    covariance = np.array([fix.cov_in_geo for _, _, fix in fixed])
-    return FixTerm(
-        torch.tensor([index for index, _, _ in fixed]),
-        torch.tensor([fix.position_in_geo for _, _, fix in fixed], dtype=torch.float64),
-        torch.from_numpy(root_information(covariance)),
-        torch.from_numpy(flights([image.timestamp_s for _, image, _ in fixed])),
+    wanted = tuple(estimate)
+    fixes, control = fixes_of(scene, survey), control_of(scene, survey)
+    attitudes = attitudes_of(scene, survey) if with_attitudes or "boresight" in wanted else None
+    for name, source, what in (
+        ("lever-arm", fixes, "positions"),
+        ("boresight", attitudes, "attitudes"),
+    ):
+        if name in wanted and source is None:
+            raise InputError(f"{name} cannot be estimated: no {what} were recorded", field="--estimate")
+    blocks = [] if fixes is None else _common_errors(survey, fixes)
+    if "lever-arm" in wanted:
+        blocks.append(SystematicError("lever-arm", (SIGMA_ARM_M,) * 3))
+    if attitudes is not None:
+        if "boresight" in wanted:
+            blocks.append(SystematicError("boresight", (SIGMA_BORESIGHT_RAD,) * 3))
+        sigma = float(np.median(1.0 / attitudes.root_information[:, 0, 0]))
+        blocks.append(SystematicError("common", (sigma,) * 3))
+    if planes is not None:
+        blocks.append(SystematicError("lidar-shift", (SIGMA_LIDAR_M,) * 3))
+    every: tuple[Term | None, ...] = (fixes, control, attitudes, planes)
+    return Problem(
+        scene.poses,
+        scene.bundle,
+        tuple(term for term in every if term is not None),
+        SystematicErrors(tuple(blocks)),
     )
 
 
-def flights(times_s: list[float | None]) -> np.ndarray:
-    """Return the flight (F,) of each fix, counted from 0 in the order of time.
+def fixes_of(scene: Scene, survey: Survey) -> Fixes | None:
+    """Return the fixes of the registered images, or None without any."""
+    by_name = {image.name: image.fix for image in survey.images}
+    fixed = [
+        (index, name, fix)
+        for index, name in enumerate(scene.sparse.image_name)
+        if (fix := by_name.get(name)) is not None
+    ]
+    if not fixed:
+        return None
+    return Fixes(
+        name=tuple(name for _, name, _ in fixed),
+        camera=np.array([index for index, _, _ in fixed]),
+        position_in_geo=np.array([fix.position_in_geo for _, _, fix in fixed]),
+        root_information=root_information(np.array([fix.cov_in_geo for _, _, fix in fixed])),
+        session=np.array([fix.session for _, _, fix in fixed]),
+    )
 
-    A gap of more than `FLIGHT_GAP_S` begins a new flight. Without the time of every fix, all belong to one flight.
-    """
-    if any(time is None for time in times_s):
-        return np.zeros(len(times_s), dtype=np.int64)
-    times = np.array(times_s, dtype=np.float64)
-    order = np.argsort(times, kind="stable")
-    flight = np.empty(len(times), dtype=np.int64)
-    flight[order] = np.concatenate([[0], np.cumsum(np.diff(times[order]) > FLIGHT_GAP_S)])
-    return flight
 
-
-def control_term(scene: Scene, survey: Survey) -> ControlTerm | None:
-    """Return the control points with marks in two or more training images, or None if there is none."""
-    rays = mark_rays(survey.control_points, scene.sparse, scene.train)
+def control_of(scene: Scene, survey: Survey) -> ControlPoints | None:
+    """Return the control points with marks in two or more registered images, or None if there is none."""
+    rays = mark_rays(survey.control_points, scene.sparse)
     marked = rays.marks_of_point >= 2
     if not marked.any():
         return None
     rays = rays.of_points(marked)
     surveyed = [point for point, enough in zip(survey.control_points, marked, strict=True) if enough]
-    control = ControlTerm(
-        point=torch.from_numpy(rays.point),
-        camera=torch.from_numpy(rays.camera),
-        bearing_in_cam=torch.from_numpy(rays.bearing_in_cam),
-        sigma_rad=torch.from_numpy(rays.sigma_rad),
-        position_in_geo=torch.tensor([point.position_in_geo for point in surveyed], dtype=torch.float64),
-        root_information=torch.eye(3, dtype=torch.float64).repeat(len(surveyed), 1, 1),
-        point_id=rays.point_id,
-        bearing_by_lens=torch.from_numpy(scene.sparse.lenses.bearing_jacobian(rays.camera, rays.xy_px)),
+    position = np.array([point.position_in_geo for point in surveyed])
+    control = ControlPoints(
+        name=rays.point_id,
+        point=rays.point,
+        camera=rays.camera,
+        bearing_in_cam=rays.bearing_in_cam,
+        sigma_rad=rays.sigma_rad,
+        bearing_by_lens=scene.sparse.lenses.bearing_jacobian(rays.camera, rays.xy_px),
+        position_in_geo=position,
+        root_information=np.tile(np.eye(3), (len(position), 1, 1)),
     )
     of_survey = np.array([point.cov_in_geo for point in surveyed])
-    return _with_covariance(control, of_survey + _mark_covariance(scene, control))
+    return replace(control, root_information=root_information(of_survey + _mark_covariance(scene, control)))
 
 
-def control_by_depth(scene: Scene, survey: Survey, marks: ControlTerm) -> tuple[ControlByDepth, ControlTerm]:
-    """Return the marks for projection onto the rendered surface, and the control points with the surface's σ added.
-
-    The surface's error has a σ of `SURFACE_SIGMA` times the distance, along each axis. All marks of a point share
-    this error, because they show one piece of the surface.
-
-    Args:
-        scene: cameras at the start of the training.
-        survey: has the control points.
-        marks: of `control_term`.
-    """
-    order = torch.argsort(marks.camera, stable=True)
-    point, camera = marks.point[order], marks.camera[order]
-    center = torch.from_numpy(scene.geo_from_model.apply(scene.poses.cam_center_in_model))[camera]
-    distance = (marks.position_in_geo[point] - center).norm(dim=1)
-    surveyed = {each.name: np.array(each.cov_in_geo) for each in survey.control_points}
-    covariance = torch.from_numpy(np.array([surveyed[name] for name in marks.point_id]))
-    identity = torch.eye(3, dtype=torch.float64)
-    lateral, surface = marks.sigma_rad[order] * distance, SURFACE_SIGMA * distance
-    of_mark = covariance[point] + (lateral.square() + surface.square())[:, None, None] * identity
-    bearing = marks.bearing_in_cam[order]
-    count = torch.bincount(point, minlength=len(marks.position_in_geo))
-    starts = {int(index): int(torch.searchsorted(camera, index)) for index in torch.unique(camera)}
-    by_depth = ControlByDepth(
-        camera=camera,
-        xy=bearing[:, :2] / bearing[:, 2:],
-        position_in_geo=marks.position_in_geo[point],
-        root_information=torch.from_numpy(root_information(of_mark.numpy())),
-        share=1.0 / count[point],
-        views=len(scene.train),
-        rows={index: slice(first, first + int((camera == index).sum())) for index, first in starts.items()},
-        xy_by_lens=_slopes(bearing, marks.bearing_by_lens, order),
-    )
-    mean = torch.zeros(len(count), dtype=torch.float64).index_add(0, point, surface.square()) / count
-    all_in = covariance.numpy() + _mark_covariance(scene, marks) + mean.numpy()[:, None, None] * np.eye(3)
-    return by_depth, _with_covariance(marks, all_in)
-
-
-def _slopes(bearing: Tensor, by_lens: Tensor | None, order: Tensor) -> Tensor | None:
-    """Return the derivatives (K, 2, L) of x/z and y/z by the lens.
-
-    Args:
-        bearing: (K, 3), already in `order`.
-        by_lens: (K, 3, L) derivatives of the bearings, not yet in `order`.
-        order: (K,) permutation.
-    """
-    if by_lens is None:
-        return None
-    by_lens, z = by_lens[order], bearing[:, 2:, None]
-    return by_lens[:, :2] / z - bearing[:, :2, None] * by_lens[:, 2:] / z**2
-
-
-def attitude_term(scene: Scene, survey: Survey) -> AttitudeTerm | None:
-    """Return the recorded rotations of the training cameras that the SfM model does not contradict, or None."""
+def attitudes_of(scene: Scene, survey: Survey) -> Attitudes | None:
+    """Return the recorded rotations of the registered images that the SfM model does not contradict, or None."""
     recorded = recorded_rotations(survey, scene.sparse)
-    mine = np.isin(recorded.image, scene.train)
-    if not mine.any():
+    if not len(recorded.image):
         return None
-    return AttitudeTerm(
-        torch.from_numpy(recorded.image[mine]),
-        torch.from_numpy(recorded.geo_from_cam[mine]),
-        torch.from_numpy(np.eye(3) / recorded.sigma_rad[mine, None, None]),
+    return Attitudes(
+        name=tuple(scene.sparse.image_name[image] for image in recorded.image),
+        camera=recorded.image,
+        geo_from_cam=recorded.geo_from_cam,
+        root_information=np.eye(3) / recorded.sigma_rad[:, None, None],
     )
 
 
-def distance_term(scene: Scene, fixes: FixTerm, points: GeolocatedPoints | None, seed: int) -> DistanceTerm | None:
-    """Return 300 long distances across the scene: between located points, else between cameras with fixes.
-
-    Their information on the scale is limited to a tenth of that of the fixes (`scale_share`). None: that share is
-    zero.
-
-    Args:
-        scene: cameras and points at the start of the training.
-        fixes: of the training cameras.
-        points: of `geolocate`; None: take the cameras.
-        seed: of the random pairs.
-
-    Raises:
-        InputError: `points` belongs to another model.
-    """
-    distances = _pairs_of_points(scene, points, seed) if points is not None else None
-    distances = _pairs_of_cameras(scene, fixes, seed) if distances is None else distances
-    weight = (distances.distance_in_geo * distances.root_information[:, 0, 0]).square().sum()
-    share = scale_share(_scale_information(fixes), float(weight))
-    return replace(distances, share=share) if share > 0 else None
+def start_of(scene: Scene, problem: Problem) -> State:
+    """Return the cameras as SfM left them, at the similarity of the scene, without systematic errors."""
+    lenses = len(problem.bundle.sums.lens)
+    cameras = np.zeros((len(scene.sparse.image_name), 6))
+    return State(scene.geo_from_model, cameras, np.zeros(lenses), np.zeros(len(problem.errors)))
 
 
-def scale_share(information_of_fixes: float, information_of_pairs: float) -> float:
-    """Return the share of each pair that limits their information on the scale to a tenth of that of the fixes.
-
-    Located points are functions of the same few fixes (`adjust.alignment`), and contain the lens's errors as well.
-    Counted as independent measurements, hundreds of pairs would claim a σ of the scale many times below that of the
-    fixes. They add no information of their own: their purpose is to steady the scale, not to decide it.
-
-    Args:
-        information_of_fixes: Σ |W (C_i − C̄)|², of ln s.
-        information_of_pairs: Σ (distance/σ)², of ln s.
-    """
-    most = _WORTH * information_of_fixes
-    return min(1.0, most / information_of_pairs) if information_of_pairs > 0 else 0.0
+def onto_control(problem: Problem, state: State) -> State:
+    """Return a state whose common errors take what is left of the fixes beside the control points."""
+    fixes = problem.term(Fixes.kind)
+    if not isinstance(fixes, Fixes):
+        return state
+    residual, errors = fixes.residuals(problem.at(state)), state.errors.copy()
+    for session in np.unique(fixes.session):
+        columns = problem.errors.columns("bias", int(session))
+        if columns is not None:
+            errors[columns] -= np.median(residual[fixes.session == session], axis=0)
+    return replace(state, errors=errors)
 
 
-def _pairs_of_points(scene: Scene, points: GeolocatedPoints, seed: int) -> DistanceTerm | None:
-    if not np.array_equal(points.point_id, scene.sparse.point_id):
-        raise InputError("the geolocated points are of another model: run `georef geolocate` again")
-    good = np.flatnonzero(points.inlier)
-    if len(good) < 2:
-        return None
-    first, second = _long_pairs(scene.point_in_model[good], seed)
-    i, j = good[first], good[second]
-    apart = points.position_in_geo[i] - points.position_in_geo[j]
-    inside = np.linalg.norm(scene.point_in_model[i] - scene.point_in_model[j], axis=1)
-    return DistanceTerm(
-        torch.from_numpy(inside), None, *_measured_distance(apart, points.cov_in_geo[i] + points.cov_in_geo[j]), 1.0
-    )
+def _common_errors(survey: Survey, fixes: Fixes) -> list[SystematicError]:
+    """Return the common error of each session that has one."""
+    blocks = []
+    for session in np.unique(fixes.session) if survey.sessions else ():
+        sigma = np.array(survey.sessions[session].sigma_common_m)
+        if sigma.any():
+            east, north, up = np.maximum(sigma, _LEAST_SIGMA_COMMON_M).tolist()
+            blocks.append(SystematicError("bias", (east, north, up), int(session)))
+    return blocks
 
 
-def _pairs_of_cameras(scene: Scene, fixes: FixTerm, seed: int) -> DistanceTerm:
-    camera, place = fixes.camera.numpy(), fixes.position_in_geo.numpy()
-    i, j = _long_pairs(scene.poses.cam_center_in_model[camera], seed)
-    root = fixes.root_information.numpy()
-    covariance = np.linalg.inv(np.swapaxes(root, 1, 2) @ root)
-    chosen = torch.from_numpy(np.column_stack([camera[i], camera[j]]))
-    return DistanceTerm(None, chosen, *_measured_distance(place[i] - place[j], covariance[i] + covariance[j]), 1.0)
-
-
-def _long_pairs(place: FloatArray, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the row numbers (P,), (P,) of pairs of points (n, 3): the longest third of randomly drawn pairs."""
-    rng = np.random.default_rng(seed)
-    first = rng.integers(0, len(place), _DRAWN * _PAIRS)
-    second = (first + rng.integers(1, len(place), len(first))) % len(place)
-    length = np.linalg.norm(place[first] - place[second], axis=1)
-    longest = np.sort(np.argsort(-length, kind="stable")[:_PAIRS])
-    return first[longest], second[longest]
-
-
-def _measured_distance(apart: FloatArray, covariance: FloatArray) -> tuple[Tensor, Tensor]:
-    """Return the lengths (P,) of differences (P, 3), and their 1/σ (P, 1, 1)."""
-    distance = np.linalg.norm(apart, axis=1)
-    along = apart / distance[:, None]
-    variance = np.einsum("pi,pij,pj->p", along, covariance, along)
-    return torch.from_numpy(distance), torch.from_numpy(variance**-0.5)[:, None, None]
-
-
-def _scale_information(fixes: FixTerm) -> float:
-    """Return the information of the fixes on ln s: Σ |W (C − C̄)|² about their weighted mean."""
-    root = fixes.root_information
-    information = root.transpose(1, 2) @ root
-    weight = information.diagonal(dim1=1, dim2=2).sum(dim=1)
-    arm = fixes.position_in_geo - (weight @ fixes.position_in_geo) / weight.sum()
-    return float((root @ arm[:, :, None]).square().sum())
-
-
-def _with_covariance(marks: ControlTerm, covariance: FloatArray) -> ControlTerm:
-    return replace(marks, root_information=torch.from_numpy(root_information(covariance)))
-
-
-def _mark_covariance(scene: Scene, marks: ControlTerm) -> FloatArray:
+def _mark_covariance(scene: Scene, marks: ControlPoints) -> FloatArray:
     """Return the covariance (J, 3, 3) of each intersected point that the σ of its marks causes."""
-    poses, position = scene.poses, marks.position_in_geo.numpy()
-    camera, point = marks.camera.numpy(), marks.point.numpy()
-    center = scene.geo_from_model.apply(poses.cam_center_in_model[camera])
-    direction = np.einsum("kji,kj->ki", poses.cam_from_model[camera], marks.bearing_in_cam.numpy())
-    distance = np.linalg.norm(position[point] - center, axis=1)
-    weight = 1.0 / (marks.sigma_rad.numpy() * distance) ** 2
+    poses, position = scene.poses, marks.position_in_geo
+    center = scene.geo_from_model.apply(poses.cam_center_in_model[marks.camera])
+    direction = np.einsum("kji,kj->ki", poses.cam_from_model[marks.camera], marks.bearing_in_cam)
+    distance = np.linalg.norm(position[marks.point] - center, axis=1)
+    weight = 1.0 / (marks.sigma_rad * distance) ** 2
     projector = np.eye(3) - direction[:, :, None] * direction[:, None, :]
     normal = np.zeros((len(position), 3, 3))
-    np.add.at(normal, point, weight[:, None, None] * projector)
+    np.add.at(normal, marks.point, weight[:, None, None] * projector)
     return np.asarray(np.linalg.inv(normal))
-
-
-def root_information(covariance: FloatArray) -> FloatArray:
-    """Return W (N, 3, 3) with WᵀW = Σ⁻¹, from covariances Σ (N, 3, 3)."""
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))

@@ -1,4 +1,4 @@
-"""Observations of an SfM model as arrays: fixes, control points, attitudes and rays."""
+"""Observations of an SfM model as arrays: fixes, control points and attitudes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from pipelines.adjust.alignment import mean_rotation
 from pipelines.adjust.similarity_fit import Correspondences, RotationPrior
 from pipelines.core.sentences import listed
 from pipelines.core.types import BoolArray, FloatArray, IntArray
-from pipelines.geometry.cameras import undistort
 from pipelines.geometry.rotations import log_so3, matrix_from_quat_xyzw
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.scene.marks import MarkRays, RayErrors, intersect_marks, mark_angles, mark_rays
@@ -133,31 +132,24 @@ def positions_in_use(
 
 def _unused(survey: Survey, model: SparseModel, rays: MarkRays) -> tuple[UnusedControlPoint, ...]:
     """Return the record of each point of `rays`, with the residuals of its marks."""
-    by_name, registered = {point.name: point for point in survey.control_points}, set(model.image_name)
-    residual_px = _residuals_px(model, rays)
-    unused = []
-    for index, name in enumerate(rays.point_id):
-        mine = rays.point == index
-        unused.append(
-            UnusedControlPoint(
-                name=name,
-                unregistered=tuple(m.image for m in by_name[name].marks if m.image not in registered),
-                registered=tuple(model.image_name[camera] for camera in rays.camera[mine]),
-                residual_px=tuple(residual_px[mine].tolist()),
-            )
-        )
-    return tuple(unused)
-
-
-def _residuals_px(model: SparseModel, rays: MarkRays) -> FloatArray:
-    """Return the angles (K,), in pixels, between the rays and the intersections of their points."""
     position, *_ = _intersect_in_local(model, rays)
     # Where the rays contradict each other, none is left: within a wide σ they meet in the least-squares point.
     wide = RayErrors(_TINY, _TINY, _WIDE_RAD)
     compromise = intersect_marks(rays, model.rotation_cam_from_local, model.cam_center_in_local, wide)
     position = np.where(np.isfinite(position), position, compromise.position_in_geo)
     angle = mark_angles(rays, position, model.rotation_cam_from_local, model.cam_center_in_local)
-    return np.asarray(np.nan_to_num(angle * rays.sigma_px / rays.sigma_rad, nan=np.inf))
+    residual_px = np.nan_to_num(angle * rays.sigma_px / rays.sigma_rad, nan=np.inf)
+    marks = {point.name: point.marks for point in survey.control_points}
+    registered = model.image_index()
+    return tuple(
+        UnusedControlPoint(
+            name=name,
+            unregistered=tuple(mark.image for mark in marks[name] if mark.image not in registered),
+            registered=tuple(model.image_name[camera] for camera in rays.camera[rays.point == index]),
+            residual_px=tuple(residual_px[rays.point == index].tolist()),
+        )
+        for index, name in enumerate(rays.point_id)
+    )
 
 
 def _intersect_in_local(model: SparseModel, rays: MarkRays) -> tuple[FloatArray, FloatArray, BoolArray]:
@@ -168,11 +160,11 @@ def _intersect_in_local(model: SparseModel, rays: MarkRays) -> tuple[FloatArray,
     center = model.cam_center_in_local
     errors = RayErrors(_TINY * float(np.ptp(center, axis=0).max()), _TINY, own_rad)
     solved = intersect_marks(rays, model.rotation_cam_from_local, center, errors)
-    count = len(rays.point_id)
-    of_marks = np.bincount(rays.point, rays.sigma_rad**2, count) / np.bincount(
-        rays.point, rays.sigma_rad**2 + own_rad**2, count
+    of_marks, of_all = (
+        np.bincount(rays.point, squared, len(rays.point_id))
+        for squared in (rays.sigma_rad**2, rays.sigma_rad**2 + own_rad**2)
     )
-    return solved.position_in_geo, solved.cov_in_geo * of_marks[:, None, None], solved.consistent
+    return solved.position_in_geo, solved.cov_in_geo * (of_marks / of_all)[:, None, None], solved.consistent
 
 
 def recorded_rotations(survey: Survey, model: SparseModel) -> RecordedRotations:
@@ -206,13 +198,3 @@ def attitude_prior(survey: Survey, model: SparseModel) -> RotationPrior | None:
     if len(recorded.image) == 0:
         return None
     return mean_rotation(recorded.geo_from_local(model), recorded.sigma_rad)
-
-
-def observation_rays(model: SparseModel) -> FloatArray:
-    """Return undistorted x/z and y/z (M, 2) of all observations; NaN where the lens model maps no ray."""
-    xy = np.empty_like(model.obs_xy_px)
-    camera_id = model.image_camera_id[model.obs_image]
-    for camera in np.unique(camera_id):
-        mine = camera_id == camera
-        xy[mine] = undistort(model.cameras[int(camera)], model.obs_xy_px[mine])
-    return xy

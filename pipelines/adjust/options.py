@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal, get_args
 
 from pydantic import Field
 
-from pipelines.core.options import StageOptions
+from pipelines.core.options import WRITTEN, StageOptions, from_text, listed_names
 from pipelines.scene.rig import RigParameters
+
+# Systematic errors to be estimated beside the common error of the fixes.
+EstimatedErrorName = Literal["lever-arm", "boresight"]
+
+
+def _error_names(text: str) -> tuple[str, ...]:
+    return () if text == "none" else listed_names(text, get_args(EstimatedErrorName), "; or none")
+
+
+EstimatedErrorNames = Annotated[tuple[EstimatedErrorName, ...], from_text(_error_names), WRITTEN]
 
 
 class CalibrateOptions(StageOptions):
@@ -50,6 +60,11 @@ class InitSim3Options(StageOptions):
         None, gt=0, description="Fail if the RMS residual of the camera centres is larger, in metres."
     )
     control_points: bool = Field(True, description="Use the control points.")
+    estimate: EstimatedErrorNames = Field(
+        (),
+        description="Systematic errors to estimate beside the common error of the positions: lever-arm, boresight, "
+        "with a comma; or none.",
+    )
     seed: int = Field(0, ge=0, description="Seed of the RANSAC.")
     accept_contradiction: bool = Field(
         False, description="Go on where sources contradict each other, with a caution and larger σ."

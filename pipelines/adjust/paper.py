@@ -1,15 +1,19 @@
-"""The similarity by the paper: plain least squares on the geolocated points (GeoRefGS section 2.4.1, eqs 16–21)."""
+"""The similarity by the paper, and the figures of an initial similarity, which both methods state alike.
+
+The paper's method is plain least squares on the geolocated points (GeoRefGS section 2.4.1, eqs 16–21).
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
 from pipelines.adjust.alignment import layout_of
-from pipelines.adjust.figures import counts_of, residuals_of, residuals_of_points
-from pipelines.adjust.similarity_fit import Correspondences
+from pipelines.adjust.similarity_fit import OUTLIER_GATE, Correspondences, covariance_of
 from pipelines.core.errors import DegenerateGeometryError
-from pipelines.geometry.similarity import jacobian_at, spread_ratio_similarity
+from pipelines.core.types import BoolArray, FloatArray
+from pipelines.geometry.similarity import Similarity, jacobian_at, spread_ratio_similarity
 from pipelines.geometry.sparse_model import SparseModel
+from pipelines.robust.statistics import ResidualStats, residual_stats, squared_mahalanobis
 from pipelines.scene.geolocated import GeolocatedPoints
 from pipelines.scene.initial_similarity import InitialSimilarity
 
@@ -32,15 +36,12 @@ def similarity_by_paper(model: SparseModel, points: GeolocatedPoints, data: Corr
     similarity = spread_ratio_similarity(local, geo)
     mapped = similarity.apply(local)
     pivot = mapped.mean(axis=0)
-    jacobian = jacobian_at(mapped, pivot)
-    normal = np.einsum("nia,nib->ab", jacobian, jacobian)
     variance = float(((geo - mapped) ** 2).mean()) * max(len(local) / len(model.image_name), 1.0)
-    size = np.ones(7)
-    size[:4] = np.sqrt(((mapped - pivot) ** 2).sum(axis=1).mean())
+    unit = np.ones(7)
+    unit[:4] = ((mapped - pivot) ** 2).sum(axis=1).mean() ** -0.5
+    covariance = covariance_of(jacobian_at(mapped, pivot).reshape(-1, 7), unit)
     return InitialSimilarity(
-        geo_from_local=similarity.to_record(
-            "local", "geo", covariance=variance * np.linalg.solve(normal, np.eye(7)), pivot=pivot
-        ),
+        geo_from_local=similarity.to_record("local", "geo", covariance=variance * covariance, pivot=pivot),
         method="paper",
         correspondences=counts_of(data.control[:0], good),
         inliers=counts_of(data.control[:0], good),
@@ -48,7 +49,31 @@ def similarity_by_paper(model: SparseModel, points: GeolocatedPoints, data: Corr
             **residuals_of(data, data.in_geo - similarity.apply(data.in_local)),
             "points": residuals_of_points(model, points, similarity),
         },
-        condition_number=float(np.linalg.cond(normal / np.outer(size, size))),
+        condition_number=float(np.linalg.cond(covariance / np.outer(unit, unit))),
         layout=layout_of(local),
         attitude_used=points.rotation_source == "recorded",
     )
+
+
+def counts_of(control: BoolArray, points: BoolArray) -> dict[str, int]:
+    """Return the numbers of camera centres and control points, from the mask of the latter, and of points."""
+    return {"gnss": int((~control).sum()), "gcp": int(control.sum()), "points": int(points.sum())}
+
+
+def agreeing_points(model: SparseModel, points: GeolocatedPoints, similarity: Similarity) -> BoolArray:
+    """Return the mask (N,) of the geolocated points that agree with a similarity within their covariance."""
+    good = points.inlier.copy()
+    missed = points.position_in_geo[good] - similarity.apply(model.point_in_local[good])
+    good[good] = squared_mahalanobis(missed, points.cov_in_geo[good]) <= OUTLIER_GATE
+    return np.asarray(good)
+
+
+def residuals_of_points(model: SparseModel, points: GeolocatedPoints, similarity: Similarity) -> ResidualStats:
+    """Return the figures of the geolocated points' residuals."""
+    good = points.inlier
+    return residual_stats(points.position_in_geo[good] - similarity.apply(model.point_in_local[good]))
+
+
+def residuals_of(data: Correspondences, missed: FloatArray) -> dict[str, ResidualStats]:
+    """Return the figures of residuals (n, 3) of camera centres and control points."""
+    return {"gnss": residual_stats(missed[~data.control]), "gcp": residual_stats(missed[data.control])}

@@ -1,303 +1,263 @@
-"""Linearised geographic half: its minimum, and the joint covariance of all unknowns.
+"""Posterior of a solved survey: covariances of cameras, lens, and points, from the matrix of the adjustment.
 
-Both come from the same normal equations (`adjust.normal_equations`). Their unknowns are the similarity's
-coordinates y, the constant errors v, and the cameras' corrections z, whose prior of bundle adjustment is N(0, I).
-The weights are those of Cauchy's kernel at the present state.
+The matrix is stored with the solution: whoever asks for a σ factorises it once, and solves nothing again. A wanted
+quantity is described by its derivatives by cameras and lens; points follow from the rays that intersect in them.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
 
 import numpy as np
-import torch
-from torch import Tensor
+from scipy.linalg import block_diag
+from scipy.sparse import bsr_matrix, csr_matrix, eye, kron
 
-from pipelines.adjust.cameras import HeldCorrections
-from pipelines.adjust.linearisation import Linearisation
-from pipelines.adjust.normal_equations import (
-    NormalEquations,
-    Observations,
-    Residuals,
-    Weights,
-    posterior_weights,
-)
-from pipelines.adjust.problem import GeoProblem
-from pipelines.adjust.sparse_adjustment import minimise_sparse
-from pipelines.adjust.sparse_linearisation import SparseLinearisation
-from pipelines.adjust.sparse_observations import State
-from pipelines.adjust.terms import ControlTerm
-from pipelines.core.types import FloatArray
+from pipelines.adjust.accuracy_grid import AccuracyGrid
+from pipelines.adjust.intersection_jacobian import IntersectionJacobian, intersection_jacobian
+from pipelines.adjust.system import NormalMatrix
+from pipelines.core.errors import InputError
+from pipelines.core.products import load_npz, save_npz
+from pipelines.core.types import FloatArray, IntArray
+from pipelines.geometry.bundle import Network
+from pipelines.geometry.cameras import CameraPoses
 from pipelines.geometry.similarity import jacobian_at, second_moment_at
+from pipelines.geometry.sparse_model import SparseModel
+from pipelines.scene.marks import MarkRays
+from pipelines.scene.trained_model import Adjustment
 
-_STEPS = 20  # linearisations
-_NEAR = 1e-4  # length of the step, in σ, that ends the descent
-_CHUNK = 64
-_ADVICE = "fixes and control points leave the similarity open: add control points, at least 3"
-
-
-@dataclass(frozen=True)
-class GeoEquations:
-    """Normal equations of a problem about its present state, in the parameters (y, v, w), float64.
-
-    w are coordinates of the camera corrections that affect a measurement: z = `seen` w. All other corrections keep
-    their prior of bundle adjustment, and are not among the unknowns.
-
-    Attributes:
-        normal: the equations, of P = 7 + p + r parameters.
-        errors: p, number of constant errors.
-        seen: (k, r), orthonormal columns; None: all k corrections.
-    """
-
-    normal: NormalEquations
-    errors: int
-    seen: FloatArray | None
-
-    @property
-    def similarity(self) -> slice:
-        """Columns of y."""
-        return slice(0, 7)
-
-    @property
-    def constant(self) -> slice:
-        """Columns of v."""
-        return slice(7, 7 + self.errors)
-
-    @property
-    def cameras(self) -> slice:
-        """Columns of w."""
-        return slice(7 + self.errors, len(self.normal.precision))
-
-    def residuals(self) -> Residuals:
-        """Return the whitened residuals (M, d) by kind."""
-        return self.normal.residuals()
-
-    def spread(self, weights: Weights, kind: str) -> FloatArray:
-        """Return the covariances (M, d, d) that the unknowns cause in the whitened observations of a kind."""
-        return self.normal.spread(weights, self.normal.observations[kind].jacobian)
-
-    def covariance_of_known(self, weights: Weights) -> FloatArray:
-        """Return the covariance (7 + p, 7 + p) of the similarity's coordinates y and the constant errors v."""
-        known = 7 + self.errors
-        return self.normal.inverse_times(weights, np.eye(len(self.normal.precision), known))[:known]
-
-
-def linearised(problem: GeoProblem) -> Linearisation:
-    """Return a problem about its present state, in the equations that it is solved with."""
-    return equations_of(problem) if problem.bundle is None else SparseLinearisation(problem, problem.bundle)
-
-
-def equations_of(problem: GeoProblem) -> GeoEquations:
-    """Return the dense normal equations of a problem, linearised about its present state."""
-    cameras, errors = problem.cameras, len(problem.errors)
-    turns = 6 * len(cameras.center)
-
-    def residuals(y: Tensor, v: Tensor, moved: Tensor) -> dict[str, Tensor]:
-        return problem.whitened(problem.estimate_at(y, moved[:turns].view(-1, 6), moved[turns:], v))
-
-    with torch.no_grad():
-        basis = torch.cat([cameras.basis.flatten(0, 1), cameras.lens_basis])
-        y, v, z = problem.similarity.y.detach(), problem.errors.vector(), cameras.z.detach()
-        moved = torch.cat([cameras.corrections().flatten(), cameras.lens()])
-        white = residuals(y, v, moved)
-    by_z: dict[str, FloatArray] = {}
-    by_x: dict[str, FloatArray] = {}
-    if white and basis.shape[1]:
-        slopes = torch.func.jacrev(residuals, argnums=(0, 1, 2), chunk_size=_CHUNK)(y, v, moved)
-        for kind, (by_y, by_v, by_moved) in slopes.items():
-            by_x[kind] = _numpy(torch.cat([by_y, by_v], dim=2))
-            by_z[kind] = _numpy(by_moved @ basis)
-    elif white:  # Derivatives by cameras that stay would take time and memory for all of them.
-        forward = torch.func.jacfwd(lambda known: residuals(known[:7], known[7:], moved))(torch.cat([y, v]))
-        by_x = {kind: _numpy(slope) for kind, slope in forward.items()}
-        by_z = {kind: np.zeros((*slope.shape[:2], 0)) for kind, slope in by_x.items()}
-    seen = _seen(list(by_z.values()), basis.shape[1])
-    observations = {
-        kind: Observations(
-            _numpy(white[kind]),
-            np.concatenate([by_x[kind], by_z[kind] if seen is None else by_z[kind] @ seen], axis=2),
-        )
-        for kind in white
-    }
-    held = float(problem.hold_prior) * _numpy(problem.similarity.held)
-    corrections = _numpy(z) if seen is None else seen.T @ _numpy(z)
-    precision = np.concatenate([held, _numpy(problem.errors.sigma) ** -2, np.ones(len(corrections))])
-    offset = np.concatenate([_numpy(y), _numpy(v), corrections])
-    return GeoEquations(NormalEquations(observations, precision, offset, advice=_ADVICE), errors, seen)
-
-
-def minimise(problem: GeoProblem) -> float:
-    """Move a problem from its present state to the minimum of its whitened loss; return −2 ln likelihood there.
-
-    A problem with the information of its bundle is solved in sparse equations (`adjust.sparse_adjustment`), others
-    by Gauss–Newton in dense ones.
-
-    Raises:
-        DegenerateGeometryError: the measurements leave the similarity open.
-        ConvergenceError: cameras still move after many steps of the sparse solver.
-    """
-    if problem.bundle is not None:
-        sparse = minimise_sparse(problem, problem.bundle)
-        place(problem, sparse.state)
-        return sparse.cost
-    for _ in range(_STEPS):
-        equations = equations_of(problem)
-        minimum = equations.normal.minimum()
-        move(problem, equations, minimum.step)
-        if np.linalg.norm(minimum.step) < _NEAR:
-            break
-    return minimum.cost
-
-
-@torch.no_grad()
-def place(problem: GeoProblem, state: State) -> None:
-    """Set the state of a problem whose cameras no parameter moves."""
-    problem.cameras.hold(HeldCorrections(state.correction, state.lens))
-    problem.similarity.y.copy_(torch.from_numpy(state.similarity))
-    problem.errors.set_vector(torch.from_numpy(state.errors).to(problem.errors.sigma.device))
-
-
-@torch.no_grad()
-def move(problem: GeoProblem, equations: GeoEquations, step: FloatArray) -> None:
-    """Move the state of a problem by a step (P,) of its equations."""
-    device = problem.similarity.y.device
-    z = problem.cameras.z
-    corrections = _numpy(z) if equations.seen is None else equations.seen.T @ _numpy(z)
-    corrections = corrections + step[equations.cameras]
-    # Corrections that affect no measurement return to zero, the mean of their prior.
-    z.copy_(torch.from_numpy(corrections if equations.seen is None else equations.seen @ corrections))
-    problem.similarity.y.add_(torch.from_numpy(step[equations.similarity]).to(device))
-    problem.errors.set_vector(problem.errors.vector() + torch.from_numpy(step[equations.constant]).to(device))
-
-
-def solution_covariances(problem: GeoProblem) -> tuple[FloatArray, FloatArray]:
-    """Return the covariances of the similarity (7, 7) about its pivot, and of the constant errors (p, p).
-
-    All other unknowns are marginalised out. The first covariance has the form of
-    `geometry.similarity.SimilarityRecord`, the second is in m and rad.
-
-    Raises:
-        DegenerateGeometryError: the measurements leave the similarity open.
-    """
-    linear = linearised(problem)
-    marginal = linear.covariance_of_known(posterior_weights(linear.residuals()))
-    root = _numpy(problem.similarity.root)
-    return root @ marginal[:7, :7] @ root.T, marginal[7:, 7:]
-
-
-@dataclass(frozen=True)
-class FreeLens:
-    """Part of the L lens parameters that stays unknown after the lens has followed the cameras.
-
-    Attributes:
-        cov: (L, L), `CorrectionBasis.lens_cov`.
-        by_control: (J, 3, L) derivative of the intersected control points in geo by the lens parameters, metres.
-    """
-
-    cov: FloatArray
-    by_control: FloatArray
+_ADVICE = "run `georef init-sim3` (and `georef train`) again"
 
 
 @dataclass(frozen=True)
 class Posterior:
-    """Joint covariance of the similarity, of k camera corrections, and of the rest of the L lens parameters.
+    """Covariances of a solved survey.
 
     Attributes:
-        covariance: (7 + k + L, 7 + k + L) of (δ ln s, δω, δt) about `pivot`, as in `SimilarityRecord`; of
-            `CameraCorrections.z`; and of the lens parameters beyond the part that follows z. All other unknowns
-            are marginalised out.
-        pivot: (3,) in geo.
+        solution: similarity, cameras and lenses.
+        sparse: the SfM model with the solved lenses.
+        normal: matrix of the normal equations, in `model`.
+        followed: (7, 6 n + L) mean similarity of the SfM points by corrections of cameras and lens.
+        lens: (ℓ,) lens parameters among the unknowns, of L in the order of `geometry.lens.Lenses`.
+        camera_cov: (n, 6, 6) of (δθ [rad], δc [m]) of the cameras, along the axes of `geo`.
+        grid: σ over the scene; None: the scene has too few points.
     """
 
-    covariance: FloatArray
-    pivot: FloatArray
+    solution: Adjustment
+    sparse: SparseModel
+    normal: NormalMatrix
+    followed: FloatArray
+    lens: IntArray
+    camera_cov: FloatArray
+    grid: AccuracyGrid | None = None
 
-    def at(self, point_in_geo: FloatArray, by_cameras: FloatArray, by_lens: FloatArray) -> FloatArray:
-        """Return the covariance (J, 3, 3) in m² of points (J, 3).
+    def of_marked_points(self, point_in_geo: FloatArray, rays: MarkRays) -> FloatArray:
+        """Return covariances (J, 3, 3) in m² of points intersected from their marks, errors of the marks included.
+
+        NaN for a point that is NaN, or that its marks do not determine.
 
         Args:
             point_in_geo: (J, 3) metres.
-            by_cameras: (J, 3, k) derivative of the points in geo by the corrections z, and the lens that follows
-                z.
-            by_lens: (J, 3, L) derivative of the points in geo by the rest of the lens.
+            rays: of the marks.
         """
-        jacobian = self._jacobian(point_in_geo, by_cameras, by_lens)
-        return np.asarray(jacobian @ self.covariance @ np.swapaxes(jacobian, 1, 2))
+        rays = rays.part(np.flatnonzero(np.isfinite(point_in_geo[rays.point]).all(axis=1)))
+        position = np.nan_to_num(point_in_geo)
+        jacobian = self._jacobian(position, rays.point, rays.camera, rays.sigma_px)
+        cov = self.normal.covariances(*self._derivatives(jacobian), 3) + self._cov_of_marks(jacobian)
+        cov[rays.marks_of_point < 2] = np.nan
+        return cov
 
-    def jointly_at(self, point_in_geo: FloatArray, by_cameras: FloatArray, by_lens: FloatArray) -> FloatArray:
-        """Return the joint covariance (3 J, 3 J) in m² of points (J, 3); the arguments are those of `at`.
+    def jointly_of_marked_points(self, point_in_geo: FloatArray, rays: MarkRays) -> FloatArray:
+        """Return the joint covariance (3 J, 3 J) in m² of points intersected from their marks.
 
-        The second-order error of the similarity is included. Relative positions are known far better than the
-        similarity, so that the square of a rotation can exceed their σ.
+        The points share the errors of similarity, cameras and lens. Those of the marks are independent.
+
+        Args:
+            point_in_geo: (J, 3) metres; all are determined by their marks.
+            rays: of the marks.
         """
-        jacobian = np.concatenate(self._jacobian(point_in_geo, by_cameras, by_lens))
-        of_similarity = second_moment_at(point_in_geo, self.covariance[:7, :7], self.pivot)
-        return np.asarray(jacobian @ self.covariance @ jacobian.T) + of_similarity
+        jacobian = self._jacobian(point_in_geo, rays.point, rays.camera, rays.sigma_px)
+        return np.asarray(self._jointly(point_in_geo, jacobian) + block_diag(*self._cov_of_marks(jacobian)))
 
-    def _jacobian(self, point_in_geo: FloatArray, by_cameras: FloatArray, by_lens: FloatArray) -> FloatArray:
-        return np.concatenate([jacobian_at(point_in_geo, self.pivot), by_cameras, by_lens], axis=2)
+    def of_scene(self, point_in_geo: FloatArray, point: IntArray, camera: IntArray) -> FloatArray:
+        """Return the covariance (J, 3, 3) in m² of points of the scene, without errors of marks.
+
+        Args:
+            point_in_geo: (J, 3) metres.
+            point: (K,) index into the points, of each ray.
+            camera: (K,) index of the camera that sees the point.
+        """
+        jacobian = self._jacobian_of_scene(point_in_geo, point, camera)
+        return self.normal.covariances(*self._derivatives(jacobian), 3)
+
+    def jointly_of_scene(self, point_in_geo: FloatArray, point: IntArray, camera: IntArray) -> FloatArray:
+        """Return the joint covariance (3 J, 3 J) in m² of points of the scene; arguments as of `of_scene`."""
+        return self._jointly(point_in_geo, self._jacobian_of_scene(point_in_geo, point, camera))
+
+    def of_tie_points(self, point_in_geo: FloatArray, point: IntArray, camera: IntArray) -> FloatArray:
+        """Return the covariance (J, 3, 3) in m² of tie points, errors of their own image observations included.
+
+        NaN for a point that fewer than two rays see.
+
+        Args:
+            point_in_geo: (J, 3) metres.
+            point: (K,) index into the points, of each observation.
+            camera: (K,) index of its camera.
+        """
+        sigma_px = np.full(len(point), np.nan if self.solution.sigma_px is None else self.solution.sigma_px)
+        jacobian = self._jacobian(point_in_geo, point, camera, sigma_px)
+        cov = self.normal.covariances(*self._derivatives(jacobian), 3) + self._cov_of_marks(jacobian)
+        cov[np.bincount(point, minlength=len(cov)) < 2] = np.nan
+        return cov
+
+    def of_lens(self) -> FloatArray | None:
+        """Return the covariance (L, L) of the lens parameters, in the order of `geometry.lens.Lenses`.
+
+        None if the lens was held. Parameters that nothing reveals have zeros.
+        """
+        if not len(self.lens):
+            return None
+        covariance = np.zeros((self._lenses, self._lenses))
+        by_border = np.eye(len(self.lens), len(self.normal.corner))
+        no_poses = csr_matrix((len(self.lens), self.normal.poses.shape[0]))
+        covariance[np.ix_(self.lens, self.lens)] = self.normal.covariance(no_poses, by_border)
+        return covariance
+
+    @cached_property
+    def of_similarity(self) -> FloatArray:
+        """Covariance (7, 7) of (δ ln s, δω, δt) about the pivot of the solution, as in `SimilarityRecord`.
+
+        It is that of the SfM points' mean similarity: of the scene, not of the cameras.
+        """
+        n = self.normal.poses.shape[0]
+        by_border = np.zeros((7, len(self.normal.corner)))
+        by_border[:, : len(self.lens)] = self.followed[:, n + self.lens]
+        in_model = self.normal.covariance(csr_matrix(self.followed[:, :n]), by_border)
+        similarity = self.solution.similarity
+        center = similarity.apply(self._poses.cam_center_in_model.mean(axis=0))
+        turn = block_diag(1.0, similarity.rotation, similarity.scale * similarity.rotation)
+        about = jacobian_at(np.array(self.solution.geo_from_model.pivot)[None], center)[0]
+        to_pivot = np.eye(7)
+        to_pivot[4:, :4] = about[:, :4]
+        by_model = to_pivot @ turn
+        return np.asarray(by_model @ in_model @ by_model.T)
+
+    @cached_property
+    def _poses(self) -> CameraPoses:
+        return self.solution.poses
+
+    @property
+    def _lenses(self) -> int:
+        return int(self.followed.shape[1] - self.normal.poses.shape[0])
+
+    def _jointly(self, point_in_geo: FloatArray, jacobian: IntersectionJacobian) -> FloatArray:
+        """Return the joint covariance of points, with the second-order error of the similarity.
+
+        Relative positions are known far better than the similarity, so that the square of a rotation can exceed
+        their σ.
+        """
+        of_similarity = second_moment_at(
+            point_in_geo, self.of_similarity, np.array(self.solution.geo_from_model.pivot)
+        )
+        return self.normal.covariance(*self._derivatives(jacobian)) + of_similarity
+
+    def _jacobian_of_scene(
+        self, point_in_geo: FloatArray, point: IntArray, camera: IntArray
+    ) -> IntersectionJacobian:
+        focal_px = np.array([self.sparse.camera_of(i).mean_focal_px for i in range(len(self.sparse.image_name))])
+        return self._jacobian(point_in_geo, point, camera, focal_px[camera])  # all rays have the same angular σ
+
+    def _jacobian(
+        self, point_in_geo: FloatArray, point: IntArray, camera: IntArray, sigma_px: FloatArray
+    ) -> IntersectionJacobian:
+        """Return the derivatives, in metres of `model`, of points (J, 3) by the cameras and lens that see them."""
+        sparse, poses = self.sparse, self._poses
+        rays = Network(
+            sparse.cameras,
+            sparse.image_camera_id,
+            poses.cam_from_model,
+            poses.cam_center_in_model,
+            self.solution.similarity.inverse().apply(point_in_geo),
+            point,
+            camera,
+            np.full((len(point), 2), np.nan),  # derivatives do not need the pixels
+        )
+        return intersection_jacobian(rays, sigma_px)
+
+    def _derivatives(self, jacobian: IntersectionJacobian) -> tuple[csr_matrix, FloatArray]:
+        """Return the derivatives (3 J, 6 n), (3 J, b) of points in geo by the unknowns."""
+        axes, count = self._geo_by_model, len(jacobian.by_lens)
+        turned = kron(eye(count), axes, format="csr")
+        by_border = np.zeros((3 * count, len(self.normal.corner)))
+        by_border[:, : len(self.lens)] = (axes @ jacobian.by_lens)[:, :, self.lens].reshape(3 * count, -1)
+        return csr_matrix(turned @ jacobian.by_poses), by_border
+
+    def _cov_of_marks(self, jacobian: IntersectionJacobian) -> FloatArray:
+        return np.asarray(self._geo_by_model @ jacobian.cov_of_marks @ self._geo_by_model.T)
+
+    @property
+    def _geo_by_model(self) -> FloatArray:
+        """Derivative (3, 3) of positions in `geo` by positions in `model`."""
+        return np.asarray(self.solution.similarity.scale * self.solution.similarity.rotation)
 
 
-def posterior(problem: GeoProblem, lens: FreeLens | None = None) -> Posterior:
-    """Return the joint covariance of all unknowns at the present state.
+def camera_covariances(normal: NormalMatrix, turn: FloatArray, scale: float) -> FloatArray:
+    """Return the covariance (n, 6, 6) of (δθ [rad], δc [m]) of all cameras, along the axes of `geo`.
 
-    1. Only the part of the lens that follows the cameras is estimated.
-    2. The rest d is independent of the estimate's own error e₁.
-    3. d shifts the intersections of the control points. With G the response of the estimate to the control points,
-       d therefore moves the estimate by −G d: the total error is e = e₁ − G d.
+    δθ turns a camera about its centre, R_geo_from_cam' = Exp(δθ) R_geo_from_cam, and δc moves its centre.
 
     Args:
-        problem: at its minimum.
-        lens: the rest of the lens; None: there is no rest.
+        normal: of cameras in `model`.
+        turn: rotation (3, 3) geo ← model.
+        scale: of geo ← model.
+    """
+    count = len(normal.position)
+    by_pose = np.broadcast_to(block_diag(turn, scale * turn), (count, 6, 6))
+    return normal.of_each_camera(np.arange(count), by_pose, np.zeros((count, 6, len(normal.corner))))
+
+
+_ARRAYS = ("data", "indices", "indptr", "border", "corner", "position", "followed", "lens", "camera_cov")
+
+
+def save_posterior(posterior: Posterior, path: Path) -> None:
+    """Write matrix and covariances as NPZ; the solution is a document of its own."""
+    normal, grid = posterior.normal, posterior.grid
+    poses = normal.poses
+    of_matrix = (poses.data, poses.indices, poses.indptr, normal.border, normal.corner, normal.position)
+    arrays = (*of_matrix, posterior.followed, posterior.lens, posterior.camera_cov)
+    of_grid = dict(AccuracyGrid.NO_ARRAYS if grid is None else grid.arrays())
+    save_npz(path, dict(zip(_ARRAYS, arrays, strict=True)) | of_grid)
+
+
+def load_posterior(path: Path, solution: Adjustment, sfm: SparseModel) -> Posterior:
+    """Read what `save_posterior` has written.
+
+    Args:
+        path: of the NPZ file.
+        solution: the document beside it.
+        sfm: the SfM model with SfM's lenses.
 
     Raises:
-        DegenerateGeometryError: the measurements leave the similarity open.
+        InputError: the file is damaged, or of another solution.
     """
-    equations = equations_of(problem)
-    normal = equations.normal
-    weights = posterior_weights(normal.residuals())
-    covariance = normal.covariance(weights)
-    cov_lens = np.zeros((0, 0)) if lens is None else lens.cov
-    shared = np.zeros((len(covariance), len(cov_lens)))
-    if lens is not None and problem.control is not None:
-        pulled = _pull_of_lens(problem.control, lens, normal, weights)
-        shared = -pulled @ cov_lens
-        covariance = covariance - shared @ pulled.T
-    turn = _joint_from_parameters(problem, equations)
-    of_all, with_lens = turn @ covariance @ turn.T, turn @ shared
-    if equations.seen is not None:  # corrections that no measurement sees keep the σ = 1 of bundle adjustment
-        of_all[7:, 7:] += np.eye(len(equations.seen)) - equations.seen @ equations.seen.T
-    joint = np.block([[of_all, with_lens], [with_lens.T, cov_lens]])
-    return Posterior(joint, problem.similarity.pivot_in_geo)
-
-
-def _pull_of_lens(control: ControlTerm, lens: FreeLens, normal: NormalEquations, weights: Weights) -> FloatArray:
-    """Return G (P, L): the response of the parameters to intersections with another lens."""
-    moved = weights[control.kind][:, None, None] * (_numpy(control.root_information) @ lens.by_control)
-    jacobian = normal.observations[control.kind].jacobian
-    return normal.inverse_times(weights, np.einsum("jdp,jdl->pl", jacobian, moved))
-
-
-def _joint_from_parameters(problem: GeoProblem, equations: GeoEquations) -> FloatArray:
-    """Return the derivative (7 + k, P) of similarity and corrections z by the parameters (y, v, w)."""
-    count = len(equations.normal.precision)
-    corrections = np.eye(count - 7 - equations.errors) if equations.seen is None else equations.seen
-    turn = np.zeros((7 + len(corrections), count))
-    turn[:7, equations.similarity] = _numpy(problem.similarity.root)
-    turn[7:, equations.cameras] = corrections
-    return turn
-
-
-def _seen(by_z: list[FloatArray], count: int) -> FloatArray | None:
-    """Return orthonormal directions (k, r) of the corrections that change the residuals.
-
-    None: there are at least as many residuals as corrections, and the directions would save nothing.
-    """
-    if sum(rows.shape[0] * rows.shape[1] for rows in by_z) >= count:
-        return None
-    stacked = np.concatenate([np.zeros((0, count)), *(rows.reshape(-1, count) for rows in by_z)])
-    return np.asarray(np.linalg.qr(stacked.T)[0])
-
-
-def _numpy(tensor: Tensor) -> FloatArray:
-    return np.asarray(tensor.detach().cpu().numpy(), dtype=np.float64)
+    arrays, n = load_npz(path, (*_ARRAYS, *AccuracyGrid.NO_ARRAYS)), len(solution.cameras)
+    border, corner, position, followed, lens, camera_cov = (arrays[name] for name in _ARRAYS[3:])
+    known, width = len(followed[0]) - 6 * n if followed.ndim == 2 else -1, len(corner)
+    fits = (
+        border.shape == (width, 6 * n)
+        and corner.shape == (width, width)
+        and position.shape == (n, 3)
+        and followed.shape == (7, 6 * n + known)
+        and camera_cov.shape == (n, 6, 6)
+        and lens.ndim == 1
+        and all(0 <= place < known for place in lens.tolist())
+        and len(lens) <= width
+        and arrays["data"].shape == (len(arrays["indices"]), 6, 6)
+        and arrays["indptr"].shape == (n + 1,)
+    )
+    if not fits:
+        raise InputError(f"does not belong to the solution beside it: {_ADVICE}", path=path)
+    poses = bsr_matrix((arrays["data"], arrays["indices"], arrays["indptr"]), shape=(6 * n, 6 * n))
+    normal, sparse = NormalMatrix(poses, border, corner, position), solution.with_lenses(sfm)
+    return Posterior(solution, sparse, normal, followed, lens, camera_cov, AccuracyGrid.of_arrays(arrays))

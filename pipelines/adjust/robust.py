@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipelines.adjust.alignment import Alignment, align
-from pipelines.adjust.contradictions import judge, marks_that_do_not_meet, unadjustable
 from pipelines.adjust.control_mistakes import mistake_in_marks
-from pipelines.adjust.figures import agreeing_points, counts_of, residuals_of, residuals_of_points
-from pipelines.adjust.joint import JointAdjustment, adjust_jointly
+from pipelines.adjust.inconsistencies import judge, marks_that_do_not_meet, unadjustable
+from pipelines.adjust.joint import JointAdjustment, Start, adjust_jointly, in_own_frame
+from pipelines.adjust.measurements import problem_of, start_of
 from pipelines.adjust.observations import (
     attitude_prior,
     control_correspondences,
@@ -19,23 +19,25 @@ from pipelines.adjust.observations import (
     positions_in_use,
 )
 from pipelines.adjust.options import InitSim3Options
-from pipelines.adjust.posterior import solution_covariances
-from pipelines.adjust.similarity_fit import OUTLIER_GATE, AdjustedSimilarity, Correspondences, RotationPrior
-from pipelines.adjust.terms import ControlTerm, FixTerm
+from pipelines.adjust.paper import agreeing_points, counts_of, residuals_of, residuals_of_points
+from pipelines.adjust.posterior import Posterior
+from pipelines.adjust.similarity_fit import AdjustedSimilarity, Correspondences, RotationPrior
+from pipelines.adjust.solution import adjusted
+from pipelines.adjust.system import Problem, minimise
+from pipelines.adjust.terms import ControlPoints, Fixes
 from pipelines.adjust.variance_components import component_of
 from pipelines.core.cautions import NOT_CHECKED, Caution, union
 from pipelines.core.errors import ContradictionError, DegenerateGeometryError
 from pipelines.core.sentences import listed
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
-from pipelines.geometry.similarity import Similarity, SimilarityRecord, umeyama
+from pipelines.geometry.similarity import SimilarityRecord
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.robust.ransac import RansacOptions, ransac
-from pipelines.robust.statistics import residual_stats, squared_mahalanobis
+from pipelines.robust.statistics import residual_stats
 from pipelines.scene.geolocated import GeolocatedPoints
 from pipelines.scene.initial_similarity import AttitudeRecord, InitialSimilarity
+from pipelines.scene.scene import Scene, initial_scene
 from pipelines.scene.survey import Survey
 
-_GUESS_POINTS = 1000
 _LEVEL = 0.01  # of the test that refutes σ where no joint adjustment is possible
 
 
@@ -48,8 +50,23 @@ class Inputs:
     points: GeolocatedPoints
 
 
-def robust_similarity(inputs: Inputs, options: InitSim3Options) -> tuple[InitialSimilarity, tuple[str, ...]]:
-    """Return the similarity by the robust method, and warnings for the user.
+@dataclass(frozen=True)
+class Estimated:
+    """Result of init-sim3: the similarity, the adjustment, and warnings for the user.
+
+    Attributes:
+        initial: the similarity, and the verdict on the measurements.
+        posterior: the adjustment.
+        warnings: outliers and measurements without use.
+    """
+
+    initial: InitialSimilarity
+    posterior: Posterior
+    warnings: tuple[str, ...]
+
+
+def robust_similarity(inputs: Inputs, options: InitSim3Options) -> Estimated:
+    """Return the similarity by the robust method.
 
     Raises:
         DegenerateGeometryError: the measurements leave the similarity open; names further measurements.
@@ -62,14 +79,8 @@ def robust_similarity(inputs: Inputs, options: InitSim3Options) -> tuple[Initial
         control = control.part(np.zeros(len(control), dtype=bool))
     of_marks = marks_that_do_not_meet(unused, mistake)
     data = fix_correspondences(survey, model).joined(control)
-    guess = _guess(model, inputs.points, np.random.default_rng(options.seed))
     try:
-        alignment = align(
-            data,
-            np.random.default_rng(options.seed),
-            attitude=attitude_prior(survey, model),
-            guesses=(guess,) if guess else (),
-        )
+        alignment = align(data, np.random.default_rng(options.seed), attitude=attitude_prior(survey, model))
     except DegenerateGeometryError as error:
         _refuse(unadjustable(survey, model, None), options)
         reasons = [positions_in_use(survey, model, data, unused), *(caution.sentence for caution in of_marks)]
@@ -81,18 +92,57 @@ def robust_similarity(inputs: Inputs, options: InitSim3Options) -> tuple[Initial
     used = tuple(point for point in survey.control_points if point.name in control.name)
     survey = survey.model_copy(update={"control_points": used})
     try:
-        joint = adjust_jointly(survey, model, _starts(data, aligned, options.seed))
+        joint = adjust_jointly(survey, model, _starts(data, aligned, options.seed), estimate=options.estimate)
     except DegenerateGeometryError as error:
         contradictions = unadjustable(survey, model, alignment.geo_from_local)
         _refuse(contradictions, options)
         unchecked = Caution(code=NOT_CHECKED, sentence=f"nothing checks the stated σ: {error}")
         cautions = union(survey.cautions, contradictions, of_marks, (unchecked,))
-        return _without_joint(aligned, alignment.solution, cautions), warnings
+        initial = _without_joint(aligned, alignment.solution, cautions)
+        return Estimated(initial, placed(inputs, initial, options), warnings)
     verdict = judge(survey, model, joint)
     _refuse(verdict.contradictions, options)
     initial, more = _joint_product(inputs, aligned, joint)
     cautions = union(survey.cautions, verdict.contradictions, of_marks, verdict.cautions)
-    return initial.model_copy(update={"cautions": cautions}), warnings + more
+    initial = initial.model_copy(update={"cautions": cautions})
+    posterior = _solved(inputs, joint, initial, options)
+    record = posterior.solution.similarity_from_local()
+    return Estimated(initial.model_copy(update={"geo_from_local": record}), posterior, warnings + more)
+
+
+def placed(inputs: Inputs, initial: InitialSimilarity, options: InitSim3Options) -> Posterior:
+    """Return the cameras of SfM at a similarity, unadjusted, with the covariance that the measurements give there.
+
+    Raises:
+        DegenerateGeometryError: the measurements leave the similarity open.
+    """
+    survey = initial.weighted(inputs.survey)
+    scene = initial_scene(inputs.model, survey, initial)
+    with_attitudes = initial.layout == "line"
+    problem = problem_of(scene, initial.in_use(survey), estimate=options.estimate, with_attitudes=with_attitudes)
+    return adjusted(scene, problem, start_of(scene, problem), initial, _rejected(scene, survey, initial))
+
+
+def _solved(
+    inputs: Inputs, joint: JointAdjustment, initial: InitialSimilarity, options: InitSim3Options
+) -> Posterior:
+    """Return the solution of a joint adjustment without the measurements that it has rejected.
+
+    Raises:
+        DegenerateGeometryError: the measurements leave the similarity open.
+    """
+    survey = initial.weighted(inputs.survey)
+    scene, state = in_own_frame(joint, survey, initial)
+    with_attitudes = initial.layout == "line"
+    problem = problem_of(scene, initial.in_use(survey), estimate=options.estimate, with_attitudes=with_attitudes)
+    state = minimise(problem, problem.start_at(state, joint.problem.errors)).state
+    return adjusted(scene, problem, state, initial, _rejected(scene, survey, initial))
+
+
+def _rejected(scene: Scene, survey: Survey, initial: InitialSimilarity) -> Problem | None:
+    """Return the problem of the rejected measurements; None if there are none."""
+    rejected = initial.rejected(survey)
+    return None if rejected is None else problem_of(scene, rejected)
 
 
 def _refuse(contradictions: tuple[Caution, ...], options: InitSim3Options) -> None:
@@ -101,26 +151,6 @@ def _refuse(contradictions: tuple[Caution, ...], options: InitSim3Options) -> No
             "; ".join(caution.sentence for caution in contradictions)
             + ". Correct what is wrong, or go on with --accept-contradiction, which widens every σ"
         )
-
-
-def _guess(model: SparseModel, points: GeolocatedPoints, rng: np.random.Generator) -> Similarity | None:
-    """Return the similarity of the best geolocated points, by RANSAC, then weighted by covariance; or None."""
-    trace = np.trace(points.cov_in_geo, axis1=1, axis2=2)
-    best = np.flatnonzero(points.inlier)
-    best = best[np.argsort(trace[best], kind="stable")][:_GUESS_POINTS]
-    local, geo, cov = model.point_in_local[best], points.position_in_geo[best], points.cov_in_geo[best]
-    try:
-        result = ransac(
-            len(best),
-            lambda chosen: umeyama(local[chosen], geo[chosen]),
-            lambda similarity: squared_mahalanobis(geo - similarity.apply(local), cov),
-            RansacOptions(3, OUTLIER_GATE, max_draws=200),
-            rng,
-        )
-        good = result.inlier
-        return umeyama(local[good], geo[good], 1 / trace[best][good])
-    except DegenerateGeometryError:
-        return None
 
 
 def _aligned_product(inputs: Inputs, data: Correspondences, alignment: Alignment) -> InitialSimilarity:
@@ -152,13 +182,15 @@ def _attitude(prior: RotationPrior | None) -> AttitudeRecord | None:
     return AttitudeRecord(quat_xyzw=(x, y, z, w), cov_rad2=(first, second, third))
 
 
-def _starts(data: Correspondences, aligned: InitialSimilarity, seed: int) -> Iterator[InitialSimilarity]:
+def _starts(data: Correspondences, aligned: InitialSimilarity, seed: int) -> Iterator[Start]:
     """Yield the alignment, then, if they are needed, those of the fixes and of the control points alone.
 
     Which fixes are outliers is for the joint adjustment to find.
     """
     aligned = aligned.model_copy(update={"gnss_outliers": ()})
-    yield aligned
+    yield Start(aligned)
+    if data.control.any():
+        yield Start(aligned, at_control=True)
     for members in (~data.control, data.control):
         if not 3 <= members.sum() < len(data):
             continue
@@ -166,7 +198,8 @@ def _starts(data: Correspondences, aligned: InitialSimilarity, seed: int) -> Ite
             solution = align(data.part(members), np.random.default_rng(seed)).solution
         except DegenerateGeometryError:
             continue
-        yield aligned.model_copy(update={"geo_from_local": _record_of(solution), "layout": "volume"})
+        alone = aligned.model_copy(update={"geo_from_local": _record_of(solution), "layout": "volume"})
+        yield Start(alone, at_control=bool(data.control[members].all()))
 
 
 def _record_of(solution: AdjustedSimilarity) -> SimilarityRecord:
@@ -199,8 +232,8 @@ def _joint_product(
     residuals = dict(aligned.residuals) | {"points": residuals_of_points(inputs.model, inputs.points, similarity)}
     rejected: dict[str, tuple[str, ...]] = {"gnss": aligned.gnss_outliers, "gcp": ()}
     warnings = []
-    for kind, term, group in (("gnss", FixTerm, "fixes"), ("gcp", ControlTerm, "control points")):
-        names, missed, used = joint.residuals(term)
+    for kind, group in (("gnss", Fixes.kind), ("gcp", ControlPoints.kind)):
+        names, missed, used = joint.residuals(group)
         if not names:
             continue
         residuals[kind], inliers[kind] = residual_stats(missed[used]), int(used.sum())
@@ -209,12 +242,8 @@ def _joint_product(
             sizes = [f"{name} ({np.linalg.norm(miss):.2f} m)" for name, miss in bad]
             warnings.append(f"{len(bad)} of {len(names)} {group} are outliers: {listed(sizes)}")
         rejected[kind] = tuple(name for name, _ in bad)
-    record = similarity.to_record(
-        "local",
-        "geo",
-        covariance=solution_covariances(joint.problem)[0],
-        pivot=joint.problem.similarity.pivot_in_geo,
-    )
+    pivot = np.array(aligned.geo_from_local.pivot)
+    record = similarity.to_record("local", "geo", pivot=pivot)
     return aligned.model_copy(
         update={
             "geo_from_local": record,

@@ -6,22 +6,21 @@ leaves the rotation open, the recorded attitudes. The unknowns may include a bia
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
+from itertools import compress
 
 import numpy as np
+from scipy.optimize import brentq
 
-from pipelines.adjust.normal_equations import NormalEquations, Observations, Weights
 from pipelines.core.types import BoolArray, FloatArray
 from pipelines.geometry.rotations import log_so3
 from pipelines.geometry.similarity import Similarity, jacobian_at, perturbation
 from pipelines.robust.statistics import median_chi2, outlier_gate, squared_mahalanobis
 
 OUTLIER_GATE = outlier_gate(3)
-# A bias of all fixes is accepted if it lowers −2 ln likelihood by more than this, the cost of one outlier.
-BIAS_COST = OUTLIER_GATE - 1.0
 _LEAST_FOR_EXCESS = 5  # points of a kind; the scatter of fewer is too uncertain
 _STEPS = 12
-_POSITIONS, _ATTITUDE = "positions", "attitude"
+_OPEN = 1e-12  # eigenvalue over the largest one, below which nothing determines a direction
 
 
 @dataclass(frozen=True)
@@ -49,25 +48,15 @@ class Correspondences:
 
     def part(self, chosen: BoolArray) -> Correspondences:
         """Return the correspondences that a mask (n,) selects."""
-        return Correspondences(
-            name=tuple(name for name, take in zip(self.name, chosen, strict=True) if take),
-            control=self.control[chosen],
-            in_local=self.in_local[chosen],
-            cov_in_local=self.cov_in_local[chosen],
-            in_geo=self.in_geo[chosen],
-            cov_in_geo=self.cov_in_geo[chosen],
-        )
+        arrays = (getattr(self, each.name)[chosen] for each in fields(self)[1:])
+        return Correspondences(tuple(compress(self.name, chosen)), *arrays)
 
     def joined(self, other: Correspondences) -> Correspondences:
         """Return these correspondences, followed by those of `other`."""
-        return Correspondences(
-            name=self.name + other.name,
-            control=np.concatenate([self.control, other.control]),
-            in_local=np.concatenate([self.in_local, other.in_local]),
-            cov_in_local=np.concatenate([self.cov_in_local, other.cov_in_local]),
-            in_geo=np.concatenate([self.in_geo, other.in_geo]),
-            cov_in_geo=np.concatenate([self.cov_in_geo, other.cov_in_geo]),
+        arrays = (
+            np.concatenate([getattr(self, each.name), getattr(other, each.name)]) for each in fields(self)[1:]
         )
+        return Correspondences(self.name + other.name, *arrays)
 
 
 @dataclass(frozen=True)
@@ -108,7 +97,6 @@ class AdjustedSimilarity:
         state: the solution.
         covariance: (7, 7) about `pivot`, see `SimilarityRecord`.
         pivot: (3,) in geo.
-        bias_cov: (3, 3) m² of the bias; zero if it is not estimated.
         response: (n, 7, 3) change of the parameters per metre of error of each measured position.
         residual: (n, 3) metres, measured (less bias) minus mapped.
         squared: (n,) whitened squared residuals.
@@ -119,7 +107,6 @@ class AdjustedSimilarity:
     state: SimilarityState
     covariance: FloatArray
     pivot: FloatArray
-    bias_cov: FloatArray
     response: FloatArray = field(repr=False)
     residual: FloatArray = field(repr=False)
     squared: FloatArray = field(repr=False)
@@ -151,7 +138,7 @@ def adjust(data: Correspondences, start: SimilarityState, prior: RotationPrior |
     for _ in range(_STEPS):
         state = _gated(data, state)
         solution = _solve(data, state, prior)
-        before, state = state, _rescaled(data, solution.state, robust=False, leverage=solution)
+        before, state = state, _rescaled(data, solution.state, robust=False)
         same = np.array_equal(_gated(data, state).inlier, before.inlier)
         if same and np.allclose(state.excess_m, before.excess_m, rtol=0.01, atol=1e-5):
             break
@@ -185,72 +172,75 @@ def _gated(data: Correspondences, state: SimilarityState) -> SimilarityState:
 def _solve(data: Correspondences, state: SimilarityState, prior: RotationPrior | None) -> AdjustedSimilarity:
     """Return the Gauss–Newton solution of the inliers, with excess and inliers held."""
     for _ in range(_STEPS):
-        equations = _equations(data, state, prior)
-        step = equations.normal.solve(equations.weights)
-        state = _moved(state, step, equations.pivot)
-        if np.abs(step * equations.unit_m).max() < 1e-9:
+        linear = _linearised(data, state, prior)
+        every = covariance_of(linear.jacobian, linear.unit)
+        step = every @ linear.jacobian.T @ linear.residual
+        state = _moved(state, step, linear.pivot)
+        if np.abs(step / linear.unit).max() < 1e-9:
             break
-    equations = _equations(data, state, prior)
-    normal, weights = equations.normal, equations.weights
-    covariance = normal.covariance(weights)
     residual, cov = residuals(data, state), residual_covariances(data, state)
     squared = squared_mahalanobis(residual, cov)
     stretch = np.linalg.slogdet(cov)[1] - np.linalg.slogdet(data.cov_in_geo)[1]
-    pull = np.swapaxes(-normal.observations[_POSITIONS].jacobian, 1, 2) @ equations.whitener
+    of_positions = linear.jacobian[: 3 * len(data)].reshape(len(data), 3, -1)
     return AdjustedSimilarity(
         state=state,
-        covariance=covariance[:7, :7],
-        pivot=equations.pivot,
-        bias_cov=covariance[7:, 7:] if state.fix_bias_in_geo is not None else np.zeros((3, 3)),
-        response=(covariance @ pull)[:, :7] * state.inlier[:, None, None],
+        covariance=every[:7, :7],
+        pivot=linear.pivot,
+        response=every[:7] @ np.swapaxes(of_positions, 1, 2) @ linear.whitener,
         residual=residual,
         squared=squared,
         cost=float(np.where(state.inlier, squared + stretch, OUTLIER_GATE).sum()),
-        condition_number=normal.condition_number(weights),
+        condition_number=float(np.linalg.cond(every / np.outer(linear.unit, linear.unit))),
     )
+
+
+def covariance_of(jacobian: FloatArray, unit: FloatArray) -> FloatArray:
+    """Return the covariance (P, P) of P parameters from whitened observations.
+
+    A direction that the observations leave open gets a wide, but finite variance.
+
+    Args:
+        jacobian: (m, P) derivatives of the observations.
+        unit: (P,) step of each parameter that changes the observations about as much as one of any other.
+    """
+    scaled = jacobian * unit
+    value, vector = np.linalg.eigh(scaled.T @ scaled)
+    inverse = (vector / np.maximum(value, _OPEN * value[-1])) @ vector.T
+    return np.asarray(inverse * np.outer(unit, unit))
 
 
 @dataclass(frozen=True)
-class _Equations:
-    normal: NormalEquations  # P = 7, or 10 with a bias
-    weights: Weights
-    whitener: FloatArray  # (n, 3, 3), W with WᵀW = Σ⁻¹
+class _Linearised:
+    """Whitened observations near a state: the n positions, and the measured rotation if there is one."""
+
+    residual: FloatArray  # (m,), measured minus computed
+    jacobian: FloatArray  # (m, P) of what is computed; P = 7, or 10 with a bias
+    whitener: FloatArray  # (n, 3, 3), W with WᵀW = Σ⁻¹; zero for outliers
     pivot: FloatArray  # (3,)
-    unit_m: FloatArray  # (P,), metres per unit of each parameter
+    unit: FloatArray  # (P,), step of each parameter that moves the positions by about a metre
 
 
-def _equations(data: Correspondences, state: SimilarityState, prior: RotationPrior | None) -> _Equations:
+def _linearised(data: Correspondences, state: SimilarityState, prior: RotationPrior | None) -> _Linearised:
     mapped = state.geo_from_local.apply(data.in_local)
     whitener = np.linalg.inv(np.linalg.cholesky(residual_covariances(data, state)))
-    weight = (whitener**2).sum(axis=(1, 2)) * state.inlier
+    whitener = whitener * state.inlier[:, None, None]
+    weight = (whitener**2).sum(axis=(1, 2))
     pivot = weight @ mapped / weight.sum()
-    jacobian = jacobian_at(mapped, pivot)
-    if state.fix_bias_in_geo is not None:
-        shared = np.where(data.control[:, None, None], 0.0, np.eye(3))
-        jacobian = np.concatenate([jacobian, shared], axis=2)
-    white = (whitener @ residuals(data, state)[..., None])[..., 0]
-    observations = {_POSITIONS: Observations(white, -whitener @ jacobian)}
-    weights = {_POSITIONS: state.inlier.astype(np.float64)}
-    count = jacobian.shape[2]
+    size_m = np.sqrt(weight @ ((mapped - pivot) ** 2).sum(axis=1) / weight.sum())
+    by_bias = np.where(data.control[:, None, None], 0.0, np.eye(3))
+    jacobian = np.concatenate([jacobian_at(mapped, pivot), by_bias], axis=2)
+    if state.fix_bias_in_geo is None:
+        jacobian = jacobian[:, :, :7]
+    residual = (whitener @ residuals(data, state)[..., None]).ravel()
+    jacobian = (whitener @ jacobian).reshape(len(residual), -1)
     if prior is not None:
-        observations[_ATTITUDE] = _attitude(prior, state, count)
-        weights[_ATTITUDE] = np.ones(1)
-    size = np.sqrt(weight @ ((mapped - pivot) ** 2).sum(axis=1) / weight.sum())
-    unit_m = np.ones(count)
-    unit_m[:4] = max(size, 1e-9)
-    normal = NormalEquations(
-        observations, np.zeros(count), np.zeros(count), unit=1.0 / unit_m, open_directions="wide"
-    )
-    return _Equations(normal, weights, whitener, pivot, unit_m)
-
-
-def _attitude(prior: RotationPrior, state: SimilarityState, count: int) -> Observations:
-    """Return the measured rotation as one observation of three angles."""
-    whitener = np.linalg.inv(np.linalg.cholesky(prior.cov_rad2))
-    jacobian = np.zeros((1, 3, count))
-    jacobian[0, :, 1:4] = -whitener
-    residual = log_so3(prior.rotation @ state.geo_from_local.rotation.T)
-    return Observations((whitener @ residual)[None], jacobian)
+        root = np.linalg.inv(np.linalg.cholesky(prior.cov_rad2))
+        turn = log_so3(prior.rotation @ state.geo_from_local.rotation.T)
+        residual = np.concatenate([residual, root @ turn])
+        jacobian = np.concatenate([jacobian, root @ np.eye(3, jacobian.shape[1], 1)])
+    unit = np.ones(jacobian.shape[1])
+    unit[:4] = 1.0 / max(size_m, 1e-9)
+    return _Linearised(residual, jacobian, whitener, pivot, unit)
 
 
 def _moved(state: SimilarityState, step: FloatArray, pivot: FloatArray) -> SimilarityState:
@@ -260,56 +250,28 @@ def _moved(state: SimilarityState, step: FloatArray, pivot: FloatArray) -> Simil
     return replace(state, geo_from_local=moved, fix_bias_in_geo=bias)
 
 
-def _rescaled(
-    data: Correspondences, state: SimilarityState, *, robust: bool, leverage: AdjustedSimilarity | None = None
-) -> SimilarityState:
-    """Return the state with the excess scatter of each kind estimated anew."""
-    excess = []
-    for kind in (False, True):
-        members = (data.control == kind) & (state.inlier | robust)
-        excess.append(_excess(data, replace(state, excess_m=(0.0, 0.0)), members, robust, leverage))
-    return replace(state, excess_m=(excess[0], excess[1]))
+def _rescaled(data: Correspondences, state: SimilarityState, *, robust: bool) -> SimilarityState:
+    """Return the state with the excess scatter of each kind estimated anew: of all, robustly, or of the inliers."""
+    members = state.inlier | robust
+    fixes, control = (_excess(data, state, members & (data.control == kind), robust) for kind in (False, True))
+    return replace(state, excess_m=(fixes, control))
 
 
-def _excess(
-    data: Correspondences,
-    state: SimilarityState,
-    members: BoolArray,
-    robust: bool,
-    leverage: AdjustedSimilarity | None,
-) -> float:
+def _excess(data: Correspondences, state: SimilarityState, members: BoolArray, robust: bool) -> float:
     """Return the σ per axis that makes the scatter of the members agree with their covariances; at least 0."""
-    count = int(members.sum())
-    if count < _LEAST_FOR_EXCESS:
+    if members.sum() < _LEAST_FOR_EXCESS:
         return 0.0
-    residual, cov = residuals(data, state)[members], residual_covariances(data, state)[members]
+    stated = replace(state, excess_m=(0.0, 0.0))
+    residual, cov = residuals(data, state)[members], residual_covariances(data, stated)[members]
     variances, axes = np.linalg.eigh(cov)
     along = (np.swapaxes(axes, 1, 2) @ residual[..., None])[..., 0] ** 2
-    # The parameters absorb a part of the scatter: their redundancy is left.
-    free = (
-        1 - 7 / (3 * max(int(state.inlier.sum()), 3)) if leverage is None else _redundancy(data, leverage, members)
-    )
+    # The seven parameters absorb a part of the scatter: their redundancy is left.
+    free = 1 - 7 / (3 * max(int(state.inlier.sum()), _LEAST_FOR_EXCESS))
 
     def surplus(sigma: float) -> float:
         squared = (along / (variances + sigma**2)).sum(axis=1)
         return float(np.median(squared) / median_chi2(3) if robust else squared.mean() / 3) - free
 
-    if surplus(0.0) <= 0:
-        return 0.0
-    low, high = 0.0, float(np.linalg.norm(residual, axis=1).max()) + 1e-9
-    while surplus(high) > 0:
-        high *= 2
-    for _ in range(40):
-        middle = (low + high) / 2
-        low, high = (middle, high) if surplus(middle) > 0 else (low, middle)
-    return high
-
-
-def _redundancy(data: Correspondences, solution: AdjustedSimilarity, members: BoolArray) -> float:
-    """Return the mean redundancy of the members: 1 less the part of an error that the adjustment absorbs."""
-    mapped = solution.state.geo_from_local.apply(data.in_local[members])
-    absorbed = jacobian_at(mapped, solution.pivot) @ solution.response[members]
-    absorbed_part = float(np.trace(absorbed, axis1=1, axis2=2).sum())
-    if solution.state.fix_bias_in_geo is not None and not data.control[members].all():
-        absorbed_part += 3.0
-    return max(1 - absorbed_part / (3 * int(members.sum())), 0.05)
+    # With the largest residual as σ, each whitened square is at most 1, and the surplus negative.
+    largest = float(np.linalg.norm(residual, axis=1).max())
+    return 0.0 if surplus(0.0) <= 0 else float(brentq(surplus, 0.0, largest))

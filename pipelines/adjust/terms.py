@@ -1,288 +1,402 @@
-"""Terms of the adjustment (GeoRefGS section 2.4, doi 10.3390/drones10030195), in float64.
+"""Terms of the adjustment: measurements of one kind, with their residuals and derivatives (GeoRefGS section 2.4).
 
-A term consists of the observations of one kind: residuals against an estimate, their root information, and their
-share in the loss. A new kind of measurement is one subclass of `Term`; no other code depends on the kinds.
-
-The residuals are whitened by their covariance: each term is half of a χ², and the whole a maximum a posteriori
-estimate. `paper` takes plain mean squares in metres instead. A Cauchy kernel bounds the effect of one bad fix.
+A term consists of the observations of one kind: residuals, their root information, and their derivatives by the
+cameras, the lens and the systematic errors. The similarity has no derivative of its own: the corrections of the
+cameras contain it (`adjust.system`). A new kind of measurement is one subclass of `Term`.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
-from typing import ClassVar, Literal, TypeVar
+from dataclasses import dataclass
+from typing import ClassVar
 
-import torch
-from torch import Tensor
+import numpy as np
 
-from pipelines.adjust.estimate import Estimate
-from pipelines.adjust.so3 import exp_so3, log_so3
-from pipelines.robust.kernels import CAUCHY_SCALE2
-
-RecordT = TypeVar("RecordT")
-Weighting = Literal["whitened", "paper"]
+from pipelines.adjust.state import State, SystematicErrors
+from pipelines.core.types import FloatArray, IntArray
+from pipelines.geometry.cameras import CameraPoses
+from pipelines.geometry.rotations import exp_so3, log_so3, right_jacobian_inverse_so3, skew
+from pipelines.geometry.similarity import Similarity, jacobian_at
 
 
-def cauchy(chi2: Tensor, dimension: int) -> Tensor:
-    """Return Cauchy's ρ (N,) of squared whitened residuals (N,) of a dimension: c² ln(1 + χ²/c²)."""
-    scale2 = CAUCHY_SCALE2[dimension]
-    return scale2 * torch.log1p(chi2 / scale2)
+@dataclass(frozen=True)
+class At:
+    """Estimate that measurements are compared with.
+
+    Attributes:
+        cam_from_model: (n, 3, 3) corrected rotations.
+        center: (n, 3) corrected projection centres in `model`.
+        geo_from_model: the similarity.
+        lens: (L,) change of the lens.
+        errors: the systematic errors.
+        vector: (p,) their values.
+        turn_by_correction: (n, 3, 3) change of the rotation Exp(δω) by δω: its right Jacobian.
+    """
+
+    cam_from_model: FloatArray
+    center: FloatArray
+    geo_from_model: Similarity
+    lens: FloatArray
+    errors: SystematicErrors
+    vector: FloatArray
+    turn_by_correction: FloatArray
+
+    @classmethod
+    def of(cls, state: State, base: CameraPoses, errors: SystematicErrors) -> At:
+        """Return the estimate of a state.
+
+        Args:
+            state: values of all unknowns.
+            base: poses that it corrects.
+            errors: its systematic errors.
+        """
+        poses, turn = state.poses(base), skew(state.correction[:, :3])
+        # Exp(−(ω + δ)) = Exp(−ω) Exp(−J δ) with J = I + ½ [ω] + ⅙ [ω]² + …
+        jacobian = np.eye(3) + turn / 2 + turn @ turn / 6
+        return cls(
+            poses.cam_from_model,
+            poses.cam_center_in_model,
+            state.geo_from_model,
+            state.lens,
+            errors,
+            state.errors,
+            jacobian,
+        )
+
+    def geo_from_cam(self, camera: IntArray) -> FloatArray:
+        """Return the rotations geo ← cam (K, 3, 3) of cameras (K,)."""
+        return np.asarray(self.geo_from_model.rotation @ np.swapaxes(self.cam_from_model[camera], 1, 2))
 
 
-def moved_tensors(record: RecordT, move: Callable[[Tensor], Tensor]) -> RecordT:
-    """Return a dataclass with every tensor replaced by `move` of it, e.g. for another device."""
-    tensors = {
-        field.name: move(getattr(record, field.name))
-        for field in fields(record)  # type: ignore[arg-type]
-        if isinstance(getattr(record, field.name), Tensor)
-    }
-    return replace(record, **tensors)  # type: ignore[type-var]
+@dataclass(frozen=True)
+class Slopes:
+    """Residuals of M observations near a state, and their derivatives.
+
+    Attributes:
+        residual: (M, d), predicted minus measured, in metres or radians.
+        row, camera: (E,) observation and camera of each block.
+        by_pose: (E, d, 6) by the corrections (δω, δc) of that camera.
+        by_lens: (M, d, L).
+        by_errors: (M, d, p).
+        by_similarity: (M, d, 7) by the mean similarity, in `model`, of the points that follow the cameras; None:
+            the observations do not depend on these points.
+    """
+
+    residual: FloatArray
+    row: IntArray
+    camera: IntArray
+    by_pose: FloatArray
+    by_lens: FloatArray
+    by_errors: FloatArray
+    by_similarity: FloatArray | None = None
+
+    def whitened(self, root: FloatArray) -> Slopes:
+        """Return residuals and derivatives in units of σ, from root information (M, d, d)."""
+        return Slopes(
+            (root @ self.residual[:, :, None])[:, :, 0],
+            self.row,
+            self.camera,
+            root[self.row] @ self.by_pose,
+            root @ self.by_lens,
+            root @ self.by_errors,
+            None if self.by_similarity is None else root @ self.by_similarity,
+        )
 
 
 class Term(ABC):
     """M observations of one kind.
 
     Attributes:
-        kind: name in losses, metrics and normal equations.
+        kind: name in normal equations, tests and products.
         dimension: d, of a residual.
-        measures: whether the observations are independent measurements. A term that is a function of others
-            steadies the training, and is not part of the posterior.
-        in_metres: whether the residuals are lengths, which plain mean squares need no whitening for.
-        root_information: (M, d, d) float64, W with WᵀW = Σ⁻¹.
-        share: weight of each observation in the loss, 0 to 1.
+        root_information: (M, d, d), W with WᵀW = Σ⁻¹.
     """
 
     kind: ClassVar[str]
     dimension: ClassVar[int] = 3
-    measures: ClassVar[bool] = True
-    in_metres: ClassVar[bool] = True
-
-    root_information: Tensor
-    share: float = 1.0
+    root_information: FloatArray
 
     @abstractmethod
-    def residuals(self, at: Estimate) -> Tensor:
+    def residuals(self, at: At) -> FloatArray:
         """Return the residuals (M, d), predicted minus measured, in metres or radians."""
 
     @abstractmethod
-    def incidence(self) -> tuple[Tensor, Tensor]:
-        """Return the observations (E,) and the cameras (E,) whose poses affect them, both int64."""
+    def slopes(self, at: At) -> Slopes:
+        """Return the residuals with their derivatives."""
 
     def __len__(self) -> int:
         return len(self.root_information)
 
-    def whitened(self, at: Estimate) -> Tensor:
+    def whitened(self, at: At) -> FloatArray:
         """Return the residuals (M, d) in units of their σ."""
-        return (self.root_information @ self.residuals(at)[:, :, None])[:, :, 0]
+        return np.asarray((self.root_information @ self.residuals(at)[:, :, None])[:, :, 0])
 
 
 @dataclass(frozen=True)
-class FixTerm(Term):
-    """Measured positions of F training cameras: the term L_abs.
+class Fixes(Term):
+    """Measured positions of F cameras: the term L_abs.
 
     Attributes:
-        camera: (F,) int64 index into the cameras.
-        position_in_geo: (F, 3) float64 metres.
-        root_information: (F, 3, 3) float64, in 1/m.
-        flight: (F,) int64, flight of each fix; None: all in one.
+        name: (F) images.
+        camera: (F,) index into the cameras.
+        position_in_geo: (F, 3) metres.
+        root_information: (F, 3, 3) of the fixes' own errors, in 1/m.
+        session: (F,) session of each fix, whose common error they share.
     """
 
-    kind: ClassVar[str] = "absolute"
+    kind: ClassVar[str] = "fixes"
 
-    camera: Tensor
-    position_in_geo: Tensor
-    root_information: Tensor
-    flight: Tensor | None = None
+    name: tuple[str, ...]
+    camera: IntArray
+    position_in_geo: FloatArray
+    root_information: FloatArray
+    session: IntArray
 
-    def incidence(self) -> tuple[Tensor, Tensor]:
-        """Return one camera for each observation."""
-        return torch.arange(len(self), device=self.camera.device), self.camera
-
-    def residuals(self, at: Estimate) -> Tensor:
-        """Return T(c_i) + lever arm + bias − C_i (F, 3) in metres."""
+    def residuals(self, at: At) -> FloatArray:
+        """Return S(c_i) + lever arm + bias − C_i (F, 3) in metres."""
         predicted = at.geo_from_model.apply(at.center[self.camera])
-        if at.errors.arm_m is not None:
-            predicted = predicted + at.geo_from_cam(self.camera) @ at.errors.arm_m
-        if at.errors.bias_m is not None:
-            predicted = predicted + (at.errors.bias_m[0] if self.flight is None else at.errors.bias_m[self.flight])
+        arm = at.errors.value(at.vector, "lever-arm")
+        if arm is not None:
+            predicted = predicted + at.geo_from_cam(self.camera) @ arm
+        for session in np.unique(self.session):
+            columns = at.errors.columns("bias", int(session))
+            if columns is not None:
+                predicted[self.session == session] += at.vector[columns]
         return predicted - self.position_in_geo
+
+    def slopes(self, at: At) -> Slopes:
+        count, similarity = len(self), at.geo_from_model
+        by_pose = np.zeros((count, 3, 6))
+        by_pose[:, :, 3:] = similarity.scale * similarity.rotation
+        by_errors = np.zeros((count, 3, len(at.vector)))
+        arm, columns = at.errors.value(at.vector, "lever-arm"), at.errors.columns("lever-arm")
+        if arm is not None and columns is not None:
+            in_model = np.swapaxes(at.cam_from_model[self.camera], 1, 2) @ arm
+            turned = similarity.rotation @ -skew(in_model)
+            by_pose[:, :, :3] = turned @ at.turn_by_correction[self.camera]
+            by_errors[:, :, columns] = at.geo_from_cam(self.camera)
+        for session in np.unique(self.session):
+            columns = at.errors.columns("bias", int(session))
+            if columns is not None:
+                by_errors[self.session == session, :, columns] = np.eye(3)
+        no_lens = np.zeros((count, 3, len(at.lens)))
+        return Slopes(self.residuals(at), np.arange(count), self.camera, by_pose, no_lens, by_errors)
 
 
 @dataclass(frozen=True)
-class ControlTerm(Term):
+class ControlPoints(Term):
     """Control points against the intersections of their image marks: the term L_gcp; J points, K marks in all.
 
     Attributes:
-        point: (K,) int64 index into the points.
-        camera: (K,) int64 index into the cameras.
-        bearing_in_cam: (K, 3) float64 unit vectors.
-        sigma_rad: (K,) float64 angular σ of a mark.
-        position_in_geo: (J, 3) float64 metres, surveyed.
-        root_information: (J, 3, 3) float64 of survey and intersection together, in 1/m; for control points through
-            the rendered depth, of the surface too.
-        point_id: of the points (J), as in the survey.
-        bearing_by_lens: (K, 3, L) float64, derivative of the bearings by the lens parameters, in the order of
-            `geometry.lens.Lenses`; None: the lens of the bearings is exact.
+        name: (J) points.
+        point: (K,) index into the points.
+        camera: (K,) index into the cameras.
+        bearing_in_cam: (K, 3) unit vectors.
+        sigma_rad: (K,) angular σ of a mark.
+        bearing_by_lens: (K, 3, L) derivative of the bearings by the lens parameters.
+        position_in_geo: (J, 3) metres, surveyed.
+        root_information: (J, 3, 3) of survey and intersection together, in 1/m.
     """
 
-    kind: ClassVar[str] = "control"
+    kind: ClassVar[str] = "control points"
 
-    point: Tensor
-    camera: Tensor
-    bearing_in_cam: Tensor
-    sigma_rad: Tensor
-    position_in_geo: Tensor
-    root_information: Tensor
-    point_id: tuple[str, ...] = ()
-    bearing_by_lens: Tensor | None = None
+    name: tuple[str, ...]
+    point: IntArray
+    camera: IntArray
+    bearing_in_cam: FloatArray
+    sigma_rad: FloatArray
+    bearing_by_lens: FloatArray
+    position_in_geo: FloatArray
+    root_information: FloatArray
 
-    def incidence(self) -> tuple[Tensor, Tensor]:
-        """Return point and camera of each mark."""
-        return self.point, self.camera
+    def residuals(self, at: At) -> FloatArray:
+        """Return S(x_j) − X_j (J, 3) in metres, with x_j the intersection of the marks of point j."""
+        return at.geo_from_model.apply(self._intersected(at)[0]) - self.position_in_geo
 
-    def residuals(self, at: Estimate) -> Tensor:
-        """Return T(x_j) − X_j (J, 3) in metres, with x_j the intersection of the marks of point j."""
-        return at.geo_from_model.apply(self.intersected(at)) - self.position_in_geo
+    def slopes(self, at: At) -> Slopes:
+        position, weight, direction, bearing_scale = self._intersected(at)
+        arm = position[self.point] - at.center[self.camera]
+        along = np.einsum("ki,ki->k", direction, arm)
+        across = arm - along[:, None] * direction
+        projector = _projector(direction)
+        normal = np.zeros((len(self), 3, 3))
+        np.add.at(normal, self.point, weight[:, None, None] * projector)
+        # N dx = Σ w (P dc − dP (x − c)), and −dP (x − c) = (ρ I + d eᵀ) dd with x − c = ρ d + e.
+        by_center = np.linalg.solve(normal, np.eye(3))[self.point] * weight[:, None, None]
+        by_direction = by_center @ (along[:, None, None] * np.eye(3) + direction[:, :, None] * across[:, None, :])
+        to_geo = at.geo_from_model.scale * at.geo_from_model.rotation
+        by_turn = by_direction @ -skew(direction) @ at.turn_by_correction[self.camera]
+        by_pose = to_geo @ np.concatenate([by_turn, by_center @ projector], axis=2)
+        turn = np.swapaxes(at.cam_from_model[self.camera], 1, 2)
+        by_bearing = to_geo @ by_direction @ projector @ turn @ self.bearing_by_lens / bearing_scale[:, None, None]
+        by_lens = np.zeros((len(self), 3, len(at.lens)))
+        if len(at.lens):
+            np.add.at(by_lens, self.point, by_bearing)
+        by_errors = np.zeros((len(self), 3, len(at.vector)))
+        residual = at.geo_from_model.apply(position) - self.position_in_geo
+        return Slopes(residual, self.point, self.camera, by_pose, by_lens, by_errors)
 
-    def bearings(self, lens: Tensor) -> Tensor:
-        """Return the unit vectors (K, 3) of the marks, to first order in the lens change (L,); L = 0: none."""
-        if self.bearing_by_lens is None or not len(lens):
-            return self.bearing_in_cam
-        return torch.nn.functional.normalize(self.bearing_in_cam + self.bearing_by_lens @ lens, dim=1)
-
-    def intersected(self, at: Estimate) -> Tensor:
-        """Return the points (J, 3) in `model` nearest to the rays of their marks, differentiable.
+    def _intersected(self, at: At) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return the points (J, 3) in `model` nearest to the rays of their marks, with weights and directions (K).
 
         The rays are weighted by their inverse lateral variance at the point, (angular σ × distance)⁻²; GeoRefGS
-        eqs 4–8. The derivative reaches cameras and lens.
+        eqs 4–8. The last array is the length of the bearings before normalisation.
         """
-        rotation, center = at.rotation[self.camera], at.center[self.camera]
-        direction = (rotation.transpose(1, 2) @ self.bearings(at.lens)[:, :, None])[:, :, 0]
-        projector = torch.eye(3, dtype=direction.dtype, device=direction.device) - (
-            direction[:, :, None] * direction[:, None, :]
-        )
-        weight = 1.0 / self.sigma_rad**2
-        point = torch.zeros(0)
+        bearing = self.bearing_in_cam
+        if len(at.lens):
+            bearing = bearing + self.bearing_by_lens @ at.lens
+        length = np.linalg.norm(bearing, axis=1)
+        center = at.center[self.camera]
+        direction = np.einsum("kji,kj->ki", at.cam_from_model[self.camera], bearing / length[:, None])
+        projector = _projector(direction)
+        position, weight = np.zeros((len(self), 3)), np.asarray(1.0 / self.sigma_rad**2)
         for _ in range(2):  # the first pass gives the distances, and so the weights
-            normal = self._sum_by_point(weight[:, None, None] * projector)
-            right = self._sum_by_point(weight[:, None, None] * (projector @ center[:, :, None]))
-            point = torch.linalg.solve_ex(normal, right).result[:, :, 0]  # `solve` would wait for the device
-            distance = (point[self.point] - center).norm(dim=1)
+            normal, right = np.zeros((len(self), 3, 3)), np.zeros((len(self), 3))
+            np.add.at(normal, self.point, weight[:, None, None] * projector)
+            np.add.at(right, self.point, weight[:, None] * np.einsum("kij,kj->ki", projector, center))
+            position = np.asarray(np.linalg.solve(normal, right[:, :, None])[:, :, 0])
+            distance = np.linalg.norm(position[self.point] - center, axis=1)
             weight = 1.0 / (self.sigma_rad * distance) ** 2
-        return point
-
-    def _sum_by_point(self, values: Tensor) -> Tensor:
-        total = torch.zeros((len(self), *values.shape[1:]), dtype=values.dtype, device=values.device)
-        return total.index_add(0, self.point, values)
+        return position, weight, direction, length
 
 
 @dataclass(frozen=True)
-class AttitudeTerm(Term):
-    """Recorded rotations of A training cameras: the term L_att.
+class Attitudes(Term):
+    """Recorded rotations of A cameras: the term L_att.
 
     Attributes:
-        camera: (A,) int64 index into the cameras.
-        geo_from_cam: (A, 3, 3) float64, of the nominal camera axes.
-        root_information: (A, 3, 3) float64, in 1/rad.
+        name: (A) images.
+        camera: (A,) index into the cameras.
+        geo_from_cam: (A, 3, 3), of the nominal camera axes.
+        root_information: (A, 3, 3), in 1/rad.
     """
 
-    kind: ClassVar[str] = "attitude"
-    in_metres: ClassVar[bool] = False
+    kind: ClassVar[str] = "attitudes"
 
-    camera: Tensor
-    geo_from_cam: Tensor
-    root_information: Tensor
+    name: tuple[str, ...]
+    camera: IntArray
+    geo_from_cam: FloatArray
+    root_information: FloatArray
 
-    def incidence(self) -> tuple[Tensor, Tensor]:
-        """Return one camera for each observation."""
-        return torch.arange(len(self), device=self.camera.device), self.camera
-
-    def residuals(self, at: Estimate) -> Tensor:
+    def residuals(self, at: At) -> FloatArray:
         """Return Log(R_iᵀ G_i B) (A, 3) in radians, from a camera to its recorded axes, with the boresight B."""
-        turned = at.geo_from_cam(self.camera)
-        recorded = self.geo_from_cam
-        if at.errors.common_rad is not None:
-            turned = exp_so3(at.errors.common_rad) @ turned
-        if at.errors.boresight_rad is not None:
-            recorded = recorded @ exp_so3(at.errors.boresight_rad)
-        return log_so3(turned.transpose(1, 2) @ recorded)
+        turned, recorded, _, _ = self._compared(at)
+        return np.asarray(log_so3(np.swapaxes(turned, 1, 2) @ recorded))
+
+    def slopes(self, at: At) -> Slopes:
+        turned, _, common, boresight = self._compared(at)
+        residual = self.residuals(at)
+        by_right = right_jacobian_inverse_so3(residual)
+        by_left = right_jacobian_inverse_so3(-residual)
+        by_pose = np.zeros((len(self), 3, 6))
+        by_pose[:, :, :3] = -by_left @ at.cam_from_model[self.camera] @ at.turn_by_correction[self.camera]
+        by_errors = np.zeros((len(self), 3, len(at.vector)))
+        if (columns := at.errors.columns("common")) is not None:
+            by_errors[:, :, columns] = -by_left @ np.swapaxes(turned, 1, 2) @ _right_jacobian(-common)
+        if (columns := at.errors.columns("boresight")) is not None:
+            by_errors[:, :, columns] = by_right @ _right_jacobian(boresight)
+        no_lens = np.zeros((len(self), 3, len(at.lens)))
+        return Slopes(residual, np.arange(len(self)), self.camera, by_pose, no_lens, by_errors)
+
+    def _compared(self, at: At) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return the cameras' and the recorded rotations (A, 3, 3), the common and the boresight error (3,)."""
+        common, boresight = (at.errors.value(at.vector, name) for name in ("common", "boresight"))
+        common = np.zeros(3) if common is None else common
+        boresight = np.zeros(3) if boresight is None else boresight
+        turned = exp_so3(common) @ at.geo_from_cam(self.camera)
+        return turned, self.geo_from_cam @ exp_so3(boresight), common, boresight
 
 
 @dataclass(frozen=True)
-class PlaneTerm(Term):
+class Planes(Term):
     """Planes of a LiDAR against the surface that the photographs show: the term L_lidar.
 
-    The LiDAR may be shifted as a whole: that shift is a constant error.
+    The LiDAR may be shifted as a whole: that shift is a systematic error. The surface moves with the mean of the
+    SfM points.
 
     Attributes:
-        point_in_model: (M, 3) float64 metres, on the surface of the photographs.
-        position_in_geo: (M, 3) float64 metres, on the plane of the LiDAR.
-        normal_in_geo: (M, 3) float64 unit normals of the planes.
-        root_information: (M, 1, 1) float64, in 1/m, of the distance between both along the normal.
+        point_in_model: (M, 3) metres, on the surface of the photographs.
+        position_in_geo: (M, 3) metres, on the plane of the LiDAR.
+        normal_in_geo: (M, 3) unit normals of the planes.
+        root_information: (M, 1, 1), in 1/m, of the distance between both along the normal.
     """
 
     kind: ClassVar[str] = "lidar"
     dimension: ClassVar[int] = 1
 
-    point_in_model: Tensor
-    position_in_geo: Tensor
-    normal_in_geo: Tensor
-    root_information: Tensor
+    point_in_model: FloatArray
+    position_in_geo: FloatArray
+    normal_in_geo: FloatArray
+    root_information: FloatArray
 
-    def incidence(self) -> tuple[Tensor, Tensor]:
-        """Return no pair: the surface of the photographs stays where it is in `model`."""
-        none = torch.zeros(0, dtype=torch.int64, device=self.position_in_geo.device)
-        return none, none
-
-    def residuals(self, at: Estimate) -> Tensor:
-        """Return n · (T(x) + shift − p) (M, 1) in metres."""
+    def residuals(self, at: At) -> FloatArray:
+        """Return n · (S(x) + shift − p) (M, 1) in metres."""
         apart = at.geo_from_model.apply(self.point_in_model) - self.position_in_geo
-        if at.errors.lidar_m is not None:
-            apart = apart + at.errors.lidar_m
-        return (self.normal_in_geo * apart).sum(dim=1, keepdim=True)
+        shift = at.errors.value(at.vector, "lidar-shift")
+        apart = apart if shift is None else apart + shift
+        return np.asarray((self.normal_in_geo * apart).sum(axis=1, keepdims=True))
+
+    def slopes(self, at: At) -> Slopes:
+        similarity, normal = at.geo_from_model, self.normal_in_geo[:, None, :]
+        moved = jacobian_at(self.point_in_model, at.center.mean(axis=0))
+        by_errors = np.zeros((len(self), 1, len(at.vector)))
+        if (columns := at.errors.columns("lidar-shift")) is not None:
+            by_errors[:, :, columns] = normal
+        none = np.zeros(0, dtype=np.int64)
+        return Slopes(
+            self.residuals(at),
+            none,
+            none,
+            np.zeros((0, 1, 6)),
+            np.zeros((len(self), 1, len(at.lens))),
+            by_errors,
+            similarity.scale * normal @ similarity.rotation @ moved,
+        )
 
 
 @dataclass(frozen=True)
-class DistanceTerm(Term):
-    """Distances between P pairs of geolocated points, or of cameras with fixes: the term L_rel.
+class CommonErrors(Term):
+    """Prior of the systematic errors as measurements of the value zero: the surplus of a wrong one is rejected.
 
-    The distances are functions of the fixes, not independent measurements.
-
-    The points are fixed at their SfM positions. In the bundle, they would follow the corrections of the cameras.
-    These corrections keep the points' mean position, rotation and size
-    (`geometry.correction_basis.correction_basis`). Fixed points are therefore right to first order for the scale,
-    the only quantity that the pairs determine.
+    One error that every fix of a session shares may be far larger than its σ says: a base station on wrong
+    coordinates. Cauchy's kernel then sets the prior aside, as it does with a bad fix.
 
     Attributes:
-        distance_in_model: (P,) float64; None: between the cameras below.
-        camera: (P, 2) int64 indices into the cameras; None: between fixed points of the scene.
-        distance_in_geo: (P,) float64 metres.
-        root_information: (P, 1, 1) float64, 1/σ of the measured distance in 1/m.
-        share: see `adjust.measurements.scale_share`.
+        errors: whose prior it is.
+        root_information: (B, 3, 3) by block.
     """
 
-    kind: ClassVar[str] = "relative"
-    dimension: ClassVar[int] = 1
-    measures: ClassVar[bool] = False
+    kind: ClassVar[str] = "systematic errors"
 
-    distance_in_model: Tensor | None
-    camera: Tensor | None
-    distance_in_geo: Tensor
-    root_information: Tensor
-    share: float = 1.0
+    errors: SystematicErrors
+    root_information: FloatArray
 
-    def incidence(self) -> tuple[Tensor, Tensor]:
-        """Return both cameras of each pair; none for fixed points."""
-        camera = self.distance_in_geo.new_zeros((0, 2), dtype=torch.int64) if self.camera is None else self.camera
-        return torch.arange(len(camera), device=camera.device).repeat_interleave(2), camera.flatten()
+    @classmethod
+    def of(cls, errors: SystematicErrors) -> CommonErrors:
+        """Return the prior of systematic errors."""
+        return cls(errors, np.array([np.diag(1.0 / np.array(block.sigma)) for block in errors.blocks]))
 
-    def residuals(self, at: Estimate) -> Tensor:
-        """Return s |x_i − x_j| − |X_i − X_j| (P, 1) in metres."""
-        if self.camera is None:
-            assert self.distance_in_model is not None
-            distance = self.distance_in_model
-        else:
-            distance = (at.center[self.camera[:, 0]] - at.center[self.camera[:, 1]]).norm(dim=1)
-        return (at.geo_from_model.scale * distance - self.distance_in_geo)[:, None]
+    def residuals(self, at: At) -> FloatArray:
+        """Return the values (B, 3)."""
+        return at.vector.reshape(-1, 3)
+
+    def slopes(self, at: At) -> Slopes:
+        count, none = len(self), np.zeros(0, dtype=np.int64)
+        by_errors = np.eye(3 * count).reshape(count, 3, 3 * count)
+        no_lens = np.zeros((count, 3, len(at.lens)))
+        return Slopes(self.residuals(at), none, none, np.zeros((0, 3, 6)), no_lens, by_errors)
+
+
+def root_information(covariance: FloatArray) -> FloatArray:
+    """Return W (N, 3, 3) with WᵀW = Σ⁻¹, from covariances Σ (N, 3, 3)."""
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))
+
+
+def _projector(direction: FloatArray) -> FloatArray:
+    return np.eye(3) - direction[:, :, None] * direction[:, None, :]
+
+
+def _right_jacobian(vector: FloatArray) -> FloatArray:
+    """Return the right Jacobian (3, 3) of Exp at a rotation vector (3,)."""
+    return np.asarray(np.linalg.inv(right_jacobian_inverse_so3(vector[None])[0]))

@@ -15,8 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.adjust.linearisation import Linearisation
-from pipelines.adjust.normal_equations import posterior_weights
+from pipelines.adjust.system import Linearised, NormalMatrix, posterior_weights
 from pipelines.core.types import BoolArray, FloatArray
 from pipelines.robust.statistics import chi2_probability_above, median_chi2, outlier_gate
 
@@ -79,17 +78,17 @@ def component_of(squared: FloatArray, free: FloatArray, dimension: int) -> Varia
     return VarianceComponent(used, agree, float(squared[used].sum()), float(free[used].sum()))
 
 
-def variance_components(linear: Linearisation) -> dict[str, VarianceComponent]:
-    """Return the test of each kind of observation of a problem at its minimum.
+def variance_components(linear: Linearised) -> tuple[dict[str, VarianceComponent], NormalMatrix]:
+    """Return the test of each kind of observation of a problem at its minimum, and the equations of its posterior.
 
     Raises:
         DegenerateGeometryError: the measurements leave the similarity open.
     """
-    residuals = linear.residuals()
+    residuals = linear.residuals
     weights = posterior_weights(residuals)
-    components = {}
+    normal, components = linear.normal(weights), {}
     for kind, rows in residuals.items():
         dimension = rows.shape[1]
-        absorbed = np.trace(linear.spread(weights, kind), axis1=1, axis2=2) * weights[kind]
+        absorbed = np.trace(linear.spread(weights, kind, normal), axis1=1, axis2=2) * weights[kind]
         components[kind] = component_of((rows**2).sum(axis=1), dimension - absorbed, dimension)
-    return components
+    return components, normal

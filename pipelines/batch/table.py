@@ -126,7 +126,8 @@ def _figures(mission: Mission) -> dict[str, object]:
         "report": f"{mission.place}/{REPORT_PAGE}" if (workspace.root / REPORT_PAGE).is_file() else None,
     }
     with contextlib.suppress(GeorefError):  # a mission may end before `evaluate`
-        figures["test_psnr"] = read_report(workspace.path(REPORT)).photometric.test.psnr
+        test = read_report(workspace.path(REPORT)).test_views
+        figures["test_psnr"] = None if test is None else test.psnr
     return figures
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,12 +15,12 @@ from pipelines.blocks.seams import compare_neighbours
 from pipelines.core.files import file_size
 from pipelines.core.products import load_json, save_json
 from pipelines.core.progress import Progress
-from pipelines.core.stages import SOLUTION, TRAIN_SEAMS
+from pipelines.core.stages import MODEL, SIM3_POSTERIOR, SOLUTION, TRAIN_POSTERIOR, TRAIN_SEAMS
 from pipelines.core.workspace import Summary
 from pipelines.formats.splat_ply import join_splat_plys
 from pipelines.scene.block_plan import BlockPlan
 from pipelines.scene.block_record import BlockRecord, BlockTraining, MergedBlock, Seam
-from pipelines.scene.trained_model import FrozenSolution, TrainedModel
+from pipelines.scene.trained_model import Adjustment, TrainedModel
 from pipelines.splat.storage import read_gaussians
 
 _BLACK = (0.0, 0.0, 0.0)
@@ -40,7 +41,7 @@ def merge_blocks(parts: Parts, plan: BlockPlan, folder: Path, progress: Progress
     trainings = [parts.training(block) for block in plan.blocks]
     cells = [_gaussians_in_cell(parts, block.id) for block in plan.blocks]
     count = join_splat_plys(cells, folder / "gaussians.ply")
-    solution = load_json(FrozenSolution, parts.whole.path(SOLUTION))
+    solution = load_json(Adjustment, parts.whole.path(SOLUTION))
     model = TrainedModel(
         **dict(solution),
         max_image_size=parts.options.effort.max_image_size,
@@ -50,7 +51,9 @@ def merge_blocks(parts: Parts, plan: BlockPlan, folder: Path, progress: Progress
         gaussians=count,
         backend=trainings[0].backend,
     )
-    save_json(model, folder / "model.json")
+    save_json(model, folder / Path(MODEL).name)
+    # Blocks hold the adjustment of init-sim3: its covariances stay.
+    shutil.copyfile(parts.workspace.path(SIM3_POSTERIOR), folder / Path(TRAIN_POSTERIOR).name)
     _write_metrics(parts, plan, folder / "metrics.jsonl")
     seams = compare_neighbours(parts, plan, solution, progress)
     blocks = tuple(

@@ -23,7 +23,7 @@ from pipelines.geometry.cameras import Pinhole, project
 from pipelines.scene.block_plan import BlockCell, BlockPlan, PlannedBlock
 from pipelines.scene.photographs import pinhole_of
 from pipelines.scene.scaffold import scaffold_gaussians
-from pipelines.scene.scene import Scene, load_initial_scene
+from pipelines.scene.scene import Scene, load_adjusted_scene
 from pipelines.splat.memory import USABLE, TrainingSize, predicted_peak_bytes
 
 _LEAST_SHARE = 0.1  # of a photograph that shows a block which it is to train
@@ -42,7 +42,7 @@ def run(stage: StageRun, options: PlanOptions) -> Summary:
         GeorefError: a product cannot be read.
     """
     workspace = stage.workspace
-    _, _, scene = load_initial_scene(workspace)
+    *_, scene = load_adjusted_scene(workspace)
     plan = plan_blocks(scene, options, stage.progress)
     save_json(plan, stage.out / "plan.json")
     shares = [block.share for block in plan.blocks]

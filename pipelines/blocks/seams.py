@@ -25,7 +25,7 @@ from pipelines.robust.statistics import mad_sigma
 from pipelines.scene.block_plan import BlockCell, BlockPlan, PlannedBlock
 from pipelines.scene.block_record import Seam
 from pipelines.scene.photographs import pinhole_of
-from pipelines.scene.trained_model import FrozenSolution
+from pipelines.scene.trained_model import Adjustment
 from pipelines.splat.depth import measured_depth
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings
@@ -40,9 +40,7 @@ _SOLID = 0.9  # alpha of a surface
 _LEAST_PIXELS = 200  # of a seam: fewer tell nothing
 
 
-def compare_neighbours(
-    parts: Parts, plan: BlockPlan, solution: FrozenSolution, progress: Progress
-) -> tuple[Seam, ...]:
+def compare_neighbours(parts: Parts, plan: BlockPlan, solution: Adjustment, progress: Progress) -> tuple[Seam, ...]:
     """Return the disagreement of all neighbours whose overlap some view shows.
 
     Args:
@@ -94,7 +92,7 @@ class SeamViews:
         solution: cameras and lenses.
     """
 
-    def __init__(self, parts: Parts, plan: BlockPlan, solution: FrozenSolution) -> None:
+    def __init__(self, parts: Parts, plan: BlockPlan, solution: Adjustment) -> None:
         self._parts, self._plan, self._solution = parts, plan, solution
         self._backend: Rasterizer = rasterizer(parts.options.backend)
         self._device = device_of(self._backend)

@@ -47,7 +47,7 @@ CONFIGURATIONS: tuple[Configuration, ...] = (
     ),
     Configuration(
         "A", "3DGS, aligned afterwards",
-        "SfM's cameras fixed, no geographic loss; similarity robustly from camera centres and fixes",
+        "cameras fixed as adjusted to the fixes, no geographic loss",
         {"method": "robust", "control_points": False}, _FIXED,
     ),
     Configuration(

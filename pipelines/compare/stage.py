@@ -189,14 +189,16 @@ def _row(configuration: Configuration, plan: Sequence[PlannedStage], runner: _Pl
     del manifests[_EVALUATE.name]  # Its warnings concern the survey, which all rows share.
     training = manifests[_TRAIN.name].values
     report = read_report(plan[-1].variant.path(REPORT))
+    test = report.test_views
+    assert test is not None and report.checkpoints.model is not None  # every configuration trains
     return ComparedRow(
         configuration=configuration.name,
         title=configuration.title,
         note=configuration.note,
-        test_psnr=report.photometric.test.psnr,
-        test_psnr_covered=report.photometric.test.psnr_covered,
-        test_covered_share=report.photometric.test.covered_share,
-        test_ssim=report.photometric.test.ssim,
+        test_psnr=test.psnr,
+        test_psnr_covered=test.psnr_covered,
+        test_covered_share=test.covered_share,
+        test_ssim=test.ssim,
         camera=point_accuracy(report.checkpoints.camera),
         model=point_accuracy(report.checkpoints.model),
         reference=surface_accuracy(report.reference),

@@ -18,7 +18,9 @@ SPARSE = "sfm/sparse"
 RIG = "calibrate/rig.json"
 POINTS = "geolocate/points.npz"
 SIM3 = "sim3/geo_from_local.json"
+ADJUSTMENT, SIM3_POSTERIOR = "sim3/adjustment.json", "sim3/adjustment.npz"
 MODEL = "train/model.json"
+TRAIN_POSTERIOR = "train/adjustment.npz"
 METRICS = "train/metrics.jsonl"
 GAUSSIANS = "train/gaussians.ply"
 REPORT = "evaluate/report.json"
@@ -90,6 +92,14 @@ APPLIED_RIG = ProductPart(
     RIG, fields=("applied.name", "applied.value", "applied.start"), optional=True, brings=(TRACK,)
 )
 
+# The solution with its covariances, which is init-sim3's until training goes on from it.
+SOLVED = (
+    *whole(SPARSE, SIM3),
+    *(
+        ProductPart(product, optional=True)
+        for product in (ADJUSTMENT, SIM3_POSTERIOR, MODEL, TRAIN_POSTERIOR, GAUSSIANS)
+    ),
+)
 
 # The accuracy of the result, which every file to hand over states.
 HEADLINE = ProductPart(REPORT, fields=("headline",), optional=True)
@@ -194,17 +204,20 @@ PIPELINE: tuple[StageSpec, ...] = (
         reads=(MEASURED, *whole(SPARSE, POINTS), APPLIED_RIG),
         product=SIM3,
         title="Estimate the similarity from the SfM model to the Earth.",
+        product_version=2,  # beside the similarity, the adjustment
+        also=(ADJUSTMENT, SIM3_POSTERIOR),
     ),
     StageSpec(
         name="train",
         module="pipelines.train.stage",
         options_place="pipelines.train.options:TrainOptions",
         folder="train",
-        reads=(MEASURED, *whole(SPARSE, SIM3, POINTS), APPLIED_RIG),
+        reads=(MEASURED, *whole(SPARSE, SIM3, ADJUSTMENT, SIM3_POSTERIOR, POINTS), APPLIED_RIG),
         product=MODEL,
         title="Train the Gaussians together with the similarity and the cameras.",
         resumable=True,
         growing=("iterations",),
+        also=(TRAIN_POSTERIOR,),
         working=("checkpoint.npz",),
         in_parts="pipelines.blocks.stage",
     ),
@@ -213,9 +226,10 @@ PIPELINE: tuple[StageSpec, ...] = (
         module="pipelines.evaluate.stage",
         options_place="pipelines.evaluate.options:EvaluateOptions",
         folder="evaluate",
-        reads=(MEASURED, *whole(SPARSE, MODEL, GAUSSIANS, SIM3), APPLIED_RIG),
+        reads=(MEASURED, *SOLVED, APPLIED_RIG),
         product=REPORT,
         title="Measure test views and check points.",
+        product_version=2,  # without training, and without the Cramér–Rao bound
     ),
     StageSpec(
         name="export-ply",
@@ -246,7 +260,7 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         module="pipelines.deliver.raster.stage",
         options_place="pipelines.deliver.options:ExportRasterOptions",
         folder="raster",
-        reads=(MEASURED, *whole(SPARSE, MODEL, GAUSSIANS, SIM3), APPLIED_RIG, HEADLINE),
+        reads=(MEASURED, *whole(SPARSE, MODEL, TRAIN_POSTERIOR, GAUSSIANS, SIM3), APPLIED_RIG, HEADLINE),
         product="raster/orthophoto.tif",
         title="Write orthophoto, surface model and their σ as rasters in a CRS.",
         resumable=True,
@@ -257,7 +271,7 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         module="pipelines.deliver.cloud.stage",
         options_place="pipelines.deliver.options:ExportCloudOptions",
         folder="cloud",
-        reads=(MEASURED, *whole(SPARSE, MODEL, GAUSSIANS, SIM3), APPLIED_RIG, HEADLINE),
+        reads=(MEASURED, *whole(SPARSE, MODEL, TRAIN_POSTERIOR, GAUSSIANS, SIM3), APPLIED_RIG, HEADLINE),
         product=CLOUD,
         title="Write the surface as a georeferenced point cloud (LAZ).",
         resumable=True,
@@ -286,10 +300,16 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         module="pipelines.deliver.cameras.stage",
         options_place="pipelines.deliver.options:ExportCamerasOptions",
         folder="cameras",
-        reads=(MEASURED, *whole(SPARSE, MODEL, GAUSSIANS, SIM3), APPLIED_RIG, HEADLINE),
+        reads=(MEASURED, *SOLVED, APPLIED_RIG, HEADLINE),
         product="cameras/cameras.csv",
-        title="Write the trained cameras for COLMAP, nerfstudio, surveyors and maps.",
-        also=("cameras/colmap", "cameras/transforms.json", "cameras/footprints.geojson"),
+        title="Write the adjusted cameras with their covariances for COLMAP, nerfstudio, surveyors and maps.",
+        also=(
+            "cameras/colmap",
+            "cameras/transforms.json",
+            "cameras/footprints.geojson",
+            "cameras/covariances.npz",
+            "cameras/camera_covariances.csv",
+        ),
     ),
     StageSpec(
         name="report",
@@ -297,7 +317,8 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         options_place="pipelines.report.options:ReportOptions",
         folder="report",
         reads=(
-            *whole(SURVEY, SPARSE, SIM3, MODEL, GAUSSIANS, REPORT),
+            *whole(SURVEY, REPORT),
+            *SOLVED,
             APPLIED_RIG,
             *(
                 ProductPart(product, optional=True)
@@ -329,7 +350,7 @@ ADJUST = StageSpec(
     reads=(MEASURED, *whole(SPARSE), APPLIED_RIG),
     product="adjust/sparse",
     title="Adjust the bundle with the fixes as priors of the camera positions.",
-    also=("adjust/geo_from_local.json",),
+    also=("adjust/geo_from_local.json", "adjust/adjustment.json", "adjust/adjustment.npz"),
 )
 
 # Parts of a training in blocks, in variants of the workspace: all once, but for those of each block.
@@ -338,7 +359,7 @@ PLAN_BLOCKS = StageSpec(
     module="pipelines.blocks.plan",
     options_place="pipelines.blocks.options:PlanOptions",
     folder="plan",
-    reads=(MEASURED, *whole(SPARSE, SIM3), APPLIED_RIG),
+    reads=(MEASURED, *whole(SPARSE, SIM3, ADJUSTMENT), APPLIED_RIG),
     product=BLOCK_PLAN,
     title="Divide the survey into blocks.",
 )
@@ -347,9 +368,9 @@ SOLVE = StageSpec(
     module="pipelines.train.solution",
     options_place="pipelines.train.options:SolutionOptions",
     folder="solution",
-    reads=(MEASURED, *whole(SPARSE, SIM3, POINTS), APPLIED_RIG),
+    reads=(MEASURED, *whole(SPARSE, SIM3, ADJUSTMENT), APPLIED_RIG),
     product=SOLUTION,
-    title="Solve similarity, cameras and exposures for all blocks.",
+    title="Take over the adjustment, and estimate the exposures, for all blocks.",
 )
 TRAIN_SCAFFOLD = StageSpec(
     name="scaffold",

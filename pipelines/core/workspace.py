@@ -113,6 +113,11 @@ class Workspace:
             raise MissingProductError(product, self.command_of(producer_of(product)))
         return path
 
+    def has(self, product: str) -> bool:
+        """Return whether a product exists."""
+        folder, _, inside = product.partition("/")
+        return (self._folder(folder) / inside).exists()
+
     def command_of(self, spec: StageSpec) -> str:
         """Return the command that makes the product of a stage here."""
         home = (self.base or self).root

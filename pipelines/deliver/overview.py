@@ -219,9 +219,10 @@ def _bounds(points_in_geo: FloatArray, survey: Survey, options: CrsOptions) -> B
 
 def _psnr(workspace: Workspace) -> float | None:
     try:
-        return read_report(workspace.path(REPORT)).photometric.test.psnr
+        test = read_report(workspace.path(REPORT)).test_views
     except GeorefError:  # not evaluated, or damaged: `georef status` tells
         return None
+    return None if test is None else test.psnr
 
 
 def _files(workspace: Workspace, states: dict[str, StageState]) -> tuple[MadeFile, ...]:

@@ -29,7 +29,7 @@ from pipelines.geodesy.vertical import VerticalDatum
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
 from pipelines.geometry.similarity import Similarity, SimilarityRecord, moved_pivot
 from pipelines.scene.survey import Survey
-from pipelines.scene.trained_model import TrainedModel
+from pipelines.scene.trained_model import Adjustment
 
 _ORIGIN_DECIMALS_DEG = 6  # 0.1 m: short numbers can be copied without loss
 _ORIGIN_DECIMALS_M = 1
@@ -100,17 +100,18 @@ class Placement:
         )
 
 
-def place(model: TrainedModel, survey: Survey, means_in_model: ArrayLike, accuracy: Headline | None) -> Placement:
-    """Return the placement of a trained model on Earth.
+def place(model: Adjustment, survey: Survey, points_in_model: ArrayLike, accuracy: Headline | None) -> Placement:
+    """Return the placement of a solved model on Earth.
 
     Args:
         model: has the similarity geo ← model and its covariance.
         survey: has the origin of geo and the vertical datum.
-        means_in_model: (N, 3) centres of all its Gaussians, N ≥ 1; their median is the middle of the scene.
+        points_in_model: (N, 3) centres of all its Gaussians, or without any its SfM points, N ≥ 1; their median is
+            the middle of the scene.
         accuracy: headline of the workspace; None: nothing states it.
     """
     geo_from_model = Similarity.from_record(model.geo_from_model)
-    scene_in_geo = np.median(geo_from_model.apply(means_in_model), axis=0)
+    scene_in_geo = np.median(geo_from_model.apply(points_in_model), axis=0)
     origin_lla = _rounded_origin(scene_in_geo, survey.origin)
     file_from_geo = _enu_at(origin_lla).inverse() @ _enu_at(lla_of(survey.origin))
     return Placement(

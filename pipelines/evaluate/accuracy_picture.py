@@ -15,25 +15,25 @@ from pipelines.plots.accuracy_map import MapPoints, NamedPlaces, SigmaRaster, wr
 from pipelines.plots.map_marks import MapCoordinates
 from pipelines.scene.report import EvaluationReport, PointResidual
 from pipelines.scene.survey import SurveyedPoint
-from pipelines.scene.trained_survey import TrainedSurvey
+from pipelines.scene.trained_survey import SolvedSurvey
 
 
 def draw_accuracy(
-    grid: AccuracyGrid, trained: TrainedSurvey, report: EvaluationReport, crs: PointCrs | None, path: Path
+    grid: AccuracyGrid, solved: SolvedSurvey, report: EvaluationReport, crs: PointCrs | None, path: Path
 ) -> None:
     """Write a map of the predicted accuracy, with cameras, control and check points, errors and coordinates.
 
     Args:
         grid: predicted σ.
-        trained: the trained survey.
+        solved: the survey.
         report: errors of triangulated points, and residuals of control points.
         crs: of the coordinates beside the map; None: longitude and latitude.
         path: of the picture.
     """
-    survey = trained.survey
+    survey = solved.survey
     raster = SigmaRaster(grid.raster(grid.sigma_h_m), grid.raster(grid.sigma_v_m), grid.corner_in_geo, grid.size_m)
     points = MapPoints(
-        cameras=trained.geo_from_model.apply(trained.poses.cam_center_in_model)[:, :2],
+        cameras=solved.geo_from_model.apply(solved.poses.cam_center_in_model)[:, :2],
         control=_named(survey.control_points, report.fit.gcp.points),
         check=_named(survey.check_points, report.checkpoints.camera.points),
     )

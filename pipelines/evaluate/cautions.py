@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import block_diag
 
-from pipelines.adjust.error_propagation import ErrorPropagation, NoErrorPropagation
-from pipelines.adjust.prediction import AccuracyPrediction
+from pipelines.adjust.posterior import Posterior
 from pipelines.core.cautions import Caution
 from pipelines.core.sentences import listed
 from pipelines.core.types import FloatArray
@@ -15,7 +14,7 @@ from pipelines.scene.marks import mark_rays
 from pipelines.scene.points_by_camera import points_by_camera
 from pipelines.scene.report import CheckPointErrors
 from pipelines.scene.survey import Survey
-from pipelines.scene.trained_survey import TrainedSurvey
+from pipelines.scene.trained_survey import SolvedSurvey
 
 _LEAST_POINTS = 3
 _RANGE = (0.005, 0.995)  # of χ²: 99 % of true predictions lie within
@@ -24,28 +23,21 @@ _SINGULAR = 1e-12  # of the largest variance
 
 
 def cautions_of_prediction(
-    trained: TrainedSurvey,
-    propagation: ErrorPropagation | NoErrorPropagation,
-    by_camera: CheckPointErrors,
-    *,
-    of_initial: bool,
+    solved: SolvedSurvey, posterior: Posterior, by_camera: CheckPointErrors, *, of_initial: bool
 ) -> tuple[Caution, ...]:
-    """Return the limits of the predicted accuracy; none without a prediction.
+    """Return the limits of the predicted accuracy.
 
     Args:
-        trained: the trained survey.
-        propagation: gives the prediction, or the reason why there is none.
+        solved: the survey.
+        posterior: gives the prediction.
         by_camera: errors of the triangulated check points.
         of_initial: whether the points are measured with the initial similarity.
     """
-    if isinstance(propagation, NoErrorPropagation):
-        return ()
-    cautions = propagation.prediction.cautions
     if of_initial:
-        sentence = "Measured with the initial similarity: the prediction is that of the trained one."
-        return (*cautions, Caution(code="prediction-of-trained-similarity", sentence=sentence))
-    test = _test_by_check_points(trained, propagation.prediction, frozenset(by_camera.blunders))
-    return cautions if test is None else (*cautions, test)
+        sentence = "Measured with the initial similarity: the prediction is that of the adjusted one."
+        return (Caution(code="prediction-of-adjusted-similarity", sentence=sentence),)
+    test = _test_by_check_points(solved, posterior, frozenset(by_camera.blunders))
+    return () if test is None else (test,)
 
 
 def refutation(
@@ -111,22 +103,20 @@ def dependent_check_points(survey: Survey) -> tuple[Caution, ...]:
     return (Caution(code="check-point-not-independent", sentence=sentence),)
 
 
-def _test_by_check_points(
-    trained: TrainedSurvey, prediction: AccuracyPrediction, blunders: frozenset[str]
-) -> Caution | None:
+def _test_by_check_points(solved: SolvedSurvey, posterior: Posterior, blunders: frozenset[str]) -> Caution | None:
     """Return the caution of the test of a prediction by the check points that it determines."""
-    points = trained.survey.check_points
+    points = solved.survey.check_points
     if len(points) < _LEAST_POINTS:
         return None
-    rays = mark_rays(points, trained.sparse)
-    position = points_by_camera(trained, rays)
-    variance = np.diagonal(prediction.of_marked_points(position, rays), axis1=1, axis2=2)
+    rays = mark_rays(points, solved.sparse)
+    position = points_by_camera(solved, rays)
+    variance = np.diagonal(posterior.of_marked_points(position, rays), axis1=1, axis2=2)
     known = np.asarray(np.isfinite(position + variance).all(axis=1))
     if known.sum() < _LEAST_POINTS:
         return None
     chosen = [point for point, is_known in zip(points, known, strict=True) if is_known]
     error = position[known] - np.array([point.position_in_geo for point in chosen])
-    cov = prediction.jointly_of_marked_points(position[known], rays.of_points(known))
+    cov = posterior.jointly_of_marked_points(position[known], rays.of_points(known))
     cov = cov + block_diag(*(point.cov_in_geo for point in chosen))
     return refutation(tuple(point.name for point in chosen), error.ravel(), cov, blunders)
 

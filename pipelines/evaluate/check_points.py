@@ -1,19 +1,12 @@
-"""Surveyed points, measured in the trained survey: check points, cross-validation, and residuals of the fit."""
+"""Surveyed points, measured in the solved survey: check points, cross-validation, and residuals of the fit."""
 
 from __future__ import annotations
 
-import logging
-from dataclasses import replace
-
 import numpy as np
 
-from pipelines.adjust.error_propagation import ErrorPropagation, NoErrorPropagation
-from pipelines.adjust.leave_one_out import LeftOut, leave_one_out
-from pipelines.adjust.solved_survey import SolvedSurvey
-from pipelines.core.errors import DegenerateGeometryError
+from pipelines.adjust.posterior import Posterior
 from pipelines.core.progress import Progress
 from pipelines.core.types import FloatArray
-from pipelines.evaluate.cramer_rao import cramer_rao_bound
 from pipelines.evaluate.point_report import (
     MeasuredPoints,
     check_point_errors,
@@ -28,90 +21,58 @@ from pipelines.scene.points_by_model import DepthMap, depth_around, points_by_mo
 from pipelines.scene.renderer import ModelRenderer
 from pipelines.scene.report import (
     CheckPointErrors,
-    CheckPoints,
     ControlResiduals,
     CrossValidation,
     Fit,
     FixResiduals,
-    NoCrossValidation,
 )
 from pipelines.scene.scene_extent import scene_area_km2
 from pipelines.scene.survey import SurveyedPoint
-from pipelines.scene.trained_survey import TrainedSurvey
-
-log = logging.getLogger(__name__)
+from pipelines.scene.trained_survey import SolvedSurvey
 
 
-def measure_check_points(
-    renderer: ModelRenderer, propagation: ErrorPropagation | NoErrorPropagation, progress: Progress
-) -> CheckPoints:
-    """Return the errors of the check points, triangulated and on the rendered surface.
+def triangulated_check_points(solved: SolvedSurvey, posterior: Posterior) -> CheckPointErrors:
+    """Return the errors of the check points as intersections of their marks' rays, with their predicted σ."""
+    points, rays = solved.survey.check_points, mark_rays(solved.survey.check_points, solved.sparse)
+    position = points_by_camera(solved, rays)
+    cov = posterior.of_marked_points(position, rays) if points else None
+    return check_point_errors(_compared(points, position, rays, cov), scene_area_km2(solved))
+
+
+def check_points_on_surface(renderer: ModelRenderer, progress: Progress) -> CheckPointErrors:
+    """Return the errors of the check points as places of the Gaussians' surface behind their marks.
 
     Args:
         renderer: of the trained model.
-        propagation: gives predicted covariances and the Cramér–Rao bound.
         progress: shows the depth maps.
     """
     trained = renderer.trained
-    rays, area_km2 = mark_rays(trained.survey.check_points, trained.sparse), scene_area_km2(trained)
-    return CheckPoints(
-        camera=_by_camera(trained, rays, propagation, area_km2), model=_by_model(renderer, rays, progress, area_km2)
-    )
+    points, rays = trained.survey.check_points, mark_rays(trained.survey.check_points, trained.sparse)
+    position = points_by_model(trained, rays, _depth_maps(renderer, rays, progress))
+    return check_point_errors(_compared(points, position, rays), scene_area_km2(trained))
 
 
-def cross_validate(
-    trained: TrainedSurvey, propagation: ErrorPropagation | NoErrorPropagation
-) -> CrossValidation | NoCrossValidation:
+def cross_validate(solved: SolvedSurvey) -> CrossValidation:
     """Return the errors of the control points, each measured by a solution without that point.
 
-    Args:
-        trained: the trained survey.
-        propagation: its solved measurements, or the reason why there are none.
-
-    Raises:
-        DegenerateGeometryError: the measurements do not determine the similarity.
+    The adjustment has stored them. The covariance is that of the solution and the marks: the survey's own is
+    subtracted. A point that entered no solution, or that the others leave open, is NaN.
     """
-    if isinstance(propagation, NoErrorPropagation):
-        return NoCrossValidation(count=0, reason=propagation.reason)
-    points = trained.survey.control_points
-    independent = _left_out(propagation.solved)
-    rays = mark_rays(points, trained.sparse).marks_of_point
-    return cross_validation_errors(MeasuredPoints(points, independent.error_in_geo, rays, independent.cov_in_geo))
+    points = solved.survey.control_points
+    error, cov = np.full((len(points), 3), np.nan), np.full((len(points), 3, 3), np.nan)
+    left_out = {row.name: row for row in solved.model.measurements if row.kind == "control point"}
+    for index, point in enumerate(points):
+        row = left_out.get(point.name)
+        if row is not None and row.left_out_error_m is not None and row.left_out_cov_m2 is not None:
+            error[index] = row.left_out_error_m
+            cov[index] = np.array(row.left_out_cov_m2) - np.array(point.cov_in_geo)
+    rays = mark_rays(points, solved.sparse).marks_of_point
+    return cross_validation_errors(MeasuredPoints(points, error, rays, cov))
 
 
-def fit_residuals(trained: TrainedSurvey) -> Fit:
+def fit_residuals(solved: SolvedSurvey) -> Fit:
     """Return the residuals of fixes and control points: the fit of the solution, not its accuracy."""
-    return Fit(gnss=_fix_residuals(trained), gcp=_control_residuals(trained))
-
-
-def _by_camera(
-    trained: TrainedSurvey,
-    rays: MarkRays,
-    propagation: ErrorPropagation | NoErrorPropagation,
-    area_km2: float | None,
-) -> CheckPointErrors:
-    """Return the errors of the intersections of the marks' rays, with prediction and bound."""
-    points = trained.survey.check_points
-    position = points_by_camera(trained, rays)
-    measured = _compared(points, position, rays)
-    if isinstance(propagation, NoErrorPropagation) or not points:
-        return check_point_errors(measured, area_km2)
-    measured = replace(measured, cov_in_geo=propagation.prediction.of_marked_points(position, rays))
-    try:
-        bound = cramer_rao_bound(propagation.solved, rays)
-    except DegenerateGeometryError as error:
-        log.info("no Cramér–Rao bound: %s", error)
-        bound = None
-    return check_point_errors(measured, area_km2, bound)
-
-
-def _by_model(
-    renderer: ModelRenderer, rays: MarkRays, progress: Progress, area_km2: float | None
-) -> CheckPointErrors:
-    """Return the errors of the places of the Gaussians' surface behind the marks."""
-    points, maps = renderer.trained.survey.check_points, _depth_maps(renderer, rays, progress)
-    position = points_by_model(renderer.trained, rays, maps)
-    return check_point_errors(_compared(points, position, rays), area_km2)
+    return Fit(gnss=_fix_residuals(solved), gcp=_control_residuals(solved))
 
 
 def _depth_maps(renderer: ModelRenderer, rays: MarkRays, progress: Progress) -> list[DepthMap]:
@@ -124,43 +85,25 @@ def _depth_maps(renderer: ModelRenderer, rays: MarkRays, progress: Progress) -> 
     return maps
 
 
-def _compared(points: tuple[SurveyedPoint, ...], position_in_geo: FloatArray, rays: MarkRays) -> MeasuredPoints:
+def _compared(
+    points: tuple[SurveyedPoint, ...], position_in_geo: FloatArray, rays: MarkRays, cov: FloatArray | None = None
+) -> MeasuredPoints:
     """Return surveyed points with the errors of their measured positions (J, 3)."""
     surveyed = np.array([point.position_in_geo for point in points]).reshape(-1, 3)
-    return MeasuredPoints(points, position_in_geo - surveyed, rays.marks_of_point)
+    return MeasuredPoints(points, position_in_geo - surveyed, rays.marks_of_point, cov)
 
 
-def _left_out(solved: SolvedSurvey) -> LeftOut:
-    """Return the J control points of the survey, each measured by a solution without that point.
-
-    The covariance is that of the solution and the marks: the survey's own covariance is subtracted. A point that
-    entered no solution is NaN.
-    """
-    points, control = solved.trained.survey.control_points, solved.problem.control
-    error, cov = np.full((len(points), 3), np.nan), np.full((len(points), 3, 3), np.nan)
-    if control is None:
-        return LeftOut(error, cov)
-    independent = leave_one_out(solved.problem)
-    used = {name: row for row, name in enumerate(control.point_id)}
-    for index, point in enumerate(points):
-        if (row := used.get(point.name)) is not None:
-            error[index] = independent.error_in_geo[row]
-            cov[index] = independent.cov_in_geo[row] - np.array(point.cov_in_geo)
-    return LeftOut(error, cov)
-
-
-def _control_residuals(trained: TrainedSurvey) -> ControlResiduals:
-    points = trained.survey.control_points
-    rays = mark_rays(points, trained.sparse)
-    measured = _compared(points, points_by_camera(trained, rays), rays)
-    rejected = np.isin([point.name for point in points], trained.model.control_outliers)
+def _control_residuals(solved: SolvedSurvey) -> ControlResiduals:
+    points = solved.survey.control_points
+    rays = mark_rays(points, solved.sparse)
+    measured = _compared(points, points_by_camera(solved, rays), rays)
+    rejected = np.isin([point.name for point in points], solved.model.control_outliers)
     stats = residual_stats(measured.error_in_geo[measured.is_measured & ~rejected])
     return ControlResiduals(**stats.model_dump(), outliers=int(rejected.sum()), points=point_residuals(measured))
 
 
-def _fix_residuals(trained: TrainedSurvey) -> FixResiduals:
-    """Return the residuals of the training cameras' fixes, without outliers."""
-    fixes = fix_differences(trained)
-    used = fixes.is_training & ~fixes.is_outlier
-    stats = residual_stats(fixes.difference_in_geo[used])
-    return FixResiduals(**stats.model_dump(), outliers=int((fixes.is_training & fixes.is_outlier).sum()))
+def _fix_residuals(solved: SolvedSurvey) -> FixResiduals:
+    """Return the residuals of the fixes, without outliers."""
+    fixes = fix_differences(solved)
+    stats = residual_stats(fixes.difference_in_geo[~fixes.is_outlier])
+    return FixResiduals(**stats.model_dump(), outliers=int(fixes.is_outlier.sum()))

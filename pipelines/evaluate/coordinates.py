@@ -38,7 +38,7 @@ def coordinates_in(crs: PointCrs, checkpoints: CheckPoints, survey: Survey) -> C
         InputError: a point lies outside the CRS's domain.
     """
     surveyed = np.array([point.position_in_geo for point in survey.check_points]).reshape(-1, 3)
-    by_camera, by_model = (surveyed + _errors(way) for way in (checkpoints.camera, checkpoints.model))
+    by_camera, by_model = (surveyed + _errors(way, surveyed) for way in (checkpoints.camera, checkpoints.model))
     # One call for all points, so that one operation transforms them all.
     in_geo = np.concatenate([np.zeros((1, 3)), surveyed, by_camera, by_model])
     known = np.isfinite(in_geo).all(axis=1)
@@ -66,8 +66,10 @@ def coordinates_in(crs: PointCrs, checkpoints: CheckPoints, survey: Survey) -> C
     )
 
 
-def _errors(checkpoints: CheckPointErrors) -> FloatArray:
+def _errors(checkpoints: CheckPointErrors | None, surveyed: FloatArray) -> FloatArray:
     """Return the errors (J, 3), measured minus surveyed, in metres; NaN: not measured."""
+    if checkpoints is None:
+        return np.full_like(surveyed, np.nan)
     errors = [(row.de_m, row.dn_m, row.du_m) for row in checkpoints.points]
     return np.array(errors, dtype=np.float64).reshape(-1, 3)  # None becomes NaN
 

@@ -49,15 +49,12 @@ class MeasuredPoints:
         return np.array([point.cov_in_geo for point in self.points]).reshape(-1, 3, 3)
 
 
-def check_point_errors(
-    measured: MeasuredPoints, area_km2: float | None, bound: FloatArray | None = None
-) -> CheckPointErrors:
+def check_point_errors(measured: MeasuredPoints, area_km2: float | None) -> CheckPointErrors:
     """Return the report's section on check points.
 
     Args:
         measured: J check points.
         area_km2: of the scene; None: not known.
-        bound: (J, 3, 3) m², Cramér–Rao bound of the covariance; None: not known.
     """
     assessment = _assess(measured, area_km2)
     blunder = _among_all(assessment, measured)
@@ -69,7 +66,6 @@ def check_point_errors(
         without_blunders=assessment.without_blunders,
         blunders=_names(measured, blunder),
         predicted=_predicted_sigma(measured),
-        cramer_rao=None if bound is None else _rms_sigma(bound),
         points=_rows(measured, blunder),
     )
 
@@ -77,11 +73,11 @@ def check_point_errors(
 def cross_validation_errors(measured: MeasuredPoints) -> CrossValidation:
     """Return the report's section on control points, each measured by a solution without that point.
 
-    The section states neither class nor bound, because control points are not check points.
+    The section states no class, because control points are not check points.
     """
     assessment = _assess(measured)
     blunder = _among_all(assessment, measured)
-    impossible = "no control point can be spared, or none entered the training"
+    impossible = "no control point can be spared, or none entered the adjustment"
     return CrossValidation(
         **assessment.stats.model_dump(),
         survey=assessment.survey,
@@ -141,7 +137,7 @@ def _by_axis(values: FloatArray) -> list[tuple[float, float, float] | tuple[None
     return [row if np.isfinite(row).all() else (None, None, None) for row in rows]
 
 
-def _rms_sigma(cov: FloatArray) -> RmsSigma:
+def rms_sigma(cov: FloatArray) -> RmsSigma:
     """Return the root mean square of σ over the points whose covariance of (J, 3, 3) is finite."""
     known = cov[np.isfinite(cov).all(axis=(1, 2))]
     if not len(known):
@@ -163,5 +159,5 @@ def _predicted_sigma(measured: MeasuredPoints) -> PredictedSigma | None:
     if known.any():
         east, north, up = (measured.error_in_geo[known] ** 2 / variance[known]).mean(axis=0).tolist()
         normalised = ByAxis(e=east, n=north, u=up)
-    sigma = _rms_sigma(measured.cov_in_geo[known])
+    sigma = rms_sigma(measured.cov_in_geo[known])
     return PredictedSigma(**sigma.model_dump(), normalised_error_squared=normalised)

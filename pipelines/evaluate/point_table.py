@@ -1,12 +1,14 @@
-"""Errors of every check and control point as a table for other programs."""
+"""Errors of every check and control point, and σ of every camera, as tables for other programs."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
+from pipelines.core.types import FloatArray
 from pipelines.formats.csv_writer import write_table
 from pipelines.geodesy.enu import ecef_from_enu, lla_from_ecef
 from pipelines.scene.report import Coordinates, EvaluationReport
@@ -36,6 +38,23 @@ def write_point_table(path: Path, report: EvaluationReport, survey: Survey) -> N
         (row.name, line.use, line.way, row.rays, *place[row.name], *_error(line), *_crs_cells(in_crs, line))
         for line in point_lines(report)
         for row in (line.row,)
+    )
+    write_table(path, (header, *rows))
+
+
+def write_camera_sigma(path: Path, names: Sequence[str], cov: FloatArray) -> None:
+    """Write one line for each camera: σ of its position and of its rotations, along east, north and up.
+
+    Args:
+        path: of the CSV file.
+        names: n photographs.
+        cov: (n, 6, 6) of (δθ [rad], δc [m]).
+    """
+    sigma = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
+    header = ("name", *(f"sigma_{axis}_m" for axis in "enu"), *(f"sigma_rotation_{axis}_deg" for axis in "enu"))
+    rows = (
+        (name, *(f"{value:.5f}" for value in (*of_camera[3:], *np.degrees(of_camera[:3]))))
+        for name, of_camera in zip(names, sigma, strict=True)
     )
     write_table(path, (header, *rows))
 

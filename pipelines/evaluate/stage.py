@@ -1,35 +1,39 @@
-"""Stage `evaluate`: renders against held-out photographs, positions against check points.
+"""Stage `evaluate`: positions against check points, renders against held-out photographs.
 
-Reads the trained model, the survey and the initial similarity. Writes `evaluate/report.json`, the errors point by
-point as `points.csv`, side-by-side renders, and the predicted accuracy over the scene as `accuracy.csv` and
-`accuracy.png`. With `--reference`, the surface is compared with a cloud; `reference_map.png` and
-`reference_histogram.png` show the distances. Check points enter no solution. Residuals of observations that entered
-one are reported as a fit, not as an accuracy (docs/accuracy.md).
+Reads survey, SfM model, adjustment, and any trained model. Writes `evaluate/report.json`, the errors point by point
+as `points.csv`, the σ of every camera as `cameras.csv`, and the predicted accuracy over the scene as `accuracy.csv`
+and `accuracy.png`; of a trained model also side-by-side renders. With `--reference`, the surface is compared with a
+cloud; `reference_map.png` and `reference_histogram.png` show the distances. Check points enter no solution.
+Residuals of observations that entered one are reported as a fit, not as an accuracy (docs/accuracy.md).
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
 from pipelines.adjust.accuracy_grid import write_csv
-from pipelines.adjust.error_propagation import (
-    ErrorPropagation,
-    NoErrorPropagation,
-    accuracy_summary,
-    propagate_errors,
-)
-from pipelines.core.cautions import union
-from pipelines.core.progress import Progress
+from pipelines.adjust.posterior import Posterior
+from pipelines.adjust.solution import posterior_of
+from pipelines.core.cautions import is_checked, union
+from pipelines.core.errors import InputError
+from pipelines.core.stages import BY_NAME
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.evaluate.accuracy_picture import draw_accuracy
 from pipelines.evaluate.cautions import cautions_of_prediction, dependent_check_points
-from pipelines.evaluate.check_points import cross_validate, fit_residuals, measure_check_points
+from pipelines.evaluate.check_points import (
+    check_points_on_surface,
+    cross_validate,
+    fit_residuals,
+    triangulated_check_points,
+)
 from pipelines.evaluate.coordinates import coordinates_in, target_crs
 from pipelines.evaluate.options import EvaluateOptions
-from pipelines.evaluate.photometric import SaveRender, compare_test_views
-from pipelines.evaluate.point_table import write_point_table
+from pipelines.evaluate.photometric import compare_test_views
+from pipelines.evaluate.point_report import rms_sigma
+from pipelines.evaluate.point_table import write_camera_sigma, write_point_table
 from pipelines.evaluate.reference.cautions import cautions_of_reference
 from pipelines.evaluate.reference.comparison import ComparedReference, compare_with_reference, open_reference
 from pipelines.evaluate.reference.pictures import draw_reference
@@ -39,101 +43,138 @@ from pipelines.geometry.similarity import SimilarityRecord
 from pipelines.scene.headline import headline
 from pipelines.scene.render_files import write_render
 from pipelines.scene.renderer import ModelRenderer
-from pipelines.scene.report import EvaluationReport, Photometric, SimilaritySigma, write_report
+from pipelines.scene.report import (
+    AccuracySummary,
+    CheckPointErrors,
+    CheckPoints,
+    EvaluationReport,
+    Photometric,
+    SimilaritySigma,
+    write_report,
+)
 from pipelines.scene.scene import photographs
-from pipelines.scene.trained_survey import load_trained
+from pipelines.scene.trained_survey import SolvedSurvey, TrainedSurvey, load_solved
 from pipelines.splat.rasterizer.backends import rasterizer
 
 
+@dataclass(frozen=True)
+class Rendered:
+    """What the Gaussians of a trained model show.
+
+    Attributes:
+        photometric: figures of the test views.
+        points: errors of the check points on the rendered surface.
+        reference: comparison with a reference cloud; None: not asked for.
+    """
+
+    photometric: Photometric
+    points: CheckPointErrors
+    reference: ComparedReference | None
+
+
 def run(stage: StageRun, options: EvaluateOptions) -> Summary:
-    """Evaluate the trained survey, write report, renders and predicted accuracy, and return the summary.
+    """Evaluate the survey, write report, renders and predicted accuracy, and return the summary.
 
     Raises:
         BackendUnavailableError: `--backend cuda` or `--reference`, and a part that it needs is missing; names each.
+        InputError: `--reference` or `--lpips-weights` without a trained model.
         GeorefError: a product, a photograph or the LPIPS weights cannot be read, or the CRS cannot be used.
     """
-    trained = load_trained(stage.workspace, options.similarity)
-    reference_files = open_reference(options)
-    crs = None if options.crs is None else target_crs(options.crs, trained.survey)
-    images = photographs(trained.sfm, trained.survey, stage.workspace, trained.model.max_image_size)
-    images.build(stage.progress)
-    renderer = ModelRenderer(trained, images, rasterizer(options.backend, stage.progress))
-    propagation = propagate_errors(stage.workspace, trained)
-    renders = stage.out / "renders"
-    renders.mkdir(parents=True, exist_ok=True)
-    save_render = partial(write_render, renders)
-    reference = None
-    if reference_files is not None:
-        scratch = stage.out / "reference"
-        reference = compare_with_reference(
-            renderer, reference_files, propagation, options, scratch=scratch, progress=stage.progress
-        )
-        draw_reference(reference, stage.out)
-    report = evaluate(
-        renderer,
-        propagation,
-        options,
-        crs=crs,
-        reference=reference,
-        save_render=save_render,
-        progress=stage.progress,
-    )
-    if isinstance(propagation, ErrorPropagation) and propagation.grid is not None:
-        write_csv(propagation.grid, trained.survey.origin, stage.out / "accuracy.csv")
-        draw_accuracy(propagation.grid, trained, report, crs, stage.out / "accuracy.png")
-    write_point_table(stage.out / "points.csv", report, trained.survey)
+    solved = load_solved(stage.workspace, options.similarity)
+    crs = None if options.crs is None else target_crs(options.crs, solved.survey)
+    posterior = posterior_of(stage.workspace, solved.model, solved.sfm)
+    if isinstance(solved, TrainedSurvey):
+        rendered = _rendered(stage, solved, posterior, options)
+    else:
+        rendered = None
+        _refuse_what_needs_gaussians(stage, options)
+    report = evaluate(solved, posterior, options, crs=crs, rendered=rendered)
+    if posterior.grid is not None:
+        write_csv(posterior.grid, solved.survey.origin, stage.out / "accuracy.csv")
+        draw_accuracy(posterior.grid, solved, report, crs, stage.out / "accuracy.png")
+    write_point_table(stage.out / "points.csv", report, solved.survey)
+    if report.cameras is not None:
+        write_camera_sigma(stage.out / "cameras.csv", solved.sfm.image_name, posterior.camera_cov)
     write_report(report, stage.out / "report.json")
     return summarise(report)
 
 
 def evaluate(
-    renderer: ModelRenderer,
-    propagation: ErrorPropagation | NoErrorPropagation,
+    solved: SolvedSurvey,
+    posterior: Posterior,
     options: EvaluateOptions,
     *,
-    crs: PointCrs | None,
-    reference: ComparedReference | None,
-    save_render: SaveRender,
-    progress: Progress,
+    crs: PointCrs | None = None,
+    rendered: Rendered | None = None,
 ) -> EvaluationReport:
-    """Return the report on a trained survey.
+    """Return the report on a solved survey.
 
     Args:
-        renderer: of the trained model.
-        propagation: covariances from the measurements, or the reason why there are none.
+        solved: the survey.
+        posterior: its covariances.
         options: of the stage.
         crs: CRS in which the report lists the check points too; None: none.
-        reference: comparison with a reference cloud; None: none.
-        save_render: saves the first test views side by side with their photographs.
-        progress: shows depth maps and test views.
+        rendered: what the Gaussians show; None: nothing is trained yet.
 
     Raises:
-        InputError: a photograph or the LPIPS weights cannot be read, or a point lies outside the CRS's domain.
+        InputError: a point lies outside the CRS's domain.
     """
-    trained = renderer.trained
-    checkpoints = measure_check_points(renderer, propagation, progress)
-    test = compare_test_views(renderer, options.lpips_weights, save_render, progress, saved=options.renders)
-    scene = accuracy_summary(propagation)
+    model = solved.model
+    camera = triangulated_check_points(solved, posterior)
+    checkpoints = CheckPoints(camera=camera, model=None if rendered is None else rendered.points)
+    scene = model.accuracy or AccuracySummary(cells=0, reason="the adjustment states no σ")
+    reference = None if rendered is None else rendered.reference
     return EvaluationReport(
-        headline=headline(checkpoints.camera, scene, trained.model.cautions),
-        photometric=Photometric(test=test),
+        headline=headline(camera, scene, model.cautions),
+        photometric=None if rendered is None else rendered.photometric,
         checkpoints=checkpoints,
-        cross_validation=cross_validate(trained, propagation) if options.cross_validate else None,
+        cross_validation=cross_validate(solved) if options.cross_validate else None,
         accuracy=scene,
-        fit=fit_residuals(trained),
-        similarity=_similarity_sigma(trained.model.geo_from_model),
-        coordinates=None if crs is None else coordinates_in(crs, checkpoints, trained.survey),
+        fit=fit_residuals(solved),
+        cameras=rms_sigma(posterior.camera_cov[:, 3:, 3:]) if is_checked(model.cautions) else None,
+        similarity=_similarity_sigma(model.geo_from_model),
+        coordinates=None if crs is None else coordinates_in(crs, checkpoints, solved.survey),
         reference=None if reference is None else reference.comparison,
-        variance_factors=trained.model.variance_factors,
+        variance_factors=model.variance_factors,
         cautions=union(
-            trained.model.cautions,
-            cautions_of_prediction(
-                trained, propagation, checkpoints.camera, of_initial=options.similarity == "initial"
-            ),
-            dependent_check_points(trained.survey),
+            model.cautions,
+            cautions_of_prediction(solved, posterior, camera, of_initial=options.similarity == "initial"),
+            dependent_check_points(solved.survey),
             () if reference is None else cautions_of_reference(reference),
         ),
     )
+
+
+def _rendered(stage: StageRun, trained: TrainedSurvey, posterior: Posterior, options: EvaluateOptions) -> Rendered:
+    """Return what the Gaussians show, with the pictures written."""
+    files, progress = open_reference(options), stage.progress
+    images = photographs(trained.sfm, trained.survey, stage.workspace, trained.model.max_image_size)
+    images.build(progress)
+    renderer = ModelRenderer(trained, images, rasterizer(options.backend, progress))
+    renders, reference = stage.out / "renders", None
+    renders.mkdir(parents=True, exist_ok=True)
+    if files is not None:
+        scratch = stage.out / "reference"
+        reference = compare_with_reference(
+            renderer, files, posterior.grid, options, scratch=scratch, progress=progress
+        )
+        draw_reference(reference, stage.out)
+    points = check_points_on_surface(renderer, progress)
+    save_render = partial(write_render, renders)
+    test = compare_test_views(renderer, options.lpips_weights, save_render, progress, saved=options.renders)
+    return Rendered(Photometric(test=test), points, reference)
+
+
+def _refuse_what_needs_gaussians(stage: StageRun, options: EvaluateOptions) -> None:
+    """Refuse options that ask for what only a trained model shows.
+
+    Raises:
+        InputError: names the option, and the command that trains.
+    """
+    for flag, value in (("--reference", options.reference), ("--lpips-weights", options.lpips_weights)):
+        if value is not None:
+            command = stage.workspace.command_of(BY_NAME["train"])
+            raise InputError(f"needs a trained model: run `{command}` first, or leave the option out", field=flag)
 
 
 def _similarity_sigma(record: SimilarityRecord) -> SimilaritySigma:

@@ -8,22 +8,23 @@ from pipelines.core.figures import WAYS
 from pipelines.core.sentences import listed
 from pipelines.core.workspace import Summary
 from pipelines.evaluate.asprs import few_points
-from pipelines.scene.report import CheckPointErrors, CheckPoints, EvaluationReport, PhotometricFigures
+from pipelines.scene.report import EvaluationReport, PhotometricFigures
 
 
 def summarise(report: EvaluationReport) -> Summary:
     """Return headline, figures, warnings and cautions of a report, for the command line."""
-    test, ways = report.photometric.test, _by_way(report.checkpoints)
-    values: dict[str, Any] = {
-        "accuracy": report.headline.model_dump(),
-        "views": test.views,
-        "psnr": test.psnr,
-        "psnr_covered": test.psnr_covered,
-        "covered_share": test.covered_share,
-        "psnr_compensated": test.psnr_compensated,
-        "ssim": test.ssim,
-    }
-    for way, errors in ways.items():
+    test = report.test_views
+    values: dict[str, Any] = {"accuracy": report.headline.model_dump()}
+    if test is not None:
+        values |= {
+            "views": test.views,
+            "psnr": test.psnr,
+            "psnr_covered": test.psnr_covered,
+            "covered_share": test.covered_share,
+            "psnr_compensated": test.psnr_compensated,
+            "ssim": test.ssim,
+        }
+    for way, errors in report.checkpoints.by_way.items():
         values |= {
             f"{way}_count": errors.count,
             f"{way}_mean_h_m": errors.mean_h_m,
@@ -35,7 +36,9 @@ def summarise(report: EvaluationReport) -> Summary:
     return Summary(key_figure, values, _warnings(report), report.cautions)
 
 
-def _test_views(test: PhotometricFigures) -> str:
+def _test_views(test: PhotometricFigures | None) -> str:
+    if test is None:
+        return "cameras alone, not trained yet"
     if test.psnr is None:
         return "no test views"
     if test.psnr_covered is None or test.covered_share is None:
@@ -43,16 +46,12 @@ def _test_views(test: PhotometricFigures) -> str:
     return f"test PSNR {test.psnr:.2f} dB, {test.psnr_covered:.2f} dB on the {test.covered_share:.0%} covered"
 
 
-def _by_way(checkpoints: CheckPoints) -> dict[str, CheckPointErrors]:
-    return {"camera": checkpoints.camera, "model": checkpoints.model}
-
-
 def _warnings(report: EvaluationReport) -> tuple[str, ...]:
     warnings = []
     asprs = report.checkpoints.camera.asprs
     if asprs.points and not asprs.enough_points:
         warnings.append(few_points(asprs))
-    for way, errors in _by_way(report.checkpoints).items():
+    for way, errors in report.checkpoints.by_way.items():
         if errors.blunders:
             warnings.append(
                 f"{WAYS[way]}, {len(errors.blunders)} of {errors.count} check points are off by more than three "

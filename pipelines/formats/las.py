@@ -29,6 +29,13 @@ _EXTRA = {
     "sigma_h": "horizontal sigma in metres",
     "sigma_v": "vertical sigma in metres",
 }
+_AXES = "enu"
+_COVARIANCE = {  # name of each element of the upper triangle, with its row and column
+    f"cov_{first}{second}": (row, column)
+    for row, first in enumerate(_AXES)
+    for column, second in enumerate(_AXES)
+    if row <= column
+}
 
 
 def laz_header(
@@ -109,7 +116,10 @@ class LazWriter(LazFile):
         )
         header.vlrs.append(laspy.VLR(*_TEXT_AREA, "Text Area Description", text.encode("utf-8") + b"\0"))
         header.add_extra_dims(
-            [laspy.ExtraBytesParams(name, "f4", description=meaning) for name, meaning in _EXTRA.items()]
+            [
+                laspy.ExtraBytesParams(name, "f4", description=meaning)
+                for name, meaning in (_EXTRA | dict.fromkeys(_COVARIANCE, "covariance in square metres")).items()
+            ]
         )
         super().__init__(path, header)
 
@@ -125,4 +135,6 @@ class LazWriter(LazFile):
         for column, name in enumerate(("nx", "ny", "nz")):
             record[name] = points.normal[:, column]
         record["sigma_h"], record["sigma_v"] = points.sigma_h_m, points.sigma_v_m
+        for name, (row, column) in _COVARIANCE.items():
+            record[name] = points.cov_m2[:, row, column]
         self._writer.write_points(record)

@@ -10,8 +10,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.sparse import bsr_matrix
 from scipy.special import exp1
 
@@ -19,6 +21,7 @@ from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.geometry.bundle import (
     Network,
+    has_positive_depth,
     lens_slots,
     linearise_bundle,
     projection_residuals,
@@ -27,11 +30,12 @@ from pipelines.geometry.bundle import (
     with_positive_depths,
 )
 from pipelines.geometry.rotations import skew
+from pipelines.geometry.similarity import Similarity
 from pipelines.robust.kernels import CAUCHY_SCALE2, cauchy_weight
 from pipelines.robust.statistics import rayleigh_sigma
 
 _CHUNK = 2**19  # observations that are linearised together
-_RIDGE = 1e-9
+_RIDGE = 1e-12  # small: what it adds to each point holds the similarity of the whole as well
 # A camera with few observations is held to a tenth of its distance from the scene.
 _LOOSEST_RELATIVE_SIGMA = 0.1
 # Means of the weight w and of w r²/2 under Gaussian noise of σ = 1, where r²/2 is exponentially distributed. Robust
@@ -39,86 +43,6 @@ _LOOSEST_RELATIVE_SIGMA = 0.1
 _HALF_SCALE2 = CAUCHY_SCALE2[2] / 2
 _MEAN_WEIGHT = float(_HALF_SCALE2 * np.exp(_HALF_SCALE2) * exp1(_HALF_SCALE2))
 _MEAN_WEIGHTED_SQUARE = _HALF_SCALE2 * (1 - _MEAN_WEIGHT)
-
-
-@dataclass(frozen=True)
-class BundleInformation:
-    """Information of the image observations on corrections x = (δω, δc) (6 n,) of all cameras, lens eliminated.
-
-    The information is `by_poses` − `lens_follows`ᵀ `lens` `lens_follows`. Axes and signs of (δω, δc) are those of
-    `geometry.correction_basis.CorrectionBasis`.
-
-    Attributes:
-        by_poses: (6 n, 6 n) sparse, in blocks (6, 6); points eliminated, lens held.
-        lens_follows: (L, 6 n) expected change of the lens parameters, in the order of `geometry.lens.Lenses`.
-        lens: (L, L) information on the lens parameters about that expectation; zero for unused parameters.
-        lens_cov: (L, L) its inverse; zero likewise.
-        points_follow: (7, 6 n) mean similarity of the points that follow the cameras, weighted by their
-            information.
-        similarity_modes: (6 n, 7) as `geometry.bundle.similarity_modes`.
-        unit: (6 n,) corrections that count as one metre at the scene.
-        loosest_sigma_m: σ in these units to which even a camera without observations is held.
-        sigma_px: σ of an image coordinate, estimated from the residuals.
-    """
-
-    by_poses: bsr_matrix
-    lens_follows: FloatArray
-    lens: FloatArray
-    lens_cov: FloatArray
-    points_follow: FloatArray
-    similarity_modes: FloatArray
-    unit: FloatArray
-    loosest_sigma_m: float
-    sigma_px: float
-
-
-def bundle_information(network: Network, *, lens_follows: bool = True) -> BundleInformation:
-    """Return the information of a bundle on its cameras.
-
-    1. Cauchy's kernel weights the observations.
-    2. The lens is uncertain: its parameters are eliminated from the information, like the points.
-    3. Chunks of points are eliminated one after the other, so that memory holds the derivatives of one chunk.
-
-    Args:
-        network: the bundle at its minimum.
-        lens_follows: whether the points follow through the lens that follows the cameras. Otherwise they follow
-            through the lens as it is.
-
-    Raises:
-        DegenerateGeometryError: fewer observations than unknowns.
-    """
-    network = with_positive_depths(network)
-    n, points, observations = len(network.camera_id), len(network.point_in_world), len(network.obs_point)
-    redundancy = 2 * observations - 6 * n - 3 * points
-    if redundancy <= 0:
-        raise DegenerateGeometryError(
-            f"{observations} observations do not determine {n} cameras and {points} points"
-        )
-    ray = network.point_in_world[network.obs_point] - network.cam_center_in_world[network.obs_image]
-    typical_m = float(np.median(np.linalg.norm(ray, axis=1)))
-    residual = projection_residuals(network)
-    weight = _robust_weights(residual)
-    variance = float((weight[:, None] * residual**2).sum() / (_MEAN_WEIGHTED_SQUARE * redundancy))
-    sums = eliminate_points(network, np.sqrt(weight / (_MEAN_WEIGHT * variance)))
-    follows, lens, lens_cov = _lens_elimination(sums)
-    pull = sums.pose_pull + follows.T @ sums.lens_pull if lens_follows else sums.pose_pull
-    return BundleInformation(
-        by_poses=sums.poses,
-        lens_follows=follows,
-        lens=lens,
-        lens_cov=lens_cov,
-        points_follow=np.asarray(-np.linalg.solve(sums.modes, pull.T)),
-        similarity_modes=similarity_modes(network.cam_center_in_world).reshape(-1, 7),
-        unit=np.tile([1 / typical_m] * 3 + [1.0] * 3, n),  # rotations in metres at the scene, so that units agree
-        loosest_sigma_m=_LOOSEST_RELATIVE_SIGMA * typical_m,
-        sigma_px=float(np.sqrt(variance)),
-    )
-
-
-def _robust_weights(residual: FloatArray) -> FloatArray:
-    length = np.linalg.norm(residual, axis=1)
-    scale = max(rayleigh_sigma(length), 1e-9)
-    return cauchy_weight((length / scale) ** 2, 2)
 
 
 @dataclass(frozen=True)
@@ -132,6 +56,8 @@ class EliminatedPoints:
         pose_pull: (6 n, 7) of the poses on the points' similarity.
         lens_pull: (L, 7) of the lens on it.
         modes: (7, 7) information on it.
+        pose_slope, lens_slope: (6 n,), (L,) gradient of half the weighted squares; zero where SfM has left the
+            observations at their minimum.
     """
 
     poses: bsr_matrix
@@ -140,6 +66,8 @@ class EliminatedPoints:
     pose_pull: FloatArray
     lens_pull: FloatArray
     modes: FloatArray
+    pose_slope: FloatArray
+    lens_slope: FloatArray
 
     def __add__(self, other: EliminatedPoints) -> EliminatedPoints:
         return EliminatedPoints(
@@ -149,11 +77,137 @@ class EliminatedPoints:
             self.pose_pull + other.pose_pull,
             self.lens_pull + other.lens_pull,
             self.modes + other.modes,
+            self.pose_slope + other.pose_slope,
+            self.lens_slope + other.lens_slope,
         )
 
 
+@dataclass(frozen=True)
+class BundleInformation:
+    """Information of the image observations on corrections x = (δω, δc) (6 n,) of cameras and ℓ (L,) of the lens.
+
+    The points are eliminated: the observations cost ½ (x, ℓ)ᵀ [poses, cross; crossᵀ, lens] (x, ℓ) + slopeᵀ (x, ℓ).
+    Axes and signs of (δω, δc) are those of `geometry.correction_basis.CorrectionBasis`, the order of ℓ that of
+    `geometry.lens.Lenses`. The points follow cameras and lens; `followed` is their mean similarity, weighted by
+    their information.
+
+    Attributes:
+        sums: the information.
+        similarity_modes: (6 n, 7) as `geometry.bundle.similarity_modes`.
+        unit: (6 n,) corrections that count as one metre at the scene.
+        loosest_sigma_m: σ in these units to which even a camera without observations is held.
+        sigma_px: σ of an image coordinate, estimated from the residuals, or 1 where each observation has its own.
+    """
+
+    sums: EliminatedPoints
+    similarity_modes: FloatArray
+    unit: FloatArray
+    loosest_sigma_m: float
+    sigma_px: float
+
+    @property
+    def followed(self) -> FloatArray:
+        """Mean similarity (7, 6 n + L) of the points that follow cameras and lens."""
+        pull = np.concatenate([self.sums.pose_pull, self.sums.lens_pull])
+        return np.asarray(-np.linalg.solve(self.sums.modes, pull.T))
+
+    @cached_property
+    def lens_elimination(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """How the lens follows the poses (L, 6 n), its information about that (L, L), and the covariance (L, L).
+
+        Parameters that no observation reveals have rows of zeros.
+        """
+        return _lens_elimination(self.sums)
+
+    def turned(self, new_from_old: Similarity, cam_center_in_new: FloatArray) -> BundleInformation:
+        """Return the same information in another frame, whose cameras have centres (n, 3)."""
+        turn, scale = new_from_old.rotation, new_from_old.scale
+        # Inverse transposed derivatives of the new corrections by the old ones, and of their mean similarity.
+        by_correction = block_diag(turn, turn / scale)
+        by_similarity = block_diag(1.0, turn, turn / scale)
+        sums, count = self.sums, len(cam_center_in_new)
+
+        def of_poses(values: FloatArray) -> FloatArray:
+            return np.asarray(by_correction @ values.reshape(count, 6, -1)).reshape(values.shape)
+
+        poses = sums.poses
+        blocks = by_correction @ poses.data @ by_correction.T
+        return BundleInformation(
+            sums=EliminatedPoints(
+                poses=bsr_matrix((blocks, poses.indices, poses.indptr), shape=poses.shape),
+                cross=of_poses(sums.cross),
+                lens=sums.lens,
+                pose_pull=of_poses(sums.pose_pull) @ by_similarity.T,
+                lens_pull=sums.lens_pull @ by_similarity.T,
+                modes=by_similarity @ sums.modes @ by_similarity.T,
+                pose_slope=of_poses(sums.pose_slope),
+                lens_slope=sums.lens_slope,
+            ),
+            similarity_modes=similarity_modes(cam_center_in_new).reshape(-1, 7),
+            unit=self.unit * np.tile([1 / scale] * 3 + [1.0] * 3, count),
+            loosest_sigma_m=scale * self.loosest_sigma_m,
+            sigma_px=self.sigma_px,
+        )
+
+
+def bundle_information(
+    network: Network, *, sigma_px: FloatArray | None = None, at_minimum: bool = True
+) -> BundleInformation:
+    """Return the information of a bundle on its cameras.
+
+    1. Cauchy's kernel weights the observations, unless their σ are stated.
+    2. Chunks of points are eliminated one after the other, so that memory holds the derivatives of one chunk.
+
+    Args:
+        network: the bundle.
+        sigma_px: (M,) stated σ of the observations; None: one σ for all is estimated from the residuals.
+        at_minimum: whether SfM has left the observations at their minimum, so that their slope is zero.
+
+    Raises:
+        DegenerateGeometryError: fewer observations than unknowns.
+    """
+    if sigma_px is not None:
+        sigma_px = sigma_px[has_positive_depth(network)]
+    network = with_positive_depths(network)
+    n, points, observations = len(network.camera_id), len(network.point_in_world), len(network.obs_point)
+    redundancy = 2 * observations - 6 * n - 3 * points
+    if redundancy <= 0:
+        raise DegenerateGeometryError(
+            f"{observations} observations do not determine {n} cameras and {points} points"
+        )
+    ray = network.point_in_world[network.obs_point] - network.cam_center_in_world[network.obs_image]
+    typical_m = float(np.median(np.linalg.norm(ray, axis=1)))
+    residual, variance = projection_residuals(network), 1.0
+    if sigma_px is None:
+        weight = _robust_weights(residual)
+        variance = float((weight[:, None] * residual**2).sum() / (_MEAN_WEIGHTED_SQUARE * redundancy))
+        root_weight = np.sqrt(weight / (_MEAN_WEIGHT * variance))
+    else:
+        root_weight = 1.0 / sigma_px
+    sums = eliminate_points(network, root_weight, residual=None if at_minimum else residual)
+    return BundleInformation(
+        sums=sums,
+        similarity_modes=similarity_modes(network.cam_center_in_world).reshape(-1, 7),
+        unit=np.tile([1 / typical_m] * 3 + [1.0] * 3, n),  # rotations in metres at the scene, so that units agree
+        loosest_sigma_m=_LOOSEST_RELATIVE_SIGMA * typical_m,
+        sigma_px=float(np.sqrt(variance)),
+    )
+
+
+def _robust_weights(residual: FloatArray) -> FloatArray:
+    length = np.linalg.norm(residual, axis=1)
+    scale = max(rayleigh_sigma(length), 1e-9)
+    return cauchy_weight((length / scale) ** 2, 2)
+
+
 def eliminate_points(
-    network: Network, root_weight: FloatArray, surveyed: FloatArray | None = None, *, ridge: float = _RIDGE
+    network: Network,
+    root_weight: FloatArray,
+    surveyed: FloatArray | None = None,
+    *,
+    residual: FloatArray | None = None,
+    pull: FloatArray | None = None,
+    ridge: float = _RIDGE,
 ) -> EliminatedPoints:
     """Return the normal equations of poses and lens of a network, chunk by chunk of its points.
 
@@ -161,11 +215,15 @@ def eliminate_points(
         network: N points and M observations, each in front of its camera; at least one.
         root_weight: (M,) inverse σ of the observations, 1/px.
         surveyed: (N, 3, 3) information on the points beyond their observations, 1/m²; None: there is none.
+        residual: (M, 2) pixels, for the slope; None: the slope is zero.
+        pull: (N, 3) gradient of half the squares of `surveyed`, 1/m, for the slope; None: it is zero.
         ridge: added to the information on a point, relative to its trace, for a point that its rays leave open.
     """
     total: EliminatedPoints | None = None
     for part, points, rows in _chunks_of_points(network):
-        sums = _eliminated(part, root_weight[rows], None if surveyed is None else surveyed[points], ridge)
+        known, own_pull = (None if array is None else array[points] for array in (surveyed, pull))
+        left = None if residual is None else residual[rows]
+        sums = _eliminated(part, root_weight[rows], known, left, own_pull, ridge=ridge)
         total = sums if total is None else total + sums
     assert total is not None
     return total
@@ -194,7 +252,13 @@ def _chunks_of_points(network: Network) -> Iterator[tuple[Network, slice, IntArr
 
 
 def _eliminated(
-    network: Network, root_weight: FloatArray, surveyed: FloatArray | None, ridge: float
+    network: Network,
+    root_weight: FloatArray,
+    surveyed: FloatArray | None,
+    residual: FloatArray | None,
+    pull: FloatArray | None,
+    *,
+    ridge: float,
 ) -> EliminatedPoints:
     """Eliminate the points of a chunk."""
     n, points = len(network.camera_id), len(network.point_in_world)
@@ -215,6 +279,12 @@ def _eliminated(
     pose = sparse_jacobian(by_pose, network.obs_image, n)
     intrinsics_point = intrinsics.T @ sparse_jacobian(white, network.obs_point, points)
     moved = (np.swapaxes(root, 1, 2) @ _point_similarity_modes(network)).reshape(3 * points, 7)
+    white_residual = np.zeros(2 * len(root_weight))
+    if residual is not None:
+        white_residual = (residual * root_weight[:, None]).ravel()
+        of_points = sparse_jacobian(white, network.obs_point, points)
+        of_pull = 0.0 if pull is None else np.einsum("nji,nj->ni", inverse_root, pull).ravel()
+        white_residual = white_residual - of_points @ (of_points.T @ white_residual + of_pull)
     return EliminatedPoints(
         own - pose_point @ pose_point.T,
         (pose.T @ intrinsics - pose_point.tocsr() @ intrinsics_point.T).toarray(),
@@ -222,6 +292,8 @@ def _eliminated(
         pose_point @ moved,
         intrinsics_point @ moved,
         moved.T @ moved,
+        np.asarray(pose.T @ white_residual),
+        np.asarray(intrinsics.T @ white_residual),
     )
 
 

@@ -65,25 +65,32 @@ def correction_basis(network: Network, *, lens_follows: bool = True) -> Correcti
     Raises:
         DegenerateGeometryError: fewer observations than unknowns.
     """
-    return basis_of(bundle_information(network, lens_follows=lens_follows))
+    return basis_of(bundle_information(network), lens_follows=lens_follows)
 
 
-def basis_of(bundle: BundleInformation) -> CorrectionBasis:
+def basis_of(bundle: BundleInformation, *, lens_follows: bool = True) -> CorrectionBasis:
     """Return the basis of `correction_basis` from the information of the bundle."""
-    flat = _whitened_basis(bundle)
-    held = flat - bundle.similarity_modes @ (bundle.points_follow @ flat)
-    return CorrectionBasis(
-        held.reshape(-1, 6, flat.shape[1]), bundle.sigma_px, bundle.lens_follows @ flat, bundle.lens_cov
-    )
+    follows, _, lens_cov = bundle.lens_elimination
+    root, complement = _root(bundle)
+    flat = solve_triangular(root, complement.T, lower=True).T * bundle.unit[:, None]
+    poses = len(bundle.unit)
+    through_lens = bundle.followed[:, poses:] @ follows if lens_follows else 0.0
+    held = flat - bundle.similarity_modes @ ((bundle.followed[:, :poses] + through_lens) @ flat)
+    return CorrectionBasis(held.reshape(-1, 6, flat.shape[1]), bundle.sigma_px, follows @ flat, lens_cov)
 
 
-def _whitened_basis(bundle: BundleInformation) -> FloatArray:
-    """Return a root (6 n, k) of the covariance of the cameras, free of similarities of the cameras."""
-    follows, unit = bundle.lens_follows, bundle.unit
-    information = bundle.by_poses.toarray() - follows.T @ bundle.lens @ follows
-    scaled = (information + information.T) / 2 * unit[:, None] * unit
-    complement = np.linalg.qr(bundle.similarity_modes / unit[:, None], mode="complete")[0][:, 7:]
+def coordinates_of(bundle: BundleInformation, correction: FloatArray) -> FloatArray:
+    """Return the coordinates z (k,) of corrections (n, 6) in the basis, without their similarity of the whole."""
+    root, complement = _root(bundle)
+    return np.asarray(root.T @ (complement.T @ (correction.ravel() / bundle.unit)))
+
+
+def _root(bundle: BundleInformation) -> tuple[FloatArray, FloatArray]:
+    """Return the Cholesky root (k, k) of the cameras' information off the similarities, and those axes (6 n, k)."""
+    follows, lens, _ = bundle.lens_elimination
+    information = bundle.sums.poses.toarray() - follows.T @ lens @ follows
+    scaled = (information + information.T) / 2 * bundle.unit[:, None] * bundle.unit
+    complement = np.linalg.qr(bundle.similarity_modes / bundle.unit[:, None], mode="complete")[0][:, 7:]
     reduced = complement.T @ scaled @ complement
     reduced += np.eye(len(reduced)) / bundle.loosest_sigma_m**2
-    root = np.linalg.cholesky(reduced)
-    return np.asarray(solve_triangular(root, complement.T, lower=True).T * unit[:, None])
+    return np.asarray(np.linalg.cholesky(reduced)), complement

@@ -49,7 +49,6 @@ class FixSeries:
         abscissa_title: what it is, with its unit.
         residual_m: (F, 3) east, north, up.
         sigma_m: (F, 3) stated σ.
-        is_used: (F,) whether the fix entered the solution.
         is_outlier: (F,) whether the solution has left it out.
     """
 
@@ -57,7 +56,6 @@ class FixSeries:
     abscissa_title: str
     residual_m: FloatArray
     sigma_m: FloatArray
-    is_used: BoolArray
     is_outlier: BoolArray
 
 
@@ -122,16 +120,11 @@ def fix_series(series: FixSeries) -> bytes:
             label="stated 2 σ",
         )
         axes.axhline(0, color=DARK, linewidth=0.6)
-        used = series.is_used & ~series.is_outlier
+        used = ~series.is_outlier
         if used.any():
             axes.axhline(float(values[used].mean()), color=BLUE, linewidth=1.2, linestyle="--", label="mean (bias)")
         for chosen, style, name in (
             (used, {"marker": "o", "color": BLUE, "s": 11}, "used"),
-            (
-                ~series.is_used & ~series.is_outlier,
-                {"marker": "s", "facecolors": "none", "edgecolors": BLUE, "s": 13},
-                "of a test view",
-            ),
             (series.is_outlier, {"marker": "X", "color": ORANGE, "edgecolors": "black", "s": 34}, "outlier"),
         ):
             if chosen.any():

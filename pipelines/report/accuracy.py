@@ -51,6 +51,7 @@ class AccuracyFacts:
         figures: of the check points: name, key in the report, form and unit.
         ninety: CE90 and LE90, triangulated and on the rendered surface.
         ways: words of the ways that have measured points.
+        surface: whether points were measured on the rendered surface.
         chart: predicted against measured σ; None: fewer than three points have both.
         within: share of the points within 1 σ and 2 σ of the prediction, horizontal and vertical; None likewise.
         cells: what is told of the predicted σ over the scene, by the beginning of its fields.
@@ -65,6 +66,7 @@ class AccuracyFacts:
     figures: tuple[tuple[str, str, str, str], ...]
     ninety: tuple[NinetyPercent, ...]
     ways: dict[str, str]
+    surface: bool
     chart: Picture | None
     within: tuple[tuple[str, float, float], ...]
     cells: dict[str, Figure]
@@ -80,8 +82,8 @@ class AccuracyFacts:
 def accuracy_facts(evaluated: EvaluatedSurvey) -> AccuracyFacts:
     """Return the accuracy of an evaluated survey."""
     report = evaluated.report
-    by_way = {"camera": report.checkpoints.camera, "model": report.checkpoints.model}
-    sigma, error = _compared(report.checkpoints.camera, evaluated.trained.survey.check_points)
+    by_way = report.checkpoints.by_way
+    sigma, error = _compared(report.checkpoints.camera, evaluated.solved.survey.check_points)
     enough = len(sigma) >= _LEAST_FOR_CHART
     crossed = report.cross_validation
     return AccuracyFacts(
@@ -92,9 +94,10 @@ def accuracy_facts(evaluated: EvaluatedSurvey) -> AccuracyFacts:
         within=_within(sigma, error) if enough else (),
         cells=CELLS,
         map=_map(evaluated),
+        surface="model" in by_way,
         crossed=crossed is not None and crossed.count > 0,
         crossed_reason="" if crossed is None or crossed.reason is None else crossed.reason,
-        check_points=len(evaluated.trained.survey.check_points),
+        check_points=len(evaluated.solved.survey.check_points),
         ce90_factor=CE90_OF_AXIS_RMSE,
         le90_factor=LE90_OF_RMSE,
         quantile_points=_LEAST_FOR_QUANTILE,

@@ -41,7 +41,7 @@ class CameraRow:
         name: of the photograph.
         use: `train`, `test`, or `outlier` for a fix that was left out.
         measured: coordinates of the fix; None: there is none.
-        adjusted: coordinates of the trained camera.
+        adjusted: coordinates of the adjusted camera.
         difference_m: adjusted minus measured, east, north, up; None: no fix.
         sigma_m: of the adjusted position, east, north, up; None: not known.
         sha256: of the file; empty: not recorded.
@@ -99,9 +99,9 @@ class CamerasFacts:
 
 def cameras_facts(evaluated: EvaluatedSurvey) -> CamerasFacts:
     """Return the positions of the photographs of an evaluated survey."""
-    trained, sigma = evaluated.trained, evaluated.camera_sigma
-    fixes = fix_differences(trained)
-    names, registered = trained.sparse.image_name, set(trained.sparse.image_name)
+    solved, sigma = evaluated.solved, evaluated.camera_sigma
+    fixes = fix_differences(solved)
+    names, registered = solved.sparse.image_name, set(solved.sparse.image_name)
     moved = np.full((len(names), 3), np.nan)
     is_outlier: BoolArray = np.zeros(len(names), dtype=bool)
     moved[fixes.camera], is_outlier[fixes.camera] = fixes.difference_in_geo, fixes.is_outlier
@@ -115,11 +115,11 @@ def cameras_facts(evaluated: EvaluatedSurvey) -> CamerasFacts:
     series, by_time = _series(evaluated, fixes)
     sigma_m = None if covariance is None else np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     return CamerasFacts(
-        photographs=len(trained.survey.images),
+        photographs=len(solved.survey.images),
         registered=len(names),
-        unregistered=tuple(image.name for image in trained.survey.images if image.name not in registered),
+        unregistered=tuple(image.name for image in solved.survey.images if image.name not in registered),
         fixes=len(fixes.camera),
-        sessions=tuple(dict.fromkeys(trained.survey.sessions)),
+        sessions=tuple(dict.fromkeys(solved.survey.sessions)),
         map=picture_of_png(drawn.png),
         arrow_factor=drawn.arrow_factor,
         ellipse_factor=drawn.ellipse_factor,
@@ -143,7 +143,7 @@ def cameras_facts(evaluated: EvaluatedSurvey) -> CamerasFacts:
 
 def bias_of(fixes: FixDifferences) -> tuple[FlightBias, ...]:
     """Return mean and scatter of the residuals of the used fixes; empty with fewer than two."""
-    used = fixes.difference_in_geo[fixes.is_training & ~fixes.is_outlier]
+    used = fixes.difference_in_geo[~fixes.is_outlier]
     if len(used) < 2:
         return ()
     means, scatter = used.mean(axis=0).tolist(), used.std(axis=0, ddof=1).tolist()
@@ -157,7 +157,7 @@ def _series(evaluated: EvaluatedSurvey, fixes: FixDifferences) -> tuple[Picture 
     """Return the picture of the residuals in time, and whether the times are known."""
     if not len(fixes.camera):
         return None, False
-    survey, names = evaluated.trained.survey, evaluated.trained.sparse.image_name
+    survey, names = evaluated.solved.survey, evaluated.solved.sparse.image_name
     by_name = {image.name: image for image in survey.images}
     images = [by_name[names[camera]] for camera in fixes.camera]
     known = [image.timestamp_s for image in images if image.timestamp_s is not None]
@@ -170,7 +170,6 @@ def _series(evaluated: EvaluatedSurvey, fixes: FixDifferences) -> tuple[Picture 
             abscissa_title="time since the first photograph in s" if by_time else "photograph, in order of names",
             residual_m=fixes.difference_in_geo,
             sigma_m=np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)),
-            is_used=fixes.is_training,
             is_outlier=fixes.is_outlier,
         )
     )
@@ -184,7 +183,7 @@ def _rows(
     adjusted = texts_of(crs, center)
     has_fix = np.atleast_1d(np.isfinite(moved).all(axis=1))
     measured = dict(zip(np.flatnonzero(has_fix).tolist(), texts_of(crs, (center - moved)[has_fix]), strict=True))
-    sha256 = {image.name: image.sha256 for image in evaluated.trained.survey.images}
+    sha256 = {image.name: image.sha256 for image in evaluated.solved.survey.images}
     return tuple(
         CameraRow(
             name=camera.name,
@@ -195,7 +194,7 @@ def _rows(
             sigma_m=None if sigma_m is None else _triple(sigma_m[index]),
             sha256=sha256.get(camera.name, ""),
         )
-        for index, camera in enumerate(evaluated.trained.model.cameras)
+        for index, camera in enumerate(evaluated.solved.model.cameras)
     )
 
 

@@ -74,7 +74,7 @@ def cut_chips(
     Raises:
         InputError: a photograph cannot be read, or has changed since `ingest`.
     """
-    sparse = evaluated.trained.sparse
+    sparse = evaluated.solved.sparse
     longest = max((max(camera.width, camera.height) for camera in sparse.cameras.values()), default=0)
     side = max(_LEAST_SIDE_PX, 2 * round(_SIDE_SHARE * longest / 2))
     by_image: dict[int, list[WantedChip]] = defaultdict(list)
@@ -92,7 +92,7 @@ def cut_chips(
 
 
 def _photograph(evaluated: EvaluatedSurvey, name: str) -> ByteArray:
-    survey = evaluated.trained.survey
+    survey = evaluated.solved.survey
     path = photograph_folder(evaluated.workspace, survey.image_dir) / name
     image = survey.image(name)
     data = read_bytes(path)

@@ -8,7 +8,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from pipelines.adjust.error_propagation import ErrorPropagation, NoErrorPropagation, propagate_errors
+from pipelines.adjust.posterior import Posterior
+from pipelines.adjust.solution import posterior_of
 from pipelines.core.cautions import is_checked
 from pipelines.core.stages import BY_NAME, REPORT
 from pipelines.core.types import FloatArray
@@ -20,7 +21,7 @@ from pipelines.geometry.refined_points import refined_points
 from pipelines.report.options import ReportOptions
 from pipelines.scene.report import EvaluationReport, read_report
 from pipelines.scene.target_crs import TargetCrs, usable_crs
-from pipelines.scene.trained_survey import TrainedSurvey, load_trained
+from pipelines.scene.trained_survey import SolvedSurvey, load_solved
 
 _LEAST_RAYS = 3  # of a point that counts as a part of the surface
 _RIM = 0.005  # fraction of the points that are taken for errors above, and below
@@ -41,20 +42,20 @@ class CameraSigma:
 
 @dataclass(frozen=True)
 class EvaluatedSurvey:
-    """Trained survey with its evaluation.
+    """Solved survey with its evaluation.
 
     Attributes:
         workspace: it was read from.
-        trained: survey, cameras and model.
+        solved: survey, cameras, and the Gaussians if there are any.
         report: of `evaluate`.
-        propagation: covariances from the measurements, or the reason why there are none.
+        posterior: covariances of the solution.
         crs: of the coordinates in the report.
     """
 
     workspace: Workspace
-    trained: TrainedSurvey
+    solved: SolvedSurvey
     report: EvaluationReport
-    propagation: ErrorPropagation | NoErrorPropagation
+    posterior: Posterior
     crs: TargetCrs
 
     @cached_property
@@ -64,20 +65,19 @@ class EvaluatedSurvey:
 
     @cached_property
     def center_in_geo(self) -> FloatArray:
-        """Trained projection centres (n, 3), metres."""
-        return self.trained.geo_from_model.apply(self.trained.poses.cam_center_in_model)
+        """Adjusted projection centres (n, 3), metres."""
+        return self.solved.geo_from_model.apply(self.solved.poses.cam_center_in_model)
 
     @cached_property
     def network(self) -> Network:
-        """The image observations with trained cameras and lenses, and points where these see them, in `model`."""
-        trained = self.trained
-        sparse, poses = trained.sparse, trained.poses
+        """The image observations with adjusted cameras and lenses, and points where these see them, in `model`."""
+        sparse, poses = self.solved.sparse, self.solved.poses
         network = Network(
             sparse.cameras,
             sparse.image_camera_id,
             poses.cam_from_model,
             poses.cam_center_in_model,
-            trained.point_in_model,
+            self.solved.point_in_model,
             sparse.obs_point,
             sparse.obs_image,
             sparse.obs_xy_px,
@@ -97,7 +97,7 @@ class EvaluatedSurvey:
     def scene_in_geo(self) -> FloatArray:
         """SfM points (N, 3) in `geo` that three photographs show, without the highest and lowest."""
         network = self.network
-        points = self.trained.geo_from_model.apply(network.point_in_world)
+        points = self.solved.geo_from_model.apply(network.point_in_world)
         points = points[np.bincount(network.obs_point, minlength=len(points)) >= _LEAST_RAYS]
         if not len(points):
             return points
@@ -112,13 +112,9 @@ class EvaluatedSurvey:
     @cached_property
     def camera_sigma(self) -> CameraSigma:
         """Covariance of the cameras."""
-        if not is_checked(self.trained.model.cautions):
+        if not is_checked(self.solved.model.cautions):
             return CameraSigma(None, "nothing checks the σ of the positions")
-        if isinstance(self.propagation, NoErrorPropagation):
-            return CameraSigma(None, self.propagation.reason)
-        if self.propagation.prediction.holds_cameras:
-            return CameraSigma(None, "the training held the cameras, and their own errors are not known")
-        return CameraSigma(self.propagation.prediction.of_cameras(), "")
+        return CameraSigma(self.posterior.camera_cov, "")
 
 
 def load_evaluated(workspace: Workspace, options: ReportOptions) -> EvaluatedSurvey:
@@ -129,10 +125,11 @@ def load_evaluated(workspace: Workspace, options: ReportOptions) -> EvaluatedSur
         InputError: a product is damaged, or the CRS cannot be used here.
     """
     report = read_report(workspace.path(REPORT))
-    trained = load_trained(workspace, _evaluated_similarity(workspace))
-    center_in_geo = trained.geo_from_model.apply(trained.poses.cam_center_in_model)
-    crs = usable_crs(options, trained.survey.origin, center_in_geo, trained.survey.vertical)
-    return EvaluatedSurvey(workspace, trained, report, propagate_errors(workspace, trained), crs)
+    solved = load_solved(workspace, _evaluated_similarity(workspace))
+    center_in_geo = solved.geo_from_model.apply(solved.poses.cam_center_in_model)
+    crs = usable_crs(options, solved.survey.origin, center_in_geo, solved.survey.vertical)
+    posterior = posterior_of(workspace, solved.model, solved.sfm)
+    return EvaluatedSurvey(workspace, solved, report, posterior, crs)
 
 
 def _evaluated_similarity(workspace: Workspace) -> Literal["trained", "initial"]:

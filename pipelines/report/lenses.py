@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.adjust.error_propagation import ErrorPropagation
 from pipelines.core.types import FloatArray
 from pipelines.geometry.cameras import LENGTHS, Camera, parameter_names, parameters_in
 from pipelines.pages.pictures import Picture, picture_of_png
@@ -27,7 +26,7 @@ class LensParameter:
         name: after COLMAP.
         unit: `px`, or empty.
         start: before SfM; None: not known.
-        value: after training.
+        value: after the adjustment.
         sigma: of `value`; None: not known.
     """
 
@@ -95,8 +94,8 @@ class LensesFacts:
 
 def lenses_facts(evaluated: EvaluatedSurvey) -> LensesFacts:
     """Return the lenses of an evaluated survey, and the residuals of its image observations."""
-    sparse, residual = evaluated.trained.sparse, evaluated.residual_px
-    covariance, reason = _covariance(evaluated)
+    sparse, residual = evaluated.solved.sparse, evaluated.residual_px
+    covariance = evaluated.posterior.of_lens()
     longest = sparse.lenses.longest
     camera_of = sparse.image_camera_id[sparse.obs_image]
     lenses = []
@@ -105,7 +104,7 @@ def lenses_facts(evaluated: EvaluatedSurvey) -> LensesFacts:
         rows = np.flatnonzero(camera_of == key)
         lenses.append(
             _lens(
-                evaluated.trained.survey,
+                evaluated.solved.survey,
                 key,
                 camera,
                 photographs=int((sparse.image_camera_id == key).sum()),
@@ -117,13 +116,13 @@ def lenses_facts(evaluated: EvaluatedSurvey) -> LensesFacts:
         )
     return LensesFacts(
         rmse_px=_rmse(residual),
-        sigma_px=_sigma_px(evaluated),
+        sigma_px=evaluated.solved.model.sigma_px,
         observations=len(residual),
         points=len(sparse.point_id),
         photographs=len(sparse.image_name),
         lenses=tuple(lens for lens in lenses if lens.photographs),
         drawn=min(len(lenses), _MOST_LENSES),
-        no_sigma=reason,
+        no_sigma="the lens was held" if covariance is None else "",
     )
 
 
@@ -201,20 +200,6 @@ def _lens(
 
 def _camera_of(prior: CameraPrior) -> Camera:
     return Camera(prior.model, prior.width, prior.height, np.array(prior.params))
-
-
-def _covariance(evaluated: EvaluatedSurvey) -> tuple[FloatArray | None, str]:
-    """Return the covariance (L, L) of all lens parameters, or the reason why it is not known."""
-    if not isinstance(evaluated.propagation, ErrorPropagation):
-        return None, evaluated.propagation.reason
-    covariance = evaluated.propagation.prediction.of_lens()
-    return covariance, "" if covariance is not None else "the training held the lens"
-
-
-def _sigma_px(evaluated: EvaluatedSurvey) -> float | None:
-    if not isinstance(evaluated.propagation, ErrorPropagation):
-        return None
-    return evaluated.propagation.solved.scene.bundle.sigma_px
 
 
 def _rmse(residual_px: FloatArray) -> float | None:

@@ -97,7 +97,7 @@ def overlap_facts(evaluated: EvaluatedSurvey) -> OverlapFacts:
         drawn_links=len(strongest),
         tied_points=TIED_POINTS,
         median_tied=float(np.median(tied)),
-        least_tied=evaluated.trained.sparse.image_name[least],
+        least_tied=evaluated.solved.sparse.image_name[least],
         least_tied_count=int(tied[least]),
         parts=parts,
     )
@@ -128,19 +128,19 @@ def overlap_of(evaluated: EvaluatedSurvey) -> OverlapRaster | None:
 
 def photographs_that_see(evaluated: EvaluatedSurvey, point_in_geo: FloatArray) -> IntArray:
     """Return the number (K,) of registered photographs whose frame holds points (K, 3); nothing hides a point."""
-    trained = evaluated.trained
-    in_model = trained.geo_from_model.inverse().apply(point_in_geo)
-    widest = {key: _widest(camera) for key, camera in trained.sparse.cameras.items()}
+    solved = evaluated.solved
+    in_model = solved.geo_from_model.inverse().apply(point_in_geo)
+    widest = {key: _widest(camera) for key, camera in solved.sparse.cameras.items()}
     count = np.zeros(len(point_in_geo), dtype=np.int64)
     for index, (rotation, center) in enumerate(
-        zip(trained.poses.cam_from_model, trained.poses.cam_center_in_model, strict=True)
+        zip(solved.poses.cam_from_model, solved.poses.cam_center_in_model, strict=True)
     ):
-        camera = trained.sparse.camera_of(index)
+        camera = solved.sparse.camera_of(index)
         in_cam = (in_model - center) @ rotation.T
         # Beyond the widest ray of the frame, the polynomial of a lens can fold back into it.
         ahead = np.flatnonzero(in_cam[:, 2] > 0)
         slope = np.linalg.norm(in_cam[ahead, :2], axis=1) / in_cam[ahead, 2]
-        ahead = ahead[slope <= widest[int(trained.sparse.image_camera_id[index])]]
+        ahead = ahead[slope <= widest[int(solved.sparse.image_camera_id[index])]]
         pixel = project(camera, in_cam[ahead])
         seen = ((pixel >= 0) & (pixel <= [camera.width, camera.height])).all(axis=1)
         count[ahead[seen]] += 1

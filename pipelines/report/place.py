@@ -66,7 +66,7 @@ def place_facts(evaluated: EvaluatedSurvey) -> PlaceFacts:
     Raises:
         InputError: the survey lies outside the domain of the CRS.
     """
-    survey, crs = evaluated.trained.survey, evaluated.crs
+    survey, crs = evaluated.solved.survey, evaluated.crs
     everything = np.concatenate([evaluated.scene_in_geo, evaluated.center_in_geo])
     lla = lla_from_ecef(ecef_from_enu(everything, survey.origin))
     lla[:, 1] -= 360.0 * np.round((lla[:, 1] - lla[0, 1]) / 360.0)
@@ -91,14 +91,14 @@ def place_facts(evaluated: EvaluatedSurvey) -> PlaceFacts:
 
 
 def _plan(evaluated: EvaluatedSurvey) -> Picture:
-    trained, center = evaluated.trained, evaluated.center_in_geo[:, :2]
+    solved, center = evaluated.solved, evaluated.center_in_geo[:, :2]
     scene = evaluated.scene_in_geo
     step = max(1, len(scene) // _MOST_DOTS)
     png = site_plan(
-        center[trained.indices("train")],
-        center[trained.indices("test")],
-        named_places(trained.survey.control_points),
-        named_places(trained.survey.check_points),
+        center[solved.indices("train")],
+        center[solved.indices("test")],
+        named_places(solved.survey.control_points),
+        named_places(solved.survey.check_points),
         scene[::step, :2],
     )
     return picture_of_png(png)

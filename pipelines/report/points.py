@@ -59,6 +59,7 @@ class PointsFacts:
         chips: number of image chips that are shown.
         marks: number of marks in registered photographs.
         side_px: side of a chip in pixels of the photographs.
+        surface: whether points were measured on the rendered surface.
     """
 
     kind: Kind
@@ -67,6 +68,7 @@ class PointsFacts:
     chips: int
     marks: int
     side_px: int
+    surface: bool
 
 
 def points_facts(
@@ -82,7 +84,7 @@ def points_facts(
     Raises:
         InputError: a photograph cannot be read, or has changed since `ingest`.
     """
-    survey, report = evaluated.trained.survey, evaluated.report
+    survey, report = evaluated.solved.survey, evaluated.report
     control = _Group("control", survey.control_points, report.fit.gcp.points, "fit.gcp.points")
     check = _Group("check", survey.check_points, report.checkpoints.camera.points, "checkpoints.camera.points")
     groups = (control, check)
@@ -114,11 +116,11 @@ class _Group:
 
 def _wanted(evaluated: EvaluatedSurvey, group: _Group, each: int) -> list[WantedChip]:
     """Return the chips of a group: for each point those photographs that show most marked points."""
-    rays = mark_rays(group.points, evaluated.trained.sparse)
+    rays = mark_rays(group.points, evaluated.solved.sparse)
     adjusted = _projected(evaluated, group.adjusted()[rays.point], rays.camera)
     surveyed = np.array([point.position_in_geo for point in group.points]).reshape(-1, 3)
     on_survey = _projected(evaluated, surveyed[rays.point], rays.camera)
-    popular = np.bincount(rays.camera, minlength=len(evaluated.trained.sparse.image_name))
+    popular = np.bincount(rays.camera, minlength=len(evaluated.solved.sparse.image_name))
     chips: list[WantedChip] = []
     for index, point in enumerate(group.points):
         marks = np.flatnonzero(rays.point == index)
@@ -139,11 +141,12 @@ def _wanted(evaluated: EvaluatedSurvey, group: _Group, each: int) -> list[Wanted
 def _facts(
     evaluated: EvaluatedSurvey, group: _Group, chips: dict[tuple[str, str], tuple[Chip, ...]], side_px: int
 ) -> PointsFacts:
-    rays = mark_rays(group.points, evaluated.trained.sparse)
+    rays = mark_rays(group.points, evaluated.solved.sparse)
     distance = rays.xy_px - _projected(evaluated, group.adjusted()[rays.point], rays.camera)
     surveyed = np.array([point.position_in_geo for point in group.points]).reshape(-1, 3)
     place = {row.name: index for index, row in enumerate(group.errors)}
-    by_model = {row.name: index for index, row in enumerate(evaluated.report.checkpoints.model.points)}
+    surface = evaluated.report.checkpoints.model
+    by_model = {} if surface is None else {row.name: index for index, row in enumerate(surface.points)}
     rows = []
     for index, (point, coordinates) in enumerate(zip(group.points, texts_of(evaluated.crs, surveyed), strict=True)):
         at = place.get(point.name)
@@ -169,18 +172,19 @@ def _facts(
         chips=sum(len(row.chips) for row in rows),
         marks=len(rays),
         side_px=side_px,
+        surface=surface is not None,
     )
 
 
 def _projected(evaluated: EvaluatedSurvey, point_in_geo: FloatArray, camera: np.ndarray) -> FloatArray:
-    """Return the pixels (K, 2) of points (K, 3) in a trained camera each; NaN for points that are NaN."""
-    trained = evaluated.trained
-    in_model = trained.geo_from_model.inverse().apply(point_in_geo)
+    """Return the pixels (K, 2) of points (K, 3) in an adjusted camera each; NaN for points that are NaN."""
+    solved = evaluated.solved
+    in_model = solved.geo_from_model.inverse().apply(point_in_geo)
     pixels = np.full((len(camera), 2), np.nan)
     for row, index in enumerate(camera):
-        in_cam = trained.poses.cam_from_model[index] @ (in_model[row] - trained.poses.cam_center_in_model[index])
+        in_cam = solved.poses.cam_from_model[index] @ (in_model[row] - solved.poses.cam_center_in_model[index])
         if in_cam[2] > 0:
-            pixels[row] = project(trained.sparse.camera_of(int(index)), in_cam)
+            pixels[row] = project(solved.sparse.camera_of(int(index)), in_cam)
     return pixels
 
 

@@ -1,8 +1,8 @@
 """Report of a survey: one page with all that is known of it, for its client and for the record.
 
-Reads survey, SfM model, trained model and the report of `evaluate`; test views, accuracy map, metrics and LiDAR of
-the training, and previews of the rasters where there are any. Writes `report/report.html` and, on request,
-`report/report.pdf`.
+Reads survey, SfM model, adjustment and the report of `evaluate`; trained model, test views, accuracy map, metrics
+and LiDAR of the training, and previews of the rasters where there are any. Writes `report/report.html` and, on
+request, `report/report.pdf`.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from pipelines.report.record import record_facts
 from pipelines.report.reference import reference_facts
 from pipelines.report.summary import SummaryFacts, summary_facts
 from pipelines.report.views import previews_facts, training_facts, views_facts
+from pipelines.scene.trained_model import TrainedModel
 
 _ROOM = __name__.rpartition(".")[0]
 _STEPS = 8
@@ -74,7 +75,7 @@ def report_page(evaluated: EvaluatedSurvey, options: ReportOptions, stage: Stage
     Raises:
         InputError: a photograph or a picture of the workspace cannot be read.
     """
-    workspace, survey = stage.workspace, evaluated.trained.survey
+    workspace, survey = stage.workspace, evaluated.solved.survey
     with stage.progress.task("sections", _STEPS) as task:
         place = place_facts(evaluated)
         task.advance(note="place")
@@ -88,14 +89,16 @@ def report_page(evaluated: EvaluatedSurvey, options: ReportOptions, stage: Stage
         task.advance(note="points")
         accuracy = accuracy_facts(evaluated)
         task.advance(note="accuracy")
-        views, training = views_facts(evaluated, options.views), training_facts(evaluated)
+        of_gaussians = _sections_of_gaussians(evaluated, options)
         task.advance(note="views")
         record = record_facts(workspace, survey)
         task.advance(note="record")
     summary = summary_facts(evaluated, _cautions(evaluated), overlap, lenses, record)
     page = Page(
         title=f"Survey report: {workspace.root.name}",
-        subtitle="Georeferenced 3D Gaussian splat, with its measured and predicted accuracy",
+        subtitle="Georeferenced 3D Gaussian splat, with its measured and predicted accuracy"
+        if of_gaussians
+        else "Georeferenced cameras, with their measured and predicted accuracy",
         about={
             "Made": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
             "Program": f"GeoRefGS {__version__}",
@@ -106,16 +109,12 @@ def report_page(evaluated: EvaluatedSurvey, options: ReportOptions, stage: Stage
             Section("summary", "Summary", "summary.html", summary),
             Section("place", "Place on Earth", "place.html", place),
             Section("accuracy", "Accuracy", "accuracy.html", accuracy),
-            Section("reference", "Surface against a reference", "reference.html", reference_facts(evaluated)),
             Section("check-points", "Check points", "points.html", check),
             Section("control-points", "Control points", "points.html", control),
             Section("positions", "Positions of the photographs", "positions.html", cameras),
             Section("overlap", "Overlap and matches", "overlap.html", overlap),
             Section("lenses", "Residuals in the image, and lenses", "lenses.html", lenses),
-            Section("test-views", "Test views", "views.html", views),
-            Section("training", "Training", "training.html", training),
-            Section("lidar", "LiDAR in the training", "lidar.html", lidar_facts(workspace)),
-            Section("rasters", "Orthophoto and surface model", "rasters.html", previews_facts(workspace)),
+            *of_gaussians,
             Section("processing", "Processing", "record.html", record),
             Section("photographs", "Photographs", "photographs.html", cameras),
         ),
@@ -124,5 +123,20 @@ def report_page(evaluated: EvaluatedSurvey, options: ReportOptions, stage: Stage
     return page, summary
 
 
+def _sections_of_gaussians(evaluated: EvaluatedSurvey, options: ReportOptions) -> tuple[Section, ...]:
+    """Return the sections on what the Gaussians show; none before training, or if `evaluate` has not seen them."""
+    workspace, model, test = evaluated.workspace, evaluated.solved.model, evaluated.report.test_views
+    if test is None or not isinstance(model, TrainedModel):
+        return ()
+    views, training = views_facts(workspace, test, options.views), training_facts(workspace, model)
+    return (
+        Section("reference", "Surface against a reference", "reference.html", reference_facts(evaluated)),
+        Section("test-views", "Test views", "views.html", views),
+        Section("training", "Training", "training.html", training),
+        Section("lidar", "LiDAR in the training", "lidar.html", lidar_facts(workspace)),
+        Section("rasters", "Orthophoto and surface model", "rasters.html", previews_facts(workspace)),
+    )
+
+
 def _cautions(evaluated: EvaluatedSurvey) -> tuple[Caution, ...]:
-    return union(evaluated.trained.model.cautions, evaluated.report.cautions)
+    return union(evaluated.solved.model.cautions, evaluated.report.cautions)

@@ -52,7 +52,7 @@ def summary_facts(
         cautions: of its products.
         overlap, lenses, record: facts of those sections.
     """
-    survey, report = evaluated.trained.survey, evaluated.report
+    survey, report = evaluated.solved.survey, evaluated.report
     measured = Measured(
         photographs=len(survey.images),
         registered=lenses.photographs,

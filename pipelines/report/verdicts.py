@@ -96,8 +96,8 @@ def verdicts(report: EvaluationReport, measured: Measured, cautions: Sequence[Ca
         _check_points(measured, report.checkpoints.camera),
         _prediction(report.checkpoints.camera),
         _blunders(report.checkpoints.camera),
-        _surface(report.checkpoints.model),
-        _views(report.photometric.test.psnr, report.photometric.test.views),
+        *(() if report.checkpoints.model is None else (_surface(report.checkpoints.model),)),
+        *(() if report.test_views is None else (_views(report.test_views.psnr, report.test_views.views),)),
         _cautions(cautions),
         _current(measured),
     )

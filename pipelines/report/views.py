@@ -17,8 +17,9 @@ from pipelines.core.workspace import Workspace
 from pipelines.pages.pictures import Picture, limited, picture_of, picture_of_png, read_picture
 from pipelines.plots.observations import curves
 from pipelines.plots.strips import without_labels
-from pipelines.report.evaluated import EvaluatedSurvey
 from pipelines.scene.render_files import DIFFERENCE_GAIN, render_name
+from pipelines.scene.report import PhotometricFigures
+from pipelines.scene.trained_model import TrainedModel
 
 _VIEW_PX, _PREVIEW_PX = 720, 1100
 _MOST_METRICS_BYTES = 256 * 1024 * 1024
@@ -98,17 +99,17 @@ class PreviewsFacts:
     surface: Picture | None
 
 
-def views_facts(evaluated: EvaluatedSurvey, most: int) -> ViewsFacts:
-    """Return the test views of an evaluated survey, with pictures of at most `most` of them.
+def views_facts(workspace: Workspace, test: PhotometricFigures, most: int) -> ViewsFacts:
+    """Return the test views of a workspace, with pictures of at most `most` of them.
 
     Raises:
         InputError: a render cannot be read.
     """
-    views = evaluated.report.photometric.test.per_view
+    views = test.per_view
     fields = {view.image: f"photometric.test.per_view.{index}" for index, view in enumerate(views)}
     worst_first = sorted(views, key=lambda view: view.psnr)
     try:
-        folder = evaluated.workspace.path(RENDERS)
+        folder = workspace.path(RENDERS)
     except MissingProductError:
         saved: dict[str, Path] = {}
     else:
@@ -130,13 +131,12 @@ def _view(name: str, field: str, file: Path) -> TestView:
     return TestView(name, field, photograph, render, difference)
 
 
-def training_facts(evaluated: EvaluatedSurvey) -> TrainingFacts:
-    """Return the training of an evaluated survey.
+def training_facts(workspace: Workspace, model: TrainedModel) -> TrainingFacts:
+    """Return the training of a workspace.
 
     Raises:
         InputError: the metrics are damaged.
     """
-    workspace, model = evaluated.workspace, evaluated.trained.model
     manifest = workspace.manifest(BY_NAME["train"])
     try:
         rows = read_metrics(workspace.path(METRICS))

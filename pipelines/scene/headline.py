@@ -54,6 +54,14 @@ def headline_of(workspace: Workspace) -> Headline | None:
     return predicted_headline(workspace)
 
 
-def predicted_headline(_workspace: Workspace) -> Headline | None:
-    """Return the accuracy that the adjustment predicts; None: no product states it before `evaluate`."""
+def predicted_headline(workspace: Workspace) -> Headline | None:
+    """Return the accuracy that the adjustment of the training, else of init-sim3, predicts; None: there is neither.
+
+    A damaged product states none; `georef status` names it.
+    """
+    from pipelines.scene.trained_model import load_solution
+
+    with contextlib.suppress(GeorefError):
+        solution = load_solution(workspace)
+        return None if solution.accuracy is None else predicted(solution.accuracy, solution.cautions)
     return None

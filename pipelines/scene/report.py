@@ -234,7 +234,6 @@ class CheckPointErrors(StatedErrors):
         without_blunders: figures without the blunders; None: there are none.
         blunders: names of the points that are blunders.
         predicted: predicted σ; None where no prediction exists.
-        cramer_rao: lower bound of σ for any unbiased estimate.
         points: one row for each point.
     """
 
@@ -242,15 +241,22 @@ class CheckPointErrors(StatedErrors):
     without_blunders: ErrorStats | None
     blunders: tuple[str, ...]
     predicted: PredictedSigma | None
-    cramer_rao: RmsSigma | None
     points: PointRows
 
 
 class CheckPoints(Product):
-    """Check points, triangulated (`camera`) and on the rendered surface behind their marks (`model`)."""
+    """Check points, triangulated (`camera`) and on the rendered surface behind their marks (`model`).
+
+    Without training, `model` is None.
+    """
 
     camera: CheckPointErrors
-    model: CheckPointErrors
+    model: CheckPointErrors | None
+
+    @property
+    def by_way(self) -> dict[Literal["camera", "model"], CheckPointErrors]:
+        """Errors by the way in which the points were measured."""
+        return {"camera": self.camera} if self.model is None else {"camera": self.camera, "model": self.model}
 
 
 class CrossValidation(StatedErrors):
@@ -269,13 +275,6 @@ class CrossValidation(StatedErrors):
     predicted: PredictedSigma | None
     points: PointRows
     reason: str | None
-
-
-class NoCrossValidation(Product):
-    """Requested cross-validation that is not possible, with the reason."""
-
-    count: Literal[0]
-    reason: str
 
 
 class AccuracySummary(_OptionalKeys):
@@ -377,11 +376,12 @@ class EvaluationReport(_OptionalKeys):
     Attributes:
         format_version: version of the format.
         headline: accuracy of the result, as every table and file states it.
-        photometric: figures of the test views.
+        photometric: figures of the test views; None: nothing is trained yet.
         checkpoints: errors of the check points.
         cross_validation: errors of the control points; None without `--cross-validate`.
         accuracy: predicted σ over the scene.
         fit: residuals of the solution.
+        cameras: predicted σ of the camera positions; None: nothing checks it.
         similarity: σ of the similarity.
         coordinates: check points in the CRS of `--crs`; absent without it.
         reference: comparison of the surface with a reference cloud; absent without `--reference`.
@@ -391,16 +391,22 @@ class EvaluationReport(_OptionalKeys):
 
     format_version: Literal[1] = 1
     headline: Headline
-    photometric: Photometric
+    photometric: Photometric | None
     checkpoints: CheckPoints
-    cross_validation: CrossValidation | NoCrossValidation | None
+    cross_validation: CrossValidation | None
     accuracy: AccuracySummary
     fit: Fit
+    cameras: RmsSigma | None
     similarity: SimilaritySigma
     coordinates: Coordinates | None = None
     reference: ReferenceComparison | None = None
     variance_factors: tuple[VarianceFactor, ...] = ()
     cautions: tuple[Caution, ...] = ()
+
+    @property
+    def test_views(self) -> PhotometricFigures | None:
+        """Figures of the test views; None: nothing is trained yet."""
+        return None if self.photometric is None else self.photometric.test
 
     @model_validator(mode="before")
     @classmethod

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 from pipelines.scene.report import (
-    CrossValidation,
     EvaluationReport,
     PointError,
     PointResidual,
@@ -57,13 +56,13 @@ def point_lines(report: EvaluationReport) -> list[PointLine]:
 
     The residual of a control point is no accuracy; its error in a solution without it is.
     """
-    crossed = report.cross_validation.points if isinstance(report.cross_validation, CrossValidation) else ()
-    by_camera, by_model = report.checkpoints.camera.points, report.checkpoints.model.points
+    crossed = () if report.cross_validation is None else report.cross_validation.points
+    ways = report.checkpoints.by_way
     return [
         *(
             line
-            for camera, model in zip(by_camera, by_model, strict=True)
-            for line in (PointLine("check", "camera", camera), PointLine("check", "model", model))
+            for rows in zip(*(errors.points for errors in ways.values()), strict=True)
+            for line in (PointLine("check", way, row) for way, row in zip(ways, rows, strict=True))
         ),
         *(PointLine("control", "left out", row) for row in crossed),
         *(PointLine("control", "fit", row) for row in report.fit.gcp.points),

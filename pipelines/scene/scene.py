@@ -15,7 +15,7 @@ import numpy as np
 from pipelines.core.errors import DegenerateGeometryError, InputError
 from pipelines.core.photograph_folder import photograph_folder
 from pipelines.core.products import load_json
-from pipelines.core.stages import SIM3, SPARSE
+from pipelines.core.stages import ADJUSTMENT, SIM3, SPARSE
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.core.workspace import Workspace
 from pipelines.formats.colmap import read_sparse
@@ -29,6 +29,7 @@ from pipelines.scene.calibrated import load_survey
 from pipelines.scene.initial_similarity import InitialSimilarity
 from pipelines.scene.photographs import ImageCache, Photograph
 from pipelines.scene.survey import Survey
+from pipelines.scene.trained_model import Adjustment
 
 
 @dataclass(frozen=True)
@@ -88,6 +89,12 @@ class Scene:
         """Information of the image observations on the cameras, which the lens follows."""
         return bundle_information(self.network)
 
+    def with_bundle(self, bundle: BundleInformation) -> Scene:
+        """Return the same scene, whose bundle is known already."""
+        same = replace(self)
+        same.__dict__["bundle"] = bundle
+        return same
+
     @cached_property
     def correction_basis(self) -> CorrectionBasis:
         """Whitened corrections of the cameras, which the lens follows. Memory is quadratic in their number."""
@@ -131,15 +138,33 @@ def initial_scene(sparse: SparseModel, survey: Survey, initial: InitialSimilarit
     return make_scene(sparse, survey, model_from_local, shift)
 
 
-def load_initial_scene(workspace: Workspace) -> tuple[InitialSimilarity, Survey, Scene]:
-    """Read the initial similarity, the survey with its variance factors, and the scene at the start of training.
+def adjusted_scene(sparse: SparseModel, survey: Survey, adjustment: Adjustment) -> Scene:
+    """Return the scene in the frame of an adjustment; `geo_from_model` is the pure shift that comes nearest to it.
+
+    Raises:
+        DegenerateGeometryError: fewer than two registered training images.
+    """
+    model_from_local = Similarity.from_record(adjustment.model_from_local)
+    middle = np.median(model_from_local.apply(sparse.point_in_local), axis=0)
+    return make_scene(sparse, survey, model_from_local, adjustment.similarity.apply(middle) - middle)
+
+
+def load_adjusted_scene(
+    workspace: Workspace, product: str = ADJUSTMENT
+) -> tuple[InitialSimilarity, Adjustment, Survey, Scene]:
+    """Read the initial similarity, the adjustment, the survey with its variance factors, and the scene.
+
+    Args:
+        workspace: of the survey.
+        product: the adjustment: that of `init-sim3`, or the solution that blocks share.
 
     Raises:
         GeorefError: a product does not exist, is damaged, or has too few images.
     """
     initial = load_json(InitialSimilarity, workspace.path(SIM3))
     survey = initial.weighted(load_survey(workspace))
-    return initial, survey, initial_scene(read_sparse(workspace.path(SPARSE)), survey, initial)
+    adjustment = load_json(Adjustment, workspace.path(product))
+    return initial, adjustment, survey, adjusted_scene(read_sparse(workspace.path(SPARSE)), survey, adjustment)
 
 
 def photographs(sparse: SparseModel, survey: Survey, workspace: Workspace, max_size_px: int) -> ImageCache:

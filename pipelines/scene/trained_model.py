@@ -11,13 +11,16 @@ import numpy as np
 from pydantic import Field
 
 from pipelines.core.cautions import Caution
-from pipelines.core.products import ImageName, Product, Rotation
+from pipelines.core.products import Covariance3, ImageName, Product, Rotation, load_json
+from pipelines.core.stages import ADJUSTMENT, MODEL
 from pipelines.core.types import Matrix34, Vector3
+from pipelines.core.workspace import Workspace
 from pipelines.geometry.cameras import CameraPoses
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
-from pipelines.geometry.similarity import SimilarityRecord
+from pipelines.geometry.similarity import Similarity, SimilarityRecord
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.scene.estimated_error import EstimatedError
+from pipelines.scene.report import AccuracySummary
 from pipelines.scene.variance_factors import VarianceFactor
 
 
@@ -47,8 +50,33 @@ class TrainedLens(Product):
     params: tuple[float, ...]
 
 
-class FrozenSolution(Product):
-    """Solution of all that does not depend on Gaussians: similarity, cameras, lenses, constant errors.
+class Measurement(Product):
+    """State of one measurement in the adjustment.
+
+    Attributes:
+        kind: of the measurement.
+        name: of the image, or of the control point.
+        used: whether it takes part; what was rejected stays rejected in every later stage.
+        reason: why it was rejected; empty: it is used.
+        residual: predicted minus measured, metres or radians.
+        normalised: length of the residual in units of its σ.
+        left_out_error_m: of a control point: error of the solution of all other measurements, east, north, up;
+            None: they leave the point open.
+        left_out_cov_m2: covariance of that error, of solution, marks and survey.
+    """
+
+    kind: Literal["fix", "control point", "attitude", "systematic error"]
+    name: str
+    used: bool
+    reason: str = ""
+    residual: Vector3
+    normalised: float
+    left_out_error_m: Vector3 | None = None
+    left_out_cov_m2: Covariance3 | None = None
+
+
+class Adjustment(Product):
+    """Solution of all that does not depend on Gaussians: similarity, cameras, lenses, systematic errors.
 
     Attributes:
         format_version: version of the format.
@@ -58,7 +86,10 @@ class FrozenSolution(Product):
         lenses: corrected lenses; a camera of the SfM model without one keeps SfM's lens.
         gnss_outliers, control_outliers: names of the images whose fixes, and of the control points that `init-sim3`
             has rejected: they entered no solution.
-        estimated_errors: constant errors of the measurements.
+        estimated_errors: systematic errors of the measurements.
+        measurements: state of every measurement.
+        sigma_px: σ of an image coordinate of a tie point.
+        accuracy: predicted σ over the scene; None: a solution that states none.
         variance_factors: tests of the stated σ, of the initial similarity.
         cautions: limits: those of the initial similarity, then the solution's own.
     """
@@ -71,8 +102,22 @@ class FrozenSolution(Product):
     gnss_outliers: tuple[str, ...] = ()
     control_outliers: tuple[str, ...] = ()
     estimated_errors: tuple[EstimatedError, ...] = ()
+    measurements: tuple[Measurement, ...] = ()
+    sigma_px: float | None = None
+    accuracy: AccuracySummary | None = None
     variance_factors: tuple[VarianceFactor, ...] = ()
     cautions: tuple[Caution, ...] = ()
+
+    @property
+    def similarity(self) -> Similarity:
+        """Similarity geo ← model."""
+        return Similarity.from_record(self.geo_from_model)
+
+    def similarity_from_local(self) -> SimilarityRecord:
+        """Return the similarity geo ← local, with the covariance of geo ← model, which is of the target frame."""
+        geo_from_local = self.similarity @ Similarity.from_record(self.model_from_local)
+        record = self.geo_from_model
+        return geo_from_local.to_record("local", "geo", covariance=np.array(record.covariance), pivot=record.pivot)
 
     @property
     def poses(self) -> CameraPoses:
@@ -90,7 +135,7 @@ class FrozenSolution(Product):
         return replace(sfm, cameras=sfm.cameras | solved)
 
 
-class TrainedModel(FrozenSolution):
+class TrainedModel(Adjustment):
     """Product of `train` beside the Gaussians: the solution of the training, and its settings.
 
     Attributes:
@@ -108,3 +153,15 @@ class TrainedModel(FrozenSolution):
     iterations: int
     gaussians: int
     backend: Literal["cpu", "cuda"]
+
+
+def load_solution(workspace: Workspace) -> Adjustment:
+    """Return the solution of a workspace: that of its training, else that of init-sim3.
+
+    Raises:
+        MissingProductError: neither exists; names the command.
+        InputError: the product is damaged.
+    """
+    if workspace.has(MODEL):
+        return load_json(TrainedModel, workspace.path(MODEL))
+    return load_json(Adjustment, workspace.path(ADJUSTMENT))

@@ -1,59 +1,63 @@
-"""Trained survey, read from the workspace: cameras in `model`, the similarity, and the Gaussians."""
+"""Solved survey, read from the workspace: cameras in `model`, the similarity, and any Gaussians."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
+from pathlib import Path
+from typing import Literal, TypeVar
 
 import numpy as np
 
 from pipelines.core.errors import InputError, MissingProductError
 from pipelines.core.products import load_json
-from pipelines.core.stages import GAUSSIANS, MODEL, SIM3, SPARSE
+from pipelines.core.stages import ADJUSTMENT, GAUSSIANS, MODEL, SIM3, SPARSE
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import Workspace
 from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.cameras import CameraPoses
-from pipelines.geometry.similarity import Similarity, SimilarityRecord
+from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.scene.calibrated import load_survey
 from pipelines.scene.initial_similarity import InitialSimilarity
 from pipelines.scene.photographs import ImageCache
 from pipelines.scene.pinholes import Pinholes
 from pipelines.scene.survey import Survey
-from pipelines.scene.trained_model import TrainedModel
+from pipelines.scene.trained_model import Adjustment, TrainedModel
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.storage import read_gaussians
 
+Solution = TypeVar("Solution", bound=Adjustment)
+
 
 @dataclass(frozen=True)
-class TrainedSurvey:
-    """Survey with its trained model.
+class SolvedSurvey:
+    """Survey with the solution of its adjustment.
 
     Attributes:
         survey: the measurements.
         sfm: the SfM model with SfM's lenses; its images have the order of `poses`.
-        model: similarity, cameras, settings.
-        poses: trained cameras in `model`.
-        gaussians: Gaussians in `model`.
+        model: similarity, cameras, lenses.
     """
 
     survey: Survey
     sfm: SparseModel
-    model: TrainedModel
-    poses: CameraPoses
-    gaussians: Gaussians
+    model: Adjustment
+
+    @cached_property
+    def poses(self) -> CameraPoses:
+        """Adjusted cameras in `model`."""
+        return self.model.poses
 
     @cached_property
     def sparse(self) -> SparseModel:
-        """SfM model with the trained lenses."""
+        """SfM model with the adjusted lenses."""
         return self.model.with_lenses(self.sfm)
 
     @property
     def geo_from_model(self) -> Similarity:
         """Similarity of `model`."""
-        return Similarity.from_record(self.model.geo_from_model)
+        return self.model.similarity
 
     @property
     def point_in_model(self) -> FloatArray:
@@ -63,6 +67,38 @@ class TrainedSurvey:
     def indices(self, split: str) -> list[int]:
         """Return the indices of the cameras of a split."""
         return [index for index, camera in enumerate(self.model.cameras) if camera.split == split]
+
+
+@dataclass(frozen=True)
+class TrainedSurvey(SolvedSurvey):
+    """Survey with its trained model.
+
+    Attributes:
+        model: similarity, cameras, settings.
+        gaussians: Gaussians in `model`.
+    """
+
+    model: TrainedModel
+    gaussians: Gaussians
+
+
+def load_solved(workspace: Workspace, similarity: Literal["trained", "initial"] = "trained") -> SolvedSurvey:
+    """Read the survey with its solution: with the trained model if there is one, else as init-sim3 has solved it.
+
+    Args:
+        workspace: holds the products.
+        similarity: choice of `geo_from_model`: the solution's, or the one that follows from `geo_from_local`.
+
+    Raises:
+        MissingProductError: a product does not exist.
+        InputError: a product is damaged, or cameras or lenses of the solution are not those of `sfm`.
+    """
+    if workspace.has(MODEL):
+        return load_trained(workspace, similarity)
+    model, sparse = load_json(Adjustment, workspace.path(ADJUSTMENT)), read_sparse(workspace.path(SPARSE))
+    _require_same_cameras(model, sparse, workspace.path(ADJUSTMENT), "run `georef init-sim3` again")
+    model = _initially_placed(model, workspace) if similarity == "initial" else model
+    return SolvedSurvey(_weighted_survey(workspace), sparse, model)
 
 
 def load_trained(workspace: Workspace, similarity: Literal["trained", "initial"] = "trained") -> TrainedSurvey:
@@ -76,26 +112,24 @@ def load_trained(workspace: Workspace, similarity: Literal["trained", "initial"]
         MissingProductError: a product does not exist.
         InputError: a product is damaged, or the cameras or lenses of `train` are not those of `sfm`.
     """
-    model_path = workspace.path(MODEL)
-    model = load_json(TrainedModel, model_path)
-    sparse = read_sparse(workspace.path(SPARSE))
-    names = tuple(camera.name for camera in model.cameras)
-    if names != sparse.image_name:
-        raise InputError("its cameras are not those of sfm/sparse: train again", path=model_path, field="cameras")
+    model, sparse = load_json(TrainedModel, workspace.path(MODEL)), read_sparse(workspace.path(SPARSE))
+    _require_same_cameras(model, sparse, workspace.path(MODEL), "train again")
+    model = _initially_placed(model, workspace) if similarity == "initial" else model
+    return TrainedSurvey(_weighted_survey(workspace), sparse, model, read_gaussians(workspace.path(GAUSSIANS)))
+
+
+def _require_same_cameras(model: Adjustment, sparse: SparseModel, path: Path, advice: str) -> None:
+    """Refuse a solution of another SfM model.
+
+    Raises:
+        InputError: its cameras or lenses are not those of `sfm`.
+    """
+    if tuple(camera.name for camera in model.cameras) != sparse.image_name:
+        raise InputError(f"its cameras are not those of sfm/sparse: {advice}", path=path, field="cameras")
     for lens in model.lenses:
         camera = sparse.cameras.get(lens.camera_id)
         if camera is None or (camera.model, len(camera.params)) != (lens.model, len(lens.params)):
-            raise InputError("its lenses are not those of sfm/sparse: train again", path=model_path, field="lenses")
-    if similarity == "initial":
-        record = _initially_placed(model, load_json(InitialSimilarity, workspace.path(SIM3)))
-        model = model.model_copy(update={"geo_from_model": record})
-    return TrainedSurvey(
-        survey=_weighted_survey(workspace),
-        sfm=sparse,
-        model=model,
-        poses=model.poses,
-        gaussians=read_gaussians(workspace.path(GAUSSIANS)),
-    )
+            raise InputError(f"its lenses are not those of sfm/sparse: {advice}", path=path, field="lenses")
 
 
 def _weighted_survey(workspace: Workspace) -> Survey:
@@ -114,12 +148,12 @@ def trained_pinholes(trained: TrainedSurvey, images: ImageCache) -> Pinholes:
     return pinholes
 
 
-def _initially_placed(model: TrainedModel, initial: InitialSimilarity) -> SimilarityRecord:
-    """Return `geo_from_model` of the initial similarity.
+def _initially_placed(model: Solution, workspace: Workspace) -> Solution:
+    """Return a solution with the `geo_from_model` of the initial similarity.
 
     The covariance carries over unchanged, because it describes a perturbation in the target frame `geo`.
     """
-    geo_from_local = Similarity.from_record(initial.geo_from_local)
-    geo_from_model = geo_from_local @ Similarity.from_record(model.model_from_local).inverse()
-    covariance = np.array(initial.geo_from_local.covariance)
-    return geo_from_model.to_record("model", "geo", covariance=covariance, pivot=initial.geo_from_local.pivot)
+    record = load_json(InitialSimilarity, workspace.path(SIM3)).geo_from_local
+    geo_from_model = Similarity.from_record(record) @ Similarity.from_record(model.model_from_local).inverse()
+    placed = geo_from_model.to_record("model", "geo", covariance=np.array(record.covariance), pivot=record.pivot)
+    return model.model_copy(update={"geo_from_model": placed})

@@ -1,9 +1,10 @@
 """Bundle adjustment with the fixes as priors of the camera positions: the usual way to a georeferenced model.
 
-Reads `ingest/survey.json` and `sfm/sparse`; writes `adjust/sparse`, the same model adjusted in the frame `geo`, and
-`adjust/geo_from_local.json`, the identity with the covariance that the fixes give. This is the baseline "SfM-BBA"
-of GeoRefGS (doi 10.3390/drones10030195), and the last step of COLMAP's `pose_prior_mapper`: image observations have
-σ = 1 px, and fixes their covariances under Cauchy's kernel. Control points do not enter.
+Reads `ingest/survey.json` and `sfm/sparse`; writes `adjust/sparse`, the same model adjusted in the frame `geo`,
+`adjust/geo_from_local.json`, the identity with the covariance that the fixes give, and `adjust/adjustment.json` and
+`.npz`, the adjusted cameras as they are, with the covariances that the fixes give them. This is the baseline
+"SfM-BBA" of GeoRefGS (doi 10.3390/drones10030195), and the last step of COLMAP's `pose_prior_mapper`: image
+observations have σ = 1 px, and fixes their covariances under Cauchy's kernel. Control points do not enter.
 """
 
 from __future__ import annotations
@@ -15,12 +16,15 @@ from typing import Any
 import numpy as np
 
 from pipelines.adjust.alignment import Alignment, align
+from pipelines.adjust.measurements import problem_of, start_of
 from pipelines.adjust.observations import attitude_prior, fix_correspondences
+from pipelines.adjust.posterior import Posterior, save_posterior
+from pipelines.adjust.solution import adjusted
 from pipelines.core.child import run_in_child
 from pipelines.core.errors import ConvergenceError, DegenerateGeometryError
 from pipelines.core.products import save_json
 from pipelines.core.progress import Progress
-from pipelines.core.stages import SPARSE
+from pipelines.core.stages import ADJUSTMENT, SIM3, SIM3_POSTERIOR, SPARSE
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.formats.colmap import (
@@ -35,6 +39,7 @@ from pipelines.geometry.sparse_model import SparseModel
 from pipelines.robust.statistics import residual_stats
 from pipelines.scene.calibrated import load_survey
 from pipelines.scene.initial_similarity import InitialSimilarity
+from pipelines.scene.scene import initial_scene
 from pipelines.scene.survey import Fix, Survey
 from pipelines.sfm.options import AdjustOptions
 from pipelines.sfm.position_priors import PriorAdjustment, position_prior
@@ -83,8 +88,12 @@ def write_adjusted(arguments: Mapping[str, Any], progress: Progress) -> dict[str
         task.advance()
     write_reconstruction(model, sparse)
     names = tuple(image.name for image, _ in _located(model, survey))
-    similarity = _identity(_aligned(read_sparse(sparse), survey, seed), names, _residuals(model, survey))
-    save_json(similarity, out / "geo_from_local.json")
+    adjusted_model = read_sparse(sparse)
+    similarity = _identity(_aligned(adjusted_model, survey, seed), names, _residuals(model, survey))
+    save_json(similarity, out / Path(SIM3).name)
+    posterior = _posterior(adjusted_model, survey.model_copy(update={"control_points": ()}), similarity)
+    save_json(posterior.solution, out / Path(ADJUSTMENT).name)
+    save_posterior(posterior, out / Path(SIM3_POSTERIOR).name)
     fixes = similarity.residuals["gnss"]
     values = {"residuals": fixes.model_dump(), "reprojection_error_px": model.compute_mean_reprojection_error()}
     return {"key_figure": f"{fixes.rmse_3d_m:.3f} m RMS from {fixes.count} fixes", "values": values}
@@ -152,6 +161,14 @@ def _identity(alignment: Alignment, names: tuple[str, ...], residual: FloatArray
         layout=alignment.layout,
         attitude_used=False,
     )
+
+
+def _posterior(model: SparseModel, survey: Survey, similarity: InitialSimilarity) -> Posterior:
+    """Return the adjusted model as it is, with the covariances that the fixes give its cameras."""
+    scene, rejected = initial_scene(model, survey, similarity), similarity.rejected(survey)
+    problem = problem_of(scene, similarity.in_use(survey))
+    of_rejected = None if rejected is None else problem_of(scene, rejected)
+    return adjusted(scene, problem, start_of(scene, problem), similarity, of_rejected)
 
 
 def _located(model: Any, survey: Survey) -> list[tuple[Any, Fix]]:

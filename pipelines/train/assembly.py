@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import torch
 
-from pipelines.adjust.problem import GeoProblem
 from pipelines.splat.densify import DefaultSettings, DefaultStrategy, Strategy
 from pipelines.splat.densify_fast import FastSettings, FastStrategy
 from pipelines.splat.densify_mcmc import McmcSettings, McmcStrategy
@@ -17,6 +16,7 @@ from pipelines.splat.rasterizer.api import Rasterizer
 from pipelines.splat.rasterizer.backends import device_of
 from pipelines.splat.surface import SurfaceSettings
 from pipelines.train.crops import Crops
+from pipelines.train.geographic.problem import GeoProblem
 from pipelines.train.initial_gaussians import TrainingScene, initial_gaussians, points_to_hold
 from pipelines.train.options import TrainOptions
 from pipelines.train.schedule import COARSE, JointOptions

@@ -16,7 +16,7 @@ import torch
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.free_memory import peak_memory_bytes
 from pipelines.core.products import load_json, save_json
-from pipelines.core.stages import BLOCK_PLAN, SCAFFOLD
+from pipelines.core.stages import BLOCK_PLAN, SCAFFOLD, SOLUTION
 from pipelines.core.threads import thread_count
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.scene.block_plan import BlockPlan, PlannedBlock
@@ -27,10 +27,11 @@ from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.memory import free_memory_bytes, require_memory
 from pipelines.splat.rasterizer.backends import device_of, rasterizer
 from pipelines.splat.storage import read_gaussians, write_gaussians
+from pipelines.train.adjusted_scene import AdjustedScene
 from pipelines.train.assembly import make_trainer
 from pipelines.train.depth_maps import DepthMaps
-from pipelines.train.frozen_training import SolvedScene, load_solved_scene
 from pipelines.train.gaussian_limit import training_size
+from pipelines.train.geographic.problem import held_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.loop import TrainingRecord
 from pipelines.train.options import BlockTrainOptions
@@ -56,7 +57,7 @@ def run(stage: StageRun, options: BlockTrainOptions) -> Summary:
     """
     backend, workspace = rasterizer(options.backend), stage.workspace
     block = load_json(BlockPlan, workspace.path(BLOCK_PLAN)).block(options.id)
-    whole = load_solved_scene(workspace)
+    whole = AdjustedScene.load(workspace, SOLUTION)
     box = SceneBox.around(whole.scene.point_in_model)
     solved = whole.of_images(_indices(whole, block))
     options = options.model_copy(update={"max_gaussians": block.gaussians, "optimize_cameras": False})
@@ -70,7 +71,7 @@ def run(stage: StageRun, options: BlockTrainOptions) -> Summary:
     masks = views.masks(block.region, scaffold, surface, stage.progress)
     region = _region(block, box, scaffold, masks)
     training = TrainingScene(_seeing(solved, masks).scene, images, surface, region)
-    trainer = make_trainer(training, solved.problem(), backend, options, solved.exposures(device_of(backend)))
+    trainer = make_trainer(training, held_problem(solved), backend, options, solved.exposures(device_of(backend)))
     record = train_in_folder(stage, trainer, options, _iterations(stage))
     measured = _measured(stage, trainer, block, record)
     write_gaussians(stage.out / "gaussians.ply", trainer.optimizer.gaussians.detached())
@@ -81,7 +82,7 @@ def run(stage: StageRun, options: BlockTrainOptions) -> Summary:
     )
 
 
-def _indices(whole: SolvedScene, block: PlannedBlock) -> np.ndarray:
+def _indices(whole: AdjustedScene, block: PlannedBlock) -> np.ndarray:
     """Return the indices of the block's cameras in the scene of the whole.
 
     Raises:
@@ -94,7 +95,7 @@ def _indices(whole: SolvedScene, block: PlannedBlock) -> np.ndarray:
     return rows
 
 
-def _surface(stage: StageRun, solved: SolvedScene, images: ImageCache) -> SceneSurface:
+def _surface(stage: StageRun, solved: AdjustedScene, images: ImageCache) -> SceneSurface:
     maps = DepthMaps(stage.workspace.cache / "surface", solved.scene, images)
     maps.build(stage.progress)
     return SceneSurface(maps)
@@ -108,7 +109,7 @@ def _region(block: PlannedBlock, box: SceneBox, scaffold: Gaussians, masks: Regi
     return TrainingRegion(block.region, box, outside, sky.to(torch.device("cpu")), masks)
 
 
-def _seeing(solved: SolvedScene, masks: RegionMasks) -> SolvedScene:
+def _seeing(solved: AdjustedScene, masks: RegionMasks) -> AdjustedScene:
     """Return the scene without the training views that do not show the block.
 
     Raises:

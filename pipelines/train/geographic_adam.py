@@ -7,13 +7,13 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from pipelines.adjust.problem import GeoProblem
+from pipelines.train.geographic.problem import GeoProblem
 from pipelines.train.schedule import JointOptions
 
 _NAMES = {
     "y": "the similarity",
     "z": "the cameras",
-    "x": "the constant errors",
+    "x": "the systematic errors",
     "u": "the weights of the losses",
 }
 _MOMENTS = ("step", "exp_avg", "exp_avg_sq")

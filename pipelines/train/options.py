@@ -6,10 +6,77 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
+from pipelines.core.errors import InputError
 from pipelines.core.options import StageOptions
-from pipelines.scene.geographic_options import GeographicOptions
 from pipelines.train.lidar.options import LidarOptions
 from pipelines.train.presets import PRESETS, Preset, described
+
+# A dense basis of more cameras takes more than 2 GiB (`geometry.correction_basis`).
+MOST_JOINT_CAMERAS = 1300
+Solve = Literal["auto", "joint", "once"]
+
+
+class GeographicOptions(StageOptions):
+    """Options of the geographic losses: measurements in use, and their weights."""
+
+    geo_loss: bool = Field(
+        True, description="Use the geographic losses; without them, similarity and cameras are held."
+    )
+    weighting: Literal["whitened", "paper"] = Field(
+        "whitened",
+        description="Residuals divided by their σ, or plain mean squares as in the paper.",
+    )
+    gcp_loss: bool = Field(True, description="Use the control points, L_gcp.")
+    gcp_mode: Literal["camera", "depth"] = Field(
+        "camera", description="Find control points by intersecting their marks, or through the rendered depth."
+    )
+    rel_loss: bool = Field(True, description="Use distances between located points, L_rel.")
+    geo_weight: float = Field(0.05, gt=0, description="Final weight w_max of the geographic losses (eq. 27).")
+    geo_schedule: Literal["rising", "constant"] = Field(
+        "rising", description="Let that weight rise as in eq. 27, or be final from the first iteration."
+    )
+    loss_weights: Literal["fixed", "learned"] = Field(
+        "fixed", description="Weigh the geographic losses by the stated σ, or learn a variance factor for each."
+    )
+    optimize_cameras: bool = Field(
+        True,
+        description="Refine similarity, cameras and, unless weighted as in the paper, the lens while training; "
+        "or hold them as init-sim3 has adjusted them.",
+    )
+    solve: Solve = Field(
+        "auto",
+        description="Refine similarity and cameras jointly with the Gaussians, or hold them as solved once by "
+        f"init-sim3; auto: once beyond {MOST_JOINT_CAMERAS} photographs.",
+    )
+
+    def solves_once(self, cameras: int) -> bool:
+        """Return whether a training of that many cameras holds what init-sim3 has solved."""
+        wanted = self.solve == "once" or (self.solve == "auto" and cameras > MOST_JOINT_CAMERAS)
+        return wanted and self.optimize_cameras and self.geo_loss
+
+    def refined_cameras(self, cameras: int) -> int:
+        """Return how many of that many cameras are refined together with the Gaussians: all or none."""
+        return cameras if self.optimize_cameras and self.geo_loss and not self.solves_once(cameras) else 0
+
+    def require_trainable(self, cameras: int) -> None:
+        """Refuse options that change the cameras' solution during a training, if the training holds it.
+
+        Raises:
+            InputError: names the option.
+        """
+        if not self.solves_once(cameras):
+            return
+        for value, plain, name in (
+            (self.weighting, "whitened", "--weighting"),
+            (self.loss_weights, "fixed", "--loss-weights"),
+            (self.gcp_mode, "camera", "--gcp-mode"),
+        ):
+            if value != plain:
+                raise InputError(
+                    f"{value!r} changes the solution of the cameras during the training, and these {cameras} are "
+                    f"solved once, by init-sim3: use {name} {plain}, --solve joint or --no-optimize-cameras",
+                    field=name,
+                )
 
 
 class SplatOptions(StageOptions):
@@ -83,18 +150,16 @@ class TrainOptions(GeographicOptions, SplatOptions, BlockOptions, LidarOptions):
         return self
 
 
-class SolutionOptions(GeographicOptions):
+class SolutionOptions(StageOptions):
     """Options of the solution that all blocks share.
 
     Attributes:
         max_image_size: longest side in pixels of the photographs whose colours give the exposures.
         exposure: whether to estimate exposures.
-        seed: seed of every random choice.
     """
 
     max_image_size: int = Field(ge=1)
     exposure: bool = True
-    seed: int = Field(0, ge=0)
 
 
 class SeamOptions(TrainOptions):

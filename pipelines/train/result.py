@@ -6,40 +6,31 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.adjust.frozen_solution import solution_of, with_exposures
 from pipelines.core.workspace import Summary
 from pipelines.scene.estimated_error import EstimatedError
-from pipelines.scene.initial_similarity import InitialSimilarity
 from pipelines.scene.lidar_report import LidarReport
-from pipelines.scene.scene import Scene
-from pipelines.scene.trained_model import TrainedModel
+from pipelines.scene.trained_model import Adjustment, TrainedModel
+from pipelines.train.adjusted_scene import with_exposures
 from pipelines.train.loop import TrainingRecord
 from pipelines.train.trainer import JointTrainer
 
 _EVIDENT_SIGMAS = 3.0
 _CAUSES = {
-    "bias": "Check the base station, the vertical datum and the antenna offset",
     "lever-arm": "`georef ingest --lever-arm` can apply it, in the axes of the body",
     "boresight": "`georef ingest --boresight` can apply it",
     "lidar-shift": "Check the LiDAR's CRS, datum and flight",
 }
 
 
-def trained_model(trainer: JointTrainer, scene: Scene, initial: InitialSimilarity) -> TrainedModel:
+def trained_model(trainer: JointTrainer, solution: Adjustment) -> TrainedModel:
     """Return the product of `train` without the Gaussians.
 
     Args:
         trainer: at the end of the training.
-        scene: cameras at the start of the training.
-        initial: similarity at the start of the training; its cautions are carried on.
-
-    Raises:
-        DegenerateGeometryError: the measurements do not determine the similarity.
+        solution: its cameras and similarity.
     """
-    exposure = None if trainer.exposures is None else trainer.exposures.affine.cpu().numpy().astype(float)
-    solution = solution_of(trainer.problem, scene, initial)
-    if exposure is not None:
-        solution = with_exposures(solution, exposure)
+    if trainer.exposures is not None:
+        solution = with_exposures(solution, trainer.exposures.affine.cpu().numpy().astype(float))
     gaussians = trainer.optimizer.gaussians
     return TrainedModel(
         **dict(solution),
@@ -84,7 +75,9 @@ def summary_of(
 
 
 def _warnings(model: TrainedModel, record: TrainingRecord) -> list[str]:
-    warnings = [text for error in model.estimated_errors if (text := _warning_of(error)) is not None]
+    # A common error of the fixes is told by the cautions of init-sim3.
+    told = (_warning_of(error) for error in model.estimated_errors if error.name != "bias")
+    warnings = [text for text in told if text is not None]
     return warnings if record.recovery is None else [*warnings, record.recovery]
 
 
@@ -100,19 +93,21 @@ def _lidar_warnings(lidar: LidarReport) -> list[str]:
 
 
 def _warning_of(error: EstimatedError) -> str | None:
-    """Return a warning if the error exceeds 3 σ or is not observable along every axis, else None."""
-    axes = "east, north, up" if error.name in {"bias", "lidar-shift"} else "right, down, forward"
-    flight = "" if error.flight is None else f" of flight {error.flight + 1}"
-    subject = f"{error.name}{flight}"
+    """Return a warning if the error exceeds 3 σ or is not observable along every axis; else None.
+
+    The common error of the fixes is everyday: init-sim3 has tested it against its prior.
+    """
+    if error.name == "bias":
+        return None
+    axes = "east, north, up" if error.name == "lidar-shift" else "right, down, forward"
     values = ", ".join(f"{value:+.3f} ± {sigma:.3f}" for value, sigma in zip(error.value, error.sigma, strict=True))
     evident = [
         abs(value) > _EVIDENT_SIGMAS * sigma and observed
         for value, sigma, observed in zip(error.value, error.sigma, error.observed, strict=True)
     ]
     if any(evident):
-        return (
-            f"{subject} of ({values}) {error.unit} {axes}, beyond 3 σ: it is taken out here. {_CAUSES[error.name]}"
-        )
+        evidence = f"{error.name} of ({values}) {error.unit} {axes}, beyond 3 σ: it is taken out here"
+        return f"{evidence}. {_CAUSES[error.name]}"
     if not all(error.observed):
-        return f"{subject} is not observable along every axis: ({values}) {error.unit} {axes}"
+        return f"{error.name} is not observable along every axis: ({values}) {error.unit} {axes}"
     return None

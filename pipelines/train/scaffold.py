@@ -6,15 +6,17 @@ SfM model, the initial similarity and the solution. Writes `gaussians.ply` in `m
 
 from __future__ import annotations
 
+from pipelines.core.stages import SOLUTION
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.scene.scaffold import scaffold_gaussians, scaffold_image_px
 from pipelines.scene.scene import photographs
 from pipelines.splat.memory import free_memory_bytes, require_memory
 from pipelines.splat.rasterizer.backends import device_of, rasterizer
 from pipelines.splat.storage import write_gaussians
+from pipelines.train.adjusted_scene import AdjustedScene
 from pipelines.train.assembly import make_trainer
-from pipelines.train.frozen_training import load_solved_scene
 from pipelines.train.gaussian_limit import training_size
+from pipelines.train.geographic.problem import held_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.options import TrainOptions
 from pipelines.train.training_files import train_in_folder
@@ -33,13 +35,13 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
         GeorefError: a product or a photograph cannot be read.
     """
     backend, workspace = rasterizer(options.backend), stage.workspace
-    solved = load_solved_scene(workspace)
+    solved = AdjustedScene.load(workspace, SOLUTION)
     coarse = coarse_options(options, len(solved.scene.train))
     images = photographs(solved.scene.sparse, solved.survey, workspace, coarse.effort.max_image_size)
     require_memory(training_size(coarse, len(images), images.largest()), free_memory_bytes(device_of(backend)))
     images.build(stage.progress)
     exposures = solved.exposures(device_of(backend))
-    trainer = make_trainer(TrainingScene(solved.scene, images), solved.problem(), backend, coarse, exposures)
+    trainer = make_trainer(TrainingScene(solved.scene, images), held_problem(solved), backend, coarse, exposures)
     record = train_in_folder(stage, trainer, coarse)
     gaussians = trainer.optimizer.gaussians.detached()
     write_gaussians(stage.out / "gaussians.ply", gaussians)

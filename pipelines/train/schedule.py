@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
-from pipelines.adjust.weights import WeightSchedule, rising_weight
 from pipelines.core.types import IntArray
 from pipelines.splat.surface import SurfaceSettings
 from pipelines.train.crops import Crops
@@ -16,6 +17,14 @@ _FINAL_RATE = 0.05  # of the geographic unknowns, relative to their first learni
 # would make the Gaussians smaller than a pixel, and push them off the surface that they start on.
 COARSE = ((2, 0.3),)
 _DENSITY_UNTIL = 0.5  # of the training
+
+
+WeightSchedule = Literal["rising", "constant"]
+
+
+def rising_weight(iteration: int, w_max: float, tau: float) -> float:
+    """Return w(t) = w_max (1 − exp(−t/τ)), GeoRefGS eq. 27."""
+    return w_max * (1.0 - math.exp(-iteration / tau))
 
 
 @dataclass(frozen=True)

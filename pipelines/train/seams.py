@@ -22,7 +22,7 @@ import torch
 from pipelines.core.durable import replace_text
 from pipelines.core.interrupts import deferred_interrupts
 from pipelines.core.products import load_json
-from pipelines.core.stages import BLOCK_GAUSSIANS, BLOCK_PLAN, SCAFFOLD
+from pipelines.core.stages import BLOCK_GAUSSIANS, BLOCK_PLAN, SCAFFOLD, SOLUTION
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.scene.block_plan import BlockCell, BlockPlan, PlannedBlock
 from pipelines.scene.photographs import ImageCache
@@ -31,8 +31,9 @@ from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.rasterizer.api import Rasterizer
 from pipelines.splat.rasterizer.backends import device_of, rasterizer
 from pipelines.splat.storage import read_gaussians, write_gaussians
+from pipelines.train.adjusted_scene import AdjustedScene
 from pipelines.train.assembly import make_finisher
-from pipelines.train.frozen_training import SolvedScene, load_solved_scene
+from pipelines.train.geographic.problem import held_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.options import SeamOptions
 from pipelines.train.region import SceneBox, TrainingRegion
@@ -52,7 +53,7 @@ def run(stage: StageRun, options: SeamOptions) -> Summary:
     """
     workspace, backend = stage.workspace, rasterizer(options.backend)
     plan = load_json(BlockPlan, workspace.path(BLOCK_PLAN))
-    solved = load_solved_scene(workspace)
+    solved = AdjustedScene.load(workspace, SOLUTION)
     images = photographs(solved.scene.sparse, solved.survey, workspace, options.effort.max_image_size)
     model = _CellFiles(stage.out, plan)
     model.begin(workspace.root, afresh=not stage.resumed)
@@ -143,7 +144,7 @@ class _CellFiles:
 class _SeamTrainer:
     """Trainer of strips, with what all of them share."""
 
-    solved: SolvedScene
+    solved: AdjustedScene
     images: ImageCache
     scaffold: Gaussians
     backend: Rasterizer
@@ -195,7 +196,7 @@ class _SeamTrainer:
         trainer = make_finisher(
             training,
             start.to(device),
-            solved.problem(),
+            held_problem(solved),
             backend=self.backend,
             options=self.options.model_copy(update={"iterations": iterations}),
             exposures=solved.exposures(device),

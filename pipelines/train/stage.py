@@ -1,40 +1,46 @@
 """Stage `train`: joint optimisation of Gaussians, similarity and cameras (GeoRefGS, section 2.4).
 
-Reads the survey, the SfM model, the geolocated points and the initial similarity. Writes `train/gaussians.ply`
-(frame `model`), `train/model.json` (similarity with covariance, cameras, constant errors), `train/metrics.jsonl`
-and the latest checkpoint. An interrupted run leaves a checkpoint in `train.partial/`, from which the next run with
-the same options continues. A finished training with fewer iterations is extended from its last checkpoint.
+Reads the survey, the SfM model, the geolocated points and the adjustment of `init-sim3`, from which it starts.
+Writes `train/gaussians.ply` (frame `model`), `train/model.json` and `train/adjustment.npz` (the adjustment at the
+end of the training), `train/metrics.jsonl` and the latest checkpoint. An interrupted run leaves a checkpoint in
+`train.partial/`, from which the next run with the same options continues. A finished training with fewer iterations
+is extended from its last checkpoint.
 """
 
 from __future__ import annotations
 
 import json
 import logging
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
-from pipelines.adjust.frozen_solution import solve_and_hold
-from pipelines.adjust.geographic import geo_problem
+from pipelines.adjust.posterior import Posterior, save_posterior
+from pipelines.adjust.system import minimise
 from pipelines.core.products import load_json, save_json
-from pipelines.core.stages import LIDAR, LIDAR_MAP, POINTS
+from pipelines.core.stages import LIDAR, LIDAR_MAP, MODEL, POINTS, SIM3_POSTERIOR, TRAIN_POSTERIOR
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.scene.calibrated import load_survey
 from pipelines.scene.geolocated import GeolocatedPoints
 from pipelines.scene.measured_cloud import CloudFiles
-from pipelines.scene.scene import load_initial_scene, photographs
-from pipelines.scene.trained_model import TrainedModel
+from pipelines.scene.scene import photographs
+from pipelines.scene.trained_model import Adjustment, TrainedModel
 from pipelines.splat.memory import free_memory_bytes, require_memory
 from pipelines.splat.rasterizer.backends import device_of, rasterizer
 from pipelines.splat.storage import write_gaussians
+from pipelines.train.adjusted_scene import AdjustedScene
 from pipelines.train.assembly import make_trainer
 from pipelines.train.depth_maps import DepthMaps
 from pipelines.train.forecast import forecast_of
 from pipelines.train.gaussian_limit import training_size, with_gaussian_limit
+from pipelines.train.geographic.problem import held_problem, refining_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.lidar.prepare import compared_lidar, draw_changes, lidar_surface
 from pipelines.train.lidar.track import ScannerTrack
 from pipelines.train.options import TrainOptions
 from pipelines.train.result import summary_of, trained_model
 from pipelines.train.surface import SceneSurface
+from pipelines.train.trainer import JointTrainer
 from pipelines.train.training_files import METRICS, train_in_folder
 
 log = logging.getLogger(__name__)
@@ -54,7 +60,8 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     backend = rasterizer(options.backend, stage.progress)
     workspace = stage.workspace
     clouds = None if options.lidar is None else CloudFiles(options.lidar, options.lidar_stated)
-    initial, survey, scene = load_initial_scene(workspace)
+    adjusted = AdjustedScene.load(workspace)
+    survey, scene = adjusted.survey, adjusted.scene
     track = None
     if options.lidar_trajectory is not None:
         track = ScannerTrack.read(options.lidar_trajectory, options.lidar_stated, survey.origin)
@@ -71,29 +78,58 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     if clouds is not None and maps is not None:
         compared = compared_lidar(
             options, clouds, maps, survey, track=track,
-            georeference=initial.geo_from_local, seed=options.seed, progress=stage.progress,
+            georeference=adjusted.adjustment.geo_from_model, seed=options.seed, progress=stage.progress,
         )  # fmt: skip
-    points = GeolocatedPoints.load(workspace.path(POINTS))
     planes = compared.planes() if compared is not None and options.lidar_register else None
-    problem = geo_problem(scene, survey, initial, options, points=points, planes=planes, seed=options.seed)
-    if problem.bundle is not None:
-        log.info("the %d cameras are solved once, before the training, and held", len(images))
-    solve_and_hold(problem)
+    measured = adjusted.measured(control_points=options.gcp_loss, planes=planes)
+    posterior: Posterior | None = None
+    if planes is not None:
+        posterior = adjusted.posterior(measured, minimise(measured, adjusted.state(measured.errors)).state)
+        adjusted = replace(adjusted, adjustment=posterior.solution)
+    refines = options.refined_cameras(len(images)) > 0
+    if refines:
+        adjusted.require_determined(measured)
+        points = GeolocatedPoints.load(workspace.path(POINTS))
+        problem = refining_problem(adjusted, measured, options, points, options.seed)
+    else:
+        log.info("similarity and cameras are held at the adjustment of init-sim3")
+        problem = held_problem(adjusted)
     surface, lidar = None if maps is None else SceneSurface(maps), None
     if compared is not None and clouds is not None:
-        shift = problem.estimate().errors.lidar_m
-        shift_m = None if shift is None else shift.detach().cpu().numpy()
+        shift_m = measured.errors.value(adjusted.error_estimates(measured.errors)[0], "lidar-shift")
         lidar = lidar_surface(compared, clouds, survey, options, shift_m)
         surface = lidar.surface
         save_json(lidar.report, stage.out / Path(LIDAR).name)
         draw_changes(stage.out / Path(LIDAR_MAP).name, lidar, scene)
     trainer = make_trainer(TrainingScene(scene, images, surface), problem, backend, options)
     record = train_in_folder(stage, trainer, options, _iterations(stage))
-    model = trained_model(trainer, scene, initial)
+    if refines:
+        posterior = adjusted.posterior(measured, problem.state())
+    model = _write_solution(stage, trainer, adjusted.adjustment, posterior)
     write_gaussians(stage.out / "gaussians.ply", trainer.optimizer.gaussians.detached())
-    save_json(model, stage.out / "model.json")
     metrics = [json.loads(row) for row in (stage.out / METRICS).read_text(encoding="utf-8").splitlines()]
     return summary_of(model, metrics, record, None if lidar is None else lidar.report)
+
+
+def _write_solution(
+    stage: StageRun, trainer: JointTrainer, held: Adjustment, posterior: Posterior | None
+) -> TrainedModel:
+    """Write the adjustment at the end of a training, and return it with the settings of the training.
+
+    Args:
+        stage: has the folder.
+        trainer: at the end of the training.
+        held: the adjustment that the training has held.
+        posterior: that of the training; None: it has held that of `init-sim3`.
+    """
+    model = trained_model(trainer, held if posterior is None else posterior.solution)
+    save_json(model, stage.out / Path(MODEL).name)
+    path = stage.out / Path(TRAIN_POSTERIOR).name
+    if posterior is None:
+        shutil.copyfile(stage.workspace.path(SIM3_POSTERIOR), path)
+    else:
+        save_posterior(posterior, path)
+    return model
 
 
 def made_in_parts(workspace: Workspace, options: TrainOptions) -> bool:

@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pipelines.adjust.problem import GeoProblem
 from pipelines.core.types import IntArray
 from pipelines.geometry.cameras import Pinhole
 from pipelines.geometry.lens import Lenses
@@ -26,6 +25,7 @@ from pipelines.splat.outlier_pixels import OutlierPixels
 from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings, Render, ScreenStats
 from pipelines.splat.surface import ObservedPoints
 from pipelines.train.checkpoint import prefixed, unprefixed
+from pipelines.train.geographic.problem import GeoProblem
 from pipelines.train.geographic_adam import GeographicAdam
 from pipelines.train.pace import iteration_seconds
 from pipelines.train.region import TrainingRegion

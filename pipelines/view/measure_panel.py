@@ -114,11 +114,6 @@ class MeasurePanel(Panel):
         with self._lock:
             self._add(point, "")
 
-    def refresh(self) -> None:
-        """Show the present measurement anew, after σ have become known."""
-        with self._lock:
-            self._compute()
-
     def _add(self, point: SurfacePoint | NoSurface, note: str) -> None:
         if isinstance(point, NoSurface):
             self._tell(f"Nothing measured: {point.reason}.")

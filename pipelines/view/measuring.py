@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import block_diag
 
-from pipelines.adjust.error_propagation import ErrorPropagation, NoErrorPropagation, propagate_errors
+from pipelines.adjust.solution import posterior_of
 from pipelines.core.cautions import is_checked
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import FloatArray
@@ -65,6 +65,11 @@ class MeasuringModel:
     Attributes:
         trained: the trained survey.
         target: the CRS.
+        posterior: covariances of the model; None: none are stated.
+
+    Raises:
+        MissingProductError: the model was stored without its covariances.
+        InputError: a product is damaged, or the CRS cannot be used here.
     """
 
     def __init__(self, workspace: Workspace, renderer: ModelRenderer, crs: CrsOptions) -> None:
@@ -72,30 +77,13 @@ class MeasuringModel:
         survey = self.trained.survey
         centers = self.trained.geo_from_model.apply(self.trained.poses.cam_center_in_model)
         self.target: TargetCrs = usable_crs(crs, survey.origin, centers, survey.vertical)
-        self._workspace = workspace
-        self._propagated: ErrorPropagation | NoErrorPropagation = NoErrorPropagation("it is being computed")
-
-    def propagate_errors(self) -> None:
-        """Compute the covariances of the model; no σ is stated before. With many cameras it takes a while.
-
-        Raises:
-            MissingProductError: init-sim3 has not been run.
-            InputError: a product is damaged.
-        """
-        if is_checked(self.trained.model.cautions):
-            self._propagated = propagate_errors(self._workspace, self.trained)
-        else:
-            self._propagated = NoErrorPropagation("nothing checks the σ of the positions")
-
-    @property
-    def propagation(self) -> ErrorPropagation | None:
-        """Covariances of the model; None: none are stated."""
-        return None if isinstance(self._propagated, NoErrorPropagation) else self._propagated
+        is_stated = is_checked(self.trained.model.cautions)
+        self.posterior = posterior_of(workspace, self.trained.model, self.trained.sfm) if is_stated else None
 
     @property
     def without_sigma(self) -> str:
         """Why no σ is stated; empty: it is."""
-        return self._propagated.reason if isinstance(self._propagated, NoErrorPropagation) else ""
+        return "" if self.posterior is not None else "nothing checks the σ of the positions"
 
     def under(self, sight: Sight) -> SurfacePoint | NoSurface:
         """Return the point of the surface under a line of sight."""
@@ -111,9 +99,9 @@ class MeasuringModel:
         The intersection is NaN with fewer than two marks; the covariance is None where none is stated.
         """
         position = points_by_camera(self.trained, rays)
-        if self.propagation is None or not np.isfinite(position).all():
+        if self.posterior is None or not np.isfinite(position).all():
             return position[0], None
-        return position[0], self.propagation.prediction.of_marked_points(position, rays)[0]
+        return position[0], self.posterior.of_marked_points(position, rays)[0]
 
     def place(self, point: SurfacePoint) -> PlacedPoint:
         """Return a point in the CRS, with σ of georeference, cameras, lens and surface."""
@@ -156,12 +144,12 @@ class MeasuringModel:
 
     def _joint_covariance(self, points: Sequence[SurfacePoint]) -> FloatArray | None:
         """Return the joint covariance (3 J, 3 J) of points without the surface's own."""
-        if self.propagation is None or not points:
+        if self.posterior is None or not points:
             return None
         position = np.array([point.position_in_geo for point in points])
         number = np.repeat(np.arange(len(points)), [len(point.cameras) for point in points])
         cameras = np.concatenate([point.cameras for point in points])
-        cov = self.propagation.prediction.jointly_of_scene(position, number, cameras)
+        cov = self.posterior.jointly_of_scene(position, number, cameras)
         return cov if np.isfinite(cov).all() else None
 
     def _heights_m(self, position_in_geo: FloatArray) -> FloatArray:

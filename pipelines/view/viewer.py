@@ -80,28 +80,16 @@ class Viewer:
         self.photo = PhotoView(server, trained, self.frame, self.signs, self.wake)
         self._build(workspace, workspace.root / FOLDER)
         server.scene.on_click()(self._clicked)
-        self._solving = threading.Thread(target=self._propagate_errors, daemon=True)
-        self._solving.start()
+        threading.Thread(target=self._prepare_clicks, daemon=True).start()
         server.on_client_connect(self._connected)
         server.on_client_disconnect(self._left)
         for client in server.get_clients().values():
             self._connected(client)
 
-    def _propagate_errors(self) -> None:
-        """Compute σ after the first picture, which should not wait for them."""
+    def _prepare_clicks(self) -> None:
+        """Sort the Gaussians after the first picture, so that neither it nor the first click waits."""
         self._first_drawn.wait(_FIRST_S)
-        self._renderer.prepare_windows()  # for the first click
-        try:
-            self.model.propagate_errors()
-        except GeorefError as error:
-            self.tell(f"No σ is stated: {error}")
-        self.measuring.refresh()
-        self._colour_points()
-
-    def wait_for_sigma(self) -> None:
-        """Compute σ now, and wait for them."""
-        self._first_drawn.set()
-        self._solving.join()
+        self._renderer.prepare_windows()
 
     def _build(self, workspace: Workspace, folder: Path) -> None:
         gui, trained = self._server.gui, self.model.trained
@@ -163,8 +151,8 @@ class Viewer:
 
     def _colour_points(self) -> None:
         grid: AccuracyGrid | None = None
-        if self._colour.value != "of the photographs" and self.model.propagation is not None:
-            grid = self.model.propagation.grid
+        if self._colour.value != "of the photographs" and self.model.posterior is not None:
+            grid = self.model.posterior.grid
         limits = self.signs.add_points(self._colour.value, grid)
         if limits is not None:
             low, high = limits

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from pipelines.adjust.alignment import Alignment, align, mean_rotation
-from pipelines.adjust.similarity_fit import Correspondences
+from pipelines.adjust.similarity_fit import Correspondences, covariance_of
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.geometry.rotations import exp_so3, log_so3
-from pipelines.geometry.similarity import Similarity, moved_pivot
+from pipelines.geometry.similarity import moved_pivot
 from tests.scenes import GEO_FROM_LOCAL, Layout, make_scene
 
 
@@ -184,7 +184,14 @@ def test_mean_rotation_survives_bad_attitudes() -> None:
     assert np.linalg.norm(log_so3(prior.rotation @ truth.T)) < 0.01
 
 
-def test_guess_far_off_does_no_harm() -> None:
-    guess = Similarity(1.0, np.eye(3), np.array([500.0, 0.0, 0.0]))
-    found = align(correspondences(), np.random.default_rng(0), guesses=(guess,))
-    assert squared_error(found) < 24.3
+def test_covariance_is_that_of_least_squares_whatever_the_units_and_wide_where_nothing_is_known() -> None:
+    rng = np.random.default_rng(5)
+    jacobian = rng.normal(size=(90, 5))
+    for unit in (np.ones(5), 10.0 ** rng.uniform(-4, 4, 5)):
+        covariance = covariance_of(jacobian / unit, unit)
+        np.testing.assert_allclose(
+            covariance / np.outer(unit, unit), np.linalg.inv(jacobian.T @ jacobian), rtol=1e-9
+        )
+    jacobian[:, 2] = 0.0
+    sigma = np.sqrt(np.diag(covariance_of(jacobian, np.ones(5))))
+    assert np.isfinite(sigma).all() and sigma[2] > 1e4 * np.delete(sigma, 2).max()

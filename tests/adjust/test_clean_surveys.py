@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.adjusted_scenes import adjusted_model, block
-from tests.scenes import WITH_GCPS, Layout, Noise, survey_of
+from tests.scenes import WITH_GCPS, Layout, Noise, session_of, survey_of
 from tests.statements import state
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -44,11 +44,16 @@ def test_statements_of_clean_surveys_are_true_and_blame_nobody() -> None:
     pooled, blamed = [], {}
     for seed, case in enumerate(CASES):
         of, rng = block(case.layout, case.images), np.random.default_rng(seed)
-        noise = Noise(fix_m=case.fix_m, pixel_px=0.2)
+        common = np.array(session_of(case.fix_m[0]).sigma_common_m) * (case.control > 0)
+        noise = Noise(fix_m=case.fix_m, pixel_px=0.2, bias_m=tuple(common * rng.normal(size=3)))
         model, survey = adjusted_model(of, noise, rng), survey_of(of.scene, noise, WITH_GCPS, rng)
         points = survey.control_points
         survey = survey.model_copy(
-            update={"control_points": points[: case.control], "check_points": points[CONTROL:]}
+            update={
+                "control_points": points[: case.control],
+                "check_points": points[CONTROL:],
+                "sessions": survey.sessions if case.control else (),
+            }
         )
         statement = state(survey, model)
         pooled.append(statement.normalised_errors(of.scene.gcp_in_geo[CONTROL:]).mean())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -122,20 +123,23 @@ def test_check_points_do_not_matter() -> None:
     np.testing.assert_array_equal(first.points.position_in_geo, second.points.position_in_geo)
 
 
-def turned_attitudes(survey: Survey, angle_deg: float) -> Survey:
-    """The survey with a boresight error: all attitudes turned alike about the vertical."""
+def turned_attitudes(survey: Survey, names: Sequence[str], change: Callable[[np.ndarray], np.ndarray]) -> Survey:
+    """The survey with the rotations (3, 3) of some images changed."""
     images = []
     for image in survey.images:
         assert image.attitude is not None
-        turned = exp_so3([0, 0, np.radians(angle_deg)]) @ matrix_from_quat_xyzw(image.attitude.quat_xyzw)
-        quat = tuple(quat_xyzw_from_matrix(turned).tolist())
+        quat = image.attitude.quat_xyzw
+        if image.name in names:
+            quat = tuple(quat_xyzw_from_matrix(change(matrix_from_quat_xyzw(quat))).tolist())
         images.append(image.model_copy(update={"attitude": image.attitude.model_copy(update={"quat_xyzw": quat})}))
     return survey.model_copy(update={"images": tuple(images)})
 
 
 def test_boresight_error_is_told() -> None:
     scene, rng = make_scene(points=60), np.random.default_rng(0)
-    survey = turned_attitudes(survey_of(scene, Noise(), Measured(), rng), 5.0)
+    about_vertical = exp_so3([0, 0, np.radians(5.0)])
+    whole = survey_of(scene, Noise(), Measured(), rng)
+    survey = turned_attitudes(whole, scene.names, lambda rotation: about_vertical @ rotation)
     found = geolocate(survey, sparse_model(scene, Noise(), rng), CONFIG)
     assert any("turned by 5." in text or "turned by 4." in text for text in found.warnings)
 
@@ -165,18 +169,9 @@ def test_a_photograph_turned_in_a_viewer_loses_its_attitude_not_the_survey() -> 
     # The drone's attitude stays in the file when a person turns the picture: it is wrong by 180° about the axis.
     scene, rng = make_scene(points=100), np.random.default_rng(0)
     whole = survey_of(scene, Noise(), Measured(), rng)
-    images = list(whole.images)
-    turned = [2, 5]
-    for index in turned:
-        attitude = images[index].attitude
-        assert attitude is not None
-        upside_down = matrix_from_quat_xyzw(attitude.quat_xyzw) @ np.diag([-1.0, -1.0, 1.0])
-        quat = tuple(float(value) for value in quat_xyzw_from_matrix(upside_down))
-        images[index] = images[index].model_copy(
-            update={"attitude": attitude.model_copy(update={"quat_xyzw": quat})}
-        )
-    survey = whole.model_copy(update={"images": tuple(images)})
+    turned = [scene.names[2], scene.names[5]]
+    survey = turned_attitudes(whole, turned, lambda rotation: rotation @ np.diag([-1.0, -1.0, 1.0]))
     found = geolocate(survey, sparse_model(scene, Noise(), rng), CONFIG)
-    for index in turned:
-        assert any(images[index].name in warning and "turned" in warning for warning in found.warnings)
+    for name in turned:
+        assert any(name in warning and "turned" in warning for warning in found.warnings)
     assert found.points.inlier.mean() > 0.9

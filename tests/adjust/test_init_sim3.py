@@ -45,6 +45,14 @@ def material(
     return survey, model, geolocate(survey, model, GeolocateOptions()).points
 
 
+def estimated(
+    survey: Survey, model: SparseModel, points: GeolocatedPoints, options: InitSim3Options
+) -> tuple[InitialSimilarity, tuple[str, ...]]:
+    """Return the similarity and the warnings."""
+    result = estimate_similarity(survey, model, points, options)
+    return result.initial, result.warnings
+
+
 def squared_error(found: InitialSimilarity) -> float:
     record = found.geo_from_local
     away = GEO_FROM_LOCAL @ Similarity.from_record(record).inverse()
@@ -74,7 +82,7 @@ def test_stage_recovers_the_truth_with_rtk(tmp_path: Path) -> None:
 def test_outlying_fixes_are_listed() -> None:
     noise = replace(Noise(fix_m=(0.05, 0.05, 0.08)), outliers=(2, 7, 11, 20))
     survey, model, points = material(noise, Measured())
-    found, warnings = estimate_similarity(survey, model, points, CONFIG)
+    found, warnings = estimated(survey, model, points, CONFIG)
     assert found.gnss_outliers == tuple(f"image_{index:03d}.jpg" for index in noise.outliers)
     assert found.inliers["gnss"] == 20
     assert squared_error(found) < 24.3  # χ²₇ at 0.999
@@ -83,7 +91,7 @@ def test_outlying_fixes_are_listed() -> None:
 
 def test_control_points_alone_carry_the_survey() -> None:
     survey, model, points = material(Noise(), Measured(fixes=False, attitudes=False, gcps=True))
-    found, _ = estimate_similarity(survey, model, points, CONFIG)
+    found, _ = estimated(survey, model, points, CONFIG)
     assert found.inliers == {"gnss": 0, "gcp": 6, "points": 0}
     assert found.residuals["gnss"].count == 0
     assert squared_error(found) < 24.3
@@ -92,7 +100,7 @@ def test_control_points_alone_carry_the_survey() -> None:
 def test_fixes_that_contradict_control_points_are_told_with_numbers() -> None:
     noise = replace(Noise(), bias_m=(0.4, 0.0, -1.2))
     survey, model, points = material(noise, Measured(gcps=True))
-    found, _ = estimate_similarity(survey, model, points, CONFIG)
+    found, _ = estimated(survey, model, points, CONFIG)
     assert squared_error(found) < 24.3
     (caution,) = found.cautions
     assert caution.code == "fixes-shifted"
@@ -101,13 +109,13 @@ def test_fixes_that_contradict_control_points_are_told_with_numbers() -> None:
 
 def test_paper_method_is_coarse_but_near() -> None:
     survey, model, points = material(Noise(), Measured())
-    found, _ = estimate_similarity(survey, model, points, InitSim3Options(method="paper"))
+    found, _ = estimated(survey, model, points, InitSim3Options(method="paper"))
     assert found.method == "paper"
     away = Similarity.from_record(found.geo_from_local).apply(model.point_in_local)
     error = np.linalg.norm(away - GEO_FROM_LOCAL.apply(model.point_in_local), axis=1)
     # 0.5° attitudes over 100 m, averaged over 24 cameras: 0.2 m.
     assert error.mean() < 0.6
-    robust, _ = estimate_similarity(survey, model, points, CONFIG)
+    robust, _ = estimated(survey, model, points, CONFIG)
     assert found.residuals["gnss"].rmse_3d_m > robust.residuals["gnss"].rmse_3d_m
 
 
@@ -121,12 +129,12 @@ def test_max_residual_fails_with_the_figures() -> None:
     survey, model, points = material(CONSUMER, Measured())
     with pytest.raises(ConvergenceError, match=r"RMS residual of 24 camera centres is \d\.\d+ m .*0\.1 m"):
         estimate_similarity(survey, model, points, InitSim3Options(max_residual=0.1))
-    assert estimate_similarity(survey, model, points, InitSim3Options(max_residual=10.0))[0].inliers["gnss"] == 24
+    assert estimated(survey, model, points, InitSim3Options(max_residual=10.0))[0].inliers["gnss"] == 24
 
 
 def test_line_needs_attitude() -> None:
     survey, model, points = material(Noise(), Measured(), layout="line")
-    found, _ = estimate_similarity(survey, model, points, CONFIG)
+    found, _ = estimated(survey, model, points, CONFIG)
     assert found.layout == "line"
     assert found.attitude_used and found.attitude is not None
     assert squared_error(found) < 24.3
@@ -152,7 +160,7 @@ def test_unusable_control_points_are_named() -> None:
     )
     broken = second.model_copy(update={"marks": shifted})
     spoilt = survey.model_copy(update={"control_points": (lonely, broken, *rest)})
-    found, warnings = estimate_similarity(spoilt, model, points, CONFIG)
+    found, warnings = estimated(spoilt, model, points, CONFIG)
     assert found.correspondences["gcp"] == 4
     assert any("gcp0: marked in fewer than 2" in text for text in warnings)
     assert any("gcp1: its" in text and "do not meet" in text for text in warnings)
@@ -211,9 +219,9 @@ def test_points_of_another_model_are_refused() -> None:
 
 def test_control_points_can_be_left_out() -> None:
     survey, model, points = material(CONSUMER, Measured(gcps=True))
-    with_control, _ = estimate_similarity(survey, model, points, CONFIG)
-    without, _ = estimate_similarity(survey, model, points, InitSim3Options(control_points=False))
+    with_control, _ = estimated(survey, model, points, CONFIG)
+    without, _ = estimated(survey, model, points, InitSim3Options(control_points=False))
     assert with_control.correspondences["gcp"] == 6
     assert without.correspondences["gcp"] == without.residuals["gcp"].count == 0
-    alone, _ = estimate_similarity(survey.model_copy(update={"control_points": ()}), model, points, CONFIG)
+    alone, _ = estimated(survey.model_copy(update={"control_points": ()}), model, points, CONFIG)
     assert without == alone

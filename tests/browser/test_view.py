@@ -135,7 +135,6 @@ def wait(holds: Callable[[], bool]) -> None:
 def opened(workspace: Workspace, browser: Browser) -> Opened:
     server, address = start_server(8700, "hill")
     viewer = Viewer(server, workspace, ViewOptions())
-    viewer.wait_for_sigma()
     page, outside = browser.new_page(viewport=SIZE), []
 
     def loopback_only(route: Route) -> None:

@@ -38,7 +38,7 @@ def made(tmp_path: Path) -> Path:
         ("geolocate", "sfm", f"error: {SPARSE} is missing: run `georef sfm {{ws}}` first"),
         ("init-sim3", "geolocate", f"error: {POINTS} is missing: run `georef geolocate {{ws}}` first"),
         ("train", "sim3", f"error: {SIM3} is missing: run `georef init-sim3 {{ws}}` first"),
-        ("evaluate", "train", f"error: {MODEL} is missing: run `georef train {{ws}}` first"),
+        ("evaluate", "sim3", f"error: {SIM3} is missing: run `georef init-sim3 {{ws}}` first"),
         ("export-ply", "train", f"error: {MODEL} is missing: run `georef train {{ws}}` first"),
     ],
 )

@@ -65,7 +65,11 @@ def test_run_refuses_before_its_first_stage(georef: Georef, interrupted: Path, p
 
 def test_other_inputs_are_refused(georef: Georef, interrupted: Path) -> None:
     assert georef("init-sim3", interrupted, "--seed", 5).code == 0
-    assert_refused(georef("run", interrupted), interrupted, "sim3/geo_from_local.json changed")
+    assert_refused(
+        georef("run", interrupted),
+        interrupted,
+        "sim3/adjustment.json, sim3/adjustment.npz, sim3/geo_from_local.json changed",
+    )
 
 
 @pytest.mark.parametrize("words", [("run",), ("train", "--resume"), ("train", "--preset", "fast")])

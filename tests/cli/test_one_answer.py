@@ -12,6 +12,7 @@ import pytest
 
 from georef_cli import batch_tables
 from georef_cli.output import print_outcomes, print_rich
+from pipelines.adjust.solution import load_adjustment
 from pipelines.batch.files import write_batch
 from pipelines.batch.missions import Mission
 from pipelines.batch.table import BatchTable, mission_row
@@ -28,12 +29,14 @@ from pipelines.deliver.tiles import stage as tiles
 from pipelines.report import stage as report
 from pipelines.scene.crs_options import CrsOptions
 from pipelines.scene.headline import headline, headline_of
-from pipelines.scene.report import AccuracySummary, EvaluationReport, TotalRmse
+from pipelines.scene.report import AccuracySummary, EvaluationReport, TotalRmse, read_report
 from pipelines.scene.survey import Survey
 from pipelines.view.viewer import accuracy_line
 from tests.cli_runs import Georef
 from tests.evaluated_workspaces import CHECK_POINTS, ERROR_M, evaluated_workspace
 from tests.reports import check_points_with
+from tests.scenes import WITH_GCPS, Noise, make_scene, sparse_model, survey_of, write_workspace
+from tests.trained_workspaces import untrained
 
 UNCHECKED = (Caution(code=NOT_CHECKED, sentence="Nothing checks the positions."),)
 
@@ -78,8 +81,8 @@ def test_it_is_the_same_everywhere(
     runs = {"ply": ply.run, "spz": spz.run, "tiles": tiles.run, "cameras": cameras.run}
     folders = {name: made(flight, f"export-{name}", run) for name, run in runs.items()}
     sidecars = [path for folder in folders.values() for path in folder.rglob("*.georef.json")]
-    assert len(sidecars) == 8
-    assert [json.loads(path.read_text("utf-8"))["accuracy"] for path in sidecars] == [figures] * 8
+    assert len(sidecars) == 10
+    assert [json.loads(path.read_text("utf-8"))["accuracy"] for path in sidecars] == [figures] * 10
 
     # In text, to the digit that is shown.
     page = (made(flight, "report", report.run) / "report.html").read_text("utf-8")
@@ -141,8 +144,38 @@ def test_without_check_points_it_is_predicted_and_called_so() -> None:
     assert headline(points, scene, UNCHECKED).text == "measured at 1 check point: RMSE H 3.0 cm, V 4.0 cm"
 
 
-def test_a_workspace_without_evaluation_states_none(real_georef: Georef, flight: Workspace) -> None:
+def test_before_evaluation_the_adjustment_predicts_it(real_georef: Georef, flight: Workspace) -> None:
     flight.path(REPORT).unlink()
+    stated = headline_of(flight)
+    grid = load_adjustment(flight).grid
+    assert stated is not None and stated.rmse_h_m is not None and grid is not None
+    assert stated.kind == "predicted"
+    assert stated.rmse_h_m == pytest.approx(np.sqrt(np.mean(grid.sigma_h_m**2)), rel=1e-12)
+    assert real_georef("status", flight.root, "--json").document["accuracy"] == stated.model_dump()
+    assert stated.text in " ".join(real_georef("info", flight.root).out.split())
+    untrained(flight)  # init-sim3 predicts it as training does
+    assert headline_of(flight) == stated
+    flight.path("sim3/adjustment.json").unlink()
     assert headline_of(flight) is None
-    assert real_georef("status", flight.root, "--json").document["accuracy"] is None
-    assert "not known yet: georef evaluate states it" in real_georef("info", flight.root).out
+
+
+def test_a_run_without_training_ends_with_its_evaluation(real_georef: Georef, tmp_path: Path) -> None:
+    scene, rng = make_scene(), np.random.default_rng(4)
+    survey = survey_of(scene, Noise(), WITH_GCPS, rng)
+    points = {"control_points": survey.control_points[2:], "check_points": survey.control_points[:2]}
+    root = write_workspace(
+        tmp_path / "ws", survey.model_copy(update=points), sparse_model(scene, Noise(), rng)
+    ).root
+    ended = real_georef("run", root, "--to", "init-sim3")
+    assert ended.code == 0
+    for title in ("Errors of the check points", "Predicted σ", "Residuals of the fit"):
+        assert title in ended.out
+    assert not (root / "evaluate").exists()  # no stage of its own
+    document = real_georef("run", root, "--to", "init-sim3", "--json").document
+    evaluation = document["evaluation"]
+    stated = Headline.model_validate(evaluation["headline"])
+    assert stated.check_points == 2 and stated.text in " ".join(ended.out.split())
+    assert evaluation["checkpoints"]["model"] is None and evaluation["cameras"]["count"] == len(scene.names)
+    # The stage, asked for by its name, states the same; and so does the report, without what Gaussians show.
+    assert real_georef("evaluate", root).code == 0
+    assert read_report(root / REPORT).model_dump(mode="json") == evaluation

@@ -17,16 +17,20 @@ import numpy as np
 import pytest
 import torch
 from pyproj import Geod, Transformer
+from scipy.sparse import bsr_matrix
 from scipy.spatial.transform import Rotation
 
+from pipelines.adjust.posterior import Posterior, save_posterior
+from pipelines.adjust.system import NormalMatrix
 from pipelines.core.products import load_json, save_json
-from pipelines.core.stages import GAUSSIANS, MODEL, REPORT, SIM3, SPARSE, SURVEY
+from pipelines.core.stages import GAUSSIANS, MODEL, REPORT, SIM3, SPARSE, SURVEY, TRAIN_POSTERIOR
+from pipelines.formats.colmap import read_sparse
 from pipelines.formats.colmap_writer import write_sparse
 from pipelines.geometry.cameras import Camera
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.scene.survey import Survey
-from pipelines.scene.trained_model import TrainedCamera
+from pipelines.scene.trained_model import TrainedCamera, TrainedModel
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.storage import write_gaussians
 from tests.cli_runs import Georef
@@ -172,7 +176,9 @@ def write_perfect_model(root: Path, made: Site) -> None:
         )
         for name, rotation, place in zip(made.names, cam_from_model, translation, strict=True)
     )
-    save_json(trained_model(Similarity(translation=shift), max_image_size=64, cameras=cameras), root / MODEL)
+    model = trained_model(Similarity(translation=shift), max_image_size=64, cameras=cameras)
+    save_json(model, root / MODEL)
+    write_flawless_posterior(root, model)
     start = Similarity(translation=shift).to_record("local", "geo", covariance=1e-6 * np.eye(7))
     save_json(initial_product(start), root / SIM3)
     # One far from everything: by model, no point is found.
@@ -180,6 +186,18 @@ def write_perfect_model(root: Path, made: Site) -> None:
         torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.zeros(1, 3), torch.zeros(1), torch.zeros(1, 1, 3)
     )
     write_gaussians(root / GAUSSIANS, speck)
+
+
+def write_flawless_posterior(root: Path, model: TrainedModel) -> None:
+    """Cameras of 1 mm and 1 mrad, independent of each other, under an exact lens."""
+    n = len(model.cameras)
+    normal = NormalMatrix(
+        bsr_matrix(1e6 * np.eye(6 * n), blocksize=(6, 6)), np.zeros((0, 6 * n)), np.zeros((0, 0)), np.eye(n, 3)
+    )
+    covariances = np.tile(1e-6 * np.eye(6), (n, 1, 1))
+    none = np.zeros(0, dtype=np.int64)
+    sparse, followed = read_sparse(root / SPARSE), np.zeros((7, 6 * n))
+    save_posterior(Posterior(model, sparse, normal, followed, none, covariances), root / TRAIN_POSTERIOR)
 
 
 def coordinates_of(root: Path) -> dict[str, Any]:

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from pyproj import Proj, Transformer
 
+from pipelines.adjust.solution import load_adjustment
 from pipelines.core.cautions import NOT_CHECKED, Caution
 from pipelines.core.errors import InputError
-from pipelines.core.manifest import MANIFEST, Manifest
 from pipelines.core.products import load_json, save_json
 from pipelines.core.stages import MODEL, SPARSE, SURVEY
-from pipelines.core.workspace import StageRun, Summary, Workspace, now
+from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.deliver.cameras.stage import run
 from pipelines.deliver.options import ExportCamerasOptions
 from pipelines.formats.colmap import read_sparse
@@ -30,7 +30,7 @@ from pipelines.geometry.rotations import map_from_cam, matrix_from_quat_xyzw
 from pipelines.scene.survey import Survey
 from pipelines.scene.trained_model import TrainedModel
 from tests.scenes import TrueScene
-from tests.trained_workspaces import IMAGES, trained_workspace
+from tests.trained_workspaces import IMAGES, scene_of, trained_workspace, untrained
 
 pycolmap = pytest.importorskip("pycolmap")
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -219,16 +219,40 @@ def test_unchecked_positions_have_no_sigma(handover: Handover, tmp_path: Path) -
     assert table.columns("kappa_deg")[0, 0] != handover.columns("kappa_deg")[0, 0]
 
 
-def test_cameras_that_training_held_have_no_sigma(tmp_path: Path) -> None:
+def test_covariances_are_full_and_those_of_the_table(handover: Handover) -> None:
+    with np.load(handover.out / "covariances.npz") as file:
+        found = {name: file[name] for name in file.files}
+    assert tuple(found["camera_name"]) == handover.scene.names
+    assert found["camera_cov"].shape == (IMAGES, 6, 6)
+    # The middle of the scene is near enough that its axes are those of each camera.
+    sigma = np.sqrt(np.diagonal(found["camera_cov"], axis1=1, axis2=2))
+    np.testing.assert_allclose(sigma[:, 3:], handover.columns("sigma_e_m", "sigma_n_m", "sigma_u_m"), atol=6e-5)
+    with (handover.out / "camera_covariances.csv").open(encoding="utf-8", newline="") as handle:
+        head, *rows = csv.reader(handle)
+    assert (head[0], head[1], head[-1], len(head)) == ("name", "cov_rotation_e_rotation_e", "cov_u_u", 22)
+    upper = np.array([row[1:] for row in rows], dtype=float)
+    np.testing.assert_allclose(upper, found["camera_cov"][:, *np.triu_indices(6)], rtol=1e-8)
+    # Points lie where the COLMAP model beside has them, and their covariances are proper ones.
+    model = read_sparse(handover.out / "colmap")
+    places = dict(zip(model.point_id.tolist(), model.point_in_local, strict=True))
+    np.testing.assert_allclose(found["position"], [places[key] for key in found["point_id"].tolist()], atol=1e-9)
+    assert (np.linalg.eigvalsh(found["point_cov_m2"]) > 0).all()
+    # A tie point adds the errors of its own rays to those of cameras and lens.
+    posterior = load_adjustment(handover.workspace)
+    in_geo = posterior.solution.similarity.apply(scene_of(posterior.solution, posterior.sparse).point_in_model)
+    of_cameras = posterior.of_scene(in_geo, posterior.sparse.obs_point, posterior.sparse.obs_image)
+    more = np.trace(found["point_cov_m2"], axis1=1, axis2=2) - np.trace(of_cameras, axis1=1, axis2=2)
+    assert (more > 0).all()
+
+
+def test_cameras_are_exported_before_training(handover: Handover, tmp_path: Path) -> None:
     _, workspace = trained_workspace(tmp_path / "ws")
-    manifest = Manifest(
-        stage="train", config={"optimize_cameras": False}, inputs={}, versions={}, started=now(), duration_s=1.0,
-        key_figure="", values={}, warnings=[],
-    )  # fmt: skip
-    save_json(manifest, workspace.root / "train" / MANIFEST)
+    untrained(workspace)
     summary = handed_over(workspace, tmp_path / "out")
-    assert [caution.code for caution in summary.cautions] == ["cameras-without-sigma"]
-    assert "held" in summary.cautions[0].sentence
+    assert summary.values["cameras"] == IMAGES
+    table = replace(handover, out=tmp_path / "out")
+    np.testing.assert_allclose(table.columns("x", "y", "z"), handover.columns("x", "y", "z"), atol=1e-4)
+    np.testing.assert_array_equal(table.columns("sigma_e_m"), handover.columns("sigma_e_m"))
 
 
 def test_crs_of_another_country_is_refused_before_the_work_begins(handover: Handover, tmp_path: Path) -> None:

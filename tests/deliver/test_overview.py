@@ -77,7 +77,8 @@ def test_geoid_without_its_grid_gives_way_only_where_nobody_asked_for_it(copied:
 
 
 def test_accuracy_is_that_of_the_evaluation_and_unknown_where_nothing_checks_it(copied: Workspace) -> None:
-    assert overview(copied, CrsOptions()).quality.accuracy is None  # not evaluated
+    before = overview(copied, CrsOptions()).quality.accuracy
+    assert before is not None and before.kind == "predicted"  # by the adjustment: not evaluated
     scene = AccuracySummary(cells=4, rms_sigma_h_m=0.03, rms_sigma_v_m=0.04, reason=None)
     unchecked = Caution(code=NOT_CHECKED, sentence="Nothing checks the positions.")
     for cautions, kind in (((), "predicted"), ((unchecked,), "unknown")):

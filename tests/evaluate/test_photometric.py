@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 
 import cv2
@@ -29,7 +30,7 @@ def test_test_views_are_those_held_out(evaluated: tuple[Workspace, Outcome]) -> 
     assert test["views"] == 2
     assert [row["image"] for row in test["per_view"]] == [f"image_{index:03d}.jpg" for index in TEST_VIEWS]
     assert test["psnr"] == pytest.approx(np.mean([row["psnr"] for row in test["per_view"]]))
-    assert 22.0 < test["psnr"] < 40.0
+    assert 30.0 < test["psnr"] < 60.0  # the Gaussians are the true ones, the cameras nearly
     assert 0.5 < test["ssim"] < 1.0
     # The orbit looks at one place from all sides: its training views show all ground of the others.
     assert test["covered_share"] == pytest.approx(np.mean([row["covered_share"] for row in test["per_view"]]))
@@ -64,7 +65,7 @@ def test_equal_images_are_reported_at_the_cap(altered: Workspace) -> None:
     write_gaussians(
         altered.root / GAUSSIANS, replace(gaussians, logit_opacities=0 * gaussians.logit_opacities - 20)
     )
-    (altered.root / "photos").unlink()
+    shutil.rmtree(altered.root / "photos")
     (altered.root / "photos").mkdir()
     for camera in model.cameras:
         black = cv2.imencode(".png", np.zeros((72, 96, 3), dtype=np.uint8))[1]

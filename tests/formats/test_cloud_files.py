@@ -22,6 +22,14 @@ from pipelines.geodesy.crs import parse_crs
 UTM = CRS("EPSG:32632").to_wkt("WKT1_GDAL")
 
 
+def covariance(rng: np.random.Generator, count: int) -> np.ndarray:
+    """Covariances in plan; nothing is known of the heights."""
+    half = rng.normal(0, 0.1, (count, 3, 3))
+    cov = half @ np.swapaxes(half, 1, 2)
+    cov[:, 2] = cov[:, :, 2] = np.nan
+    return cov.astype(np.float32)
+
+
 def points(count: int, near: np.ndarray, spread: np.ndarray, seed: int = 0) -> CloudPoints:
     rng = np.random.default_rng(seed)
     normal = rng.normal(size=(count, 3))
@@ -29,8 +37,7 @@ def points(count: int, near: np.ndarray, spread: np.ndarray, seed: int = 0) -> C
         near + spread * rng.uniform(-1, 1, (count, 3)),
         (normal / np.linalg.norm(normal, axis=1, keepdims=True)).astype(np.float32),
         rng.integers(0, 256, (count, 3), dtype=np.uint8),
-        rng.uniform(0.01, 1, count).astype(np.float32),
-        np.full(count, np.nan, np.float32),
+        covariance(rng, count),
     )
 
 
@@ -75,6 +82,9 @@ def test_all_dimensions_come_back_from_several_parts(tmp_path: Path) -> None:
         np.testing.assert_array_equal(las[axis], np.concatenate([part.normal for part in parts])[:, column])
     np.testing.assert_array_equal(las["sigma_h"], np.concatenate([part.sigma_h_m for part in parts]))
     assert np.isnan(las["sigma_v"]).all()
+    cov = np.concatenate([part.cov_m2 for part in parts])
+    for name, (row, column) in {"ee": (0, 0), "en": (0, 1), "nn": (1, 1), "eu": (0, 2), "uu": (2, 2)}.items():
+        np.testing.assert_array_equal(las[f"cov_{name}"], cov[:, row, column])
     assert set(las.return_number) == set(las.number_of_returns) == {1}
     assert (las.header.generating_software, las.header.creation_date) == ("test 1", date.today())
     text = las.header.vlrs.get_by_id("LASF_Spec", (3,))[0]

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, norm
 
-from pipelines.adjust.error_propagation import ErrorPropagation
 from pipelines.core.errors import InputError
 from pipelines.core.products import load_json
 from pipelines.core.progress import SILENT
@@ -29,7 +28,7 @@ from pipelines.scene.survey import Survey
 from tests.evaluated_workspaces import CHECK_POINTS, ERROR_M
 from tests.report.conftest import Reported
 from tests.reports import check_points_with, report_with
-from tests.trained_workspaces import NOISE
+from tests.trained_workspaces import NOISE, scene_of
 
 
 def test_photographs_that_see_a_point_are_those_that_observe_it(reported: Reported) -> None:
@@ -85,11 +84,9 @@ def test_mean_residuals_by_region_show_a_planted_pattern() -> None:
 
 
 def test_lens_covariance_lies_between_its_free_part_and_that_of_the_photographs(reported: Reported) -> None:
-    propagation = reported.survey.propagation
-    assert isinstance(propagation, ErrorPropagation)
-    covariance, basis = propagation.prediction.of_lens(), propagation.solved.scene.correction_basis
+    covariance = reported.survey.posterior.of_lens()
+    basis = scene_of(reported.survey.solved.model, reported.survey.solved.sfm).correction_basis
     assert covariance is not None
-    assert basis is not None
     from_photographs = basis.lens_matrix @ basis.lens_matrix.T + basis.lens_cov
     scale = 1 / np.sqrt(np.diag(from_photographs))
 
@@ -97,17 +94,17 @@ def test_lens_covariance_lies_between_its_free_part_and_that_of_the_photographs(
         return float(np.linalg.eigvalsh(matrix * scale[:, None] * scale)[0])
 
     assert least(from_photographs - covariance) > -1e-3  # fixes and control points add information
-    assert least(covariance - basis.lens_cov) > -1e-2  # of what no camera reveals they know little
+    # Of what no camera reveals they know little: marks of control points, as much as one tie point.
+    assert least(covariance - basis.lens_cov) > -0.1
     assert np.trace(from_photographs - covariance) > 0
 
 
 def test_fix_differences_are_the_errors_of_the_fixes(reported: Reported) -> None:
     survey = load_json(Survey, reported.truth.workspace.path(SURVEY))
     fixes = np.array([image.fix.position_in_geo for image in survey.images if image.fix is not None])
-    found = fix_differences(reported.survey.trained)
+    found = fix_differences(reported.survey.solved)
     np.testing.assert_allclose(found.difference_in_geo, reported.truth.scene.center_in_geo - fixes, atol=1e-6)
-    assert found.is_training.tolist() == [index != 2 for index in range(len(fixes))]
-    used = found.difference_in_geo[found.is_training]
+    used = found.difference_in_geo  # also of the test view
     assert [bias.mean_m for bias in bias_of(found)] == pytest.approx(used.mean(axis=0).tolist())
     outlier = replace(found, is_outlier=np.arange(len(fixes)) == 0)
     assert bias_of(outlier)[0].mean_m == pytest.approx(used[1:, 0].mean())
@@ -126,7 +123,7 @@ def test_photographs_have_coordinates_and_differences(reported: Reported) -> Non
 def test_chips_show_the_mark_and_where_the_points_project(reported: Reported) -> None:
     control, check = points_facts(reported.survey, 2, SILENT)
     assert (len(control.rows), len(check.rows)) == (3, CHECK_POINTS)
-    scene, survey = reported.truth.scene, reported.survey.trained.survey
+    scene, survey = reported.truth.scene, reported.survey.solved.survey
     for row, point in zip(check.rows, survey.check_points, strict=True):
         assert row.field is not None
         assert len(row.chips) == 2

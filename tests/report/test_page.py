@@ -21,11 +21,12 @@ from pipelines.pages.page import value_at
 from pipelines.report.options import ReportOptions
 from pipelines.report.points import points_facts
 from pipelines.report.stage import run
-from pipelines.scene.report import write_report
+from pipelines.scene.report import read_report, write_report
 from pipelines.scene.survey import Survey
 from tests.evaluated_workspaces import evaluated_workspace
 from tests.report.conftest import HOSTILE, Reported, page_of
 from tests.reports import report_with
+from tests.trained_workspaces import untrained
 
 
 @dataclass
@@ -156,11 +157,11 @@ def test_without_evaluation_the_command_is_named(tmp_path: Path) -> None:
 
 
 def test_photograph_that_changed_is_refused(reported: Reported) -> None:
-    trained = reported.survey.trained
+    trained = reported.survey.solved
     images = tuple(image.model_copy(update={"sha256": "0" * 64}) for image in trained.survey.images)
     changed = replace(trained, survey=trained.survey.model_copy(update={"images": images}))
     with pytest.raises(InputError, match="has changed since `georef ingest` read it"):
-        points_facts(replace(reported.survey, trained=changed), 1, SILENT)
+        points_facts(replace(reported.survey, solved=changed), 1, SILENT)
 
 
 def test_pdf_without_chromium_is_refused_before_the_work(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -169,3 +170,17 @@ def test_pdf_without_chromium_is_refused_before_the_work(monkeypatch: pytest.Mon
     monkeypatch.setattr("pipelines.pages.chromium._INSTALLED", ())
     with pytest.raises(BackendUnavailableError, match="Chromium is missing: install it"):
         run(StageRun(Workspace(tmp_path), tmp_path), ReportOptions(pdf=True))
+
+
+def test_before_training_the_sections_of_the_cameras_are_there(tmp_path: Path) -> None:
+    made = evaluated_workspace(tmp_path / "flight")
+    report = read_report(made.workspace.path(REPORT))
+    alone = report.checkpoints.model_copy(update={"model": None})
+    untrained(made.workspace)
+    update = {"photometric": None, "checkpoints": alone}
+    write_report(report.model_copy(update=update), made.workspace.path(REPORT))
+    page = page_of(made)
+    sections = set(re.findall(r'<section id="([^"]+)"', page))
+    assert {"summary", "accuracy", "check-points", "positions", "lenses", "photographs"} <= sections
+    assert not {"test-views", "training", "lidar", "rasters", "reference"} & sections
+    assert "rendered surface" not in page and "PSNR" not in page and "Test views" not in page

@@ -55,9 +55,9 @@ def in_crs(position_in_geo: np.ndarray, crs: str = UTM) -> np.ndarray:
 
 
 def cloud_points(position: np.ndarray) -> CloudPoints:
-    none = np.full(len(position), np.nan, np.float32)
+    none = np.full((len(position), 3, 3), np.nan, np.float32)
     zeros = np.zeros((len(position), 3))
-    return CloudPoints(position, zeros.astype(np.float32), zeros.astype(np.uint8), none, none)
+    return CloudPoints(position, zeros.astype(np.float32), zeros.astype(np.uint8), none)
 
 
 def all_points(path: Path, stated: CloudCrs = CloudCrs()) -> np.ndarray:  # noqa: B008

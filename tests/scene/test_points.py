@@ -14,7 +14,16 @@ from pipelines.scene.points_by_model import DepthMap, points_by_model
 from pipelines.scene.survey import SurveyedPoint
 from pipelines.scene.trained_survey import TrainedSurvey
 from pipelines.splat.initialise import gaussians_of_size
-from tests.scenes import GEO_FROM_LOCAL, Measured, Noise, make_scene, sparse_model, survey_of, trained_model
+from tests.scenes import (
+    GEO_FROM_LOCAL,
+    Measured,
+    Noise,
+    make_scene,
+    sparse_model,
+    survey_of,
+    trained_cameras,
+    trained_model,
+)
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -29,11 +38,12 @@ def trained() -> TrainedSurvey:
     truth, rng = make_scene(images=8, points=20), np.random.default_rng(0)
     geo_from_model = MODEL_FROM_GEO.inverse()
     rotation = np.swapaxes(truth.geo_from_cam, 1, 2) @ geo_from_model.rotation
+    poses = CameraPoses(rotation, MODEL_FROM_GEO.apply(truth.center_in_geo))
+    cameras = trained_cameras(truth.names, poses)
     return TrainedSurvey(
         survey=survey_of(truth, EXACT, Measured(gcps=True), rng),
         sfm=sparse_model(truth, EXACT, rng),
-        model=trained_model(geo_from_model, MODEL_FROM_GEO @ GEO_FROM_LOCAL),
-        poses=CameraPoses(rotation, MODEL_FROM_GEO.apply(truth.center_in_geo)),
+        model=trained_model(geo_from_model, MODEL_FROM_GEO @ GEO_FROM_LOCAL, cameras=cameras),
         gaussians=gaussians_of_size(np.zeros((1, 3)), np.zeros((1, 3)), np.ones(1)),
     )
 

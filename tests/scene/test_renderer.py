@@ -11,8 +11,8 @@ from pipelines.scene.renderer import ModelRenderer
 from pipelines.scene.scene import photographs
 from pipelines.scene.trained_survey import TrainedSurvey
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
-from tests.scenes import trained_model
-from tests.splat_scenes import CAMERA, SPACING_M, RenderedFlight, ground_height
+from tests.scenes import trained_cameras, trained_model
+from tests.splat_scenes import CAMERA, SPACING_M, TEST_VIEWS, RenderedFlight, ground_height
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -21,9 +21,10 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 def renderer(flights: list[RenderedFlight]) -> ModelRenderer:
     """Of the true Gaussians in true cameras; the frame `model` is `geo`."""
     rendered, scene = flights[0].rendered, flights[0].rendered.scene
-    model = trained_model(Similarity(), max_image_size=CAMERA.width).model_copy(update={"sh_degree": 0})
     poses = CameraPoses(np.swapaxes(scene.geo_from_cam, 1, 2), scene.center_in_geo)
-    trained = TrainedSurvey(rendered.survey, rendered.sparse, model, poses, rendered.gaussians)
+    cameras = trained_cameras(scene.names, poses, test=TEST_VIEWS)
+    model = trained_model(Similarity(), max_image_size=CAMERA.width, cameras=cameras)
+    trained = TrainedSurvey(rendered.survey, rendered.sparse, model, rendered.gaussians)
     workspace = flights[0].workspace("renderer")
     images = photographs(rendered.sparse, rendered.survey, workspace, CAMERA.width)
     return ModelRenderer(trained, images, CpuRasterizer())

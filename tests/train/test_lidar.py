@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 
-from pipelines.adjust.estimate import Estimate
-from pipelines.adjust.similarity import LearnableSimilarity
-from pipelines.adjust.systematic import SystematicErrorValues
+from pipelines.adjust.state import State, SystematicError, SystematicErrors
+from pipelines.adjust.terms import At
 from pipelines.core.errors import InputError
+from pipelines.geometry.cameras import CameraPoses
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.thinning import voxel_keys
 from pipelines.train.lidar.changes import _areas, verdict
 from pipelines.train.lidar.cloud import planes_of
-from pipelines.train.lidar.planes import plane_term
+from pipelines.train.lidar.planes import planes_of as observed_planes
 from pipelines.train.lidar.prepare import registration_of
 from pipelines.train.lidar.registration import registration
 from pipelines.train.lidar.surface import LidarPlanes
@@ -104,12 +103,12 @@ def test_another_place_is_refused() -> None:
 
 def test_planes_agree_with_the_shift_that_was_found() -> None:
     found = registration(scanned(TOWN, (0.06, -0.08, 0.10)), views_of(TOWN), 0)
-    similarity = LearnableSimilarity(Similarity(translation=np.array([9.0, 5.0, 1.0])), np.eye(7), np.zeros(3))
-    planes = plane_term(found, similarity.current())
-    errors = SystematicErrorValues(lidar_m=torch.from_numpy(found.shift_m))
-    none = torch.zeros(0, dtype=torch.float64)
-    at = Estimate(none, none, similarity.at(similarity.y), errors, none)
-    white = planes.whitened(at).detach().numpy()
+    similarity = Similarity(translation=np.array([9.0, 5.0, 1.0]))
+    planes = observed_planes(found, similarity)
+    errors = SystematicErrors((SystematicError("lidar-shift", (1.0, 1.0, 1.0)),))
+    state = State(similarity, np.zeros((1, 6)), np.zeros(0), found.shift_m)
+    base = CameraPoses(np.eye(3)[None], np.zeros((1, 3)))
+    white = planes.whitened(At.of(state, base, errors))
     assert len(planes) > 30
     # The medians of clusters, in units of their robust spread.
     assert abs(np.median(white)) < 0.5 and np.median(np.abs(white)) == pytest.approx(0.6745, rel=0.1)

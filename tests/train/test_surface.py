@@ -17,8 +17,8 @@ from pipelines.train.depth_maps import DepthMaps
 from pipelines.train.guessed_surface import guessed_points
 from pipelines.train.initial_gaussians import TrainingScene, initial_gaussians, points_to_hold
 from pipelines.train.surface import SceneSurface, spread_evenly
-from tests.scenes import write_workspace
-from tests.splat_scenes import CAMERA, GEO_FROM_LOCAL, Rendered, ground_height, make_rendered
+from tests.scenes import GEO_FROM_LOCAL, write_workspace
+from tests.splat_scenes import CAMERA, Rendered, ground_height, make_rendered
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -20,6 +20,4 @@ def viewed(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
 @pytest.fixture(scope="session")
 def model(viewed: Workspace) -> MeasuringModel:
     """The hill, to measure in."""
-    measuring = MeasuringModel(viewed, renderer_of(viewed), CrsOptions())
-    measuring.propagate_errors()
-    return measuring
+    return MeasuringModel(viewed, renderer_of(viewed), CrsOptions())

@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from pipelines.core.cautions import NOT_CHECKED, Caution
+from pipelines.core.errors import MissingProductError
+from pipelines.core.workspace import Workspace
 from pipelines.scene.crs_options import CrsOptions
 from pipelines.scene.marks import mark_rays
 from pipelines.scene.points_by_model import depth_around, points_by_model
@@ -125,9 +132,12 @@ def test_shared_errors_cancel_in_distances(model: MeasuringModel) -> None:
     assert distance.value == pytest.approx(2.0, abs=0.2)
 
 
-def test_no_sigma_is_stated_before_it_is_known(viewed, model: MeasuringModel) -> None:
-    fresh = MeasuringModel(viewed, model.reader.renderer, CrsOptions())
-    points = corners(fresh, 5.0)
-    assert fresh.without_sigma == "it is being computed"
-    assert fresh.place(points[0]).sigma_m is None
-    assert {quantity.sigma for quantity in fresh.distance(points[:2])} == {None}
+def test_no_sigma_is_stated_that_nothing_checks(viewed: Workspace, model: MeasuringModel, tmp_path: Path) -> None:
+    """And the viewer solves nothing: without a stored posterior there is none."""
+    renderer = model.reader.renderer
+    unchecked = (Caution(code=NOT_CHECKED, sentence="Nothing checks the positions."),)
+    trained = replace(renderer.trained, model=renderer.trained.model.model_copy(update={"cautions": unchecked}))
+    fresh = MeasuringModel(viewed, SimpleNamespace(trained=trained), CrsOptions())  # type: ignore[arg-type]
+    assert fresh.posterior is None and "nothing checks" in fresh.without_sigma
+    with pytest.raises(MissingProductError, match=r"train/adjustment\.npz"):
+        MeasuringModel(Workspace(tmp_path), renderer, CrsOptions())

@@ -1,4 +1,4 @@
-"""Trained cameras on Earth: positions, angles and σ in the terms of a survey."""
+"""Adjusted cameras on Earth: positions, angles and σ in the terms of a survey."""
 
 from __future__ import annotations
 
@@ -6,24 +6,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.adjust.error_propagation import NoErrorPropagation, propagate_errors
-from pipelines.core.cautions import Caution, is_checked
 from pipelines.core.types import FloatArray
-from pipelines.core.workspace import Workspace
-from pipelines.deliver.placement import Placement
 from pipelines.formats.camera_table import CameraTable
 from pipelines.geodesy.enu import geo_from_enu_at, lla_from_enu
 from pipelines.geodesy.grid_axes import grid_from_enu
 from pipelines.geometry.rotations import omega_phi_kappa_deg, omega_phi_kappa_jacobian, yaw_pitch_roll_deg
 from pipelines.scene.target_crs import TargetCrs
-from pipelines.scene.trained_survey import TrainedSurvey
-
-UNKNOWN_SIGMA = "cameras-without-sigma"
+from pipelines.scene.trained_survey import SolvedSurvey
 
 
 @dataclass(frozen=True)
 class CamerasOnEarth:
-    """n trained cameras in the frame `geo`.
+    """n adjusted cameras in the frame `geo`.
 
     Attributes:
         name, split: n each.
@@ -39,14 +33,14 @@ class CamerasOnEarth:
     covariance: FloatArray
 
 
-def cameras_on_earth(trained: TrainedSurvey, covariance: FloatArray | None) -> CamerasOnEarth:
-    """Return the trained cameras on Earth.
+def cameras_on_earth(solved: SolvedSurvey, covariance: FloatArray | None) -> CamerasOnEarth:
+    """Return the adjusted cameras on Earth.
 
     Args:
-        trained: the trained survey.
+        solved: the survey.
         covariance: (n, 6, 6) as in `CamerasOnEarth`; None: not known.
     """
-    cameras, poses, similarity = trained.model.cameras, trained.poses, trained.geo_from_model
+    cameras, poses, similarity = solved.model.cameras, solved.poses, solved.geo_from_model
     return CamerasOnEarth(
         name=tuple(camera.name for camera in cameras),
         split=tuple(camera.split for camera in cameras),
@@ -54,26 +48,6 @@ def cameras_on_earth(trained: TrainedSurvey, covariance: FloatArray | None) -> C
         center_in_geo=similarity.apply(poses.cam_center_in_model),
         covariance=np.full((len(cameras), 6, 6), np.nan) if covariance is None else covariance,
     )
-
-
-def predicted_covariance(
-    workspace: Workspace, trained: TrainedSurvey, placement: Placement
-) -> tuple[FloatArray | None, tuple[Caution, ...]]:
-    """Return the covariance (n, 6, 6) of the cameras in `geo`, and its limits; None, with the reason, if unknown.
-
-    Raises:
-        MissingProductError: init-sim3 has not been run.
-        InputError: a product is damaged.
-    """
-    if not is_checked(placement.cautions):
-        return None, _unknown("nothing checks the σ of the positions")
-    propagation = propagate_errors(workspace, trained)
-    if isinstance(propagation, NoErrorPropagation):
-        return None, _unknown(propagation.reason)
-    prediction = propagation.prediction
-    if prediction.holds_cameras:
-        return None, _unknown("the training held the cameras, and their own errors are not known")
-    return prediction.of_cameras(), prediction.cautions
 
 
 def camera_table(cameras: CamerasOnEarth, crs: TargetCrs) -> CameraTable:
@@ -106,7 +80,3 @@ def _sigma(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:
     """Return σ (n, 3) of quantities with derivatives (n, 3, 3) by others that have covariances (n, 3, 3)."""
     propagated = jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)
     return np.asarray(np.sqrt(np.diagonal(propagated, axis1=1, axis2=2)))
-
-
-def _unknown(reason: str) -> tuple[Caution, ...]:
-    return (Caution(code=UNKNOWN_SIGMA, sentence=f"The cameras have no σ: {reason}."),)

@@ -1,11 +1,13 @@
-"""Export of the trained cameras and lenses, placed on Earth, in the forms that other programs read.
+"""Export of the adjusted cameras and lenses, placed on Earth, in the forms that other programs read.
 
-Reads survey, SfM model, trained model and initial similarity. Writes into `cameras/` (docs/deliverables.md):
+Reads survey, SfM model, initial similarity, and the adjustment: of the training, or
+before it of init-sim3. Writes into `cameras/` (docs/deliverables.md):
 
 - `colmap/`: cameras, images and points as a COLMAP model, in the frame of `splat.ply`;
 - `transforms.json`: the same cameras for nerfstudio, in the same frame;
 - `cameras.csv`: positions in the CRS of the contract, angles in both conventions, σ;
-- `footprints.geojson`: the ground that each photograph shows.
+- `footprints.geojson`: the ground that each photograph shows;
+- `covariances.npz` and `camera_covariances.csv`: full covariances of cameras and tie points, in the same frame.
 """
 
 from __future__ import annotations
@@ -16,11 +18,13 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.core.cautions import Caution, union
+from pipelines.adjust.solution import posterior_of
+from pipelines.core.cautions import Caution, is_checked, union
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import StageRun, Summary
+from pipelines.deliver.cameras.covariances import covariances_in_file, write_covariances
 from pipelines.deliver.cameras.footprints import footprints_of
-from pipelines.deliver.cameras.on_earth import camera_table, cameras_on_earth, predicted_covariance
+from pipelines.deliver.cameras.on_earth import camera_table, cameras_on_earth
 from pipelines.deliver.options import ExportCamerasOptions
 from pipelines.deliver.placement import Placement, place
 from pipelines.formats.camera_table import CameraTable, write_camera_table
@@ -31,12 +35,14 @@ from pipelines.formats.nerfstudio import Frame, lens_of, write_transforms
 from pipelines.geodesy.crs import parse_crs
 from pipelines.geometry.bundle import Network
 from pipelines.geometry.refined_points import refined_points
-from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.scene.headline import headline_of
 from pipelines.scene.target_crs import TargetCrs, target_crs
-from pipelines.scene.trained_survey import TrainedSurvey, load_trained
+from pipelines.scene.trained_survey import SolvedSurvey, TrainedSurvey, load_solved
 
+_UNKNOWN = (
+    Caution(code="cameras-without-sigma", sentence="The cameras have no σ: nothing checks the σ of the positions."),
+)
 _LENS_TOLERANCE_PX = 0.01  # of a lens that nerfstudio's model replaces: below, nobody need know
 
 
@@ -44,30 +50,39 @@ def run(stage: StageRun, options: ExportCamerasOptions) -> Summary:
     """Write the cameras in all forms, and return their key figures.
 
     Raises:
-        MissingProductError: a stage up to train has not been run.
+        MissingProductError: a stage up to init-sim3 has not been run.
         InputError: a product is damaged, or the CRS cannot be used here.
     """
-    trained = load_trained(stage.workspace)
+    solved = load_solved(stage.workspace)
     accuracy = headline_of(stage.workspace)
-    placement = place(trained.model, trained.survey, trained.gaussians.means.numpy(), accuracy)
-    on_earth = cameras_on_earth(trained, None)
-    crs = target_crs(options, trained.survey.origin, on_earth.center_in_geo, trained.survey.vertical)
+    points = solved.gaussians.means.numpy() if isinstance(solved, TrainedSurvey) else solved.point_in_model
+    placement = place(solved.model, solved.survey, points, accuracy)
+    on_earth = cameras_on_earth(solved, None)
+    crs = target_crs(options, solved.survey.origin, on_earth.center_in_geo, solved.survey.vertical)
     camera_table(on_earth, crs)  # a CRS that cannot hold the cameras is refused before the work begins
-    with stage.progress.task("cameras", 4) as task:
-        covariance, limits = predicted_covariance(stage.workspace, trained, placement)
-        cameras = replace(on_earth, covariance=on_earth.covariance if covariance is None else covariance)
+    with stage.progress.task("cameras", 5) as task:
+        posterior = None
+        if is_checked(solved.model.cautions):
+            posterior = posterior_of(stage.workspace, solved.model, solved.sfm)
+        cameras = cameras_on_earth(solved, None if posterior is None else posterior.camera_cov)
         table = camera_table(cameras, crs)
         task.advance(note="σ")
-        model = model_in_file(trained, placement)
+        model = model_in_file(solved, placement)
+        found = covariances_in_file(model, posterior, placement.file_from_geo)
+        npz, csv = stage.out / "covariances.npz", stage.out / "camera_covariances.csv"
+        write_covariances(found, npz, csv)
+        for path in (npz, csv):
+            write_sidecar(placement.sidecar(), path)
+        task.advance(note="covariances")
         write_sparse(model, stage.out / "colmap")
         write_sidecar(placement.sidecar(), stage.out / "colmap")
         task.advance(note="COLMAP")
         lens_limits = _write_nerfstudio(stage.out / "transforms.json", model, placement)
         task.advance(note="nerfstudio")
-        footprints = footprints_of(trained.survey, model, table, placement)
+        footprints = footprints_of(solved.survey, model, table, placement)
         write_features(stage.out / "footprints.geojson", footprints.features)
         task.advance(note="footprints")
-    cautions, sigma = union(trained.model.cautions, limits), _scene_sigma(table)
+    cautions, sigma = union(solved.model.cautions, _UNKNOWN if posterior is None else ()), _scene_sigma(table)
     on_ellipsoid = TargetCrs(parse_crs("EPSG:4979"), crs.origin, footprints.corner_lla)
     bounds = _bounds(footprints.corner_lla[:, [1, 0, 2]])
     write_sidecar(on_ellipsoid.sidecar(bounds, accuracy, sigma, cautions), stage.out / "footprints.geojson")
@@ -77,20 +92,19 @@ def run(stage: StageRun, options: ExportCamerasOptions) -> Summary:
     return _summary(table, model, sidecar, union(cautions, lens_limits))
 
 
-def model_in_file(trained: TrainedSurvey, placement: Placement) -> SparseModel:
-    """Return the trained cameras and lenses in the frame of the placement, with the points as they now see them."""
+def model_in_file(solved: SolvedSurvey, placement: Placement) -> SparseModel:
+    """Return the adjusted cameras and lenses in the frame of the placement, with the points as these see them."""
     file_from_model = placement.file_from_model
-    points = Similarity.from_record(trained.model.model_from_local).apply(trained.sfm.point_in_local)
-    rotation = trained.poses.cam_from_model @ file_from_model.rotation.T
-    center = file_from_model.apply(trained.poses.cam_center_in_model)
-    sparse = trained.sparse
+    rotation = solved.poses.cam_from_model @ file_from_model.rotation.T
+    center = file_from_model.apply(solved.poses.cam_center_in_model)
+    sparse = solved.sparse
     refined = refined_points(
         Network(
             sparse.cameras,
             sparse.image_camera_id,
             rotation,
             center,
-            file_from_model.apply(points),
+            file_from_model.apply(solved.point_in_model),
             sparse.obs_point,
             sparse.obs_image,
             sparse.obs_xy_px,

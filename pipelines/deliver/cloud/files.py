@@ -40,6 +40,7 @@ class CloudFiles:
         target, tally = self.frame.target, Tally()
         place = [f"CRS: {target.crs.name}", f"heights: {target.crs.vertical.name}, {target.crs.height_unit}"]
         lines = [*place, "sigma_h, sigma_v: predicted standard deviations in metres: " + SIGMA_COUNTS]
+        lines.append("cov_ee to cov_uu: their covariance in square metres, along east, north, up")
         software = f"GeoRefGS {__version__}"
         with ExitStack() as stack:
             writers: list[LazWriter | CloudPlyWriter] = [

@@ -31,23 +31,20 @@ class CloudFrame:
     crs_from_geo: FloatArray
 
     def points(self, cloud: SurfaceCloud, grid: AccuracyGrid | None) -> CloudPoints:
-        """Return points in the CRS, with the σ of the georeference and of the surface together.
+        """Return points in the CRS, with the covariance of the georeference and of the surface together.
 
         Args:
             cloud: in `geo`.
-            grid: predicted σ of the georeference; None: unknown, and so is the sum.
+            grid: predicted covariance of the georeference; None: unknown, and so is the sum.
         """
-        georeference = np.full((len(cloud), 3), np.nan) if grid is None else grid.sigma_at(cloud.position)
+        georeference = np.full((len(cloud), 3, 3), np.nan) if grid is None else grid.cov_at(cloud.position)
         # The surface is uncertain along its normal. Along itself, a surface has no place.
-        vertical = np.hypot(georeference[:, 2], cloud.sigma_m * cloud.normal[:, 2])
-        plan = np.hypot(georeference[:, 0], georeference[:, 1])
-        horizontal = np.hypot(plan, cloud.sigma_m * np.hypot(cloud.normal[:, 0], cloud.normal[:, 1]))
+        across = cloud.sigma_m[:, None] * cloud.normal
         return CloudPoints(
             self.target.xyz_from_geo(cloud.position),
             (cloud.normal @ self.crs_from_geo.T).astype(np.float32),
             cloud.rgb,
-            horizontal.astype(np.float32),
-            vertical.astype(np.float32),
+            (georeference + across[:, :, None] * across[:, None, :]).astype(np.float32),
         )
 
 

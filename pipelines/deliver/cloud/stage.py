@@ -48,15 +48,15 @@ def run(stage: StageRun, options: ExportCloudOptions) -> Summary:
     scratch = stage.out / "depth_maps"
     views = SurfaceViews(renderer, scratch, colours=True, confirmed=True, progress=stage.progress)
     settings = fusion_settings(views, geo_from_model, options.min_views, options.spacing)
-    sigma = predicted_sigma(stage.workspace, trained)
+    grid, no_sigma = predicted_sigma(stage.workspace, trained)
     squares = fused_squares(views, geo_from_model, settings, stage.progress)
-    tally = files.write(frame.points(square, sigma.grid) for square in squares)
+    tally = files.write(frame.points(square, grid) for square in squares)
     if not tally.count:
         raise DegenerateGeometryError(
             f"no point of the surface is seen alike by {options.min_views} training views: train longer, or lower "
             "--min-views"
         )
-    cautions = union(trained.model.cautions, _no_sigma(sigma.reason))
+    cautions = union(trained.model.cautions, _no_sigma(no_sigma))
     sidecar = target.sidecar(tally.bounds, headline_of(stage.workspace), tally.sigma(SIGMA_COUNTS), cautions)
     for path in files.paths:
         write_sidecar(sidecar, path)
@@ -67,7 +67,9 @@ def run(stage: StageRun, options: ExportCloudOptions) -> Summary:
 def _no_sigma(reason: str) -> tuple[Caution, ...]:
     if not reason:
         return ()
-    sentence = f"The cloud states no σ, and its dimensions sigma_h and sigma_v are empty: {reason}."
+    sentence = (
+        f"The cloud states no σ, and its dimensions sigma_h, sigma_v and cov_ee to cov_uu are empty: {reason}."
+    )
     return (Caution(code="no-sigma", sentence=sentence),)
 
 

@@ -66,19 +66,19 @@ def raster_source(stage: StageRun, wanted: Request) -> tuple[RasterSource, str]:
         centers_in_model=trained.poses.cam_center_in_model[trained.indices("train")],
         training_px=training_px,
     )
-    sigma = predicted_sigma(stage.workspace, trained)
+    sigma, no_sigma = predicted_sigma(stage.workspace, trained)
     source = RasterSource(
         scene=scene,
         views=views,
         geo_from_model=trained.geo_from_model,
         target=target,
-        sigma=sigma.grid,
+        sigma=sigma,
         training_px=training_px,
         height_unit_m=target.height_unit_m,
         training_gsd_m=wanted.sampling.training_m,
         min_views=wanted.options.min_views,
     )
-    return source, sigma.reason
+    return source, no_sigma
 
 
 def _within(trained: TrainedSurvey, gaussians: Gaussians) -> Gaussians:

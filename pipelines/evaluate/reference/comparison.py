@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from pipelines.adjust.error_propagation import ErrorPropagation, NoErrorPropagation
+from pipelines.adjust.accuracy_grid import AccuracyGrid
 from pipelines.core.cautions import is_checked
 from pipelines.core.durable import remove
 from pipelines.core.errors import DegenerateGeometryError
@@ -85,7 +85,7 @@ def open_reference(options: EvaluateOptions) -> CloudFiles | None:
 def compare_with_reference(
     renderer: ModelRenderer,
     files: CloudFiles,
-    propagation: ErrorPropagation | NoErrorPropagation,
+    grid: AccuracyGrid | None,
     options: EvaluateOptions,
     *,
     scratch: Path,
@@ -96,7 +96,7 @@ def compare_with_reference(
     Args:
         renderer: of the trained model.
         files: the reference.
-        propagation: σ of the georeference, or the reason why there is none.
+        grid: predicted σ of the georeference; None: not known.
         options: of the stage, with `reference`.
         scratch: folder for depth maps and sorted points; removed at the end.
         progress: shows depth maps, points and squares.
@@ -117,7 +117,7 @@ def compare_with_reference(
     settings = ComparisonSettings.of_spacings(spacing_m, model.settings.spacing_m, min(THRESHOLDS_M), box)
     tally = _compare(reference, model.points, seen, settings, progress)
     cores = tally.cores()
-    sigma_m = _georeference_sigma(cores.position, cores.normal, trained, propagation)
+    sigma_m = _georeference_sigma(cores.position, cores.normal, trained, grid)
     known = np.zeros(len(cores.position)) if sigma_m is None or model.moved is not None else sigma_m
     lod_m = level_of_detection(cores.noise_m, np.hypot(known, options.reference_sigma))
     table = CoreTable(cores, lod_m)
@@ -238,11 +238,9 @@ def _georeference_sigma(
     position: FloatArray,
     normal: FloatArray,
     trained: TrainedSurvey,
-    propagation: ErrorPropagation | NoErrorPropagation,
+    grid: AccuracyGrid | None,
 ) -> FloatArray | None:
     """Return the predicted σ (C,) of the georeference along normals; None: not known."""
-    if isinstance(propagation, NoErrorPropagation) or propagation.grid is None or not len(position):
+    if grid is None or not len(position) or not is_checked(trained.model.cautions):
         return None
-    if not is_checked(trained.model.cautions):
-        return None
-    return np.asarray(np.linalg.norm(propagation.grid.sigma_at(position) * normal, axis=1))
+    return np.asarray(np.sqrt(np.einsum("ci,cij,cj->c", normal, grid.cov_at(position), normal)))

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 
-from pipelines.adjust.terms import PlaneTerm
+from pipelines.adjust.terms import Planes
 from pipelines.geometry.similarity import Similarity
 from pipelines.robust.statistics import mad_sigma
 from pipelines.train.lidar.registration import Registration
@@ -15,7 +14,7 @@ _LEAST_POINTS = 5
 _LEAST_SIGMA_M = 1e-3
 
 
-def plane_term(found: Registration, geo_from_model: Similarity) -> PlaneTerm:
+def planes_of(found: Registration, geo_from_model: Similarity) -> Planes:
     """Return one plane for each cluster of 5 m and each direction that planes face there.
 
     The errors of neighbouring points are not independent: the median of a cluster is one observation. Its σ is the
@@ -38,9 +37,9 @@ def plane_term(found: Registration, geo_from_model: Similarity) -> PlaneTerm:
     normal, off = matches.normal_in_model[middle], distance[middle]
     measured = matches.point_in_model[middle]
     sigma_m = max(mad_sigma(off), _LEAST_SIGMA_M)
-    return PlaneTerm(
-        point_in_model=torch.from_numpy(measured + off[:, None] * normal),
-        position_in_geo=torch.from_numpy(geo_from_model.apply(measured + found.shift_m)),
-        normal_in_geo=torch.from_numpy(normal),
-        root_information=torch.full((len(middle), 1, 1), 1.0 / sigma_m, dtype=torch.float64),
+    return Planes(
+        point_in_model=measured + off[:, None] * normal,
+        position_in_geo=geo_from_model.apply(measured + found.shift_m),
+        normal_in_geo=normal,
+        root_information=np.full((len(middle), 1, 1), 1.0 / sigma_m),
     )

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.adjust.terms import PlaneTerm
+from pipelines.adjust.terms import Planes
 from pipelines.core.errors import DegenerateGeometryError, InputError
 from pipelines.core.progress import Progress
 from pipelines.core.types import FloatArray, Vector3
@@ -31,7 +31,7 @@ from pipelines.train.lidar.changes import CloudVerdict, verdict
 from pipelines.train.lidar.cloud import LidarCloud, read_cloud
 from pipelines.train.lidar.free_space import free_space
 from pipelines.train.lidar.options import LidarOptions
-from pipelines.train.lidar.planes import plane_term
+from pipelines.train.lidar.planes import planes_of
 from pipelines.train.lidar.registration import Registration, registration
 from pipelines.train.lidar.surface import FusedSurface
 from pipelines.train.lidar.track import ScannerTrack
@@ -69,9 +69,9 @@ class ComparedLidar:
     registration: Registration
     record: LidarRegistration
 
-    def planes(self) -> PlaneTerm:
+    def planes(self) -> Planes:
         """Return the planes that the cloud shares with the photographs."""
-        return plane_term(self.registration, self.maps.scene.geo_from_model)
+        return planes_of(self.registration, self.maps.scene.geo_from_model)
 
 
 @dataclass(frozen=True)

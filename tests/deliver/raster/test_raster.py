@@ -16,9 +16,9 @@ import rasterio
 import torch
 from rio_cogeo.cogeo import cog_validate
 
-from pipelines.adjust.error_propagation import ErrorPropagation, propagate_errors
 from pipelines.adjust.geolocate import geolocate
 from pipelines.adjust.options import GeolocateOptions
+from pipelines.adjust.solution import load_adjustment
 from pipelines.core.errors import InputError
 from pipelines.core.products import load_json, save_json
 from pipelines.core.runner import run_stage
@@ -30,7 +30,6 @@ from pipelines.geometry.cameras import Camera, Pinhole
 from pipelines.geometry.rotations import exp_so3, quat_xyzw_from_matrix
 from pipelines.geometry.similarity import Similarity
 from pipelines.scene.trained_model import TrainedCamera
-from pipelines.scene.trained_survey import load_trained
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
@@ -48,6 +47,7 @@ from tests.scenes import (
     trained_model,
     write_workspace,
 )
+from tests.trained_workspaces import write_adjustment
 
 CAMERA = Camera("PINHOLE", 192, 144, np.array([220.0, 220.0, 96.0, 72.0]))
 GEO_FROM_MODEL = Similarity(1.7, exp_so3(np.array([0.3, -0.2, 1.0])), np.array([12.0, -7.0, 4.0]))
@@ -122,6 +122,7 @@ def write_trained(root: Path) -> Workspace:
     geolocate(survey, sparse, GeolocateOptions()).points.save(root / POINTS)
     save_json(trained_model(GEO_FROM_MODEL, max_image_size=192, cameras=cameras), root / MODEL)
     write_gaussians(root / GAUSSIANS, transformed(surface_gaussians(), GEO_FROM_MODEL.inverse()))
+    write_adjustment(workspace)
     _write_photographs(root, scene)
     return workspace
 
@@ -235,10 +236,10 @@ def test_rasters_are_valid_and_say_where_they_are(workspace: Workspace) -> None:
 
 def test_sigma_is_that_of_georeference_and_surface(workspace: Workspace) -> None:
     """On a surface without noise it is the σ that is predicted for the place."""
-    propagation = propagate_errors(workspace, load_trained(workspace))
-    assert isinstance(propagation, ErrorPropagation) and propagation.grid is not None
+    grid = load_adjustment(workspace).grid
+    assert grid is not None
     points = np.array([[-8.0, 6, 0], [0, 10, 0], [7, -7, 0]])
-    expected, xyz = propagation.grid.sigma_at(points), in_utm(points, workspace)
+    expected, xyz = grid.sigma_at(points), in_utm(points, workspace)
     horizontal, vertical = (at(workspace.path(f"raster/{name}.tif"), xyz) for name in ("sigma_h", "sigma_v"))
     np.testing.assert_allclose(vertical, expected[:, 2], rtol=0.03)
     np.testing.assert_allclose(horizontal, np.hypot(expected[:, 0], expected[:, 1]), rtol=0.1)

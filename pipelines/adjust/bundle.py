@@ -1,0 +1,140 @@
+"""Bundle adjustment of raw image measurements: cameras and points from pixels and surveyed points alone.
+
+SfM delivers a bundle at its minimum, and `adjust.system` takes it from there. Measurements of another program come
+without that minimum. Gauss–Newton steps find it, with the same normal equations: the points are eliminated
+(`geometry.bundle_information`), the cameras solved (`adjust.system.NormalMatrix`), the points follow
+(`adjust.intersection_jacobian`). All observations have their stated weight: no kernel, no variance factor.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from pipelines.adjust.intersection_jacobian import IntersectionJacobian, intersection_jacobian
+from pipelines.adjust.system import NormalMatrix
+from pipelines.core.errors import ConvergenceError, DegenerateGeometryError, InputError
+from pipelines.core.types import FloatArray, IntArray
+from pipelines.geometry.bundle import Network, has_positive_depth, linearise_bundle, projection_residuals
+from pipelines.geometry.bundle_information import eliminate_points
+from pipelines.geometry.rotations import exp_so3
+from pipelines.geometry.similarity import jacobian_at
+
+_ROUNDS = 30
+_STILL = 1e-6  # change of an observation, in σ, that ends the descent
+_FLAT = 1e-6  # extent of control points across their line over that along it, which leaves the frame open
+
+
+@dataclass(frozen=True)
+class SurveyedPoints:
+    """Surveyed points of a network: their rows (J,), positions (J, 3) in metres, covariances (J, 3, 3) in m²."""
+
+    point: IntArray
+    position_in_world: FloatArray
+    cov_in_world: FloatArray
+
+
+@dataclass(frozen=True)
+class AdjustedBundle:
+    """Minimum of a bundle, with its covariances; the lens is exactly known.
+
+    Attributes:
+        network: with adjusted cameras and points.
+        residual_px: (M, 2) projected minus observed.
+        sigma0: root of the weighted sum of squares over the redundancy; 1 where all σ are true.
+        redundancy: observations minus unknowns.
+        normal: normal equations of the cameras.
+        points: how the points follow the cameras.
+    """
+
+    network: Network
+    residual_px: FloatArray
+    sigma0: float
+    redundancy: int
+    normal: NormalMatrix
+    points: IntersectionJacobian
+
+    @cached_property
+    def camera_cov(self) -> FloatArray:
+        """Covariances (n, 6, 6) of (δω [rad], δc [m]) along the axes of `world`, at the stated σ."""
+        count = len(self.network.camera_id)
+        return self.normal.of_each_camera(
+            np.arange(count), np.tile(np.eye(6), (count, 1, 1)), np.zeros((count, 6, 0))
+        )
+
+    @cached_property
+    def point_cov(self) -> FloatArray:
+        """Covariances (N, 3, 3) of the points in m², at the stated σ."""
+        none = np.zeros((3 * len(self.network.point_in_world), 0))
+        return self.normal.covariances(self.points.by_poses, none, 3) + self.points.cov_of_marks
+
+
+def adjust_bundle(network: Network, sigma_px: FloatArray, surveyed: SurveyedPoints) -> AdjustedBundle:
+    """Return the least-squares adjustment of a network, from its approximate cameras and points.
+
+    Args:
+        network: a lens that is held, approximate cameras and points, and the observations.
+        sigma_px: (M,) σ of the observations.
+        surveyed: control points; a network needs three or more.
+
+    Raises:
+        InputError: a point lies behind a camera that observes it.
+        ConvergenceError: the steps do not end.
+        DegenerateGeometryError: fewer than three control points, or all on one line.
+    """
+    information = np.zeros((len(network.point_in_world), 3, 3))
+    information[surveyed.point] = np.linalg.inv(surveyed.cov_in_world)
+    target = network.point_in_world.copy()
+    target[surveyed.point] = surveyed.position_in_world
+    _refuse_open_layouts(surveyed)
+    before = np.full((len(sigma_px), 2), np.inf)
+    for _ in range(_ROUNDS):
+        if not has_positive_depth(network).all():
+            raise InputError("a point of the network lies behind a camera that observes it")
+        residual = projection_residuals(network)
+        apart = network.point_in_world - target
+        pull = np.einsum("nij,nj->ni", information, apart)
+        sums = eliminate_points(network, 1.0 / sigma_px, information, residual=residual, pull=pull)
+        normal = NormalMatrix(
+            sums.poses, np.zeros((0, sums.poses.shape[0])), np.zeros((0, 0)), network.cam_center_in_world
+        )
+        points = intersection_jacobian(network, sigma_px, information)
+        if (np.abs(residual - before) / sigma_px[:, None]).max() < _STILL:
+            observed = 2 * len(sigma_px) + 3 * len(surveyed.point)
+            redundancy = observed - 6 * len(network.camera_id) - 3 * len(network.point_in_world)
+            squares = float(((residual / sigma_px[:, None]) ** 2).sum() + (apart * pull).sum())
+            return AdjustedBundle(network, residual, np.sqrt(squares / redundancy), redundancy, normal, points)
+        step, _ = normal.solve(-sums.pose_slope[:, None], np.zeros((0, 1)))
+        network = _moved(network, step[:, 0], points, pull + _slope_of_points(network, residual, sigma_px))
+        before = residual
+    raise ConvergenceError(f"the bundle does not settle in {_ROUNDS} steps: start with better cameras and points")
+
+
+def _refuse_open_layouts(surveyed: SurveyedPoints) -> None:
+    position = surveyed.position_in_world
+    by_similarity = jacobian_at(position, position.mean(axis=0) if len(position) else np.zeros(3)).reshape(-1, 7)
+    if np.linalg.matrix_rank(by_similarity, tol=_FLAT * np.abs(by_similarity).max(initial=1.0)) < 7:
+        raise DegenerateGeometryError(
+            f"{len(position)} control points leave the frame open: three are needed that are not on one line"
+        )
+
+
+def _slope_of_points(network: Network, residual: FloatArray, sigma_px: FloatArray) -> FloatArray:
+    """Return the gradient (N, 3) of half the weighted squares of the observations by the points."""
+    by_point, slope = linearise_bundle(network).jacobian_point, np.zeros_like(network.point_in_world)
+    np.add.at(slope, network.obs_point, np.einsum("mij,mi->mj", by_point, residual / sigma_px[:, None] ** 2))
+    return slope
+
+
+def _moved(network: Network, step: FloatArray, points: IntersectionJacobian, slope: FloatArray) -> Network:
+    """Return the network after a step (6 n,) of the cameras, which the points follow to their own minimum."""
+    turn, shift = np.split(step.reshape(-1, 6), 2, axis=1)
+    followed = (points.by_poses @ step).reshape(-1, 3) - np.einsum("nij,nj->ni", points.cov_of_marks, slope)
+    return replace(
+        network,
+        cam_from_world=network.cam_from_world @ exp_so3(-turn),
+        cam_center_in_world=network.cam_center_in_world + shift,
+        point_in_world=network.point_in_world + followed,
+    )

@@ -1,0 +1,213 @@
+"""A solved state as a product: similarity, cameras, lens, systematic errors, measurements, posterior."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+
+from pipelines.adjust.accuracy_grid import accuracy_grid
+from pipelines.adjust.posterior import Posterior, camera_covariances, load_posterior
+from pipelines.adjust.state import State
+from pipelines.adjust.system import (
+    Linearised,
+    NormalMatrix,
+    Problem,
+    linearised,
+    posterior_weights,
+    robust_weights,
+)
+from pipelines.adjust.terms import Attitudes, ControlPoints, Fixes
+from pipelines.core.cautions import union
+from pipelines.core.stages import SIM3_POSTERIOR, SPARSE, TRAIN_POSTERIOR
+from pipelines.core.types import FloatArray
+from pipelines.core.workspace import Workspace
+from pipelines.formats.colmap import read_sparse
+from pipelines.geometry.cameras import CameraPoses
+from pipelines.geometry.rotations import quat_xyzw_from_matrix
+from pipelines.geometry.sparse_model import SparseModel
+from pipelines.scene.initial_similarity import InitialSimilarity
+from pipelines.scene.report import AccuracySummary
+from pipelines.scene.scene import Scene
+from pipelines.scene.trained_model import (
+    Adjustment,
+    Measurement,
+    TrainedCamera,
+    TrainedLens,
+    TrainedModel,
+    load_solution,
+)
+
+Named = Fixes | ControlPoints | Attitudes
+_OPEN = 1e-9  # redundancy below which the other observations leave a direction open
+_REJECTED = "contradicts the others at the 99.9 % level"
+
+
+def adjusted(
+    scene: Scene, problem: Problem, state: State, initial: InitialSimilarity, rejected: Problem | None = None
+) -> Posterior:
+    """Return a state as the solution of a survey, with its covariances.
+
+    Args:
+        scene: cameras as SfM left them.
+        problem: the measurements in use.
+        state: values of all unknowns.
+        initial: its verdict on each measurement stands; its factors and cautions are carried on.
+        rejected: problem of the measurements that were rejected; None: there are none.
+
+    Raises:
+        DegenerateGeometryError: the measurements leave the similarity open.
+    """
+    near = linearised(problem, state)
+    normal = near.normal(posterior_weights(near.residuals))
+    sparse, similarity = scene.sparse, state.geo_from_model
+    poses = state.poses(scene.poses)
+    pivot = similarity.apply(poses.cam_center_in_model).mean(axis=0)
+    covariance = normal.of_errors(len(problem.lens), len(problem.errors))
+    solution = Adjustment(
+        geo_from_model=similarity.to_record("model", "geo", pivot=pivot),
+        model_from_local=scene.model_from_local.to_record("local", "model"),
+        cameras=_cameras(scene, poses),
+        lenses=_lenses(sparse, state.lens),
+        gnss_outliers=initial.gnss_outliers,
+        control_outliers=initial.control_outliers,
+        estimated_errors=problem.errors.estimates(state.errors, covariance),
+        measurements=(*_measurements(near, normal), *_rejected(rejected, state)),
+        sigma_px=problem.bundle.sigma_px,
+        variance_factors=initial.variance_factors,
+        cautions=union(initial.cautions),
+    )
+    of_cameras = camera_covariances(normal, similarity.rotation, similarity.scale)
+    lens, moved = problem.lens, solution.with_lenses(sparse)
+    posterior = Posterior(solution, moved, normal, problem.bundle.followed, lens, of_cameras)
+    record = similarity.to_record("model", "geo", covariance=posterior.of_similarity, pivot=pivot)
+    grid = accuracy_grid(sparse, similarity.apply(scene.point_in_model), posterior.of_scene)
+    summary = AccuracySummary(cells=0, reason="the scene has too few points") if grid is None else grid.summary()
+    solution = solution.model_copy(update={"geo_from_model": record, "accuracy": summary})
+    return replace(posterior, solution=solution, grid=grid)
+
+
+def load_adjustment(workspace: Workspace) -> Posterior:
+    """Return the adjustment of a workspace: that of its training, else that of init-sim3.
+
+    Raises:
+        MissingProductError: neither exists.
+        InputError: a product is damaged.
+    """
+    return posterior_of(workspace, load_solution(workspace), read_sparse(workspace.path(SPARSE)))
+
+
+def posterior_of(workspace: Workspace, solution: Adjustment, sfm: SparseModel) -> Posterior:
+    """Return the posterior that is stored beside a solution of a workspace.
+
+    Raises:
+        MissingProductError: there is none.
+        InputError: the product is damaged, or of another solution.
+    """
+    product = TRAIN_POSTERIOR if isinstance(solution, TrainedModel) else SIM3_POSTERIOR
+    return load_posterior(workspace.path(product), solution, sfm)
+
+
+def _cameras(scene: Scene, poses: CameraPoses) -> tuple[TrainedCamera, ...]:
+    train = set(map(int, scene.train))
+    quats = quat_xyzw_from_matrix(poses.cam_from_model)
+    translations = -np.einsum("nij,nj->ni", poses.cam_from_model, poses.cam_center_in_model)
+    return tuple(
+        TrainedCamera(
+            name=name,
+            split="train" if index in train else "test",
+            quat_xyzw=tuple(quats[index]),
+            translation=tuple(translations[index]),
+        )
+        for index, name in enumerate(scene.sparse.image_name)
+    )
+
+
+def _lenses(sparse: SparseModel, change: FloatArray) -> tuple[TrainedLens, ...]:
+    """Return the lenses after a change (L,); none if the lens was held."""
+    if not len(change):
+        return ()
+    return tuple(
+        TrainedLens(camera_id=key, model=camera.model, params=tuple(camera.params.tolist()))
+        for key, camera in sparse.lenses.moved(change).cameras.items()
+    )
+
+
+_KINDS: dict[str, Literal["fix", "control point", "attitude"]] = {
+    Fixes.kind: "fix",
+    ControlPoints.kind: "control point",
+    Attitudes.kind: "attitude",
+}
+
+
+def _measurements(near: Linearised, normal: NormalMatrix) -> Iterator[Measurement]:
+    """Yield the state of every measurement in use, and of every systematic error."""
+    for term in near.problem.measured:
+        if isinstance(term, Named):
+            left_out = _left_out(near, term, normal) if isinstance(term, ControlPoints) else None
+            yield from _states(near.problem, term, near.state, reason="", left_out=left_out)
+    for error, row in zip(near.problem.errors.blocks, near.state.errors.reshape(-1, 3), strict=True):
+        yield Measurement(
+            kind="systematic error",
+            name=error.name if error.session is None else f"{error.name} of session {error.session + 1}",
+            used=True,
+            residual=tuple(row.tolist()),
+            normalised=float(np.linalg.norm(row / np.array(error.sigma))),
+        )
+
+
+def _rejected(problem: Problem | None, state: State) -> Iterator[Measurement]:
+    """Yield the state of the measurements that were rejected."""
+    if problem is None:
+        return
+    for term in problem.measured:
+        if isinstance(term, Named):
+            yield from _states(
+                problem, term, replace(state, errors=np.zeros(len(problem.errors))), reason=_REJECTED
+            )
+
+
+def _states(
+    problem: Problem, term: Named, state: State, *, reason: str, left_out: list[dict[str, object]] | None = None
+) -> Iterator[Measurement]:
+    at = problem.at(state)
+    residual, white = term.residuals(at), term.whitened(at)
+    for row, name in enumerate(term.name):
+        yield Measurement(
+            kind=_KINDS[term.kind],
+            name=name,
+            used=not reason,
+            reason=reason,
+            residual=tuple(residual[row].tolist()),
+            normalised=float(np.linalg.norm(white[row])),
+            **({} if left_out is None else left_out[row]),
+        )
+
+
+def _left_out(near: Linearised, control: ControlPoints, normal: NormalMatrix) -> list[dict[str, object]]:
+    """Return the error of each control point against the solution of all other observations, and its covariance.
+
+    The computation is linear and needs no second solution. With the normal matrix N of all observations, a point
+    with Jacobian A and weight w has the leverage H = w A N⁻¹ Aᵀ. Its residual without it is (I − H)⁻¹ r (Cook and
+    Weisberg 1982, section 2.2). The weights of the other observations are held.
+    """
+    kind = control.kind
+    white, residuals = near.rows[kind].residual, near.residuals
+    weights, expected = robust_weights(residuals), posterior_weights(residuals)
+    leverage = near.spread(weights, kind) * weights[kind][:, None, None]
+    spread = near.spread(expected, kind, normal)
+    free = np.eye(3) - leverage
+    known = np.linalg.eigvalsh((free + np.swapaxes(free, 1, 2)) / 2)[:, 0] > _OPEN
+    rows: list[dict[str, object]] = [{} for _ in known]
+    for row in np.flatnonzero(known):
+        unwhiten = np.linalg.inv(control.root_information[row])
+        error = unwhiten @ np.linalg.solve(free[row], white[row])
+        others = np.linalg.solve(np.eye(3) - expected[kind][row] * spread[row], spread[row])
+        cov = unwhiten @ (np.eye(3) + (others + others.T) / 2) @ unwhiten.T
+        rows[row] = {
+            "left_out_error_m": tuple(error.tolist()),
+            "left_out_cov_m2": tuple(map(tuple, cov.tolist())),
+        }
+    return rows

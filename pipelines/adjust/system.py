@@ -1,0 +1,471 @@
+"""The one system of the adjustment: sparse normal equations of all cameras, lens and systematic errors.
+
+The unknowns are corrections x of all cameras, which contain a similarity of the whole, changes ℓ of the lens and
+systematic errors v. Image observations enter as the information of the bundle about SfM's minimum
+(`geometry.bundle_information`), with the points eliminated; all other measurements as terms (`adjust.terms`):
+
+    | N   Bᵀ | | x      |
+    | B   C  | | border | ,   Schur complement of N: S = C − B N⁻¹ Bᵀ,   border = (ℓ, v).
+
+N is sparse and is factorised by nested dissection (`geometry.sparse_cholesky`); the border is dense and small. A
+similarity of the whole costs the bundle nothing, so that fixes and control points alone determine it. After each
+step, it is moved from the corrections into the similarity (`State.without_common_motion`): the information about
+SfM's minimum then holds, wherever on Earth the cameras have gone.
+
+Terms that depend on the mean similarity g of the SfM points (planes of a LiDAR) add g to the border, with the
+constraint g = F (x, ℓ) and its multipliers: F is dense, but has seven rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg import lu_factor, lu_solve
+from scipy.sparse import bsr_matrix, csr_matrix, diags
+
+from pipelines.adjust.state import State, SystematicErrors
+from pipelines.adjust.terms import At, CommonErrors, Slopes, Term
+from pipelines.core.errors import ConvergenceError, DegenerateGeometryError
+from pipelines.core.types import FloatArray, IntArray
+from pipelines.geometry.bundle_information import BundleInformation
+from pipelines.geometry.cameras import CameraPoses
+from pipelines.geometry.sparse_cholesky import SparseCholesky
+from pipelines.robust.kernels import NOISE_WEIGHT, cauchy_loss, cauchy_weight
+
+_ROUNDS = 150
+_STILL = 5e-6  # change of a whitened residual that ends the descent
+_NOISE = 1e-10  # relative rise of the cost that rounding causes
+_HALVINGS = 12  # of a step that raises the cost
+_SLOW = 0.8  # of the step before: a step that is longer is slow to shrink
+_NEW_FACTOR = 0.6  # a step that leaves more of the last change of the residuals asks for a new factor
+_CHUNK = 32  # groups of rows whose covariances are computed together
+_EQUILIBRATIONS = 8
+_OPEN = 1e-13  # singular value of the equilibrated Schur complement over the largest
+_UNSEEN = 10.0  # times the bundle's loosest σ, at which a camera is held that nothing observes
+_ADVICE = "fixes and control points leave the similarity open: add control points, at least 3"
+
+# By kind of observation: residuals (M, d), weights (M,).
+Residuals = Mapping[str, FloatArray]
+Weights = Mapping[str, FloatArray]
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Cameras, and all that was measured of them.
+
+    Attributes:
+        base: poses as SfM left them, in `model`.
+        bundle: information of the image observations on them.
+        measured: terms of the survey, at most one of a kind.
+        errors: systematic errors of the measurements.
+        lens_held: whether the lens stays as it is, exactly known.
+    """
+
+    base: CameraPoses
+    bundle: BundleInformation
+    measured: tuple[Term, ...]
+    errors: SystematicErrors = field(default_factory=SystematicErrors)
+    lens_held: bool = False
+
+    @property
+    def terms(self) -> tuple[Term, ...]:
+        """All terms, the prior of the systematic errors among them."""
+        prior = (CommonErrors.of(self.errors),) if len(self.errors) else ()
+        return (*self.measured, *prior)
+
+    def term(self, kind: str) -> Term | None:
+        """Return the term of a kind; None if there is none."""
+        return next((term for term in self.terms if term.kind == kind), None)
+
+    @cached_property
+    def lens(self) -> IntArray:
+        """Lens parameters that are unknowns: those that an observation reveals, unless the lens is held."""
+        seen = np.flatnonzero(np.diag(self.bundle.sums.lens) > 0)
+        return seen[:0] if self.lens_held else seen
+
+    @cached_property
+    def poses(self) -> bsr_matrix:
+        """Information (6 n, 6 n) of the image observations on x, with a hold of cameras that nothing observes."""
+        bundle = self.bundle
+        own = bundle.sums.poses.diagonal() * bundle.unit**2
+        weak = own < bundle.loosest_sigma_m**-2
+        hold = diags(weak * (_UNSEEN * bundle.unit * bundle.loosest_sigma_m) ** -2.0).tobsr((6, 6))
+        return (bundle.sums.poses + hold).tobsr((6, 6))
+
+    @cached_property
+    def of_rounding(self) -> FloatArray:
+        """Information (7, 7) on a similarity of the whole in `poses`, which should be zero: ridge and rounding."""
+        modes = self.bundle.similarity_modes
+        return np.asarray(modes.T @ (self.bundle.sums.poses @ modes))
+
+    def at(self, state: State) -> At:
+        """Return the estimate of a state, as terms need it."""
+        return At.of(state, self.base, self.errors)
+
+    def residuals(self, state: State) -> dict[str, FloatArray]:
+        """Return the whitened residuals (M, d) by kind."""
+        at = self.at(state)
+        return {term.kind: term.whitened(at) for term in self.terms}
+
+    def start_at(self, state: State, errors: SystematicErrors) -> State:
+        """Return a state of a problem with other systematic errors, with those that this one has as well."""
+        values = np.zeros(len(self.errors))
+        for block in self.errors.blocks:
+            here, there = (each.columns(block.name, block.session) for each in (self.errors, errors))
+            if here is not None and there is not None:
+                values[here] = state.errors[there]
+        return replace(state, errors=values)
+
+
+@dataclass(frozen=True)
+class Rows:
+    """M whitened observations of one kind near a state.
+
+    Attributes:
+        residual: (M, d) at the state.
+        by_poses: (M d, 6 n) sparse derivative by the corrections of the cameras.
+        by_border: (M d, b) derivative by the border: lens, systematic errors, similarity of the points if any.
+    """
+
+    residual: FloatArray
+    by_poses: csr_matrix
+    by_border: FloatArray
+
+
+@dataclass(frozen=True)
+class NormalMatrix:
+    """Matrix of the normal equations: the information of all measurements on all unknowns.
+
+    Attributes:
+        poses: (6 n, 6 n) N, sparse in blocks (6, 6).
+        border: (b, 6 n) B.
+        corner: (b, b) C.
+        position: (n, 3) of the cameras; decides the cost of the factorisation, not its result.
+    """
+
+    poses: bsr_matrix
+    border: FloatArray
+    corner: FloatArray
+    position: FloatArray
+
+    @cached_property
+    def factor(self) -> SparseCholesky:
+        """Factor of N.
+
+        Raises:
+            DegenerateGeometryError: the measurements leave the similarity open.
+        """
+        try:
+            return SparseCholesky(self.poses, self.position)
+        except DegenerateGeometryError:
+            raise DegenerateGeometryError(_ADVICE) from None
+
+    @cached_property
+    def response(self) -> FloatArray:
+        """N⁻¹ Bᵀ (6 n, b)."""
+        right = np.ascontiguousarray(self.border.T)
+        return self.factor.solve(right) if right.size else right
+
+    @cached_property
+    def _schur(self) -> _EquilibratedLU:
+        return _EquilibratedLU(self.corner - self.border @ self.response)
+
+    def solve(self, poses: FloatArray, border: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the unknowns (6 n, m) and (b, m) for right sides of the same shapes."""
+        inner = self.factor.solve(poses)
+        outer = self._schur.solve(border - self.border @ inner)
+        return inner - self.response @ outer, outer
+
+    def covariance(self, by_poses: csr_matrix, by_border: FloatArray) -> FloatArray:
+        """Return the covariance (m, m) of quantities with derivatives (m, 6 n) and (m, b)."""
+        if not len(by_border):
+            return np.zeros((0, 0))
+        by_poses = csr_matrix(by_poses)
+        within = self.factor.inverse_form(by_poses.T.tocsc()) if by_poses.nnz else 0.0
+        return np.asarray(within + self._of_border(by_border - by_poses @ self.response))
+
+    def covariances(self, by_poses: csr_matrix, by_border: FloatArray, size: int) -> FloatArray:
+        """Return the covariances (m, size, size) of groups of `size` quantities; derivatives as in `covariance`."""
+        by_poses, count = csr_matrix(by_poses), len(by_border) // size
+        covariance = np.empty((count, size, size))
+        for first in range(0, count, _CHUNK):
+            rows = slice(size * first, size * (first + _CHUNK))
+            joint = self.covariance(by_poses[rows], by_border[rows])
+            among = np.arange(len(joint) // size)
+            covariance[first : first + _CHUNK] = joint.reshape(len(among), size, -1, size)[among, :, among]
+        return covariance
+
+    def of_errors(self, lens: int, count: int) -> FloatArray:
+        """Return the covariance (count, count) of the systematic errors, which follow `lens` parameters."""
+        return self._of_border(np.eye(count, len(self.corner), lens))
+
+    def of_each_camera(self, camera: IntArray, by_pose: FloatArray, by_border: FloatArray) -> FloatArray:
+        """Return the covariances (m, d, d) of quantities that depend on one camera each.
+
+        Args:
+            camera: (m,) that camera.
+            by_pose: (m, d, 6) derivative by its corrections.
+            by_border: (m, d, b).
+        """
+        response = self.response.reshape(len(self.position), 6, -1)[camera]
+        across = by_border - by_pose @ response
+        within = by_pose @ self._camera_blocks[camera] @ np.swapaxes(by_pose, 1, 2)
+        return np.asarray(within + self._of_border(across))
+
+    @cached_property
+    def _camera_blocks(self) -> FloatArray:
+        return self.factor.inverse_diagonal()
+
+    def _of_border(self, left: FloatArray) -> FloatArray:
+        """Return the products left S⁻¹ leftᵀ (…, m, m) of border vectors (…, m, b)."""
+        if not len(self.corner):
+            return np.zeros((*left.shape[:-1], left.shape[-2]))
+        solved = self._schur.solve(left.reshape(-1, left.shape[-1]).T).T.reshape(left.shape)
+        return np.asarray(left @ np.swapaxes(solved, -1, -2))
+
+
+@dataclass(frozen=True)
+class Linearised:
+    """Problem near a state: the whitened observations by kind, and the state's own pull."""
+
+    problem: Problem
+    state: State
+    rows: dict[str, Rows]
+
+    @property
+    def residuals(self) -> Residuals:
+        """Whitened residuals (M, d) by kind."""
+        return {kind: rows.residual for kind, rows in self.rows.items()}
+
+    def normal(self, weights: Weights) -> NormalMatrix:
+        """Return the normal equations with weights (M,) of the observations.
+
+        Raises:
+            DegenerateGeometryError: the measurements leave the similarity open.
+        """
+        self._refuse_open_layouts()
+        problem, lens = self.problem, self.problem.lens
+        matrix, width = problem.poses, self._width
+        border, corner = np.zeros((width, matrix.shape[0])), np.zeros((width, width))
+        border[: len(lens)] = problem.bundle.sums.cross[:, lens].T
+        corner[: len(lens), : len(lens)] = problem.bundle.sums.lens[np.ix_(lens, lens)]
+        for kind, rows in self.rows.items():
+            weight = np.repeat(weights[kind], rows.residual.shape[1])
+            weighted = rows.by_poses.T @ diags(weight)
+            if rows.by_poses.nnz:
+                matrix = matrix + (weighted @ rows.by_poses).tobsr((6, 6))
+            border += (weighted @ rows.by_border).T
+            corner += rows.by_border.T @ (weight[:, None] * rows.by_border)
+        if self._has_points:  # g = F (x, ℓ), with multipliers
+            followed, n = problem.bundle.followed, matrix.shape[0]
+            known = np.zeros((7, width))
+            known[:, : len(lens)], known[:, -7:] = -followed[:, n + lens], np.eye(7)
+            border = np.concatenate([border, -followed[:, :n]])
+            corner = np.block([[corner, known.T], [known, np.zeros((7, 7))]])
+        return NormalMatrix(matrix.tobsr((6, 6)), border, corner, problem.base.cam_center_in_model)
+
+    def step(self, normal: NormalMatrix, weights: Weights) -> tuple[FloatArray, FloatArray]:
+        """Return the step (n, 6), (L + p,) to the minimum of the weighted squares."""
+        problem, state = self.problem, self.state
+        slope_poses, slope_lens = _slope_of_bundle(problem, state)
+        border = np.zeros(len(normal.corner))
+        border[: len(problem.lens)] = slope_lens[problem.lens]
+        for kind, rows in self.rows.items():
+            pull = (weights[kind][:, None] * rows.residual).ravel()
+            slope_poses = slope_poses + rows.by_poses.T @ pull
+            border[: self._width] += rows.by_border.T @ pull
+        poses, found = normal.solve(-slope_poses[:, None], -border[:, None])
+        moved = np.zeros(len(state.lens) + len(problem.errors))
+        moved[problem.lens] = found[: len(problem.lens), 0]
+        moved[len(state.lens) :] = found[len(problem.lens) :, 0][: len(problem.errors)]
+        return poses.reshape(-1, 6), moved
+
+    def spread(self, weights: Weights, kind: str, normal: NormalMatrix | None = None) -> FloatArray:
+        """Return the covariances (M, d, d) that the unknowns cause in the whitened observations of a kind."""
+        normal, rows = self.normal(weights) if normal is None else normal, self.rows[kind]
+        count, d = rows.residual.shape
+        by_border = np.pad(rows.by_border, ((0, 0), (0, len(normal.corner) - self._width)))
+        blocks = rows.by_poses.tobsr((d, 6)) if rows.by_poses.nnz else None
+        if blocks is not None and (np.diff(blocks.indptr) == 1).all():  # each observation belongs to one camera
+            return normal.of_each_camera(
+                blocks.indices, blocks.data, by_border.reshape(count, d, len(normal.corner))
+            )
+        return normal.covariances(rows.by_poses, by_border, d)
+
+    def _refuse_open_layouts(self) -> None:
+        """Refuse measurements that know less of some movement of the whole than ridge and rounding of the bundle.
+
+        The factor of N does not show an open direction: the ridge on each point closes it, with a σ that grows
+        smaller with the number of points.
+        """
+        problem, lenses, count = self.problem, len(self.problem.lens), len(self.problem.errors)
+        known = np.zeros((7 + count, 7 + count))
+        for rows in self.rows.values():
+            whole = rows.by_poses @ problem.bundle.similarity_modes
+            if self._has_points:
+                whole = whole + rows.by_border[:, lenses + count :]
+            by_unknowns = np.hstack([whole, rows.by_border[:, lenses : lenses + count]])
+            known += by_unknowns.T @ by_unknowns
+        information = known[:7, :7] - known[:7, 7:] @ np.linalg.solve(known[7:, 7:], known[7:, :7])
+        scale = 1.0 / np.sqrt(np.diag(information) + np.abs(np.diag(problem.of_rounding)))
+        beyond = (information - problem.of_rounding) * scale[:, None] * scale
+        if np.linalg.eigvalsh(beyond)[0] <= _OPEN:
+            raise DegenerateGeometryError(_ADVICE)
+
+    @property
+    def _width(self) -> int:
+        """Number of unknowns of the border, without multipliers."""
+        return len(self.problem.lens) + len(self.problem.errors) + 7 * self._has_points
+
+    @property
+    def _has_points(self) -> bool:
+        return any(term.kind == "lidar" for term in self.problem.terms)
+
+
+@dataclass(frozen=True)
+class Minimum:
+    """Minimum of a problem: the state there, −2 ln likelihood, and equations that were factorised near by."""
+
+    state: State
+    cost: float
+    normal: NormalMatrix
+
+
+def linearised(problem: Problem, state: State) -> Linearised:
+    """Return the observations of a problem near a state."""
+    at, columns = problem.at(state), 6 * len(problem.base.cam_center_in_model)
+    slopes = {term.kind: term.slopes(at).whitened(term.root_information) for term in problem.terms}
+    has_points = any(slope.by_similarity is not None for slope in slopes.values())
+    rows = {kind: _rows(problem, slope, columns, has_points=has_points) for kind, slope in slopes.items()}
+    return Linearised(problem, state, rows)
+
+
+def _rows(problem: Problem, slopes: Slopes, columns: int, *, has_points: bool) -> Rows:
+    count, d = slopes.residual.shape
+    parts = [slopes.by_lens[:, :, problem.lens], slopes.by_errors]
+    if has_points:
+        none = np.zeros((count, d, 7))
+        parts.append(none if slopes.by_similarity is None else slopes.by_similarity)
+    by_border = np.concatenate(parts, axis=2).reshape(count * d, -1)
+    row = np.broadcast_to((d * slopes.row)[:, None, None] + np.arange(d)[:, None], slopes.by_pose.shape)
+    column = np.broadcast_to((6 * slopes.camera)[:, None, None] + np.arange(6), slopes.by_pose.shape)
+    entries = (slopes.by_pose.ravel(), (row.ravel(), column.ravel()))
+    return Rows(slopes.residual, csr_matrix(entries, shape=(count * d, columns)), by_border)
+
+
+def minimise(problem: Problem, start: State, normal: NormalMatrix | None = None) -> Minimum:
+    """Return the minimum of Cauchy's cost of all terms, with the information of the bundle.
+
+    A quasi-Newton step takes the slope at the present state and a factor that may be older: the minimum is exact,
+    and few factorisations are needed. A step that raises the cost is halved. Where steps shrink slowly, because the
+    weights of a redescending kernel are stiff, the next one is stretched.
+
+    Args:
+        problem: the measurements.
+        start: state to start from.
+        normal: equations of a state near by, whose factor the first steps take; None: there are none.
+
+    Raises:
+        ConvergenceError: the steps do not end.
+        DegenerateGeometryError: the measurements leave the similarity open.
+    """
+    state, residuals = start, problem.residuals(start)
+    cost, last = cost_at(problem, start, residuals), np.inf
+    stretch, unstretched = 1.0, np.inf
+    for _ in range(_ROUNDS):
+        near, weights = linearised(problem, state), robust_weights(residuals)
+        if normal is None:
+            normal, last = near.normal(weights), np.inf
+        step = near.step(normal, weights)
+        for halving in range(_HALVINGS + 1):
+            moved = _moved(problem, state, step, stretch * 0.5**halving)
+            new = problem.residuals(moved)
+            change, reached = _largest_change(residuals, new), cost_at(problem, moved, new)
+            if reached <= cost + _NOISE * (1 + abs(cost)) or change < _STILL:
+                break
+        else:
+            raise ConvergenceError(f"the cameras do not settle: the last step changed a residual by {change:.1e} σ")
+        state, residuals, cost = moved, new, reached
+        if change < _STILL:
+            return Minimum(state, cost, normal)
+        if halving or change > _NEW_FACTOR * last:
+            normal = None
+        whole = change / (stretch * 0.5**halving)
+        stretch = 2 * stretch if not halving and _SLOW * unstretched < whole < unstretched else 1.0
+        last, unstretched = change, whole
+    raise ConvergenceError(f"the cameras do not settle: the last step changed a residual by {last:.1e} σ")
+
+
+def _moved(problem: Problem, state: State, step: tuple[FloatArray, FloatArray], part: float) -> State:
+    """Return the state after a part of a step, without a similarity of the whole among the corrections."""
+    poses, border = step
+    lenses = len(state.lens)
+    moved = state.moved(part * poses, part * border[:lenses], part * border[lenses:])
+    mean = problem.bundle.followed @ np.concatenate([moved.correction.ravel(), moved.lens])
+    center = problem.base.cam_center_in_model.mean(axis=0)
+    return moved.without_common_motion(mean, problem.bundle.similarity_modes, center)
+
+
+def _slope_of_bundle(problem: Problem, state: State) -> tuple[FloatArray, FloatArray]:
+    """Return the slope (6 n,), (L,) of half the cost of the image observations."""
+    sums, x, lens = problem.bundle.sums, state.correction.ravel(), state.lens
+    by_poses = problem.poses @ x + sums.cross @ lens + sums.pose_slope
+    return np.asarray(by_poses), np.asarray(sums.cross.T @ x + sums.lens @ lens + sums.lens_slope)
+
+
+def cost_at(problem: Problem, state: State, residuals: Residuals) -> float:
+    """Return −2 ln likelihood of a state: Cauchy's cost of the residuals, and that of the image observations."""
+    by_poses, by_lens = _slope_of_bundle(problem, state)
+    x, sums = state.correction.ravel(), problem.bundle.sums
+    of_bundle = x @ (by_poses + sums.pose_slope) + state.lens @ (by_lens + sums.lens_slope)
+    return float(of_bundle) + sum(
+        float(cauchy_loss((rows**2).sum(axis=1), rows.shape[1]).sum()) for rows in residuals.values()
+    )
+
+
+def robust_weights(residuals: Residuals) -> dict[str, FloatArray]:
+    """Return Cauchy's weights (M,) of whitened residuals (M, d), by kind."""
+    return {kind: cauchy_weight((rows**2).sum(axis=1), rows.shape[1]) for kind, rows in residuals.items()}
+
+
+def posterior_weights(residuals: Residuals) -> dict[str, FloatArray]:
+    """Return the weights (M,), by kind, whose normal matrix is the inverse covariance of the estimate.
+
+    Cauchy's weight is also below 1 under pure noise (`robust.kernels.NOISE_WEIGHT`). A prior counts at most once.
+    """
+    weights = robust_weights(residuals)
+    for kind, rows in residuals.items():
+        weights[kind] = weights[kind] / NOISE_WEIGHT[rows.shape[1]]
+        if kind == CommonErrors.kind:
+            weights[kind] = np.minimum(weights[kind], 1.0)
+    return weights
+
+
+def _largest_change(before: Residuals, after: Residuals) -> float:
+    return max((float(np.abs(after[kind] - before[kind]).max(initial=0.0)) for kind in after), default=0.0)
+
+
+class _EquilibratedLU:
+    """LU factors of a symmetric, perhaps indefinite matrix, scaled to a largest entry of 1 in rows and columns."""
+
+    def __init__(self, matrix: FloatArray) -> None:
+        self._scale = np.ones(len(matrix))
+        if not len(matrix):
+            return
+        for _ in range(_EQUILIBRATIONS):
+            largest = np.abs(matrix * self._scale[:, None] * self._scale).max(axis=1)
+            self._scale /= np.sqrt(np.where(largest > 0, largest, 1.0))
+        scaled = matrix * self._scale[:, None] * self._scale
+        size = np.linalg.svd(scaled, compute_uv=False)
+        if size[-1] <= _OPEN * size[0]:
+            raise DegenerateGeometryError(_ADVICE)
+        self._factors = lu_factor(scaled)
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        """Return the solution (b, m) for right sides (b, m)."""
+        if not len(self._scale):
+            return right
+        return np.asarray(lu_solve(self._factors, right * self._scale[:, None]) * self._scale[:, None])

@@ -1,0 +1,156 @@
+"""Scene of a training with the adjustment that it starts from, and its solution without photographs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import get_args
+
+import numpy as np
+import torch
+
+from pipelines.adjust.measurements import problem_of
+from pipelines.adjust.options import EstimatedErrorName
+from pipelines.adjust.posterior import Posterior
+from pipelines.adjust.solution import adjusted
+from pipelines.adjust.state import State, SystematicErrors
+from pipelines.adjust.system import Problem, linearised, posterior_weights
+from pipelines.adjust.terms import Planes
+from pipelines.core.stages import ADJUSTMENT
+from pipelines.core.types import FloatArray, IntArray
+from pipelines.core.workspace import Workspace
+from pipelines.geometry.rotations import log_so3
+from pipelines.scene.initial_similarity import InitialSimilarity
+from pipelines.scene.photographs import ImageCache
+from pipelines.scene.pinholes import Pinholes
+from pipelines.scene.scene import Scene, load_adjusted_scene
+from pipelines.scene.survey import Survey
+from pipelines.scene.trained_model import Adjustment
+from pipelines.splat.exposure import HeldExposures
+from pipelines.splat.rasterizer.api import Rasterizer
+from pipelines.train.region import RegionViews
+
+
+@dataclass(frozen=True)
+class AdjustedScene:
+    """Scene of a survey, or of some of its cameras, with their adjustment.
+
+    Attributes:
+        initial: product of `init-sim3`; its verdict on each measurement stands.
+        survey: the measurements, with the variance factors in their covariances.
+        scene: cameras and points as SfM left them, in the frame of the adjustment.
+        adjustment: of the same cameras.
+    """
+
+    initial: InitialSimilarity
+    survey: Survey
+    scene: Scene
+    adjustment: Adjustment
+
+    @classmethod
+    def load(cls, workspace: Workspace, product: str = ADJUSTMENT) -> AdjustedScene:
+        """Return the scene of the whole survey; arguments and errors are those of `load_adjusted_scene`."""
+        initial, adjustment, survey, scene = load_adjusted_scene(workspace, product)
+        return cls(initial, survey, scene, adjustment)
+
+    def of_images(self, images: IntArray) -> AdjustedScene:
+        """Return the scene of some cameras (K,), in ascending order."""
+        cameras = tuple(self.adjustment.cameras[index] for index in sorted(set(images.tolist())))
+        adjustment = self.adjustment.model_copy(update={"cameras": cameras})
+        return replace(self, scene=self.scene.of_images(images), adjustment=adjustment)
+
+    def trained_on(self, train: IntArray) -> AdjustedScene:
+        """Return the scene with other training images (T,), ascending."""
+        return replace(self, scene=replace(self.scene, train=train))
+
+    def views(self, images: ImageCache, indices: IntArray, rasterizer: Rasterizer) -> RegionViews:
+        """Return views (T,), under the adjusted lenses, in which a region can be looked for."""
+        pinholes = Pinholes(images, self.scene.sparse.lenses)
+        pinholes.renew(self.adjustment.with_lenses(self.scene.sparse).lenses)
+        return RegionViews(indices, self.adjustment.poses, pinholes, rasterizer)
+
+    def exposures(self, device: torch.device) -> HeldExposures | None:
+        """Return the exposures of the adjustment, the identity for cameras without one; None: nobody has one."""
+        exposures = [camera.exposure for camera in self.adjustment.cameras]
+        if all(exposure is None for exposure in exposures):
+            return None
+        every = np.array([np.eye(3, 4) if exposure is None else exposure for exposure in exposures])
+        return HeldExposures(torch.from_numpy(every).float().to(device))
+
+    def measured(self, *, control_points: bool = True, planes: Planes | None = None) -> Problem:
+        """Return the measurements in use, with the systematic errors that the adjustment has estimated.
+
+        Args:
+            control_points: whether they are used.
+            planes: of a LiDAR whose shift is a systematic error; None: none.
+        """
+        survey = self.initial.in_use(self.survey)
+        if not control_points:
+            survey = survey.model_copy(update={"control_points": ()})
+        known = {error.name for error in self.adjustment.estimated_errors}
+        return problem_of(
+            self.scene,
+            survey,
+            estimate=tuple(name for name in get_args(EstimatedErrorName) if name in known),
+            with_attitudes=self.initial.layout == "line",
+            planes=planes,
+        )
+
+    def state(self, errors: SystematicErrors) -> State:
+        """Return the adjustment as corrections of SfM's cameras and lens, with values of systematic errors."""
+        sfm, poses, lenses = self.scene.poses, self.adjustment.poses, self.scene.sparse.lenses
+        turn = -log_so3(np.swapaxes(sfm.cam_from_model, 1, 2) @ poses.cam_from_model)
+        moved = poses.cam_center_in_model - sfm.cam_center_in_model
+        return State(
+            self.adjustment.similarity,
+            np.concatenate([turn, moved], axis=1),
+            lenses.change_to(self.adjustment.with_lenses(self.scene.sparse).lenses),
+            self.error_estimates(errors)[0],
+        )
+
+    def error_estimates(self, errors: SystematicErrors) -> tuple[FloatArray, FloatArray]:
+        """Return the values (p,) of systematic errors in the adjustment, and their σ (p,), in metres and radians.
+
+        An error that it does not have is zero, with the σ of its prior.
+        """
+        value, sigma = np.zeros(len(errors)), errors.sigma
+        for estimate in self.adjustment.estimated_errors:
+            columns = errors.columns(estimate.name, estimate.session)
+            if columns is not None:
+                unit = np.radians(1.0) if estimate.unit == "deg" else 1.0
+                value[columns], sigma[columns] = unit * np.array(estimate.value), unit * np.array(estimate.sigma)
+        # The estimates leave out the rotation that all attitudes share.
+        columns = errors.columns("common")
+        for measurement in self.adjustment.measurements:
+            if columns is not None and (measurement.kind, measurement.name) == ("systematic error", "common"):
+                value[columns] = measurement.residual
+        return value, sigma
+
+    def require_determined(self, problem: Problem) -> None:
+        """Refuse measurements whose adjustment a training could not state at its end.
+
+        Raises:
+            DegenerateGeometryError: they leave the similarity open.
+        """
+        near = linearised(problem, self.state(problem.errors))
+        near.normal(posterior_weights(near.residuals))
+
+    def posterior(self, problem: Problem, state: State) -> Posterior:
+        """Return a state of the measurements as an adjustment, with its covariances.
+
+        Raises:
+            DegenerateGeometryError: the measurements leave the similarity open.
+        """
+        rejected = self.initial.rejected(self.survey)
+        of_rejected = None if rejected is None else problem_of(self.scene, rejected)
+        return adjusted(self.scene, problem, state, self.initial, of_rejected)
+
+
+def with_exposures(adjustment: Adjustment, exposure: FloatArray) -> Adjustment:
+    """Return an adjustment with the exposures (n, 3, 4) of its training cameras."""
+    cameras = tuple(
+        camera.model_copy(update={"exposure": tuple(map(tuple, affine.tolist()))})
+        if camera.split == "train"
+        else camera
+        for camera, affine in zip(adjustment.cameras, exposure, strict=True)
+    )
+    return adjustment.model_copy(update={"cameras": cameras})

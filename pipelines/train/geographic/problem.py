@@ -1,0 +1,311 @@
+"""Geographic losses of a training: their sum, their weights, and their start at the adjustment.
+
+Whitened residuals make each term half of a χ², and the whole a maximum a posteriori estimate: but for L_rel and the
+photographs, the loss is that of the adjustment, so that a training starts at its minimum. `paper` takes plain mean
+squares in metres instead. A Cauchy kernel bounds the effect of one bad fix.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Literal, TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pipelines.adjust import terms as adjustment
+from pipelines.adjust.state import State, SystematicErrors
+from pipelines.adjust.system import Problem
+from pipelines.geometry.cameras import Pinhole
+from pipelines.geometry.correction_basis import coordinates_of
+from pipelines.robust.kernels import MEAN_WEIGHTED_CHI2
+from pipelines.scene.geolocated import GeolocatedPoints
+from pipelines.splat.depth import depth_at
+from pipelines.train.adjusted_scene import AdjustedScene
+from pipelines.train.geographic.terms import (
+    ControlByDepth,
+    ControlTerm,
+    FixTerm,
+    Term,
+    control_by_depth,
+    depth_residuals,
+    distance_term,
+    moved_tensors,
+    tensor_term,
+)
+from pipelines.train.geographic.unknowns import (
+    CameraCorrections,
+    Estimate,
+    LearnableErrors,
+    LearnableSimilarity,
+    cauchy,
+)
+from pipelines.train.options import GeographicOptions
+
+Weighting = Literal["whitened", "paper"]
+TermT = TypeVar("TermT", bound=Term)
+
+# A learned variance stays within this factor of the stated one, or of 1 m² if residuals are not whitened.
+_BOUND = {"whitened": 100.0, "paper": 1e4}
+# Uncertainty of the stated variances: σ of the logarithm.
+PRIOR_LOG_VARIANCE = 1.0
+
+
+class TermWeights(torch.nn.Module):
+    """Log-variances s = b tanh(u/b) of the terms, bounded by b so that no term vanishes or explodes; else s = 0.
+
+    Kendall, Gal and Cipolla (doi 10.1109/CVPR.2018.00781, eq. 7): a term of squared residuals becomes
+    e^{−s} χ² + d s with its log-variance s. Here the robust kernel is applied to e^{−s} χ², so that outliers do not
+    raise the variance. The factor d is the mean of the kernel's weighted χ² under noise of the stated σ: the loss
+    is then stationary at s = 0.
+
+    Args:
+        dimensions: of the residuals, by the kind of the term.
+        weighting: of the residuals.
+        learned: learn the variances; otherwise s = 0.
+    """
+
+    def __init__(self, dimensions: Mapping[str, int], weighting: Weighting, learned: bool) -> None:
+        super().__init__()
+        self.weighting, self.learned = weighting, learned
+        self.bound = math.log(_BOUND[weighting])
+        self._dimensions = dict(dimensions)
+        self.u = torch.nn.Parameter(torch.zeros(len(dimensions) if learned else 0, dtype=torch.float64))
+
+    def log_variance(self, kind: str) -> Tensor | None:
+        """Return s of a term; None if the variances are not learned."""
+        if not self.learned:
+            return None
+        return self.bound * torch.tanh(self.u[list(self._dimensions).index(kind)] / self.bound)
+
+    def variance_factors(self) -> dict[str, float]:
+        """Return e^s by term; empty if the variances are not learned."""
+        log_variances = {kind: self.log_variance(kind) for kind in self._dimensions}
+        return {kind: math.exp(float(s.detach())) for kind, s in log_variances.items() if s is not None}
+
+    def price(self, kind: str) -> float:
+        """Return d, the factor of s in the loss of one residual of a term."""
+        dimension = self._dimensions[kind]
+        return MEAN_WEIGHTED_CHI2[dimension] if self.weighting == "whitened" else float(dimension)
+
+    def prior(self) -> Tensor:
+        """Return the prior of the variances, a χ² of s; zero if none is stated or none learned. Scalar."""
+        if not self.learned or self.weighting == "paper":
+            return self.u.new_zeros(())
+        s = self.bound * torch.tanh(self.u / self.bound)
+        return (s / PRIOR_LOG_VARIANCE).square().sum()
+
+
+class GeoProblem(torch.nn.Module):
+    """Geographic losses, with the prior of bundle adjustment on the corrections of the cameras.
+
+    Args:
+        similarity: `geo_from_model`.
+        cameras: poses in `model`.
+        terms: the observations, at most one term of a kind; none: the loss is zero, and nothing moves.
+        errors: systematic errors of the measurements; None: there are none.
+        weighting: "whitened" (maximum a posteriori) or "paper" (plain mean squares).
+        learned_weights: learn a variance factor of each term.
+        control_by_depth: marks of the control points, if training projects them onto the rendered depth. Then
+            `depth_loss` takes the place of the control points' term in the loss. None: the term is in it.
+    """
+
+    def __init__(
+        self,
+        similarity: LearnableSimilarity,
+        cameras: CameraCorrections,
+        terms: Sequence[Term] = (),
+        *,
+        errors: LearnableErrors | None = None,
+        weighting: Weighting = "whitened",
+        learned_weights: bool = False,
+        control_by_depth: ControlByDepth | None = None,
+    ) -> None:
+        super().__init__()
+        self.similarity, self.cameras, self.errors = similarity, cameras, errors
+        self.terms, self.control_by_depth = tuple(terms), control_by_depth
+        self.weighting = weighting
+        self.weights = TermWeights({term.kind: term.dimension for term in terms}, weighting, learned_weights)
+
+    def term(self, kind: type[TermT]) -> TermT | None:
+        """Return the term of a kind; None if there is none."""
+        return next((term for term in self.terms if isinstance(term, kind)), None)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> GeoProblem:
+        """Move the observations between devices together with the parameters."""
+        super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
+        self.terms = tuple(moved_tensors(term, fn) for term in self.terms)
+        if self.control_by_depth is not None:
+            self.control_by_depth = moved_tensors(self.control_by_depth, fn)
+        return self
+
+    def learned(self) -> dict[str, torch.nn.Parameter]:
+        """Return the learned parameters by name: similarity y, cameras z, and, if any, errors x and weights u."""
+        more = {"u": self.weights.u} if self.errors is None else {"x": self.errors.x, "u": self.weights.u}
+        return {"y": self.similarity.y, "z": self.cameras.z} | {k: p for k, p in more.items() if len(p)}
+
+    def estimate(self) -> Estimate:
+        """Return the present estimate, differentiable in all parameters of `learned`."""
+        rotation, center = self.cameras.moved()
+        if self.errors is None:
+            errors, vector = SystematicErrors(), center.new_zeros(0)
+        else:
+            errors, vector = self.errors.errors, self.errors.vector()
+        return Estimate(rotation, center, self.similarity(), errors, vector, self.cameras.lens())
+
+    def state(self) -> State:
+        """Return the present values as a state of the adjustment."""
+        with torch.no_grad():
+            tensors = [self.cameras.corrections(), self.cameras.lens()]
+            tensors += [] if self.errors is None else [self.errors.vector()]
+            return State(self.similarity.current(), *(tensor.cpu().numpy() for tensor in tensors))
+
+    def losses(self) -> dict[str, Tensor]:
+        """Return the losses by kind: of each term, a mean of ρ; of the cameras; and of the systematic errors."""
+        at = self.estimate()
+        values = {term.kind: self._rho(term, self._squared_as(term, at)).mean() for term in self.terms}
+        # A problem that holds the cameras has no z, and no loss.
+        values["cameras"] = self.cameras.z.square().sum() / self._normaliser()
+        if self.errors is not None and len(at.vector):
+            values["errors"] = self.errors.prior() / self._normaliser()
+        return values
+
+    def loss(self) -> Tensor:
+        """Return L_abs + λ_gcp L_gcp + λ_rel L_rel + λ_att L_att + the losses of cameras and errors; scalar.
+
+        - Whitened: every χ² has the same weight. λ is therefore the number of observations of a term over the
+          number of fixes, times `Term.share`, which is below 1 for L_rel only.
+        - Paper: every λ is 1, and cameras and errors have no loss.
+        - Control points through the rendered depth are not included: see `depth_loss`.
+        """
+        values = self.losses()
+        whitened = self.weighting == "whitened"
+        total = values["cameras"] if whitened else 0.0 * values["cameras"]
+        if whitened and "errors" in values:
+            total = total + values["errors"]
+        for term in self.terms:
+            if self.control_by_depth is None or not isinstance(term, ControlTerm):
+                total = total + self._factor(term) * self._priced(term, values[term.kind])
+        return total + self.weights.prior() / self._normaliser() if self.weights.learned else total
+
+    def sees_by_depth(self, camera: int) -> bool:
+        """Return whether a view has marks for `depth_loss`, and so needs a rendered depth."""
+        return self.control_by_depth is not None and camera in self.control_by_depth.rows
+
+    def depth_loss(self, camera: int, depth_m: Tensor, alpha: Tensor, pinhole: Pinhole) -> Tensor | None:
+        """Return λ_gcp L_gcp of one view for control points through the rendered depth; scalar.
+
+        - The gradient reaches similarity, camera and Gaussians.
+        - Each point has weight 1, whatever the number of its marks.
+        - The loss of a view is scaled by the number of views: its mean over the views is the loss of all marks.
+        - Marks on a nearly transparent render have weight 0: there is no surface yet.
+
+        Args:
+            camera: index of the view.
+            depth_m: (H, W) expected depth, metres, differentiable.
+            alpha: (H, W) opacity of the render.
+            pinhole: intrinsics of these pixels, with the present lens.
+
+        Returns:
+            None if the view has no marks.
+        """
+        marks, control = self.control_by_depth, self.term(ControlTerm)
+        if marks is None or control is None or not self.sees_by_depth(camera):
+            return None
+        rows = marks.rows[camera]
+        xy = marks.rays(rows, self.cameras.lens())
+        depth, seen = depth_at(depth_m, alpha, xy, pinhole)
+        surveyed = marks.position_in_geo[rows]
+        residual = depth_residuals(self.cameras.pose(camera), self.similarity(), surveyed, xy, depth)
+        if self.weighting == "whitened":
+            residual = (marks.root_information[rows] @ residual[:, :, None])[:, :, 0]
+        share = marks.share[rows] * seen
+        rho = self._priced(control, self._rho(control, residual))
+        return self._factor(control) * marks.views / len(control) * (share * rho).sum()
+
+    def _normaliser(self) -> int:
+        """Return N of the means: the number of fixes, or of cameras if there is no fix."""
+        fixes = self.term(FixTerm)
+        return len(self.cameras.center) if fixes is None else len(fixes)
+
+    def _factor(self, term: Term) -> float:
+        """Return λ of a term."""
+        return 1.0 if self.weighting == "paper" else term.share * len(term) / self._normaliser()
+
+    def _squared_as(self, term: Term, at: Estimate) -> Tensor:
+        """Return the residuals (M, d) to be squared: whitened, or lengths in metres with "paper"."""
+        in_metres = self.weighting == "paper" and term.in_metres
+        return term.residuals(at) if in_metres else term.whitened(at)
+
+    def _rho(self, term: Term, residual: Tensor) -> Tensor:
+        """Return ρ (M,) of residuals (M, d), divided by the learned σ of their term."""
+        s = self.weights.log_variance(term.kind)
+        scaled = residual if s is None else torch.exp(-0.5 * s) * residual
+        chi2 = scaled.square().sum(dim=1)
+        return chi2 if self.weighting == "paper" else cauchy(chi2, term.dimension)
+
+    def _priced(self, term: Term, value: Tensor) -> Tensor:
+        """Return a term's ρ plus the normalisation of its learned variance."""
+        s = self.weights.log_variance(term.kind)
+        return value if s is None else value + self.weights.price(term.kind) * s
+
+
+def refining_problem(
+    adjusted: AdjustedScene,
+    measured: Problem,
+    options: GeographicOptions,
+    points: GeolocatedPoints | None = None,
+    seed: int = 0,
+) -> GeoProblem:
+    """Return the problem of a training that refines similarity, cameras, lens and systematic errors.
+
+    With `paper` the lens stays, because plain mean squares hold no lens to the photographs.
+
+    Args:
+        adjusted: the adjustment, from which the training starts.
+        measured: the measurements in use.
+        options: weights, and the terms that training has beside those of the adjustment.
+        points: of `geolocate`, for L_rel; None: L_rel uses the cameras and their fixes.
+        seed: of the random pairs for L_rel.
+
+    Raises:
+        InputError: `points` belongs to another model.
+    """
+    scene, state, record = adjusted.scene, adjusted.state(measured.errors), adjusted.adjustment.geo_from_model
+    terms: list[Term] = []
+    by_depth = None
+    for term in measured.measured:
+        if isinstance(term, adjustment.ControlPoints) and options.gcp_mode == "depth":
+            by_depth, on_surface = control_by_depth(scene, adjusted.survey, term)
+            terms.append(tensor_term(on_surface, measured.errors))
+        else:
+            terms.append(tensor_term(term, measured.errors))
+        if isinstance(term, adjustment.Fixes) and options.rel_loss and len(term) > 1:
+            distances = distance_term(scene, term, points, seed)
+            terms += [] if distances is None else [distances]
+    lens_follows = options.weighting == "whitened"
+    basis = scene.correction_basis if lens_follows else scene.correction_basis_through_sfm_lens
+    z = coordinates_of(scene.bundle, state.correction)
+    lens = basis.lens_matrix if lens_follows else np.zeros((len(state.lens), len(z)))
+    return GeoProblem(
+        LearnableSimilarity(state.geo_from_model, np.array(record.covariance), np.array(record.pivot)),
+        CameraCorrections(scene.poses, basis.matrix, lens, state, z),
+        terms,
+        errors=LearnableErrors(measured.errors, *adjusted.error_estimates(measured.errors)),
+        weighting=options.weighting,
+        learned_weights=options.loss_weights == "learned",
+        control_by_depth=by_depth,
+    )
+
+
+def held_problem(adjusted: AdjustedScene) -> GeoProblem:
+    """Return the problem of a training that holds similarity, cameras and lens of the adjustment."""
+    record, poses = adjusted.adjustment.geo_from_model, adjusted.adjustment.poses
+    state = replace(adjusted.state(SystematicErrors()), correction=np.zeros((len(poses.cam_from_model), 6)))
+    return GeoProblem(
+        LearnableSimilarity(state.geo_from_model, np.array(record.covariance), np.array(record.pivot)),
+        CameraCorrections.held(poses, state),
+    )

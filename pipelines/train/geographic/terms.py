@@ -1,0 +1,441 @@
+"""Terms of the geographic losses as tensors: the adjustment's measurements, with gradients (GeoRefGS section 2.4).
+
+`tensor_term` makes the tensors of a term of `adjust.terms`, which describes its residuals. L_rel, a function of
+other measurements, and control points through the rendered depth exist in training alone.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from typing import ClassVar, TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pipelines.adjust import terms as adjustment
+from pipelines.adjust.state import SystematicErrors
+from pipelines.core.errors import InputError
+from pipelines.core.types import FloatArray, IntArray
+from pipelines.scene.geolocated import GeolocatedPoints
+from pipelines.scene.scene import Scene
+from pipelines.scene.survey import Survey
+from pipelines.train.geographic.unknowns import Estimate, TensorSimilarity, exp_so3, log_so3
+
+RecordT = TypeVar("RecordT")
+
+# σ of the rendered surface at a mark, as a fraction of its distance: 12 cm at 60 m.
+SURFACE_SIGMA = 2e-3
+_WORTH = 0.1  # share of the fixes' information on the scale that the distances may repeat
+_PAIRS = 300
+# Candidates drawn for each pair in use. The longest are used, because short pairs hardly constrain the scale.
+_DRAWN = 3
+
+
+def moved_tensors(record: RecordT, move: Callable[[Tensor], Tensor]) -> RecordT:
+    """Return a dataclass with every tensor replaced by `move` of it, e.g. for another device."""
+    tensors = {
+        field.name: move(getattr(record, field.name))
+        for field in fields(record)  # type: ignore[arg-type]
+        if isinstance(getattr(record, field.name), Tensor)
+    }
+    return replace(record, **tensors)  # type: ignore[type-var]
+
+
+class Term(ABC):
+    """M observations of one kind.
+
+    Attributes:
+        kind: name in losses and metrics.
+        dimension: d, of a residual.
+        in_metres: whether the residuals are lengths, which plain mean squares need no whitening for.
+        root_information: (M, d, d) float64, W with WᵀW = Σ⁻¹.
+        share: weight of each observation in the loss, 0 to 1.
+    """
+
+    kind: ClassVar[str]
+    dimension: ClassVar[int] = 3
+    in_metres: ClassVar[bool] = True
+
+    root_information: Tensor
+    share: float = 1.0
+
+    @abstractmethod
+    def residuals(self, at: Estimate) -> Tensor:
+        """Return the residuals (M, d), predicted minus measured, in metres or radians."""
+
+    def __len__(self) -> int:
+        return len(self.root_information)
+
+    def whitened(self, at: Estimate) -> Tensor:
+        """Return the residuals (M, d) in units of their σ."""
+        return (self.root_information @ self.residuals(at)[:, :, None])[:, :, 0]
+
+
+@dataclass(frozen=True)
+class FixTerm(Term):
+    """L_abs, `adjust.terms.Fixes`.
+
+    Attributes:
+        camera: (F,) int64 index into the cameras.
+        position_in_geo: (F, 3) float64 metres.
+        root_information: (F, 3, 3) float64, in 1/m.
+        bias: (F, B) float64, 1 where a block of the systematic errors is the bias of the fix's session.
+    """
+
+    kind: ClassVar[str] = "absolute"
+
+    camera: Tensor
+    position_in_geo: Tensor
+    root_information: Tensor
+    bias: Tensor
+
+    def residuals(self, at: Estimate) -> Tensor:
+        predicted = at.geo_from_model.apply(at.center[self.camera]) + self.bias @ at.vector.view(-1, 3)
+        arm = at.error("lever-arm")
+        if arm is not None:
+            predicted = predicted + at.geo_from_cam(self.camera) @ arm
+        return predicted - self.position_in_geo
+
+
+@dataclass(frozen=True)
+class ControlTerm(Term):
+    """L_gcp, `adjust.terms.ControlPoints`; J points, K marks in all.
+
+    Attributes:
+        point: (K,) int64 index into the points.
+        camera: (K,) int64 index into the cameras.
+        bearing_in_cam: (K, 3) float64 unit vectors.
+        sigma_rad: (K,) float64 angular σ of a mark.
+        bearing_by_lens: (K, 3, L) float64, derivative of the bearings by the lens parameters.
+        position_in_geo: (J, 3) float64 metres, surveyed.
+        root_information: (J, 3, 3) float64 of survey and intersection together, in 1/m; for control points through
+            the rendered depth, of the surface too.
+    """
+
+    kind: ClassVar[str] = "control"
+
+    point: Tensor
+    camera: Tensor
+    bearing_in_cam: Tensor
+    sigma_rad: Tensor
+    bearing_by_lens: Tensor
+    position_in_geo: Tensor
+    root_information: Tensor
+
+    def residuals(self, at: Estimate) -> Tensor:
+        return at.geo_from_model.apply(self._intersected(at)) - self.position_in_geo
+
+    def _intersected(self, at: Estimate) -> Tensor:
+        """Return the points (J, 3) in `model` nearest to the rays of their marks."""
+        bearing = self.bearing_in_cam
+        if len(at.lens):
+            bearing = torch.nn.functional.normalize(bearing + self.bearing_by_lens @ at.lens, dim=1)
+        rotation, center = at.rotation[self.camera], at.center[self.camera]
+        direction = (rotation.transpose(1, 2) @ bearing[:, :, None])[:, :, 0]
+        projector = torch.eye(3, dtype=direction.dtype, device=direction.device) - (
+            direction[:, :, None] * direction[:, None, :]
+        )
+        weight = 1.0 / self.sigma_rad**2
+        point = torch.zeros(0)
+        for _ in range(2):  # the first pass gives the distances, and so the weights
+            normal = self._sum_by_point(weight[:, None, None] * projector)
+            right = self._sum_by_point(weight[:, None, None] * (projector @ center[:, :, None]))
+            point = torch.linalg.solve_ex(normal, right).result[:, :, 0]  # `solve` would wait for the device
+            distance = (point[self.point] - center).norm(dim=1)
+            weight = 1.0 / (self.sigma_rad * distance.detach()) ** 2
+        return point
+
+    def _sum_by_point(self, values: Tensor) -> Tensor:
+        total = torch.zeros((len(self), *values.shape[1:]), dtype=values.dtype, device=values.device)
+        return total.index_add(0, self.point, values)
+
+
+@dataclass(frozen=True)
+class AttitudeTerm(Term):
+    """L_att, `adjust.terms.Attitudes`.
+
+    Attributes:
+        camera: (A,) int64 index into the cameras.
+        geo_from_cam: (A, 3, 3) float64, of the nominal camera axes.
+        root_information: (A, 3, 3) float64, in 1/rad.
+    """
+
+    kind: ClassVar[str] = "attitude"
+    in_metres: ClassVar[bool] = False
+
+    camera: Tensor
+    geo_from_cam: Tensor
+    root_information: Tensor
+
+    def residuals(self, at: Estimate) -> Tensor:
+        turned, recorded = at.geo_from_cam(self.camera), self.geo_from_cam
+        common, boresight = at.error("common"), at.error("boresight")
+        if common is not None:
+            turned = exp_so3(common) @ turned
+        if boresight is not None:
+            recorded = recorded @ exp_so3(boresight)
+        return log_so3(turned.transpose(1, 2) @ recorded)
+
+
+@dataclass(frozen=True)
+class PlaneTerm(Term):
+    """L_lidar, `adjust.terms.Planes`.
+
+    Attributes:
+        point_in_model: (M, 3) float64 metres, on the surface of the photographs.
+        position_in_geo: (M, 3) float64 metres, on the plane of the LiDAR.
+        normal_in_geo: (M, 3) float64 unit normals of the planes.
+        root_information: (M, 1, 1) float64, in 1/m, of the distance between both along the normal.
+    """
+
+    kind: ClassVar[str] = "lidar"
+    dimension: ClassVar[int] = 1
+
+    point_in_model: Tensor
+    position_in_geo: Tensor
+    normal_in_geo: Tensor
+    root_information: Tensor
+
+    def residuals(self, at: Estimate) -> Tensor:
+        apart = at.geo_from_model.apply(self.point_in_model) - self.position_in_geo
+        shift = at.error("lidar-shift")
+        apart = apart if shift is None else apart + shift
+        return (self.normal_in_geo * apart).sum(dim=1, keepdim=True)
+
+
+def tensor_term(term: adjustment.Term, errors: SystematicErrors) -> Term:
+    """Return a term of the adjustment as tensors.
+
+    Args:
+        term: of the adjustment.
+        errors: the systematic errors of its problem.
+    """
+    match term:
+        case adjustment.Fixes():
+            blocks = [(block.name, block.session) for block in errors.blocks]
+            bias = [[block == ("bias", session) for block in blocks] for session in term.session.tolist()]
+            return FixTerm(
+                torch.from_numpy(term.camera),
+                torch.from_numpy(term.position_in_geo),
+                torch.from_numpy(term.root_information),
+                torch.tensor(bias, dtype=torch.float64).view(len(term), len(blocks)),
+            )
+        case adjustment.ControlPoints():
+            return _of_arrays(ControlTerm, term)
+        case adjustment.Attitudes():
+            return _of_arrays(AttitudeTerm, term)
+        case adjustment.Planes():
+            return _of_arrays(PlaneTerm, term)
+    raise TypeError(f"{term.kind} has no tensors")
+
+
+def _of_arrays(kind: Callable[..., RecordT], term: adjustment.Term) -> RecordT:
+    """Return the tensor term whose fields are those of a term of the adjustment."""
+    names = [field.name for field in fields(kind) if field.name != "share"]  # type: ignore[arg-type]
+    return kind(**{name: torch.from_numpy(np.ascontiguousarray(getattr(term, name))) for name in names})
+
+
+@dataclass(frozen=True)
+class DistanceTerm(Term):
+    """Distances between P pairs of geolocated points, or of cameras with fixes: the term L_rel.
+
+    The distances are functions of the fixes, not independent measurements.
+
+    The points are fixed at their SfM positions. In the bundle, they would follow the corrections of the cameras.
+    These corrections keep the points' mean position, rotation and size
+    (`geometry.correction_basis.correction_basis`). Fixed points are therefore right to first order for the scale,
+    the only quantity that the pairs determine.
+
+    Attributes:
+        distance_in_model: (P,) float64; None: between the cameras below.
+        camera: (P, 2) int64 indices into the cameras; None: between fixed points of the scene.
+        distance_in_geo: (P,) float64 metres.
+        root_information: (P, 1, 1) float64, 1/σ of the measured distance in 1/m.
+        share: limits their information on the scale to a tenth of that of the fixes.
+    """
+
+    kind: ClassVar[str] = "relative"
+    dimension: ClassVar[int] = 1
+
+    distance_in_model: Tensor | None
+    camera: Tensor | None
+    distance_in_geo: Tensor
+    root_information: Tensor
+    share: float = 1.0
+
+    def residuals(self, at: Estimate) -> Tensor:
+        """Return s |x_i − x_j| − |X_i − X_j| (P, 1) in metres."""
+        if self.camera is None:
+            assert self.distance_in_model is not None
+            distance = self.distance_in_model
+        else:
+            distance = (at.center[self.camera[:, 0]] - at.center[self.camera[:, 1]]).norm(dim=1)
+        return (at.geo_from_model.scale * distance - self.distance_in_geo)[:, None]
+
+
+def distance_term(
+    scene: Scene, fixes: adjustment.Fixes, points: GeolocatedPoints | None, seed: int
+) -> DistanceTerm | None:
+    """Return 300 long distances across the scene: between located points, else between cameras with fixes.
+
+    Located points are functions of the same few fixes (`adjust.alignment`), and contain the lens's errors as well.
+    Counted as independent measurements, hundreds of pairs would claim a σ of the scale many times below that of the
+    fixes. Their purpose is to steady the scale, not to decide it. None: their share of the information is zero.
+
+    Args:
+        scene: cameras and points as SfM left them.
+        fixes: of the cameras; at least two.
+        points: of `geolocate`; None: take the cameras.
+        seed: of the random pairs.
+
+    Raises:
+        InputError: `points` belongs to another model.
+    """
+    distances = _pairs_of_points(scene, points, seed) if points is not None else None
+    distances = _pairs_of_cameras(scene, fixes, seed) if distances is None else distances
+    of_pairs = float((distances.distance_in_geo * distances.root_information[:, 0, 0]).square().sum())
+    share = min(1.0, _WORTH * _scale_information(fixes) / of_pairs) if of_pairs > 0 else 0.0
+    return replace(distances, share=share) if share > 0 else None
+
+
+def _pairs_of_points(scene: Scene, points: GeolocatedPoints, seed: int) -> DistanceTerm | None:
+    if not np.array_equal(points.point_id, scene.sparse.point_id):
+        raise InputError("the geolocated points are of another model: run `georef geolocate` again")
+    good = np.flatnonzero(points.inlier)
+    if len(good) < 2:
+        return None
+    first, second = _long_pairs(scene.point_in_model[good], seed)
+    i, j = good[first], good[second]
+    apart = points.position_in_geo[i] - points.position_in_geo[j]
+    inside = np.linalg.norm(scene.point_in_model[i] - scene.point_in_model[j], axis=1)
+    measured = _measured_distance(apart, points.cov_in_geo[i] + points.cov_in_geo[j])
+    return DistanceTerm(torch.from_numpy(inside), None, *measured)
+
+
+def _pairs_of_cameras(scene: Scene, fixes: adjustment.Fixes, seed: int) -> DistanceTerm:
+    camera, place, root = fixes.camera, fixes.position_in_geo, fixes.root_information
+    i, j = _long_pairs(scene.poses.cam_center_in_model[camera], seed)
+    covariance = np.linalg.inv(np.swapaxes(root, 1, 2) @ root)
+    chosen = torch.from_numpy(np.column_stack([camera[i], camera[j]]))
+    return DistanceTerm(None, chosen, *_measured_distance(place[i] - place[j], covariance[i] + covariance[j]))
+
+
+def _long_pairs(place: FloatArray, seed: int) -> tuple[IntArray, IntArray]:
+    """Return the row numbers (P,), (P,) of pairs of points (n, 3): the longest third of randomly drawn pairs."""
+    rng = np.random.default_rng(seed)
+    first = rng.integers(0, len(place), _DRAWN * _PAIRS)
+    second = (first + rng.integers(1, len(place), len(first))) % len(place)
+    length = np.linalg.norm(place[first] - place[second], axis=1)
+    longest = np.sort(np.argsort(-length, kind="stable")[:_PAIRS])
+    return first[longest], second[longest]
+
+
+def _measured_distance(apart: FloatArray, covariance: FloatArray) -> tuple[Tensor, Tensor]:
+    """Return the lengths (P,) of differences (P, 3), and their 1/σ (P, 1, 1)."""
+    distance = np.linalg.norm(apart, axis=1)
+    along = apart / distance[:, None]
+    variance = np.einsum("pi,pij,pj->p", along, covariance, along)
+    return torch.from_numpy(distance), torch.from_numpy(variance**-0.5)[:, None, None]
+
+
+def _scale_information(fixes: adjustment.Fixes) -> float:
+    """Return the information of the fixes on ln s: Σ |W (C − C̄)|² about their weighted mean."""
+    root, place = fixes.root_information, fixes.position_in_geo
+    weight = (root**2).sum(axis=(1, 2))
+    arm = place - weight @ place / weight.sum()
+    return float(((root @ arm[:, :, None]) ** 2).sum())
+
+
+@dataclass(frozen=True)
+class ControlByDepth:
+    """Image marks of the control points, K in all, each projected onto the rendered surface on its own.
+
+    Attributes:
+        camera: (K,) int64 index into the cameras.
+        xy: (K, 2) float64, x/z and y/z of the marks' rays.
+        xy_by_lens: (K, 2, L) float64, derivative of `xy` by the lens parameters.
+        position_in_geo: (K, 3) float64 metres, surveyed.
+        root_information: (K, 3, 3) float64 of survey, mark and surface together, in 1/m.
+        share: (K,) float64, one over the number of marks of the same point.
+        views: number of training views, all rendered equally often.
+        rows: slice of the K marks, by camera.
+    """
+
+    camera: Tensor
+    xy: Tensor
+    xy_by_lens: Tensor
+    position_in_geo: Tensor
+    root_information: Tensor
+    share: Tensor
+    views: int
+    rows: dict[int, slice]
+
+    def rays(self, rows: slice, lens: Tensor) -> Tensor:
+        """Return the rays x/z and y/z (K', 2) of a slice of the marks, to first order in the lens change (L,)."""
+        return self.xy[rows] + self.xy_by_lens[rows] @ lens if len(lens) else self.xy[rows]
+
+
+def control_by_depth(
+    scene: Scene, survey: Survey, marks: adjustment.ControlPoints
+) -> tuple[ControlByDepth, adjustment.ControlPoints]:
+    """Return the marks for projection onto the rendered surface, and the control points with the surface's σ added.
+
+    The surface's error has a σ of `SURFACE_SIGMA` times the distance, along each axis. All marks of a point share
+    this error, because they show one piece of the surface.
+
+    Args:
+        scene: cameras as SfM left them.
+        survey: has the control points.
+        marks: of the adjustment. Those in test views are not rendered.
+    """
+    order = np.argsort(marks.camera, kind="stable")
+    order = order[np.isin(marks.camera[order], scene.train)]
+    point, camera, bearing = marks.point[order], marks.camera[order], marks.bearing_in_cam[order]
+    center = scene.geo_from_model.apply(scene.poses.cam_center_in_model)[camera]
+    distance = np.linalg.norm(marks.position_in_geo[point] - center, axis=1)
+    surveyed = {each.name: np.array(each.cov_in_geo) for each in survey.control_points}
+    lateral, surface = marks.sigma_rad[order] * distance, SURFACE_SIGMA * distance
+    of_survey = np.array([surveyed[name] for name in marks.name])[point]
+    of_mark = of_survey + (lateral**2 + surface**2)[:, None, None] * np.eye(3)
+    by_lens, z = marks.bearing_by_lens[order], bearing[:, 2:, None]
+    count = np.bincount(point, minlength=len(marks))
+    seen = [np.searchsorted(camera, [index, index + 1]).tolist() for index in np.unique(camera)]
+    by_depth = ControlByDepth(
+        camera=torch.from_numpy(camera),
+        xy=torch.from_numpy(bearing[:, :2] / bearing[:, 2:]),
+        xy_by_lens=torch.from_numpy(by_lens[:, :2] / z - bearing[:, :2, None] * by_lens[:, 2:] / z**2),
+        position_in_geo=torch.from_numpy(marks.position_in_geo[point]),
+        root_information=torch.from_numpy(adjustment.root_information(of_mark)),
+        share=torch.from_numpy(1.0 / count[point]),
+        views=len(scene.train),
+        rows={int(index): slice(*ends) for index, ends in zip(np.unique(camera), seen, strict=True)},
+    )
+    mean = np.bincount(point, surface**2, minlength=len(marks)) / np.maximum(count, 1)
+    root = marks.root_information
+    covariance = np.linalg.inv(np.swapaxes(root, 1, 2) @ root) + mean[:, None, None] * np.eye(3)
+    return by_depth, replace(marks, root_information=adjustment.root_information(covariance))
+
+
+def depth_residuals(
+    pose: tuple[Tensor, Tensor],
+    geo_from_model: TensorSimilarity,
+    position_in_geo: Tensor,
+    xy: Tensor,
+    depth_m: Tensor,
+) -> Tensor:
+    """Return T(c_i + R_iᵀ z (x, y, 1)) − X_j (K, 3) in metres, of the K marks of one camera.
+
+    Args:
+        pose: rotation cam ← model (3, 3) and centre (3,) of that camera.
+        geo_from_model: the similarity T.
+        position_in_geo: (K, 3) metres, surveyed, of each mark.
+        xy: (K, 2) x/z and y/z of the marks' rays.
+        depth_m: (K,) rendered depth along the camera's z axis at the marks.
+    """
+    rotation, center = pose
+    ray = torch.nn.functional.pad(xy, (0, 1), value=1.0)
+    point = center + (depth_m[:, None] * ray) @ rotation
+    return geo_from_model.apply(point) - position_in_geo
