@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from pipelines.view.quantities import (
@@ -36,6 +36,7 @@ def test_sigma_is_that_of_draws(seed: int) -> None:
         (length(points)[0], [length(exact(each))[0].value for each in drawn]),
         (plan_area(points), [plan_area(exact(each)).value for each in drawn]),
     ):
+        assume(quantity.value > 5 * quantity.sigma)  # an area of nearly zero has no sign to be linear in
         assert quantity.sigma == pytest.approx(np.std(draws), rel=0.16)  # 500 draws know σ to 3 %
 
 
