@@ -21,6 +21,7 @@ from pipelines.adjust.system import Problem
 from pipelines.adjust.terms import Attitudes, ControlPoints, Fixes, Planes, Term, root_information
 from pipelines.core.errors import InputError
 from pipelines.core.types import FloatArray
+from pipelines.scene.initial_similarity import InitialSimilarity
 from pipelines.scene.marks import mark_rays
 from pipelines.scene.scene import Scene
 from pipelines.scene.survey import Survey
@@ -74,6 +75,12 @@ def problem_of(
         tuple(term for term in every if term is not None),
         SystematicErrors(tuple(blocks)),
     )
+
+
+def rejected_of(scene: Scene, survey: Survey, initial: InitialSimilarity) -> Problem | None:
+    """Return the problem of the measurements that `init-sim3` has rejected; None if there are none."""
+    rejected = initial.rejected(survey)
+    return None if rejected is None else problem_of(scene, rejected)
 
 
 def fixes_of(scene: Scene, survey: Survey) -> Fixes | None:

@@ -11,7 +11,7 @@ from pipelines.adjust.alignment import Alignment, align
 from pipelines.adjust.control_mistakes import mistake_in_marks
 from pipelines.adjust.inconsistencies import judge, marks_that_do_not_meet, unadjustable
 from pipelines.adjust.joint import JointAdjustment, Start, adjust_jointly, in_own_frame
-from pipelines.adjust.measurements import problem_of, start_of
+from pipelines.adjust.measurements import problem_of, rejected_of, start_of
 from pipelines.adjust.observations import (
     attitude_prior,
     control_correspondences,
@@ -118,9 +118,8 @@ def placed(inputs: Inputs, initial: InitialSimilarity, options: InitSim3Options)
     """
     survey = initial.weighted(inputs.survey)
     scene = initial_scene(inputs.model, survey, initial)
-    with_attitudes = initial.layout == "line"
-    problem = problem_of(scene, initial.in_use(survey), estimate=options.estimate, with_attitudes=with_attitudes)
-    return adjusted(scene, problem, start_of(scene, problem), initial, _rejected(scene, survey, initial))
+    problem = _in_use(scene, survey, initial, options)
+    return adjusted(scene, problem, start_of(scene, problem), initial, rejected_of(scene, survey, initial))
 
 
 def _solved(
@@ -133,16 +132,15 @@ def _solved(
     """
     survey = initial.weighted(inputs.survey)
     scene, state = in_own_frame(joint, survey, initial)
-    with_attitudes = initial.layout == "line"
-    problem = problem_of(scene, initial.in_use(survey), estimate=options.estimate, with_attitudes=with_attitudes)
+    problem = _in_use(scene, survey, initial, options)
     state = minimise(problem, problem.start_at(state, joint.problem.errors)).state
-    return adjusted(scene, problem, state, initial, _rejected(scene, survey, initial))
+    return adjusted(scene, problem, state, initial, rejected_of(scene, survey, initial))
 
 
-def _rejected(scene: Scene, survey: Survey, initial: InitialSimilarity) -> Problem | None:
-    """Return the problem of the rejected measurements; None if there are none."""
-    rejected = initial.rejected(survey)
-    return None if rejected is None else problem_of(scene, rejected)
+def _in_use(scene: Scene, survey: Survey, initial: InitialSimilarity, options: InitSim3Options) -> Problem:
+    """Return the problem of the measurements that were not rejected."""
+    with_attitudes = initial.layout == "line"
+    return problem_of(scene, initial.in_use(survey), estimate=options.estimate, with_attitudes=with_attitudes)
 
 
 def _refuse(contradictions: tuple[Caution, ...], options: InitSim3Options) -> None:

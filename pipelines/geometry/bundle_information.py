@@ -105,7 +105,7 @@ class BundleInformation:
     loosest_sigma_m: float
     sigma_px: float
 
-    @property
+    @cached_property
     def followed(self) -> FloatArray:
         """Mean similarity (7, 6 n + L) of the points that follow cameras and lens."""
         pull = np.concatenate([self.sums.pose_pull, self.sums.lens_pull])

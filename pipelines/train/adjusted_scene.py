@@ -8,7 +8,7 @@ from typing import get_args
 import numpy as np
 import torch
 
-from pipelines.adjust.measurements import problem_of
+from pipelines.adjust.measurements import problem_of, rejected_of
 from pipelines.adjust.options import EstimatedErrorName
 from pipelines.adjust.posterior import Posterior
 from pipelines.adjust.solution import adjusted
@@ -140,9 +140,8 @@ class AdjustedScene:
         Raises:
             DegenerateGeometryError: the measurements leave the similarity open.
         """
-        rejected = self.initial.rejected(self.survey)
-        of_rejected = None if rejected is None else problem_of(self.scene, rejected)
-        return adjusted(self.scene, problem, state, self.initial, of_rejected)
+        rejected = rejected_of(self.scene, self.survey, self.initial)
+        return adjusted(self.scene, problem, state, self.initial, rejected)
 
 
 def with_exposures(adjustment: Adjustment, exposure: FloatArray) -> Adjustment:
