@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 
 from pipelines.core.workspace import Workspace
-from pipelines.pages.chromium import NO_NETWORK, chromium_path
+from pipelines.report.chromium import NO_NETWORK, chromium_path
 from pipelines.view.loopback import start_server, stop_server
 from pipelines.view.options import ViewOptions
 from pipelines.view.viewer import Viewer

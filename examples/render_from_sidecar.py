@@ -21,12 +21,12 @@ from pipelines.core.workspace import Workspace
 from pipelines.formats.georef_sidecar import read_sidecar
 from pipelines.geodesy.enu import Origin, ecef_from_enu, ecef_from_enu_rotation, lla_of
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
-from pipelines.scene.scene import photographs
-from pipelines.scene.survey import Fix, SurveyImage
-from pipelines.scene.trained_survey import TrainedSurvey, load_trained, trained_pinholes
+from pipelines.splat.gaussians import read_gaussians
 from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.backends import rasterizer
-from pipelines.splat.storage import read_gaussians
+from pipelines.survey.scene import photographs
+from pipelines.survey.survey import Fix, SurveyImage
+from pipelines.survey.trained_survey import TrainedSurvey, load_trained, trained_pinholes
 
 
 def geo_from_cam(image: SurveyImage, trained: TrainedSurvey, recorded: bool) -> FloatArray:

@@ -2,6 +2,8 @@
 
 Exit codes: 0 done, 1 known failure, 2 usage, 130 interrupted. An unexpected exception keeps its traceback. All
 messages go to stderr; stdout is for the result, or with `--json` for the error as one JSON document.
+
+Ends of commands: exit code, message for people and document for programs of each kind of exception.
 """
 
 from __future__ import annotations
@@ -15,25 +17,78 @@ import sys
 import traceback as tracebacks
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from types import FrameType, TracebackType
 from typing import IO, TYPE_CHECKING, TextIO
 
 import click
 
-from georef_cli.endings import FAILED, ErrorDocument, defect_document, ending_of
 from georef_cli.verbosity import LineFormatter, SafeFormatter, Verbosity
-from pipelines.core.errors import GeorefError
-from pipelines.core.interrupts import SIGNALS
-from pipelines.core.printable import printable_lines
+from pipelines.core.errors import GeorefError, InputError, storage_error
+from pipelines.core.progress import SIGNALS
+from pipelines.core.sentences import printable, printable_lines
 
 if TYPE_CHECKING:
     from pipelines.core.stages import StageSpec
     from pipelines.core.workspace import Workspace
 
+log = logging.getLogger(__name__)
+
+FAILED, USAGE, INTERRUPTED = 1, 2, 130
+ErrorDocument = dict[str, str | int | None]
+
+
+@dataclass(frozen=True)
+class Ending:
+    """End of a command by an exception.
+
+    Attributes:
+        code: exit code.
+        message: text for stderr.
+        error: JSON form: code, message, path, line, field, hint.
+    """
+
+    code: int
+    message: str
+    error: ErrorDocument
+
+
+def ending_of(error: BaseException) -> Ending | None:
+    """Return the end of a command by a known exception; None for one that nobody foresaw."""
+    if isinstance(error, click.Abort | KeyboardInterrupt):
+        return Ending(INTERRUPTED, "interrupted", _document("interrupted", "interrupted"))
+    if isinstance(error, click.ClickException):
+        return _of_click(error)
+    known = error if isinstance(error, GeorefError) else storage_error(error)
+    if known is None:
+        return None
+    usage = isinstance(known, InputError) and known.is_usage
+    return Ending(USAGE if usage else FAILED, f"error: {printable(str(known))}", known.document())
+
+
+def defect_document(error: BaseException) -> ErrorDocument:
+    """Return the JSON form of an exception that nobody foresaw."""
+    return _document("defect", f"{type(error).__name__}: {error}")
+
+
+def _of_click(error: click.ClickException) -> Ending:
+    text = io.StringIO()
+    error.show(text)
+    context = getattr(error, "ctx", None)
+    param = getattr(error, "param", None)
+    field = param.opts[-1] if isinstance(param, click.Option) else None
+    document = _document("usage" if error.exit_code == USAGE else "failed", error.format_message())
+    document["field"] = field or getattr(error, "option_name", None)
+    document["hint"] = None if context is None else f"{context.command_path} --help"
+    return Ending(error.exit_code, printable_lines(text.getvalue().rstrip("\n")), document)
+
+
+def _document(code: str, message: str) -> ErrorDocument:
+    return {"code": code, "message": message, "path": None, "line": None, "field": None, "hint": None}
+
+
 LOGGERS = ("pipelines", "georef_cli")
 FILE_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
-
-log = logging.getLogger(__name__)
 
 
 def guarded(group: click.Group, arguments: Sequence[str] | None) -> int:
@@ -79,7 +134,7 @@ def _print_error(document: ErrorDocument) -> None:
 
 def _send_error(document: ErrorDocument) -> None:
     """Send the kind of an error to the program that started this one."""
-    from georef_cli.sender import stderr_sender
+    from georef_cli.verbosity import stderr_sender
 
     with contextlib.suppress(KeyboardInterrupt):  # nobody reads it
         stderr_sender().send("error", code=document["code"])
@@ -173,8 +228,8 @@ def _attached(handler: logging.Handler, level: int) -> Iterator[None]:
 
 
 def _sending_handler() -> logging.Handler:
-    from georef_cli.sender import stderr_sender
-    from pipelines.core.messages import SentRecords
+    from georef_cli.verbosity import stderr_sender
+    from pipelines.core.child import SentRecords
 
     handler = SentRecords(stderr_sender())
     handler.setFormatter(SafeFormatter())

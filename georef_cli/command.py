@@ -11,7 +11,7 @@ import click
 
 from georef_cli import boundary
 from georef_cli.verbosity import Verbosity
-from pipelines.core.threads import limit_threads
+from pipelines.core.machine import limit_threads
 
 _VERBOSITY = tuple(field.name for field in fields(Verbosity))
 

@@ -24,7 +24,7 @@ from rich.table import Column as TableColumn
 from rich.text import Text
 
 from georef_cli.verbosity import LineFormatter, Verbosity
-from pipelines.core.cautions import AT_END
+from pipelines.core.products import AT_END
 from pipelines.core.progress import SILENT, Progress, ProgressTask
 
 LINE_EVERY_S = 30.0
@@ -66,7 +66,7 @@ def is_told(verbosity: Verbosity) -> bool:
 def progress_for(verbosity: Verbosity) -> Progress:
     """Return the display of progress: bars on a terminal, log lines elsewhere; none with `--quiet`."""
     if verbosity.json_progress:
-        from georef_cli.sender import stderr_sender
+        from georef_cli.verbosity import stderr_sender
 
         return stderr_sender()
     if verbosity.quiet:

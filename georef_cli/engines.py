@@ -10,14 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from pipelines.core.free_memory import free_main_memory_bytes
-from pipelines.core.threads import thread_count
-from pipelines.engine.chosen import chosen_engine
-from pipelines.engine.job import Engine
-from pipelines.engine.local import LocalEngine
+from pipelines.core.machine import free_main_memory_bytes, thread_count
+from pipelines.jobs.engine import Engine
+from pipelines.jobs.local import LocalEngine, chosen_engine
 
 if TYPE_CHECKING:
-    from pipelines.engine.cluster import ClusterAddress
+    from pipelines.jobs.cluster import ClusterAddress
 
 log = logging.getLogger(__name__)
 
@@ -74,8 +72,8 @@ def engine_for(values: Mapping[str, Any], at_a_time: int | None = None) -> Engin
                 raise click.UsageError(f"--{option} is for --cluster.")
         cores = thread_count()
         return LocalEngine(at_a_time or cores, cores, free_main_memory_bytes())
-    from pipelines.engine.dask_engine import DaskEngine
-    from pipelines.engine.storage import Storage
+    from pipelines.jobs.dask_engine import DaskEngine
+    from pipelines.jobs.storage import Storage
 
     address = cluster_address(values["cluster"], values, "--cluster")
     return DaskEngine(address, at_a_time, None if values["storage"] is None else Storage(values["storage"]))
@@ -106,8 +104,12 @@ def cluster_address(text: str, values: Mapping[str, Any], option: str, *, is_nod
         click.UsageError: a bad address, or one that needs a certificate.
         InputError: the certificate is missing, not valid now, or open to others.
     """
-    from pipelines.engine.certificates import check_own_certificates, make_own_certificates
-    from pipelines.engine.cluster import ClusterAddress, is_on_this_machine
+    from pipelines.jobs.cluster import (
+        ClusterAddress,
+        check_own_certificates,
+        is_on_this_machine,
+        make_own_certificates,
+    )
 
     certificates: Path | None = values["certificates"]
     if values["insecure"] and certificates is not None:

@@ -1,28 +1,44 @@
-"""Forecast of a run: what its stages would do, for which photographs, for how long, with how much memory."""
+"""Forecast of a run: what its stages would do, for which photographs, for how long, with how much memory.
+
+Dry run: what the stages would do, with which options, for how long and with how much memory.
+
+Time left of a whole run, from the forecast of its stages and the pace of those that are done.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import contextlib
+import dataclasses
+import logging
+import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from pipelines.core.options import StageOptions
-from pipelines.core.photograph_folder import photograph_folder
-from pipelines.core.plan import PlannedStage, plan
+from georef_cli import tables
+from georef_cli.layout import plain_table, shown
+from georef_cli.output import print_json, print_rich, size
+from georef_cli.tables import Renderable
+from pipelines.core.errors import GeorefError
+from pipelines.core.options import StageOptions, notation
+from pipelines.core.plan import PlannedStage, photograph_folder, plan
 from pipelines.core.products import load_json
 from pipelines.core.progress import SILENT, Progress
+from pipelines.core.sentences import about
 from pipelines.core.stages import SURVEY, StageSpec
 from pipelines.core.staleness import Flags
 from pipelines.core.workspace import Summary, Workspace
 from pipelines.ingest.options import IngestOptions
-from pipelines.scene.survey import Survey
 from pipelines.sfm.options import SfmOptions
+from pipelines.survey.survey import Survey
 from pipelines.train.options import TrainOptions
 
 if TYPE_CHECKING:
     from pipelines.sfm.forecast import ReconstructionForecast
     from pipelines.train.forecast import TrainingForecast
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -157,3 +173,133 @@ def _training(planned: Sequence[PlannedStage], photographs: Photographs | None) 
         return None
     assert isinstance(row.resolved, TrainOptions)
     return forecast(photographs.count, photographs.size_px, row.resolved)
+
+
+_STYLE = {
+    "run": "yellow",
+    "perhaps": "yellow",
+    "resume": "cyan",
+    "extend": "cyan",
+    "keep": "green",
+    "refuse": "red",
+}
+
+
+def print_dry_run(
+    workspace: Workspace,
+    stages: tuple[StageSpec, ...],
+    flags: Mapping[str, Flags],
+    *,
+    force: bool,
+    as_json: bool,
+    progress: Progress,
+) -> None:
+    """Print what a run of the stages would do, and what `ingest` would find; nothing is written.
+
+    Args:
+        workspace: may not exist yet.
+        stages: in the order of the pipeline.
+        flags: all options by stage, the remembered ones among them.
+        force: as of the run.
+        as_json: print one document.
+        progress: shows the reading of the photographs' tags.
+
+    Raises:
+        GeorefError: the run would be refused for its options or its input.
+    """
+    run = forecast_run(workspace, stages, flags, force=force)
+    survey = checked_inputs(workspace, run.planned, progress)
+    for warning in () if survey is None else survey.warnings:
+        log.warning("ingest: %s", warning)
+    if as_json:
+        print_json(_document(workspace, run, survey))
+        return
+    table = plain_table("stage", "", "about", "why", right=[2])
+    for row in run.planned:
+        action = f"[{_STYLE[row.action]}]{row.action}[/]"
+        table.add_row(row.stage, action, about(run.seconds.get(row.stage)), shown(row.reason))
+    parts: list[Renderable] = [table, *tables.origins([origin for row in run.planned for origin in row.options])]
+    if run.photographs is not None:
+        width, height = run.photographs.size_px
+        files = "" if run.photographs.bytes is None else f", {size(run.photographs.bytes)}"
+        parts.append(f"\n[bold]Photographs[/]: {run.photographs.count} of {width}×{height} px{files}")
+    if survey is not None:
+        parts.append(f"\n[bold]Survey[/]: {shown(survey.key_figure)}")
+    if run.reconstruction is not None:
+        parts += ["\n[bold]Reconstruction[/]", *(f"  {shown(text)}" for text in run.reconstruction.sentences())]
+    if run.training is not None:
+        parts += ["\n[bold]Training[/]", *(f"  {shown(text)}" for text in run.training.sentences())]
+    print_rich(*parts, "\n[dim]Nothing was run. Times are estimates for an idle machine.[/]")
+
+
+def announce_training(
+    workspace: Workspace, stages: tuple[StageSpec, ...], flags: Mapping[str, Flags], *, force: bool
+) -> None:
+    """Log the forecast of the training that a run will come to, at its start: not after hours of other stages.
+
+    Args:
+        workspace, stages, flags, force: as for `print_dry_run`. A run that will be refused is announced by nothing.
+    """
+    if all(spec.options is not TrainOptions for spec in stages):
+        return
+    with contextlib.suppress(GeorefError):
+        training = forecast_run(workspace, stages, flags, force=force).training
+        for sentence in () if training is None else training.sentences():
+            log.info("train: %s", sentence)
+
+
+def _document(workspace: Workspace, run: RunForecast, survey: Summary | None) -> dict[str, Any]:
+    stages = [
+        {
+            "stage": row.stage,
+            "action": row.action,
+            "reason": row.reason,
+            "seconds": run.seconds.get(row.stage),
+            "options": [{**dataclasses.asdict(origin), "value": notation(origin.value)} for origin in row.options],
+        }
+        for row in run.planned
+    ]
+    return {
+        "workspace": str(workspace.root),
+        "stages": stages,
+        "survey": survey and {name: getattr(survey, name) for name in ("key_figure", "values", "warnings")},
+        "photographs": run.photographs and dataclasses.asdict(run.photographs),
+        "reconstruction": run.reconstruction and dataclasses.asdict(run.reconstruction),
+        "training": run.training and dataclasses.asdict(run.training),
+    }
+
+
+class RunTimeLeft:
+    """Time that the remaining stages of a run will take.
+
+    Stages that the forecast knows no time for count as nothing: they take seconds. Stages that are done correct the
+    forecast of the others, because one machine is slower than another by a factor.
+
+    Args:
+        seconds: forecast by stage, of those that take long; None: not known.
+        clock: returns seconds.
+    """
+
+    def __init__(self, seconds: Mapping[str, float | None], clock: Callable[[], float] = time.monotonic) -> None:
+        self._unknown = any(value is None for value in seconds.values())
+        self._left = {stage: value for stage, value in seconds.items() if value is not None}
+        self._clock, self._began = clock, clock()
+        self._forecast_s = self._took_s = 0.0
+
+    def begin(self) -> None:
+        """Begin to measure a stage."""
+        self._began = self._clock()
+
+    def end(self, stage: str) -> None:
+        """Note the end of a stage."""
+        forecast_s = self._left.pop(stage, 0.0)
+        if forecast_s:
+            self._forecast_s += forecast_s
+            self._took_s += self._clock() - self._began
+
+    @property
+    def seconds(self) -> float | None:
+        """Seconds that the stages not yet done will take; None: not known."""
+        if self._unknown:
+            return None
+        return sum(self._left.values()) * (self._took_s / self._forecast_s if self._forecast_s else 1.0)

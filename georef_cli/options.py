@@ -1,6 +1,8 @@
 """Options of the commands: those that all commands share, and those of a stage.
 
 A stage's options are derived from its class of options (names, types, meaning, defaults): each is defined once.
+
+Options of any stage as texts: `--set train.sh_degree=1`.
 """
 
 from __future__ import annotations
@@ -13,8 +15,9 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 import click
 from pydantic.fields import FieldInfo
 
-from pipelines.core.options import StageOptions, flag_name, is_written, notation
-from pipelines.core.origins import names_of_flags
+from pipelines.core.options import StageOptions, flag_name, input_markers, is_written, notation, parse_toml
+from pipelines.core.plan import names_of_flags
+from pipelines.core.stages import StageSpec
 from pipelines.core.workspace import Workspace
 
 _BOUNDS = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
@@ -144,3 +147,52 @@ def _shown(info: FieldInfo) -> str:
     if is_written(info):
         return notation(info.default)
     return {True: "on", False: "off"}[info.default] if isinstance(info.default, bool) else str(info.default)
+
+
+def set_option() -> click.Option:
+    """Return the option `--set`."""
+    return click.Option(
+        ["--set", "settings"],
+        multiple=True,
+        metavar="STAGE.OPTION=VALUE",
+        help="Set any option of a stage by its key in georef.toml (`--set train.sh_degree=1`).  [repeatable]",
+    )
+
+
+def settings(texts: Iterable[str], stages: Iterable[StageSpec]) -> dict[str, dict[str, Any]]:
+    """Return the options that texts set, by stage and field.
+
+    Args:
+        texts: `stage.field=value`; the value is one of TOML, or else a plain text. Paths become absolute.
+        stages: that will run.
+
+    Raises:
+        click.UsageError: no such form, stage or option.
+    """
+    by_name = {spec.name: spec for spec in stages}
+    found: dict[str, dict[str, Any]] = {}
+    for text in texts:
+        key, equals, value = text.partition("=")
+        stage, _, name = key.partition(".")
+        if not equals or not name:
+            raise click.UsageError(f"--set: {text!r} is not of the form stage.option=value, like train.sh_degree=1")
+        if stage not in by_name:
+            raise click.UsageError(f"--set: {stage!r} is not among the stages to run: {', '.join(by_name)}")
+        options = by_name[stage].options
+        if name not in options.model_fields:
+            raise click.UsageError(
+                f"--set: {stage} has no option {name!r}; it has {', '.join(options.model_fields)}"
+            )
+        parsed = _value(value)
+        is_path = name in input_markers(options) and isinstance(parsed, str)
+        found.setdefault(stage, {})[name] = Path(parsed).absolute() if is_path else parsed
+    return found
+
+
+def _value(text: str) -> Any:
+    """Return a value of TOML; a text that is none, or more than one, as it is."""
+    try:
+        document = parse_toml(f"value = {text}")
+    except ValueError:
+        return text
+    return document["value"] if len(document) == 1 else text

@@ -1,4 +1,7 @@
-"""Results on stdout: a short text for people, or one JSON document."""
+"""Results on stdout: a short text for people, or one JSON document.
+
+Overview of a result for people: `georef info`, and the end of `georef run`.
+"""
 
 from __future__ import annotations
 
@@ -8,20 +11,124 @@ from typing import TYPE_CHECKING, Any
 
 import click
 from rich.console import Console, RenderableType
+from rich.table import Table
 from rich.text import Text
 
-from georef_cli import overview, tables
-from georef_cli.markup import Safe, shown
-from pipelines.core.cautions import Caution, union
-from pipelines.core.products import dump_json
+from georef_cli import tables
+from georef_cli.layout import ByWidth, Safe, plain_table, shown
+from georef_cli.tables import Renderable
+from pipelines.core.products import Caution, dump_json, union
 from pipelines.core.runner import Outcome
 from pipelines.core.staleness import cautions_by_stage
 from pipelines.core.workspace import Workspace
-from pipelines.scene.headline import headline_of
+from pipelines.survey.headline import headline_of
 
 if TYPE_CHECKING:
     from pipelines.deliver.overview import Overview
-    from pipelines.scene.report import EvaluationReport
+    from pipelines.survey.report import EvaluationReport
+
+_UNITS = ("B", "kB", "MB", "GB", "TB")
+
+
+def whole(result: Overview) -> list[Renderable]:
+    """Return the text of `georef info`: place, accuracy, files with their use, further deliverables, cautions."""
+    parts: list[Renderable] = [_headline(result), *_interrupted(result), _place(result), _files(result)]
+    if result.further:
+        parts.append("\n[bold]Not made yet[/]")
+        parts += [
+            f"  {shown(spec.command(result.workspace))}  [dim]{shown(spec.title)}[/]" for spec in result.further
+        ]
+    return [*parts, *tables.cautions(result.cautions)]
+
+
+def short(result: Overview) -> list[Renderable]:
+    """Return the end of `georef run`: where the result is, how good it is, where the files are, what comes next."""
+    workspace = result.workspace
+    files = plain_table("", "", header=False)
+    files.columns[0].overflow = "fold"
+    for file in result.files:
+        style = tables.STATE_STYLE.get(file.state, "dim")
+        state = "" if file.state == "current" else f"[{style}]{file.state}[/] "
+        files.add_row(f"  {shown(file.path)}", f"{state}[dim]{shown(file.purpose)}[/]")
+    names = ",".join(spec.name.removeprefix("export-") for spec in result.further)
+    further = {
+        f"georef view {workspace}": "see it in a browser, and measure in it",
+        f"georef info {workspace}": "sizes and states of the files",
+        f"georef evaluate {workspace}": "all figures of test views, check points and fit",
+        **({f"georef run {workspace} --deliver {names}": "further deliverables"} if names else {}),
+    }
+    steps = [f"  {shown(command)}  [dim]{use}[/]" for command, use in further.items()]
+    parts: list[Renderable] = ["", _headline(result), *_interrupted(result), _place(result, brief=True)]
+    return [*parts, f"\n[bold]Files[/] in {shown(str(workspace))}", files, "\n[bold]Next[/]", *steps]
+
+
+def size(count: int) -> str:
+    """Return a number of bytes as `812 B`, `3.1 MB`."""
+    thousands = min((len(str(count)) - 1) // 3, len(_UNITS) - 1)
+    return f"{count / 1000**thousands:.{1 if thousands else 0}f} {_UNITS[thousands]}"
+
+
+def _headline(result: Overview) -> str:
+    """Return the first line: whether the result is that of the present inputs and options, its size, its place."""
+    lat, lon, _ = result.center_lla
+    place = f"{abs(lat):.6f}° {'S' if lat < 0 else 'N'}, {abs(lon):.6f}° {'W' if lon < 0 else 'E'}"
+    gaussians = f"{result.gaussians} Gaussians at {place}"
+    if not result.outdated:
+        return f"[bold]{shown(str(result.workspace))}[/]: {gaussians}"
+    first, *others = result.outdated
+    style, more = (
+        tables.STATE_STYLE[first.state],
+        f"; and {', '.join(row.stage for row in others)}" if others else "",
+    )
+    why = f"{first.stage}: {first.reason}{more}"
+    return f"[bold]{shown(str(result.workspace))}[/] is [{style}]{first.state}[/] ({shown(why)}): {gaussians}"
+
+
+def _interrupted(result: Overview) -> list[str]:
+    """Return a line for each stage beside whose product an interrupted run lies."""
+    return [f"[yellow]{stage}[/]: {shown(found)}" for stage, found in result.interrupted.items()]
+
+
+def _place(result: Overview, *, brief: bool = False) -> Table:
+    """Return the lines on the place on Earth and its accuracy."""
+    bounds, quality = result.bounds, result.quality
+    lines = {
+        "longitude": f"{bounds.west:.6f} … {bounds.east:.6f}°",
+        "latitude": f"{bounds.south:.6f} … {bounds.north:.6f}°",
+        "height": f"{bounds.height_m[0]:.2f} … {bounds.height_m[1]:.2f} m, ellipsoidal",
+        bounds.crs: ", ".join(
+            f"{low:.{_decimals(unit)}f} … {high:.{_decimals(unit)}f} {unit}"
+            for low, high, unit in zip(bounds.low, bounds.high, bounds.units, strict=True)
+        ),
+    }
+    if not brief:
+        lines[""] = f"heights {bounds.heights}" + "".join(f"; {text}" for text in bounds.assumed)
+    accuracy = quality.accuracy
+    lines["accuracy"] = "not known yet: georef evaluate states it" if accuracy is None else accuracy.text
+    if accuracy is not None and accuracy.kind != "measured":
+        lines["accuracy"] += "; check points measure it (--checkpoints, --check)"
+    if quality.psnr is not None:
+        lines["test views"] = f"PSNR {quality.psnr:.2f} dB"
+    table = Table(show_header=False, box=None, pad_edge=False)
+    for name, text in lines.items():
+        table.add_row(shown(name), shown(text))
+    return table
+
+
+def _files(result: Overview) -> ByWidth:
+    wide = plain_table("\nfile", "\nsize", "\nmade", "\nstate", "\nuse", right=[1])
+    narrow = plain_table("\nfile", "\nsize", "\nstate", "\nuse", right=[1])
+    for file in result.files:
+        name, count, use = shown(file.path), size(file.bytes), shown(file.purpose)
+        state = f"[{tables.STATE_STYLE.get(file.state, 'dim')}]{file.state}[/]"
+        wide.add_row(name, count, tables.when(file.made), state, use)
+        narrow.add_row(name, count, state, use)
+    return ByWidth(tables.WIDE, wide, narrow)
+
+
+def _decimals(unit: str) -> int:
+    return 6 if unit.startswith("deg") else 2
+
 
 PIPED_WIDTH = 120
 
@@ -110,7 +217,7 @@ def print_outcomes(
     if not told:
         print_rich(tables.outcomes(outcomes))
     if result is not None:
-        print_rich(*overview.short(result))
+        print_rich(*short(result))
     else:
         if solved is not None:
             print_rich(*tables.report(solved))

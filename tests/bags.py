@@ -15,8 +15,8 @@ from ruamel.yaml import YAML
 from scipy.spatial.transform import Rotation
 
 from pipelines.geodesy.enu import Origin, geo_from_enu_at, lla_from_enu
-from pipelines.geometry.rig import mount
 from pipelines.geometry.rotations import ENU_FROM_NED, quat_xyzw_from_matrix
+from pipelines.geometry.trajectory import mount
 from tests.earth import enu_from_lla
 
 START = 1_700_000_000_000_000_000

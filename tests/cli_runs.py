@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipelines.core.printable import printable
+from pipelines.core.sentences import printable
 
 REPOSITORY = Path(__file__).parents[1]
 WITH_FAKES = "from tests import fakes; fakes.install(); from georef_cli.main import main; main()"

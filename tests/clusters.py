@@ -13,8 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from pipelines.engine.certificates import make_certificates
-from pipelines.engine.cluster import ClusterAddress, connected
+from pipelines.jobs.cluster import ClusterAddress, connected, make_certificates
 from tests.cli_runs import REPOSITORY, Result, finish
 
 PATIENCE_S = 180.0

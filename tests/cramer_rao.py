@@ -22,14 +22,15 @@ from scipy.sparse import bsr_matrix, csr_matrix, diags, hstack
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.geometry.bundle import (
+    EliminatedPoints,
     Network,
+    eliminate_points,
     has_positive_depth,
     lens_slots,
     linearise_bundle,
     sparse_jacobian,
     with_positive_depths,
 )
-from pipelines.geometry.bundle_information import EliminatedPoints, eliminate_points
 from pipelines.geometry.sparse_cholesky import SparseCholesky
 
 _WORST_SCALED = 1e-10  # least pivot of the scaled normal matrix: a smaller one leaves a direction undetermined

@@ -16,10 +16,9 @@ from pipelines.geodesy.enu import Origin, ecef_from_enu
 from pipelines.geodesy.vertical import VerticalDatum
 from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.similarity import Similarity
-from pipelines.scene.block_record import BlockTraining
-from pipelines.scene.survey import Survey
-from pipelines.splat.gaussians import Gaussians
-from pipelines.splat.storage import write_gaussians
+from pipelines.splat.gaussians import Gaussians, write_gaussians
+from pipelines.survey.block_plan import BlockTraining
+from pipelines.survey.survey import Survey
 from tests.scenes import trained_model
 
 ORIGIN = Origin(lat_deg=50.8231, lon_deg=-0.1372, alt_m=55.0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pipelines.geometry.cameras import Pinhole
-from pipelines.geometry.depth_support import DepthViews
+from pipelines.surface.visibility import DepthViews
 
 CAMERA = Pinhole(96, 72, 60.0, 60.0, 48.0, 36.0)
 UP = np.array([0.0, 0.0, 1.0])

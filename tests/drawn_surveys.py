@@ -13,14 +13,13 @@ import numpy as np
 from scipy.sparse import diags
 
 from pipelines.adjust.posterior import Posterior
-from pipelines.geometry.bundle import Network
-from pipelines.geometry.bundle_information import BundleInformation, bundle_information
+from pipelines.geometry.bundle import BundleInformation, Network, bundle_information
 from pipelines.geometry.cameras import CameraPoses
 from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.sparse_cholesky import SparseCholesky
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.scene.marks import RayErrors, intersect_marks, mark_rays
-from pipelines.scene.survey import Fix, FixSession, Mark, Survey, SurveyedPoint
+from pipelines.survey.marks import RayErrors, intersect_marks, mark_rays
+from pipelines.survey.survey import Fix, FixSession, Mark, Survey, SurveyedPoint
 from tests.scenes import GEO_FROM_LOCAL, Measured, Noise, TrueScene, looking_at, sparse_model, survey_of
 
 MARK_PX = 0.3

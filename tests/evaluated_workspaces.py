@@ -9,16 +9,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from pipelines.core.cautions import Caution
-from pipelines.core.products import load_json, save_json
+from pipelines.core.products import Caution, load_json, save_json
 from pipelines.core.stages import METRICS, RENDERS, REPORT, SURVEY
 from pipelines.core.types import Vector3
 from pipelines.core.workspace import Workspace
-from pipelines.evaluate.point_report import MeasuredPoints, check_point_errors
-from pipelines.plots.strips import labelled
-from pipelines.scene.render_files import write_render
-from pipelines.scene.report import ViewFigures, write_report
-from pipelines.scene.survey import Survey, SurveyedPoint
+from pipelines.evaluate.check_points import MeasuredPoints, check_point_errors
+from pipelines.report.plots.charts import labelled
+from pipelines.survey.photographs import write_render
+from pipelines.survey.report import ViewFigures, write_report
+from pipelines.survey.survey import Survey, SurveyedPoint
 from tests.reports import report_with
 from tests.scenes import TrueScene
 from tests.trained_workspaces import trained_workspace

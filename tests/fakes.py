@@ -14,9 +14,8 @@ from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
-from pipelines.core.cautions import Caution
 from pipelines.core.options import StageOptions
-from pipelines.core.products import dump_json
+from pipelines.core.products import Caution, dump_json
 from pipelines.core.stages import PIPELINE, STAGES, StageSpec, producer_of, products_of
 from pipelines.core.workspace import StageRun, Summary, Workspace
 

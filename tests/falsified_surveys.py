@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from pipelines.scene.survey import Fix, Mark, Survey, SurveyedPoint
+from pipelines.survey.survey import Fix, Mark, Survey, SurveyedPoint
 from tests.adjusted_scenes import Block
 from tests.scenes import CAMERA, WITH_GCPS, Noise, survey_of
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from pipelines.geometry.rotations import log_so3, matrix_from_quat_xyzw
-from pipelines.scene.survey import Survey
+from pipelines.survey.survey import Survey
 from tests import bags
 
 Ingest = Callable[..., Survey]

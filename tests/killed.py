@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from pipelines.splat.storage import read_gaussians
+from pipelines.splat.gaussians import read_gaussians
 from tests.cli_runs import Result, finish, start
 
 GEOREF = "from georef_cli.main import main; main()"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pipelines.geometry.rays import UncertainCameras
+from pipelines.geometry.intersection import UncertainCameras
 
 
 def intersect_one(xy: np.ndarray, views: list[int], of: UncertainCameras) -> tuple[np.ndarray, np.ndarray]:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from pipelines.core.cautions import Caution
+from pipelines.core.products import Caution
 from pipelines.core.stages import REPORT
 from pipelines.core.workspace import Workspace
 from pipelines.robust.statistics import ResidualStats
-from pipelines.scene.headline import headline
-from pipelines.scene.report import (
+from pipelines.survey.headline import headline
+from pipelines.survey.report import (
     AccuracySummary,
     AsprsStatement,
     CheckPointErrors,

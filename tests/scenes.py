@@ -13,16 +13,16 @@ from pipelines.core.manifest import MANIFEST
 from pipelines.core.products import save_json
 from pipelines.core.stages import SPARSE, SURVEY, StageSpec
 from pipelines.core.workspace import Workspace
-from pipelines.formats.colmap_writer import write_sparse
+from pipelines.formats.colmap import write_sparse
 from pipelines.geodesy.enu import Origin
 from pipelines.geodesy.vertical import VerticalDatum
 from pipelines.geometry.cameras import Camera, CameraPoses, project
 from pipelines.geometry.rotations import exp_so3, quat_xyzw_from_matrix
 from pipelines.geometry.similarity import Similarity, SimilarityRecord
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.scene.initial_similarity import InitialSimilarity
-from pipelines.scene.survey import Attitude, CameraPrior, Fix, FixSession, Mark, Survey, SurveyedPoint, SurveyImage
-from pipelines.scene.trained_model import TrainedCamera, TrainedModel
+from pipelines.survey.adjustment import InitialSimilarity
+from pipelines.survey.survey import Attitude, CameraPrior, Fix, FixSession, Mark, Survey, SurveyedPoint, SurveyImage
+from pipelines.survey.trained_model import TrainedCamera, TrainedModel
 
 CAMERA = Camera("OPENCV", 1200, 900, np.array([1020.0, 1018.0, 603.0, 447.0, -0.045, 0.012, 3e-4, -2e-4]))
 GEO_FROM_LOCAL = Similarity(12.5, exp_so3([0.4, -1.1, 2.0]), np.array([30.0, -45.0, 70.0]))

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from pipelines.geodesy.enu import Origin
 from pipelines.geodesy.vertical import VerticalDatum
-from pipelines.scene.survey import CameraPrior, Survey, SurveyImage
 from pipelines.sfm.options import SfmOptions
 from pipelines.simulate.options import SimulateOptions
+from pipelines.survey.survey import CameraPrior, Survey, SurveyImage
 
 IMAGES, WIDTH, HEIGHT = 10, 240, 180
 FOCAL = 0.85 * WIDTH

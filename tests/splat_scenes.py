@@ -19,11 +19,11 @@ from pipelines.core.workspace import Workspace
 from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.cameras import Camera, Pinhole
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.scene.survey import Survey
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
 from pipelines.splat.sh import sh_from_rgb
+from pipelines.survey.survey import Survey
 from tests.scenes import (
     Measured,
     Noise,

@@ -9,14 +9,13 @@ import numpy as np
 from pipelines.adjust.geolocate import geolocate
 from pipelines.adjust.init_sim3 import estimate_similarity
 from pipelines.adjust.options import GeolocateOptions, InitSim3Options
-from pipelines.core.cautions import Caution
+from pipelines.core.products import Caution
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.scene.initial_similarity import InitialSimilarity
-from pipelines.scene.marks import mark_rays
-from pipelines.scene.points_by_camera import points_by_camera
-from pipelines.scene.survey import Survey
-from pipelines.scene.trained_survey import SolvedSurvey
+from pipelines.survey.adjustment import InitialSimilarity
+from pipelines.survey.marks import mark_rays
+from pipelines.survey.survey import Survey
+from pipelines.survey.trained_survey import SolvedSurvey, points_by_camera
 
 
 @dataclass(frozen=True)

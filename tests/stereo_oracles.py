@@ -6,10 +6,15 @@ import cv2
 import numpy as np
 
 from pipelines.core.types import Float32Array
-from pipelines.stereo.agreement import AgreementSettings, DepthEstimate
-from pipelines.stereo.match_kernels import NOISE_VARIANCE
-from pipelines.stereo.matching import UNSEEN, MatchSettings
-from pipelines.stereo.views import StereoCamera, StereoView, opencv_camera_matrix
+from pipelines.surface.agreement import AgreementSettings, DepthEstimate
+from pipelines.surface.matching import (
+    NOISE_VARIANCE,
+    UNSEEN,
+    MatchSettings,
+    StereoCamera,
+    StereoView,
+    opencv_camera_matrix,
+)
 
 
 def score_of_depth(

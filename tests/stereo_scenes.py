@@ -6,10 +6,9 @@ import cv2
 import numpy as np
 
 from pipelines.geometry.cameras import Pinhole
-from pipelines.stereo.agreement import DepthEstimate
-from pipelines.stereo.matching import MatchSettings
-from pipelines.stereo.sweep import NormalMap, Planes, plane_sweep
-from pipelines.stereo.views import StereoCamera, StereoView
+from pipelines.surface.agreement import DepthEstimate
+from pipelines.surface.matching import MatchSettings, StereoCamera, StereoView
+from pipelines.surface.sweep import NormalMap, Planes, plane_sweep
 
 CAMERA = Pinhole(120, 90, 110.0, 110.0, 60.0, 45.0)
 GROUND_M, ROOF_M, ROOF_SIDE_M = 0.0, 6.0, 8.0

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.colmap_writer import write_sparse
+from pipelines.formats.colmap import write_sparse
 from pipelines.geodesy.enu import Origin, lla_from_enu
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.scene.survey import Survey, SurveyedPoint, SurveyImage
+from pipelines.survey.survey import Survey, SurveyedPoint, SurveyImage
 from tests.photos import jpeg
 
 # The shortest training that leaves a splat: the statement of accuracy does not depend on its photographs.

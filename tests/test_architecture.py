@@ -26,25 +26,18 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     ("pipelines.core",),
     ("pipelines.geodesy", "pipelines.geometry", "pipelines.robust"),
     ("pipelines.formats",),
-    (
-        "pipelines.engine",
-        "pipelines.pages",
-        "pipelines.plots",
-        "pipelines.scene",
-        "pipelines.splat",
-        "pipelines.stereo",
-    ),
+    ("pipelines.splat", "pipelines.survey"),
     # The adjustment, with calibrate, geolocate and init-sim3, which are its steps.
     ("pipelines.adjust",),
+    ("pipelines.surface",),
+    # The stage `report`, and the pages and plots that others draw with.
+    ("pipelines.report",),
+    ("pipelines.jobs",),
     (
-        "pipelines.batch",
-        "pipelines.blocks",
         "pipelines.compare",
         "pipelines.deliver",
         "pipelines.evaluate",
         "pipelines.ingest",
-        "pipelines.machine",
-        "pipelines.report",
         "pipelines.sfm",
         "pipelines.simulate",
         "pipelines.train",
@@ -52,15 +45,15 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     ),
     ("georef_cli",),
 )
-STAGE_FLOOR = 5
+STAGE_FLOOR = 8
 STAGE_ROOMS = FLOORS[STAGE_FLOOR]
 # The command line starts stages through the runner, chooses the engine, and shows products; what makes them is none
 # of its business.
 SEEN_BY_CLI = (
     "pipelines.core",
     "pipelines.adjust",
-    "pipelines.engine",
-    "pipelines.scene",
+    "pipelines.jobs",
+    "pipelines.survey",
     "georef_cli",
     *STAGE_ROOMS,
 )
@@ -70,19 +63,19 @@ HOMES: dict[str, tuple[str, ...]] = {
     "rich": ("georef_cli",),
     "pyproj": ("pipelines.geodesy",),
     "pycolmap": ("pipelines.sfm", "pipelines.formats"),
-    "numba": ("pipelines.splat", "pipelines.stereo", "pipelines.geometry", "pipelines.robust"),
+    "numba": ("pipelines.splat", "pipelines.surface", "pipelines.geometry", "pipelines.robust"),
     "gsplat": ("pipelines.splat.rasterizer.cuda_kernels",),
-    "torch": ("pipelines.splat", "pipelines.adjust", "pipelines.scene", *STAGE_ROOMS),
+    "torch": ("pipelines.splat", "pipelines.survey", "pipelines.surface", "pipelines.jobs.machine", *STAGE_ROOMS),
     "filelock": ("pipelines.core",),
     "laspy": ("pipelines.formats",),
-    "py4dgeo": ("pipelines.evaluate.reference.m3c2",),
+    "py4dgeo": ("pipelines.evaluate.reference_distances",),
     "plyfile": ("pipelines.formats",),
     "exifread": ("pipelines.formats",),
     "defusedxml": ("pipelines.formats",),
     "rosbags": ("pipelines.formats",),
     "embreex": ("pipelines.simulate",),
-    "matplotlib": ("pipelines.plots",),
-    "jinja2": ("pipelines.pages",),
+    "matplotlib": ("pipelines.report.plots",),
+    "jinja2": ("pipelines.report.page",),
     "zstandard": ("pipelines.formats",),
     "rasterio": ("pipelines.formats",),
     "pyogrio": ("pipelines.formats",),
@@ -90,9 +83,9 @@ HOMES: dict[str, tuple[str, ...]] = {
     "viser": ("pipelines.view",),
     "websockets": ("pipelines.view",),
     "msgspec": ("pipelines.view",),
-    "dask": ("pipelines.engine",),
-    "distributed": ("pipelines.engine",),
-    "fsspec": ("pipelines.engine",),
+    "dask": ("pipelines.jobs",),
+    "distributed": ("pipelines.jobs",),
+    "fsspec": ("pipelines.jobs",),
 }
 # The entry point of a process whose log records go to its parent.
 CHILD = "pipelines.core.child"
@@ -218,13 +211,13 @@ def test_files_form_no_circle() -> None:
 @pytest.mark.parametrize(
     ("importer", "imported", "rule"),
     [
-        ("pipelines.core.runner", "pipelines.scene.survey", "points upwards"),
-        ("pipelines.geometry.rays", "pipelines.formats.colmap", "points upwards"),
+        ("pipelines.core.runner", "pipelines.survey.survey", "points upwards"),
+        ("pipelines.geometry.intersection", "pipelines.formats.colmap", "points upwards"),
         ("pipelines.evaluate.stage", "pipelines.train.trainer", "ties two stages"),
         ("pipelines.compare.stage", "pipelines.evaluate.report", "ties two stages"),
-        ("pipelines.formats.odm", "pipelines.ingest.notes", "points upwards"),
+        ("pipelines.formats.ground_points", "pipelines.ingest.survey_assembly", "points upwards"),
         ("georef_cli.tables", "pipelines.splat.gaussians", "goes past the stages"),
-        ("pipelines.train.stage", "pipelines.scene.scene", None),
+        ("pipelines.train.stage", "pipelines.survey.scene", None),
         ("georef_cli.commands.run", "pipelines.core.runner", None),
     ],
 )

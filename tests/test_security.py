@@ -14,18 +14,17 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pipelines.core.child import python_command, python_environment
 from pipelines.core.errors import InputError
 from pipelines.core.products import load_json
-from pipelines.core.restart import python_command, python_environment
 from pipelines.core.stages import POINTS, SPARSE, SURVEY
 from pipelines.core.workspace import Workspace
-from pipelines.formats.colmap import read_sparse
-from pipelines.formats.colmap_writer import write_sparse
+from pipelines.formats.colmap import read_sparse, write_sparse
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.stage import survey_and_track
-from pipelines.scene.geolocated import GeolocatedPoints
-from pipelines.scene.scene import photographs
-from pipelines.scene.survey import FixSession, Survey
+from pipelines.survey.adjustment import GeolocatedPoints
+from pipelines.survey.scene import photographs
+from pipelines.survey.survey import FixSession, Survey
 from tests.photos import Exif, gps_entries, jpeg, write_flight
 from tests.scenes import Measured, Noise, make_scene, sparse_model, survey_of, write_workspace
 
@@ -37,11 +36,11 @@ FORBIDDEN = {
 # The files that start a process: this program again, for native code and for jobs; the user's browser; the
 # compilers of the CUDA kernels, which are asked for their versions; and Python, which calls them.
 STARTS_ITSELF = REPOSITORY / "pipelines/core/child.py"
-STARTS_JOBS = REPOSITORY / "pipelines/engine/process.py"
-STARTS_A_BROWSER = REPOSITORY / "pipelines/pages/chromium.py"
+STARTS_JOBS = REPOSITORY / "pipelines/jobs/local.py"
+STARTS_A_BROWSER = REPOSITORY / "pipelines/report/chromium.py"
 STARTS_A_COMPILER = REPOSITORY / "pipelines/splat/rasterizer/cuda_kernels.py"
 ASKS_COMPILERS = REPOSITORY / "pipelines/splat/rasterizer/cuda_parts.py"
-STARTS_WORKERS = REPOSITORY / "pipelines/engine/nodes.py"  # by Dask
+STARTS_WORKERS = REPOSITORY / "pipelines/jobs/dask_task.py"  # by Dask
 STARTERS = (STARTS_ITSELF, STARTS_JOBS, STARTS_A_BROWSER, STARTS_A_COMPILER, ASKS_COMPILERS)
 ESCAPES = ["../secret.jpg", "/etc/passwd", "a/../../secret.jpg", "", "a\nb.jpg", "a\x00b.jpg"]
 
@@ -87,7 +86,7 @@ def test_nothing_that_is_read_can_be_executed(package: str) -> None:
 def test_only_this_python_and_named_programs_are_started(
     file: Path, arguments: str, environment: str | None
 ) -> None:
-    """No module of the current folder is imported by a Python that is started: `pipelines.core.restart`."""
+    """No module of the current folder is imported by a Python that is started: `pipelines.core.child`."""
     calls = [node for name, node in _calls(ast.parse(file.read_text("utf-8"))) if "subprocess" in name]
     (call,) = [node for node in calls if isinstance(node, ast.Call)]
     assert ast.unparse(call.args[0]).startswith(arguments)
@@ -103,7 +102,7 @@ def test_one_module_knows_how_python_is_started_without_the_current_folder() -> 
     assert "os.environ.update(python_environment())" in STARTS_WORKERS.read_text("utf-8")
     files = [file for package in ("georef_cli", "pipelines") for file in (REPOSITORY / package).rglob("*.py")]
     named = {file for file in files if "sys.executable" in file.read_text("utf-8")}
-    assert named == {REPOSITORY / "pipelines/core/restart.py", ASKS_COMPILERS}  # which looks beside it for ninja
+    assert named == {REPOSITORY / "pipelines/core/child.py", ASKS_COMPILERS}  # which looks beside it for ninja
 
 
 @pytest.fixture

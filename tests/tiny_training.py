@@ -12,7 +12,6 @@ import torch
 from pipelines.adjust.state import State
 from pipelines.geometry.cameras import Camera, CameraPoses, Pinhole
 from pipelines.geometry.similarity import Similarity
-from pipelines.scene.photographs import ImageCache, Photograph
 from pipelines.splat.densify import DefaultSettings, DefaultStrategy, Strategy
 from pipelines.splat.exposure import Exposures
 from pipelines.splat.gaussians import Gaussians
@@ -20,6 +19,7 @@ from pipelines.splat.optimizer import GaussianAdam
 from pipelines.splat.outlier_pixels import OutlierPixels
 from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
+from pipelines.survey.photographs import ImageCache, Photograph
 from pipelines.train.geographic.problem import GeoProblem
 from pipelines.train.geographic.unknowns import CameraCorrections, LearnableSimilarity
 from pipelines.train.schedule import JointOptions

@@ -7,9 +7,9 @@ from functools import cache
 
 import numpy as np
 
-from pipelines.geometry.depth_support import DepthViews
 from pipelines.geometry.rotations import geo_from_cam
-from pipelines.train.lidar.cloud import LidarCloud, planes_of
+from pipelines.surface.lidar_cloud import LidarCloud, planes_of
+from pipelines.surface.visibility import DepthViews
 
 SIZE, FOCAL_PX = (96, 72), 80.0
 SIGMA_M, SPACING_M = 0.02, 0.5

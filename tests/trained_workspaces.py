@@ -19,12 +19,12 @@ from pipelines.geometry.cameras import CameraPoses
 from pipelines.geometry.rotations import log_so3
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.scene.calibrated import load_survey
-from pipelines.scene.initial_similarity import InitialSimilarity
-from pipelines.scene.scene import Scene
-from pipelines.scene.trained_model import Adjustment, TrainedModel
+from pipelines.splat.gaussians import write_gaussians
 from pipelines.splat.initialise import gaussians_of_size
-from pipelines.splat.storage import write_gaussians
+from pipelines.survey.adjustment import InitialSimilarity
+from pipelines.survey.calibrated import load_survey
+from pipelines.survey.scene import Scene
+from pipelines.survey.trained_model import Adjustment, TrainedModel
 from tests.scenes import (
     GEO_FROM_LOCAL,
     WITH_GCPS,

@@ -13,12 +13,11 @@ from pipelines.core.stages import GAUSSIANS, MODEL
 from pipelines.core.workspace import Workspace
 from pipelines.geometry.cameras import CameraPoses
 from pipelines.geometry.similarity import Similarity
-from pipelines.scene.renderer import ModelRenderer
-from pipelines.scene.scene import photographs
-from pipelines.scene.trained_survey import load_trained
-from pipelines.splat.gaussians import Gaussians
+from pipelines.splat.gaussians import Gaussians, write_gaussians
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
-from pipelines.splat.storage import write_gaussians
+from pipelines.surface.surface_views import ModelRenderer
+from pipelines.survey.scene import photographs
+from pipelines.survey.trained_survey import load_trained
 from tests.scenes import GEO_FROM_LOCAL, trained_cameras, trained_model
 from tests.splat_scenes import (
     CAMERA,

@@ -24,8 +24,8 @@ import numpy as np
 
 from pipelines.core.options import resolve
 from pipelines.simulate.options import SimulateOptions
+from pipelines.simulate.recording import write_trajectory
 from pipelines.simulate.stage import fly_survey
-from pipelines.simulate.write import write_trajectory
 
 # Name of the profile, receiver, whether there are control points.
 PROFILES = {

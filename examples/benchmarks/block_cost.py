@@ -14,9 +14,8 @@ import numpy as np
 from blocks import copied, georef
 
 from pipelines.core.products import load_json
-from pipelines.scene.block_plan import BlockPlan, PlannedBlock
-from pipelines.scene.block_record import BlockTraining
-from pipelines.train.pace import BlockCost
+from pipelines.jobs.costs import BlockCost
+from pipelines.survey.block_plan import BlockPlan, BlockTraining, PlannedBlock
 
 # Blocks, Gaussians of the whole, longest side of the photographs.
 _SIZES = ((2, 10_000, 240), (3, 30_000, 320), (4, 60_000, 400), (4, 120_000, 320), (3, 120_000, 480))

@@ -27,13 +27,12 @@ from pipelines.core.products import load_json
 from pipelines.core.stages import BLOCK_RECORD, REPORT
 from pipelines.core.types import BoolArray, FloatArray
 from pipelines.core.workspace import Workspace
-from pipelines.scene.block_plan import BlockCell
-from pipelines.scene.block_record import BlockRecord
-from pipelines.scene.renderer import ModelRenderer
-from pipelines.scene.report import read_report
-from pipelines.scene.scene import photographs
-from pipelines.scene.trained_survey import load_trained
 from pipelines.splat.rasterizer.backends import rasterizer
+from pipelines.surface.surface_views import ModelRenderer
+from pipelines.survey.block_plan import BlockCell, BlockRecord
+from pipelines.survey.report import read_report
+from pipelines.survey.scene import photographs
+from pipelines.survey.trained_survey import load_trained
 
 # Half the width of the bands along the seams, relative to the square root of a cell's mean area.
 _BAND = 0.05

@@ -29,18 +29,16 @@ from pipelines.core.types import FloatArray, IntArray
 from pipelines.core.workspace import Workspace
 from pipelines.deliver.placement import place
 from pipelines.geometry.cameras import Pinhole, pose_matrix
-from pipelines.scene.marks import MarkRays, mark_rays
-from pipelines.scene.points_by_model import depth_around
-from pipelines.scene.renderer import ModelRenderer
-from pipelines.scene.report import read_report
-from pipelines.scene.scene import photographs
-from pipelines.scene.trained_survey import TrainedSurvey, load_trained
-from pipelines.splat.gaussians import Gaussians
+from pipelines.splat.gaussians import Gaussians, read_gaussians, transformed
 from pipelines.splat.rasterizer.api import ALPHA_MAX, ALPHA_MIN, RasterSettings
 from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.splat.rasterizer.reference import project_gaussians
-from pipelines.splat.storage import read_gaussians
-from pipelines.splat.transform import transformed
+from pipelines.surface.picking import depth_around
+from pipelines.surface.surface_views import ModelRenderer
+from pipelines.survey.marks import MarkRays, mark_rays
+from pipelines.survey.report import read_report
+from pipelines.survey.scene import photographs
+from pipelines.survey.trained_survey import TrainedSurvey, load_trained
 
 LEAST_OPACITY = 0.5
 NOT_HIDDEN = 1.01  # of the depth of the frontmost centre

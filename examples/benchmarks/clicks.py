@@ -20,17 +20,16 @@ import numpy as np
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import Workspace
 from pipelines.geodesy.enu import ecef_from_enu, enu_from_ecef
-from pipelines.scene.crs_options import CrsOptions
-from pipelines.scene.renderer import ModelRenderer
-from pipelines.scene.scene import photographs
-from pipelines.scene.trained_survey import load_trained
-from pipelines.simulate.mesh import Material
+from pipelines.simulate.mesh import MISS, Material, Raycaster
 from pipelines.simulate.options import SimulateOptions
-from pipelines.simulate.raycast import MISS, Raycaster
 from pipelines.simulate.stage import fly_survey
 from pipelines.splat.rasterizer.backends import rasterizer
+from pipelines.surface.picking import Sight, SurfacePoint
+from pipelines.surface.surface_views import ModelRenderer
+from pipelines.survey.options import CrsOptions
+from pipelines.survey.scene import photographs
+from pipelines.survey.trained_survey import load_trained
 from pipelines.view.measuring import MeasuringModel
-from pipelines.view.surface_points import Sight, SurfacePoint
 
 _NAMES = ("scene", "flight", "images", "size", "seed")
 _PIXEL_RAD = 1 / 700  # of a page of 800 px

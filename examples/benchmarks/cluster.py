@@ -20,7 +20,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from pipelines.engine.cluster import ClusterAddress, connected
+from pipelines.jobs.cluster import ClusterAddress, connected
 
 REPOSITORY = Path(__file__).parents[2]
 GEOREF = (sys.executable, "-m", "georef_cli")

@@ -8,8 +8,7 @@ import time
 
 import numpy as np
 
-from pipelines.geometry.intersection import intersect_rays
-from pipelines.geometry.rays import Rays, UncertainCameras
+from pipelines.geometry.intersection import Rays, UncertainCameras, intersect_rays
 from pipelines.geometry.rotations import exp_so3, geo_from_cam
 
 

@@ -38,7 +38,7 @@ from raster import make_scene
 from torch import Tensor
 from training import iterations, now, psnr_of_test_views, trainer_on
 
-from pipelines.core.versions import library_versions
+from pipelines.core.fingerprints import library_versions
 from pipelines.geometry.cameras import Pinhole
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.rasterizer.api import RasterSettings, Render

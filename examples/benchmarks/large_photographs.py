@@ -14,17 +14,17 @@ from pathlib import Path
 
 import cv2
 
-from pipelines.core.free_memory import peak_memory_bytes
-from pipelines.core.photograph_folder import photograph_folder
+from pipelines.core.machine import peak_memory_bytes
+from pipelines.core.plan import photograph_folder
 from pipelines.core.workspace import Workspace
 from pipelines.geometry.cameras import Camera
-from pipelines.scene.photographs import ImageCache, Photograph
 from pipelines.splat.memory import predicted_peak_bytes
 from pipelines.splat.rasterizer.backends import rasterizer
+from pipelines.surface.depth_maps import DepthMaps
+from pipelines.survey.photographs import ImageCache, Photograph
 from pipelines.train.adjusted_scene import AdjustedScene
 from pipelines.train.assembly import make_trainer
-from pipelines.train.depth_maps import DepthMaps
-from pipelines.train.gaussian_limit import training_size
+from pipelines.train.forecast import training_size
 from pipelines.train.geographic.problem import held_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.options import TrainOptions

@@ -36,21 +36,20 @@ from pipelines.core.stages import BY_NAME, REPORT
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import Workspace
 from pipelines.geodesy.enu import ecef_from_enu, enu_from_ecef
-from pipelines.scene.cloud_options import CloudCrs
-from pipelines.scene.measured_cloud import CloudFiles
-from pipelines.scene.renderer import ModelRenderer
-from pipelines.scene.report import read_report
-from pipelines.scene.scene import photographs
-from pipelines.scene.trained_survey import load_trained
-from pipelines.simulate.mesh import Material
+from pipelines.simulate.mesh import MISS, Material, Raycaster
 from pipelines.simulate.options import SimulateOptions
-from pipelines.simulate.raycast import MISS, Raycaster
 from pipelines.simulate.stage import RecordedFlight, fly_survey, write_lidar_flight
 from pipelines.simulate.truth import Truth
 from pipelines.splat.rasterizer.backends import rasterizer
+from pipelines.surface.depth_maps import DepthMaps
+from pipelines.surface.measured_cloud import CloudFiles
+from pipelines.surface.surface_views import ModelRenderer
+from pipelines.survey.options import CloudCrs
+from pipelines.survey.report import read_report
+from pipelines.survey.scene import photographs
+from pipelines.survey.trained_survey import load_trained
 from pipelines.train.adjusted_scene import AdjustedScene
-from pipelines.train.depth_maps import DepthMaps
-from pipelines.train.lidar.prepare import compared_lidar, lidar_surface, registration_of
+from pipelines.train.lidar import compared_lidar, lidar_surface, registration_of
 from pipelines.train.options import TrainOptions
 
 CLASSES = {

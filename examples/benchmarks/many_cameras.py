@@ -19,17 +19,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.sparse import diags
 
-from pipelines.adjust.intersection_jacobian import intersection_jacobian
-from pipelines.adjust.posterior import camera_covariances
+from pipelines.adjust.posterior import camera_covariances, intersection_jacobian
 from pipelines.adjust.state import State, SystematicError, SystematicErrors
 from pipelines.adjust.system import Problem, linearised, minimise, posterior_weights
 from pipelines.adjust.terms import ControlPoints, Fixes
-from pipelines.core.free_memory import peak_memory_bytes
+from pipelines.core.machine import peak_memory_bytes
 from pipelines.core.types import FloatArray, IntArray
-from pipelines.geometry.bundle import Network
-from pipelines.geometry.bundle_information import BundleInformation, bundle_information
-from pipelines.geometry.cameras import Camera, CameraPoses, project_each
-from pipelines.geometry.lens import Lenses, bearings
+from pipelines.geometry.bundle import BundleInformation, Network, bundle_information
+from pipelines.geometry.cameras import Camera, CameraPoses, Lenses, bearings, project_each
 from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.similarity import perturbation
 from pipelines.geometry.sparse_cholesky import SparseCholesky

@@ -33,14 +33,12 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from pipelines.core.free_memory import peak_memory_bytes
+from pipelines.core.machine import peak_memory_bytes
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.formats.colmap import flatten, quiet_colmap
 from pipelines.geometry.similarity import umeyama
-from pipelines.sfm.drift import remove_drift
-from pipelines.sfm.last_adjustment import LastAdjustment, adjust_finally
-from pipelines.sfm.mapping import MapperRun, run_mapper
-from pipelines.sfm.pairs import CameraDirections, select_pairs
+from pipelines.sfm.features import CameraDirections, select_pairs
+from pipelines.sfm.mapping import LastAdjustment, MapperRun, adjust_finally, remove_drift, run_mapper
 
 SIZE_PX, FOCAL_PX, HEIGHT_M = (1200, 900), 1000.0, 100.0
 FORWARD_OVERLAP, SIDE_OVERLAP = 0.8, 0.6

@@ -18,9 +18,9 @@ import torch
 from training import ViewQuality, scene_of, trainer_on
 
 from pipelines.core.types import BoolArray, ByteArray
-from pipelines.scene.photographs import ImageCache, save_array
-from pipelines.scene.scene import Scene
 from pipelines.splat.rasterizer.api import RasterSettings
+from pipelines.survey.photographs import ImageCache, save_array
+from pipelines.survey.scene import Scene
 from pipelines.train.options import TrainOptions
 from pipelines.train.trainer import JointTrainer
 

@@ -20,8 +20,7 @@ from pipelines.core.manifest import MANIFEST
 from pipelines.core.runner import run_stage
 from pipelines.core.stages import BY_NAME, GAUSSIANS
 from pipelines.core.workspace import Workspace
-from pipelines.splat.gaussians import Gaussians, rotation_matrices
-from pipelines.splat.storage import read_gaussians, write_gaussians
+from pipelines.splat.gaussians import Gaussians, read_gaussians, rotation_matrices, write_gaussians
 
 
 def multiplied(gaussians: Gaussians, count: int) -> Gaussians:

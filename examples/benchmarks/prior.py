@@ -25,10 +25,10 @@ from pipelines.core.products import load_json
 from pipelines.core.stages import REPORT, SURVEY
 from pipelines.core.workspace import Workspace
 from pipelines.geodesy.enu import ecef_from_enu
-from pipelines.scene.cloud_options import CloudCrs
-from pipelines.scene.measured_cloud import CloudFiles
-from pipelines.scene.report import read_report
-from pipelines.scene.survey import Survey
+from pipelines.surface.measured_cloud import CloudFiles
+from pipelines.survey.options import CloudCrs
+from pipelines.survey.report import read_report
+from pipelines.survey.survey import Survey
 
 
 def main() -> None:

@@ -1,7 +1,7 @@
 """Project the time of large surveys from the models of SfM and blocks: python examples/benchmarks/projection.py.
 
 Nothing is reconstructed or trained: surveys are made up, divided into blocks, and the models that were fitted to
-small surveys (pipelines/sfm/pace.py, pipelines/train/pace.py) are evaluated at their sizes. What is printed is a
+small surveys (pipelines/jobs/costs.py) are evaluated at their sizes. What is printed is a
 projection, for processors only: nothing was measured on a GPU.
 """
 
@@ -12,12 +12,12 @@ from dataclasses import dataclass
 
 from block_plan import made_up_scene
 
-from pipelines.blocks.options import PlanOptions
-from pipelines.blocks.plan import plan_blocks
-from pipelines.scene.block_plan import BlockPlan
-from pipelines.scene.scene import Scene
+from pipelines.sfm.forecast import pace
 from pipelines.sfm.options import SfmOptions
-from pipelines.sfm.pace import reconstruction_pace
+from pipelines.survey.block_plan import BlockPlan
+from pipelines.survey.scene import Scene
+from pipelines.train.blocks.options import PlanOptions
+from pipelines.train.blocks.plan import plan_blocks
 from pipelines.train.forecast import block_processor_s
 from pipelines.train.options import TrainOptions
 
@@ -65,19 +65,19 @@ def plan_of(scene: Scene, machines: Machines) -> BlockPlan:
 
 def projected(count: int, scene: Scene, machines: Machines) -> list[str]:
     """Return the steps of a survey on some machines: times, and the number and memory of the blocks."""
-    pace = reconstruction_pace(count, PHOTO_PX, SfmOptions())
+    reconstruction = pace(count, PHOTO_PX, SfmOptions())
     plan = plan_of(scene, machines)
     options = TrainOptions(preset="standard", max_image_size=TRAINED_PX)
     whole = block_processor_s(plan, PHOTO_PX, options)
     blocks = block_processor_s(plan, PHOTO_PX, options.model_copy(update={"dense": False}))
-    sfm = (pace.features_s + pace.matching_s) / machines.cores / SHARING
+    sfm = (reconstruction.features_s + reconstruction.matching_s) / machines.cores / SHARING
     stereo = (sum(whole.values()) - sum(blocks.values())) / machines.cores / SHARING
     # The longest block is the least time, however many workers there are.
     together = sum(blocks.values()) / machines.workers / SHARING
     training = max(together, *blocks.values())
     peak_gib = max(block.peak_bytes for block in plan.blocks) / 2**30
     size = f"{len(plan.blocks)} of {peak_gib:.1f} GiB"
-    times = (sfm, pace.mapping_s, stereo, training)
+    times = (sfm, reconstruction.mapping_s, stereo, training)
     return [*map(hours, times), size, hours(sum(times))]
 
 

@@ -23,9 +23,8 @@ from pipelines.core.types import FloatArray, IntArray
 from pipelines.formats.georef_sidecar import CrsSidecar, sidecar_path
 from pipelines.geodesy.crs import PointCrs, parse_crs
 from pipelines.geodesy.enu import ecef_from_enu, ecef_from_lla, enu_from_ecef, lla_from_ecef
-from pipelines.simulate.mesh import Material
+from pipelines.simulate.mesh import MISS, Material, Raycaster
 from pipelines.simulate.options import SimulateOptions
-from pipelines.simulate.raycast import MISS, Raycaster
 from pipelines.simulate.stage import fly_survey
 
 _ABOVE_M, _BELOW_M = 200.0, 200.0

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.deliver.tiles.stage import Tiling, write_tiles, write_whole
+from pipelines.deliver.tiles import Tiling, write_tiles, write_whole
 from pipelines.formats.georef_sidecar import GeorefSidecar
 from pipelines.formats.splat_ply import SplatArrays
 from pipelines.geodesy.crs import ECEF, parse_crs

@@ -32,19 +32,19 @@ from pipelines.core.stages import PIPELINE, POINTS
 from pipelines.core.workspace import Workspace
 from pipelines.evaluate.check_points import check_points_on_surface
 from pipelines.evaluate.photometric import compare_test_views
-from pipelines.machine.inspection import inspect_machine
-from pipelines.scene.geolocated import GeolocatedPoints
-from pipelines.scene.renderer import ModelRenderer
-from pipelines.scene.scene import photographs
-from pipelines.scene.trained_survey import TrainedSurvey
+from pipelines.jobs.machine import inspect_machine
 from pipelines.splat.rasterizer.backends import rasterizer
+from pipelines.surface.surface_views import ModelRenderer
+from pipelines.survey.adjustment import GeolocatedPoints
+from pipelines.survey.scene import photographs
+from pipelines.survey.trained_survey import TrainedSurvey
 from pipelines.train.adjusted_scene import AdjustedScene
 from pipelines.train.assembly import make_trainer
-from pipelines.train.checkpoint import load_checkpoint
 from pipelines.train.geographic.problem import held_problem, refining_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.options import TrainOptions
 from pipelines.train.result import trained_model
+from pipelines.train.trainer import load_checkpoint
 
 _POLL_S = 0.1
 _GEOREF = (sys.executable, "-c", "from georef_cli.main import main; main()")

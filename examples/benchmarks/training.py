@@ -29,8 +29,6 @@ from raster import make_scene
 from pipelines.core.types import IntArray
 from pipelines.core.workspace import Workspace
 from pipelines.geometry.cameras import Pinhole
-from pipelines.scene.photographs import ImageCache
-from pipelines.scene.scene import Scene, photographs
 from pipelines.splat.densify import DefaultSettings, DefaultStrategy
 from pipelines.splat.losses import photometric_loss
 from pipelines.splat.memory import TrainingSize, predicted_peak_bytes
@@ -38,9 +36,11 @@ from pipelines.splat.metrics import psnr
 from pipelines.splat.optimizer import GaussianAdam
 from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.backends import rasterizer
+from pipelines.surface.depth_maps import DepthMaps
+from pipelines.survey.photographs import ImageCache
+from pipelines.survey.scene import Scene, photographs
 from pipelines.train.adjusted_scene import AdjustedScene
 from pipelines.train.assembly import make_trainer
-from pipelines.train.depth_maps import DepthMaps
 from pipelines.train.geographic.problem import refining_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.options import TrainOptions

@@ -24,12 +24,11 @@ from playwright.sync_api import Page, sync_playwright
 
 from pipelines.core.stages import GAUSSIANS, MODEL, STAGES
 from pipelines.core.workspace import Workspace
-from pipelines.pages.chromium import chromium_path
-from pipelines.splat.gaussians import Gaussians
-from pipelines.splat.storage import read_gaussians, write_gaussians
+from pipelines.report.chromium import chromium_path
+from pipelines.splat.gaussians import Gaussians, read_gaussians, write_gaussians
 from pipelines.view.loopback import start_server, stop_server
 from pipelines.view.options import ViewOptions
-from pipelines.view.view_frame import ViewerCamera
+from pipelines.view.pictures import ViewerCamera
 from pipelines.view.viewer import Viewer
 from tests.browser.chromium import FLAGS
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from dask_jobqueue import SLURMCluster
 from distributed import Security
 
-from pipelines.core.restart import THIS_PROGRAM, python_command
+from pipelines.core.child import THIS_PROGRAM, python_command
 
 # Of each worker. Dask's own threads are jobs at a time; the cores belong to the job.
 CORES, MEMORY_GB, GPUS = 16, 64, 0

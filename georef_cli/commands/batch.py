@@ -8,16 +8,14 @@ from typing import Any
 
 import click
 
-from georef_cli import batch_tables, options
+from georef_cli import job_tables, options
 from georef_cli.command import Command
 from georef_cli.commands.run import OWNERS, deliver_option, slice_option
 from georef_cli.display import progress_for
 from georef_cli.engines import engine_for, engine_options
 from georef_cli.forecast import RunForecast, checked_inputs, forecast_run
+from georef_cli.options import set_option, settings
 from georef_cli.output import print_json, print_rich
-from georef_cli.settings import set_option, settings
-from pipelines.batch.missions import Mission, MissionList, load_missions
-from pipelines.batch.runner import PlannedMission
 from pipelines.core import runner
 from pipelines.core.errors import GeorefError
 from pipelines.core.options import input_paths
@@ -25,6 +23,8 @@ from pipelines.core.plan import plan
 from pipelines.core.progress import Progress
 from pipelines.core.stages import BY_NAME
 from pipelines.core.staleness import stage_config
+from pipelines.jobs.batch import PlannedMission
+from pipelines.jobs.missions import Mission, MissionList, load_missions
 
 log = logging.getLogger(__name__)
 
@@ -32,8 +32,7 @@ FAILED = 1
 
 
 def _batch(ctx: click.Context, **values: Any) -> int:
-    from pipelines.batch.files import page_file
-    from pipelines.batch.runner import run_batch
+    from pipelines.jobs.batch import page_file, run_batch
 
     listed = _missions(values)
     progress = progress_for(ctx.obj)
@@ -41,18 +40,18 @@ def _batch(ctx: click.Context, **values: Any) -> int:
     planned = [mission for mission, _ in forecasts]
     engine = engine_for(values, values["at_a_time"])
     if values["dry_run"]:
-        rows = batch_tables.dry_rows(forecasts)
+        rows = job_tables.dry_rows(forecasts)
         if values["as_json"]:
             print_json({"batch": listed.name, "missions": rows})
         else:
             together = engine.together([row.job(listed.folder) for row in planned if not row.is_current])
-            print_rich(*batch_tables.dry_run(rows, together))
+            print_rich(*job_tables.dry_run(rows, together))
         return FAILED if any(row.refusal for row in planned) else 0
     table = run_batch(listed, planned, engine, progress)
     if values["as_json"]:
         print_json(table.model_dump(mode="json"))
     else:
-        print_rich(*batch_tables.batch(table, page_file(listed.folder, listed.name)))
+        print_rich(*job_tables.batch(table, page_file(listed.folder, listed.name)))
     return 0 if table.is_complete else FAILED
 
 

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from georef_cli import block_tables, boundary, options
+from georef_cli import boundary, job_tables, options
 from georef_cli.command import Command
 from georef_cli.display import is_told, progress_for
-from georef_cli.dry_run import announce_training
 from georef_cli.engines import asked_engine, engine_options
+from georef_cli.forecast import announce_training
 from georef_cli.output import print_json, print_outcome, print_rich
 from pipelines.core import runner
 from pipelines.core.products import load_json
@@ -29,11 +29,11 @@ from pipelines.core.stages import (
 )
 from pipelines.core.staleness import must_exist, stage_config
 from pipelines.core.workspace import Workspace
-from pipelines.scene.survey import Survey
+from pipelines.survey.survey import Survey
 
 if TYPE_CHECKING:
-    from pipelines.blocks.parts import Parts
-    from pipelines.scene.block_plan import BlockPlan
+    from pipelines.survey.block_plan import BlockPlan
+    from pipelines.train.blocks.parts import Parts
 
 TRAIN = BY_NAME["train"]
 ACTIONS = ("plan", "scaffold", "train", "seams", "merge")
@@ -88,7 +88,7 @@ def _parts(workspace: Workspace, flags: dict[str, Any]) -> Parts:
     Raises:
         InputError: an unknown or invalid option.
     """
-    from pipelines.blocks.parts import Parts
+    from pipelines.train.blocks.parts import Parts
 
     asked = runner.remembered(workspace, TRAIN, flags)
     resolved: Any = stage_config(workspace, TRAIN, asked)
@@ -109,7 +109,7 @@ def _print_plan(parts: Parts, outcome: runner.Outcome, values: dict[str, Any]) -
     if values["as_json"]:
         print_json({"stage": outcome.stage, "ran": outcome.ran, **plan.model_dump(mode="json")})
     else:
-        print_rich(*block_tables.plan(plan, parts.states(plan), _processor_s(parts, plan)))
+        print_rich(*job_tables.plan(plan, parts.states(plan), _processor_s(parts, plan)))
 
 
 def _processor_s(parts: Parts, plan: BlockPlan) -> dict[int, float] | None:
@@ -139,7 +139,7 @@ def _run_part(
 
 
 def _train(ctx: click.Context, workspace: Workspace, given: dict[str, Any], values: dict[str, Any]) -> None:
-    from pipelines.blocks.stage import train_blocks
+    from pipelines.train.blocks.stage import train_blocks
 
     parts = _parts(workspace, given)
     with workspace.lock("blocks train"):
@@ -148,13 +148,13 @@ def _train(ctx: click.Context, workspace: Workspace, given: dict[str, Any], valu
     if values["as_json"]:
         print_json({"blocks": [parts.training(block).model_dump(mode="json") for block in plan.blocks]})
     else:
-        print_rich(*block_tables.plan(plan, parts.states(plan)))
+        print_rich(*job_tables.plan(plan, parts.states(plan)))
 
 
 def _all(
     ctx: click.Context, workspace: Workspace, given: dict[str, Any], values: dict[str, Any], *, only_merge: bool
 ) -> None:
-    from pipelines.blocks.stage import require_trained
+    from pipelines.train.blocks.stage import require_trained
 
     parts = _parts(workspace, given)
     if only_merge:

@@ -9,13 +9,13 @@ from rich.console import RenderableType
 from rich.table import Table
 
 from georef_cli.display import is_told
-from georef_cli.markup import shown
+from georef_cli.layout import shown
 from georef_cli.output import print_outcome
 from georef_cli.stage import StageCommand
 from pipelines.core.products import load_json
 from pipelines.core.stages import RIG
 from pipelines.core.workspace import Workspace
-from pipelines.scene.rig import RigCalibration
+from pipelines.survey.survey import RigCalibration
 
 _COMPONENTS = {"boresight": ("x", "y", "z"), "lever-arm": ("forward", "right", "down"), "time-offset": ("",)}
 

@@ -8,12 +8,12 @@ import click
 
 from georef_cli import options
 from georef_cli.command import Command
-from georef_cli.markup import shown
+from georef_cli.layout import shown
 from georef_cli.output import print_json, print_rich
 
 
 def _certificates(folder: Path, as_json: bool) -> None:
-    from pipelines.engine.certificates import CERTIFICATE, KEY, make_certificates
+    from pipelines.jobs.cluster import CERTIFICATE, KEY, make_certificates
 
     make_certificates(folder)
     if as_json:

@@ -13,7 +13,7 @@ from georef_cli.output import print_json
 
 
 def _scheduler(listen: str | None, as_json: bool, **values: Any) -> None:
-    from pipelines.engine.nodes import run_scheduler
+    from pipelines.jobs.dask_task import run_scheduler
 
     everywhere = "127.0.0.1" if values["certificates"] is None else "0.0.0.0"
     address = cluster_address(listen or everywhere, values, "--listen", is_node=True)

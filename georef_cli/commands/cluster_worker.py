@@ -11,8 +11,7 @@ from georef_cli.command import Command
 from georef_cli.engines import certificates_options, cluster_address
 from georef_cli.output import print_json
 from pipelines.core.errors import ResourceError
-from pipelines.core.free_memory import free_main_memory_bytes
-from pipelines.core.threads import thread_count
+from pipelines.core.machine import free_main_memory_bytes, thread_count
 
 _USABLE = 0.9  # of the free memory: other programs grow, too
 _GIB = 1 << 30
@@ -28,7 +27,7 @@ def _worker(
     as_json: bool,
     **values: Any,
 ) -> None:
-    from pipelines.engine.nodes import run_worker
+    from pipelines.jobs.dask_task import run_worker
 
     scheduler = cluster_address(address, values, "ADDRESS", is_node=True)
     free = free_main_memory_bytes()
@@ -42,7 +41,7 @@ def _worker(
 
 
 def _gpus() -> int:
-    from pipelines.machine.inspection import inspect_machine
+    from pipelines.jobs.machine import inspect_machine
 
     return len(inspect_machine().gpus)
 

@@ -10,19 +10,18 @@ import click
 from georef_cli import options
 from georef_cli.command import Command
 from georef_cli.display import progress_for
-from georef_cli.layout import plain_table
-from georef_cli.markup import shown
+from georef_cli.layout import plain_table, shown
 from georef_cli.output import print_json, print_rich
 
 if TYPE_CHECKING:
-    from pipelines.machine.inspection import Machine
+    from pipelines.jobs.machine import Machine
 
 _MOST_GRIDS = 12
 
 
 @click.pass_context
 def _doctor(ctx: click.Context, as_json: bool, compile_cuda: bool) -> None:
-    from pipelines.machine.inspection import compile_cuda_kernels, inspect_machine
+    from pipelines.jobs.machine import compile_cuda_kernels, inspect_machine
 
     if compile_cuda:
         compile_cuda_kernels(progress_for(ctx.obj))

@@ -8,10 +8,10 @@ import click
 
 from georef_cli.display import is_told
 from georef_cli.output import print_outcome
-from georef_cli.point_tables import coordinate_tables, error_tables
 from georef_cli.stage import StageCommand
+from georef_cli.tables import coordinate_tables, error_tables
 from pipelines.core.stages import REPORT
-from pipelines.scene.report import read_report
+from pipelines.survey.report import read_report
 
 
 class EvaluateCommand(StageCommand):

@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from georef_cli import options
-from georef_cli.deliverable import DeliverableCommand
+from georef_cli.stage import DeliverableCommand
 from pipelines.deliver.options import MeasurableOptions
 
 _DOC = """Write the splat as a PLY with its place on Earth.

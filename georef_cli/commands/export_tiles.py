@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from georef_cli.deliverable import DeliverableCommand
+from georef_cli.stage import DeliverableCommand
 
 command = DeliverableCommand(
     "export-tiles",

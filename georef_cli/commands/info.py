@@ -12,11 +12,11 @@ from georef_cli.output import print_json, print_rich
 from pipelines.core.options import resolve
 from pipelines.core.staleness import must_exist
 from pipelines.core.workspace import Workspace
-from pipelines.scene.crs_options import CrsOptions
+from pipelines.survey.options import CrsOptions
 
 
 def _info(ctx: click.Context, workspace: Workspace, as_json: bool, **_values: Any) -> None:
-    from georef_cli.overview import whole
+    from georef_cli.output import whole
     from pipelines.deliver.overview import overview
 
     must_exist(workspace)

@@ -10,12 +10,12 @@ import click
 from georef_cli import options, tables
 from georef_cli.command import Command
 from georef_cli.display import progress_for
-from georef_cli.markup import shown
+from georef_cli.layout import shown
 from georef_cli.output import print_json, print_rich
 
 
 def _inspect(ctx: click.Context, bag: Path, as_json: bool) -> None:
-    from pipelines.ingest.bag.inspection import inspect_bag
+    from pipelines.ingest.bag_inspection import inspect_bag
 
     report = inspect_bag(bag, progress_for(ctx.obj))
     document = dataclasses.asdict(report)

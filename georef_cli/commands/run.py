@@ -12,25 +12,23 @@ import click
 from georef_cli import boundary, options
 from georef_cli.command import Command
 from georef_cli.display import is_told, progress_for
-from georef_cli.dry_run import announce_training, print_dry_run
-from georef_cli.forecast import forecast_run
+from georef_cli.forecast import RunTimeLeft, announce_training, forecast_run, print_dry_run
+from georef_cli.options import set_option, settings
 from georef_cli.output import print_outcomes
-from georef_cli.settings import set_option, settings
-from georef_cli.time_left import RunTimeLeft
 from pipelines.core import runner
 from pipelines.core.errors import GeorefError
-from pipelines.core.origins import names_of_flags
+from pipelines.core.plan import names_of_flags
 from pipelines.core.progress import SILENT, ProgressTask
 from pipelines.core.sentences import about
 from pipelines.core.stages import BY_NAME, DELIVERABLES, MODEL, PIPELINE, StageSpec, named_deliverables, stage_slice
 from pipelines.core.staleness import Flags, must_exist
 from pipelines.core.workspace import Workspace
 from pipelines.ingest.options import IngestOptions
-from pipelines.scene.crs_options import CrsOptions
+from pipelines.survey.options import CrsOptions
 
 if TYPE_CHECKING:
     from pipelines.deliver.overview import Overview
-    from pipelines.scene.report import EvaluationReport
+    from pipelines.survey.report import EvaluationReport
 
 log = logging.getLogger(__name__)
 
@@ -142,7 +140,7 @@ def _evaluated_cameras(workspace: Workspace) -> EvaluationReport | None:
     from pipelines.adjust.solution import posterior_of
     from pipelines.evaluate.options import EvaluateOptions
     from pipelines.evaluate.stage import evaluate
-    from pipelines.scene.trained_survey import load_solved
+    from pipelines.survey.trained_survey import load_solved
 
     try:
         solved = load_solved(workspace)

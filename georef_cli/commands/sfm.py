@@ -26,7 +26,7 @@ class _SfmCommand(StageCommand):
             with asked_engine(values):
                 super().act(ctx, **values)
             return
-        from pipelines.sfm.chunk_work import work_chunk
+        from pipelines.sfm.chunks import work_chunk
 
         worked = work_chunk(values["workspace"], name, progress_for(ctx.obj))
         if values["as_json"]:

@@ -12,7 +12,7 @@ import click
 from georef_cli import options
 from georef_cli.command import Command
 from georef_cli.display import progress_for
-from georef_cli.markup import shown
+from georef_cli.layout import shown
 from georef_cli.output import print_json, print_rich
 from pipelines.core.options import CONFIG_FILE, resolve
 from pipelines.core.sentences import duration

@@ -12,10 +12,10 @@ from georef_cli.command import Command
 from georef_cli.output import document_of_cautions, print_json, print_rich
 from pipelines.core import staleness as states
 from pipelines.core.options import notation
-from pipelines.core.origins import option_origins
+from pipelines.core.plan import option_origins
 from pipelines.core.stages import BY_NAME
 from pipelines.core.workspace import Workspace
-from pipelines.scene.headline import headline_of
+from pipelines.survey.headline import headline_of
 
 
 def _status(workspace: Workspace, with_options: bool, as_json: bool) -> None:

@@ -29,7 +29,7 @@ def topic_text(name: str) -> str:
 
 
 def _presets() -> str:
-    from pipelines.train.presets import PRESETS, RUN_MINUTES
+    from pipelines.train.options import PRESETS, RUN_MINUTES
 
     rows = [f"  {'':10}{'iterations':>10}{'longest side':>15}{'Gaussians':>12}{'time':>12}"]
     for name, preset in PRESETS.items():

@@ -13,10 +13,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from pipelines.core.types import FloatArray, IntArray
-from pipelines.formats.csv_writer import write_table
+from pipelines.formats.tables import write_table
 from pipelines.geodesy.enu import Origin, ecef_from_enu, lla_from_ecef
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.scene.report import AccuracySummary
+from pipelines.survey.report import AccuracySummary
 
 _CELLS = 48  # along the longer side of the grid
 _LEAST_RAYS = 3  # of an SfM point that counts as a part of the scene

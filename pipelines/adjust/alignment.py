@@ -44,9 +44,7 @@ from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import FloatArray
 from pipelines.geometry.rotations import exp_so3, log_so3
 from pipelines.geometry.similarity import Similarity, umeyama
-from pipelines.robust.kernels import cauchy_weight
-from pipelines.robust.ransac import RansacOptions, ransac
-from pipelines.robust.statistics import median_chi2, squared_mahalanobis
+from pipelines.robust.statistics import RansacOptions, cauchy_weight, median_chi2, ransac, squared_mahalanobis
 
 _WORST_ROTATION_RAD = np.radians(5.0)  # beyond, the linear covariance is not valid
 _FLAT = 0.02  # third extent of the layout over the first

@@ -2,8 +2,8 @@
 
 SfM delivers a bundle at its minimum, and `adjust.system` takes it from there. Measurements of another program come
 without that minimum. Gauss–Newton steps find it, with the same normal equations: the points are eliminated
-(`geometry.bundle_information`), the cameras solved (`adjust.system.NormalMatrix`), the points follow
-(`adjust.intersection_jacobian`). All observations have their stated weight: no kernel, no variance factor.
+(`geometry.bundle`), the cameras solved (`adjust.system.NormalMatrix`), the points follow
+(`adjust.posterior`). All observations have their stated weight: no kernel, no variance factor.
 """
 
 from __future__ import annotations
@@ -13,12 +13,17 @@ from functools import cached_property
 
 import numpy as np
 
-from pipelines.adjust.intersection_jacobian import IntersectionJacobian, intersection_jacobian
+from pipelines.adjust.posterior import IntersectionJacobian, intersection_jacobian
 from pipelines.adjust.system import NormalMatrix
 from pipelines.core.errors import ConvergenceError, DegenerateGeometryError, InputError
 from pipelines.core.types import FloatArray, IntArray
-from pipelines.geometry.bundle import Network, has_positive_depth, linearise_bundle, projection_residuals
-from pipelines.geometry.bundle_information import eliminate_points
+from pipelines.geometry.bundle import (
+    Network,
+    eliminate_points,
+    has_positive_depth,
+    linearise_bundle,
+    projection_residuals,
+)
 from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.similarity import jacobian_at
 

@@ -2,7 +2,7 @@
 
 Reads `ingest/survey.json`, and if any parameter is to be estimated, `ingest/track.npz` and `sfm/sparse`. Writes
 `calibrate/rig.json`. Its applied estimates change positions and attitudes when later stages read the survey
-(`scene.calibrated.load_survey`). The SfM model stays as it is.
+(`survey.calibrated.load_survey`). The SfM model stays as it is.
 """
 
 from __future__ import annotations
@@ -33,9 +33,8 @@ from pipelines.core.workspace import StageRun, Summary
 from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.rotations import log_so3
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.scene.navigation import NavigationTrack, load_track, require_estimable
-from pipelines.scene.rig import RigCalibration, RigEstimate, RigParameter
-from pipelines.scene.survey import Survey
+from pipelines.survey.calibrated import NavigationTrack, load_track, require_estimable
+from pipelines.survey.survey import RigCalibration, RigEstimate, RigParameter, Survey
 
 # A parameter without any information has an infinite σ, which JSON cannot hold.
 _ENDLESS = 1e6

@@ -12,7 +12,7 @@ from pipelines.core.types import FloatArray
 from pipelines.geodesy.vertical import FOOT_M, MOST_GEOID_M
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.robust.statistics import typical_sigma
-from pipelines.scene.survey import Survey
+from pipelines.survey.survey import Survey
 
 # A shift of all fixes up to this is everyday work with an autonomous base station.
 EVERYDAY_SHIFT_M = 5.0

@@ -29,16 +29,15 @@ from pipelines.core.sentences import listed
 from pipelines.core.stages import SPARSE
 from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.core.workspace import StageRun, Summary
+from pipelines.formats.cloud_ply import write_point_ply
 from pipelines.formats.colmap import read_sparse
-from pipelines.formats.point_ply import write_point_ply
 from pipelines.geometry.cameras import undistort
-from pipelines.geometry.intersection import intersect_rays
-from pipelines.geometry.rays import CommonRotation, Intersections, Rays, UncertainCameras
+from pipelines.geometry.intersection import CommonRotation, Intersections, Rays, UncertainCameras, intersect_rays
 from pipelines.geometry.rotations import log_so3
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.scene.calibrated import load_survey
-from pipelines.scene.geolocated import GeolocatedPoints
-from pipelines.scene.survey import Survey
+from pipelines.survey.adjustment import GeolocatedPoints
+from pipelines.survey.calibrated import load_survey
+from pipelines.survey.survey import Survey
 
 log = logging.getLogger(__name__)
 

@@ -26,9 +26,8 @@ from pipelines.geodesy.vertical import FOOT_M
 from pipelines.geometry.similarity import Similarity, umeyama
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.robust.patterns import blunders_among, scatter_about_median, two_groups
-from pipelines.robust.ransac import RansacOptions, ransac
-from pipelines.robust.statistics import median_chi2, outlier_gate, typical_sigma
-from pipelines.scene.survey import Survey
+from pipelines.robust.statistics import RansacOptions, median_chi2, outlier_gate, ransac, typical_sigma
+from pipelines.survey.survey import Survey
 
 # A hypothesis explains an inconsistency if it lowers the scatter by so much.
 _EXPLAINS = 2.0

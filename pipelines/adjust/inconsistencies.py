@@ -24,8 +24,8 @@ from pipelines.adjust.hypotheses import (
 from pipelines.adjust.joint import JointAdjustment
 from pipelines.adjust.observations import UnusedControlPoint, attitude_prior
 from pipelines.adjust.terms import ControlPoints, Fixes
-from pipelines.core.cautions import Caution
 from pipelines.core.errors import DegenerateGeometryError
+from pipelines.core.products import Caution
 from pipelines.core.sentences import listed
 from pipelines.core.types import FloatArray
 from pipelines.geometry.rotations import log_so3
@@ -33,8 +33,8 @@ from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.robust.patterns import median_spacing
 from pipelines.robust.statistics import outlier_gate, typical_sigma
-from pipelines.scene.survey import Survey
-from pipelines.scene.variance_factors import Group, VarianceFactor
+from pipelines.survey.report_parts import Group, VarianceFactor
+from pipelines.survey.survey import Survey
 
 _SIGMA_REFUTED = "sigma-refuted"
 # A stated σ that is too small by this factor is an inconsistency, if the scatter is so many metres or is explained.

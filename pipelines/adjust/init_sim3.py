@@ -25,10 +25,9 @@ from pipelines.core.stages import ADJUSTMENT, POINTS, SIM3, SIM3_POSTERIOR, SPAR
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.scene.calibrated import load_survey
-from pipelines.scene.geolocated import GeolocatedPoints
-from pipelines.scene.initial_similarity import InitialSimilarity
-from pipelines.scene.survey import Survey
+from pipelines.survey.adjustment import GeolocatedPoints, InitialSimilarity
+from pipelines.survey.calibrated import load_survey
+from pipelines.survey.survey import Survey
 
 
 def run(stage: StageRun, options: InitSim3Options) -> Summary:

@@ -24,18 +24,18 @@ from pipelines.core.types import BoolArray, FloatArray
 from pipelines.geometry.rotations import log_so3
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.scene.estimated_error import EstimatedError
-from pipelines.scene.initial_similarity import InitialSimilarity
-from pipelines.scene.marks import RayErrors, intersect_marks, mark_angles, mark_rays
-from pipelines.scene.scene import Scene, initial_scene
-from pipelines.scene.survey import Survey
-from pipelines.scene.variance_factors import (
+from pipelines.survey.adjustment import InitialSimilarity
+from pipelines.survey.marks import RayErrors, intersect_marks, mark_angles, mark_rays
+from pipelines.survey.report_parts import (
+    EstimatedError,
     Group,
     SigmaSource,
     VarianceFactor,
     applied_factors,
     with_variance_factors,
 )
+from pipelines.survey.scene import Scene, initial_scene
+from pipelines.survey.survey import Survey
 
 _ROUNDS, _SETTLED = 8, 0.02  # of the factors, and their relative change at which they are final
 _NEAR = 0.5  # relative change up to which the equations before it serve the first steps

@@ -21,10 +21,10 @@ from pipelines.adjust.system import Problem
 from pipelines.adjust.terms import Attitudes, ControlPoints, Fixes, Planes, Term, root_information
 from pipelines.core.errors import InputError
 from pipelines.core.types import FloatArray
-from pipelines.scene.initial_similarity import InitialSimilarity
-from pipelines.scene.marks import mark_rays
-from pipelines.scene.scene import Scene
-from pipelines.scene.survey import Survey
+from pipelines.survey.adjustment import InitialSimilarity
+from pipelines.survey.marks import mark_rays
+from pipelines.survey.scene import Scene
+from pipelines.survey.survey import Survey
 
 _LEAST_SIGMA_COMMON_M = 1e-4  # of an axis without a common error, where another axis has one
 

@@ -12,8 +12,8 @@ from pipelines.core.sentences import listed
 from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.geometry.rotations import log_so3, matrix_from_quat_xyzw
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.scene.marks import MarkRays, RayErrors, intersect_marks, mark_angles, mark_rays
-from pipelines.scene.survey import Survey
+from pipelines.survey.marks import MarkRays, RayErrors, intersect_marks, mark_angles, mark_rays
+from pipelines.survey.survey import Survey
 
 _CONTRADICTION_SIGMAS = 6.0
 _CONTRADICTION_RAD = np.radians(15.0)  # lower limit, because the σ of attitudes are often optimistic

@@ -7,7 +7,7 @@ from typing import Annotated, Literal, get_args
 from pydantic import Field
 
 from pipelines.core.options import WRITTEN, StageOptions, from_text, listed_names
-from pipelines.scene.rig import RigParameters
+from pipelines.survey.survey import RigParameters
 
 # Systematic errors to be estimated beside the common error of the fixes.
 EstimatedErrorName = Literal["lever-arm", "boresight"]

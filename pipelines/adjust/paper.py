@@ -14,8 +14,7 @@ from pipelines.core.types import BoolArray, FloatArray
 from pipelines.geometry.similarity import Similarity, jacobian_at, spread_ratio_similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.robust.statistics import ResidualStats, residual_stats, squared_mahalanobis
-from pipelines.scene.geolocated import GeolocatedPoints
-from pipelines.scene.initial_similarity import InitialSimilarity
+from pipelines.survey.adjustment import GeolocatedPoints, InitialSimilarity
 
 
 def similarity_by_paper(model: SparseModel, points: GeolocatedPoints, data: Correspondences) -> InitialSimilarity:

@@ -2,6 +2,8 @@
 
 The matrix is stored with the solution: whoever asks for a σ factorises it once, and solves nothing again. A wanted
 quantity is described by its derivatives by cameras and lens; points follow from the rays that intersect in them.
+
+Derivatives of intersected points by poses and lens of the cameras that see them.
 """
 
 from __future__ import annotations
@@ -15,17 +17,70 @@ from scipy.linalg import block_diag
 from scipy.sparse import bsr_matrix, csr_matrix, eye, kron
 
 from pipelines.adjust.accuracy_grid import AccuracyGrid
-from pipelines.adjust.intersection_jacobian import IntersectionJacobian, intersection_jacobian
 from pipelines.adjust.system import NormalMatrix
 from pipelines.core.errors import InputError
 from pipelines.core.products import load_npz, save_npz
 from pipelines.core.types import FloatArray, IntArray
-from pipelines.geometry.bundle import Network
+from pipelines.geometry.bundle import (
+    Network,
+    has_positive_depth,
+    lens_slots,
+    linearise_bundle,
+    with_positive_depths,
+)
 from pipelines.geometry.cameras import CameraPoses
 from pipelines.geometry.similarity import jacobian_at, second_moment_at
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.scene.marks import MarkRays
-from pipelines.scene.trained_model import Adjustment
+from pipelines.survey.marks import MarkRays
+from pipelines.survey.trained_model import Adjustment
+
+
+@dataclass(frozen=True)
+class IntersectionJacobian:
+    """Effect of poses, lens and marks on N intersected points, to first order.
+
+    Attributes:
+        by_poses: (3 N, 6 n) sparse, metres by (δω, δc) of each camera as in
+            `geometry.correction_basis.CorrectionBasis`.
+        by_lens: (N, 3, L) metres by the lens parameters, in the order of `CorrectionBasis`.
+        cov_of_marks: (N, 3, 3) m², from the σ of the marks; NaN for a point that its rays do not determine.
+    """
+
+    by_poses: csr_matrix
+    by_lens: FloatArray
+    cov_of_marks: FloatArray
+
+
+def intersection_jacobian(
+    marks: Network, sigma_px: FloatArray, surveyed: FloatArray | None = None
+) -> IntersectionJacobian:
+    """Return the derivatives by poses and lens of the points of a network, each intersected from its own marks.
+
+    The derivatives are taken at the projections of the points; the pixels of the marks do not enter. Marks of
+    points behind their camera do not count.
+
+    Args:
+        marks: N points, M marks.
+        sigma_px: (M,) σ of the marks.
+        surveyed: (N, 3, 3) information on the points beyond their marks, 1/m²; None: there is none.
+    """
+    sigma_px, marks = sigma_px[has_positive_depth(marks)], with_positive_depths(marks)
+    lin, count = linearise_bundle(marks), len(marks.point_in_world)
+    pull = np.swapaxes(lin.jacobian_point, 1, 2) / (sigma_px**2)[:, None, None]
+    normal = np.zeros((count, 3, 3)) if surveyed is None else surveyed.copy()
+    np.add.at(normal, marks.obs_point, pull @ lin.jacobian_point)
+    value, vector = np.linalg.eigh(normal)
+    value[value[:, 0] <= 1e-9 * value[:, 2]] = np.nan
+    cov = (vector / value[:, None, :]) @ np.swapaxes(vector, 1, 2)
+    response = -cov[marks.obs_point] @ pull  # (M, 3, 2) metres per pixel
+    lens = np.zeros((count, len(marks.cameras), 3, lin.jacobian_intrinsics.shape[2]))
+    np.add.at(lens, (marks.obs_point, lens_slots(marks)), response @ lin.jacobian_intrinsics)
+    order = np.argsort(marks.obs_point, kind="stable")
+    first = np.searchsorted(marks.obs_point[order], np.arange(count + 1))
+    blocks = ((response @ lin.jacobian_pose)[order], marks.obs_image[order], first)
+    poses = bsr_matrix(blocks, shape=(3 * count, 6 * len(marks.camera_id)))
+    return IntersectionJacobian(csr_matrix(poses), np.swapaxes(lens, 1, 2).reshape(count, 3, -1), cov)
+
 
 _ADVICE = "run `georef init-sim3` (and `georef train`) again"
 
@@ -39,7 +94,7 @@ class Posterior:
         sparse: the SfM model with the solved lenses.
         normal: matrix of the normal equations, in `model`.
         followed: (7, 6 n + L) mean similarity of the SfM points by corrections of cameras and lens.
-        lens: (ℓ,) lens parameters among the unknowns, of L in the order of `geometry.lens.Lenses`.
+        lens: (ℓ,) lens parameters among the unknowns, of L in the order of `geometry.cameras.Lenses`.
         camera_cov: (n, 6, 6) of (δθ [rad], δc [m]) of the cameras, along the axes of `geo`.
         grid: σ over the scene; None: the scene has too few points.
     """
@@ -112,7 +167,7 @@ class Posterior:
         return cov
 
     def of_lens(self) -> FloatArray | None:
-        """Return the covariance (L, L) of the lens parameters, in the order of `geometry.lens.Lenses`.
+        """Return the covariance (L, L) of the lens parameters, in the order of `geometry.cameras.Lenses`.
 
         None if the lens was held. Parameters that nothing reveals have zeros.
         """

@@ -26,17 +26,16 @@ from pipelines.adjust.solution import adjusted
 from pipelines.adjust.system import Problem, minimise
 from pipelines.adjust.terms import ControlPoints, Fixes
 from pipelines.adjust.variance_components import component_of
-from pipelines.core.cautions import NOT_CHECKED, Caution, union
 from pipelines.core.errors import ContradictionError, DegenerateGeometryError
+from pipelines.core.products import NOT_CHECKED, Caution, union
 from pipelines.core.sentences import listed
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
 from pipelines.geometry.similarity import SimilarityRecord
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.robust.statistics import residual_stats
-from pipelines.scene.geolocated import GeolocatedPoints
-from pipelines.scene.initial_similarity import AttitudeRecord, InitialSimilarity
-from pipelines.scene.scene import Scene, initial_scene
-from pipelines.scene.survey import Survey
+from pipelines.survey.adjustment import AttitudeRecord, GeolocatedPoints, InitialSimilarity
+from pipelines.survey.scene import Scene, initial_scene
+from pipelines.survey.survey import Survey
 
 _LEVEL = 0.01  # of the test that refutes σ where no joint adjustment is possible
 

@@ -20,7 +20,7 @@ from pipelines.adjust.system import (
     robust_weights,
 )
 from pipelines.adjust.terms import Attitudes, ControlPoints, Fixes
-from pipelines.core.cautions import union
+from pipelines.core.products import union
 from pipelines.core.stages import SIM3_POSTERIOR, SPARSE, TRAIN_POSTERIOR
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import Workspace
@@ -28,10 +28,10 @@ from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.cameras import CameraPoses
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.scene.initial_similarity import InitialSimilarity
-from pipelines.scene.report import AccuracySummary
-from pipelines.scene.scene import Scene
-from pipelines.scene.trained_model import (
+from pipelines.survey.adjustment import InitialSimilarity
+from pipelines.survey.report import AccuracySummary
+from pipelines.survey.scene import Scene
+from pipelines.survey.trained_model import (
     Adjustment,
     Measurement,
     TrainedCamera,

@@ -11,7 +11,7 @@ from pipelines.core.types import FloatArray
 from pipelines.geometry.cameras import CameraPoses
 from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.similarity import Similarity, perturbation
-from pipelines.scene.estimated_error import EstimatedError
+from pipelines.survey.report_parts import EstimatedError
 
 SIGMA_ARM_M = 1.0  # wider than any error of a mounting, and finite, so that unobservable errors show by their σ
 SIGMA_LIDAR_M = 1.0

@@ -2,7 +2,7 @@
 
 The unknowns are corrections x of all cameras, which contain a similarity of the whole, changes ℓ of the lens and
 systematic errors v. Image observations enter as the information of the bundle about SfM's minimum
-(`geometry.bundle_information`), with the points eliminated; all other measurements as terms (`adjust.terms`):
+(`geometry.bundle`), with the points eliminated; all other measurements as terms (`adjust.terms`):
 
     | N   Bᵀ | | x      |
     | B   C  | | border | ,   Schur complement of N: S = C − B N⁻¹ Bᵀ,   border = (ℓ, v).
@@ -30,10 +30,10 @@ from pipelines.adjust.state import State, SystematicErrors
 from pipelines.adjust.terms import At, CommonErrors, Slopes, Term
 from pipelines.core.errors import ConvergenceError, DegenerateGeometryError
 from pipelines.core.types import FloatArray, IntArray
-from pipelines.geometry.bundle_information import BundleInformation
+from pipelines.geometry.bundle import BundleInformation
 from pipelines.geometry.cameras import CameraPoses
 from pipelines.geometry.sparse_cholesky import SparseCholesky
-from pipelines.robust.kernels import NOISE_WEIGHT, cauchy_loss, cauchy_weight
+from pipelines.robust.statistics import NOISE_WEIGHT, cauchy_loss, cauchy_weight
 
 _ROUNDS = 150
 _STILL = 5e-6  # change of a whitened residual that ends the descent
@@ -434,7 +434,7 @@ def robust_weights(residuals: Residuals) -> dict[str, FloatArray]:
 def posterior_weights(residuals: Residuals) -> dict[str, FloatArray]:
     """Return the weights (M,), by kind, whose normal matrix is the inverse covariance of the estimate.
 
-    Cauchy's weight is also below 1 under pure noise (`robust.kernels.NOISE_WEIGHT`). A prior counts at most once.
+    Cauchy's weight is also below 1 under pure noise (`statistics.NOISE_WEIGHT`). A prior counts at most once.
     """
     weights = robust_weights(residuals)
     for kind, rows in residuals.items():

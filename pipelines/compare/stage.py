@@ -12,17 +12,16 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 
-from pipelines.compare.configurations import BY_CONFIGURATION, COMMON_TRAIN_OPTIONS, Configuration
-from pipelines.compare.files import write_comparison
+from pipelines.compare.configurations import BY_CONFIGURATION, COMMON_TRAIN_OPTIONS, Configuration, write_comparison
 from pipelines.compare.table import ComparedRow, Comparison, JsonScalar, point_accuracy, surface_accuracy
-from pipelines.core.cautions import union
 from pipelines.core.errors import ConvergenceError, DegenerateGeometryError, GeorefError
+from pipelines.core.products import union
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.runner import Outcome, run_pipeline, run_stage
 from pipelines.core.stages import ADJUST, BY_NAME, REPORT, StageSpec, stage_slice
 from pipelines.core.staleness import Flags, must_exist, stage_config
 from pipelines.core.workspace import Workspace
-from pipelines.scene.report import read_report
+from pipelines.survey.report import read_report
 
 log = logging.getLogger(__name__)
 

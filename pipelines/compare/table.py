@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Literal
 
-from pipelines.core.cautions import Caution
 from pipelines.core.figures import WAYS
-from pipelines.core.products import Product
-from pipelines.plots.bars import Panel
-from pipelines.scene.reference_report import ReferenceComparison
-from pipelines.scene.report import CheckPointErrors
+from pipelines.core.products import Caution, Product
+from pipelines.report.plots.charts import Panel
+from pipelines.survey.report import CheckPointErrors
+from pipelines.survey.report_parts import ReferenceComparison
 
 REFERENCE_HEADS = ("M3C2 median", "NMAD", "F1 0.05 m", "F1 0.1 m", "F1 0.3 m")
 JsonScalar = bool | int | float | str

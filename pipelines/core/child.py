@@ -2,6 +2,13 @@
 
 Native code hears no signals while it works, and its failed checks abort the process. In a child both are harmless:
 an interrupt kills the child at once, and a crash becomes one error. Parent and child exchange lines of JSON.
+
+Messages of a process to the one that started it: log records and progress as lines of JSON.
+
+How this program starts Python again, for native code, jobs, workers and compilers: the one place that knows.
+
+Python looks for modules in the current folder first when it is started with `-m` or `-c`. That folder belongs to
+the photographs, and a `queue.py` among them is a file of the user, not code of this program.
 """
 
 from __future__ import annotations
@@ -17,12 +24,12 @@ import sys
 import tempfile
 import threading
 import traceback
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, TextIO
 
 from pipelines.core import errors
-from pipelines.core.durable import storage_failure_of
 from pipelines.core.errors import (
     CrashError,
     GeorefError,
@@ -32,11 +39,133 @@ from pipelines.core.errors import (
     storage_error,
     storage_error_in,
 )
-from pipelines.core.messages import MessageReceiver, MessageSender, SentRecords
-from pipelines.core.progress import SILENT, Progress
-from pipelines.core.restart import python_command, python_environment
+from pipelines.core.files import storage_failure_of
+from pipelines.core.progress import SILENT, Progress, ProgressTask
 
 log = logging.getLogger(__name__)
+
+
+class MessageSender:
+    """Sender of messages, and the `Progress` of its process.
+
+    Args:
+        stream: that the receiver reads.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream, self._lock = stream, threading.Lock()
+
+    def send(self, kind: str, **content: Any) -> None:
+        """Send one message.
+
+        Raises:
+            OSError: nobody reads the stream.
+        """
+        with self._lock:
+            self._stream.write(json.dumps({"kind": kind, **content}) + "\n")
+            self._stream.flush()
+
+    @contextmanager
+    def task(self, name: str, total: int | None = None) -> Iterator[ProgressTask]:
+        """Open a task that the receiver shows."""
+        self.send("begin", name=name, total=total)
+        try:
+            yield _SentTask(self)
+        finally:
+            self.send("end")
+
+
+class _SentTask:
+    def __init__(self, sender: MessageSender) -> None:
+        self._sender = sender
+
+    def advance(self, steps: int = 1, note: str = "", left_s: float | None = None) -> None:
+        """Send the steps."""
+        self._sender.send("advance", steps=steps, note=note, left_s=left_s)
+
+
+class SentRecords(logging.Handler):
+    """Handler that sends log records."""
+
+    def __init__(self, sender: MessageSender) -> None:
+        super().__init__()
+        self._sender = sender
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Send a record."""
+        self._sender.send("log", name=record.name, level=record.levelno, text=self.format(record))
+
+
+class MessageReceiver:
+    """Receiver that shows the tasks of another process, and logs its records as those of this process.
+
+    Args:
+        progress: shows the tasks.
+    """
+
+    def __init__(self, progress: Progress) -> None:
+        self._progress = progress
+        self._open: list[tuple[AbstractContextManager[ProgressTask], ProgressTask]] = []
+
+    def take(self, message: Mapping[str, Any]) -> bool:
+        """Return whether a message was one of progress or of the log, and act on it."""
+        match message["kind"]:
+            case "log":
+                self.log(message["name"], message["level"], message["text"])
+            case "begin":
+                context = self._progress.task(message["name"], message["total"])
+                self._open.append((context, context.__enter__()))
+            case "advance":
+                self._open[-1][1].advance(message["steps"], message["note"], message["left_s"])
+            case "end":
+                self._open.pop()[0].__exit__(None, None, None)
+            case _:
+                return False
+        return True
+
+    def log(self, name: str, level: int, text: str) -> None:
+        """Log a record of the other process."""
+        logging.getLogger(name).log(level, "%s", text)
+
+    def close(self) -> None:
+        """Close the tasks that the other process has left open."""
+        while self._open:
+            self._open.pop()[0].__exit__(None, None, None)
+
+
+# Arguments of Python that start the command line.
+THIS_PROGRAM = ("-m", "georef_cli")
+_HOME = Path(__file__).parents[2]
+
+
+def python_command(arguments: Sequence[str]) -> list[str]:
+    """Return the command that runs this Python, which takes no module from the current folder.
+
+    Args:
+        arguments: of Python, such as `-m` and a module.
+    """
+    return [sys.executable, "-P", *arguments]
+
+
+def python_environment() -> dict[str, str]:
+    """Return this environment, in which Python finds the modules that this process finds, and none beside the data.
+
+    The safe path is also a variable, for what libraries start by themselves: Dask's nannies spawn their workers.
+    A checkout that is itself the current folder comes last, behind the standard library and installed packages.
+    """
+    path = [entry for entry in sys.path if Path(entry).is_absolute() and not _is_current(Path(entry))]
+    if _is_current(_HOME):
+        path.append(str(_HOME))
+    return {**os.environ, "PYTHONSAFEPATH": "1", "PYTHONPATH": os.pathsep.join(path)}
+
+
+def _is_current(folder: Path) -> bool:
+    """Return whether a folder is the current one, by whatever name."""
+    try:
+        return folder.samefile(os.curdir)
+    except OSError:  # Python lists a `python311.zip` that does not exist.
+        return False
+
 
 _LIBRARY = "pipelines"
 _DIE_WITH_PARENT = 1  # PR_SET_PDEATHSIG of Linux

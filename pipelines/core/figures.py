@@ -1,7 +1,7 @@
 """Accuracy figures, each defined once (label, meaning, unit, decimals); and the headline, the accuracy of a result.
 
 Tables, pages and sentences take their words and decimals from here, so that one figure has one name and the same
-digits everywhere. `scene.headline` says which figure is the headline of a workspace.
+digits everywhere. `survey.trained_model` says which figure is the headline of a workspace.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Figure:
 ACCURACY_H = Figure("H", "horizontal accuracy", "cm", 1)
 ACCURACY_V = Figure("V", "vertical accuracy", "cm", 1)
 CHECK_POINTS = Figure("checks", "check points that the accuracy was measured at", "", 0)
-# Errors of surveyed points, by field of `scene.report.ErrorStats`.
+# Errors of surveyed points, by field of `survey.report.ErrorStats`.
 ERRORS = {
     "count": Figure("points", "points", "", 0),
     "mean_e_m": Figure("mean E", "mean error east (bias)"),
@@ -64,7 +64,7 @@ ERRORS = {
     "max_v_m": Figure("max V", "largest vertical error"),
     "max_3d_m": Figure("max 3D", "largest error in three dimensions"),
 }
-# Predicted σ over the cells of the scene, by the beginning of the fields of `scene.report.AccuracySummary`.
+# Predicted σ over the cells of the scene, by the beginning of the fields of `survey.report.AccuracySummary`.
 CELLS = {
     "least": Figure("least", "σ of the best cell of the scene"),
     "median": Figure("median", "median σ over the cells of the scene"),

@@ -2,21 +2,163 @@
 
 A named pipe blocks its reader until somebody writes, and a device may deliver bytes without end. Archives state how
 large their content is: a few kilobytes can ask for gigabytes.
+
+Files that survive a power failure: flushed to the disk before a name leads to them.
 """
 
 from __future__ import annotations
 
+import contextlib
 import math
+import os
+import shutil
 import stat
+import sys
+import tempfile
 import zipfile
-from collections.abc import Collection
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
+from pipelines.core.errors import InputError, StorageError, storage_error
 
-from pipelines.core.errors import InputError
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+_PROBE_BYTES = 1 << 20
+
+
+def replace_file(draft: Path, path: Path) -> None:
+    """Rename a complete draft to `path`; after a power failure `path` is the old or the new file, whole.
+
+    Raises:
+        OSError: the draft cannot be flushed or renamed.
+    """
+    sync_file(draft)
+    draft.replace(path)
+    sync_folder(path.parent)
+
+
+@contextmanager
+def replacing(path: Path, draft: Path) -> Iterator[None]:
+    """Rename a draft to `path` when it was written; one that cannot be completed keeps no room on a full disk.
+
+    Raises:
+        OSError: the file cannot be written; an existing one stays.
+    """
+    try:
+        yield
+        replace_file(draft, path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            draft.unlink()
+        raise
+
+
+def replace_text(path: Path, text: str) -> None:
+    """Write a text file; an existing file is replaced when the new one is complete.
+
+    Raises:
+        OSError: the file cannot be written; the existing one stays.
+    """
+    replace_texts({path: text})
+
+
+def replace_texts(texts: Mapping[Path, str]) -> None:
+    """Write text files; existing ones are replaced when all new ones are complete.
+
+    Raises:
+        OSError: a file cannot be written; the existing ones stay, and no draft is left.
+    """
+    drafts = {path: path.with_name(f"{path.name}.tmp") for path in texts}
+    path = None
+    try:
+        for path, text in texts.items():
+            drafts[path].write_text(text, encoding="utf-8", newline="")
+            sync_file(drafts[path])
+        for path, draft in drafts.items():
+            draft.replace(path)
+    except OSError as error:
+        for draft in drafts.values():
+            with contextlib.suppress(OSError):
+                draft.unlink()
+        error.filename = str(path)  # a full disk is noticed by `write`, which knows no name
+        raise
+    for folder in {path.parent for path in texts}:
+        sync_folder(folder)
+
+
+def replace_folder(draft: Path, folder: Path, aside: Path) -> None:
+    """Rename a complete and flushed draft to `folder`; an existing folder is moved to `aside` first.
+
+    If the draft cannot be renamed, the existing folder returns to its place.
+
+    Raises:
+        OSError: a folder cannot be renamed.
+    """
+    if folder.exists():
+        remove(aside)
+        folder.rename(aside)
+    try:
+        draft.rename(folder)
+    except OSError:
+        if aside.exists():
+            aside.rename(folder)
+        raise
+    sync_folder(folder.parent)
+
+
+def sync_file(path: Path) -> None:
+    """Flush a file's content to the disk."""
+    with path.open("r+b" if os.access(path, os.W_OK) else "rb") as handle:
+        os.fsync(handle.fileno())
+
+
+def sync_folder(path: Path) -> None:
+    """Flush the names in a folder to the disk; Windows does so by itself."""
+    if sys.platform == "win32":
+        return
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def sync_tree(folder: Path) -> None:
+    """Flush all files and folders below a folder, and itself, to the disk."""
+    for path in folder.rglob("*"):
+        if path.is_symlink():
+            continue
+        if path.is_dir():
+            sync_folder(path)
+        elif path.is_file():
+            sync_file(path)
+    sync_folder(folder)
+
+
+def storage_failure_of(folder: Path) -> StorageError | None:
+    """Return the failure that meets whoever writes a megabyte into a folder, or None."""
+    try:
+        with tempfile.TemporaryFile(dir=folder) as handle:
+            handle.write(bytes(_PROBE_BYTES))
+            handle.flush()
+            os.fsync(handle.fileno())
+    except OSError as error:
+        error.filename = str(folder)
+        return storage_error(error)
+    return None
+
+
+def remove(path: Path) -> None:
+    """Remove a folder, a file, or a symbolic link but not its target; a missing path is no error."""
+    if path.is_symlink() or path.is_file():
+        path.unlink()
+    elif path.exists():
+        shutil.rmtree(path)
+
 
 _SPECIAL = {
     stat.S_IFIFO: "a named pipe",
@@ -89,6 +231,8 @@ def read_npz(path: Path, names: Collection[str] | None = None) -> dict[str, NDAr
 
 
 def _read_array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> NDArray[Any]:
+    from numpy.lib import format as npy
+
     with archive.open(entry) as stream:
         shape, dtype = _header(stream)
         body = entry.file_size - stream.tell()
@@ -98,13 +242,15 @@ def _read_array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> NDArray[Any
     if promised != body:
         raise ValueError(f"the header of {entry.filename} promises {promised} bytes, the entry holds {body}")
     with archive.open(entry) as stream:
-        array: NDArray[Any] = np.lib.format.read_array(stream, allow_pickle=False)
+        array: NDArray[Any] = npy.read_array(stream, allow_pickle=False)
     return array
 
 
 def _header(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    version = np.lib.format.read_magic(stream)
-    readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    from numpy.lib import format as npy  # numpy costs time, and every command imports this file
+
+    version = npy.read_magic(stream)
+    readers = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
     if version not in readers:
         raise ValueError(f"version {version} of NPY is unknown")
     shape, _, dtype = readers[version](stream)

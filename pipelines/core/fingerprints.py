@@ -1,4 +1,7 @@
-"""Hashes of the inputs of a stage: equal hashes and equal options mean an equal product."""
+"""Hashes of the inputs of a stage: equal hashes and equal options mean an equal product.
+
+Versions of this package and of the libraries whose results depend on their version.
+"""
 
 from __future__ import annotations
 
@@ -8,9 +11,11 @@ import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from pipelines import __version__
 from pipelines.core.errors import InputError, MissingProductError
 from pipelines.core.files import file_size
 from pipelines.core.manifest import FileRecord, Memo, hash_file
@@ -228,3 +233,18 @@ def _input_files(folder: Path, workspace_root: Path, marker: InputMarker) -> lis
 
 def _files(folder: Path) -> list[Path]:
     return sorted(file for file in folder.rglob("*") if file.is_file())
+
+
+LIBRARIES = ("numpy", "pycolmap", "torch", "numba", "pyproj")
+NOT_INSTALLED = "not installed"
+
+
+def library_versions(libraries: Sequence[str] = LIBRARIES) -> dict[str, str]:
+    """Return the versions by distribution, this package's first; `not installed` for a missing one."""
+    versions = {"georefgs": __version__}
+    for name in libraries:
+        try:
+            versions[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            versions[name] = NOT_INSTALLED
+    return versions

@@ -10,8 +10,8 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, FiniteFloat, model_validator
 
-from pipelines.core.cautions import Caution
 from pipelines.core.files import file_size
+from pipelines.core.products import Caution
 
 MANIFEST = "manifest.json"
 Memo = dict[Path, str]

@@ -1,29 +1,105 @@
-"""Plan of a run: what each stage would do, and why, without doing it."""
+"""Plan of a run: what each stage would do, and why, without doing it.
+
+Origin of each option's value: default, `georef.toml`, an earlier request, or the present command line.
+
+Folder of a survey's photographs, also after it was moved.
+"""
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from pathlib import Path
+from typing import Any, Literal
 
 from pipelines.core.errors import InputError
-from pipelines.core.guards import damaged_product, is_unfinished, refuse_loss, refuse_loss_by_options
 from pipelines.core.manifest import Memo
-from pipelines.core.options import StageOptions, flag_name, input_paths
-from pipelines.core.origins import OptionOrigin, option_origins
-from pipelines.core.stages import StageSpec, producer_of
+from pipelines.core.options import StageOptions, flag_name, input_paths, load_toml
+from pipelines.core.stages import BY_NAME, StageSpec, producer_of
 from pipelines.core.staleness import (
     BY_HAND,
     Flags,
     changed_inputs,
     changed_options,
+    damaged_product,
     found_interrupted,
+    is_unfinished,
+    refuse_loss,
+    refuse_loss_by_options,
     request,
     stage_config,
     why_damaged,
     why_stale,
 )
 from pipelines.core.workspace import Workspace
+
+Origin = Literal["default", "georef.toml", "remembered", "command line"]
+
+
+@dataclass(frozen=True)
+class OptionOrigin:
+    """Value of an option, and where the value comes from.
+
+    Attributes:
+        stage: the subcommand.
+        flag: of the command line.
+        value: the resolved value.
+        origin: `remembered` is a flag of an earlier command.
+    """
+
+    stage: str
+    flag: str
+    value: Any
+    origin: Origin
+
+
+def option_origins(workspace: Workspace, spec: StageSpec, flags: Flags | None = None) -> list[OptionOrigin]:
+    """Return the options of a stage whose value is no default, with their origins.
+
+    Args:
+        workspace: holds `georef.toml` and the remembered options.
+        spec: the stage.
+        flags: the present request; None: what is remembered.
+
+    Raises:
+        InputError: an option is unknown or invalid.
+    """
+    remembered = workspace.requests().get(spec.name, {})
+    asked = remembered if flags is None else flags
+    options = stage_config(workspace, spec, asked)
+    table = load_toml(workspace.config_file, BY_NAME).get(spec.name, {})
+    rows = []
+    for name in type(options).model_fields:
+        origin: Origin = "default"
+        if name in asked:
+            is_old = flags is None or (name in remembered and remembered[name] == _plain(options, name))
+            origin = "remembered" if is_old else "command line"
+        elif name in table:
+            origin = "georef.toml"
+        if origin != "default":
+            rows.append(OptionOrigin(spec.name, flag_name(type(options), name), getattr(options, name), origin))
+    return rows
+
+
+def names_of_flags(options_type: type[StageOptions], flags: Collection[str]) -> list[str]:
+    """Return the fields of the flags that a user names, without dashes in front: `gcp`, `max-image-size`.
+
+    Raises:
+        ValueError: no option has one of the names.
+    """
+    by_flag = {flag_name(options_type, name).removeprefix("--"): name for name in options_type.model_fields}
+    named = [text.removeprefix("--").replace("_", "-") for text in flags]
+    unknown = [text for text in named if text not in by_flag]
+    if unknown:
+        raise ValueError(f"{unknown[0]!r} is no option; the options are {', '.join(by_flag)}")
+    return [by_flag[text] for text in named]
+
+
+def _plain(options: StageOptions, name: str) -> Any:
+    """Return an option's value as JSON has it, the form in which it is remembered."""
+    return options.model_dump(mode="json")[name]
+
 
 Action = Literal["run", "resume", "extend", "keep", "perhaps", "refuse"]
 
@@ -130,3 +206,24 @@ def _require_inputs(options: StageOptions) -> None:
     for name, path in input_paths(options).items():
         if not path.exists():
             raise InputError("no such file or folder", path=path, field=flag_name(type(options), name))
+
+
+def photograph_folder(workspace: Workspace, image_dir: str) -> Path:
+    """Return the folder of photographs that a survey names; if it is gone, the one that `ingest` is to read now.
+
+    Whoever reads a photograph compares its hash with that of the survey.
+
+    Args:
+        workspace: of the survey.
+        image_dir: of the survey: absolute, or inside the workspace.
+    """
+    home = workspace.base or workspace
+    named = home.root / image_dir
+    if named.is_dir():
+        return named
+    spec = BY_NAME["ingest"]
+    with contextlib.suppress(InputError):
+        images: Path | None = getattr(stage_config(home, spec, home.requests().get(spec.name, {})), "images", None)
+        if images is not None and images.is_dir():
+            return images
+    return named

@@ -1,21 +1,24 @@
-"""Runner of the stages in a workspace; stages whose product is current are skipped."""
+"""Runner of the stages in a workspace; stages whose product is current are skipped.
+
+Traces of a refused command: a workspace that was not there before, and in which no stage has ended.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import logging
 import time
-from collections.abc import Callable, Collection, Mapping
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
 
-from pipelines.core.cautions import AT_END, union
-from pipelines.core.durable import remove
 from pipelines.core.errors import (
     ConvergenceError,
     DamagedPartialError,
@@ -23,39 +26,84 @@ from pipelines.core.errors import (
     GeorefError,
     InputError,
     MissingProductError,
+    WorkspaceBusyError,
     storage_failures,
 )
-from pipelines.core.guards import (
-    damaged_product,
-    extendable_product,
-    is_unfinished,
-    refuse_damaged_inputs,
-    refuse_loss,
-    refuse_loss_by_options,
-    warn_of_stale_inputs,
-)
+from pipelines.core.files import remove
+from pipelines.core.fingerprints import library_versions
+from pipelines.core.lock import WriteLock
 from pipelines.core.manifest import Manifest, Memo, record_files
+from pipelines.core.options import REQUESTS
+from pipelines.core.products import AT_END, union
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.sentences import duration
-from pipelines.core.stages import StageSpec, products_of
+from pipelines.core.stages import STAGES, StageSpec, products_of
 from pipelines.core.staleness import (
     BY_HAND,
     Flags,
     Request,
     cautions_by_stage,
     continuing_command,
+    damaged_product,
+    extendable_product,
     found_interrupted,
+    is_unfinished,
     must_exist,
+    refuse_damaged_inputs,
+    refuse_loss,
+    refuse_loss_by_options,
     request,
     stage_config,
+    warn_of_stale_inputs,
     why_damaged,
     why_stale,
 )
-from pipelines.core.traces import no_traces_of_refusal
-from pipelines.core.versions import library_versions
 from pipelines.core.workspace import Resume, StageRun, Summary, Workspace, now
 
 log = logging.getLogger(__name__)
+
+
+@contextmanager
+def no_traces_of_refusal(workspace: Workspace) -> Iterator[None]:
+    """Remove what a command wrote, if it fails before the first product of a new workspace.
+
+    Files of others in the folder stay, `georef.toml` among them. An interrupted command keeps what it has written:
+    it can be completed.
+
+    Args:
+        workspace: not locked by this process.
+
+    Raises:
+        GeorefError: the failure.
+    """
+    missing = [folder for folder in (workspace.root, *workspace.root.parents) if not folder.exists()]
+    is_new = workspace.base is None and not workspace.has_begun()
+    try:
+        yield
+    except WorkspaceBusyError:
+        raise
+    except GeorefError:
+        if is_new and not workspace.has_product():
+            with contextlib.suppress(OSError, GeorefError):
+                _clear(workspace, missing)
+        raise
+
+
+def _clear(workspace: Workspace, missing: Sequence[Path]) -> None:
+    """Remove lock, logs, requests and partial products, and the folders that were missing, if they are empty."""
+    if not workspace.root.is_dir():
+        return
+    lock = WriteLock(workspace.root)
+    with lock.hold("cleaning up"):
+        for spec in STAGES:
+            remove(workspace.partial(spec))
+            workspace.log_file(spec).unlink(missing_ok=True)
+        (workspace.root / REQUESTS).unlink(missing_ok=True)
+        lock.discard()
+    for folder in (workspace.root / "logs", *missing):
+        with contextlib.suppress(OSError):  # of others, or not empty
+            folder.rmdir()
+
 
 # Numbers that no matrix, no float and no product can hold.
 _WITHOUT_SOLUTION = (np.linalg.LinAlgError, OverflowError, FloatingPointError, RecursionError, ValidationError)

@@ -219,7 +219,7 @@ PIPELINE: tuple[StageSpec, ...] = (
         growing=("iterations",),
         also=(TRAIN_POSTERIOR,),
         working=("checkpoint.npz",),
-        in_parts="pipelines.blocks.stage",
+        in_parts="pipelines.train.blocks.stage",
     ),
     StageSpec(
         name="evaluate",
@@ -257,7 +257,7 @@ DELIVERABLES: tuple[StageSpec, ...] = (
     ),
     StageSpec(
         name="export-raster",
-        module="pipelines.deliver.raster.stage",
+        module="pipelines.deliver.raster",
         options_place="pipelines.deliver.options:ExportRasterOptions",
         folder="raster",
         reads=(MEASURED, *whole(SPARSE, MODEL, TRAIN_POSTERIOR, GAUSSIANS, SIM3), APPLIED_RIG, HEADLINE),
@@ -268,7 +268,7 @@ DELIVERABLES: tuple[StageSpec, ...] = (
     ),
     StageSpec(
         name="export-cloud",
-        module="pipelines.deliver.cloud.stage",
+        module="pipelines.deliver.cloud",
         options_place="pipelines.deliver.options:ExportCloudOptions",
         folder="cloud",
         reads=(MEASURED, *whole(SPARSE, MODEL, TRAIN_POSTERIOR, GAUSSIANS, SIM3), APPLIED_RIG, HEADLINE),
@@ -287,7 +287,7 @@ DELIVERABLES: tuple[StageSpec, ...] = (
     ),
     StageSpec(
         name="export-tiles",
-        module="pipelines.deliver.tiles.stage",
+        module="pipelines.deliver.tiles",
         options_place="pipelines.deliver.options:ExportTilesOptions",
         folder="tiles",
         reads=(MEASURED, *whole(MODEL, GAUSSIANS), APPLIED_RIG, HEADLINE),
@@ -297,7 +297,7 @@ DELIVERABLES: tuple[StageSpec, ...] = (
     ),
     StageSpec(
         name="export-cameras",
-        module="pipelines.deliver.cameras.stage",
+        module="pipelines.deliver.cameras",
         options_place="pipelines.deliver.options:ExportCamerasOptions",
         folder="cameras",
         reads=(MEASURED, *SOLVED, APPLIED_RIG, HEADLINE),
@@ -356,8 +356,8 @@ ADJUST = StageSpec(
 # Parts of a training in blocks, in variants of the workspace: all once, but for those of each block.
 PLAN_BLOCKS = StageSpec(
     name="plan",
-    module="pipelines.blocks.plan",
-    options_place="pipelines.blocks.options:PlanOptions",
+    module="pipelines.train.blocks.plan",
+    options_place="pipelines.train.blocks.options:PlanOptions",
     folder="plan",
     reads=(MEASURED, *whole(SPARSE, SIM3, ADJUSTMENT), APPLIED_RIG),
     product=BLOCK_PLAN,
@@ -365,7 +365,7 @@ PLAN_BLOCKS = StageSpec(
 )
 SOLVE = StageSpec(
     name="solve",
-    module="pipelines.train.solution",
+    module="pipelines.train.blocks.solution",
     options_place="pipelines.train.options:SolutionOptions",
     folder="solution",
     reads=(MEASURED, *whole(SPARSE, SIM3, ADJUSTMENT), APPLIED_RIG),
@@ -374,7 +374,7 @@ SOLVE = StageSpec(
 )
 TRAIN_SCAFFOLD = StageSpec(
     name="scaffold",
-    module="pipelines.train.scaffold",
+    module="pipelines.train.blocks.scaffold",
     options_place="pipelines.train.options:TrainOptions",
     folder="scaffold",
     reads=(MEASURED, *whole(SPARSE, SIM3, SOLUTION), APPLIED_RIG),
@@ -385,7 +385,7 @@ TRAIN_SCAFFOLD = StageSpec(
 )
 TRAIN_BLOCK = StageSpec(
     name="block",
-    module="pipelines.train.block",
+    module="pipelines.train.blocks.block",
     options_place="pipelines.train.options:BlockTrainOptions",
     folder="block",
     reads=(MEASURED, *whole(SPARSE, SIM3, BLOCK_PLAN, SOLUTION, SCAFFOLD), APPLIED_RIG),
@@ -398,7 +398,7 @@ TRAIN_BLOCK = StageSpec(
 )
 TRAIN_SEAMS = StageSpec(
     name="seams",
-    module="pipelines.train.seams",
+    module="pipelines.train.blocks.seams",
     options_place="pipelines.train.options:SeamOptions",
     folder="seams",
     reads=(MEASURED, *whole(SPARSE, SIM3, BLOCK_PLAN, SOLUTION, SCAFFOLD), APPLIED_RIG),

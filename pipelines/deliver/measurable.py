@@ -11,6 +11,8 @@ surface is wrong by a part of the Gaussian's size. So:
 
 Reads `ingest/survey.json`, the photographs, `sfm/sparse`, `train/model.json` and `train/gaussians.ply`. Writes
 `measurable/splat.measurable.ply` and its sidecar, beside `export/splat.ply` of `export-ply`.
+
+Predicted σ of the georeference over the scene, for files that state it.
 """
 
 from __future__ import annotations
@@ -25,25 +27,21 @@ import torch
 from scipy.spatial import ConvexHull, KDTree
 from torch import Tensor
 
+from pipelines.adjust.accuracy_grid import AccuracyGrid
+from pipelines.adjust.solution import posterior_of
 from pipelines.core.errors import DegenerateGeometryError, ResourceError
+from pipelines.core.products import is_checked
 from pipelines.core.progress import Progress
 from pipelines.core.sentences import about
 from pipelines.core.stages import MEASURABLE_SPLAT
-from pipelines.core.workspace import StageRun, Summary
+from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.deliver.options import MeasurableOptions
 from pipelines.deliver.placement import place
 from pipelines.deliver.ply import write_ply
 from pipelines.deliver.splat import SplatFigures, placed_splat
 from pipelines.geometry.cameras import pose_matrix
 from pipelines.geometry.similarity import Similarity
-from pipelines.scene.headline import headline_of
-from pipelines.scene.renderer import ModelRenderer
-from pipelines.scene.scene import photographs
-from pipelines.scene.surface_cloud.fusion import SurfaceCloud, fused_squares, fusion_settings
-from pipelines.scene.surface_cloud.plan import pixel_on_surface_m
-from pipelines.scene.surface_views import SurfaceView, SurfaceViews
-from pipelines.scene.trained_survey import TrainedSurvey, load_trained
-from pipelines.splat.contributions import view_contributions
+from pipelines.splat.densify import view_contributions
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.memory import USABLE, TrainingSize, free_memory_bytes, predicted_peak_bytes
 from pipelines.splat.metrics import psnr
@@ -51,7 +49,12 @@ from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings
 from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.splat.repainting import ShownView, repainted, shuffled_passes
 from pipelines.splat.sh import coefficient_count
-from pipelines.splat.surface_discs import surface_discs
+from pipelines.splat.surface import surface_discs
+from pipelines.surface.fusion import SurfaceCloud, fused_squares, fusion_settings, pixel_on_surface_m
+from pipelines.surface.surface_views import ModelRenderer, SurfaceView, SurfaceViews
+from pipelines.survey.headline import headline_of
+from pipelines.survey.scene import photographs
+from pipelines.survey.trained_survey import SolvedSurvey, TrainedSurvey, load_trained
 
 log = logging.getLogger(__name__)
 
@@ -296,3 +299,18 @@ def _psnr_change_db(before: ModelRenderer, after: ModelRenderer, progress: Progr
             changes.append(now - was)
             task.advance()
     return float(np.mean(changes)) if changes else None
+
+
+def predicted_sigma(workspace: Workspace, solved: SolvedSurvey) -> tuple[AccuracyGrid | None, str]:
+    """Return the predicted σ over the scene; None, with the reason as the end of a sentence, if it is not known.
+
+    Nothing is stated where nothing checks it.
+
+    Raises:
+        MissingProductError: the solution was stored without its covariances.
+        InputError: a product is damaged.
+    """
+    if not is_checked(solved.model.cautions):
+        return None, "nothing checks the σ of the positions"
+    grid = posterior_of(workspace, solved.model, solved.sfm).grid
+    return grid, "" if grid is not None else "the scene has too few points"

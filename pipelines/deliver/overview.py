@@ -11,26 +11,25 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.core.cautions import Caution
 from pipelines.core.errors import GeorefError
 from pipelines.core.figures import Headline
-from pipelines.core.products import load_json
+from pipelines.core.products import Caution, load_json
 from pipelines.core.stages import BY_NAME, DELIVERABLES, GAUSSIANS, MODEL, REPORT, StageSpec
 from pipelines.core.staleness import StageState, cautions_by_stage, status
 from pipelines.core.types import FloatArray, Vector3
 from pipelines.core.workspace import Workspace
+from pipelines.deliver.options import PURPOSES
 from pipelines.deliver.placement import place
-from pipelines.deliver.purposes import PURPOSES
-from pipelines.formats.geojson import Json, feature, polygon
 from pipelines.formats.splat_ply import read_centres
+from pipelines.formats.vector_files import Json, feature, polygon
 from pipelines.geodesy.enu import ecef_from_enu, lla_from_ecef
-from pipelines.scene.calibrated import load_survey
-from pipelines.scene.crs_options import CrsOptions
-from pipelines.scene.headline import headline_of
-from pipelines.scene.report import read_report
-from pipelines.scene.survey import Survey
-from pipelines.scene.target_crs import usable_crs
-from pipelines.scene.trained_model import TrainedModel
+from pipelines.survey.calibrated import load_survey
+from pipelines.survey.headline import headline_of
+from pipelines.survey.options import CrsOptions
+from pipelines.survey.report import read_report
+from pipelines.survey.survey import Survey
+from pipelines.survey.target_crs import usable_crs
+from pipelines.survey.trained_model import TrainedModel
 
 _RIM = 0.01  # fraction of the Gaussians outside the bounds at either end: sky, and floaters
 _MOST = 100_000  # Gaussians that the bounds are taken from

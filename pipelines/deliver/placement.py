@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pipelines.core.cautions import Caution, is_checked
 from pipelines.core.figures import Headline
+from pipelines.core.products import Caution, is_checked
 from pipelines.core.types import FloatArray, Quaternion, Row7, Vector3
 from pipelines.formats.georef_sidecar import GeoreferenceSigma, GeorefSidecar, georeference_sigma
 from pipelines.geodesy.crs import ECEF, parse_crs
@@ -28,8 +28,8 @@ from pipelines.geodesy.enu import (
 from pipelines.geodesy.vertical import VerticalDatum
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
 from pipelines.geometry.similarity import Similarity, SimilarityRecord, moved_pivot
-from pipelines.scene.survey import Survey
-from pipelines.scene.trained_model import Adjustment
+from pipelines.survey.survey import Survey
+from pipelines.survey.trained_model import Adjustment
 
 _ORIGIN_DECIMALS_DEG = 6  # 0.1 m: short numbers can be copied without loss
 _ORIGIN_DECIMALS_M = 1

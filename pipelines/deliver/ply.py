@@ -13,7 +13,7 @@ from pipelines.core.workspace import StageRun, Summary
 from pipelines.deliver.options import ExportPlyOptions
 from pipelines.deliver.splat import PlacedSplat, load_splat
 from pipelines.formats.georef_sidecar import write_sidecar
-from pipelines.splat.storage import write_gaussians
+from pipelines.splat.gaussians import write_gaussians
 
 
 def run(stage: StageRun, options: ExportPlyOptions) -> Summary:

@@ -19,14 +19,12 @@ from pipelines.core.workspace import Workspace
 from pipelines.deliver.options import SplatOptions, WebSplatOptions
 from pipelines.deliver.placement import Placement, place
 from pipelines.formats.splat_ply import SplatArrays, read_centres, read_logit_opacities
-from pipelines.scene.block_record import BlockRecord
-from pipelines.scene.calibrated import load_survey
-from pipelines.scene.headline import headline_of
-from pipelines.scene.trained_model import TrainedModel
-from pipelines.splat.gaussians import Gaussians
+from pipelines.splat.gaussians import Gaussians, read_gaussians, transformed
 from pipelines.splat.sh import coefficient_count
-from pipelines.splat.storage import read_gaussians
-from pipelines.splat.transform import transformed
+from pipelines.survey.block_plan import BlockRecord
+from pipelines.survey.calibrated import load_survey
+from pipelines.survey.headline import headline_of
+from pipelines.survey.trained_model import TrainedModel
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from pipelines.deliver.splat import codec_arrays, load_splat
 from pipelines.formats.georef_sidecar import write_sidecar
 from pipelines.formats.spz import SpzVersion, write_spz
 from pipelines.geometry.similarity import Similarity
-from pipelines.splat.transform import transformed
+from pipelines.splat.gaussians import transformed
 
 # Columns: the file's right, up and back, along east, north and up.
 ENU_FROM_RUB = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])

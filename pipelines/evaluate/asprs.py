@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pipelines.core.types import BoolArray, FloatArray
-from pipelines.scene.report import AsprsStatement, ErrorStats, Rmse, TotalRmse, VegetatedAccuracy
+from pipelines.survey.report import AsprsStatement, ErrorStats, Rmse, TotalRmse, VegetatedAccuracy
 
 STANDARD = "ASPRS, Edition 2, Version 2, 2024"
 # Check points by the area of the project: so many up to the first area, ten more for each further one, and no more

@@ -6,15 +6,14 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from pipelines.adjust.posterior import Posterior
-from pipelines.core.cautions import Caution
+from pipelines.core.products import Caution
 from pipelines.core.sentences import listed
 from pipelines.core.types import FloatArray
 from pipelines.robust.statistics import chi2_quantile
-from pipelines.scene.marks import mark_rays
-from pipelines.scene.points_by_camera import points_by_camera
-from pipelines.scene.report import CheckPointErrors
-from pipelines.scene.survey import Survey
-from pipelines.scene.trained_survey import SolvedSurvey
+from pipelines.survey.marks import mark_rays
+from pipelines.survey.report import CheckPointErrors
+from pipelines.survey.survey import Survey
+from pipelines.survey.trained_survey import SolvedSurvey, points_by_camera
 
 _LEAST_POINTS = 3
 _RANGE = (0.005, 0.995)  # of χ²: 99 % of true predictions lie within

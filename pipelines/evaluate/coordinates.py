@@ -1,14 +1,23 @@
-"""Positions of the report in a CRS that the user names: ENU → ECEF → CRS, point by point."""
+"""Positions of the report in a CRS that the user names: ENU → ECEF → CRS, point by point.
+
+Errors of every check and control point, and σ of every camera, as tables for other programs.
+"""
 
 from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
 from pipelines.core.types import FloatArray, Vector3
+from pipelines.formats.tables import write_table
 from pipelines.geodesy.crs import PointCrs, parse_crs
 from pipelines.geodesy.enu import ecef_from_enu, lla_from_ecef, lla_of
-from pipelines.scene.report import CheckPointErrors, CheckPoints, Coordinates, PointCoordinates
-from pipelines.scene.survey import Survey
+from pipelines.survey.headline import PointLine, point_lines
+from pipelines.survey.report import CheckPointErrors, CheckPoints, Coordinates, EvaluationReport, PointCoordinates
+from pipelines.survey.survey import Survey
 
 
 def target_crs(text: str, survey: Survey) -> PointCrs:
@@ -81,3 +90,78 @@ def _measured(xyz: FloatArray) -> Vector3 | None:
 def _vector(xyz: FloatArray) -> Vector3:
     x, y, z = xyz.tolist()
     return x, y, z
+
+
+_NAME = ("name", "use", "measured", "rays")
+_PLACE = ("latitude_deg", "longitude_deg", "ellipsoidal_height_m", "east_m", "north_m", "up_m")
+_ERROR = ("de_m", "dn_m", "du_m", "dh_m", "d3_m", "sigma_e_m", "sigma_n_m", "sigma_u_m", "blunder")
+_IN_CRS = ("crs", "x", "y", "z", "x_measured", "y_measured", "z_measured")
+
+
+def write_point_table(path: Path, report: EvaluationReport, survey: Survey) -> None:
+    """Write one line for each point and way in which it was measured; what is not known stays empty.
+
+    The place is the surveyed one. With `--crs`, check points have their coordinates there too.
+
+    Args:
+        path: of the CSV file.
+        report: of the same survey.
+        survey: has the surveyed positions.
+    """
+    place = _places(survey)
+    in_crs = report.coordinates
+    header = (*_NAME, *_PLACE, *_ERROR, *(_IN_CRS if in_crs is not None else ()))
+    rows = (
+        (row.name, line.use, line.way, row.rays, *place[row.name], *_error(line), *_crs_cells(in_crs, line))
+        for line in point_lines(report)
+        for row in (line.row,)
+    )
+    write_table(path, (header, *rows))
+
+
+def write_camera_sigma(path: Path, names: Sequence[str], cov: FloatArray) -> None:
+    """Write one line for each camera: σ of its position and of its rotations, along east, north and up.
+
+    Args:
+        path: of the CSV file.
+        names: n photographs.
+        cov: (n, 6, 6) of (δθ [rad], δc [m]).
+    """
+    sigma = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
+    header = ("name", *(f"sigma_{axis}_m" for axis in "enu"), *(f"sigma_rotation_{axis}_deg" for axis in "enu"))
+    rows = (
+        (name, *(f"{value:.5f}" for value in (*of_camera[3:], *np.degrees(of_camera[:3]))))
+        for name, of_camera in zip(names, sigma, strict=True)
+    )
+    write_table(path, (header, *rows))
+
+
+def _places(survey: Survey) -> dict[str, list[str]]:
+    """Return the cells of each surveyed position, by name."""
+    points = (*survey.control_points, *survey.check_points)
+    in_geo = np.array([point.position_in_geo for point in points]).reshape(-1, 3)
+    lla = lla_from_ecef(ecef_from_enu(in_geo, survey.origin)) if points else in_geo
+    return {
+        point.name: [f"{lat:.9f}", f"{lon:.9f}", f"{alt:.4f}", *(f"{value:.4f}" for value in enu)]
+        for point, (lat, lon, alt), enu in zip(points, lla.tolist(), in_geo.tolist(), strict=True)
+    }
+
+
+def _error(line: PointLine) -> list[str]:
+    error, sigma = line.error_m, line.sigma_m
+    lengths = () if error is None else (*error, math.hypot(*error[:2]), math.hypot(*error))
+    cells = [f"{value:.4f}" for value in lengths] or [""] * 5
+    cells += [""] * 3 if sigma is None else [f"{value:.4f}" for value in sigma]
+    return [*cells, "" if line.way == "fit" else str(int(line.is_blunder))]
+
+
+def _crs_cells(coordinates: Coordinates | None, line: PointLine) -> list[str]:
+    """Return the cells of a point in the CRS; empty for a point that the report does not list there."""
+    if coordinates is None:
+        return []
+    point = next((point for point in coordinates.points if point.name == line.row.name), None)
+    if point is None or line.use != "check":
+        return [""] * len(_IN_CRS)
+    measured = point.camera if line.way == "camera" else point.model
+    texts = coordinates.texts(point.surveyed), coordinates.texts(measured)
+    return [coordinates.crs, *texts[0], *texts[1]]

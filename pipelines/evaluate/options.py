@@ -8,8 +8,8 @@ from pydantic import Field
 
 from pipelines.core.options import InputPath, StageOptions
 from pipelines.geodesy.vertical import Vertical
-from pipelines.scene.cloud_options import CloudPath
-from pipelines.scene.reference_report import Alignment
+from pipelines.survey.options import CloudPath
+from pipelines.survey.report_parts import Alignment
 
 
 class EvaluateOptions(StageOptions):

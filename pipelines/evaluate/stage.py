@@ -5,56 +5,166 @@ as `points.csv`, the σ of every camera as `cameras.csv`, and the predicted accu
 and `accuracy.png`; of a trained model also side-by-side renders. With `--reference`, the surface is compared with a
 cloud; `reference_map.png` and `reference_histogram.png` show the distances. Check points enter no solution.
 Residuals of observations that entered one are reported as a fit, not as an accuracy (docs/accuracy.md).
+
+Headline, figures, warnings and cautions of an evaluation.
+
+Picture of the predicted accuracy, with the errors of the surveyed points as arrows.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from pipelines.adjust.accuracy_grid import write_csv
+from pipelines.adjust.accuracy_grid import AccuracyGrid, write_csv
 from pipelines.adjust.posterior import Posterior
 from pipelines.adjust.solution import posterior_of
-from pipelines.core.cautions import is_checked, union
 from pipelines.core.errors import InputError
+from pipelines.core.figures import WAYS
+from pipelines.core.products import is_checked, union
+from pipelines.core.sentences import listed
 from pipelines.core.stages import BY_NAME
+from pipelines.core.types import FloatArray
 from pipelines.core.workspace import StageRun, Summary
-from pipelines.evaluate.accuracy_picture import draw_accuracy
+from pipelines.evaluate.asprs import few_points
 from pipelines.evaluate.cautions import cautions_of_prediction, dependent_check_points
 from pipelines.evaluate.check_points import (
     check_points_on_surface,
     cross_validate,
     fit_residuals,
+    rms_sigma,
     triangulated_check_points,
 )
-from pipelines.evaluate.coordinates import coordinates_in, target_crs
+from pipelines.evaluate.coordinates import coordinates_in, target_crs, write_camera_sigma, write_point_table
 from pipelines.evaluate.options import EvaluateOptions
 from pipelines.evaluate.photometric import compare_test_views
-from pipelines.evaluate.point_report import rms_sigma
-from pipelines.evaluate.point_table import write_camera_sigma, write_point_table
-from pipelines.evaluate.reference.cautions import cautions_of_reference
-from pipelines.evaluate.reference.comparison import ComparedReference, compare_with_reference, open_reference
-from pipelines.evaluate.reference.pictures import draw_reference
-from pipelines.evaluate.summary import summarise
+from pipelines.evaluate.reference import (
+    ComparedReference,
+    cautions_of_reference,
+    compare_with_reference,
+    draw_reference,
+    open_reference,
+)
 from pipelines.geodesy.crs import PointCrs
+from pipelines.geodesy.enu import Origin, ecef_from_enu, lla_from_ecef
 from pipelines.geometry.similarity import SimilarityRecord
-from pipelines.scene.headline import headline
-from pipelines.scene.render_files import write_render
-from pipelines.scene.renderer import ModelRenderer
-from pipelines.scene.report import (
+from pipelines.report.plots.maps import MapCoordinates, MapPoints, NamedPlaces, SigmaRaster, write_accuracy_map
+from pipelines.splat.rasterizer.backends import rasterizer
+from pipelines.surface.surface_views import ModelRenderer
+from pipelines.survey.headline import headline
+from pipelines.survey.photographs import write_render
+from pipelines.survey.report import (
     AccuracySummary,
     CheckPointErrors,
     CheckPoints,
     EvaluationReport,
     Photometric,
+    PhotometricFigures,
+    PointResidual,
     SimilaritySigma,
     write_report,
 )
-from pipelines.scene.scene import photographs
-from pipelines.scene.trained_survey import SolvedSurvey, TrainedSurvey, load_solved
-from pipelines.splat.rasterizer.backends import rasterizer
+from pipelines.survey.scene import photographs
+from pipelines.survey.survey import SurveyedPoint
+from pipelines.survey.trained_survey import SolvedSurvey, TrainedSurvey, load_solved
+
+
+def summarise(report: EvaluationReport) -> Summary:
+    """Return headline, figures, warnings and cautions of a report, for the command line."""
+    test = report.test_views
+    values: dict[str, Any] = {"accuracy": report.headline.model_dump()}
+    if test is not None:
+        values |= {
+            "views": test.views,
+            "psnr": test.psnr,
+            "psnr_covered": test.psnr_covered,
+            "covered_share": test.covered_share,
+            "psnr_compensated": test.psnr_compensated,
+            "ssim": test.ssim,
+        }
+    for way, errors in report.checkpoints.by_way.items():
+        values |= {
+            f"{way}_count": errors.count,
+            f"{way}_mean_h_m": errors.mean_h_m,
+            f"{way}_rmse_h_m": errors.rmse_h_m,
+            f"{way}_rmse_v_m": errors.rmse_v_m,
+            f"{way}_rmse_3d_m": errors.rmse_3d_m,
+        }
+    key_figure = f"{report.headline.sentence}; {_test_views(test)}"
+    return Summary(key_figure, values, _warnings(report), report.cautions)
+
+
+def _test_views(test: PhotometricFigures | None) -> str:
+    if test is None:
+        return "cameras alone, not trained yet"
+    if test.psnr is None:
+        return "no test views"
+    if test.psnr_covered is None or test.covered_share is None:
+        return f"test PSNR {test.psnr:.2f} dB"
+    return f"test PSNR {test.psnr:.2f} dB, {test.psnr_covered:.2f} dB on the {test.covered_share:.0%} covered"
+
+
+def _warnings(report: EvaluationReport) -> tuple[str, ...]:
+    warnings = []
+    asprs = report.checkpoints.camera.asprs
+    if asprs.points and not asprs.enough_points:
+        warnings.append(few_points(asprs))
+    for way, errors in report.checkpoints.by_way.items():
+        if errors.blunders:
+            warnings.append(
+                f"{WAYS[way]}, {len(errors.blunders)} of {errors.count} check points are off by more than three "
+                f"times the class that the others meet: {listed(errors.blunders)}"
+            )
+    crossed = report.cross_validation
+    if crossed is not None and crossed.reason is not None:
+        warnings.append(f"no cross-validation: {crossed.reason}")
+    return tuple(warnings)
+
+
+def draw_accuracy(
+    grid: AccuracyGrid, solved: SolvedSurvey, report: EvaluationReport, crs: PointCrs | None, path: Path
+) -> None:
+    """Write a map of the predicted accuracy, with cameras, control and check points, errors and coordinates.
+
+    Args:
+        grid: predicted σ.
+        solved: the survey.
+        report: errors of triangulated points, and residuals of control points.
+        crs: of the coordinates beside the map; None: longitude and latitude.
+        path: of the picture.
+    """
+    survey = solved.survey
+    raster = SigmaRaster(grid.raster(grid.sigma_h_m), grid.raster(grid.sigma_v_m), grid.corner_in_geo, grid.size_m)
+    points = MapPoints(
+        cameras=solved.geo_from_model.apply(solved.poses.cam_center_in_model)[:, :2],
+        control=_named(survey.control_points, report.fit.gcp.points),
+        check=_named(survey.check_points, report.checkpoints.camera.points),
+    )
+    write_accuracy_map(path, raster, points, _coordinates(survey.origin, crs))
+
+
+def _named(points: Sequence[SurveyedPoint], rows: Sequence[PointResidual]) -> NamedPlaces:
+    place = np.array([point.position_in_geo for point in points]).reshape(-1, 3)[:, :2]
+    errors = np.array([(row.de_m, row.dn_m, row.du_m) for row in rows], dtype=np.float64)  # None becomes NaN
+    return NamedPlaces(place, tuple(point.name for point in points), errors.reshape(-1, 3))
+
+
+def _coordinates(origin: Origin, crs: PointCrs | None) -> MapCoordinates:
+    """Return the coordinates of places at the height of the origin."""
+
+    def lla(place: FloatArray) -> FloatArray:
+        return lla_from_ecef(ecef_from_enu(np.column_stack([place, np.zeros(len(place))]), origin))
+
+    if crs is None or crs.is_geocentric:
+        return MapCoordinates("WGS84", ("longitude", "latitude"), "°", lambda place: lla(place)[:, [1, 0]])
+    names = ("longitude", "latitude") if crs.is_geographic else ("easting", "northing")
+    unit = "°" if crs.units[0] == "degree" else {"metre": "m"}.get(crs.units[0], crs.units[0])
+    return MapCoordinates(crs.name, names, unit, lambda place: crs.xyz_from_lla(lla(place))[:, :2])
 
 
 @dataclass(frozen=True)

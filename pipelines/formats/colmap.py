@@ -1,27 +1,165 @@
-"""COLMAP sparse models, binary or text, as flat numpy arrays."""
+"""COLMAP sparse models, binary or text, as flat numpy arrays.
+
+Check of a COLMAP model before COLMAP reads it: every count fits the file, and every reference exists.
+
+COLMAP trusts the counts in its binary files. A forged track length of 2³⁶ is read for ever, past the end of the
+file. Layouts after `reconstruction_io_binary.cc` and `reconstruction_io_text.cc` of COLMAP 4.
+
+Flat numpy arrays as COLMAP sparse models, written as COLMAP writes them.
+"""
 
 from __future__ import annotations
 
 import logging
+import mmap
 import signal
+import struct
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.core.durable import storage_failure_of
 from pipelines.core.errors import BackendUnavailableError, InputError, StorageError
+from pipelines.core.files import file_size, storage_failure_of
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.core.validators import stays_inside
-from pipelines.formats.colmap_check import check_model_files
 from pipelines.geometry.cameras import Camera
 from pipelines.geometry.sparse_model import SparseModel
 
 log = logging.getLogger(__name__)
+
+FILES = ("rigs", "cameras", "frames", "images", "points3D")
+_REQUIRED = ("cameras", "images", "points3D")
+_OBSERVATION_BYTES, _TRACK_BYTES = 24, 8
+_LONGEST_NAME = 4096
+# Parameters of COLMAP's camera models by number of the model, from SIMPLE_PINHOLE on.
+_CAMERA_PARAMS = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2)
+_INVALID_CAMERA = "has a camera model that is unknown"
+_INVALID_NAME = "has a name that is not UTF-8"
+
+
+class _CutOffError(ValueError):
+    """A record that reaches beyond the end of its file."""
+
+
+def check_model_files(folder: Path) -> None:
+    """Refuse a COLMAP model, binary or text, whose files do not hold what they state.
+
+    Raises:
+        InputError: no model, not regular files, or counts and sizes that disagree; names the file.
+    """
+    if not folder.is_dir():
+        raise InputError("no such folder; expected a COLMAP model (cameras, images, points3D)", path=folder)
+    suffix = next((s for s in (".bin", ".txt") if all((folder / (n + s)).exists() for n in _REQUIRED)), None)
+    if suffix is None:
+        raise InputError(
+            "not a readable COLMAP model: cameras, images and points3D, all .bin or all .txt, are needed",
+            path=folder,
+        )
+    for name in FILES:
+        file = folder / (name + suffix)
+        if not file.exists():
+            continue
+        size = file_size(file)
+        if suffix == ".bin":
+            _check_binary(file, size, _RECORDS[name])
+        elif name == "images":
+            _check_text(file)
+
+
+def _check_binary(file: Path, size: int, record_end: Callable[[_Bytes, int], int]) -> None:
+    cut_off = "shorter than the number of its records says: it is truncated, copy it again"
+    if size < 8:
+        raise InputError(cut_off, path=file)
+    with file.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        record = _Bytes(data, size)
+        (count,) = struct.unpack_from("<Q", data)
+        if count > size:
+            raise InputError(cut_off, path=file)
+        at = 8
+        for number in range(count):
+            try:
+                at = record_end(record, at)
+            except _CutOffError as error:
+                raise InputError(f"{cut_off} (record {number + 1} of {count})", path=file) from error
+            except ValueError as error:
+                raise InputError(f"record {number + 1} of {count} {error}: it is damaged", path=file) from error
+        if at != size:
+            raise InputError(f"has {size - at} bytes behind its {count} records: it is damaged", path=file)
+
+
+def _check_text(file: Path) -> None:
+    with file.open("rb") as stream:
+        for number, line in enumerate(stream, start=1):
+            try:
+                line.decode("utf-8")
+            except UnicodeDecodeError as error:
+                raise InputError(_INVALID_NAME, path=file, line=number) from error
+
+
+@dataclass(frozen=True)
+class _Bytes:
+    """Content of a file, read within its size."""
+
+    data: mmap.mmap
+    size: int
+
+    def unsigned(self, at: int, width: int) -> int:
+        self.end(at + width)
+        return int.from_bytes(self.data[at : at + width], "little")
+
+    def end(self, at: int) -> int:
+        """Return the end of a record, which lies inside the file."""
+        if at > self.size:
+            raise _CutOffError
+        return at
+
+
+def _camera(record: _Bytes, at: int) -> int:
+    model = record.unsigned(at + 4, 4)
+    if model >= len(_CAMERA_PARAMS):
+        raise ValueError(_INVALID_CAMERA)
+    return record.end(at + 24 + 8 * _CAMERA_PARAMS[model])
+
+
+def _image(record: _Bytes, at: int) -> int:
+    name_at = at + 64
+    name_end = record.data.find(b"\0", name_at, min(record.size, name_at + _LONGEST_NAME))
+    if name_end < 0:
+        raise _CutOffError
+    try:
+        record.data[name_at:name_end].decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise ValueError(_INVALID_NAME) from error
+    return record.end(name_end + 9 + _OBSERVATION_BYTES * record.unsigned(name_end + 1, 8))
+
+
+def _point(record: _Bytes, at: int) -> int:
+    return record.end(at + 51 + _TRACK_BYTES * record.unsigned(at + 43, 8))
+
+
+def _frame(record: _Bytes, at: int) -> int:
+    return record.end(at + 68 + 16 * record.unsigned(at + 64, 4))
+
+
+def _rig(record: _Bytes, at: int) -> int:
+    sensors = record.unsigned(at + 4, 4)
+    at = record.end(at + 8 + (8 if sensors else 0))
+    if sensors > record.size:
+        raise _CutOffError
+    for _ in range(sensors - 1):
+        at = record.end(at + 9 + (56 if record.unsigned(at + 8, 1) else 0))
+    return at
+
+
+_RECORDS: dict[str, Callable[[_Bytes, int], int]] = {
+    "rigs": _rig, "cameras": _camera, "frames": _frame, "images": _image, "points3D": _point,
+}  # fmt: skip
 
 
 # COLMAP logs a line for each step; only its errors are of use here.
@@ -183,3 +321,63 @@ def _check(model: SparseModel, path: Path) -> None:
     if astray is not None:
         message = f"{astray!r} leaves the folder of photographs: names are relative to it"
         raise InputError(message, path=path, field="images")
+
+
+def write_sparse(model: SparseModel, path: Path) -> None:
+    """Write a model in COLMAP's binary form; `read_sparse` returns the same model, and COLMAP opens it.
+
+    Every image gets its own frame and every camera a trivial rig. The folder is made if missing.
+
+    Raises:
+        BackendUnavailableError: pycolmap is not installed.
+        StorageError: the disk is full.
+        OSError: the folder cannot be made.
+    """
+    pycolmap = pycolmap_module()
+    reconstruction = pycolmap.Reconstruction()
+    for camera_id, camera in model.cameras.items():
+        reconstruction.add_camera_with_trivial_rig(
+            pycolmap.Camera(
+                camera_id=camera_id,
+                model=camera.model,
+                width=camera.width,
+                height=camera.height,
+                params=camera.params,
+            )
+        )
+    rank = _add_images(reconstruction, model)
+    _add_points(reconstruction, model, rank)
+    write_reconstruction(reconstruction, path)
+
+
+def _add_images(reconstruction: Any, model: SparseModel) -> IntArray:
+    """Add the images with their pixels; return the place of each observation in its image's list."""
+    pycolmap = pycolmap_module()
+    by_image = np.argsort(model.obs_image, kind="stable")
+    bounds = np.searchsorted(model.obs_image[by_image], np.arange(len(model.image_name) + 1))
+    rank = np.empty(len(by_image), dtype=np.int64)
+    rank[by_image] = np.arange(len(by_image)) - bounds[model.obs_image[by_image]]
+    for index, name in enumerate(model.image_name):
+        pixels = model.obs_xy_px[by_image[bounds[index] : bounds[index + 1]]]
+        image = pycolmap.Image(name, pixels, camera_id=int(model.image_camera_id[index]))
+        image.image_id = int(model.image_id[index])
+        rotation = pycolmap.Rotation3d(model.rotation_cam_from_local[index])
+        pose = pycolmap.Rigid3d(rotation, model.translation_cam_from_local[index])
+        reconstruction.add_image_with_trivial_frame(image, pose)
+    return rank
+
+
+def _add_points(reconstruction: Any, model: SparseModel, rank: IntArray) -> None:
+    pycolmap = pycolmap_module()
+    starts = np.searchsorted(model.obs_point, np.arange(len(model.point_id) + 1))
+    observer = model.image_id[model.obs_image]
+    for index, point_id in enumerate(model.point_id):
+        run = slice(starts[index], starts[index + 1])
+        point = pycolmap.Point3D(xyz=model.point_in_local[index], color=model.point_rgb[index])
+        if np.isfinite(model.point_error_px[index]):
+            point.error = model.point_error_px[index]
+        point.track.elements = [
+            pycolmap.TrackElement(int(image_id), int(place))
+            for image_id, place in zip(observer[run], rank[run], strict=True)
+        ]
+        reconstruction.add_point3D_with_id(int(point_id), point)

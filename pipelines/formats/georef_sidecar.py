@@ -16,10 +16,9 @@ from numpy.typing import ArrayLike
 from pydantic import ConfigDict, Field, field_validator, model_validator
 from pydantic.alias_generators import to_camel
 
-from pipelines.core.cautions import Caution
-from pipelines.core.durable import replace_file
 from pipelines.core.figures import Headline
-from pipelines.core.products import Product, load_json
+from pipelines.core.files import replace_file
+from pipelines.core.products import Caution, Product, load_json
 from pipelines.core.types import FloatArray, Matrix4, Quaternion, Row7, Vector3
 from pipelines.geodesy.vertical import VerticalDatum
 from pipelines.geometry.rotations import matrix_from_quat_xyzw

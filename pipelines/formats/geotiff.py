@@ -14,7 +14,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.core.durable import replace_file
+from pipelines.core.files import replace_file
 
 NODATA = -9999.0
 _CACHE_BYTES = 256 * 1024 * 1024

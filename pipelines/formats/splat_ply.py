@@ -15,9 +15,8 @@ from numpy.lib import recfunctions
 from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement, PlyParseError
 
-from pipelines.core.durable import replace_file
 from pipelines.core.errors import InputError
-from pipelines.core.files import file_size
+from pipelines.core.files import file_size, replace_file
 from pipelines.core.types import Float32Array, IntArray
 
 _HEADER_LIMIT = 64 * 1024

@@ -5,14 +5,23 @@ longitude first, as in ODM's files and PROJ's visualisation order; `lla` is lati
 
 One operation serves all points of a call, or neighbours on two sides of an operation's border would be torn apart
 by metres. `pipelines.geodesy.operations` chooses it, and refuses where a grid is missing.
+
+Texts of a CRS that would open files: refused before PROJ sees them.
+
+PROJ strings, WKT and PROJJSON may name files of grids, triangulations and definitions, and PROJ opens any path. A
+grid that PROJ finds by its bare name, in its own folders, is accepted.
+
+Axes of a map grid at a place: how far grid north lies from true north.
 """
 
 from __future__ import annotations
 
+import json
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,10 +32,54 @@ from pyproj.exceptions import CRSError, ProjError
 
 from pipelines.core.errors import InputError
 from pipelines.core.types import FloatArray
-from pipelines.geodesy.crs_text import file_in
+from pipelines.geodesy.enu import ecef_from_enu_rotation, ecef_from_lla, lla_from_ecef
 from pipelines.geodesy.operations import Operation, OperationRequest, best_operation, proj_errors
 from pipelines.geodesy.plausible import ListedPoints, check_area, horizontal_of, rough_lon_lat
 from pipelines.geodesy.vertical import ELLIPSOIDAL, VerticalChoice, VerticalDatum, assumed_ellipsoidal, name_of
+
+_BARE_NAME = re.compile(r"[\w.-]+")
+_GRIDS = re.compile(r'(?<!\w)\w*grids?\s*=\s*"?([^\s"]*)', re.IGNORECASE)
+_FILES = re.compile(r"(?<!\w)(?:init|file|catalog)\s*=", re.IGNORECASE)
+_PIPELINE = re.compile(r"(?<!\w)(?:proj\s*=\s*pipeline|\+step)(?!\w)", re.IGNORECASE)
+_WKT_FILE = re.compile(r"PARAMETERFILE", re.IGNORECASE)
+_WKT_FILE_NAME = re.compile(r'PARAMETERFILE\s*[\[(]\s*"[^"]*"\s*,\s*"([^"]*)"', re.IGNORECASE)
+
+
+def file_in(text: str) -> str | None:
+    """Return the part of a CRS text that would open a file outside PROJ's own folders; None if there is none."""
+    forbidden = _FILES.search(text) or _PIPELINE.search(text)
+    if forbidden:
+        return forbidden[0]
+    for grids in _GRIDS.finditer(text):
+        if not all(_is_bare(name) for name in grids[1].split(",")):
+            return grids[0]
+    names = _WKT_FILE_NAME.findall(text)
+    if len(names) != len(_WKT_FILE.findall(text)):
+        return "PARAMETERFILE"
+    if text.lstrip().startswith("{"):
+        names += _values(text)
+    return next((name for name in names if not _is_bare(name)), None)
+
+
+def _is_bare(name: str) -> bool:
+    return _BARE_NAME.fullmatch(name.removeprefix("@")) is not None  # @ marks an optional grid
+
+
+def _values(text: str) -> Iterator[str]:
+    """Yield the texts that stand for values of parameters in PROJJSON."""
+    try:
+        pending: list[Any] = [json.loads(text)]
+    except (ValueError, RecursionError):
+        return  # PROJ refuses it, too
+    while pending:
+        item = pending.pop()
+        if isinstance(item, dict):
+            if isinstance(item.get("value"), str):
+                yield item["value"]
+            pending += item.values()
+        elif isinstance(item, list):
+            pending += item
+
 
 ECEF = "EPSG:4978"
 _MAX_TEXT = 20_000
@@ -318,3 +371,35 @@ def _vertical_crs(choice: VerticalChoice) -> CRS:
 
 def _short(name: str) -> str:
     return name if len(name) <= 120 else name[:117] + "…"
+
+
+_STEP_M = 10.0  # long against the rounding of eastings and northings, short against the curvature of a grid
+
+
+def grid_from_enu(crs: PointCrs, lla: ArrayLike) -> FloatArray:
+    """Return rotations (n, 3, 3) from true East-North-Up to the axes of a CRS, at places `lla` (n, 3).
+
+    The third axis stays up, along the normal of the ellipsoid. The first two are the directions in which the first
+    and the second coordinate grow. In a projection that is not conformal they are not at right angles: the result
+    is the rotation nearest to them. A CRS without a grid (angles, or geocentric) has the axes of true
+    East-North-Up.
+
+    Raises:
+        InputError: the axes of the CRS are left-handed, or a place lies outside its domain.
+    """
+    places = np.asarray(lla, dtype=np.float64).reshape(-1, 3)
+    rotations = np.tile(np.eye(3), (len(places), 1, 1))
+    if crs.is_geographic or crs.is_geocentric or not len(places):
+        return rotations
+    axes = ecef_from_enu_rotation(places)
+    steps = _STEP_M * np.stack([axes[..., 0], -axes[..., 0], axes[..., 1], -axes[..., 1]])
+    moved = crs.xyz_from_lla(lla_from_ecef(ecef_from_lla(places) + steps).reshape(-1, 3)).reshape(4, -1, 3)
+    by_enu = np.stack([moved[0] - moved[1], moved[2] - moved[3]], axis=-1)[:, :2]  # (n, xy, east and north)
+    left, _, right = np.linalg.svd(by_enu)
+    rotations[:, :2, :2] = left @ right
+    if (np.linalg.det(rotations) < 0).any():
+        raise InputError(
+            f"the axes of {crs.name} are left-handed, and angles of cameras are not defined in them: give a CRS "
+            "whose coordinates are easting and northing"
+        )
+    return rotations

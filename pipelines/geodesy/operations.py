@@ -3,6 +3,8 @@
 PROJ would rather answer than fail: without a geoid's grid it applies a *ballpark* transformation, that is none, and
 a grid that a PROJ string calls optional (`+nadgrids=@file`) is a shift of zero where it is missing. Here both are
 errors that name the grid.
+
+Grids of PROJ on this machine: geoid models and datum shifts.
 """
 
 from __future__ import annotations
@@ -160,3 +162,21 @@ def _area(lon: FloatArray, lat: FloatArray) -> AreaOfInterest:
 
 def _wrapped(lon_deg: float) -> float:
     return lon_deg - 360.0 * round(lon_deg / 360.0) if abs(lon_deg) > 180.0 else lon_deg
+
+
+_SUFFIXES = (".tif", ".gtx", ".gsb")
+
+
+def grid_folders() -> list[Path]:
+    """Return the existing folders in which PROJ looks for grids."""
+    from pyproj import datadir
+
+    named = [*datadir.get_data_dir().split(";"), datadir.get_user_data_dir()]
+    folders = [Path(part) for text in named for part in (text.split(":") if "/" in text else [text]) if part]
+    return [folder for folder in dict.fromkeys(folders) if folder.is_dir()]
+
+
+def installed_grids() -> list[str]:
+    """Return the file names of the grids in PROJ's folders, sorted."""
+    files = (file for folder in grid_folders() for file in folder.iterdir())
+    return sorted({file.name for file in files if file.suffix.lower() in _SUFFIXES})

@@ -1,18 +1,30 @@
-"""Bundle of photographs: cameras, points, image observations, and the derivatives of the observations."""
+"""Bundle of photographs: cameras, points, image observations, and the derivatives of the observations.
+
+Information that bundle adjustment leaves in the camera poses, as a sparse matrix.
+
+The points are eliminated from the normal matrix of the bundle (Schur complement). Two cameras stay coupled only if
+they see a common point, so that the memory grows with the number of cameras and not with its square. Two dense
+parts of low rank complete the sparse one: the lens, which all its cameras share, and the seven movements of a
+similarity, which no observation resists.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
-from scipy.sparse import csr_matrix
+from scipy.linalg import block_diag
+from scipy.sparse import bsr_matrix, csr_matrix
+from scipy.special import exp1
 
+from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import BoolArray, FloatArray, IntArray
-from pipelines.geometry.cameras import Camera, project, project_each
-from pipelines.geometry.lens import parameter_derivative
+from pipelines.geometry.cameras import Camera, parameter_derivative, project, project_each
 from pipelines.geometry.rotations import skew
+from pipelines.geometry.similarity import Similarity
+from pipelines.robust.statistics import CAUCHY_SCALE2, cauchy_weight, rayleigh_sigma
 
 _STEP = 1e-6
 
@@ -150,3 +162,297 @@ def similarity_modes(cam_center_in_world: FloatArray) -> FloatArray:
     modes[:, 3:, 1:4] = -skew(arm)
     modes[:, 3:, 4:] = np.eye(3)
     return modes
+
+
+_CHUNK = 2**19  # observations that are linearised together
+_RIDGE = 1e-12  # small: what it adds to each point holds the similarity of the whole as well
+# A camera with few observations is held to a tenth of its distance from the scene.
+_LOOSEST_RELATIVE_SIGMA = 0.1
+# Means of the weight w and of w r²/2 under Gaussian noise of σ = 1, where r²/2 is exponentially distributed. Robust
+# weights lower the sum of squares of pure noise: without these means the stated σ would be a fifth too small.
+_HALF_SCALE2 = CAUCHY_SCALE2[2] / 2
+_MEAN_WEIGHT = float(_HALF_SCALE2 * np.exp(_HALF_SCALE2) * exp1(_HALF_SCALE2))
+_MEAN_WEIGHTED_SQUARE = _HALF_SCALE2 * (1 - _MEAN_WEIGHT)
+
+
+@dataclass(frozen=True)
+class EliminatedPoints:
+    """Normal equations of n poses and L lens parameters, with the points eliminated.
+
+    Attributes:
+        poses: (6 n, 6 n) sparse, in blocks (6, 6).
+        cross: (6 n, L).
+        lens: (L, L).
+        pose_pull: (6 n, 7) of the poses on the points' similarity.
+        lens_pull: (L, 7) of the lens on it.
+        modes: (7, 7) information on it.
+        pose_slope, lens_slope: (6 n,), (L,) gradient of half the weighted squares; zero where SfM has left the
+            observations at their minimum.
+    """
+
+    poses: bsr_matrix
+    cross: FloatArray
+    lens: FloatArray
+    pose_pull: FloatArray
+    lens_pull: FloatArray
+    modes: FloatArray
+    pose_slope: FloatArray
+    lens_slope: FloatArray
+
+    def __add__(self, other: EliminatedPoints) -> EliminatedPoints:
+        return EliminatedPoints(
+            self.poses + other.poses,
+            self.cross + other.cross,
+            self.lens + other.lens,
+            self.pose_pull + other.pose_pull,
+            self.lens_pull + other.lens_pull,
+            self.modes + other.modes,
+            self.pose_slope + other.pose_slope,
+            self.lens_slope + other.lens_slope,
+        )
+
+
+@dataclass(frozen=True)
+class BundleInformation:
+    """Information of the image observations on corrections x = (δω, δc) (6 n,) of cameras and ℓ (L,) of the lens.
+
+    The points are eliminated: the observations cost ½ (x, ℓ)ᵀ [poses, cross; crossᵀ, lens] (x, ℓ) + slopeᵀ (x, ℓ).
+    Axes and signs of (δω, δc) are those of `geometry.correction_basis.CorrectionBasis`, the order of ℓ that of
+    `geometry.cameras.Lenses`. The points follow cameras and lens; `followed` is their mean similarity, weighted by
+    their information.
+
+    Attributes:
+        sums: the information.
+        similarity_modes: (6 n, 7) as `geometry.bundle.similarity_modes`.
+        unit: (6 n,) corrections that count as one metre at the scene.
+        loosest_sigma_m: σ in these units to which even a camera without observations is held.
+        sigma_px: σ of an image coordinate, estimated from the residuals, or 1 where each observation has its own.
+    """
+
+    sums: EliminatedPoints
+    similarity_modes: FloatArray
+    unit: FloatArray
+    loosest_sigma_m: float
+    sigma_px: float
+
+    @cached_property
+    def followed(self) -> FloatArray:
+        """Mean similarity (7, 6 n + L) of the points that follow cameras and lens."""
+        pull = np.concatenate([self.sums.pose_pull, self.sums.lens_pull])
+        return np.asarray(-np.linalg.solve(self.sums.modes, pull.T))
+
+    @cached_property
+    def lens_elimination(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """How the lens follows the poses (L, 6 n), its information about that (L, L), and the covariance (L, L).
+
+        Parameters that no observation reveals have rows of zeros.
+        """
+        return _lens_elimination(self.sums)
+
+    def turned(self, new_from_old: Similarity, cam_center_in_new: FloatArray) -> BundleInformation:
+        """Return the same information in another frame, whose cameras have centres (n, 3)."""
+        turn, scale = new_from_old.rotation, new_from_old.scale
+        # Inverse transposed derivatives of the new corrections by the old ones, and of their mean similarity.
+        by_correction = block_diag(turn, turn / scale)
+        by_similarity = block_diag(1.0, turn, turn / scale)
+        sums, count = self.sums, len(cam_center_in_new)
+
+        def of_poses(values: FloatArray) -> FloatArray:
+            return np.asarray(by_correction @ values.reshape(count, 6, -1)).reshape(values.shape)
+
+        poses = sums.poses
+        blocks = by_correction @ poses.data @ by_correction.T
+        return BundleInformation(
+            sums=EliminatedPoints(
+                poses=bsr_matrix((blocks, poses.indices, poses.indptr), shape=poses.shape),
+                cross=of_poses(sums.cross),
+                lens=sums.lens,
+                pose_pull=of_poses(sums.pose_pull) @ by_similarity.T,
+                lens_pull=sums.lens_pull @ by_similarity.T,
+                modes=by_similarity @ sums.modes @ by_similarity.T,
+                pose_slope=of_poses(sums.pose_slope),
+                lens_slope=sums.lens_slope,
+            ),
+            similarity_modes=similarity_modes(cam_center_in_new).reshape(-1, 7),
+            unit=self.unit * np.tile([1 / scale] * 3 + [1.0] * 3, count),
+            loosest_sigma_m=scale * self.loosest_sigma_m,
+            sigma_px=self.sigma_px,
+        )
+
+
+def bundle_information(
+    network: Network, *, sigma_px: FloatArray | None = None, at_minimum: bool = True
+) -> BundleInformation:
+    """Return the information of a bundle on its cameras.
+
+    1. Cauchy's kernel weights the observations, unless their σ are stated.
+    2. Chunks of points are eliminated one after the other, so that memory holds the derivatives of one chunk.
+
+    Args:
+        network: the bundle.
+        sigma_px: (M,) stated σ of the observations; None: one σ for all is estimated from the residuals.
+        at_minimum: whether SfM has left the observations at their minimum, so that their slope is zero.
+
+    Raises:
+        DegenerateGeometryError: fewer observations than unknowns.
+    """
+    if sigma_px is not None:
+        sigma_px = sigma_px[has_positive_depth(network)]
+    network = with_positive_depths(network)
+    n, points, observations = len(network.camera_id), len(network.point_in_world), len(network.obs_point)
+    redundancy = 2 * observations - 6 * n - 3 * points
+    if redundancy <= 0:
+        raise DegenerateGeometryError(
+            f"{observations} observations do not determine {n} cameras and {points} points"
+        )
+    ray = network.point_in_world[network.obs_point] - network.cam_center_in_world[network.obs_image]
+    typical_m = float(np.median(np.linalg.norm(ray, axis=1)))
+    residual, variance = projection_residuals(network), 1.0
+    if sigma_px is None:
+        weight = _robust_weights(residual)
+        variance = float((weight[:, None] * residual**2).sum() / (_MEAN_WEIGHTED_SQUARE * redundancy))
+        root_weight = np.sqrt(weight / (_MEAN_WEIGHT * variance))
+    else:
+        root_weight = 1.0 / sigma_px
+    sums = eliminate_points(network, root_weight, residual=None if at_minimum else residual)
+    return BundleInformation(
+        sums=sums,
+        similarity_modes=similarity_modes(network.cam_center_in_world).reshape(-1, 7),
+        unit=np.tile([1 / typical_m] * 3 + [1.0] * 3, n),  # rotations in metres at the scene, so that units agree
+        loosest_sigma_m=_LOOSEST_RELATIVE_SIGMA * typical_m,
+        sigma_px=float(np.sqrt(variance)),
+    )
+
+
+def _robust_weights(residual: FloatArray) -> FloatArray:
+    length = np.linalg.norm(residual, axis=1)
+    scale = max(rayleigh_sigma(length), 1e-9)
+    return cauchy_weight((length / scale) ** 2, 2)
+
+
+def eliminate_points(
+    network: Network,
+    root_weight: FloatArray,
+    surveyed: FloatArray | None = None,
+    *,
+    residual: FloatArray | None = None,
+    pull: FloatArray | None = None,
+    ridge: float = _RIDGE,
+) -> EliminatedPoints:
+    """Return the normal equations of poses and lens of a network, chunk by chunk of its points.
+
+    Args:
+        network: N points and M observations, each in front of its camera; at least one.
+        root_weight: (M,) inverse σ of the observations, 1/px.
+        surveyed: (N, 3, 3) information on the points beyond their observations, 1/m²; None: there is none.
+        residual: (M, 2) pixels, for the slope; None: the slope is zero.
+        pull: (N, 3) gradient of half the squares of `surveyed`, 1/m, for the slope; None: it is zero.
+        ridge: added to the information on a point, relative to its trace, for a point that its rays leave open.
+    """
+    total: EliminatedPoints | None = None
+    for part, points, rows in _chunks_of_points(network):
+        known, own_pull = (None if array is None else array[points] for array in (surveyed, pull))
+        left = None if residual is None else residual[rows]
+        sums = _eliminated(part, root_weight[rows], known, left, own_pull, ridge=ridge)
+        total = sums if total is None else total + sums
+    assert total is not None
+    return total
+
+
+def _chunks_of_points(network: Network) -> Iterator[tuple[Network, slice, IntArray]]:
+    """Yield networks with a part of the points each, with the rows of these points and of their observations."""
+    order = np.argsort(network.obs_point, kind="stable")
+    last = np.cumsum(np.bincount(network.obs_point, minlength=len(network.point_in_world)))
+    first_point = first = 0
+    while first_point < len(last):
+        next_point = max(int(np.searchsorted(last, first + _CHUNK, side="right")), first_point + 1)
+        rows = order[first : last[next_point - 1]]
+        yield (
+            replace(
+                network,
+                point_in_world=network.point_in_world[first_point:next_point],
+                obs_point=network.obs_point[rows] - first_point,
+                obs_image=network.obs_image[rows],
+                obs_xy_px=network.obs_xy_px[rows],
+            ),
+            slice(first_point, next_point),
+            rows,
+        )
+        first_point, first = next_point, int(last[next_point - 1])
+
+
+def _eliminated(
+    network: Network,
+    root_weight: FloatArray,
+    surveyed: FloatArray | None,
+    residual: FloatArray | None,
+    pull: FloatArray | None,
+    *,
+    ridge: float,
+) -> EliminatedPoints:
+    """Eliminate the points of a chunk."""
+    n, points = len(network.camera_id), len(network.point_in_world)
+    linearised, scaled = linearise_bundle(network), root_weight[:, None, None]
+    by_pose, by_point = linearised.jacobian_pose * scaled, linearised.jacobian_point * scaled
+    intrinsics = sparse_jacobian(linearised.jacobian_intrinsics * scaled, lens_slots(network), len(network.cameras))
+    normal = np.zeros((points, 3, 3))
+    np.add.at(normal, network.obs_point, np.swapaxes(by_point, 1, 2) @ by_point)
+    if surveyed is not None:
+        normal += surveyed
+    normal += ridge * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3) + 1e-12 * np.eye(3)
+    root = np.linalg.cholesky(normal)
+    inverse_root = np.swapaxes(np.linalg.inv(root), 1, 2)
+    white = by_point @ inverse_root[network.obs_point]
+    transposed = np.swapaxes(by_pose, 1, 2)
+    pose_point = _blocks(transposed @ white, network.obs_image, network.obs_point, (n, points))
+    own = _blocks(transposed @ by_pose, network.obs_image, network.obs_image, (n, n))
+    pose = sparse_jacobian(by_pose, network.obs_image, n)
+    intrinsics_point = intrinsics.T @ sparse_jacobian(white, network.obs_point, points)
+    moved = (np.swapaxes(root, 1, 2) @ _point_similarity_modes(network)).reshape(3 * points, 7)
+    white_residual = np.zeros(2 * len(root_weight))
+    if residual is not None:
+        white_residual = (residual * root_weight[:, None]).ravel()
+        of_points = sparse_jacobian(white, network.obs_point, points)
+        of_pull = 0.0 if pull is None else np.einsum("nji,nj->ni", inverse_root, pull).ravel()
+        white_residual = white_residual - of_points @ (of_points.T @ white_residual + of_pull)
+    return EliminatedPoints(
+        own - pose_point @ pose_point.T,
+        (pose.T @ intrinsics - pose_point.tocsr() @ intrinsics_point.T).toarray(),
+        (intrinsics.T @ intrinsics - intrinsics_point @ intrinsics_point.T).toarray(),
+        pose_point @ moved,
+        intrinsics_point @ moved,
+        moved.T @ moved,
+        np.asarray(pose.T @ white_residual),
+        np.asarray(intrinsics.T @ white_residual),
+    )
+
+
+def _blocks(blocks: FloatArray, row: IntArray, column: IntArray, shape: tuple[int, int]) -> bsr_matrix:
+    """Return the sparse matrix of blocks (M, h, w) at block rows and columns (M,); those at one place add up."""
+    order = np.lexsort((column, row))
+    pointer = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=shape[0]))])
+    height, width = blocks.shape[1:]
+    size = (shape[0] * height, shape[1] * width)
+    matrix = bsr_matrix((blocks[order], column[order], pointer), shape=size)
+    matrix.sum_duplicates()
+    return matrix
+
+
+def _lens_elimination(sums: EliminatedPoints) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return how the lens follows the poses (L, 6 n), its information about that (L, L), and the covariance."""
+    diagonal = np.diag(sums.lens)
+    used = np.flatnonzero(diagonal > 0)  # shorter parameter lists leave empty columns
+    scale = 1.0 / np.sqrt(diagonal[used])
+    block = sums.lens[np.ix_(used, used)] * scale[:, None] * scale + 1e-9 * np.eye(len(used))
+    follows = np.zeros((len(diagonal), len(sums.cross)))
+    information, cov = np.zeros_like(sums.lens), np.zeros_like(sums.lens)
+    follows[used] = -scale[:, None] * np.linalg.solve(block, (sums.cross[:, used] * scale).T)
+    information[np.ix_(used, used)] = block / scale[:, None] / scale
+    cov[np.ix_(used, used)] = scale[:, None] * np.linalg.solve(block, np.eye(len(used))) * scale
+    return follows, information, cov
+
+
+def _point_similarity_modes(network: Network) -> FloatArray:
+    """Return the movements (N, 3, 7) of points under an infinitesimal similarity about the mean camera centre."""
+    arm = network.point_in_world - network.cam_center_in_world.mean(axis=0)
+    return np.concatenate([arm[:, :, None], -skew(arm), np.tile(np.eye(3), (len(arm), 1, 1))], axis=2)

@@ -14,8 +14,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from pipelines.core.types import FloatArray
-from pipelines.geometry.bundle import Network
-from pipelines.geometry.bundle_information import BundleInformation, bundle_information
+from pipelines.geometry.bundle import BundleInformation, Network, bundle_information
 
 _COPIES = 4  # information, its factor, the basis, and a Jacobian or a normal matrix of the same size
 
@@ -31,7 +30,7 @@ class CorrectionBasis:
 
     `δω` [rad] turns a camera about its centre, axes of the world: `R' = R Exp(−δω)`; `δc` [m] moves the centre.
 
-    The lens parameters correlate with the poses. Their error, (L,) in the order of `geometry.lens.Lenses`, is
+    The lens parameters correlate with the poses. Their error, (L,) in the order of `geometry.cameras.Lenses`, is
     lens_matrix @ z plus an error with covariance `lens_cov` that is independent of z.
 
     Attributes:

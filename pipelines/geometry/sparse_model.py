@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipelines.core.types import ByteArray, FloatArray, IntArray
-from pipelines.geometry.cameras import Camera
-from pipelines.geometry.lens import Lenses
+from pipelines.geometry.cameras import Camera, Lenses
 
 
 @dataclass(frozen=True)

@@ -1,18 +1,23 @@
-"""Events of a DJI flight tied to its photographs: the number in a photograph's name is that of its event."""
+"""Events of a DJI flight tied to its photographs: the number in a photograph's name is that of its event.
+
+Files of `--trajectory`, each read as what its content shows it to be.
+"""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
 from pipelines.core.errors import ContradictionError, InputError
 from pipelines.core.types import IntArray
-from pipelines.formats.dji_mrk import CameraEvents
-from pipelines.formats.pose_table import PoseTable
+from pipelines.formats.gnss_logs import FIRST_LINE, CameraEvents, read_mrk, read_pos
+from pipelines.formats.metashape import HEADER, REFERENCE, read_cameras
+from pipelines.formats.tables import beginning
+from pipelines.formats.trajectory_csv import PoseTable, read_trajectory
 from pipelines.geodesy.enu import ecef_from_enu_rotation, lla_from_ecef
 from pipelines.ingest.image_poses import ImagePoses
 from pipelines.ingest.notes import Notes
@@ -122,3 +127,28 @@ def _refuse_other_times(events: CameraEvents, photos: Sequence[Photo], rows: Int
             f"have the times of their events (EXIF of {worst}: {off_s.max():.0f} s off): is it the file of another "
             "flight?"
         )
+
+
+def read_positions(path: Path, photos: Sequence[Photo], notes: Notes) -> PoseTable:
+    """Read a table of poses; the kind of the file follows from its content, and is noted.
+
+    1. The first line begins with %: RTKLIB's solution.
+    2. The first line is an event of DJI's timestamp file: that.
+    3. A line begins with `#Label`: Metashape's reference.
+    4. Anything else: a CSV with a header.
+
+    Raises:
+        InputError: the file cannot be read as what it seems to be.
+        ContradictionError: events are not those of the photographs.
+    """
+    lines = [line for line in beginning(path).splitlines() if line.strip()]
+    if lines and lines[0].startswith("%"):
+        notes.assume(f"{path.name} is read as RTKLIB's solution: positions of the antenna")
+        return read_pos(path)
+    if lines and FIRST_LINE.match(lines[0]):
+        notes.assume(f"{path.name} is read as DJI's timestamp file: positions of the camera, by photograph number")
+        return positions_of_events(read_mrk(path), photos, notes)
+    if any(HEADER.match(line) for line in lines):
+        notes.assume(f"{path.name} is read as {REFERENCE}")
+        return read_cameras(path)
+    return read_trajectory(path)

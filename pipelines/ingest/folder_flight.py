@@ -9,23 +9,25 @@ import numpy as np
 from pipelines.core.errors import InputError
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import FloatArray
-from pipelines.formats.dji_mrk import read_mrk
-from pipelines.formats.odm import read_geo
-from pipelines.formats.pose_table import PoseTable
-from pipelines.geometry.rig import Rig
-from pipelines.geometry.trajectory import Trajectory
-from pipelines.ingest.camera_events import at_times_of_events, event_of_each, from_antenna_to_camera
-from pipelines.ingest.camera_priors import camera_priors
-from pipelines.ingest.flight_record import FlightRecord, require_enough
+from pipelines.formats.gnss_logs import read_mrk
+from pipelines.formats.ground_points import read_geo
+from pipelines.formats.trajectory_csv import PoseTable
+from pipelines.geometry.trajectory import Rig, Trajectory
+from pipelines.ingest.camera_events import at_times_of_events, event_of_each, from_antenna_to_camera, read_positions
+from pipelines.ingest.exif_poses import poses_from_tags
 from pipelines.ingest.image_poses import ImagePoses
+from pipelines.ingest.navigation import (
+    FlightRecord,
+    RecordedNavigation,
+    at_cameras,
+    body_mount,
+    given_rig,
+    require_enough,
+)
 from pipelines.ingest.notes import Notes
 from pipelines.ingest.options import IngestOptions
-from pipelines.ingest.photo_folder import Photo, scan_folder
-from pipelines.ingest.photo_poses import poses_from_tags
-from pipelines.ingest.recorded_navigation import RecordedNavigation
-from pipelines.ingest.rig import at_cameras, body_mount, given_rig
+from pipelines.ingest.photo_folder import Photo, camera_priors, scan_folder
 from pipelines.ingest.table_poses import poses_from_table
-from pipelines.ingest.trajectory_files import read_positions
 
 
 def read_folder(

@@ -1,15 +1,23 @@
-"""Measured positions and attitudes of images, with σ, whatever they were read from."""
+"""Measured positions and attitudes of images, with σ, whatever they were read from.
+
+σ of positions: by option, else by the file, else by the kind of receiver.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+
 from pipelines.core.types import BoolArray, FloatArray
-from pipelines.formats.pose_table import complete
+from pipelines.formats.trajectory_csv import complete
 from pipelines.geodesy.enu import lla_from_ecef
 from pipelines.geodesy.vertical import VerticalDatum
 from pipelines.geometry.trajectory import Trajectory
+from pipelines.ingest.notes import Notes
+from pipelines.ingest.options import IngestOptions
 
 PoseSource = Literal["exif", "csv", "geo.txt", "metashape", "pos", "mrk", "bag"]
 SigmaSource = Literal["file", "option", "default"]
@@ -57,3 +65,48 @@ class ImagePoses:
     def located_lla(self) -> FloatArray:
         """WGS84 latitude, longitude and ellipsoidal height of the images that have a position (K, 3)."""
         return lla_from_ecef(self.position_in_ecef[self.located])
+
+
+# σ horizontal and vertical in metres where the file is silent, by kind of receiver, from the best to the worst.
+RECEIVER_SIGMA_M = {
+    "RTK fixed": (0.02, 0.03),
+    "RTK float": (0.5, 1.0),
+    "single-frequency": (2.5, 5.0),
+    "unknown receiver": (5.0, 10.0),
+}
+RECEIVERS = tuple(RECEIVER_SIGMA_M)
+
+
+def with_defaults(
+    stated: FloatArray, receivers: Sequence[str], located: BoolArray, options: IngestOptions, notes: Notes
+) -> tuple[FloatArray, tuple[SigmaSource, ...]]:
+    """Return σ east, north, up (N, 3) by precedence, and who gave it (N,).
+
+    Args:
+        stated: (N, 3) σ of the file, NaN where it is silent.
+        receivers: (N,) kinds of receiver.
+        located: (N,) which images have a position: defaults of others are not noted.
+        options: σ that the user gave.
+        notes: the defaults that were assumed.
+    """
+    from_file = complete(stated)
+    sigma = np.where(np.isfinite(stated), stated, [_default(receiver) for receiver in receivers])
+    if options.sigma_h is not None:
+        sigma[:, :2] = options.sigma_h
+    if options.sigma_v is not None:
+        sigma[:, 2] = options.sigma_v
+    for receiver in sorted(set(receivers)):
+        rows = located & ~from_file & (np.array(receivers) == receiver)
+        horizontal_m, vertical_m = RECEIVER_SIGMA_M[receiver]
+        parts = [f"{horizontal_m:g} m horizontal"] if options.sigma_h is None else []
+        parts += [f"{vertical_m:g} m vertical"] if options.sigma_v is None else []
+        if rows.any() and parts:
+            notes.assume(f"σ of positions without one ({int(rows.sum())}): {', '.join(parts)} ({receiver})")
+    overridden = options.sigma_h is not None or options.sigma_v is not None
+    sources: list[SigmaSource] = ["option" if overridden else "file" if row else "default" for row in from_file]
+    return sigma, tuple(sources)
+
+
+def _default(receiver: str) -> tuple[float, float, float]:
+    horizontal_m, vertical_m = RECEIVER_SIGMA_M[receiver]
+    return horizontal_m, horizontal_m, vertical_m

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from pipelines.core.cautions import Caution
+from pipelines.core.products import Caution
 
 _SHOWN = 4
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from pipelines.core.errors import InputError
 from pipelines.core.types import FloatArray
-from pipelines.formats.pose_table import PoseTable
+from pipelines.formats.trajectory_csv import PoseTable
 from pipelines.geodesy.crs import PointCrs, parse_crs
 from pipelines.geodesy.operations import WGS84
 from pipelines.ingest.notes import Notes

@@ -15,16 +15,15 @@ from pipelines.core.errors import InputError
 from pipelines.core.products import save_json
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.workspace import StageRun, Summary, Workspace
-from pipelines.ingest.bag.flight import count_frames, read_bag
-from pipelines.ingest.flight_record import FlightRecord
+from pipelines.ingest.bag_flight import count_frames, read_bag
 from pipelines.ingest.folder_flight import read_folder
 from pipelines.ingest.ground_points import list_ground_points, tie_ground_points
+from pipelines.ingest.navigation import FlightRecord
 from pipelines.ingest.notes import Notes
-from pipelines.ingest.option_checks import check_options
-from pipelines.ingest.options import IngestOptions
+from pipelines.ingest.options import IngestOptions, check_options
 from pipelines.ingest.survey_assembly import SurveyInputs, assemble_survey, nowhere
-from pipelines.scene.navigation import NavigationTrack
-from pipelines.scene.survey import Survey
+from pipelines.survey.calibrated import NavigationTrack
+from pipelines.survey.survey import Survey
 
 log = logging.getLogger(__name__)
 

@@ -1,4 +1,9 @@
-"""One survey in one frame out of everything that was read, and what is assumed and doubtful about it."""
+"""One survey in one frame out of everything that was read, and what is assumed and doubtful about it.
+
+Images and surveyed points as the survey records them: positions, attitudes and covariances in geo.
+
+Sessions of fixes that share one error, of a base station, a receiver or a day, and the σ of that error.
+"""
 
 from __future__ import annotations
 
@@ -7,20 +12,257 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from pipelines.core.errors import InputError
-from pipelines.geodesy.enu import Origin, ecef_from_lla, lla_from_ecef, median_lla
+from pipelines.core.types import FloatArray, IntArray, Matrix3, Vector3
+from pipelines.geodesy.enu import (
+    Origin,
+    ecef_from_lla,
+    enu_from_ecef,
+    geo_from_enu_at,
+    lla_from_ecef,
+    lla_of,
+    median_lla,
+)
 from pipelines.geodesy.vertical import VerticalDatum
-from pipelines.ingest.fix_sessions import fix_sessions
-from pipelines.ingest.flight_record import LEAST_IMAGES, FlightRecord
-from pipelines.ingest.ground_points import GroundFile, GroundPoint, require_near, split_checks
-from pipelines.ingest.image_poses import ImagePoses
+from pipelines.geometry.rotations import quat_xyzw_from_matrix
+from pipelines.ingest.ground_points import GroundFile, GroundPoint, UnmarkedPoints, require_near, split_checks
+from pipelines.ingest.image_poses import RECEIVERS, ImagePoses, SigmaSource
+from pipelines.ingest.navigation import LEAST_IMAGES, FlightRecord
 from pipelines.ingest.notes import Notes
 from pipelines.ingest.options import IngestOptions
-from pipelines.ingest.survey_records import held_out, image_records, point_records, unmarked_records
-from pipelines.scene.calibrated import FIX_RANGE_M
-from pipelines.scene.navigation import NavigationTrack, require_estimable
-from pipelines.scene.survey import Survey
+from pipelines.survey.calibrated import FIX_RANGE_M, NavigationTrack, require_estimable
+from pipelines.survey.survey import Attitude, Fix, FixSession, Survey, SurveyedPoint, SurveyImage, UnmarkedPoint
+
+SIGMA_GIMBAL_DEG = 2.0
+SIGMA_TABLE_ATTITUDE_DEG = 1.0
+
+
+def image_records(
+    flight: FlightRecord, session_of: IntArray, origin: Origin, options: IngestOptions
+) -> tuple[SurveyImage, ...]:
+    """Return the photographs with fixes and attitudes in the frame at an origin, and their split.
+
+    Args:
+        flight: photographs and their measured poses.
+        session_of: (N,) session of each fix.
+        origin: of the frame.
+        options: of `ingest`.
+    """
+    poses = flight.poses
+    fixes, attitudes = _fixes(poses, session_of, origin), _attitudes(poses, origin, options)
+    test = held_out(len(flight.photos), options.test_every)
+    return tuple(
+        SurveyImage(
+            name=photo.name,
+            camera_id=flight.camera_of[photo.name],
+            sha256=photo.file.sha256,
+            timestamp_s=float(poses.time_s[row]) if np.isfinite(poses.time_s[row]) else None,
+            fix=fixes[row],
+            attitude=attitudes[row],
+            split="test" if row in test else "train",
+        )
+        for row, photo in enumerate(flight.photos)
+    )
+
+
+def held_out(count: int, every: int) -> range:
+    """Return the rows of the test images: every N-th, none where that would leave too few to train on."""
+    rows = range(0, count, every) if every else range(0)
+    return rows if count - len(rows) >= LEAST_IMAGES else range(0)
+
+
+def point_records(
+    points: Sequence[GroundPoint], origin: Origin, options: IngestOptions
+) -> tuple[SurveyedPoint, ...]:
+    """Return control or check points in the frame at an origin."""
+    if not points:
+        return ()
+    position_in_ecef = np.array([point.position_in_ecef for point in points])
+    position = enu_from_ecef(position_in_ecef, origin)
+    sigma_m = np.array([_sigma_enu_m(point, options) for point in points])
+    covariance = _turned(sigma_m, position_in_ecef, origin)
+    return tuple(
+        SurveyedPoint(
+            name=point.name,
+            position_in_geo=_vector(position[row]),
+            cov_in_geo=_matrix(covariance[row]),
+            marks=point.marks,
+            land_cover="vegetated" if point.name in options.vegetated else "open",
+        )
+        for row, point in enumerate(points)
+    )
+
+
+def unmarked_records(points: UnmarkedPoints, origin: Origin, options: IngestOptions) -> tuple[UnmarkedPoint, ...]:
+    """Return points without enough marks in the frame at an origin."""
+    return tuple(
+        UnmarkedPoint(**record.model_dump(), use=use)
+        for use, of_use in points.items()
+        for record in point_records(of_use, origin, options)
+    )
+
+
+def _sigma_enu_m(point: GroundPoint, options: IngestOptions) -> Vector3:
+    """Return σ by precedence: option, then file, then default."""
+    stated = options.model_fields_set
+    horizontal = point.sigma_h_m if point.sigma_h_m and "sigma_gcp_h" not in stated else options.sigma_gcp_h
+    vertical = point.sigma_v_m if point.sigma_v_m and "sigma_gcp_v" not in stated else options.sigma_gcp_v
+    return horizontal, horizontal, vertical
+
+
+def _fixes(poses: ImagePoses, session_of: IntArray, origin: Origin) -> list[Fix | None]:
+    position = enu_from_ecef(poses.position_in_ecef, origin)
+    covariance = _turned(poses.sigma_enu_m, poses.position_in_ecef, origin)
+    return [
+        Fix(
+            position_in_geo=_vector(position[row]),
+            cov_in_geo=_matrix(covariance[row]),
+            source=poses.source,
+            sigma_source=poses.sigma_source[row],
+            session=int(session_of[row]),
+        )
+        if located
+        else None
+        for row, located in enumerate(poses.located)
+    ]
+
+
+def _turned(sigma_enu_m: FloatArray, position_in_ecef: FloatArray, origin: Origin) -> FloatArray:
+    """Return covariances in geo (N, 3, 3) of σ (N, 3) against north and up at each place (N, 3)."""
+    geo_from_enu = geo_from_enu_at(lla_from_ecef(position_in_ecef), origin)
+    return geo_from_enu @ (sigma_enu_m[:, :, None] ** 2 * np.swapaxes(geo_from_enu, -1, -2))
+
+
+def _attitudes(poses: ImagePoses, origin: Origin, options: IngestOptions) -> list[Attitude | None]:
+    attitudes: list[Attitude | None] = [None] * len(poses.position_in_ecef)
+    rows = np.flatnonzero(np.isfinite(poses.enu_from_cam).all(axis=(1, 2))).tolist()
+    # Without a position, north is the origin's: within a survey it turns by minutes of arc.
+    located = poses.located[rows, None]
+    place = np.where(located, lla_from_ecef(poses.position_in_ecef[rows]), lla_of(origin))
+    geo_from_cam = geo_from_enu_at(place, origin) @ poses.enu_from_cam[rows]
+    for row, quat in zip(rows, quat_xyzw_from_matrix(geo_from_cam), strict=True):
+        x, y, z, w = (float(value) for value in quat)
+        attitudes[row] = Attitude(
+            quat_xyzw=(x, y, z, w),
+            sigma_deg=_attitude_sigma_deg(poses, row, options),
+            source=poses.attitude_source[row],
+        )
+    return attitudes
+
+
+def _attitude_sigma_deg(poses: ImagePoses, row: int, options: IngestOptions) -> float:
+    """Return σ by precedence: option, then file, then the source's default."""
+    if options.sigma_attitude is not None:
+        return options.sigma_attitude
+    if np.isfinite(poses.sigma_attitude_deg[row]):
+        return float(poses.sigma_attitude_deg[row])
+    return SIGMA_GIMBAL_DEG if poses.attitude_source[row] == "gimbal" else SIGMA_TABLE_ATTITUDE_DEG
+
+
+def _vector(values: ArrayLike) -> Vector3:
+    x, y, z = (float(value) for value in np.asarray(values))
+    return (x, y, z)
+
+
+def _matrix(values: FloatArray) -> Matrix3:
+    return (_vector(values[0]), _vector(values[1]), _vector(values[2]))
+
+
+# σ of the common error horizontal and vertical in metres, by kind of receiver. No file tells it: the σ in files are
+# those of single positions against the base station, not of the base station itself.
+COMMON_SIGMA_M = {
+    "RTK fixed": (0.03, 0.05),
+    "RTK float": (0.3, 0.6),
+    "single-frequency": (1.5, 3.0),
+    "unknown receiver": (2.0, 4.0),
+}
+# Gap in time after which the base station may stand elsewhere, and the satellites do.
+SESSION_GAP_S = 4 * 3600.0
+# Median σ, horizontal, up to which a receiver that does not tell its solution has had one of that kind.
+_FIXED_SIGMA_M, _FLOAT_SIGMA_M = 0.1, 1.0
+
+
+def fix_sessions(
+    poses: ImagePoses, options: IngestOptions, notes: Notes
+) -> tuple[tuple[FixSession, ...], IntArray]:
+    """Return the sessions, and the session of each of N images (N,), 0 for images without a position.
+
+    Positions of one kind of receiver form a session as long as none comes more than four hours after the one before
+    it. Where the time of one is unknown, all of its kind form one session: a session too many would count as an
+    independent check of a common error.
+
+    Args:
+        poses: measured, of the N images.
+        options: σ that the user gave.
+        notes: the defaults that were assumed.
+    """
+    sessions: list[FixSession] = []
+    session_of = np.zeros(len(poses.receivers), dtype=np.int64)
+    located, sigma_h_m = poses.located, poses.sigma_enu_m[:, :2].max(axis=1)
+    for receiver in RECEIVERS:
+        rows = np.flatnonzero(located & (np.array(poses.receivers) == receiver))
+        by_time = _by_time(poses.time_s[rows])
+        session_of[rows] = len(sessions) + by_time
+        for number in np.unique(by_time):
+            kind = _kind(receiver, float(np.median(sigma_h_m[rows[by_time == number]])))
+            sessions.append(_session(kind, options))
+    counts = np.bincount(session_of[located], minlength=len(sessions))
+    for kind in COMMON_SIGMA_M:
+        of_kind = sum(
+            int(count) for session, count in zip(sessions, counts, strict=True) if session.receiver == kind
+        )
+        if of_kind:
+            _note_default(kind, of_kind, options, notes)
+    return tuple(sessions), session_of
+
+
+def _by_time(time_s: FloatArray) -> IntArray:
+    session = np.zeros(len(time_s), dtype=np.int64)
+    if np.isfinite(time_s).all():
+        order = np.argsort(time_s, kind="stable")
+        session[order[1:]] = np.cumsum(np.diff(time_s[order]) > SESSION_GAP_S)
+    return session
+
+
+def _kind(receiver: str, sigma_h_m: float) -> str:
+    """Return the kind of receiver of a session: as recorded, or better where its σ tells of corrections.
+
+    Programs that write corrected positions into photographs leave the other tags as they were. Decimetres do not
+    tell a float solution from code corrections, whose common error is that of a plain receiver.
+    """
+    if receiver in ("RTK fixed", "RTK float"):
+        return receiver
+    if sigma_h_m <= _FIXED_SIGMA_M:
+        return "RTK fixed"
+    return "RTK float" if receiver == RECEIVERS[-1] and sigma_h_m <= _FLOAT_SIGMA_M else receiver
+
+
+def _session(kind: str, options: IngestOptions) -> FixSession:
+    horizontal_m, vertical_m = COMMON_SIGMA_M[kind]
+    given_h, given_v = options.sigma_common_h, options.sigma_common_v
+    h_m, v_m = horizontal_m if given_h is None else given_h, vertical_m if given_v is None else given_v
+    overridden = given_h is not None or given_v is not None
+    source: SigmaSource = "option" if overridden else "default"
+    return FixSession(receiver=kind, sigma_common_m=(h_m, h_m, v_m), sigma_source=source)
+
+
+def _note_default(kind: str, count: int, options: IngestOptions, notes: Notes) -> None:
+    horizontal_m, vertical_m = COMMON_SIGMA_M[kind]
+    defaults = {
+        "--sigma-common-h": f"{horizontal_m:g} m horizontal",
+        "--sigma-common-v": f"{vertical_m:g} m vertical",
+    }
+    if options.sigma_common_h is not None:
+        del defaults["--sigma-common-h"]
+    if options.sigma_common_v is not None:
+        del defaults["--sigma-common-v"]
+    if defaults:
+        notes.assume(
+            f"σ of the error that the positions of a session share ({count}): {', '.join(defaults.values())} "
+            f"({kind}); state yours with {' and '.join(defaults)}"
+        )
 
 
 @dataclass(frozen=True)

@@ -1,1 +1,1 @@
-"""The report of a survey: everything that is known of it, as one page and as a PDF."""
+"""The report of a survey, and what every page and picture is made with: frame, plots, PDF."""

@@ -10,11 +10,11 @@ from pipelines.core.errors import MissingProductError
 from pipelines.core.figures import CELLS, ERRORS, WAYS, Figure
 from pipelines.core.stages import ACCURACY_MAP
 from pipelines.core.types import FloatArray
-from pipelines.pages.pictures import Picture, picture_of_png, png_file
-from pipelines.plots.observations import predicted_against_measured
-from pipelines.report.evaluated import EvaluatedSurvey
-from pipelines.scene.report import CheckPointErrors, PredictedPointError
-from pipelines.scene.survey import SurveyedPoint
+from pipelines.report.page import Picture, picture_of_png, png_file
+from pipelines.report.plots.observations import predicted_against_measured
+from pipelines.report.views import EvaluatedSurvey
+from pipelines.survey.report import CheckPointErrors, PredictedPointError
+from pipelines.survey.survey import SurveyedPoint
 
 # Of a circular normal distribution in plan, and of a normal one in height, both without bias: 90 % lie within.
 CE90_OF_AXIS_RMSE = 2.1460

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from pipelines.scene.crs_options import CrsOptions
+from pipelines.survey.options import CrsOptions
 
 
 class ReportOptions(CrsOptions):

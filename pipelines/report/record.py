@@ -1,4 +1,9 @@
-"""Record of the processing: stages with options, inputs, versions and times; assumptions, warnings, cautions."""
+"""Record of the processing: stages with options, inputs, versions and times; assumptions, warnings, cautions.
+
+LiDAR that the training has used: its registration, and the places that have changed since.
+
+Comparison of the surface with a reference cloud: map, histogram, and the figures by class and slope.
+"""
 
 from __future__ import annotations
 
@@ -7,13 +12,16 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
-from pipelines.core.cautions import Caution
 from pipelines.core.errors import InputError
 from pipelines.core.options import flag_name, notation
-from pipelines.core.stages import BY_NAME, StageSpec
+from pipelines.core.products import Caution, load_json
+from pipelines.core.stages import BY_NAME, LIDAR, LIDAR_MAP, REFERENCE_HISTOGRAM, REFERENCE_MAP, StageSpec
 from pipelines.core.staleness import cautions_by_stage, status
 from pipelines.core.workspace import Workspace
-from pipelines.scene.survey import Survey
+from pipelines.report.page import Picture, limited, picture_of, png_file, read_picture
+from pipelines.report.views import EvaluatedSurvey
+from pipelines.survey.report_parts import LidarReport
+from pipelines.survey.survey import Survey
 
 _REPORT = "report"
 
@@ -132,3 +140,79 @@ def _versions(by_version: dict[str, list[str]]) -> str:
     if len(by_version) == 1:
         return next(iter(by_version))
     return "; ".join(f"{version} ({', '.join(stages)})" for version, stages in by_version.items())
+
+
+_MAP_PX = 1400
+_LISTED = 12
+
+
+@dataclass(frozen=True)
+class ShiftRow:
+    """Shift along one axis, and its σ, in metres; whether it is beyond 3 σ."""
+
+    axis: str
+    shift_m: float
+    sigma_m: float
+    beyond: bool
+
+
+@dataclass(frozen=True)
+class LidarFacts:
+    """LiDAR of a training.
+
+    Attributes:
+        report: the record of the training.
+        shift: by axis.
+        listed: number of areas in the table.
+        map: picture; None: not kept.
+    """
+
+    report: LidarReport
+    shift: tuple[ShiftRow, ...]
+    listed: int
+    map: Picture | None
+
+
+def lidar_facts(workspace: Workspace) -> LidarFacts | None:
+    """Return the LiDAR of a training; None: it has used none.
+
+    Raises:
+        InputError: record or map cannot be read.
+    """
+    if not (workspace.root / LIDAR).is_file():
+        return None
+    report, drawn = load_json(LidarReport, workspace.root / LIDAR), workspace.root / LIDAR_MAP
+    registration = report.registration
+    rows = zip(("east", "north", "up"), registration.shift_m, registration.sigma_m, strict=True)
+    return LidarFacts(
+        report,
+        tuple(ShiftRow(axis, shift, sigma, abs(shift) > 3 * sigma) for axis, shift, sigma in rows),
+        min(len(report.areas), _LISTED),
+        picture_of(limited(read_picture(drawn), _MAP_PX)) if drawn.is_file() else None,
+    )
+
+
+@dataclass(frozen=True)
+class ReferenceFacts:
+    """Pictures of a comparison.
+
+    Attributes:
+        is_compared: whether `evaluate` had a reference.
+        map, histogram: None: nothing was measured.
+    """
+
+    is_compared: bool
+    map: Picture | None
+    histogram: Picture | None
+
+
+def reference_facts(evaluated: EvaluatedSurvey) -> ReferenceFacts:
+    """Return the pictures of the comparison with a reference.
+
+    Raises:
+        InputError: a picture is damaged.
+    """
+    if evaluated.report.reference is None:
+        return ReferenceFacts(False, None, None)
+    paths = (evaluated.workspace.root / product for product in (REFERENCE_MAP, REFERENCE_HISTOGRAM))
+    return ReferenceFacts(True, *(png_file(path) if path.is_file() else None for path in paths))

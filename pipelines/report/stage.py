@@ -3,32 +3,96 @@
 Reads survey, SfM model, adjustment and the report of `evaluate`; trained model, test views, accuracy map, metrics
 and LiDAR of the training, and previews of the rasters where there are any. Writes `report/report.html` and, on
 request, `report/report.pdf`.
+
+Summary of the report: key figures, traffic lights, cautions.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from datetime import UTC, datetime
 
 from pipelines import __version__
-from pipelines.core.cautions import Caution, union
+from pipelines.core.figures import Headline
+from pipelines.core.products import Caution, union
 from pipelines.core.stages import REPORT_PAGE
 from pipelines.core.workspace import StageRun, Summary
-from pipelines.pages.chromium import chromium_path, print_pdf
-from pipelines.pages.page import Page, Section, write_page
 from pipelines.report.accuracy import accuracy_facts
-from pipelines.report.cameras import cameras_facts
-from pipelines.report.evaluated import EvaluatedSurvey, load_evaluated
-from pipelines.report.lenses import lenses_facts
-from pipelines.report.lidar import lidar_facts
+from pipelines.report.cameras import LensesFacts, cameras_facts, lenses_facts
+from pipelines.report.chromium import chromium_path, print_pdf
 from pipelines.report.options import ReportOptions
-from pipelines.report.overlap import overlap_facts
-from pipelines.report.place import place_facts
+from pipelines.report.page import Page, Section, write_page
+from pipelines.report.place import OverlapFacts, overlap_facts, place_facts
 from pipelines.report.points import points_facts
-from pipelines.report.record import record_facts
-from pipelines.report.reference import reference_facts
-from pipelines.report.summary import SummaryFacts, summary_facts
-from pipelines.report.views import previews_facts, training_facts, views_facts
-from pipelines.scene.trained_model import TrainedModel
+from pipelines.report.record import RecordFacts, lidar_facts, record_facts, reference_facts
+from pipelines.report.verdicts import Measured, Verdict, verdicts
+from pipelines.report.views import EvaluatedSurvey, load_evaluated, previews_facts, training_facts, views_facts
+from pipelines.survey.trained_model import TrainedModel
+
+_NOTES = {
+    "measured": "RMSE of the triangulated check points, their survey's error included",
+    "predicted": "no check points: root mean square of the predicted σ over the scene",
+    "unknown": "neither measured nor predicted",
+}
+
+
+@dataclass(frozen=True)
+class SummaryFacts:
+    """Summary of an evaluated survey.
+
+    Attributes:
+        verdicts: traffic lights.
+        cautions: limits of the result.
+        headline: accuracy of the result.
+        accuracy_note: what its figures are.
+        statement: ASPRS statement of the triangulated check points; None without any.
+    """
+
+    verdicts: tuple[Verdict, ...]
+    cautions: tuple[Caution, ...]
+    headline: Headline
+    accuracy_note: str
+    statement: str | None
+
+
+def summary_facts(
+    evaluated: EvaluatedSurvey,
+    cautions: tuple[Caution, ...],
+    overlap: OverlapFacts,
+    lenses: LensesFacts,
+    record: RecordFacts,
+) -> SummaryFacts:
+    """Return the summary of an evaluated survey.
+
+    Args:
+        evaluated: the survey.
+        cautions: of its products.
+        overlap, lenses, record: facts of those sections.
+    """
+    survey, report = evaluated.solved.survey, evaluated.report
+    measured = Measured(
+        photographs=len(survey.images),
+        registered=lenses.photographs,
+        enough_share=overlap.enough_share,
+        enough=overlap.enough,
+        parts=overlap.parts,
+        rmse_px=lenses.rmse_px,
+        fixes=report.fit.gnss.count + report.fit.gnss.outliers,
+        fix_outliers=report.fit.gnss.outliers,
+        control_points=len(survey.control_points) - report.fit.gcp.outliers,
+        control_outliers=report.fit.gcp.outliers,
+        check_points=len(survey.check_points),
+        stale=tuple(stage.name for stage in record.stages if stage.state in ("stale", "damaged")),
+        workspace=str(evaluated.workspace.root),
+    )
+    return SummaryFacts(
+        verdicts=verdicts(report, measured, cautions),
+        cautions=cautions,
+        headline=report.headline,
+        accuracy_note=_NOTES[report.headline.kind],
+        statement=report.checkpoints.camera.asprs.statement,
+    )
+
 
 _ROOM = __name__.rpartition(".")[0]
 _STEPS = 8

@@ -9,11 +9,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from pipelines.core.cautions import NOT_CHECKED, Caution
+from pipelines.core.products import NOT_CHECKED, Caution
 from pipelines.core.sentences import listed
-from pipelines.pages.text import decibel, number, share
-from pipelines.scene.report import ByAxis, CheckPointErrors, EvaluationReport
-from pipelines.scene.variance_factors import VarianceFactor
+from pipelines.report.page import decibel, number, share
+from pipelines.survey.report import ByAxis, CheckPointErrors, EvaluationReport
+from pipelines.survey.report_parts import VarianceFactor
 
 Level = Literal["good", "fair", "poor", "unknown"]
 

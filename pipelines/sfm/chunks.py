@@ -3,23 +3,58 @@
 The plan lies in the partial product of the stage, and a folder for each chunk beside it. A chunk is finished when
 its folder holds `database.db`. The folder's name has a hash of all that the chunk is made from: a finished chunk is
 used again exactly as long as it is right.
+
+Work on one chunk of a reconstruction: a process of its own, which needs no other that runs at the same time.
+
+Reads `ingest/survey.json`, the photographs, the plan in `sfm.partial/`, and for matches the finished features.
+Writes the chunk's folder only, whose lock it holds. The same command again continues a chunk that was interrupted.
+
+Features and matches of a large survey in chunks, as jobs of an engine, and their way into one database.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import logging
+import shutil
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
 
-from pipelines.core.products import Product
+from pipelines.core.child import run_in_child
+from pipelines.core.errors import DamagedPartialError, GeorefError, InputError
+from pipelines.core.files import remove, replace_text
+from pipelines.core.fingerprints import library_versions
+from pipelines.core.lock import WriteLock
+from pipelines.core.plan import photograph_folder
+from pipelines.core.products import Product, load_json
+from pipelines.core.progress import Progress
+from pipelines.core.sentences import listed
+from pipelines.core.stages import BY_NAME, SURVEY
 from pipelines.core.types import IntArray
-from pipelines.core.versions import library_versions
-from pipelines.scene.survey import Survey
+from pipelines.core.workspace import StageRun, Workspace
+from pipelines.formats.colmap import quiet_colmap
+from pipelines.jobs.engine import Job, JobEnd
+from pipelines.jobs.local import failed_of
+from pipelines.sfm.colmap_database import (
+    FEATURES,
+    MATCHES,
+    copy_rows,
+    finish_database,
+    remove_database,
+    require_sound,
+    write_frame,
+)
+from pipelines.sfm.features import SfmJob, candidate_pairs, extract_features, match_features
+from pipelines.sfm.memory import chunk_peak_bytes
 from pipelines.sfm.options import SfmOptions
+from pipelines.survey.survey import Survey
+
+log = logging.getLogger(__name__)
 
 PLAN = "chunks.json"
 FOLDER = "chunks"
@@ -123,3 +158,214 @@ def _cut(rows: IntArray, size: int) -> list[IntArray]:
 
 def _digest(*content: object) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
+
+
+_DRAFT = "unfinished.db"
+_RUN_AGAIN = "run the same command again (finished features and matches are kept)"
+
+
+def work_chunk(workspace: Workspace, name: str, progress: Progress) -> bool:
+    """Work on a chunk until it is finished, and return whether there was anything to do.
+
+    Args:
+        workspace: in which `georef sfm` has planned the chunks.
+        name: of the chunk.
+        progress: shows its photographs or pairs.
+
+    Raises:
+        InputError: no such chunk is planned, or a photograph has changed.
+        WorkspaceBusyError: another process works on the chunk.
+        GeorefError: a crash of COLMAP, or a full disk.
+    """
+    partial = workspace.partial(BY_NAME["sfm"])
+    chunk = _planned(workspace, load_plan(workspace), name)
+    folder = chunk.folder(partial)
+    with WriteLock(folder).hold(f"sfm --chunk {name}"):
+        if chunk.is_finished(partial):
+            log.info("%s: finished before", name)
+            return False
+        survey = workspace.path(SURVEY)
+        images = photograph_folder(workspace, load_json(Survey, survey).image_dir)
+        arguments = {"survey": str(survey), "images": str(images), "partial": str(partial), "name": name}
+        run_in_child("pipelines.sfm.chunks:write_chunk", arguments, _RUN_AGAIN, progress, writes=folder)
+    return True
+
+
+def load_plan(workspace: Workspace) -> ChunkPlan:
+    """Return the plan of the chunks of a workspace.
+
+    Raises:
+        InputError: there is none.
+    """
+    path = workspace.partial(BY_NAME["sfm"]) / PLAN
+    if not path.is_file():
+        raise InputError(f"no chunks are planned: `georef sfm {workspace.root}` plans them", path=path)
+    return load_json(ChunkPlan, path)
+
+
+def write_chunk(arguments: Mapping[str, Any], progress: Progress) -> None:
+    """Compute the features or matches of a chunk, in a child process.
+
+    Args:
+        arguments: paths of `survey`, `images` and `partial`, and the `name` of the chunk.
+        progress: shows its photographs or pairs.
+
+    Raises:
+        GeorefError: as `work_chunk`.
+    """
+    partial = Path(arguments["partial"])
+    plan = load_json(ChunkPlan, partial / PLAN)
+    chunk = next(chunk for chunk in plan.chunks if chunk.name == arguments["name"])
+    draft = chunk.folder(partial) / _DRAFT
+    draft.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        require_sound(draft)
+    except DamagedPartialError as error:
+        log.warning("%s: starts afresh: %s", chunk.name, error)
+        remove_database(draft)
+    job = SfmJob(load_json(Survey, Path(arguments["survey"])), Path(arguments["images"]), draft, plan.options)
+    with quiet_colmap() as colmap:
+        colmap.set_random_seed(plan.options.seed)
+        if chunk.kind == "features":
+            extract_features(colmap, job, chunk.images, progress)
+            finish_database(draft, chunk.database(partial))
+        else:
+            write_frame(colmap, draft, job.survey, chunk.images, plan.options)
+            for features in plan.of_kind("features"):
+                shared = sorted(set(chunk.images).intersection(features.images))
+                if shared:
+                    copy_finished(features, partial, draft, FEATURES, shared)
+            match_features(colmap, job, np.array(chunk.pairs, dtype=np.int64).reshape(-1, 2), progress)
+            finish_database(draft, chunk.database(partial), without=FEATURES)
+
+
+def copy_finished(
+    chunk: Chunk, partial: Path, target: Path, tables: tuple[str, ...], images: list[int] | None = None
+) -> None:
+    """Copy rows of a finished chunk into a database; see `copy_rows`.
+
+    Raises:
+        InputError: the chunk is not finished, or its database is damaged; a damaged one is removed, so that the
+            chunk is computed again.
+    """
+    database = chunk.database(partial)
+    if not chunk.is_finished(partial):
+        raise InputError(f"{chunk.name} is not finished, and its features are needed", path=database)
+    try:
+        copy_rows(database, target, tables, images)
+    except DamagedPartialError as error:
+        remove_database(database)
+        raise InputError(f"{error.message}: it was removed; run `georef sfm` again", path=database) from error
+
+
+def _planned(workspace: Workspace, plan: ChunkPlan, name: str) -> Chunk:
+    for chunk in plan.chunks:
+        if chunk.name == name:
+            count = len(load_json(Survey, workspace.path(SURVEY)).images)
+            if max((*chunk.images, *(index for pair in chunk.pairs for index in pair)), default=0) >= count:
+                raise InputError(
+                    f"{name} has more photographs than the survey: `georef sfm {workspace.root}` plans anew",
+                    path=workspace.partial(BY_NAME["sfm"]) / PLAN,
+                )
+            return chunk
+    names = f"{plan.chunks[0].name} … {plan.chunks[-1].name}" if plan.chunks else "none"
+    raise InputError(f"{name!r} is none of the chunks {names}", field="--chunk")
+
+
+_TITLES: dict[Kind, str] = {
+    "features": "chunks of features",
+    "matches": "chunks of matches",
+}
+
+
+def work_in_chunks(stage: StageRun, survey: Survey, options: SfmOptions) -> ChunkPlan:
+    """Compute features and matches in chunks that the engine in use shares out, and return their plan.
+
+    Chunks that an earlier run has finished are kept.
+
+    Args:
+        stage: run of `sfm`; its partial product receives plan and chunks.
+        survey: the photographs.
+        options: of the stage.
+
+    Raises:
+        GeorefError: chunks have failed; the others are finished and kept.
+        KeyboardInterrupt: the user stopped the run; the chunks have saved their work.
+    """
+    plan = plan_chunks(survey, candidate_pairs(survey, options), options)
+    replace_text(stage.out / PLAN, plan.model_dump_json())
+    for kind in _TITLES:
+        _work(stage, survey, plan, kind)
+    return plan
+
+
+def _work(stage: StageRun, survey: Survey, plan: ChunkPlan, kind: Kind) -> None:
+    """Run those chunks of a kind that are not finished.
+
+    Raises:
+        GeorefError: at least one has failed.
+    """
+
+    def ended(_: JobEnd) -> None:
+        finished = sum(chunk.is_finished(stage.out) for chunk in plan.chunks)
+        stage.record_progress(f"{finished} of {len(plan.chunks)} chunks")
+
+    title = _TITLES[kind]
+    waiting = [chunk for chunk in plan.of_kind(kind) if not chunk.is_finished(stage.out)]
+    jobs = [_job(stage, survey, plan, chunk) for chunk in waiting]
+    if failed := failed_of(title, jobs, ended, stage.progress):
+        names = listed([end.job.name for end in failed])
+        raise GeorefError(
+            f"{len(failed)} of {len(jobs)} {title} failed ({names}): {failed[0].error}; the same command works on "
+            "those again and keeps the others"
+        )
+
+
+def _job(stage: StageRun, survey: Survey, plan: ChunkPlan, chunk: Chunk) -> Job:
+    """Return the command that works on a chunk, with all that it reads and writes."""
+    root = stage.workspace.root.absolute()
+    if chunk.kind == "features":
+        images = photograph_folder(stage.workspace, survey.image_dir)
+        reads = [images / survey.images[index].name for index in chunk.images]
+    else:
+        needed = set(chunk.images)
+        reads = [
+            features.database(stage.out)
+            for features in plan.of_kind("features")
+            if not needed.isdisjoint(features.images)
+        ]
+    return Job(
+        chunk.name,
+        ("sfm", str(root), "--chunk", chunk.name),
+        chunk_peak_bytes(survey.largest_photograph_px, plan.options),
+        folder=root,
+        writes=chunk.folder(stage.out),
+        reads=(stage.workspace.path(SURVEY), stage.out / PLAN, *reads),
+    )
+
+
+def join_chunks(colmap: Any, job: SfmJob, plan: ChunkPlan, partial: Path, progress: Progress) -> None:
+    """Copy the features and matches of all chunks into the database of the job, which is made anew.
+
+    Args:
+        colmap: the pycolmap module.
+        job: inputs of the reconstruction.
+        plan: its chunks, all of them finished.
+        partial: the partial product of the stage.
+        progress: shows the chunks.
+
+    Raises:
+        InputError: a chunk is damaged; it was removed, and the same command computes it again.
+    """
+    remove_database(job.database)  # An interrupted run may have left half of it, or one for other chunks.
+    write_frame(colmap, job.database, job.survey, range(len(job.survey.images)), job.options)
+    with progress.task("joining chunks", len(plan.chunks)) as task:
+        for chunk in plan.chunks:
+            copy_finished(chunk, partial, job.database, FEATURES if chunk.kind == "features" else MATCHES)
+            task.advance()
+
+
+def remove_chunks(partial: Path) -> None:
+    """Remove plan and chunks from the product, which has all of them in its database."""
+    remove(partial / PLAN)
+    shutil.rmtree(partial / FOLDER, ignore_errors=True)

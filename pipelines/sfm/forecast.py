@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from pipelines.core.free_memory import free_main_memory_bytes
+from pipelines.core.machine import free_main_memory_bytes, thread_count
 from pipelines.core.sentences import about
+from pipelines.jobs.costs import ReconstructionPace, reconstruction_pace
 from pipelines.sfm.chunks import is_chunked
 from pipelines.sfm.mapping import MapperName, chosen_mapper
 from pipelines.sfm.memory import peak_bytes, why_too_large
 from pipelines.sfm.options import SfmOptions
-from pipelines.sfm.pace import reconstruction_seconds
 
 
 @dataclass(frozen=True)
@@ -61,8 +61,23 @@ def forecast(photographs: int, photo_px: tuple[int, int], options: SfmOptions) -
         photographs=photographs,
         mapper=chosen_mapper(photographs, options),
         chunks=math.ceil(photographs / options.chunk_size) if is_chunked(photographs, options) else 1,
-        seconds=reconstruction_seconds(photographs, photo_px, options),
+        seconds=pace(photographs, photo_px, options).total_s / thread_count(),
         peak_bytes=peak_bytes(photographs, photo_px, options),
         free_bytes=free_bytes,
         refusal=why_too_large(photographs, photo_px, options, free_bytes) or "",
+    )
+
+
+def pace(photographs: int, photo_px: tuple[int, int], options: SfmOptions) -> ReconstructionPace:
+    """Return about how many seconds one core needs for each step; arguments as for `forecast`."""
+    shrink = max(max(photo_px) / options.max_image_size, 1.0)
+    every = photographs * (photographs - 1) / 2
+    # Half of the largest number of neighbours: most pairs are chosen by both of their images.
+    pairs = every if options.pairs == "exhaustive" else min(every, photographs * options.max_neighbors / 2)
+    return reconstruction_pace(
+        photographs,
+        photo_px[0] * photo_px[1] / shrink**2 / 1e6,
+        pairs,
+        doubled=options.doubles(photo_px),
+        max_features=options.max_features,
     )

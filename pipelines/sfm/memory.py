@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pipelines.core.errors import ResourceError
-from pipelines.core.threads import chosen_threads
+from pipelines.core.machine import chosen_threads
 from pipelines.sfm.mapping import chosen_mapper
 from pipelines.sfm.options import SfmOptions
 

@@ -37,12 +37,12 @@ from pipelines.formats.colmap import (
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.robust.statistics import residual_stats
-from pipelines.scene.calibrated import load_survey
-from pipelines.scene.initial_similarity import InitialSimilarity
-from pipelines.scene.scene import initial_scene
-from pipelines.scene.survey import Fix, Survey
+from pipelines.sfm.colmap_database import PriorAdjustment, position_prior
 from pipelines.sfm.options import AdjustOptions
-from pipelines.sfm.position_priors import PriorAdjustment, position_prior
+from pipelines.survey.adjustment import InitialSimilarity
+from pipelines.survey.calibrated import load_survey
+from pipelines.survey.scene import initial_scene
+from pipelines.survey.survey import Fix, Survey
 
 _MOST_ITERATIONS = 100
 _FORCE_SFM = "COLMAP cannot adjust the model: reconstruct it again (`georef sfm --force`)"

@@ -17,22 +17,20 @@ from typing import Any
 
 from pipelines.core.child import run_in_child
 from pipelines.core.errors import CrashError, DamagedPartialError, DegenerateGeometryError
-from pipelines.core.free_memory import free_main_memory_bytes
-from pipelines.core.photograph_folder import photograph_folder
+from pipelines.core.machine import free_main_memory_bytes
+from pipelines.core.plan import photograph_folder
 from pipelines.core.products import load_json
 from pipelines.core.progress import Progress
 from pipelines.core.stages import SURVEY
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.formats.colmap import quiet_colmap, write_reconstruction
-from pipelines.scene.survey import Survey
-from pipelines.sfm.chunked import join_chunks, remove_chunks, work_in_chunks
-from pipelines.sfm.chunks import ChunkPlan, is_chunked
+from pipelines.sfm.chunks import ChunkPlan, is_chunked, join_chunks, remove_chunks, work_in_chunks
 from pipelines.sfm.colmap_database import require_sound
 from pipelines.sfm.features import SfmJob
-from pipelines.sfm.imported import import_model
 from pipelines.sfm.memory import require_memory
 from pipelines.sfm.options import SfmOptions
-from pipelines.sfm.reconstruction import map_matches, reconstruct
+from pipelines.sfm.reconstruction import import_model, map_matches, reconstruct
+from pipelines.survey.survey import Survey
 
 log = logging.getLogger(__name__)
 

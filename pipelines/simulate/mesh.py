@@ -1,4 +1,9 @@
-"""Triangles with the data of their texture: material, a row of parameters, and a plane for its coordinates."""
+"""Triangles with the data of their texture: material, a row of parameters, and a plane for its coordinates.
+
+Ray casting against a mesh with Embree (the sole home of embreex).
+
+Terrain: gentle relief in the town, hills towards the horizon.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +13,8 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipelines.core.types import ByteArray, Float32Array, FloatArray
+from pipelines.core.errors import BackendUnavailableError
+from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray
 
 Color = tuple[float, float, float]
 
@@ -146,3 +152,139 @@ class MeshBuilder:
             uv_shift=shared[:, 8:10].astype(np.float32),
             texture_params=np.array(self._texture_params, dtype=np.float32),
         )
+
+
+MISS = -1
+
+
+@dataclass(frozen=True)
+class Hits:
+    """First hits of N rays.
+
+    Attributes:
+        triangle: (N,) int32, or `MISS`.
+        distance: (N,) float32, in units of the direction's length.
+        barycentric: (N, 2) float32, weights of the triangle's corners 1 and 2.
+    """
+
+    triangle: NDArray[np.int32]
+    distance: Float32Array
+    barycentric: Float32Array
+
+
+class Raycaster:
+    """Ray caster of a mesh.
+
+    Raises:
+        BackendUnavailableError: embreex is not installed (it has no wheel for this platform).
+    """
+
+    def __init__(self, mesh: Mesh) -> None:
+        try:
+            from embreex.mesh_construction import TriangleMesh
+            from embreex.rtcore_scene import EmbreeScene
+        except ImportError as error:
+            raise BackendUnavailableError(
+                "the simulator needs the ray caster `embreex`: pip install embreex "
+                "(wheels exist for Linux x86-64, macOS and Windows)"
+            ) from error
+        self._mesh = mesh
+        self._scene = EmbreeScene(robust=True)
+        corners = np.ascontiguousarray(mesh.corners.reshape(-1, 3), dtype=np.float32)
+        self._geometry = TriangleMesh(self._scene, corners, np.arange(len(corners), dtype=np.int32).reshape(-1, 3))
+
+    def first_hits(self, origins: ArrayLike, directions: ArrayLike) -> Hits:
+        """Return the first hits of rays from origins (N, 3) along directions (N, 3)."""
+        hits = self._scene.run(*_rays(origins, directions), output=1)
+        return Hits(hits["primID"], hits["tfar"], np.stack([hits["u"], hits["v"]], axis=1))
+
+    def blocked(self, origins: ArrayLike, directions: ArrayLike) -> BoolArray:
+        """Return whether rays hit any triangle: (N,)."""
+        hit: BoolArray = self._scene.run(*_rays(origins, directions), query="OCCLUDED") != MISS
+        return hit
+
+    def exact_distance(self, origin: FloatArray, directions: FloatArray, hits: Hits) -> FloatArray:
+        """Return distances (N,) in float64 to the planes of the triangles that rays hit; NaN for a miss.
+
+        Embree's own distances are single precision, which means centimetres at the horizon.
+        """
+        corners = self._mesh.corners[hits.triangle]
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            distance = np.einsum("ni,ni->n", corners[:, 0] - origin, normal) / np.einsum(
+                "ni,ni->n", directions, normal
+            )
+        return np.where(hits.triangle == MISS, np.nan, distance)
+
+
+def _rays(origins: ArrayLike, directions: ArrayLike) -> tuple[Float32Array, Float32Array]:
+    towards = np.ascontiguousarray(directions, dtype=np.float32)
+    start = np.ascontiguousarray(np.broadcast_to(np.asarray(origins, dtype=np.float32), towards.shape))
+    return start, towards
+
+
+HORIZON_M = 1600.0
+_INNER_M, _CELL_M = 150.0, 2.5
+
+
+@dataclass(frozen=True)
+class Terrain:
+    """Terrain whose height is a sum of waves, zero at the origin.
+
+    Attributes:
+        waves: (W, 2) radians per metre, east and north.
+        phases: (W,) radians.
+        near_m, far_m: (W,) amplitudes in the town and at the horizon.
+    """
+
+    waves: FloatArray
+    phases: FloatArray
+    near_m: FloatArray
+    far_m: FloatArray
+
+    def height(self, xy: ArrayLike) -> FloatArray:
+        """Return heights (…,) in metres of places (…, 2)."""
+        place = np.asarray(xy, dtype=np.float64)
+        raised = np.sin(place @ self.waves.T + self.phases) - np.sin(self.phases)
+        distance = np.linalg.norm(place, axis=-1)
+        hills = np.clip((distance - 160.0) / 500.0, 0.0, 1.0)[..., None] ** 2
+        return np.asarray((raised * (self.near_m + hills * self.far_m)).sum(axis=-1))
+
+    def normal(self, xy: FloatArray) -> FloatArray:
+        """Return upward unit normals (N, 3) at places (N, 2)."""
+        step = 0.5 * np.eye(2)
+        east, north = (self.height(xy + aside) - self.height(xy - aside) for aside in step)
+        normal = np.stack([-east, -north, np.ones(len(xy))], axis=1)
+        return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
+
+
+def make_terrain(relief_m: float, rng: np.random.Generator) -> Terrain:
+    """Return terrain whose height in the town varies by about ± `relief_m`."""
+    lengths = np.array([420.0, 260.0, 150.0, 90.0])
+    bearing = rng.uniform(0, 2 * np.pi, len(lengths))
+    waves = 2 * np.pi / lengths[:, None] * np.stack([np.sin(bearing), np.cos(bearing)], axis=1)
+    shares = np.array([0.5, 0.3, 0.15, 0.05])
+    return Terrain(
+        waves, rng.uniform(0, 2 * np.pi, len(lengths)), relief_m * shares, np.array([16.0, 9.0, 3.0, 0.5])
+    )
+
+
+def add_terrain(builder: MeshBuilder, terrain: Terrain, axes: FloatArray, texture: TextureParameters) -> None:
+    """Add the terrain as a grid, fine in the town and coarse beyond; `axes` (3, 3) are the town's."""
+    inner = np.arange(0.0, _INNER_M + _CELL_M / 2, _CELL_M)
+    outer = np.geomspace(_INNER_M, HORIZON_M, 40)[1:]
+    half = np.concatenate([inner, outer])
+    line = np.concatenate([-half[:0:-1], half])
+    east, north = np.meshgrid(line, line, indexing="ij")
+    places = np.stack([east.ravel(), north.ravel()], axis=1)
+    vertices = np.concatenate([places, terrain.height(places)[:, None]], axis=1)
+    index = np.arange(len(places)).reshape(len(line), len(line))
+    a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))
+    faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    builder.triangles(
+        vertices[faces],
+        Material.TERRAIN,
+        builder.add_texture(texture),
+        (np.zeros(3), axes[0], axes[1]),
+        terrain.normal(places)[faces],
+    )

@@ -9,8 +9,15 @@ import numpy as np
 from pipelines.core.types import FloatArray
 from pipelines.simulate.buildings import Building, TargetSite, add_building, add_car, add_tree
 from pipelines.simulate.layout import STYLES, BuildingPlan, TownLayout, make_town_layout
-from pipelines.simulate.mesh import Material, Mesh, MeshBuilder, TextureParameters
-from pipelines.simulate.terrain import Terrain, add_terrain, make_terrain
+from pipelines.simulate.mesh import (
+    Material,
+    Mesh,
+    MeshBuilder,
+    Terrain,
+    TextureParameters,
+    add_terrain,
+    make_terrain,
+)
 from pipelines.simulate.textures import GroundPlan
 
 

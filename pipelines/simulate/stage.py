@@ -18,23 +18,20 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from pipelines.core.durable import replace_folder, sync_tree
 from pipelines.core.errors import InputError
+from pipelines.core.files import replace_folder, sync_tree
+from pipelines.core.machine import chosen_threads
 from pipelines.core.products import save_json
 from pipelines.core.progress import SILENT, Progress
-from pipelines.core.threads import chosen_threads
-from pipelines.formats.bag.writer import BagCamera, BagFlight, write_bag
+from pipelines.formats.bag_writer import BagCamera, BagFlight, write_bag
 from pipelines.formats.exif_writer import DroneTags, with_tags
-from pipelines.simulate.lidar import LidarFlight
-from pipelines.simulate.lidar_files import LidarFiles
+from pipelines.simulate.lens import Renderer, Sensor
+from pipelines.simulate.lidar import LidarFiles, LidarFlight
 from pipelines.simulate.options import SimulateOptions
-from pipelines.simulate.recording import Recording, record
-from pipelines.simulate.render import Renderer, Sensor
+from pipelines.simulate.recording import Recording, record, write_gnss, write_imu, write_points, write_trajectory
 from pipelines.simulate.sensors import in_local_enu
-from pipelines.simulate.targets import WANTED_RAYS
 from pipelines.simulate.truth import TrueLidar
-from pipelines.simulate.world import World, check_clearance, make_world
-from pipelines.simulate.write import write_gnss, write_imu, write_points, write_trajectory
+from pipelines.simulate.world import WANTED_RAYS, World, check_clearance, make_world
 
 log = logging.getLogger(__name__)
 

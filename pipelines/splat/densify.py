@@ -3,11 +3,26 @@
 A strategy observes every render after its backward pass. Then it may edit the Gaussians through the optimiser,
 which keeps the moments of the rows that stay. Settings are apart from running state. The state can be saved, and
 all random numbers come from the strategy's own generator.
+
+Contribution of every Gaussian to a view: the pixels that it makes up, and those of them with a high error.
+
+The blending weight of Gaussian k at pixel p is w_k(p) = α_k(p) T_k(p), and Σ_p w_k(p) e(p) is the derivative of
+Σ_p e(p) c(p) by the Gaussian's colour. One render of grey Gaussians and its backward pass therefore give the sums
+of all Gaussians at once, on every backend (the auxiliary gradient of doi 10.48550/arXiv.2404.06109, section 3.1).
+
+Density control by several views together: fewer Gaussians for the same image.
+
+After FastGS (doi 10.48550/arXiv.2511.04283, section 3) and Taming 3DGS (doi 10.1145/3680528.3687694):
+
+1. A Gaussian is cloned or split only if it makes up pixels with a high error in several sampled views; a large
+   gradient in one view is not enough.
+2. A Gaussian that makes up hardly any pixel of any view is removed.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -15,11 +30,55 @@ import torch
 from torch import Tensor
 
 from pipelines.geometry.cameras import Pinhole
-from pipelines.splat.contributions import Probe
 from pipelines.splat.gaussians import Gaussians, rotation_matrices
-from pipelines.splat.morton import morton_order
 from pipelines.splat.optimizer import GaussianAdam
-from pipelines.splat.rasterizer.api import ScreenStats
+from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings, ScreenStats
+from pipelines.splat.sh import C0
+from pipelines.splat.spatial import morton_order
+
+# An error counts as high from this fraction of the view's largest (FastGS takes maps normalised to 0 … 1).
+_HIGH_ERROR = 0.1
+
+
+@dataclass(frozen=True)
+class ViewContributions:
+    """Contributions of N Gaussians to one view.
+
+    Attributes:
+        weight_px: (N,) pixels that each Gaussian makes up, Σ w.
+        high_error_px: (N,) those of them whose error is high, Σ w [error is high].
+    """
+
+    weight_px: Tensor
+    high_error_px: Tensor
+
+
+# Returns the contributions to a number of different training views, drawn with the generator.
+Probe = Callable[[int, torch.Generator], list[ViewContributions]]
+
+
+def view_contributions(
+    gaussians: Gaussians, cam_from_model: Tensor, camera: Pinhole, error: Tensor, rasterizer: Rasterizer
+) -> ViewContributions:
+    """Return the contributions of all Gaussians to one view.
+
+    Args:
+        gaussians: N of them.
+        cam_from_model: (4, 4) pose.
+        camera: of H × W pixels.
+        error: (H, W) absolute error of the view, 0 where no pixel counts.
+        rasterizer: backend.
+    """
+    scaled = error / error.max().clamp_min(1e-9)
+    maps = torch.stack([torch.ones_like(error), (scaled > _HIGH_ERROR).to(error), torch.zeros_like(error)], dim=-1)
+    grey = gaussians.detached()
+    grey.sh = torch.zeros(len(gaussians), 1, 3, device=error.device, requires_grad=True)
+    with torch.enable_grad():
+        render = rasterizer.render(grey, cam_from_model.detach(), camera, RasterSettings(sh_degree=0))
+        (gradient,) = torch.autograd.grad((render.colour * maps).sum(), grey.sh)
+    sums = gradient[:, 0] / C0
+    return ViewContributions(sums[:, 0], sums[:, 1])
+
 
 _CHILDREN = 2
 _SHRINK = 0.8 * _CHILDREN  # 3DGS: a child of a split has 1/1.6 of its parent's standard deviations
@@ -235,3 +294,72 @@ class DefaultStrategy:
 
 def _between(low: int, value: int, high: int) -> int:
     return min(max(value, low), high)
+
+
+@dataclass(frozen=True)
+class FastSettings:
+    """Settings of `FastStrategy` beside those of the default one.
+
+    Attributes:
+        views: number of views to sample for an edit.
+        high_error_px: pixels of high error, mean over the views that see a Gaussian, from which that Gaussian is
+            cloned or split.
+        least_px: a Gaussian that makes up fewer pixels in each of the views is removed,
+        least_views: if at least this number of views sees it.
+        prune_stop: last iteration that removes Gaussians, later than the last that adds them.
+    """
+
+    views: int = 10
+    high_error_px: float = 0.2
+    least_px: float = 0.2
+    least_views: int = 2
+    prune_stop: int = 25_000
+
+    @classmethod
+    def for_iterations(cls, iterations: int) -> FastSettings:
+        """Return settings whose removal ends at five sixths of the training, so that Gaussians can settle."""
+        return cls(prune_stop=iterations * 5 // 6)
+
+
+class FastStrategy(DefaultStrategy):
+    """Default density control, with additions and removals that several views agree on."""
+
+    def __init__(
+        self, settings: DefaultSettings, fast: FastSettings, extent_m: float, count: int, seed: int = 0
+    ) -> None:
+        """Start without observations; see `DefaultStrategy`."""
+        super().__init__(settings, extent_m, count, seed)
+        self.fast = fast
+
+    def update(self, iteration: int, optimizer: GaussianAdam, probe: Probe | None = None) -> DensityEdit:
+        """See `Strategy.update`.
+
+        Raises:
+            ValueError: no probe.
+        """
+        settings = self.settings
+        adds = settings.start < iteration <= settings.stop and iteration % settings.every == 0
+        # Sampling views costs renders, and removal alone changes little: a quarter of the edits is enough.
+        removes = settings.stop < iteration <= self.fast.prune_stop and iteration % (4 * settings.every) == 0
+        if not adds and not removes:
+            return DensityEdit()
+        if probe is None:
+            raise ValueError("this strategy asks training views: it needs a probe")
+        contributions = probe(self.fast.views, self._generator)
+        alive = self._alive(optimizer.gaussians.detached(), iteration) & ~self._redundant(contributions)
+        chosen = self._agreed(alive, contributions) if adds else torch.zeros_like(alive)
+        return self._edit(optimizer, alive, chosen)
+
+    def _redundant(self, contributions: list[ViewContributions]) -> Tensor:
+        """Return the mask of the Gaussians that views see, but that make up hardly any pixel of them."""
+        weight = torch.stack([view.weight_px for view in contributions])
+        views = (weight > 0).sum(dim=0)
+        return (views >= self.fast.least_views) & (weight.amax(dim=0) < self.fast.least_px)
+
+    def _agreed(self, alive: Tensor, contributions: list[ViewContributions]) -> Tensor:
+        """Return the mask of the Gaussians to clone or split; those with most pixels in error if room is short."""
+        error = torch.stack([view.high_error_px for view in contributions])
+        views = torch.stack([view.weight_px > 0 for view in contributions]).sum(dim=0)
+        score = error.sum(dim=0) / views.clamp_min(1)
+        pulled = self._mean_gradient(alive.device) >= self.settings.gradient_threshold
+        return self._within_room(alive, alive & pulled & (score >= self.fast.high_error_px), score)

@@ -18,12 +18,11 @@ import torch
 from torch import Tensor
 
 from pipelines.geometry.cameras import Pinhole
-from pipelines.splat.contributions import Probe
-from pipelines.splat.densify import DensityEdit
+from pipelines.splat.densify import DensityEdit, Probe
 from pipelines.splat.gaussians import Gaussians, rotation_matrices
-from pipelines.splat.morton import morton_order
 from pipelines.splat.optimizer import GaussianAdam
 from pipelines.splat.rasterizer.api import ScreenStats
+from pipelines.splat.spatial import morton_order
 
 _MOST_COPIES = 51  # of one Gaussian in one edit: the binomials of eq. 9 are tabulated
 _SEEDS_APART = 1_000_003  # more than there are iterations

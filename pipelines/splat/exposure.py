@@ -3,12 +3,35 @@
 Photographs of one flight differ in exposure and white balance. Without exposures, a model bakes these differences
 into the colours of Gaussians that few views see. The images cannot tell a change of all exposures from a change of
 all Gaussians: the mean over the training photographs is therefore held at the identity.
+
+Exposures of all photographs from the colours of points that several photographs show, without Gaussians.
+
+Photograph i shows the colour c of a point as A_i c + b_i (`splat.exposure`). Exposures and the colours of the
+points are unknown. Robust least squares adjusts them together, as a bundle adjustment does with poses and points:
+
+1. Linearised normal equations; the points are eliminated (Schur complement).
+2. The reduced matrix couples photographs with common points only, in blocks of 12 × 12. Conjugate gradients solve
+   it.
+3. Cauchy's weights follow from the residuals: a point may shine, or move, in one of its photographs.
+
+A weak prior holds each exposure near the identity where a photograph has too few colours to determine it. All
+exposures together can change against all colours: in the end, their mean is made the identity, as in training.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
 import torch
+from scipy.sparse import bsr_matrix
+from scipy.sparse.linalg import LinearOperator, cg
 from torch import Tensor
+
+from pipelines.core.errors import DegenerateGeometryError
+from pipelines.core.types import Float32Array, FloatArray, IntArray
+from pipelines.robust.statistics import cauchy_weight, median_chi2
 
 _FIRST_RATE, _LAST_RATE = 5e-3, 5e-4
 _BETA1, _BETA2, _EPS = 0.9, 0.999, 1e-15
@@ -118,3 +141,183 @@ def fitted_affine(rendered: Tensor, photograph: Tensor, mask: Tensor | None = No
     # gelsd: the smallest solution if a render has too few colours to determine all twelve numbers.
     solution: Tensor = torch.linalg.lstsq(design.cpu(), y.cpu(), driver="gelsd").solution
     return solution.T.to(rendered)
+
+
+_CHUNK = 2**17  # observations whose points are eliminated together
+_ROUNDS = 15
+_STILL = 5e-4  # change of an exposure that ends the adjustment: an eighth of a grey level
+_ACCURATE = 1e-3  # of a step, relative: the next one makes up for it
+_LEAST_SIGMA = 1e-3  # of a colour: rounding to 256 levels
+# σ of the prior: gain of a channel, leak from one channel to another, offset. A colour runs from 0 to 1.
+_GAIN, _LEAK, _OFFSET = 0.5, 0.1, 0.2
+_SIGMA = np.where(np.eye(3, 4, dtype=bool), _GAIN, _LEAK)
+_SIGMA[:, 3] = _OFFSET
+
+
+@dataclass(frozen=True)
+class PointColours:
+    """Colours of M observations, sorted by point.
+
+    Attributes:
+        point: (M,) index into the points, ascending.
+        image: (M,) index into the photographs.
+        colour: (M, 3) RGB from 0 to 1.
+    """
+
+    point: IntArray
+    image: IntArray
+    colour: Float32Array
+
+    def __len__(self) -> int:
+        return len(self.point)
+
+
+def adjusted_exposures(observed: PointColours, count: int) -> FloatArray:
+    """Return the exposures (count, 3, 4) of all photographs: gain matrix and offset (A | b).
+
+    The mean over the photographs with observations is the identity. A photograph without observations has it too.
+    Memory holds the coupled pairs of photographs, and the derivatives of one chunk of observations.
+
+    Args:
+        observed: colours; points with one observation do not count.
+        count: number of photographs.
+
+    Raises:
+        DegenerateGeometryError: no point has two observations.
+    """
+    rays = np.bincount(observed.point)
+    several = rays[observed.point] >= 2
+    if not several.any():
+        raise DegenerateGeometryError("no point is seen in two photographs: exposures cannot be compared")
+    point = np.unique(observed.point[several], return_inverse=True)[1]
+    observed = PointColours(point, observed.image[several], observed.colour[several])
+    seen = np.bincount(observed.image, minlength=count) > 0
+    exposure = np.tile(np.eye(3, 4), (count, 1, 1))
+    for _ in range(_ROUNDS):
+        step = _step(observed, exposure)
+        exposure = exposure + step
+        if np.abs(step).max() < _STILL:
+            break
+    exposure[seen] = _about_identity(exposure[seen])
+    return exposure
+
+
+def _about_identity(exposure: FloatArray) -> FloatArray:
+    """Return exposures (n, 3, 4) of other colours of the points, such that their mean is the identity."""
+    mean = exposure.mean(axis=0)
+    change = np.linalg.solve(mean[:, :3], np.column_stack([np.eye(3), -mean[:, 3]]))
+    gain = exposure[:, :, :3]
+    return np.concatenate([gain @ change[:, :3], gain @ change[:, 3:] + exposure[:, :, 3:]], axis=2)
+
+
+def _step(observed: PointColours, exposure: FloatArray) -> FloatArray:
+    """Return the Gauss–Newton step (n, 3, 4) of the exposures."""
+    count, redundancy = len(exposure), 3 * len(observed) - 3 * int(observed.point[-1] + 1) - 12 * len(exposure)
+    squared = np.concatenate([part.squared for part in _parts(observed, exposure, None)])
+    share = max(redundancy / (3 * len(observed)), 0.1)
+    sigma2 = max(float(np.median(squared)) / median_chi2(3) / share, _LEAST_SIGMA**2)
+    weight = cauchy_weight(squared / sigma2, 3) / sigma2
+    precise = _SIGMA.ravel() ** -2.0
+    own = np.tile(np.diag(precise), (count, 1, 1))
+    slope = ((exposure - np.eye(3, 4)).reshape(count, 12) * precise).ravel()
+    coupled: bsr_matrix | None = None
+    for part in _parts(observed, exposure, weight):
+        np.add.at(own, part.image, part.normal)
+        size = (12 * count, 3 * part.points)
+        order = np.lexsort((part.point, part.image))
+        pointer = np.concatenate([[0], np.cumsum(np.bincount(part.image, minlength=count))])
+        cross = bsr_matrix((part.cross[order], part.point[order], pointer), shape=size)
+        slope += (
+            np.bincount(
+                (12 * part.image[:, None] + np.arange(12)).ravel(), part.slope.ravel(), minlength=12 * count
+            )
+            - cross @ part.of_points.ravel()
+        )
+        taken = (cross @ cross.T).tobsr((12, 12))
+        coupled = taken if coupled is None else coupled + taken
+    diagonal = bsr_matrix((own, np.arange(count), np.arange(count + 1)), shape=(12 * count, 12 * count))
+    return -_solved((diagonal - coupled).tobsr((12, 12)), slope).reshape(count, 3, 4)
+
+
+def _solved(matrix: bsr_matrix, right: FloatArray) -> FloatArray:
+    """Return the solution of a positive definite system by conjugate gradients, preconditioned by its blocks."""
+    count = matrix.shape[0] // 12
+    row = np.repeat(np.arange(count), np.diff(matrix.indptr))
+    on_diagonal = row == matrix.indices
+    blocks = np.empty((count, 12, 12))
+    blocks[row[on_diagonal]] = matrix.data[on_diagonal]
+    inverse = np.linalg.inv(blocks)
+
+    def by_blocks(vector: FloatArray) -> FloatArray:
+        return np.asarray((inverse @ vector.reshape(count, 12, 1)).ravel())
+
+    preconditioner = LinearOperator(matrix.shape, matvec=by_blocks, dtype=np.float64)
+    return np.asarray(cg(matrix, right, rtol=_ACCURATE, M=preconditioner)[0])
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Normal equations of m observations of P points, which are whole tracks."""
+
+    points: int
+    point: IntArray  # (m,) from 0
+    image: IntArray  # (m,)
+    squared: FloatArray  # (m,) residuals, squared
+    normal: FloatArray  # (m, 12, 12) of an exposure
+    cross: FloatArray  # (m, 12, 3) of exposure and point, the latter whitened
+    slope: FloatArray  # (m, 12) by the exposure
+    of_points: FloatArray  # (P, 3) slope by the point, whitened
+
+
+def _parts(observed: PointColours, exposure: FloatArray, weight: FloatArray | None) -> Iterator[_Part]:
+    """Yield the normal equations by chunks of points, each point's colour being the best under the exposures.
+
+    Args:
+        observed: colours of all points.
+        exposure: (n, 3, 4).
+        weight: (M,) of the observations; None: equal weights.
+    """
+    last = np.cumsum(np.bincount(observed.point))
+    first_point = first = 0
+    while first_point < len(last):
+        next_point = max(int(np.searchsorted(last, first + _CHUNK, side="right")), first_point + 1)
+        rows = slice(first, int(last[next_point - 1]))
+        w = np.ones(rows.stop - first) if weight is None else weight[rows]
+        yield _part(
+            observed.point[rows] - first_point,
+            observed.image[rows],
+            observed.colour[rows].astype(np.float64),
+            exposure[observed.image[rows]],
+            w,
+        )
+        first_point, first = next_point, rows.stop
+
+
+def _part(point: IntArray, image: IntArray, colour: FloatArray, exposure: FloatArray, weight: FloatArray) -> _Part:
+    gain, count = exposure[:, :, :3], int(point[-1]) + 1
+    pull = weight[:, None, None] * np.swapaxes(gain, 1, 2)
+    start = np.flatnonzero(np.diff(point, prepend=-1))
+    normal = np.add.reduceat(pull @ gain, start)
+    normal += 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    right = np.add.reduceat((pull @ (colour - exposure[:, :, 3])[:, :, None]), start)
+    of_point = np.linalg.solve(normal, right)[:, :, 0]
+    residual = (exposure @ np.append(of_point, np.ones((count, 1)), axis=1)[point][:, :, None])[:, :, 0] - colour
+    known = np.append(of_point, np.ones((count, 1)), axis=1)[point]  # (m, 4)
+    inverse_root = np.swapaxes(np.linalg.inv(np.linalg.cholesky(normal)), 1, 2)
+    own = np.zeros((len(point), 3, 4, 3, 4))
+    outer = weight[:, None, None] * known[:, :, None] * known[:, None, :]
+    for channel in range(3):
+        own[:, channel, :, channel] = outer
+    white_gain = (weight[:, None, None] * gain) @ inverse_root[point]  # (m, 3, 3)
+    cross = (white_gain[:, :, None, :] * known[:, None, :, None]).reshape(-1, 12, 3)
+    by_point = np.add.reduceat(pull @ residual[:, :, None], start)
+    return _Part(
+        points=count,
+        point=point,
+        image=image,
+        squared=(residual**2).sum(axis=1),
+        normal=own.reshape(-1, 12, 12),
+        cross=cross,
+        slope=(weight[:, None, None] * residual[:, :, None] * known[:, None, :]).reshape(-1, 12),
+        of_points=(np.swapaxes(inverse_root, 1, 2) @ by_point)[:, :, 0],
+    )

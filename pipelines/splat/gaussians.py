@@ -1,15 +1,28 @@
-"""Gaussians as tensors, a row for each Gaussian, in the form in which they are optimised and stored."""
+"""Gaussians as tensors, a row for each Gaussian, in the form in which they are optimised and stored.
+
+Reading and writing of Gaussians as files.
+
+Transformation of Gaussians to another frame.
+
+Detection of values that are not finite, without waiting for the device at every iteration.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from pipelines.core.errors import ConvergenceError
 from pipelines.core.types import Float32Array
+from pipelines.formats.splat_ply import SplatArrays, read_splat_ply, write_splat_ply
+from pipelines.geometry.rotations import quat_xyzw_from_matrix
+from pipelines.geometry.similarity import Similarity
+from pipelines.splat import sh
 
 
 @dataclass
@@ -80,3 +93,104 @@ def rotation_matrices(quats_wxyz: Tensor) -> Tensor:
         2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
     ]  # fmt: skip
     return torch.stack(rows, dim=1).reshape(-1, 3, 3)
+
+
+def write_gaussians(path: Path, gaussians: Gaussians) -> None:
+    """Write Gaussians as a 3DGS PLY; the file appears whole or not at all.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    write_splat_ply(path, SplatArrays(**gaussians.arrays()))
+
+
+def read_gaussians(path: Path, rows: slice = slice(None)) -> Gaussians:
+    """Read Gaussians from a 3DGS PLY; of a part of its rows, nothing else comes into memory.
+
+    Raises:
+        InputError: no such file, not a PLY of that form, cut off, or with values that are not finite.
+    """
+    return Gaussians.from_arrays(vars(read_splat_ply(path, rows)))
+
+
+def transformed(gaussians: Gaussians, target_from_source: Similarity) -> Gaussians:
+    """Return the same Gaussians in another frame: a camera that moves along sees the same image.
+
+    Centres are mapped, scales multiplied, rotations and the direction-dependent bands of the colours turned, in
+    float64. The result has the input's type, so that the target frame's origin must lie near the scene.
+
+    Args:
+        gaussians: N Gaussians.
+        target_from_source: p_target = s R p_source + t.
+    """
+    device, kind = gaussians.means.device, gaussians.means.dtype
+    turn = torch.as_tensor(target_from_source.rotation, dtype=torch.float64, device=device)
+    shift = torch.as_tensor(target_from_source.translation, dtype=torch.float64, device=device)
+    x, y, z, w = quat_xyzw_from_matrix(target_from_source.rotation).tolist()
+    quat_wxyz = torch.tensor([w, x, y, z], dtype=torch.float64, device=device)
+    unit = torch.nn.functional.normalize(gaussians.quats_wxyz.double(), dim=1)
+    return Gaussians(
+        means=(target_from_source.scale * gaussians.means.double() @ turn.T + shift).to(kind),
+        quats_wxyz=_quaternion_product(quat_wxyz, unit).to(kind),
+        log_scales=(gaussians.log_scales.double() + math.log(target_from_source.scale)).to(kind),
+        logit_opacities=gaussians.logit_opacities.clone(),
+        sh=sh.rotate_sh(gaussians.sh, turn.cpu()),
+    )
+
+
+def _quaternion_product(left_wxyz: Tensor, right_wxyz: Tensor) -> Tensor:
+    """Return quaternions (N, 4) of the rotation `left` (4,) after the rotations `right` (N, 4)."""
+    w, x, y, z = left_wxyz.unbind(-1)
+    matrix = torch.stack(
+        [
+            torch.stack([w, -x, -y, -z]),
+            torch.stack([x, w, -z, y]),
+            torch.stack([y, z, w, -x]),
+            torch.stack([z, -y, x, w]),
+        ]
+    )
+    return right_wxyz @ matrix.T
+
+
+_NEVER = 2**62
+
+
+class NonFiniteError(ConvergenceError):
+    """A loss or a gradient is not finite.
+
+    Args:
+        name: of the loss or gradient.
+        iteration: the first with a value that is not finite.
+    """
+
+    def __init__(self, name: str, iteration: int) -> None:
+        self.name, self.iteration = name, iteration
+        super().__init__(f"the {name} is not finite at iteration {iteration}")
+
+
+class FinitenessMonitor:
+    """Records on the device, for each of several scalars, the first iteration at which it was not finite."""
+
+    def __init__(self, names: tuple[str, ...], device: torch.device) -> None:
+        self._names = names
+        self._first = torch.full((len(names),), _NEVER, dtype=torch.int64, device=device)
+
+    def note(self, iteration: int, values: Mapping[str, Tensor]) -> None:
+        """Record this iteration's scalars, by name; a sum over a tensor stands for all of its values."""
+        row = torch.stack([values[name].detach().double() for name in self._names])
+        self._first = torch.where(torch.isfinite(row), self._first, self._first.clamp_max(iteration))
+
+    def check(self) -> None:
+        """Wait for the device and report the first value that was not finite.
+
+        Raises:
+            NonFiniteError: of the earliest iteration; of several scalars at once, the first by order of names.
+        """
+        first = self._first.cpu()
+        place = int(first.argmin())
+        if int(first[place]) < _NEVER:
+            raise NonFiniteError(self._names[place], int(first[place]))
+
+    def reset(self) -> None:
+        """Forget all records."""
+        self._first.fill_(_NEVER)

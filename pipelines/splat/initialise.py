@@ -14,8 +14,8 @@ from scipy.spatial import cKDTree
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.splat.gaussians import Gaussians
-from pipelines.splat.morton import morton_order
 from pipelines.splat.sh import coefficient_count, sh_from_rgb
+from pipelines.splat.spatial import morton_order
 
 log = logging.getLogger(__name__)
 

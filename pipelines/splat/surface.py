@@ -5,21 +5,104 @@
 2. Each Gaussian is flattened towards a disc (as in PGSR, doi 10.1109/TVCG.2024.3494046, eq. 1).
 3. The normals of the discs are pulled to the normals of the rendered depth (2D Gaussian Splatting,
    doi 10.1145/3641519.3657428, eq. 14).
+
+Discs on a surface: flat Gaussians whose centres are points of it.
+
+Depth of a render: choice of the depth map to measure in, and sampling of it at rays.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
 
+from pipelines.core.types import ByteArray, FloatArray
 from pipelines.geometry.cameras import Pinhole
-from pipelines.splat.depth import depth_at
+from pipelines.geometry.rotations import quat_xyzw_from_matrix
 from pipelines.splat.gaussians import Gaussians, rotation_matrices
 from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings
-from pipelines.splat.sh import sh_from_rgb
+from pipelines.splat.sh import coefficient_count, sh_from_rgb
+
+# In spacings. Wider discs hide more of the places behind them, so that a reader of depths meets a centre too near.
+# Narrower ones leave gaps. Between four discs, the transmittance is (1 − 0.9 exp(−1/4 / 0.5²))⁴ = 0.2.
+_SIGMA = 0.5
+_THICKNESS = 0.05  # in spacings
+_OPACITY = 0.9
+
+
+def surface_discs(
+    point_in_model: FloatArray, normal_in_model: FloatArray, rgb: ByteArray, spacing_m: float, sh_degree: int
+) -> Gaussians:
+    """Return a disc of one colour at each point of a surface.
+
+    Args:
+        point_in_model: (P, 3) metres, about `spacing_m` apart.
+        normal_in_model: (P, 3) unit vectors.
+        rgb: (P, 3) colours.
+        spacing_m: between neighbouring points, in units of `model`.
+        sh_degree: of the harmonics; those above degree 0 are zero.
+    """
+    count = len(point_in_model)
+    aside = np.eye(3)[np.abs(normal_in_model).argmin(axis=1)]
+    first = np.cross(aside, normal_in_model)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    axes = np.stack([first, np.cross(normal_in_model, first), normal_in_model], axis=2)
+    sh = torch.zeros(count, coefficient_count(sh_degree), 3)
+    sh[:, 0] = sh_from_rgb(torch.from_numpy(rgb).float() / 255)
+    sigmas_m = spacing_m * np.array([_SIGMA, _SIGMA, _THICKNESS])
+    return Gaussians(
+        means=torch.from_numpy(point_in_model).float(),
+        quats_wxyz=torch.from_numpy(np.roll(quat_xyzw_from_matrix(axes), 1, axis=1)).float(),
+        log_scales=torch.from_numpy(np.log(sigmas_m)).float().repeat(count, 1),
+        logit_opacities=torch.full((count,), float(np.log(_OPACITY / (1 - _OPACITY)))),
+        sh=sh,
+    )
+
+
+_SOLID = 0.5  # least opacity of a surface
+_ONE_SURFACE = 0.003  # of the depth: largest spread of the Gaussians of one surface
+
+
+def depth_at(depth_m: Tensor, alpha: Tensor, xy: Tensor, camera: Pinhole) -> tuple[Tensor, Tensor]:
+    """Return depths (K,) at rays, and whether they count (K,), as 0 and 1.
+
+    Depths are bilinear between pixel centres, and differentiable. Rays outside the image or through pixels without
+    a surface do not count.
+
+    Args:
+        depth_m: (H, W) expected depth, along the camera's z axis.
+        alpha: (H, W).
+        xy: (K, 2) x/z and y/z of the rays.
+        camera: of H × W pixels.
+    """
+    x = (camera.fx * xy[:, 0] + camera.cx) / camera.width
+    y = (camera.fy * xy[:, 1] + camera.cy) / camera.height
+    place = 2 * torch.stack([x, y], dim=1) - 1
+    maps = torch.stack([depth_m, alpha.detach()])[None]
+    sampled = functional.grid_sample(
+        maps, place.to(maps.dtype)[None, None], align_corners=False, padding_mode="border"
+    )[0, :, 0].to(xy.dtype)
+    seen = ((place.abs() < 1).all(dim=1) & (sampled[1] > _SOLID)).to(xy.dtype)
+    return sampled[0], seen
+
+
+def measured_depth(median_m: Tensor, expected_m: Tensor, variance_m2: Tensor) -> Tensor:
+    """Return the depth (H, W) to measure in, 0 without a surface.
+
+    The median selects the surface that a pixel shows, whatever haze lies before and behind it. If all Gaussians of
+    the pixel lie on one surface, the mean is less noisy than the median.
+
+    Args:
+        median_m, expected_m: (H, W) depths of a render.
+        variance_m2: (H, W) of its depth.
+    """
+    one_surface = variance_m2 < (_ONE_SURFACE * median_m).square()
+    return torch.where(one_surface, expected_m, median_m)
+
 
 _SPREAD = 0.005  # of the depth: the loss of a smaller spread grows with its square
 _NEAR = 0.002  # of the depth

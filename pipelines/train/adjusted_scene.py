@@ -19,14 +19,13 @@ from pipelines.core.stages import ADJUSTMENT
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.core.workspace import Workspace
 from pipelines.geometry.rotations import log_so3
-from pipelines.scene.initial_similarity import InitialSimilarity
-from pipelines.scene.photographs import ImageCache
-from pipelines.scene.pinholes import Pinholes
-from pipelines.scene.scene import Scene, load_adjusted_scene
-from pipelines.scene.survey import Survey
-from pipelines.scene.trained_model import Adjustment
 from pipelines.splat.exposure import HeldExposures
 from pipelines.splat.rasterizer.api import Rasterizer
+from pipelines.survey.adjustment import InitialSimilarity
+from pipelines.survey.photographs import ImageCache, Pinholes
+from pipelines.survey.scene import Scene, load_adjusted_scene
+from pipelines.survey.survey import Survey
+from pipelines.survey.trained_model import Adjustment
 from pipelines.train.region import RegionViews
 
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from pipelines.splat.densify import DefaultSettings, DefaultStrategy, Strategy
-from pipelines.splat.densify_fast import FastSettings, FastStrategy
+from pipelines.splat.densify import DefaultSettings, DefaultStrategy, FastSettings, FastStrategy, Strategy
 from pipelines.splat.densify_mcmc import McmcSettings, McmcStrategy
 from pipelines.splat.exposure import Exposures, HeldExposures
 from pipelines.splat.gaussians import Gaussians
@@ -15,11 +14,11 @@ from pipelines.splat.outlier_pixels import OutlierPixels, OutlierSettings
 from pipelines.splat.rasterizer.api import Rasterizer
 from pipelines.splat.rasterizer.backends import device_of
 from pipelines.splat.surface import SurfaceSettings
-from pipelines.train.crops import Crops
 from pipelines.train.geographic.problem import GeoProblem
 from pipelines.train.initial_gaussians import TrainingScene, initial_gaussians, points_to_hold
 from pipelines.train.options import TrainOptions
 from pipelines.train.schedule import COARSE, JointOptions
+from pipelines.train.target_images import Crops
 from pipelines.train.trainer import JointTrainer, TrainingViews
 
 _OUTLIERS_FROM = 0.5  # of the iterations: before, the model is too coarse to tell what has moved

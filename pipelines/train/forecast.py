@@ -1,26 +1,79 @@
-"""Forecast of a training: size, time and memory for the photographs of a survey, before it starts."""
+"""Forecast of a training: size, time and memory for the photographs of a survey, before it starts.
+
+Default limit of Gaussians: by the pixels of the photographs, within what the preset and the memory allow.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
+from pipelines.core.machine import thread_count
 from pipelines.core.sentences import about
-from pipelines.core.threads import thread_count
 from pipelines.geometry.cameras import Pinhole
-from pipelines.scene.block_plan import BlockPlan
-from pipelines.scene.cloud_options import NOT_IN_BLOCKS
-from pipelines.scene.survey import Survey
-from pipelines.splat.memory import USABLE, free_memory_bytes, predicted_peak_bytes
+from pipelines.jobs.costs import BLOCK_SECONDS, MEASURED_CORES, SURFACE_FACTOR, iteration_seconds
+from pipelines.splat.memory import USABLE, TrainingSize, fitting_gaussians, free_memory_bytes, predicted_peak_bytes
 from pipelines.splat.rasterizer.backends import chosen_backend
-from pipelines.train.crops import Crops
-from pipelines.train.depth_maps import StereoOptions
-from pipelines.train.gaussian_limit import training_size, with_gaussian_limit
-from pipelines.train.options import TrainOptions
-from pipelines.train.pace import BLOCK_SECONDS, MEASURED_CORES, SURFACE_FACTOR, iteration_seconds
+from pipelines.surface.depth_maps import StereoOptions
+from pipelines.survey.block_plan import BlockPlan
+from pipelines.survey.options import NOT_IN_BLOCKS
+from pipelines.survey.survey import Survey
+from pipelines.train.options import PRESETS, TrainOptions
 from pipelines.train.schedule import COARSE, pyramid
+from pipelines.train.target_images import Crops
+
+# Pixels of all photographs for each Gaussian: where eight photographs overlap, five pixels on the ground.
+_PIXELS_EACH = 40
+
+
+def training_size(options: TrainOptions, photographs: int, largest: Pinhole, beside: int = 0) -> TrainingSize:
+    """Return the quantities that determine the memory of a training.
+
+    Args:
+        options: of the training.
+        photographs: number of the photographs.
+        largest: camera of the largest photograph at training size.
+        beside: number of frozen Gaussians that are rendered too.
+    """
+    return TrainingSize(
+        options.effort.max_gaussians + beside,
+        Crops(options.crop_size).largest_of(largest),
+        options.sh_degree,
+        options.refined_cameras(photographs),
+        largest.width * largest.height,
+    )
+
+
+def with_gaussian_limit(
+    options: TrainOptions, photographs: int, largest: Pinhole, free_bytes: int | None
+) -> TrainOptions:
+    """Return options that state the limit of Gaussians; they are unchanged if the user states one.
+
+    1. Photographs of the preset's size have the preset's limit.
+    2. Larger ones have more, in proportion to their pixels, as far as all photographs together have 40 pixels for
+       each, and as far as they fit into memory.
+
+    Args:
+        options: of the training.
+        photographs: number of the photographs.
+        largest: camera of the largest photograph at training size.
+        free_bytes: memory that is free; None: unknown.
+    """
+    preset = PRESETS[options.preset]
+    enlarged = max(largest.width, largest.height) / preset.max_image_size
+    if options.max_gaussians is not None or enlarged <= 1:
+        return options
+    limits = [
+        round(enlarged**2 * preset.max_gaussians),
+        photographs * largest.width * largest.height // _PIXELS_EACH,
+    ]
+    if free_bytes is not None:
+        size = replace(training_size(options, photographs, largest), gaussians=min(limits))
+        limits.append(fitting_gaussians(size, free_bytes))
+    return options.model_copy(update={"max_gaussians": max(preset.max_gaussians, min(limits))})
+
 
 # Stereo, by photographs (the sweep has one size) and by megapixels of the depth maps: half of the processor time of
 # one thread on an Intel Xeon (AVX-512), 2026-11-22. Two threads on two idle cores were not measured.

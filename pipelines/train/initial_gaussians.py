@@ -1,4 +1,23 @@
-"""Initial Gaussians of a training, and the points that its surface losses hold them to."""
+"""Initial Gaussians of a training, and the points that its surface losses hold them to.
+
+Background points for parts of the photographs without known points: sky, horizon, bare ground around the scene.
+
+Floaters would fill these parts if they started empty: Gaussians of the scene that grow in mid-air until they cover
+the gap, in front of everything else. Rays through such parts therefore start with a Gaussian of the pixel's colour:
+on the ground, or far away if the ray does not meet the ground.
+
+Points for parts of the photographs whose depth stereo does not know: crowns in wind, water, smooth ground.
+
+Without Gaussians to start from, density control would have to split the few that reach into such a part, again and
+again. Points on the rays of its pixels, at the height of the SfM points around them, start as dense as the surface.
+
+Ground beneath the scene: what a viewer sees through a gap in the model.
+
+No photograph shows the foot of some wall, or what stands in a narrow yard. With nothing behind it, such a gap is
+a black hole, and whatever Gaussian is near grows over it. A sheet of flat Gaussians in the colours of the ground,
+below all points, ends each ray that looks down. It lies only where a known surface hides it from photographs, or
+none looks: elsewhere photographs decide what is there, and the sheet would count as a surface.
+"""
 
 from __future__ import annotations
 
@@ -7,21 +26,277 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
+import cv2
 import numpy as np
 import torch
+from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from pipelines.core.types import BoolArray, FloatArray, IntArray
-from pipelines.scene.photographs import ImageCache
-from pipelines.scene.scene import Scene
+from pipelines.core.types import BoolArray, ByteArray, FloatArray, IntArray
+from pipelines.geometry.cameras import Pinhole
+from pipelines.geometry.footprints import PointSurface, ground_points, thin_to_voxels
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.initialise import InitialisationOptions, gaussians_from_points, gaussians_of_size
 from pipelines.splat.surface import ObservedPoints
-from pipelines.train.background import background
-from pipelines.train.guessed_surface import guessed_points
+from pipelines.survey.photographs import ImageCache
+from pipelines.survey.scene import Scene
 from pipelines.train.region import TrainingRegion
-from pipelines.train.surface import SceneSurface, SurfacePoints
-from pipelines.train.underlay import hidden, underlay
+from pipelines.train.surface import SceneSurface, SurfacePoints, spread_evenly
+
+_BACKGROUND_COLUMNS = 24  # cells across an image
+_MOST_VIEWS = 120
+_GROUND_SHARE = 0.1  # of the points lie below the ground
+_STEEPEST = 0.5  # largest slope of the ground; a steeper plane was fitted to walls
+_GROUND_REACH = 6.0  # in scene radii: beyond, the ground counts as infinitely far
+_SKY_RADIUS = 12.0  # in scene radii
+
+
+@dataclass(frozen=True)
+class Background:
+    """B points on rays that meet no known point.
+
+    Attributes:
+        point_in_model: (B, 3) metres.
+        rgb: (B, 3) uint8.
+        sigma_m: (B,) half the width of the image cell, at the distance of the point.
+    """
+
+    point_in_model: FloatArray
+    rgb: ByteArray
+    sigma_m: FloatArray
+
+
+def background(scene: Scene, images: ImageCache, points: FloatArray) -> Background:
+    """Return points on the rays of all image cells of the training views that show none of the known points.
+
+    The z axis of `model` points up, and the ground is a plane below most of the points.
+
+    Args:
+        scene: cameras.
+        images: undistorted photographs, for the colours.
+        points: (N, 3) known points in `model`, metres.
+    """
+    middle = np.median(points, axis=0)
+    radius = float(np.percentile(np.linalg.norm(points - middle, axis=1), 90))
+    ground = ground_plane(points)
+    points_beyond, colours, sigmas = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)], [np.zeros(0)]
+    step = max(1, len(scene.train) // _MOST_VIEWS)
+    for index in map(int, scene.train[::step]):
+        camera, center = images.pinhole(index), scene.poses.cam_center_in_model[index]
+        cells = _empty_cells(scene, index, camera, points)
+        pixel = (cells + 0.5) * (camera.width / _BACKGROUND_COLUMNS)
+        ray = _rays(pixel, camera) @ scene.poses.cam_from_model[index]
+        distance = _distance(ray, center, ground, radius)
+        points_beyond.append(center + distance[:, None] * ray)
+        colours.append(_image_colours(images.image(index), pixel))
+        sigmas.append(0.5 * distance * camera.width / (_BACKGROUND_COLUMNS * camera.fx))
+    return _thinned(Background(np.concatenate(points_beyond), np.concatenate(colours), np.concatenate(sigmas)))
+
+
+def _empty_cells(scene: Scene, index: int, camera: Pinhole, points: FloatArray) -> FloatArray:
+    """Return the cells (E, 2), as column and row, that have no point in them or in a cell beside them."""
+    rows = max(1, round(_BACKGROUND_COLUMNS * camera.height / camera.width))
+    in_cam = (points - scene.poses.cam_center_in_model[index]) @ scene.poses.cam_from_model[index].T
+    xy = camera.project(in_cam)
+    shown = xy[camera.holds(xy)]
+    occupied = np.zeros((rows + 2, _BACKGROUND_COLUMNS + 2), dtype=bool)
+    column, row = (shown * [_BACKGROUND_COLUMNS / camera.width, rows / camera.height]).astype(int).T
+    for shift_row in (0, 1, 2):
+        for shift_column in (0, 1, 2):
+            occupied[row + shift_row, column + shift_column] = True
+    empty_row, empty_column = np.nonzero(~occupied[1:-1, 1:-1])
+    return np.stack([empty_column, empty_row], axis=1).astype(np.float64)
+
+
+def _rays(pixel: FloatArray, camera: Pinhole) -> FloatArray:
+    ray = camera.rays(pixel)
+    return np.asarray(ray / np.linalg.norm(ray, axis=1, keepdims=True))
+
+
+def ground_plane(points: FloatArray) -> FloatArray:
+    """Return (a, b, c) of the plane z = a x + b y + c below which a tenth of points (N, 3) lies.
+
+    The method is quantile regression (doi 10.2307/1913643) by reweighted least squares. The plane is level if the
+    points determine no slope, or a slope that is too steep for ground.
+    """
+    center = np.median(points, axis=0)
+    spread = max(float(np.abs(points - center).mean()), 1e-9)
+    arm = (points - center) / spread
+    near = (np.abs(arm) < _GROUND_REACH).all(axis=1)  # a wrong match far out would tilt the plane
+    design, height = np.column_stack([arm[near, :2], np.ones(near.sum())]), arm[near, 2]
+    plane = np.array([0.0, 0.0, float(np.quantile(height, _GROUND_SHARE))])
+    for _ in range(50):
+        residual = height - design @ plane
+        weight = np.where(residual > 0, _GROUND_SHARE, 1 - _GROUND_SHARE) / np.maximum(np.abs(residual), 1e-4)
+        plane = np.linalg.lstsq(np.sqrt(weight)[:, None] * design, np.sqrt(weight) * height, rcond=None)[0]
+    if not np.hypot(plane[0], plane[1]) < _STEEPEST:
+        plane = np.array([0.0, 0.0, float(np.quantile(height, _GROUND_SHARE))])
+    return np.array([plane[0], plane[1], spread * plane[2] + center[2] - plane[:2] @ center[:2]])
+
+
+def _distance(ray: FloatArray, center: FloatArray, ground: FloatArray, radius: float) -> FloatArray:
+    """Return distances (E,) along rays (E, 3): to the ground if the ray meets it within reach, else to the sky."""
+    height = center[2] - ground[:2] @ center[:2] - ground[2]
+    fall = ground[:2] @ ray[:, :2].T - ray[:, 2]
+    to_ground = height / np.maximum(fall, 1e-6)
+    meets = (fall > 0) & (to_ground > 0) & (to_ground < _GROUND_REACH * radius)
+    return np.where(meets, to_ground, _SKY_RADIUS * radius)
+
+
+def _image_colours(image: ByteArray, pixel: FloatArray) -> ByteArray:
+    row = np.clip(pixel[:, 1].astype(int), 0, image.shape[0] - 1)
+    column = np.clip(pixel[:, 0].astype(int), 0, image.shape[1] - 1)
+    return np.asarray(image[row, column])
+
+
+def _thinned(all_points: Background) -> Background:
+    """Return one point in each cube of its own size, because neighbouring views see the same places."""
+    first = thin_to_voxels(all_points.point_in_model, 2 * all_points.sigma_m)
+    return Background(all_points.point_in_model[first], all_points.rgb[first], all_points.sigma_m[first])
+
+
+_CANDIDATES = 4  # drawn for each wanted point
+_RAY_COLUMNS = 64  # along the longer side of a view: neighbouring rays meet neighbouring ground
+
+
+def guessed_points(
+    scene: Scene,
+    surface: SceneSurface,
+    count: int,
+    seed: int,
+    inside: Callable[[FloatArray], BoolArray],
+) -> SurfacePoints:
+    """Return points, without normals, at pixels of the training views whose depth is not known.
+
+    Each lies where the ray of its pixel meets the surface through the SfM points, z up. Sky has none.
+
+    Args:
+        scene: cameras and SfM points.
+        surface: with the known depths.
+        count: limit of the points, which are spread as evenly as the photographs resolve them.
+        seed: of the choice of pixels.
+        inside: returns which of points (N, 3) count, as a mask (N,).
+    """
+    if count < 1:
+        return SurfacePoints(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros((0, 3)))
+    ground, random = PointSurface(scene.point_in_model), np.random.default_rng(seed)
+    each = -(-_CANDIDATES * count // max(len(scene.train), 1))
+    points, colours, sizes = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)], [np.zeros(0)]
+    for index in map(int, scene.train):
+        camera = surface.camera(index)
+        unknown = surface.depth(index) == 0
+        depth = _ground_depth(scene, index, camera, ground, unknown)
+        rows, columns = np.nonzero(unknown & np.isfinite(depth))
+        chosen = random.permutation(len(rows))[:each]
+        rows, columns = rows[chosen], columns[chosen]
+        in_cam = depth[rows, columns, None] * camera.rays(np.stack([columns, rows], axis=1) + 0.5)
+        points.append(in_cam @ scene.poses.cam_from_model[index] + scene.poses.cam_center_in_model[index])
+        colours.append(surface.rgb(index)[rows, columns])
+        sizes.append(depth[rows, columns] / camera.fx)
+    place, rgb, size_m = np.concatenate(points), np.concatenate(colours), np.concatenate(sizes)
+    counted = np.flatnonzero(inside(place))
+    kept = counted[spread_evenly(place[counted], size_m[counted], count)]
+    return SurfacePoints(place[kept], rgb[kept], np.full((len(kept), 3), np.nan))
+
+
+def _ground_depth(scene: Scene, index: int, camera: Pinhole, ground: PointSurface, wanted: BoolArray) -> FloatArray:
+    """Return the depth (H, W) of the ground in a view, in metres, from a few rays around the wanted pixels.
+
+    It is NaN where a ray meets no ground, and away from the wanted pixels.
+    """
+    center, coarse = scene.poses.cam_center_in_model[index], camera.limited(_RAY_COLUMNS)
+    around = cv2.resize(wanted.astype(np.float32), (coarse.width, coarse.height), interpolation=cv2.INTER_AREA) > 0
+    near = cv2.dilate(around.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0  # pixels are between four rays
+    rays = coarse.points_at(np.ones(near.shape))[near.ravel()] @ scene.poses.cam_from_model[index]
+    place = ground_points(rays, center, ground)
+    along = np.full(near.shape, np.nan)
+    along[near] = np.linalg.norm(place - center, axis=1) / np.linalg.norm(rays, axis=1)
+    size = camera.width, camera.height
+    return np.asarray(cv2.resize(along, size, interpolation=cv2.INTER_LINEAR))
+
+
+_STRAY = 0.01  # of the points at either end of an axis lie outside of the sheet
+_LOW = 0.05  # of the points of a cell may lie below it: stereo errs
+_ROOF_REACH_M = 20.0  # a cell whose points lie on a roof has ground within this distance
+_DEPTH = 0.5  # below the ground, in cells
+_LOOKED_AT = 16  # points near a place whose mean colour it has
+_HIDDEN_SHARE = 0.5  # of the views that face a place: some know no depth before it
+_COLOUR_POINTS = 40_000
+_UPRIGHT = 3.0  # factor on heights, when points near a place of the sheet are looked for: not those of roofs
+
+
+def underlay(points: SurfacePoints, count: int, seed: int) -> tuple[SurfacePoints, float]:
+    """Return places on a sheet beneath the points, on a square grid with z up, and the side of its cells in metres.
+
+    Each place lies half a side below the lowest ground that points show within 20 m, smoothed but never above them.
+
+    Args:
+        points: of the scene, in `model`, in metres; at least one.
+        count: limit of the places; 0: none.
+        seed: of the choice of points for the colours.
+    """
+    place = points.point_in_model
+    low, high = np.quantile(place[:, :2], [_STRAY, 1 - _STRAY], axis=0)
+    side_m = float(np.sqrt(np.prod(high - low) / max(count, 1)))
+    if count < 1 or not side_m > 0:
+        return points.part(np.zeros(0, dtype=np.int64)), 0.0
+    columns, rows = (int(n) for n in np.maximum((high - low) // side_m, 1))
+    cell = np.floor((place[:, :2] - low) / side_m).astype(np.int64)
+    inside = np.flatnonzero(((cell >= 0) & (cell < (columns, rows))).all(axis=1))
+    lowest = _low_heights(cell[inside, 1] * columns + cell[inside, 0], place[inside, 2], columns * rows)
+    height = _ground(lowest.reshape(rows, columns), side_m) - _DEPTH * side_m
+    row, column = np.divmod(np.arange(columns * rows), columns)
+    sheet = np.column_stack([low + side_m * (np.stack([column, row], axis=1) + 0.5), height.ravel()])[:count]
+    normal = np.broadcast_to([0.0, 0.0, 1.0], sheet.shape)
+    return SurfacePoints(sheet, _colours(points, sheet, seed), normal), side_m
+
+
+def hidden(points: FloatArray, scene: Scene, surface: SceneSurface) -> BoolArray:
+    """Return which of points (K, 3) in `model` lie behind known depths in most of the training views facing them.
+
+    A point that no view faces is hidden, too.
+    """
+    facing, behind = np.zeros(len(points), dtype=np.int64), np.zeros(len(points), dtype=np.int64)
+    for index in map(int, scene.train):
+        camera = surface.camera(index)
+        in_cam = (points - scene.poses.cam_center_in_model[index]) @ scene.poses.cam_from_model[index].T
+        xy = camera.project(in_cam)
+        shown = np.flatnonzero(camera.holds(xy))
+        column, row = xy[shown].astype(np.int64).T
+        depth = surface.depth(index)[row, column]
+        facing[shown] += 1
+        behind[shown] += (depth > 0) & (depth < in_cam[shown, 2])
+    return np.asarray(behind >= _HIDDEN_SHARE * facing)
+
+
+def _low_heights(cell: IntArray, height: FloatArray, count: int) -> FloatArray:
+    """Return the height (count,) of each cell that few of its points lie below; NaN without a point."""
+    order = np.lexsort((height, cell))
+    number = np.bincount(cell, minlength=count)
+    first = np.cumsum(number) - number
+    low = np.full(count, np.nan)
+    filled = number > 0
+    low[filled] = height[order[(first + (_LOW * number).astype(np.int64))[filled]]]
+    return low
+
+
+def _ground(lowest: FloatArray, side_m: float) -> FloatArray:
+    """Return the heights (rows, columns) of ground, given the lowest points of cells; NaN: no point lies there."""
+    nearest = ndimage.distance_transform_edt(np.isnan(lowest), return_distances=False, return_indices=True)
+    known = lowest[tuple(nearest)]
+    reach = 2 * int(np.ceil(_ROOF_REACH_M / side_m)) + 1
+    smooth = ndimage.uniform_filter(ndimage.minimum_filter(known, size=reach, mode="nearest"), 3, mode="nearest")
+    return np.asarray(np.minimum(smooth, known))
+
+
+def _colours(points: SurfacePoints, sheet: FloatArray, seed: int) -> ByteArray:
+    """Return the mean colour (K, 3) of the points near each place of the sheet."""
+    drawn = np.random.default_rng(seed).permutation(len(points.rgb))[:_COLOUR_POINTS]
+    stretch = np.array([1.0, 1.0, _UPRIGHT])
+    tree = cKDTree(points.point_in_model[drawn] * stretch)
+    _, near = tree.query(sheet * stretch, k=min(_LOOKED_AT, len(drawn)))
+    return np.asarray(points.rgb[drawn][near.reshape(len(sheet), -1)].mean(axis=1).round().astype(np.uint8))
+
 
 _SURFACE_SHARE = 0.8  # of the limit of Gaussians starts on the surface; density control places the others
 _MOSTLY_KNOWN = 0.6  # of the pixels: with fewer known depths, more Gaussians are needed off the surface

@@ -1,27 +1,87 @@
-"""Training loop: iterations, metrics, checkpoints, interruption, and one recovery from a divergence."""
+"""Training loop: iterations, metrics, checkpoints, interruption, and one recovery from a divergence.
+
+Progress of a training: the first iteration, in which kernels compile, and then all iterations.
+
+Files of a training in the folder of its stage, and the training that writes them.
+"""
 
 from __future__ import annotations
 
 import json
 import logging
 import math
+import shutil
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from types import TracebackType
 
 import torch
 
 from pipelines.core.errors import ConvergenceError, DamagedPartialError, InputError
-from pipelines.core.interrupts import deferred_interrupts
-from pipelines.core.progress import Progress
-from pipelines.splat.finiteness import NonFiniteError
-from pipelines.train.checkpoint import load_checkpoint, save_checkpoint
-from pipelines.train.pace import TimeLeft
-from pipelines.train.trainer import JointTrainer, StepReport
-from pipelines.train.training_progress import TrainingProgress
+from pipelines.core.progress import Progress, ProgressTask, deferred_interrupts
+from pipelines.core.workspace import StageRun
+from pipelines.jobs.costs import TimeLeft
+from pipelines.splat.gaussians import NonFiniteError
+from pipelines.train.options import TrainOptions
+from pipelines.train.trainer import JointTrainer, StepReport, load_checkpoint, save_checkpoint
 
 log = logging.getLogger(__name__)
+
+_COMPILING = "compiling kernels (a minute, once)"
+
+
+class TrainingProgress:
+    """Tasks of a training, closed at the end of the context.
+
+    The first iteration of a run has a task of its own: its duration is no measure of the others.
+
+    Args:
+        progress: shows the tasks.
+        begun: iterations of earlier runs.
+        iterations: length of the training.
+        time_left: of the training.
+    """
+
+    def __init__(self, progress: Progress, begun: int, iterations: int, time_left: TimeLeft) -> None:
+        self._progress, self._iterations, self._time_left = progress, iterations, time_left
+        self._shown = begun
+        self._first, self._all = ExitStack(), ExitStack()
+        self._warming_up: ProgressTask | None = None
+        self._training: ProgressTask | None = None
+
+    def __enter__(self) -> TrainingProgress:
+        if self._shown < self._iterations:
+            self._warming_up = self._first.enter_context(self._progress.task("first iteration", 1))
+            self._warming_up.advance(0, _COMPILING)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._all.close()
+        self._first.close()
+
+    def iterated(self, iteration: int, note: str | None) -> None:
+        """Note the end of an iteration.
+
+        Args:
+            iteration: that has ended, from 1.
+            note: on the training; None: the display stays as it is.
+        """
+        if self._warming_up is not None:
+            self._warming_up.advance(1, " ")
+            self._warming_up = None
+            self._first.close()
+            self._training = self._all.enter_context(self._progress.task("training", self._iterations))
+            self._training.advance(self._shown)
+            self._time_left.start(iteration)
+        if note is not None and self._training is not None:
+            self._training.advance(max(iteration - self._shown, 0), note, self._time_left.after(iteration))
+            self._shown = max(iteration, self._shown)
+
 
 _RECOVERY_RATE = 0.3  # factor on the learning rates after a divergence
 
@@ -221,3 +281,48 @@ def _metrics_row(trainer: JointTrainer, report: StepReport, seconds: float) -> d
     if report.by_depth is not None:
         row["control_by_depth"] = float(report.by_depth)
     return row | {f"variance_{name}": factors[name] for name in factors}
+
+
+CHECKPOINT, METRICS = "checkpoint.npz", "metrics.jsonl"
+
+
+def train_in_folder(stage: StageRun, trainer: JointTrainer, options: TrainOptions, done: int = 0) -> TrainingRecord:
+    """Run all remaining iterations of a training, and return its record.
+
+    An interrupted run is resumed. A finished training of fewer iterations is extended from its last state.
+
+    Args:
+        stage: has the folder.
+        trainer: before its first iteration.
+        options: of the training.
+        done: iterations of the finished training that the stage extends.
+
+    Raises:
+        KeyboardInterrupt: the user asked to stop; a checkpoint was written.
+        ConvergenceError: the training diverged twice.
+        InputError: the checkpoint cannot be read.
+        StorageError: a file cannot be written or copied.
+    """
+    extend = not stage.resumed and _take_over(stage, options.effort.iterations, done)
+    files = LoopOptions(
+        stage.out / CHECKPOINT,
+        stage.out / METRICS,
+        options.checkpoint_every,
+        options.log_every,
+        resume=stage.resumed or extend,
+        extend=extend,
+        note=stage.record_progress,
+    )
+    return optimise(trainer, files, stage.progress)
+
+
+def _take_over(stage: StageRun, iterations: int, done: int) -> bool:
+    """Copy the last state of a finished training of fewer iterations, and return whether there is one."""
+    if stage.extends is None or not all((stage.extends / name).is_file() for name in (CHECKPOINT, METRICS)):
+        return False
+    if done >= iterations:
+        return False
+    log.info("the training of %d iterations is extended to %d; --force trains afresh", done, iterations)
+    for name in (CHECKPOINT, METRICS):
+        shutil.copyfile(stage.extends / name, stage.out / name)
+    return True

@@ -1,15 +1,99 @@
-"""Options of `georef train`: of the splat, of the geographic losses, and of the run."""
+"""Options of `georef train`: of the splat, of the geographic losses, and of the run.
+
+Presets of effort: iterations, size of the photographs and number of Gaussians.
+
+Options of the LiDAR that training takes its surface from.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Literal
 
 from pydantic import Field, model_validator
 
 from pipelines.core.errors import InputError
-from pipelines.core.options import StageOptions
-from pipelines.train.lidar.options import LidarOptions
-from pipelines.train.presets import PRESETS, Preset, described
+from pipelines.core.options import InputPath, StageOptions
+from pipelines.geodesy.vertical import Vertical
+from pipelines.survey.options import CloudCrs, CloudPath
+
+
+@dataclass(frozen=True)
+class Preset:
+    """Effort of a training.
+
+    Attributes:
+        iterations: length of the training.
+        max_image_size: longest side of a photograph in pixels.
+        max_gaussians: limit of the Gaussians.
+    """
+
+    iterations: int
+    max_image_size: int
+    max_gaussians: int
+
+    def __str__(self) -> str:
+        """Return the effort as `800 iterations, 480 px, 80000 Gaussians`."""
+        return f"{self.iterations} iterations, {self.max_image_size} px, {self.max_gaussians} Gaussians"
+
+
+PRESETS = {
+    "smoke": Preset(200, 320, 20_000),
+    "fast": Preset(800, 480, 80_000),
+    "standard": Preset(1_500, 800, 150_000),
+    "high": Preset(2_000, 2_000, 300_000),
+}
+# Of `georef run` with 48 photographs of a megapixel, kernels compiled, on 2 idle cores of an AMD EPYC
+# (docs/benchmarks.md, Presets).
+RUN_MINUTES = {"smoke": 1, "fast": 2, "standard": 4, "high": 10}
+
+
+def described() -> str:
+    """Return all presets, each with its effort and the time of a run."""
+    efforts = (f"{name}: {preset}, about {RUN_MINUTES[name]} min" for name, preset in PRESETS.items())
+    return f"{'; '.join(efforts)} (for 48 photographs on 2 cores)."
+
+
+LidarPull = Literal["depth", "gaussians", "both"]
+
+
+class LidarOptions(StageOptions):
+    """Options of a LiDAR cloud: where it lies, how accurate it is, and how training uses it."""
+
+    lidar: CloudPath | None = Field(
+        None, description="LiDAR of the same place to hold the surface to: LAS, LAZ or PLY, or a folder of tiles."
+    )
+    lidar_crs: str | None = Field(None, description="CRS of the LiDAR, for files that state none.")
+    lidar_vertical: Vertical | None = Field(
+        None, description="Datum of the LiDAR's heights, where its CRS has no vertical part."
+    )
+    lidar_trajectory: InputPath | None = Field(
+        None,
+        description="Track of the LiDAR's scanner, on the clock of its points: CSV with timestamp, latitude, "
+        "longitude, altitude.",
+    )
+    lidar_sigma: float = Field(0.03, gt=0, le=10, description="Stated σ of the LiDAR's points in metres.")
+    lidar_pull: LidarPull = Field(
+        "both",
+        description="Hold rendered depths to the LiDAR, Gaussians, each with a confidence of its own, or both.",
+    )
+    lidar_register: bool = Field(False, description="Estimate a shift of the LiDAR, and take it out.")
+
+    @model_validator(mode="after")
+    def _used(self) -> LidarOptions:
+        if self.lidar is None and (
+            self.lidar_crs or self.lidar_vertical or self.lidar_trajectory or self.lidar_register
+        ):
+            raise ValueError(
+                "--lidar-crs, --lidar-vertical, --lidar-trajectory and --lidar-register belong to --lidar"
+            )
+        return self
+
+    @property
+    def lidar_stated(self) -> CloudCrs:
+        """CRS of the LiDAR as the user states it."""
+        return CloudCrs(self.lidar_crs, self.lidar_vertical)
+
 
 # A dense basis of more cameras takes more than 2 GiB (`geometry.correction_basis`).
 MOST_JOINT_CAMERAS = 1300

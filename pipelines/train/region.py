@@ -16,10 +16,10 @@ import torch
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
 from pipelines.geometry.cameras import CameraPoses, Pinhole
-from pipelines.scene.block_plan import BlockCell
-from pipelines.scene.pinholes import Pinholes
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings, Window
+from pipelines.survey.block_plan import BlockCell
+from pipelines.survey.photographs import Pinholes
 from pipelines.train.surface import SceneSurface
 
 _STAND_IN_PX = 160  # longest side of the stand-in's renders

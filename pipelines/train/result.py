@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 
 from pipelines.core.workspace import Summary
-from pipelines.scene.estimated_error import EstimatedError
-from pipelines.scene.lidar_report import LidarReport
-from pipelines.scene.trained_model import Adjustment, TrainedModel
+from pipelines.survey.report_parts import EstimatedError, LidarReport
+from pipelines.survey.trained_model import Adjustment, TrainedModel
 from pipelines.train.adjusted_scene import with_exposures
 from pipelines.train.loop import TrainingRecord
 from pipelines.train.trainer import JointTrainer

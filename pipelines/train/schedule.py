@@ -10,7 +10,7 @@ import numpy as np
 
 from pipelines.core.types import IntArray
 from pipelines.splat.surface import SurfaceSettings
-from pipelines.train.crops import Crops
+from pipelines.train.target_images import Crops
 
 _FINAL_RATE = 0.05  # of the geographic unknowns, relative to their first learning rate
 # Factor by which photographs are shrunken, and the fraction of the training up to which they are. A larger factor

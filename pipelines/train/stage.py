@@ -20,28 +20,27 @@ from pipelines.adjust.system import minimise
 from pipelines.core.products import load_json, save_json
 from pipelines.core.stages import LIDAR, LIDAR_MAP, MODEL, POINTS, SIM3_POSTERIOR, TRAIN_POSTERIOR
 from pipelines.core.workspace import StageRun, Summary, Workspace
-from pipelines.scene.calibrated import load_survey
-from pipelines.scene.geolocated import GeolocatedPoints
-from pipelines.scene.measured_cloud import CloudFiles
-from pipelines.scene.scene import photographs
-from pipelines.scene.trained_model import Adjustment, TrainedModel
+from pipelines.splat.gaussians import write_gaussians
 from pipelines.splat.memory import free_memory_bytes, require_memory
 from pipelines.splat.rasterizer.backends import device_of, rasterizer
-from pipelines.splat.storage import write_gaussians
+from pipelines.surface.depth_maps import DepthMaps
+from pipelines.surface.lidar_cloud import ScannerTrack
+from pipelines.surface.measured_cloud import CloudFiles
+from pipelines.survey.adjustment import GeolocatedPoints
+from pipelines.survey.calibrated import load_survey
+from pipelines.survey.scene import photographs
+from pipelines.survey.trained_model import Adjustment, TrainedModel
 from pipelines.train.adjusted_scene import AdjustedScene
 from pipelines.train.assembly import make_trainer
-from pipelines.train.depth_maps import DepthMaps
-from pipelines.train.forecast import forecast_of
-from pipelines.train.gaussian_limit import training_size, with_gaussian_limit
+from pipelines.train.forecast import forecast_of, training_size, with_gaussian_limit
 from pipelines.train.geographic.problem import held_problem, refining_problem
 from pipelines.train.initial_gaussians import TrainingScene
-from pipelines.train.lidar.prepare import compared_lidar, draw_changes, lidar_surface
-from pipelines.train.lidar.track import ScannerTrack
+from pipelines.train.lidar import compared_lidar, draw_changes, lidar_surface
+from pipelines.train.loop import METRICS, train_in_folder
 from pipelines.train.options import TrainOptions
 from pipelines.train.result import summary_of, trained_model
 from pipelines.train.surface import SceneSurface
 from pipelines.train.trainer import JointTrainer
-from pipelines.train.training_files import METRICS, train_in_folder
 
 log = logging.getLogger(__name__)
 

@@ -1,38 +1,75 @@
-"""Joint optimisation of Gaussians, similarity and cameras, one view an iteration (GeoRefGS, section 2.4)."""
+"""Joint optimisation of Gaussians, similarity and cameras, one view an iteration (GeoRefGS, section 2.4).
+
+Checkpoints: named tensors in one NPZ file without pickle, replaced in one step.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from pipelines.core.errors import InputError
+from pipelines.core.files import read_npz, replacing
 from pipelines.core.types import IntArray
-from pipelines.geometry.cameras import Pinhole
-from pipelines.geometry.lens import Lenses
-from pipelines.scene.photographs import ImageCache
-from pipelines.scene.pinholes import Pinholes
-from pipelines.splat.contributions import ViewContributions, view_contributions
-from pipelines.splat.densify import Strategy
+from pipelines.geometry.cameras import Lenses, Pinhole
+from pipelines.jobs.costs import iteration_seconds
+from pipelines.splat.densify import Strategy, ViewContributions, view_contributions
 from pipelines.splat.exposure import Exposures, HeldExposures
-from pipelines.splat.finiteness import FinitenessMonitor
-from pipelines.splat.gaussians import Gaussians
+from pipelines.splat.gaussians import FinitenessMonitor, Gaussians
 from pipelines.splat.losses import photometric_loss
 from pipelines.splat.optimizer import GaussianAdam
 from pipelines.splat.outlier_pixels import OutlierPixels
 from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings, Render, ScreenStats
 from pipelines.splat.surface import ObservedPoints
-from pipelines.train.checkpoint import prefixed, unprefixed
-from pipelines.train.geographic.problem import GeoProblem
-from pipelines.train.geographic_adam import GeographicAdam
-from pipelines.train.pace import iteration_seconds
+from pipelines.survey.photographs import ImageCache, Pinholes
+from pipelines.train.geographic.problem import GeographicAdam, GeoProblem
 from pipelines.train.region import TrainingRegion
 from pipelines.train.schedule import JointOptions, TrainingSchedule
 from pipelines.train.surface import GaussianLoss
 from pipelines.train.surface_losses import RenderedView, SurfaceLosses
 from pipelines.train.target_images import Look, TargetImage, TargetImages
+
+
+def save_checkpoint(path: Path, state: Mapping[str, Tensor]) -> None:
+    """Write tensors to an NPZ file, which replaces an existing file only when complete."""
+    draft = path.with_suffix(".tmp")
+    with replacing(path, draft), draft.open("wb") as handle:
+        arrays = {name: tensor.detach().cpu().numpy() for name, tensor in state.items()}
+        np.savez(handle, **arrays)  # type: ignore[arg-type]
+
+
+def load_checkpoint(path: Path) -> dict[str, Tensor]:
+    """Return the tensors of a checkpoint by name.
+
+    Raises:
+        InputError: the file cannot be read as a checkpoint.
+    """
+    try:
+        return {name: torch.from_numpy(array) for name, array in read_npz(path).items()}
+    except (
+        InputError,
+        TypeError,
+        ValueError,
+    ) as error:  # torch has no complex halves, texts or foreign byte orders
+        raise InputError(f"not a readable checkpoint: {error}; train without --resume") from error
+
+
+def prefixed(prefix: str, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return the tensors with `prefix/name` for names."""
+    return {f"{prefix}/{name}": tensor for name, tensor in state.items()}
+
+
+def unprefixed(prefix: str, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return the tensors whose names begin with `prefix/`, without that prefix: inverts `prefixed`."""
+    return {
+        name.removeprefix(f"{prefix}/"): tensor for name, tensor in state.items() if name.startswith(f"{prefix}/")
+    }
+
 
 _LENS_EVERY = 100  # iterations between two reads of the lens: each read waits for the device
 # Each non-finite gradient shows in one of these: colours pass it on to the opacities.
@@ -175,7 +212,7 @@ class JointTrainer:
 
     @torch.no_grad()
     def sample_contributions(self, count: int, generator: torch.Generator) -> list[ViewContributions]:
-        """Return the contributions of all Gaussians to different training views (`splat.contributions.Probe`).
+        """Return the contributions of all Gaussians to different training views (`splat.densify.Probe`).
 
         Args:
             count: number of views; fewer if there are not as many.

@@ -1,28 +1,56 @@
-"""Panel of the viewer in which points are marked in photographs, and the marks written for `--gcp`."""
+"""Panel of the viewer in which points are marked in photographs, and the marks written for `--gcp`.
+
+Base of the viewer's panels: buttons, one place for results, and one for what failed.
+"""
 
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipelines.core.errors import GeorefError, StorageError
 from pipelines.core.types import FloatArray
-from pipelines.geometry.cameras import distort
-from pipelines.geometry.lens import bearings
-from pipelines.scene.survey import SurveyedPoint
-from pipelines.view.kept_marks import KeptMarks
-from pipelines.view.marking import MarkedPoint, appears_in, points_to_mark, rays_of, residuals_px
+from pipelines.geometry.cameras import bearings, distort
+from pipelines.surface.picking import SurfacePoint
+from pipelines.survey.survey import SurveyedPoint
+from pipelines.view.marking import KeptMarks, MarkedPoint, appears_in, points_to_mark, rays_of, residuals_px
 from pipelines.view.measuring import MeasuringModel
-from pipelines.view.panel import Panel
 from pipelines.view.photo_view import PhotoView
+from pipelines.view.saved import PlaceRow, failure, mark_table, paragraph, place_table
 from pipelines.view.signs import Signs
-from pipelines.view.surface_points import SurfacePoint
-from pipelines.view.tables import PlaceRow, mark_table, paragraph, place_table
 
 if TYPE_CHECKING:
     import viser
+
+
+class Panel:
+    """Panel with buttons; an error of what a button does is told above the results, and leaves them as they are."""
+
+    _result: viser.GuiHtmlHandle
+    _failed: viser.GuiHtmlHandle
+
+    def _add_results(self, gui: viser.GuiApi) -> None:
+        self._failed, self._result = gui.add_html(""), gui.add_html("")
+
+    def _button(self, gui: viser.GuiApi, label: str, act: Callable[[], None], hint: str | None = None) -> None:
+        gui.add_button(label, hint=hint).on_click(lambda _: self._safely(act))
+
+    def _safely(self, act: Callable[[], None]) -> None:
+        try:
+            act()
+        except GeorefError as error:
+            stays = " The page keeps what it shows: make room on the disk, then try again."
+            self._failed.content = failure(f"Not done: {error}.{stays if isinstance(error, StorageError) else ''}")
+        else:
+            self._failed.content = ""
+
+    def _tell(self, sentence: str) -> None:
+        self._result.content = paragraph(sentence)
+
 
 _NONE = "—"
 

@@ -1,18 +1,30 @@
-"""Marking of points in photographs: where a point must appear, what its marks give, and the files for `--gcp`."""
+"""Marking of points in photographs: where a point must appear, what its marks give, and the files for `--gcp`.
+
+Marks kept on disk as they are set: what the viewers of a workspace change in the marks of its survey.
+
+The file has one record for each changed mark and point. A record that the survey has taken over, because what was
+written was ingested, is dropped; until then it stays, so that no viewer writes marks without those of another.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
+from pydantic import Field
 
 from pipelines.core.errors import InputError
-from pipelines.core.types import FloatArray
+from pipelines.core.files import replace_texts
+from pipelines.core.products import ImageName, Product, load_json
+from pipelines.core.types import FloatArray, Vector3
 from pipelines.geometry.cameras import project
-from pipelines.scene.marks import MarkRays, mark_angles, mark_rays
-from pipelines.scene.survey import Mark, Survey, SurveyedPoint
-from pipelines.scene.trained_survey import TrainedSurvey
+from pipelines.survey.marks import MarkRays, mark_angles, mark_rays
+from pipelines.survey.survey import Mark, Survey, SurveyedPoint
+from pipelines.survey.trained_survey import TrainedSurvey
+from pipelines.view.saved import History, changing
 
 CONTROL, CHECK = "gcp_list.txt", "checkpoints.txt"
 SIGMA_PX = 0.5  # of a mark that somebody sets with care; the survey's own marks keep theirs
@@ -126,3 +138,217 @@ def mark_texts(crs: str, points: Sequence[MarkedPoint]) -> dict[str, str]:
 
 
 _IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
+MARKS = "marks.json"
+_SAME_PX = 1e-3  # files of marks have three decimals
+_SAME_LLA = (1e-8, 1e-8, 1e-3)  # degrees, degrees, metres: a millimetre
+
+Name = str
+Key = tuple[Name, ImageName | None]
+
+
+class KeptPoint(Product):
+    """Changed point.
+
+    Attributes:
+        point: its name.
+        lla: latitude and longitude in degrees, ellipsoidal height in metres; None: as surveyed, or not surveyed.
+        is_check: whether it is a check point.
+    """
+
+    point: Name = Field(min_length=1)
+    lla: Vector3 | None
+    is_check: bool
+
+    @property
+    def key(self) -> Key:
+        """What the record is about."""
+        return self.point, None
+
+
+class KeptMark(Product):
+    """Changed mark.
+
+    Attributes:
+        point: its name.
+        image: that shows it.
+        place_px: in pixels of the full image; None: removed.
+    """
+
+    point: Name = Field(min_length=1)
+    image: ImageName
+    place_px: tuple[float, float] | None
+
+    @property
+    def key(self) -> Key:
+        """What the record is about."""
+        return self.point, self.image
+
+
+Record = KeptPoint | KeptMark
+
+
+class KeptRecords(Product):
+    """Content of the file.
+
+    Attributes:
+        is_written: whether the files for `--gcp` have all of it.
+        points, marks: the records.
+    """
+
+    format_version: Literal[1] = 1
+    is_written: bool = True
+    points: tuple[KeptPoint, ...] = ()
+    marks: tuple[KeptMark, ...] = ()
+
+
+class KeptMarks:
+    """Points of a workspace with their marks, as surveyed and as changed in its viewers.
+
+    Args:
+        folder: of the files.
+        surveyed: points of the survey.
+        lla_of, xyz_of: convert points (N, 3) from the viewer's CRS to latitude, longitude, height, and back.
+
+    Attributes:
+        is_written: whether the files for `--gcp` have all changes.
+
+    Raises:
+        InputError: the file cannot be read, or holds no marks of the viewer.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        surveyed: Sequence[MarkedPoint],
+        lla_of: Callable[[FloatArray], FloatArray],
+        xyz_of: Callable[[FloatArray], FloatArray],
+    ) -> None:
+        self._folder, self._lla_of, self._xyz_of = folder, lla_of, xyz_of
+        self._surveyed = {point.name: point for point in surveyed}
+        self._history = History()
+        self._take(*self._read())
+
+    @property
+    def points(self) -> Sequence[MarkedPoint]:
+        """All points, those of the survey first."""
+        return self._points
+
+    def set_mark(self, point: Name, image: str, place_px: tuple[float, float] | None) -> None:
+        """Set the mark of a point in an image, or remove it (None).
+
+        Raises:
+            GeorefError: nothing was changed, and why.
+        """
+        step = f"{'removal of the mark' if place_px is None else 'mark'} of {point} in {image}"
+        self._put(KeptMark(point=point, image=image, place_px=place_px), step)
+
+    def set_point(self, name: Name, xyz: tuple[float, float, float] | None, *, is_check: bool) -> None:
+        """Make a point, or change its coordinates in the CRS (None: leave them) and its use.
+
+        Raises:
+            GeorefError: nothing was changed, and why.
+        """
+        if len(name.split()) != 1:
+            raise InputError(f"the files of marks have no place for a space: name {name!r} without one")
+        former = self._records.get((name, None))
+        lla = former.lla if isinstance(former, KeptPoint) else None
+        if xyz is not None:
+            lat, lon, height = self._lla_of(np.array([xyz]))[0].tolist()
+            lla = (lat, lon, height)
+        self._put(KeptPoint(point=name, lla=lla, is_check=is_check), f"point {name}")
+
+    def remove_point(self, name: Name) -> None:
+        """Remove a point that was made here, with its marks.
+
+        Raises:
+            GeorefError: nothing was changed, and why.
+        """
+        if name in self._surveyed:
+            raise InputError(f"{name} is a point of the survey: remove its marks, or ingest the survey without it")
+        self._step(dict.fromkeys(key for key in self._records if key[0] == name), f"removal of {name}")
+
+    def undo(self) -> str | None:
+        """Undo the last change of this viewer and return it in words; None: there is none.
+
+        Raises:
+            GeorefError: nothing was changed, and why.
+        """
+        return self._history.undo()
+
+    def write(self, crs: str) -> list[Path]:
+        """Write the surveyed points with their marks for `--gcp` and `--checkpoints`; return the files written.
+
+        Args:
+            crs: name of the CRS.
+
+        Raises:
+            GeorefError: nothing was written, and why.
+        """
+        with changing(self._folder):
+            self._take(*self._read())
+            texts = {self._folder / name: text for name, text in mark_texts(crs, self._points).items()}
+            if texts:
+                self._save(self._records, is_written=True, others=texts)
+        return list(texts)
+
+    def _put(self, record: Record, step: str) -> None:
+        self._step({record.key: record}, step)
+
+    def _step(self, wanted: Mapping[Key, Record | None], step: str) -> None:
+        former = self._change(wanted)
+        self._history.add(step, lambda: self._change(former))
+
+    def _change(self, wanted: Mapping[Key, Record | None]) -> Mapping[Key, Record | None]:
+        """Set records of the file or drop them (None), and return the former ones."""
+        with changing(self._folder):
+            records, _ = self._read()
+            former = {key: records.pop(key, None) for key in wanted}
+            records |= {key: record for key, record in wanted.items() if record is not None}
+            self._save(records, is_written=False)
+        return former
+
+    def _save(
+        self, records: dict[Key, Record], *, is_written: bool, others: Mapping[Path, str] | None = None
+    ) -> None:
+        content = KeptRecords(
+            is_written=is_written,
+            points=tuple(each for each in records.values() if isinstance(each, KeptPoint)),
+            marks=tuple(each for each in records.values() if isinstance(each, KeptMark)),
+        )
+        replace_texts({**(others or {}), self._folder / MARKS: content.model_dump_json(indent=1) + "\n"})
+        self._take(records, is_written)
+
+    def _read(self) -> tuple[dict[Key, Record], bool]:
+        """Return the records of the file that the survey has not taken over, and whether all are written."""
+        path = self._folder / MARKS
+        content = load_json(KeptRecords, path) if path.exists() else KeptRecords()
+        records: Sequence[Record] = (*content.points, *content.marks)
+        return {each.key: each for each in records if not self._is_surveyed(each)}, content.is_written
+
+    def _is_surveyed(self, record: Record) -> bool:
+        """Return whether the survey says what a record says."""
+        surveyed = self._surveyed.get(record.point)
+        if isinstance(record, KeptMark):
+            place = None if surveyed is None else surveyed.marks.get(record.image)
+            if place is None or record.place_px is None:
+                return place is record.place_px
+            return bool(np.abs(np.subtract(place, record.place_px)).max() < _SAME_PX)
+        if surveyed is None or surveyed.is_check != record.is_check:
+            return False
+        if surveyed.xyz is None or record.lla is None:
+            return record.lla is None
+        apart = np.abs(self._lla_of(np.array([surveyed.xyz]))[0] - record.lla)
+        return bool((apart < _SAME_LLA).all())
+
+    def _take(self, records: dict[Key, Record], is_written: bool) -> None:
+        points = dict(self._surveyed)
+        for record in records.values():
+            point = points.get(record.point, MarkedPoint(record.point, None))
+            if isinstance(record, KeptMark):
+                points[record.point] = point.with_mark(record.image, record.place_px)
+            else:
+                xyz = point.xyz if record.lla is None else tuple(self._xyz_of(np.array([record.lla]))[0].tolist())
+                points[record.point] = replace(point, xyz=xyz, is_check=record.is_check)
+        self._records, self._points, self.is_written = records, tuple(points.values()), is_written

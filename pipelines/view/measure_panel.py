@@ -10,16 +10,28 @@ from typing import TYPE_CHECKING, get_args
 import numpy as np
 
 from pipelines.geodesy.enu import lla_from_enu
-from pipelines.scene.marks import mark_rays
-from pipelines.scene.survey import SurveyedPoint
+from pipelines.surface.picking import NoSurface, Sight, SurfacePoint
+from pipelines.survey.marks import mark_rays
+from pipelines.survey.survey import SurveyedPoint
+from pipelines.view.mark_panel import Panel
 from pipelines.view.measuring import MeasuringModel
-from pipelines.view.panel import Panel
 from pipelines.view.quantities import BaseKind, BasePlane, Quantity
-from pipelines.view.saved import Kind, Measurement, SavedMeasurements, SavedPoint, SavedQuantity, new_id
+from pipelines.view.saved import (
+    History,
+    Kind,
+    Measurement,
+    PlaceRow,
+    SavedMeasurements,
+    SavedPoint,
+    SavedQuantity,
+    new_id,
+    paragraph,
+    place_table,
+    quantity_table,
+    quantity_text,
+    saved_table,
+)
 from pipelines.view.signs import Signs
-from pipelines.view.store import History
-from pipelines.view.surface_points import NoSurface, Sight, SurfacePoint
-from pipelines.view.tables import PlaceRow, paragraph, place_table, quantity_table, quantity_text, saved_table
 
 if TYPE_CHECKING:
     import viser

@@ -9,15 +9,16 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from pipelines.adjust.solution import posterior_of
-from pipelines.core.cautions import is_checked
+from pipelines.core.products import is_checked
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import Workspace
-from pipelines.scene.crs_options import CrsOptions
-from pipelines.scene.marks import MarkRays
-from pipelines.scene.points_by_camera import points_by_camera
-from pipelines.scene.renderer import ModelRenderer
-from pipelines.scene.target_crs import TargetCrs, usable_crs
+from pipelines.surface.picking import NoSurface, Sight, SurfacePoint, SurfaceReader
+from pipelines.surface.surface_views import ModelRenderer
+from pipelines.survey.marks import MarkRays
+from pipelines.survey.options import CrsOptions
+from pipelines.survey.target_crs import TargetCrs, usable_crs
+from pipelines.survey.trained_survey import points_by_camera
 from pipelines.view.quantities import (
     BasePlane,
     MeasuredPoints,
@@ -30,7 +31,6 @@ from pipelines.view.quantities import (
     surface_area,
     volumes,
 )
-from pipelines.view.surface_points import NoSurface, Sight, SurfacePoint, SurfaceReader
 
 _MOST_SAMPLES = 400  # of the surface in a polygon: a few seconds
 _JOINT_SAMPLES = 40  # of which so many enter the joint covariance

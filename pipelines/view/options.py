@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from pipelines.scene.crs_options import CrsOptions
+from pipelines.survey.options import CrsOptions
 
 
 class ViewOptions(CrsOptions):

@@ -9,10 +9,9 @@ import numpy as np
 
 from pipelines.core.types import FloatArray
 from pipelines.geometry.rotations import rotation_towards
-from pipelines.scene.trained_survey import TrainedSurvey
-from pipelines.view.pictures import Blend
+from pipelines.survey.trained_survey import TrainedSurvey
+from pipelines.view.pictures import Blend, ViewFrame
 from pipelines.view.signs import Signs, wxyz_of
-from pipelines.view.view_frame import ViewFrame
 
 if TYPE_CHECKING:
     import viser

@@ -2,26 +2,119 @@
 
 The machine that holds the model draws them, with the rasteriser that trained it: what is seen is what is measured,
 colours that depend on the direction included, and a page without a graphics card shows millions of Gaussians.
+
+Frame of the viewer, and cameras in it.
+
+The viewer's depth images end at 167 units. Its frame is therefore a small copy of the scene around its middle, with
+the axes of `geo`: east, north, up.
+
+Loop that draws the picture of one page: small while its camera moves, at full size when it stands.
 """
 
 from __future__ import annotations
 
+import logging
 import threading
+import time
 from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
-from pipelines.core.errors import InputError
-from pipelines.core.photograph_folder import photograph_folder
+from pipelines.core.errors import GeorefError, InputError
+from pipelines.core.plan import photograph_folder
 from pipelines.core.types import ByteArray, Float32Array, FloatArray
 from pipelines.core.workspace import Workspace
 from pipelines.formats.image_file import read_bytes, require_unchanged
-from pipelines.geometry.cameras import Camera, distort, undistort
-from pipelines.scene.renderer import ModelRenderer
-from pipelines.splat.depth import measured_depth
-from pipelines.view.view_frame import ViewerCamera, ViewFrame
+from pipelines.geometry.cameras import Camera, Pinhole, distort, undistort
+from pipelines.geometry.rotations import matrix_from_quat_xyzw
+from pipelines.geometry.similarity import Similarity
+from pipelines.splat.surface import measured_depth
+from pipelines.surface.picking import Sight
+from pipelines.surface.surface_views import ModelRenderer, ViewPose
+from pipelines.survey.trained_survey import TrainedSurvey
+
+if TYPE_CHECKING:
+    import viser
+
+log = logging.getLogger(__name__)
+
+_RADIUS = 10.0  # of the scene, in units of the viewer
+_RIM = 0.02  # share of the SfM points outside the scene, on each side
+
+
+@dataclass(frozen=True)
+class ViewerCamera:
+    """Camera of a page, in the frame of the viewer.
+
+    Attributes:
+        wxyz: (4,) rotation view ← camera; the camera's axes are x right, y down, z forward.
+        position: (3,).
+        fov_rad: vertical field of view.
+        width, height: of the page in pixels.
+    """
+
+    wxyz: FloatArray
+    position: FloatArray
+    fov_rad: float
+    width: int
+    height: int
+
+    @property
+    def rotation(self) -> FloatArray:
+        """Rotation (3, 3) view ← camera."""
+        w, x, y, z = self.wxyz
+        return matrix_from_quat_xyzw([x, y, z, w])
+
+    def pinhole(self, width: int, height: int) -> Pinhole:
+        """Return the camera with another number of pixels."""
+        focal = height / 2 / np.tan(self.fov_rad / 2)
+        return Pinhole(width, height, focal, focal, width / 2, height / 2)
+
+
+@dataclass(frozen=True)
+class ViewFrame:
+    """Frame of the viewer.
+
+    Attributes:
+        view_from_model: similarity.
+        radius_m: of the scene.
+    """
+
+    view_from_model: Similarity
+    radius_m: float
+
+    @property
+    def model_from_view(self) -> Similarity:
+        """Similarity back."""
+        return self.view_from_model.inverse()
+
+    def pose(self, camera: ViewerCamera, width: int, height: int) -> ViewPose:
+        """Return a page's camera in `model`, with its own number of pixels."""
+        cam_from_model = camera.rotation.T @ self.view_from_model.rotation
+        center = self.model_from_view.apply(camera.position[None])[0]
+        return ViewPose(camera.pinhole(width, height), cam_from_model, center)
+
+    def sight(self, camera: ViewerCamera, start: FloatArray, direction: FloatArray) -> Sight:
+        """Return a line of sight in `model` of one in the viewer's frame: start (3,) and direction (3,)."""
+        model_from_view = self.model_from_view
+        turned = model_from_view.rotation @ direction
+        pixel_rad = 1.0 / camera.pinhole(camera.width, camera.height).fx
+        return Sight(model_from_view.apply(start[None])[0], turned / np.linalg.norm(turned), pixel_rad)
+
+
+def frame_of(trained: TrainedSurvey) -> ViewFrame:
+    """Return the frame of a trained survey's scene: its SfM points without the rim, or its cameras without any."""
+    points = trained.point_in_model if len(trained.point_in_model) else trained.poses.cam_center_in_model
+    in_geo = trained.geo_from_model.apply(points)
+    low, high = np.quantile(in_geo, [_RIM, 1 - _RIM], axis=0)
+    radius_m = max(float(np.linalg.norm(high - low)) / 2, 1e-3)
+    view_from_geo = Similarity(_RADIUS / radius_m, np.eye(3), -(low + high) / 2 * _RADIUS / radius_m)
+    return ViewFrame(view_from_geo @ trained.geo_from_model, radius_m)
+
 
 _KEPT_PHOTOGRAPHS = 3  # at full size, in memory
 _SAME_PLACE = 1e-4  # of the scene's radius: a camera this near to a photograph's sees what it saw
@@ -157,3 +250,100 @@ def _widest_slope(lens: Camera) -> float:
 def _pixels(width: int, height: int) -> FloatArray:
     """Return the centres (H, W, 2) of the pixels of a picture."""
     return np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1)
+
+
+_MOVING_S = 0.12  # of drawing one picture while the camera moves
+_STILL_S = 0.2  # without movement until the full picture is drawn
+_LEAST_PX, _MOST_PX = 160, 1920  # of the longer side
+_DEPTH_PX = 480  # of the longer side of the depth: it only decides which signs are hidden
+_QUALITY_MOVING, _QUALITY_STILL = 70, 95  # of the JPEG
+
+
+class PictureLoop:
+    """Loop of one page, on a thread of its own.
+
+    Args:
+        client: the page.
+        painter: of the pictures.
+        blend: returns the photograph to blend over the picture, or None.
+        drawn: called after each picture at full size.
+    """
+
+    def __init__(
+        self,
+        client: viser.ClientHandle,
+        painter: Painter,
+        blend: Callable[[], Blend | None],
+        drawn: Callable[[], None],
+    ) -> None:
+        self._client, self._painter, self._blend, self._told = client, painter, blend, drawn
+        self._changed, self._ended = threading.Event(), threading.Event()
+        self._moving_px = 480.0
+        self.drawn = 0  # pictures at full size
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        client.camera.on_update(lambda _: self.wake())
+        self._thread.start()
+        self.wake()
+
+    def wake(self) -> None:
+        """Draw anew."""
+        self._changed.set()
+
+    def end(self) -> None:
+        """End the loop."""
+        self._ended.set()
+        self._changed.set()
+
+    def _run(self) -> None:
+        while True:
+            self._changed.wait()
+            if self._ended.is_set():
+                return
+            self._changed.clear()
+            try:
+                self._draw_moving()
+                if not self._changed.wait(_STILL_S):
+                    self._draw(_MOST_PX, _QUALITY_STILL)
+                    self.drawn += 1
+                    self._told()
+            except GeorefError as error:
+                self._client.add_notification("No picture", str(error), color="red")
+            except Exception:  # the page is gone, or the picture cannot be drawn: the next one may
+                if self._ended.is_set():
+                    return
+                log.exception("the picture could not be drawn")
+
+    def _draw_moving(self) -> None:
+        began = time.monotonic()
+        self._draw(int(self._moving_px), _QUALITY_MOVING)
+        factor = np.sqrt(_MOVING_S / max(time.monotonic() - began, 1e-3))
+        self._moving_px = float(np.clip(self._moving_px * np.clip(factor, 0.5, 1.3), _LEAST_PX, _MOST_PX))
+
+    def _draw(self, longer_px: int, quality: int) -> None:
+        camera = camera_of(self._client)
+        if camera is None:
+            return
+        scale = min(1.0, longer_px / max(camera.width, camera.height))
+        width, height = max(round(camera.width * scale), 1), max(round(camera.height * scale), 1)
+        picture = self._painter.paint(camera, width, height, self._blend())
+        self._client.scene.set_background_image(
+            picture.rgb, format="jpeg", jpeg_quality=quality, depth=_small_depth(picture)
+        )
+        self._client.flush()
+
+
+def camera_of(client: viser.ClientHandle) -> ViewerCamera | None:
+    """Return the camera of a page; None before the page has told it."""
+    handle = client.camera
+    if handle._state.update_timestamp == 0.0 or not handle.image_width or not handle.image_height:
+        return None
+    return ViewerCamera(
+        np.array(handle.wxyz), np.array(handle.position), float(handle.fov), handle.image_width, handle.image_height
+    )
+
+
+def _small_depth(picture: Picture) -> np.ndarray:
+    height, width = picture.depth.shape
+    scale = min(1.0, _DEPTH_PX / max(width, height))
+    size = max(round(width * scale), 1), max(round(height * scale), 1)
+    return cv2.resize(picture.depth, size, interpolation=cv2.INTER_NEAREST)

@@ -2,27 +2,88 @@
 
 The points are stored in `geo` with the covariance of the surface and the photographs that show them, so that σ of
 what is made of several measurements is again the joint one.
+
+What the viewer's files have in common: one writer at a time, clear failures, and steps that can be undone.
+
+Several viewers may show one workspace. Each change reads the file again, changes the records that it is about, and
+writes the file whole: nothing is lost of what another viewer has saved meanwhile.
+
+Tables of the viewer's panels, as HTML; all texts of the survey are escaped.
 """
 
 from __future__ import annotations
 
+import html
 import json
 import uuid
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field, ValidationError
 
-from pipelines.core.durable import replace_texts
-from pipelines.core.errors import InputError
+from pipelines.core.errors import InputError, storage_failures
+from pipelines.core.files import replace_texts
+from pipelines.core.lock import WriteLock
 from pipelines.core.products import ImageName, Product
-from pipelines.core.types import Matrix3, Vector3
-from pipelines.formats.csv_writer import table_text
-from pipelines.formats.geojson import Json, feature, features_text
-from pipelines.view.store import changing
-from pipelines.view.surface_points import SurfacePoint
+from pipelines.core.types import FloatArray, Matrix3, Vector3
+from pipelines.formats.tables import table_text
+from pipelines.formats.vector_files import Json, feature, features_text
+from pipelines.surface.picking import SurfacePoint
+from pipelines.survey.target_crs import TargetCrs
+from pipelines.view.quantities import Quantity
+
+FOLDER = "view"  # of the workspace: what the user saves in the viewer
+_PATIENCE_S = 5.0  # for another viewer, which holds the folder for the time of one write
+_MOST_STEPS = 100
+
+
+@contextmanager
+def changing(folder: Path) -> Iterator[None]:
+    """Hold the right to change the viewer's files in a folder.
+
+    Raises:
+        WorkspaceBusyError: another process holds it for too long.
+        InputError: the folder cannot be made or locked.
+        StorageError: the disk is full or fails.
+    """
+    with storage_failures():
+        try:
+            with WriteLock(folder).hold("georef view", _PATIENCE_S):
+                yield
+        except OSError as error:
+            error.filename = error.filename or str(folder)
+            raise
+
+
+class History:
+    """Steps that can be undone, the last one first."""
+
+    def __init__(self) -> None:
+        self._steps: deque[tuple[str, Callable[[], object]]] = deque(maxlen=_MOST_STEPS)
+
+    def add(self, step: str, undo: Callable[[], object]) -> None:
+        """Add a step that was taken.
+
+        Args:
+            step: in words, for the user.
+            undo: undoes it; a step whose undoing fails can be undone again.
+        """
+        self._steps.append((step, undo))
+
+    def undo(self) -> str | None:
+        """Undo the last step and return it in words; None: there is none."""
+        if not self._steps:
+            return None
+        step, undo = self._steps[-1]
+        undo()
+        self._steps.pop()
+        return step
+
 
 MEASUREMENTS, TABLE = "measurements.geojson", "measurements.csv"
 Kind = Literal["point", "distance", "polyline", "area", "volume"]
@@ -207,3 +268,96 @@ def _anticlockwise(ring: list[list[float]]) -> list[list[float]]:
     area = float((x - x[0]) @ np.roll(y - y[0], -1) - (y - y[0]) @ np.roll(x - x[0], -1))
     turned = ring if area > 0 else ring[::-1]
     return [*turned, turned[0]]
+
+
+_TEXT = "font-size:0.85em;margin:0.4em 0.8em"
+_ALARM = "padding:0.4em 0.6em;border-left:0.3em solid #d33;background:rgba(221,51,51,0.12);font-weight:600"
+_TABLE = "width:100%;font-size:0.8em;border-spacing:0.3em 0.1em;font-variant-numeric:tabular-nums;text-align:right"
+
+
+@dataclass(frozen=True)
+class PlaceRow:
+    """Place (3,) in `geo` with σ (3,) east, north, up in metres, or None."""
+
+    name: str
+    position_in_geo: FloatArray
+    sigma_m: FloatArray | None
+
+
+def paragraph(text: str, mark: str = "note") -> str:
+    """Return a paragraph; `data-…` of the name `mark` lets scripts find it."""
+    return f'<p data-{mark}="yes" style="{_TEXT}">{html.escape(text)}</p>'
+
+
+def failure(text: str) -> str:
+    """Return a paragraph that stands out."""
+    return f'<p data-failed="yes" role="alert" style="{_TEXT};{_ALARM}">{html.escape(text)}</p>'
+
+
+def place_table(target: TargetCrs, rows: Sequence[PlaceRow], marked: str = "place") -> str:
+    """Return places with their coordinates in the CRS.
+
+    Args:
+        target: the CRS.
+        rows: the places.
+        marked: name of the attribute `data-…` that holds a row's metres in `geo`, for scripts.
+    """
+    crs = target.crs
+    names = ("longitude", "latitude", "height") if crs.is_geographic else ("easting", "northing", "height")
+    heads = "".join(f"<th>{name} ({html.escape(unit)})</th>" for name, unit in zip(names, crs.units, strict=True))
+    decimals = (8, 8, 3) if crs.is_geographic else (3, 3, 3)
+    lines = []
+    for row in rows:
+        xyz = target.xyz_from_geo(row.position_in_geo[None])[0]
+        cells = "".join(f"<td>{value:.{digits}f}</td>" for value, digits in zip(xyz, decimals, strict=True))
+        data = ",".join(f"{value:.6f}" for value in row.position_in_geo)
+        lines.append(f'<tr data-{marked}="{data}"><th>{html.escape(row.name)}</th>{cells}</tr>')
+        if row.sigma_m is not None:
+            cells = "".join(f"<td>±{value:.3f}</td>" for value in row.sigma_m)
+            lines.append(f"<tr><th>σ E, N, U (m)</th>{cells}</tr>")
+    return _html_table(f"<tr><th></th>{heads}</tr>{''.join(lines)}")
+
+
+def quantity_text(quantity: Quantity) -> str:
+    """Return a quantity with its σ and unit in one line."""
+    sigma = "" if quantity.sigma is None else f" ± {quantity.sigma:.3f}"
+    return f"{quantity.name} {quantity.value:.3f}{sigma} {quantity.unit}"
+
+
+def quantity_table(quantities: Sequence[Quantity]) -> str:
+    """Return quantities with their σ; empty without any."""
+    rows = []
+    for each in quantities:
+        sigma = "" if each.sigma is None else f"±{each.sigma:.3f}"
+        data = f'data-quantity="{html.escape(each.name)}" data-value="{each.value:.6f}"'
+        data += "" if each.sigma is None else f' data-sigma="{each.sigma:.6f}"'
+        cells = f"<td>{each.value:.3f}</td><td>{sigma}</td><td>{html.escape(each.unit)}</td>"
+        rows.append(f"<tr {data}><th>{html.escape(each.name)}</th>{cells}</tr>")
+    return _html_table("".join(rows)) if rows else ""
+
+
+def saved_table(rows: Sequence[tuple[str, str, str]]) -> str:
+    """Return saved measurements: name, what is shown of it, values."""
+    if not rows:
+        return "<p>Nothing saved yet.</p>"
+    lines = [
+        f'<tr data-saved="{html.escape(name)}"><th>{html.escape(shown)}</th><td>{html.escape(values)}</td></tr>'
+        for name, shown, values in rows
+    ]
+    return _html_table("".join(lines))
+
+
+def mark_table(marks: Mapping[str, tuple[float, float]], residual_px: Mapping[str, float]) -> str:
+    """Return the marks of a point by image, with their residuals where the point is determined."""
+    lines = []
+    for image, (x, y) in marks.items():
+        residual = f"{residual_px[image]:.2f}" if image in residual_px else ""
+        name = html.escape(image)
+        cells = f"<td>{x:.2f}</td><td>{y:.2f}</td><td>{residual}</td>"
+        lines.append(f'<tr data-mark="{name}" data-px="{x:.3f},{y:.3f}"><th>{name}</th>{cells}</tr>')
+    heads = "<tr><th>mark in</th><th>x (px)</th><th>y (px)</th><th>residual (px)</th></tr>"
+    return _html_table(heads + "".join(lines))
+
+
+def _html_table(rows: str) -> str:
+    return f'<table style="{_TABLE}">{rows}</table>'

@@ -11,10 +11,10 @@ import numpy as np
 from pipelines.adjust.accuracy_grid import AccuracyGrid
 from pipelines.core.types import FloatArray
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
-from pipelines.plots.style import BLUE, DARK, ORANGE, colours_of
-from pipelines.scene.survey import SurveyedPoint
-from pipelines.scene.trained_survey import TrainedSurvey
-from pipelines.view.view_frame import ViewFrame
+from pipelines.report.plots.style import BLUE, DARK, ORANGE, colours_of
+from pipelines.survey.survey import SurveyedPoint
+from pipelines.survey.trained_survey import TrainedSurvey
+from pipelines.view.pictures import ViewFrame
 
 if TYPE_CHECKING:
     import viser

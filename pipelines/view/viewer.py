@@ -16,24 +16,21 @@ from pipelines.core.manifest import hash_file
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.stages import GAUSSIANS, MODEL, REPORT
 from pipelines.core.workspace import Workspace
-from pipelines.scene.headline import headline_of
-from pipelines.scene.renderer import ModelRenderer
-from pipelines.scene.report import EvaluationReport, read_report
-from pipelines.scene.scene import photographs
-from pipelines.scene.trained_survey import load_trained
 from pipelines.splat.rasterizer.backends import rasterizer
+from pipelines.surface.surface_views import ModelRenderer
+from pipelines.survey.headline import headline_of
+from pipelines.survey.report import EvaluationReport, read_report
+from pipelines.survey.scene import photographs
+from pipelines.survey.trained_survey import load_trained
 from pipelines.view.loopback import start_server, stop_server
 from pipelines.view.mark_panel import MarkPanel
 from pipelines.view.measure_panel import MeasurePanel
 from pipelines.view.measuring import MeasuringModel
 from pipelines.view.options import ViewOptions
 from pipelines.view.photo_view import PhotoView
-from pipelines.view.picture_loop import PictureLoop, camera_of
-from pipelines.view.pictures import Painter, Photographs
+from pipelines.view.pictures import Painter, Photographs, PictureLoop, ViewFrame, camera_of, frame_of
+from pipelines.view.saved import FOLDER, paragraph
 from pipelines.view.signs import Kind, PointColour, PointError, Signs
-from pipelines.view.store import FOLDER
-from pipelines.view.tables import paragraph
-from pipelines.view.view_frame import ViewFrame, frame_of
 
 if TYPE_CHECKING:
     import viser

@@ -19,17 +19,16 @@ from pipelines.core.fingerprints import fingerprints
 from pipelines.core.products import load_json
 from pipelines.core.stages import BY_NAME, RIG, SURVEY, TRACK, stage_slice
 from pipelines.core.workspace import Workspace
-from pipelines.formats.colmap_writer import write_sparse
+from pipelines.formats.colmap import write_sparse
 from pipelines.geodesy.enu import lla_from_enu
 from pipelines.geometry.cameras import Camera
-from pipelines.geometry.rig import boresight
 from pipelines.geometry.rotations import log_so3, matrix_from_quat_xyzw
-from pipelines.scene.calibrated import load_survey
-from pipelines.scene.rig import RigCalibration
-from pipelines.scene.survey import Survey
+from pipelines.geometry.trajectory import boresight
 from pipelines.simulate.options import SimulateOptions
 from pipelines.simulate.stage import simulate
 from pipelines.simulate.truth import Truth
+from pipelines.survey.calibrated import load_survey
+from pipelines.survey.survey import RigCalibration, Survey
 from tests import bags
 from tests.earth import enu_from_lla
 from tests.scenes import Noise, TrueScene, sparse_model

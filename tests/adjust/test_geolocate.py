@@ -16,8 +16,8 @@ from pipelines.core.errors import InputError
 from pipelines.core.runner import run_stage
 from pipelines.core.stages import BY_NAME, POINTS
 from pipelines.geometry.rotations import exp_so3, matrix_from_quat_xyzw, quat_xyzw_from_matrix
-from pipelines.scene.geolocated import GeolocatedPoints
-from pipelines.scene.survey import Survey
+from pipelines.survey.adjustment import GeolocatedPoints
+from pipelines.survey.survey import Survey
 from tests.scenes import (
     Measured,
     Noise,

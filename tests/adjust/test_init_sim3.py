@@ -20,9 +20,8 @@ from pipelines.core.stages import BY_NAME, SIM3
 from pipelines.geometry.rotations import log_so3
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.scene.geolocated import GeolocatedPoints
-from pipelines.scene.initial_similarity import InitialSimilarity
-from pipelines.scene.survey import Survey
+from pipelines.survey.adjustment import GeolocatedPoints, InitialSimilarity
+from pipelines.survey.survey import Survey
 from tests.scenes import (
     GEO_FROM_LOCAL,
     Measured,

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipelines.adjust.intersection_jacobian import intersection_jacobian
+from pipelines.adjust.posterior import intersection_jacobian
 from tests.bundle_scenes import exact_network, jacobian
 
 

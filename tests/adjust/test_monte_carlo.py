@@ -18,16 +18,16 @@ import pytest
 from scipy.linalg import block_diag
 from scipy.sparse import csr_matrix
 
-from pipelines.adjust.intersection_jacobian import intersection_jacobian
 from pipelines.adjust.measurements import problem_of, start_of
+from pipelines.adjust.posterior import intersection_jacobian
 from pipelines.adjust.solution import adjusted
 from pipelines.adjust.system import linearised, minimise
 from pipelines.evaluate.cautions import refutation
 from pipelines.geometry.bundle import Network
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.scene.scene import Scene
-from pipelines.scene.survey import Fix, Mark, Survey, SurveyedPoint
+from pipelines.survey.scene import Scene
+from pipelines.survey.survey import Fix, Mark, Survey, SurveyedPoint
 from tests.bundle_scenes import SIGMA_PX, adjuster, exact_network, noisy, pixels, readjusted, size
 from tests.drawn_surveys import missed, rows_of
 from tests.scenes import Measured, Noise, initial_product, material

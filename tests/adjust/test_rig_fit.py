@@ -16,10 +16,9 @@ from pipelines.adjust.rig_fit import (
 )
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import FloatArray
-from pipelines.geometry.rig import boresight
 from pipelines.geometry.rotations import exp_so3, log_so3
 from pipelines.geometry.similarity import Similarity
-from pipelines.geometry.trajectory import Trajectory
+from pipelines.geometry.trajectory import Trajectory, boresight
 from pipelines.simulate.flight import FlightPlan, TrueTrajectory, make_trajectory
 from pipelines.simulate.sensors import RECEIVERS, Mounting, record_gnss, record_imu
 

@@ -18,9 +18,9 @@ from pipelines.core.errors import InputError
 from pipelines.core.products import load_npz, save_npz
 from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.similarity import Similarity
-from pipelines.scene.marks import mark_rays
-from pipelines.scene.scene import Scene, initial_scene
-from pipelines.scene.survey import Survey
+from pipelines.survey.marks import mark_rays
+from pipelines.survey.scene import Scene, initial_scene
+from pipelines.survey.survey import Survey
 from tests.drawn_surveys import Receiver, drawn, flight, missed, surveyed
 from tests.scenes import GEO_FROM_LOCAL, initial_product
 

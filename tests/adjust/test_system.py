@@ -10,16 +10,13 @@ import numpy as np
 import pytest
 
 from pipelines.adjust.bundle import SurveyedPoints, adjust_bundle
-from pipelines.adjust.intersection_jacobian import intersection_jacobian
-from pipelines.adjust.posterior import camera_covariances
+from pipelines.adjust.posterior import camera_covariances, intersection_jacobian
 from pipelines.adjust.state import State, SystematicError, SystematicErrors
 from pipelines.adjust.system import Minimum, NormalMatrix, Problem, linearised, minimise
 from pipelines.adjust.terms import Attitudes, CommonErrors, ControlPoints, Fixes, Planes, Term
 from pipelines.core.errors import DegenerateGeometryError, InputError
-from pipelines.geometry.bundle import Network
-from pipelines.geometry.bundle_information import bundle_information
-from pipelines.geometry.cameras import CameraPoses
-from pipelines.geometry.lens import Lenses, bearings
+from pipelines.geometry.bundle import Network, bundle_information
+from pipelines.geometry.cameras import CameraPoses, Lenses, bearings
 from pipelines.geometry.rotations import exp_so3, log_so3
 from pipelines.geometry.similarity import Similarity, perturbation
 from tests.bundle_scenes import (

@@ -25,7 +25,7 @@ from playwright.sync_api import Browser, ConsoleMessage, Page, Response, Route, 
 from pipelines.core.errors import BackendUnavailableError
 from pipelines.geometry.cameras import Pinhole
 from pipelines.geometry.similarity import Similarity
-from pipelines.pages.chromium import NO_NETWORK, chromium_path
+from pipelines.report.chromium import NO_NETWORK, chromium_path
 
 CACHE = Path(__file__).parents[2] / "build/browser"
 CESIUM_VERSION = "1.145.0"

@@ -10,8 +10,8 @@ import pytest
 from playwright.sync_api import Browser
 
 from pipelines.deliver.splat import codec_arrays
-from pipelines.deliver.tiles.page import write_page
-from pipelines.deliver.tiles.stage import Tiling, write_tiles
+from pipelines.deliver.tiles import Tiling, write_tiles
+from pipelines.deliver.tiles_page import write_page
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.level_of_detail import DetailTile
 from tests.browser import hill

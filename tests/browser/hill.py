@@ -13,7 +13,7 @@ import torch
 from pipelines.deliver.options import PageOptions, SplatOptions
 from pipelines.deliver.placement import place
 from pipelines.deliver.splat import PlacedSplat, placed_splat
-from pipelines.deliver.tiles.page import ScenePage, ShownScene, scene_page
+from pipelines.deliver.tiles_page import ScenePage, ShownScene, scene_page
 from pipelines.geodesy.enu import (
     Origin,
     ecef_from_enu,
@@ -26,13 +26,12 @@ from pipelines.geodesy.vertical import VerticalDatum
 from pipelines.geometry.cameras import Pinhole
 from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.similarity import Similarity
-from pipelines.scene.survey import Survey, SurveyedPoint
-from pipelines.scene.target_crs import target_crs
-from pipelines.splat.gaussians import Gaussians
+from pipelines.splat.gaussians import Gaussians, transformed
 from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
 from pipelines.splat.sh import sh_from_rgb
-from pipelines.splat.transform import transformed
+from pipelines.survey.survey import Survey, SurveyedPoint
+from pipelines.survey.target_crs import target_crs
 from tests.scenes import trained_model
 
 ORIGIN = Origin(lat_deg=46.0, lon_deg=7.75, alt_m=1600.0)

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, Route
 
-from pipelines.compare.files import PAGE, write_comparison
+from pipelines.compare.configurations import PAGE, write_comparison
 from pipelines.compare.table import ComparedRow, Comparison, PointAccuracy
 from pipelines.core.workspace import StageRun
-from pipelines.pages.chromium import print_pdf
+from pipelines.report.chromium import print_pdf
 from pipelines.report.options import ReportOptions
 from pipelines.report.stage import run
 from tests.evaluated_workspaces import evaluated_workspace

@@ -17,16 +17,14 @@ from playwright.sync_api import Browser, Page, Route
 from pipelines.core.runner import run_stage
 from pipelines.core.stages import BY_NAME, REPORT
 from pipelines.core.workspace import Workspace
-from pipelines.formats.odm import read_ground_points
-from pipelines.scene.report import read_report
-from pipelines.scene.survey import SurveyedPoint
+from pipelines.formats.ground_points import read_ground_points
+from pipelines.survey.report import read_report
+from pipelines.survey.survey import SurveyedPoint
 from pipelines.view.loopback import start_server
 from pipelines.view.marking import CHECK
 from pipelines.view.options import ViewOptions
-from pipelines.view.picture_loop import camera_of
-from pipelines.view.saved import read_measurements
-from pipelines.view.store import FOLDER
-from pipelines.view.view_frame import ViewerCamera
+from pipelines.view.pictures import ViewerCamera, camera_of
+from pipelines.view.saved import FOLDER, read_measurements
 from pipelines.view.viewer import Viewer
 from tests.faults.injection import filled, mounted
 from tests.splat_scenes import make_rendered

@@ -14,7 +14,7 @@ import pytest
 
 from pipelines.core.products import load_json
 from pipelines.core.stages import SURVEY
-from pipelines.scene.survey import Survey
+from pipelines.survey.survey import Survey
 from tests.cli_runs import Georef, finish, products_in, start, write_files
 from tests.photos import Exif, gps_entries, jpeg, write_flight
 

@@ -15,8 +15,8 @@ import torch
 from pipelines.core.products import load_json, save_json
 from pipelines.core.stages import BY_NAME, GAUSSIANS, MODEL, POINTS, REPORT, SIM3, SPARSE, SURVEY
 from pipelines.geometry.similarity import Similarity
-from pipelines.scene.geolocated import GeolocatedPoints
-from pipelines.scene.survey import Survey
+from pipelines.survey.adjustment import GeolocatedPoints
+from pipelines.survey.survey import Survey
 from tests.cli_runs import Georef, products_in, write_files
 from tests.photos import jpeg
 from tests.scenes import Measured, Noise, make_scene, sparse_model, survey_of, trained_model, write_workspace

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.core import restart
+from pipelines.core import child
 from pipelines.core.stages import BY_NAME
 from pipelines.core.workspace import Workspace
 from tests import fakes
@@ -40,7 +40,7 @@ main()
 @pytest.fixture
 def with_fakes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fake stages in the processes of the missions."""
-    monkeypatch.setattr(restart, "THIS_PROGRAM", ("-c", WITH_FAKES))
+    monkeypatch.setattr(child, "THIS_PROGRAM", ("-c", WITH_FAKES))
 
 
 def write_missions(folder: Path) -> Path:
@@ -118,7 +118,7 @@ def test_ctrl_c_stops_all_and_the_same_command_goes_on(
     real_georef: Georef, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Both trainings have work to lose, which they keep: the next call would resume them."""
-    monkeypatch.setattr(restart, "THIS_PROGRAM", ("-c", STUCK))
+    monkeypatch.setattr(child, "THIS_PROGRAM", ("-c", STUCK))
     names = ("a", "b")
     for name in names:
         fakes.photographs(tmp_path / name / "images")

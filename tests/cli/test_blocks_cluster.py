@@ -14,7 +14,7 @@ import pytest
 from pipelines.core.products import load_json
 from pipelines.core.stages import BLOCK_RECORD
 from pipelines.core.workspace import Workspace
-from pipelines.scene.block_record import BlockRecord
+from pipelines.survey.block_plan import BlockRecord
 from tests.block_scenes import make_field, write_field
 from tests.cli_runs import Result, start
 from tests.clusters import RunningCluster, finish_patiently, running_cluster, wait_until

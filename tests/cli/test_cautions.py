@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.core.cautions import Caution
 from pipelines.core.options import StageOptions
+from pipelines.core.products import Caution
 from pipelines.core.stages import BY_NAME, PIPELINE
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from tests import fakes

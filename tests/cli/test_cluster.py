@@ -13,7 +13,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 
-from pipelines.engine.certificates import CERTIFICATE, KEY, make_certificates, make_own_certificates
+from pipelines.jobs.cluster import CERTIFICATE, KEY, make_certificates, make_own_certificates
 from tests.cli_runs import Georef, finish, start
 from tests.clusters import greeting
 from tests.photos import write_flight

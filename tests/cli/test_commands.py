@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from pipelines.core.errors import ConvergenceError
+from pipelines.core.machine import chosen_threads, thread_count
 from pipelines.core.stages import BY_NAME, PIPELINE
-from pipelines.core.threads import chosen_threads, thread_count
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from tests import fakes
 from tests.cli_runs import Georef

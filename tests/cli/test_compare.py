@@ -10,10 +10,9 @@ from typing import Any
 import pytest
 
 from pipelines.compare.configurations import BY_CONFIGURATION
-from pipelines.core.cautions import Caution
 from pipelines.core.errors import ConvergenceError, InputError
 from pipelines.core.options import StageOptions
-from pipelines.core.products import dump_json
+from pipelines.core.products import Caution, dump_json
 from pipelines.core.stages import BY_NAME, PIPELINE
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from tests import fakes

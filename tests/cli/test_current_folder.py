@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.core import restart
+from pipelines.core import child
 from tests.block_scenes import make_field, write_field
 from tests.cli_runs import REPOSITORY, finish
 from tests.photos import write_flight
@@ -121,8 +121,8 @@ def test_only_a_checkout_is_found_in_the_current_folder(tmp_path: Path, monkeypa
     monkeypatch.chdir(tmp_path / "photos")
     named = ["", ".", "../photos", str(tmp_path / "photos"), str(tmp_path / "link")]
     monkeypatch.setattr(sys, "path", [*named, "/usr/lib/modules-of-a-user", *sys.path])
-    path = restart.python_environment()["PYTHONPATH"].split(os.pathsep)
+    path = child.python_environment()["PYTHONPATH"].split(os.pathsep)
     assert path[0] == "/usr/lib/modules-of-a-user" and not set(named) & set(path)
     monkeypatch.chdir(REPOSITORY)
-    path = restart.python_environment()["PYTHONPATH"].split(os.pathsep)
+    path = child.python_environment()["PYTHONPATH"].split(os.pathsep)
     assert path.index(str(REPOSITORY)) == len(path) - 1

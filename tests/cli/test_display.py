@@ -16,19 +16,13 @@ from georef_cli import display, tables
 from georef_cli.output import print_rich
 from georef_cli.verbosity import Verbosity
 from pipelines.compare.table import ComparedRow, Comparison, PointAccuracy
-from pipelines.core.cautions import Caution
+from pipelines.core.products import Caution
 from pipelines.core.progress import SILENT
 from pipelines.core.runner import Outcome
 from pipelines.core.sentences import duration
 from pipelines.core.staleness import StageState
 from pipelines.core.workspace import Manifest, Workspace
-from pipelines.scene.report import (
-    AsprsStatement,
-    ByAxis,
-    PredictedSigma,
-    TotalRmse,
-    VegetatedAccuracy,
-)
+from pipelines.survey.report import AsprsStatement, ByAxis, PredictedSigma, TotalRmse, VegetatedAccuracy
 from tests.reports import check_points_with, cross_validation_with, report_with
 
 REPORT = report_with(

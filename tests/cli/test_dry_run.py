@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from pipelines.core.workspace import StageRun, Summary, Workspace
-from pipelines.train.pace import TimeLeft, iteration_seconds
+from pipelines.jobs.costs import TimeLeft, iteration_seconds
 from tests import bags, fakes
 from tests.cli_runs import Georef
 from tests.photos import write_flight

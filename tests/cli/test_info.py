@@ -6,14 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from georef_cli.output import print_outcomes
-from georef_cli.overview import size
+from georef_cli.output import print_outcomes, size
 from pipelines.core.manifest import MANIFEST, Manifest
 from pipelines.core.products import save_json
 from pipelines.core.stages import BY_NAME, MODEL, SPLAT
 from pipelines.core.workspace import Workspace, now
 from pipelines.deliver.overview import overview
-from pipelines.scene.crs_options import CrsOptions
+from pipelines.survey.options import CrsOptions
 from tests.cli_runs import Georef
 from tests.trained_workspaces import trained_workspace
 

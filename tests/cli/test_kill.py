@@ -21,9 +21,9 @@ from pipelines.core.products import load_json
 from pipelines.core.stages import PIPELINE, SPLAT, SURVEY
 from pipelines.core.workspace import Workspace
 from pipelines.formats.georef_sidecar import read_sidecar
-from pipelines.scene.survey import Survey
-from pipelines.splat.storage import read_gaussians
-from pipelines.train.checkpoint import load_checkpoint
+from pipelines.splat.gaussians import read_gaussians
+from pipelines.survey.survey import Survey
+from pipelines.train.trainer import load_checkpoint
 from tests.cli_runs import Result, finish, start
 from tests.killed import GEOREF, PATIENCE_S, asked, georef
 

@@ -13,11 +13,11 @@ from click.shell_completion import BashComplete
 from georef_cli.main import PROGRAM, cli
 from georef_cli.topics import TOPICS, topic_text
 from pipelines.core.errors import BackendUnavailableError
-from pipelines.core.threads import available_cores
-from pipelines.core.versions import NOT_INSTALLED
-from pipelines.machine import inspection
-from pipelines.splat.rasterizer.cuda_parts import CudaPart
-from pipelines.train.presets import PRESETS
+from pipelines.core.fingerprints import NOT_INSTALLED
+from pipelines.core.machine import available_cores
+from pipelines.jobs import machine
+from pipelines.splat.rasterizer.cuda_kernels import CudaPart
+from pipelines.train.options import PRESETS
 from tests.cli.test_help import examples_in, parse
 from tests.cli_runs import REPOSITORY, Georef
 
@@ -28,26 +28,26 @@ def test_doctor_tells_what_there_is_and_why_not(real_georef: Georef, monkeypatch
             raise BackendUnavailableError("no GPU: give --backend cpu")
         return name
 
-    monkeypatch.setattr(inspection, "chosen_backend", chosen_backend)
+    monkeypatch.setattr(machine, "chosen_backend", chosen_backend)
     parts = CudaPart("NVIDIA driver", None, "install it"), CudaPart("C++ compiler", "g++ 12", "")
-    monkeypatch.setattr(inspection, "running_parts", lambda: parts[:1])
-    monkeypatch.setattr(inspection, "compiling_parts", lambda: parts[1:])
-    monkeypatch.setattr(inspection, "kernels_ready", lambda: None)
+    monkeypatch.setattr(machine, "running_parts", lambda: parts[:1])
+    monkeypatch.setattr(machine, "compiling_parts", lambda: parts[1:])
+    monkeypatch.setattr(machine, "kernels_ready", lambda: None)
     monkeypatch.setenv("CHROMIUM", "/opt/chromium")
-    machine = real_georef("doctor", "--json").document
-    assert machine["cores"] == available_cores()
-    assert machine["memory_bytes"] > machine["free_bytes"] > 0
-    assert machine["backends"] == [
+    offered = real_georef("doctor", "--json").document
+    assert offered["cores"] == available_cores()
+    assert offered["memory_bytes"] > offered["free_bytes"] > 0
+    assert offered["backends"] == [
         {"name": "cpu", "available": True, "reason": ""},
         {"name": "cuda", "available": False, "reason": "no GPU: give --backend cpu"},
     ]
-    assert machine["cuda_parts"] == [
+    assert offered["cuda_parts"] == [
         {"name": "NVIDIA driver", "found": None, "remedy": "install it"},
         {"name": "C++ compiler", "found": "g++ 12", "remedy": ""},
     ]
-    assert machine["cuda_kernels"] is None
-    assert machine["chromium"] == "/opt/chromium"
-    assert machine["versions"]["numpy"] != NOT_INSTALLED
+    assert offered["cuda_kernels"] is None
+    assert offered["chromium"] == "/opt/chromium"
+    assert offered["versions"]["numpy"] != NOT_INSTALLED
     text = real_georef("doctor").out
     words = " ".join(text.split())
     assert (

@@ -10,27 +10,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from georef_cli import batch_tables
+from georef_cli import job_tables
 from georef_cli.output import print_outcomes, print_rich
 from pipelines.adjust.solution import load_adjustment
-from pipelines.batch.files import write_batch
-from pipelines.batch.missions import Mission
-from pipelines.batch.table import BatchTable, mission_row
-from pipelines.core.cautions import NOT_CHECKED, Caution
 from pipelines.core.figures import Headline
 from pipelines.core.fingerprints import fingerprints
-from pipelines.core.products import load_json, save_json
+from pipelines.core.products import NOT_CHECKED, Caution, load_json, save_json
 from pipelines.core.stages import BY_NAME, DELIVERABLES, HEADLINE, PIPELINE, REPORT
 from pipelines.core.workspace import StageRun, Summary, Workspace
-from pipelines.deliver import ply, spz
-from pipelines.deliver.cameras import stage as cameras
+from pipelines.deliver import cameras, ply, spz, tiles
 from pipelines.deliver.overview import overview
-from pipelines.deliver.tiles import stage as tiles
+from pipelines.jobs.batch import BatchTable, mission_row, write_batch
+from pipelines.jobs.missions import Mission
 from pipelines.report import stage as report
-from pipelines.scene.crs_options import CrsOptions
-from pipelines.scene.headline import headline, headline_of
-from pipelines.scene.report import AccuracySummary, EvaluationReport, TotalRmse, read_report
-from pipelines.scene.survey import Survey
+from pipelines.survey.headline import headline, headline_of
+from pipelines.survey.options import CrsOptions
+from pipelines.survey.report import AccuracySummary, EvaluationReport, TotalRmse, read_report
+from pipelines.survey.survey import Survey
 from pipelines.view.viewer import accuracy_line
 from tests.cli_runs import Georef
 from tests.evaluated_workspaces import CHECK_POINTS, ERROR_M, evaluated_workspace
@@ -102,7 +98,7 @@ def test_it_is_the_same_everywhere(
     ):
         assert text in " ".join(where.split())
     write_batch(tmp_path, table)
-    print_rich(*batch_tables.batch(table, tmp_path))
+    print_rich(*job_tables.batch(table, tmp_path))
     horizontal, vertical = re.findall(r"[HV] (\d\.\d) cm", text)
     assert re.search(rf"measured +{horizontal} +{vertical} +3", capsys.readouterr().out)
     for html in ((tmp_path / "b.batch.html").read_text("utf-8"), page):

@@ -24,15 +24,13 @@ from pipelines.adjust.posterior import Posterior, save_posterior
 from pipelines.adjust.system import NormalMatrix
 from pipelines.core.products import load_json, save_json
 from pipelines.core.stages import GAUSSIANS, MODEL, REPORT, SIM3, SPARSE, SURVEY, TRAIN_POSTERIOR
-from pipelines.formats.colmap import read_sparse
-from pipelines.formats.colmap_writer import write_sparse
+from pipelines.formats.colmap import read_sparse, write_sparse
 from pipelines.geometry.cameras import Camera
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.scene.survey import Survey
-from pipelines.scene.trained_model import TrainedCamera, TrainedModel
-from pipelines.splat.gaussians import Gaussians
-from pipelines.splat.storage import write_gaussians
+from pipelines.splat.gaussians import Gaussians, write_gaussians
+from pipelines.survey.survey import Survey
+from pipelines.survey.trained_model import TrainedCamera, TrainedModel
 from tests.cli_runs import Georef
 from tests.map_projections import US_FOOT_M, long_island, utm
 from tests.photos import jpeg

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.core.printable import printable, printable_lines
+from pipelines.core.sentences import printable, printable_lines
 from tests.cli_runs import REPOSITORY, WITH_FAKES
 
 ATTACK = "\x1b[31m\x1b]0;title\x07\x9b2J\u202egpj\u2066\r\nerror: forged"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from georef_cli.time_left import RunTimeLeft
+from georef_cli.forecast import RunTimeLeft
 
 
 def test_a_machine_twice_as_slow_doubles_the_rest() -> None:

@@ -19,9 +19,9 @@ from pipelines.core.products import load_json, save_json
 from pipelines.core.stages import GAUSSIANS, REPORT, SIM3, SURVEY
 from pipelines.core.workspace import Workspace
 from pipelines.geometry.similarity import Similarity, SimilarityRecord
-from pipelines.scene.initial_similarity import InitialSimilarity
-from pipelines.scene.survey import Survey
-from pipelines.scene.trained_survey import load_trained
+from pipelines.survey.adjustment import InitialSimilarity
+from pipelines.survey.survey import Survey
+from pipelines.survey.trained_survey import load_trained
 from tests.splat_scenes import RenderedFlight
 
 pytest.importorskip("pycolmap")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pipelines.compare.files import PAGE, write_comparison
+from pipelines.compare.configurations import PAGE, write_comparison
 from pipelines.compare.table import (
     ComparedRow,
     Comparison,

@@ -7,7 +7,7 @@ import json
 import pytest
 from pydantic import ValidationError
 
-from pipelines.core.cautions import Caution, union
+from pipelines.core.products import Caution, union
 from pipelines.core.stages import BY_NAME
 from pipelines.core.staleness import cautions_by_stage
 from pipelines.core.workspace import Manifest, Workspace, now

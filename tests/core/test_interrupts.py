@@ -7,7 +7,7 @@ import threading
 
 import pytest
 
-from pipelines.core.interrupts import deferred_interrupts
+from pipelines.core.progress import deferred_interrupts
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

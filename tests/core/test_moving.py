@@ -12,7 +12,7 @@ import pytest
 from pipelines.core import runner
 from pipelines.core import staleness as states
 from pipelines.core.manifest import MANIFEST
-from pipelines.core.photograph_folder import photograph_folder
+from pipelines.core.plan import photograph_folder
 from pipelines.core.stages import BY_NAME, stage_slice
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from tests import fakes

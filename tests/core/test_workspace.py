@@ -16,7 +16,7 @@ import pytest
 from pipelines.core import runner
 from pipelines.core import staleness as states
 from pipelines.core.errors import InputError, MissingProductError, WorkspaceBusyError
-from pipelines.core.photograph_folder import photograph_folder
+from pipelines.core.plan import photograph_folder
 from pipelines.core.stages import BY_NAME, MODEL, PIPELINE, POINTS, SIM3, SPARSE, stage_slice
 from pipelines.core.workspace import Workspace
 from tests import fakes

@@ -13,22 +13,20 @@ import pytest
 from pyproj import Proj, Transformer
 
 from pipelines.adjust.solution import load_adjustment
-from pipelines.core.cautions import NOT_CHECKED, Caution
 from pipelines.core.errors import InputError
-from pipelines.core.products import load_json, save_json
+from pipelines.core.products import NOT_CHECKED, Caution, load_json, save_json
 from pipelines.core.stages import MODEL, SPARSE, SURVEY
 from pipelines.core.workspace import StageRun, Summary, Workspace
-from pipelines.deliver.cameras.stage import run
+from pipelines.deliver.cameras import run
 from pipelines.deliver.options import ExportCamerasOptions
-from pipelines.formats.colmap import read_sparse
-from pipelines.formats.colmap_writer import write_sparse
+from pipelines.formats.colmap import read_sparse, write_sparse
 from pipelines.formats.georef_sidecar import CrsSidecar, read_sidecar, sidecar_path
 from pipelines.formats.trajectory_csv import read_trajectory
 from pipelines.geodesy.enu import Origin, ecef_from_enu, ecef_from_lla, enu_from_ecef, geo_from_enu_at, lla_from_enu
 from pipelines.geometry.cameras import Camera, project
 from pipelines.geometry.rotations import map_from_cam, matrix_from_quat_xyzw
-from pipelines.scene.survey import Survey
-from pipelines.scene.trained_model import TrainedModel
+from pipelines.survey.survey import Survey
+from pipelines.survey.trained_model import TrainedModel
 from tests.scenes import TrueScene
 from tests.trained_workspaces import IMAGES, scene_of, trained_workspace, untrained
 

@@ -21,11 +21,10 @@ from pipelines.formats.georef_sidecar import CrsSidecar, sidecar_path
 from pipelines.geodesy.enu import enu_from_ecef
 from pipelines.geometry.cameras import CameraPoses
 from pipelines.geometry.similarity import Similarity
-from pipelines.scene.calibrated import load_survey
-from pipelines.scene.surface_cloud import plan
-from pipelines.scene.surface_cloud.fusion import FusionSettings, SurfaceCloud, fused_squares
-from pipelines.scene.surface_cloud.plan import pixel_on_surface_m
-from pipelines.scene.surface_views import SurfaceViews
+from pipelines.surface import fusion
+from pipelines.surface.fusion import FusionSettings, SurfaceCloud, fused_squares, pixel_on_surface_m
+from pipelines.surface.surface_views import SurfaceViews
+from pipelines.survey.calibrated import load_survey
 from tests.depth_scenes import BOX_M, CAMERA, DOWN, depth_map, looking_down
 from tests.splat_scenes import ground_height
 
@@ -88,7 +87,7 @@ def test_each_voxel_holds_one_point(tmp_path: Path) -> None:
 def test_squares_have_no_seam(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     views = surface_views(tmp_path, np.random.default_rng(2).normal(0, 0.03, len(CENTERS)))
     whole = cloud(views)
-    monkeypatch.setattr(plan, "_MOST_CANDIDATES", 3000)
+    monkeypatch.setattr(fusion, "_MOST_CANDIDATES", 3000)
     parts = list(fused_squares(views, GEO_FROM_MODEL, SETTINGS))
     assert len(parts) > 8
     together = np.concatenate([part.position for part in parts])

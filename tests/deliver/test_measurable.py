@@ -22,13 +22,12 @@ from pipelines.geodesy.enu import enu_from_ecef
 from pipelines.geometry.cameras import Pinhole
 from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.similarity import Similarity
-from pipelines.scene.calibrated import load_survey
-from pipelines.scene.surface_cloud.fusion import SurfaceCloud
-from pipelines.splat.gaussians import Gaussians
+from pipelines.splat.gaussians import Gaussians, read_gaussians, write_gaussians
 from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
 from pipelines.splat.repainting import ShownView, repainted, shuffled_passes
-from pipelines.splat.storage import read_gaussians, write_gaussians
+from pipelines.surface.fusion import SurfaceCloud
+from pipelines.survey.calibrated import load_survey
 from tests.splat_scenes import ground_height
 
 GEO_FROM_MODEL = Similarity(2.0, exp_so3(np.array([0.3, -0.2, 1.1])), np.array([100.0, 50.0, 3.0]))
@@ -76,7 +75,7 @@ def test_discs_replace_gaussians_beside_the_surface_and_no_others() -> None:
 def test_discs_lie_in_the_surface_and_close_it() -> None:
     """From above, no pixel sees more than a fifth of what lies behind, and the colour is that of the surface.
 
-    Between four discs the transmittance is 0.2 (`splat.surface_discs`), on a slope less; dilation only closes more.
+    Between four discs the transmittance is 0.2 (`splat.surface`), on a slope less; dilation only closes more.
     """
     surface = slope()
     empty = displaced(np.zeros(0), surface)

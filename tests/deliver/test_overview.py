@@ -9,18 +9,17 @@ import numpy as np
 import pytest
 from pyproj import Transformer
 
-from pipelines.core.cautions import NOT_CHECKED, Caution
 from pipelines.core.errors import InputError, MissingProductError
-from pipelines.core.products import load_json, save_json
+from pipelines.core.products import NOT_CHECKED, Caution, load_json, save_json
 from pipelines.core.stages import DELIVERABLES, MODEL, SPLAT, SURVEY
 from pipelines.core.workspace import Workspace
+from pipelines.deliver.options import PURPOSES
 from pipelines.deliver.overview import Bounds, overview
-from pipelines.deliver.purposes import PURPOSES
 from pipelines.geodesy.enu import ecef_from_enu
 from pipelines.geodesy.vertical import VerticalDatum, parse_vertical
-from pipelines.scene.crs_options import CrsOptions
-from pipelines.scene.report import AccuracySummary
-from pipelines.scene.survey import Survey
+from pipelines.survey.options import CrsOptions
+from pipelines.survey.report import AccuracySummary
+from pipelines.survey.survey import Survey
 from tests.reports import report_with
 from tests.scenes import TrueScene
 from tests.trained_workspaces import trained_workspace

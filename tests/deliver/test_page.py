@@ -14,21 +14,21 @@ import pytest
 import torch
 from pydantic import ValidationError
 
-from pipelines.core.cautions import Caution
 from pipelines.core.figures import Headline
-from pipelines.core.printable import printable
+from pipelines.core.products import Caution
+from pipelines.core.sentences import printable
 from pipelines.deliver.options import CESIUM, PageOptions, SplatOptions
 from pipelines.deliver.placement import place
 from pipelines.deliver.splat import placed_splat
-from pipelines.deliver.tiles.local_crs import LocalCrs, fit_local_crs
-from pipelines.deliver.tiles.page import ScenePage, ShownScene, scene_page, write_page
+from pipelines.deliver.tiles_content import LocalCrs, fit_local_crs
+from pipelines.deliver.tiles_page import ScenePage, ShownScene, scene_page, write_page
 from pipelines.geodesy.crs import parse_crs
 from pipelines.geodesy.enu import ecef_from_enu, ecef_from_enu_rotation, ecef_from_lla, lla_from_ecef
 from pipelines.geodesy.vertical import parse_vertical
 from pipelines.geometry.similarity import Similarity
-from pipelines.scene.survey import Survey
-from pipelines.scene.target_crs import target_crs
 from pipelines.splat.gaussians import Gaussians
+from pipelines.survey.survey import Survey
+from pipelines.survey.target_crs import target_crs
 from tests.scenes import Measured, Noise, make_scene, survey_of, trained_model
 
 HOSTILE = "</script><script>alert(1)</script><!-- & \u2028 \x1b[2J\u202e \" ' ` ${1} \\u003c Ω"

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from pipelines.core.cautions import Caution
 from pipelines.core.errors import DegenerateGeometryError, InputError
-from pipelines.core.products import save_json
+from pipelines.core.products import Caution, save_json
 from pipelines.core.stages import GAUSSIANS, MODEL, SURVEY
 from pipelines.core.workspace import StageRun, Workspace
 from pipelines.deliver.options import ExportPlyOptions
@@ -24,12 +23,11 @@ from pipelines.geodesy.vertical import VerticalDatum
 from pipelines.geometry.cameras import Pinhole
 from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.similarity import Similarity, covariance_at
-from pipelines.scene.survey import Survey
-from pipelines.scene.trained_model import TrainedModel
-from pipelines.splat.gaussians import Gaussians
+from pipelines.splat.gaussians import Gaussians, read_gaussians, write_gaussians
 from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.reference import render_reference
-from pipelines.splat.storage import read_gaussians, write_gaussians
+from pipelines.survey.survey import Survey
+from pipelines.survey.trained_model import TrainedModel
 
 OPTIONS = ExportPlyOptions()
 # The scene lies 3 km from the survey's origin, where vertical and north have visibly turned.

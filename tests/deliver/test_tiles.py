@@ -17,15 +17,13 @@ from pipelines.core.products import save_json
 from pipelines.core.stages import BLOCK_RECORD, GAUSSIANS
 from pipelines.core.workspace import StageRun
 from pipelines.deliver.options import ExportTilesOptions
-from pipelines.deliver.tiles.content import read_glb, write_glb
-from pipelines.deliver.tiles.stage import run, write_whole
+from pipelines.deliver.tiles import run, write_whole
+from pipelines.deliver.tiles_content import read_glb, write_glb
 from pipelines.formats.georef_sidecar import read_sidecar
 from pipelines.formats.splat_ply import SplatArrays
-from pipelines.scene.block_plan import BlockCell
-from pipelines.scene.block_record import BlockRecord, MergedBlock
-from pipelines.splat.gaussians import Gaussians
+from pipelines.splat.gaussians import Gaussians, write_gaussians
 from pipelines.splat.level_of_detail import DetailTile
-from pipelines.splat.storage import write_gaussians
+from pipelines.survey.block_plan import BlockCell, BlockRecord, MergedBlock
 from tests.delivered_scenes import block_training, splat_arrays, true_ecef, write_trained
 
 COUNT = 2600

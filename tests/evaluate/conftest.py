@@ -26,10 +26,9 @@ from pipelines.core.stages import (
 )
 from pipelines.core.workspace import Workspace
 from pipelines.formats.colmap import read_sparse
-from pipelines.scene.survey import Survey
-from pipelines.scene.trained_model import TrainedModel
-from pipelines.splat.storage import write_gaussians
-from pipelines.splat.transform import transformed
+from pipelines.splat.gaussians import transformed, write_gaussians
+from pipelines.survey.survey import Survey
+from pipelines.survey.trained_model import TrainedModel
 from tests.scenes import write_workspace
 from tests.splat_scenes import CAMERA, Rendered, make_rendered, write_photographs
 

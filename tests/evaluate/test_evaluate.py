@@ -14,17 +14,16 @@ import pytest
 from georef_cli import boundary
 from georef_cli.main import cli
 from pipelines.adjust import system
-from pipelines.core.cautions import Caution
 from pipelines.core.errors import InputError
-from pipelines.core.products import load_json, save_json
+from pipelines.core.products import Caution, load_json, save_json
 from pipelines.core.runner import Outcome, run_stage
 from pipelines.core.stages import BY_NAME, MODEL, SURVEY
 from pipelines.core.staleness import status
 from pipelines.core.workspace import Workspace
 from pipelines.evaluate.asprs import few_points
-from pipelines.scene.report import AsprsStatement
-from pipelines.scene.survey import Mark, Survey
-from pipelines.scene.trained_model import TrainedModel
+from pipelines.survey.report import AsprsStatement
+from pipelines.survey.survey import Mark, Survey
+from pipelines.survey.trained_model import TrainedModel
 from tests.evaluate.conftest import solve
 from tests.reports import report_of
 from tests.splat_scenes import NOISE, SIGMA_M, Rendered, ground_height

@@ -13,10 +13,10 @@ from pipelines.core.products import load_json, save_json
 from pipelines.core.runner import Outcome, run_stage
 from pipelines.core.stages import BY_NAME, GAUSSIANS, MODEL
 from pipelines.core.workspace import Workspace
-from pipelines.plots.strips import band_height_px
-from pipelines.scene.render_files import render_name
-from pipelines.scene.trained_model import TrainedModel
-from pipelines.splat.storage import read_gaussians, write_gaussians
+from pipelines.report.plots.charts import band_height_px
+from pipelines.splat.gaussians import read_gaussians, write_gaussians
+from pipelines.survey.photographs import render_name
+from pipelines.survey.trained_model import TrainedModel
 from tests.reports import report_of
 from tests.splat_scenes import TEST_VIEWS
 

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from georef_cli.point_tables import coordinate_tables, error_tables
-from pipelines.evaluate.point_table import write_point_table
+from georef_cli.tables import coordinate_tables, error_tables
+from pipelines.evaluate.coordinates import write_point_table
 from pipelines.geodesy.enu import ecef_from_enu, ecef_from_lla
-from pipelines.scene.report import (
+from pipelines.survey.headline import point_lines
+from pipelines.survey.report import (
     Coordinates,
     EvaluationReport,
     PointCoordinates,
@@ -21,8 +22,7 @@ from pipelines.scene.report import (
     PointResidual,
     PredictedPointError,
 )
-from pipelines.scene.report_points import point_lines
-from pipelines.scene.survey import Survey
+from pipelines.survey.survey import Survey
 from tests.reports import check_points_with, cross_validation_with, report_with
 from tests.scenes import material
 

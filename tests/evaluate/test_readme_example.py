@@ -11,7 +11,7 @@ from pathlib import Path
 from pipelines.core.runner import Outcome
 from pipelines.core.stages import REPORT
 from pipelines.core.workspace import Workspace
-from pipelines.scene.report import read_report
+from pipelines.survey.report import read_report
 from tests.scripts import REPOSITORY
 
 

@@ -13,24 +13,24 @@ from pipelines.core.errors import InputError
 from pipelines.core.runner import run_stage
 from pipelines.core.stages import BY_NAME, CLOUD, REFERENCE_HISTOGRAM, REFERENCE_MAP
 from pipelines.core.workspace import Workspace
-from pipelines.evaluate.reference.alignment import fit_alignment
-from pipelines.evaluate.reference.distances import (
+from pipelines.evaluate.reference_distances import (
     CLASSES,
+    CONFIDENCE_95,
     ComparisonSettings,
     CorePoints,
     SquareDistances,
+    TiledPoints,
     compare_square,
     kinds_of,
+    plane_normals,
 )
-from pipelines.evaluate.reference.figures import CoreTable, DistanceTally, level_of_detection, m3c2_figures
-from pipelines.evaluate.reference.m3c2 import CONFIDENCE_95
-from pipelines.evaluate.reference.normals import plane_normals
-from pipelines.evaluate.reference.seen import SeenSurface, Viewpoints, seen_surface
-from pipelines.evaluate.reference.tiles import TiledPoints
+from pipelines.evaluate.reference_figures import CoreTable, DistanceTally, level_of_detection, m3c2_figures
 from pipelines.geometry.similarity import perturbation
-from pipelines.scene.report import read_report
+from pipelines.surface.registration import fit_alignment
+from pipelines.surface.visibility import SeenSurface, Viewpoints, seen_surface
+from pipelines.survey.report import read_report
 from tests.depth_scenes import BOX_M, CAMERA, DOWN, looking_down
-from tests.scene.test_measured_cloud import write_las
+from tests.survey.test_measured_cloud import write_las
 
 GROUND, BUILDING = 2, 6
 CENTERS = np.array(looking_down(8))

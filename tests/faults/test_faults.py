@@ -16,8 +16,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipelines.batch.missions import Mission, MissionList
-from pipelines.batch.runner import PlannedMission, run_batch
 from pipelines.core import staleness as states
 from pipelines.core.errors import InputError, StorageError
 from pipelines.core.products import save_json
@@ -25,11 +23,13 @@ from pipelines.core.progress import SILENT, Progress
 from pipelines.core.runner import run_stage
 from pipelines.core.stages import BY_NAME, GAUSSIANS, MODEL
 from pipelines.core.workspace import Workspace
-from pipelines.engine.job import Job, JobEnd
 from pipelines.geometry.similarity import Similarity
+from pipelines.jobs.batch import PlannedMission, run_batch
+from pipelines.jobs.engine import Job, JobEnd
+from pipelines.jobs.missions import Mission, MissionList
 from pipelines.simulate.options import SimulateOptions
 from pipelines.simulate.stage import simulate
-from pipelines.splat.storage import write_gaussians
+from pipelines.splat.gaussians import write_gaussians
 from tests.cli_runs import REPOSITORY, WITH_FAKES
 from tests.faults.injection import Disk, Kind, mounted
 from tests.photos import write_flight

@@ -14,8 +14,8 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin
 
 from pipelines.core.errors import InputError
-from pipelines.formats.bag.limits import MAX_CHUNK_BYTES, unpacked
-from pipelines.formats.bag.reader import open_bag
+from pipelines.formats.bag import open_bag
+from pipelines.formats.bag_limits import MAX_CHUNK_BYTES, unpacked
 from tests import bags
 
 if sys.version_info >= (3, 14):

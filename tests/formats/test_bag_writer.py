@@ -10,8 +10,8 @@ import pytest
 from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
-from pipelines.formats.bag import writer as bag_writer
-from pipelines.formats.bag.writer import BagCamera, BagFlight, write_bag
+from pipelines.formats import bag_writer
+from pipelines.formats.bag_writer import BagCamera, BagFlight, write_bag
 from pipelines.geometry.rotations import ENU_FROM_NED, geo_from_cam
 
 START = 1_700_000_000_000_000_000

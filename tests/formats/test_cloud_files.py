@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 from plyfile import PlyData
 from pyproj import CRS
 
-from pipelines.formats.cloud_ply import CloudPlyWriter
-from pipelines.formats.cloud_points import CloudPoints
+from pipelines.formats.cloud_ply import CloudPlyWriter, CloudPoints
 from pipelines.formats.las import DEGREE_STEP, METRE_STEP, LazWriter
 from pipelines.geodesy.crs import parse_crs
 

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from pipelines.core.errors import InputError
-from pipelines.formats.colmap import read_sparse
-from pipelines.formats.colmap_writer import write_sparse
+from pipelines.formats.colmap import read_sparse, write_sparse
 from pipelines.geometry.sparse_model import SparseModel
 from tests.scenes import Noise, make_scene, sparse_model
 

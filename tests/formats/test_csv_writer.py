@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.formats.camera_table import CameraTable, write_camera_table
-from pipelines.formats.csv_writer import plain_text, write_table
+from pipelines.formats.camera_files import CameraTable, write_camera_table
+from pipelines.formats.tables import plain_text, write_table
 from pipelines.formats.trajectory_csv import read_trajectory
 from tests.cli_runs import REPOSITORY
 
@@ -45,4 +45,4 @@ def test_one_writer_writes_all_tables() -> None:
         for node in ast.walk(ast.parse(file.read_text("utf-8")))
         if isinstance(node, ast.Call) and ast.unparse(node.func) in ("csv.writer", "csv.DictWriter")
     }
-    assert users == {"csv_writer.py"}
+    assert users == {"tables.py"}

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipelines.formats.geojson import feature, polygon, write_features
+from pipelines.formats.vector_files import feature, polygon, write_features
 
 
 def area(ring: list[list[float]]) -> float:

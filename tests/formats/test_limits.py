@@ -11,9 +11,9 @@ import pytest
 
 from pipelines.core.errors import InputError
 from pipelines.core.options import read_toml
-from pipelines.formats import text
-from pipelines.formats.metashape_markers import read_markers_xml
-from pipelines.formats.odm import read_ground_points
+from pipelines.formats import tables
+from pipelines.formats.ground_points import read_ground_points
+from pipelines.formats.metashape import read_markers_xml
 from pipelines.formats.trajectory_csv import read_trajectory
 
 MIB = 1 << 20
@@ -55,7 +55,7 @@ def test_what_a_file_may_ask_for_is_bounded(
 ) -> None:
     path = tmp_path / "hostile"
     path.write_bytes(content)
-    monkeypatch.setattr(text, "MOST_LINES", 10_000)  # a hundredth
+    monkeypatch.setattr(tables, "MOST_LINES", 10_000)  # a hundredth
 
     def refused() -> None:
         with pytest.raises(InputError, match=f"hostile.*{fault}"):

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.formats.nerfstudio import Frame, lens_of, write_transforms
+from pipelines.formats.camera_files import Frame, lens_of, write_transforms
 from pipelines.geometry.cameras import MODELS, Camera, distort
 
 FX, FY, CX, CY = 900.0, 905.0, 602.0, 447.0

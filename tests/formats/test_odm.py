@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipelines.core.errors import InputError
-from pipelines.formats.odm import read_geo, read_ground_points
+from pipelines.formats.ground_points import read_geo, read_ground_points
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 
 

@@ -8,12 +8,9 @@ import numpy as np
 import pytest
 
 from pipelines.core.errors import InputError
-from pipelines.formats.dji_mrk import read_mrk
-from pipelines.formats.gps_time import unix_from_gps, unix_from_week
-from pipelines.formats.metashape_markers import read_markers_xml
-from pipelines.formats.metashape_reference import read_cameras, read_markers
-from pipelines.formats.pix4d import read_marks, read_point_table
-from pipelines.formats.rtklib_pos import read_pos
+from pipelines.formats.gnss_logs import read_mrk, read_pos, unix_from_gps, unix_from_week
+from pipelines.formats.ground_points import read_marks, read_point_table
+from pipelines.formats.metashape import read_cameras, read_markers, read_markers_xml
 from pipelines.geodesy.enu import ecef_from_enu_rotation, ecef_from_lla
 from pipelines.geometry.rotations import geo_from_cam, matrix_from_quat_xyzw
 from tests.photos import FLIGHT_START_S

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from pipelines.core.errors import InputError
-from pipelines.formats.pose_table import PoseTable
-from pipelines.formats.trajectory_csv import read_trajectory
+from pipelines.formats.trajectory_csv import PoseTable, read_trajectory
 from pipelines.geometry.rotations import geo_from_cam, matrix_from_quat_xyzw
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from pipelines.formats.xmp import XmpError, read_dji
+from pipelines.formats.exif import XmpError, read_dji
 from tests.photos import dji_xmp, jpeg
 
 RTK = {"RtkFlag": "50", "RtkStdLat": "0.011", "RtkStdLon": "0.012", "RtkStdHgt": "0.025"}

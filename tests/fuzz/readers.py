@@ -25,18 +25,14 @@ from pipelines.core.runner import run_stage
 from pipelines.core.stages import BY_NAME, POINTS, SPARSE
 from pipelines.core.staleness import status
 from pipelines.core.workspace import Manifest, Workspace
-from pipelines.formats.bag.images import COMPRESSED, IMAGE, BadImageError, ImageWriter
-from pipelines.formats.bag.reader import UndecodableError, open_bag
+from pipelines.formats.bag import COMPRESSED, IMAGE, BadImageError, ImageWriter, UndecodableError, open_bag
 from pipelines.formats.colmap import pycolmap_module, read_sparse
-from pipelines.formats.dji_mrk import read_mrk
 from pipelines.formats.exif import read_tags
 from pipelines.formats.georef_sidecar import GeorefSidecar, read_sidecar, write_sidecar
+from pipelines.formats.gnss_logs import read_mrk, read_pos
+from pipelines.formats.ground_points import read_geo, read_ground_points, read_marks, read_point_table
 from pipelines.formats.image_file import inspect_image, read_bytes
-from pipelines.formats.metashape_markers import read_markers_xml
-from pipelines.formats.metashape_reference import read_cameras, read_markers
-from pipelines.formats.odm import read_geo, read_ground_points
-from pipelines.formats.pix4d import read_marks, read_point_table
-from pipelines.formats.rtklib_pos import read_pos
+from pipelines.formats.metashape import read_cameras, read_markers, read_markers_xml
 from pipelines.formats.splat_ply import SplatArrays, read_splat_ply, write_splat_ply
 from pipelines.formats.spz import read_spz, write_spz
 from pipelines.formats.trajectory_csv import read_trajectory
@@ -44,17 +40,15 @@ from pipelines.geodesy.crs import parse_crs
 from pipelines.geodesy.enu import Origin
 from pipelines.geodesy.vertical import VerticalDatum
 from pipelines.geometry.similarity import Similarity
-from pipelines.ingest.bag.inspection import inspect_bag
-from pipelines.scene.cloud_options import CloudCrs
-from pipelines.scene.geolocated import GeolocatedPoints
-from pipelines.scene.initial_similarity import InitialSimilarity
-from pipelines.scene.measured_cloud import CloudFiles
-from pipelines.scene.navigation import NavigationTrack
-from pipelines.scene.report import EvaluationReport
-from pipelines.scene.rig import RigCalibration, RigEstimate
-from pipelines.scene.survey import Survey
-from pipelines.scene.trained_model import TrainedModel
-from pipelines.train.checkpoint import load_checkpoint
+from pipelines.ingest.bag_inspection import inspect_bag
+from pipelines.surface.measured_cloud import CloudFiles
+from pipelines.survey.adjustment import GeolocatedPoints, InitialSimilarity
+from pipelines.survey.calibrated import NavigationTrack
+from pipelines.survey.options import CloudCrs
+from pipelines.survey.report import EvaluationReport
+from pipelines.survey.survey import RigCalibration, RigEstimate, Survey
+from pipelines.survey.trained_model import TrainedModel
+from pipelines.train.trainer import load_checkpoint
 from tests import bags
 from tests.formats.test_surveyors_tables import DEGREES, MRK, POS_HEAD, REFERENCE, SIGMAS, TAIL, XML
 from tests.photos import Exif, dji_xmp, gps_entries, jpeg

@@ -11,8 +11,7 @@ import pytest
 from pyproj import CRS
 
 from pipelines.core.errors import InputError
-from pipelines.geodesy.crs import parse_crs
-from pipelines.geodesy.crs_text import file_in
+from pipelines.geodesy.crs import file_in, parse_crs
 
 WKT = (
     'PROJCS["x",GEOGCS["W",DATUM["D",SPHEROID["e",6378137,298.257223563]],PRIMEM["G",0],'

@@ -7,8 +7,7 @@ import pytest
 from pyproj import Proj
 
 from pipelines.core.errors import InputError
-from pipelines.geodesy.crs import parse_crs
-from pipelines.geodesy.grid_axes import grid_from_enu
+from pipelines.geodesy.crs import grid_from_enu, parse_crs
 
 
 @pytest.mark.parametrize(

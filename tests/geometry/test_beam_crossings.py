@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipelines.geometry.beam_crossings import crossings
+from pipelines.surface.crossings import crossings
 
 
 def test_upright_beams_cross_the_cells_above_their_ends() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipelines.geometry.cameras import Pinhole
-from pipelines.geometry.depth_support import DepthViews, support
+from pipelines.surface.visibility import DepthViews, support
 from tests.depth_scenes import BOX_M, CAMERA, UP, depth_views, looking_down
 
 TOLERANCE = 0.01

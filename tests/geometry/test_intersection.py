@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.geometry.intersection import intersect_rays
-from pipelines.geometry.rays import CommonRotation, Rays, UncertainCameras
+from pipelines.geometry.intersection import CommonRotation, Rays, UncertainCameras, intersect_rays
 from pipelines.geometry.rotations import exp_so3
 from tests.oracles import intersect_one
 from tests.scenes import make_scene

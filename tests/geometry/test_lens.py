@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.geometry.cameras import Camera, Pinhole, distort, undistort
-from pipelines.geometry.lens import Lenses, bearings, refit_pinhole
+from pipelines.geometry.cameras import Camera, Lenses, Pinhole, bearings, distort, refit_pinhole, undistort
 
 PINHOLE = Pinhole(320, 240, 250.0, 251.0, 161.0, 119.0)
 PLAIN = Camera("PINHOLE", 640, 480, np.array([500.0, 502.0, 322.0, 238.0]))

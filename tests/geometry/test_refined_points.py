@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from pipelines.geometry import refined_points as module
+from pipelines.geometry import intersection as module
 from pipelines.geometry.bundle import Network
 from pipelines.geometry.cameras import project
-from pipelines.geometry.refined_points import refined_points
-from pipelines.robust.kernels import cauchy_loss
+from pipelines.geometry.intersection import refined_points
+from pipelines.robust.statistics import cauchy_loss
 from tests.bundle_scenes import exact_network, noisy
 
 EXACT = exact_network(images=6)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipelines.geometry.rig import Rig, boresight, mount, with_rig
 from pipelines.geometry.rotations import exp_so3
+from pipelines.geometry.trajectory import Rig, boresight, mount, with_rig
 
 COUNT = 5
 RNG = np.random.default_rng(0)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipelines.geometry.cameras import Pinhole
-from pipelines.geometry.surfel_visibility import Surfels, seen_surfels
+from pipelines.surface.crossings import Surfels, seen_surfels
 
 CAMERA = Pinhole(96, 72, 80.0, 80.0, 48.0, 36.0)
 STEP_M = 0.1

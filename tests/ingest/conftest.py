@@ -9,7 +9,7 @@ import pytest
 from georef_cli import boundary
 from georef_cli.main import cli
 from pipelines.core.products import load_json
-from pipelines.scene.survey import Survey
+from pipelines.survey.survey import Survey
 from tests import bags
 from tests.bags import Message
 from tests.ingested_bags import Ingest, Refused

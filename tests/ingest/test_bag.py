@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin
 
-from pipelines.geometry.rig import mount
 from pipelines.geometry.rotations import log_so3, matrix_from_quat_xyzw
-from pipelines.scene.navigation import NavigationTrack
+from pipelines.geometry.trajectory import mount
+from pipelines.survey.calibrated import NavigationTrack
 from tests import bags
 from tests.bags import Flight, Form, Message
 from tests.ingested_bags import Ingest, Refused, check, warned

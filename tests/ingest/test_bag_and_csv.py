@@ -15,10 +15,10 @@ from pipelines.geodesy.enu import lla_from_enu
 from pipelines.geometry.rotations import log_so3, matrix_from_quat_xyzw
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.stage import survey_and_track
-from pipelines.scene.survey import Survey
 from pipelines.simulate.options import SimulateOptions
 from pipelines.simulate.stage import simulate
 from pipelines.simulate.truth import Truth
+from pipelines.survey.survey import Survey
 from tests import bags
 from tests.earth import enu_from_lla
 

@@ -8,9 +8,8 @@ import pytest
 
 from pipelines.formats.exif import LensTags, PhotoTags
 from pipelines.formats.image_file import ImageFile
-from pipelines.ingest.camera_priors import camera_priors, focal_px
 from pipelines.ingest.notes import Notes
-from pipelines.ingest.photo_folder import Photo
+from pipelines.ingest.photo_folder import Photo, camera_priors, focal_px
 
 
 def _photo(name: str, width: int, height: int, tags: PhotoTags) -> Photo:

@@ -18,13 +18,12 @@ from pipelines.core.staleness import status
 from pipelines.core.workspace import Workspace
 from pipelines.geodesy.enu import ecef_from_lla
 from pipelines.geodesy.vertical import VerticalDatum
-from pipelines.ingest.fix_sessions import COMMON_SIGMA_M, SESSION_GAP_S, fix_sessions
-from pipelines.ingest.image_poses import ImagePoses
+from pipelines.ingest.image_poses import RECEIVER_SIGMA_M, RECEIVERS, ImagePoses
 from pipelines.ingest.notes import Notes
 from pipelines.ingest.options import IngestOptions
-from pipelines.ingest.position_sigma import RECEIVER_SIGMA_M, RECEIVERS
 from pipelines.ingest.stage import survey_and_track
-from pipelines.scene.survey import FixSession, Survey
+from pipelines.ingest.survey_assembly import COMMON_SIGMA_M, SESSION_GAP_S, fix_sessions
+from pipelines.survey.survey import FixSession, Survey
 from tests.photos import Exif, dji_xmp, gps_entries, jpeg, write_flight
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from pipelines.core.errors import InputError
-from pipelines.ingest.image_names import ImageNames
+from pipelines.ingest.photo_folder import ImageNames
 
 TABLE = Path("gcp_list.txt")
 NAMES = ImageNames(["100/DJI_1.JPG", "100/DJI_2.JPG", "101/DJI_1.JPG", "top.png"])

@@ -9,18 +9,16 @@ import numpy as np
 import pytest
 
 from pipelines.core.errors import InputError
-from pipelines.formats.exif import GpsTag, PhotoTags
+from pipelines.formats.exif import DjiTags, GpsTag, PhotoTags
 from pipelines.formats.image_file import ImageFile
-from pipelines.formats.pose_table import PoseTable
-from pipelines.formats.xmp import DjiTags
+from pipelines.formats.trajectory_csv import PoseTable
 from pipelines.geodesy import enu
 from pipelines.geometry.rotations import geo_from_cam
-from pipelines.ingest.image_poses import ImagePoses
+from pipelines.ingest.exif_poses import poses_from_tags
+from pipelines.ingest.image_poses import RECEIVER_SIGMA_M, ImagePoses
 from pipelines.ingest.notes import Notes
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import Photo
-from pipelines.ingest.photo_poses import poses_from_tags
-from pipelines.ingest.position_sigma import RECEIVER_SIGMA_M
 from pipelines.ingest.table_poses import poses_from_table
 
 GPS = GpsTag(46.02, 7.75, 1620.0, None, "")

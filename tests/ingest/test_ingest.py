@@ -18,7 +18,7 @@ from pipelines.geodesy.crs import parse_crs
 from pipelines.geometry.rotations import geo_from_cam, matrix_from_quat_xyzw
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.stage import survey_and_track
-from pipelines.scene.survey import Survey
+from pipelines.survey.survey import Survey
 from tests.earth import enu_from_lla
 from tests.photos import FLIGHT_START_S, Exif, dji_xmp, gps_entries, jpeg, write_flight
 

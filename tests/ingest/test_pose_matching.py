@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from pipelines.core.errors import InputError
-from pipelines.formats.pose_table import PoseTable
+from pipelines.formats.trajectory_csv import PoseTable
 from pipelines.ingest.notes import Notes
-from pipelines.ingest.pose_matching import match_by_name
+from pipelines.ingest.table_poses import match_by_name
 
 
 def _named(names: tuple[str, ...]) -> PoseTable:

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from pipelines.core.errors import InputError
-from pipelines.formats.odm import read_geo
-from pipelines.formats.pose_table import PoseTable
-from pipelines.formats.trajectory_csv import read_trajectory
+from pipelines.formats.ground_points import read_geo
+from pipelines.formats.trajectory_csv import PoseTable, read_trajectory
 from pipelines.ingest.notes import Notes
-from pipelines.ingest.pose_tables import usable_rows
+from pipelines.ingest.table_poses import usable_rows
 
 
 def _read(tmp_path: Path, name: str, text: str) -> PoseTable:

@@ -17,7 +17,7 @@ from pipelines.geodesy.enu import Origin
 from pipelines.geometry.rotations import log_so3, matrix_from_quat_xyzw
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.stage import survey_and_track
-from pipelines.scene.survey import Survey
+from pipelines.survey.survey import Survey
 
 DATA = Path(os.environ.get("GEOREF_DATA", "no-samples"))
 ORBIT, BEACH = DATA / "orbit_dev", DATA / "brighton_beach"

@@ -12,7 +12,7 @@ from pipelines.core.errors import ContradictionError, InputError
 from pipelines.geodesy.enu import ecef_from_enu, ecef_from_lla, enu_from_ecef
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.stage import survey_and_track
-from pipelines.scene.survey import Survey
+from pipelines.survey.survey import Survey
 from tests.formats.test_surveyors_tables import DEGREES, SECOND, TAIL, WEEK, WGS84
 from tests.photos import FLIGHT_START_S, Exif, dji_xmp, gps_entries, jpeg, write_flight
 

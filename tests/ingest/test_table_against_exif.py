@@ -14,11 +14,11 @@ from pipelines.formats.exif import GpsTag, PhotoTags
 from pipelines.formats.image_file import ImageFile
 from pipelines.geodesy.enu import Origin, ecef_from_enu, ecef_from_lla, lla_from_ecef
 from pipelines.geodesy.vertical import VerticalDatum
+from pipelines.ingest.exif_poses import compare_with_exif
 from pipelines.ingest.image_poses import ImagePoses
 from pipelines.ingest.notes import Notes
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import Photo
-from pipelines.ingest.table_against_exif import compare_with_exif
 
 ORIGIN = Origin(lat_deg=46.0, lon_deg=7.75, alt_m=1600.0)
 PATH = Path("t.csv")

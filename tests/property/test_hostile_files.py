@@ -13,13 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipelines.core.errors import InputError
-from pipelines.formats.dji_mrk import read_mrk
 from pipelines.formats.exif import read_tags
+from pipelines.formats.gnss_logs import read_mrk, read_pos
+from pipelines.formats.ground_points import read_geo, read_ground_points, read_marks, read_point_table
 from pipelines.formats.image_file import header_size, inspect_image
-from pipelines.formats.metashape_reference import read_cameras, read_markers
-from pipelines.formats.odm import read_geo, read_ground_points
-from pipelines.formats.pix4d import read_marks, read_point_table
-from pipelines.formats.rtklib_pos import read_pos
+from pipelines.formats.metashape import read_cameras, read_markers
 from pipelines.formats.trajectory_csv import read_trajectory
 from pipelines.geodesy.crs import parse_crs
 from tests.photos import Exif, dji_xmp, gps_entries, jpeg

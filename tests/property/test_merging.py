@@ -7,8 +7,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipelines.formats.splat_ply import SplatArrays
-from pipelines.splat.level_of_detail import DetailTile, SceneExtent, Tiler, best_cut, build_tiles
-from pipelines.splat.merging import Mixture, bounds_of, drawn, merged, mixture_of
+from pipelines.splat.level_of_detail import (
+    DetailTile,
+    Mixture,
+    SceneExtent,
+    Tiler,
+    best_cut,
+    bounds_of,
+    build_tiles,
+    drawn,
+    merged,
+    mixture_of,
+)
 
 SEEDS = st.integers(0, 2**32 - 1)
 

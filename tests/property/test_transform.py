@@ -11,8 +11,7 @@ from torch import Tensor
 from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.similarity import Similarity
 from pipelines.splat import sh
-from pipelines.splat.gaussians import Gaussians, rotation_matrices
-from pipelines.splat.transform import transformed
+from pipelines.splat.gaussians import Gaussians, rotation_matrices, transformed
 
 angles = st.floats(-4, 4, allow_nan=False)
 offsets = st.floats(-50, 50, allow_nan=False)

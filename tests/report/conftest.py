@@ -8,9 +8,9 @@ import pytest
 
 from pipelines.core.stages import REPORT_PAGE
 from pipelines.core.workspace import StageRun
-from pipelines.report.evaluated import EvaluatedSurvey, load_evaluated
 from pipelines.report.options import ReportOptions
 from pipelines.report.stage import run
+from pipelines.report.views import EvaluatedSurvey, load_evaluated
 from tests.evaluated_workspaces import Evaluated, evaluated_workspace
 
 HOSTILE = "<script>alert(1)</script>"  # in the names of all points, so that every test meets it

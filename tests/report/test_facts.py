@@ -16,15 +16,13 @@ from pipelines.core.products import load_json
 from pipelines.core.progress import SILENT
 from pipelines.core.stages import SURVEY
 from pipelines.report.accuracy import ninety_percent
-from pipelines.report.cameras import bias_of, cameras_facts
-from pipelines.report.chips import cut_chips
-from pipelines.report.lenses import lenses_facts, mean_by_region
-from pipelines.report.overlap import links_of, overlap_facts, photographs_that_see, ties_of
-from pipelines.report.points import points_facts
+from pipelines.report.cameras import bias_of, cameras_facts, lenses_facts, mean_by_region
+from pipelines.report.place import links_of, overlap_facts, photographs_that_see, ties_of
+from pipelines.report.points import cut_chips, points_facts
 from pipelines.report.verdicts import FIX_OUTLIERS, REGISTERED, Measured, level_of, verdicts
 from pipelines.report.views import read_metrics
-from pipelines.scene.fix_differences import fix_differences
-from pipelines.scene.survey import Survey
+from pipelines.survey.survey import Survey
+from pipelines.survey.trained_survey import fix_differences
 from tests.evaluated_workspaces import CHECK_POINTS, ERROR_M
 from tests.report.conftest import Reported
 from tests.reports import check_points_with, report_with

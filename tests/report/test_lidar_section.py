@@ -10,10 +10,10 @@ import numpy as np
 from pipelines.core.products import save_json
 from pipelines.core.stages import LIDAR, LIDAR_MAP
 from pipelines.core.workspace import Workspace
-from pipelines.pages.page import Page, Section, write_page
-from pipelines.plots.lidar_map import DrawnArea, write_lidar_map
-from pipelines.report.lidar import lidar_facts
-from pipelines.scene.lidar_report import LidarArea, LidarRegistration, LidarReport
+from pipelines.report.page import Page, Section, write_page
+from pipelines.report.plots.maps import DrawnArea, write_lidar_map
+from pipelines.report.record import lidar_facts
+from pipelines.survey.report_parts import LidarArea, LidarRegistration, LidarReport
 
 
 def area(kind: str, area_m2: float) -> LidarArea:

@@ -17,12 +17,12 @@ from pipelines.core.products import load_json, save_json
 from pipelines.core.progress import SILENT
 from pipelines.core.stages import ACCURACY_MAP, METRICS, RENDERS, REPORT, SURVEY
 from pipelines.core.workspace import StageRun, Workspace
-from pipelines.pages.page import value_at
 from pipelines.report.options import ReportOptions
+from pipelines.report.page import value_at
 from pipelines.report.points import points_facts
 from pipelines.report.stage import run
-from pipelines.scene.report import read_report, write_report
-from pipelines.scene.survey import Survey
+from pipelines.survey.report import read_report, write_report
+from pipelines.survey.survey import Survey
 from tests.evaluated_workspaces import evaluated_workspace
 from tests.report.conftest import HOSTILE, Reported, page_of
 from tests.reports import report_with
@@ -167,7 +167,7 @@ def test_photograph_that_changed_is_refused(reported: Reported) -> None:
 def test_pdf_without_chromium_is_refused_before_the_work(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.delenv("CHROMIUM", raising=False)
-    monkeypatch.setattr("pipelines.pages.chromium._INSTALLED", ())
+    monkeypatch.setattr("pipelines.report.chromium._INSTALLED", ())
     with pytest.raises(BackendUnavailableError, match="Chromium is missing: install it"):
         run(StageRun(Workspace(tmp_path), tmp_path), ReportOptions(pdf=True))
 

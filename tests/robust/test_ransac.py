@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipelines.core.errors import DegenerateGeometryError
-from pipelines.robust.ransac import RansacOptions, draws_needed, ransac
+from pipelines.robust.statistics import RansacOptions, draws_needed, ransac
 
 OPTIONS = RansacOptions(sample_size=2, gate=9.0)
 

@@ -23,12 +23,10 @@ from pipelines.core.products import save_json
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.stages import BY_NAME, SPARSE, SURVEY
 from pipelines.core.workspace import StageRun, Workspace
-from pipelines.engine.chosen import chosen_engine
-from pipelines.engine.job import Job, JobEnd
 from pipelines.formats.colmap import quiet_colmap, read_sparse
-from pipelines.sfm.chunk_work import work_chunk, write_chunk
-from pipelines.sfm.chunked import work_in_chunks
-from pipelines.sfm.chunks import ChunkPlan, plan_chunks
+from pipelines.jobs.engine import Job, JobEnd
+from pipelines.jobs.local import chosen_engine
+from pipelines.sfm.chunks import ChunkPlan, plan_chunks, work_chunk, work_in_chunks, write_chunk
 from pipelines.sfm.features import SfmJob, candidate_pairs, extract_features
 from pipelines.sfm.stage import run
 from tests.cli_runs import finish, start

@@ -11,12 +11,11 @@ import numpy as np
 import pytest
 
 from pipelines.core.errors import InputError
-from pipelines.formats.colmap import load_reconstruction
-from pipelines.formats.colmap_writer import write_sparse
+from pipelines.formats.colmap import load_reconstruction, write_sparse
 from pipelines.geometry.cameras import Camera
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.scene.survey import Survey
-from pipelines.sfm.imported import find_model, import_model
+from pipelines.sfm.reconstruction import find_model, import_model
+from pipelines.survey.survey import Survey
 from tests.scenes import Measured, Noise, make_scene, sparse_model, survey_of
 
 pytest.importorskip("pycolmap")

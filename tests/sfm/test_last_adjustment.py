@@ -12,7 +12,7 @@ import pytest
 
 from pipelines.formats.colmap import quiet_colmap
 from pipelines.geometry.similarity import umeyama
-from pipelines.sfm.last_adjustment import LastAdjustment, adjust_finally
+from pipelines.sfm.mapping import LastAdjustment, adjust_finally
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from pipelines.sfm.pairs import CameraDirections, all_pairs, select_pairs
+from pipelines.sfm.features import CameraDirections, all_pairs, select_pairs
 
 DOWN = np.array([0.0, 0.0, -1.0])
 

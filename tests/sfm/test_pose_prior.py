@@ -17,7 +17,7 @@ from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.scene.initial_similarity import InitialSimilarity
+from pipelines.survey.adjustment import InitialSimilarity
 from tests.scenes import (
     Measured,
     Noise,

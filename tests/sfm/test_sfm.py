@@ -20,12 +20,11 @@ from pipelines.core.staleness import status
 from pipelines.core.workspace import StageRun, Workspace
 from pipelines.formats.colmap import quiet_colmap, read_sparse
 from pipelines.geometry.similarity import umeyama
-from pipelines.scene.survey import Fix, Survey, SurveyedPoint
 from pipelines.sfm.features import SfmJob, candidate_pairs, extract_features
-from pipelines.sfm.imported import import_model
 from pipelines.sfm.options import SfmOptions
-from pipelines.sfm.reconstruction import reconstruct
+from pipelines.sfm.reconstruction import import_model, reconstruct
 from pipelines.sfm.stage import _summarise, run
+from pipelines.survey.survey import Fix, Survey, SurveyedPoint
 from tests.sfm_scenes import CONFIG, HEIGHT, IMAGES, WIDTH, Photographs, survey_of
 
 pycolmap = pytest.importorskip("pycolmap")

@@ -10,13 +10,12 @@ import pytest
 
 from pipelines.formats.trajectory_csv import read_trajectory
 from pipelines.geodesy.enu import Origin
-from pipelines.scene.cloud_options import CloudCrs
-from pipelines.scene.measured_cloud import CloudFiles
-from pipelines.simulate.lidar import NOISE, LidarFlight
-from pipelines.simulate.lidar_files import LidarFiles
-from pipelines.simulate.lidar_options import LidarFlightOptions
-from pipelines.simulate.raycast import Raycaster
+from pipelines.simulate.lidar import NOISE, LidarFiles, LidarFlight
+from pipelines.simulate.mesh import Raycaster
+from pipelines.simulate.options import LidarFlightOptions
 from pipelines.simulate.scene import SimulatedScene, build_scene
+from pipelines.surface.measured_cloud import CloudFiles
+from pipelines.survey.options import CloudCrs
 
 SHIFT = np.array([0.1, -0.2, 0.05])
 ORIGIN = Origin(lat_deg=-33.86, lon_deg=151.21, alt_m=-20.0)

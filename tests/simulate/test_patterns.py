@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipelines.simulate.patterns import Pyramid, band, cell_random, fbm, noise, stripes
+from pipelines.simulate.textures import Pyramid, band, cell_random, fbm, noise, stripes
 
 
 def averaged(on: np.ndarray) -> np.ndarray:

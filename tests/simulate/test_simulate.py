@@ -23,12 +23,12 @@ from pipelines.geodesy.enu import Origin, lla_from_enu
 from pipelines.geometry.rotations import geo_from_cam, log_so3
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.stage import survey_and_track
+from pipelines.simulate.lens import Renderer, Sensor
 from pipelines.simulate.options import SimulateOptions
-from pipelines.simulate.render import Renderer, Sensor
+from pipelines.simulate.recording import write_trajectory
 from pipelines.simulate.stage import SimulationSummary, fly_survey, simulate
 from pipelines.simulate.truth import Truth
 from pipelines.simulate.world import make_world
-from pipelines.simulate.write import write_trajectory
 from tests.earth import enu_from_lla
 
 ORIGIN = "-33.86,151.21,-20"  # south, east, below the ellipsoid

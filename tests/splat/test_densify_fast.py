@@ -5,9 +5,15 @@ from __future__ import annotations
 import pytest
 import torch
 
-from pipelines.splat.contributions import Probe, ViewContributions, view_contributions
-from pipelines.splat.densify import DefaultSettings, DensityEdit
-from pipelines.splat.densify_fast import FastSettings, FastStrategy
+from pipelines.splat.densify import (
+    DefaultSettings,
+    DensityEdit,
+    FastSettings,
+    FastStrategy,
+    Probe,
+    ViewContributions,
+    view_contributions,
+)
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.optimizer import GaussianAdam
 from pipelines.splat.rasterizer.api import RasterSettings, ScreenStats

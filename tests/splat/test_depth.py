@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from pipelines.geometry.cameras import Pinhole
-from pipelines.splat.depth import depth_at, measured_depth
+from pipelines.splat.surface import depth_at, measured_depth
 
 PINHOLE = Pinhole(24, 18, 20.0, 20.0, 12.0, 9.0)
 

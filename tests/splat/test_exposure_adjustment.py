@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipelines.core.errors import DegenerateGeometryError
-from pipelines.splat.exposure_adjustment import PointColours, adjusted_exposures
+from pipelines.splat.exposure import PointColours, adjusted_exposures
 
 NOISE = 0.01
 
@@ -64,7 +64,7 @@ def test_photographs_without_points_keep_the_identity() -> None:
 def test_chunks_of_points_do_not_change_the_result(monkeypatch: pytest.MonkeyPatch) -> None:
     observed, _, _ = flight(10, 2)
     whole = adjusted_exposures(observed, 10)
-    monkeypatch.setattr("pipelines.splat.exposure_adjustment._CHUNK", 64)
+    monkeypatch.setattr("pipelines.splat.exposure._CHUNK", 64)
     np.testing.assert_allclose(adjusted_exposures(observed, 10), whole, atol=1e-5)
 
 

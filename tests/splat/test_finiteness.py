@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from pipelines.splat.finiteness import FinitenessMonitor, NonFiniteError
+from pipelines.splat.gaussians import FinitenessMonitor, NonFiniteError
 
 CPU = torch.device("cpu")
 

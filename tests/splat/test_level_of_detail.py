@@ -9,8 +9,7 @@ from torch.nn.functional import max_pool2d
 from pipelines.formats.splat_ply import SplatArrays
 from pipelines.geometry.cameras import Pinhole
 from pipelines.splat.gaussians import Gaussians
-from pipelines.splat.level_of_detail import SceneExtent, Tiler, build_tiles
-from pipelines.splat.merging import shadow_areas
+from pipelines.splat.level_of_detail import SceneExtent, Tiler, build_tiles, shadow_areas
 from pipelines.splat.rasterizer.api import RasterSettings, Render
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
 

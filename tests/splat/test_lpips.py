@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from pipelines.core.errors import InputError
-from pipelines.splat.lpips import Lpips
+from pipelines.splat.metrics import Lpips
 
 VGG16 = (64, 64, "M", 128, 128, "M", 256, 256, 256, "M", 512, 512, 512, "M", 512, 512, 512)
 TAKEN = (3, 8, 15, 22, 29)  # the last ReLU before each pooling

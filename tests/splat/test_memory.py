@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from pipelines.core.errors import ResourceError
-from pipelines.core.free_memory import _free_in_group
+from pipelines.core.machine import _free_in_group
 from pipelines.geometry.cameras import Pinhole
 from pipelines.splat.memory import (
     TrainingSize,
@@ -26,7 +26,7 @@ SIZE = TrainingSize(300_000, CAMERA, 3, 0)
 # Iterations and one edit of 150 000 Gaussians to 300 000, in a process of their own: a peak cannot be taken back.
 TRAINING = """
 import torch
-from pipelines.core.free_memory import peak_memory_bytes as peak
+from pipelines.core.machine import peak_memory_bytes as peak
 from pipelines.splat.densify import DefaultSettings, DefaultStrategy
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.losses import photometric_loss
@@ -92,7 +92,7 @@ def test_the_machine_tells_how_much_is_free() -> None:
 
 def test_the_peak_of_a_process_is_not_that_of_its_parent() -> None:
     ballast = np.ones(400_000_000, dtype=np.uint8)
-    program = "from pipelines.core.free_memory import peak_memory_bytes; print(peak_memory_bytes())"
+    program = "from pipelines.core.machine import peak_memory_bytes; print(peak_memory_bytes())"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60)
     assert 2**22 < int(done.stdout) < len(ballast)
 

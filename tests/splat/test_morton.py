@@ -6,7 +6,7 @@ import itertools
 
 import torch
 
-from pipelines.splat.morton import morton_order
+from pipelines.splat.spatial import morton_order
 
 
 def test_cells_of_a_grid_follow_the_z_curve() -> None:

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from pipelines.splat.free_space import FreeSpace, FreeSpaceLoss
 from pipelines.splat.gaussians import Gaussians
-from pipelines.splat.plane_attraction import MeasuredPlanes, PlaneAttraction
+from pipelines.splat.losses import FreeSpace, FreeSpaceLoss, MeasuredPlanes, PlaneAttraction
 
 CPU = torch.device("cpu")
 

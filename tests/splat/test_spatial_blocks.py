@@ -12,7 +12,7 @@ from pipelines.geometry.cameras import Pinhole
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.rasterizer.api import RasterSettings, Window
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
-from pipelines.splat.spatial_blocks import SpatialBlocks
+from pipelines.splat.spatial import SpatialBlocks
 
 CAMERA = Pinhole(160, 120, 130.0, 125.0, 70.0, 66.0)
 

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import torch
 
-from pipelines.splat.gaussians import Gaussians
-from pipelines.splat.storage import read_gaussians, write_gaussians
+from pipelines.splat.gaussians import Gaussians, read_gaussians, write_gaussians
 
 
 def test_round_trip(tmp_path: Path) -> None:

@@ -11,10 +11,10 @@ import pytest
 
 from pipelines.geometry.cameras import Camera
 from pipelines.geometry.similarity import Similarity
-from pipelines.scene.photographs import ImageCache, Photograph
-from pipelines.scene.scene import Scene
-from pipelines.scene.scene import make_scene as in_model
-from pipelines.train.background import background, ground_plane
+from pipelines.survey.photographs import ImageCache, Photograph
+from pipelines.survey.scene import Scene
+from pipelines.survey.scene import make_scene as in_model
+from pipelines.train.initial_gaussians import background, ground_plane
 from tests.scenes import Measured, Noise, make_scene, sparse_model, survey_of
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipelines.scene.block_plan import BlockCell, BlockPlan, PlannedBlock
+from pipelines.jobs.costs import BLOCK_SECONDS, SURFACE_FACTOR, BlockCost
+from pipelines.survey.block_plan import BlockCell, BlockPlan, PlannedBlock
 from pipelines.train.forecast import block_processor_s
 from pipelines.train.options import TrainOptions
-from pipelines.train.pace import BLOCK_SECONDS, SURFACE_FACTOR, BlockCost
 
 PHOTO_PX = (640, 480)
 

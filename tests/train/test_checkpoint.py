@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from pipelines.core.errors import InputError
-from pipelines.train.checkpoint import load_checkpoint, prefixed, save_checkpoint, unprefixed
+from pipelines.train.trainer import load_checkpoint, prefixed, save_checkpoint, unprefixed
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

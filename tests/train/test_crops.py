@@ -10,19 +10,17 @@ import pytest
 import torch
 from torch import Tensor
 
-from pipelines.scene.photographs import ImageCache
-from pipelines.scene.pinholes import Pinholes
 from pipelines.splat.densify import DefaultStrategy
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.losses import photometric_loss
 from pipelines.splat.rasterizer.api import RasterSettings, Window
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
 from pipelines.splat.surface import ObservedPoints, SurfaceSettings
-from pipelines.train.crops import Crops
+from pipelines.survey.photographs import ImageCache, Pinholes
 from pipelines.train.region import RegionMasks
 from pipelines.train.schedule import JointOptions
 from pipelines.train.surface_losses import RenderedView, SurfaceLosses
-from pipelines.train.target_images import Look, TargetImages
+from pipelines.train.target_images import Crops, Look, TargetImages
 from tests import tiny_training as tiny
 
 pytestmark = pytest.mark.usefixtures("one_thread")

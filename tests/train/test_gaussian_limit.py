@@ -8,9 +8,8 @@ import pytest
 
 from pipelines.geometry.cameras import Pinhole
 from pipelines.splat.memory import USABLE, predicted_peak_bytes
-from pipelines.train.gaussian_limit import training_size, with_gaussian_limit
-from pipelines.train.options import TrainOptions
-from pipelines.train.presets import PRESETS
+from pipelines.train.forecast import training_size, with_gaussian_limit
+from pipelines.train.options import PRESETS, TrainOptions
 
 STANDARD = PRESETS["standard"]
 SIDE_PX = 4 * STANDARD.max_image_size

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipelines.train.background import ground_plane
+from pipelines.train.initial_gaussians import ground_plane
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

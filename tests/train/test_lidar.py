@@ -9,14 +9,13 @@ from pipelines.adjust.state import State, SystematicError, SystematicErrors
 from pipelines.adjust.terms import At
 from pipelines.core.errors import InputError
 from pipelines.geometry.cameras import CameraPoses
+from pipelines.geometry.footprints import voxel_keys
 from pipelines.geometry.similarity import Similarity
-from pipelines.geometry.thinning import voxel_keys
-from pipelines.train.lidar.changes import _areas, verdict
-from pipelines.train.lidar.cloud import planes_of
-from pipelines.train.lidar.planes import planes_of as observed_planes
-from pipelines.train.lidar.prepare import registration_of
-from pipelines.train.lidar.registration import registration
-from pipelines.train.lidar.surface import LidarPlanes
+from pipelines.surface.lidar_cloud import planes_of
+from pipelines.surface.registration import registration
+from pipelines.train.lidar import planes_of as observed_planes
+from pipelines.train.lidar import registration_of
+from pipelines.train.lidar_surface import LidarPlanes, _areas, verdict
 from tests.towns import EXTRA, PIXEL_M, SIGMA_M, TOWN, WITH_EXTRA, Town, scanned, surface_of, views_of
 
 

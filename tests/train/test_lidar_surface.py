@@ -12,11 +12,10 @@ import pytest
 from pipelines.core.errors import InputError
 from pipelines.geodesy.enu import Origin, lla_from_enu
 from pipelines.geometry.cameras import CameraPoses, Pinhole
-from pipelines.scene.cloud_options import CloudCrs
-from pipelines.train.lidar.changes import CloudVerdict
-from pipelines.train.lidar.free_space import free_space
-from pipelines.train.lidar.surface import FusedSurface
-from pipelines.train.lidar.track import ScannerTrack
+from pipelines.surface.lidar_cloud import ScannerTrack
+from pipelines.survey.options import CloudCrs
+from pipelines.train.lidar import free_space
+from pipelines.train.lidar_surface import CloudVerdict, FusedSurface
 from tests.towns import EXTRA, FOCAL_PX, HOUSES, PIXEL_M, SIZE, TOWN, WITH_EXTRA, scanned, surface_of, views_of
 
 CAMERA = Pinhole(*SIZE, FOCAL_PX, FOCAL_PX, SIZE[0] / 2, SIZE[1] / 2)

@@ -13,11 +13,10 @@ import torch
 
 from pipelines.core.errors import ConvergenceError, DamagedPartialError
 from pipelines.core.progress import SILENT
-from pipelines.scene.photographs import ImageCache
-from pipelines.splat.densify import Strategy
-from pipelines.splat.densify_fast import FastSettings, FastStrategy
+from pipelines.splat.densify import FastSettings, FastStrategy, Strategy
 from pipelines.splat.densify_mcmc import McmcSettings, McmcStrategy
 from pipelines.splat.surface import SurfaceSettings
+from pipelines.survey.photographs import ImageCache
 from pipelines.train.loop import LoopOptions, optimise
 from pipelines.train.schedule import JointOptions
 from pipelines.train.trainer import JointTrainer

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipelines.train.pull_weights import pull_weights
+from pipelines.train.surface import pull_weights
 
 HEIGHT, WIDTH = 60, 80
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import torch
 
-from pipelines.scene.block_plan import BlockCell
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
+from pipelines.survey.block_plan import BlockCell
 from pipelines.train.region import RegionMasks, SceneBox, TrainingRegion, region_mask, stand_in_depth
 from pipelines.train.schedule import JointOptions
 from pipelines.train.trainer import JointTrainer

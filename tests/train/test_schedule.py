@@ -7,8 +7,8 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from pipelines.train.crops import Crops
 from pipelines.train.schedule import JointOptions, TrainingSchedule
+from pipelines.train.target_images import Crops
 
 VIEWS = np.array([0, 1, 2, 4, 5, 6, 7, 8, 10, 11, 12, 13])
 

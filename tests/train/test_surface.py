@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 import torch
 
-from pipelines.scene.photographs import ImageCache, save_array
-from pipelines.scene.scene import Scene, make_scene, photographs
 from pipelines.splat.initialise import InitialisationOptions
-from pipelines.train.depth_maps import DepthMaps
-from pipelines.train.guessed_surface import guessed_points
-from pipelines.train.initial_gaussians import TrainingScene, initial_gaussians, points_to_hold
+from pipelines.surface.depth_maps import DepthMaps
+from pipelines.survey.photographs import ImageCache, save_array
+from pipelines.survey.scene import Scene, make_scene, photographs
+from pipelines.train.initial_gaussians import TrainingScene, guessed_points, initial_gaussians, points_to_hold
 from pipelines.train.surface import SceneSurface, spread_evenly
 from tests.scenes import GEO_FROM_LOCAL, write_workspace
 from tests.splat_scenes import CAMERA, Rendered, ground_height, make_rendered

@@ -10,8 +10,7 @@ import pytest
 import torch
 
 from pipelines.geometry.cameras import Camera, Pinhole
-from pipelines.scene.photographs import ImageCache, Photograph
-from pipelines.scene.pinholes import Pinholes
+from pipelines.survey.photographs import ImageCache, Photograph, Pinholes
 from pipelines.train.target_images import Look, TargetImages, shrunken
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -24,15 +24,13 @@ from pipelines.core.workspace import Workspace
 from pipelines.geometry.cameras import Pinhole
 from pipelines.geometry.rotations import log_so3, matrix_from_quat_xyzw
 from pipelines.geometry.similarity import Similarity
-from pipelines.scene.survey import Survey
-from pipelines.scene.trained_model import Adjustment, TrainedModel
-from pipelines.splat.gaussians import Gaussians
+from pipelines.splat.gaussians import Gaussians, read_gaussians
 from pipelines.splat.metrics import psnr
 from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
-from pipelines.splat.storage import read_gaussians
-from pipelines.train.options import TrainOptions
-from pipelines.train.presets import PRESETS, RUN_MINUTES, Preset
+from pipelines.survey.survey import Survey
+from pipelines.survey.trained_model import Adjustment, TrainedModel
+from pipelines.train.options import PRESETS, RUN_MINUTES, Preset, TrainOptions
 from tests.scenes import GEO_FROM_LOCAL
 from tests.splat_scenes import TRAINING, RenderedFlight, adjust_workspace
 from tests.threads import single_thread

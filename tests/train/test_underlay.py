@@ -10,8 +10,8 @@ import pytest
 
 from pipelines.core.types import FloatArray
 from pipelines.geometry.cameras import CameraPoses, Pinhole
+from pipelines.train.initial_gaussians import hidden, underlay
 from pipelines.train.surface import SurfacePoints
-from pipelines.train.underlay import hidden, underlay
 
 SLOPE, ROOF_M = 0.1, 15.0
 GROUND, ROOF = (90, 140, 60), (200, 60, 60)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from pipelines.core.workspace import Workspace
-from pipelines.scene.crs_options import CrsOptions
+from pipelines.survey.options import CrsOptions
 from pipelines.view.measuring import MeasuringModel
 from tests.splat_scenes import make_rendered
 from tests.view_scenes import renderer_of, smooth, viewed_workspace

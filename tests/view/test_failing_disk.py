@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from pipelines.core.errors import InputError, StorageError
-from pipelines.formats.odm import read_ground_points
+from pipelines.formats.ground_points import read_ground_points
 from pipelines.view.marking import CHECK, CONTROL
 from pipelines.view.saved import TABLE, SavedMeasurements
 from tests.cli_runs import REPOSITORY

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from pipelines.core.errors import InputError
-from pipelines.formats.odm import read_ground_points
-from pipelines.view.kept_marks import MARKS, KeptMarks
-from pipelines.view.marking import CHECK, CONTROL, MarkedPoint
+from pipelines.formats.ground_points import read_ground_points
+from pipelines.view.marking import CHECK, CONTROL, MARKS, KeptMarks, MarkedPoint
 
 SURVEYED = (
     MarkedPoint("G1", (10.0, 45.0, 100.0), marks={"a.jpg": (1.0, 2.0), "b.jpg": (3.0, 4.0)}),

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from pipelines.core.errors import InputError
-from pipelines.formats.odm import read_ground_points
-from pipelines.scene.points_by_camera import points_by_camera
-from pipelines.scene.survey import SurveyedPoint
+from pipelines.formats.ground_points import read_ground_points
+from pipelines.survey.survey import SurveyedPoint
+from pipelines.survey.trained_survey import points_by_camera
 from pipelines.view.marking import (
     CHECK,
     CONTROL,

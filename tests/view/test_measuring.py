@@ -9,16 +9,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pipelines.core.cautions import NOT_CHECKED, Caution
 from pipelines.core.errors import MissingProductError
+from pipelines.core.products import NOT_CHECKED, Caution
 from pipelines.core.workspace import Workspace
-from pipelines.scene.crs_options import CrsOptions
-from pipelines.scene.marks import mark_rays
-from pipelines.scene.points_by_model import depth_around, points_by_model
+from pipelines.surface.picking import NoSurface, Sight, SurfacePoint, depth_around, points_by_model
+from pipelines.survey.marks import mark_rays
+from pipelines.survey.options import CrsOptions
 from pipelines.view import measuring
 from pipelines.view.measuring import MeasuringModel
 from pipelines.view.quantities import BasePlane
-from pipelines.view.surface_points import NoSurface, Sight, SurfacePoint
 from tests.splat_scenes import ground_height
 from tests.view_scenes import renderer_of
 

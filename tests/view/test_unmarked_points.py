@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.odm import read_ground_points
-from pipelines.scene.survey import Survey, SurveyedPoint
+from pipelines.formats.ground_points import read_ground_points
+from pipelines.survey.survey import Survey, SurveyedPoint
 from pipelines.view.marking import mark_texts, points_to_mark
 from tests.scenes import material
 

@@ -22,14 +22,7 @@ from torch.autograd.function import once_differentiable
 from pipelines.core.errors import InputError
 from pipelines.geometry.cameras import Pinhole
 from pipelines.splat.gaussians import Gaussians
-from pipelines.splat.rasterizer import (
-    cpu_blend,
-    cpu_blend_gradient,
-    cpu_gradients,
-    cpu_project,
-    cpu_tiles,
-    cpu_view,
-)
+from pipelines.splat.rasterizer import cpu_blend, cpu_gaussian, cpu_gradients, cpu_project
 from pipelines.splat.rasterizer.api import BackendName, RasterSettings, Render, ScreenStats
 
 _Array = NDArray[Any]
@@ -90,7 +83,7 @@ def predicted_bytes(
     gradients = count * (11 + 3 * (sh_degree + 1) ** 2) * 4 + count * 5
     splats = cpu_project.SPLAT_WIDTH + cpu_project.ELLIPSE_WIDTH
     in_view = count if visible is None else visible
-    hits = in_view * hits_per_visible * (16 + 4 * cpu_blend_gradient.HIT_GRADIENT_WIDTH)
+    hits = in_view * hits_per_visible * (16 + 4 * cpu_blend.HIT_GRADIENT_WIDTH)
     # Colour, alpha, Σ w z, Σ w z² and median depth, and the gradients of all but the median.
     images = camera.width * camera.height * 13 * 4
     return int(gradients + in_view * (4 * splats + 48) + hits + images)
@@ -129,9 +122,9 @@ class _RenderContext:
         """Background colour (3,) float64."""
         return np.array(self.settings.background, dtype=np.float64)
 
-    def view(self, pose: _Array) -> cpu_view.View:
+    def view(self, pose: _Array) -> cpu_gaussian.View:
         """Return the camera in the form of the kernels."""
-        return cpu_view.make_view(self.camera, self.settings, pose)
+        return cpu_gaussian.make_view(self.camera, self.settings, pose)
 
 
 @dataclass
@@ -242,17 +235,17 @@ def _depth_rank(depth: _Array) -> _Array:
 
 def list_tiles(ellipses: _Array, width: int, height: int) -> TileLists:
     """Return the hits of ellipses (M, ELLIPSE_WIDTH), nearest first, on the tiles of an image."""
-    columns, rows = cpu_tiles.tile_grid(width, height)
+    columns, rows = cpu_project.tile_grid(width, height)
     tiles = columns * rows
-    per_tile = np.empty((cpu_tiles.RUNS, tiles), dtype=np.int64)
+    per_tile = np.empty((cpu_project.RUNS, tiles), dtype=np.int64)
     splat_start = np.zeros(len(ellipses) + 1, dtype=np.int64)
-    cpu_tiles.count_hits(ellipses, width, height, per_tile, splat_start[1:])
+    cpu_project.count_hits(ellipses, width, height, per_tile, splat_start[1:])
     np.cumsum(splat_start, out=splat_start)
     tile_start = np.empty(tiles + 1, dtype=np.int64)
-    cpu_tiles.starts_from_counts(per_tile, tile_start)
+    cpu_project.starts_from_counts(per_tile, tile_start)
     hits = np.empty(splat_start[-1], dtype=np.int64)
     places = np.empty(splat_start[-1], dtype=np.int64)
-    cpu_tiles.list_hits(ellipses, width, height, per_tile, splat_start, hits, places)
+    cpu_project.list_hits(ellipses, width, height, per_tile, splat_start, hits, places)
     return TileLists(hits, tile_start, np.empty(tiles, dtype=np.int64), splat_start, places)
 
 
@@ -278,8 +271,8 @@ def blend_tiles(
 
 def _hit_gradient(context: _RenderContext, images: tuple[_Array, ...], grads: tuple[_Array, ...]) -> _Array:
     lists = context.lists
-    gradient = np.empty(len(lists.hits) * cpu_blend_gradient.HIT_GRADIENT_WIDTH, dtype=context.table.dtype)
-    cpu_blend_gradient.blend_gradient(
+    gradient = np.empty(len(lists.hits) * cpu_blend.HIT_GRADIENT_WIDTH, dtype=context.table.dtype)
+    cpu_blend.blend_gradient(
         *(context.table, lists.hits, lists.tile_start, lists.tile_end),
         *(context.background, images, grads, gradient, context.workers),
     )

@@ -3,6 +3,10 @@
 One row of a tile is one vector (see `cpu_lanes`). Once a pixel is done, its transmittance T is kept as −T: no splat
 adds to the pixel any more, and the final value of T stays known. Forward and backward walk the same lists in the
 same direction with the same arithmetic, so that both take the same decisions at every cut-off.
+
+Derivative of blending, as numba kernels: from the gradients of the images to those of the hits.
+
+The kernels walk the lists of `cpu_blend` in the same direction with the same arithmetic.
 """
 
 from __future__ import annotations
@@ -13,15 +17,18 @@ import numpy as np
 from numba import prange
 
 from pipelines.splat.rasterizer.api import ALPHA_MAX, TRANSMITTANCE_MIN
-from pipelines.splat.rasterizer.cpu_jit import jit, parallel_jit, worker_jit
 from pipelines.splat.rasterizer.cpu_lanes import (
     LANES,
     any_positive,
     exp,
+    jit,
     load,
+    parallel_jit,
     splat,
     store,
+    store_totals,
     where_greater,
+    worker_jit,
 )
 from pipelines.splat.rasterizer.cpu_project import (
     BLUE,
@@ -35,10 +42,12 @@ from pipelines.splat.rasterizer.cpu_project import (
     RED,
     SLOPE_X,
     SLOPE_Y,
+    TILE_HEIGHT,
+    TILE_WIDTH,
     X,
     Y,
+    unpack_hit,
 )
-from pipelines.splat.rasterizer.cpu_tiles import TILE_HEIGHT, TILE_WIDTH, unpack_hit
 
 TILE_PIXELS = TILE_WIDTH * TILE_HEIGHT
 # Hits between two checks which rows of the tile are not done yet.
@@ -192,3 +201,153 @@ def blend(
     """
     for worker in prange(workers):
         _blend(table, hits, tile_start, background, images, tile_end, np.int64(worker), workers)
+
+
+# Planes of a tile's scratch memory beside `T`.
+G_RED, G_GREEN, G_BLUE, G_DEPTH, G_DEPTH2, G_REST, REMAINING = 1, 2, 3, 4, 5, 6, 7
+BACKWARD_PLANES = 8
+
+# Places in the gradient of one hit: Σ q and its moments in dx and dy, where q = ∂L/∂(exponent) at each pixel, and
+# ∂L/∂ depth, its slopes and colour. The order is in fours, because sums are formed in fours.
+Q, Q_X, Q_Y, Q_YY, Q_XX, Q_XY, D_DEPTH, D_SLOPE_X, D_RED, D_GREEN, D_BLUE, D_SLOPE_Y = range(12)
+HIT_GRADIENT_WIDTH = 12
+
+
+@jit
+def _start_tile_gradient(scratch: Any, tile_x: int, tile_y: int, background: Any, images: Any, grads: Any) -> None:
+    """Fill the scratch planes with the gradient of each pixel's colour, alpha and depth.
+
+    With v_i = g·c_i + g_z z_i + g_zz z_i² − (g·background − g_alpha) the loss is Σ w_i v_i plus a constant.
+    Background and alpha therefore need no further term. `REMAINING` starts as the whole sum.
+    """
+    colour, alpha, depth, depth2, _ = images
+    g_colour, g_alpha, g_depth, g_depth2 = grads
+    for row in range(min(TILE_HEIGHT, colour.shape[0] - tile_y)):
+        for column in range(min(TILE_WIDTH, colour.shape[1] - tile_x)):
+            at = row * TILE_WIDTH + column
+            y, x = tile_y + row, tile_x + column
+            red, green, blue = g_colour[y, x, 0], g_colour[y, x, 1], g_colour[y, x, 2]
+            behind = red * background[0] + green * background[1] + blue * background[2]
+            scratch[G_RED * TILE_PIXELS + at] = red
+            scratch[G_GREEN * TILE_PIXELS + at] = green
+            scratch[G_BLUE * TILE_PIXELS + at] = blue
+            scratch[G_REST * TILE_PIXELS + at] = behind - g_alpha[y, x]
+            whole = red * colour[y, x, 0] + green * colour[y, x, 1] + blue * colour[y, x, 2] - behind
+            whole += g_alpha[y, x] * alpha[y, x]
+            if depth.shape[0] > 0:
+                scratch[G_DEPTH * TILE_PIXELS + at] = g_depth[y, x]
+                scratch[G_DEPTH2 * TILE_PIXELS + at] = g_depth2[y, x]
+                whole += g_depth[y, x] * depth[y, x] + g_depth2[y, x] * depth2[y, x]
+            scratch[REMAINING * TILE_PIXELS + at] = whole
+
+
+@jit
+def _store_hit_gradient(gradient: Any, place: int, dx: Any, moments: Any, colour_and_depth: Any) -> None:
+    """Sum a hit's gradient over the columns, in each of which dx is constant."""
+    q, qy, qyy = moments
+    red, green, blue, depth, slope_y = colour_and_depth
+    start, qx = place * HIT_GRADIENT_WIDTH, q * dx
+    store_totals(gradient, start + Q, q, qx, qy, qyy)
+    store_totals(gradient, start + Q_XX, qx * dx, qy * dx, depth, depth * dx)
+    store_totals(gradient, start + D_RED, red, green, blue, slope_y)
+
+
+@jit
+def _blend_tile_gradient(table: Any, hits: Any, first: int, last: int, tile_x: int, tile_y: int, depth: bool,
+                         scratch: Any, lane_x: Any, gradient: Any) -> None:  # fmt: skip
+    """Write the gradient of hits first … last − 1; `scratch` as `start_tile` and `_start_tile_gradient` left it.
+
+    ∂L/∂α_i = T_i v_i − (Σ_{j>i} w_j v_j) / (1 − α_i), and q_i = ∂L/∂ln α_i = α_i ∂L/∂α_i.
+    """
+    number = table.dtype.type
+    zero, one, t_min = splat(number(0.0)), splat(number(1.0)), splat(number(TRANSMITTANCE_MIN))
+    cutoff, alpha_max = splat(number(LOG_ALPHA_MIN)), splat(number(ALPHA_MAX))
+    pixel_x = load(lane_x, 0) + splat(number(tile_x))
+    top, bottom = 0, TILE_HEIGHT - 1
+    for place in range(first, last):
+        if (place - first) % HITS_PER_CHECK == 0:
+            top, bottom = alive_rows(scratch, top, bottom)
+        index, first_row, last_row = unpack_hit(hits[place])
+        red, green, blue = splat(table[index, RED]), splat(table[index, GREEN]), splat(table[index, BLUE])
+        dx = pixel_x - splat(table[index, X])
+        q_sum, qy_sum, qyy_sum, red_sum, green_sum, blue_sum, depth_sum, slope_y_sum = (
+            zero, zero, zero, zero, zero, zero, zero, zero,
+        )  # fmt: skip
+        for row in range(max(first_row, top), min(last_row, bottom) + 1):
+            at = row * TILE_WIDTH
+            dy = number(tile_y + row) + number(0.5) - table[index, Y]
+            exponent = row_exponent(table, index, dx, dy)
+            free_alpha = exp(exponent)
+            alpha = where_greater(free_alpha, alpha_max, alpha_max, free_alpha)
+            alpha = where_greater(cutoff, exponent, zero, alpha)
+            t = load(scratch, T * TILE_PIXELS + at)
+            kept = one - alpha
+            t_next = t * kept
+            alpha = where_greater(t_next, t_min, alpha, zero)
+            weight = alpha * t
+            done = where_greater(t, zero, zero - t, t)
+            store(scratch, T * TILE_PIXELS + at, where_greater(t_next, t_min, t_next, done))
+
+            g_red = load(scratch, G_RED * TILE_PIXELS + at)
+            g_green = load(scratch, G_GREEN * TILE_PIXELS + at)
+            g_blue = load(scratch, G_BLUE * TILE_PIXELS + at)
+            value = g_red * red + g_green * green + g_blue * blue - load(scratch, G_REST * TILE_PIXELS + at)
+            if depth:
+                z = row_depth(table, index, dx, dy)
+                g_depth2 = z * load(scratch, G_DEPTH2 * TILE_PIXELS + at)
+                g_depth = g_depth2 + load(scratch, G_DEPTH * TILE_PIXELS + at)
+                value = value + g_depth * z
+                g_depth = weight * (g_depth + g_depth2)
+                depth_sum = depth_sum + g_depth
+                slope_y_sum = slope_y_sum + g_depth * splat(dy)
+            part = weight * value
+            remaining = load(scratch, REMAINING * TILE_PIXELS + at) - part
+            store(scratch, REMAINING * TILE_PIXELS + at, remaining)
+            q = where_greater(free_alpha, alpha_max, zero, part - remaining * (alpha / kept))
+            qy = q * splat(dy)
+            q_sum = q_sum + q
+            qy_sum = qy_sum + qy
+            qyy_sum = qyy_sum + qy * splat(dy)
+            red_sum = red_sum + weight * g_red
+            green_sum = green_sum + weight * g_green
+            blue_sum = blue_sum + weight * g_blue
+        colour_and_depth = (red_sum, green_sum, blue_sum, depth_sum, slope_y_sum)
+        _store_hit_gradient(gradient, place, dx, (q_sum, qy_sum, qyy_sum), colour_and_depth)
+
+
+@worker_jit
+def _blend_gradient(
+    table: Any, hits: Any, tile_start: Any, tile_end: Any, background: Any, images: Any, grads: Any, gradient: Any,
+    worker: int, workers: int,
+) -> None:  # fmt: skip
+    height, width = images[1].shape
+    columns = (width + TILE_WIDTH - 1) // TILE_WIDTH
+    depth = images[2].shape[0] > 0
+    scratch = np.empty(BACKWARD_PLANES * TILE_PIXELS, table.dtype)
+    lane_x = pixel_centers(table.dtype)
+    for tile in range(worker, tile_end.shape[0], workers):
+        x, y = tile % columns * TILE_WIDTH, tile // columns * TILE_HEIGHT
+        start_tile(scratch, x, y, width, height)
+        _start_tile_gradient(scratch, x, y, background, images, grads)
+        _blend_tile_gradient(table, hits, tile_start[tile], tile_end[tile], x, y, depth, scratch, lane_x, gradient)
+        for k in range(tile_end[tile] * HIT_GRADIENT_WIDTH, tile_start[tile + 1] * HIT_GRADIENT_WIDTH):
+            gradient[k] = 0
+
+
+@parallel_jit
+def blend_gradient(
+    table: Any, hits: Any, tile_start: Any, tile_end: Any, background: Any, images: Any, grads: Any, gradient: Any,
+    workers: int,
+) -> None:  # fmt: skip
+    """Write the derivative of `blend`.
+
+    Args:
+        table, hits, tile_start, tile_end, background, images: arguments and results of `blend`.
+        grads: ∂L/∂ colour (H, W, 3), alpha (H, W), Σ w z and Σ w z² (H, W or 0, 0).
+        gradient: (H · HIT_GRADIENT_WIDTH,) of the hits in their order, written.
+        workers: number of threads.
+    """
+    for worker in prange(workers):
+        _blend_gradient(
+            table, hits, tile_start, tile_end, background, images, grads, gradient, np.int64(worker), workers
+        )

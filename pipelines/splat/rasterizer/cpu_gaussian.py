@@ -2,15 +2,226 @@
 
 Arithmetic is float64 whatever the arrays hold: it is scalar code, where float32 is no faster. Small matrices are
 flat tuples, row by row, so that they stay in registers.
+
+Real spherical harmonics of degree 0 to 3 and their derivative, as numba kernels.
+
+Order, signs and polynomials are those of 3DGS (doi 10.1145/3592433).
+
+Slope of the depth of a Gaussian across the screen, and its derivative, as numba functions.
+
+With V the principal axes along (u, v, z), in rows, D their variances, and K the screen covariance with a part of
+the image's dilation, the slope is q = s p, p = K⁻¹ c, c = (V D Vᵀ)_uz,vz. The factor s ≤ 1 keeps z near the depth
+of the centre, see `api`; it depends on C, the screen covariance with all of the dilation.
+
+Camera in the form of the kernels.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
-from pipelines.splat.rasterizer.cpu_jit import jit
-from pipelines.splat.rasterizer.cpu_view import View
+import numpy as np
+
+from pipelines.core.types import FloatArray
+from pipelines.geometry.cameras import Pinhole
+from pipelines.splat.rasterizer.api import ALPHA_MIN, DEPTH_REACH, SLOPE_DILATION, RasterSettings
+from pipelines.splat.rasterizer.cpu_lanes import jit
+from pipelines.splat.rasterizer.reference import FRUSTUM_MARGIN
+
+# N_lm of the real spherical harmonics; the other factor of each is a polynomial of the direction.
+_C0 = math.sqrt(1 / (4 * math.pi))
+_C1 = math.sqrt(3 / (4 * math.pi))
+_C2 = math.sqrt(15 / (4 * math.pi))
+_C2_ZONAL = math.sqrt(5 / (16 * math.pi))
+_C3_3 = math.sqrt(35 / (32 * math.pi))
+_C3_2 = math.sqrt(105 / (4 * math.pi))
+_C3_1 = math.sqrt(21 / (32 * math.pi))
+_C3_0 = math.sqrt(7 / (16 * math.pi))
+
+MAX_COEFFICIENTS = 16
+
+
+@jit
+def sh_basis(direction: Any, degree: int, basis: Any) -> None:
+    """Write the (degree + 1)² functions of a unit vector (x, y, z) into `basis` (16,)."""
+    x, y, z = direction
+    basis[0] = _C0
+    if degree < 1:
+        return
+    basis[1], basis[2], basis[3] = -_C1 * y, _C1 * z, -_C1 * x
+    if degree < 2:
+        return
+    xx, yy, zz = x * x, y * y, z * z
+    basis[4] = _C2 * x * y
+    basis[5] = -_C2 * y * z
+    basis[6] = _C2_ZONAL * (2 * zz - xx - yy)
+    basis[7] = -_C2 * x * z
+    basis[8] = 0.5 * _C2 * (xx - yy)
+    if degree < 3:
+        return
+    basis[9] = -_C3_3 * y * (3 * xx - yy)
+    basis[10] = _C3_2 * x * y * z
+    basis[11] = -_C3_1 * y * (4 * zz - xx - yy)
+    basis[12] = _C3_0 * z * (2 * zz - 3 * xx - 3 * yy)
+    basis[13] = -_C3_1 * x * (4 * zz - xx - yy)
+    basis[14] = 0.5 * _C3_2 * z * (xx - yy)
+    basis[15] = -_C3_3 * x * (xx - 3 * yy)
+
+
+@jit
+def sh_direction_gradient(direction: Any, degree: int, weight: Any) -> Any:
+    """Return Σ_k weight[k] · ∂basis[k]/∂(x, y, z), with the polynomials as functions of all space."""
+    x, y, z = direction
+    gx, gy, gz = 0.0, 0.0, 0.0
+    if degree >= 1:
+        gx, gy, gz = -_C1 * weight[3], -_C1 * weight[1], _C1 * weight[2]
+    if degree >= 2:
+        zonal, planar = 2 * _C2_ZONAL * weight[6], _C2 * weight[8]
+        gx += _C2 * (y * weight[4] - z * weight[7]) + x * (planar - zonal)
+        gy += _C2 * (x * weight[4] - z * weight[5]) - y * (planar + zonal)
+        gz += -_C2 * (y * weight[5] + x * weight[7]) + 2 * z * zonal
+    if degree >= 3:
+        xx, yy, zz = x * x, y * y, z * z
+        w9, w10, w11 = _C3_3 * weight[9], _C3_2 * weight[10], _C3_1 * weight[11]
+        w12, w13 = _C3_0 * weight[12], _C3_1 * weight[13]
+        w14, w15 = 0.5 * _C3_2 * weight[14], _C3_3 * weight[15]
+        gx += -6 * x * y * w9 + y * z * w10 + 2 * x * y * w11 - 6 * x * z * w12
+        gx += (3 * xx + yy - 4 * zz) * w13 + 2 * x * z * w14 + 3 * (yy - xx) * w15
+        gy += 3 * (yy - xx) * w9 + x * z * w10 + (xx + 3 * yy - 4 * zz) * w11 - 6 * y * z * w12
+        gy += 2 * x * y * w13 - 2 * y * z * w14 + 6 * x * y * w15
+        gz += x * y * w10 - 8 * y * z * w11 + (6 * zz - 3 * xx - 3 * yy) * w12
+        gz += -8 * x * z * w13 + (xx - yy) * w14
+    return gx, gy, gz
+
+
+# Mahalanobis radius at which an opaque Gaussian falls to ALPHA_MIN.
+WIDEST = math.sqrt(-2 * math.log(ALPHA_MIN))
+# Largest standard deviation of the depth over the screen, in depths of the centre.
+_SPREAD_MAX = DEPTH_REACH / WIDEST
+
+
+@jit
+def _free_slope(axes: Any, variance: Any, narrow: Any) -> Any:
+    """Return K⁻¹ (xx, xy, yy) and p (2), given V (9), D (3) and K (xx, xy, yy)."""
+    a, b, c = variance
+    xz = axes[0] * axes[6] * a + axes[1] * axes[7] * b + axes[2] * axes[8] * c
+    yz = axes[3] * axes[6] * a + axes[4] * axes[7] * b + axes[5] * axes[8] * c
+    xx, xy, yy = narrow
+    scale = 1.0 / (xx * yy - xy * xy)
+    inverse = (yy * scale, -xy * scale, xx * scale)
+    return inverse, _times(inverse, (xz, yz))
+
+
+@jit
+def _narrow(cov: Any, dilation: float) -> Any:
+    """Return K of C (xx, xy, yy), which is dilated by `dilation`."""
+    xx, xy, yy = cov
+    less = (1 - SLOPE_DILATION) * dilation
+    return xx - less, xy, yy - less
+
+
+@jit
+def _times(symmetric: Any, vector: Any) -> Any:
+    xx, xy, yy = symmetric
+    x, y = vector
+    return xx * x + xy * y, xy * x + yy * y
+
+
+@jit
+def _shrinkage(spread2: float, depth: float) -> float:
+    """Return s, given p · C p, the variance of the depth over the screen."""
+    most = _SPREAD_MAX * depth
+    return most / math.sqrt(spread2) if spread2 > most * most else 1.0
+
+
+@jit
+def depth_slope(axes: Any, variance: Any, cov: Any, dilation: float, depth: float) -> Any:
+    """Return ∂z/∂u, ∂z/∂v of a Gaussian in m/px.
+
+    Args:
+        axes: V (9).
+        variance: D (3).
+        cov: C (xx, xy, yy).
+        dilation: of C in px².
+        depth: z of the centre.
+    """
+    _, (px, py) = _free_slope(axes, variance, _narrow(cov, dilation))
+    wide_x, wide_y = _times(cov, (px, py))
+    s = _shrinkage(px * wide_x + py * wide_y, depth)
+    return s * px, s * py
+
+
+@jit
+def depth_slope_gradient(axes: Any, variance: Any, cov: Any, dilation: float, depth: float, g_slope: Any) -> Any:
+    """Return the slope and, given ∂L/∂ slope, ∂L/∂c (2), the symmetric ∂L/∂C (xx, xy, yy) and ∂L/∂z.
+
+    K and C differ by a constant: ∂L/∂C is that of both.
+    """
+    inverse, (px, py) = _free_slope(axes, variance, _narrow(cov, dilation))
+    wide_x, wide_y = _times(cov, (px, py))
+    spread2 = px * wide_x + py * wide_y
+    s = _shrinkage(spread2, depth)
+    gx, gy = s * g_slope[0], s * g_slope[1]
+    g_depth, share = 0.0, 0.0
+    if s < 1.0:
+        # s = const · z / √(p · C p).
+        along = gx * px + gy * py
+        g_depth, share = along / depth, -along / spread2
+    hx, hy = _times(inverse, (gx + share * wide_x, gy + share * wide_y))
+    # d(K⁻¹) = −K⁻¹ dK K⁻¹: −½ (h pᵀ + p hᵀ), and ½ p pᵀ of that share for the dC of the length.
+    kx, ky = hx - 0.5 * share * px, hy - 0.5 * share * py
+    g_cov = (-kx * px, -0.5 * (kx * py + ky * px), -ky * py)
+    return (s * px, s * py), (hx, hy), g_cov, g_depth
+
+
+class View(NamedTuple):
+    """Camera of the kernels: lengths in pixels, slopes x/z and y/z, near plane in metres.
+
+    A standard deviation of 1 m at a depth of 1 m is at most `stretch_x` px wide and `stretch_y` px high.
+    """
+
+    width: float
+    height: float
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    slope_x_min: float
+    slope_x_max: float
+    slope_y_min: float
+    slope_y_max: float
+    near: float
+    dilation: float
+    stretch_x: float
+    stretch_y: float
+
+
+def make_view(camera: Pinhole, settings: RasterSettings, pose: FloatArray) -> View:
+    """Return the kernels' form of `camera`; the Jacobian is taken no further out than its slopes, as in gsplat."""
+    margin_x = FRUSTUM_MARGIN * 0.5 * camera.width / camera.fx
+    margin_y = FRUSTUM_MARGIN * 0.5 * camera.height / camera.fy
+    slope_x_min, slope_x_max = -camera.cx / camera.fx - margin_x, (camera.width - camera.cx) / camera.fx + margin_x
+    slope_y_min, slope_y_max = -camera.cy / camera.fy - margin_y, (camera.height - camera.cy) / camera.fy + margin_y
+    # The norm of a rotation is 1. Derivatives vary all entries of the pose, however, and leave the rotations.
+    norm = float(np.linalg.norm(pose[:, :3], 2))
+    image = settings.image_of(camera)
+    return View(
+        width=float(image.width),
+        height=float(image.height),
+        fx=float(camera.fx),
+        fy=float(camera.fy),
+        cx=float(image.cx),
+        cy=float(image.cy),
+        slope_x_min=slope_x_min,
+        slope_x_max=slope_x_max,
+        slope_y_min=slope_y_min,
+        slope_y_max=slope_y_max,
+        near=float(settings.near_m),
+        dilation=float(settings.dilation_px2),
+        stretch_x=camera.fx * norm * math.hypot(1.0, max(-slope_x_min, slope_x_max)),
+        stretch_y=camera.fy * norm * math.hypot(1.0, max(-slope_y_min, slope_y_max)),
+    )
 
 
 @jit

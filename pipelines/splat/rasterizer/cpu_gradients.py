@@ -2,6 +2,8 @@
 
 Sums run in a fixed order whatever the number of threads, without atomic additions: the result is the same bit for
 bit on every run.
+
+Derivative of the projection and of the colour of one Gaussian, as numba functions.
 """
 
 from __future__ import annotations
@@ -12,13 +14,231 @@ from typing import Any
 import numpy as np
 from numba import prange
 
-from pipelines.splat.rasterizer.cpu_blend_gradient import HIT_GRADIENT_WIDTH, Q
-from pipelines.splat.rasterizer.cpu_gaussian import log_sigmoid, row3, unit_direction
-from pipelines.splat.rasterizer.cpu_gaussian_gradient import colour_gradient, geometry_gradient, unnormalised
-from pipelines.splat.rasterizer.cpu_jit import jit, parallel_jit, worker_jit
+from pipelines.splat.rasterizer.cpu_blend import (
+    D_BLUE,
+    D_DEPTH,
+    D_GREEN,
+    D_RED,
+    D_SLOPE_X,
+    D_SLOPE_Y,
+    HIT_GRADIENT_WIDTH,
+    Q_X,
+    Q_XX,
+    Q_XY,
+    Q_Y,
+    Q_YY,
+    Q,
+)
+from pipelines.splat.rasterizer.cpu_gaussian import (
+    MAX_COEFFICIENTS,
+    View,
+    depth_slope_gradient,
+    jacobian,
+    log_sigmoid,
+    point_in_cam,
+    rotation,
+    row3,
+    screen_covariance,
+    screen_from_model,
+    sh_basis,
+    sh_colour,
+    sh_direction_gradient,
+    times_rotation,
+    unit_direction,
+    unit_quat,
+    variances,
+)
+from pipelines.splat.rasterizer.cpu_lanes import jit, parallel_jit, worker_jit
 from pipelines.splat.rasterizer.cpu_project import BLOCK
-from pipelines.splat.rasterizer.cpu_sh import MAX_COEFFICIENTS
-from pipelines.splat.rasterizer.cpu_view import View
+
+
+@jit
+def _conic_gradients(cov: Any, sums: Any) -> Any:
+    """Return ∂L/∂ screen mean (u, v) and the symmetric ∂L/∂C (xx, xy, yy) of the screen covariance C.
+
+    The exponent is −½ dᵀ C⁻¹ d, so that the gradients are C⁻¹ Σ q d and ½ C⁻¹ (Σ q d dᵀ) C⁻¹.
+    """
+    xx, xy, yy = cov
+    scale = 1.0 / (xx * yy - xy * xy)
+    a, b, c = yy * scale, -xy * scale, xx * scale
+    # Rows of C⁻¹ Σ q d dᵀ.
+    m00, m01 = a * sums[Q_XX] + b * sums[Q_XY], a * sums[Q_XY] + b * sums[Q_YY]
+    m10, m11 = b * sums[Q_XX] + c * sums[Q_XY], b * sums[Q_XY] + c * sums[Q_YY]
+    mean = (a * sums[Q_X] + b * sums[Q_Y], b * sums[Q_X] + c * sums[Q_Y])
+    return mean, (0.5 * (m00 * a + m01 * b), 0.5 * (m00 * b + m01 * c), 0.5 * (m10 * b + m11 * c))
+
+
+@jit
+def _covariance_gradients(axes: Any, variance: Any, view: View, depth: float, sums: Any) -> Any:
+    """Return ∂L/∂ screen mean (2), depth of the centre, screen covariance (3), covariance with the depth (2)."""
+    cov = screen_covariance(axes, variance, view.dilation)
+    (gu, gv), (xx, xy, yy) = _conic_gradients(cov, sums)
+    g_depth, g_slope = sums[D_DEPTH], (sums[D_SLOPE_X], sums[D_SLOPE_Y])
+    if g_depth == 0.0 and g_slope[0] == 0.0 and g_slope[1] == 0.0:
+        # True of every render without depth.
+        return (gu, gv), 0.0, (xx, xy, yy), (0.0, 0.0)
+    slope, g_c, (s_xx, s_xy, s_yy), g_reach = depth_slope_gradient(
+        axes, variance, cov, view.dilation, depth, g_slope
+    )
+    g_mean = (gu - slope[0] * g_depth, gv - slope[1] * g_depth)
+    return g_mean, g_depth + g_reach, (xx + s_xx, xy + s_xy, yy + s_yy), g_c
+
+
+@jit
+def _axes_gradient(axes: Any, variance: Any, g_cov: Any, g_c: Any) -> Any:
+    """Return ∂L/∂V (9), given the symmetric ∂L/∂ screen covariance and ∂L/∂ its covariance with depth."""
+    xx, xy, yy = g_cov
+    xz, yz = g_c
+    a, b, c = variance
+    return (
+        a * (2 * xx * axes[0] + 2 * xy * axes[3] + xz * axes[6]),
+        b * (2 * xx * axes[1] + 2 * xy * axes[4] + xz * axes[7]),
+        c * (2 * xx * axes[2] + 2 * xy * axes[5] + xz * axes[8]),
+        a * (2 * xy * axes[0] + 2 * yy * axes[3] + yz * axes[6]),
+        b * (2 * xy * axes[1] + 2 * yy * axes[4] + yz * axes[7]),
+        c * (2 * xy * axes[2] + 2 * yy * axes[5] + yz * axes[8]),
+        a * (xz * axes[0] + yz * axes[3]),
+        b * (xz * axes[1] + yz * axes[4]),
+        c * (xz * axes[2] + yz * axes[5]),
+    )
+
+
+@jit
+def _times_transposed(v: Any, r: Any) -> Any:
+    """Return V Rᵀ (9)."""
+    return (
+        v[0] * r[0] + v[1] * r[1] + v[2] * r[2],
+        v[0] * r[3] + v[1] * r[4] + v[2] * r[5],
+        v[0] * r[6] + v[1] * r[7] + v[2] * r[8],
+        v[3] * r[0] + v[4] * r[1] + v[5] * r[2],
+        v[3] * r[3] + v[4] * r[4] + v[5] * r[5],
+        v[3] * r[6] + v[4] * r[7] + v[5] * r[8],
+        v[6] * r[0] + v[7] * r[1] + v[8] * r[2],
+        v[6] * r[3] + v[7] * r[4] + v[8] * r[5],
+        v[6] * r[6] + v[7] * r[7] + v[8] * r[8],
+    )
+
+
+@jit
+def _transposed_times(w: Any, v: Any, i: int, k: int) -> float:
+    """Return entry (i, k) of Wᵀ V."""
+    return float(w[i] * v[k] + w[3 + i] * v[3 + k] + w[6 + i] * v[6 + k])
+
+
+@jit
+def _quat_gradient(quat: Any, scale: float, w: Any, v: Any) -> Any:
+    """Return ∂L/∂ quaternion (4) before normalisation, with ∂L/∂R = Wᵀ ∂L/∂V."""
+    r00, r01, r02 = _transposed_times(w, v, 0, 0), _transposed_times(w, v, 0, 1), _transposed_times(w, v, 0, 2)
+    r10, r11, r12 = _transposed_times(w, v, 1, 0), _transposed_times(w, v, 1, 1), _transposed_times(w, v, 1, 2)
+    r20, r21, r22 = _transposed_times(w, v, 2, 0), _transposed_times(w, v, 2, 1), _transposed_times(w, v, 2, 2)
+    qw, qx, qy, qz = quat
+    gw = 2 * (qx * (r21 - r12) + qy * (r02 - r20) + qz * (r10 - r01))
+    gx = 2 * (qw * (r21 - r12) + qy * (r01 + r10) + qz * (r02 + r20) - 2 * qx * (r11 + r22))
+    gy = 2 * (qw * (r02 - r20) + qx * (r01 + r10) + qz * (r12 + r21) - 2 * qy * (r00 + r22))
+    gz = 2 * (qw * (r10 - r01) + qx * (r02 + r20) + qy * (r12 + r21) - 2 * qz * (r00 + r11))
+    along = qw * gw + qx * gx + qy * gy + qz * gz
+    return (
+        scale * (gw - along * qw),
+        scale * (gx - along * qx),
+        scale * (gy - along * qy),
+        scale * (gz - along * qz),
+    )
+
+
+@jit
+def _point_gradient(view: View, point: Any, g_mean: Any, g_depth: float, pose: Any, g_w: Any) -> Any:
+    """Return ∂L/∂ point in the camera's frame (3): through the screen mean, the depth and the Jacobian."""
+    x, y, z = point
+    gu, gv = g_mean
+    j00 = g_w[0] * pose[0, 0] + g_w[1] * pose[0, 1] + g_w[2] * pose[0, 2]
+    j02 = g_w[0] * pose[2, 0] + g_w[1] * pose[2, 1] + g_w[2] * pose[2, 2]
+    j11 = g_w[3] * pose[1, 0] + g_w[4] * pose[1, 1] + g_w[5] * pose[1, 2]
+    j12 = g_w[3] * pose[2, 0] + g_w[4] * pose[2, 1] + g_w[5] * pose[2, 2]
+    fx_z, fy_z = view.fx / z, view.fy / z
+    gx, gy = fx_z * gu, fy_z * gv
+    gz = g_depth - (x * gx + y * gy + fx_z * j00 + fy_z * j11) / z
+    slope_x, slope_y = x / z, y / z
+    if view.slope_x_min <= slope_x <= view.slope_x_max:
+        gx -= fx_z * j02 / z
+        gz += 2 * fx_z * slope_x * j02 / z
+    else:
+        gz += fx_z * min(max(slope_x, view.slope_x_min), view.slope_x_max) * j02 / z
+    if view.slope_y_min <= slope_y <= view.slope_y_max:
+        gy -= fy_z * j12 / z
+        gz += 2 * fy_z * slope_y * j12 / z
+    else:
+        gz += fy_z * min(max(slope_y, view.slope_y_min), view.slope_y_max) * j12 / z
+    return gx, gy, gz
+
+
+@jit
+def _add_pose_gradient(camera: Any, mean: Any, g_point: Any, jac: Any, g_w: Any) -> None:
+    """Add ∂L/∂[A | t] (12) of p = A m + t and W."""
+    j00, j02, j11, j12 = jac
+    x, y, z = mean
+    gx, gy, gz = g_point
+    camera[0] += gx * x + j00 * g_w[0]
+    camera[1] += gx * y + j00 * g_w[1]
+    camera[2] += gx * z + j00 * g_w[2]
+    camera[3] += gx
+    camera[4] += gy * x + j11 * g_w[3]
+    camera[5] += gy * y + j11 * g_w[4]
+    camera[6] += gy * z + j11 * g_w[5]
+    camera[7] += gy
+    camera[8] += gz * x + j02 * g_w[0] + j12 * g_w[3] + g_w[6]
+    camera[9] += gz * y + j02 * g_w[1] + j12 * g_w[4] + g_w[7]
+    camera[10] += gz * z + j02 * g_w[2] + j12 * g_w[5] + g_w[8]
+    camera[11] += gz
+
+
+@jit
+def colour_gradient(
+    sh: Any, i: int, direction: Any, degree: int, sums: Any, basis: Any, weight: Any, g_sh: Any
+) -> Any:
+    """Write row i of ∂L/∂ SH, and return ∂L/∂ direction, with the basis as functions of all space."""
+    terms = (degree + 1) ** 2
+    sh_basis(direction, degree, basis)
+    red, green, blue = sh_colour(sh, i, basis, terms)
+    g_red = sums[D_RED] if red >= 0.0 else 0.0
+    g_green = sums[D_GREEN] if green >= 0.0 else 0.0
+    g_blue = sums[D_BLUE] if blue >= 0.0 else 0.0
+    for k in range(terms):
+        g_sh[i, k, 0], g_sh[i, k, 1], g_sh[i, k, 2] = basis[k] * g_red, basis[k] * g_green, basis[k] * g_blue
+        weight[k] = sh[i, k, 0] * g_red + sh[i, k, 1] * g_green + sh[i, k, 2] * g_blue
+    return sh_direction_gradient(direction, degree, weight)
+
+
+@jit
+def unnormalised(direction: Any, scale: float, gradient: Any) -> Any:
+    """Return ∂L/∂v of a vector v, given ∂L/∂ direction of direction = scale · v of unit length."""
+    x, y, z = direction
+    gx, gy, gz = gradient
+    along = x * gx + y * gy + z * gz
+    return scale * (gx - along * x), scale * (gy - along * y), scale * (gz - along * z)
+
+
+@jit
+def geometry_gradient(quats: Any, log_scales: Any, i: int, mean: Any, pose: Any, view: View, sums: Any,
+                       camera: Any, g_quats: Any, g_log_scales: Any) -> Any:  # fmt: skip
+    """Write row i of ∂L/∂ quaternion and log scales, add to ∂L/∂ pose; return ∂L/∂ point and screen mean."""
+    point = point_in_cam(pose, mean)
+    quat, scale = unit_quat(quats, i)
+    turn = rotation(quat)
+    jac = jacobian(view, point)
+    w = screen_from_model(jac, pose)
+    axes, variance = times_rotation(w, turn), variances(log_scales, i)
+    g_mean, g_depth, g_cov, g_c = _covariance_gradients(axes, variance, view, point[2], sums)
+    g_axes = _axes_gradient(axes, variance, g_cov, g_c)
+    g_w = _times_transposed(g_axes, turn)
+    g_quats[i, 0], g_quats[i, 1], g_quats[i, 2], g_quats[i, 3] = _quat_gradient(quat, scale, w, g_axes)
+    # Scaling a principal axis means scaling its column of V.
+    g_log_scales[i, 0] = _transposed_times(axes, g_axes, 0, 0)
+    g_log_scales[i, 1] = _transposed_times(axes, g_axes, 1, 1)
+    g_log_scales[i, 2] = _transposed_times(axes, g_axes, 2, 2)
+    g_point = _point_gradient(view, point, g_mean, g_depth, pose, g_w)
+    _add_pose_gradient(camera, mean, g_point, jac, g_w)
+    return g_point, g_mean
+
 
 # Entries of a block's share of the camera's gradient: 12 of the pose, row by row, then 3 of the centre.
 CAMERA_WIDTH = 15

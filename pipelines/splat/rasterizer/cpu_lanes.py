@@ -3,6 +3,16 @@
 numba leaves vectorising to LLVM, which gives up on loops with calls, selections or state that outlives the loop.
 Here each operation is emitted as one LLVM vector instruction instead. LLVM maps it to the instructions of the
 processor: AVX-512, AVX2, SSE or NEON. Elements are float32 or float64.
+
+Compilation of the kernels.
+
+1. A kernel is a short parallel loop over workers (`parallel_jit`).
+2. Each worker runs one serial function (`worker_jit`), because the parallel compiler is slow on long bodies.
+3. The serial function is made of small functions (`jit`). These are always inlined: the reference counts of arrays
+   passed between threads would cost more than the work.
+4. Numba's cache keeps only the functions that Python calls. They contain the others.
+
+Of all flags that allow the compiler to reorder or assume, only fused multiply-add is set: results are reproducible.
 """
 
 from __future__ import annotations
@@ -13,7 +23,7 @@ from typing import Any
 
 import numba.extending
 from llvmlite import ir
-from numba import types
+from numba import njit, types
 from numba.core import cgutils
 from numba.extending import models, overload, register_model
 
@@ -193,3 +203,11 @@ def _resolve_exp(x: Any) -> Any:
         return y * y
 
     return libm if x.element.bitwidth == 64 else polynomial
+
+
+_OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract"}}
+
+jit: Any = njit(forceinline=True, **_OPTIONS)
+worker_jit: Any = njit(**_OPTIONS)
+kernel_jit: Any = njit(cache=True, **_OPTIONS)
+parallel_jit: Any = njit(cache=True, parallel=True, **_OPTIONS)

@@ -24,13 +24,12 @@ from types import ModuleType
 
 import torch
 
-from pipelines.core.durable import replace_file
+from pipelines.core.child import python_command, python_environment
 from pipelines.core.errors import BackendUnavailableError, InputError, WorkspaceBusyError
-from pipelines.core.free_memory import free_main_memory_bytes
+from pipelines.core.files import replace_file
 from pipelines.core.lock import WriteLock
+from pipelines.core.machine import free_main_memory_bytes, thread_count
 from pipelines.core.progress import SILENT, Progress
-from pipelines.core.restart import python_command, python_environment
-from pipelines.core.threads import thread_count
 from pipelines.splat.rasterizer.cuda_parts import (
     compiling_parts,
     gsplat,

@@ -19,9 +19,9 @@ from pipelines.adjust import terms as adjustment
 from pipelines.adjust.state import SystematicErrors
 from pipelines.core.errors import InputError
 from pipelines.core.types import FloatArray, IntArray
-from pipelines.scene.geolocated import GeolocatedPoints
-from pipelines.scene.scene import Scene
-from pipelines.scene.survey import Survey
+from pipelines.survey.adjustment import GeolocatedPoints
+from pipelines.survey.scene import Scene
+from pipelines.survey.survey import Survey
 from pipelines.train.geographic.unknowns import Estimate, TensorSimilarity, exp_so3, log_so3
 
 RecordT = TypeVar("RecordT")

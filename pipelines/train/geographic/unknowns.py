@@ -13,7 +13,7 @@ from pipelines.adjust.state import ErrorName, State, SystematicErrors
 from pipelines.core.types import FloatArray
 from pipelines.geometry.cameras import CameraPoses
 from pipelines.geometry.similarity import Similarity, perturbation
-from pipelines.robust.kernels import CAUCHY_SCALE2
+from pipelines.robust.statistics import CAUCHY_SCALE2
 
 
 def exp_so3(rotation_vector: Tensor) -> Tensor:
@@ -200,7 +200,7 @@ class CameraCorrections(torch.nn.Module):
         return self.held_poses + (self.basis.flatten(0, 1) @ self.z).view(-1, 6)
 
     def lens(self) -> Tensor:
-        """Return the change (L,) of the lens parameters, in the order of `geometry.lens.Lenses`; L = 0: none."""
+        """Return the change (L,) of the lens parameters, in the order of `geometry.cameras.Lenses`; L = 0: none."""
         return self.held_lens + self.lens_basis @ self.z
 
     def moved(self) -> tuple[Tensor, Tensor]:

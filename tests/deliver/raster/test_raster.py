@@ -29,13 +29,11 @@ from pipelines.geodesy.enu import lla_from_enu
 from pipelines.geometry.cameras import Camera, Pinhole
 from pipelines.geometry.rotations import exp_so3, quat_xyzw_from_matrix
 from pipelines.geometry.similarity import Similarity
-from pipelines.scene.trained_model import TrainedCamera
-from pipelines.splat.gaussians import Gaussians
+from pipelines.splat.gaussians import Gaussians, transformed, write_gaussians
 from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
 from pipelines.splat.sh import sh_from_rgb
-from pipelines.splat.storage import write_gaussians
-from pipelines.splat.transform import transformed
+from pipelines.survey.trained_model import TrainedCamera
 from tests.scenes import (
     Measured,
     Noise,
@@ -151,7 +149,7 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
 
 def in_utm(points_in_geo: np.ndarray, workspace: Workspace) -> np.ndarray:
     """Return points (N, 3) in UTM, by pyproj alone."""
-    from pipelines.scene.calibrated import load_survey
+    from pipelines.survey.calibrated import load_survey
 
     lat, lon, height = lla_from_enu(points_in_geo, load_survey(workspace).origin).T
     east, north = pyproj.Transformer.from_crs("EPSG:4326", UTM, always_xy=True).transform(lon, lat)

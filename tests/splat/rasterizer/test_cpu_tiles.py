@@ -8,8 +8,17 @@ import torch
 
 from pipelines.splat.rasterizer import cpu
 from pipelines.splat.rasterizer.api import RasterSettings
-from pipelines.splat.rasterizer.cpu_project import E_LEVEL, E_X, E_XX, E_XY, E_Y, E_YY
-from pipelines.splat.rasterizer.cpu_tiles import TILE_HEIGHT, TILE_WIDTH, tile_grid
+from pipelines.splat.rasterizer.cpu_project import (
+    E_LEVEL,
+    E_X,
+    E_XX,
+    E_XY,
+    E_Y,
+    E_YY,
+    TILE_HEIGHT,
+    TILE_WIDTH,
+    tile_grid,
+)
 
 
 @pytest.fixture

@@ -16,10 +16,10 @@ from pipelines.adjust.options import GeolocateOptions, InitSim3Options
 from pipelines.adjust.posterior import Posterior
 from pipelines.core.errors import DegenerateGeometryError, InputError
 from pipelines.geometry.correction_basis import predicted_basis_bytes
-from pipelines.robust.kernels import CAUCHY_SCALE2
-from pipelines.scene.geolocated import GeolocatedPoints
-from pipelines.scene.scene import adjusted_scene
-from pipelines.scene.survey import Survey
+from pipelines.robust.statistics import CAUCHY_SCALE2
+from pipelines.survey.adjustment import GeolocatedPoints
+from pipelines.survey.scene import adjusted_scene
+from pipelines.survey.survey import Survey
 from pipelines.train.adjusted_scene import AdjustedScene, with_exposures
 from pipelines.train.geographic.problem import GeoProblem, TermWeights, held_problem, refining_problem
 from pipelines.train.geographic.terms import SURFACE_SIGMA, DistanceTerm, depth_residuals

@@ -14,7 +14,7 @@ from pipelines.adjust.state import State
 from pipelines.adjust.system import Problem
 from pipelines.adjust.terms import Planes, Term
 from pipelines.geometry.similarity import perturbation
-from pipelines.scene.scene import Scene, initial_scene
+from pipelines.survey.scene import Scene, initial_scene
 from pipelines.train.geographic.terms import tensor_term
 from pipelines.train.geographic.unknowns import CameraCorrections, Estimate, LearnableSimilarity
 from tests.scenes import initial, material, session_of

@@ -1,0 +1,133 @@
+"""Tables of `georef batch` for people.
+
+Tables of a training in blocks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from georef_cli.forecast import RunForecast
+from georef_cli.layout import ByWidth, plain_table, shown
+from georef_cli.tables import WIDE, Renderable
+from pipelines.core.figures import ACCURACY_H, ACCURACY_V, CHECK_POINTS, MISSING, Headline
+from pipelines.core.sentences import about, duration
+from pipelines.jobs.batch import BatchTable, MissionRow, PlannedMission
+
+if TYPE_CHECKING:
+    from pipelines.survey.block_plan import BlockPlan
+
+_STYLE = {"done": "green", "current": "green", "failed": "red", "interrupted": "yellow", "waiting": "dim"}
+_DASH = MISSING
+_ACCURACY = ("accuracy", *(f"{figure.label} {figure.unit}" for figure in (ACCURACY_H, ACCURACY_V)))
+
+
+def batch(table: BatchTable, page: Path) -> list[Renderable]:
+    """Return the table of a batch, its failures, and where the page of it is."""
+    wide = plain_table(
+        *("mission", "state", "took", "photographs", *_ACCURACY, CHECK_POINTS.label, "PSNR", "remarks"),
+        right=(2, 3, 5, 6, 7, 8, 9),
+    )
+    narrow = plain_table("mission", "state", "took", *_ACCURACY, "remarks", right=(2, 4, 5, 6))
+    for row in table.missions:
+        state = f"[{_STYLE[row.state]}]{row.state}[/]"
+        accuracy = _accuracy(row.accuracy)
+        took = duration(row.processing_s if row.seconds is None else row.seconds)
+        remarks = str(len(row.warnings) + len(row.cautions) or "")
+        checks = CHECK_POINTS.text(None if row.accuracy is None else row.accuracy.check_points)
+        psnr = _DASH if row.test_psnr is None else f"{row.test_psnr:.2f}"
+        wide.add_row(shown(row.mission), state, took, _photographs(row), *accuracy, checks, psnr, remarks)
+        narrow.add_row(shown(row.mission), state, took, *accuracy, remarks)
+    failures = [
+        f"[red]{shown(row.mission)}[/] {shown(row.failure)}"
+        + ("" if row.log is None else f" [dim]{shown(row.log)}[/]")
+        for row in table.missions
+        if row.failure is not None
+    ]
+    states = ", ".join(f"{count} {state}" for state, count in table.counts.items())
+    ending = f"\n{len(table.missions)} missions: {states}. All of it is in {shown(str(page))}"
+    return [ByWidth(WIDE, wide, narrow), *(["", *failures] if failures else []), ending]
+
+
+def dry_rows(missions: Iterable[tuple[PlannedMission, RunForecast | None]]) -> list[dict[str, Any]]:
+    """Return what a batch would do, a row for each mission, as plain values."""
+    return [
+        {
+            "mission": planned.mission.name,
+            "workspace": str(planned.mission.workspace.root),
+            "stages": dict(planned.actions),
+            "refusal": planned.refusal,
+            "photographs": run.photographs.count if run is not None and run.photographs is not None else None,
+            "seconds": None if run is None else sum(value or 0.0 for value in run.seconds.values()),
+            "peak_bytes": planned.peak_bytes,
+        }
+        for planned, run in missions
+    ]
+
+
+def dry_run(rows: Sequence[dict[str, Any]], together: int) -> list[Renderable]:
+    """Return the table of a dry run.
+
+    Args:
+        rows: from `dry_rows`.
+        together: number of missions that run at a time.
+    """
+    table = plain_table("mission", "photographs", "about", "memory", "stages to run", right=[1, 2, 3])
+    for row in rows:
+        stages = ", ".join(stage for stage, action in row["stages"].items() if action != "keep")
+        table.add_row(
+            shown(row["mission"]),
+            _DASH if row["photographs"] is None else str(row["photographs"]),
+            about(row["seconds"] or None),
+            f"{row['peak_bytes'] / 2**30:.1f} GiB",
+            f"[red]refused:[/] {shown(row['refusal'])}" if row["refusal"] else stages or "nothing to do",
+        )
+    return [
+        table,
+        f"\n{together} at a time. [dim]Nothing was run. Times are for one mission alone on an idle machine.[/]",
+    ]
+
+
+def _photographs(row: MissionRow) -> str:
+    if row.images is None:
+        return _DASH
+    return str(row.images) if row.registered is None else f"{row.registered} of {row.images}"
+
+
+def _accuracy(headline: Headline | None) -> tuple[str, str, str]:
+    if headline is None:
+        return _DASH, _DASH, _DASH
+    return headline.kind, ACCURACY_H.text(headline.rmse_h_m), ACCURACY_V.text(headline.rmse_v_m)
+
+
+def plan(
+    document: BlockPlan, states: Mapping[int, str], processor_s: Mapping[int, float] | None = None
+) -> list[Renderable]:
+    """Return the blocks of a plan, with what is known of their training.
+
+    Args:
+        document: the plan.
+        states: by number of the block: `trained`, or why it must be trained.
+        processor_s: predicted time of one core, by number of the block; None: unknown.
+    """
+    heads = ["block", "photographs", "Gaussians", "in a view", "memory"] + ["processor time"] * bool(processor_s)
+    table = plain_table(*heads, "", right=list(range(len(heads))))
+    for block in document.blocks:
+        table.add_row(
+            str(block.id),
+            str(len(block.cameras)),
+            f"{block.gaussians:,}".replace(",", " "),
+            f"{block.visible:,.0f}".replace(",", " "),
+            f"{block.peak_bytes / 2**30:.1f} GiB",
+            *([about(processor_s[block.id])] if processor_s else []),
+            shown(states.get(block.id, "")),
+        )
+    number = len(document.blocks)
+    whole = f"{number} blocks of {document.photographs} photographs, {document.gaussians} Gaussians in all"
+    if document.memory_bytes is not None:
+        whole += f", for workers with {document.memory_bytes / 2**30:.1f} GiB"
+    if processor_s:
+        whole += f"; about {about(sum(processor_s.values()))} of one core for all of them"
+    return [table, whole]

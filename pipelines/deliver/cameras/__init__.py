@@ -1,1 +1,0 @@
-"""Export of the trained cameras: COLMAP, nerfstudio, a table for surveyors, footprints for maps."""

@@ -1,1 +1,0 @@
-"""Point cloud: the fused surface of the trained model."""

@@ -1,1 +1,0 @@
-"""Stage `export-raster`: orthophoto, surface model and their σ as rasters in a CRS, contours and pictures."""

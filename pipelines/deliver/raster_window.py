@@ -1,0 +1,326 @@
+"""Cells of one window: colour, height and σ, from the view from above and from what the training views show.
+
+What the rasters are made from, read from the workspace.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.ndimage import binary_closing, binary_opening, uniform_filter
+
+from pipelines.adjust.accuracy_grid import AccuracyGrid
+from pipelines.core.errors import DegenerateGeometryError
+from pipelines.core.types import BoolArray, ByteArray, FloatArray, IntArray
+from pipelines.core.workspace import StageRun
+from pipelines.deliver.measurable import predicted_sigma
+from pipelines.deliver.options import ExportRasterOptions
+from pipelines.deliver.raster_plan import GroundSampling, PlanScene, dilation_cells2, samples_per_cell
+from pipelines.formats.geotiff import RasterFrame
+from pipelines.geometry.similarity import Similarity
+from pipelines.splat.gaussians import Gaussians
+from pipelines.splat.rasterizer.backends import rasterizer
+from pipelines.splat.rasterizer.orthographic import PlanView, render_orthographic
+from pipelines.surface.surface_views import ModelRenderer, SurfaceViews
+from pipelines.survey.scene import photographs
+from pipelines.survey.target_crs import TargetCrs
+from pipelines.survey.trained_survey import TrainedSurvey, scene_points
+
+_SOLID = 0.5  # least opacity of a surface
+_ONE_SURFACE_GSD = 4.0  # training pixels: largest spread of the heights of the Gaussians of one surface
+_AVERAGED = 5  # checked cells on a side over which the surface's own noise is averaged
+_MOST_THROUGH = 0.5  # largest number of views that look through a surface, as a part of those that agree
+# Checked cells: half the width of slivers that are dropped, and of gaps that are closed.
+_OPENED, _CLOSED = 2, 3
+_SIGMA_PX = 0.15  # of a ray through a photograph, in training pixels: by simulated flights
+_NODE_PX = 64  # cells between two nodes at which the georeference's σ is taken
+_NODES = 4  # nodes along each side, at which the way from the CRS to `geo` is fitted
+
+
+@dataclass(frozen=True)
+class RasterSource:
+    """What the windows of the rasters are made from.
+
+    Attributes:
+        scene: Gaussians over the plane.
+        views: depth maps of the training views.
+        geo_from_model: similarity.
+        target: the CRS.
+        sigma: predicted σ of the georeference over the scene; None: not known.
+        training_px: size of a training pixel on the ground, in cells.
+        height_unit_m: unit of the heights.
+        training_gsd_m: size of a training pixel on the ground.
+        min_views: least number of training views that show a cell's surface.
+    """
+
+    scene: PlanScene
+    views: SurfaceViews
+    geo_from_model: Similarity
+    target: TargetCrs
+    sigma: AccuracyGrid | None
+    training_px: float
+    height_unit_m: float
+    training_gsd_m: float
+    min_views: int
+
+
+@dataclass(frozen=True)
+class WindowCells:
+    """Cells of a window of H × W.
+
+    Attributes:
+        rgba: (4, H, W); alpha is 255 where there is a surface, else 0.
+        height: (H, W) in the CRS's unit; NaN: no surface.
+        sigma_h_m, sigma_v_m: (H, W) metres; NaN: no surface, or not known.
+    """
+
+    rgba: ByteArray
+    height: FloatArray
+    sigma_h_m: FloatArray
+    sigma_v_m: FloatArray
+
+
+def render_window(source: RasterSource, frame: RasterFrame, column: int, row: int) -> WindowCells:
+    """Return the cells of a window.
+
+    1. Heights are the depths at which the view from above is half opaque, or their mean if the Gaussians of a cell
+       lie on one surface.
+    2. A cell counts if enough training views show the surface there, and more than look through it. Nothing else
+       tells the seen ground from what training left where nobody looked.
+    3. σ is that of the georeference and of the surface. The surface's own is the RMS difference of the training
+       views from it: their errors correlate, and more views do not make them smaller.
+
+    Args:
+        source: the scene.
+        frame: of the window.
+        column, row: of its first cell in the raster.
+    """
+    inner = samples_per_cell(source.training_px)
+    view = _render(source, frame, column, row, inner)
+    depth = _depth(view, source)
+    middle = inner // 2
+    height = np.where(view.alpha > _SOLID, source.scene.level - depth, np.nan)[middle::inner, middle::inner]
+    colour, alpha = _reduced(view.colour, inner), _reduced(view.alpha, inner)
+    seen, noise_up_m, noise_h_m = _support(source, frame, height)
+    height = np.where(seen, height, np.nan)
+    solid = np.isfinite(height)
+    rgba = np.zeros((4, frame.rows, frame.columns), dtype=np.uint8)
+    # Colours were blended over black: what is not opaque would be dark.
+    rgb = np.clip(colour / np.maximum(alpha, _SOLID)[..., None], 0.0, 1.0)
+    rgba[:3] = np.where(solid, np.moveaxis(np.round(255 * rgb), 2, 0), 0)
+    rgba[3] = np.where(solid, 255, 0)
+    sigma_h, sigma_v = _georeference_sigma(source, frame, height)
+    sigma_h, sigma_v = np.hypot(sigma_h, noise_h_m), np.hypot(sigma_v, noise_up_m)
+    return WindowCells(rgba, height, np.where(solid, sigma_h, np.nan), np.where(solid, sigma_v, np.nan))
+
+
+def _render(source: RasterSource, frame: RasterFrame, column: int, row: int, inner: int) -> PlanView:
+    """Return the view with `inner` × `inner` samples a cell, blurred as the training was."""
+    splats = source.scene.splats
+    dilation = dilation_cells2(source.training_px) * inner**2
+    if inner > 1:
+        splats = splats.scaled(float(inner))
+    return render_orthographic(
+        splats,
+        frame.columns * inner,
+        frame.rows * inner,
+        corner=(float(column * inner), float(row * inner)),
+        dilation_px2=dilation,
+    )
+
+
+def _depth(view: PlanView, source: RasterSource) -> FloatArray:
+    """Return the depth of the surface: the mean of one surface is less noisy than the median."""
+    limit = _ONE_SURFACE_GSD * source.training_gsd_m / source.height_unit_m
+    one_surface = view.depth_variance < limit**2
+    return np.where(one_surface & (view.median_depth > 0), view.expected_depth, view.median_depth)
+
+
+def _reduced(values: FloatArray, inner: int) -> FloatArray:
+    """Return the mean over `inner` × `inner` samples."""
+    rows, columns = values.shape[0] // inner, values.shape[1] // inner
+    blocks = values.reshape(rows, inner, columns, inner, *values.shape[2:])
+    return np.asarray(blocks.mean(axis=(1, 3)))
+
+
+def _support(
+    source: RasterSource, frame: RasterFrame, height: FloatArray
+) -> tuple[BoolArray, FloatArray, FloatArray]:
+    """Return which cells are seen (H, W), and the surface's own noise (H, W), up and horizontal, in metres.
+
+    Training pixels that are larger than the cells are checked once.
+    """
+    stride = max(int(source.training_px), 1)
+    rows, columns = (
+        np.minimum(np.arange(stride // 2, size + stride // 2, stride), size - 1) for size in height.shape
+    )
+    checked = height[np.ix_(rows, columns)]
+    at_row, at_column = np.nonzero(np.isfinite(checked))
+    up, horizontal = np.zeros(checked.shape), np.zeros(checked.shape)
+    seen = np.zeros(checked.shape, dtype=bool)
+    if len(at_row):
+        cell = np.column_stack([columns[at_column], rows[at_row]]) + 0.5
+        in_geo = _in_geo(source, frame, cell, checked[at_row, at_column])
+        support = source.views.support(source.geo_from_model.inverse().apply(in_geo))
+        # All views may agree on a wrong surface where their rays meet at small angles.
+        lateral_m = _SIGMA_PX * source.training_gsd_m / np.sqrt(np.maximum(support.views, 1))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            square = np.nan_to_num(support.rms_up_m**2 + (lateral_m / support.spread_rad) ** 2, nan=np.inf)
+        enough = (support.views >= source.min_views) & (support.seen_through <= _MOST_THROUGH * support.views)
+        shown = enough & (square < source.training_gsd_m**2)
+        seen[at_row, at_column] = shown
+        up[at_row, at_column] = np.where(shown, square, 0.0)
+        horizontal[at_row, at_column] = 2 * up[at_row, at_column] * np.nan_to_num(support.spread_rad) ** 2
+    weight = uniform_filter(seen.astype(np.float64), _AVERAGED, mode="constant")
+    noise_up_m, noise_h_m = (
+        np.sqrt(
+            np.maximum(uniform_filter(square, _AVERAGED, mode="constant"), 0.0)
+            / np.maximum(weight, 0.5 / _AVERAGED**2)
+        )
+        for square in (up, horizontal)
+    )
+    seen = _tidied(seen)
+    row_of = np.minimum(np.arange(height.shape[0]) // stride, len(rows) - 1)
+    column_of = np.minimum(np.arange(height.shape[1]) // stride, len(columns) - 1)
+    whole = np.ix_(row_of, column_of)
+    return seen[whole], noise_up_m[whole], noise_h_m[whole]
+
+
+def _tidied(seen: BoolArray) -> BoolArray:
+    """Return seen cells (H, W) without slivers and narrow gaps.
+
+    Slivers are agreements by chance. At the edge of a roof no view agrees with the mixed height of a cell, and
+    cells between seen ones were seen too.
+    """
+    margin = _OPENED + _CLOSED
+    wider = binary_opening(np.pad(seen, margin, mode="edge"), iterations=_OPENED)
+    wider = binary_closing(wider, iterations=_CLOSED)
+    return np.asarray(wider[margin:-margin, margin:-margin])
+
+
+def _every(stride: int, size: int) -> IntArray:
+    """Return the middle cell of each run of `stride` cells."""
+    return np.minimum(np.arange(stride // 2, size + stride // 2, stride), size - 1)
+
+
+def _in_geo(source: RasterSource, frame: RasterFrame, cell: FloatArray, height: FloatArray) -> FloatArray:
+    """Return places (K, 3) in `geo` of cells (K, 2) and heights (K,), to a fraction of a millimetre.
+
+    Within a window the way from the CRS to `geo` is a quadratic: it is fitted to exactly transformed nodes.
+    """
+    low = np.array([0.0, 0.0, height.min()])
+    size = np.array([frame.columns, frame.rows, max(height.max() - height.min(), 1.0)])
+    nodes = np.stack(np.meshgrid(*3 * (np.linspace(0, 1, _NODES),), indexing="ij"), axis=-1).reshape(-1, 3)
+    place = low + nodes * size
+    xyz = np.column_stack(
+        [frame.west + place[:, 0] * frame.step_x, frame.north - place[:, 1] * frame.step_y, place[:, 2]]
+    )
+    coefficients = np.linalg.lstsq(_quadratic(nodes), source.target.geo_from_xyz(xyz), rcond=None)[0]
+    return np.asarray(_quadratic((np.column_stack([cell, height]) - low) / size) @ coefficients)
+
+
+def _quadratic(x: FloatArray) -> FloatArray:
+    products = [x[:, i] * x[:, j] for i in range(3) for j in range(i, 3)]
+    return np.column_stack([np.ones(len(x)), x, *products])
+
+
+def _georeference_sigma(
+    source: RasterSource, frame: RasterFrame, height: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return σ_H and σ_V (H, W) of the georeference in metres; NaN: not known."""
+    if source.sigma is None or not np.isfinite(height).any():
+        return np.full(height.shape, np.nan), np.full(height.shape, np.nan)
+    columns, rows = (np.linspace(0, size, size // _NODE_PX + 2) for size in (frame.columns, frame.rows))
+    cell = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+    in_geo = _in_geo(source, frame, cell, np.full(len(cell), np.nanmedian(height)))
+    sigma = source.sigma.sigma_at(in_geo)
+    shape = (len(rows), len(columns))
+    spread = _spread(rows, frame.rows), _spread(columns, frame.columns)
+    horizontal, vertical = np.hypot(sigma[:, 0], sigma[:, 1]).reshape(shape), sigma[:, 2].reshape(shape)
+    return spread[0] @ horizontal @ spread[1].T, spread[0] @ vertical @ spread[1].T
+
+
+def _spread(nodes: FloatArray, cells: int) -> FloatArray:
+    """Return the weights (cells, nodes) that interpolate linearly from nodes to the middles of cells."""
+    middle = np.arange(cells) + 0.5
+    return np.stack([np.interp(middle, nodes, unit) for unit in np.eye(len(nodes))], axis=1)
+
+
+_LEAST_OPACITY = 1 / 255
+_AROUND = 0.1  # of the scene's extent: Gaussians further outside it, in plan, reach into no cell
+_HAZE_VIEWS = 2  # training views that look through a Gaussian, and none that shows a surface there
+
+
+@dataclass(frozen=True)
+class Request:
+    """What rasters are wanted of what survey."""
+
+    trained: TrainedSurvey
+    target: TargetCrs
+    frame: RasterFrame
+    sampling: GroundSampling
+    options: ExportRasterOptions
+
+
+def raster_source(stage: StageRun, wanted: Request) -> tuple[RasterSource, str]:
+    """Return what the windows are made from, and the reason why σ is not known, or an empty text.
+
+    Args:
+        stage: the run; its folder holds the depth maps until the stage ends.
+        wanted: the rasters.
+
+    Raises:
+        InputError: a photograph cannot be read, or the depth maps do not fit on the disk.
+        DegenerateGeometryError: no Gaussian lies within the scene.
+    """
+    trained, target, frame = wanted.trained, wanted.target, wanted.frame
+    images = photographs(trained.sfm, trained.survey, stage.workspace, trained.model.max_image_size)
+    images.build(stage.progress)
+    renderer = ModelRenderer(trained, images, rasterizer("auto", stage.progress))
+    views = SurfaceViews(renderer, stage.out / "depth_maps", confirmed=True, progress=stage.progress)
+    training_px = wanted.sampling.training_m / (frame.step_x * target.horizontal_unit_m)
+    gaussians = _within(trained, trained.gaussians)
+    scene = PlanScene(
+        _without_haze(gaussians, views),
+        trained.geo_from_model,
+        target,
+        frame,
+        centers_in_model=trained.poses.cam_center_in_model[trained.indices("train")],
+        training_px=training_px,
+    )
+    sigma, no_sigma = predicted_sigma(stage.workspace, trained)
+    source = RasterSource(
+        scene=scene,
+        views=views,
+        geo_from_model=trained.geo_from_model,
+        target=target,
+        sigma=sigma,
+        training_px=training_px,
+        height_unit_m=target.height_unit_m,
+        training_gsd_m=wanted.sampling.training_m,
+        min_views=wanted.options.min_views,
+    )
+    return source, no_sigma
+
+
+def _within(trained: TrainedSurvey, gaussians: Gaussians) -> Gaussians:
+    """Return the Gaussians that reach into the scene; far ones may lie outside the domain of the CRS."""
+    points = scene_points(trained)
+    low, high = points.min(axis=0), points.max(axis=0)
+    around = float(np.linalg.norm(high - low)) * np.array([_AROUND, _AROUND, 1.0])  # masts stand above all points
+    in_geo = trained.geo_from_model.apply(gaussians.means.numpy())
+    inside = ((in_geo >= low - around) & (in_geo <= high + around)).all(axis=1)
+    solid = torch.sigmoid(gaussians.logit_opacities) >= _LEAST_OPACITY
+    chosen = gaussians.select(solid & torch.from_numpy(inside))
+    if len(chosen) == 0:
+        raise DegenerateGeometryError("no Gaussian lies within the scene of the SfM points: train again")
+    return chosen
+
+
+def _without_haze(gaussians: Gaussians, views: SurfaceViews) -> Gaussians:
+    """Return the Gaussians without those in the air, through which the training views look at the surface."""
+    support = views.support(gaussians.means.double().numpy())
+    haze = (support.views == 0) & (support.seen_through >= _HAZE_VIEWS)
+    return gaussians.select(torch.from_numpy(~haze))

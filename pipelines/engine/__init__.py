@@ -1,1 +1,0 @@
-"""Engine: commands of this program as jobs, several at a time, for work that consists of many parts."""

@@ -1,0 +1,314 @@
+"""Comparison of the surface of a trained survey with a reference cloud, square by square in bounded memory.
+
+1. The model's cloud is the one that `export-cloud` writes: fused depth maps, and not the centres of Gaussians.
+2. The reference is read twice. A first pass keeps one point a voxel of 0.25 m, for what photographs saw and for the
+   shift between the clouds. A second pass sorts all points into squares on the disk.
+3. In each square, distances are measured both ways and along the reference's normals (`distances`).
+4. Recall counts points that three photographs saw, and precision the model's points where the reference covers the
+   plan.
+
+Cautions of a comparison with a reference.
+
+Map and histogram of a comparison with a reference.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from pipelines.adjust.accuracy_grid import AccuracyGrid
+from pipelines.core.errors import DegenerateGeometryError
+from pipelines.core.files import remove
+from pipelines.core.products import Caution, is_checked
+from pipelines.core.progress import Progress
+from pipelines.core.stages import REFERENCE_HISTOGRAM, REFERENCE_MAP
+from pipelines.core.types import FloatArray
+from pipelines.evaluate.options import EvaluateOptions
+from pipelines.evaluate.reference_distances import (
+    CLASSES,
+    Box,
+    ComparisonSettings,
+    TiledPoints,
+    compare_square,
+    plane_normals,
+    require_m3c2,
+)
+from pipelines.evaluate.reference_figures import THRESHOLDS_M, CoreTable, DistanceTally, level_of_detection
+from pipelines.geodesy.enu import Origin
+from pipelines.geometry.footprints import first_of_voxels
+from pipelines.geometry.similarity import Similarity
+from pipelines.report.plots.charts import write_distance_histogram, write_distance_map
+from pipelines.surface.fusion import FusionSettings, fused_squares, fusion_settings
+from pipelines.surface.measured_cloud import CloudFiles, MeasuredCloud, Thinning, read_thinned
+from pipelines.surface.registration import Fit, fit_alignment
+from pipelines.surface.surface_views import ModelRenderer, SurfaceViews
+from pipelines.surface.visibility import SeenSurface, Viewpoints, seen_surface
+from pipelines.survey.options import CloudCrs
+from pipelines.survey.report_parts import ReferenceComparison
+from pipelines.survey.trained_survey import TrainedSurvey, scene_points
+
+_SQUARE_M = 32.0  # two million points of the reference at the most, in voxels of 0.025 m
+_OVERVIEW_M, _MOST_OVERVIEW = 0.25, 10_000_000
+_MARGIN_M, _MARGIN_UP_M = 10.0, 100.0  # around the SfM points: heights of a wrong datum are off by up to 100 m
+_LEAST_VIEWS = 3  # that agree on a point of the model, as in `export-cloud`
+_SAMPLE = 20_000  # points of the reference that tell its spacing
+
+
+@dataclass(frozen=True)
+class ComparedReference:
+    """Figures of the comparison, and the core points for map and histogram."""
+
+    comparison: ReferenceComparison
+    table: CoreTable
+    assumptions: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Model:
+    """The model's cloud, and the similarity by which it was moved; None: it was not."""
+
+    points: TiledPoints
+    settings: FusionSettings
+    fit: Fit | None
+    moved: Similarity | None
+
+
+def open_reference(options: EvaluateOptions) -> CloudFiles | None:
+    """Return the reference of `--reference`, its headers and CRS checked; None without that option.
+
+    Raises:
+        BackendUnavailableError: py4dgeo is not installed.
+        InputError: an unreadable file, or no CRS.
+    """
+    if options.reference is None:
+        return None
+    require_m3c2()
+    stated = CloudCrs(options.reference_crs, options.reference_vertical, "--reference")
+    return CloudFiles(options.reference, stated)
+
+
+def compare_with_reference(
+    renderer: ModelRenderer,
+    files: CloudFiles,
+    grid: AccuracyGrid | None,
+    options: EvaluateOptions,
+    *,
+    scratch: Path,
+    progress: Progress,
+) -> ComparedReference:
+    """Return the comparison of a trained survey with a reference.
+
+    Args:
+        renderer: of the trained model.
+        files: the reference.
+        grid: predicted σ of the georeference; None: not known.
+        options: of the stage, with `reference`.
+        scratch: folder for depth maps and sorted points; removed at the end.
+        progress: shows depth maps, points and squares.
+
+    Raises:
+        InputError: a damaged file, a missing grid, a reference of another place, or no room on the disk.
+        DegenerateGeometryError: the views agree on no point of a surface, or nothing tells how to move the model.
+    """
+    assert options.reference is not None  # the caller opened its files
+    trained = renderer.trained
+    box = _bounds(trained)
+    thinning = Thinning(_OVERVIEW_M, _MOST_OVERVIEW, *box)
+    overview = read_thinned(files, trained.survey.origin, thinning, progress)
+    model = _model(renderer, overview, options, scratch, progress)
+    seen = seen_surface(_viewpoints(renderer, model.moved), overview.position_in_geo, overview.voxel_m, progress)
+    reference = _sorted_reference(files, trained.survey.origin, box, scratch / "reference", progress)
+    spacing_m = _spacing(reference)
+    settings = ComparisonSettings.of_spacings(spacing_m, model.settings.spacing_m, min(THRESHOLDS_M), box)
+    tally = _compare(reference, model.points, seen, settings, progress)
+    cores = tally.cores()
+    sigma_m = _georeference_sigma(cores.position, cores.normal, trained, grid)
+    known = np.zeros(len(cores.position)) if sigma_m is None or model.moved is not None else sigma_m
+    lod_m = level_of_detection(cores.noise_m, np.hypot(known, options.reference_sigma))
+    table = CoreTable(cores, lod_m)
+    comparison = ReferenceComparison(
+        name=options.reference.name,
+        crs=files.crs_names,
+        points=tally.points,
+        seen=tally.seen / max(tally.points, 1),
+        spacing_m=spacing_m,
+        model_points=len(model.points),
+        model_spacing_m=model.settings.spacing_m,
+        sigma_m=options.reference_sigma,
+        georeference_sigma_m=None if sigma_m is None or not len(sigma_m) else float(np.median(sigma_m)),
+        shift=None if model.fit is None else model.fit.shift,
+        aligned="none" if model.moved is None else options.reference_align,
+        cylinder_m=settings.core_m,
+        groups=tally.groups(table),
+    )
+    remove(scratch)
+    return ComparedReference(comparison, table, files.assumptions)
+
+
+def _compare(
+    reference: TiledPoints,
+    model: TiledPoints,
+    seen: SeenSurface,
+    settings: ComparisonSettings,
+    progress: Progress,
+) -> DistanceTally:
+    tally, squares = DistanceTally(), sorted(reference.squares | model.squares)
+    with progress.task("squares of the reference", len(squares)) as task:
+        for square in squares:
+            tally.add(compare_square(square, reference, model, seen, settings))
+            task.advance()
+    return tally
+
+
+def _bounds(trained: TrainedSurvey) -> Box:
+    """Return the corners (3,) of the box around the scene; a reference may lie above or below it."""
+    points = scene_points(trained)
+    margin = np.array([_MARGIN_M, _MARGIN_M, _MARGIN_UP_M])
+    return points.min(axis=0) - margin, points.max(axis=0) + margin
+
+
+def _model(
+    renderer: ModelRenderer, overview: MeasuredCloud, options: EvaluateOptions, scratch: Path, progress: Progress
+) -> _Model:
+    """Return the model's cloud in squares, and its shift against the reference."""
+    geo_from_model = renderer.trained.geo_from_model
+    views = SurfaceViews(renderer, scratch / "depth_maps", colours=True, confirmed=True, progress=progress)
+    settings = fusion_settings(views, geo_from_model, _LEAST_VIEWS)
+    delivered = TiledPoints(scratch / "delivered", _SQUARE_M)
+    sample = []
+    for square in fused_squares(views, geo_from_model, settings, progress):
+        delivered.append(square.position, square.normal, None)
+        sample.append(square.position[first_of_voxels(square.position, 2 * _OVERVIEW_M)])
+    views.close()
+    if not len(delivered):
+        raise DegenerateGeometryError("no point of the surface is seen alike by three training views: train longer")
+    sparse = overview.position_in_geo[first_of_voxels(overview.position_in_geo, 2 * _OVERVIEW_M)]
+    normal, kind = plane_normals(sparse, 2 * _OVERVIEW_M), options.reference_align
+    fit = fit_alignment(np.concatenate(sample), sparse, normal, 2 * _OVERVIEW_M, kind)
+    if kind == "none":
+        return _Model(delivered, settings, fit, None)
+    if fit is None:
+        raise DegenerateGeometryError(
+            f"--reference-align {kind}: the surface and the reference have too little in common to move one onto "
+            "the other, or nothing in them fixes all axes: compare without it"
+        )
+    similarity = fit.reference_from_model
+    return _Model(_moved(delivered, similarity, scratch / "moved"), settings, fit, similarity)
+
+
+def _moved(points: TiledPoints, similarity: Similarity, folder: Path) -> TiledPoints:
+    """Return points in the place that a similarity gives them."""
+    moved = TiledPoints(folder, points.side_m)
+    for square in sorted(points.squares):
+        rows, own = points.around(square, 0.0)
+        normal = rows["normal"][own] @ similarity.rotation.T
+        moved.append(similarity.apply(rows["position"][own]), normal, None)
+    return moved
+
+
+def _viewpoints(renderer: ModelRenderer, moved: Similarity | None) -> Viewpoints:
+    """Return the training cameras in geo, moved as the model's cloud was."""
+    trained = renderer.trained
+    cameras, poses = trained.indices("train"), trained.poses
+    similarity = trained.geo_from_model if moved is None else moved @ trained.geo_from_model
+    return Viewpoints(
+        poses.cam_from_model[cameras] @ similarity.rotation.T,
+        similarity.apply(poses.cam_center_in_model[cameras]),
+        tuple(renderer.pinhole(index) for index in cameras),
+    )
+
+
+def _sorted_reference(files: CloudFiles, origin: Origin, box: Box, folder: Path, progress: Progress) -> TiledPoints:
+    """Return the points of the reference within the box of the scene, in squares."""
+    (low, high), reference = box, TiledPoints(folder, _SQUARE_M)
+    for chunk in files.chunks(origin, progress):
+        place = chunk.position_in_geo
+        inside = ((place >= low) & (place <= high)).all(axis=1)
+        reference.append(place[inside], None, chunk.classification[inside])
+    return reference
+
+
+def _spacing(reference: TiledPoints) -> float:
+    """Return the median distance between neighbours, in the square with the most points."""
+    rows, own = max((reference.around(square, 0.0) for square in reference.squares), key=lambda part: len(part[0]))
+    place = rows["position"][own]
+    place = place[first_of_voxels(place, min(THRESHOLDS_M) / 2)]
+    chosen = np.random.default_rng(0).permutation(len(place))[:_SAMPLE]
+    if len(place) < 2:
+        return _SQUARE_M
+    return float(np.median(cKDTree(place).query(place[chosen], k=2)[0][:, 1]))
+
+
+def _georeference_sigma(
+    position: FloatArray,
+    normal: FloatArray,
+    trained: TrainedSurvey,
+    grid: AccuracyGrid | None,
+) -> FloatArray | None:
+    """Return the predicted σ (C,) of the georeference along normals; None: not known."""
+    if grid is None or not len(position) or not is_checked(trained.model.cautions):
+        return None
+    return np.asarray(np.sqrt(np.einsum("ci,cij,cj->c", normal, grid.cov_at(position), normal)))
+
+
+_SHIFTED_SIGMAS = 3.0
+_SEEN = 0.05
+
+
+def cautions_of_reference(found: ComparedReference) -> tuple[Caution, ...]:
+    """Return the limits of a comparison with a reference."""
+    comparison, sentences = found.comparison, []
+    for assumption in found.assumptions:
+        sentences.append(("reference-heights", assumption[0].upper() + assumption[1:] + "."))
+    fine = max(comparison.spacing_m, comparison.model_spacing_m)
+    least = comparison.groups[0].scores[0].threshold_m
+    if fine > least:
+        sentences.append(
+            (
+                "reference-spacing",
+                f"Points are {fine:.3f} m apart: shares within shorter distances, and C2C, say more about the "
+                "spacing than about the surface. M3C2 does not depend on it.",
+            )
+        )
+    shift = comparison.shift
+    if shift is not None and comparison.aligned == "none":
+        sigma = [max(s, comparison.georeference_sigma_m or 0.0, comparison.sigma_m) for s in shift.sigma_m]
+        if any(abs(value) > _SHIFTED_SIGMAS * s for value, s in zip(shift.enu_m, sigma, strict=True)):
+            sentences.append(
+                (
+                    "reference-shifted",
+                    "The model lies off the reference as a whole: moving it by "
+                    f"{shift.enu_m[0]:+.3f} m east, {shift.enu_m[1]:+.3f} m north and {shift.enu_m[2]:+.3f} m up "
+                    "fits best, which is more than three times the σ of both (--reference-align shift judges the "
+                    "shape alone).",
+                )
+            )
+    if comparison.seen < _SEEN:
+        sentences.append(
+            (
+                "reference-unseen",
+                f"Photographs saw {100 * comparison.seen:.1f} % of the reference's points within the scene.",
+            )
+        )
+    return tuple(Caution(code=code, sentence=sentence) for code, sentence in sentences)
+
+
+def draw_reference(found: ComparedReference, folder: Path) -> None:
+    """Write map and histogram of the distances along the normals; nothing if none was measured."""
+    cores, lod_m = found.table.cores, found.table.lod_m
+    known = np.isfinite(cores.distance_m)
+    if not known.any():
+        return
+    distance_m, kind = cores.distance_m[known], cores.kinds.of_class[known]
+    groups = {name: distance_m[kind == place] for place, name in enumerate(CLASSES) if (kind == place).any()}
+    if len(groups) == 1:
+        groups = {"all": distance_m}
+    place, size_m = cores.position[known], found.comparison.cylinder_m
+    write_distance_map(folder / REFERENCE_MAP.rpartition("/")[2], place[:, :2], distance_m, size_m)
+    write_distance_histogram(
+        folder / REFERENCE_HISTOGRAM.rpartition("/")[2], groups, float(np.median(lod_m[known]))
+    )

@@ -1,1 +1,0 @@
-"""Comparison of the model's surface with a reference cloud."""

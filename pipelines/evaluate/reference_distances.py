@@ -1,0 +1,420 @@
+"""Distances between the model's cloud and the reference in one square of the plan.
+
+Distances between two clouds along the normals of one of them (M3C2), by py4dgeo.
+
+Lague, Brodu and Leroux 2013, doi 10.1016/j.isprsjprs.2013.04.009.
+
+Normals of a cloud from the nearest points.
+
+Points of clouds on the disk, by squares of the plan: memory holds one square and its margin.
+"""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from pipelines.core.errors import BackendUnavailableError, InputError
+from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
+from pipelines.geometry.footprints import first_of_voxels
+from pipelines.surface.visibility import SeenSurface
+
+LEAST_POINTS = 4  # in the cylinder, of each cloud
+CONFIDENCE_95 = 1.96
+
+
+@dataclass(frozen=True)
+class M3c2Distances:
+    """Distances at C core points.
+
+    Attributes:
+        distance_m: (C,) second cloud minus first along the normals; NaN where one has too few points.
+        noise_m: (C,) σ of the distance that the roughness of both clouds causes.
+    """
+
+    distance_m: FloatArray
+    noise_m: FloatArray
+
+
+def require_m3c2() -> None:
+    """Import py4dgeo, so that its absence is told before work starts.
+
+    Raises:
+        BackendUnavailableError: py4dgeo is not installed.
+    """
+    _py4dgeo()
+
+
+def m3c2(
+    first: FloatArray,
+    second: FloatArray,
+    core: FloatArray,
+    normal: FloatArray,
+    *,
+    radius_m: float,
+    reach_m: float,
+) -> M3c2Distances:
+    """Return the distances of two clouds at core points.
+
+    Args:
+        first: (P, 3) metres.
+        second: (Q, 3) metres.
+        core: (C, 3) places.
+        normal: (C, 3) unit vectors.
+        radius_m: of the cylinders.
+        reach_m: half the length of the cylinders: the largest distance that is found.
+    """
+    nothing = np.full(len(core), np.nan)
+    if not (len(core) and len(first) and len(second)):
+        return M3c2Distances(nothing, nothing.copy())
+    py4dgeo = _py4dgeo()
+    middle = core.mean(axis=0)
+    algorithm = py4dgeo.M3C2(
+        epochs=(py4dgeo.Epoch(first - middle), py4dgeo.Epoch(second - middle)),
+        corepoints=np.ascontiguousarray(core - middle),
+        corepoint_normals=np.ascontiguousarray(normal, dtype=np.float64),
+        cyl_radius=radius_m,
+        max_distance=reach_m,
+    )
+    distance, uncertainty = algorithm.run()
+    known = (uncertainty["num_samples1"] >= LEAST_POINTS) & (uncertainty["num_samples2"] >= LEAST_POINTS)
+    known &= np.isfinite(distance)
+    with np.errstate(invalid="ignore"):
+        noise = uncertainty["lodetection"] / CONFIDENCE_95
+    return M3c2Distances(np.where(known, distance, np.nan), np.where(known, noise, np.nan))
+
+
+def _py4dgeo() -> Any:
+    try:
+        import py4dgeo
+    except ImportError as error:
+        message = "--reference needs py4dgeo: pip install 'georefgs[reference]'"
+        raise BackendUnavailableError(message) from error
+    # It logs to stdout, which belongs to our results, and into a file of the current folder.
+    log = logging.getLogger("py4dgeo")
+    for handler in list(log.handlers):
+        log.removeHandler(handler)
+    log.setLevel(logging.WARNING)
+    return py4dgeo
+
+
+_NEIGHBOURS = 16
+_FARTHEST = 6.0  # spacings: a point whose neighbours lie further off stands alone
+
+
+def plane_normals(position: FloatArray, spacing_m: float) -> FloatArray:
+    """Return unit normals (P, 3), upwards, of planes through the neighbours of points; NaN for lone points.
+
+    Args:
+        position: (P, 3) metres, about `spacing_m` apart.
+        spacing_m: between the points.
+    """
+    count = min(_NEIGHBOURS, len(position))
+    if count < 4:
+        return np.full(position.shape, np.nan)
+    distance, row = cKDTree(position).query(position, k=count)
+    arm = position[row] - position[row].mean(axis=1, keepdims=True)
+    _, axes = np.linalg.eigh(np.einsum("pki,pkj->pij", arm, arm))
+    normal = axes[:, :, 0] * np.where(axes[:, 2:, 0] < 0, -1.0, 1.0)
+    lone = distance[:, count // 2] > _FARTHEST * spacing_m
+    return np.where(lone[:, None], np.nan, normal)
+
+
+Square = tuple[int, int]
+_ROW = np.dtype([("position", "<f8", 3), ("normal", "<f4", 3), ("classification", "u1")])
+_SPARE_BYTES = 1 << 28  # of the disk, to be left free
+
+
+class TiledPoints:
+    """Points in `geo` with a normal and a class, in a file a square.
+
+    Args:
+        folder: scratch folder, made if missing.
+        side_m: of the squares.
+    """
+
+    def __init__(self, folder: Path, side_m: float) -> None:
+        self.side_m = side_m
+        self._folder = folder
+        self._count: dict[Square, int] = {}
+        folder.mkdir(parents=True, exist_ok=True)
+
+    def __len__(self) -> int:
+        """Return the number of points."""
+        return sum(self._count.values())
+
+    @property
+    def squares(self) -> set[Square]:
+        """Squares that hold points."""
+        return set(self._count)
+
+    def append(
+        self, position: FloatArray, normal: FloatArray | Float32Array | None, classification: ByteArray | None
+    ) -> None:
+        """Append points.
+
+        Args:
+            position: (P, 3) in geo, metres.
+            normal: (P, 3); None: unknown, written as zeros.
+            classification: (P,) class of LAS; None: 0.
+
+        Raises:
+            InputError: the disk is full.
+        """
+        rows = np.zeros(len(position), dtype=_ROW)
+        if shutil.disk_usage(self._folder).free < rows.nbytes + _SPARE_BYTES:
+            raise InputError("no room for the points that are compared: make room on this disk", path=self._folder)
+        rows["position"] = position
+        if normal is not None:
+            rows["normal"] = normal
+        if classification is not None:
+            rows["classification"] = classification
+        square = np.floor(position[:, :2] / self.side_m).astype(np.int64)
+        order = np.lexsort(square.T)
+        starts = np.flatnonzero(np.any(np.diff(square[order], axis=0, prepend=square[order][:1] - 1), axis=1))
+        for part in np.split(order, starts[1:]) if len(order) else []:
+            name = (int(square[part[0], 0]), int(square[part[0], 1]))
+            with self._path(name).open("ab") as file:
+                file.write(rows[part].tobytes())
+            self._count[name] = self._count.get(name, 0) + len(part)
+
+    def around(self, square: Square, margin_m: float) -> tuple[NDArray[np.void], NDArray[np.bool_]]:
+        """Return the rows in a square and its margin, and which of them lie in the square itself."""
+        reach = int(np.ceil(margin_m / self.side_m))
+        names = [
+            (square[0] + across, square[1] + along)
+            for across in range(-reach, reach + 1)
+            for along in range(-reach, reach + 1)
+        ]
+        parts = [np.fromfile(self._path(name), dtype=_ROW) for name in names if name in self._count]
+        rows = np.concatenate([np.empty(0, dtype=_ROW), *parts])
+        offset = rows["position"][:, :2] - self.side_m * np.array(square)
+        near = ((offset >= -margin_m) & (offset < self.side_m + margin_m)).all(axis=1)
+        rows, offset = rows[near], offset[near]
+        return rows, np.asarray(((offset >= 0) & (offset < self.side_m)).all(axis=1))
+
+    def _path(self, square: Square) -> Path:
+        return self._folder / f"{square[0]}_{square[1]}.points"
+
+
+CLASSES = ("other", "ground", "roof", "wall", "vegetation")
+SLOPES = ("0–15°", "15–45°", "45–75°", "75–90°")
+_SLOPE_LIMITS_DEG = (15.0, 45.0, 75.0)
+_WALL_DEG = 60.0  # a steeper part of a building is no roof
+_GROUND, _BUILDING, _VEGETATION = (2,), (6,), (3, 4, 5)  # classes of LAS
+FARTHEST_M = 2.0  # of the nearest points that are looked for
+_REACH_M = 1.0  # of the cylinders
+_MOST_POINTS = 2_000_000  # of a cloud in a square, for M3C2: seconds
+Box = tuple[FloatArray, FloatArray]
+_CORE_SPACINGS = 3.0  # between core points: a cylinder of this radius holds about 28 points of a surface
+
+
+@dataclass(frozen=True)
+class ComparisonSettings:
+    """Settings of the comparison, in metres.
+
+    Attributes:
+        voxel_m: side of the voxels of which one point of the reference counts.
+        core_m: between core points, and radius of the cylinders.
+        cover_m: side of the cells of the plan that the reference covers if they hold one of its points.
+        cut: corners (3,) of the box outside of which the reference was left out; None: all of it is there.
+    """
+
+    voxel_m: float
+    core_m: float
+    cover_m: float
+    cut: Box | None = None
+
+    @classmethod
+    def of_spacings(
+        cls, reference_m: float, model_m: float, least_threshold_m: float, cut: Box | None
+    ) -> ComparisonSettings:
+        """Return the settings for clouds with a distance between neighbours, and for a least threshold."""
+        spacing_m = max(reference_m, model_m, least_threshold_m / 2)
+        return cls(least_threshold_m / 2, _CORE_SPACINGS * spacing_m, max(1.0, 4 * reference_m), cut)
+
+    def uncut(self, place: FloatArray) -> BoolArray:
+        """Return at which of places (P, 3) a cylinder is not cut in the plan.
+
+        A cut one holds points of the model alone on its outer side, whose mean height is another on uneven ground.
+        """
+        if self.cut is None:
+            return np.ones(len(place), dtype=bool)
+        low, high = self.cut
+        inside = (place[:, :2] >= low[:2] + self.core_m) & (place[:, :2] <= high[:2] - self.core_m)
+        return np.asarray(inside.all(axis=1))
+
+
+@dataclass(frozen=True)
+class Kinds:
+    """Class and slope of P points.
+
+    Attributes:
+        of_class: (P,) index in `CLASSES`.
+        of_slope: (P,) index in `SLOPES`; the number of slopes where the slope is not known.
+    """
+
+    of_class: IntArray
+    of_slope: IntArray
+
+    def part(self, rows: IntArray | BoolArray) -> Kinds:
+        """Return the kinds of some rows."""
+        return Kinds(self.of_class[rows], self.of_slope[rows])
+
+
+@dataclass(frozen=True)
+class CorePoints:
+    """M3C2 at C places of the reference that photographs saw.
+
+    Attributes:
+        position: (C, 3) in geo.
+        normal: (C, 3) towards the cameras.
+        distance_m: (C,) model minus reference; NaN: not measured.
+        noise_m: (C,) σ from the roughness of both clouds.
+        kinds: class and slope.
+    """
+
+    position: FloatArray
+    normal: FloatArray
+    distance_m: FloatArray
+    noise_m: FloatArray
+    kinds: Kinds
+
+
+@dataclass(frozen=True)
+class SquareDistances:
+    """Distances in one square, in metres; those beyond `FARTHEST_M` are infinite.
+
+    Attributes:
+        to_reference_m: (M,) of the model's points that the reference covers.
+        model_kinds: class and slope of the nearest points of the reference.
+        to_model_m: (R,) of the reference's points that photographs saw.
+        reference_kinds: their class and slope.
+        points: number of the reference's points, seen or not.
+        cores: M3C2.
+    """
+
+    to_reference_m: FloatArray
+    model_kinds: Kinds
+    to_model_m: FloatArray
+    reference_kinds: Kinds
+    points: int
+    cores: CorePoints
+
+
+def compare_square(
+    square: Square,
+    reference: TiledPoints,
+    model: TiledPoints,
+    seen: SeenSurface,
+    settings: ComparisonSettings,
+) -> SquareDistances:
+    """Return the distances between two clouds in a square."""
+    margin_m = FARTHEST_M + 3 * settings.core_m
+    rows, own = reference.around(square, margin_m)
+    every = _at_random(rows["position"])
+    kept = first_of_voxels(rows["position"], settings.voxel_m)
+    rows, own = rows[kept], own[kept]
+    model_rows, model_own = model.around(square, margin_m)
+    place, normal, kinds = rows["position"], *_surface(rows, model_rows, settings)
+    is_seen = np.zeros(len(rows), dtype=bool)
+    is_seen[own] = seen.sees(place[own])
+    to_model, _ = _nearest(place[is_seen], model_rows["position"])
+    covered = model_own & _covered(model_rows["position"], place, settings.cover_m)
+    to_reference, nearest = _nearest(model_rows["position"][covered], place)
+    usable = np.flatnonzero(is_seen & np.isfinite(normal[:, 0]) & settings.uncut(place))
+    cores = usable[first_of_voxels(place[usable], settings.core_m)]
+    model_every = _at_random(model_rows["position"])
+    measured = m3c2(every, model_every, place[cores], normal[cores], radius_m=settings.core_m, reach_m=_REACH_M)
+    return SquareDistances(
+        to_reference,
+        kinds.part(nearest),
+        to_model,
+        kinds.part(is_seen),
+        int(own.sum()),
+        CorePoints(place[cores], normal[cores], measured.distance_m, measured.noise_m, kinds.part(cores)),
+    )
+
+
+def kinds_of(classification: NDArray[np.uint8], normal: FloatArray) -> Kinds:
+    """Return class and slope of points.
+
+    Args:
+        classification: (P,) of LAS.
+        normal: (P, 3) unit vectors with an arbitrary sign; NaN: not known.
+    """
+    slope = np.degrees(np.arccos(np.clip(np.abs(normal[:, 2]), 0, 1)))
+    steep = slope > _WALL_DEG
+    building = np.isin(classification, _BUILDING)
+    index = {name: place for place, name in enumerate(CLASSES)}
+    of_class = np.select(
+        [
+            np.isin(classification, _GROUND),
+            building & steep,
+            building,
+            np.isin(classification, _VEGETATION),
+        ],
+        [index["ground"], index["wall"], index["roof"], index["vegetation"]],
+        index["other"],
+    )
+    of_slope = np.where(np.isfinite(slope), np.searchsorted(_SLOPE_LIMITS_DEG, slope), len(SLOPES))
+    return Kinds(of_class.astype(np.int64), of_slope.astype(np.int64))
+
+
+def _surface(
+    rows: NDArray[np.void], model_rows: NDArray[np.void], settings: ComparisonSettings
+) -> tuple[FloatArray, Kinds]:
+    """Return normals (P, 3) of the reference on the side of the model's normals, and the kinds of its points."""
+    place = rows["position"]
+    if not len(place):
+        return np.zeros((0, 3)), kinds_of(rows["classification"], np.zeros((0, 3)))
+    # Neighbours of a normal are half a core apart: noise would turn the normals of closer ones.
+    spacing_m = settings.core_m / 2
+    sparse = first_of_voxels(place, spacing_m)
+    normal = plane_normals(place[sparse], spacing_m)
+    if len(model_rows):
+        towards = model_rows["normal"][cKDTree(model_rows["position"]).query(place[sparse])[1]].astype(np.float64)
+        against = np.einsum("ni,ni->n", normal, towards) < 0
+        normal = np.where(against[:, None], -normal, normal)
+    normal = normal[cKDTree(place[sparse]).query(place)[1]]
+    return normal, kinds_of(rows["classification"], normal)
+
+
+def _at_random(position: FloatArray) -> FloatArray:
+    """Return points (P, 3), or as many of them as M3C2 takes.
+
+    One point a voxel would not do: where a noisy surface lies near a border of voxels, the few points beyond that
+    border would count as much as the many before it, which shifts the mean by up to one σ.
+    """
+    if len(position) <= _MOST_POINTS:
+        return position
+    return position[np.sort(np.random.default_rng(0).choice(len(position), _MOST_POINTS, replace=False))]
+
+
+def _nearest(position: FloatArray, others: FloatArray) -> tuple[FloatArray, IntArray]:
+    """Return distances to the nearest of other points, infinite beyond `FARTHEST_M`, and the rows of these."""
+    if not (len(position) and len(others)):
+        return np.full(len(position), np.inf), np.zeros(len(position), dtype=np.int64)
+    distance, row = cKDTree(others).query(position)
+    return np.where(distance <= FARTHEST_M, distance, np.inf), row.astype(np.int64)
+
+
+def _covered(position: FloatArray, reference: FloatArray, cover_m: float) -> BoolArray:
+    """Return whether the reference has a point in the cell of the plan in which points (P, 3) lie."""
+    if not (len(position) and len(reference)):
+        return np.zeros(len(position), dtype=bool)
+    low = np.floor(np.minimum(position.min(axis=0), reference.min(axis=0))[:2] / cover_m).astype(np.int64)
+    width = int(max(position[:, 1].max(), reference[:, 1].max()) / cover_m - low[1]) + 2
+
+    def keys(points: FloatArray) -> IntArray:
+        cell = np.floor(points[:, :2] / cover_m).astype(np.int64) - low
+        return np.asarray(cell[:, 0] * width + cell[:, 1])
+
+    return np.asarray(np.isin(keys(position), np.unique(keys(reference))))

@@ -1,0 +1,434 @@
+"""Reading of ROS bags, one message at a time: rosbag2 folders and bare files (mcap, sqlite3), and ROS 1 bags.
+
+Definitions of message types come from the bag, else from the ROS distribution. PX4's messages are in no
+distribution: for them the layout of `bag.definitions` counts that fits the message. A damaged definition harms its
+own topic only.
+
+Decoding of photographs from ROS messages.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.core.errors import InputError
+from pipelines.core.types import ByteArray
+from pipelines.formats.bag_limits import DEFINITIONS, bound_decompressors, check_files, refuse_large_chunk, unpacked
+from pipelines.formats.image_file import MAX_BYTES, MAX_PIXELS, header_size
+
+# Schemas of mcap that do not belong in a ROS bag; the reader cannot open a bag with them.
+_FOREIGN_SCHEMAS = ("jsonschema", "protobuf", "flatbuffer", "ros1msg")
+# PX4 sends a message within milliseconds of its sample.
+_SAMPLE_LAG_US = 60_000_000
+_REPAIR = "repair it with `mcap recover` (mcap) or `ros2 bag reindex` (sqlite3, or metadata.yaml missing)"
+
+
+class UndecodableError(ValueError):
+    """A message that does not fit its definition, or whose definition is unknown."""
+
+
+@dataclass(frozen=True)
+class BagTopic:
+    """Topic: name, message type (`sensor_msgs/msg/Imu`) and number of messages."""
+
+    name: str
+    type: str
+    count: int
+
+
+@dataclass(frozen=True)
+class RawMessage:
+    """Message as stored; `bag_ns` is the time of recording, nanoseconds since 1970."""
+
+    topic: str
+    type: str
+    bag_ns: int
+    data: bytes
+
+
+class Bag:
+    """Open bag; see `open_bag`.
+
+    Attributes:
+        path: file or folder.
+        topics: by name.
+        damage: reason why reading ended before the end of the bag; None if it did not.
+        fallback_types: types decoded by a definition that the bag itself does not have.
+    """
+
+    def __init__(self, path: Path, reader: Any, ros2: bool) -> None:
+        self.path, self._reader, self._ros2 = path, reader, ros2
+        self._packed = _unpack_here(reader)
+        self._connections = list(reader.connections)
+        # Any file of a split bag may have the definition.
+        links = [link for part in _parts(reader) for link in part.connections] + self._connections
+        self._definitions = {link.msgtype: link.msgdef for link in links if link.msgdef.data}
+        self._stores: dict[str, Any] = {}
+        self.damage: str | None = None
+        self.fallback_types: set[str] = set()
+        counts: dict[tuple[str, str], int] = {}
+        for link in self._connections:
+            key = (link.topic, link.msgtype)
+            counts[key] = counts.get(key, 0) + link.msgcount
+        self.topics = {
+            name: BagTopic(name, kind, count) for (name, kind), count in sorted(counts.items(), reverse=True)
+        }
+
+    @property
+    def message_count(self) -> int:
+        """Number of messages of all topics, by the bag's index."""
+        return sum(topic.count for topic in self.topics.values())
+
+    def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
+        """Yield the messages of these topics by time of recording.
+
+        Reading ends early where the bag is damaged; `damage` then states the reason.
+        """
+        wanted = {name: self.topics[name].type for name in topics}
+        links = [link for link in self._connections if wanted.get(link.topic) == link.msgtype]
+        if not links:
+            return
+        stream = self._reader.messages(connections=links)
+        while True:
+            try:
+                link, bag_ns, data = next(stream)
+                if not isinstance(bag_ns, int) or not isinstance(data, bytes | bytearray | memoryview):
+                    raise TypeError(f"a message of {link.topic} is no bytes")  # SQLite has any type in any column
+                data = unpacked(bytes(data), MAX_BYTES) if self._packed else bytes(data)
+            except StopIteration:
+                return
+            except Exception as error:  # the library raises any error of its parsers
+                self.damage = f"{type(error).__name__}: {error}"
+                return
+            yield RawMessage(link.topic, link.msgtype, bag_ns, data)
+
+    def decode(self, message: RawMessage) -> Any:
+        """Return the message as an object with the fields of its definition.
+
+        Raises:
+            UndecodableError: the message does not fit, or has no known definition.
+        """
+        store = self._store(message)
+        try:
+            if self._ros2:
+                return store.deserialize_cdr(message.data, message.type)
+            return store.deserialize_ros1(message.data, message.type)
+        except Exception as error:  # hostile bytes make generated code raise any error
+            raise UndecodableError(f"{type(error).__name__}: {error}") from error
+
+    def first(self, topic: str) -> Any | None:
+        """Return the first message of a topic that decodes, or None."""
+        for attempt, message in enumerate(self.messages([topic])):
+            try:
+                return self.decode(message)
+            except UndecodableError:
+                if attempt >= 9:
+                    break
+        return None
+
+    def header_stamp_ns(self, message: RawMessage) -> int | None:
+        """Return the stamp of a message that begins with a `std_msgs/Header`, without decoding it; None if zero."""
+        try:
+            if not self._ros2:
+                sec, nanosec = struct.unpack_from("<II", message.data, 4)
+            else:
+                order = "<" if message.data[1] & 1 else ">"
+                sec, nanosec = struct.unpack_from(f"{order}iI", message.data, 4)
+        except (struct.error, IndexError):
+            return None
+        return sec * 1_000_000_000 + nanosec or None
+
+    def _store(self, message: RawMessage) -> Any:
+        """Return a typestore that has the type of `message`."""
+        kind = message.type
+        if kind not in self._stores:
+            stated = self._definitions.get(kind)
+            if stated is None and kind in DEFINITIONS:
+                self._stores[kind] = self._store_that_fits(message)
+            else:
+                self._stores[kind] = self._make_store(kind, stated)
+        store = self._stores[kind]
+        if isinstance(store, str):
+            raise UndecodableError(store)
+        return store
+
+    def _make_store(self, kind: str, stated: Any | None) -> Any:
+        """Return a typestore that has `kind` by the bag's or a default definition, or the reason why none has."""
+        if stated is not None:
+            try:
+                return _stated_store(stated, kind)
+            except Exception as error:  # a grammar error, an unknown word, a repeated name …
+                return f"its definition of {kind} cannot be read: {type(error).__name__}: {error}"
+        self.fallback_types.add(kind)
+        common = _common_store(self._ros2)
+        return common if kind in common.types else f"it has no definition of {kind}"
+
+    def _store_that_fits(self, message: RawMessage) -> Any:
+        """Return a typestore with the layout of `DEFINITIONS` that fits `message`."""
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+        for release, text in DEFINITIONS[message.type].items():
+            store = get_typestore(Stores.EMPTY)
+            store.register(get_types_from_msg(text, message.type))
+            try:
+                decoded: Any = store.deserialize_cdr(message.data, message.type)
+            except Exception:  # another length, or damaged
+                continue
+            sample = getattr(decoded, "timestamp_sample", 0)
+            if sample and abs(sample - decoded.timestamp) > _SAMPLE_LAG_US:
+                continue
+            self.fallback_types.add(f"{message.type} (as of PX4 {release})")
+            return store
+        # The failure is not stored: the next message may be whole.
+        raise UndecodableError(
+            f"{len(message.data)} bytes are none of the layouts of {message.type} that are known here"
+        )
+
+
+@contextmanager
+def open_bag(path: Path) -> Iterator[Bag]:
+    """Open a bag for reading.
+
+    Raises:
+        InputError: no bag, damaged beyond opening, or with chunks too large for memory.
+    """
+    ros2 = path.suffix != ".bag"
+    reader = _reader(path, ros2)
+    try:
+        reader.open()
+    except InputError:
+        raise
+    except KeyError as error:
+        if error.args[0] not in _FOREIGN_SCHEMAS:
+            raise InputError(f"is no bag, or is damaged ({_describe(error)}): {_REPAIR}", path=path) from error
+        raise InputError(
+            f"has a topic in {error.args[0]!r}, which is not ROS 2's: leave it out with `mcap filter`", path=path
+        ) from error
+    except Exception as error:  # truncated and forged files make the parser raise any error
+        raise InputError(f"is no bag, or is damaged ({_describe(error)}): {_REPAIR}", path=path) from error
+    try:
+        _check_chunks(reader, path)
+        _check_topics(reader, path)
+        yield Bag(path, reader, ros2)
+    finally:
+        reader.close()
+
+
+def _reader(path: Path, ros2: bool) -> Any:
+    from rosbags import rosbag1, rosbag2
+
+    if not path.exists():
+        raise InputError("no such bag", path=path, field="--bag")
+    if path.is_dir() and not (path / "metadata.yaml").exists():
+        raise InputError(
+            "has no metadata.yaml: give the .mcap or .db3 file in it, or `ros2 bag reindex` the folder",
+            path=path,
+            field="--bag",
+        )
+    if not path.is_dir() and path.suffix not in (".bag", ".mcap", ".db3"):
+        raise InputError(
+            "is no bag: give a rosbag2 folder, or a .mcap, .db3 or .bag file", path=path, field="--bag"
+        )
+    try:
+        check_files(path)
+        bound_decompressors()
+        return rosbag2.Reader(path) if ros2 else rosbag1.Reader(path)
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(f"is no bag, or is damaged ({_describe(error)}): {_REPAIR}", path=path) from error
+
+
+def _check_chunks(reader: Any, path: Path) -> None:
+    for storage in _parts(reader):
+        largest = max((chunk.uncompressed_size for chunk in getattr(storage, "chunks", ())), default=0)
+        refuse_large_chunk(path, largest)
+
+
+def _check_topics(reader: Any, path: Path) -> None:
+    """Refuse topics whose names, types or counts are none: SQLite and YAML have any type in any place."""
+    for link in reader.connections:
+        if not (isinstance(link.topic, str) and isinstance(link.msgtype, str) and isinstance(link.msgcount, int)):
+            raise InputError(f"is damaged (topic {str(link.topic)[:40]!r}): {_REPAIR}", path=path)
+
+
+def _unpack_here(reader: Any) -> bool:
+    """Return whether messages are compressed one by one, and let rosbags hand them over packed."""
+    storage: Any = getattr(reader, "storage", None)
+    if getattr(getattr(storage, "metadata", None), "compression_mode", None) != "message":
+        return False
+    storage.metadata = storage.metadata._replace(compression_mode=None)
+    return True
+
+
+def _parts(reader: Any) -> list[Any]:
+    """Return the files of a rosbag2."""
+    outer = getattr(reader, "storage", None)
+    return list(getattr(outer, "storages", [] if outer is None else [outer]))
+
+
+@lru_cache(maxsize=256)
+def _stated_store(definition: Any, kind: str) -> Any:
+    """Return a typestore with the types of a definition; the code that decodes them is generated once."""
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.EMPTY)
+    store.register(_parsed(definition, kind))
+    return store
+
+
+@lru_cache
+def _common_store(ros2: bool) -> Any:
+    """Return a typestore with the types of a ROS distribution."""
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_JAZZY if ros2 else Stores.ROS1_NOETIC)
+
+
+def _parsed(definition: Any, kind: str) -> Any:
+    """Return the types of a definition, in ROS's message language or in IDL."""
+    from rosbags.interfaces import MessageDefinitionFormat
+    from rosbags.typesys import get_types_from_idl, get_types_from_msg
+
+    if definition.format == MessageDefinitionFormat.MSG:
+        return get_types_from_msg(definition.data, kind)
+    rule = "=" * 80 + "\n"
+    # rosbags' parser takes no directives; the definitions that they include follow below.
+    text = re.sub(r"^[ \t]*#.*$", "", definition.data, flags=re.MULTILINE)
+    if not text.startswith(f"{rule}IDL: "):
+        return get_types_from_idl(text)
+    types: dict[str, Any] = {}
+    for part in text.split(rule)[1:]:
+        types.update(get_types_from_idl(part.partition("\n")[2]))
+    return types
+
+
+def _describe(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}".rstrip(": ").rstrip(".")
+
+
+IMAGE, COMPRESSED, INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/CameraInfo"
+_PNG_EFFORT = 1
+_BAYER = ("rggb", "bggr", "gbrg", "grbg")
+# Encoding → bytes a pixel.
+_PIXEL_BYTES = {
+    "rgb8": 3, "bgr8": 3, "8uc3": 3, "rgba8": 4, "bgra8": 4, "8uc4": 4, "mono8": 1, "8uc1": 1, "mono16": 2,
+    "yuv422": 2, "uyvy": 2, "yuv422_yuy2": 2, "yuyv": 2,
+    **{f"bayer_{pattern}{depth}": depth // 8 for pattern in _BAYER for depth in (8, 16)},
+}  # fmt: skip
+ENCODINGS = tuple(_PIXEL_BYTES)
+
+
+class BadImageError(ValueError):
+    """An image message that cannot become a photograph; the text states the reason."""
+
+
+@dataclass
+class ImageWriter:
+    """Converts image messages to the bytes of a JPEG or PNG file.
+
+    JPEG and PNG in a `CompressedImage` stay as they are. A raw `Image` becomes a PNG without loss, but for 16 bits,
+    which become 8 by the same factor for the whole bag: the first image decides how many bits are in use.
+
+    Attributes:
+        bits: bits in use of 16-bit images; None before the first.
+    """
+
+    bits: int | None = None
+
+    def encoded(self, kind: str, message: Any) -> tuple[bytes, str]:
+        """Return the file's bytes and its suffix.
+
+        Raises:
+            BadImageError: unknown encoding, too few bytes, or too many pixels.
+        """
+        if kind == COMPRESSED:
+            return _compressed(message)
+        import cv2
+
+        done, data = cv2.imencode(".png", self._pixels(message), [cv2.IMWRITE_PNG_COMPRESSION, _PNG_EFFORT])
+        if not done:
+            raise BadImageError("does not encode as PNG")
+        return data.tobytes(), ".png"
+
+    def _pixels(self, message: Any) -> ByteArray:
+        """Return BGR or grey pixels of a raw image."""
+        encoding = str(message.encoding).strip().lower()
+        if encoding not in _PIXEL_BYTES:
+            raise BadImageError(f"encoding {message.encoding!r} is none of {', '.join(ENCODINGS)}")
+        raw = _rows(message, _PIXEL_BYTES[encoding])
+        if encoding.endswith("16"):
+            return _to_bgr(
+                self._eight_bits(raw.view(">u2" if message.is_bigendian else "<u2")), encoding[:-2] + "8"
+            )
+        return _to_bgr(raw, encoding)
+
+    def _eight_bits(self, pixels: NDArray[np.uint16]) -> ByteArray:
+        if self.bits is None:
+            used = int(pixels.max(initial=1)).bit_length()
+            self.bits = next(bits for bits in (8, 10, 12, 14, 16) if used <= bits)
+        return np.asarray(np.minimum(pixels >> (self.bits - 8), 255).astype(np.uint8))
+
+
+def sharpness(data: bytes) -> float:
+    """Return the variance of the Laplacian of an encoded image at a quarter of its size: low for blurred images."""
+    import cv2
+
+    grey = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_REDUCED_GRAYSCALE_4)
+    return 0.0 if grey is None else float(cv2.Laplacian(grey, cv2.CV_64F).var())
+
+
+def _compressed(message: Any) -> tuple[bytes, str]:
+    data = np.asarray(message.data, dtype=np.uint8).tobytes()
+    if len(data) > MAX_BYTES:
+        raise BadImageError(f"has {len(data) / 2**20:.0f} MiB (limit {MAX_BYTES // 2**20})")
+    size = header_size(data)
+    if data[:2] == b"\xff\xd8":
+        suffix = ".jpg"
+    elif data[:4] == b"\x89PNG":
+        suffix = ".png"
+    else:
+        raise BadImageError(f"is neither JPEG nor PNG (format {str(message.format)[:40]!r})")
+    if size is None or not 0 < size[0] * size[1] <= MAX_PIXELS:
+        raise BadImageError("has a damaged header")
+    return data, suffix
+
+
+def _rows(message: Any, pixel_bytes: int) -> ByteArray:
+    """Return the bytes (height, width · pixel_bytes) of a raw image without the padding of its rows."""
+    width, height, step = int(message.width), int(message.height), int(message.step)
+    data = np.asarray(message.data, dtype=np.uint8)
+    if not 0 < width * height <= MAX_PIXELS:
+        raise BadImageError(f"claims {width}×{height} pixels")
+    if step < width * pixel_bytes or len(data) < step * height:
+        raise BadImageError(f"{len(data)} bytes in rows of {step} are too few for {width}×{height} pixels")
+    rows = data[: step * height].reshape(height, step)[:, : width * pixel_bytes]
+    return np.ascontiguousarray(rows)
+
+
+def _to_bgr(raw: ByteArray, encoding: str) -> ByteArray:
+    """Return BGR (height, width, 3) or grey (height, width) of rows of bytes."""
+    import cv2
+
+    height = len(raw)
+    if encoding in ("mono8", "8uc1"):
+        return raw
+    if encoding.startswith("bayer_"):
+        return np.asarray(cv2.cvtColor(raw, getattr(cv2, f"COLOR_Bayer{encoding[6:10].upper()}2BGR")), np.uint8)
+    pixels = raw.reshape(height, -1, _PIXEL_BYTES[encoding])
+    codes = {
+        "rgb8": cv2.COLOR_RGB2BGR, "rgba8": cv2.COLOR_RGBA2BGR, "bgra8": cv2.COLOR_BGRA2BGR,
+        "8uc4": cv2.COLOR_BGRA2BGR, "yuv422": cv2.COLOR_YUV2BGR_UYVY, "uyvy": cv2.COLOR_YUV2BGR_UYVY,
+        "yuv422_yuy2": cv2.COLOR_YUV2BGR_YUY2, "yuyv": cv2.COLOR_YUV2BGR_YUY2,
+    }  # fmt: skip
+    return pixels if encoding not in codes else np.asarray(cv2.cvtColor(pixels, codes[encoding]), np.uint8)

@@ -1,0 +1,389 @@
+"""Limits of a bag, checked before rosbags opens it: sizes of records and chunks, and what they unpack to.
+
+rosbags trusts sizes: it allocates what a record claims, unpacks what a compressed block holds, and has all chunks
+in memory that overlap in time.
+
+Layouts of PX4's messages for bags that do not carry their own definitions (sqlite3 bags up to ROS 2 Humble).
+
+After `msg/*.msg` of PX4-Autopilot and px4_msgs. Fields changed between releases. The length of a message reveals
+its layout, together with the distance of `timestamp_sample` from `timestamp`.
+"""
+
+from __future__ import annotations
+
+import mmap
+import struct
+import sys
+from collections.abc import Collection, Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from pipelines.core.errors import InputError
+from pipelines.core.files import file_size
+
+# A chunk is unpacked in one piece, with up to three copies in memory; ROS writes 0.8 to 4 MiB.
+MAX_CHUNK_BYTES = 200 * 1024 * 1024
+# Chunks of the same moment are in memory together. Recorders close one chunk before they begin the next.
+_MAX_TOGETHER_BYTES = 256 * 1024 * 1024
+_MAX_METADATA_BYTES = 16 * 1024 * 1024
+# Recordings of sensors compress by a factor of 2 to 20.
+_MOST_UNPACKED, _SMALL_BYTES = 100, 1024 * 1024 * 1024
+_BLOCK_BYTES = 1024 * 1024
+_MAGIC = b"\x89MCAP0\r\n"
+_CHUNK, _CHUNK_INDEX, _HEAD_BYTES = 0x06, 0x08, 9
+
+
+class _Chunk(NamedTuple):
+    """Chunk of an mcap as its own header or the index states it."""
+
+    start_ns: int
+    end_ns: int
+    compressed_bytes: int
+    uncompressed_bytes: int
+
+
+def check_files(path: Path) -> None:
+    """Refuse a bag whose files are no regular files, or ask for more memory than any recorder's.
+
+    Args:
+        path: bag file, or folder of a rosbag2.
+
+    Raises:
+        InputError: names the file and its fault.
+        ValueError: damaged records of an mcap.
+    """
+    files = [path]
+    if path.is_dir():
+        file_size(path / "metadata.yaml", limit_bytes=_MAX_METADATA_BYTES, kind="metadata.yaml")
+        files = sorted(file for file in path.iterdir() if file.suffix in (".mcap", ".db3", ".zstd"))
+    for file in files:
+        size = file_size(file, field="--bag")
+        if file.suffix == ".mcap" and size:
+            _check_mcap(file)
+        elif file.suffix == ".zstd":
+            _check_unpacked(file, size)
+
+
+def refuse_large_chunk(path: Path, uncompressed_bytes: int) -> None:
+    """Refuse a chunk that unpacks to more than 200 MiB.
+
+    Raises:
+        InputError: states the size and a command that rewrites the bag.
+    """
+    if uncompressed_bytes > MAX_CHUNK_BYTES:
+        raise InputError(
+            f"has a chunk of {uncompressed_bytes / 2**20:.0f} MiB (limit {MAX_CHUNK_BYTES // 2**20}): rewrite it "
+            "with smaller ones, e.g. `mcap compress --chunk-size 4194304`",
+            path=path,
+        )
+
+
+def unpacked(data: bytes, limit_bytes: int = MAX_CHUNK_BYTES) -> bytes:
+    """Return the content of zstd frames.
+
+    Raises:
+        ValueError: damaged, or more than `limit_bytes`.
+    """
+    zstd, parts, total = _zstd(), [], 0
+    while data:
+        decompressor = zstd.ZstdDecompressor()
+        parts.append(decompressor.decompress(data, max_length=limit_bytes + 1 - total))
+        total += len(parts[-1])
+        if total > limit_bytes:
+            raise ValueError(f"unpacks to more than {limit_bytes / 2**20:.0f} MiB")
+        if not decompressor.eof:
+            raise ValueError("compressed data end too early")
+        data = decompressor.unused_data
+    return b"".join(parts)
+
+
+@cache
+def bound_decompressors() -> None:
+    """Let rosbags unpack chunks of mcap and of ROS 1 up to the limit only."""
+    from lz4.frame import LZ4FrameDecompressor
+    from rosbags.rosbag1 import reader as rosbag1
+    from rosbags.rosbag2 import storage_mcap
+
+    def lz4(data: bytes, limit_bytes: int = MAX_CHUNK_BYTES) -> bytes:
+        return _at_most(LZ4FrameDecompressor().decompress(data, max_length=limit_bytes + 1), limit_bytes)
+
+    def bz2(data: bytes) -> bytes:
+        from bz2 import BZ2Decompressor
+
+        return _at_most(BZ2Decompressor().decompress(data, max_length=MAX_CHUNK_BYTES + 1), MAX_CHUNK_BYTES)
+
+    storage_mcap.DECOMPRESSORS.update({"lz4": lz4, "zstd": unpacked})
+    rosbag1.decompressors.update({"lz4": lz4, "bz2": bz2})
+
+
+def _at_most(data: bytes, limit_bytes: int) -> bytes:
+    if len(data) > limit_bytes:
+        raise ValueError(f"a chunk unpacks to more than {limit_bytes / 2**20:.0f} MiB")
+    return data
+
+
+def _zstd() -> Any:
+    if sys.version_info >= (3, 14):
+        from compression import zstd
+    else:
+        from backports import zstd
+    return zstd
+
+
+def _check_unpacked(file: Path, size: int) -> None:
+    """Refuse a compressed file of a rosbag2 that fills the disk: rosbags unpacks it whole."""
+    limit_bytes, total = max(_SMALL_BYTES, _MOST_UNPACKED * size), 0
+    with _zstd().open(file, "rb") as stream:
+        while block := stream.read(_BLOCK_BYTES):
+            total += len(block)
+            if total > limit_bytes:
+                raise InputError(f"unpacks to more than {limit_bytes / 2**20:.0f} MiB: it is forged", path=file)
+
+
+def _check_mcap(file: Path) -> None:
+    with file.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        chunks: dict[int, _Chunk] = {}
+        index: dict[int, _Chunk] = {}
+        for operation, at, length in _records(data):
+            if operation == _CHUNK:
+                chunks[at - _HEAD_BYTES] = _stored_chunk(data, at, length)
+            elif operation == _CHUNK_INDEX:
+                offset, chunk = _indexed_chunk(data, at, length)
+                if offset in index:
+                    raise ValueError(f"the chunk at {offset} is in the index twice")
+                index[offset] = chunk
+    for chunk in chunks.values():
+        refuse_large_chunk(file, chunk.uncompressed_bytes)
+    wrong = next((offset for offset, chunk in index.items() if chunks.get(offset) != chunk), None)
+    if wrong is not None:
+        raise ValueError(f"the index does not agree with the chunk at {wrong}")
+    together = _together(index.values())
+    if together > _MAX_TOGETHER_BYTES:
+        raise InputError(
+            f"has chunks of the same moment of {together / 2**20:.0f} MiB in all (limit "
+            f"{_MAX_TOGETHER_BYTES // 2**20}): sort it with `mcap sort`",
+            path=file,
+        )
+
+
+def _records(data: mmap.mmap) -> Iterator[tuple[int, int, int]]:
+    """Yield operation, place and length of the content of each record of an mcap."""
+    end = len(data) - len(_MAGIC)
+    if data[: len(_MAGIC)] != _MAGIC:
+        raise ValueError("File magic is invalid")
+    at = len(_MAGIC)
+    while at < end:
+        if at + _HEAD_BYTES > end:
+            raise ValueError(f"truncated record at offset {at}")
+        operation, length = struct.unpack_from("<BQ", data, at)
+        at += _HEAD_BYTES
+        if length > end - at:
+            raise ValueError(f"the record at offset {at - _HEAD_BYTES} claims {length} bytes, {end - at} follow")
+        yield operation, at, length
+        at += length
+
+
+def _stored_chunk(data: mmap.mmap, at: int, length: int) -> _Chunk:
+    start_ns, end_ns, uncompressed, _, name = struct.unpack_from("<QQQII", data, at)
+    (compressed,) = struct.unpack_from("<Q", data, at + 32 + name) if name < 64 else (2**64,)
+    if 40 + name + compressed > length:
+        raise ValueError(f"the chunk at offset {at - _HEAD_BYTES} is larger than its record")
+    if not name and compressed != uncompressed:
+        raise ValueError(f"the chunk at offset {at - _HEAD_BYTES} has another size than it states")
+    return _Chunk(start_ns, end_ns, compressed, uncompressed)
+
+
+def _indexed_chunk(data: mmap.mmap, at: int, length: int) -> tuple[int, _Chunk]:
+    """Return the offset of a chunk and what the index states about it."""
+    record = data[at : at + length]
+    start_ns, end_ns, offset, _, channels = struct.unpack_from("<QQQQI", record)
+    (name,) = struct.unpack_from("<I", record, 44 + channels)
+    compressed, uncompressed = struct.unpack_from("<QQ", record, 48 + channels + name)
+    return offset, _Chunk(start_ns, end_ns, compressed, uncompressed)
+
+
+def _together(chunks: Collection[_Chunk]) -> int:
+    """Return the greatest sum of bytes of chunks that overlap in time."""
+    events = [(chunk.start_ns, 0, chunk.uncompressed_bytes) for chunk in chunks]
+    events += [(chunk.end_ns, 1, -chunk.uncompressed_bytes) for chunk in chunks]
+    total = greatest = 0
+    for _, _, change in sorted(events):
+        total += change
+        greatest = max(greatest, total)
+    return greatest
+
+
+_ATTITUDE = """
+uint64 timestamp
+{sample}
+float32[4] q
+float32[4] delta_q_reset
+uint8 quat_reset_counter
+"""
+
+_GLOBAL_POSITION_1_11 = """
+uint64 timestamp
+float64 lat
+float64 lon
+float32 alt
+float32 alt_ellipsoid
+float32 delta_alt
+uint8 lat_lon_reset_counter
+uint8 alt_reset_counter
+float32 vel_n
+float32 vel_e
+float32 vel_d
+float32 yaw
+float32 eph
+float32 epv
+float32 terrain_alt
+bool terrain_alt_valid
+bool dead_reckoning
+"""
+
+_GLOBAL_POSITION_1_14 = """
+uint64 timestamp
+uint64 timestamp_sample
+float64 lat
+float64 lon
+float32 alt
+float32 alt_ellipsoid
+float32 delta_alt
+uint8 lat_lon_reset_counter
+uint8 alt_reset_counter
+float32 eph
+float32 epv
+float32 terrain_alt
+bool terrain_alt_valid
+bool dead_reckoning
+"""
+
+_GLOBAL_POSITION_1_16 = """
+uint64 timestamp
+uint64 timestamp_sample
+float64 lat
+float64 lon
+float32 alt
+float32 alt_ellipsoid
+bool lat_lon_valid
+bool alt_valid
+float32 delta_alt
+float32 delta_terrain
+uint8 lat_lon_reset_counter
+uint8 alt_reset_counter
+uint8 terrain_reset_counter
+float32 eph
+float32 epv
+float32 terrain_alt
+bool terrain_alt_valid
+bool dead_reckoning
+"""
+
+_GPS = """
+uint64 timestamp
+uint64 timestamp_sample
+uint32 device_id
+{place}
+float32 s_variance_m_s
+float32 c_variance_rad
+uint8 fix_type
+float32 eph
+float32 epv
+float32 hdop
+float32 vdop
+int32 noise_per_ms
+uint16 automatic_gain_control
+uint8 jamming_state
+int32 jamming_indicator
+uint8 spoofing_state
+{authentication}
+float32 vel_m_s
+float32 vel_n_m_s
+float32 vel_e_m_s
+float32 vel_d_m_s
+float32 cog_rad
+bool vel_ned_valid
+int32 timestamp_time_relative
+uint64 time_utc_usec
+uint8 satellites_used
+{error}
+float32 heading
+float32 heading_offset
+float32 heading_accuracy
+float32 rtcm_injection_rate
+uint8 selected_rtcm_instance
+{tail}
+"""
+
+_WHOLE = "int32 lat\nint32 lon\nint32 alt\nint32 alt_ellipsoid"
+_DEGREES = "float64 latitude_deg\nfloat64 longitude_deg\nfloat64 altitude_msl_m\nfloat64 altitude_ellipsoid_m"
+_RTCM = "bool rtcm_crc_failed\nuint8 rtcm_msg_used"
+_QUALITY = "\n".join(
+    f"uint8 quality_{name}" for name in ("corrections", "receiver", "gnss_signals", "post_processing")
+)
+_ANTENNA = "\n".join(f"float32 antenna_offset_{axis}" for axis in "xyz")
+_SINCE_1_16 = {"place": _DEGREES, "authentication": "uint8 authentication_state", "error": "uint32 system_error"}
+
+_ODOMETRY_OLD = """
+uint64 timestamp
+{sample}
+uint8 local_frame
+float32 x
+float32 y
+float32 z
+float32[4] q
+float32[4] q_offset
+float32[21] pose_covariance
+{velocity_frame}
+float32 vx
+float32 vy
+float32 vz
+float32 rollspeed
+float32 pitchspeed
+float32 yawspeed
+float32[21] velocity_covariance
+"""
+
+_ODOMETRY = """
+uint64 timestamp
+uint64 timestamp_sample
+uint8 pose_frame
+float32[3] position
+float32[4] q
+uint8 velocity_frame
+float32[3] velocity
+float32[3] angular_velocity
+float32[3] position_variance
+float32[3] orientation_variance
+float32[3] velocity_variance
+uint8 reset_counter
+int8 quality
+"""
+
+_SAMPLE = "uint64 timestamp_sample"
+
+# Layouts of each message from the newest to the oldest, by the release in which the layout first appeared.
+DEFINITIONS: dict[str, dict[str, str]] = {
+    "px4_msgs/msg/SensorGps": {
+        "1.17": _GPS.format(**_SINCE_1_16, tail=f"{_RTCM}\n{_ANTENNA}"),
+        "1.16 with quality": _GPS.format(**_SINCE_1_16, tail=f"{_RTCM}\n{_QUALITY}"),
+        "1.16": _GPS.format(**_SINCE_1_16, tail=_RTCM),
+        "1.15": _GPS.format(place=_DEGREES, authentication="", error="", tail=_RTCM),
+        "1.14": _GPS.format(place=_WHOLE, authentication="", error="", tail=""),
+    },
+    "px4_msgs/msg/VehicleAttitude": {
+        "1.14": _ATTITUDE.format(sample=_SAMPLE),
+        "1.11": _ATTITUDE.format(sample=""),
+    },
+    "px4_msgs/msg/VehicleGlobalPosition": {
+        "1.16": _GLOBAL_POSITION_1_16,
+        "1.14": _GLOBAL_POSITION_1_14,
+        "1.11": _GLOBAL_POSITION_1_11,
+    },
+    "px4_msgs/msg/VehicleOdometry": {
+        "1.14": _ODOMETRY,
+        "1.12": _ODOMETRY_OLD.format(sample=_SAMPLE, velocity_frame="uint8 velocity_frame"),
+        "1.11": _ODOMETRY_OLD.format(sample="", velocity_frame=""),
+    },
+}

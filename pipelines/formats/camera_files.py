@@ -1,0 +1,183 @@
+"""Cameras as nerfstudio's `transforms.json` (its documentation, "Data conventions").
+
+A frame has `transform_matrix`, world ← camera with OpenGL's axes (x right, y up, z backward), and the intrinsics of
+its photograph in pixels, the centre of the top-left pixel at (0.5, 0.5). One camera model serves all frames:
+`OPENCV` (k1, k2, k3, p1, p2) or `OPENCV_FISHEYE` (k1 … k4).
+
+Table of cameras as CSV: position, angles in both conventions, and σ.
+
+`read_trajectory` of `trajectory_csv` reads position, yaw, pitch, roll and σ back, so that a table can be the input
+of another survey. A σ that is not known is an empty cell.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipelines.core.files import replace_file
+from pipelines.core.products import dump_json
+from pipelines.core.types import FloatArray
+from pipelines.formats.tables import write_table
+from pipelines.geometry.cameras import Camera, distort, full_parameters, undistort
+
+_FISHEYE = "OPENCV_FISHEYE"
+_CAM_FROM_GL = np.diag([1.0, -1.0, -1.0])
+_LENS_SAMPLES = 25  # pixels along each side of an image that a lens is fitted to
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Photograph: its name, its lens, and its pose world ← camera (x right, y down, z forward)."""
+
+    name: str
+    camera: Camera
+    world_from_cam: FloatArray
+    center_in_world: FloatArray
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Intrinsics as nerfstudio has them.
+
+    Attributes:
+        model: `OPENCV` or `OPENCV_FISHEYE`.
+        intrinsics: by nerfstudio's names.
+        error_px: largest distance within the image from the lens that they stand for.
+    """
+
+    model: str
+    intrinsics: dict[str, float | int]
+    error_px: float
+
+
+def lens_of(camera: Camera) -> Lens:
+    """Return the intrinsics of a camera in nerfstudio's terms.
+
+    A rational lens (FULL_OPENCV with k4, k5, k6) is replaced by the polynomial that least squares fits to it.
+    """
+    fx, fy, cx, cy, *distortion = full_parameters(camera).tolist()
+    place = {"w": camera.width, "h": camera.height, "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy}
+    k1, k2, p1, p2, k3, *rational = distortion
+    if camera.model == _FISHEYE:
+        fisheye = dict(zip(("k1", "k2", "k3", "k4"), distortion[:4], strict=True))
+        return Lens(_FISHEYE, {**place, **fisheye}, 0.0)
+    if not any(rational):
+        return Lens("OPENCV", {**place, "k1": k1, "k2": k2, "k3": k3, "p1": p1, "p2": p2}, 0.0)
+    fitted, error = _polynomial(camera, np.array([fx, fy]), np.array([cx, cy]))
+    return Lens("OPENCV", {**place, **dict(zip(("k1", "k2", "k3", "p1", "p2"), fitted, strict=True))}, error)
+
+
+def _polynomial(camera: Camera, focal: FloatArray, center: FloatArray) -> tuple[list[float], float]:
+    """Return k1, k2, k3, p1, p2 of the polynomial nearest to a lens, and its largest error in pixels."""
+    x, y = (np.linspace(0.0, side, _LENS_SAMPLES) for side in (camera.width, camera.height))
+    ray = undistort(camera, np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
+    ray = ray[np.isfinite(ray).all(axis=1)]
+    x, y = ray.T
+    r2 = x * x + y * y
+    powers = np.stack([r2, r2**2, r2**3], axis=-1)
+    by_x = np.column_stack([x[:, None] * powers, 2 * x * y, r2 + 2 * x * x]) * focal[0]
+    by_y = np.column_stack([y[:, None] * powers, r2 + 2 * y * y, 2 * x * y]) * focal[1]
+    bent = distort(camera, ray) - center - focal * ray
+    design, target = np.concatenate([by_x, by_y]), np.concatenate([bent[:, 0], bent[:, 1]])
+    solution = np.linalg.lstsq(design, target, rcond=None)[0]
+    error = (design @ solution - target).reshape(2, -1)
+    return solution.tolist(), float(np.hypot(*error).max())
+
+
+def write_transforms(path: Path, frames: Sequence[Frame], lenses: Sequence[Lens]) -> None:
+    """Write `transforms.json`; the file appears whole or not at all.
+
+    Args:
+        path: of the file.
+        frames: the photographs; `file_path` becomes their name.
+        lenses: of each frame, all of one model.
+
+    Raises:
+        ValueError: the lenses have different models, or there is no frame.
+        OSError: the file cannot be written.
+    """
+    models = {lens.model for lens in lenses}
+    if len(models) != 1:
+        raise ValueError(f"expected one camera model, got {sorted(models)}")
+    document: dict[str, Any] = {
+        "camera_model": models.pop(),
+        "frames": [
+            {"file_path": frame.name, **lens.intrinsics, "transform_matrix": _opengl(frame).tolist()}
+            for frame, lens in zip(frames, lenses, strict=True)
+        ],
+    }
+    draft = path.with_name(path.name + ".tmp")
+    draft.write_text(dump_json(document) + "\n", encoding="utf-8")
+    replace_file(draft, path)
+
+
+def _opengl(frame: Frame) -> FloatArray:
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = frame.world_from_cam @ _CAM_FROM_GL, frame.center_in_world
+    return matrix
+
+
+_METRES, _DEGREES, _ANGLE = "%.4f", "%.9f", "%.6f"  # 0.1 mm; 0.1 mm on the ground; 1 cm at 500 km
+_EASTING_NORTHING = ("x", "y", "z")
+_GEOGRAPHIC = ("longitude", "latitude", "altitude")
+_MAP_ANGLES = ("omega_deg", "phi_deg", "kappa_deg")
+_GIMBAL = ("yaw_deg", "pitch_deg", "roll_deg")
+_SIGMA = ("sigma_e_m", "sigma_n_m", "sigma_u_m")
+_SIGMA_ANGLES = ("sigma_omega_deg", "sigma_phi_deg", "sigma_kappa_deg")
+
+
+@dataclass(frozen=True)
+class CameraTable:
+    """Cameras of n photographs.
+
+    Attributes:
+        name: n names.
+        split: of each, `train` or `test`.
+        position: (n, 3) in a CRS: easting, northing, height, or longitude, latitude, height.
+        geographic: whether the first two are degrees.
+        omega_phi_kappa_deg: (n, 3) against the axes of the CRS.
+        yaw_pitch_roll_deg: (n, 3) against true north and the vertical.
+        sigma_enu_m: (n, 3) along true east, north, up; NaN: not known.
+        sigma_angles_deg: (n, 3) of ω, φ, κ; NaN: not known.
+    """
+
+    name: tuple[str, ...]
+    split: tuple[str, ...]
+    position: FloatArray
+    geographic: bool
+    omega_phi_kappa_deg: FloatArray
+    yaw_pitch_roll_deg: FloatArray
+    sigma_enu_m: FloatArray
+    sigma_angles_deg: FloatArray
+
+
+def write_camera_table(path: Path, table: CameraTable) -> None:
+    """Write the table; the file appears whole or not at all.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    plan = _DEGREES if table.geographic else _METRES
+    forms = [plan, plan, _METRES, *[_ANGLE] * 6, *[_METRES] * 3, *[_ANGLE] * 3]
+    numbers = np.concatenate(
+        [
+            table.position,
+            table.omega_phi_kappa_deg,
+            table.yaw_pitch_roll_deg,
+            table.sigma_enu_m,
+            table.sigma_angles_deg,
+        ],
+        axis=1,
+    )
+    position = _GEOGRAPHIC if table.geographic else _EASTING_NORTHING
+    header = ("name", "split", *position, *_MAP_ANGLES, *_GIMBAL, *_SIGMA, *_SIGMA_ANGLES)
+    rows = (
+        (name, split, *(form % value if np.isfinite(value) else "" for form, value in zip(forms, row, strict=True)))
+        for name, split, row in zip(table.name, table.split, numbers, strict=True)
+    )
+    write_table(path, (header, *rows))

@@ -1,0 +1,300 @@
+"""DJI's timestamp file (`…_Timestamp.MRK`): time, position and σ of the camera at each event of a flight.
+
+A line has, between tabs: number, second, [week], north,N east,E down,V latitude,Lat longitude,Lon height,Ellh,
+three σ (N, E, V), flag,Q. Position and ellipsoidal height are those of the camera; north, east and down in
+millimetres lead there from the antenna (DJI's manuals of Phantom 4 RTK and Zenmuse P1).
+
+GPS time: weeks since 1980-01-06 and seconds, ahead of UTC by the leap seconds since then (IERS Bulletin C).
+
+RTKLIB's solution (`.pos`): positions of an antenna by time, with σ.
+
+The header, in lines that begin with %, states the clock (GPST, UTC or JST), the form of the coordinates and the
+surface of the heights. Rows have the time in two cells, as a date or as GPS week and second of the week. Source:
+RTKLIB's manual, appendix B.1.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pipelines.core.errors import InputError
+from pipelines.core.types import FloatArray, IntArray
+from pipelines.formats.exif import RTK_FIXED, RTK_FLOAT
+from pipelines.formats.tables import number, read_lines
+from pipelines.formats.trajectory_csv import PoseTable
+from pipelines.geodesy.enu import ecef_from_enu_rotation, lla_from_ecef
+
+WEEK_S = 604_800.0
+_EPOCH_S = datetime(1980, 1, 6, tzinfo=UTC).timestamp()
+# Days at whose beginning (UTC) GPS time has come to be one second more ahead; none has been announced since 2017.
+_LEAP_DAYS = (
+    (1981, 7), (1982, 7), (1983, 7), (1985, 7), (1988, 1), (1990, 1), (1991, 1), (1992, 7), (1993, 7), (1994, 7),
+    (1996, 1), (1997, 7), (1999, 1), (2006, 1), (2009, 1), (2012, 7), (2015, 7), (2017, 1),
+)  # fmt: skip
+_LEAPS_S = np.array([datetime(year, month, 1, tzinfo=UTC).timestamp() for year, month in _LEAP_DAYS])
+
+
+def unix_from_gps(gps_s: ArrayLike) -> FloatArray:
+    """Return seconds since 1970 UTC of GPS times (N,), given as seconds since 1970 by a clock without leap seconds.
+
+    A time in the inserted second itself is that of the second after it.
+    """
+    clock = np.asarray(gps_s, dtype=np.float64)
+    # GPS time at each leap: that of UTC, and the seconds inserted by then.
+    at_leaps = _LEAPS_S + np.arange(1, len(_LEAPS_S) + 1)
+    return np.asarray(clock - np.searchsorted(at_leaps, clock, side="right"))
+
+
+def unix_from_week(week: ArrayLike, second: ArrayLike) -> FloatArray:
+    """Return seconds since 1970 UTC of GPS weeks (N,), counted since 1980, and seconds of the week (N,)."""
+    weeks, seconds = np.asarray(week, dtype=np.float64), np.asarray(second, dtype=np.float64)
+    return unix_from_gps(_EPOCH_S + WEEK_S * weeks + seconds)
+
+
+_NUMBER = r"([-+]?\d+(?:\.\d*)?)"
+FIRST_LINE = re.compile(rf"\s*\d+\s+{_NUMBER}\s+\[\d+\]\s+{_NUMBER}\s*,\s*N\b")
+_LINE = re.compile(
+    rf"(\d{{1,9}})\s+{_NUMBER}\s+\[(\d{{1,5}})\]\s+{_NUMBER}\s*,\s*N\s+{_NUMBER}\s*,\s*E\s+{_NUMBER}\s*,\s*V\s+"
+    rf"{_NUMBER}\s*,\s*Lat\s+{_NUMBER}\s*,\s*Lon\s+{_NUMBER}\s*,\s*Ellh\s+"
+    rf"{_NUMBER}\s*,\s*{_NUMBER}\s*,\s*{_NUMBER}\s+(\d{{1,3}})\s*,\s*Q"
+)
+_LAYOUT = "number, second, [week], n,N e,E v,V, lat,Lat lon,Lon h,Ellh, three σ, flag,Q"
+_NO_POSITION = 0
+_DJI_RECEIVER = {RTK_FIXED: "RTK fixed", RTK_FLOAT: "RTK float"}
+
+
+@dataclass(frozen=True)
+class CameraEvents:
+    """N events of a camera.
+
+    Attributes:
+        path: their file.
+        lines: (N,) line of each.
+        number: (N,) of the photograph.
+        time_s: (N,) seconds since 1970 UTC.
+        lon_lat_alt: (N, 3) of the camera, degrees and ellipsoidal metres; NaN without a position.
+        sigma_enu_m: (N, 3); NaN where unknown.
+        receiver: (N,) kind of receiver, as of `PoseTable`.
+        camera_from_antenna_enu_m: (N, 3) from the antenna to the camera.
+    """
+
+    path: Path
+    lines: IntArray
+    number: IntArray
+    time_s: FloatArray
+    lon_lat_alt: FloatArray
+    sigma_enu_m: FloatArray
+    receiver: NDArray[np.str_]
+    camera_from_antenna_enu_m: FloatArray
+
+
+def read_mrk(path: Path) -> CameraEvents:
+    """Read a timestamp file.
+
+    Raises:
+        InputError: no event, a line of another layout, a coordinate out of range, or one number twice.
+    """
+    lines: list[int] = []
+    values: list[list[float]] = []
+    line_of: dict[int, int] = {}
+    for line, text in enumerate(read_lines(path), start=1):
+        if not text.strip():
+            continue
+        match = _LINE.fullmatch(text.strip())
+        if match is None:
+            raise InputError(f"is no line of a DJI timestamp file: {_LAYOUT}", path=path, line=line)
+        number = int(match[1])
+        if number in line_of:
+            message = f"event {number} stands in line {line_of[number]} already"
+            raise InputError(message, path=path, line=line)
+        line_of[number] = line
+        lines.append(line)
+        values.append([float(text) for text in match.groups()])
+    table = np.array(values)
+    _check_marks(table, path, lines)
+    known = table[:, 12] != _NO_POSITION
+    north_east_down_m = table[:, 3:6] / 1000
+    sigma = table[:, [10, 9, 11]]
+    return CameraEvents(
+        path=path,
+        lines=np.array(lines, dtype=np.int64),
+        number=table[:, 0].astype(np.int64),
+        time_s=unix_from_week(table[:, 2], table[:, 1]),
+        lon_lat_alt=np.where(known[:, None], table[:, [7, 6, 8]], np.nan),
+        sigma_enu_m=np.where((sigma > 0).all(axis=1, keepdims=True), sigma, np.nan),
+        receiver=np.array([_DJI_RECEIVER.get(int(flag), "single-frequency") for flag in table[:, 12]]),
+        camera_from_antenna_enu_m=north_east_down_m[:, [1, 0, 2]] * np.array([1.0, 1.0, -1.0]),
+    )
+
+
+def _check_marks(table: FloatArray, path: Path, lines: list[int]) -> None:
+    """Raise for the first value out of range."""
+    for column, low, high, field in (
+        (1, 0, WEEK_S, "second of week"), (6, -90, 90, "Lat"), (7, -180, 180, "Lon"), (8, -1000, 20_000, "Ellh"),
+        (9, 0, 1e6, "σ"), (10, 0, 1e6, "σ"), (11, 0, 1e6, "σ"),
+    ):  # fmt: skip
+        bad = np.flatnonzero((table[:, column] < low) | (table[:, column] > high))
+        if len(bad):
+            message = f"{table[bad[0], column]:g} is out of range {low:g} … {high:g}"
+            raise InputError(message, path=path, line=lines[bad[0]], field=field)
+
+
+_JST_S = 9 * 3600.0
+_EARTH_M = (5e6, 8e6)  # distances from its centre
+# By the quality Q of a solution; 3 is with SBAS, 4 with code corrections, 5 without any.
+_RTKLIB_RECEIVER = {1: "RTK fixed", 2: "RTK float", **dict.fromkeys((3, 4, 5), "single-frequency")}
+_Form = Literal["degrees", "sexagesimal", "ecef"]
+
+
+@dataclass(frozen=True)
+class _Header:
+    line: int
+    clock: str
+    form: _Form
+    above_geoid: bool
+
+
+def read_pos(path: Path) -> PoseTable:
+    """Read a solution.
+
+    Raises:
+        InputError: no header, a baseline instead of positions, no row, too few cells, a cell that is no number, or
+            a value out of range.
+    """
+    lines = [(at, text.strip()) for at, text in enumerate(read_lines(path), start=1) if text.strip()]
+    header = _header([(at, text) for at, text in lines if text.startswith("%")], path)
+    rows = [(at, re.split(r"[\s,;]+", text.strip(",;"))) for at, text in lines if not text.startswith("%")]
+    if not rows:
+        raise InputError("has a header but no rows", path=path)
+    places = 7 if header.form == "sexagesimal" else 3
+    table = np.array([_numbers(cells[2:], places, path, at) for at, cells in rows])
+    if header.form == "ecef":
+        xyz, sigma = table[:, :3], _sigma_of_ecef(table)
+    else:
+        # σ are those of north, east, up.
+        xyz, sigma = table[:, [1, 0, 2]], np.where(table[:, 5:8] > 0, table[:, 5:8], np.nan)[:, [1, 0, 2]]
+    _check_solutions(xyz, header.form, path, [at for at, _ in rows])
+    return PoseTable(
+        path=path,
+        source="pos",
+        lines=np.array([at for at, _ in rows], dtype=np.int64),
+        names=None,
+        time_s=_times(header.clock, [(at, cells[:2]) for at, cells in rows], path),
+        xyz=xyz,
+        geographic=header.form != "ecef",
+        receiver=np.array(
+            [_RTKLIB_RECEIVER.get(int(quality), "unknown receiver") for quality in np.nan_to_num(table[:, 3])]
+        ),
+        sigma_enu_m=sigma if np.isfinite(sigma).any() else None,
+        assumed_crs="EPSG:4978" if header.form == "ecef" else "EPSG:4326" if header.above_geoid else "EPSG:4979",
+        heights_above_geoid=header.above_geoid,
+        header_line=header.line,
+    )
+
+
+def _header(comments: Sequence[tuple[int, str]], path: Path) -> _Header:
+    above_geoid = any("height=" in text and "/geodetic" in text for _, text in comments)
+    for line, text in reversed(comments):
+        words = text.lstrip("% ").split()
+        clock = words[0].upper() if words else ""
+        if clock not in ("GPST", "UTC", "JST"):
+            continue
+        if "baseline" in text:
+            raise InputError(
+                "has baselines from the base station, not positions: let RTKLIB write Lat/Lon/Height",
+                path=path,
+                line=line,
+            )
+        form: _Form | None = None
+        if "x-ecef" in text:
+            form = "ecef"
+        elif "latitude" in text:
+            form = "degrees" if "(deg)" in text else "sexagesimal"
+        if form is not None:
+            return _Header(line, clock, form, above_geoid and form != "ecef")
+    raise InputError(
+        "has no header of RTKLIB: let it be written (Output Header), it states clock and coordinates", path=path
+    )
+
+
+def _numbers(cells: Sequence[str], places: int, path: Path, line: int) -> list[float]:
+    """Return three coordinates, quality, satellites, three σ and three correlated σ; NaN for what is missing."""
+    if len(cells) < places:
+        raise InputError(f"has {len(cells) + 2} cells, expected time, position, quality …", path=path, line=line)
+    values = [number(text, path=path, line=line, field="position") for text in cells[:places]]
+    if places == 7:
+        values = [_degrees(cells[0], values[:3]), _degrees(cells[3], values[3:6]), values[6]]
+    rest = [number(text, path=path, line=line, field="quality and σ") for text in cells[places : places + 8]]
+    return values + rest + [np.nan] * (8 - len(rest))
+
+
+def _degrees(text: str, parts: Sequence[float]) -> float:
+    """Return degrees, minutes and seconds as degrees; the sign of −0° counts."""
+    sign = -1.0 if text.startswith("-") else 1.0
+    return sign * (abs(parts[0]) + parts[1] / 60 + parts[2] / 3600)
+
+
+def _sigma_of_ecef(table: FloatArray) -> FloatArray:
+    """Return σ east, north, up (N, 3) of rows with σ x, y, z, xy, yz, zx; NaN where they are unknown.
+
+    RTKLIB writes a covariance as its root with its sign.
+    """
+    x, y, z, xy, yz, zx = (np.sign(column) * column**2 for column in table[:, 5:11].T)
+    cov = np.stack([np.stack([x, xy, zx], -1), np.stack([xy, y, yz], -1), np.stack([zx, yz, z], -1)], -2)
+    ecef_from_enu = ecef_from_enu_rotation(lla_from_ecef(table[:, :3]))
+    variance = np.einsum("nji,njk,nki->ni", ecef_from_enu, cov, ecef_from_enu)
+    return np.sqrt(np.where(variance > 0, variance, np.nan))
+
+
+def _check_solutions(xyz: FloatArray, form: _Form, path: Path, lines: Sequence[int]) -> None:
+    if form == "ecef":
+        distance = np.linalg.norm(xyz, axis=1)
+        good = ~((distance < _EARTH_M[0]) | (distance > _EARTH_M[1]))
+    else:
+        good = ~((np.abs(xyz[:, 1]) > 90) | (np.abs(xyz[:, 0]) > 360))
+    bad = np.flatnonzero(~good)
+    if len(bad):
+        raise InputError("is no place on Earth", path=path, line=lines[bad[0]], field="position")
+
+
+def _times(clock: str, rows: Sequence[tuple[int, list[str]]], path: Path) -> FloatArray:
+    """Return seconds since 1970 UTC (N,)."""
+    by_week = "/" not in rows[0][1][0]
+    if by_week:
+        table = np.array([[number(text, path=path, line=at, field="time") for text in cells] for at, cells in rows])
+        bad = np.flatnonzero(
+            ~((table[:, 0] >= 0) & (table[:, 0] < 1e5) & (table[:, 1] >= 0) & (table[:, 1] <= WEEK_S))
+        )
+        if len(bad):
+            raise InputError("is no GPS week and second", path=path, line=rows[bad[0]][0], field="time")
+        return unix_from_week(table[:, 0], table[:, 1])
+    time_s = np.array([_date(cells, path, at) for at, cells in rows])
+    if clock == "GPST":
+        return unix_from_gps(time_s)
+    return time_s - _JST_S if clock == "JST" else time_s
+
+
+def _date(cells: Sequence[str], path: Path, line: int) -> float:
+    """Return the seconds since 1970 of a date, counted without leap seconds."""
+    text = " ".join(cells)
+    match = re.fullmatch(r"(\d{4})/(\d{1,2})/(\d{1,2}) (\d{1,2}):(\d{1,2}):(\d{1,2})(\.\d*)?", text)
+    try:
+        if match is None:
+            raise ValueError(text)
+        year, month, day, hour, minute, second = (int(part) for part in match.groups()[:6])
+        # RTKLIB rounds seconds, and writes 60.000.
+        start = datetime(year, month, day, hour, minute, tzinfo=UTC).timestamp()
+        if second > 60:
+            raise ValueError(text)
+    except ValueError:
+        message = f"{text[:40]!r} is no time like 2024/05/01 12:00:00.000"
+        raise InputError(message, path=path, line=line, field="time") from None
+    return start + second + float(f"0{match[7] or ''}")

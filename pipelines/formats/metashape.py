@@ -1,0 +1,344 @@
+"""Metashape's markers with their projections (Tools ▸ Export ▸ Export Markers, XML).
+
+A camera's label names the image. The centre of the top-left pixel is (0.5, 0.5), as here. Projections that are not
+pinned were placed by Metashape and not by a person: they are left out. A marker whose reference is not enabled is a
+check point. defusedxml refuses entities and document type definitions.
+
+Metashape's reference table (File ▸ Export ▸ Export Reference): cameras, or markers without their marks.
+
+A comment states the CRS as WKT, and another one is the header: `#Label,X/Longitude,Y/Latitude,Z/Altitude,…`. X is
+the easting or longitude. Yaw, pitch and roll are those of the camera's mount: pitch 0 looks straight down. Columns
+with `_est` and errors are results of Metashape and are not read.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+from xml.sax import ContentHandler, SAXException
+
+import numpy as np
+
+from pipelines.core.errors import InputError
+from pipelines.core.files import file_size
+from pipelines.core.types import FloatArray
+from pipelines.formats.ground_points import GroundPoints, ListedMark, ListedPoint, without_repeats
+from pipelines.formats.tables import Row, named_columns, read_lines, rows, separator_of, split
+from pipelines.formats.trajectory_csv import PoseTable, complete
+from pipelines.geometry.rotations import geo_from_cam, quat_xyzw_from_matrix
+
+if TYPE_CHECKING:
+    from xml.sax.xmlreader import AttributesImpl, Locator
+
+MARKERS = "Metashape's markers"
+_MAX_BYTES = 64 * 1024 * 1024
+_LONGEST_TAG = 1 << 20  # The parser begins an unfinished tag again with every part of the file.
+_LONGEST_CRS, _MAX_DEPTH = 1 << 16, 100
+_OFF = frozenset({"0", "false"})
+
+
+def read_markers_xml(path: Path) -> GroundPoints:
+    """Read markers and their pinned projections; markers without coordinates are left out.
+
+    Raises:
+        InputError: unreadable, not well-formed XML, not of Metashape, several chunks, a value that is no number, or
+            no marker with coordinates.
+    """
+    from defusedxml.common import DefusedXmlException
+    from defusedxml.sax import make_parser
+
+    file_size(path, limit_bytes=_MAX_BYTES, kind="file of markers")
+    reader = _Reader(path)
+    parser = make_parser()
+    parser.forbid_dtd = True
+    parser.setContentHandler(reader)
+    reader.setDocumentLocator(parser)
+    try:
+        with path.open("rb") as stream:
+            while data := stream.read(_LONGEST_TAG):
+                before = reader.events
+                parser.feed(data)
+                if len(data) == _LONGEST_TAG and reader.events == before:
+                    message = f"a tag or comment is longer than {_LONGEST_TAG >> 20} MiB, the limit"
+                    raise InputError(message, path=path, line=reader.line)
+        parser.close()
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror}", path=path) from error
+    except (SAXException, DefusedXmlException, ValueError, LookupError) as error:
+        message = " ".join(str(error).split())[:200]
+        raise InputError(f"is no well-formed XML: {message}", path=path) from error
+    return reader.result()
+
+
+class _Reader(ContentHandler):
+    """Reader of one document, element by element."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self._path = path
+        self._place: Locator | None = None
+        self.events = 0
+        self._open: list[str] = []
+        self._chunks = 0
+        self._marker: tuple[str, str] | None = None  # id and label
+        self._projected: str | None = None  # id
+        self._crs = ""
+        self._crs_line = 1
+        self._labels: dict[str, str] = {}  # of cameras, by id
+        self._names: dict[str, str] = {}  # of markers, by id
+        self._ids: dict[str, str] = {}  # of markers, by name
+        self._points: list[ListedPoint] = []
+        self._projections: list[tuple[int, str, str, float, float]] = []  # line, marker, camera, x, y
+        self._left_out: list[str] = []
+
+    def setDocumentLocator(self, locator: Locator) -> None:
+        """Keep the parser's place, for errors."""
+        self._place = locator
+
+    def startElement(self, name: str, attrs: AttributesImpl) -> None:
+        """Read an element that begins."""
+        self.events += 1
+        values = {str(key): str(value) for key, value in attrs.items()}
+        parent = self._open[-1] if self._open else ""
+        self._open.append(name)
+        if len(self._open) > _MAX_DEPTH:
+            raise InputError("is nested too deeply", path=self._path, line=self.line)
+        if name == "chunk":
+            self._chunks += 1
+            if self._chunks > 1:
+                raise InputError("has several chunks: export the markers of one", path=self._path, line=self.line)
+        elif name == "camera" and "id" in values and "label" in values:
+            self._labels[values["id"]] = values["label"]
+        elif name == "marker" and "marker_id" in values:
+            self._projected = values["marker_id"]
+        elif name == "marker" and "id" in values:
+            self._marker = (values["id"], values.get("label", ""))
+        elif name == "reference" and parent == "marker" and self._marker is not None:
+            self._read_point(values)
+        elif name == "reference":
+            self._crs_line = self.line
+        elif name == "location" and parent == "marker" and self._projected is not None:
+            self._read_projection(values)
+
+    def endElement(self, name: str) -> None:
+        """Close an element."""
+        self.events += 1
+        self._open.pop()
+        if name == "marker":
+            self._marker = self._projected = None
+
+    def characters(self, content: str) -> None:
+        """Gather the text of the CRS."""
+        self.events += 1
+        if self._open and self._open[-1] == "reference":
+            self._crs += content
+            if len(self._crs) > _LONGEST_CRS:
+                message = f"the CRS is longer than {_LONGEST_CRS} characters, the limit"
+                raise InputError(message, path=self._path, line=self.line)
+
+    def result(self) -> GroundPoints:
+        """Return the points and marks that were read."""
+        if not self._points:
+            raise InputError("has no marker with coordinates: is it an export of markers?", path=self._path)
+        known = {point.name for point in self._points}
+        marks = [
+            ListedMark(line, self._names[marker], self._labels.get(camera, f"camera {camera}"), x, y)
+            for line, marker, camera, x, y in self._projections
+            if self._names.get(marker) in known
+        ]
+        crs = self._crs.strip()
+        return GroundPoints(
+            path=self._path,
+            kind=MARKERS,
+            points=without_repeats(self._points, self._path),
+            marks=tuple(marks),
+            crs_text=crs or None,
+            crs_line=self._crs_line,
+            left_out=tuple(self._left_out),
+        )
+
+    @property
+    def line(self) -> int:
+        """Line that is being read."""
+        return 1 if self._place is None else int(self._place.getLineNumber() or 1)
+
+    def _read_point(self, values: dict[str, str]) -> None:
+        marker, name = self._marker or ("", "")
+        if not {"x", "y", "z"} <= set(values):
+            return
+        if not name:
+            raise InputError("has no name", path=self._path, line=self.line, field="label")
+        if self._ids.setdefault(name, marker) != marker:
+            raise InputError(f"two markers have the name {name}", path=self._path, line=self.line)
+        self._names[marker] = name
+        both = self._sigma(values, "sxyz")
+        horizontal = [sigma for axis in ("sx", "sy") if (sigma := self._sigma(values, axis)) is not None]
+        self._points.append(
+            ListedPoint(
+                line=self.line,
+                name=name,
+                xyz=(self._number(values, "x"), self._number(values, "y"), self._number(values, "z")),
+                sigma_h_m=max(horizontal) if horizontal else both,
+                sigma_v_m=self._sigma(values, "sz") or both,
+                is_check=values.get("enabled", "true").lower() in _OFF,
+            )
+        )
+
+    def _read_projection(self, values: dict[str, str]) -> None:
+        marker, camera = self._projected or "", values.get("camera_id", "")
+        if not {"x", "y"} <= set(values) or values.get("valid", "true").lower() in _OFF:
+            return
+        if values.get("pinned", "true").lower() in _OFF:
+            self._left_out.append(f"{self._path.name}:{self.line}")
+            return
+        self._projections.append((self.line, marker, camera, self._number(values, "x"), self._number(values, "y")))
+
+    def _number(self, values: dict[str, str], key: str) -> float:
+        try:
+            value = float(values[key])
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            message = f"{values[key][:40]!r} is no number"
+            raise InputError(message, path=self._path, line=self.line, field=key)
+        return value
+
+    def _sigma(self, values: dict[str, str], key: str) -> float | None:
+        """Return a σ that is above zero, or None."""
+        value = self._number(values, key) if key in values else 0.0
+        return value if value > 0 else None
+
+
+REFERENCE = "Metashape's reference"
+HEADER = re.compile(r"#\s*label\b", re.IGNORECASE)
+_CRS = re.compile(r"#\s*CoordinateSystem:\s*(.*)", re.IGNORECASE)
+_GIMBAL_FROM_MOUNT_PITCH_DEG = -90.0
+_ALIASES = {
+    "label": "label",
+    **dict.fromkeys(("x/longitude", "x/easting", "x", "longitude", "easting"), "x"),
+    **dict.fromkeys(("y/latitude", "y/northing", "y", "latitude", "northing"), "y"),
+    **dict.fromkeys(("z/altitude", "z", "altitude"), "z"),
+    "accuracy": "sigma",
+    "accuracyx/y": "sigma_h",
+    "accuracyz": "sigma_v",
+    **{name: name for name in ("yaw", "pitch", "roll")},
+    **dict.fromkeys(("enable", "enabled"), "enabled"),
+}
+_RESULT = re.compile(r"error|est|variance|var\b|omega|phi|kappa|projections", re.IGNORECASE)
+_DISABLED = frozenset({"0", "false"})
+
+
+def read_markers(path: Path) -> GroundPoints:
+    """Read markers without marks; a marker that is not enabled is a check point, as in Metashape.
+
+    Raises:
+        InputError: no header, no rows, a column is missing, a cell is no number, or one point at two places.
+    """
+    table = _Reference(path)
+    points = [
+        ListedPoint(
+            line=row.line,
+            name=row.text("label"),
+            xyz=(row.finite("x"), row.finite("y"), row.finite("z")),
+            sigma_h_m=row.sigma_m("sigma_h") or row.sigma_m("sigma"),
+            sigma_v_m=row.sigma_m("sigma_v") or row.sigma_m("sigma"),
+            is_check=not _is_enabled(row),
+        )
+        for row in table.rows
+        if row.text("x")
+    ]
+    if not points:
+        raise InputError("has no marker with coordinates", path=path)
+    return GroundPoints(
+        path=path,
+        kind=REFERENCE,
+        points=without_repeats(points, path),
+        crs_text=table.crs_text,
+        crs_line=table.crs_line,
+        geographic=table.geographic,
+        unknown_columns=table.unknown_columns,
+    )
+
+
+def read_cameras(path: Path) -> PoseTable:
+    """Read the positions, and the angles where they are there, of cameras; a label names the image.
+
+    Raises:
+        InputError: no header, no rows, a column is missing, or a cell is no number.
+    """
+    table = _Reference(path)
+    on = np.array([_is_enabled(row) for row in table.rows])
+    xyz = np.array([[row.number("x"), row.number("y"), row.number("z")] for row in table.rows])
+    sigma = np.array([_sigma_enu_m(row) for row in table.rows])
+    return PoseTable(
+        path=path,
+        source="metashape",
+        lines=np.array([row.line for row in table.rows], dtype=np.int64),
+        names=tuple(row.text("label") for row in table.rows),
+        time_s=None,
+        xyz=np.where(on[:, None], xyz, np.nan),
+        geographic=table.geographic,
+        quat_xyzw=_quaternions(table.rows),
+        sigma_enu_m=sigma if np.isfinite(sigma).any() else None,
+        crs_text=table.crs_text,
+        crs_line=table.crs_line,
+        unknown_columns=table.unknown_columns,
+        header_line=table.header_line,
+    )
+
+
+class _Reference:
+    """Header and rows of a reference table.
+
+    Raises:
+        InputError: no header, no row, or a column is missing.
+    """
+
+    def __init__(self, path: Path) -> None:
+        lines = [(at, text.strip()) for at, text in enumerate(read_lines(path), start=1) if text.strip()]
+        header = next(((at, text) for at, text in lines if HEADER.match(text)), None)
+        if header is None:
+            raise InputError("has no line that begins with #Label", path=path)
+        self.header_line, text = header
+        stated = next(((at, found[1]) for at, text in lines if (found := _CRS.match(text))), None)
+        self.crs_line = 1 if stated is None else stated[0]
+        self.crs_text = None if stated is None else stated[1]
+        self.geographic = True if "longitude" in text.lower() else None
+        separator = separator_of(text)
+        cells = split(text.lstrip("# "), separator, path=path, line=self.header_line)
+        columns, unknown = named_columns(cells, _ALIASES, path, self.header_line)
+        self.unknown_columns = tuple(name for name in unknown if not _RESULT.search(name))
+        missing = [name for name in ("label", "x", "y", "z") if name not in columns]
+        if missing:
+            raise InputError(f"the header names no {', '.join(missing)}", path=path, line=self.header_line)
+        kept = [(at, text) for at, text in lines if at > self.header_line and not text.startswith("#")]
+        self.rows: list[Row] = list(rows(path, kept, separator, columns))
+        if not self.rows:
+            raise InputError("has a header but no rows", path=path)
+        unnamed = next((row for row in self.rows if not row.text("label")), None)
+        if unnamed is not None:
+            raise InputError("has no name", path=path, line=unnamed.line, field="label")
+
+
+def _is_enabled(row: Row) -> bool:
+    return "enabled" not in row.columns or row.text("enabled").lower() not in _DISABLED
+
+
+def _sigma_enu_m(row: Row) -> tuple[float, float, float]:
+    horizontal = row.sigma_m("sigma_h") or row.sigma_m("sigma") or np.nan
+    return horizontal, horizontal, row.sigma_m("sigma_v") or row.sigma_m("sigma") or np.nan
+
+
+def _quaternions(table: Sequence[Row]) -> FloatArray | None:
+    """Return rotations camera → East-North-Up (N, 4), NaN where a row has no angles; None without any."""
+    angles = np.array([[row.number(name) for name in ("yaw", "pitch", "roll")] for row in table])
+    known = complete(angles)
+    if not known.any():
+        return None
+    result = np.full((len(table), 4), np.nan)
+    gimbal = angles[known] + np.array([0.0, _GIMBAL_FROM_MOUNT_PITCH_DEG, 0.0])
+    result[known] = quat_xyzw_from_matrix(geo_from_cam(gimbal))
+    return result

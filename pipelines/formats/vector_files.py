@@ -1,0 +1,150 @@
+"""GeoJSON (RFC 7946): longitude and latitude in WGS84 degrees, outer rings anticlockwise, cut at the date line.
+
+Contour lines as GeoPackage and DXF: a line a height, with the height as attribute and as z.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from pipelines.core.files import replace_file, replace_text
+from pipelines.core.types import FloatArray
+from pipelines.geometry.footprints import clipped_ring
+
+_DECIMALS = 8  # of a degree: 1 mm
+
+Json = dict[str, Any]
+
+
+def polygon(lon_lat: ArrayLike) -> Json | None:
+    """Return the geometry of a ring (K, 2) in degrees, not closed: a Polygon, or two if it crosses the date line.
+
+    None, which is the geometry of an unlocated feature, if the ring has no area.
+    """
+    ring = np.asarray(lon_lat, dtype=np.float64)
+    if len(ring) < 3:
+        return None
+    ring = ring.copy()
+    ring[:, 0] -= 360.0 * np.round((ring[:, 0] - ring[0, 0]) / 360.0)
+    turned = [ring + np.array([turn, 0.0]) for turn in (-360.0, 0.0, 360.0)]
+    rings = [closed for part in turned if (closed := _closed(_between_date_lines(part))) is not None]
+    if not rings:
+        return None
+    if len(rings) == 1:
+        return {"type": "Polygon", "coordinates": [rings[0]]}
+    return {"type": "MultiPolygon", "coordinates": [[one] for one in rings]}
+
+
+def feature(geometry: Json | None, properties: Mapping[str, Any], bbox: Sequence[float] | None = None) -> Json:
+    """Return a feature; NaN among the properties becomes null."""
+    box = {} if bbox is None else {"bbox": list(bbox)}
+    known = {name: None if _is_nan(value) else value for name, value in properties.items()}
+    return {"type": "Feature", **box, "geometry": geometry, "properties": known}
+
+
+def write_features(path: Path, features: Sequence[Json]) -> None:
+    """Write a FeatureCollection, one feature a line; the file appears whole or not at all.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    replace_text(path, features_text(features))
+
+
+def features_text(features: Sequence[Json]) -> str:
+    """Return a FeatureCollection as text, one feature a line."""
+    lines = ",\n".join(json.dumps(one, allow_nan=False, ensure_ascii=False) for one in features)
+    return f'{{"type": "FeatureCollection", "features": [\n{lines}\n]}}\n'
+
+
+def _between_date_lines(ring: FloatArray) -> FloatArray:
+    east_of = clipped_ring(ring, ring[:, 0] + 180.0)
+    return clipped_ring(east_of, 180.0 - east_of[:, 0])
+
+
+def _closed(ring: FloatArray) -> list[list[float]] | None:
+    if len(ring) < 3:
+        return None
+    rounded = np.round(ring, _DECIMALS)
+    x, y = rounded[:, 0] - rounded[0, 0], rounded[:, 1] - rounded[0, 1]
+    area = float(x @ np.roll(y, -1) - y @ np.roll(x, -1))
+    if area == 0.0:
+        return None
+    outline = rounded if area > 0 else rounded[::-1]
+    return [*outline.tolist(), outline[0].tolist()]
+
+
+def _is_nan(value: object) -> bool:
+    return isinstance(value, float) and math.isnan(value)
+
+
+_LINE_STRING_Z = 1002  # OGC 06-103r4, table 8
+_MINOR, _MAJOR = "CONTOURS", "CONTOURS_MAJOR"
+
+
+@dataclass(frozen=True)
+class ContourLine:
+    """Line of equal height.
+
+    Attributes:
+        height: in the unit of the CRS's heights.
+        xy: (K, 2) in the CRS, easting or longitude first.
+        is_major: whether it is one of every fifth, drawn thicker.
+    """
+
+    height: float
+    xy: FloatArray
+    is_major: bool
+
+
+def write_contours_gpkg(path: Path, lines: Sequence[ContourLine], wkt: str) -> None:
+    """Write contour lines as a GeoPackage (OGC 12-128r18) with the layer `contours`."""
+    import pyogrio
+
+    draft = path.with_name(f".{path.name}")  # GDAL takes the format from the suffix
+    draft.unlink(missing_ok=True)
+    pyogrio.raw.write(
+        draft,
+        geometry=np.array([_wkb(line) for line in lines], dtype=object),
+        field_data=[
+            np.array([line.height for line in lines], dtype=np.float64),
+            np.array([line.is_major for line in lines], dtype=np.bool_),
+        ],
+        fields=["height", "major"],
+        layer="contours",
+        driver="GPKG",
+        geometry_type="LineString Z",
+        crs=wkt,
+    )
+    replace_file(draft, path)
+
+
+def write_contours_dxf(path: Path, lines: Sequence[ContourLine]) -> None:
+    """Write contour lines as DXF (R2010) polylines with their height as elevation, every fifth on its own layer."""
+    from ezdxf.filemanagement import new
+
+    document = new("R2010")
+    document.layers.add(_MINOR, color=8)
+    document.layers.add(_MAJOR, color=7, lineweight=50)
+    space = document.modelspace()
+    for line in lines:
+        layer = _MAJOR if line.is_major else _MINOR
+        polyline = space.add_lwpolyline(line.xy.tolist(), dxfattribs={"layer": layer})
+        polyline.dxf.elevation = line.height
+    draft = path.with_name(path.name + ".tmp")
+    document.saveas(draft)
+    replace_file(draft, path)
+
+
+def _wkb(line: ContourLine) -> bytes:
+    points = np.column_stack([line.xy, np.full(len(line.xy), line.height)])
+    return struct.pack("<BII", 1, _LINE_STRING_Z, len(points)) + points.astype("<f8").tobytes()

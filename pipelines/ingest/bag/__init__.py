@@ -1,1 +1,0 @@
-"""ROS bags into the survey: topics, clocks, frames, photographs."""

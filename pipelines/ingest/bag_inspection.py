@@ -1,0 +1,184 @@
+"""`georef inspect`: what a ROS bag holds, what `ingest` would select of it, and what is missing.
+
+Reads the bag once, message by message; writes nothing.
+"""
+
+from __future__ import annotations
+
+from array import array
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipelines.core.progress import SILENT, Progress
+from pipelines.formats.bag import COMPRESSED, IMAGE, INFO, Bag, RawMessage, UndecodableError, open_bag
+from pipelines.ingest import bag_messages as bag_transforms
+from pipelines.ingest.bag_messages import ATTITUDES, BASE, POSITIONS, Transforms
+from pipelines.ingest.bag_streams import RequestedTopics, SelectedTopics, select_topics
+
+_KNOWN = {IMAGE, COMPRESSED, INFO, *POSITIONS, *ATTITUDES}
+# A gap is worth telling if it is this many times the usual step.
+_GAP_STEPS = 3.0
+
+
+@dataclass(frozen=True)
+class TopicReport:
+    """A topic.
+
+    Attributes:
+        use: what `ingest` would take from it, or "".
+        messages: that could be read.
+        rate_hz: by the median step between stamps; None for fewer than two messages.
+        first_s, last_s: time span; `longest_gap_s`: in it.
+        gaps: steps of more than three times the median.
+        backwards: stamps that are not later than the one before.
+        clock: "stamp", or "recording" where messages have none.
+        frame: of the first message; `child`: its child frame.
+        problem: why the type or its messages cannot be read.
+    """
+
+    name: str
+    type: str
+    use: str
+    messages: int
+    rate_hz: float | None
+    first_s: float | None
+    last_s: float | None
+    longest_gap_s: float | None
+    gaps: int
+    backwards: int
+    clock: str
+    frame: str
+    problem: str
+
+
+@dataclass(frozen=True)
+class BagReport:
+    """A bag: its topics, remarks on those that `ingest` would select, and what is missing."""
+
+    path: str
+    messages: int
+    topics: tuple[TopicReport, ...]
+    remarks: tuple[str, ...]
+    missing: tuple[str, ...]
+
+
+@dataclass
+class _Tally:
+    """Counts of one pass over a topic."""
+
+    times: array[int] = field(default_factory=lambda: array("q"))
+    stamped: bool = False
+    frame: str = ""
+    child: str = ""
+    problem: str = ""
+    described: bool = False
+
+
+def inspect_bag(path: Path, progress: Progress = SILENT) -> BagReport:
+    """Report on a bag.
+
+    Raises:
+        InputError: it cannot be opened.
+    """
+    with open_bag(path) as bag:
+        topics = select_topics(bag, RequestedTopics())
+        tallies = {name: _Tally() for name in bag.topics}
+        transforms = Transforms()
+        with progress.task("bag", bag.message_count) as task:
+            for message in bag.messages(list(bag.topics)):
+                _count(bag, message, tallies[message.topic], transforms)
+                task.advance()
+        uses = {
+            topics.image: "photographs",
+            topics.info: "lens",
+            topics.fix: "positions",
+            topics.attitude: "attitudes",
+        }
+        if topics.fix is not None and topics.fix == topics.attitude:
+            uses[topics.fix] = "positions, attitudes"
+        reports = tuple(
+            _report(name, bag.topics[name].type, uses.get(name, ""), tally)
+            for name, tally in sorted(tallies.items())
+        )
+        missing = _missing(bag, topics, tallies, transforms)
+        count = sum(len(tally.times) for tally in tallies.values())
+        return BagReport(str(path), count, reports, topics.remarks, missing)
+
+
+def _count(bag: Bag, message: RawMessage, tally: _Tally, transforms: Transforms) -> None:
+    is_frames = message.type in (bag_transforms.TYPE, bag_transforms.OLD_TYPE)
+    if not tally.described or is_frames:
+        tally.described = True
+        try:
+            decoded = bag.decode(message)
+            if is_frames:
+                transforms.add(decoded, static=message.topic.endswith("static"))
+            _describe(decoded, tally)
+        except UndecodableError as error:
+            tally.problem = str(error)[:200]
+    stamp = bag.header_stamp_ns(message) if tally.stamped else None
+    tally.times.append(stamp or message.bag_ns)
+
+
+def _describe(message: Any, tally: _Tally) -> None:
+    header = getattr(message, "header", None)
+    if header is not None:
+        tally.stamped = bool(header.stamp.sec or header.stamp.nanosec)
+        tally.frame = str(header.frame_id)
+    tally.child = str(getattr(message, "child_frame_id", ""))
+
+
+def _report(name: str, kind: str, use: str, tally: _Tally) -> TopicReport:
+    times = np.frombuffer(tally.times, dtype=np.int64) if len(tally.times) else np.empty(0, np.int64)
+    steps = np.diff(times) / 1e9
+    forward = steps[steps > 0]
+    usual = float(np.median(forward)) if len(forward) else None
+    return TopicReport(
+        name=name,
+        type=kind,
+        use=use,
+        messages=len(times),
+        rate_hz=None if usual is None else 1.0 / usual,
+        first_s=float(times.min() / 1e9) if len(times) else None,
+        last_s=float(times.max() / 1e9) if len(times) else None,
+        longest_gap_s=float(forward.max()) if len(forward) else None,
+        gaps=int((forward > _GAP_STEPS * usual).sum()) if usual is not None else 0,
+        backwards=int((steps <= 0).sum()),
+        clock="stamp" if tally.stamped else "recording",
+        frame=" → ".join(filter(None, (tally.frame, tally.child))),
+        problem=tally.problem,
+    )
+
+
+def _missing(
+    bag: Bag, topics: SelectedTopics, tallies: dict[str, _Tally], transforms: Transforms
+) -> tuple[str, ...]:
+    """Return what a survey would lack, and the remedies."""
+    missing: list[str] = []
+    if bag.damage is not None:
+        missing.append(f"the bag is damaged and could not be read to its end ({bag.damage})")
+    if topics.image is None:
+        missing.append("no photographs: no topic of sensor_msgs/Image or CompressedImage")
+    if topics.info is None:
+        missing.append("no CameraInfo for the photographs: the focal length is assumed, or give --focal-px")
+    if topics.fix is None:
+        missing.append("no positions: ground control points alone can place the model (--gcp)")
+    elif not POSITIONS[bag.topics[topics.fix].type].geodetic:
+        missing.append(f"{topics.fix} is in a local frame: give --origin LAT,LON,HEIGHT of its zero")
+    if topics.attitude is None:
+        missing.append("no attitudes: a lever arm cannot be applied")
+        return tuple(missing)
+    if topics.image is None:
+        return tuple(missing)
+    body = tallies[topics.attitude].child or tallies[topics.attitude].frame or BASE
+    body = body if body in transforms or BASE not in transforms else BASE
+    camera, at = tallies[topics.image].frame, np.zeros(1)
+    if transforms.between(body, camera, at) is None:
+        missing.append(f"/tf does not link camera {camera!r} and body {body!r}: give --camera-mount YAW,PITCH,ROLL")
+    antenna = tallies[topics.fix].child or tallies[topics.fix].frame or BASE if topics.fix else None
+    if antenna is not None and transforms.between(body, antenna, at) is None:
+        missing.append(f"/tf does not link antenna {antenna!r} and body {body!r}: give --lever-arm")
+    return tuple(missing)

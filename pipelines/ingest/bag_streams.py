@@ -1,0 +1,330 @@
+"""The small messages of a bag, read in one pass: stamps of the photographs, positions, attitudes, frames, lens.
+
+Photographs pass by undecoded here, so that memory does not grow with them.
+
+Which topics of a bag to use: by type, by rule where several fit, or as the user says.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections import Counter
+from collections.abc import Container, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipelines.core.errors import InputError
+from pipelines.core.progress import SILENT, Progress
+from pipelines.core.types import BoolArray, FloatArray
+from pipelines.formats.bag import COMPRESSED, IMAGE, INFO, Bag, BagTopic, RawMessage, UndecodableError
+from pipelines.ingest import bag_messages as bag_transforms
+from pipelines.ingest.bag_messages import ATTITUDES, POSITIONS, Axes, Transforms, stamp_ns
+from pipelines.ingest.notes import Notes
+
+# Pictures that are no photographs.
+_NOT_PHOTOS = ("depth", "disparity", "mask", "confidence", "segmentation", "thermal", "theora")
+
+
+@dataclass(frozen=True)
+class RequestedTopics:
+    """Topics that the user named."""
+
+    image: str | None = None
+    fix: str | None = None
+    attitude: str | None = None
+
+
+@dataclass(frozen=True)
+class SelectedTopics:
+    """The topics to read, None where the bag has none; `remarks` names those that were not selected."""
+
+    image: str | None
+    info: str | None
+    fix: str | None
+    attitude: str | None
+    remarks: tuple[str, ...]
+
+
+def select_topics(bag: Bag, requested: RequestedTopics) -> SelectedTopics:
+    """Select the topics to read.
+
+    Images: names that tell of depth, masks and the like come last, then topics with a `CameraInfo` beside them
+    first, then those with more messages. Positions and attitudes: by the order of types in `messages`
+    (receivers before estimators before local frames), then those with more messages. Attitudes only where the
+    first message has one. Equals go by name.
+
+    Raises:
+        InputError: a named topic is not there, or is of no type that fits.
+    """
+    remarks: list[str] = []
+    images = sorted(_of(bag, (IMAGE, COMPRESSED)), key=lambda topic: _image_rank(bag, topic))
+    image = _pick(bag, images, requested.image, flag="--image-topic", subject="photographs", remarks=remarks)
+    fixes = sorted(_of(bag, POSITIONS), key=lambda topic: (POSITIONS[topic.type].rank, -topic.count, topic.name))
+    fix = _pick(bag, fixes, requested.fix, flag="--fix-topic", subject="positions", remarks=remarks)
+    attitudes = sorted(
+        _of(bag, ATTITUDES), key=lambda topic: (ATTITUDES[topic.type].rank, -topic.count, topic.name)
+    )
+    if requested.attitude is None:
+        attitudes = [topic for topic in attitudes if _has_attitude(bag, topic)]
+    attitude = _pick(
+        bag, attitudes, requested.attitude, flag="--attitude-topic", subject="attitudes", remarks=remarks
+    )
+    return SelectedTopics(image, info_topic(bag, image), fix, attitude, tuple(remarks))
+
+
+def info_topic(bag: Bag, image: str | None) -> str | None:
+    """Return the `CameraInfo` of an image topic: in its namespace, or the only one."""
+    infos = _of(bag, (INFO,))
+    if image is not None:
+        parts = image.split("/")
+        for depth in range(len(parts) - 1, 1, -1):
+            beside = "/".join([*parts[:depth], "camera_info"])
+            if any(topic.name == beside for topic in infos):
+                return beside
+    return infos[0].name if len(infos) == 1 else None
+
+
+def _of(bag: Bag, types: Container[str]) -> list[BagTopic]:
+    return [topic for topic in bag.topics.values() if topic.count and topic.type in types]
+
+
+def _image_rank(bag: Bag, topic: BagTopic) -> tuple[bool, bool, int, str]:
+    name = topic.name.lower()
+    beside = info_topic(bag, topic.name)
+    near = beside is not None and topic.name.startswith(beside.removesuffix("camera_info"))
+    return any(word in name for word in _NOT_PHOTOS), not near, -topic.count, topic.name
+
+
+def _has_attitude(bag: Bag, topic: BagTopic) -> bool:
+    message = bag.first(topic.name)
+    return message is not None and not ATTITUDES[topic.type].read(message).problem
+
+
+def _pick(
+    bag: Bag, candidates: list[BagTopic], requested: str | None, *, flag: str, subject: str, remarks: list[str]
+) -> str | None:
+    names = [topic.name for topic in candidates]
+    if requested is not None:
+        if requested not in names:
+            is_other = requested in bag.topics
+            problem = f"is a {bag.topics[requested].type}" if is_other else "is not in the bag"
+            fitting = f"those with {subject}: {', '.join(names)}" if names else f"no topic has {subject}"
+            raise InputError(f"{requested} {problem}; {fitting}", path=bag.path, field=flag)
+        return requested
+    if len(names) > 1:
+        remarks.append(f"{subject} are from {names[0]}, not {', '.join(names[1:5])}: see {flag}")
+    return names[0] if names else None
+
+
+DAY_NS = 86_400_000_000_000
+# A stamp this far off the others, against the recorder's clock, is no late message but a wrong clock.
+_JUMP_NS = 60_000_000_000
+
+
+@dataclass
+class TopicSamples:
+    """Samples of one topic in the order of recording.
+
+    Attributes:
+        topic: its name.
+        type: of its messages.
+        stamps: nanoseconds of the message's own clock; 0 where it has none.
+        bag_times: nanoseconds of the recorder's clock.
+        values: `width` numbers a sample.
+        receivers: the kind of receiver of each sample.
+        frame: of the first sample; `world`: its local frame; `axes`: of the frame.
+        problems: how many messages were left out, by reason.
+    """
+
+    topic: str
+    type: str
+    width: int = 0
+    stamps: array[int] = field(default_factory=lambda: array("q"))
+    bag_times: array[int] = field(default_factory=lambda: array("q"))
+    values: array[float] = field(default_factory=lambda: array("d"))
+    receivers: list[str] = field(default_factory=list)
+    frame: str = ""
+    world: str = ""
+    axes: Axes = "flu"
+    problems: Counter[str] = field(default_factory=Counter)
+
+    def add(self, stamp: int | None, bag_ns: int, values: tuple[float, ...] = (), receiver: str = "") -> None:
+        """Append a sample."""
+        self.stamps.append(stamp or 0)
+        self.bag_times.append(bag_ns)
+        self.values.extend(values)
+        self.receivers.append(receiver)
+
+    def table(self) -> FloatArray:
+        """Return the values (N, width)."""
+        return np.frombuffer(self.values, dtype=np.float64).reshape(-1, self.width)
+
+
+@dataclass(frozen=True)
+class SampleTimes:
+    """When the samples of a topic were taken: seconds (N,), and which of them are usable (N,)."""
+
+    time_s: FloatArray
+    usable: BoolArray
+
+
+@dataclass(frozen=True)
+class BagStreams:
+    """The small messages of a bag.
+
+    Attributes:
+        path: of the bag.
+        images: stamps of every message of the image topic; `image_frame`: frame of the first.
+        positions: latitude, longitude, height (or east, north, up) and their σ.
+        attitudes: quaternion xyzw frame → East-North-Up, and σ in degrees.
+        transforms: the frames.
+        info: first `CameraInfo`, or None.
+        clocks: when the samples were taken, by topic.
+    """
+
+    path: Path
+    images: TopicSamples
+    image_frame: str
+    positions: TopicSamples | None
+    attitudes: TopicSamples | None
+    transforms: Transforms
+    info: Any | None
+    clocks: Mapping[str, SampleTimes]
+
+
+def read_streams(bag: Bag, topics: SelectedTopics, notes: Notes, progress: Progress = SILENT) -> BagStreams:
+    """Read everything but the pictures; messages that cannot be used are counted and noted."""
+    assert topics.image is not None
+    images = _series(bag, topics.image, 0)
+    positions = None if topics.fix is None else _series(bag, topics.fix, 6)
+    attitudes = None if topics.attitude is None else _series(bag, topics.attitude, 5)
+    transforms, image_frame, info = Transforms(), "", None
+    kinds = (bag_transforms.TYPE, bag_transforms.OLD_TYPE)
+    frames = [topic.name for topic in bag.topics.values() if topic.type in kinds]
+    wanted = {topics.image, *frames, *filter(None, (topics.info, topics.fix, topics.attitude))}
+    undecodable: dict[str, list[str]] = {}
+    total = sum(bag.topics[name].count for name in wanted)
+    with progress.task("bag", total) as task:
+        for message in bag.messages(wanted):
+            task.advance()
+            try:
+                if message.topic == images.topic:
+                    images.add(bag.header_stamp_ns(message), message.bag_ns)
+                    image_frame = image_frame or _frame(bag, message)
+                elif message.topic == topics.info:
+                    info = info or bag.decode(message)
+                elif message.topic in frames:
+                    transforms.add(bag.decode(message), static=message.topic.endswith("static"))
+                else:
+                    _navigation(bag, message, positions, attitudes)
+            except UndecodableError as error:
+                undecodable.setdefault(message.topic, []).append(str(error)[:120])
+    series = [samples for samples in (images, positions, attitudes) if samples is not None]
+    _note_losses(bag, series, undecodable, transforms.refused, notes)
+    clocks = settle_clocks(series, notes)
+    return BagStreams(bag.path, images, image_frame, positions, attitudes, transforms, info, clocks)
+
+
+def _series(bag: Bag, topic: str, width: int) -> TopicSamples:
+    return TopicSamples(topic, bag.topics[topic].type, width)
+
+
+def _note_losses(
+    bag: Bag, series: list[TopicSamples], undecodable: dict[str, list[str]], refused: int, notes: Notes
+) -> None:
+    for topic, errors in undecodable.items():
+        notes.warn(f"{len(errors)} messages of {topic} do not decode and were left out: {errors[0]}")
+    if refused:
+        notes.warn(f"{refused} transforms in /tf are not finite or not possible and were left out")
+    if bag.damage is not None:
+        count = sum(_count(samples) for samples in series)
+        notes.warn(f"{bag.path.name} is damaged: it could be read for {count} messages only ({bag.damage})")
+    if bag.fallback_types:
+        notes.assume(
+            f"the bag lacks definitions of {', '.join(sorted(bag.fallback_types))}: the usual ones are used"
+        )
+    for samples in series:
+        for problem, count in samples.problems.items():
+            notes.warn(f"{count} of {_count(samples)} messages of {samples.topic} were left out: {problem}")
+
+
+def _frame(bag: Bag, message: RawMessage) -> str:
+    """Return the frame of an image; one that does not decode is counted when the photographs are read."""
+    try:
+        return str(bag.decode(message).header.frame_id) or "camera"
+    except UndecodableError:
+        return ""
+
+
+def _count(series: TopicSamples) -> int:
+    return len(series.stamps) + sum(series.problems.values())
+
+
+def _navigation(
+    bag: Bag, message: RawMessage, positions: TopicSamples | None, attitudes: TopicSamples | None
+) -> None:
+    decoded = bag.decode(message)
+    if positions is not None and message.topic == positions.topic:
+        position = POSITIONS[message.type].read(decoded)
+        if position.problem:
+            positions.problems[position.problem] += 1
+        else:
+            positions.frame = positions.frame or position.frame
+            positions.world = positions.world or position.world
+            values = (*position.place, *position.sigma_enu_m)
+            positions.add(stamp_ns(decoded), message.bag_ns, values, position.receiver)
+    if attitudes is not None and message.topic == attitudes.topic:
+        attitude = ATTITUDES[message.type].read(decoded)
+        if attitude.problem:
+            attitudes.problems[attitude.problem] += 1
+        else:
+            if not attitudes.frame:
+                attitudes.frame, attitudes.axes = attitude.frame, attitude.axes
+            attitudes.add(stamp_ns(decoded), message.bag_ns, (*attitude.quat_xyzw, attitude.sigma_deg))
+
+
+def settle_clocks(series: list[TopicSamples], notes: Notes) -> dict[str, SampleTimes]:
+    """Return times on one clock for all topics, in seconds: the messages' own stamps, where they have any.
+
+    Messages without a stamp get the time of recording. Topics that count from another epoch than the rest (since
+    boot) are brought to the recorder's clock by the median difference; if all do (a simulator's time), they keep
+    it. Left out are stamps that jump by more than a minute against the recorder's clock, and those that are not
+    later than one before.
+    """
+    raw = {
+        samples.topic: (np.array(samples.stamps, dtype=np.int64), np.array(samples.bag_times, dtype=np.int64))
+        for samples in series
+    }
+    offset = {
+        topic: int(np.median((stamp - bag)[stamp != 0])) if (stamp != 0).any() else 0
+        for topic, (stamp, bag) in raw.items()
+    }
+    other_epoch = {topic for topic in raw if len(raw[topic][0]) and abs(offset[topic]) > DAY_NS}
+    mixed = bool(other_epoch) and len(other_epoch) < sum(len(stamp) > 0 for stamp, _ in raw.values())
+    clocks = {}
+    for topic, (stamp, bag) in raw.items():
+        without = int((stamp == 0).sum())
+        if without:
+            notes.assume(f"{without} messages of {topic} have no stamp: the time of recording is used")
+        time = np.where(stamp == 0, bag + offset[topic], stamp)
+        jump = np.abs(time - bag - offset[topic]) > _JUMP_NS
+        _note_left_out(notes, jump, topic, "have a stamp more than a minute off the others")
+        if mixed and topic in other_epoch:
+            time = time - offset[topic]
+            notes.assume(
+                f"stamps of {topic} count from another epoch: brought to the recorder's clock by their median"
+            )
+        usable = ~jump
+        latest = np.maximum.accumulate(np.where(usable, time, np.iinfo(np.int64).min))
+        backwards = usable & np.concatenate([[False], time[1:] <= latest[:-1]])
+        _note_left_out(notes, backwards, topic, "have a stamp that is not later than one before")
+        clocks[topic] = SampleTimes(time / 1e9, usable & ~backwards)
+    return clocks
+
+
+def _note_left_out(notes: Notes, bad: BoolArray, topic: str, reason: str) -> None:
+    if bad.any():
+        notes.warn(f"{int(bad.sum())} of {len(bad)} messages of {topic} {reason}, and were left out")

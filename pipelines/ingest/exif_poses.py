@@ -1,0 +1,282 @@
+"""Poses of images from the photographs' own tags: EXIF, and DJI's XMP.
+
+Positions of a table against those in the photographs' EXIF, image by image, in view of the σ of both.
+
+EXIF is not used where a table is given. But two receivers that disagree by far more than their σ are a
+contradiction that nothing later would notice: heights in feet, another zone, exchanged axes, times that are off.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from pipelines.core.errors import ContradictionError
+from pipelines.core.products import Caution
+from pipelines.core.sentences import listed
+from pipelines.core.types import FloatArray
+from pipelines.formats.exif import RTK_FIXED, RTK_FLOAT, PhotoTags
+from pipelines.formats.trajectory_csv import complete
+from pipelines.geodesy.crs import parse_crs
+from pipelines.geodesy.enu import ecef_from_enu_rotation, ecef_from_lla, lla_from_ecef
+from pipelines.geodesy.operations import WGS84
+from pipelines.geodesy.vertical import FOOT_M, MOST_GEOID_M, assumed_ellipsoidal
+from pipelines.geometry.rotations import geo_from_cam
+from pipelines.ingest.image_poses import AttitudeSource, ImagePoses, with_defaults
+from pipelines.ingest.notes import Notes
+from pipelines.ingest.options import IngestOptions
+from pipelines.ingest.photo_folder import Photo
+from pipelines.robust.patterns import blunders_among, median_spacing, scatter_about_median, two_groups
+from pipelines.robust.statistics import mad_sigma
+
+# Vertical over horizontal σ of a fix that states only the horizontal one.
+_VERTICAL_RATIO = 2.0
+_EXIF_NOTE = "EXIF altitude, which is often above a geoid or barometric, taken as ellipsoidal: see --vertical"
+
+
+def poses_from_tags(photos: Sequence[Photo], options: IngestOptions, notes: Notes) -> ImagePoses:
+    """Return positions from EXIF, attitudes and RTK σ from DJI's XMP.
+
+    Raises:
+        InputError: `--vertical` names a geoid whose grid is missing.
+    """
+    xyz = np.array([_lon_lat_alt(photo.tags) for photo in photos])
+    located = complete(xyz)
+    flat = [photo.name for photo in photos if photo.tags.gps is not None and altitude_m(photo.tags) is None]
+    notes.warn_counted(
+        flat, "image has a GPS position without altitude", "images have GPS positions without altitude"
+    )
+    datums = sorted({photo.tags.gps.datum for photo in photos if photo.tags.gps is not None} - {""})
+    if datums:
+        notes.assume(f"GPSMapDatum {', '.join(datums)} is taken as WGS84")
+    crs = parse_crs(WGS84, vertical=options.vertical)
+    position_in_ecef = np.full((len(photos), 3), np.nan)
+    position_in_ecef[located] = ecef_from_lla(crs.lla_from_xyz(xyz[located]))
+    stated = np.array([_stated_sigma(photo.tags) for photo in photos])
+    receivers = tuple(_receiver(photo.tags) for photo in photos)
+    sigma, sigma_source = with_defaults(stated, receivers, located, options, notes)
+    gimbal: list[AttitudeSource] = ["gimbal" for _ in photos]
+    return ImagePoses(
+        position_in_ecef=position_in_ecef,
+        sigma_enu_m=sigma,
+        sigma_source=sigma_source,
+        receivers=receivers,
+        enu_from_cam=gimbal_attitudes(photos),
+        attitude_source=tuple(gimbal),
+        sigma_attitude_deg=np.full(len(photos), np.nan),
+        time_s=photo_times(photos),
+        source="exif",
+        crs_name=WGS84,
+        vertical=crs.vertical if crs.vertical.stated else assumed_ellipsoidal(_EXIF_NOTE),
+    )
+
+
+def altitude_m(tags: PhotoTags) -> float | None:
+    """Return the height of a photograph that has a GPS position: EXIF's, else that of DJI's XMP."""
+    if tags.gps is None:
+        return None
+    if tags.gps.alt_m is None and tags.dji is not None:
+        return tags.dji.absolute_altitude_m
+    return tags.gps.alt_m
+
+
+def photo_times(photos: Sequence[Photo]) -> FloatArray:
+    """Return seconds since 1970 UTC (N,), NaN where a photograph has no time."""
+    return np.array([_or_nan(photo.tags.timestamp_s) for photo in photos])
+
+
+def gimbal_attitudes(photos: Sequence[Photo]) -> FloatArray:
+    """Return rotations camera → East-North-Up (N, 3, 3) from DJI's XMP, NaN where it has none."""
+    enu_from_cam = np.full((len(photos), 3, 3), np.nan)
+    for row, photo in enumerate(photos):
+        dji = photo.tags.dji
+        if dji is not None and dji.gimbal_yaw_pitch_roll_deg is not None:
+            enu_from_cam[row] = geo_from_cam(dji.gimbal_yaw_pitch_roll_deg)
+    return enu_from_cam
+
+
+def _lon_lat_alt(tags: PhotoTags) -> tuple[float, float, float]:
+    gps = tags.gps
+    return (np.nan, np.nan, np.nan) if gps is None else (gps.lon_deg, gps.lat_deg, _or_nan(altitude_m(tags)))
+
+
+def _stated_sigma(tags: PhotoTags) -> FloatArray:
+    """Return σ east, north, up (3,) that the tags state, NaN if none."""
+    if tags.dji is not None and tags.dji.rtk_sigma_enu_m is not None:
+        return np.array(tags.dji.rtk_sigma_enu_m)
+    if tags.gps is not None and tags.gps.sigma_h_m is not None:
+        return tags.gps.sigma_h_m * np.array([1.0, 1.0, _VERTICAL_RATIO])
+    return np.full(3, np.nan)
+
+
+def _receiver(tags: PhotoTags) -> str:
+    flag = None if tags.dji is None else tags.dji.rtk_flag
+    return {RTK_FIXED: "RTK fixed", RTK_FLOAT: "RTK float"}.get(flag or 0, "single-frequency")
+
+
+def _or_nan(value: float | None) -> float:
+    return np.nan if value is None else value
+
+
+_SIGMAS, _LEAST_M = 4.0, 1.0
+_MOST_CONTRADICTING = 1 / 3
+# Another unit shows if heights differ by this many times what σ allow, and that unit leaves this part of a height.
+_EVIDENT, _UNIT_PART = 2.0, 0.05
+_KILOMETRES_M = 2_000.0
+_LEAST_TIMED = 6  # photographs, for a velocity
+
+
+def compare_with_exif(
+    poses: ImagePoses, photos: Sequence[Photo], path: Path, options: IngestOptions, notes: Notes
+) -> None:
+    """Compare the positions of a table with those of EXIF.
+
+    Args:
+        poses: by the table.
+        photos: the photographs.
+        path: of the table.
+        options: of `ingest`.
+        notes: cautions of what differs.
+
+    Raises:
+        ContradictionError: most positions differ beyond the σ of both, and the options do not accept that.
+    """
+    # Stated σ are those of the table: a track good to centimetres says nothing about the photographs' receiver.
+    own_sigma = options.model_copy(update={"sigma_h": None, "sigma_v": None})
+    exif = poses_from_tags(photos, own_sigma, Notes())
+    both = np.flatnonzero(poses.located & exif.located)
+    if not len(both):
+        return
+    lla = lla_from_ecef(exif.position_in_ecef[both])
+    enu_from_ecef = np.swapaxes(ecef_from_enu_rotation(lla), 1, 2)
+    apart = np.einsum("nij,nj->ni", enu_from_ecef, poses.position_in_ecef[both] - exif.position_in_ecef[both])
+    sigma = np.hypot(poses.sigma_enu_m[both], exif.sigma_enu_m[both])
+    in_table = lla_from_ecef(poses.position_in_ecef[both])[:, 2]
+    from_ecef, origin = enu_from_ecef[len(both) // 2], exif.position_in_ecef[both[len(both) // 2]]
+    in_enu = [(each.position_in_ecef[both] - origin) @ from_ecef.T for each in (exif, poses)]
+    places = _Places(
+        name=tuple(photos[int(row)].name for row in both),
+        exif=in_enu[0][:, :2],
+        table=in_enu[1][:, :2],
+        sigma_m=sigma[:, :2],
+        time_s=exif.time_s[both],
+    )
+    heights = _heights(np.column_stack([in_table, lla[:, 2]]), apart[:, 2], sigma[:, 2], path)
+    found = [*_horizontal(places, path), *heights]
+    for fatal, caution in found:
+        if fatal and not options.accept_contradiction:
+            raise ContradictionError(
+                f"{path}: {caution.sentence}. Correct what is wrong, or go on with --accept-contradiction"
+            )
+        notes.caution(caution)
+
+
+@dataclass(frozen=True)
+class _Places:
+    """Horizontal positions of n photographs by EXIF and by the table, metres east and north, with the σ of both."""
+
+    name: tuple[str, ...]
+    exif: FloatArray  # (n, 2)
+    table: FloatArray  # (n, 2)
+    sigma_m: FloatArray  # (n, 2)
+    time_s: FloatArray  # (n,) NaN where unknown
+
+    @property
+    def apart(self) -> FloatArray:
+        return self.table - self.exif
+
+
+def _horizontal(places: _Places, path: Path) -> list[tuple[bool, Caution]]:
+    distance = np.hypot(*places.apart.T)
+    allowed = np.maximum(_SIGMAS * np.hypot(*places.sigma_m.T), _LEAST_M)
+    contradicting = distance > allowed
+    if contradicting.mean() <= _MOST_CONTRADICTING:
+        return []
+    cause = _cause(places, float(np.median(distance)), float(np.median(allowed)) / _SIGMAS)
+    sentence = f"{int(contradicting.sum())} of {len(distance)} positions in {path.name} {cause}"
+    return [(True, Caution(code="table-against-exif", sentence=sentence))]
+
+
+def _cause(places: _Places, typical_m: float, sigma_m: float) -> str:
+    """Return how most positions differ, by the first pattern that leaves less than half of the difference.
+
+    Args:
+        places: of table and EXIF.
+        typical_m: median distance between both.
+        sigma_m: σ of that distance.
+    """
+    apart, names = places.apart, places.name
+    if typical_m > _KILOMETRES_M:
+        return f"are {typical_m / 1000:.0f} km from those in EXIF: another CRS or zone, or exchanged axes?"
+    if scatter_about_median(apart) < 0.2 * typical_m:
+        east, north = np.median(apart, axis=0)
+        return (
+            f"are shifted by {east:+.1f} m east and {north:+.1f} m north against EXIF: another datum, or a base "
+            "station in a wrong place?"
+        )
+    swapped = (places.table - places.table.mean(axis=0))[:, ::-1] - (places.exif - places.exif.mean(axis=0))
+    if scatter_about_median(swapped) < 0.5 * scatter_about_median(apart):
+        return "differ from those in EXIF as mirrored ones do: east and north are exchanged"
+    if (groups := two_groups(apart)) is not None:
+        second = listed([names[row] for row in np.flatnonzero(groups.second)])
+        return (
+            f"differ from those in EXIF: {int(groups.second.sum())} are shifted by {groups.apart[0]:+.1f} m east "
+            f"and {groups.apart[1]:+.1f} m north against the others: another base station? ({second})"
+        )
+    if (bad := blunders_among(apart, sigma_m)) is not None and bad.mean() < 0.5:
+        off = np.hypot(*(apart - np.median(apart, axis=0)).T)
+        rows = np.flatnonzero(bad)[np.argsort(-off[bad], kind="stable")]
+        return (
+            "differ from those in EXIF, and the others agree: these are blunders, in the table or in EXIF: "
+            f"{listed([f'{names[row]} {off[row]:.1f} m' for row in rows])}"
+        )
+    differ = f"differ from those in EXIF by {typical_m:.1f} m"
+    nearest, at = KDTree(places.exif).query(places.table)
+    if (offset := _clock_offset(places)) is not None:
+        return f"{differ}, along the track: the times are off by about {offset:+.1f} s"
+    if float(np.median(nearest)) < max(2.0 * sigma_m, 0.2 * typical_m) and (at != np.arange(len(at))).mean() > 0.5:
+        return f"{differ}, but lie where other photographs were taken: rows of other images, or times that are off?"
+    if typical_m < median_spacing(places.exif) / 2:
+        return f"{differ}, without any pattern: noise, so that σ of the table or of EXIF is too small"
+    return f"{differ}, in changing directions: times that are off, or rows of other images?"
+
+
+def _clock_offset(places: _Places) -> float | None:
+    """Return the time in s by which the table's positions are later, if that explains half of the difference."""
+    order = np.argsort(places.time_s, kind="stable")
+    time_s = places.time_s[order]
+    if len(order) < _LEAST_TIMED or not np.isfinite(time_s).all() or np.diff(time_s).min() <= 0.0:
+        return None
+    velocity = np.gradient(places.exif[order], time_s, axis=0)
+    apart = places.apart[order]
+    offset = float((velocity * apart).sum() / max((velocity**2).sum(), 1e-9))
+    left = scatter_about_median(apart - offset * velocity)
+    return offset if left < 0.5 * scatter_about_median(apart) else None
+
+
+def _heights(
+    heights_m: FloatArray, apart_m: FloatArray, sigma_m: FloatArray, path: Path
+) -> list[tuple[bool, Caution]]:
+    """Compare heights (n, 2) of table and EXIF, which are apart (n,), with the σ (n,) of both."""
+    offset, spread = float(np.median(apart_m)), mad_sigma(apart_m)
+    allowed = max(_SIGMAS * float(np.median(sigma_m)), _LEAST_M)
+    if abs(offset) <= allowed:
+        return []
+    for factor, cause in (
+        (FOOT_M, "in feet, and taken for metres"),
+        (1 / FOOT_M, "in metres, and taken for feet"),
+    ):
+        left = abs(float(np.median(heights_m[:, 0] * factor - heights_m[:, 1])))
+        tolerance = max(_UNIT_PART * abs(float(np.median(heights_m[:, 1]))), allowed / _SIGMAS)
+        if abs(offset) > _EVIDENT * allowed and left < tolerance:
+            sentence = f"the heights in {path.name} are {cause}: those in EXIF are {factor:.4g} times as large"
+            return [(True, Caution(code="feet", sentence=sentence))]
+    sentence = (
+        f"the heights in {path.name} differ from those in EXIF by {offset:+.1f} m (± {spread:.1f} m): one is above "
+        "the ellipsoid, the other above a geoid, the take-off or a barometer's zero; see --vertical"
+    )
+    return [(abs(offset) > MOST_GEOID_M, Caution(code="heights-apart", sentence=sentence))]

@@ -1,0 +1,178 @@
+"""Everything that a flight left: photographs, their cameras, measured poses, and the navigation by time.
+
+The navigation as recorded, Earth-centred, until the survey's frame is known.
+
+From the places and attitudes that the instruments measured to those of the cameras: lever arm and boresight.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.core.errors import InputError
+from pipelines.core.types import FloatArray
+from pipelines.formats.trajectory_csv import complete
+from pipelines.geodesy.enu import Origin, ecef_from_enu_rotation, enu_from_ecef, geo_from_enu_at, lla_from_ecef
+from pipelines.geometry.trajectory import Rig, Trajectory, boresight, mount, with_rig
+from pipelines.ingest.image_poses import ImagePoses
+from pipelines.ingest.notes import Notes
+from pipelines.ingest.options import IngestOptions
+from pipelines.ingest.photo_folder import Photo
+from pipelines.survey.calibrated import NavigationTrack
+from pipelines.survey.survey import CameraPrior
+
+
+@dataclass(frozen=True)
+class RecordedNavigation:
+    """The navigation on its own clock, and how the cameras of N photographs sit in it.
+
+    Attributes:
+        positions: of the antenna, Earth-centred.
+        attitudes: rotations body → East-North-Up at the antenna, forward-right-down.
+        rig: of the N photographs, as `ingest` was told or as `/tf` has it.
+        body_known: whether the body's axes are known; where not, the camera's nominal axes stand for them.
+        images: names of the photographs.
+        image_time_s: (N,) their times on the camera's clock.
+        time_offset_s: navigation clock minus camera clock.
+    """
+
+    positions: Trajectory
+    attitudes: Trajectory
+    rig: Rig
+    body_known: bool
+    images: tuple[str, ...]
+    image_time_s: FloatArray
+    time_offset_s: float
+
+    def in_geo(self, origin: Origin) -> NavigationTrack | None:
+        """Return the navigation in the frame at an origin; None if it has no positions."""
+        if not len(self.positions):
+            return None
+        mounts, arms = self.rig.of_each(len(self.images))
+        return NavigationTrack(
+            position_time_s=self.positions.time_s,
+            antenna_in_geo=enu_from_ecef(self.positions.position, origin),
+            sigma_m=self.positions.sigma_m,
+            attitude_time_s=self.attitudes.time_s,
+            geo_from_body=self._geo_from_body(origin),
+            image=np.array(self.images, dtype=np.str_),
+            image_time_s=self.image_time_s,
+            cam_from_body=mounts,
+            antenna_in_body=arms,
+            nominal_from_cam=self.rig.nominal_from_cam,
+            time_offset_s=np.array(self.time_offset_s),
+            max_gap_s=np.array(self.positions.max_gap_s),
+            body_known=np.array(self.body_known),
+        )
+
+    def _geo_from_body(self, origin: Origin) -> FloatArray:
+        """Turn attitudes against north and up where each was taken into the frame at the origin.
+
+        Where attitudes begin or end beyond the positions, the first or last position stands for the place: at
+        45° latitude north turns by a second of arc in 30 m.
+        """
+        clock = self.positions.time_s
+        time_s = np.clip(self.attitudes.time_s, clock[0], clock[-1])
+        place = replace(self.positions, max_gap_s=np.inf).at(time_s).position
+        return geo_from_enu_at(lla_from_ecef(place), origin) @ self.attitudes.rotation
+
+
+LEAST_IMAGES = 3
+
+
+@dataclass(frozen=True)
+class FlightRecord:
+    """What was read of a flight.
+
+    Attributes:
+        folder: of the photographs.
+        photos: the N photographs.
+        cameras: before any reconstruction.
+        camera_of: id of each photograph's camera, by name.
+        poses: measured, of the N photographs.
+        navigation: None where it was not recorded by time.
+    """
+
+    folder: Path
+    photos: list[Photo]
+    cameras: tuple[CameraPrior, ...]
+    camera_of: dict[str, int]
+    poses: ImagePoses
+    navigation: RecordedNavigation | None
+
+
+def require_enough(photos: Sequence[Photo], source: Path, field: str, notes: Notes) -> None:
+    """Refuse fewer photographs than a survey needs.
+
+    Raises:
+        InputError: fewer than three.
+    """
+    if len(photos) < LEAST_IMAGES:
+        raise too_few(len(photos), source, field, notes)
+
+
+def too_few(count: int, source: Path, field: str, notes: Notes) -> InputError:
+    """Return the error of fewer photographs than a survey needs, with everything that was noted on the way."""
+    reasons = "".join(f"; {warning}" for warning in notes.warnings)
+    return InputError(f"{count} usable images, a survey needs {LEAST_IMAGES}{reasons}", path=source, field=field)
+
+
+def given_rig(options: IngestOptions) -> Rig:
+    """Return the rig that the options state."""
+    return Rig(
+        cam_from_body=None if options.camera_mount is None else mount(options.camera_mount),
+        antenna_in_body=None if options.lever_arm is None else np.array(options.lever_arm),
+        nominal_from_cam=boresight(options.boresight),
+    )
+
+
+def body_mount(rig: Rig) -> FloatArray:
+    """Return the mount (3, 3); where none is stated, the camera's nominal axes stand for the body's."""
+    return np.eye(3) if rig.cam_from_body is None else rig.cam_from_body
+
+
+def at_cameras(poses: ImagePoses, rig: Rig, names: Sequence[str], notes: Notes) -> ImagePoses:
+    """Bring positions of the antenna to the camera, and attitudes of the nominal camera to the true one.
+
+    Raises:
+        InputError: a lever arm without the mount, whose axes it is given in.
+    """
+    if rig.antenna_in_body is not None and rig.cam_from_body is None:
+        raise InputError("is given in the body's axes: give --camera-mount YAW,PITCH,ROLL too", field="--lever-arm")
+    mounted = replace(rig, cam_from_body=body_mount(rig))
+    enu_from_body = poses.enu_from_cam @ body_mount(rig)
+    position_in_ecef, enu_from_cam = camera_poses(poses.position_in_ecef, enu_from_body, mounted, names, notes)
+    return replace(poses, position_in_ecef=position_in_ecef, enu_from_cam=enu_from_cam)
+
+
+def camera_poses(
+    antenna_in_ecef: FloatArray, enu_from_body: FloatArray, rig: Rig, names: Sequence[str], notes: Notes
+) -> tuple[FloatArray, FloatArray]:
+    """Return camera centres in ECEF (N, 3) and attitudes camera → East-North-Up (N, 3, 3), NaN where unknown.
+
+    A position that a lever arm would move, but without an attitude to move it by, is left out and noted.
+
+    Args:
+        antenna_in_ecef: (N, 3) metres.
+        enu_from_body: (N, 3, 3) attitudes against north and up at the antenna.
+        rig: of the photographs.
+        names: of the photographs, for the note.
+        notes: positions that were left out.
+    """
+    # With the antenna at zero, its own East-North-Up is a Cartesian frame that needs no place on Earth.
+    offset_in_enu, enu_from_cam = with_rig(np.zeros_like(antenna_in_ecef), enu_from_body, rig)
+    located = complete(antenna_in_ecef)
+    lost = np.flatnonzero(located & ~complete(offset_in_enu))
+    notes.warn_counted(
+        [names[row] for row in lost.tolist()],
+        "position is without an attitude to apply the lever arm by, and was left out",
+        "positions are without attitudes to apply the lever arm by, and were left out",
+    )
+    ecef_from_enu = ecef_from_enu_rotation(lla_from_ecef(antenna_in_ecef[located]))
+    position_in_ecef = antenna_in_ecef.copy()
+    position_in_ecef[located] += np.einsum("nij,nj->ni", ecef_from_enu, offset_in_enu[located])
+    return position_in_ecef, enu_from_cam

@@ -1,0 +1,326 @@
+"""Run of a batch: each mission is `georef run` in a process of its own, and the table follows their ends.
+
+Table of a batch: state, accuracy, time and warnings of each mission.
+
+Files of a batch: its table as JSON and as a page, beside the missions.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+from urllib.parse import quote
+
+from pipelines import __version__
+from pipelines.core.errors import GeorefError, StorageError, storage_failures
+from pipelines.core.figures import Headline
+from pipelines.core.files import replace_text
+from pipelines.core.manifest import Manifest
+from pipelines.core.plan import Action
+from pipelines.core.products import Caution, Product, union
+from pipelines.core.progress import Progress
+from pipelines.core.stages import REPORT, REPORT_PAGE
+from pipelines.core.staleness import cautions_by_stage
+from pipelines.core.workspace import now
+from pipelines.jobs.engine import Engine, Job, JobEnd
+from pipelines.jobs.missions import Mission, MissionList
+from pipelines.report.page import Page, Section, moment, write_page
+from pipelines.survey.headline import headline_of
+from pipelines.survey.report import read_report
+
+log = logging.getLogger(__name__)
+
+MissionState = Literal["waiting", "current", "done", "interrupted", "failed"]
+
+
+class MissionRow(Product):
+    """Row of the table.
+
+    Attributes:
+        mission: its name.
+        workspace: path of its workspace, relative to the folder of the batch.
+        state: `waiting`: not run by this batch yet; `current`: there was nothing to do.
+        failure: reason of the failure, with the stage.
+        log: log of the stage that failed, relative to the folder of the batch.
+        seconds: of this run; None: it did not run.
+        processing_s: of all stages, whenever they ran.
+        images, registered: number of photographs, and of those in the SfM model.
+        accuracy: headline of its result.
+        test_psnr: mean over the test views, dB.
+        report: page of `georef report`, relative to the folder of the batch.
+        warnings: of the stages.
+        cautions: limits of the result.
+    """
+
+    mission: str
+    workspace: str
+    state: MissionState
+    failure: str | None = None
+    log: str | None = None
+    seconds: float | None = None
+    processing_s: float | None = None
+    images: int | None = None
+    registered: int | None = None
+    accuracy: Headline | None = None
+    test_psnr: float | None = None
+    report: str | None = None
+    warnings: tuple[str, ...] = ()
+    cautions: tuple[Caution, ...] = ()
+
+
+class BatchTable(Product):
+    """Table of the missions.
+
+    Attributes:
+        format_version: version of the format.
+        batch: name of the batch.
+        missions: one row for each mission.
+    """
+
+    format_version: Literal[1] = 1
+    batch: str
+    missions: tuple[MissionRow, ...]
+
+    @property
+    def counts(self) -> Counter[str]:
+        """Number of missions by state."""
+        return Counter(row.state for row in self.missions)
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether every mission has its result."""
+        return all(row.state in ("done", "current") for row in self.missions)
+
+
+def mission_row(mission: Mission, state: MissionState, end: JobEnd | None = None) -> MissionRow:
+    """Return the row of a mission; it has figures if the mission has its result.
+
+    Args:
+        mission: the mission.
+        state: of the mission.
+        end: of its run; None: it did not run.
+    """
+    seconds = None if end is None else round(end.seconds, 3)
+    row = MissionRow(mission=mission.name, workspace=mission.place, state=state, seconds=seconds)
+    if state == "failed" and end is not None:
+        log = mission.workspace.root / "logs" / f"{end.place}.log"
+        return row.model_copy(
+            update={
+                "failure": f"{end.place}: {end.error}" if end.place else end.error,
+                "log": f"{mission.place}/logs/{end.place}.log" if end.place and log.is_file() else None,
+            }
+        )
+    return row.model_copy(update=_figures(mission)) if state in ("done", "current") else row
+
+
+def state_of(end: JobEnd) -> MissionState:
+    """Return the state of a mission whose run has ended."""
+    return "done" if end.is_done else "interrupted" if end.is_interrupted else "failed"
+
+
+def _figures(mission: Mission) -> dict[str, object]:
+    """Return the figures of a mission's products, by field of the row."""
+    workspace = mission.workspace
+    manifests: dict[str, Manifest] = {}
+    for spec in mission.stages:
+        with contextlib.suppress(GeorefError):  # put there by hand, or damaged since
+            manifest = workspace.manifest(spec)
+            if manifest is not None:
+                manifests[spec.name] = manifest
+    figures: dict[str, object] = {
+        "processing_s": round(sum(manifest.duration_s for manifest in manifests.values()), 3),
+        "images": _count(manifests, "ingest", "images"),
+        "registered": _count(manifests, "sfm", "registered"),
+        "warnings": _unique(text for manifest in manifests.values() for text in manifest.warnings),
+        "cautions": union(*cautions_by_stage(workspace).values()),
+        "accuracy": headline_of(workspace),
+        "report": f"{mission.place}/{REPORT_PAGE}" if (workspace.root / REPORT_PAGE).is_file() else None,
+    }
+    with contextlib.suppress(GeorefError):  # a mission may end before `evaluate`
+        test = read_report(workspace.path(REPORT)).test_views
+        figures["test_psnr"] = None if test is None else test.psnr
+    return figures
+
+
+def _count(manifests: dict[str, Manifest], stage: str, name: str) -> int | None:
+    """Return a whole number among the values of a stage; None without it: users edit manifests."""
+    value = manifests[stage].values.get(name) if stage in manifests else None
+    return value if isinstance(value, int) else None
+
+
+def _unique(texts: Iterable[str]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(texts))
+
+
+_ROOM = __name__.rpartition(".")[0]
+
+
+def json_file(folder: Path, batch: str) -> Path:
+    """Return the path of a batch's table as JSON."""
+    return folder / f"{batch}.batch.json"
+
+
+def page_file(folder: Path, batch: str) -> Path:
+    """Return the path of a batch's page."""
+    return folder / f"{batch}.batch.html"
+
+
+def write_batch(folder: Path, table: BatchTable) -> None:
+    """Write the table as JSON and as a page; existing files are replaced when the new ones are complete.
+
+    Raises:
+        OSError: a file cannot be written; the existing one stays.
+    """
+    write_page(batch_page(table), _ROOM, page_file(folder, table.batch))
+    replace_text(json_file(folder, table.batch), table.model_dump_json(indent=1) + "\n")
+
+
+def batch_page(table: BatchTable) -> Page:
+    """Return the page of a batch."""
+    links = {row.mission: quote(row.report) for row in table.missions if row.report is not None}
+    remarks = [row for row in table.missions if row.warnings or row.cautions]
+    failed = [row for row in table.missions if row.failure is not None]
+    facts = {"table": table, "links": links, "remarks": remarks, "failed": failed}
+    states = ", ".join(f"{count} {state}" for state, count in table.counts.items())
+    return Page(
+        title=f"Batch: {table.batch}",
+        subtitle=f"{len(table.missions)} missions: {states}",
+        about={"Program": f"GeoRefGS {__version__}", "Made": moment(now())},
+        sections=(
+            Section("missions", "Missions", "missions.html", facts),
+            *([Section("failures", "Failures", "failures.html", facts)] if failed else []),
+            *([Section("remarks", "Warnings and cautions", "remarks.html", facts)] if remarks else []),
+        ),
+        document=table.model_dump(mode="json"),
+    )
+
+
+# Interpreter, libraries, COLMAP's features of large photographs: on top of what is predicted for the training.
+BASE_BYTES = 1 << 30
+
+
+@dataclass(frozen=True)
+class PlannedMission:
+    """Mission with the forecast of its run.
+
+    Attributes:
+        mission: the mission.
+        actions: what its run would do with each stage; none where the run will be refused.
+        inputs: files and folders that its options name.
+        refusal: reason why the run will be refused, else empty.
+        training_bytes: predicted peak of its training in main memory; 0 without one, or if unknown.
+        uses_gpu: whether it trains on a GPU.
+    """
+
+    mission: Mission
+    actions: Mapping[str, Action]
+    training_bytes: int = 0
+    uses_gpu: bool = False
+    inputs: tuple[Path, ...] = ()
+    refusal: str = ""
+
+    @property
+    def is_current(self) -> bool:
+        """Whether there is nothing to do."""
+        return bool(self.actions) and all(action == "keep" for action in self.actions.values())
+
+    @property
+    def peak_bytes(self) -> int:
+        """Predicted peak of the memory of its run."""
+        return BASE_BYTES + self.training_bytes
+
+    def job(self, folder: Path) -> Job:
+        """Return the command that completes the mission of a list in a folder."""
+        workspace = self.mission.workspace.root
+        return Job(
+            self.mission.name,
+            run_arguments(self.mission),
+            self.peak_bytes,
+            self.uses_gpu,
+            folder,
+            writes=workspace,
+            reads=tuple(path for path in self.inputs if not path.is_relative_to(workspace)),
+        )
+
+
+def run_batch(
+    listed: MissionList, planned: Sequence[PlannedMission], engine: Engine, progress: Progress
+) -> BatchTable:
+    """Run the missions that are not current, and return the table of all; one that fails stops no other.
+
+    The table is written beside the missions at the beginning and at the end of each mission, as JSON and as a page.
+
+    Args:
+        listed: the missions.
+        planned: the same with their forecasts, in the same order.
+        engine: runs them.
+        progress: shows all missions, and one line for each that runs.
+
+    Raises:
+        KeyboardInterrupt: the user stopped the batch; the missions that ran have saved their work.
+        StorageError: the table cannot be written.
+    """
+    rows = {
+        plan.mission.name: mission_row(plan.mission, "current" if plan.is_current else "waiting")
+        for plan in planned
+    }
+
+    def table() -> BatchTable:
+        return BatchTable(batch=listed.name, missions=tuple(rows.values()))
+
+    def ended(end: JobEnd) -> None:
+        rows[end.job.name] = mission_row(by_name[end.job.name], state_of(end), end)
+        with contextlib.suppress(OSError):  # It stops no mission; the last writing tells.
+            write_batch(listed.folder, table())
+
+    by_name = {plan.mission.name: plan.mission for plan in planned}
+    with storage_failures(listed.folder):
+        write_batch(listed.folder, table())
+    jobs = [plan.job(listed.folder) for plan in planned if not plan.is_current]
+    if jobs:
+        engine.run("missions", jobs, ended, progress)
+        _write_last(listed, table())
+    return table()
+
+
+def _write_last(listed: MissionList, table: BatchTable) -> None:
+    """Write the table; where missions have failed, which tell why, a table that cannot be written is a warning.
+
+    Raises:
+        StorageError: all missions are complete, and the table cannot be written.
+    """
+    try:
+        with storage_failures(listed.folder):
+            write_batch(listed.folder, table)
+    except StorageError as error:
+        if table.is_complete:
+            raise
+        log.warning("the table of the batch is not that of now: %s", error)
+
+
+def run_arguments(mission: Mission) -> tuple[str, ...]:
+    """Return the arguments of `georef` that run a mission; paths in them are absolute."""
+    running = {spec.name for spec in mission.stages}
+    settings = [
+        f"{stage}.{option}={_literal(value)}"
+        for stage, flags in mission.flags.items()
+        if stage in running
+        for option, value in flags.items()
+    ]
+    return (
+        *("run", str(mission.workspace.root.absolute())),
+        *(("--to", mission.last) if mission.last else ()),
+        *(("--deliver", mission.deliver) if mission.deliver else ()),
+        *(word for setting in settings for word in ("--set", setting)),
+    )
+
+
+def _literal(value: Any) -> str:
+    """Return a value as TOML writes it, for which JSON's form of texts, numbers and lists will do."""
+    return json.dumps(str(value) if isinstance(value, Path) else value, ensure_ascii=False)

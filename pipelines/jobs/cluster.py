@@ -1,0 +1,345 @@
+"""Access to a Dask cluster: its address and certificate, and what its workers offer.
+
+Dask executes what it is sent, and a scheduler obeys everybody who reaches it. Connections therefore need a
+certificate on both sides, or never leave this machine.
+
+Certificates of a Dask cluster: made, kept for their owner alone, and checked where a cluster is used.
+
+Dask executes what it is sent: whoever holds the key of a cluster can run programs on all its machines, as the user
+who has started it.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import logging
+import os
+import tempfile
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import SplitResult, urlsplit
+
+from pipelines.core.errors import BackendUnavailableError, ClusterError, InputError
+from pipelines.jobs.engine import Job
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+CERTIFICATE, KEY = "cluster.pem", "cluster.key"
+_OF_OTHERS, _OF_EVERYBODY = 0o077, 0o007  # bits of a mode
+_MINUTES = "%Y-%m-%d %H:%M UTC"
+_RENEW = (
+    f"delete {CERTIFICATE} and {KEY} there, make new ones by `georef cluster certificates`, copy them to every "
+    "machine of the cluster, and start scheduler and workers again"
+)
+
+
+def import_distributed() -> Any:
+    """Return Dask's library.
+
+    Raises:
+        BackendUnavailableError: it is not installed; names the extra.
+    """
+    try:
+        import distributed
+    except ImportError as error:
+        raise BackendUnavailableError(
+            "a cluster needs Dask: install it with `pip install 'georefgs[cluster]'`"
+        ) from error
+    return distributed
+
+
+def make_certificates(folder: Path) -> None:
+    """Write a new certificate and its key, which are all that a machine needs to belong to a cluster.
+
+    The certificate is its own authority. It is valid for a year, as those that Dask makes for itself. Folder and
+    files are for their owner alone.
+
+    Raises:
+        InputError: the folder has a certificate already.
+        BackendUnavailableError: the extra is not installed.
+    """
+    distributed = import_distributed()
+    try:
+        security = distributed.Security.temporary()
+    except ImportError as error:
+        raise _needs_cryptography() from error
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    for name, text in ((KEY, security.tls_client_key), (CERTIFICATE, security.tls_client_cert)):
+        try:
+            descriptor = os.open(folder / name, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+        except FileExistsError as error:
+            raise InputError("exists: delete it to make another", path=folder / name) from error
+        with os.fdopen(descriptor, "w", encoding="utf-8") as handle:
+            handle.write(text)
+
+
+def make_own_certificates(folder: Path) -> None:
+    """Make the certificate of a user's clusters where there is none; several programs may ask at once.
+
+    Raises:
+        BackendUnavailableError: the extra is not installed.
+    """
+    if folder.is_dir() and any(folder.iterdir()):
+        return
+    folder.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder.parent) as drafts:
+        draft = Path(drafts, folder.name)
+        make_certificates(draft)
+        with suppress(OSError):  # Another program was faster.
+            draft.rename(folder)
+
+
+def check_own_certificates(folder: Path) -> None:
+    """Check that nobody else can read a user's key, or put another in its place.
+
+    Raises:
+        InputError: folder or files belong to somebody else, or others have access.
+    """
+    if os.name != "posix":
+        return
+    for path in (folder, folder / CERTIFICATE, folder / KEY):
+        if not path.exists():  # which `check_certificates` tells
+            continue
+        status = path.stat()
+        if status.st_uid != os.geteuid():
+            raise InputError("belongs to another user, who can run programs as you: delete it", path=path)
+        if status.st_mode & _OF_OTHERS:
+            raise InputError(
+                "is open to other users, who can run programs as you. If none of them has read or changed it: "
+                f"`chmod -R go-rwx {folder}`; else delete it",
+                path=path,
+            )
+
+
+def check_certificates(folder: Path) -> None:
+    """Check that a folder has a certificate and its key, and that the certificate is valid now.
+
+    Raises:
+        InputError: one is missing, everybody can read the key, or the certificate is none, has expired, or is not
+            valid yet; names its dates.
+        BackendUnavailableError: the extra is not installed.
+    """
+    for name in (CERTIFICATE, KEY):
+        if not (folder / name).is_file():
+            raise InputError(
+                f"has no {name}: name the folder of the cluster's certificate with --certificates. `georef cluster "
+                "certificates DIR` makes one; `georef cluster scheduler` makes yours for this machine",
+                path=folder,
+            )
+    if os.name == "posix" and (folder / KEY).stat().st_mode & _OF_EVERYBODY:
+        raise InputError("can be read by every user of this machine: `chmod 600` it", path=folder / KEY)
+    try:
+        from cryptography import x509
+    except ImportError as error:
+        raise _needs_cryptography() from error
+    path = folder / CERTIFICATE
+    try:
+        certificates = x509.load_pem_x509_certificates(path.read_bytes())
+    except ValueError as error:
+        raise InputError(f"is no certificate in the form PEM: {_RENEW}", path=path) from error
+    now = datetime.now(UTC)
+    for certificate in certificates:
+        since, until = certificate.not_valid_before_utc, certificate.not_valid_after_utc
+        if now > until:
+            raise InputError(f"has expired on {until:{_MINUTES}}: {_RENEW}", path=path)
+        if now < since:
+            clock = f"the clock of this machine says {now:{_MINUTES}}: set it, or {_RENEW}"
+            raise InputError(f"is valid from {since:{_MINUTES}} on, and {clock}", path=path)
+
+
+def _needs_cryptography() -> BackendUnavailableError:
+    return BackendUnavailableError(
+        "certificates need cryptography: install it with `pip install 'georefgs[cluster]'`"
+    )
+
+
+PORT = 8786
+# Names of Dask's resources; cores are told, not taken.
+MEMORY, GPU, CORES = "MEMORY", "GPU", "CORES"
+_CONNECT_S = 20.0
+
+
+@dataclass(frozen=True)
+class ClusterAddress:
+    """Address of a scheduler, and the certificate that its cluster shares.
+
+    Args:
+        address: `tls://host:port`, `tcp://127.0.0.1:port`, or without the scheme.
+        certificates: folder with `cluster.pem` and `cluster.key`; None: no encryption, on this machine only.
+
+    Raises:
+        ValueError: no such address, or one of another machine without a certificate.
+        InputError: the certificate is missing or not valid now.
+        BackendUnavailableError: the extra is not installed.
+    """
+
+    address: str
+    certificates: Path | None = None
+
+    def __post_init__(self) -> None:
+        scheme = self._parts.scheme
+        if not self.host or scheme not in ("tls", "tcp"):
+            raise ValueError(f"{self.address!r} is no address such as tls://host:{PORT}")
+        if self.certificates is None:
+            if scheme == "tls" or not is_loopback(self.host):
+                raise ValueError(
+                    f"{self.address} needs certificates: without them only tcp://127.0.0.1 is used, because "
+                    "everybody who reaches a scheduler can run programs on its workers"
+                )
+            return
+        if scheme == "tcp":
+            raise ValueError(f"{self.address} is not encrypted: write tls://, or add --insecure")
+        check_certificates(self.certificates)
+
+    @property
+    def host(self) -> str:
+        """Host name or number."""
+        return self._parts.hostname or ""
+
+    @property
+    def port(self) -> int:
+        """Port."""
+        return self._parts.port or PORT
+
+    @property
+    def url(self) -> str:
+        """Address as Dask writes it."""
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return f"{self._parts.scheme}://{host}:{self.port}"
+
+    def dask_options(self) -> tuple[str, ...]:
+        """Return the options of `dask scheduler` and `dask worker` for the certificate."""
+        if self.certificates is None:
+            return ()
+        certificate, key = str(self.certificates / CERTIFICATE), str(self.certificates / KEY)
+        return ("--tls-ca-file", certificate, "--tls-cert", certificate, "--tls-key", key)
+
+    @property
+    def _parts(self) -> SplitResult:
+        return _parts(self.address, "tcp" if self.certificates is None else "tls")
+
+
+def is_on_this_machine(address: str) -> bool:
+    """Return whether an address is that of this machine, seen by itself only."""
+    return is_loopback(_parts(address, "tls").hostname or "")
+
+
+def _parts(address: str, scheme: str) -> SplitResult:
+    """Return the parts of an address, with this scheme if it has none.
+
+    Raises:
+        ValueError: it is none.
+    """
+    parts = urlsplit(address if "://" in address else f"{scheme}://{address}")
+    _ = parts.port  # raises if it is none
+    return parts
+
+
+@contextmanager
+def connected(cluster: ClusterAddress) -> Iterator[Client]:
+    """Connect to the scheduler while the context lasts.
+
+    Raises:
+        BackendUnavailableError: the extra is not installed.
+        ClusterError: no scheduler answers there, or it refuses the certificate.
+    """
+    distributed = import_distributed()
+    for name in ("distributed", "tornado"):  # They log each lost connection with a traceback.
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    security: dict[str, Any] = {}
+    if cluster.certificates is not None:
+        certificate, key = str(cluster.certificates / CERTIFICATE), str(cluster.certificates / KEY)
+        security = {"tls_ca_file": certificate, "tls_client_cert": certificate, "tls_client_key": key}
+    try:
+        client = distributed.Client(
+            cluster.url,
+            security=distributed.Security(require_encryption=bool(security), **security),
+            timeout=_CONNECT_S,
+            set_as_default=False,
+        )
+    except (OSError, TimeoutError, ValueError, RuntimeError) as error:
+        hint = "" if not security else ", and whether it has the same certificate"
+        raise ClusterError(f"no scheduler answers at {cluster.url}: check that it runs{hint}") from error
+    try:
+        yield client
+    finally:
+        with suppress(OSError, TimeoutError, RuntimeError):
+            client.close(timeout=5)
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether a host is this machine, seen by itself only."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+@dataclass(frozen=True)
+class Place:
+    """Worker of the cluster, and what it offers to jobs.
+
+    Attributes:
+        address: of the worker; another one after its restart.
+        name: for people.
+        slots: number of jobs at a time.
+        memory_bytes: for all jobs together.
+        gpus: number of GPUs.
+    """
+
+    address: str
+    name: str
+    slots: int
+    memory_bytes: int
+    gpus: int
+
+    def admits(self, job: Job, running: Sequence[Job], largest_bytes: int) -> bool:
+        """Return whether a job may run beside others; one that is too large for all runs alone on the largest."""
+        gpus_taken = sum(other.uses_gpu for other in running)
+        if len(running) >= self.slots or (job.uses_gpu and gpus_taken >= self.gpus):
+            return False
+        taken = sum(min(other.peak_bytes, self.memory_bytes) for other in running)
+        return taken + min(job.peak_bytes, largest_bytes) <= self.memory_bytes
+
+
+def places_of(workers: Mapping[str, Mapping[str, Any]]) -> dict[str, Place]:
+    """Return the workers that offer memory to jobs, by address.
+
+    Args:
+        workers: from the scheduler, by address.
+    """
+    return {
+        address: Place(
+            address,
+            f"{worker['name']} on {worker['host']}" if worker["name"] != address else address,
+            int(worker["nthreads"]),
+            int(worker["resources"][MEMORY]),
+            int(worker["resources"].get(GPU, 0)),
+        )
+        for address, worker in workers.items()
+        if MEMORY in worker["resources"]
+    }
+
+
+def place_for(
+    job: Job, places: Mapping[str, Place], running: Mapping[str, Sequence[Job]], avoided: Collection[str] = ()
+) -> Place | None:
+    """Return the worker for a job: the one with the fewest jobs that has room, or None.
+
+    Args:
+        job: that waits.
+        places: workers by address.
+        running: jobs by address of their worker.
+        avoided: addresses of workers on which the job has failed; they are chosen if there are no others.
+    """
+    largest = max((place.memory_bytes for place in places.values()), default=0)
+    others = [place for address, place in places.items() if address not in avoided]
+    free = [
+        place for place in others or places.values() if place.admits(job, running.get(place.address, ()), largest)
+    ]
+    return min(free, key=lambda place: len(running.get(place.address, ())), default=None)

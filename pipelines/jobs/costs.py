@@ -1,0 +1,158 @@
+"""Cost models: seconds of a reconstruction and of an iteration of training, and the time that is left of one.
+
+The seconds are those of a stated machine. On another one they give an estimate before the training starts, and the
+proportions of iterations with shrunken and with whole photographs, for the time left of a running training.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import nnls
+
+from pipelines.core.types import FloatArray
+
+# Four reconstructions of 18, 48, 48 and 40 photographs took 61, 134, 148 and 175 s, on 2 cores of an AMD EPYC
+# beside other programs, 2026-11-22. This model says 49, 147, 125 and 103 s.
+_MEASURED_CORES = 2
+_FEATURES_MEGAPIXEL_S, _PAIR_S, _MAPPING_S = 1.2, 0.12, 0.8
+# Of photographs that are not doubled: one of 0.8 megapixels takes 0.72 s on one core, doubled 2.15 s.
+_OWN_SIZE_FEATURES_MEGAPIXEL_S = 0.45
+# Features a megapixel of aerial photographs, about, and their number for which `_PAIR_S` holds: matching compares
+# each feature of a photograph with each of the other.
+_FEATURES_MEGAPIXEL, _OWN_SIZE_FEATURES_MEGAPIXEL, _PAIR_FEATURES = 6000, 3000, 5000
+
+
+@dataclass(frozen=True)
+class ReconstructionPace:
+    """Seconds of one core for the steps of a reconstruction."""
+
+    features_s: float
+    matching_s: float
+    mapping_s: float
+
+    @property
+    def total_s(self) -> float:
+        """Seconds of one core for all steps."""
+        return self.features_s + self.matching_s + self.mapping_s
+
+
+def reconstruction_pace(
+    photographs: int, megapixels: float, pairs: float, *, doubled: bool, max_features: int
+) -> ReconstructionPace:
+    """Return about how many seconds one core needs for each step.
+
+    Args:
+        photographs: number of photographs.
+        megapixels: of each, as features are looked for.
+        pairs: of photographs that are matched.
+        doubled: whether features are looked for on twice that size, too.
+        max_features: of a photograph.
+    """
+    detection_s = _FEATURES_MEGAPIXEL_S if doubled else _OWN_SIZE_FEATURES_MEGAPIXEL_S
+    found = megapixels * (_FEATURES_MEGAPIXEL if doubled else _OWN_SIZE_FEATURES_MEGAPIXEL)
+    compared = (min(found, max_features) / _PAIR_FEATURES) ** 2
+    return ReconstructionPace(
+        features_s=_MEASURED_CORES * photographs * detection_s * megapixels,
+        matching_s=_MEASURED_CORES * _PAIR_S * pairs * compared,
+        mapping_s=_MEASURED_CORES * photographs * _MAPPING_S,
+    )
+
+
+# Fitted to one whole iteration of docs/benchmarks.md: 10 000 … 1 000 000 Gaussians, 0.25 … 1.2 megapixels, a third
+# of the Gaussians in view. 2 cores of an AMD EPYC (AVX-512), CPU backend, 2026-11-21.
+MEASURED_ON = "2 cores of an AMD EPYC"
+MEASURED_CORES = 2
+_FIXED_S, _MEGAPIXEL_S, _MILLION_GAUSSIANS_S = 0.003, 0.092, 0.367
+# Part of a Gaussian's time that does not depend on whether an iteration sees it.
+_UNSEEN_SHARE = 0.3
+# Surface losses render depth and normals too. Ratio of seven trainings with them to the fit, 1.5 … 2.0, 2026-11-22.
+SURFACE_FACTOR = 1.9
+
+
+def iteration_seconds(pixels: float, gaussians: float, *, surface: bool, windows: int = 1) -> float:
+    """Return the seconds of one iteration on the machine of `MEASURED_ON`.
+
+    Args:
+        pixels: of the photograph.
+        gaussians: number of Gaussians.
+        surface: whether surface losses hold the Gaussians.
+        windows: number of windows in which the photograph is seen, one at an iteration.
+    """
+    seen = 1 / windows  # of the pixels, and of the Gaussians that the photograph shows
+    of_gaussians = _MILLION_GAUSSIANS_S * (_UNSEEN_SHARE + (1 - _UNSEEN_SHARE) * seen)
+    plain = _FIXED_S + _MEGAPIXEL_S * seen * pixels / 1e6 + of_gaussians * gaussians / 1e6
+    return (SURFACE_FACTOR if surface else 1.0) * plain
+
+
+@dataclass(frozen=True)
+class BlockCost:
+    """Cost of a block's training: c₀ + c₁ · pixels + c₂ · visible Gaussians + c₃ · all of them, each in millions.
+
+    Attributes:
+        coefficients: (4,) c₀ … c₃: processor seconds of an iteration, or bytes of the process at its peak.
+    """
+
+    coefficients: FloatArray
+
+    def of(self, pixels: float, visible: float, gaussians: float) -> float:
+        """Return the cost.
+
+        Args:
+            pixels: of the block in a view.
+            visible: number of the Gaussians in a view.
+            gaussians: number of all Gaussians, those that stand in for the rest among them.
+        """
+        return float((_design(np.array([[pixels, visible, gaussians]])) @ self.coefficients).item())
+
+    @staticmethod
+    def fitted(sizes: FloatArray, measured: FloatArray) -> BlockCost:
+        """Return the model that fits measured blocks best in relative terms, with no coefficient below zero.
+
+        Args:
+            sizes: (B, 3) pixels, visible and all Gaussians of each block.
+            measured: (B,) their cost.
+        """
+        return BlockCost(nnls(_design(sizes) / measured[:, None], np.ones(len(measured)))[0])
+
+
+# Processor seconds of an iteration, fitted by examples/benchmarks/block_cost.py to 16 blocks of 7 000 … 51 000
+# Gaussians and 35 000 … 141 000 pixels a view, on one thread of an AMD EPYC, 2026-11-22. For a million Gaussians in
+# 1.2 megapixels it gives 1.0 s, and the measurements above 0.96 s.
+BLOCK_SECONDS = BlockCost(np.array([0.0046, 0.202, 1.20, 0.353]))
+
+
+def _design(sizes: FloatArray) -> FloatArray:
+    return np.column_stack([np.ones(len(sizes)), sizes / 1e6])
+
+
+class TimeLeft:
+    """Time that the remaining iterations will take, from the speed of those done and the work of each.
+
+    Args:
+        work: of an iteration, counted from 1, in any unit.
+        iterations: length of the training.
+        clock: returns seconds.
+    """
+
+    def __init__(
+        self, work: Callable[[int], float], iterations: int, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._done = np.concatenate([[0.0], np.cumsum([work(i) for i in range(1, iterations + 1)])])
+        self._clock = clock
+        self._begun: tuple[int, float] | None = None
+
+    def start(self, iteration: int) -> None:
+        """Begin to measure the speed, after `iteration`."""
+        self._begun = iteration, self._clock()
+
+    def after(self, iteration: int) -> float | None:
+        """Return the seconds that are left after an iteration; None as long as the speed is unknown."""
+        if self._begun is None or iteration <= self._begun[0]:
+            return None
+        first, began = self._begun
+        speed = (self._clock() - began) / (self._done[iteration] - self._done[first])
+        return float(speed * (self._done[-1] - self._done[iteration]))

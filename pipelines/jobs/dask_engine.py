@@ -1,0 +1,380 @@
+"""Engine on the workers of a Dask cluster.
+
+The engine chooses the worker of each job, as the local engine chooses what runs beside what; Dask carries the jobs
+and the events. A job ends with the event of its worker. A cancelled task is the one sign to stop a job: Ctrl-C, the
+end of the engine and the end of the scheduler all lead to it, and the job saves its work.
+
+Jobs of one call of the cluster's engine: where they run, how they fare, and what comes after a failure.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import queue
+import time
+import uuid
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from pipelines import __version__
+from pipelines.core.errors import ClusterError, WorkspaceBusyError
+from pipelines.core.progress import Progress, ProgressTask, StopRequest, deferred_interrupts
+from pipelines.jobs.cluster import GPU, MEMORY, ClusterAddress, Place, connected, place_for, places_of
+from pipelines.jobs.dask_task import UNFIT, JobRequest, folder_tokens, run_job
+from pipelines.jobs.engine import INTERRUPTED, Job, JobDisplay, JobEnd, tell_end
+from pipelines.jobs.local import ProcessEnd
+from pipelines.jobs.storage import EngineExchange, Storage
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+log = logging.getLogger(__name__)
+
+MOST_FAILURES = 3
+# Failures that may belong to the machine, or to the moment. Bad input fails everywhere.
+_LOST = "lost"
+_TRIED_AGAIN = ("backend", "crash", "defect", "resources", "storage", _LOST)
+_LOOK_EVERY_S = 0.2
+# A cancelled job that waits behind those of another command never begins, and tells no end.
+_START_PATIENCE_S = 3.0
+_REFRESH_EVERY_S = 1.0
+# A process whose worker was killed saves its work, and holds its lock meanwhile.
+_BUSY_PAUSE_S, _BUSY_PATIENCE_S = 3.0, 600.0
+
+
+@dataclass
+class PendingJob:
+    """Job that has not ended.
+
+    Attributes:
+        job: the job.
+        token: file that its worker must see.
+        failures: so far.
+        avoided: addresses of workers on which it has failed.
+        not_before: time of the next attempt at the earliest.
+        busy_since: time since which its folder is locked by another process; None: it is not.
+    """
+
+    job: Job
+    token: str
+    failures: int = 0
+    avoided: set[str] = field(default_factory=set)
+    not_before: float = 0.0
+    busy_since: float | None = None
+
+
+@dataclass
+class _Attempt:
+    """Attempt at a job, which runs on a worker."""
+
+    pending: PendingJob
+    place: Place
+    future: Future[None]
+    display: JobDisplay
+    since: float
+    has_started: bool = False
+
+
+class ClusterRun:
+    """Jobs of one call of the engine.
+
+    Args:
+        client: connected to the scheduler.
+        waiting: jobs in the order in which they begin where resources allow.
+        at_a_time: most jobs at a time.
+        exchange: through which files go; None: they are shared.
+        ended: called at the end of each job.
+        progress: shows a line for each job that runs.
+        task: counts the jobs that have ended.
+    """
+
+    def __init__(
+        self,
+        client: Client,
+        waiting: list[PendingJob],
+        at_a_time: int,
+        exchange: EngineExchange | None,
+        *,
+        ended: Callable[[JobEnd], None],
+        progress: Progress,
+        task: ProgressTask,
+    ) -> None:
+        self._client, self._waiting, self._at_a_time = client, waiting, at_a_time
+        self._exchange = exchange
+        self._told, self._progress, self._task = ended, progress, task
+        self._running: dict[str, _Attempt] = {}
+        self._places: dict[str, Place] = {}
+        self._unfit: set[str] = set()
+        self._refreshed = -math.inf
+        self._warned = ""
+        self._topic = f"georef-{uuid.uuid4().hex}"
+        self._events: queue.Queue[dict[str, Any]] = queue.Queue()
+        client.subscribe_topic(self._topic, lambda event: self._events.put(event[1]))
+
+    def until_all_have_ended(self, title: str, stop: StopRequest) -> None:
+        """Start jobs where there is room, and follow them.
+
+        Raises:
+            ClusterError: the scheduler is lost, or no worker can run the jobs.
+        """
+        is_stopping, stopped = False, math.inf
+        while self._running or (self._waiting and not stop.requested):
+            if stop.requested and not is_stopping:
+                is_stopping, stopped = True, time.monotonic()
+                log.warning("stopping %d %s: Ctrl-C again does not wait for them", len(self._running), title)
+                for attempt in self._running.values():
+                    attempt.future.cancel()
+            self._refresh(is_stopping)
+            if not is_stopping:
+                self._start()
+            self._take_events(is_stopping)
+            if time.monotonic() - stopped > _START_PATIENCE_S:
+                for name in [name for name, attempt in self._running.items() if not attempt.has_started]:
+                    self._finish(name, ProcessEnd(INTERRUPTED, 0.0))
+
+    def close(self) -> None:
+        """Cancel what still runs, and close its lines."""
+        for attempt in self._running.values():
+            attempt.display.close()
+        if self._client.status == "running":
+            self._client.cancel([attempt.future for attempt in self._running.values()])
+            self._client.unsubscribe_topic(self._topic)
+
+    def _refresh(self, is_stopping: bool) -> None:
+        """Look which workers there are; jobs of lost workers have failed there.
+
+        Raises:
+            ClusterError: the scheduler is lost.
+        """
+        if time.monotonic() - self._refreshed < _REFRESH_EVERY_S:
+            return
+        try:
+            if self._client.status != "running":
+                raise OSError
+            workers = self._client.scheduler_info()["workers"]
+        except (OSError, TimeoutError, RuntimeError) as error:
+            self._lose_scheduler(error)
+        self._places = {
+            address: place for address, place in places_of(workers).items() if address not in self._unfit
+        }
+        self._refreshed = time.monotonic()
+        for name, attempt in list(self._running.items()):
+            # Dask cancels all tasks when its scheduler is lost, too; but then the program does not come here.
+            is_cancelled = attempt.future.status == "cancelled" and not is_stopping
+            if is_cancelled or attempt.place.address not in workers:
+                attempt.future.cancel()
+                seconds = time.monotonic() - attempt.since
+                why = "its task was cancelled" if is_cancelled else "its worker was lost"
+                self._end(name, ProcessEnd(1, seconds, why, _LOST), is_stopping)
+
+    def _lose_scheduler(self, cause: Exception) -> None:
+        """Tell that the running jobs are interrupted.
+
+        Raises:
+            ClusterError: always.
+        """
+        for name, attempt in list(self._running.items()):
+            self._finish(name, ProcessEnd(INTERRUPTED, time.monotonic() - attempt.since))
+        raise ClusterError(
+            "the scheduler is lost: the jobs save their work and stop; start scheduler and workers, then repeat "
+            "the command, which goes on"
+        ) from cause
+
+    def _start(self) -> None:
+        """Start waiting jobs on workers that have room.
+
+        Raises:
+            ClusterError: no worker can run the jobs.
+        """
+        if self._unfit and not self._places and not self._running:
+            raise ClusterError(f"no worker can run the jobs: {self._warned}")
+        now = time.monotonic()
+        for pending in list(self._waiting):
+            if len(self._running) >= self._at_a_time:
+                return
+            if now < pending.not_before:
+                continue
+            place = place_for(pending.job, self._places, self._jobs_by_worker(), pending.avoided)
+            if place is not None:
+                self._waiting.remove(pending)
+                self._submit(pending, place)
+        if not self._running and not any(pending.not_before > now for pending in self._waiting):
+            self._warn_of_waiting()
+
+    def _jobs_by_worker(self) -> dict[str, list[Job]]:
+        by_worker: dict[str, list[Job]] = {}
+        for attempt in self._running.values():
+            by_worker.setdefault(attempt.place.address, []).append(attempt.pending.job)
+        return by_worker
+
+    def _warn_of_waiting(self) -> None:
+        """Tell once why nothing runs."""
+        if not self._waiting:
+            return
+        wanted = "a GPU" if self._places else f"{MEMORY}, as those of `georef cluster worker` do"
+        text = f"waiting: no worker offers {wanted}"
+        if text != self._warned:
+            self._warned = text
+            log.warning("%s", text)
+
+    def _submit(self, pending: PendingJob, place: Place) -> None:
+        attempt = uuid.uuid4().hex
+        request = JobRequest(
+            topic=self._topic,
+            attempt=attempt,
+            version=__version__,
+            arguments=list(pending.job.arguments),
+            token=pending.token,
+            parcel=None if self._exchange is None else self._exchange.send(pending.job, attempt),
+        )
+        resources = {MEMORY: min(pending.job.peak_bytes, place.memory_bytes)}
+        if pending.job.uses_gpu:
+            resources[GPU] = 1
+        log.info("%s: started on %s", pending.job.name, place.name)
+        future = self._client.submit(
+            run_job, request, key=f"georef-{attempt}", workers=[place.address], resources=resources, pure=False
+        )
+        future.add_done_callback(lambda future: self._events.put({"attempt": attempt, "future": future}))
+        display = JobDisplay(self._progress, pending.job.name)
+        self._running[attempt] = _Attempt(pending, place, future, display, time.monotonic())
+
+    def _take_events(self, is_stopping: bool) -> None:
+        """Act on the events that have come, after waiting for one."""
+        try:
+            event = self._events.get(timeout=_LOOK_EVERY_S)
+            while True:
+                self._take(event, is_stopping)
+                event = self._events.get_nowait()
+        except queue.Empty:
+            return
+
+    def _take(self, event: dict[str, Any], is_stopping: bool) -> None:
+        name = event["attempt"]
+        attempt = self._running.get(name)
+        if attempt is None:  # It has ended.
+            return
+        for message in event.get("messages", ()):
+            attempt.display.take(message)
+        if "started" in event:
+            if attempt.has_started:  # Dask began it again on a worker that was restarted under the same address.
+                attempt.pending.failures += 1
+            attempt.has_started = True
+        if "ended" in event:
+            self._end(name, ProcessEnd(**event["ended"]), is_stopping)
+        elif "future" in event and attempt.future.status == "error":
+            seconds = time.monotonic() - attempt.since
+            self._end(name, ProcessEnd(1, seconds, f"{attempt.future.exception()}", _LOST), is_stopping)
+
+    def _end(self, name: str, end: ProcessEnd, is_stopping: bool) -> None:
+        """Finish an attempt, or let its job wait for the next one."""
+        attempt = self._running[name]
+        pending, place = attempt.pending, attempt.place
+        if is_stopping:
+            self._finish(name, end if end.kind != _LOST else ProcessEnd(INTERRUPTED, end.seconds))
+        elif end.kind == UNFIT:
+            self._unfit.add(place.address)
+            self._places.pop(place.address, None)
+            self._warned = f"{place.name} {end.error}"
+            log.warning("%s: it gets no jobs", self._warned)
+            self._repeat(name)
+        elif end.kind == _LOST and not attempt.has_started:
+            self._repeat(name)
+        elif end.code == INTERRUPTED:  # Its worker closes.
+            log.warning("%s: interrupted on %s, goes on elsewhere", pending.job.name, place.name)
+            pending.avoided.add(place.address)
+            self._repeat(name)
+        elif end.kind == WorkspaceBusyError.code and self._may_wait(pending):
+            self._repeat(name, _BUSY_PAUSE_S)
+        elif end.code < 0 or end.kind in _TRIED_AGAIN:
+            pending.failures += 1
+            pending.avoided.add(place.address)
+            if pending.failures >= MOST_FAILURES:
+                text = f"failed {pending.failures} times, at last on {place.name}: {end.error}"
+                self._finish(name, ProcessEnd(end.code, end.seconds, text, end.kind))
+            else:
+                log.warning("%s: tried again, failed on %s: %s", pending.job.name, place.name, end.error)
+                self._repeat(name)
+        else:
+            self._finish(name, end)
+
+    def _may_wait(self, pending: PendingJob) -> bool:
+        """Return whether another process may still hold the lock of the job's folder."""
+        now = time.monotonic()
+        pending.busy_since = now if pending.busy_since is None else pending.busy_since
+        return now - pending.busy_since < _BUSY_PATIENCE_S
+
+    def _repeat(self, name: str, pause_s: float = 0.0) -> None:
+        attempt = self._running.pop(name)
+        attempt.display.close()
+        attempt.pending.not_before = time.monotonic() + pause_s
+        self._waiting.insert(0, attempt.pending)
+
+    def _finish(self, name: str, end: ProcessEnd) -> None:
+        attempt = self._running.pop(name)
+        attempt.display.close()
+        if self._exchange is not None:
+            self._exchange.collect(attempt.pending.job)
+        job_end = JobEnd(attempt.pending.job, end.code, end.seconds, attempt.display.place, end.error)
+        tell_end(job_end)
+        self._task.advance(left_s=math.inf)
+        self._told(job_end)
+
+
+@dataclass(frozen=True)
+class DaskEngine:
+    """Engine that runs jobs on the workers of a Dask cluster.
+
+    A job whose worker is lost, or that fails for a reason that may belong to the machine, is tried again, on
+    another worker if there is one; after three failures it has failed. Workers that join are used, also later.
+
+    Attributes:
+        cluster: the scheduler's address and certificate.
+        at_a_time: most jobs at a time; None: as many as the workers take.
+        storage: through which the files of the jobs go; None: the workers share the folders of the jobs.
+    """
+
+    cluster: ClusterAddress
+    at_a_time: int | None = None
+    storage: Storage | None = None
+
+    def together(self, jobs: Sequence[Job]) -> int:
+        """Return how many of the jobs run at a time at the beginning; see `Engine`."""
+        with connected(self.cluster) as client:
+            places = places_of(client.scheduler_info()["workers"])
+        running: dict[str, list[Job]] = {}
+        for job in jobs:
+            if (place := place_for(job, places, running)) is not None:
+                running.setdefault(place.address, []).append(job)
+        count = sum(map(len, running.values()))
+        return max(min(count, self.at_a_time or count), 1)
+
+    def run(self, title: str, jobs: Sequence[Job], ended: Callable[[JobEnd], None], progress: Progress) -> None:
+        """Run jobs until all have ended; see `Engine`.
+
+        Raises:
+            ClusterError: there is no scheduler, it is lost, or no worker can run the jobs.
+            InputError: a job needs files that cannot go through the storage.
+            StorageError: the storage failed.
+            KeyboardInterrupt: see `Engine`.
+        """
+        exchange = None
+        if self.storage is not None:
+            self.storage.check()
+            exchange = EngineExchange(self.storage)
+        with (
+            connected(self.cluster) as client,
+            folder_tokens([job.folder for job in jobs if exchange is None]) as tokens,
+            progress.task(title, len(jobs)) as task,
+            deferred_interrupts() as stop,
+        ):
+            waiting = [PendingJob(job, tokens.get(job.folder, "")) for job in jobs]
+            at_a_time = self.at_a_time or len(jobs)
+            run = ClusterRun(client, waiting, at_a_time, exchange, ended=ended, progress=progress, task=task)
+            try:
+                run.until_all_have_ended(title, stop)
+            finally:
+                run.close()
+            if stop.requested:
+                raise KeyboardInterrupt

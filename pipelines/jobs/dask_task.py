@@ -1,0 +1,236 @@
+"""Job on a worker of a Dask cluster: runs it as a process, and sends its messages and its end to the engine.
+
+The payload is a document of names and paths. The program that runs is fixed.
+
+Nodes of a Dask cluster on this machine: scheduler and worker.
+
+Dask's own programs run; this module gives them the options that a safe cluster of this package needs.
+
+Tokens: files by which a worker recognises that it shares a folder, and not only its name.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import queue
+import threading
+import time
+import uuid
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, TypedDict
+
+from pipelines import __version__
+from pipelines.core import child
+from pipelines.core.child import python_environment
+from pipelines.core.errors import GeorefError
+from pipelines.core.machine import available_cores
+from pipelines.jobs.cluster import CORES, GPU, MEMORY, ClusterAddress, import_distributed
+from pipelines.jobs.local import JobProcess, ProcessEnd
+from pipelines.jobs.storage import Parcel, arguments_in, worker_exchange
+
+UNFIT = "unfit"  # kind of the end of a job that its worker cannot run; another one may
+_SENT = ("log", "begin", "advance", "end")
+_SEND_EVERY_S = 0.25
+
+
+class JobRequest(TypedDict):
+    """Request to a worker.
+
+    Attributes:
+        topic: of the events that the engine reads.
+        attempt: names this attempt at the job.
+        version: of this package.
+        arguments: of `georef`.
+        token: file that a worker sees if it shares the folder of the job; empty: none is needed.
+        parcel: parts that come from a storage; None: the folder is shared.
+    """
+
+    topic: str
+    attempt: str
+    version: str
+    arguments: list[str]
+    token: str
+    parcel: Parcel | None
+
+
+def run_job(request: JobRequest) -> None:
+    """Run a job on this worker until it ends, or until nobody wants it any more.
+
+    A job is not wanted when the engine has cancelled it, when the engine or the scheduler is gone, and when this
+    worker closes. Its process then saves its work, as after Ctrl-C.
+    """
+    from distributed import get_worker
+
+    worker = get_worker()
+    events = _Events(worker, request)
+    events.send(started=True)
+    end = _obstacle(request) or _run_where_its_files_are(worker, request, events)
+    events.send(ended=dataclasses.asdict(end))
+
+
+def _obstacle(request: JobRequest) -> ProcessEnd | None:
+    """Return why this worker cannot run the job; None: it can."""
+    if request["version"] != __version__:
+        return ProcessEnd(1, 0.0, f"has georefgs {__version__}, and {request['version']} is wanted", UNFIT)
+    if request["token"] and not Path(request["token"]).is_file():
+        return ProcessEnd(1, 0.0, f"does not see {Path(request['token']).parent}", UNFIT)
+    return None
+
+
+def _run_where_its_files_are(worker: Any, request: JobRequest, events: _Events) -> ProcessEnd:
+    """Run the job in the shared folder, or in a scratch folder with its parts."""
+    parcel, arguments = request["parcel"], request["arguments"]
+    if parcel is None:
+        return _run(worker, arguments, events)
+    scratch = Path(worker.local_directory).resolve() / request["attempt"]
+    started = time.monotonic()
+    try:
+        with worker_exchange(parcel, scratch):
+            return _run(worker, arguments_in(parcel, arguments, scratch), events)
+    except GeorefError as error:
+        return ProcessEnd(1, time.monotonic() - started, str(error), error.code)
+
+
+def _run(worker: Any, arguments: Sequence[str], events: _Events) -> ProcessEnd:
+    ends: queue.Queue[ProcessEnd] = queue.Queue()
+    key = worker.get_current_task()
+    cores = int(worker.state.total_resources.get(CORES, available_cores()))
+    threads = max(cores // worker.state.nthreads, 1)
+    try:
+        running = JobProcess(child.THIS_PROGRAM, arguments, threads, events.take, ends.put)
+    except OSError as error:
+        return ProcessEnd(1, 0.0, f"cannot be started: {error.strerror}")
+    is_wanted = True
+    while True:
+        try:
+            return ends.get(timeout=_SEND_EVERY_S)
+        except queue.Empty:
+            events.flush()
+        if is_wanted and not _is_wanted(worker, key):
+            is_wanted = False
+            running.interrupt()
+
+
+def _is_wanted(worker: Any, key: Any) -> bool:
+    """Return whether a worker is to go on with its task."""
+    task = worker.state.tasks.get(key)
+    return worker.status.name in ("running", "paused") and task is not None and task.state == "executing"
+
+
+class _Events:
+    """Sender of a job's messages; steps that follow each other are added up, so that many become few."""
+
+    def __init__(self, worker: Any, request: JobRequest) -> None:
+        self._worker, self._request = worker, request
+        self._lock = threading.Lock()
+        self._messages: list[dict[str, Any]] = []
+
+    def take(self, message: Mapping[str, Any]) -> bool:
+        """Return whether a message was one of progress or of the log, and keep it until `flush`."""
+        if message["kind"] not in _SENT:
+            return False
+        with self._lock:
+            last = self._messages[-1] if self._messages else {"kind": ""}
+            if message["kind"] == last["kind"] == "advance":
+                self._messages[-1] = {
+                    **message,
+                    "steps": last["steps"] + message["steps"],
+                    "note": message["note"] or last["note"],
+                }
+            else:
+                self._messages.append(dict(message))
+        return True
+
+    def flush(self) -> None:
+        """Send the messages that were kept."""
+        with self._lock:
+            messages, self._messages = self._messages, []
+        if messages:
+            self._log(messages=messages)
+
+    def send(self, **content: Any) -> None:
+        """Send what was kept, and one event."""
+        self.flush()
+        self._log(**content)
+
+    def _log(self, **content: Any) -> None:
+        self._worker.log_event(self._request["topic"], {"attempt": self._request["attempt"], **content})
+
+
+# The pages of the status servers are not encrypted and ask for no certificate.
+_PRIVATE_PAGES = ("--no-dashboard", "--dashboard-address", "127.0.0.1:0")
+
+
+def run_scheduler(listen: ClusterAddress) -> None:
+    """Run a scheduler until it is interrupted.
+
+    Raises:
+        BackendUnavailableError: the extra is not installed.
+    """
+    import_distributed()
+    from distributed.cli.dask_scheduler import main
+
+    scheme = listen.url.partition(":")[0]
+    place = ("--protocol", scheme, "--host", listen.host, "--port", str(listen.port))
+    _call(main, [*place, *listen.dask_options(), *_PRIVATE_PAGES])
+
+
+def run_worker(
+    scheduler: ClusterAddress, *, jobs: int, cores: int, memory_bytes: int, gpus: int, name: str | None = None
+) -> None:
+    """Run a worker until it is interrupted, or its scheduler ends.
+
+    Args:
+        scheduler: its address.
+        jobs: most jobs at a time.
+        cores: that they share.
+        memory_bytes: that they share.
+        gpus: number of GPUs; a job takes one.
+        name: for people; None: its address.
+
+    Raises:
+        BackendUnavailableError: the extra is not installed.
+    """
+    import_distributed()
+    from distributed.cli.dask_worker import main
+
+    resources = f"{MEMORY}={memory_bytes},{CORES}={cores}" + (f",{GPU}={gpus}" if gpus else "")
+    # Dask's own limit of memory counts the worker alone; the jobs are processes of their own.
+    options = ["--nthreads", str(jobs), "--memory-limit", "0", "--resources", resources]
+    here = ["--host", "127.0.0.1"] if scheduler.certificates is None else []
+    named = [] if name is None else ["--name", name]
+    _call(main, [scheduler.url, *options, *here, *named, *scheduler.dask_options(), *_PRIVATE_PAGES])
+
+
+def _call(main: object, arguments: Sequence[str]) -> None:
+    """Run a program of Dask with encryption demanded where it has a certificate."""
+    import dask
+
+    os.environ.update(python_environment())  # Nannies spawn the processes of their workers by this environment.
+    is_encrypted = "--tls-cert" in arguments
+    with dask.config.set({"distributed.comm.require-encryption": is_encrypted}):
+        main(args=list(arguments), standalone_mode=False)  # type: ignore[operator]
+
+
+@contextmanager
+def folder_tokens(folders: Iterable[Path | None]) -> Iterator[dict[Path | None, str]]:
+    """Put a token into each folder while the context lasts, and return their paths by folder.
+
+    Raises:
+        OSError: a folder cannot be written.
+    """
+    name = f".georef-{uuid.uuid4().hex}"
+    tokens: dict[Path | None, str] = {
+        folder: str(folder.absolute() / name) for folder in folders if folder is not None
+    }
+    try:
+        for token in tokens.values():
+            Path(token).touch()
+        yield tokens
+    finally:
+        for token in tokens.values():
+            with suppress(OSError):
+                Path(token).unlink()

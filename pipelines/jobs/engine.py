@@ -1,0 +1,182 @@
+"""Jobs, their ends, and the interface of the engines that run them.
+
+Display of one job: the messages of its process as one line of the progress, and as records of the log.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from pipelines.core.child import MessageReceiver
+from pipelines.core.progress import Progress, ProgressTask
+from pipelines.core.sentences import duration
+
+log = logging.getLogger(__name__)
+
+INTERRUPTED = 130
+
+
+@dataclass(frozen=True)
+class Job:
+    """Command of this program whose repetition completes an earlier, interrupted one.
+
+    Only names and paths travel: a job runs on every machine that sees its paths, and leaves its result there.
+
+    Attributes:
+        name: for people, unique among the jobs of a run.
+        arguments: of `georef`.
+        peak_bytes: predicted peak of the memory.
+        uses_gpu: whether it takes a whole GPU.
+        folder: that its command works in, such as the workspace; a machine that does not see it cannot run the job.
+        writes: file or folder in `folder` that it changes; needed where its files go through a storage.
+        reads: further files and folders in `folder` that it needs there.
+    """
+
+    name: str
+    arguments: tuple[str, ...]
+    peak_bytes: int
+    uses_gpu: bool = False
+    folder: Path | None = None
+    writes: Path | None = None
+    reads: tuple[Path, ...] = ()
+
+
+@dataclass(frozen=True)
+class JobEnd:
+    """End of a job.
+
+    Attributes:
+        job: the job.
+        code: exit code; below zero the signal that ended the process.
+        seconds: from start to end.
+        place: step that the job was at (`train`); empty if it named none.
+        error: message of a job that failed, else empty.
+    """
+
+    job: Job
+    code: int
+    seconds: float
+    place: str
+    error: str
+
+    @property
+    def is_done(self) -> bool:
+        """Whether the job has reached its result."""
+        return self.code == 0
+
+    @property
+    def is_interrupted(self) -> bool:
+        """Whether the job was stopped and goes on when it is run again."""
+        return self.code == INTERRUPTED
+
+
+class Engine(Protocol):
+    """Runner of jobs."""
+
+    def together(self, jobs: Sequence[Job]) -> int:
+        """Return how many of the jobs run at a time at the beginning; at least 1."""
+
+    def run(self, title: str, jobs: Sequence[Job], ended: Callable[[JobEnd], None], progress: Progress) -> None:
+        """Run jobs until all have ended; one that fails stops no other.
+
+        Args:
+            title: what the jobs are, for the display: `missions`.
+            jobs: in the order in which they begin where resources allow.
+            ended: called in this thread at the end of each job.
+            progress: shows a task for all jobs, and one for each that runs.
+
+        Raises:
+            KeyboardInterrupt: the user stopped the run. The jobs that ran have saved their work, and `ended` was
+                called for each of them.
+        """
+
+
+class JobLine:
+    """Progress of a job as one line: its outermost task, with the task inside as its note.
+
+    Attributes:
+        place: latest note of the outermost task: the stage that runs.
+    """
+
+    def __init__(self, progress: Progress, name: str) -> None:
+        self.place = ""
+        self._progress, self._name = progress, name
+        self._outer: ProgressTask | None = None
+
+    @contextmanager
+    def task(self, name: str, total: int | None = None) -> Iterator[ProgressTask]:
+        """Open a task of the job."""
+        if self._outer is not None:
+            yield _InnerTask(self, name, total)
+            return
+        with self._progress.task(self._name, total) as outer:
+            self._outer = outer
+            try:
+                yield self
+            finally:
+                self._outer = None
+
+    def advance(self, steps: int = 1, note: str = "", left_s: float | None = None) -> None:
+        """Advance the outermost task."""
+        self.place = note or self.place
+        self.show(steps, self.place)
+
+    def show(self, steps: int, note: str) -> None:
+        """Add steps to the line and change its note; the time that a job will still take is not known."""
+        if self._outer is not None:
+            self._outer.advance(steps, note=note, left_s=math.inf)
+
+
+class _InnerTask:
+    def __init__(self, line: JobLine, name: str, total: int | None) -> None:
+        self._line, self._name, self._total = line, name, total
+        self._done, self._note = 0, ""
+
+    def advance(self, steps: int = 1, note: str = "", left_s: float | None = None) -> None:
+        """Add steps, and show their count as the note of the line."""
+        self._done, self._note = self._done + steps, note.strip() or self._note
+        count = f"{self._name} {self._done}" + ("" if self._total is None else f"/{self._total}")
+        left = "" if not left_s or math.isinf(left_s) else f"{duration(left_s)} left"
+        place = "" if self._name == self._line.place else self._line.place
+        self._line.show(0, " · ".join(filter(None, (place, count, self._note, left))))
+
+
+class JobDisplay(MessageReceiver):
+    """Receiver of a job's messages: its tasks are one line, and its log records name it.
+
+    Only warnings are logged by default: many jobs say much.
+
+    Args:
+        progress: shows the line.
+        name: of the job.
+    """
+
+    def __init__(self, progress: Progress, name: str) -> None:
+        self._line, self._name = JobLine(progress, name), name
+        super().__init__(self._line)
+
+    @property
+    def place(self) -> str:
+        """Step that the job is at."""
+        return self._line.place
+
+    def log(self, name: str, level: int, text: str) -> None:
+        """Log a record of the job."""
+        shown = level if level >= logging.WARNING else logging.DEBUG
+        log.log(shown, "%s: %s", self._name, text)
+
+
+def tell_end(end: JobEnd) -> None:
+    """Log the end of a job."""
+    if end.is_done:
+        log.info("%s: done (%s)", end.job.name, duration(end.seconds))
+    elif end.is_interrupted:
+        log.warning("%s: interrupted at %s", end.job.name, end.place or "its start")
+    else:
+        log.error("%s: failed%s: %s", end.job.name, f" at {end.place}" if end.place else "", end.error)

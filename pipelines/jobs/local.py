@@ -1,0 +1,301 @@
+"""Engine on this machine: as many processes at a time as cores and memory allow.
+
+Process of one job: this program again, which tells its progress, its log and its error as messages.
+
+A crash of the process is the end of its job, and of no other. The process stops when its reader is gone
+(`georef_cli/verbosity.py`), so that no job outlives a killed parent for long.
+
+Engine that the stages of this command share their work with: chosen by the command line, used by a stage.
+
+A stage that consists of many parts asks for it. The runner and the workspace know of no engine.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import queue
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
+from dataclasses import dataclass, field
+from typing import Any
+
+from pipelines.core import child
+from pipelines.core.child import python_command, python_environment
+from pipelines.core.machine import free_main_memory_bytes, thread_count
+from pipelines.core.progress import Progress, deferred_interrupts
+from pipelines.jobs.engine import INTERRUPTED, Engine, Job, JobDisplay, JobEnd, tell_end
+
+log = logging.getLogger(__name__)
+
+_TAIL_LINES = 20
+_KILLED = "the system killed it, as it does when memory is short: run fewer at a time"
+
+
+@dataclass(frozen=True)
+class ProcessEnd:
+    """End of a process.
+
+    Attributes:
+        code: exit code; below zero the signal that ended it.
+        seconds: from start to end.
+        error: its message if it failed, else empty.
+        kind: kind of the failure (`GeorefError.code`); empty if it did not tell.
+    """
+
+    code: int
+    seconds: float
+    error: str = ""
+    kind: str = ""
+
+
+class JobProcess:
+    """Running process of a job.
+
+    Args:
+        program: arguments of Python that start this program.
+        arguments: of the program.
+        threads: that the job computes with.
+        take: gets the messages in a thread; false: it was none of progress or log.
+        ended: called at the end of the process, in the same thread.
+
+    Raises:
+        OSError: the process cannot be started.
+    """
+
+    def __init__(
+        self,
+        program: Sequence[str],
+        arguments: Sequence[str],
+        threads: int,
+        take: Callable[[Mapping[str, Any]], bool],
+        ended: Callable[[ProcessEnd], None],
+    ) -> None:
+        self._take, self._ended = take, ended
+        self._kind = ""
+        self._plain: deque[str] = deque(maxlen=_TAIL_LINES)
+        self._started = time.monotonic()
+        self._is_interrupted = False
+        # A group of its own: Ctrl-C on the terminal reaches the parent alone, which passes it on once.
+        self._process = subprocess.Popen(
+            python_command([*program, *arguments, "--json-progress", "--threads", str(threads)]),
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            encoding="utf-8",
+            errors="replace",
+            env=python_environment(),
+            **_OWN_GROUP,
+        )
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def interrupt(self) -> None:
+        """Ask the process to save its work and end, as Ctrl-C does."""
+        self._is_interrupted = True
+        with suppress(OSError):  # It has ended.
+            self._process.send_signal(_INTERRUPT)
+
+    def kill(self) -> None:
+        """End the process at once, and wait for its end."""
+        self._process.kill()
+        self._reader.join()
+
+    def _read(self) -> None:
+        assert self._process.stderr is not None
+        with self._process.stderr as lines:
+            for line in lines:
+                message = _message(line)
+                if message is not None and message["kind"] == "error":
+                    self._kind = str(message["code"])
+                elif message is None or not self._take(message):
+                    self._plain.append(line.rstrip())
+        code = self._process.wait()
+        if code < 0 and self._is_interrupted:  # before it could handle signals
+            code = INTERRUPTED
+        seconds = time.monotonic() - self._started
+        self._ended(ProcessEnd(code, seconds, "" if code == 0 else self._error(code), self._kind))
+
+    def _error(self, code: int) -> str:
+        """Return the message of the process; its last line, below usage or a traceback."""
+        said = next((line for line in reversed(self._plain) if line.strip()), "")
+        text = said.removeprefix("error: ").removeprefix("Error: ")
+        if code < 0:
+            ending = _KILLED if code == -_SIGKILL else f"it crashed ({_name(-code)})"
+            return f"{ending}: {text}" if text else ending
+        return text or f"it ended with exit code {code}"
+
+
+def _message(line: str) -> dict[str, Any] | None:
+    """Return the message in a line; None for lines of others, as native libraries write them."""
+    try:
+        message = json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+    return message if isinstance(message, dict) and "kind" in message else None
+
+
+def _name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"
+
+
+_OWN_GROUP: dict[str, Any]
+if sys.platform == "win32":
+    _OWN_GROUP = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
+    _INTERRUPT = signal.CTRL_BREAK_EVENT
+    _SIGKILL = 9
+else:
+    _OWN_GROUP = {"process_group": 0}
+    _INTERRUPT = signal.SIGTERM  # SIGINT is ignored by what a shell has started in the background
+    _SIGKILL = signal.SIGKILL
+
+
+_LOOK_EVERY_S = 0.2
+_USABLE = 0.9  # of the free memory: other programs grow, too
+
+
+@dataclass(frozen=True)
+class LocalEngine:
+    """Engine that runs jobs as processes of this machine.
+
+    Attributes:
+        at_a_time: most jobs at a time.
+        cores: that the jobs share.
+        free_bytes: memory that the jobs share; None: unknown, only their number is limited.
+        program: arguments of Python that start this program.
+    """
+
+    at_a_time: int
+    cores: int
+    free_bytes: int | None = None
+    program: tuple[str, ...] = field(default_factory=lambda: child.THIS_PROGRAM)
+
+    def together(self, jobs: Sequence[Job]) -> int:
+        """Return how many of the jobs run at a time at the beginning; see `Engine`."""
+        return max(len(self._startable(jobs, [])), 1)
+
+    def run(self, title: str, jobs: Sequence[Job], ended: Callable[[JobEnd], None], progress: Progress) -> None:
+        """Run jobs until all have ended; see `Engine`.
+
+        A job that needs more memory than there is runs alone. Smaller jobs pass one that has to wait for memory.
+        """
+        threads = max(self.cores // self.together(jobs), 1)
+        waiting, running = list(jobs), dict[str, _RunningJob]()
+
+        def end_of(end: JobEnd) -> None:
+            tell_end(end)
+            task.advance(left_s=math.inf)
+            ended(end)
+
+        finished: queue.Queue[JobEnd] = queue.Queue()
+        with progress.task(title, len(jobs)) as task, deferred_interrupts() as stop:
+            try:
+                is_stopping = False
+                while running or (waiting and not stop.requested):
+                    if not stop.requested:
+                        for job in self._startable(waiting, [other.job for other in running.values()]):
+                            log.info("%s: started with %d thread%s", job.name, threads, "" if threads == 1 else "s")
+                            waiting.remove(job)
+                            try:
+                                running[job.name] = _RunningJob(job, self.program, threads, progress, finished)
+                            except OSError as error:  # a command line that is too long, no more processes
+                                end_of(JobEnd(job, 1, 0.0, "", f"cannot be started: {error.strerror}"))
+                    elif not is_stopping:
+                        is_stopping = True
+                        log.warning("stopping %d %s: Ctrl-C again ends them at once", len(running), title)
+                        for job_process in running.values():
+                            job_process.interrupt()
+                    try:
+                        end = finished.get(timeout=_LOOK_EVERY_S)
+                    except queue.Empty:
+                        continue
+                    del running[end.job.name]
+                    end_of(end)
+            finally:
+                for job_process in running.values():
+                    job_process.kill()
+            if stop.requested:
+                raise KeyboardInterrupt
+
+    def _startable(self, waiting: Iterable[Job], running: Sequence[Job]) -> list[Job]:
+        """Return the waiting jobs that may start beside those that run."""
+        beside = list(running)
+        for job in waiting:
+            if self._admits(job, beside):
+                beside.append(job)
+        return beside[len(running) :]
+
+    def _admits(self, job: Job, running: Sequence[Job]) -> bool:
+        """Return whether a job may run beside others."""
+        if not running:
+            return True
+        if len(running) >= self.at_a_time or (job.uses_gpu and any(other.uses_gpu for other in running)):
+            return False
+        needed = job.peak_bytes + sum(other.peak_bytes for other in running)
+        return self.free_bytes is None or needed <= _USABLE * self.free_bytes
+
+
+class _RunningJob(JobProcess):
+    """Process of a job, whose messages are shown, and whose end is put into a queue."""
+
+    def __init__(
+        self, job: Job, program: Sequence[str], threads: int, progress: Progress, finished: queue.Queue[JobEnd]
+    ) -> None:
+        self.job, self._finished = job, finished
+        self._display = JobDisplay(progress, job.name)
+        super().__init__(program, job.arguments, threads, self._display.take, self._put)
+
+    def _put(self, end: ProcessEnd) -> None:
+        self._display.close()
+        self._finished.put(JobEnd(self.job, end.code, end.seconds, self._display.place, end.error))
+
+
+_CHOSEN: ContextVar[Engine | None] = ContextVar("engine", default=None)
+
+
+@contextmanager
+def chosen_engine(engine: Engine) -> Iterator[None]:
+    """Let the stages that run in this context share their work with an engine."""
+    token = _CHOSEN.set(engine)
+    try:
+        yield
+    finally:
+        _CHOSEN.reset(token)
+
+
+def engine_in_use() -> Engine:
+    """Return the engine of this context; by default, processes that share all cores and the free memory."""
+    cores = thread_count()
+    return _CHOSEN.get() or LocalEngine(cores, cores, free_main_memory_bytes())
+
+
+def failed_of(title: str, jobs: Sequence[Job], ended: Callable[[JobEnd], None], progress: Progress) -> list[JobEnd]:
+    """Run jobs on the engine in use, and return the ends of those that have failed.
+
+    Args:
+        title, jobs, ended, progress: as for `Engine.run`.
+
+    Raises:
+        KeyboardInterrupt: the user stopped the run; the jobs that ran have saved their work.
+    """
+    failed: list[JobEnd] = []
+
+    def take(end: JobEnd) -> None:
+        if not (end.is_done or end.is_interrupted):
+            failed.append(end)
+        ended(end)
+
+    if jobs:
+        engine_in_use().run(title, jobs, take, progress)
+    return failed

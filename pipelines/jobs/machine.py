@@ -1,0 +1,132 @@
+"""Inspection of the machine: cores, memory, GPU, backends, grids of PROJ, Chromium, versions of the libraries."""
+
+from __future__ import annotations
+
+import os
+import platform
+from dataclasses import dataclass
+
+import torch
+
+from pipelines.core.errors import BackendUnavailableError
+from pipelines.core.fingerprints import library_versions
+from pipelines.core.machine import available_cores, thread_count
+from pipelines.core.progress import Progress
+from pipelines.geodesy.operations import grid_folders, installed_grids
+from pipelines.report.chromium import named_or_installed
+from pipelines.splat.memory import free_memory_bytes
+from pipelines.splat.rasterizer.api import BackendName
+from pipelines.splat.rasterizer.backends import BACKENDS, chosen_backend
+from pipelines.splat.rasterizer.cuda_kernels import compile_kernels, kernels_ready
+from pipelines.splat.rasterizer.cuda_parts import CudaPart, compiling_parts, running_parts
+
+_LIBRARIES = (
+    *("numpy", "scipy", "numba", "torch", "gsplat", "cuda-toolkit", "pycolmap", "opencv-contrib-python-headless"),
+    *("pyproj", "rasterio", "laspy", "pyogrio", "rosbags", "matplotlib", "click", "rich"),
+)
+
+
+@dataclass(frozen=True)
+class Gpu:
+    """GPU that torch sees: its name, and its memory in bytes."""
+
+    name: str
+    bytes: int
+
+
+@dataclass(frozen=True)
+class BackendState:
+    """Rasteriser backend: whether it can be used, and the reason why not."""
+
+    name: str
+    available: bool
+    reason: str
+
+
+@dataclass(frozen=True)
+class Machine:
+    """What was found on this machine.
+
+    Attributes:
+        system: operating system, its release, and the processor's architecture.
+        python: version.
+        cores: that this process may use.
+        threads: that stages compute with (`--threads`).
+        memory_bytes, free_bytes: main memory; None: the system does not state it.
+        gpus: that torch sees.
+        backends: of the rasteriser.
+        cuda_parts: what the cuda backend needs, and what compiles its kernels.
+        cuda_kernels: place of the compiled kernels; None: the first use compiles them.
+        grid_folders: in which PROJ looks for grids.
+        grids: file names of the installed geoid models and datum shifts.
+        chromium: path of Chromium or Chrome; None: not found.
+        versions: of this package and its libraries.
+    """
+
+    system: str
+    python: str
+    cores: int
+    threads: int
+    memory_bytes: int | None
+    free_bytes: int | None
+    gpus: tuple[Gpu, ...]
+    backends: tuple[BackendState, ...]
+    cuda_parts: tuple[CudaPart, ...]
+    cuda_kernels: str | None
+    grid_folders: tuple[str, ...]
+    grids: tuple[str, ...]
+    chromium: str | None
+    versions: dict[str, str]
+
+
+def inspect_machine() -> Machine:
+    """Return what was found on this machine."""
+    return Machine(
+        system=f"{platform.system()} {platform.release()} {platform.machine()}",
+        python=platform.python_version(),
+        cores=available_cores(),
+        threads=thread_count(),
+        memory_bytes=_memory_bytes(),
+        free_bytes=free_memory_bytes(torch.device("cpu")),
+        gpus=_gpus(),
+        backends=tuple(_backend(name) for name in BACKENDS),
+        cuda_parts=(*running_parts(), *compiling_parts()),
+        cuda_kernels=kernels_ready(),
+        grid_folders=tuple(map(str, grid_folders())),
+        grids=tuple(installed_grids()),
+        chromium=named_or_installed(),
+        versions=library_versions(_LIBRARIES),
+    )
+
+
+def compile_cuda_kernels(progress: Progress) -> None:
+    """Compile the kernels of the cuda backend, unless that is done.
+
+    Raises:
+        BackendUnavailableError: a part is missing (names each), or the compiler fails (names its log).
+        InputError: neither a GPU nor the variable TORCH_CUDA_ARCH_LIST tells what to compile for.
+    """
+    if kernels_ready() is None:
+        compile_kernels(progress)
+
+
+def _backend(name: BackendName) -> BackendState:
+    try:
+        chosen_backend(name)
+    except BackendUnavailableError as error:
+        return BackendState(name, False, str(error))
+    return BackendState(name, True, "")
+
+
+def _gpus() -> tuple[Gpu, ...]:
+    if not torch.cuda.is_available():
+        return ()
+    found = (torch.cuda.get_device_properties(index) for index in range(torch.cuda.device_count()))
+    return tuple(Gpu(properties.name, int(properties.total_memory)) for properties in found)
+
+
+def _memory_bytes() -> int | None:
+    try:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, ValueError, OSError):
+        return None

@@ -1,0 +1,301 @@
+"""Missions of a batch: from a TOML file with defaults and differences, or from a folder of mission folders.
+
+Input is hostile until parsed. Workspaces lie inside the folder of the file. A table may name inputs anywhere, as
+`georef.toml` may. The first bad value is an error that names mission and key, before any work starts.
+"""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from pipelines.core.errors import GeorefError, InputError
+from pipelines.core.files import file_size
+from pipelines.core.options import CONFIG_FILE, REQUESTS, input_markers, load_toml, read_toml
+from pipelines.core.stages import BY_NAME, StageSpec, named_deliverables, stage_slice
+from pipelines.core.staleness import Flags
+from pipelines.core.validators import stays_inside
+from pipelines.core.workspace import Workspace
+
+_MAX_TOML_BYTES = 4 * 1024 * 1024
+_MOST_MISSIONS = 10_000
+_NAME = re.compile(r"[^\W_][\w.-]{0,99}(?<!\.)")
+_OWN_KEYS = ("workspace", "to", "deliver")
+# Files of a mission folder under their usual names, by option of `ingest`.
+USUAL_INPUTS = {
+    "images": "images",
+    "trajectory": "trajectory.csv",
+    "gcp": "gcp_list.txt",
+    "checkpoints": "checkpoints.txt",
+}
+
+Owners = Mapping[str, tuple[str, ...]]
+
+
+@dataclass(frozen=True)
+class Mission:
+    """Mission of a batch.
+
+    Attributes:
+        name: unique in the batch, and a name of a folder.
+        workspace: its workspace, which may not exist yet.
+        place: path of the workspace, relative to the folder of the batch.
+        last: last stage to run; None: all.
+        deliver: names of deliverables, as for `georef run --deliver`.
+        flags: options by stage and field.
+    """
+
+    name: str
+    workspace: Workspace
+    place: str
+    last: str | None = None
+    deliver: str | None = None
+    flags: Mapping[str, Flags] = field(default_factory=dict, hash=False)
+
+    @property
+    def stages(self) -> tuple[StageSpec, ...]:
+        """Stages to run."""
+        return (*stage_slice(None, self.last), *named_deliverables(self.deliver))
+
+    def overridden(self, last: str | None, deliver: str | None, flags: Mapping[str, Flags]) -> Mission:
+        """Return the mission with what the command line gives for all missions."""
+        merged = {stage: {**self.flags.get(stage, {}), **flags.get(stage, {})} for stage in (*self.flags, *flags)}
+        return replace(self, last=last or self.last, deliver=deliver or self.deliver, flags=merged)
+
+
+@dataclass(frozen=True)
+class MissionList:
+    """Missions of a batch.
+
+    Attributes:
+        name: of the batch: that of the file or folder.
+        folder: holds the workspaces, and receives the table of results.
+        missions: in order.
+    """
+
+    name: str
+    folder: Path
+    missions: tuple[Mission, ...]
+
+    def overridden(self, last: str | None, deliver: str | None, flags: Mapping[str, Flags]) -> MissionList:
+        """Return the missions with what the command line gives for all of them.
+
+        Raises:
+            ValueError: `deliver` names no deliverable.
+        """
+        named_deliverables(deliver)
+        return replace(self, missions=tuple(mission.overridden(last, deliver, flags) for mission in self.missions))
+
+
+def load_missions(path: Path, owners: Owners) -> MissionList:
+    """Return the missions of a TOML file, or of a folder.
+
+    Args:
+        path: of the file or folder.
+        owners: options that a mission may have outside the tables of its stages, with the stages that they are for.
+
+    Raises:
+        InputError: no such file, or a bad name, key or value; names file, mission and key.
+    """
+    listed = _in_folder(path) if path.is_dir() else _in_file(path, owners)
+    if not listed.missions:
+        raise InputError("holds no mission", path=path)
+    return listed
+
+
+def _in_folder(folder: Path) -> MissionList:
+    """Return the missions of a folder: its folders with photographs, with `georef.toml`, or begun before.
+
+    Raises:
+        InputError: a folder leads outside, or cannot be used as a name.
+    """
+    signs = (USUAL_INPUTS["images"], CONFIG_FILE, REQUESTS)
+    found = []
+    for root in sorted(folder.iterdir()):
+        if root.name.startswith(".") or not root.is_dir() or not any((root / sign).exists() for sign in signs):
+            continue
+        _require_name(root.name, folder, root.name)
+        _require_inside(root, folder, folder, root.name)
+        workspace = Workspace(root)
+        known = {
+            *load_toml(workspace.config_file, BY_NAME).get("ingest", {}),
+            *workspace.requests().get("ingest", {}),
+        }
+        usual = {
+            option: root / name
+            for option, name in USUAL_INPUTS.items()
+            if option not in known and (root / name).exists()
+        }
+        if "bag" in known:
+            usual.pop("images", None)
+        found.append(Mission(root.name, workspace, root.name, flags={"ingest": usual}))
+    return MissionList(folder.resolve().name, folder, tuple(found))
+
+
+def _in_file(path: Path, owners: Owners) -> MissionList:
+    file_size(path, limit_bytes=_MAX_TOML_BYTES, kind="list of missions")
+    document = read_toml(path)
+    for key, value in document.items():
+        if key not in ("defaults", "missions"):
+            raise InputError("unknown table; there are defaults and missions", path=path, field=key)
+        if not isinstance(value, dict):
+            raise InputError("expected a table", path=path, field=key)
+    tables = document.get("missions", {})
+    if len(tables) > _MOST_MISSIONS:
+        raise InputError(f"{len(tables)} missions are too many (limit {_MOST_MISSIONS})", path=path)
+    defaults = _Table(path, "defaults", owners).read(document.get("defaults", {}))
+    missions = tuple(_mission(path, name, table, defaults, owners) for name, table in tables.items())
+    _require_own_workspaces(path, missions)
+    return MissionList(path.stem, path.parent, missions)
+
+
+@dataclass(frozen=True)
+class _Settings:
+    """Checked content of a table of the file."""
+
+    own: Mapping[str, str]
+    flags: Mapping[str, Flags]
+
+
+@dataclass(frozen=True)
+class _Table:
+    """Reader of `[defaults]` or of one mission's table.
+
+    Attributes:
+        path: of the file.
+        name: of the table, for errors: `missions.north`.
+        owners: see `load_missions`.
+    """
+
+    path: Path
+    name: str
+    owners: Owners
+
+    def read(self, table: Any) -> _Settings:
+        """Return the content of the table.
+
+        Raises:
+            InputError: an unknown key or a bad value.
+        """
+        if not isinstance(table, dict):
+            raise InputError("expected a table", path=self.path, field=self.name)
+        own: dict[str, str] = {}
+        flags: dict[str, dict[str, Any]] = {}
+        for key, value in table.items():
+            if key in _OWN_KEYS:
+                own[key] = self._own(key, value)
+            elif key in BY_NAME:
+                flags.setdefault(key, {}).update(self._stage(key, value))
+            elif key in self.owners:
+                for owner in self.owners[key]:
+                    flags.setdefault(owner, {})[key] = self._value(BY_NAME[owner], key, value, key)
+            else:
+                known = ", ".join((*_OWN_KEYS, *self.owners))
+                raise self._error(
+                    key, f"unknown key; known are {known}, and tables of stages: {', '.join(BY_NAME)}"
+                )
+        return _Settings(own, flags)
+
+    def _own(self, key: str, value: Any) -> str:
+        if not isinstance(value, str):
+            raise self._error(key, "expected a text")
+        try:
+            if key == "to":
+                stage_slice(None, value) if value in BY_NAME else BY_NAME[value]
+            elif key == "deliver":
+                named_deliverables(value)
+            elif not stays_inside(value):
+                raise ValueError("leads out of the folder of the file: give a relative path inside it")
+        except (GeorefError, ValueError, KeyError) as error:
+            raise self._error(key, "is no stage" if isinstance(error, KeyError) else str(error)) from error
+        return value
+
+    def _stage(self, stage: str, table: Any) -> dict[str, Any]:
+        if not isinstance(table, dict):
+            raise self._error(stage, "expected a table of options")
+        return {key: self._value(BY_NAME[stage], key, value, f"{stage}.{key}") for key, value in table.items()}
+
+    def _value(self, spec: StageSpec, option: str, value: Any, key: str) -> Any:
+        """Return the value of an option, with paths relative to the file made absolute."""
+        if option not in spec.options.model_fields:
+            raise self._error(key, f"unknown option; {spec.name} has {', '.join(spec.options.model_fields)}")
+        if any(unicodedata.category(sign) in ("Cc", "Cs") for text in _texts(value) for sign in text):
+            raise self._error(key, "has a control character")
+        if option in input_markers(spec.options) and isinstance(value, str):
+            value = str((self.path.parent / value).absolute())
+        try:
+            spec.options.model_validate({option: value})
+        except ValidationError as error:
+            at_option = next((fault for fault in error.errors() if fault["loc"][:1] == (option,)), None)
+            if at_option is not None:  # A fault of several options together is found when all are known.
+                raise self._error(key, at_option["msg"]) from error
+        return value
+
+    def _error(self, key: str, message: str) -> InputError:
+        return InputError(message, path=self.path, field=f"{self.name}.{key}")
+
+
+def _mission(path: Path, name: str, table: Any, defaults: _Settings, owners: Owners) -> Mission:
+    label = f"missions.{name}"
+    _require_name(name, path, label)
+    own = _Table(path, label, owners).read(table)
+    settings = {**defaults.own, **own.own}
+    flags = {
+        stage: {**defaults.flags.get(stage, {}), **own.flags.get(stage, {})}
+        for stage in dict.fromkeys((*defaults.flags, *own.flags))
+    }
+    for stage, given in flags.items():
+        try:
+            BY_NAME[stage].options.model_validate(given)
+        except ValidationError as error:
+            raise InputError(error.errors()[0]["msg"], path=path, field=f"{label}.{stage}") from error
+    place = own.own.get("workspace", f"{defaults.own['workspace']}/{name}" if "workspace" in defaults.own else name)
+    root = path.parent.absolute() / place
+    _require_inside(root, path.parent, path, label)
+    mission = Mission(name, Workspace(root), place, settings.get("to"), settings.get("deliver"), flags)
+    running = {spec.name for spec in mission.stages}
+    for key in table:
+        stages = (key,) if key in BY_NAME else owners.get(key, ())
+        if stages and not running.intersection(stages):
+            text = f"is for {' and '.join(stages)}, which is not among the stages to run"
+            raise InputError(text, path=path, field=f"{label}.{key}")
+    return mission
+
+
+def _require_name(name: str, path: Path, label: str) -> None:
+    if not _NAME.fullmatch(name):
+        raise InputError(
+            "cannot be the name of a mission: use letters, digits, '.', '-' and '_'", path=path, field=label
+        )
+
+
+def _require_inside(root: Path, folder: Path, path: Path, label: str) -> None:
+    """Refuse a workspace that a symbolic link leads out of its folder."""
+    if not root.resolve().is_relative_to(folder.resolve()):
+        raise InputError("its workspace leads out of the folder of missions", path=path, field=label)
+
+
+def _require_own_workspaces(path: Path, missions: Sequence[Mission]) -> None:
+    """Refuse two missions in one workspace; some file systems do not tell capitals from small letters."""
+    taken: dict[str, str] = {}
+    for mission in missions:
+        place = str(mission.workspace.root.resolve()).casefold()
+        if place in taken:
+            raise InputError(
+                f"has the workspace of {taken[place]}", path=path, field=f"missions.{mission.name}.workspace"
+            )
+        taken[place] = mission.name
+
+
+def _texts(value: Any) -> Iterator[str]:
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, list):
+        for part in value:
+            yield from _texts(part)

@@ -1,0 +1,406 @@
+"""Folders that go through an object store, where machines share no disk.
+
+A part is a file or folder inside a folder of jobs, such as a workspace. The store holds an index of it, and one
+object for each file in the state that the index lists; an object is never changed. The index is written after the
+objects, so that an interrupted copy leaves the part as it was. Only files whose size or time differs are copied.
+
+Exchange of a job's files between engine and workers through a storage: named parts of one folder, no others.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import os
+import shutil
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any, Literal, TypedDict, TypeVar
+from urllib.parse import urlsplit
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from pipelines.core.errors import BackendUnavailableError, GeorefError, InputError, StorageError
+from pipelines.core.validators import stays_inside
+from pipelines.jobs.engine import Job
+
+log = logging.getLogger(__name__)
+
+_MOST_INDEX_BYTES = 256 * 1024 * 1024
+# Files that belong to one machine, that can be made again, or that are being written.
+_LEFT_OUT_NAMES = (".lock", ".lock.holder")
+_LEFT_OUT_FOLDERS = ("cache",)
+_DRAFT = ".tmp"
+_AT_ONCE = 64
+# Stores of buckets; to make a folder there would make a bucket that is misspelt.
+_WITHOUT_FOLDERS = ("s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "adl")
+
+_Result = TypeVar("_Result")
+Writer = Literal["engine", "worker"]
+
+
+class PartIndex(BaseModel):
+    """Index of a part.
+
+    Attributes:
+        format_version: of this document.
+        part: relative path of the part.
+        attempt: at the job that the part was sent for; workers of earlier attempts may not write any more.
+        writer: who wrote it; `worker`: the engine has not collected it.
+        files: size in bytes and time of change in nanoseconds by path, relative to the folder of the part.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    format_version: Literal[1] = 1
+    part: str
+    attempt: str
+    writer: Writer
+    files: Mapping[str, tuple[int, int]]
+
+
+@dataclass(frozen=True)
+class Storage:
+    """Store that a URL of fsspec names, such as `s3://bucket/prefix` or `file:///mnt/exchange`.
+
+    Attributes:
+        url: of the store.
+    """
+
+    url: str
+
+    def check(self) -> None:
+        """Connect to the store.
+
+        Raises:
+            BackendUnavailableError: a library for this kind of store is not installed.
+            StorageError: the URL is wrong, or the store cannot be reached.
+        """
+        self._reached(lambda: self._store().exists(self._home("")))
+
+    def index(self, part: str) -> PartIndex | None:
+        """Return the index of a part; None: the store does not have it.
+
+        Raises:
+            StorageError: the store cannot be read.
+            InputError: the index is damaged, or names a path outside its part.
+        """
+        return self._reached(lambda: self._index(part))
+
+    def send(self, folder: Path, part: str, writer: Writer, attempt: str = "") -> PartIndex:
+        """Copy a part of a folder into the store, and delete there what it has no more.
+
+        A file that vanishes meanwhile, as when a stage ends, makes the copy start anew.
+
+        Args:
+            folder: that holds the part.
+            part: relative path of a file or folder.
+            writer: whose copy it is.
+            attempt: at the job that it is for.
+
+        Raises:
+            StorageError: the store cannot be written, or another attempt has taken over from this worker.
+        """
+        return self._reached(lambda: self._send(folder, part, writer, attempt))
+
+    def fetch(self, folder: Path, part: str, before: PartIndex | None = None) -> PartIndex | None:
+        """Copy a part from the store into a folder; a file that is newer there stays.
+
+        Args:
+            folder: that receives the part.
+            part: its relative path.
+            before: what the folder had sent: files that are no longer listed are deleted.
+
+        Returns:
+            The index; None: the store does not have the part.
+
+        Raises:
+            StorageError: the store cannot be read.
+            InputError: the index is damaged.
+        """
+        return self._reached(lambda: self._fetch(folder, part, before))
+
+    def _index(self, part: str) -> PartIndex | None:
+        store, place = self._store(), self._index_place(part)
+        if not store.exists(place):
+            return None
+        if store.size(place) > _MOST_INDEX_BYTES:
+            raise InputError("is too large for an index", path=place)
+        try:
+            index = PartIndex.model_validate_json(store.cat_file(place))
+        except ValidationError as error:
+            raise InputError(f"is a damaged index: delete it; {error.errors()[0]['msg']}", path=place) from error
+        if index.part != part or not all(name == "." or stays_inside(name) for name in index.files):
+            raise InputError("lists what does not belong to its part: delete it", path=place)
+        return index
+
+    def _send(self, folder: Path, part: str, writer: Writer, attempt: str) -> PartIndex:
+        store, before, home = self._store(), self._index(part), self._home(part)
+        if writer == "worker" and before is not None and before.attempt != attempt:
+            raise StorageError(f"{part}: another attempt at the job has taken over")
+        held = set() if before is None else {_object(name, state) for name, state in before.files.items()}
+        if urlsplit(self.url).scheme not in _WITHOUT_FOLDERS:
+            store.makedirs(home, exist_ok=True)
+        while True:
+            files = dict(_files_of(folder / part))
+            try:
+                keys = {name: _object(name, state) for name, state in files.items()}
+                for names in _batches([name for name, key in keys.items() if key not in held]):
+                    places = [f"{home}/{keys[name]}" for name in names]
+                    store.put([str(folder / part / name) for name in names], places)
+                    held.update(keys[name] for name in names)
+                break
+            except FileNotFoundError:
+                if all((folder / part / name).exists() for name in files):
+                    raise
+        index = PartIndex(part=part, attempt=attempt, writer=writer, files=files)
+        if index != before:
+            self._write_index(index)
+            wanted = set(keys.values())
+            for place in store.ls(home, detail=False):
+                if place.rpartition("/")[2] not in wanted:
+                    store.rm_file(place)
+        return index
+
+    def _fetch(self, folder: Path, part: str, before: PartIndex | None) -> PartIndex | None:
+        store, index = self._store(), self._index(part)
+        if index is None:
+            return None
+        for names in _batches(
+            [name for name, state in index.files.items() if _is_older(folder / part / name, state)]
+        ):
+            paths = [folder / part / name for name in names]
+            for path in paths:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                if not path.parent.resolve().is_relative_to(folder.resolve()):
+                    raise InputError("a symbolic link leads out of the folder", path=path)
+            drafts = [path.with_name(path.name + _DRAFT) for path in paths]
+            keys = [_object(name, index.files[name]) for name in names]
+            store.get([f"{self._home(part)}/{key}" for key in keys], [str(draft) for draft in drafts])
+            for name, path, draft in zip(names, paths, drafts, strict=True):
+                time_ns = index.files[name][1]
+                os.utime(draft, ns=(time_ns, time_ns))
+                draft.replace(path)
+        for name in () if before is None else before.files.keys() - index.files.keys():
+            if _state_of(folder / part / name) == tuple(before.files[name]):  # type: ignore[union-attr]
+                (folder / part / name).unlink()
+        return index
+
+    def mark_collected(self, index: PartIndex) -> None:
+        """Note that the engine has a part as a worker left it.
+
+        Raises:
+            StorageError: the store cannot be written.
+        """
+        self._reached(lambda: self._write_index(index.model_copy(update={"writer": "engine"})))
+
+    def _write_index(self, index: PartIndex) -> None:
+        place = self._index_place(index.part)
+        self._store().pipe_file(place, json.dumps(index.model_dump(mode="json")).encode())
+
+    def _index_place(self, part: str) -> str:
+        return f"{self._home(part)}.json"
+
+    def _home(self, part: str) -> str:
+        """Return the folder of a part's objects, as the library of the store writes it."""
+        import fsspec
+
+        root = fsspec.core.url_to_fs(self.url)[1].rstrip("/")
+        return f"{root}/{_digest(part)}"
+
+    def _store(self) -> Any:
+        import fsspec
+
+        return fsspec.core.url_to_fs(self.url)[0]
+
+    def _reached(self, action: Callable[[], _Result]) -> _Result:
+        """Return the result of an action on the store.
+
+        Raises:
+            BackendUnavailableError: a library is not installed.
+            StorageError: the store failed.
+        """
+        try:
+            return action()
+        except (InputError, StorageError):
+            raise
+        except ImportError as error:
+            raise BackendUnavailableError(f"{self.url}: {error}") from error
+        except Exception as error:  # Each library of a store has exceptions of its own.
+            raise StorageError(f"{self.url}: {type(error).__name__}: {error}") from error
+
+
+def _files_of(path: Path) -> Iterator[tuple[str, tuple[int, int]]]:
+    """Yield the files of a part: path relative to it, size and time of change."""
+    if path.is_file():
+        if (state := _state_of(path)) is not None:
+            yield ".", state
+        return
+    for folder, folders, names in os.walk(path):
+        inside = PurePosixPath(Path(folder).relative_to(path).as_posix())
+        if inside == PurePosixPath("."):
+            folders[:] = [name for name in folders if name not in _LEFT_OUT_FOLDERS]
+        for name in names:
+            relative = str(inside / name)
+            if name in _LEFT_OUT_NAMES or name.endswith(_DRAFT) or not stays_inside(relative):
+                continue
+            if (state := _state_of(Path(folder) / name)) is not None:
+                yield relative, state
+
+
+def _is_older(path: Path, state: tuple[int, int]) -> bool:
+    """Return whether a file is missing, or older than a state or of another size."""
+    own = _state_of(path)
+    return own is None or (own != state and own[1] <= state[1])
+
+
+def _state_of(path: Path) -> tuple[int, int] | None:
+    """Return size and time of change of a file; None: there is none."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_size, status.st_mtime_ns
+
+
+def _batches(names: list[str]) -> Iterator[list[str]]:
+    """Yield the names of files that are copied at once."""
+    for start in range(0, len(names), _AT_ONCE):
+        yield names[start : start + _AT_ONCE]
+
+
+def _object(name: str, state: tuple[int, int]) -> str:
+    """Return the name of the object that holds a file in a state."""
+    return _digest(f"{name}\0{state[0]}\0{state[1]}")
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+_SAVE_EVERY_S = 60.0
+
+
+class Parcel(TypedDict):
+    """Parts of a job, as a worker is told.
+
+    Attributes:
+        url: of the storage.
+        folder: of the engine; it stands at the beginning of paths in the arguments.
+        attempt: at the job.
+        reads: parts that the job reads, relative to the folder.
+        writes: part that the job reads and writes.
+    """
+
+    url: str
+    folder: str
+    attempt: str
+    reads: list[str]
+    writes: str
+
+
+class EngineExchange:
+    """Side of the engine, whose folder has everything before and after a run.
+
+    Args:
+        storage: that the workers use.
+    """
+
+    def __init__(self, storage: Storage) -> None:
+        self._storage = storage
+        self._sent: dict[str, PartIndex] = {}
+
+    def send(self, job: Job, attempt: str) -> Parcel:
+        """Put what an attempt at a job needs into the storage, after collecting what an earlier one left there.
+
+        Raises:
+            InputError: the job names no parts, or a part lies outside its folder.
+            StorageError: the storage failed.
+        """
+        if job.folder is None or job.writes is None:
+            raise InputError(f"{job.name} cannot run through a storage: use a shared folder", field="--storage")
+        folder = job.folder.resolve()
+        writes, *reads = [_part(folder, path) for path in (job.writes, *job.reads)]
+        self._collect(folder, writes)
+        for part in reads:
+            self._storage.send(folder, part, "engine")
+        self._sent[writes] = self._storage.send(folder, writes, "engine", attempt)
+        return Parcel(url=self._storage.url, folder=str(job.folder), attempt=attempt, reads=reads, writes=writes)
+
+    def collect(self, job: Job) -> None:
+        """Take the results of a job into the folder of the engine.
+
+        Raises:
+            InputError: the index in the storage is damaged.
+            StorageError: the storage failed.
+        """
+        if job.folder is not None and job.writes is not None:
+            self._collect(job.folder.resolve(), _part(job.folder.resolve(), job.writes))
+
+    def _collect(self, folder: Path, part: str) -> None:
+        index = self._storage.index(part)
+        if index is not None and index.writer == "worker":
+            self._storage.fetch(folder, part, self._sent.get(part))
+            self._storage.mark_collected(index)
+
+
+@contextmanager
+def worker_exchange(parcel: Parcel, scratch: Path) -> Iterator[None]:
+    """Fetch the parts of a job into a scratch folder, and put its results back when the context ends.
+
+    Meanwhile results are put back every minute, so that a lost worker loses little.
+
+    Args:
+        parcel: the parts.
+        scratch: folder of this job, which is deleted in the end.
+
+    Raises:
+        InputError: an index in the storage is damaged.
+        StorageError: the storage failed.
+    """
+    storage, stopped = Storage(parcel["url"]), threading.Event()
+
+    def save() -> None:
+        while not stopped.wait(_SAVE_EVERY_S):
+            try:
+                storage.send(scratch, parcel["writes"], "worker", parcel["attempt"])
+            except GeorefError as error:
+                log.warning("results were not put back, next attempt in a minute: %s", error)
+
+    saving = threading.Thread(target=save, daemon=True)
+    try:
+        for part in (*parcel["reads"], parcel["writes"]):
+            storage.fetch(scratch, part)
+        scratch.mkdir(parents=True, exist_ok=True)
+        saving.start()
+        yield
+        stopped.set()
+        saving.join()
+        storage.send(scratch, parcel["writes"], "worker", parcel["attempt"])
+    finally:
+        stopped.set()
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
+def arguments_in(parcel: Parcel, arguments: Sequence[str], scratch: Path) -> list[str]:
+    """Return the arguments of a job with the scratch folder in place of the engine's folder."""
+    here, there = f"{parcel['folder']}/", f"{scratch}/"
+    return [f"{argument}/".replace(here, there).removesuffix("/") for argument in arguments]
+
+
+def _part(folder: Path, path: Path) -> str:
+    """Return a path relative to a folder.
+
+    Raises:
+        InputError: it lies outside.
+    """
+    try:
+        return path.resolve().relative_to(folder).as_posix()
+    except ValueError:
+        raise InputError(
+            f"lies outside {folder}: with --storage everything that a job reads lies in one folder", path=path
+        ) from None

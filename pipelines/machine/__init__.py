@@ -1,1 +1,0 @@
-"""The machine: what `georef` finds on it, and what is missing."""

@@ -1,0 +1,97 @@
+"""Chromium: where it is, and the PDF of a page, printed without a window and without a network."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+
+from pipelines.core.errors import BackendUnavailableError, CrashError
+from pipelines.core.files import replace_file
+
+_ON_PATH = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome", "msedge")
+# Where browsers are on macOS and Windows, which do not put them on PATH.
+_INSTALLED = (
+    "/Applications/Google Chrome.app/Contents/MacOS/Google Chrome",
+    "/Applications/Chromium.app/Contents/MacOS/Chromium",
+    "C:/Program Files/Google/Chrome/Application/chrome.exe",
+    "C:/Program Files (x86)/Microsoft/Edge/Application/msedge.exe",
+)
+NO_NETWORK = "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1"
+_PATIENCE_S = 300.0
+_LONGEST_MESSAGE = 300
+
+
+def named_or_installed() -> str | None:
+    """Return Chromium or Chrome as the variable CHROMIUM names it, else where it is installed; None: nowhere."""
+    on_path = (shutil.which(name) for name in _ON_PATH)
+    installed = (place for place in _INSTALLED if Path(place).is_file())
+    return os.environ.get("CHROMIUM") or next(filter(None, [*on_path, *installed]), None)
+
+
+def chromium_path() -> str:
+    """Return the path of Chromium or Chrome: that of the variable CHROMIUM, on PATH, or where it is installed.
+
+    Raises:
+        BackendUnavailableError: there is none; says what to install.
+    """
+    browser = named_or_installed()
+    if os.environ.get("CHROMIUM") and browser and shutil.which(browser) is None:
+        raise BackendUnavailableError(f"the variable CHROMIUM names {browser}, which is no program: correct it")
+    if browser is None:
+        raise BackendUnavailableError(
+            "Chromium is missing: install it (`apt-get install chromium`, or Chrome from google.com/chrome), or "
+            "name a Chromium or Chrome in the variable CHROMIUM"
+        )
+    return browser
+
+
+def print_pdf(page: Path, pdf: Path) -> None:
+    """Print a page as PDF; the file appears when it is complete.
+
+    Args:
+        page: HTML file.
+        pdf: file to write.
+
+    Raises:
+        BackendUnavailableError: there is no Chromium.
+        CrashError: Chromium did not print; says what it reported.
+    """
+    browser = chromium_path()
+    with tempfile.TemporaryDirectory() as profile:
+        draft = pdf.with_suffix(".tmp")
+        command = [
+            browser,
+            "--headless=new",
+            "--disable-gpu",
+            "--no-first-run",
+            "--disable-extensions",
+            "--disable-background-networking",
+            NO_NETWORK,
+            f"--user-data-dir={profile}",
+            "--no-pdf-header-footer",
+            f"--print-to-pdf={draft.absolute()}",
+        ]
+        if hasattr(os, "geteuid") and os.geteuid() == 0:  # Chromium's sandbox refuses root, in containers mostly.
+            command.append("--no-sandbox")
+        try:
+            done = subprocess.run(
+                [*command, page.absolute().as_uri()],
+                stdin=subprocess.DEVNULL,
+                capture_output=True,
+                text=True,
+                errors="replace",
+                timeout=_PATIENCE_S,
+                check=False,
+            )
+        except subprocess.TimeoutExpired as error:
+            raise CrashError(f"{browser} did not print the page within {_PATIENCE_S:.0f} s") from error
+        if done.returncode != 0 or not draft.is_file():
+            reason = " ".join(done.stderr.split())[-_LONGEST_MESSAGE:]
+            raise CrashError(
+                f"{browser} did not print the page (exit code {done.returncode}): {reason}. Without --pdf the page "
+                "is written, and any browser prints it"
+            )
+    replace_file(draft, pdf)

@@ -1,0 +1,335 @@
+"""Pages for people: a frame with style, contents and sections, which every report of the package shares.
+
+A page is one file. It holds its style and its pictures, has no script, and loads nothing: its own policy forbids
+both. Texts of users (names of points, of photographs, of workspaces) enter through the escaping of jinja2 only, and
+their control characters are written as escapes.
+
+A room that makes a page has a folder `templates/` with one template a section. The templates hold all HTML; Python
+gives them typed facts.
+
+Figures as text: decimals that fit their size, a true minus, a dash for what does not exist.
+
+Pictures inside a page: as data, at a size that the page needs.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
+from math import isnan
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipelines.core.errors import InputError
+from pipelines.core.figures import ACCURACY_H, MISSING
+from pipelines.core.files import replace_text
+from pipelines.core.sentences import printable_lines
+from pipelines.core.types import ByteArray
+from pipelines.formats.image_file import MAX_PIXELS, header_size, read_bytes
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+
+
+def number(value: float | None, decimals: int = 2) -> str:
+    """Return a number with fixed decimals: `−0.12`; a dash for None and NaN."""
+    if value is None or isnan(value):
+        return MISSING
+    text = f"{value:.{decimals}f}"
+    if float(text) == 0.0:
+        text = text.removeprefix("-")
+    return text.replace("-", "−")
+
+
+def metres(value: float | None) -> str:
+    """Return metres without their unit: millimetres below 10 m, tenths of them below 1 cm, else centimetres."""
+    if value is None or isnan(value):
+        return MISSING
+    return "0" if value == 0 else number(value, 4 if abs(value) < 0.00995 else 3 if abs(value) < 9.9995 else 2)
+
+
+def in_metres(value: float | None) -> str:
+    """Return metres with their unit."""
+    return MISSING if value is None or isnan(value) else f"{metres(value)} m"
+
+
+def accuracy(value: float | None) -> str:
+    """Return a figure of the headline, given in metres, with its unit."""
+    return ACCURACY_H.with_unit(value)
+
+
+def signed(value: float | None) -> str:
+    """Return millimetre-fine metres without their unit, with a sign: a column of errors."""
+    text = number(value, 3)
+    return text if text == MISSING or text.startswith("−") else f"+{text}"
+
+
+def share(value: float | None) -> str:
+    """Return a share of one as per cent: `97.5 %`."""
+    return MISSING if value is None or isnan(value) else f"{number(100 * value, 1).removesuffix('.0')} %"
+
+
+def ratio(value: float | None) -> str:
+    """Return a ratio with two decimals."""
+    return number(value, 2)
+
+
+def square_km(value: float | None) -> str:
+    """Return an area in square kilometres, with its unit."""
+    return MISSING if value is None else f"{number(value, 3)} km²"
+
+
+def decibel(value: float | None) -> str:
+    """Return decibels with their unit."""
+    return MISSING if value is None else f"{number(value, 2)} dB"
+
+
+def similarity(value: float | None) -> str:
+    """Return a figure between 0 and 1 with four decimals (SSIM, LPIPS)."""
+    return number(value, 4)
+
+
+def parts_per_million(value: float | None) -> str:
+    """Return a relative quantity in parts per million, or per cent from one per mille on: `96.4 ppm`, `1.86 %`."""
+    if value is None:
+        return MISSING
+    return f"{number(1e6 * value, 1)} ppm" if abs(value) < 1e-3 else f"{number(100 * value, 2)} %"
+
+
+def whole(value: int | None) -> str:
+    """Return a whole number with thin spaces between thousands."""
+    return MISSING if value is None else f"{value:,}".replace(",", "\u2009").replace("-", "−")
+
+
+def plain(value: object) -> str:
+    """Return any value as text; a dash for None."""
+    return MISSING if value is None else str(value)
+
+
+def duration(seconds: float | None) -> str:
+    """Return a duration: `48 s`, `12 min 3 s`, `2 h 5 min`."""
+    if seconds is None:
+        return MISSING
+    if seconds < 10:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    if minutes < 60:
+        return f"{minutes} min {rest} s" if minutes else f"{rest} s"
+    return f"{minutes // 60} h {minutes % 60} min"
+
+
+def moment(value: datetime | None) -> str:
+    """Return a time in UTC, to the minute."""
+    return MISSING if value is None else f"{value:%Y-%m-%d %H:%M} UTC"
+
+
+def as_json(value: object) -> str:
+    """Return a value of a JSON document in full, for programs that read the page."""
+    return json.dumps(value, allow_nan=False)
+
+
+FORMS: dict[str, Callable[..., str]] = {
+    "accuracy": accuracy,
+    "as_json": as_json,
+    "whole": whole,
+    "decibel": decibel,
+    "duration": duration,
+    "in_metres": in_metres,
+    "metres": metres,
+    "moment": moment,
+    "number": number,
+    "parts_per_million": parts_per_million,
+    "plain": plain,
+    "ratio": ratio,
+    "share": share,
+    "signed": signed,
+    "similarity": similarity,
+    "square_km": square_km,
+}
+
+
+def formatted(value: Any, form: str) -> str:
+    """Return a value in one of the forms."""
+    return FORMS[form](value)
+
+
+_FRAME = "frame.html"
+
+
+@dataclass(frozen=True)
+class Section:
+    """Section of a page.
+
+    Attributes:
+        anchor: name that links lead to: lower-case letters and hyphens.
+        title: its heading.
+        template: file in the `templates/` of the page's room.
+        facts: what the template shows, under the name `facts`.
+    """
+
+    anchor: str
+    title: str
+    template: str
+    facts: object
+
+
+@dataclass(frozen=True)
+class Page:
+    """Content of a page.
+
+    Attributes:
+        title: heading.
+        subtitle: line below it.
+        about: name and value of each line of the head, such as the time at which the page was made.
+        sections: in order.
+        document: JSON document that figures of the page are taken from by their path (`figure` in `macros.html`).
+    """
+
+    title: str
+    subtitle: str
+    about: Mapping[str, str]
+    sections: Sequence[Section]
+    document: Mapping[str, Any] = field(default_factory=dict)
+
+
+def render_page(page: Page, room: str) -> str:
+    """Return the HTML of a page.
+
+    Args:
+        page: its content.
+        room: package with the folder `templates/` of its sections, such as `pipelines.report`.
+
+    Raises:
+        jinja2.UndefinedError: a template names a fact that does not exist.
+    """
+    return _environment(room).get_template(_FRAME).render(page=page, document=page.document)
+
+
+def write_page(page: Page, room: str, path: Path) -> None:
+    """Write the HTML of a page; an existing file is replaced when the new one is complete.
+
+    Raises:
+        OSError: the file cannot be written; the existing one stays.
+    """
+    replace_text(path, render_page(page, room))
+
+
+def value_at(document: Any, path: str) -> Any:
+    """Return the value at a path of keys and indices: `checkpoints.camera.points.3.de_m`.
+
+    None where a part on the way is None: a part of a report that does not exist has no figures.
+
+    Raises:
+        KeyError, IndexError: the document has no such path.
+    """
+    for key in path.split("."):
+        if document is None:
+            return None
+        document = document[int(key)] if isinstance(document, list) else document[key]
+    return document
+
+
+def _environment(room: str) -> Environment:
+    from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=ChoiceLoader([PackageLoader(room), PackageLoader("pipelines.report")]),
+        autoescape=True,
+        finalize=lambda value: printable_lines(value) if type(value) is str else value,  # not of markup
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= FORMS
+    environment.globals |= {"value_at": value_at, "formatted": formatted}
+    return environment
+
+
+_PNG = b"\x89PNG"
+_QUALITY = 82
+_PAPER = 255  # behind transparent pixels
+
+
+@dataclass(frozen=True)
+class Picture:
+    """Picture as the address of an `img` element.
+
+    Attributes:
+        address: `data:` with the whole picture.
+        width_px, height_px: of its pixels.
+    """
+
+    address: str
+    width_px: int
+    height_px: int
+
+
+def picture_of_png(data: bytes) -> Picture:
+    """Return the picture of a PNG that this package drew."""
+    size = header_size(data)
+    assert size is not None
+    return Picture(_address("png", data), *size)
+
+
+def png_file(path: Path) -> Picture:
+    """Return a PNG file as it is.
+
+    Raises:
+        InputError: it cannot be read, or is no PNG.
+    """
+    data = read_bytes(path)
+    if header_size(data) is None or not data.startswith(_PNG):
+        raise InputError("is no PNG: delete it, or make it again", path=path)
+    return picture_of_png(data)
+
+
+def picture_of(rgb: ByteArray, *, quality: int = _QUALITY) -> Picture:
+    """Return a photograph (H, W, 3) RGB as JPEG."""
+    import cv2
+
+    height, width = rgb.shape[:2]
+    _, data = cv2.imencode(".jpg", np.ascontiguousarray(rgb[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return Picture(_address("jpeg", data.tobytes()), width, height)
+
+
+def read_picture(path: Path) -> ByteArray:
+    """Return a picture of the workspace as (H, W, 3) RGB, transparent pixels on white.
+
+    Raises:
+        InputError: it cannot be read, does not decode, or claims more than 400 million pixels.
+    """
+    import cv2
+
+    data = read_bytes(path)
+    size = header_size(data)
+    if size is None or not 0 < size[0] * size[1] <= MAX_PIXELS:
+        raise InputError("is no picture that can be shown: delete it, or make it again", path=path)
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+    if pixels is None or pixels.dtype != np.uint8:
+        raise InputError("is no picture that can be shown: delete it, or make it again", path=path)
+    if pixels.ndim == 2:
+        pixels = np.repeat(pixels[..., None], 3, axis=2)
+    if pixels.shape[2] == 4:
+        alpha = pixels[..., 3:] / np.float32(255)
+        pixels = (pixels[..., :3] * alpha + _PAPER * (1 - alpha)).round().astype(np.uint8)
+    return np.asarray(pixels[..., ::-1])
+
+
+def limited(rgb: ByteArray, longest_px: int) -> ByteArray:
+    """Return a picture (H, W, 3), made smaller so that its longer side has at most `longest_px` pixels."""
+    import cv2
+
+    scale = longest_px / max(rgb.shape[:2])
+    if scale >= 1:
+        return rgb
+    height, width = (max(1, round(side * scale)) for side in rgb.shape[:2])
+    return np.asarray(cv2.resize(rgb, (width, height), interpolation=cv2.INTER_AREA))
+
+
+def _address(kind: str, data: bytes) -> str:
+    return f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"

@@ -1,0 +1,237 @@
+"""Bar charts as PNG files.
+
+Distances between two surfaces: as a map and as histograms.
+
+Pictures side by side, each with its label above.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipelines.core.types import ByteArray, FloatArray
+from pipelines.report.plots.plans import add_bearings, bar_axes, frame_around, new_plan
+from pipelines.report.plots.style import (
+    BLUE,
+    DARK,
+    EMPTY_COLOUR,
+    FIGURE_POINTS,
+    GREY,
+    LABEL_POINTS,
+    ORANGE,
+    SERIES_COLOURS,
+    TICK_POINTS,
+    label,
+    new_figure,
+    pixels_of,
+    write_png,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_PANEL_INCHES = (4.6, 4.2)
+_WIDE_RANGE = 20.0  # between the largest and the smallest bar: beyond, only a logarithmic axis shows both
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One chart: a group of bars for each member, a bar for each series.
+
+    Attributes:
+        title: above it.
+        axis: what the bars measure, with its unit.
+        members: names of the G groups.
+        series: by name, G heights; None leaves a gap.
+        digits: decimals of the figures on the bars.
+        least: where a linear axis begins.
+    """
+
+    title: str
+    axis: str
+    members: tuple[str, ...]
+    series: Mapping[str, Sequence[float | None]]
+    digits: int = 3
+    least: float = 0.0
+
+
+def write_bars(path: Path, panels: Sequence[Panel]) -> None:
+    """Draw the panels side by side; a file that is there is replaced when the new one is complete."""
+    width, height = _PANEL_INCHES
+    figure = new_figure((width * len(panels), height), "constrained")
+    for axes, panel in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
+        _draw(axes, panel)
+    write_png(figure, path)
+
+
+def _draw(axes: Axes, panel: Panel) -> None:
+    _scale(axes, panel)
+    width = 0.8 / len(panel.series)
+    for position, (name, values) in enumerate(panel.series.items()):
+        heights = {index: value for index, value in enumerate(values) if value is not None}
+        left = [index + (position - (len(panel.series) - 1) / 2) * width for index in heights]
+        colour = SERIES_COLOURS[position]
+        bars = axes.bar(left, list(heights.values()), 0.94 * width, color=colour, label=name)
+        figures = [f"{value:.{panel.digits}f}" for value in heights.values()]
+        turn = 90 if len(panel.series) > 1 else 0
+        axes.bar_label(bars, figures, padding=2, fontsize=FIGURE_POINTS, rotation=turn)
+    label(axes, panel.title, y=panel.axis)
+    axes.set_xticks(range(len(panel.members)), panel.members)
+    axes.spines[["top", "right"]].set_visible(False)
+    if len(panel.series) > 1:
+        below = (0.5, -0.08)
+        axes.legend(
+            frameon=False, fontsize=TICK_POINTS, loc="upper center", bbox_to_anchor=below, ncols=len(panel.series)
+        )
+
+
+def _scale(axes: Axes, panel: Panel) -> None:
+    """A logarithmic axis where bars of unlike size would vanish on a linear one."""
+    heights = [value for values in panel.series.values() for value in values if value is not None]
+    if heights and min(heights) > 0 and max(heights) > _WIDE_RANGE * min(heights):
+        axes.set_yscale("log")
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.set_ylim(min(heights) / 2, max(heights) * 3)
+    elif heights:
+        axes.set_ylim(panel.least, panel.least + 1.18 * max(max(heights) - panel.least, 1e-9))
+
+
+_MOST_CELLS = 600  # along the longer side of the map
+_SCALE_QUANTILE = 0.95
+_BINS = 121
+_COLOURS = (BLUE, ORANGE, DARK, "#3a9d6e", GREY)
+
+
+def write_distance_map(path: Path, place_m: FloatArray, distance_m: FloatArray, size_m: float) -> None:
+    """Write the map of signed distances: blue below zero, red above.
+
+    Args:
+        path: of the PNG.
+        place_m: (C, 2) east and north, C ≥ 1.
+        distance_m: (C,).
+        size_m: least side of a cell, which shows the median of its distances.
+    """
+    frame = frame_around(place_m)
+    cell_m = max(size_m, frame.longer_m / _MOST_CELLS)
+    raster = _medians(place_m, distance_m, frame.low, frame.high, cell_m)
+    limit_m = _round_up(float(np.quantile(np.abs(distance_m), _SCALE_QUANTILE)))
+    figure, axes = new_plan(frame, "Model minus reference along the normals (M3C2)", right_inches=1.0)
+    axes.set_facecolor(EMPTY_COLOUR)
+    rows, columns = raster.shape
+    east, north = frame.low.tolist()
+    image = axes.imshow(
+        raster,
+        origin="lower",
+        extent=(east, east + columns * cell_m, north, north + rows * cell_m),
+        cmap="RdBu_r",
+        vmin=-limit_m,
+        vmax=limit_m,
+        interpolation="nearest",
+    )
+    axes.set_xlim(frame.low[0], frame.high[0])
+    axes.set_ylim(frame.low[1], frame.high[1])
+    bar = figure.colorbar(image, cax=bar_axes(figure, axes), extend="both")
+    bar.set_label("m; above 0: the model lies before the reference", fontsize=LABEL_POINTS)
+    bar.ax.tick_params(labelsize=TICK_POINTS)
+    add_bearings(axes)
+    write_png(figure, path)
+
+
+def write_distance_histogram(path: Path, groups: Mapping[str, FloatArray], lod_m: float) -> None:
+    """Write the densities of signed distances by group, and the band of the level of detection.
+
+    Args:
+        path: of the PNG.
+        groups: distances (C,) by name, none empty.
+        lod_m: median level of detection, 95 %.
+    """
+    everything = np.concatenate(list(groups.values()))
+    limit_m = _round_up(max(float(np.quantile(np.abs(everything), 0.98)), 1.5 * lod_m))
+    edges = np.linspace(-limit_m, limit_m, _BINS + 1)
+    figure = new_figure((6.2, 3.4), "constrained")
+    axes = figure.add_subplot()
+    axes.axvspan(-lod_m, lod_m, color=EMPTY_COLOUR, label="level of detection (median, 95 %)")
+    for (name, distance_m), colour in zip(groups.items(), _COLOURS, strict=False):
+        count, _ = np.histogram(np.clip(distance_m, -limit_m, limit_m), edges)
+        density = count / (len(distance_m) * (edges[1] - edges[0]))
+        axes.stairs(density, edges, color=colour, linewidth=1.4, label=f"{name} ({len(distance_m)})")
+        axes.axvline(float(np.median(distance_m)), color=colour, linewidth=0.8, linestyle=":")
+    axes.set_ylim(bottom=0)
+    axes.set_xlim(-limit_m, limit_m)
+    label(axes, "", x="model minus reference in m (dotted: median; ends hold all beyond)", y="density in 1/m")
+    axes.legend(fontsize=TICK_POINTS, frameon=False)
+    write_png(figure, path)
+
+
+def _medians(
+    place_m: FloatArray, values: FloatArray, low: FloatArray, high: FloatArray, cell_m: float
+) -> FloatArray:
+    """Return the medians (R, C) of values in cells, rows from the south; NaN: none."""
+    columns, rows = (np.ceil((high - low) / cell_m).astype(int)).tolist()
+    raster = np.full((rows, columns), np.nan)
+    cell = np.floor((place_m - low) / cell_m).astype(np.int64)
+    order = np.lexsort((values, cell[:, 0], cell[:, 1]))
+    key = (cell[:, 1] * columns + cell[:, 0])[order]
+    first = np.flatnonzero(np.diff(key, prepend=-1))
+    last = np.append(first[1:], len(key)) - 1
+    ordered = values[order]
+    raster.flat[key[first]] = (ordered[(first + last) // 2] + ordered[(first + last + 1) // 2]) / 2
+    return raster
+
+
+def _round_up(value: float) -> float:
+    """Return the next 1, 2 or 5 times a power of ten that is not below a value; 0.01 at the least."""
+    power = 10.0 ** np.floor(np.log10(max(value, 0.01)))
+    return float(next(step * power for step in (1, 2, 5, 10) if step * power >= max(value, 0.01) * (1 - 1e-9)))
+
+
+# Of the band above the pictures: its height and that of its letters, in pixels, by the width of a picture.
+_BAND_PART, _LEAST_BAND_PX, _MOST_BAND_PX = 0.055, 14, 40
+_LETTER_PART, _LETTER_WIDTH = 0.62, 0.62  # height by the band's, width by the height
+_DOTS_PER_INCH, _POINTS_PER_INCH = 100, 72
+
+
+def labelled(pictures: Sequence[ByteArray], labels: Sequence[str]) -> ByteArray:
+    """Return pictures of one size (H, W, 3) side by side (H + band, n W, 3), each with its label in a band above.
+
+    A label that is too long for its picture loses its beginning: the end of a name tells photographs apart.
+    """
+    strip = np.concatenate(pictures, axis=1)
+    width = pictures[0].shape[1]
+    band_px = band_height_px(width)
+    letters_px = _LETTER_PART * band_px
+    figure = new_figure(
+        (strip.shape[1] / _DOTS_PER_INCH, band_px / _DOTS_PER_INCH), None, dots_per_inch=_DOTS_PER_INCH
+    )
+    most = max(int(width / (_LETTER_WIDTH * letters_px)), 1)
+    for place, text in enumerate(labels):
+        shown = text if len(text) <= most else f"…{text[len(text) - most + 1 :]}"
+        figure.text(
+            (place + 0.5) / len(labels),
+            0.5,
+            shown,
+            ha="center",
+            va="center",
+            color=DARK,
+            parse_math=False,
+            fontsize=letters_px * _POINTS_PER_INCH / _DOTS_PER_INCH,
+        )
+    band = pixels_of(figure)[:band_px, : strip.shape[1]]
+    return np.concatenate([band, strip], axis=0)
+
+
+def without_labels(strip: ByteArray, count: int) -> list[ByteArray]:
+    """Return the pictures (H, W, 3) of a strip that `labelled` has made of `count` pictures."""
+    width = strip.shape[1] // count
+    pictures = strip[band_height_px(width) :]
+    return [pictures[:, place * width : (place + 1) * width] for place in range(count)]
+
+
+def band_height_px(width_px: int) -> int:
+    """Return the height of the band above pictures of a width."""
+    return min(max(round(_BAND_PART * width_px), _LEAST_BAND_PX), _MOST_BAND_PX)

@@ -1,0 +1,421 @@
+"""What a surveyor looks for on a map beside its colours: names, errors as arrows, coordinates, and north.
+
+The predicted accuracy over a scene as a pair of maps, horizontal and vertical σ.
+
+Map of the places where LiDAR and photographs contradict each other.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from pipelines.core.types import FloatArray
+from pipelines.report.plots.plans import add_bearings, add_legend, add_names, frame_around, new_plan
+from pipelines.report.plots.style import (
+    BLUE,
+    COLOUR_MAP,
+    DARK,
+    EMPTY_COLOUR,
+    FIGURE_POINTS,
+    GREY,
+    HEADING_POINTS,
+    LABEL_POINTS,
+    ORANGE,
+    TICK_POINTS,
+    label,
+    new_figure,
+    write_png,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.image import AxesImage
+
+_MOST_NAMES = 100  # more would hide the map
+_NAME_OFFSET_POINTS = (4, 3)
+_LONGEST_ARROW = 0.14  # of the longer side of the map
+_OUTLIER = 4.0  # times the median: such an arrow may leave the map
+_METRES_PER_DEGREE = 111_320.0
+_NORTH_LENGTH, _NORTH_LEFT, _NORTH_GAP = 0.28, 0.45, 0.04  # inches: the arrow, its distance from the map's corner
+
+
+@dataclass(frozen=True)
+class MapCoordinates:
+    """Coordinates to write beside the metres of a map.
+
+    Attributes:
+        crs: name of the CRS.
+        names: of the first and second coordinate: `longitude`, `latitude`.
+        unit: of both.
+        of: returns coordinates (N, 2) of places east and north (N, 2).
+    """
+
+    crs: str
+    names: tuple[str, str]
+    unit: str
+    of: Callable[[FloatArray], FloatArray]
+
+    def label(self, axis: int) -> str:
+        """Return the second line of the label of an axis."""
+        return f"{self.names[axis]} in {self.unit} ({self.crs})"
+
+
+def write_ticks(axes: Axes, coordinates: MapCoordinates) -> None:
+    """Write a coordinate below each tick, as it is on the lower or left edge of the map."""
+    from matplotlib.ticker import FuncFormatter
+
+    (west, east), (south, north) = axes.get_xlim(), axes.get_ylim()
+    decimals = _decimals(min(east - west, north - south), coordinates.unit)
+
+    def text(value: float, axis: int) -> str:
+        place = np.array([[value, south]] if axis == 0 else [[west, value]])
+        return f"{value:.10g}\n{coordinates.of(place)[0, axis]:.{decimals}f}"
+
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: text(value, 0)))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: text(value, 1)))
+
+
+def write_names(axes: Axes, places: FloatArray, names: Sequence[str]) -> None:
+    """Write the names beside their places (K, 2); no name where they are too many."""
+    from matplotlib.patheffects import withStroke
+
+    if len(names) > _MOST_NAMES:
+        return
+    for name, place in zip(names, places.tolist(), strict=True):
+        axes.annotate(
+            name,
+            place,
+            xytext=_NAME_OFFSET_POINTS,
+            textcoords="offset points",
+            fontsize=FIGURE_POINTS,
+            color=DARK,
+            parse_math=False,
+            annotation_clip=True,
+            path_effects=[withStroke(linewidth=1.6, foreground="white")],
+        )
+
+
+def exaggeration(lengths_m: FloatArray, side_m: float) -> float | None:
+    """Return the factor 1, 2 or 5 times a power of ten by which errors are drawn; None: none is to be drawn.
+
+    The longest arrow takes a seventh of the map's longer side, where it is not four times as long as the median.
+
+    Args:
+        lengths_m: (K,) of the errors; NaN: not measured.
+        side_m: of the map.
+    """
+    known = lengths_m[np.isfinite(lengths_m)]
+    longest = 0.0 if not len(known) else min(float(known.max()), _OUTLIER * float(np.median(known)))
+    if longest <= 0:
+        return None
+    factor = _LONGEST_ARROW * side_m / longest
+    power = 10.0 ** math.floor(math.log10(factor))
+    return next(step * power for step in (5.0, 2.0, 1.0) if step * power <= factor * (1 + 1e-9))
+
+
+def draw_errors(axes: Axes, places: FloatArray, errors_m: FloatArray, factor: float, *, of_control: bool) -> None:
+    """Draw errors (K, 2) east and north, times a factor, as arrows at their places (K, 2); NaN: none."""
+    known = np.isfinite(errors_m).all(axis=1)
+    if not known.any():
+        return
+    (east, north), (right, up) = places[known].T, factor * errors_m[known].T
+    axes.quiver(
+        east, north, right, up,
+        angles="xy", scale_units="xy", scale=1.0, width=0.006, zorder=5,
+        color=ORANGE if of_control else DARK, edgecolor="white", linewidth=0.4,
+    )  # fmt: skip
+
+
+def draw_north(figure: Figure, axes: Axes) -> None:
+    """Draw an arrow to the north left of a map, at its upper edge: up, as the axes of the map are."""
+    width, height = figure.get_size_inches()
+    box = axes.get_position()
+    x, foot = box.x0 - _NORTH_LEFT / width, box.y1 + _NORTH_GAP / height
+    head = foot + _NORTH_LENGTH / height
+    axes.annotate(
+        "",
+        xy=(x, head),
+        xytext=(x, foot),
+        xycoords="figure fraction",
+        textcoords="figure fraction",
+        arrowprops={"arrowstyle": "-|>", "color": DARK, "shrinkA": 0, "shrinkB": 0, "linewidth": 1.4},
+    )
+    figure.text(x, head, "N", ha="center", va="bottom", fontsize=LABEL_POINTS, color=DARK)
+
+
+def _decimals(side_m: float, unit: str) -> int:
+    """Return the decimals that state a coordinate to a hundredth of a map's side, or better."""
+    step = side_m / 100 / (_METRES_PER_DEGREE if unit == "°" else 1.0)
+    return max(0, math.ceil(-math.log10(step)))
+
+
+# Of the picture, in inches: the longer side of a map, and the room around each map for what is written there.
+_MAP = 4.4
+_LEFT, _RIGHT, _BELOW, _ABOVE = 1.15, 0.95, 1.2, 0.8
+_BAR_GAP, _BAR_WIDTH = 0.1, 0.16
+_LEGEND_HEIGHT, _HEADING_DEPTH = 0.2, 0.2  # above the lower edge, below the upper one
+
+_NARROWEST = 0.4  # shorter side of a map over its longer one
+_MARGIN = 0.04  # of the longer side, around everything that is shown
+_MOST_TICKS = 8  # on the longer side
+
+_CAMERAS = {"marker": "X", "linewidths": 0.4, "color": "black", "edgecolors": "white"}
+_CHECK = {"marker": "o", "s": 24, "linewidths": 0.8, "color": "white", "edgecolors": "black"}
+_CONTROL = {"marker": "^", "s": 34, "linewidths": 0.8, "color": ORANGE, "edgecolors": "black"}
+# Of the sign of a camera in square points: many cameras must not hide the map.
+_LARGEST_SIGN, _SMALLEST_SIGN, _LARGE_SIGNS = 26.0, 9.0, 100
+
+
+@dataclass(frozen=True)
+class SigmaRaster:
+    """Standard deviations over a scene, as R rows from the south and C columns from the west.
+
+    Attributes:
+        sigma_h_m: (R, C) horizontal; NaN where there is no scene.
+        sigma_v_m: (R, C) vertical.
+        corner_m: (2,) east and north of the south-western corner.
+        cell_m: side of a cell.
+    """
+
+    sigma_h_m: FloatArray
+    sigma_v_m: FloatArray
+    corner_m: FloatArray
+    cell_m: float
+
+    @property
+    def bounds_m(self) -> tuple[FloatArray, FloatArray]:
+        """East and north (2,) of the south-western and of the north-eastern corner."""
+        rows, columns = self.sigma_h_m.shape
+        return self.corner_m, self.corner_m + self.cell_m * np.array([columns, rows])
+
+
+def _nowhere() -> FloatArray:
+    return np.empty((0, 2))
+
+
+@dataclass(frozen=True)
+class NamedPlaces:
+    """Surveyed points to mark on a map.
+
+    Attributes:
+        place: (K, 2) east and north in metres.
+        names: of the points; empty: none is written.
+        error_m: (K, 3) east, north, up, to be drawn as arrows; NaN: not measured; None: no arrows.
+    """
+
+    place: FloatArray = field(default_factory=_nowhere)
+    names: tuple[str, ...] = ()
+    error_m: FloatArray | None = None
+
+    def error_of(self, axes: tuple[int, ...]) -> FloatArray:
+        """Return the errors (K, len(axes)) along some axes; NaN where there is none."""
+        none = np.full((len(self.place), len(axes)), np.nan)
+        return none if self.error_m is None else self.error_m[:, axes]
+
+
+@dataclass(frozen=True)
+class MapPoints:
+    """Points to mark on a map: cameras (K, 2) in metres east and north, control and check points."""
+
+    cameras: FloatArray = field(default_factory=_nowhere)
+    control: NamedPlaces = NamedPlaces()
+    check: NamedPlaces = NamedPlaces()
+
+
+def write_accuracy_map(
+    path: Path, raster: SigmaRaster, points: MapPoints, coordinates: MapCoordinates | None = None
+) -> None:
+    """Draw horizontal and vertical σ side by side, north up, with cameras, control and check points.
+
+    Errors of the points are arrows: horizontal ones on the left, vertical ones, up and down, on the right.
+
+    Args:
+        path: of the picture.
+        raster: σ.
+        points: to mark.
+        coordinates: to write below the metres of the axes; None: none.
+    """
+    low, high = _limits(raster, points)
+    width, height = (_MAP * (high - low) / (high - low).max()).tolist()
+    size = (2 * (_LEFT + width + _RIGHT), _BELOW + height + _ABOVE)
+    figure = new_figure(size, None)
+    figure.suptitle("Predicted accuracy, 1 σ", fontsize=HEADING_POINTS, y=1 - _HEADING_DEPTH / size[1])
+    maps = (("σ H", "horizontal", raster.sigma_h_m, (0, 1)), ("σ V", "vertical", raster.sigma_v_m, (2,)))
+    for number, (symbol, direction, sigma_m, errors_along) in enumerate(maps):
+        left = _LEFT + number * size[0] / 2
+        axes = figure.add_axes(_share(size, left, width, height))
+        bar = figure.add_axes(_share(size, left + width + _BAR_GAP, _BAR_WIDTH, height))
+        image = _draw(axes, raster, sigma_m)
+        _mark(axes, points)
+        axes.set_xlim(low[0], high[0])
+        axes.set_ylim(low[1], high[1])
+        factor = _draw_errors(axes, points, errors_along, float((high - low).max()))
+        arrows = "" if factor is None else f"; arrows: errors × {factor:,g}"
+        below = ("", "") if coordinates is None else (f"\n{coordinates.label(0)}", f"\n{coordinates.label(1)}")
+        label(
+            axes,
+            f"{symbol}, {direction}{arrows}",
+            x=f"east of the survey's origin in m{below[0]}",
+            y=f"north of the survey's origin in m{below[1]}",
+        )
+        if coordinates is not None:
+            write_ticks(axes, coordinates)
+        draw_north(figure, axes)
+        axes.locator_params("x", nbins=max(round(_MOST_TICKS * width / _MAP), 2))
+        axes.locator_params("y", nbins=max(round(_MOST_TICKS * height / _MAP), 2))
+        _scale(figure, image, bar, f"{symbol} in m")
+    _add_legend(figure)
+    write_png(figure, path)
+
+
+def _share(
+    size: tuple[float, float], left: float, width: float, height: float
+) -> tuple[float, float, float, float]:
+    """Left, lower edge, width and height in parts of the picture, of axes above the room for labels."""
+    return left / size[0], _BELOW / size[1], width / size[0], height / size[1]
+
+
+def _limits(raster: SigmaRaster, points: MapPoints) -> tuple[FloatArray, FloatArray]:
+    """South-western and north-eastern corner (2,) of the maps: all is inside, and neither side is too narrow."""
+    corners = np.array(raster.bounds_m)
+    places = np.concatenate([corners, points.cameras, points.control.place, points.check.place])
+    low, high = places.min(axis=0), places.max(axis=0)
+    longer = float((high - low).max())
+    half = np.maximum(high - low, _NARROWEST * longer) / 2 + _MARGIN * longer
+    return (low + high) / 2 - half, (low + high) / 2 + half
+
+
+def _draw(axes: Axes, raster: SigmaRaster, sigma_m: FloatArray) -> AxesImage:
+    (west, south), (east, north) = (corner.tolist() for corner in raster.bounds_m)
+    axes.set_facecolor(EMPTY_COLOUR)
+    image = axes.imshow(
+        np.ma.masked_invalid(sigma_m),
+        cmap=COLOUR_MAP,
+        origin="lower",
+        extent=(west, east, south, north),
+        interpolation="nearest",
+        aspect="equal",
+    )
+    axes.ticklabel_format(useOffset=False, style="plain")
+    return image
+
+
+def _scale(figure: Figure, image: AxesImage, axes: Axes, text: str) -> None:
+    bar = figure.colorbar(image, cax=axes)
+    bar.set_label(text, fontsize=LABEL_POINTS)
+    axes.tick_params(labelsize=TICK_POINTS)
+    axes.ticklabel_format(useOffset=False, style="plain")
+
+
+def _mark(axes: Axes, points: MapPoints) -> None:
+    size = min(max(_LARGEST_SIGN * _LARGE_SIGNS / max(len(points.cameras), 1), _SMALLEST_SIGN), _LARGEST_SIGN)
+    kinds: tuple[tuple[str, FloatArray, Mapping[str, Any]], ...] = (
+        ("camera", points.cameras, {**_CAMERAS, "s": size}),
+        (_named("check point", points.check, "its triangulated error"), points.check.place, _CHECK),
+        (_named("control point", points.control, "its residual"), points.control.place, _CONTROL),
+    )
+    for name, places, style in kinds:
+        if len(places):
+            axes.scatter(places[:, 0], places[:, 1], label=name, zorder=4, **style)
+    for group in (points.check, points.control):
+        write_names(axes, group.place[: len(group.names)], group.names)
+
+
+def _named(name: str, points: NamedPlaces, arrow: str) -> str:
+    return name if points.error_m is None else f"{name}, with {arrow}"
+
+
+def _draw_errors(axes: Axes, points: MapPoints, along: tuple[int, ...], side_m: float) -> float | None:
+    """Draw the errors along the map's axes, or up and down; return their exaggeration, None without errors."""
+    groups = [(points.control, points.control.error_of(along)), (points.check, points.check.error_of(along))]
+    lengths_m = np.concatenate([np.linalg.norm(errors_m, axis=1) for _, errors_m in groups])
+    factor = exaggeration(lengths_m, side_m)
+    for group, errors_m in groups if factor is not None else ():
+        plan_m = errors_m if len(along) == 2 else np.column_stack([np.zeros(len(errors_m)), errors_m])
+        draw_errors(axes, group.place, plan_m, factor or 1.0, of_control=group is points.control)
+    return factor
+
+
+def _add_legend(figure: Figure) -> None:
+    handles, names = figure.axes[0].get_legend_handles_labels()
+    if names:
+        place = (0.5, _LEGEND_HEIGHT / figure.get_figheight())
+        figure.legend(
+            handles,
+            names,
+            loc="center",
+            bbox_to_anchor=place,
+            ncols=len(names),
+            fontsize=TICK_POINTS,
+            frameon=False,
+        )
+
+
+_COLOUR = {"removed": ORANGE, "added": BLUE}
+_MEANING = {"removed": "only in the LiDAR", "added": "only in the photographs"}
+_MOST_POINTS = 40_000
+_NAMED = 12
+
+
+@dataclass(frozen=True)
+class DrawnArea:
+    """Changed area.
+
+    Attributes:
+        kind: `removed`: only the LiDAR has it; `added`: only the photographs have it.
+        area_m2: in plan.
+        corner_in_geo: (C, 2) south-western corners of its cells, east and north in metres.
+        cell_m: side of these cells.
+    """
+
+    kind: Literal["removed", "added"]
+    area_m2: float
+    corner_in_geo: FloatArray
+    cell_m: float
+
+
+def write_lidar_map(path: Path, points_in_geo: FloatArray, areas: Sequence[DrawnArea]) -> None:
+    """Write the map as PNG.
+
+    Args:
+        path: of the picture.
+        points_in_geo: (P, 3) cloud, drawn by its height.
+        areas: that have changed, the largest first.
+
+    Raises:
+        OSError: the picture cannot be written.
+    """
+    from matplotlib.collections import PolyCollection
+
+    step = max(1, len(points_in_geo) // _MOST_POINTS)
+    drawn = points_in_geo[::step]
+    figure, axes = new_plan(frame_around(drawn), "LiDAR against photographs", legend_rows=1)
+    low, high = np.quantile(drawn[:, 2], [0.02, 0.98])
+    shade = 0.93 - 0.55 * np.clip((drawn[:, 2] - low) / max(high - low, 1e-6), 0, 1)
+    axes.scatter(
+        drawn[:, 0], drawn[:, 1], s=1.2, c=np.repeat(shade[:, None], 3, axis=1), linewidths=0, rasterized=True
+    )
+    axes.scatter([], [], s=12, color=GREY, label="LiDAR, dark: high")
+    square = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+    for kind, meaning in _MEANING.items():
+        mine = [area for area in areas if area.kind == kind]
+        total_m2 = sum(area.area_m2 for area in mine)
+        if mine:
+            corners = np.concatenate([area.corner_in_geo[:, None] + area.cell_m * square for area in mine])
+            cells = PolyCollection(list(corners), facecolors=_COLOUR[kind], edgecolors="none", label="", zorder=4)
+            axes.add_collection(cells)
+        axes.scatter([], [], s=24, marker="s", color=_COLOUR[kind], label=f"{meaning}: {total_m2:.0f} m²")
+    middles = [area.corner_in_geo.mean(axis=0) + area.cell_m / 2 for area in areas[:_NAMED]]
+    if middles:
+        names = [f"{area.area_m2:.0f} m²" for area in areas[:_NAMED]]
+        add_names(figure, axes, np.array(middles), names, np.zeros((0, 2)))
+    add_bearings(axes)
+    add_legend(figure, axes)
+    write_png(figure, path)

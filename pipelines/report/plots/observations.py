@@ -1,0 +1,217 @@
+"""Charts of observations: residuals in the image and in time, correlations, prediction against measurement."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipelines.core.types import BoolArray, FloatArray
+from pipelines.report.plots.plans import nice_number
+from pipelines.report.plots.style import (
+    BLUE,
+    COLOUR_MAP,
+    DARK,
+    FIGURE_POINTS,
+    GREY,
+    LABEL_POINTS,
+    ORANGE,
+    TICK_POINTS,
+    label,
+    new_figure,
+    png_of,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_AXES = ("east", "north", "up")
+_ARROW_SHARE, _ARROW_QUANTILE = 0.9, 0.95  # of a region, that an arrow of this quantile takes
+_CHART_INCHES = (6.4, 3.2)
+
+
+@dataclass(frozen=True)
+class DrawnField:
+    """Field of residuals, with its magnification; None: there are no arrows."""
+
+    png: bytes
+    factor: float | None
+
+
+@dataclass(frozen=True)
+class FixSeries:
+    """Residuals of F fixes in time.
+
+    Attributes:
+        abscissa: (F,) seconds since the first, or the number of the photograph.
+        abscissa_title: what it is, with its unit.
+        residual_m: (F, 3) east, north, up.
+        sigma_m: (F, 3) stated σ.
+        is_outlier: (F,) whether the solution has left it out.
+    """
+
+    abscissa: FloatArray
+    abscissa_title: str
+    residual_m: FloatArray
+    sigma_m: FloatArray
+    is_outlier: BoolArray
+
+
+def residual_field(size_px: tuple[int, int], mean_px: FloatArray, rms_px: FloatArray, title: str) -> DrawnField:
+    """Return mean reprojection residuals by image region as arrows on their RMS.
+
+    Args:
+        size_px: width and height of the photographs.
+        mean_px: (R, C, 2) mean residual of each region, rows from the top; NaN: too few observations.
+        rms_px: (R, C) root mean square length.
+        title: above it.
+    """
+    width, height = size_px
+    rows, columns = rms_px.shape
+    scale = 6.4 / max(width, height)
+    figure = new_figure((width * scale + 1.7, height * scale + 1.0), "constrained")
+    axes = figure.subplots()
+    label(axes, title, x="x in px", y="y in px")
+    image = axes.imshow(
+        np.ma.masked_invalid(rms_px), cmap=COLOUR_MAP, extent=(0, width, height, 0), interpolation="nearest"
+    )
+    bar = figure.colorbar(image, ax=axes, fraction=0.04, pad=0.02)
+    bar.set_label("RMS of the residuals in px", fontsize=LABEL_POINTS)
+    bar.ax.tick_params(labelsize=TICK_POINTS)
+    x = (np.arange(columns) + 0.5) * width / columns
+    y = (np.arange(rows) + 0.5) * height / rows
+    grid = np.stack(np.meshgrid(x, y), axis=-1)
+    known = np.isfinite(mean_px).all(axis=-1)
+    longest = float(np.quantile(np.linalg.norm(mean_px[known], axis=-1), _ARROW_QUANTILE)) if known.any() else 0.0
+    factor = None
+    if longest > 0:
+        factor = nice_number(_ARROW_SHARE * min(width / columns, height / rows) / longest)
+        arrow = factor * mean_px[known]
+        axes.quiver(
+            *grid[known].T,
+            *arrow.T,
+            angles="xy",
+            scale_units="xy",
+            scale=1,
+            color="white",
+            edgecolor="black",  # readable on every colour
+            linewidth=0.5,
+            width=0.004,
+            pivot="mid",
+        )
+    return DrawnField(png_of(figure), factor)
+
+
+def fix_series(series: FixSeries) -> bytes:
+    """Return the residuals of fixes, east, north and up, with the stated 2 σ and the mean, as PNG."""
+    figure = new_figure((7.6, 6.0), "constrained")
+    order = np.argsort(series.abscissa, kind="stable")
+    for axis, axes in enumerate(figure.subplots(3, 1, sharex=True)):
+        values, sigma = series.residual_m[:, axis], series.sigma_m[:, axis]
+        axes.fill_between(
+            series.abscissa[order],
+            -2 * sigma[order],
+            2 * sigma[order],
+            color=GREY,
+            alpha=0.3,
+            linewidth=0,
+            label="stated 2 σ",
+        )
+        axes.axhline(0, color=DARK, linewidth=0.6)
+        used = ~series.is_outlier
+        if used.any():
+            axes.axhline(float(values[used].mean()), color=BLUE, linewidth=1.2, linestyle="--", label="mean (bias)")
+        for chosen, style, name in (
+            (used, {"marker": "o", "color": BLUE, "s": 11}, "used"),
+            (series.is_outlier, {"marker": "X", "color": ORANGE, "edgecolors": "black", "s": 34}, "outlier"),
+        ):
+            if chosen.any():
+                axes.scatter(series.abscissa[chosen], values[chosen], label=name, linewidths=0.7, zorder=3, **style)
+        label(axes, "", y=f"{_AXES[axis]} in m")
+        axes.spines[["top", "right"]].set_visible(False)
+    axes.set_xlabel(series.abscissa_title, fontsize=LABEL_POINTS)
+    handles, names = figure.axes[0].get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside upper center", ncols=len(names), fontsize=TICK_POINTS, frameon=False)
+    return png_of(figure)
+
+
+def correlation_matrix(names: Sequence[str], correlation: FloatArray) -> bytes:
+    """Return correlations (P, P) of named parameters as PNG, with the figures in the cells."""
+    side = 0.42 * len(names) + 1.4
+    figure = new_figure((side + 0.8, side), "constrained")
+    axes = figure.subplots()
+    image = axes.imshow(correlation, cmap="PuOr", vmin=-1, vmax=1)
+    axes.set_xticks(range(len(names)), names)
+    axes.set_yticks(range(len(names)), names)
+    axes.tick_params(labelsize=TICK_POINTS, length=0)
+    for row, values in enumerate(correlation):
+        for column, value in enumerate(values):
+            dark = abs(value) > 0.65
+            axes.text(
+                column,
+                row,
+                f"{round(float(value), 2) + 0.0:.2f}".replace("-", "−"),
+                ha="center",
+                va="center",
+                fontsize=FIGURE_POINTS - 1,
+                color="white" if dark else "black",
+            )
+    label(axes, "Correlation of the lens parameters")
+    bar = figure.colorbar(image, ax=axes, fraction=0.04, pad=0.02)
+    bar.ax.tick_params(labelsize=TICK_POINTS)
+    return png_of(figure)
+
+
+def predicted_against_measured(sigma_m: FloatArray, error_m: FloatArray) -> bytes:
+    """Return predicted σ against measured errors of check points as PNG.
+
+    Args:
+        sigma_m: (J, 2) horizontal and vertical, of error and survey together.
+        error_m: (J, 2) lengths, horizontal and vertical.
+    """
+    figure = new_figure((7.6, 3.9), "constrained")
+    for axis, (axes, name) in enumerate(zip(figure.subplots(1, 2), ("horizontal", "vertical"), strict=True)):
+        sigma, error = sigma_m[:, axis], error_m[:, axis]
+        most = 1.15 * max(float(sigma.max()), 1e-6)
+        line = np.array([0.0, most])
+        axes.fill_between(line, 0, line, color=BLUE, alpha=0.14, linewidth=0, label="within 1 σ")
+        axes.fill_between(line, line, 2 * line, color=BLUE, alpha=0.07, linewidth=0, label="within 2 σ")
+        axes.scatter(sigma, error, s=16, color=DARK, zorder=3, label="check point")
+        axes.set_xlim(0, most)
+        axes.set_ylim(0, 1.1 * max(float(error.max()), 2 * most))
+        label(axes, name, x="predicted σ with survey in m", y="measured error in m")
+        axes.spines[["top", "right"]].set_visible(False)
+    handles, names = figure.axes[0].get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside lower center", ncols=3, fontsize=TICK_POINTS, frameon=False)
+    return png_of(figure)
+
+
+def curves(abscissa_title: str, panels: Mapping[str, Mapping[str, tuple[FloatArray, FloatArray]]]) -> bytes:
+    """Return curves below each other as PNG.
+
+    Args:
+        abscissa_title: what runs to the right.
+        panels: by the quantity on the ordinate, with its unit: the curves by name, abscissa (N,) and ordinate (N,).
+    """
+    width, height = _CHART_INCHES
+    figure = new_figure((width, 0.62 * height * len(panels) + 0.5), "constrained")
+    all_axes = np.atleast_1d(figure.subplots(len(panels), 1, sharex=True))
+    for axes, (quantity, lines) in zip(all_axes, panels.items(), strict=True):
+        _draw_lines(axes, quantity, lines)
+    all_axes[-1].set_xlabel(abscissa_title, fontsize=LABEL_POINTS)
+    return png_of(figure)
+
+
+def _draw_lines(axes: Axes, quantity: str, lines: Mapping[str, tuple[FloatArray, FloatArray]]) -> None:
+    styles = ((BLUE, "-"), (ORANGE, "-"), (DARK, "-"), (BLUE, "--"), (ORANGE, "--"), (DARK, "--"))
+    for (name, (x, y)), (colour, dash) in zip(lines.items(), styles, strict=False):
+        axes.plot(x, y, label=name, color=colour, linestyle=dash, linewidth=1.3)
+    positive = [value for _, y in lines.values() for value in y if value > 0]
+    if len(lines) > 1:
+        if positive and max(positive) > 100 * min(positive):
+            axes.set_yscale("log")
+        axes.legend(fontsize=TICK_POINTS, frameon=False, ncols=2)
+    label(axes, "", y=quantity)
+    axes.spines[["top", "right"]].set_visible(False)

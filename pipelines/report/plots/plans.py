@@ -1,0 +1,407 @@
+"""Plans: axes with east to the right and north up, with north arrow, scale bar and names that do not overlap.
+
+Plans of a survey: where it is, how the cameras moved, how often the ground is seen, how photographs are tied.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from math import floor, log10
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipelines.core.types import BoolArray, FloatArray, IntArray
+from pipelines.report.plots.style import (
+    BLUE,
+    COLOUR_MAP,
+    DARK,
+    EMPTY_COLOUR,
+    FIGURE_POINTS,
+    GREY,
+    LABEL_POINTS,
+    ORANGE,
+    TICK_POINTS,
+    label,
+    new_figure,
+    png_of,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.transforms import Bbox
+
+LONGER_INCHES = 6.2
+_LEFT, _RIGHT, _BELOW, _ABOVE = 0.85, 0.25, 0.6, 0.4  # around the map, in inches
+_LEGEND_ROW = 0.22
+_NARROWEST = 0.45  # shorter side of a map over its longer one
+_MARGIN = 0.06  # of the longer side, around everything that is shown
+_BAR_SHARE = 0.25  # of the width, that the scale bar takes at most
+_SIDES = ((1, 1), (-1, 1), (1, -1), (-1, -1))  # of a sign, where its name may stand
+_SIGN_DOTS = 4.0  # half the width of a sign
+_BOX = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85}
+
+
+@dataclass(frozen=True)
+class Frame:
+    """South-western and north-eastern corner (2,) of a plan, in metres."""
+
+    low: FloatArray
+    high: FloatArray
+
+    @property
+    def longer_m(self) -> float:
+        """Longer side."""
+        return float((self.high - self.low).max())
+
+
+def frame_around(*places: FloatArray) -> Frame:
+    """Return the frame around groups of places (N, 2) in metres; a margin is added, and no side is too narrow."""
+    everything = np.concatenate([np.zeros((0, 2)), *(np.asarray(group)[:, :2] for group in places)])
+    everything = everything[np.isfinite(everything).all(axis=1)]
+    if not len(everything):
+        everything = np.zeros((1, 2))
+    low, high = everything.min(axis=0), everything.max(axis=0)
+    longer = max(float((high - low).max()), 1.0)
+    half = np.maximum(high - low, _NARROWEST * longer) / 2 + _MARGIN * longer
+    return Frame((low + high) / 2 - half, (low + high) / 2 + half)
+
+
+def new_plan(frame: Frame, title: str, *, right_inches: float = 0.0, legend_rows: int = 0) -> tuple[Figure, Axes]:
+    """Return a figure with the axes of a plan.
+
+    Args:
+        frame: that the axes show.
+        title: above them.
+        right_inches: room beside the map, for a colour bar.
+        legend_rows: rows of the legend below the map.
+    """
+    width, height = (LONGER_INCHES * (frame.high - frame.low) / frame.longer_m).tolist()
+    below = _BELOW + _LEGEND_ROW * (legend_rows + 0.4 * bool(legend_rows))
+    size = (_LEFT + width + _RIGHT + right_inches, below + height + _ABOVE)
+    figure = new_figure(size, None)
+    axes = figure.add_axes((_LEFT / size[0], below / size[1], width / size[0], height / size[1]))
+    label(axes, title, x="east of the survey's origin in m", y="north of the survey's origin in m")
+    axes.set_xlim(frame.low[0], frame.high[0])
+    axes.set_ylim(frame.low[1], frame.high[1])
+    axes.set_aspect("equal")
+    axes.ticklabel_format(useOffset=False, style="plain")
+    axes.locator_params("x", nbins=max(round(8 * width / LONGER_INCHES), 3))
+    return figure, axes
+
+
+def bar_axes(figure: Figure, axes: Axes) -> Axes:
+    """Return the axes of a colour bar beside a plan that has room for it."""
+    place, width = axes.get_position(), figure.get_figwidth()
+    return figure.add_axes((place.x1 + 0.1 / width, place.y0, 0.16 / width, place.height))
+
+
+def add_bearings(axes: Axes) -> None:
+    """Add north arrow and scale bar to a plan, inside its upper corners."""
+    (west, east), (south, north) = axes.get_xlim(), axes.get_ylim()
+    width, height = east - west, north - south
+    length = nice_number(_BAR_SHARE * width)
+    left, top = west + 0.03 * width, north - 0.035 * max(width, height)
+    tick = 0.008 * max(width, height)
+    style: dict[str, Any] = {"color": DARK, "linewidth": 1.6, "zorder": 9, "solid_capstyle": "butt"}
+    axes.plot([left, left + length], [top, top], **style)
+    for end in (left, left + length):
+        axes.plot([end, end], [top - tick, top + tick], **style)
+    axes.text(
+        left + length / 2,
+        top - 2 * tick,
+        f"{length:g} m",
+        ha="center",
+        va="top",
+        fontsize=TICK_POINTS,
+        bbox=_BOX,
+        zorder=9,
+    )
+    axes.annotate(
+        "N",
+        xy=(0.965, 0.975),
+        xytext=(0.965, 0.89),
+        xycoords="axes fraction",
+        ha="center",
+        va="center",
+        fontsize=TICK_POINTS + 1,
+        fontweight="bold",
+        arrowprops={"arrowstyle": "-|>", "color": DARK, "linewidth": 1.4},
+        bbox=_BOX,
+        zorder=9,
+    )
+
+
+def add_legend(figure: Figure, axes: Axes, columns: int = 4) -> None:
+    """Add the legend of a plan below it."""
+    handles, names = axes.get_legend_handles_labels()
+    if names:
+        figure.legend(
+            handles,
+            names,
+            loc="lower center",
+            bbox_to_anchor=(0.5, 0.04 / figure.get_figheight()),
+            ncols=min(columns, len(names)),
+            fontsize=TICK_POINTS,
+            frameon=False,
+        )
+
+
+def add_names(figure: Figure, axes: Axes, places: FloatArray, names: Sequence[str], others: FloatArray) -> int:
+    """Write names beside places (N, 2), as many as cover no sign and no other name, and return their number.
+
+    Args:
+        figure: of the axes.
+        axes: of the plan, with its limits.
+        places: (N, 2) metres.
+        names: N.
+        others: (M, 2) places of further signs, in metres.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    renderer = FigureCanvasAgg(figure).get_renderer()  # type: ignore[no-untyped-call]
+    taken = [text.get_window_extent(renderer) for text in axes.texts]
+    signs = axes.transData.transform(np.concatenate([places, others]))
+    inside, written = axes.get_window_extent(renderer), 0
+    for place, name in zip(places, names, strict=True):
+        for across, along in _SIDES:
+            text = axes.annotate(
+                name,
+                xy=(float(place[0]), float(place[1])),
+                xytext=(5 * across, 5 * along),
+                textcoords="offset points",
+                ha="left" if across > 0 else "right",
+                va="bottom" if along > 0 else "top",
+                fontsize=FIGURE_POINTS,
+                color=DARK,
+                zorder=8,
+                parse_math=False,  # A name may hold what is a formula elsewhere.
+            )
+            box = text.get_window_extent(renderer)
+            free = not any(box.overlaps(other) for other in taken) and not _holds_any(box, signs)
+            if free and inside.contains(box.x0, box.y0) and inside.contains(box.x1, box.y1):
+                taken.append(box)
+                written += 1
+                break
+            text.remove()
+    return written
+
+
+def _holds_any(box: Bbox, places: FloatArray) -> bool:
+    """Return whether a sign at places (N, 2) in dots touches a box."""
+    low, high = np.array([box.x0, box.y0]) - _SIGN_DOTS, np.array([box.x1, box.y1]) + _SIGN_DOTS
+    return bool(((places > low) & (places < high)).all(axis=1).any())
+
+
+def nice_number(most: float) -> float:
+    """Return the largest of 1, 2, 5 times a power of ten that is not above `most` > 0."""
+    power = 10.0 ** floor(log10(most))
+    return float(max(step * power for step in (1.0, 2.0, 5.0) if step * power <= most * (1 + 1e-9)))
+
+
+_BAR_ROOM = 0.9  # inches
+_ARROW_SHARE, _ELLIPSE_SHARE = 0.08, 0.02  # of the longer side: the largest arrow, the median semi-axis
+_OVERLAP_STEPS = (1, 2, 3, 4, 5, 7, 10, 15, 20)
+
+
+@dataclass(frozen=True)
+class NamedPlaces:
+    """Names and places (N, 2), east and north in metres, of surveyed points."""
+
+    names: Sequence[str]
+    place_m: FloatArray
+
+
+@dataclass(frozen=True)
+class DrawnMovement:
+    """Map of the cameras' movements, with its magnifications; None: nothing of the kind is drawn."""
+
+    png: bytes
+    arrow_factor: float | None
+    ellipse_factor: float | None
+
+
+def site_plan(
+    training_m: FloatArray, test_m: FloatArray, control: NamedPlaces, check: NamedPlaces, scene_m: FloatArray
+) -> bytes:
+    """Return the plan of a survey as PNG.
+
+    Args:
+        training_m, test_m: (n, 2) cameras of the photographs.
+        control, check: surveyed points.
+        scene_m: (N, 2) points of the scene, drawn as its ground.
+    """
+    frame = frame_around(training_m, test_m, control.place_m, check.place_m)
+    figure, axes = new_plan(frame, "Photographs and surveyed points", legend_rows=1)
+    axes.scatter(scene_m[:, 0], scene_m[:, 1], s=1.5, color=GREY, alpha=0.6, linewidths=0, rasterized=True)
+    size = float(np.clip(2600 / max(len(training_m), 1), 7, 24))
+    styles: tuple[tuple[str, FloatArray, dict[str, Any]], ...] = (
+        ("photograph for training", training_m, {"marker": "x", "s": size, "color": BLUE, "linewidths": 0.9}),
+        (
+            "test view",
+            test_m,
+            {"marker": "s", "s": size, "facecolors": "none", "edgecolors": BLUE, "linewidths": 0.9},
+        ),
+        (
+            "control point",
+            control.place_m,
+            {"marker": "^", "s": 42, "color": ORANGE, "edgecolors": "black", "linewidths": 0.8},
+        ),
+        (
+            "check point",
+            check.place_m,
+            {"marker": "o", "s": 28, "color": "white", "edgecolors": "black", "linewidths": 0.9},
+        ),
+    )
+    for order, (name, places, style) in enumerate(styles):
+        if len(places):
+            axes.scatter(places[:, 0], places[:, 1], label=name, zorder=3 + order, **style)
+    add_bearings(axes)
+    marked = np.concatenate([control.place_m, check.place_m])
+    add_names(figure, axes, marked, [*control.names, *check.names], np.concatenate([training_m, test_m]))
+    add_legend(figure, axes)
+    return png_of(figure)
+
+
+def movement_plan(
+    center_m: FloatArray, moved_m: FloatArray, covariance: FloatArray | None, is_outlier: BoolArray
+) -> DrawnMovement:
+    """Return the plan of the cameras with arrows from measured to adjusted positions, and their error ellipses.
+
+    Args:
+        center_m: (n, 2) adjusted positions.
+        moved_m: (n, 2) adjusted minus measured; NaN: not measured.
+        covariance: (n, 2, 2) m² of the adjusted positions in plan; None: not known.
+        is_outlier: (n,) whether the solution has left the measured position out.
+    """
+    from matplotlib.collections import EllipseCollection
+
+    frame = frame_around(center_m)
+    figure, axes = new_plan(frame, "Adjusted positions of the photographs", legend_rows=2)
+    axes.scatter(center_m[:, 0], center_m[:, 1], s=5, color=DARK, zorder=3, label="adjusted position")
+    known = np.isfinite(moved_m).all(axis=1)
+    arrow_factor = ellipse_factor = None
+    used = known & ~is_outlier
+    sized = used if used.any() else known  # the arrow of an outlier may leave the map
+    largest = float(np.linalg.norm(moved_m[sized], axis=1).max()) if known.any() else 0.0
+    if largest > 0:
+        arrow_factor = nice_number(_ARROW_SHARE * frame.longer_m / largest)
+        for chosen, colour, name in (
+            (known & ~is_outlier, BLUE, "from measured to adjusted"),
+            (known & is_outlier, ORANGE, "the same, left out as an outlier"),
+        ):
+            if chosen.any():
+                start, arrow = center_m[chosen] - arrow_factor * moved_m[chosen], arrow_factor * moved_m[chosen]
+                axes.quiver(
+                    *start.T,
+                    *arrow.T,
+                    angles="xy",
+                    scale_units="xy",
+                    scale=1,
+                    color=colour,
+                    width=0.003,
+                    zorder=4,
+                    label=f"{name} (× {arrow_factor:g})",
+                )
+    if covariance is not None and np.isfinite(covariance).all():
+        variance, axis = np.linalg.eigh(covariance)
+        semi = np.sqrt(np.maximum(variance, 0.0))
+        middle = float(np.median(semi[:, 1]))
+        if middle > 0:
+            ellipse_factor = nice_number(_ELLIPSE_SHARE * frame.longer_m / middle)
+            angle = np.degrees(np.arctan2(axis[:, 1, 1], axis[:, 0, 1]))
+            axes.add_collection(
+                EllipseCollection(
+                    2 * ellipse_factor * semi[:, 1],
+                    2 * ellipse_factor * semi[:, 0],
+                    angle,
+                    units="xy",
+                    offsets=center_m,
+                    transOffset=axes.transData,
+                    facecolors="none",
+                    edgecolors=DARK,
+                    linewidths=0.7,
+                )
+            )
+            axes.plot([], [], "o", mfc="none", mec=DARK, label=f"1 σ ellipse (× {ellipse_factor:g})")
+    add_bearings(axes)
+    add_legend(figure, axes, columns=2)
+    return DrawnMovement(png_of(figure), arrow_factor, ellipse_factor)
+
+
+def overlap_plan(count: IntArray, corner_m: FloatArray, cell_m: float, camera_m: FloatArray) -> bytes:
+    """Return the map of the number of photographs that see each cell of the ground, as PNG.
+
+    Args:
+        count: (R, C) rows from the south, columns from the west; −1: no scene.
+        corner_m: (2,) east and north of the south-western corner.
+        cell_m: side of a cell.
+        camera_m: (n, 2) cameras.
+    """
+    from matplotlib import colormaps
+    from matplotlib.colors import BoundaryNorm
+
+    rows, columns = count.shape
+    far = corner_m + cell_m * np.array([columns, rows])
+    figure, axes = new_plan(frame_around(np.stack([corner_m, far])), "Overlap", right_inches=_BAR_ROOM)
+    axes.set_facecolor(EMPTY_COLOUR)
+    edges = [0, *_OVERLAP_STEPS, max(_OVERLAP_STEPS[-1] + 1, int(count.max()) + 1)]
+    image = axes.imshow(
+        np.ma.masked_less(count, 0),
+        cmap=colormaps[COLOUR_MAP],
+        norm=BoundaryNorm(edges, colormaps[COLOUR_MAP].N),
+        origin="lower",
+        extent=(corner_m[0], far[0], corner_m[1], far[1]),
+        interpolation="nearest",
+    )
+    (west, east), (south, north) = axes.get_xlim(), axes.get_ylim()
+    axes.scatter(camera_m[:, 0], camera_m[:, 1], s=6, color="white", edgecolors=DARK, linewidths=0.5)
+    axes.set_xlim(west, east)
+    axes.set_ylim(south, north)
+    bar = figure.colorbar(image, cax=bar_axes(figure, axes))
+    bar.set_ticks(
+        ticks=[(low + high) / 2 for low, high in pairwise(edges)],
+        labels=[str(low) if high == low + 1 else f"{low}–{high - 1}" for low, high in pairwise(edges)],
+    )
+    bar.set_label("photographs that see the cell", fontsize=LABEL_POINTS)
+    bar.ax.tick_params(labelsize=TICK_POINTS)
+    add_bearings(axes)
+    return png_of(figure)
+
+
+def match_plan(camera_m: FloatArray, pairs: IntArray, shared: IntArray) -> bytes:
+    """Return the graph of the photographs that share points, as PNG: strong links last, dark and thick.
+
+    Args:
+        camera_m: (n, 2) cameras.
+        pairs: (P, 2) indices of cameras.
+        shared: (P,) number of points that both see, at least 1.
+    """
+    from matplotlib import colormaps
+    from matplotlib.collections import LineCollection
+    from matplotlib.colors import LogNorm
+
+    figure, axes = new_plan(frame_around(camera_m), "Photographs that share points", right_inches=_BAR_ROOM)
+    order = np.argsort(shared, kind="stable")
+    most = max(int(shared.max()), 2) if len(shared) else 2
+    norm, reversed_map = LogNorm(1, most), colormaps[f"{COLOUR_MAP}_r"]
+    strength = np.log(shared[order]) / np.log(most)
+    lines = LineCollection(
+        list(camera_m[pairs[order]]),
+        cmap=reversed_map,
+        norm=norm,
+        linewidths=0.3 + 1.5 * strength,
+        alpha=0.85,
+    )
+    lines.set_array(shared[order])
+    axes.add_collection(lines)
+    axes.scatter(camera_m[:, 0], camera_m[:, 1], s=10, color="white", edgecolors=DARK, linewidths=0.7, zorder=3)
+    bar = figure.colorbar(lines, cax=bar_axes(figure, axes))
+    bar.set_label("points that two photographs share", fontsize=LABEL_POINTS)
+    bar.ax.tick_params(labelsize=TICK_POINTS)
+    bar.ax.yaxis.set_major_formatter("{x:g}")
+    add_bearings(axes)
+    return png_of(figure)

@@ -1,1 +1,0 @@
-"""Point cloud of the fused surface of the trained model, in `geo`."""

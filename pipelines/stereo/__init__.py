@@ -1,1 +1,0 @@
-"""Multi-view stereo: depth maps from photographs whose cameras are known."""

@@ -1,0 +1,1 @@
+"""Where the surface is: stereo, depth maps, fusion, visibility, picking, measured clouds and registration."""

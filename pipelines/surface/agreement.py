@@ -1,0 +1,271 @@
+"""Numba kernel that compares the depths of views; it holds no GIL, so that threads share the views.
+
+Agreement between the depths of several views (geometric consistency): depths of one view alone are chance.
+
+Refinement of a surface on finer pixels: each pixel compares hypotheses around its own prior only.
+
+The scheme is that of cascaded cost volumes (Gu et al., doi 10.1109/CVPR42600.2020.00257). A window across the edge
+of a roof then sees the roof where the roof is, and the ground where the ground is. A sweep of planes takes that
+ground for roof.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+from numba import njit
+
+from pipelines.core.types import Float32Array, FloatArray
+from pipelines.geometry.cameras import Pinhole
+from pipelines.surface.matching import UNSEEN, Matcher, MatchSettings, StereoCamera, StereoView, WinnerTakesAll
+from pipelines.surface.sweep import NormalMap, SweepResult, sweep_result
+
+# ruff: noqa: PLR0917  (kernels take arrays, not objects)
+
+
+_GRAZING = 0.1  # of the depth: a ray that grazes the planes moves further between them
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def compare_depths(
+    depth: Any,
+    ray_from_pixel: Any,
+    center: Any,
+    other_center: Any,
+    pixel_from_world: Any,
+    other: Any,
+    other_index: Any,
+    other_normals: Any,
+    limits: Any,
+    sums: Any,
+    counts: Any,
+) -> None:
+    """Compare the points of a view with the surface of one other view, and add up what the comparison says.
+
+    Args:
+        depth: (H, W) float64 along the optical axis of the view; 0: no point.
+        ray_from_pixel: (3, 3), from pixel (column, row, 1) to a ray of length one along the axis.
+        center: (3,) of the view in `world`.
+        other_center: (3,) of the other view.
+        pixel_from_world: (3, 3) homogeneous pixel in the other view of a place relative to its centre.
+        other: (4, h, w) float32: offset, score, step and sharpness of the other view.
+        other_index: (h, w) rows of `other_normals`.
+        other_normals: (F, 3).
+        limits: (3,) least score, steps, and free, of `AgreementSettings`.
+        sums: (2, H, W) float64; grows by the weighted differences of the depth, and by their weights.
+        counts: (2, H, W) int32; grows by one where the other view agrees, and where it looks through the point.
+    """
+    least_score, steps, free = limits[0], limits[1], limits[2]
+    rows, columns = other.shape[1], other.shape[2]
+    for v in range(depth.shape[0]):
+        for u in range(depth.shape[1]):
+            length = depth[v, u]
+            if length <= 0:
+                continue
+            x, y = u + 0.5, v + 0.5
+            r0 = ray_from_pixel[0, 0] * x + ray_from_pixel[0, 1] * y + ray_from_pixel[0, 2]
+            r1 = ray_from_pixel[1, 0] * x + ray_from_pixel[1, 1] * y + ray_from_pixel[1, 2]
+            r2 = ray_from_pixel[2, 0] * x + ray_from_pixel[2, 1] * y + ray_from_pixel[2, 2]
+            p0, p1, p2 = center[0] + length * r0, center[1] + length * r1, center[2] + length * r2
+            q0, q1, q2 = p0 - other_center[0], p1 - other_center[1], p2 - other_center[2]
+            z = pixel_from_world[2, 0] * q0 + pixel_from_world[2, 1] * q1 + pixel_from_world[2, 2] * q2
+            if z <= 0:
+                continue
+            across = (pixel_from_world[0, 0] * q0 + pixel_from_world[0, 1] * q1 + pixel_from_world[0, 2] * q2) / z
+            down = (pixel_from_world[1, 0] * q0 + pixel_from_world[1, 1] * q1 + pixel_from_world[1, 2] * q2) / z
+            if not (across >= 0 and across < columns and down >= 0 and down < rows):
+                continue
+            column, row = int(across), int(down)
+            if not other[1, row, column] > least_score:
+                continue
+            which = other_index[row, column]
+            n0, n1, n2 = other_normals[which, 0], other_normals[which, 1], other_normals[which, 2]
+            offset = p0 * n0 + p1 * n1 + p2 * n2
+            residual = np.float64(other[0, row, column]) - offset
+            seen_at = offset - (n0 * other_center[0] + n1 * other_center[1] + n2 * other_center[2])
+            if residual / seen_at > free:
+                counts[1, v, u] += 1
+            if abs(residual) < steps * other[2, row, column]:
+                along = r0 * n0 + r1 * n1 + r2 * n2
+                longer = residual / along
+                if abs(longer) < _GRAZING * length:
+                    weight = (along * other[3, row, column]) ** 2
+                    sums[0, v, u] += weight * longer
+                    sums[1, v, u] += weight
+                    counts[0, v, u] += 1
+
+
+@dataclass(frozen=True)
+class DepthEstimate:
+    """Depths of one view, estimated by a sweep or its refinement."""
+
+    camera: StereoCamera
+    sweep: SweepResult
+
+    def depth(self) -> FloatArray:
+        """Return the depth (H, W) along the optical axis."""
+        return self.sweep.normals.depth(self.camera, self.sweep.offset_m)
+
+
+@dataclass(frozen=True)
+class AgreementSettings:
+    """Thresholds of agreement.
+
+    Attributes:
+        least_score: smallest correlation that counts.
+        steps: largest difference, in steps of the sweep.
+        least_views: number of other views that must agree.
+        free: a view looks through a place if its own surface lies further away by this part of its distance.
+        most_through: largest number of views that look through a surface, as a part of the views that agree.
+        rim: a surface ends where the next pixel lies behind its plane by this part of the depth.
+    """
+
+    least_score: float = 0.4
+    steps: float = 1.5
+    least_views: int = 2
+    free: float = 0.02
+    most_through: float = 0.5
+    rim: float = 0.01
+
+
+def agreed_depth(
+    reference: DepthEstimate, others: list[DepthEstimate], settings: AgreementSettings
+) -> Float32Array:
+    """Return depths (H, W) along the optical axis of `reference`, the mean of the views that agree; 0 if few do.
+
+    1. Each point of the reference is reprojected into each other view. The residual is the distance to the surface
+       of that view along its normal: on a plane, pixels need not coincide.
+    2. Views weigh by the square of the sharpness of their peaks, because noise of the score moves a blunt peak
+       further. A view without a baseline agrees with any depth.
+    3. Where too many views look through a point, the point is no surface, even if others agree: all views from one
+       side of a roof take the ground beside it for roof.
+    """
+    own, depth = reference.sweep, reference.depth()
+    good = (own.score > settings.least_score) & np.isfinite(depth) & (depth > 0)
+    length = np.where(good, depth, 0.0)
+    per_metre = own.normals.offset_per_metre(reference.camera)
+    sums, counts = np.zeros((2, *depth.shape)), np.zeros((2, *depth.shape), np.int32)
+    sums[1] = (per_metre * own.sharpness) ** 2
+    limits = np.array([settings.least_score, settings.steps, settings.free])
+    camera = reference.camera
+    for other in others:
+        surface = other.sweep
+        compare_depths(
+            *(length, camera.cam_from_world.T @ np.linalg.inv(_camera_matrix(camera.pinhole))),
+            *(camera.center_in_world, other.camera.center_in_world),
+            _camera_matrix(other.camera.pinhole) @ other.camera.cam_from_world,
+            np.stack([surface.offset_m, surface.score, surface.step_m, surface.sharpness]),
+            *(surface.normals.index, surface.normals.normals_in_world, limits, sums, counts),
+        )
+    views, through = counts
+    agreed = good & (views >= settings.least_views) & (through < settings.most_through * views)
+    mean = length + np.divide(sums[0], sums[1], out=np.zeros_like(length), where=agreed)
+    return np.where(agreed, mean, 0.0).astype(np.float32)
+
+
+def _camera_matrix(camera: Pinhole) -> FloatArray:
+    return np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+
+
+def without_rims(depth: Float32Array, reach_px: int, rim: float) -> Float32Array:
+    """Return a depth map (H, W) with 0 where a surface ends before another within `reach_px`.
+
+    Foreground fattening is the reason: the contrast of an edge dominates the windows across it, so that the ground
+    beside a roof matches as roof. The outermost half window of a surface is therefore none. The test compares
+    inverse depths, which are linear on a plane however steep the view.
+
+    Args:
+        depth: along the optical axis, 0 where unknown.
+        reach_px: half the window's side.
+        rim: see `AgreementSettings`.
+    """
+    height, width = depth.shape
+    inverse = np.where(depth > 0, 1 / np.maximum(depth, 1e-9), np.nan)
+    ends = np.zeros(depth.shape, dtype=np.bool_)
+    for reach in range(1, reach_px + 1):
+        around = np.pad(inverse, reach, constant_values=np.nan)
+        for down, right in itertools.product((-reach, 0, reach), repeat=2):
+            ahead = around[reach + down :, reach + right :][:height, :width]
+            behind = around[reach - down :, reach - right :][:height, :width]
+            ends |= ahead < (2 - rim) * inverse - behind
+    return np.where(ends, np.float32(0), depth)
+
+
+_REACH = 4  # steps on either side of the prior
+_STEPS = 3  # for one step of the sweep that the prior is from
+_SPECKLE_PX = 5  # parts smaller than half of this are chance where one view alone has depths
+
+
+@dataclass(frozen=True)
+class SurfacePrior:
+    """Rough surface to start a refinement from.
+
+    Attributes:
+        normals: directions of the offsets.
+        offset_m: (H, W) of the surface at each pixel of a view.
+        step_m: (H, W) between two hypotheses.
+    """
+
+    normals: NormalMap
+    offset_m: Float32Array
+    step_m: Float32Array
+
+
+def surface_prior(estimate: DepthEstimate, agreed: Float32Array, camera: StereoCamera) -> SurfacePrior:
+    """Return the prior at the pixels of a finer camera: depths that views agree on, elsewhere the view's own.
+
+    Args:
+        estimate: the view's own depths, on coarse pixels.
+        agreed: (H, W) depths that views agree on, on the same pixels; 0 elsewhere.
+        camera: the finer camera.
+    """
+    normals, own = estimate.sweep.normals, estimate.depth()
+    own = np.where(np.isfinite(own) & (own > 0), own, 0).astype(np.float32)
+    own = np.asarray(cv2.medianBlur(own, _SPECKLE_PX), np.float32)
+    offset = normals.offset(estimate.camera, np.where(agreed > 0, agreed, own))
+    size = (camera.pinhole.width, camera.pinhole.height)
+    finer = [
+        # Interpolation between roof and ground would make offsets at which nothing lies.
+        cv2.resize(image, size, interpolation=cv2.INTER_NEAREST)
+        for image in (normals.index, offset.astype(np.float32), estimate.sweep.step_m / np.float32(_STEPS))
+    ]
+    which = np.asarray(finer[0], np.uint8)
+    return SurfacePrior(
+        NormalMap(normals.normals_in_world, which),
+        np.asarray(finer[1], np.float32),
+        np.asarray(finer[2], np.float32),
+    )
+
+
+def refine(
+    reference: StereoView, neighbours: list[StereoView], prior: SurfacePrior, settings: MatchSettings
+) -> SweepResult:
+    """Compare a view with its neighbours at offsets around a prior, and keep the best.
+
+    A best match at either end of the range means that the surface lies outside of it: its score becomes −1.
+
+    Args:
+        reference: view whose surface is wanted.
+        neighbours: one or more views of the same place from elsewhere.
+        prior: rough surface at the pixels of `reference`.
+        settings: of the comparison.
+
+    Raises:
+        ValueError: no neighbours.
+    """
+    if not neighbours:
+        raise ValueError("no neighbours to compare with")
+    matcher, search = Matcher(reference, neighbours, settings), WinnerTakesAll(reference.grey.shape)
+    middle = prior.normals.depth(reference.camera, prior.offset_m).astype(np.float32)
+    with np.errstate(divide="ignore"):
+        step = (prior.step_m / prior.normals.offset_per_metre(reference.camera)).astype(np.float32)
+    for number in range(-_REACH, _REACH + 1):
+        search.add(matcher(middle + np.float32(number) * step))
+    winner = search.winner()
+    offset = prior.offset_m + (winner.hypothesis - _REACH) * prior.step_m
+    refined = sweep_result(winner, prior.normals, offset, prior.step_m)
+    return replace(refined, score=np.where(winner.inner, refined.score, np.float32(UNSEEN)))

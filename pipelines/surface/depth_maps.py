@@ -1,0 +1,252 @@
+"""Depth maps of the training photographs by multi-view stereo, cached on disk: depths on which views agree.
+
+1. A plane sweep gives each view's depths on coarse pixels.
+2. The refinement on finer pixels starts from the depths on which views agree, elsewhere from the view's own.
+3. The depth map keeps the refined depths on which views agree.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from pipelines.core.machine import thread_count
+from pipelines.core.progress import SILENT, Progress, ProgressTask
+from pipelines.core.types import ByteArray, Float32Array
+from pipelines.geometry.cameras import Pinhole
+from pipelines.surface.agreement import (
+    AgreementSettings,
+    DepthEstimate,
+    agreed_depth,
+    refine,
+    surface_prior,
+    without_rims,
+)
+from pipelines.surface.matching import UNSEEN, MatchSettings, StereoCamera, StereoView
+from pipelines.surface.sweep import (
+    NormalMap,
+    Planes,
+    PointVisibility,
+    SweepResult,
+    best_neighbours,
+    plane_sweep,
+    planes_for,
+)
+from pipelines.survey.photographs import ImageCache, save_array
+from pipelines.survey.scene import Scene
+
+# Form of the cached arrays, a part of their key: files of another form lie in another folder.
+_FORM = b"coarse, fine: direction, offset, score, step, sharpness, by kernels"
+
+
+@dataclass(frozen=True)
+class StereoOptions:
+    """Options of the depth maps.
+
+    Attributes:
+        coarse_px: longest side of the photographs in the plane sweep, whose time grows with its cube.
+        fine_px: longest side of the photographs in the refinement, and of the depth maps.
+        neighbours: number of views that each view is compared with.
+        matching: comparison in the plane sweep; a wide window finds the surface where there is little texture.
+        refining: comparison in the refinement, where the surface is nearly known; a small window does not extend it
+            across the foot of a wall.
+        agreement: thresholds of agreement.
+    """
+
+    coarse_px: int = 320
+    fine_px: int = 640
+    neighbours: int = 10
+    matching: MatchSettings = field(default_factory=MatchSettings)
+    refining: MatchSettings = field(default_factory=lambda: MatchSettings(window_px=3, reach_px=2))
+    agreement: AgreementSettings = field(default_factory=AgreementSettings)
+
+
+class DepthMaps:
+    """Depth maps of the training photographs, computed once and cached on disk.
+
+    Memory holds no more than one view and its neighbours.
+
+    Args:
+        folder: cache, in which each scene has a folder of its own.
+        scene: cameras and SfM points.
+        images: undistorted photographs.
+        options: of the depth maps; None: the defaults.
+    """
+
+    def __init__(
+        self, folder: Path, scene: Scene, images: ImageCache, options: StereoOptions | None = None
+    ) -> None:
+        self.scene, self.images = scene, images
+        self._options = options or StereoOptions()
+        sparse = scene.sparse
+        self._visibility = PointVisibility(
+            scene.point_in_model, scene.poses.cam_center_in_model, sparse.obs_point, sparse.obs_image
+        )
+        # All neighbours of a view need the view's own planes and neighbours again, and these do not change.
+        self._neighbours = cache(self._find_neighbours)
+        self._planes = cache(self._find_planes)
+        self.folder = folder / self._key()
+
+    def build(self, progress: Progress = SILENT) -> None:
+        """Compute the depth maps that are not in the cache, several views at once.
+
+        A view needs the previous step of its neighbours. Each step therefore finishes all views before the next
+        step begins.
+
+        Raises:
+            InputError: a photograph cannot be read, or has another size than its camera.
+        """
+        train = [int(index) for index in self.scene.train]
+        steps = (("coarse", self._sweep), ("fine", self._refine), ("depth", self._agree))
+        if not all(self._path(index, "depth").exists() for index in train):
+            for index in train:  # Photographs share masks, which two threads must not write at once.
+                self.images.mask(index)
+            with progress.task("surface", len(steps) * len(train)) as task:
+                task.advance(0, "compiling kernels (a minute, once)")
+                for kind, make in steps:
+                    self._make_all(kind, make, train, task)
+        for kind, _ in steps[:-1]:  # and the files that an interrupted run has left
+            for index in train:
+                self._path(index, kind).unlink(missing_ok=True)
+
+    def _make_all(
+        self, kind: str, make: Callable[[int], Float32Array], views: list[int], task: ProgressTask
+    ) -> None:
+        """Write the arrays of one step that do not exist; the kernels let go of the interpreter."""
+
+        def write(index: int) -> None:
+            if not self._path(index, kind).exists():
+                save_array(self._path(index, kind), make(index))
+
+        with ThreadPoolExecutor(thread_count()) as pool:
+            jobs = [pool.submit(write, index) for index in views]
+            try:
+                for job in jobs:
+                    job.result()
+                    task.advance(1, " ")
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
+
+    def camera(self, index: int) -> Pinhole:
+        """Return the camera of a depth map."""
+        return self._pinhole(index, "fine")
+
+    def depth(self, index: int) -> Float32Array:
+        """Return the depth (H, W) in metres along a training view's optical axis, mapped from disk; 0: unknown."""
+        array: Float32Array = np.load(self._path(index, "depth"), mmap_mode="r", allow_pickle=False)
+        return array
+
+    def rgb(self, index: int) -> ByteArray:
+        """Return the photograph (H, W, 3) at the pixels of its depth map."""
+        return self._rgb(self.camera(index), index)
+
+    def _sweep(self, index: int) -> Float32Array:
+        sweeps, others = self._planes(index), self._neighbours(index)
+        if not sweeps:
+            return _empty_maps(self._pinhole(index, "coarse"))
+        reference, *views = (self._view(self._pinhole(j, "coarse"), j) for j in (index, *others))
+        return _packed(plane_sweep(reference, views, sweeps, self._options.matching))
+
+    def _refine(self, index: int) -> Float32Array:
+        own = self._surface(index, "coarse")
+        if own is None:
+            return _empty_maps(self.camera(index))
+        reference, *views = (self._view(self.camera(j), j) for j in (index, *self._neighbours(index)))
+        prior = surface_prior(own, self._agreed(own, index, "coarse"), reference.camera)
+        return _packed(refine(reference, views, prior, self._options.refining))
+
+    def _agree(self, index: int) -> Float32Array:
+        own = self._surface(index, "fine")
+        if own is None:
+            return np.zeros((self.camera(index).height, self.camera(index).width), dtype=np.float32)
+        return self._agreed(own, index, "fine")
+
+    def _agreed(self, own: DepthEstimate, index: int, kind: str) -> Float32Array:
+        """Return the depths (H, W) on which views agree; 0 elsewhere."""
+        others, options = [self._surface(j, kind) for j in self._neighbours(index)], self._options
+        depth = agreed_depth(own, [other for other in others if other is not None], options.agreement)
+        # Refined depths started from the sweep: its window sets the width of a rim on fine pixels too.
+        window_px = options.matching.window_px * own.camera.pinhole.width / self._pinhole(index, "coarse").width
+        return without_rims(depth, int(window_px / 2), options.agreement.rim)
+
+    def _surface(self, index: int, kind: str) -> DepthEstimate | None:
+        sweeps = self._planes(index)
+        if not sweeps:
+            return None
+        pinhole = self._pinhole(index, kind)
+        normal_index, *rest = np.load(self._path(index, kind), mmap_mode="r", allow_pickle=False)
+        normals = NormalMap(np.stack([planes.normal_in_world for planes in sweeps]), normal_index.astype(np.uint8))
+        return DepthEstimate(self._camera(pinhole, index), SweepResult(normals, *rest))
+
+    def _find_planes(self, index: int) -> list[Planes]:
+        others = self._neighbours(index)
+        if not others:
+            return []
+        points = self.scene.point_in_model[self._visibility.points_in_view(index)]
+        cameras = [self._camera(self._pinhole(j, "coarse"), j) for j in others]
+        return planes_for(self._camera(self._pinhole(index, "coarse"), index), cameras, points)
+
+    def _find_neighbours(self, index: int) -> list[int]:
+        return best_neighbours(self._visibility, index, self.scene.train, self._options.neighbours)
+
+    def _pinhole(self, index: int, kind: str) -> Pinhole:
+        longest_px = self._options.coarse_px if kind == "coarse" else self._options.fine_px
+        return self.images.pinhole(index).limited(longest_px)
+
+    def _camera(self, pinhole: Pinhole, index: int) -> StereoCamera:
+        poses = self.scene.poses
+        return StereoCamera(pinhole, poses.cam_from_model[index], poses.cam_center_in_model[index])
+
+    def _view(self, pinhole: Pinhole, index: int) -> StereoView:
+        grey = cv2.cvtColor(self._rgb(pinhole, index), cv2.COLOR_RGB2GRAY).astype(np.float32) + 1
+        mask = np.array(self.images.mask(index), dtype=np.uint8)
+        grey[cv2.resize(mask, grey.shape[::-1], interpolation=cv2.INTER_NEAREST) == 0] = 0
+        return StereoView(self._camera(pinhole, index), grey)
+
+    def _rgb(self, pinhole: Pinhole, index: int) -> ByteArray:
+        whole = self.images.pinhole(index)
+        # A view is read by all of its neighbours: large photographs are shrunken once. Nothing must be cut off.
+        most = max(max(whole.width, whole.height) // (2 * self._options.fine_px), 1)
+        shrink = max(s for s in range(1, most + 1) if whole.width % s == 0 == whole.height % s)
+        image = np.array(self.images.shrunken(index, shrink))
+        small = cv2.resize(image, (pinhole.width, pinhole.height), interpolation=cv2.INTER_AREA)
+        return np.asarray(small, np.uint8)
+
+    def _path(self, index: int, kind: str) -> Path:
+        return self.folder / f"{index:06d}.{kind}.npy"
+
+    def _key(self) -> str:
+        """Return a hash of all inputs of the depth maps."""
+        digest = hashlib.sha256(_FORM)
+        poses, sparse = self.scene.poses, self.scene.sparse
+        arrays = (
+            poses.cam_from_model, poses.cam_center_in_model, self.scene.point_in_model, self.scene.train,
+            sparse.obs_point, sparse.obs_image,
+        )  # fmt: skip
+        for array in arrays:
+            digest.update(np.ascontiguousarray(array).tobytes())
+        for index in range(len(sparse.image_name)):
+            digest.update(self.images.key(index).encode())
+        digest.update(repr(self._options).encode())
+        return digest.hexdigest()[:32]
+
+
+def _packed(sweep: SweepResult) -> Float32Array:
+    """Return direction, offset, score, step and sharpness of each pixel as one array (5, H, W)."""
+    normal_index = sweep.normals.index.astype(np.float32)
+    return np.stack([normal_index, sweep.offset_m, sweep.score, sweep.step_m, sweep.sharpness])
+
+
+def _empty_maps(pinhole: Pinhole) -> Float32Array:
+    """Return the array (5, H, W) of `_packed` for a view without planes: no pixel has a depth."""
+    empty = np.zeros((5, pinhole.height, pinhole.width), dtype=np.float32)
+    empty[1], empty[2] = np.nan, UNSEEN
+    return empty

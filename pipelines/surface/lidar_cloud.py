@@ -1,0 +1,207 @@
+"""LiDAR cloud of the scene: points with the planes around them, in `model`.
+
+Track of a scanner: its place at the time of each point of a LiDAR cloud.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from pipelines.core.errors import InputError
+from pipelines.core.progress import SILENT, Progress
+from pipelines.core.types import ByteArray, FloatArray, IntArray
+from pipelines.formats.trajectory_csv import read_trajectory
+from pipelines.geodesy.crs import parse_crs
+from pipelines.geodesy.enu import Origin, ecef_from_lla, enu_from_ecef
+from pipelines.geometry.trajectory import Trajectory
+from pipelines.surface.measured_cloud import CloudFiles, Thinning, read_thinned
+from pipelines.survey.options import CloudCrs
+from pipelines.survey.scene import Scene
+from pipelines.survey.survey import Survey
+
+_WGS84 = "EPSG:4979"
+_MAX_GAP_S = 2.0
+_LEAST_COVERED = 0.5  # of the points: with fewer, the clocks differ
+
+
+@dataclass(frozen=True)
+class ScannerTrack:
+    """Places of a scanner by time, in geo."""
+
+    trajectory: Trajectory
+
+    @classmethod
+    def read(cls, path: Path, stated: CloudCrs, origin: Origin) -> ScannerTrack:
+        """Return the track of a CSV file: time, and latitude, longitude, altitude or x, y, z.
+
+        Args:
+            path: of the file, on the clock of the cloud's points.
+            stated: CRS and vertical datum of the cloud, which those of a track without a CRS are.
+            origin: of geo.
+
+        Raises:
+            InputError: an unreadable file, or one without times.
+        """
+        table = read_trajectory(path)
+        if table.time_s is None:
+            raise InputError("has no column `timestamp`", path=path, field="--lidar-trajectory")
+        text = _WGS84 if table.geographic else stated.crs
+        if text is None:
+            raise InputError(
+                "has projected coordinates: --lidar-crs states their CRS", path=path, field="--lidar-trajectory"
+            )
+        lla = parse_crs(text, vertical=stated.vertical, path=path).lla_from_xyz(table.xyz, path=path)
+        order = np.argsort(table.time_s, kind="stable")
+        time_s, first = np.unique(table.time_s[order], return_index=True)
+        place = enu_from_ecef(ecef_from_lla(lla), origin)[order][first]
+        return cls(Trajectory.from_samples(time_s, position=place, max_gap_s=_MAX_GAP_S))
+
+    def at(self, gps_time_s: FloatArray) -> FloatArray:
+        """Return the scanner's places (P, 3) at times (P,); NaN where the track has none.
+
+        Raises:
+            InputError: the track has none for most times.
+        """
+        known = np.isfinite(gps_time_s)
+        place = np.full((len(gps_time_s), 3), np.nan)
+        place[known] = self.trajectory.at(gps_time_s[known]).position
+        covered = float(np.isfinite(place[:, 0]).mean())
+        if covered < _LEAST_COVERED:
+            raise InputError(
+                f"has a place for the times of {covered:.0%} of the points: it counts on another clock, or belongs "
+                "to another flight",
+                field="--lidar-trajectory",
+            )
+        return place
+
+
+_NEIGHBOURS = 12
+_MOST_POINTS = 3_000_000
+_MARGIN = 0.1  # of the scene's size, around its points
+_SCENE_SHARE = 0.01  # of the SfM points on each side may lie outside the scene
+_BATCH = 100_000
+_ABOVE_M, _BELOW_M = 500.0, 500.0  # a wrong datum must show itself, not lie outside the box
+
+
+@dataclass(frozen=True)
+class LidarCloud:
+    """P points.
+
+    Attributes:
+        position_in_model: (P, 3) metres, moved along the normal onto the plane through the neighbours.
+        normal_in_model: (P, 3) unit vectors of the planes through their neighbours, with an arbitrary sign.
+        roughness_m: (P,) RMS of the neighbours about that plane.
+        reach_m: (P,) distance to the furthest of these neighbours.
+        classification: (P,) class of LAS.
+        voxel_m: distance between the points, about.
+        scanner_in_model: (P, 3) the scanner's place at the time of each point; NaN where unknown. None: unknown.
+    """
+
+    position_in_model: FloatArray
+    normal_in_model: FloatArray
+    roughness_m: FloatArray
+    reach_m: FloatArray
+    classification: ByteArray
+    voxel_m: float
+    scanner_in_model: FloatArray | None = None
+
+    def __len__(self) -> int:
+        """Return the number of points."""
+        return len(self.position_in_model)
+
+    def part(self, rows: IntArray | np.ndarray) -> LidarCloud:
+        """Return the points of some rows."""
+        return LidarCloud(
+            self.position_in_model[rows],
+            self.normal_in_model[rows],
+            self.roughness_m[rows],
+            self.reach_m[rows],
+            self.classification[rows],
+            self.voxel_m,
+            None if self.scanner_in_model is None else self.scanner_in_model[rows],
+        )
+
+    def moved(self, shift: FloatArray) -> LidarCloud:
+        """Return the cloud shifted by a vector (3,)."""
+        scanner = None if self.scanner_in_model is None else self.scanner_in_model + shift
+        return replace(self, position_in_model=self.position_in_model + shift, scanner_in_model=scanner)
+
+    def incidence(self) -> FloatArray:
+        """Return the cosine of the angle between beam and normal (P,), from 0: grazing; NaN where unknown."""
+        if self.scanner_in_model is None:
+            return np.full(len(self), np.nan)
+        beam = self.scanner_in_model - self.position_in_model
+        along = np.abs(np.einsum("pi,pi->p", beam, self.normal_in_model))
+        return np.asarray(along / np.linalg.norm(beam, axis=1))
+
+
+def read_cloud(
+    files: CloudFiles,
+    scene: Scene,
+    survey: Survey,
+    pixel_m: float,
+    *,
+    progress: Progress = SILENT,
+    track: ScannerTrack | None = None,
+) -> LidarCloud:
+    """Return the points of the clouds in the scene, as dense as the photographs resolve it.
+
+    Args:
+        files: the clouds.
+        scene: cameras and SfM points.
+        survey: has the origin of `geo`.
+        pixel_m: size of a pixel of the photographs on the surface.
+        progress: shows the points read.
+        track: of the scanner; None: not known.
+
+    Raises:
+        InputError: as `read_thinned` and `ScannerTrack.at`, or too few points in the scene.
+    """
+    in_geo = scene.geo_from_model.apply(scene.point_in_model)
+    low, high = np.quantile(in_geo, [_SCENE_SHARE, 1 - _SCENE_SHARE], axis=0)
+    margin = _MARGIN * float((high - low)[:2].max())
+    low, high = low - np.array([margin, margin, _BELOW_M]), high + np.array([margin, margin, _ABOVE_M])
+    cloud = read_thinned(files, survey.origin, Thinning(pixel_m, _MOST_POINTS, low, high), progress)
+    if len(cloud) <= 10 * _NEIGHBOURS:
+        raise InputError(f"only {len(cloud)} points lie in the scene of the photographs", field="--lidar")
+    model_from_geo = scene.geo_from_model.inverse()
+    scanner = None if track is None else model_from_geo.apply(track.at(cloud.gps_time_s))
+    planes = planes_of(
+        model_from_geo.apply(cloud.position_in_geo), cloud.classification, cloud.voxel_m, cloud.weight
+    )
+    return replace(planes, scanner_in_model=scanner)
+
+
+def planes_of(
+    position: FloatArray, classification: ByteArray, voxel_m: float, weight: IntArray | None = None
+) -> LidarCloud:
+    """Return points (P, 3) with the plane through the neighbours of each.
+
+    Args:
+        position: (P, 3) metres in `model`, P ≥ 12.
+        classification: (P,) class of LAS.
+        voxel_m: distance between the points, about.
+        weight: (P,) number of measured points that each stands for; None: 1. Where a noisy surface lies near a
+            border of voxels, the few points beyond the border have as many voxels as the many before it: with
+            equal weights the plane would lie beside the surface, by up to a third of the noise's σ.
+    """
+    count = np.ones(len(position)) if weight is None else weight.astype(np.float64)
+    tree = cKDTree(position)
+    normal, roughness, reach = np.empty_like(position), np.empty(len(position)), np.empty(len(position))
+    onto_plane = np.empty_like(position)
+    for first in range(0, len(position), _BATCH):
+        rows = slice(first, first + _BATCH)
+        distance, nearest = tree.query(position[rows], k=_NEIGHBOURS)
+        around, share = position[nearest], count[nearest] / count[nearest].sum(axis=1, keepdims=True)
+        middle = np.einsum("pk,pki->pi", share, around)
+        arm = around - middle[:, None]
+        spread, axes = np.linalg.eigh(np.einsum("pk,pki,pkj->pij", share, arm, arm))
+        off = np.einsum("pi,pi->p", position[rows] - middle, axes[:, :, 0])
+        onto_plane[rows] = position[rows] - off[:, None] * axes[:, :, 0]
+        normal[rows], roughness[rows] = axes[:, :, 0], np.sqrt(np.maximum(spread[:, 0], 0))
+        reach[rows] = distance[:, -1]
+    return LidarCloud(onto_plane, normal, roughness, reach, classification, voxel_m)

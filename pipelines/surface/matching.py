@@ -1,0 +1,410 @@
+"""Photographs with known cameras, as stereo compares them.
+
+Numba kernels of photometric matching; they hold no GIL, so that threads match several views at once.
+
+All loops run along image rows and without branches: LLVM makes vector instructions of them. Floating-point flags
+exclude NaN and infinity, which callers therefore keep out.
+
+Photometric matching of a photograph with its neighbours, hypothesis by hypothesis; the best hypothesis wins.
+
+1. Normalised cross-correlation compares photographs: exposure does not change it.
+2. The neighbours that agree best count (Kang, Szeliski & Chai, doi 10.1109/CVPR.2001.990462): an obstacle hides a
+   place from some sides only.
+3. A guided filter averages the correlations of each hypothesis, but not across edges of the photograph (Rhemann et
+   al., doi 10.1109/CVPR.2011.5995372). Ground without texture needs a wide window; beside the edge of a roof a wide
+   window sees the roof.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numba import njit
+
+from pipelines.core.types import BoolArray, Float32Array, FloatArray
+from pipelines.geometry.cameras import Pinhole
+
+
+@dataclass(frozen=True)
+class StereoCamera:
+    """Undistorted camera in a metric frame `world`.
+
+    Attributes:
+        pinhole: of H × W pixels.
+        cam_from_world: (3, 3) rotation.
+        center_in_world: (3,).
+    """
+
+    pinhole: Pinhole
+    cam_from_world: FloatArray
+    center_in_world: FloatArray
+
+    def rays(self) -> FloatArray:
+        """Return viewing rays (H, W, 3) in `world`, of length one along the optical axis."""
+        x, y = np.meshgrid(np.arange(self.pinhole.width) + 0.5, np.arange(self.pinhole.height) + 0.5)
+        return np.asarray(self.pinhole.rays(np.stack([x, y], axis=-1)) @ self.cam_from_world)
+
+
+@dataclass(frozen=True)
+class StereoView:
+    """Photograph with its camera.
+
+    Attributes:
+        camera: of H × W pixels.
+        grey: (H, W), 1 … 256; 0 outside the photograph's valid part.
+    """
+
+    camera: StereoCamera
+    grey: Float32Array
+
+
+def opencv_camera_matrix(camera: Pinhole) -> FloatArray:
+    """Return the camera matrix (3, 3) with pixels counted from the centre of the first, as OpenCV does."""
+    return np.array([[camera.fx, 0, camera.cx - 0.5], [0, camera.fy, camera.cy - 0.5], [0, 0, 1]])
+
+
+# ruff: noqa: PLR0917  (kernels take arrays, not objects)
+
+
+_FAST = {"contract", "nsz", "arcp", "reassoc", "nnan", "ninf"}
+_UNSEEN = np.float32(-1.0)  # correlation outside a neighbour's image
+NOISE_VARIANCE = np.float32(0.3)  # grey levels²: windows that vary less than the sensor's noise do not correlate
+_LEAST_DEPTH = np.float32(1e-3)
+_ZERO, _ONE = np.float32(0.0), np.float32(1.0)
+
+
+@njit(nogil=True, fastmath=_FAST, error_model="numpy", inline="always")
+def _reflected(row: int, height: int) -> int:
+    """Return the row that a row beyond the image mirrors."""
+    inside = -row - 1 if row < 0 else row
+    return 2 * height - inside - 1 if inside >= height else inside
+
+
+@njit(nogil=True, fastmath=_FAST, error_model="numpy")
+def _project_row(
+    depth: Any, row: int, per_depth: Any, start: Any, size: Any, stride: int, place: Any, fraction: Any, miss: Any
+) -> None:
+    """Project the pixels of a row at their depths (W,) into a neighbour, clamped to its image.
+
+    Writes the index of the upper left of four pixels into `place` (W,), the position between them into `fraction`
+    (2, W), and into `miss` (W,) 0 where nothing was clamped.
+    """
+    y = np.float32(row)
+    x0 = per_depth[0, 1] * y + per_depth[0, 2]
+    y0 = per_depth[1, 1] * y + per_depth[1, 2]
+    z0 = per_depth[2, 1] * y + per_depth[2, 2]
+    x_step, y_step, z_step = per_depth[0, 0], per_depth[1, 0], per_depth[2, 0]
+    x_start, y_start, z_start, right, bottom = start[0], start[1], start[2], size[0], size[1]
+    for i in range(depth.shape[0]):
+        column, d = np.float32(i), depth[i]
+        z = d * (z_step * column + z0) + z_start
+        ahead = max(z, _LEAST_DEPTH)
+        inverse = _ONE / ahead
+        u = (d * (x_step * column + x0) + x_start) * inverse
+        v = (d * (y_step * column + y0) + y_start) * inverse
+        inner_u, inner_v = min(max(u, _ZERO), right), min(max(v, _ZERO), bottom)
+        whole_u, whole_v = np.int32(inner_u), np.int32(inner_v)
+        place[i] = whole_v * stride + whole_u
+        fraction[0, i] = inner_u - np.float32(whole_u)
+        fraction[1, i] = inner_v - np.float32(whole_v)
+        miss[i] = abs(inner_u - u) + abs(inner_v - v) + (ahead - z)
+
+
+@njit(nogil=True, fastmath=_FAST, error_model="numpy")
+def _sample_row(grey: Any, stride: int, place: Any, fraction: Any, miss: Any, shown: Any) -> None:
+    """Write the interpolated grey levels at places into `shown` (W,); 0 where the place was missed."""
+    down = np.uint32(stride)
+    for i in range(place.shape[0]):
+        first = np.uint32(place[i])
+        a, b = grey[first], grey[first + np.uint32(1)]
+        c, d = grey[first + down], grey[first + down + np.uint32(1)]
+        above, below = a + fraction[0, i] * (b - a), c + fraction[0, i] * (d - c)
+        level = above + fraction[1, i] * (below - above)
+        shown[i] = level if miss[i] == _ZERO else _ZERO
+
+
+@njit(nogil=True, fastmath=_FAST, error_model="numpy")
+def _add_across(reference: Any, padded: Any, half: int, sums: Any) -> None:
+    """Write Σ other, Σ other², Σ reference · other over windows along a row into sums (3, W).
+
+    Args:
+        reference: (W + 2 half,) row of the reference, mirrored at its ends.
+        padded: (W + 2 half,) likewise of the neighbour, as the reference sees it.
+        half: of the window.
+        sums: output.
+    """
+    width = sums.shape[1]
+    for k in range(2 * half + 1):
+        for i in range(width):
+            level = padded[i + k]
+            product = reference[i + k] * level
+            if k == 0:
+                sums[0, i], sums[1, i], sums[2, i] = level, level * level, product
+            else:
+                sums[0, i] += level
+                sums[1, i] += level * level
+                sums[2, i] += product
+
+
+@njit(nogil=True, fastmath=_FAST, error_model="numpy")
+def _mirror_ends(padded: Any, half: int) -> None:
+    width = padded.shape[0] - 2 * half
+    for k in range(half):
+        padded[half - 1 - k] = padded[half + k]
+        padded[half + width + k] = padded[half + width - 1 - k]
+
+
+@njit(nogil=True, fastmath=_FAST, error_model="numpy")
+def _correlate_row(ring: Any, shown: Any, mean: Any, inverse_sigma: Any, total: Any, score: Any) -> None:
+    """Write the correlation of a row with a neighbour into score (W,).
+
+    Args:
+        ring: (window, 3, W) sums along the rows of the window.
+        shown: (W,) the neighbour's grey levels at the row itself.
+        mean: (W,) of the reference's windows.
+        inverse_sigma: (W,) of the reference's windows.
+        total: (3, W) scratch.
+        score: output.
+    """
+    window, width = ring.shape[0], shown.shape[0]
+    share = np.float32(1.0 / (window * window))
+    for q in range(3):
+        for i in range(width):
+            total[q, i] = ring[0, q, i]
+        for k in range(1, window):
+            for i in range(width):
+                total[q, i] += ring[k, q, i]
+    for i in range(width):
+        other = total[0, i] * share
+        variance = max(total[1, i] * share - other * other, NOISE_VARIANCE)
+        level = (total[2, i] * share - mean[i] * other) * inverse_sigma[i] / np.sqrt(variance)
+        score[i] = _UNSEEN if shown[i] == _ZERO else level
+
+
+@njit(nogil=True, fastmath=_FAST, error_model="numpy")
+def _keep_largest(score: Any, largest: Any) -> None:
+    """Insert scores (W,) into the sorted largest (k, W) so far; overwrites them."""
+    for rank in range(largest.shape[0]):
+        for i in range(score.shape[0]):
+            kept, new = largest[rank, i], score[i]
+            largest[rank, i] = max(kept, new)
+            score[i] = min(kept, new)
+
+
+@njit(nogil=True, cache=True, fastmath=_FAST, error_model="numpy")
+def match_rows(
+    depth: Any,
+    rows: Any,
+    reference: Any,
+    mean: Any,
+    inverse_sigma: Any,
+    greys: Any,
+    sizes: Any,
+    per_depth: Any,
+    starts: Any,
+    out: Any,
+) -> None:
+    """Write the best correlations of some rows of a view with n neighbours, under a hypothesis of depth.
+
+    Args:
+        depth: (H, W) hypothesis, finite.
+        rows: (2,) first row and the row after the last.
+        reference: (H, W + 2 half) grey levels, mirrored at the ends of rows; half = window // 2.
+        mean: (H, W) of the reference's windows.
+        inverse_sigma: (H, W) of the reference's windows.
+        greys: (n, h + 1, w + 1) grey levels of the neighbours; the last row and column are not read with weight.
+        sizes: (n, 2) largest column and row of each neighbour, float32.
+        per_depth: (n, 3, 3) float32, starts: (n, 3) float32: of a pixel (column, row) at depth d, the neighbour's
+            homogeneous pixel is d · per_depth · (column, row, 1) + start.
+        out: (H, k, W) the largest correlations, largest first, k at most n.
+    """
+    count, height, width = len(greys), depth.shape[0], depth.shape[1]
+    half = (reference.shape[1] - width) // 2
+    window, stride = 2 * half + 1, greys.shape[2]
+    flat = greys.reshape(count, -1)
+    ring = np.empty((count, window, 3, width), np.float32)
+    shown = np.zeros((count, window, width + 2 * half), np.float32)
+    place, fraction = np.empty(width, np.int32), np.empty((2, width), np.float32)
+    miss, score, total = np.empty(width, np.float32), np.empty(width, np.float32), np.empty((3, width), np.float32)
+    for pushed in range(rows[0] - half, rows[1] + half):
+        row, slot = _reflected(pushed, height), (pushed + window) % window
+        done = pushed - half
+        if done >= rows[0]:
+            out[done] = np.float32(-2.0)
+        for k in range(count):
+            _project_row(depth[row], row, per_depth[k], starts[k], sizes[k], stride, place, fraction, miss)
+            _sample_row(flat[k], stride, place, fraction, miss, shown[k, slot, half : half + width])
+            _mirror_ends(shown[k, slot], half)
+            _add_across(reference[row], shown[k, slot], half, ring[k, slot])
+            if done >= rows[0]:
+                middle = shown[k, (done + window) % window, half : half + width]
+                _correlate_row(ring[k], middle, mean[done], inverse_sigma[done], total, score)
+                _keep_largest(score, out[done])
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def keep_winner(number: int, score: Any, last: Any, best: Any, before: Any, after: Any, hypothesis: Any) -> None:
+    """Compare the scores of hypothesis `number` with the best so far, pixel by pixel.
+
+    Args:
+        number: of the hypothesis, from 0.
+        score: (P,) its scores.
+        last: (P,) scores of the hypothesis before; receives `score`.
+        best: (P,) largest scores so far.
+        before: (P,) scores of the hypotheses before the best ones.
+        after: (P,) scores of those after the best ones.
+        hypothesis: (P,) numbers of the best, int32.
+    """
+    for i in range(score.shape[0]):
+        new = score[i]
+        if new > best[i]:
+            best[i], before[i], after[i], hypothesis[i] = new, last[i], np.float32(-2.0), number
+        elif hypothesis[i] == number - 1:
+            after[i] = new
+        last[i] = new
+
+
+UNSEEN = float(_UNSEEN)
+_LEAST_CURVATURE = 1e-6
+_FURTHEST_M = 1e7  # hypotheses beyond are as good as infinite, and kernels need finite numbers
+
+
+@dataclass(frozen=True)
+class MatchSettings:
+    """Settings of the comparison.
+
+    Attributes:
+        window_px: side of the correlation window, odd.
+        reach_px: radius of the guided filter that averages correlations.
+        edge_grey: step in grey levels across which the filter does not average.
+        views: number of neighbours that count, the best of all.
+    """
+
+    window_px: int = 5
+    reach_px: int = 6
+    edge_grey: float = 10.0
+    views: int = 3
+
+    @property
+    def support_px(self) -> int:
+        """Distance from a pixel up to which its score depends on the image: the guided filter averages averages."""
+        return self.window_px // 2 + 2 * self.reach_px
+
+
+class Matcher:
+    """Compares a photograph (H, W) with its neighbours under hypotheses of depth.
+
+    Args:
+        reference: view whose surface is wanted.
+        neighbours: one or more views of the same place from elsewhere.
+        settings: of the comparison.
+    """
+
+    def __init__(self, reference: StereoView, neighbours: list[StereoView], settings: MatchSettings) -> None:
+        grey, side = reference.grey, (settings.window_px, settings.window_px)
+        self._settings, self._grey = settings, grey
+        self._mean, square = (
+            np.asarray(cv2.boxFilter(image, -1, side, borderType=cv2.BORDER_REFLECT), np.float32)
+            for image in (grey, grey * grey)
+        )
+        variance = square - self._mean * self._mean
+        self._inverse_sigma = (1 / np.sqrt(np.maximum(variance, NOISE_VARIANCE))).astype(np.float32)
+        half = settings.window_px // 2
+        self._mirrored = np.pad(grey, ((0, 0), (half, half)), mode="symmetric")
+        self._greys, self._sizes = _stacked([view.grey for view in neighbours])
+        self._per_depth, self._starts = _projections(reference, neighbours)
+        height, width = grey.shape
+        self._largest = np.empty((height, min(settings.views, len(neighbours)), width), np.float32)
+        self._guided: tuple[slice, cv2.ximgproc.GuidedFilter] | None = None
+
+    def __call__(self, depth: Float32Array, rows: slice | None = None) -> Float32Array:
+        """Return the score (h, W) of a hypothesis in some rows of the view.
+
+        Args:
+            depth: (H, W) along the optical axis; not positive: no hypothesis, UNSEEN.
+            rows: first row and the row after the last; None: all. Rows within the settings' `support_px` of either
+                end are less exact.
+        """
+        part = rows or slice(0, len(self._grey))
+        seen = (depth > 0) & (depth < _FURTHEST_M)
+        match_rows(
+            *(np.where(seen, depth, np.float32(0)), np.array([part.start, part.stop]), self._mirrored),
+            *(self._mean, self._inverse_sigma, self._greys, self._sizes, self._per_depth, self._starts),
+            self._largest,
+        )
+        score = self._filter(part).filter(self._largest[part].mean(axis=1))
+        return np.where(seen[part], score, np.float32(UNSEEN))
+
+    def _filter(self, part: slice) -> cv2.ximgproc.GuidedFilter:
+        """Return the guided filter of some rows; the rows of a hypothesis are mostly those of the one before."""
+        if self._guided is None or self._guided[0] != part:
+            settings = self._settings
+            guide = np.ascontiguousarray(self._grey[part])
+            self._guided = (
+                part,
+                cv2.ximgproc.createGuidedFilter(guide, settings.reach_px, settings.edge_grey**2),
+            )
+        return self._guided[1]
+
+
+def _stacked(images: list[Float32Array]) -> tuple[Float32Array, Float32Array]:
+    """Return images in one array (n, h + 1, w + 1), and the largest column and row (n, 2) of each."""
+    height, width = (max(image.shape[axis] for image in images) for axis in (0, 1))
+    greys = np.zeros((len(images), height + 1, width + 1), np.float32)
+    for grey, image in zip(greys, images, strict=True):
+        grey[: image.shape[0], : image.shape[1]] = image
+    return greys, np.array([[image.shape[1] - 1, image.shape[0] - 1] for image in images], np.float32)
+
+
+def _projections(reference: StereoView, neighbours: list[StereoView]) -> tuple[Float32Array, Float32Array]:
+    """Return matrices (n, 3, 3) and vectors (n, 3) that project pixels with depths into neighbours."""
+    camera = reference.camera
+    world_from_pixel = camera.cam_from_world.T @ np.linalg.inv(opencv_camera_matrix(camera.pinhole))
+    per_depth, starts = [], []
+    for view in neighbours:
+        pixel_from_world = opencv_camera_matrix(view.camera.pinhole) @ view.camera.cam_from_world
+        per_depth.append(pixel_from_world @ world_from_pixel)
+        starts.append(pixel_from_world @ (camera.center_in_world - view.camera.center_in_world))
+    return np.array(per_depth, np.float32), np.array(starts, np.float32)
+
+
+@dataclass(frozen=True)
+class Winner:
+    """Best of a sequence of hypotheses at each pixel.
+
+    Attributes:
+        hypothesis: (H, W) its number, with a fraction.
+        score: (H, W) correlation, −1 … 1.
+        curvature: (H, W) minus the second derivative of the score by the number.
+        inner: (H, W) whether scores of the hypotheses before and after exist.
+    """
+
+    hypothesis: FloatArray
+    score: Float32Array
+    curvature: Float32Array
+    inner: BoolArray
+
+
+class WinnerTakesAll:
+    """Search for the largest of a sequence of score images at each pixel, with the scores before and after it."""
+
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        self._count = 0
+        self._hypothesis = np.full(shape, -2, dtype=np.int32)
+        self._best, self._before, self._after, self._last = (np.full(shape, -2.0, np.float32) for _ in range(4))
+
+    def add(self, score: Float32Array) -> None:
+        """Take the scores (H, W) of the next hypothesis."""
+        images = (score, self._last, self._best, self._before, self._after, self._hypothesis)
+        keep_winner(self._count, *(image.reshape(-1) for image in images))
+        self._count += 1
+
+    def winner(self) -> Winner:
+        """Return the best hypotheses, refined by the parabola through the scores before and after if both exist."""
+        inner = (self._before > UNSEEN) & (self._after > UNSEEN)
+        curvature = np.maximum(2 * self._best - self._before - self._after, _LEAST_CURVATURE)
+        shift = np.where(inner, 0.5 * (self._after - self._before) / curvature, 0.0).clip(-0.5, 0.5)
+        return Winner(self._hypothesis + shift, self._best, np.where(inner, curvature, _LEAST_CURVATURE), inner)

@@ -1,0 +1,300 @@
+"""Points of LiDAR in the survey's frame: the only way in which clouds of other instruments are read.
+
+1. Headers are checked, and each file's CRS is found or refused, before work starts.
+2. Chunks are transformed in float64. Noise, withdrawn points and overlap are dropped.
+3. One point a voxel is kept, a measured one. Memory holds no more than a multiple of the kept points: where they
+   would become too many, the voxels grow.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.core.errors import InputError
+from pipelines.core.progress import SILENT, Progress
+from pipelines.core.types import ByteArray, FloatArray, IntArray
+from pipelines.formats.cloud_ply import CloudChunk, CloudFile, open_cloud_ply
+from pipelines.formats.las import open_las
+from pipelines.geodesy.crs import PointCrs, parse_crs
+from pipelines.geodesy.enu import Origin, ecef_from_lla, enu_from_ecef
+from pipelines.geometry.footprints import voxel_keys
+from pipelines.survey.options import CLOUD_SUFFIXES, CloudCrs
+
+log = logging.getLogger(__name__)
+
+NOISE_CLASSES = (7, 18)  # low and high noise
+_READERS: dict[str, Callable[[Path], CloudFile]] = {".las": open_las, ".laz": open_las, ".ply": open_cloud_ply}
+_CHUNK = 1_000_000
+_MOST_FILES = 10_000
+_KEY_SIDE = 2**21 - 1  # voxels along an axis for which a key of 63 bits is unique
+_SPACING_CHANGE = 2**0.5  # of the voxels, where the points would become too many
+
+
+@dataclass(frozen=True)
+class Thinning:
+    """How many points to keep, and where.
+
+    Attributes:
+        voxel_m: side of the voxels, of which each keeps one point.
+        most: limit of the points; beyond, the voxels grow.
+        low_in_geo, high_in_geo: (3,) corners of the box outside which points are dropped; None: no limit.
+    """
+
+    voxel_m: float
+    most: int = 20_000_000
+    low_in_geo: FloatArray | None = None
+    high_in_geo: FloatArray | None = None
+
+
+@dataclass(frozen=True)
+class MeasuredCloud:
+    """P points in geo.
+
+    Attributes:
+        position_in_geo: (P, 3) metres.
+        classification: (P,) class of LAS; 0: never classified.
+        weight: (P,) int64, number of measured points in its voxel.
+        gps_time_s: (P,) time of the file; NaN: none.
+        voxel_m: side of the voxels at the end.
+    """
+
+    position_in_geo: FloatArray
+    classification: ByteArray
+    weight: IntArray
+    gps_time_s: FloatArray
+    voxel_m: float
+
+    def __len__(self) -> int:
+        """Return the number of points."""
+        return len(self.position_in_geo)
+
+    def part(self, rows: IntArray | np.ndarray) -> MeasuredCloud:
+        """Return the points of some rows."""
+        return MeasuredCloud(
+            self.position_in_geo[rows],
+            self.classification[rows],
+            self.weight[rows],
+            self.gps_time_s[rows],
+            self.voxel_m,
+        )
+
+
+@dataclass
+class ReadTally:
+    """Numbers of points by what became of them."""
+
+    read: int = 0
+    noise: int = 0
+    withheld: int = 0
+    overlap: int = 0
+    outside: int = 0
+
+
+class CloudFiles:
+    """Files of one or several clouds, whose headers and CRS have been checked.
+
+    Args:
+        path: file, or folder whose LAS, LAZ and PLY files are taken, also from its subfolders.
+        stated: CRS that the user states.
+
+    Attributes:
+        count: number of points.
+        assumptions: sentences on what the files do not say.
+
+    Raises:
+        InputError: no file, an unreadable one, or one without a CRS; a CRS that PROJ cannot use.
+    """
+
+    def __init__(self, path: Path, stated: CloudCrs) -> None:
+        self._files = [_opened(file, stated) for file in _paths(path, stated)]
+        self._crs = [_crs_of(file, stated) for file in self._files]
+        self.count = sum(file.count for file in self._files)
+        self.tally = ReadTally()
+        silent = {_short_name(crs.name) for crs in self._crs if not crs.vertical.stated}
+        self.assumptions = tuple(
+            f"the heights of the cloud were taken as ellipsoidal: {name} has no vertical part "
+            f"({stated.flag}-vertical states one)"
+            for name in sorted(silent)
+        )
+
+    @property
+    def crs_names(self) -> tuple[str, ...]:
+        """Names of the CRSs of the files, without repetition."""
+        return tuple(dict.fromkeys(_short_name(crs.name) for crs in self._crs))
+
+    def chunks(self, origin: Origin, progress: Progress = SILENT) -> Iterator[MeasuredCloud]:
+        """Yield all valid points in geo, a chunk at a time and not thinned.
+
+        Args:
+            origin: of geo.
+            progress: shows the points read.
+
+        Raises:
+            InputError: a damaged file, points outside their CRS, or a missing grid.
+        """
+        with progress.task("lidar", self.count) as task:
+            for file, crs in zip(self._files, self._crs, strict=True):
+                serving: PointCrs | None = None
+                for raw in file.chunks(_CHUNK):
+                    chunk = self._valid(raw, file.path)
+                    if len(chunk):
+                        lla = (serving or crs).lla_from_xyz(chunk.position, path=file.path)
+                        # One operation serves the file: neighbours in two chunks keep their distance.
+                        serving = serving or crs.serving(lla)
+                        yield _in_geo(chunk, lla, origin)
+                    task.advance(len(raw))
+
+    def _valid(self, chunk: CloudChunk, path: Path) -> CloudChunk:
+        """Return the points that count, and note the others."""
+        if not np.isfinite(chunk.position).all():
+            raise InputError("holds coordinates that are not finite", path=path)
+        noise = np.isin(chunk.classification, NOISE_CLASSES)
+        keep = ~(noise | chunk.withheld | chunk.overlap)
+        self.tally.read += len(chunk)
+        self.tally.noise += int(noise.sum())
+        self.tally.withheld += int((chunk.withheld & ~noise).sum())
+        self.tally.overlap += int((chunk.overlap & ~noise & ~chunk.withheld).sum())
+        return CloudChunk(
+            chunk.position[keep],
+            chunk.classification[keep],
+            chunk.overlap[keep],
+            chunk.withheld[keep],
+            None if chunk.gps_time_s is None else chunk.gps_time_s[keep],
+        )
+
+
+def read_thinned(
+    files: CloudFiles, origin: Origin, thinning: Thinning, progress: Progress = SILENT
+) -> MeasuredCloud:
+    """Return one point of each voxel that the clouds meet, the first.
+
+    Memory holds at most three times `thinning.most` points.
+
+    Args:
+        files: the clouds.
+        origin: of geo.
+        thinning: voxels, limit and box.
+        progress: shows the points read.
+
+    Raises:
+        InputError: as `CloudFiles.chunks`; or no point lies in the box.
+    """
+    voxel_m, held = thinning.voxel_m, 0
+    waiting: list[MeasuredCloud] = []
+    for chunk in files.chunks(origin, progress):
+        inside = _inside(chunk.position_in_geo, thinning)
+        files.tally.outside += int((~inside).sum())
+        part = _thinned([chunk.part(inside)], voxel_m)
+        waiting, held = [*waiting, part], held + len(part)
+        if held > 2 * thinning.most:
+            merged, voxel_m = _limited(waiting, voxel_m, thinning.most)
+            waiting, held = [merged], len(merged)
+    if not held:
+        raise InputError(
+            f"none of the {files.tally.read} points lies where the photographs look: another place, or a wrong CRS "
+            f"({', '.join(files.crs_names)})"
+        )
+    cloud, voxel_m = _limited(waiting, voxel_m, thinning.most)
+    log.info(
+        "lidar: %d of %d points kept in voxels of %.3f m; dropped: %d noise, %d withheld, %d overlap, %d outside",
+        len(cloud), files.tally.read, voxel_m, files.tally.noise, files.tally.withheld, files.tally.overlap,
+        files.tally.outside,
+    )  # fmt: skip
+    return cloud
+
+
+def _limited(parts: list[MeasuredCloud], voxel_m: float, most: int) -> tuple[MeasuredCloud, float]:
+    """Return the points of all parts, thinned until they are no more than `most`, and the side of the voxels."""
+    cloud = _thinned(parts, voxel_m)
+    while len(cloud) > most:
+        voxel_m *= _SPACING_CHANGE
+        cloud = _thinned([cloud], voxel_m)
+    return cloud, voxel_m
+
+
+def _thinned(parts: list[MeasuredCloud], voxel_m: float) -> MeasuredCloud:
+    """Return the first point of each voxel, with the number of points in the voxel."""
+    position = np.concatenate([part.position_in_geo for part in parts])
+    if not len(position):
+        return replace(parts[0], voxel_m=voxel_m)
+    low, high = position.min(axis=0), position.max(axis=0)
+    if not (high - low < _KEY_SIDE * voxel_m).all():
+        reach_m = float((high - low).max())
+        raise InputError(f"points {reach_m / 1000:.0f} km apart do not fit into voxels of {voxel_m:g} m")
+    keys = voxel_keys(position, voxel_m)
+    _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
+    weight = np.bincount(inverse, np.concatenate([part.weight for part in parts])).astype(np.int64)
+    order = np.argsort(first)
+    rows = first[order]
+    return MeasuredCloud(
+        position[rows],
+        np.concatenate([part.classification for part in parts])[rows],
+        weight[order],
+        np.concatenate([part.gps_time_s for part in parts])[rows],
+        voxel_m,
+    )
+
+
+def _inside(position: FloatArray, thinning: Thinning) -> np.ndarray:
+    inside = np.ones(len(position), dtype=bool)
+    if thinning.low_in_geo is not None:
+        inside &= (position >= thinning.low_in_geo).all(axis=1)
+    if thinning.high_in_geo is not None:
+        inside &= (position <= thinning.high_in_geo).all(axis=1)
+    return inside
+
+
+def _in_geo(chunk: CloudChunk, lla: FloatArray, origin: Origin) -> MeasuredCloud:
+    count = len(chunk)
+    time = np.full(count, np.nan) if chunk.gps_time_s is None else chunk.gps_time_s
+    place = enu_from_ecef(ecef_from_lla(lla), origin)
+    return MeasuredCloud(place, chunk.classification, np.ones(count, np.int64), time, 0.0)
+
+
+def _short_name(name: str) -> str:
+    """Return the name that a WKT gives its CRS; any other text itself."""
+    found = re.match(r'\w+\["([^"]+)"', name)
+    return found[1] if found else name
+
+
+def _paths(path: Path, stated: CloudCrs) -> list[Path]:
+    """Return the files of a path in the order of their names."""
+    if path.is_dir():
+        files = sorted(
+            file
+            for file in path.rglob("*")
+            if file.suffix.lower() in CLOUD_SUFFIXES
+            and not any(part[0] == "." for part in file.relative_to(path).parts)
+        )
+        if not files:
+            raise InputError("no LAS, LAZ or PLY file in this folder", path=path, field=stated.flag)
+        if len(files) > _MOST_FILES:
+            raise InputError(f"{len(files)} files (limit {_MOST_FILES})", path=path, field=stated.flag)
+        return files
+    return [path]
+
+
+def _opened(path: Path, stated: CloudCrs) -> CloudFile:
+    reader = _READERS.get(path.suffix.lower())
+    if reader is None:
+        hint = " (CloudCompare and PDAL convert E57)" if path.suffix.lower() == ".e57" else ""
+        raise InputError(f"expected .las, .laz or .ply{hint}", path=path, field=stated.flag)
+    return reader(path)
+
+
+def _crs_of(file: CloudFile, stated: CloudCrs) -> PointCrs:
+    if file.crs is not None:
+        return parse_crs(file.crs, vertical=stated.vertical, path=file.path)
+    if stated.crs is None:
+        raise InputError(
+            f"states no CRS: give {stated.flag}-crs EPSG:n, or EPSG:n+m with the vertical CRS",
+            path=file.path,
+            field=stated.flag,
+        )
+    return parse_crs(stated.crs, vertical=stated.vertical, field=f"{stated.flag}-crs")

@@ -1,0 +1,451 @@
+"""Support of points by depth maps: how many views show a surface there, and how far apart their surfaces lie.
+
+1. A view's surface at a point is read off its depth map at the point's projection: linear in inverse depth between
+   the four pixels around it, if these lie on one surface (the inverse depth of a plane is linear on the image).
+   Otherwise it is that of the pixel.
+2. The view agrees if that depth differs from the point's by at most `tolerance` of the depth.
+3. The view looks through the point if its surface lies further behind than that, and a nearer surface hides it.
+4. The residual of an agreeing view is the vector along the ray from the point to the view's surface.
+
+Which points of a reference the photographs saw: those that no other point of the reference hides.
+
+The model has no say: a surface that training missed was seen all the same.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numba import njit, prange
+from scipy.ndimage import minimum_filter
+
+from pipelines.core.progress import SILENT, Progress
+from pipelines.core.types import BoolArray, Float32Array, FloatArray, IntArray
+from pipelines.geometry.cameras import Pinhole
+
+# ruff: noqa: PLR0917  (kernels take arrays, not objects)
+
+
+_ONE_SURFACE = (
+    0.04  # of the depth: largest range of four pixels of one surface, as of ground seen under 5° at f = 500 px
+)
+_BLOCK = 512  # points that share a choice of cameras
+_CELLS = 256  # across the points' extent, to sort them into blocks
+_NEAR = 1e-6  # least depth
+
+_VIEWS, _THROUGH, _UP, _UP2, _HORIZONTAL2, _Z2, _NORMAL, _NORMAL2, _DIRECTION = range(9)
+_SUMS = _DIRECTION + 3
+
+
+@dataclass(frozen=True)
+class DepthViews:
+    """V depth maps with their cameras, in one frame (metres).
+
+    Attributes:
+        cam_from_world: (V, 3, 3) rotations.
+        center_in_world: (V, 3) camera centres.
+        intrinsics_px: (V, 4) fx, fy, cx, cy of pinholes; the centre of the top-left pixel is (0.5, 0.5).
+        size_px: (V, 2) width and height.
+        start: (V,) index of each map's first pixel in `depth_m`.
+        depth_m: all pixels of all maps, row by row, as one array (P,); along the camera's z axis, 0: no surface.
+    """
+
+    cam_from_world: FloatArray
+    center_in_world: FloatArray
+    intrinsics_px: FloatArray
+    size_px: IntArray
+    start: IntArray
+    depth_m: Float32Array
+
+
+@dataclass(frozen=True)
+class Support:
+    """Support of N points; a mean or RMS is NaN for a point without an agreeing view.
+
+    The surface of a single view is uncertain by about these RMS. Errors of the views correlate, because the same
+    Gaussians cause them: the RMS does not fall with √views.
+
+    Attributes:
+        views: (N,) number of views whose surface agrees.
+        seen_through: (N,) number of views that look through the point.
+        mean_up_m: (N,) mean upward component of the residuals.
+        rms_up_m: (N,) RMS of their upward components: the height's, on level ground.
+        rms_horizontal_m: (N,) RMS of their horizontal components. On level ground most of it is the rays' slant.
+        rms_depth_m: (N,) RMS along the cameras' z axes.
+        mean_normal_m, rms_normal_m: (N,) mean and RMS along the points' normals, whatever the slant of rays and
+            surface; NaN without a normal.
+        spread_rad: (N,) RMS angle of the agreeing rays about their mean direction: 0 without parallax.
+        mean_ray: (N, 3) mean of the agreeing rays' unit vectors, from the cameras to the point.
+    """
+
+    views: IntArray
+    seen_through: IntArray
+    mean_up_m: FloatArray
+    rms_up_m: FloatArray
+    rms_horizontal_m: FloatArray
+    rms_depth_m: FloatArray
+    mean_normal_m: FloatArray
+    rms_normal_m: FloatArray
+    spread_rad: FloatArray
+    mean_ray: FloatArray
+
+    def scaled(self, scale: float) -> Support:
+        """Return the support in a frame whose unit is 1/`scale` of this one's."""
+        lengths = {name: scale * value for name, value in vars(self).items() if name.endswith("_m")}
+        return replace(self, **lengths)
+
+
+def support(
+    point_in_world: FloatArray,
+    views: DepthViews,
+    up_in_world: FloatArray,
+    tolerance: float,
+    normal_in_world: FloatArray | None = None,
+) -> Support:
+    """Return the support of points by depth maps.
+
+    Args:
+        point_in_world: (N, 3) metres, finite.
+        views: depth maps and cameras.
+        up_in_world: (3,) unit vector.
+        tolerance: largest difference of depths that agree, as a part of the depth.
+        normal_in_world: (N, 3) unit normals with an arbitrary sign; NaN where unknown.
+    """
+    points = np.ascontiguousarray(point_in_world, dtype=np.float64).reshape(-1, 3)
+    normals = np.full_like(points, np.nan) if normal_in_world is None else normal_in_world
+    depth = views.depth_m.view()
+    depth.flags.writeable = False  # as mapped files are: one type of array, compiled once
+    sums = np.zeros((len(points), _SUMS))
+    if len(points):
+        _sum_support(
+            points,
+            np.ascontiguousarray(normals, dtype=np.float64),
+            _blocks(points),
+            np.ascontiguousarray(views.cam_from_world, dtype=np.float64),
+            np.ascontiguousarray(views.center_in_world, dtype=np.float64),
+            np.ascontiguousarray(views.intrinsics_px, dtype=np.float64),
+            np.ascontiguousarray(views.size_px, dtype=np.int64),
+            np.ascontiguousarray(views.start, dtype=np.int64),
+            depth,
+            np.ascontiguousarray(up_in_world, dtype=np.float64),
+            tolerance,
+            sums,
+        )
+    with np.errstate(invalid="ignore"):
+        count = np.where(sums[:, _VIEWS] > 0, sums[:, _VIEWS], np.nan)
+        resultant = np.linalg.norm(sums[:, _DIRECTION:], axis=1) / count
+        return Support(
+            views=sums[:, _VIEWS].astype(np.int64),
+            seen_through=sums[:, _THROUGH].astype(np.int64),
+            mean_up_m=sums[:, _UP] / count,
+            rms_up_m=np.sqrt(sums[:, _UP2] / count),
+            rms_horizontal_m=np.sqrt(sums[:, _HORIZONTAL2] / count),
+            rms_depth_m=np.sqrt(sums[:, _Z2] / count),
+            mean_normal_m=sums[:, _NORMAL] / count,
+            rms_normal_m=np.sqrt(sums[:, _NORMAL2] / count),
+            spread_rad=np.sqrt(np.maximum(2 * (1 - resultant), 0)),
+            mean_ray=sums[:, _DIRECTION:] / count[:, None],
+        )
+
+
+def _blocks(points: FloatArray) -> IntArray:
+    """Return the points' indices, ordered so that consecutive ones lie close together."""
+    low = points.min(axis=0)
+    size = max(float(np.ptp(points, axis=0).max()), _NEAR) / _CELLS
+    cell = ((points - low) / size).astype(np.int64)
+    return np.argsort((cell[:, 2] * (_CELLS + 1) + cell[:, 1]) * (_CELLS + 1) + cell[:, 0], kind="stable")
+
+
+@njit(nogil=True, error_model="numpy")
+def _sees(middle: Any, radius: float, rotation: Any, center: Any, intrinsics: Any, size: Any) -> bool:
+    """Return whether a sphere may touch the frustum of a camera."""
+    x, y, z = 0.0, 0.0, 0.0
+    for k in range(3):
+        d = middle[k] - center[k]
+        x += rotation[0, k] * d
+        y += rotation[1, k] * d
+        z += rotation[2, k] * d
+    if z < -radius:
+        return False
+    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
+    left, right = -cx / fx, (size[0] - cx) / fx
+    above, below = -cy / fy, (size[1] - cy) / fy
+    # Signed distances from the four planes through the centre and the image's sides, outwards.
+    if max((left * z - x) / np.sqrt(1 + left * left), (x - right * z) / np.sqrt(1 + right * right)) > radius:
+        return False
+    return max((above * z - y) / np.sqrt(1 + above * above), (y - below * z) / np.sqrt(1 + below * below)) <= radius
+
+
+@njit(nogil=True, error_model="numpy")
+def _surface(depth: Any, start: int, width: int, height: int, u: float, v: float) -> float:
+    """Return the depth of a view's surface at a place on its image; 0: none."""
+    own = depth[start + int(v) * width + int(u)]
+    column = min(max(int(np.floor(u - 0.5)), 0), width - 2)
+    row = min(max(int(np.floor(v - 0.5)), 0), height - 2)
+    if width < 2 or height < 2:
+        return own
+    first = start + row * width + column
+    a, b, c, d = depth[first], depth[first + 1], depth[first + width], depth[first + width + 1]
+    least = min(a, b, c, d)
+    if least <= 0 or max(a, b, c, d) > (1 + _ONE_SURFACE) * least:
+        return own
+    # Clamped beyond the outermost pixel centres.
+    right = min(max(u - 0.5 - column, 0.0), 1.0)
+    down = min(max(v - 0.5 - row, 0.0), 1.0)
+    above = (1 - right) / a + right / b
+    below = (1 - right) / c + right / d
+    return 1 / ((1 - down) * above + down * below)
+
+
+@njit(nogil=True, error_model="numpy")
+def _add_view(
+    point: Any,
+    normal: Any,
+    rotation: Any,
+    center: Any,
+    intrinsics: Any,
+    size: Any,
+    start: int,
+    depth: Any,
+    up: Any,
+    tolerance: float,
+    total: Any,
+) -> None:
+    """Add one view to the sums of one point."""
+    x, y, z = 0.0, 0.0, 0.0
+    for k in range(3):
+        d = point[k] - center[k]
+        x += rotation[0, k] * d
+        y += rotation[1, k] * d
+        z += rotation[2, k] * d
+    if z <= _NEAR:
+        return
+    u = intrinsics[0] * x / z + intrinsics[2]
+    v = intrinsics[1] * y / z + intrinsics[3]
+    if not (u >= 0 and u < size[0] and v >= 0 and v < size[1]):
+        return
+    surface = _surface(depth, start, size[0], size[1], u, v)
+    if surface <= 0:
+        return
+    difference = surface - z
+    if difference > tolerance * z:
+        total[_THROUGH] += 1
+    if abs(difference) > tolerance * z:
+        return
+    ratio = difference / z
+    upwards, along, square, length = 0.0, 0.0, 0.0, 0.0
+    for k in range(3):
+        d = point[k] - center[k]
+        residual = ratio * d
+        upwards += residual * up[k]
+        along += residual * normal[k]
+        square += residual * residual
+        length += d * d
+    length = np.sqrt(length)
+    for k in range(3):
+        total[_DIRECTION + k] += (point[k] - center[k]) / length
+    total[_VIEWS] += 1
+    total[_UP] += upwards
+    total[_UP2] += upwards * upwards
+    total[_HORIZONTAL2] += max(square - upwards * upwards, 0.0)
+    total[_Z2] += difference * difference
+    total[_NORMAL] += along
+    total[_NORMAL2] += along * along
+
+
+@njit(nogil=True, error_model="numpy")
+def _sum_block(
+    rows: Any,
+    points: Any,
+    normals: Any,
+    rotations: Any,
+    centers: Any,
+    intrinsics: Any,
+    sizes: Any,
+    starts: Any,
+    depth: Any,
+    up: Any,
+    tolerance: float,
+    sums: Any,
+) -> None:
+    """Add all views to the sums of the points of one block."""
+    low, high = points[rows[0]].copy(), points[rows[0]].copy()
+    for row in rows:
+        for k in range(3):
+            low[k] = min(low[k], points[row, k])
+            high[k] = max(high[k], points[row, k])
+    middle = 0.5 * (low + high)
+    radius = 0.5 * np.sqrt(((high - low) ** 2).sum())
+    for view in range(len(starts)):
+        if not _sees(middle, radius, rotations[view], centers[view], intrinsics[view], sizes[view]):
+            continue
+        for row in rows:
+            _add_view(
+                points[row],
+                normals[row],
+                rotations[view],
+                centers[view],
+                intrinsics[view],
+                sizes[view],
+                starts[view],
+                depth,
+                up,
+                tolerance,
+                sums[row],
+            )
+
+
+@njit(parallel=True, nogil=True, cache=True, error_model="numpy")
+def _sum_support(
+    points: Any,
+    normals: Any,
+    order: Any,
+    rotations: Any,
+    centers: Any,
+    intrinsics: Any,
+    sizes: Any,
+    starts: Any,
+    depth: Any,
+    up: Any,
+    tolerance: float,
+    sums: Any,
+) -> None:
+    """Fill the sums (N, _SUMS) of all points, block by block; `order` puts the points of a block together."""
+    for block in prange((len(order) + _BLOCK - 1) // _BLOCK):
+        rows = order[block * _BLOCK : min((block + 1) * _BLOCK, len(order))]
+        _sum_block(rows, points, normals, rotations, centers, intrinsics, sizes, starts, depth, up, tolerance, sums)
+
+
+LEAST_VIEWS = 3  # as many as must agree on a point of the model's cloud
+_CELL_VOXELS = 1.5  # width of a pixel of the maps on the surface: none stays empty between the points
+_TOLERANCE_VOXELS = 4.0  # a map shows the nearest point of three pixels: on a slope of 45° the others lie behind
+_NEAR_M = 0.1
+_BLOCK_M = 40.0  # side of the blocks of points that a view shows or not
+_UPWARDS = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True)
+class Viewpoints:
+    """Cameras of V photographs in `geo`.
+
+    Attributes:
+        cam_from_geo: (V, 3, 3) rotations.
+        center_in_geo: (V, 3) metres.
+        pinholes: V, of undistorted photographs.
+    """
+
+    cam_from_geo: FloatArray
+    center_in_geo: FloatArray
+    pinholes: tuple[Pinhole, ...]
+
+
+@dataclass(frozen=True)
+class SeenSurface:
+    """Depth maps of a reference from the photographs.
+
+    Attributes:
+        views: the maps.
+        tolerance: largest difference of depths of one surface, as a part of the depth.
+    """
+
+    views: DepthViews
+    tolerance: float
+
+    def sees(self, position_in_geo: FloatArray) -> BoolArray:
+        """Return whether enough photographs saw points (P, 3)."""
+        return np.asarray(support(position_in_geo, self.views, _UPWARDS, self.tolerance).views >= LEAST_VIEWS)
+
+
+def seen_surface(
+    viewpoints: Viewpoints, position_in_geo: FloatArray, voxel_m: float, progress: Progress = SILENT
+) -> SeenSurface:
+    """Return the depth maps of a reference.
+
+    Args:
+        viewpoints: cameras.
+        position_in_geo: (P, 3) points of the reference, one a voxel.
+        voxel_m: side of the voxels.
+        progress: shows the photographs.
+    """
+    blocks = _position_blocks(position_in_geo)
+    maps: list[Float32Array] = []
+    intrinsics, sizes, depths = [], [], []
+    with progress.task("photographs of the reference", len(viewpoints.pinholes)) as task:
+        for rotation, center, pinhole in zip(
+            viewpoints.cam_from_geo, viewpoints.center_in_geo, viewpoints.pinholes, strict=True
+        ):
+            shown = _in_view(blocks, rotation, center, pinhole)
+            depths.append(float(np.median(shown[:, 2])) if len(shown) else np.inf)
+            # Never larger than the photograph, and one pixel if nothing is in view.
+            shrink = float(np.clip(_CELL_VOXELS * voxel_m * pinhole.fx / depths[-1], 1, pinhole.width))
+            coarse = _coarse(pinhole, shrink if len(shown) else float(pinhole.width))
+            maps.append(_depth_map(shown, coarse, pinhole.fx / coarse.fx))
+            intrinsics.append([coarse.fx, coarse.fy, coarse.cx, coarse.cy])
+            sizes.append([coarse.width, coarse.height])
+            task.advance()
+    start = np.concatenate([[0], np.cumsum([depth.size for depth in maps])])[:-1]
+    typical_m = float(np.median(depths))
+    return SeenSurface(
+        DepthViews(
+            viewpoints.cam_from_geo,
+            viewpoints.center_in_geo,
+            np.array(intrinsics),
+            np.array(sizes),
+            start.astype(np.int64),
+            np.concatenate([depth.ravel() for depth in maps]),
+        ),
+        _TOLERANCE_VOXELS * voxel_m / typical_m,
+    )
+
+
+def _position_blocks(position: FloatArray) -> list[tuple[FloatArray, FloatArray, float]]:
+    """Return points by blocks of the plan: the points, the middle and the radius of each block."""
+    cell = np.floor(position[:, :2] / _BLOCK_M).astype(np.int64)
+    order = np.lexsort(cell.T)
+    starts = np.flatnonzero(np.any(np.diff(cell[order], axis=0, prepend=cell[order][:1] - 1), axis=1))
+    parts = [position[rows] for rows in np.split(order, starts[1:])]
+    middles = [(part.min(axis=0) + part.max(axis=0)) / 2 for part in parts]
+    radii = [float(np.linalg.norm(np.ptp(part, axis=0))) / 2 for part in parts]
+    return list(zip(parts, middles, radii, strict=True))
+
+
+def _in_view(
+    blocks: list[tuple[FloatArray, FloatArray, float]],
+    rotation: FloatArray,
+    center: FloatArray,
+    pinhole: Pinhole,
+) -> FloatArray:
+    """Return pixel coordinates and depth (K, 3) of the points in a view."""
+    corner = max(pinhole.cx, pinhole.width - pinhole.cx), max(pinhole.cy, pinhole.height - pinhole.cy)
+    half = np.arctan(np.hypot(corner[0] / pinhole.fx, corner[1] / pinhole.fy))
+    near = []
+    for part, middle, radius in blocks:
+        arm = middle - center
+        distance = float(np.linalg.norm(arm))
+        off = np.arccos(np.clip(rotation[2] @ arm / max(distance, 1e-9), -1, 1))
+        if distance <= radius or off <= half + np.arcsin(min(radius / distance, 1.0)):
+            near.append(part)
+    in_cam = (np.concatenate(near) - center) @ rotation.T if near else np.zeros((0, 3))
+    in_cam = in_cam[in_cam[:, 2] > _NEAR_M]
+    xy = pinhole.project(in_cam)
+    return np.column_stack([xy, in_cam[:, 2]])[pinhole.holds(xy)]
+
+
+def _coarse(pinhole: Pinhole, shrink: float) -> Pinhole:
+    """Return the pinhole of an image that is `shrink` times smaller."""
+    width, height = max(int(np.ceil(pinhole.width / shrink)), 1), max(int(np.ceil(pinhole.height / shrink)), 1)
+    return Pinhole(
+        width, height, pinhole.fx / shrink, pinhole.fy / shrink, pinhole.cx / shrink, pinhole.cy / shrink
+    )
+
+
+def _depth_map(shown: FloatArray, coarse: Pinhole, shrink: float) -> Float32Array:
+    """Return the least depth (H, W) of the points in and beside each pixel; 0: none."""
+    depth = np.full((coarse.height, coarse.width), np.inf, dtype=np.float32)
+    column = np.minimum((shown[:, 0] / shrink).astype(np.int64), coarse.width - 1)
+    row = np.minimum((shown[:, 1] / shrink).astype(np.int64), coarse.height - 1)
+    np.minimum.at(depth, (row, column), shown[:, 2].astype(np.float32))
+    nearest = minimum_filter(depth, size=3, mode="nearest")
+    return np.where(np.isfinite(nearest), nearest, 0).astype(np.float32)

@@ -1,0 +1,243 @@
+"""Product of the division of a survey into blocks: cells in `model`, and what each block trains.
+
+Records of a training in blocks: of one block, and of the merged model with the disagreement of neighbours.
+
+Effort of the scaffold: the coarse model of the whole survey that stands in for the world around a block.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydantic import Field
+
+from pipelines.core.errors import InputError
+from pipelines.core.products import ImageName, Product
+from pipelines.core.types import BoolArray, FloatArray
+
+Bound = tuple[float | None, float | None]
+
+
+class BlockCell(Product):
+    """Vertical prism in `model`, half-open: a point on its western or southern side is inside.
+
+    Attributes:
+        low: east and north of the sides in the west and south, metres; None: without end.
+        high: of the sides in the east and north.
+    """
+
+    low: Bound = (None, None)
+    high: Bound = (None, None)
+
+    def contains(self, points: FloatArray) -> BoolArray:
+        """Return which of points (N, 2 or more), east first, lie inside: a mask (N,)."""
+        inside = np.ones(len(points), dtype=bool)
+        for axis in (0, 1):
+            low, high = self.low[axis], self.high[axis]
+            if low is not None:
+                inside &= points[:, axis] >= low
+            if high is not None:
+                inside &= points[:, axis] < high
+        return inside
+
+    def widened(self, margin_m: ArrayLike) -> BlockCell:
+        """Return the cell with each side moved outwards by the margin (2,), east and north."""
+        margin = np.asarray(margin_m, dtype=np.float64)
+        return BlockCell(low=_moved(self.low, -margin), high=_moved(self.high, margin))
+
+    def cut(self, axis: int, place: float) -> tuple[BlockCell, BlockCell]:
+        """Return the parts below and from a place on an axis (0: east, 1: north)."""
+        below, above = list(self.high), list(self.low)
+        below[axis] = above[axis] = place
+        return BlockCell(low=self.low, high=(below[0], below[1])), BlockCell(
+            low=(above[0], above[1]), high=self.high
+        )
+
+    def common(self, other: BlockCell) -> BlockCell | None:
+        """Return the part that two cells have in common; None: they have none."""
+        if not self.meets(other):
+            return None
+        low = [_outermost(self.low[axis], other.low[axis], max) for axis in (0, 1)]
+        high = [_outermost(self.high[axis], other.high[axis], min) for axis in (0, 1)]
+        return BlockCell(low=(low[0], low[1]), high=(high[0], high[1]))
+
+    def meets(self, other: BlockCell) -> bool:
+        """Return whether the cells have points in common."""
+        bounds = [
+            (low, high)
+            for axis in (0, 1)
+            for low, high in ((self.low[axis], other.high[axis]), (other.low[axis], self.high[axis]))
+        ]
+        return all(low is None or high is None or low < high for low, high in bounds)
+
+
+class PlannedBlock(Product):
+    """Block of the plan.
+
+    Attributes:
+        id: number, from 0.
+        cell: of the Gaussians that the merged model takes from this block.
+        margin_m: width of the overlap beyond the cell, east and north.
+        cameras: training images that see the block.
+        share: of the survey's load that lies in the cell.
+        gaussians: limit of the Gaussians in training, those of the overlap among them.
+        visible: predicted number of the block's Gaussians in a view.
+        view_px: predicted number of the block's pixels in a view.
+        peak_bytes: predicted peak of the memory of the process that trains it.
+    """
+
+    id: int = Field(ge=0)
+    cell: BlockCell
+    margin_m: tuple[float, float]
+    cameras: tuple[ImageName, ...]
+    share: float = Field(ge=0, le=1)
+    gaussians: int = Field(gt=0)
+    visible: float = Field(ge=0)
+    view_px: float = Field(ge=0)
+    peak_bytes: int = Field(ge=0)
+
+    @property
+    def region(self) -> BlockCell:
+        """Cell with its overlap: where the block is trained."""
+        return self.cell.widened(self.margin_m)
+
+
+class BlockPlan(Product):
+    """Division of a survey into blocks, whose cells share the plane out among them.
+
+    Attributes:
+        format_version: version of the format.
+        blocks: in the order of their numbers.
+        gaussians: limit of the Gaussians of the whole.
+        scaffold_gaussians: limit of the Gaussians of the coarse model of the whole.
+        photographs: number of training images.
+        memory_bytes: of a worker, for which the plan was made; None: the number of blocks was given.
+    """
+
+    format_version: Literal[1] = 1
+    blocks: tuple[PlannedBlock, ...] = Field(min_length=1)
+    gaussians: int
+    scaffold_gaussians: int
+    photographs: int
+    memory_bytes: int | None = None
+
+    def block(self, number: int) -> PlannedBlock:
+        """Return the block of a number.
+
+        Raises:
+            InputError: there is no such block.
+        """
+        for block in self.blocks:
+            if block.id == number:
+                return block
+        raise InputError(f"there is no block {number}: the plan has 0 … {len(self.blocks) - 1}", field="--id")
+
+
+def _outermost(one: float | None, other: float | None, choose: Callable[[float, float], float]) -> float | None:
+    """Return one of two bounds; None has no end."""
+    if one is None or other is None:
+        return other if one is None else one
+    return choose(one, other)
+
+
+def _moved(bound: Bound, by: FloatArray) -> Bound:
+    east, north = (None if value is None else value + float(step) for value, step in zip(bound, by, strict=True))
+    return east, north
+
+
+class BlockTraining(Product):
+    """Training of one block, as measured: for the merged product, and to fit the model of time and memory.
+
+    Attributes:
+        id: number of the block.
+        iterations: of the training.
+        gaussians: at its end, those of the overlap among them.
+        gaussians_in_cell: those that the merged model takes.
+        photographs: trained on.
+        seconds: of the iterations.
+        processor_s: of all processors together, for one iteration; None: unknown.
+        mean_gaussians: mean number during the training.
+        mean_visible: mean number in a view, those that stood in for the rest among them.
+        mean_px: mean number of the pixels of a view that were rendered.
+        surroundings: Gaussians that stood in for the rest.
+        peak_bytes: peak of the process's memory; None: not measured on this system.
+        threads: that the training computed with.
+        backend: rasteriser of the training.
+        train_psnr: mean of the last iterations, decibels.
+    """
+
+    id: int = Field(ge=0)
+    iterations: int
+    gaussians: int
+    gaussians_in_cell: int
+    photographs: int
+    seconds: float
+    processor_s: float | None
+    mean_gaussians: float
+    mean_visible: float
+    mean_px: float
+    surroundings: int
+    peak_bytes: int | None
+    threads: int
+    backend: Literal["cpu", "cuda"]
+    train_psnr: float
+
+
+class Seam(Product):
+    """Disagreement of two neighbouring blocks in their overlap, which both have trained.
+
+    Attributes:
+        blocks: their numbers.
+        views: number of the views that were rendered by both.
+        pixels: number of pixels compared.
+        depth_median_m: median of the difference in depth, second less first.
+        depth_nmad_m: 1.4826 × the median absolute deviation of the differences in depth.
+        colour_rms: root mean square of the differences in colour, of colours from 0 to 1.
+    """
+
+    blocks: tuple[int, int]
+    views: int
+    pixels: int
+    depth_median_m: float
+    depth_nmad_m: float
+    colour_rms: float
+
+
+class MergedBlock(Product):
+    """Block of a merged model: its cell in `model`, and its training."""
+
+    cell: BlockCell
+    training: BlockTraining
+
+
+class BlockRecord(Product):
+    """Record of a model that was trained in blocks.
+
+    Attributes:
+        format_version: version of the format.
+        blocks: in the order of their numbers.
+        seams: of neighbours whose overlap some view shows.
+    """
+
+    format_version: Literal[1] = 1
+    blocks: tuple[MergedBlock, ...]
+    seams: tuple[Seam, ...]
+
+
+_SHARE = 0.1
+_MOST = 200_000
+_LEAST = 2_000
+_MOST_IMAGE_PX = 320
+
+
+def scaffold_gaussians(most: int) -> int:
+    """Return the limit of the scaffold's Gaussians for a survey with a limit of `most`."""
+    return min(max(int(_SHARE * most), _LEAST), _MOST, most)
+
+
+def scaffold_image_px(max_image_size: int) -> int:
+    """Return the longest side in pixels of the photographs that the scaffold is trained on."""
+    return min(max_image_size, _MOST_IMAGE_PX)

@@ -1,0 +1,134 @@
+"""Headline of a workspace: its accuracy as measured at check points, else as predicted.
+
+Whoever states the accuracy of a result asks `headline_of`, so that terminal, pages and sidecars state the same.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import dataclass
+from typing import Literal
+
+from pipelines.core.errors import GeorefError
+from pipelines.core.figures import Headline
+from pipelines.core.products import Caution, is_checked
+from pipelines.core.stages import REPORT
+from pipelines.core.workspace import Workspace
+from pipelines.survey.report import (
+    AccuracySummary,
+    CheckPointErrors,
+    EvaluationReport,
+    PointError,
+    PointResidual,
+    PredictedPointError,
+    read_report,
+)
+
+_NOT_CHECKED = "nothing checks the σ of the positions"
+
+
+def headline(triangulated: CheckPointErrors, scene: AccuracySummary, cautions: tuple[Caution, ...]) -> Headline:
+    """Return the accuracy as the check points measure it, else as the σ of the scene predict it.
+
+    Args:
+        triangulated: errors of the triangulated check points; those under vegetation do not count.
+        scene: predicted σ.
+        cautions: of the result; one says whether anything checks the σ.
+    """
+    total = triangulated.with_survey
+    if total is None:
+        return predicted(scene, cautions)
+    count = triangulated.asprs.points
+    return Headline(kind="measured", rmse_h_m=total.rmse_h_m, rmse_v_m=total.rmse_v_m, check_points=count)
+
+
+def predicted(scene: AccuracySummary, cautions: tuple[Caution, ...]) -> Headline:
+    """Return the predicted accuracy: the root mean square of σ over the cells of the scene.
+
+    Without anything that checks the σ of the positions, the accuracy is not known.
+    """
+    if not is_checked(cautions):
+        return Headline(kind="unknown", reason=_NOT_CHECKED)
+    if scene.rms_sigma_h_m is None or scene.rms_sigma_v_m is None:
+        return Headline(kind="unknown", reason=scene.reason or "no σ is predicted")
+    return Headline(kind="predicted", rmse_h_m=scene.rms_sigma_h_m, rmse_v_m=scene.rms_sigma_v_m)
+
+
+def headline_of(workspace: Workspace) -> Headline | None:
+    """Return the accuracy of a workspace: that of its evaluation, else the predicted one; None: neither exists.
+
+    A damaged report states none; `georef status` names it.
+    """
+    with contextlib.suppress(GeorefError):
+        return read_report(workspace.path(REPORT)).headline
+    return predicted_headline(workspace)
+
+
+def predicted_headline(workspace: Workspace) -> Headline | None:
+    """Return the accuracy that the adjustment of the training, else of init-sim3, predicts; None: there is neither.
+
+    A damaged product states none; `georef status` names it.
+    """
+    from pipelines.survey.trained_model import load_solution
+
+    with contextlib.suppress(GeorefError):
+        solution = load_solution(workspace)
+        return None if solution.accuracy is None else predicted(solution.accuracy, solution.cautions)
+    return None
+
+
+Way = Literal["camera", "model", "left out", "fit"]
+
+
+@dataclass(frozen=True)
+class PointLine:
+    """Error of one point, measured in one way.
+
+    Attributes:
+        use: whether the point is a check point or entered the solution.
+        way: triangulated, on the rendered surface, by a solution that left the point out, or as the residual of
+            the fit.
+        row: of the report.
+    """
+
+    use: Literal["check", "control"]
+    way: Way
+    row: PointResidual
+
+    @property
+    def error_m(self) -> tuple[float, float, float] | None:
+        """Error east, north, up; None: the point was not measured."""
+        east, north, up = self.row.de_m, self.row.dn_m, self.row.du_m
+        return None if east is None or north is None or up is None else (east, north, up)
+
+    @property
+    def sigma_m(self) -> tuple[float, float, float] | None:
+        """Predicted σ east, north, up; None: there is no prediction."""
+        row = self.row
+        if not isinstance(row, PredictedPointError):
+            return None
+        east, north, up = row.sigma_e_m, row.sigma_n_m, row.sigma_u_m
+        return None if east is None or north is None or up is None else (east, north, up)
+
+    @property
+    def is_blunder(self) -> bool:
+        """Whether the error exceeds three times the class that the other points meet."""
+        return isinstance(self.row, PointError) and self.row.blunder
+
+
+def point_lines(report: EvaluationReport) -> list[PointLine]:
+    """Return the errors of all points: check points triangulated and on the rendered surface, then control points.
+
+    The residual of a control point is no accuracy; its error in a solution without it is.
+    """
+    crossed = () if report.cross_validation is None else report.cross_validation.points
+    ways = report.checkpoints.by_way
+    return [
+        *(
+            line
+            for rows in zip(*(errors.points for errors in ways.values()), strict=True)
+            for line in (PointLine("check", way, row) for way, row in zip(ways, rows, strict=True))
+        ),
+        *(PointLine("control", "left out", row) for row in crossed),
+        *(PointLine("control", "fit", row) for row in report.fit.gcp.points),
+    ]

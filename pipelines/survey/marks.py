@@ -1,0 +1,180 @@
+"""Image marks of surveyed points as rays. Only here does a mark become a ray, and its σ an angle."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipelines.core.types import BoolArray, FloatArray, IntArray
+from pipelines.geometry.cameras import bearings
+from pipelines.geometry.intersection import Intersections, Rays, UncertainCameras, intersect_rays
+from pipelines.geometry.sparse_model import SparseModel
+from pipelines.survey.survey import SurveyedPoint
+
+
+@dataclass(frozen=True)
+class MarkRays:
+    """K image marks of J surveyed points, in registered images.
+
+    Attributes:
+        point_id: (J,) names of the points, as in the survey.
+        point: (K,) index into the points, ascending.
+        camera: (K,) index into the images of the SfM model.
+        xy_px: (K, 2) pixels of the photograph.
+        bearing_in_cam: (K, 3) unit vectors.
+        sigma_px: (K,) σ of a mark in pixels.
+        sigma_rad: (K,) σ of a mark as an angle: `sigma_px` over the mean focal length.
+    """
+
+    point_id: tuple[str, ...]
+    point: IntArray
+    camera: IntArray
+    xy_px: FloatArray
+    bearing_in_cam: FloatArray
+    sigma_px: FloatArray
+    sigma_rad: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.point)
+
+    @property
+    def xy(self) -> FloatArray:
+        """Ratios x/z and y/z (K, 2) of the rays in the camera."""
+        return np.asarray(self.bearing_in_cam[:, :2] / self.bearing_in_cam[:, 2:])
+
+    @property
+    def marks_of_point(self) -> IntArray:
+        """Number of marks (J,) of each point; no two are in one image."""
+        return np.bincount(self.point, minlength=len(self.point_id)).astype(np.int64)
+
+    def part(self, chosen: BoolArray | IntArray) -> MarkRays:
+        """Return the chosen marks; the points stay the same.
+
+        Args:
+            chosen: (K,) mask, or indices.
+        """
+        return MarkRays(
+            self.point_id,
+            self.point[chosen],
+            self.camera[chosen],
+            self.xy_px[chosen],
+            self.bearing_in_cam[chosen],
+            self.sigma_px[chosen],
+            self.sigma_rad[chosen],
+        )
+
+    def of_points(self, chosen: BoolArray) -> MarkRays:
+        """Return the marks of the chosen points, which are numbered anew.
+
+        Args:
+            chosen: (J,) mask.
+        """
+        rays = self.part(chosen[self.point])
+        number = np.cumsum(chosen) - 1
+        point_id = tuple(name for name, keep in zip(self.point_id, chosen, strict=True) if keep)
+        return MarkRays(
+            point_id,
+            number[rays.point],
+            rays.camera,
+            rays.xy_px,
+            rays.bearing_in_cam,
+            rays.sigma_px,
+            rays.sigma_rad,
+        )
+
+
+def mark_rays(
+    points: Sequence[SurveyedPoint], sparse: SparseModel, images: Iterable[int] | None = None
+) -> MarkRays:
+    """Return the rays of all marks in registered images.
+
+    A mark is left out if the lens maps no ray to its pixel.
+
+    Args:
+        points: J points; their order is kept.
+        sparse: cameras and lenses.
+        images: indices of the images in use; None: all.
+    """
+    index = sparse.image_index()
+    wanted = set(range(len(sparse.image_name))) if images is None else set(map(int, images))
+    rows = [
+        (j, index[mark.image], mark.x_px, mark.y_px, mark.sigma_px)
+        for j, point in enumerate(points)
+        for mark in point.marks
+        if index.get(mark.image) in wanted
+    ]
+    table = np.array(rows, dtype=np.float64).reshape(-1, 5)
+    point, camera = table[:, 0].astype(np.int64), table[:, 1].astype(np.int64)
+    bearing, focal_px = np.full((len(table), 3), np.nan), np.ones(len(table))
+    for image in np.unique(camera):
+        mine = camera == image
+        lens = sparse.camera_of(int(image))
+        bearing[mine], focal_px[mine] = bearings(lens, table[mine, 2:4]), lens.mean_focal_px
+    rays = MarkRays(
+        tuple(point.name for point in points),
+        point,
+        camera,
+        table[:, 2:4],
+        bearing,
+        table[:, 4],
+        table[:, 4] / focal_px,
+    )
+    return rays.part(np.isfinite(bearing).all(axis=1))
+
+
+@dataclass(frozen=True)
+class RayErrors:
+    """Errors of K rays, apart from those of their marks.
+
+    Attributes:
+        sigma_center: σ of a projection centre along each axis, in units of the cameras' frame.
+        sigma_attitude_rad: σ of a camera's attitude about each axis.
+        sigma_lens_rad: (K,) or scalar; added in quadrature to the σ of the marks.
+    """
+
+    sigma_center: float
+    sigma_attitude_rad: float
+    sigma_lens_rad: FloatArray | float = 0.0
+
+
+def intersect_marks(
+    rays: MarkRays, cam_from_frame: FloatArray, center_in_frame: FloatArray, errors: RayErrors
+) -> Intersections:
+    """Intersect the rays of each of the J points, in the frame of the cameras.
+
+    Args:
+        rays: rays of the marks.
+        cam_from_frame: (n, 3, 3) rotations of all images.
+        center_in_frame: (n, 3) projection centres of all images.
+        errors: of cameras and lenses.
+    """
+    count = len(rays)
+    # One view for each mark, because marks of one image may have different σ.
+    views = UncertainCameras(
+        center_in_geo=center_in_frame[rays.camera],
+        rotation_geo_from_cam=np.swapaxes(cam_from_frame[rays.camera], 1, 2),
+        cov_center_in_geo=np.tile(np.eye(3) * errors.sigma_center**2, (count, 1, 1)),
+        sigma_attitude_rad=np.full(count, errors.sigma_attitude_rad),
+        sigma_ray=np.hypot(rays.sigma_rad, errors.sigma_lens_rad),
+    )
+    return intersect_rays(Rays(rays.point, np.arange(count), rays.xy), views, len(rays.point_id))
+
+
+def mark_angles(
+    rays: MarkRays, position_in_frame: FloatArray, cam_from_frame: FloatArray, center_in_frame: FloatArray
+) -> FloatArray:
+    """Return the angles (K,) in radians between the marks and their points; NaN for a point without position.
+
+    Args:
+        rays: rays of the marks.
+        position_in_frame: (J, 3) points.
+        cam_from_frame: (n, 3, 3) rotations of all images.
+        center_in_frame: (n, 3) projection centres of all images.
+    """
+    arm = position_in_frame[rays.point] - center_in_frame[rays.camera]
+    in_cam = np.einsum("kij,kj->ki", cam_from_frame[rays.camera], arm)
+    across = np.linalg.norm(np.cross(rays.bearing_in_cam, in_cam), axis=1)
+    along = np.einsum("ki,ki->k", rays.bearing_in_cam, in_cam)
+    return np.asarray(np.arctan2(across, along))

@@ -1,0 +1,53 @@
+"""Options of clouds of other instruments: path, CRS and datum of the heights.
+
+Options of everything whose coordinates are in a CRS.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
+
+from pipelines.core.options import InputMarker, StageOptions
+from pipelines.geodesy.vertical import Vertical, VerticalChoice
+
+CLOUD_SUFFIXES = frozenset({".las", ".laz", ".ply"})
+NOT_IN_BLOCKS = (
+    "a training in blocks does not use LiDAR: its shift is estimated against the depth maps of all photographs. "
+    "Omit --lidar, or train in one run: `--blocks 1`, with a smaller --max-gaussians or --max-image-size where "
+    "memory is short"
+)
+CloudPath = Annotated[Path, InputMarker(CLOUD_SUFFIXES)]
+
+
+@dataclass(frozen=True)
+class CloudCrs:
+    """CRS of clouds as the user states it; what the files say themselves counts first.
+
+    Attributes:
+        crs: text of the CRS, for files without one.
+        vertical: datum of the heights, where the CRS has no vertical part.
+        flag: option that named the clouds, for errors: `--lidar` has `--lidar-crs` and `--lidar-vertical`.
+    """
+
+    crs: str | None = None
+    vertical: VerticalChoice | None = None
+    flag: str = "--lidar"
+
+
+class CrsOptions(StageOptions):
+    """Options of every file whose coordinates are in a CRS."""
+
+    crs: str | None = Field(
+        None,
+        description="CRS of the file: EPSG:32632, EPSG:32632+3855, a PROJ string or WKT. Without it: the UTM zone "
+        "of the scene.",
+    )
+    vertical: Vertical | None = Field(
+        None,
+        description="Datum of the heights where --crs is silent: ellipsoidal, EGM96, EGM2008 or EPSG:n. Without "
+        "it: that of the survey.",
+    )

@@ -1,0 +1,298 @@
+"""Undistorted photographs at training size, cached as plain arrays on disk and mapped into memory.
+
+Cameras of the undistorted photographs under a lens that has changed since.
+
+Files of the test views: photograph, render and their difference side by side in one PNG.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.core.errors import InputError
+from pipelines.core.files import replacing
+from pipelines.core.progress import SILENT, Progress
+from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray
+from pipelines.formats.image_file import read_bytes, require_unchanged
+from pipelines.geometry.cameras import Camera, Lenses, Pinhole, distort, refit_pinhole, undistort
+
+log = logging.getLogger(__name__)
+
+# Width of the edge that the mask leaves out: interpolation there needs pixels from beyond the photograph.
+_EDGE_PX = 0.5
+_SAME_RAY = 1e-6  # of normalised coordinates
+_BAND_PX = 1_000_000  # pixels whose distortion is computed at once, in two hundred bytes each
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """Photograph to undistort: its name, its file, its camera at full size, and the survey's hash of the file."""
+
+    name: str
+    file: Path
+    camera: Camera
+    sha256: str = ""
+
+
+def pinhole_of(camera: Camera, max_size_px: int) -> Pinhole:
+    """Return the pinhole camera of the same view, its longer side limited to `max_size_px`.
+
+    The focal length is scaled with the size. Distortion parameters are dropped.
+    """
+    return Pinhole(camera.width, camera.height, *_focal_and_centre(camera)).limited(max_size_px)
+
+
+def _focal_and_centre(camera: Camera) -> tuple[float, float, float, float]:
+    p = camera.params
+    one_focal = camera.model.startswith("SIMPLE") or camera.model.startswith("RADIAL")
+    return (p[0], p[0], p[1], p[2]) if one_focal else (p[0], p[1], p[2], p[3])
+
+
+class ImageCache:
+    """Undistorted images on disk: uint8 RGB arrays, made once and mapped into memory on access.
+
+    Memory does not grow with their number. Only the last distortion map stays in memory, until all images are
+    built. Masks, one for each camera, and shrunken images are stored beside the images.
+
+    Args:
+        folder: folder of the arrays.
+        photographs: photographs to undistort, in the order of the indices.
+        max_size_px: limit of the longer side.
+    """
+
+    def __init__(self, folder: Path, photographs: list[Photograph], max_size_px: int) -> None:
+        self._folder = folder
+        self._photographs = photographs
+        self.max_size_px = max_size_px
+        self._last_map: tuple[str, Float32Array, BoolArray] | None = None
+
+    def __len__(self) -> int:
+        return len(self._photographs)
+
+    def pinhole(self, index: int) -> Pinhole:
+        """Return the camera of an undistorted image."""
+        return pinhole_of(self._photographs[index].camera, self.max_size_px)
+
+    def largest(self) -> Pinhole:
+        """Return the camera of the image with the most pixels."""
+        cameras = (self.pinhole(index) for index in range(len(self)))
+        return max(cameras, key=lambda camera: camera.width * camera.height)
+
+    def build(self, progress: Progress = SILENT) -> None:
+        """Make all images that are not yet in the cache.
+
+        Raises:
+            InputError: a photograph cannot be read, is not that of the survey, or has another size than its camera.
+        """
+        with progress.task("undistorting", len(self)) as task:
+            for index in range(len(self)):
+                if not self._path(index).exists():
+                    self._write(index)
+                task.advance()
+        self._last_map = None
+
+    def image(self, index: int) -> ByteArray:
+        """Return the RGB values (H, W, 3) of an image, mapped from disk; a missing or damaged file is made again.
+
+        Raises:
+            InputError: the photograph cannot be read, or has another size than its camera.
+        """
+        return self._mapped(self._path(index), lambda: self._write(index))
+
+    def shrunken(self, index: int, shrink: int) -> ByteArray:
+        """Return the RGB values (H // s, W // s, 3) of a shrunken image, mapped from disk; each is made once.
+
+        Args:
+            index: of the image.
+            shrink: s: each pixel is the mean of s × s pixels.
+
+        Raises:
+            InputError: the photograph cannot be read, or has another size than its camera.
+        """
+        if shrink == 1:
+            return self.image(index)
+
+        def write() -> None:
+            image = self.image(index)
+            height, width = (side // shrink for side in image.shape[:2])
+            blocks = image[: height * shrink, : width * shrink]
+            save_array(path, cv2.resize(blocks, (width, height), interpolation=cv2.INTER_AREA))
+
+        path = self._folder / f"{self.key(index)}.{shrink}.npy"
+        return self._mapped(path, write)
+
+    def _mapped(self, path: Path, write: Callable[[], None]) -> ByteArray:
+        if not path.exists():
+            write()
+        try:
+            return self._open(path)
+        except (ValueError, EOFError):  # truncated by a full disk or a power failure
+            log.warning("%s is damaged and made again", path)
+            write()
+            return self._open(path)
+
+    def mask(self, index: int) -> BoolArray:
+        """Return the mask (H, W) of the pixels that the photograph covers, mapped from disk."""
+        path = self._folder / f"{self.mask_key(index)}.mask.npy"
+        if not path.exists():
+            save_array(path, self._map(index)[1])
+        array: BoolArray = np.load(path, mmap_mode="r", allow_pickle=False)
+        return array
+
+    def mask_key(self, index: int) -> str:
+        """Return the key of an image's mask, which all photographs of one camera share."""
+        camera = self._photographs[index].camera
+        key = f"{camera.model}|{camera.width}x{camera.height}|{camera.params.tobytes().hex()}|{self.max_size_px}"
+        return hashlib.sha256(key.encode()).hexdigest()[:32]
+
+    @staticmethod
+    def _open(path: Path) -> ByteArray:
+        array: ByteArray = np.load(path, mmap_mode="r", allow_pickle=False)
+        return array
+
+    def _path(self, index: int) -> Path:
+        return self._folder / f"{self.key(index)}.npy"
+
+    def key(self, index: int) -> str:
+        """Return the key of an undistorted image: a hash of file name, size, time and content, camera and limit.
+
+        Raises:
+            InputError: the photograph does not exist.
+        """
+        photograph = self._photographs[index]
+        try:
+            stat = photograph.file.stat()
+        except OSError as error:
+            message = f"the photograph cannot be read ({error.strerror}): put it back, or run `georef ingest` again"
+            raise InputError(message, path=photograph.file) from error
+        camera = photograph.camera
+        key = (
+            f"{photograph.name}|{stat.st_size}|{stat.st_mtime_ns}|{camera.model}|{camera.width}x{camera.height}|"
+            f"{camera.params.tobytes().hex()}|{self.max_size_px}|{photograph.sha256}"
+        )
+        return hashlib.sha256(key.encode()).hexdigest()[:32]
+
+    def _write(self, index: int) -> None:
+        photograph, pinhole = self._photographs[index], self.pinhole(index)
+        # COLMAP ignores the EXIF orientation of images, and so must this cache.
+        data = read_bytes(photograph.file)
+        require_unchanged(data, photograph.sha256, photograph.file)
+        flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+        full = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+        if full is None:
+            raise InputError("the photograph cannot be read", path=photograph.file)
+        if (full.shape[1], full.shape[0]) != (photograph.camera.width, photograph.camera.height):
+            raise InputError(
+                f"the photograph is {full.shape[1]}×{full.shape[0]}, its camera "
+                f"{photograph.camera.width}×{photograph.camera.height}",
+                path=photograph.file,
+            )
+        small = cv2.resize(full, (pinhole.width, pinhole.height), interpolation=cv2.INTER_AREA)
+        source, _ = self._map(index)
+        flat = cv2.remap(small, source[..., 0], source[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+        save_array(self._path(index), np.ascontiguousarray(flat[..., ::-1]))
+
+    def _map(self, index: int) -> tuple[Float32Array, BoolArray]:
+        """Return the place (H, W, 2) of each undistorted pixel in the shrunken photograph, and the mask (H, W)."""
+        key = self.mask_key(index)
+        if self._last_map is None or self._last_map[0] != key:
+            self._last_map = (key, *_distortion_map(self._photographs[index].camera, self.pinhole(index)))
+        return self._last_map[1:]
+
+
+def save_array(path: Path, array: NDArray[Any]) -> None:
+    """Write an array to a temporary file, and rename that: the file at `path` is always complete."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draft = path.with_name(f"{path.stem}.{uuid4().hex}.tmp")  # Several processes may make the same file at once.
+    with replacing(path, draft), draft.open("wb") as handle:
+        np.save(handle, array, allow_pickle=False)
+
+
+def _distortion_map(camera: Camera, pinhole: Pinhole) -> tuple[Float32Array, BoolArray]:
+    source = np.empty((pinhole.height, pinhole.width, 2), dtype=np.float32)
+    inside = np.empty((pinhole.height, pinhole.width), dtype=bool)
+    rows = max(1, _BAND_PX // pinhole.width)
+    for top in range(0, pinhole.height, rows):
+        band = slice(top, min(top + rows, pinhole.height))
+        source[band], inside[band] = _distortion_of_rows(camera, pinhole, band)
+    return source, inside
+
+
+def _distortion_of_rows(camera: Camera, pinhole: Pinhole, rows: slice) -> tuple[FloatArray, BoolArray]:
+    u, v = np.meshgrid(np.arange(pinhole.width) + 0.5, np.arange(rows.start, rows.stop) + 0.5)
+    ray = np.stack([(u - pinhole.cx) / pinhole.fx, (v - pinhole.cy) / pinhole.fy], axis=-1)
+    full = distort(camera, ray)
+    # Beyond its fold a lens polynomial leads back into the picture, to the pixel of another ray.
+    with np.errstate(invalid="ignore"):
+        own = (np.abs(undistort(camera, full) - ray) < _SAME_RAY).all(axis=-1)
+    size = np.array([pinhole.width / camera.width, pinhole.height / camera.height])
+    small = full * size
+    limit = np.array([pinhole.width, pinhole.height]) - _EDGE_PX
+    inside = own & ((small >= _EDGE_PX) & (small <= limit)).all(axis=-1)
+    # cv2 counts from the centre of the first pixel, and is slow to reflect pixels far outside.
+    return np.clip(np.nan_to_num(small - 0.5), -limit, 2 * limit), inside
+
+
+class Pinholes:
+    """Pinhole of each image, which maps the rays of the present lens to pixels of the undistorted photograph.
+
+    Photographs are undistorted once, with SfM's lens. A change of the lens is expressed as another pinhole
+    (`geometry.cameras`).
+
+    Args:
+        images: the undistorted photographs.
+        sfm: the lenses with which they were undistorted; None: the lenses never change.
+    """
+
+    def __init__(self, images: ImageCache, sfm: Lenses | None = None) -> None:
+        self._images, self._sfm, self._now = images, sfm, sfm
+        self._fitted: dict[int, Pinhole] = {}
+
+    def renew(self, now: Lenses) -> None:
+        """Set the present lenses of the images."""
+        self._now = now
+        self._fitted.clear()
+
+    def of(self, index: int) -> Pinhole:
+        """Return the camera of an image, at the size of the undistorted photographs."""
+        if self._sfm is None or self._now is None:
+            return self._images.pinhole(index)
+        key = int(self._sfm.camera_id[index])  # Photographs of one camera share a pinhole.
+        if key not in self._fitted:
+            before, after = self._sfm.of(index), self._now.of(index)
+            self._fitted[key] = refit_pinhole(self._images.pinhole(index), before, after)
+        return self._fitted[key]
+
+
+DIFFERENCE_GAIN = 3
+_LONGEST_NAME_BYTES = 255
+
+
+def write_render(folder: Path, image: str, strip: ByteArray) -> None:
+    """Write a photograph beside its render as PNG.
+
+    Args:
+        folder: of the PNG.
+        image: name of the photograph.
+        strip: (H, W, 3) RGB: the photograph, its render, their difference, with labels above.
+    """
+    _, png = cv2.imencode(".png", np.ascontiguousarray(strip[..., ::-1]))  # `imwrite` reports no full disk
+    (folder / render_name(image)).write_bytes(png.tobytes())
+
+
+def render_name(image: str) -> str:
+    """Return the file name of an image's render: its folders and name, or their hash beyond 255 bytes."""
+    name = Path(image).with_suffix(".png").as_posix().replace("/", "_")
+    if len(name.encode()) <= _LONGEST_NAME_BYTES:
+        return name
+    return f"{hashlib.sha256(name.encode()).hexdigest()[:32]}.png"

@@ -1,0 +1,443 @@
+"""Product of `evaluate`: quality and accuracy of a trained survey, stored as `evaluate/report.json`.
+
+Lengths are metres, axes those of `geo` (east, north, up). An error is the measured minus the surveyed position. A
+figure that does not exist, such as a mean over no points, is None. docs/formats.md explains every field.
+
+Errors of a report point by point, in one list for tables, files and pictures.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import SerializerFunctionWrapHandler, model_serializer, model_validator
+
+from pipelines.core.errors import InputError
+from pipelines.core.figures import Headline
+from pipelines.core.products import Caution, ImageName, Product, dump_json, load_json
+from pipelines.core.types import Vector3
+from pipelines.robust.statistics import ResidualStats
+from pipelines.survey.report_parts import ReferenceComparison, VarianceFactor
+
+
+class _OptionalKeys(Product):
+    """Base of parts with optional keys: a field with the default None is written only if it has a value."""
+
+    @model_serializer(mode="wrap")
+    def _existing_keys(self, serialise: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        fields = type(self).model_fields
+        document: dict[str, Any] = serialise(self)
+        return {key: value for key, value in document.items() if value is not None or fields[key].is_required()}
+
+
+class ViewFigures(Product):
+    """Photometric figures of one test view: PSNR in dB, SSIM, LPIPS.
+
+    Attributes:
+        covered_share: share of the pixels whose ground at least two training views show; None: not known.
+        psnr_covered: PSNR over these pixels; None: there are none.
+    """
+
+    image: ImageName
+    psnr: float
+    psnr_compensated: float
+    ssim: float
+    lpips: float | None
+    covered_share: float | None = None
+    psnr_covered: float | None = None
+
+
+class PhotometricFigures(_OptionalKeys):
+    """Photometric figures of all test views: means, and the figures of each view.
+
+    Attributes:
+        views: number of test views.
+        psnr: dB.
+        psnr_compensated: dB, after an affine change of colour that is fitted to each photograph.
+        psnr_covered: dB, over the pixels whose ground at least two training views show, mean over the views that
+            have any.
+        covered_share: share of these pixels, mean over the views.
+        ssim: structural similarity.
+        lpips: perceptual distance; None without weights of the network.
+        lpips_reason: reason why there is no LPIPS.
+        per_view: figures of each view.
+    """
+
+    views: int
+    psnr: float | None
+    psnr_compensated: float | None
+    ssim: float | None
+    lpips: float | None
+    lpips_reason: str | None = None
+    psnr_covered: float | None = None
+    covered_share: float | None = None
+    per_view: tuple[ViewFigures, ...]
+
+
+class Photometric(Product):
+    """Photometric figures by split."""
+
+    test: PhotometricFigures
+
+
+class ErrorStats(Product):
+    """Figures of errors; `mean_e_m`, `mean_n_m`, `mean_u_m` are signed (the bias), all others are lengths."""
+
+    count: int
+    mean_e_m: float | None
+    mean_n_m: float | None
+    mean_u_m: float | None
+    mean_h_m: float | None
+    median_h_m: float | None
+    rmse_e_m: float | None
+    rmse_n_m: float | None
+    rmse_h_m: float | None
+    rmse_v_m: float | None
+    rmse_3d_m: float | None
+    max_h_m: float | None
+    max_v_m: float | None
+    max_3d_m: float | None
+
+
+class Rmse(Product):
+    """Horizontal (east and north together) and vertical root mean square."""
+
+    rmse_h_m: float
+    rmse_v_m: float
+
+
+class TotalRmse(Rmse):
+    """Horizontal, vertical and three-dimensional root mean square."""
+
+    rmse_3d_m: float
+
+
+class VegetatedAccuracy(Product):
+    """Vertical accuracy under vegetation (VVA), the points' own survey included; the standard gives it no class."""
+
+    count: int
+    rmse_v_m: float
+
+
+class AsprsStatement(Product):
+    """Accuracy classes of the ASPRS standard, edition 2, version 2 (2024).
+
+    Attributes:
+        points: number of check points outside vegetation: horizontal, vertical (NVA) and 3-D accuracy are theirs.
+        horizontal_class, vertical_class, class_3d: smallest classes of whole centimetres that the errors meet
+            ("5 cm"); None without these points.
+        vegetated: vertical accuracy under vegetation; None: no such point.
+        area_km2: of the scene, by which the standard counts; None: not known.
+        least_points: number of check points that the standard demands for this area.
+        enough_points: whether there are that many.
+        statement: sentence to quote; None without check points.
+    """
+
+    points: int
+    horizontal_class: str | None
+    vertical_class: str | None
+    class_3d: str | None
+    vegetated: VegetatedAccuracy | None
+    area_km2: float | None
+    least_points: int
+    enough_points: bool
+    statement: str | None
+
+
+class ByAxis(Product):
+    """Figure by axis: east, north, up."""
+
+    e: float | None
+    n: float | None
+    u: float | None
+
+
+class RmsSigma(Product):
+    """Root mean square of σ over `count` points, horizontal and vertical."""
+
+    count: int
+    rms_h_m: float | None
+    rms_v_m: float | None
+
+
+class PredictedSigma(RmsSigma):
+    """Predicted σ, and its test against the errors.
+
+    Attributes:
+        normalised_error_squared: mean of error² / (predicted + survey variance); 1 if both variances are true.
+    """
+
+    normalised_error_squared: ByAxis
+
+
+class PointResidual(Product):
+    """Error of a surveyed point.
+
+    Attributes:
+        name: as in the survey.
+        rays: number of marks in registered images.
+        de_m, dn_m, du_m: error; None: not measured.
+    """
+
+    name: str
+    rays: int
+    de_m: float | None
+    dn_m: float | None
+    du_m: float | None
+
+
+class PointError(PointResidual):
+    """Error of a point that entered no solution.
+
+    Attributes:
+        blunder: whether the error exceeds three times the class that the other points meet.
+    """
+
+    blunder: bool
+
+
+class PredictedPointError(PointError):
+    """Error of a point that entered no solution, with its predicted σ.
+
+    Attributes:
+        sigma_e_m, sigma_n_m, sigma_u_m: None: the rays do not determine the point.
+    """
+
+    sigma_e_m: float | None
+    sigma_n_m: float | None
+    sigma_u_m: float | None
+
+
+PointRows = tuple[PredictedPointError | PointError, ...]
+
+
+class StatedErrors(ErrorStats):
+    """Figures of errors, with those of the survey.
+
+    Attributes:
+        survey: σ of the points' own survey.
+        with_survey: errors and survey in quadrature.
+
+    Points under vegetation count in the errors alone, and neither in `survey` nor in `with_survey`.
+    """
+
+    survey: Rmse | None
+    with_survey: TotalRmse | None
+
+
+class CheckPointErrors(StatedErrors):
+    """Errors of the check points, measured in one way.
+
+    Attributes:
+        asprs: accuracy classes.
+        without_blunders: figures without the blunders; None: there are none.
+        blunders: names of the points that are blunders.
+        predicted: predicted σ; None where no prediction exists.
+        points: one row for each point.
+    """
+
+    asprs: AsprsStatement
+    without_blunders: ErrorStats | None
+    blunders: tuple[str, ...]
+    predicted: PredictedSigma | None
+    points: PointRows
+
+
+class CheckPoints(Product):
+    """Check points, triangulated (`camera`) and on the rendered surface behind their marks (`model`).
+
+    Without training, `model` is None.
+    """
+
+    camera: CheckPointErrors
+    model: CheckPointErrors | None
+
+    @property
+    def by_way(self) -> dict[Literal["camera", "model"], CheckPointErrors]:
+        """Errors by the way in which the points were measured."""
+        return {"camera": self.camera} if self.model is None else {"camera": self.camera, "model": self.model}
+
+
+class CrossValidation(StatedErrors):
+    """Errors of the control points, each measured by a solution without that point.
+
+    Attributes:
+        without_blunders: figures without the blunders; None: there are none.
+        blunders: names of the points that are blunders.
+        predicted: predicted σ.
+        points: one row for each point.
+        reason: reason why there are no errors, else None.
+    """
+
+    without_blunders: ErrorStats | None
+    blunders: tuple[str, ...]
+    predicted: PredictedSigma | None
+    points: PointRows
+    reason: str | None
+
+
+class AccuracySummary(_OptionalKeys):
+    """Predicted σ over the cells of the scene.
+
+    Attributes:
+        cells: number of cells.
+        cell_m: side of a cell.
+        least_sigma_h_m, median_sigma_h_m, largest_sigma_h_m: horizontal.
+        least_sigma_v_m, median_sigma_v_m, largest_sigma_v_m: vertical.
+        rms_sigma_h_m, rms_sigma_v_m: root mean square, the RMSE that the prediction lets expect.
+        reason: reason why there are no cells, else None.
+    """
+
+    cells: int
+    cell_m: float | None = None
+    least_sigma_h_m: float | None = None
+    median_sigma_h_m: float | None = None
+    largest_sigma_h_m: float | None = None
+    least_sigma_v_m: float | None = None
+    median_sigma_v_m: float | None = None
+    largest_sigma_v_m: float | None = None
+    rms_sigma_h_m: float | None = None
+    rms_sigma_v_m: float | None = None
+    reason: str | None
+
+
+class FixResiduals(ResidualStats):
+    """Residuals of the training cameras' fixes; `outliers` is the number of those left out."""
+
+    outliers: int
+
+
+class ControlResiduals(ResidualStats):
+    """Residuals of the control points: figures of the used ones; `outliers` is the number of the others."""
+
+    outliers: int = 0
+    points: tuple[PointResidual, ...]
+
+
+class Fit(Product):
+    """Residuals of the observations that entered the solution. These are no accuracy."""
+
+    gnss: FixResiduals
+    gcp: ControlResiduals
+
+
+class SimilaritySigma(Product):
+    """σ of the trained similarity: of ln(scale), and of the translation along east, north, up."""
+
+    sigma_ln_scale: float
+    sigma_translation_m: Vector3
+
+
+class PointCoordinates(Product):
+    """Coordinates of a check point in a CRS, as surveyed and as measured; None: not measured."""
+
+    name: str
+    surveyed: Vector3
+    camera: Vector3 | None
+    model: Vector3 | None
+
+
+class Coordinates(Product):
+    """Check points and origin of `geo` in a CRS: easting or longitude first, height last.
+
+    Attributes:
+        crs: name of the CRS.
+        units: of the three coordinates.
+        heights: surface that the heights count from.
+        operation: published operation between WGS84 and the CRS.
+        operation_accuracy_m: its accuracy; None: not known.
+        origin: origin of `geo`.
+        points: the check points.
+    """
+
+    crs: str
+    units: tuple[str, str, str]
+    heights: str
+    operation: str
+    operation_accuracy_m: float | None
+    origin: Vector3
+    points: tuple[PointCoordinates, ...]
+
+    def texts(self, xyz: Vector3 | None) -> tuple[str, str, str]:
+        """Return coordinates as texts to a tenth of a millimetre; empty ones for None."""
+        if xyz is None:
+            return "", "", ""
+        first, second, third = (
+            f"{value:.{9 if 'degree' in unit or 'grad' in unit else 4}f}"
+            for value, unit in zip(xyz, self.units, strict=True)
+        )
+        return first, second, third
+
+
+class EvaluationReport(_OptionalKeys):
+    """Product of `evaluate`.
+
+    Attributes:
+        format_version: version of the format.
+        headline: accuracy of the result, as every table and file states it.
+        photometric: figures of the test views; None: nothing is trained yet.
+        checkpoints: errors of the check points.
+        cross_validation: errors of the control points; None without `--cross-validate`.
+        accuracy: predicted σ over the scene.
+        fit: residuals of the solution.
+        cameras: predicted σ of the camera positions; None: nothing checks it.
+        similarity: σ of the similarity.
+        coordinates: check points in the CRS of `--crs`; absent without it.
+        reference: comparison of the surface with a reference cloud; absent without `--reference`.
+        variance_factors: tests of the stated σ.
+        cautions: limits of the result: those of the model, then those that `evaluate` found.
+    """
+
+    format_version: Literal[1] = 1
+    headline: Headline
+    photometric: Photometric | None
+    checkpoints: CheckPoints
+    cross_validation: CrossValidation | None
+    accuracy: AccuracySummary
+    fit: Fit
+    cameras: RmsSigma | None
+    similarity: SimilaritySigma
+    coordinates: Coordinates | None = None
+    reference: ReferenceComparison | None = None
+    variance_factors: tuple[VarianceFactor, ...] = ()
+    cautions: tuple[Caution, ...] = ()
+
+    @property
+    def test_views(self) -> PhotometricFigures | None:
+        """Figures of the test views; None: nothing is trained yet."""
+        return None if self.photometric is None else self.photometric.test
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_cautions_in_one_list(cls, document: Any) -> Any:
+        """Read a report from before cautions had codes: `accuracy` held the limits of the prediction as text."""
+        accuracy = document.get("accuracy") if isinstance(document, dict) else None
+        if not isinstance(accuracy, dict) or "cautions" not in accuracy:
+            return document
+        texts = accuracy["cautions"] if isinstance(accuracy["cautions"], list) else [accuracy["cautions"]]
+        return {
+            **document,
+            "accuracy": {name: value for name, value in accuracy.items() if name != "cautions"},
+            "cautions": [{"code": "prediction-limited", "sentence": text} for text in texts],
+        }
+
+
+def write_report(report: EvaluationReport, path: Path) -> None:
+    """Write a report as JSON."""
+    path.write_text(dump_json(report.model_dump(mode="json")) + "\n", encoding="utf-8")
+
+
+def read_report(path: Path) -> EvaluationReport:
+    """Return the report at `path`.
+
+    Raises:
+        InputError: the file cannot be read or is no report; names the field at fault.
+    """
+    try:
+        return load_json(EvaluationReport, path)
+    except InputError as error:
+        if not isinstance(error.__cause__, ValueError):  # The file cannot be read: its content is not at fault.
+            raise
+        message = "not a report: make it again with `georef evaluate --force`"
+        raise InputError(message, path=path, field=error.field) from error

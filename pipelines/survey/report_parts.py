@@ -1,0 +1,320 @@
+"""Comparison of the model's surface with a reference cloud: part of `evaluate/report.json`. Lengths are metres.
+
+Record of the LiDAR that a training has used: `train/lidar.json`.
+
+Variance factors of a survey's measurements: tests of the stated σ, and the survey with σ that passed them.
+
+Estimated systematic error of the measurements: part of the adjustment.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from pipelines.core.products import Covariance3, Product
+from pipelines.core.types import Matrix3, Matrix34, Vector3
+from pipelines.survey.survey import Survey, SurveyedPoint, SurveyImage
+
+Alignment = Literal["none", "shift", "similarity"]
+
+
+class SurfaceScore(Product):
+    """Shares of points that lie within a distance of the other cloud; None: there are no points.
+
+    Attributes:
+        threshold_m: the distance.
+        precision: of the model's points, where the reference covers the plan.
+        recall: of the reference's points that photographs saw.
+        f1: their harmonic mean.
+    """
+
+    threshold_m: float
+    precision: float | None
+    recall: float | None
+    f1: float | None
+
+
+class M3c2Figures(Product):
+    """Distances model minus reference along the reference's normals (M3C2), positive on the cameras' side.
+
+    Attributes:
+        core_points: places on the reference that photographs saw.
+        measured: places at which both clouds have points within the cylinder.
+        median_m, mean_m: signed.
+        nmad_m: 1.4826 times the median absolute deviation from the median.
+        rmse_m: root mean square.
+        abs_95_m: 95 % of the distances are shorter.
+        median_lod_m: median level of detection, 95 %.
+        significant: share of the distances beyond their level of detection.
+    """
+
+    core_points: int
+    measured: int
+    median_m: float | None
+    mean_m: float | None
+    nmad_m: float | None
+    rmse_m: float | None
+    abs_95_m: float | None
+    median_lod_m: float | None
+    significant: float | None
+
+
+class CloudDistances(Product):
+    """Distances of the model's points from the nearest point of the reference (C2C), to the millimetre.
+
+    Attributes:
+        count: points of the model where the reference covers the plan.
+        median_m, mean_m, abs_95_m: of the distances; those beyond 2 m count as 2 m.
+    """
+
+    count: int
+    median_m: float | None
+    mean_m: float | None
+    abs_95_m: float | None
+
+
+class ReferenceGroup(Product):
+    """Figures of one part of the surface.
+
+    Attributes:
+        name: `all`; a class (`ground`, `roof`, `wall`, `vegetation`, `other`); or a range of slopes.
+        kind: of the name.
+        seen_points: points of the reference that photographs saw.
+        m3c2, c2c, scores: distances and shares.
+    """
+
+    name: str
+    kind: Literal["all", "class", "slope"]
+    seen_points: int
+    m3c2: M3c2Figures
+    c2c: CloudDistances
+    scores: tuple[SurfaceScore, ...]
+
+
+class ReferenceShift(Product):
+    """Translation that moves the model onto the reference best, by points and planes.
+
+    Attributes:
+        enu_m: east, north, up.
+        sigma_m: their σ, from the spread between parts of the scene.
+        scale_ppm, turn_deg: of the similarity; 0 for a shift.
+        reference_from_model: rows of the matrix [sR | t] in geo.
+        points: that decide.
+    """
+
+    enu_m: Vector3
+    sigma_m: Vector3
+    scale_ppm: float
+    turn_deg: float
+    reference_from_model: Matrix34
+    points: int
+
+
+class ReferenceComparison(Product):
+    """Comparison of the surface with a reference cloud.
+
+    Attributes:
+        name: of the file or folder.
+        crs: of the reference.
+        points: of the reference within the scene, after thinning.
+        seen: share of them that photographs saw.
+        spacing_m: median distance between neighbours in the reference.
+        model_points: of the model's cloud.
+        model_spacing_m: side of its voxels.
+        sigma_m: stated σ of the reference.
+        georeference_sigma_m: median predicted σ of the georeference along the normals; None: not known, and the
+            level of detection does not hold it.
+        shift: of the model against the reference.
+        aligned: whether that was removed before the comparison.
+        cylinder_m: radius of the cylinders of M3C2.
+        groups: figures of the whole, of classes and of slopes.
+    """
+
+    name: str
+    crs: tuple[str, ...]
+    points: int
+    seen: float
+    spacing_m: float
+    model_points: int
+    model_spacing_m: float
+    sigma_m: float
+    georeference_sigma_m: float | None
+    shift: ReferenceShift | None
+    aligned: Alignment
+    cylinder_m: float
+    groups: tuple[ReferenceGroup, ...]
+
+    def group(self, name: str) -> ReferenceGroup:
+        """Return the figures of a part of the surface."""
+        return next(group for group in self.groups if group.name == name)
+
+
+class LidarArea(Product):
+    """Area where the LiDAR and the photographs contradict each other.
+
+    Attributes:
+        kind: `removed`: the photographs look through the LiDAR's points; `added`: they show a surface above them.
+        area_m2: in plan.
+        points: of the thinned cloud.
+        center_in_geo: mean of these points.
+        lat_deg, lon_deg: of that mean.
+    """
+
+    kind: Literal["removed", "added"]
+    area_m2: float
+    points: int
+    center_in_geo: Vector3
+    lat_deg: float
+    lon_deg: float
+
+
+class LidarRegistration(Product):
+    """Shift of the LiDAR against the surface of the photographs, axes of geo.
+
+    Attributes:
+        shift_m: LiDAR minus photographs.
+        sigma_m: of the shift: comparison, georeference and stated σ of the LiDAR.
+        sigma_comparison_m: of the comparison alone.
+        points: compared, on planes.
+        spread_m: robust σ of the distances that remain.
+        wall_bias_m: surface of stereo outside the LiDAR's walls.
+        removed: whether the shift was taken out, by `--lidar-register`.
+    """
+
+    shift_m: Vector3
+    sigma_m: Vector3
+    sigma_comparison_m: Vector3
+    points: int
+    spread_m: float
+    wall_bias_m: float
+    removed: bool
+
+
+class LidarReport(Product):
+    """LiDAR of a training.
+
+    Attributes:
+        crs: names of the files' CRSs.
+        read, noise, withheld, overlap, outside: numbers of points read, and dropped by reason.
+        points: that remain after thinning.
+        voxel_m: distance between them, about.
+        registration: check against the photographs.
+        rejected_share: of the points, which contradict the photographs.
+        confidence: median over the points.
+        areas: that have changed, the largest first.
+        assumptions: what the files do not say.
+    """
+
+    format_version: Literal[1] = 1
+    crs: tuple[str, ...]
+    read: int
+    noise: int
+    withheld: int
+    overlap: int
+    outside: int
+    points: int
+    voxel_m: float
+    registration: LidarRegistration
+    rejected_share: float
+    confidence: float
+    areas: tuple[LidarArea, ...]
+    assumptions: tuple[str, ...] = ()
+
+
+Group = Literal["fixes", "control points", "marks", "attitudes", "tie points"]
+SigmaSource = Literal["stated", "default"]
+
+
+class VarianceFactor(Product):
+    """Test of the stated σ of one group of measurements, after a least-squares adjustment.
+
+    Attributes:
+        group: kind of measurement.
+        count: number of measurements in the group.
+        used: number of them in the test; the others are outliers.
+        redundancy: degrees of freedom of the test.
+        estimated: estimated factor of the stated variance; None without redundancy.
+        probability: probability of a larger factor if the stated σ are right; 1 without redundancy.
+        applied: factor by which the variance was multiplied.
+        sigma_source: whether σ was stated, or is a default that nobody stated.
+    """
+
+    group: Group
+    count: int
+    used: int
+    redundancy: float
+    estimated: float | None
+    probability: float
+    applied: float
+    sigma_source: SigmaSource
+
+
+def applied_factors(factors: tuple[VarianceFactor, ...]) -> dict[Group, float]:
+    """Return the applied factor by group, groups without one left out."""
+    return {factor.group: factor.applied for factor in factors if factor.applied != 1.0}
+
+
+def with_variance_factors(survey: Survey, applied: dict[Group, float]) -> Survey:
+    """Return the survey with the covariances of each group multiplied by its factor.
+
+    The σ of marks applies to check points too: the same person marks both. The surveyed positions of the check
+    points keep their covariance.
+    """
+    if not applied:
+        return survey
+    of_marks = applied.get("marks", 1.0)
+    return survey.model_copy(
+        update={
+            "images": tuple(_image(image, applied) for image in survey.images),
+            "control_points": tuple(
+                _point(point, applied.get("control points", 1.0), of_marks) for point in survey.control_points
+            ),
+            "check_points": tuple(_point(point, 1.0, of_marks) for point in survey.check_points),
+        }
+    )
+
+
+def _image(image: SurveyImage, applied: dict[Group, float]) -> SurveyImage:
+    fix, attitude = image.fix, image.attitude
+    if fix is not None:
+        fix = fix.model_copy(update={"cov_in_geo": _scaled(fix.cov_in_geo, applied.get("fixes", 1.0))})
+    if attitude is not None:
+        sigma_deg = attitude.sigma_deg * applied.get("attitudes", 1.0) ** 0.5
+        attitude = attitude.model_copy(update={"sigma_deg": sigma_deg})
+    return image.model_copy(update={"fix": fix, "attitude": attitude})
+
+
+def _point(point: SurveyedPoint, of_survey: float, of_marks: float) -> SurveyedPoint:
+    marks = tuple(mark.model_copy(update={"sigma_px": mark.sigma_px * of_marks**0.5}) for mark in point.marks)
+    return point.model_copy(update={"cov_in_geo": _scaled(point.cov_in_geo, of_survey), "marks": marks})
+
+
+def _scaled(covariance: Covariance3, factor: float) -> Matrix3:
+    first, second, third = (factor * np.array(covariance)).tolist()
+    return (tuple(first), tuple(second), tuple(third))
+
+
+class EstimatedError(Product):
+    """Systematic error of the measurements that the adjustment estimated, with its σ, by axis.
+
+    Attributes:
+        name: `bias`: fix minus truth, east, north, up, in m. `lever-arm`: antenna seen from the camera beyond the
+            arm that the survey has applied, camera axes, in m. `boresight`: rotation vector from the true to the
+            nominal camera axes, in degrees. `lidar-shift`: LiDAR minus its true place, east, north, up, in m.
+        session: of a bias: index into the survey's sessions.
+        unit: of `value` and `sigma`.
+        value: the estimate.
+        sigma: its σ.
+        prior: σ of its prior.
+        observed: σ is at most half of that of the prior.
+    """
+
+    name: Literal["bias", "lever-arm", "boresight", "lidar-shift"]
+    session: int | None = None
+    unit: Literal["m", "deg"]
+    value: Vector3
+    sigma: Vector3
+    prior: Vector3
+    observed: tuple[bool, bool, bool]

@@ -1,0 +1,188 @@
+"""Scene of training and evaluation: cameras, points and photographs in the frame `model`.
+
+The frame `model` has the axes and the metre of `geo`. Its origin lies near the scene, so that float32 resolves
+fractions of a millimetre. `model_from_local`, its relation to the SfM frame, is fixed when training starts.
+Training refines `geo_from_model`, its relation to the Earth.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from pipelines.core.errors import DegenerateGeometryError, InputError
+from pipelines.core.plan import photograph_folder
+from pipelines.core.products import load_json
+from pipelines.core.stages import ADJUSTMENT, SIM3, SPARSE
+from pipelines.core.types import FloatArray, IntArray
+from pipelines.core.workspace import Workspace
+from pipelines.formats.colmap import read_sparse
+from pipelines.geometry.bundle import BundleInformation, Network, bundle_information
+from pipelines.geometry.cameras import CameraPoses
+from pipelines.geometry.correction_basis import CorrectionBasis, basis_of, correction_basis
+from pipelines.geometry.similarity import Similarity
+from pipelines.geometry.sparse_model import SparseModel
+from pipelines.survey.adjustment import InitialSimilarity
+from pipelines.survey.calibrated import load_survey
+from pipelines.survey.photographs import ImageCache, Photograph
+from pipelines.survey.survey import Survey
+from pipelines.survey.trained_model import Adjustment
+
+
+@dataclass(frozen=True)
+class Scene:
+    """n registered cameras and N points in `model`.
+
+    Attributes:
+        sparse: the SfM model (frame `local`).
+        model_from_local: similarity that stays fixed.
+        geo_from_model: initial estimate, a pure shift.
+        train, test: indices of the cameras in each split.
+    """
+
+    sparse: SparseModel
+    model_from_local: Similarity
+    geo_from_model: Similarity
+    train: IntArray
+    test: IntArray
+
+    @cached_property
+    def poses(self) -> CameraPoses:
+        """Cameras of the SfM model, in `model`."""
+        turn = self.model_from_local.rotation
+        return CameraPoses(
+            self.sparse.rotation_cam_from_local @ turn.T,
+            self.model_from_local.apply(self.sparse.cam_center_in_local),
+        )
+
+    def of_images(self, images: IntArray) -> Scene:
+        """Return the scene of some cameras (K,), in ascending order, in the same frame."""
+        rows = np.unique(images)
+        train, test = (np.searchsorted(rows, np.intersect1d(split, rows)) for split in (self.train, self.test))
+        return replace(self, sparse=self.sparse.of_images(rows), train=train, test=test)
+
+    @cached_property
+    def point_in_model(self) -> FloatArray:
+        """Points of the SfM model (N, 3), metres in `model`."""
+        return self.model_from_local.apply(self.sparse.point_in_local)
+
+    @cached_property
+    def network(self) -> Network:
+        """Cameras, points and image observations of the SfM model, in `model`."""
+        sparse, poses = self.sparse, self.poses
+        return Network(
+            sparse.cameras,
+            sparse.image_camera_id,
+            poses.cam_from_model,
+            poses.cam_center_in_model,
+            self.point_in_model,
+            sparse.obs_point,
+            sparse.obs_image,
+            sparse.obs_xy_px,
+        )
+
+    @cached_property
+    def bundle(self) -> BundleInformation:
+        """Information of the image observations on the cameras, which the lens follows."""
+        return bundle_information(self.network)
+
+    def with_bundle(self, bundle: BundleInformation) -> Scene:
+        """Return the same scene, whose bundle is known already."""
+        same = replace(self)
+        same.__dict__["bundle"] = bundle
+        return same
+
+    @cached_property
+    def correction_basis(self) -> CorrectionBasis:
+        """Whitened corrections of the cameras, which the lens follows. Memory is quadratic in their number."""
+        return basis_of(self.bundle)
+
+    @cached_property
+    def correction_basis_through_sfm_lens(self) -> CorrectionBasis:
+        """Whitened corrections of the cameras under a lens that stays."""
+        return correction_basis(self.network, lens_follows=False)
+
+
+def make_scene(sparse: SparseModel, survey: Survey, model_from_local: Similarity, shift: FloatArray) -> Scene:
+    """Return the scene of a sparse model.
+
+    Args:
+        sparse: the SfM model.
+        survey: has the split into training and test images.
+        model_from_local: similarity from the SfM frame.
+        shift: (3,) origin of the frame `model` in `geo`.
+
+    Raises:
+        DegenerateGeometryError: fewer than two registered training images.
+    """
+    index = sparse.image_index()
+    train = np.array([index[name] for name in survey.names("train") if name in index], dtype=np.int64)
+    test = np.array([index[name] for name in survey.names("test") if name in index], dtype=np.int64)
+    if len(train) < 2:
+        raise DegenerateGeometryError(f"{len(train)} registered training images are too few to train on")
+    return Scene(sparse, model_from_local, Similarity(translation=shift), train, test)
+
+
+def initial_scene(sparse: SparseModel, survey: Survey, initial: InitialSimilarity) -> Scene:
+    """Return the scene at the start of training, its origin at the median SfM point, rounded to a metre.
+
+    Raises:
+        DegenerateGeometryError: fewer than two registered training images.
+    """
+    geo_from_local = Similarity.from_record(initial.geo_from_local)
+    shift = np.round(np.median(geo_from_local.apply(sparse.point_in_local), axis=0))
+    model_from_local = replace(geo_from_local, translation=geo_from_local.translation - shift)
+    return make_scene(sparse, survey, model_from_local, shift)
+
+
+def adjusted_scene(sparse: SparseModel, survey: Survey, adjustment: Adjustment) -> Scene:
+    """Return the scene in the frame of an adjustment; `geo_from_model` is the pure shift that comes nearest to it.
+
+    Raises:
+        DegenerateGeometryError: fewer than two registered training images.
+    """
+    model_from_local = Similarity.from_record(adjustment.model_from_local)
+    middle = np.median(model_from_local.apply(sparse.point_in_local), axis=0)
+    return make_scene(sparse, survey, model_from_local, adjustment.similarity.apply(middle) - middle)
+
+
+def load_adjusted_scene(
+    workspace: Workspace, product: str = ADJUSTMENT
+) -> tuple[InitialSimilarity, Adjustment, Survey, Scene]:
+    """Read the initial similarity, the adjustment, the survey with its variance factors, and the scene.
+
+    Args:
+        workspace: of the survey.
+        product: the adjustment: that of `init-sim3`, or the solution that blocks share.
+
+    Raises:
+        GeorefError: a product does not exist, is damaged, or has too few images.
+    """
+    initial = load_json(InitialSimilarity, workspace.path(SIM3))
+    survey = initial.weighted(load_survey(workspace))
+    adjustment = load_json(Adjustment, workspace.path(product))
+    return initial, adjustment, survey, adjusted_scene(read_sparse(workspace.path(SPARSE)), survey, adjustment)
+
+
+def photographs(sparse: SparseModel, survey: Survey, workspace: Workspace, max_size_px: int) -> ImageCache:
+    """Return the cache of the registered photographs, undistorted with their longer side limited to `max_size_px`.
+
+    Raises:
+        InputError: an image of the model is not in the survey.
+    """
+    known = {image.name: image.sha256 for image in survey.images}
+    foreign = [name for name in sparse.image_name if name not in known]
+    if foreign:
+        raise InputError(
+            f"{len(foreign)} images are not in the survey, the first is {foreign[0]!r}: take the model over with "
+            "`georef sfm --import`, which leaves them out",
+            path=workspace.root / SPARSE,
+        )
+    folder = photograph_folder(workspace, survey.image_dir)
+    shots = [
+        Photograph(name, folder / name, sparse.camera_of(index), known[name])
+        for index, name in enumerate(sparse.image_name)
+    ]
+    return ImageCache(workspace.cache / "undistorted", shots, max_size_px)

@@ -1,0 +1,330 @@
+"""Product of `ingest`: the survey, with its images, cameras, fixes, attitudes and marks.
+
+All positions are in the frame `geo`: East-North-Up metres at the survey's origin.
+
+Product of `calibrate`: estimates of time offset, boresight and lever arm with their σ.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Container
+from typing import Annotated, Any, Literal, get_args
+
+from pydantic import AfterValidator, Field, model_validator
+
+from pipelines.core.options import WRITTEN, from_text, listed_names
+from pipelines.core.products import Caution, Covariance3, ImageName, Product, Rotation
+from pipelines.core.types import Vector3
+from pipelines.core.validators import image_dir
+from pipelines.geodesy.enu import Origin
+from pipelines.geodesy.vertical import VerticalDatum
+
+RigParameter = Literal["time-offset", "boresight", "lever-arm"]
+RIG_PARAMETERS: tuple[RigParameter, ...] = get_args(RigParameter)
+_COMPONENTS: dict[RigParameter, int] = {"time-offset": 1, "boresight": 3, "lever-arm": 3}
+
+
+def in_usual_order(names: Container[RigParameter]) -> tuple[RigParameter, ...]:
+    """Return the named parameters of the rig in their usual order, without repetition."""
+    return tuple(name for name in RIG_PARAMETERS if name in names)
+
+
+# Type of an option that names parameters of the rig.
+RigParameters = Annotated[
+    tuple[RigParameter, ...],
+    from_text(lambda text: listed_names(text, RIG_PARAMETERS)),
+    AfterValidator(in_usual_order),
+    WRITTEN,
+]
+
+
+class RigEstimate(Product):
+    """Parameter of the rig, estimated from the SfM cameras.
+
+    Sign and unit are those of the option of `ingest` with the same name.
+
+    Attributes:
+        name: the parameter.
+        unit: of value, σ and start.
+        value: estimate, by component.
+        sigma: σ, by component.
+        start: value given to `ingest`, by component.
+        observable: by component, whether σ is small enough for the estimate to be used.
+    """
+
+    name: RigParameter
+    unit: Literal["s", "deg", "m"]
+    value: tuple[float, ...]
+    sigma: tuple[float, ...]
+    start: tuple[float, ...]
+    observable: tuple[bool, ...]
+
+    @model_validator(mode="after")
+    def _has_all_components(self) -> RigEstimate:
+        lengths = {len(self.value), len(self.sigma), len(self.start), len(self.observable)}
+        if lengths != {_COMPONENTS[self.name]}:
+            raise ValueError(
+                f"{self.name} has {_COMPONENTS[self.name]} components: value, sigma, start, observable"
+            )
+        return self
+
+    @property
+    def usable(self) -> bool:
+        """Whether every component is observable."""
+        return all(self.observable)
+
+
+class RigCalibration(Product):
+    """Product of `calibrate`: estimates of the rig, divided into those applied to the survey and the others.
+
+    Attributes:
+        format_version: version of the format.
+        wanted: parameters that were to be estimated.
+        applied: estimates that `load_survey` applies.
+        not_applied: all other estimates.
+        images: number of images in the fit.
+        control_points: number of control points in the fit.
+        rms_position_m, rms_attitude_deg: robust σ of the residuals per axis.
+        problem: reason why nothing was estimated; else empty.
+    """
+
+    format_version: Literal[1] = 1
+    wanted: tuple[RigParameter, ...] = ()
+    applied: tuple[RigEstimate, ...] = ()
+    not_applied: tuple[RigEstimate, ...] = ()
+    images: int = 0
+    control_points: int = 0
+    rms_position_m: float | None = None
+    rms_attitude_deg: float | None = None
+    problem: str = ""
+
+    @model_validator(mode="after")
+    def _names_each_once(self) -> RigCalibration:
+        names = [estimate.name for estimate in (*self.applied, *self.not_applied)]
+        if len(set(names)) != len(names):
+            raise ValueError("a parameter is estimated twice")
+        return self
+
+    @property
+    def estimates(self) -> tuple[RigEstimate, ...]:
+        """All estimates, in the usual order of the parameters."""
+        by_name = {estimate.name: estimate for estimate in (*self.applied, *self.not_applied)}
+        return tuple(by_name[name] for name in in_usual_order(by_name))
+
+
+_NotNegative = Annotated[float, Field(ge=0)]
+
+
+class CameraPrior(Product):
+    """Intrinsics of a camera before SfM.
+
+    Attributes:
+        camera_id: number from 1.
+        model: COLMAP's name of the camera model.
+        width, height: of the full image in pixels.
+        params: COLMAP's parameters of the model, in pixels of the full image.
+        focal_source: source of the focal length.
+        make_model: of the camera, as recorded in the photographs.
+    """
+
+    camera_id: int = Field(ge=1)
+    model: str
+    width: int = Field(gt=0)
+    height: int = Field(gt=0)
+    params: tuple[float, ...]
+    focal_source: Literal["exif", "option", "assumed", "calibrated"]
+    make_model: str = ""
+
+
+class Fix(Product):
+    """Measured position of a camera centre.
+
+    Attributes:
+        position_in_geo: metres.
+        cov_in_geo: 3×3, m².
+        source: kind of record that the position comes from.
+        sigma_source: source of σ: the recording, an option, or the default.
+        session: index into the survey's `sessions`.
+    """
+
+    position_in_geo: Vector3
+    cov_in_geo: Covariance3
+    source: Literal["exif", "csv", "geo.txt", "metashape", "pos", "mrk", "bag"]
+    sigma_source: Literal["file", "option", "default"]
+    session: int = Field(0, ge=0)
+
+
+class FixSession(Product):
+    """Fixes that share one error beside their own: of the base station, the receiver, or the day.
+
+    Attributes:
+        receiver: kind of receiver, of `ingest.image_poses.RECEIVERS`.
+        sigma_common_m: σ of the common error east, north, up in metres; 0: none along that axis.
+        sigma_source: source of that σ: the recording, an option, or the default by receiver.
+    """
+
+    receiver: str
+    sigma_common_m: tuple[_NotNegative, _NotNegative, _NotNegative]
+    sigma_source: Literal["file", "option", "default"]
+
+
+class Attitude(Product):
+    """Measured rotation of a camera: `p_geo = R(quat_xyzw) p_cam + centre`.
+
+    Attributes:
+        quat_xyzw: rotation geo ← cam.
+        sigma_deg: σ per axis in degrees.
+        source: kind of record that the rotation comes from.
+    """
+
+    quat_xyzw: Rotation
+    sigma_deg: float = Field(gt=0)
+    source: Literal["gimbal", "csv", "geo.txt", "metashape", "pos", "mrk", "bag"]
+
+
+class SurveyImage(Product):
+    """Photograph of the survey.
+
+    Attributes:
+        name: path relative to the survey's `image_dir`.
+        camera_id: of the survey's `cameras`.
+        sha256: hash of the file; empty in a survey written by hand: the photograph is not checked then.
+        timestamp_s: time of exposure, camera clock.
+        fix: measured position of its centre.
+        attitude: measured rotation.
+        split: use of the photograph, for training or as a test view.
+    """
+
+    name: ImageName
+    camera_id: int
+    sha256: str
+    timestamp_s: float | None = None
+    fix: Fix | None = None
+    attitude: Attitude | None = None
+    split: Literal["train", "test"] = "train"
+
+
+class Mark(Product):
+    """Image coordinates of a surveyed point: pixels of the full image, centre of the top-left pixel (0.5, 0.5)."""
+
+    image: ImageName
+    x_px: float
+    y_px: float
+    sigma_px: float = Field(gt=0)
+
+
+class SurveyedPoint(Product):
+    """Control or check point: position in geo (m), 3×3 covariance (m²), marks, and what covers the ground there."""
+
+    name: str
+    position_in_geo: Vector3
+    cov_in_geo: Covariance3
+    marks: tuple[Mark, ...]
+    land_cover: Literal["open", "vegetated"] = "open"
+
+    @model_validator(mode="after")
+    def _is_marked_once_an_image(self) -> SurveyedPoint:
+        images = [mark.image for mark in self.marks]
+        if len(set(images)) != len(images):
+            raise ValueError("marks: two are in one image")
+        return self
+
+
+class UnmarkedPoint(SurveyedPoint):
+    """Surveyed point with marks in fewer than two images: it enters nothing until it is marked.
+
+    Attributes:
+        use: what the point is surveyed for.
+    """
+
+    use: Literal["control", "check"]
+
+
+class Survey(Product):
+    """Product of `ingest`: all measurements of a survey, in one frame.
+
+    Positions and attitudes are as recorded, with the rig that was given to `ingest`. `calibrated.load_survey`
+    replaces that rig by the estimates of `calibrate`.
+
+    Attributes:
+        format_version: version of the format.
+        origin: of the frame `geo`.
+        source_crs: CRS in which the positions were recorded.
+        vertical: vertical datum of the recorded heights.
+        image_dir: folder of photographs, absolute or inside the workspace.
+        cameras: intrinsics before SfM.
+        images: the photographs.
+        sessions: groups of fixes with one common error each; empty: no common error is modelled.
+        control_points: points that enter the solution.
+        check_points: points that enter no solution.
+        unmarked_points: points with too few marks to be measured, which enter nothing.
+        assumptions: decisions that `ingest` made where the input states nothing.
+        warnings: messages that the user should read.
+        cautions: limits of every result of the survey.
+        estimate: parameters of the rig to be estimated after sfm.
+        default_sigmas: groups of measurements whose σ nobody stated.
+    """
+
+    format_version: Literal[2] = 2
+    origin: Origin
+    source_crs: str
+    vertical: VerticalDatum
+    image_dir: Annotated[str, AfterValidator(image_dir)]
+    cameras: tuple[CameraPrior, ...]
+    images: tuple[SurveyImage, ...]
+    sessions: tuple[FixSession, ...] = ()
+    control_points: tuple[SurveyedPoint, ...] = ()
+    check_points: tuple[SurveyedPoint, ...] = ()
+    unmarked_points: tuple[UnmarkedPoint, ...] = ()
+    assumptions: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    cautions: tuple[Caution, ...] = ()
+    estimate: tuple[RigParameter, ...] = ()
+    default_sigmas: tuple[Literal["fixes", "control points", "marks", "attitudes"], ...] = ()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _is_of_this_version(cls, document: Any) -> Any:
+        if isinstance(document, dict) and document.get("format_version") == 1:
+            raise ValueError(
+                "an earlier version of georef made this survey, without the common errors of its positions: run "
+                "`georef ingest` again, which knows its options"
+            )
+        return document
+
+    @model_validator(mode="after")
+    def _belongs_together(self) -> Survey:
+        names = {
+            "images": [image.name for image in self.images],
+            "control_points": [point.name for point in self.control_points],
+            "check_points": [point.name for point in self.check_points],
+            "unmarked_points": [point.name for point in self.unmarked_points],
+        }
+        for field, of_field in names.items():
+            if len(set(of_field)) != len(of_field):
+                raise ValueError(f"{field}: two have the same name")
+        cameras = {camera.camera_id for camera in self.cameras}
+        lost = next((image for image in self.images if image.camera_id not in cameras), None)
+        if lost is not None:
+            raise ValueError(f"images: {lost.name} has camera {lost.camera_id}, which is not among the cameras")
+        fixed = [(image, image.fix) for image in self.images if self.sessions and image.fix is not None]
+        stray = next(((image, fix) for image, fix in fixed if fix.session >= len(self.sessions)), None)
+        if stray is not None:
+            raise ValueError(
+                f"images: {stray[0].name} has session {stray[1].session}, which is not among the sessions"
+            )
+        return self
+
+    @property
+    def largest_photograph_px(self) -> tuple[int, int]:
+        """Width and height of the largest photographs."""
+        largest = max(self.cameras, key=lambda camera: camera.width * camera.height)
+        return largest.width, largest.height
+
+    def image(self, name: str) -> SurveyImage | None:
+        """Return the image of that name, or None."""
+        return next((image for image in self.images if image.name == name), None)
+
+    def names(self, split: Literal["train", "test"]) -> tuple[str, ...]:
+        """Return the names of the images in a split, in order."""
+        return tuple(image.name for image in self.images if image.split == split)

@@ -1,0 +1,170 @@
+"""The CRS of a deliverable: the user's, or the UTM zone of the scene, with every point transformed by itself."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from pipelines.core.errors import InputError
+from pipelines.core.figures import Headline
+from pipelines.core.products import Caution
+from pipelines.core.types import FloatArray, Vector3
+from pipelines.formats.georef_sidecar import CrsSidecar, SceneSigma
+from pipelines.geodesy.crs import PointCrs, parse_crs
+from pipelines.geodesy.enu import (
+    SEMI_MAJOR_M,
+    Origin,
+    ecef_from_enu,
+    ecef_from_lla,
+    enu_from_ecef,
+    lla_from_ecef,
+    median_lla,
+)
+from pipelines.geodesy.vertical import ELLIPSOIDAL, VerticalChoice, VerticalDatum, parse_vertical
+from pipelines.survey.options import CrsOptions
+
+
+@dataclass(frozen=True)
+class TargetCrs:
+    """CRS of a file, with one operation for the whole scene.
+
+    Attributes:
+        crs: the CRS.
+        origin: of the frame `geo`.
+        lla: (M, 3) places that span the scene.
+        assumed: what the user did not state, for the user and the file; empty: nothing.
+    """
+
+    crs: PointCrs
+    origin: Origin
+    lla: FloatArray
+    assumed: tuple[str, ...] = ()
+
+    @property
+    def horizontal_unit_m(self) -> float:
+        """Unit of the plan in metres; of degrees along a meridian, by which a raster's cells are judged."""
+        if self.crs.is_geographic:
+            return self.crs.horizontal_unit * SEMI_MAJOR_M
+        return self.crs.horizontal_unit
+
+    @property
+    def height_unit_m(self) -> float:
+        """Unit of the heights in metres."""
+        return self.crs.height_unit_m
+
+    def xyz_from_geo(self, points: ArrayLike) -> FloatArray:
+        """Return points (N, 3) in the CRS, easting or longitude first, of points (N, 3) in `geo`.
+
+        Raises:
+            InputError: a point lies outside the domain of the CRS.
+        """
+        return self.crs.xyz_from_lla(lla_from_ecef(ecef_from_enu(points, self.origin)))
+
+    def geo_from_xyz(self, points: ArrayLike) -> FloatArray:
+        """Return points (N, 3) in `geo` of points (N, 3) in the CRS.
+
+        Raises:
+            InputError: a point lies outside the domain of the CRS.
+        """
+        return enu_from_ecef(ecef_from_lla(self.crs.lla_from_xyz(points)), self.origin)
+
+    def sidecar(
+        self,
+        bounds: ArrayLike,
+        accuracy: Headline | None,
+        sigma: SceneSigma | None,
+        cautions: tuple[Caution, ...],
+    ) -> CrsSidecar:
+        """Return the sidecar of a file in this CRS.
+
+        Args:
+            bounds: (2, 3) least and largest coordinates.
+            accuracy: of the result; None: not stated.
+            sigma: predicted, of the file's points or cells; None: not known.
+            cautions: limits of the model.
+        """
+        operation = self.crs.operation(self.lla)
+        low, high = np.asarray(bounds, dtype=np.float64)
+        return CrsSidecar(
+            crs=self.crs.name,
+            crs_wkt=self.crs.wkt,
+            vertical_datum=self.crs.vertical,
+            units=self.crs.units,
+            operation=operation.name,
+            operation_accuracy_m=operation.accuracy_m,
+            bounds=(_vector(low), _vector(high)),
+            accuracy=accuracy,
+            sigma=sigma,
+            assumed=self.assumed,
+            cautions=cautions,
+        )
+
+
+def target_crs(options: CrsOptions, origin: Origin, scene_in_geo: ArrayLike, heights: VerticalDatum) -> TargetCrs:
+    """Return the CRS of a deliverable.
+
+    Args:
+        options: the user's CRS and datum of heights.
+        origin: of `geo`.
+        scene_in_geo: (M, 3) places that span the scene, such as the corners of its bounds; M ≥ 1.
+        heights: what the survey's input heights referred to: the default.
+
+    Raises:
+        InputError: not a CRS, not for this place, or a grid that it needs is not installed.
+    """
+    lla = lla_from_ecef(ecef_from_enu(scene_in_geo, origin)).reshape(-1, 3)
+    text = options.crs or utm_zone(lla)
+    vertical = options.vertical or _as_choice(heights)
+    crs = parse_crs(text, vertical=vertical, field="--crs")
+    assumed = []
+    if options.crs is None:
+        assumed.append(f"no --crs was given: the UTM zone of the scene, {text}")
+    if not crs.states_vertical and options.vertical is None:
+        source = "stated for" if heights.stated else "assumed for"
+        assumed.append(f"no --vertical was given: heights are {crs.vertical.name}, as {source} the survey's input")
+    return TargetCrs(crs.serving(lla), origin, lla, tuple(assumed))
+
+
+def usable_crs(options: CrsOptions, origin: Origin, scene_in_geo: ArrayLike, heights: VerticalDatum) -> TargetCrs:
+    """Return the CRS in which a result is shown: `target_crs`, or one with ellipsoidal heights.
+
+    Only the default gives way, where the survey's datum needs a grid that is not installed: a user who names a CRS
+    or a datum learns what is missing.
+
+    Args:
+        options, origin, scene_in_geo, heights: as for `target_crs`.
+
+    Raises:
+        InputError: as `target_crs`, for a CRS or a datum that the user named.
+    """
+    try:
+        return target_crs(options, origin, scene_in_geo, heights)
+    except InputError:
+        if options.crs is not None or options.vertical is not None:
+            raise
+    choice = VerticalChoice(ELLIPSOIDAL, None)
+    crs = target_crs(CrsOptions(vertical=choice), origin, scene_in_geo, heights)
+    return replace(
+        crs, assumed=(*crs.assumed, f"heights are ellipsoidal: the grid of {heights.name} is not installed")
+    )
+
+
+def utm_zone(lla: ArrayLike) -> str:
+    """Return the WGS84 UTM zone of the middle of places (M, 3) as `EPSG:n`."""
+    lat, lon, _ = median_lla(lla)
+    zone = int((lon + 180.0) // 6.0) % 60 + 1
+    return f"EPSG:{(32700 if lat < 0 else 32600) + zone}"
+
+
+def _as_choice(heights: VerticalDatum) -> VerticalChoice:
+    try:
+        return parse_vertical(heights.name)
+    except InputError:  # a datum that has no code: the ellipsoid needs none
+        return parse_vertical("ellipsoidal")
+
+
+def _vector(values: FloatArray) -> Vector3:
+    x, y, z = values.tolist()
+    return x, y, z

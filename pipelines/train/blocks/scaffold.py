@@ -1,0 +1,69 @@
+"""Training of the scaffold: a coarse model of the whole survey with sky and horizon.
+
+In the training of a block its Gaussians outside the block stand in for the rest of the world. Reads the survey, the
+SfM model, the initial similarity and the solution. Writes `gaussians.ply` in `model`.
+"""
+
+from __future__ import annotations
+
+from pipelines.core.stages import SOLUTION
+from pipelines.core.workspace import StageRun, Summary
+from pipelines.splat.gaussians import write_gaussians
+from pipelines.splat.memory import free_memory_bytes, require_memory
+from pipelines.splat.rasterizer.backends import device_of, rasterizer
+from pipelines.survey.block_plan import scaffold_gaussians, scaffold_image_px
+from pipelines.survey.scene import photographs
+from pipelines.train.adjusted_scene import AdjustedScene
+from pipelines.train.assembly import make_trainer
+from pipelines.train.forecast import training_size
+from pipelines.train.geographic.problem import held_problem
+from pipelines.train.initial_gaussians import TrainingScene
+from pipelines.train.loop import train_in_folder
+from pipelines.train.options import TrainOptions
+
+_SHARE = 0.5  # of a block's iterations
+_MOST_ITERATIONS, _MOST_LOOKS = 3_000, 10_000
+
+
+def run(stage: StageRun, options: TrainOptions) -> Summary:
+    """Train the scaffold, and return its key figures.
+
+    Raises:
+        ResourceError: the training would not fit into memory.
+        ConvergenceError: the training diverged twice.
+        KeyboardInterrupt: the user asked to stop; a checkpoint was written.
+        GeorefError: a product or a photograph cannot be read.
+    """
+    backend, workspace = rasterizer(options.backend), stage.workspace
+    solved = AdjustedScene.load(workspace, SOLUTION)
+    coarse = coarse_options(options, len(solved.scene.train))
+    images = photographs(solved.scene.sparse, solved.survey, workspace, coarse.effort.max_image_size)
+    require_memory(training_size(coarse, len(images), images.largest()), free_memory_bytes(device_of(backend)))
+    images.build(stage.progress)
+    exposures = solved.exposures(device_of(backend))
+    trainer = make_trainer(TrainingScene(solved.scene, images), held_problem(solved), backend, coarse, exposures)
+    record = train_in_folder(stage, trainer, coarse)
+    gaussians = trainer.optimizer.gaussians.detached()
+    write_gaussians(stage.out / "gaussians.ply", gaussians)
+    values = {"gaussians": len(gaussians), "iterations": trainer.iteration, "seconds": round(record.seconds, 1)}
+    return Summary(f"{len(gaussians)} Gaussians of the whole", values)
+
+
+def coarse_options(options: TrainOptions, photographs_count: int) -> TrainOptions:
+    """Return the options of the scaffold's training: fewer iterations, Gaussians and pixels, and no stereo.
+
+    Args:
+        options: of the blocks.
+        photographs_count: number of training photographs; each is looked at once, if they are not too many.
+    """
+    effort = options.effort
+    looks = min(photographs_count, _MOST_LOOKS)
+    return options.model_copy(
+        update={
+            "iterations": max(min(int(_SHARE * effort.iterations), _MOST_ITERATIONS), looks),
+            "max_gaussians": scaffold_gaussians(effort.max_gaussians),
+            "max_image_size": scaffold_image_px(effort.max_image_size),
+            "optimize_cameras": False,
+            "dense": False,
+        }
+    )

@@ -1,0 +1,206 @@
+"""Training across the seams: Gaussians along the sides of cells are adapted to those on the other side.
+
+Each block was trained with Gaussians of its own beyond its cell, which the merged model does not take. Their
+successors lie elsewhere: along a seam they leave gaps, or lie double. Strip by strip, the seams are therefore
+trained for a while, with the Gaussians of all blocks in it, while those around the strip are frozen. No Gaussian is
+added or removed.
+
+Reads the survey, the SfM model, the initial similarity, the plan, the solution, the scaffold, and the Gaussians of
+the blocks. Writes `<number>.ply` with the Gaussians of each cell. An interrupted run goes on at the next seam.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from pipelines.core.files import replace_text
+from pipelines.core.products import load_json
+from pipelines.core.progress import deferred_interrupts
+from pipelines.core.stages import BLOCK_GAUSSIANS, BLOCK_PLAN, SCAFFOLD, SOLUTION
+from pipelines.core.workspace import StageRun, Summary
+from pipelines.splat.gaussians import Gaussians, read_gaussians, write_gaussians
+from pipelines.splat.rasterizer.api import Rasterizer
+from pipelines.splat.rasterizer.backends import device_of, rasterizer
+from pipelines.survey.block_plan import BlockCell, BlockPlan, PlannedBlock
+from pipelines.survey.photographs import ImageCache
+from pipelines.survey.scene import photographs
+from pipelines.train.adjusted_scene import AdjustedScene
+from pipelines.train.assembly import make_finisher
+from pipelines.train.geographic.problem import held_problem
+from pipelines.train.initial_gaussians import TrainingScene
+from pipelines.train.options import SeamOptions
+from pipelines.train.region import SceneBox, TrainingRegion
+
+_SHARE = 0.2  # of a block's iterations
+_WIDTH = 0.5  # of the blocks' overlap, on each side of a seam
+_LEAST_VIEWS = 2
+_DONE = "done.txt"
+
+
+def run(stage: StageRun, options: SeamOptions) -> Summary:
+    """Train all seams, and return their key figures.
+
+    Raises:
+        KeyboardInterrupt: the user asked to stop; the seams that have ended are kept.
+        GeorefError: a product or a photograph cannot be read.
+    """
+    workspace, backend = stage.workspace, rasterizer(options.backend)
+    plan = load_json(BlockPlan, workspace.path(BLOCK_PLAN))
+    solved = AdjustedScene.load(workspace, SOLUTION)
+    images = photographs(solved.scene.sparse, solved.survey, workspace, options.effort.max_image_size)
+    model = _CellFiles(stage.out, plan)
+    model.begin(workspace.root, afresh=not stage.resumed)
+    scaffold = read_gaussians(workspace.path(SCAFFOLD))
+    strips = _SeamTrainer(solved, images, scaffold, backend, options)
+    seams = list(seams_of(plan))
+    with stage.progress.task("seams", len(seams)) as task, deferred_interrupts() as stop:
+        for number, (first, second, strip) in enumerate(seams):
+            if number >= model.done():
+                strips.train(model, first, second, strip)
+                model.end(number + 1)
+                stage.record_progress(f"{number + 1} of {len(seams)} seams")
+            task.advance()
+            if stop.requested:
+                raise KeyboardInterrupt
+    count = sum(len(model.read(block.id)) for block in plan.blocks)
+    values = {"seams": len(seams), "gaussians": count}
+    return Summary(f"{len(seams)} seams of {len(plan.blocks)} blocks, {count} Gaussians", values)
+
+
+def seams_of(plan: BlockPlan) -> Iterable[tuple[PlannedBlock, PlannedBlock, BlockCell]]:
+    """Yield the pairs of blocks that have a strip along their common side, and the strip."""
+    for first, second in combinations(plan.blocks, 2):
+        if (strip := strip_of(first, second)) is not None:
+            yield first, second, strip
+
+
+def strip_of(first: PlannedBlock, second: PlannedBlock) -> BlockCell | None:
+    """Return the strip along the common side of two blocks; None: they have none, or share a corner only."""
+    half = _WIDTH * np.minimum(first.margin_m, second.margin_m)
+    touching = [axis for axis in (0, 1) if _touches(first.cell, second.cell, axis)]
+    if len(touching) != 1 or not (half > 0).all():
+        return None
+    wide, other = first.cell.widened(half), second.cell.widened(half)
+    return wide.common(other)
+
+
+def _touches(first: BlockCell, second: BlockCell, axis: int) -> bool:
+    """Return whether one cell ends where the other begins."""
+    return (first.high[axis] is not None and first.high[axis] == second.low[axis]) or (
+        second.high[axis] is not None and second.high[axis] == first.low[axis]
+    )
+
+
+@dataclass(frozen=True)
+class _CellFiles:
+    """Gaussians of each cell, in files of the stage's folder, and the number of seams that are done."""
+
+    folder: Path
+    plan: BlockPlan
+
+    def begin(self, blocks: Path, *, afresh: bool) -> None:
+        """Write the Gaussians of each cell as its block has trained them, unless an interrupted run has."""
+        if not afresh and (self.folder / _DONE).is_file():
+            return
+        for block in self.plan.blocks:
+            gaussians = read_gaussians(blocks / str(block.id) / BLOCK_GAUSSIANS)
+            inside = block.cell.contains(gaussians.means.double().numpy())
+            write_gaussians(self._path(block.id), gaussians.select(torch.from_numpy(inside)))
+        self.end(0)
+
+    def done(self) -> int:
+        """Return the number of seams that are done."""
+        return int((self.folder / _DONE).read_text(encoding="utf-8"))
+
+    def end(self, number: int) -> None:
+        """Record the number of seams that are done."""
+        replace_text(self.folder / _DONE, str(number))
+
+    def near(self, cell: BlockCell) -> dict[int, Gaussians]:
+        """Return the Gaussians of the blocks that reach into a cell, by number."""
+        return {block.id: self.read(block.id) for block in self.plan.blocks if block.cell.meets(cell)}
+
+    def read(self, number: int) -> Gaussians:
+        """Return the Gaussians of a cell."""
+        return read_gaussians(self._path(number))
+
+    def write(self, parts: dict[int, Gaussians]) -> None:
+        """Replace the Gaussians of cells."""
+        for number, gaussians in parts.items():
+            write_gaussians(self._path(number), gaussians)
+
+    def _path(self, number: int) -> Path:
+        return self.folder / f"{number}.ply"
+
+
+@dataclass(frozen=True)
+class _SeamTrainer:
+    """Trainer of strips, with what all of them share."""
+
+    solved: AdjustedScene
+    images: ImageCache
+    scaffold: Gaussians
+    backend: Rasterizer
+    options: SeamOptions
+
+    def train(self, model: _CellFiles, first: PlannedBlock, second: PlannedBlock, strip: BlockCell) -> None:
+        """Train the Gaussians of a strip, and put them back."""
+        around = strip.widened(_WIDTH * np.minimum(first.margin_m, second.margin_m))
+        parts = model.near(around)
+        together = Gaussians.concatenate(list(parts.values()))
+        means = together.means.double().numpy()
+        own = strip.contains(means)
+        frozen = together.select(torch.from_numpy(around.contains(means) & ~own))
+        beyond = torch.from_numpy(~around.contains(self.scaffold.means.double().numpy()))
+        surroundings = Gaussians.concatenate([frozen, self.scaffold.select(beyond)])
+        start = together.select(torch.from_numpy(own))
+        trained = self._trained(sorted({*first.cameras, *second.cameras}), strip, start, surroundings)
+        if trained is None:
+            return
+        rows = torch.from_numpy(own)
+        for name, values in together.tensors().items():
+            values[rows] = trained.tensors()[name]
+        ends = np.cumsum([len(part) for part in parts.values()])
+        changed = {
+            number: together.select(torch.arange(end - len(part), end))
+            for (number, part), end in zip(parts.items(), ends.tolist(), strict=True)
+            if own[end - len(part) : end].any()
+        }
+        model.write(changed)
+
+    def _trained(
+        self, names: list[str], strip: BlockCell, start: Gaussians, surroundings: Gaussians
+    ) -> Gaussians | None:
+        """Return the Gaussians of a strip after their training; None if too few views show the strip."""
+        if not len(start):
+            return None
+        device, index = device_of(self.backend), self.solved.scene.sparse.image_index()
+        train = np.array([index[name] for name in names if name in index], dtype=np.int64)
+        everything = Gaussians.concatenate([start, surroundings]).to(device)
+        masks = self.solved.views(self.images, train, self.backend).masks(strip, everything)
+        seeing = masks.seeing()
+        if len(seeing) < _LEAST_VIEWS:
+            return None
+        box = SceneBox.around(self.solved.scene.point_in_model)
+        region = TrainingRegion(strip, box, surroundings.to(device), start.select(torch.zeros(0).long()), masks)
+        solved = self.solved.trained_on(seeing)
+        training = TrainingScene(solved.scene, self.images, None, region)
+        iterations = max(int(_SHARE * self.options.effort.iterations), 1)
+        trainer = make_finisher(
+            training,
+            start.to(device),
+            held_problem(solved),
+            backend=self.backend,
+            options=self.options.model_copy(update={"iterations": iterations}),
+            exposures=solved.exposures(device),
+        )
+        for _ in range(iterations):
+            trainer.step()
+        trainer.check_finite()
+        return trainer.optimizer.gaussians.detached().to(torch.device("cpu"))

@@ -1,0 +1,156 @@
+"""Training in blocks: plan, solution and scaffold once, the blocks as jobs of the engine, and the merged model.
+
+The second module of stage `train`, for surveys that one training does not hold. Its product is that of `train`.
+Each block is a command over the workspace whose repetition completes it. Finished blocks are kept, and interrupted
+ones continue from their checkpoints.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from pipelines.core.errors import GeorefError, MissingProductError
+from pipelines.core.options import CONFIG_FILE, REQUESTS
+from pipelines.core.progress import Progress
+from pipelines.core.stages import PLAN_BLOCKS, SOLVE, TRAIN_BLOCK, TRAIN_SCAFFOLD, TRAIN_SEAMS
+from pipelines.core.workspace import StageRun, Summary
+from pipelines.jobs.engine import Job, JobEnd
+from pipelines.jobs.local import failed_of
+from pipelines.survey.block_plan import BlockPlan
+from pipelines.train.blocks.merge import merge_blocks
+from pipelines.train.blocks.parts import UPSTREAM, Parts, TrainingRequest
+
+log = logging.getLogger(__name__)
+
+
+def run(stage: StageRun, options: TrainingRequest) -> Summary:
+    """Train what is not trained, write the merged model, and return its key figures.
+
+    Raises:
+        KeyboardInterrupt: the user asked to stop; the blocks that ran have saved their work.
+        GeorefError: a part fails; the blocks that have ended are kept.
+    """
+    parts = Parts(stage.workspace, options)
+    plan = train_blocks(parts, stage.progress, force=stage.afresh, note=stage.record_progress)
+    _run_jobs("seams", seam_jobs(parts, plan, force=stage.afresh), stage.progress, stage.record_progress)
+    return merge_blocks(parts, plan, stage.out, stage.progress)
+
+
+def train_blocks(
+    parts: Parts, progress: Progress, *, force: bool = False, note: Callable[[str], None] = lambda _text: None
+) -> BlockPlan:
+    """Bring plan, solution, scaffold and all blocks up to date, and return the plan.
+
+    Args:
+        parts: of the training.
+        progress: shows the tasks and jobs.
+        force: start all afresh.
+        note: receives how far the work has come, after each block (`2 of 4 blocks`).
+
+    Raises:
+        KeyboardInterrupt: the user asked to stop; the blocks that ran have saved their work.
+        GeorefError: a part fails; the blocks that have ended are kept.
+    """
+    parts.run(PLAN_BLOCKS, force=force, progress=progress)
+    parts.run(SOLVE, force=force, progress=progress)
+    plan = parts.plan()
+    log.info("train: %d blocks", len(plan.blocks))
+    _run_jobs("scaffold", scaffold_jobs(parts, plan, force=force), progress, note)
+    _run_jobs("blocks", block_jobs(parts, plan, force=force), progress, note)
+    return plan
+
+
+def scaffold_jobs(parts: Parts, plan: BlockPlan, *, force: bool = False) -> list[Job]:
+    """Return the job that trains the scaffold; none if it is current."""
+    if not force and not parts.why_missing(TRAIN_SCAFFOLD):
+        return []
+    job = Job("scaffold", ("blocks", "scaffold"), min(block.peak_bytes for block in plan.blocks))
+    return [_placed(job, parts, "scaffold", force=force)]
+
+
+def block_jobs(parts: Parts, plan: BlockPlan, *, force: bool = False) -> list[Job]:
+    """Return the jobs that train the blocks which are not current, the largest first.
+
+    Args:
+        parts: of the training.
+        plan: of the blocks.
+        force: train all afresh.
+    """
+    blocks = plan.blocks if force else tuple(parts.waiting(plan))
+    return [
+        _placed(
+            Job(f"block {b.id}", ("blocks", "train", "--id", str(b.id)), b.peak_bytes),
+            parts,
+            str(b.id),
+            force=force,
+        )
+        for b in sorted(blocks, key=lambda block: -block.gaussians)
+    ]
+
+
+def seam_jobs(parts: Parts, plan: BlockPlan, *, force: bool = False) -> list[Job]:
+    """Return the job that trains across the seams; none if that is current."""
+    if not force and not parts.why_missing(TRAIN_SEAMS):
+        return []
+    job = Job("seams", ("blocks", "seams"), max(block.peak_bytes for block in plan.blocks))
+    return [_placed(job, parts, "seams", force=force)]
+
+
+def require_trained(parts: Parts, plan: BlockPlan) -> None:
+    """Refuse to merge blocks that are not current.
+
+    Raises:
+        MissingProductError: names the first such block, and how to train it.
+    """
+    for block in plan.blocks:
+        if parts.why_missing(TRAIN_BLOCK, block.id):
+            command = f"georef blocks train {parts.workspace.root} --id {block.id}"
+            raise MissingProductError(f"blocks/{block.id}", command)
+
+
+def _placed(job: Job, parts: Parts, place: str, *, force: bool) -> Job:
+    """Return a job with its place in the workspace.
+
+    Args:
+        job: its arguments are those behind `georef`, without the workspace.
+        parts: of the training.
+        place: folder of its product, in `blocks/`.
+        force: start afresh.
+    """
+    root, shared = parts.workspace.root.absolute(), parts.whole.root.absolute()
+    command, action, *more = job.arguments
+    read = [root / name for name in (*(spec.folder for spec in UPSTREAM), REQUESTS, CONFIG_FILE)]
+    read += [shared / spec.folder for spec in (PLAN_BLOCKS, SOLVE, TRAIN_SCAFFOLD)]
+    if place == TRAIN_SEAMS.folder:
+        read += [shared / str(block.id) for block in parts.plan().blocks]
+    return replace(
+        job,
+        arguments=(command, action, str(root), *more, *(("--force",) if force else ())),
+        uses_gpu=parts.on_gpu(),
+        folder=root,
+        writes=shared / place,
+        reads=tuple(path for path in read if path.exists() and path != shared / place),
+    )
+
+
+def _run_jobs(title: str, jobs: Sequence[Job], progress: Progress, note: Callable[[str], None]) -> None:
+    """Run jobs to their ends.
+
+    Raises:
+        GeorefError: jobs have failed; names them.
+    """
+    done = 0
+
+    def ended(end: JobEnd) -> None:
+        nonlocal done
+        if end.is_done:
+            done += 1
+            note(f"{done} of {len(jobs)} {title}")
+
+    if failed := failed_of(title, jobs, ended, progress):
+        reasons = "; ".join(f"{end.job.name}: {end.error}" for end in failed)
+        raise GeorefError(
+            f"{len(failed)} of {len(jobs)} {title} failed ({reasons}): the same command trains what is missing"
+        )

@@ -1,0 +1,369 @@
+"""LiDAR of a training, from its files to the surface that Gaussians are held to.
+
+1. Cloud of the scene, in `model`.
+2. Registration against the depth maps: a shift beyond 3 σ is refused, or taken out on request. It is never taken
+   out unasked.
+3. Confidence, and places that have changed.
+
+Depth maps of the training photographs as one set, against which a LiDAR cloud is compared.
+
+Planes of a LiDAR as observations of the adjustment.
+
+Space that the beams of a LiDAR have crossed, and in which nothing stands.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy import ndimage
+
+from pipelines.adjust.terms import Planes
+from pipelines.core.errors import DegenerateGeometryError, InputError
+from pipelines.core.progress import Progress
+from pipelines.core.types import BoolArray, FloatArray, Vector3
+from pipelines.geodesy.enu import lla_from_enu
+from pipelines.geometry.similarity import Similarity, SimilarityRecord, covariance_at
+from pipelines.report.plots.maps import DrawnArea, write_lidar_map
+from pipelines.robust.statistics import mad_sigma
+from pipelines.splat.losses import FreeSpace
+from pipelines.surface.crossings import crossings
+from pipelines.surface.depth_maps import DepthMaps
+from pipelines.surface.lidar_cloud import LidarCloud, ScannerTrack, read_cloud
+from pipelines.surface.measured_cloud import CloudFiles
+from pipelines.surface.registration import Registration, registration
+from pipelines.surface.visibility import DepthViews
+from pipelines.survey.report_parts import LidarArea, LidarRegistration, LidarReport
+from pipelines.survey.scene import Scene
+from pipelines.survey.survey import Survey
+from pipelines.train.lidar_surface import CloudVerdict, FusedSurface, verdict
+from pipelines.train.options import LidarOptions
+from pipelines.train.surface import SceneSurface
+
+log = logging.getLogger(__name__)
+
+
+def depth_views(maps: DepthMaps) -> DepthViews:
+    """Return the depth maps of all training views, in `model`."""
+    train, poses = [int(index) for index in maps.scene.train], maps.scene.poses
+    cameras = [maps.camera(index) for index in train]
+    depths = [np.asarray(maps.depth(index)).ravel() for index in train]
+    return DepthViews(
+        cam_from_world=poses.cam_from_model[train],
+        center_in_world=poses.cam_center_in_model[train],
+        intrinsics_px=np.array([(camera.fx, camera.fy, camera.cx, camera.cy) for camera in cameras]),
+        size_px=np.array([(camera.width, camera.height) for camera in cameras], dtype=np.int64),
+        start=np.concatenate([[0], np.cumsum([len(depth) for depth in depths])[:-1]]).astype(np.int64),
+        depth_m=np.concatenate(depths),
+    )
+
+
+def pixel_size_m(maps: DepthMaps) -> float:
+    """Return the size of a pixel of the depth maps on the surface, the median over all training views."""
+    sizes = []
+    for index in map(int, maps.scene.train):
+        depth = maps.depth(index)[::8, ::8]
+        if (depth > 0).any():
+            sizes.append(float(np.median(depth[depth > 0])) / maps.camera(index).fx)
+    return float(np.median(sizes)) if sizes else 0.1
+
+
+_CLUSTER_M = 5.0
+_LEAST_POINTS = 5
+_LEAST_SIGMA_M = 1e-3
+
+
+def planes_of(found: Registration, geo_from_model: Similarity) -> Planes:
+    """Return one plane for each cluster of 5 m and each direction that planes face there.
+
+    The errors of neighbouring points are not independent: the median of a cluster is one observation. Its σ is the
+    robust spread of these medians about the shift.
+
+    Args:
+        found: registration, whose shift is part of the observations again.
+        geo_from_model: initial similarity, a pure shift.
+    """
+    matches = found.matches
+    distance = matches.distance_m - found.wall_bias_m * matches.wall
+    facing = np.abs(matches.normal_in_model).argmax(axis=1)
+    side = np.sign(np.take_along_axis(matches.normal_in_model, facing[:, None], axis=1))[:, 0]
+    cell = np.floor(matches.point_in_model / _CLUSTER_M).astype(np.int64)
+    key = np.column_stack([cell, facing, side.astype(np.int64)])
+    _, cluster, count = np.unique(key, axis=0, return_inverse=True, return_counts=True)
+    order = np.lexsort((distance, cluster.ravel()))
+    first = np.concatenate([[0], np.cumsum(count)[:-1]])
+    middle = order[first + count // 2][count >= _LEAST_POINTS]
+    normal, off = matches.normal_in_model[middle], distance[middle]
+    measured = matches.point_in_model[middle]
+    sigma_m = max(mad_sigma(off), _LEAST_SIGMA_M)
+    return Planes(
+        point_in_model=measured + off[:, None] * normal,
+        position_in_geo=geo_from_model.apply(measured + found.shift_m),
+        normal_in_geo=normal,
+        root_information=np.full((len(middle), 1, 1), 1.0 / sigma_m),
+    )
+
+
+_LEAST_CELL_M, _CELL_SPACINGS = 1.0, 3.0  # least sides of a cell
+_MOST_CELLS = 40_000_000
+_GROWTH = 1.3
+_LEAST_BEAMS = 3
+
+
+def free_space(cloud: LidarCloud, gone: BoolArray, shown: FloatArray) -> FreeSpace | None:
+    """Return the cells that beams have crossed and in which nothing is seen; None: no beam is known.
+
+    Args:
+        cloud: with the scanner's places.
+        gone: (P,) points that contradict the photographs: their beams do not count.
+        shown: (S, 3) surface that the photographs show; what stands there now is not free.
+    """
+    if cloud.scanner_in_model is None:
+        return None
+    beams = np.flatnonzero(np.isfinite(cloud.scanner_in_model[:, 0]) & ~gone)
+    if not len(beams):
+        return None
+    end = cloud.position_in_model
+    low, high = end[beams].min(axis=0), end[beams].max(axis=0)
+    cell_m = max(_LEAST_CELL_M, _CELL_SPACINGS * cloud.voxel_m)
+    while np.prod(np.ceil((high - low) / cell_m) + 1) > _MOST_CELLS:
+        cell_m *= _GROWTH
+    shape = (np.ceil((high - low) / cell_m) + 1).astype(np.int64)
+    count = crossings(end[beams], cloud.scanner_in_model[beams], low, cell_m, shape)
+    taken = np.zeros(shape, dtype=bool)
+    for points in (end, shown):
+        cell = np.floor((points - low) / cell_m).astype(np.int64)
+        cell = cell[((cell >= 0) & (cell < shape)).all(axis=1)]
+        taken[tuple(cell.T)] = True
+    taken = ndimage.binary_dilation(taken, np.ones((3, 3, 3)))
+    return FreeSpace(low, cell_m, (count >= _LEAST_BEAMS) & ~taken)
+
+
+_GATE_SIGMAS = 3.0
+_ANOTHER_DATUM_M = 1.0
+_CELL_M = 4.0
+_STRIDE = 3
+_MOST_LISTED = 50
+
+
+@dataclass(frozen=True)
+class ComparedLidar:
+    """Cloud of the scene, compared with the photographs and not moved.
+
+    Attributes:
+        cloud: in `model`.
+        maps: depth maps of the training views.
+        views: the same as one set.
+        shown: (S, 3) surface that they show.
+        pixel_m: size of their pixels on the surface.
+        registration: shift of the cloud.
+        record: of the registration.
+    """
+
+    cloud: LidarCloud
+    maps: DepthMaps
+    views: DepthViews
+    shown: FloatArray
+    pixel_m: float
+    registration: Registration
+    record: LidarRegistration
+
+    def planes(self) -> Planes:
+        """Return the planes that the cloud shares with the photographs."""
+        return planes_of(self.registration, self.maps.scene.geo_from_model)
+
+
+@dataclass(frozen=True)
+class LidarSurface:
+    """Surface with LiDAR, and its record.
+
+    Attributes:
+        surface: of stereo and LiDAR.
+        report: for `train/lidar.json`.
+        verdict: of the photographs on the cloud.
+        cloud: registered, in `model`.
+    """
+
+    surface: FusedSurface
+    report: LidarReport
+    verdict: CloudVerdict
+    cloud: LidarCloud
+
+
+def compared_lidar(
+    options: LidarOptions,
+    files: CloudFiles,
+    maps: DepthMaps,
+    survey: Survey,
+    *,
+    track: ScannerTrack | None,
+    georeference: SimilarityRecord,
+    seed: int,
+    progress: Progress,
+) -> ComparedLidar:
+    """Return the cloud of the scene, compared with the photographs.
+
+    Args:
+        options: of the LiDAR.
+        files: the clouds.
+        maps: depth maps of the training views.
+        survey: has the origin of `geo`.
+        track: of the scanner; None: not known.
+        georeference: initial similarity to `geo`, with covariance.
+        seed: of random choices.
+        progress: shows the points read.
+
+    Raises:
+        InputError: the cloud lies elsewhere, in height or plan, or is shifted beyond 3 σ.
+    """
+    pixel_m, views = pixel_size_m(maps), depth_views(maps)
+    cloud = read_cloud(files, maps.scene, survey, pixel_m, progress=progress, track=track)
+    shown = SceneSurface(maps).all_points(_STRIDE)
+    found = registration_of(cloud, shown, views, seed)
+    record = _checked(found, cloud, maps.scene, georeference, options)
+    return ComparedLidar(cloud, maps, views, shown, pixel_m, found, record)
+
+
+def lidar_surface(
+    compared: ComparedLidar, files: CloudFiles, survey: Survey, options: LidarOptions, shift_m: FloatArray | None
+) -> LidarSurface:
+    """Return the surface of stereo and LiDAR.
+
+    Args:
+        compared: the cloud.
+        files: of the cloud, with the numbers of points read and dropped.
+        survey: has the origin of `geo`.
+        options: of the LiDAR.
+        shift_m: (3,) shift of the LiDAR to take out, axes of geo; None: none.
+    """
+    cloud = compared.cloud if shift_m is None else compared.cloud.moved(-shift_m)
+    judged = verdict(cloud, compared.views, compared.shown, sigma_m=options.lidar_sigma, pixel_m=compared.pixel_m)
+    tally = files.tally
+    report = LidarReport(
+        crs=files.crs_names,
+        read=tally.read,
+        noise=tally.noise,
+        withheld=tally.withheld,
+        overlap=tally.overlap,
+        outside=tally.outside,
+        points=len(cloud),
+        voxel_m=cloud.voxel_m,
+        registration=compared.record,
+        rejected_share=float(judged.rejected.mean()),
+        confidence=float(np.median(judged.confidence)),
+        areas=_areas(judged, compared.maps.scene, survey),
+        assumptions=files.assumptions,
+    )
+    free = free_space(cloud, judged.rejected, compared.shown)
+    surface = FusedSurface(compared.maps, cloud, judged, compared.pixel_m, pull=options.lidar_pull, free=free)
+    return LidarSurface(surface, report, judged, cloud)
+
+
+def draw_changes(path: Path, lidar: LidarSurface, scene: Scene) -> None:
+    """Write the map of the places that have changed as PNG."""
+    shift = scene.geo_from_model.translation  # a pure shift at the start of the training
+    areas = [
+        DrawnArea(area.kind, area.area_m2, area.cells + shift[:2], area.cell_m) for area in lidar.verdict.areas
+    ]
+    write_lidar_map(path, lidar.cloud.position_in_model + shift, areas)
+
+
+def registration_of(cloud: LidarCloud, shown: FloatArray, views: DepthViews, seed: int) -> Registration:
+    """Return the shift of a cloud against the depth maps.
+
+    Raises:
+        InputError: the cloud lies above or below the surface of the photographs by more than the search reaches,
+            or the two have no surface in common.
+    """
+    height_m, cells = _height_difference(cloud.position_in_model, shown)
+    if cells and abs(height_m) > _ANOTHER_DATUM_M:
+        raise InputError(
+            f"the LiDAR lies {abs(height_m):.2f} m {'above' if height_m > 0 else 'below'} the surface of the "
+            f"photographs (median of {cells} places): the heights of one of them count from another vertical "
+            "datum, or are in another unit. State the LiDAR's by --lidar-vertical or --lidar-crs, and the survey's "
+            "by `georef ingest --vertical`",
+            field="--lidar",
+        )
+    try:
+        return registration(cloud, views, seed)
+    except DegenerateGeometryError as error:
+        raise InputError(f"{error}: another place, another time, or a wrong CRS", field="--lidar") from error
+
+
+def _checked(
+    compared: Registration,
+    cloud: LidarCloud,
+    scene: Scene,
+    georeference: SimilarityRecord,
+    options: LidarOptions,
+) -> LidarRegistration:
+    """Return the record of a registration.
+
+    Raises:
+        InputError: a shift beyond 3 σ, and no request to take it out.
+    """
+    middle = scene.geo_from_model.apply(np.median(cloud.position_in_model, axis=0))[None]
+    of_georeference = covariance_at(middle, georeference.covariance, georeference.pivot)[0]
+    variance = np.diag(compared.covariance_m2 + of_georeference) + options.lidar_sigma**2
+    sigma = np.sqrt(variance)
+    record = LidarRegistration(
+        shift_m=_vector(compared.shift_m),
+        sigma_m=_vector(sigma),
+        sigma_comparison_m=_vector(np.sqrt(np.diag(compared.covariance_m2))),
+        points=len(compared.matches),
+        spread_m=compared.spread_m,
+        wall_bias_m=compared.wall_bias_m,
+        removed=options.lidar_register,
+    )
+    text = ", ".join(f"{value:+.3f} ± {one:.3f}" for value, one in zip(compared.shift_m, sigma, strict=True))
+    log.info("lidar: shift east, north, up %s m against the photographs, of %d points", text, record.points)
+    if (np.abs(compared.shift_m) > _GATE_SIGMAS * sigma).any() and not options.lidar_register:
+        raise InputError(
+            f"the LiDAR is shifted by {text} m (east, north, up) against the photographs, beyond 3 σ. Check its "
+            "CRS, its datum and the survey's georeference; --lidar-register takes the shift out, --lidar-sigma "
+            "states a lower accuracy",
+            field="--lidar",
+        )
+    return record
+
+
+def _height_difference(cloud: FloatArray, shown: FloatArray) -> tuple[float, int]:
+    """Return the median height of the cloud above the photographs' surface, and the number of cells compared."""
+    low = np.minimum(cloud.min(axis=0), shown.min(axis=0))[:2]
+    medians = []
+    for points in (cloud, shown):
+        cell = np.floor((points[:, :2] - low) / _CELL_M).astype(np.int64)
+        key = cell[:, 0] * 10_000_000 + cell[:, 1]
+        order = np.lexsort((points[:, 2], key))
+        cells, first, count = np.unique(key[order], return_index=True, return_counts=True)
+        medians.append((cells, points[order, 2][first + count // 2]))
+    common, mine, theirs = np.intersect1d(medians[0][0], medians[1][0], return_indices=True)
+    if not len(common):
+        return 0.0, 0
+    return float(np.median(medians[0][1][mine] - medians[1][1][theirs])), len(common)
+
+
+def _areas(judged: CloudVerdict, scene: Scene, survey: Survey) -> tuple[LidarArea, ...]:
+    areas = []
+    for area in judged.areas[:_MOST_LISTED]:
+        center = scene.geo_from_model.apply(area.center_in_model)
+        lat, lon, _ = lla_from_enu(center, survey.origin)
+        areas.append(
+            LidarArea(
+                kind=area.kind,
+                area_m2=area.area_m2,
+                points=area.points,
+                center_in_geo=_vector(center),
+                lat_deg=float(lat),
+                lon_deg=float(lon),
+            )
+        )
+    return tuple(areas)
+
+
+def _vector(values: FloatArray) -> Vector3:
+    x, y, z = np.asarray(values).tolist()
+    return x, y, z
