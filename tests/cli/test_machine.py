@@ -16,7 +16,7 @@ from pipelines.core.errors import BackendUnavailableError
 from pipelines.core.fingerprints import NOT_INSTALLED
 from pipelines.core.machine import available_cores
 from pipelines.jobs import machine
-from pipelines.splat.rasterizer.cuda_kernels import CudaPart
+from pipelines.splat.rasterizer.cuda_parts import CudaPart
 from pipelines.train.options import PRESETS
 from tests.cli.test_help import examples_in, parse
 from tests.cli_runs import REPOSITORY, Georef
