@@ -15,8 +15,16 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 import click
 from pydantic.fields import FieldInfo
 
-from pipelines.core.options import StageOptions, flag_name, input_markers, is_written, notation, parse_toml
-from pipelines.core.plan import names_of_flags
+from pipelines.core.options import (
+    StageOptions,
+    WrittenMarker,
+    flag_name,
+    has_mark,
+    input_markers,
+    names_of_flags,
+    notation,
+    parse_toml,
+)
 from pipelines.core.stages import StageSpec
 from pipelines.core.workspace import Workspace
 
@@ -91,7 +99,7 @@ def stage_option(options_type: type[StageOptions], name: str) -> click.Option:
     """
     info, flag = options_type.model_fields[name], flag_name(options_type, name)
     help_text = " ".join(filter(None, [info.description, _default_and_range(info)]))
-    if is_written(info):
+    if has_mark(info, WrittenMarker):
         return click.Option([flag, name], type=click.STRING, default=None, help=help_text)
     kind = _bare_type(info.annotation)
     if kind is bool:
@@ -144,7 +152,7 @@ def _default_and_range(info: FieldInfo) -> str:
 
 
 def _shown(info: FieldInfo) -> str:
-    if is_written(info):
+    if has_mark(info, WrittenMarker):
         return notation(info.default)
     return {True: "on", False: "off"}[info.default] if isinstance(info.default, bool) else str(info.default)
 

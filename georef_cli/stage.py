@@ -24,6 +24,7 @@ from pipelines.core import runner
 from pipelines.core.errors import InputError, storage_failures
 from pipelines.core.files import remove, replace_file, replace_folder
 from pipelines.core.manifest import MANIFEST
+from pipelines.core.options import remembered
 from pipelines.core.stages import BY_NAME, StageSpec
 from pipelines.core.staleness import must_exist
 from pipelines.core.validators import require_text
@@ -70,21 +71,21 @@ class StageCommand(Command):
         workspace = values["workspace"]
         if self.spec.reads:
             must_exist(workspace)
-        flags = {self.spec.name: self.flags(ctx, values)}
         print_dry_run(
             workspace,
             (self.spec,),
-            flags,
+            self.flags(ctx, values),
             force=values["force"],
             as_json=values["as_json"],
             progress=progress_for(ctx.obj),
         )
 
-    def flags(self, ctx: click.Context, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the options of this and earlier commands."""
+    def flags(self, ctx: click.Context, values: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+        """Return the options of this and earlier commands, by stage."""
+        name = self.spec.name
         given = options.given(ctx, self.spec.options.model_fields)
         forget = options.forgotten(self.spec.options, values["forget"])
-        return runner.remembered(values["workspace"], self.spec, given, forget)
+        return remembered(values["workspace"].root, [name], {name: given}, {name: forget})
 
     def act(self, ctx: click.Context, **values: Any) -> None:
         """Run the stage and print its result."""
@@ -103,12 +104,12 @@ class StageCommand(Command):
             GeorefError: the stage failed.
         """
         workspace, flags = values["workspace"], self.flags(ctx, values)
-        announce_training(workspace, (self.spec,), {self.spec.name: flags}, force=values["force"])
+        announce_training(workspace, (self.spec,), flags, force=values["force"])
         with boundary.logged_to_file(workspace, self.spec):
             return runner.run_stage(
                 workspace,
                 self.spec,
-                flags,
+                flags[self.spec.name],
                 force=values["force"],
                 resume=resume,
                 progress=progress_for(ctx.obj),

@@ -16,9 +16,8 @@ from georef_cli.engines import engine_for, engine_options
 from georef_cli.forecast import RunForecast, checked_inputs, forecast_run
 from georef_cli.options import set_option, settings
 from georef_cli.output import print_json, print_rich
-from pipelines.core import runner
 from pipelines.core.errors import GeorefError
-from pipelines.core.options import input_paths
+from pipelines.core.options import input_paths, remembered
 from pipelines.core.plan import plan
 from pipelines.core.progress import Progress
 from pipelines.core.stages import BY_NAME
@@ -79,10 +78,7 @@ def _planned(mission: Mission, *, check: bool, progress: Progress) -> tuple[Plan
         progress: shows that reading.
     """
     try:
-        asked = {
-            spec.name: runner.remembered(mission.workspace, spec, mission.flags.get(spec.name, {}))
-            for spec in mission.stages
-        }
+        asked = remembered(mission.workspace.root, [spec.name for spec in mission.stages], mission.flags)
         rows = plan(mission.workspace, mission.stages, asked)
         actions = {row.stage: row.action for row in rows}
         if check:

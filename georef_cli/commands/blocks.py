@@ -15,6 +15,7 @@ from georef_cli.engines import asked_engine, engine_options
 from georef_cli.forecast import announce_training
 from georef_cli.output import print_json, print_outcome, print_rich
 from pipelines.core import runner
+from pipelines.core.options import remembered
 from pipelines.core.products import load_json
 from pipelines.core.stages import (
     BLOCK_RECORD,
@@ -27,7 +28,7 @@ from pipelines.core.stages import (
     TRAIN_SEAMS,
     StageSpec,
 )
-from pipelines.core.staleness import must_exist, stage_config
+from pipelines.core.staleness import Flags, must_exist, stage_config
 from pipelines.core.workspace import Workspace
 from pipelines.survey.survey import Survey
 
@@ -90,15 +91,18 @@ def _parts(workspace: Workspace, flags: dict[str, Any]) -> Parts:
     """
     from pipelines.train.blocks.parts import Parts
 
-    asked = runner.remembered(workspace, TRAIN, flags)
-    resolved: Any = stage_config(workspace, TRAIN, asked)
+    resolved: Any = stage_config(workspace, TRAIN, _remembered(workspace, flags)[TRAIN.name])
     return Parts(workspace, resolved)
+
+
+def _remembered(workspace: Workspace, flags: Flags) -> dict[str, dict[str, Any]]:
+    return remembered(workspace.root, [TRAIN.name], {TRAIN.name: flags})
 
 
 def _plan(ctx: click.Context, workspace: Workspace, given: dict[str, Any], values: dict[str, Any]) -> None:
     parts = _parts(workspace, given)
     with workspace.lock("blocks plan"):
-        workspace.remember({TRAIN.name: runner.remembered(workspace, TRAIN, given)})
+        workspace.remember(_remembered(workspace, given))
     with boundary.logged_to_file(parts.whole, PLAN_BLOCKS):
         outcome = parts.run(PLAN_BLOCKS, force=values["force"], progress=progress_for(ctx.obj))
     _print_plan(parts, outcome, values)
@@ -143,7 +147,7 @@ def _train(ctx: click.Context, workspace: Workspace, given: dict[str, Any], valu
 
     parts = _parts(workspace, given)
     with workspace.lock("blocks train"):
-        workspace.remember({TRAIN.name: runner.remembered(workspace, TRAIN, given)})
+        workspace.remember(_remembered(workspace, given))
         plan = train_blocks(parts, progress_for(ctx.obj), force=values["force"])
     if values["as_json"]:
         print_json({"blocks": [parts.training(block).model_dump(mode="json") for block in plan.blocks]})
@@ -159,13 +163,13 @@ def _all(
     parts = _parts(workspace, given)
     if only_merge:
         require_trained(parts, parts.plan())
-    flags = runner.remembered(workspace, TRAIN, given)
-    announce_training(workspace, (TRAIN,), {TRAIN.name: flags}, force=values["force"])
+    flags = _remembered(workspace, given)
+    announce_training(workspace, (TRAIN,), flags, force=values["force"])
     with boundary.logged_to_file(workspace, TRAIN):
         outcome = runner.run_stage(
             workspace,
             TRAIN,
-            flags,
+            flags[TRAIN.name],
             force=values["force"] and not only_merge,
             renew=not parts.is_merged() and (workspace.root / BLOCK_RECORD).exists(),
             resume="if-same",

@@ -17,7 +17,7 @@ from georef_cli.options import set_option, settings
 from georef_cli.output import print_outcomes
 from pipelines.core import runner
 from pipelines.core.errors import GeorefError
-from pipelines.core.plan import names_of_flags
+from pipelines.core.options import names_of_flags, remembered
 from pipelines.core.progress import SILENT, ProgressTask
 from pipelines.core.sentences import about
 from pipelines.core.stages import BY_NAME, DELIVERABLES, MODEL, PIPELINE, StageSpec, named_deliverables, stage_slice
@@ -68,10 +68,7 @@ def _run(ctx: click.Context, **values: Any) -> None:
     forget, force = _forgotten(values["forget"], stages), values["force"] or values["rerun_from"] is not None
     if stages[0].reads:
         must_exist(workspace)
-    asked = {
-        spec.name: runner.remembered(workspace, spec, flags.get(spec.name, {}), forget.get(spec.name, ()))
-        for spec in stages
-    }
+    asked = remembered(workspace.root, [spec.name for spec in stages], flags, forget)
     if values["dry_run"]:
         print_dry_run(
             workspace, stages, asked, force=force, as_json=values["as_json"], progress=progress_for(ctx.obj)

@@ -29,11 +29,7 @@ _IN_PROCESS = " in process "
 
 @dataclass(frozen=True)
 class WriteLock:
-    """Right to write in a folder, held by at most one process.
-
-    Attributes:
-        folder: the folder; made when the lock is first held.
-    """
+    """Right to write in a folder, held by at most one process; the folder is made when the lock is first held."""
 
     folder: Path
 
@@ -64,12 +60,6 @@ class WriteLock:
                 (self.folder / name).unlink(missing_ok=True)
 
     def _locked_file(self, patience_s: float) -> BinaryIO:
-        """Return the open and locked file.
-
-        Raises:
-            WorkspaceBusyError: another process holds the lock.
-            InputError: the folder cannot be made, written or locked.
-        """
         while True:
             try:
                 self.folder.mkdir(parents=True, exist_ok=True)

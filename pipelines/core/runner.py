@@ -1,7 +1,4 @@
-"""Runner of the stages in a workspace; stages whose product is current are skipped.
-
-Traces of a refused command: a workspace that was not there before, and in which no stage has ended.
-"""
+"""Runner of the stages in a workspace; those whose product is current are skipped."""
 
 from __future__ import annotations
 
@@ -13,8 +10,6 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
-from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
@@ -33,7 +28,7 @@ from pipelines.core.files import remove
 from pipelines.core.fingerprints import library_versions
 from pipelines.core.lock import WriteLock
 from pipelines.core.manifest import Manifest, Memo, record_files
-from pipelines.core.options import REQUESTS
+from pipelines.core.options import REQUESTS, remembered
 from pipelines.core.products import AT_END, union
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.sentences import duration
@@ -44,8 +39,8 @@ from pipelines.core.staleness import (
     Request,
     cautions_by_stage,
     continuing_command,
-    damaged_product,
     extendable_product,
+    finding,
     found_interrupted,
     is_unfinished,
     must_exist,
@@ -68,13 +63,7 @@ def no_traces_of_refusal(workspace: Workspace) -> Iterator[None]:
     """Remove what a command wrote, if it fails before the first product of a new workspace.
 
     Files of others in the folder stay, `georef.toml` among them. An interrupted command keeps what it has written:
-    it can be completed.
-
-    Args:
-        workspace: not locked by this process.
-
-    Raises:
-        GeorefError: the failure.
+    it can be completed. The workspace is not locked by this process.
     """
     missing = [folder for folder in (workspace.root, *workspace.root.parents) if not folder.exists()]
     is_new = workspace.base is None and not workspace.has_begun()
@@ -118,17 +107,6 @@ class Outcome:
     stage: str
     ran: bool
     manifest: Manifest
-
-
-@dataclass(frozen=True)
-class _Job:
-    """Stage to run, with the arguments of `run_stage`."""
-
-    workspace: Workspace
-    asked: Request
-    resume: Resume
-    progress: Progress
-    place: str
 
 
 @storage_failures()
@@ -178,7 +156,7 @@ def run_stage(
         if previous is not None:
             return Outcome(spec.name, False, _with_present_files(workspace, asked, previous))
         try:
-            manifest = _execute(_Job(workspace, asked, "never" if force else resume, progress, place))
+            manifest = _execute(workspace, asked, "never" if force else resume, progress, place)
         except InputError:
             workspace.remember({spec.name: before})
             raise
@@ -216,11 +194,7 @@ def run_pipeline(
     if stages[0].reads:
         must_exist(workspace)
     before = workspace.requests()
-    forget = forget or {}
-    asked = {
-        spec.name: remembered(workspace, spec, flags.get(spec.name, {}), forget.get(spec.name, ()))
-        for spec in stages
-    }
+    asked = remembered(workspace.root, [spec.name for spec in stages], flags, forget)
     for spec in stages:
         options = stage_config(workspace, spec, asked[spec.name])
         if not force:
@@ -251,12 +225,6 @@ def run_pipeline(
     return outcomes
 
 
-def remembered(workspace: Workspace, spec: StageSpec, flags: Flags, forget: Collection[str] = ()) -> dict[str, Any]:
-    """Return the options that a stage was last requested with but those of `forget`, overridden by `flags`."""
-    before = workspace.requests().get(spec.name, {})
-    return {**{name: value for name, value in before.items() if name not in forget}, **flags}
-
-
 def _goes_on(workspace: Workspace, asked: Request) -> bool:
     """Return whether to go on with an interrupted run beside a current product, and tell what lies there.
 
@@ -264,7 +232,7 @@ def _goes_on(workspace: Workspace, asked: Request) -> bool:
     deleted; what another request can continue stays.
     """
     spec, partial = asked.spec, workspace.partial_product(asked.spec)
-    if not partial.exists() or workspace.placed_by_hand(spec):
+    if not partial.folder.exists() or workspace.placed_by_hand(spec):
         return False
     found = found_interrupted(workspace, spec)
     if is_unfinished(workspace, asked):
@@ -282,12 +250,11 @@ def _goes_on(workspace: Workspace, asked: Request) -> bool:
     return False
 
 
-def _execute(job: _Job) -> Manifest:
-    workspace, asked = job.workspace, job.asked
+def _execute(workspace: Workspace, asked: Request, resume: Resume, progress: Progress, place: str) -> Manifest:
     spec, resolved = asked.spec, asked.options.model_dump(mode="json")
-    _tell_interrupted(job)
+    _tell_interrupted(workspace, asked, resume)
     started, clock = now(), time.monotonic()
-    summary = _run(job)
+    summary = _run(workspace, asked, resume, progress, place)
     out = workspace.partial(spec)
     for product in products_of(spec):
         if not (out / product.removeprefix(f"{spec.folder}/")).exists():
@@ -313,19 +280,19 @@ def _execute(job: _Job) -> Manifest:
         files=record_files(out, spec.working),
         input_files=asked.inputs.files,
     )
-    workspace.set_aside(damaged_product(workspace, spec, {}, by_content=False))
+    workspace.set_aside(finding(workspace, spec, {}).damaged)
     workspace.commit(spec, manifest)
     log.info("%s: %s (%s)", spec.name, summary.key_figure, duration(manifest.duration_s))
     return manifest
 
 
-def _tell_interrupted(job: _Job) -> None:
+def _tell_interrupted(workspace: Workspace, asked: Request, resume: Resume) -> None:
     """Log what an interrupted run has left, and whether this one goes on with it."""
-    spec, partial = job.asked.spec, job.workspace.partial_product(job.asked.spec)
-    if not spec.resumable or not partial.exists():
+    spec, partial = asked.spec, workspace.partial_product(asked.spec)
+    if not spec.resumable or not partial.folder.exists():
         return
-    found = found_interrupted(job.workspace, spec)
-    if job.resume != "never" and partial.is_of(job.asked.token):
+    found = found_interrupted(workspace, spec)
+    if resume != "never" and partial.is_of(asked.token):
         log.info("%s: goes on with an interrupted run: %s", spec.name, found)
     else:
         log.warning("%s: starts afresh; what an interrupted run had done is dropped: %s", spec.name, found)
@@ -343,29 +310,29 @@ def _with_present_files(workspace: Workspace, asked: Request, manifest: Manifest
     return renewed
 
 
-def _run(job: _Job) -> Summary:
+def _run(workspace: Workspace, asked: Request, resume: Resume, progress: Progress, place: str) -> Summary:
     """Run the module of a stage; afresh, if the partial product to be continued is damaged.
 
     Raises:
         GeorefError: a known failure, which is recorded.
     """
-    workspace, asked, place = job.workspace, job.asked, job.place
-    spec, token = asked.spec, asked.token
-    out, resumed = workspace.begin(spec, token, job.resume)
-    extends = None if job.resume == "never" else extendable_product(workspace, asked)
+    spec, token, afresh = asked.spec, asked.token, resume == "never"
+    out, resumed = workspace.begin(spec, token, resume)
+    extends = None if afresh else extendable_product(workspace, asked)
     log.info("%s: %s%s", spec.name, "resumed" if resumed else "started", f", {place}" if place else "")
     try:
         with storage_failures(out):
-            run = _module(workspace, asked).run
-            afresh = job.resume == "never"
+            module = importlib.import_module(spec.module)
+            if spec.in_parts and module.made_in_parts(workspace, asked.options):
+                module = importlib.import_module(spec.in_parts)
             try:
-                summary: Summary = run(
-                    StageRun(workspace, out, job.progress, resumed, extends, afresh), asked.options
+                summary: Summary = module.run(
+                    StageRun(workspace, out, progress, resumed, extends, afresh), asked.options
                 )
             except DamagedPartialError as error:
                 log.warning("%s: starts afresh; what the interrupted run left is damaged (%s)", spec.name, error)
                 out, _ = workspace.begin(spec, token, "never")
-                summary = run(StageRun(workspace, out, job.progress, afresh=afresh), asked.options)
+                summary = module.run(StageRun(workspace, out, progress, afresh=afresh), asked.options)
     except GeorefError as error:
         workspace.partial_product(spec).fail(str(error), worthless=isinstance(error, _RESULTS))
         raise
@@ -381,19 +348,11 @@ def _run(job: _Job) -> Summary:
     return summary
 
 
-def _module(workspace: Workspace, asked: Request) -> ModuleType:
-    """Return the module that makes a stage's product, whole or in parts."""
-    spec = asked.spec
-    module = importlib.import_module(spec.module)
-    if spec.in_parts and module.made_in_parts(workspace, asked.options):
-        return importlib.import_module(spec.in_parts)
-    return module
-
-
 def _current(workspace: Workspace, asked: Request, memo: Memo) -> Manifest | None:
     """Return the manifest of a product that need not be made again, or None."""
     spec = asked.spec
-    if workspace.placed_by_hand(spec):
+    found = finding(workspace, spec, memo, by_content=True)
+    if found.by_hand:
         log.info("%s: %s was %s and is kept; --force replaces it", spec.name, spec.product, BY_HAND)
         return Manifest(
             stage=spec.name,
@@ -406,17 +365,12 @@ def _current(workspace: Workspace, asked: Request, memo: Memo) -> Manifest | Non
             values={},
             warnings=[],
         )
-    try:
-        manifest = workspace.manifest(spec)
-    except InputError as error:
-        log.warning("%s: made again, because %s", spec.name, error)
-        return None
-    if manifest is None:
-        return None
-    damage = why_damaged(workspace.damaged(spec, manifest, memo, by_content=True))
-    if damage:
-        log.warning("%s: damaged, made again: %s", spec.name, damage)
-        return None
-    reason = why_stale(workspace, asked, manifest)
-    log.info("%s: %s", spec.name, f"made again: {reason}" if reason else f"current: {manifest.key_figure}")
-    return None if reason else manifest
+    if found.unreadable:
+        log.warning("%s: made again, because %s", spec.name, found.unreadable)
+    elif found.damaged:
+        log.warning("%s: damaged, made again: %s", spec.name, why_damaged(found.damaged))
+    elif (manifest := found.manifest) is not None:
+        reason = why_stale(workspace, asked, manifest)
+        log.info("%s: %s", spec.name, f"made again: {reason}" if reason else f"current: {manifest.key_figure}")
+        return None if reason else manifest
+    return None
