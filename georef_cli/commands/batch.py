@@ -10,7 +10,7 @@ import click
 
 from georef_cli import job_tables, options
 from georef_cli.command import Command
-from georef_cli.commands.run import OWNERS, deliver_option, slice_option
+from georef_cli.commands.run import OWNERS, deliver_option, deliverables, slice_option
 from georef_cli.display import progress_for
 from georef_cli.engines import engine_for, engine_options
 from georef_cli.forecast import RunForecast, checked_inputs, forecast_run
@@ -23,7 +23,7 @@ from pipelines.core.progress import Progress
 from pipelines.core.stages import BY_NAME
 from pipelines.core.staleness import stage_config
 from pipelines.jobs.batch import PlannedMission
-from pipelines.jobs.missions import Mission, MissionList, load_missions
+from pipelines.jobs.missions import Mission, load_missions
 
 log = logging.getLogger(__name__)
 
@@ -33,7 +33,9 @@ FAILED = 1
 def _batch(ctx: click.Context, **values: Any) -> int:
     from pipelines.jobs.batch import page_file, run_batch
 
-    listed = _missions(values)
+    flags = settings(values["settings"], BY_NAME.values())
+    listed = load_missions(values["missions"], OWNERS, values["last"], values["deliver"], flags)
+    deliverables(values["deliver"])  # refuses a bad name
     progress = progress_for(ctx.obj)
     forecasts = [_planned(mission, check=values["dry_run"], progress=progress) for mission in listed.missions]
     planned = [mission for mission, _ in forecasts]
@@ -52,21 +54,6 @@ def _batch(ctx: click.Context, **values: Any) -> int:
     else:
         print_rich(*job_tables.batch(table, page_file(listed.folder, listed.name)))
     return 0 if table.is_complete else FAILED
-
-
-def _missions(values: dict[str, Any]) -> MissionList:
-    """Return the missions, with the options of the command line for all of them.
-
-    Raises:
-        InputError: a bad name, key or value in the file.
-        click.UsageError: a bad option.
-    """
-    flags = settings(values["settings"], BY_NAME.values())
-    listed = load_missions(values["missions"], OWNERS)
-    try:
-        return listed.overridden(values["last"], values["deliver"], flags)
-    except ValueError as error:
-        raise click.UsageError(f"--deliver: {error}") from error
 
 
 def _planned(mission: Mission, *, check: bool, progress: Progress) -> tuple[PlannedMission, RunForecast | None]:

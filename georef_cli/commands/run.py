@@ -62,7 +62,7 @@ def _run(ctx: click.Context, **values: Any) -> None:
     if values["first"] and values["rerun_from"]:
         raise click.UsageError("--from and --rerun-from exclude each other.")
     first = values["first"] or values["rerun_from"]
-    stages = (*_stages(first, values["last"]), *_deliverables(values["deliver"]))
+    stages = (*_stages(first, values["last"]), *deliverables(values["deliver"]))
     flags = _flags(ctx, stages, settings(values["settings"], stages))
     workspace = values["workspace"]
     forget, force = _forgotten(values["forget"], stages), values["force"] or values["rerun_from"] is not None
@@ -154,7 +154,7 @@ def _stages(first: str | None, last: str | None) -> tuple[StageSpec, ...]:
         raise click.UsageError(str(error)) from error
 
 
-def _deliverables(text: str | None) -> tuple[StageSpec, ...]:
+def deliverables(text: str | None) -> tuple[StageSpec, ...]:
     """Return the stages of the deliverables in a text, such as `raster,cloud` or `all`.
 
     Raises:

@@ -46,9 +46,8 @@ def reconstruction_pace(
     """Return about how many seconds one core needs for each step.
 
     Args:
-        photographs: number of photographs.
+        photographs, pairs: numbers of photographs, and of pairs that are matched.
         megapixels: of each, as features are looked for.
-        pairs: of photographs that are matched.
         doubled: whether features are looked for on twice that size, too.
         max_features: of a photograph.
     """
@@ -77,8 +76,7 @@ def iteration_seconds(pixels: float, gaussians: float, *, surface: bool, windows
     """Return the seconds of one iteration on the machine of `MEASURED_ON`.
 
     Args:
-        pixels: of the photograph.
-        gaussians: number of Gaussians.
+        pixels, gaussians: of the photograph, and of the whole model.
         surface: whether surface losses hold the Gaussians.
         windows: number of windows in which the photograph is seen, one at an iteration.
     """
@@ -99,12 +97,9 @@ class BlockCost:
     coefficients: FloatArray
 
     def of(self, pixels: float, visible: float, gaussians: float) -> float:
-        """Return the cost.
+        """Return the cost of a block with so many pixels and Gaussians in a view, and Gaussians in all.
 
-        Args:
-            pixels: of the block in a view.
-            visible: number of the Gaussians in a view.
-            gaussians: number of all Gaussians, those that stand in for the rest among them.
+        Those that stand in for the rest of the survey count too.
         """
         return float((_design(np.array([[pixels, visible, gaussians]])) @ self.coefficients).item())
 
@@ -132,10 +127,7 @@ def _design(sizes: FloatArray) -> FloatArray:
 class TimeLeft:
     """Time that the remaining iterations will take, from the speed of those done and the work of each.
 
-    Args:
-        work: of an iteration, counted from 1, in any unit.
-        iterations: length of the training.
-        clock: returns seconds.
+    The work is that of an iteration, counted from 1, in any unit.
     """
 
     def __init__(

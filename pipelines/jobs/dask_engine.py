@@ -3,8 +3,6 @@
 The engine chooses the worker of each job, as the local engine chooses what runs beside what; Dask carries the jobs
 and the events. A job ends with the event of its worker. A cancelled task is the one sign to stop a job: Ctrl-C, the
 end of the engine and the end of the scheduler all lead to it, and the job saves its work.
-
-Jobs of one call of the cluster's engine: where they run, how they fare, and what comes after a failure.
 """
 
 from __future__ import annotations
@@ -49,9 +47,7 @@ class PendingJob:
     """Job that has not ended.
 
     Attributes:
-        job: the job.
         token: file that its worker must see.
-        failures: so far.
         avoided: addresses of workers on which it has failed.
         not_before: time of the next attempt at the earliest.
         busy_since: time since which its folder is locked by another process; None: it is not.
@@ -78,7 +74,7 @@ class _Attempt:
 
 
 class ClusterRun:
-    """Jobs of one call of the engine.
+    """Jobs of one call of the engine: where they run, how they fare, and what comes after a failure.
 
     Args:
         client: connected to the scheduler.
@@ -143,11 +139,7 @@ class ClusterRun:
             self._client.unsubscribe_topic(self._topic)
 
     def _refresh(self, is_stopping: bool) -> None:
-        """Look which workers there are; jobs of lost workers have failed there.
-
-        Raises:
-            ClusterError: the scheduler is lost.
-        """
+        """Look which workers there are; jobs of lost workers have failed there."""
         if time.monotonic() - self._refreshed < _REFRESH_EVERY_S:
             return
         try:
@@ -170,11 +162,7 @@ class ClusterRun:
                 self._end(name, ProcessEnd(1, seconds, why, _LOST), is_stopping)
 
     def _lose_scheduler(self, cause: Exception) -> None:
-        """Tell that the running jobs are interrupted.
-
-        Raises:
-            ClusterError: always.
-        """
+        """Tell that the running jobs are interrupted, and raise."""
         for name, attempt in list(self._running.items()):
             self._finish(name, ProcessEnd(INTERRUPTED, time.monotonic() - attempt.since))
         raise ClusterError(
@@ -183,11 +171,7 @@ class ClusterRun:
         ) from cause
 
     def _start(self) -> None:
-        """Start waiting jobs on workers that have room.
-
-        Raises:
-            ClusterError: no worker can run the jobs.
-        """
+        """Start waiting jobs on workers that have room."""
         if self._unfit and not self._places and not self._running:
             raise ClusterError(f"no worker can run the jobs: {self._warned}")
         now = time.monotonic()
@@ -196,23 +180,18 @@ class ClusterRun:
                 return
             if now < pending.not_before:
                 continue
-            place = place_for(pending.job, self._places, self._jobs_by_worker(), pending.avoided)
+            by_worker: dict[str, list[Job]] = {}
+            for attempt in self._running.values():
+                by_worker.setdefault(attempt.place.address, []).append(attempt.pending.job)
+            place = place_for(pending.job, self._places, by_worker, pending.avoided)
             if place is not None:
                 self._waiting.remove(pending)
                 self._submit(pending, place)
-        if not self._running and not any(pending.not_before > now for pending in self._waiting):
+        if self._waiting and not self._running and all(pending.not_before <= now for pending in self._waiting):
             self._warn_of_waiting()
-
-    def _jobs_by_worker(self) -> dict[str, list[Job]]:
-        by_worker: dict[str, list[Job]] = {}
-        for attempt in self._running.values():
-            by_worker.setdefault(attempt.place.address, []).append(attempt.pending.job)
-        return by_worker
 
     def _warn_of_waiting(self) -> None:
         """Tell once why nothing runs."""
-        if not self._waiting:
-            return
         wanted = "a GPU" if self._places else f"{MEMORY}, as those of `georef cluster worker` do"
         text = f"waiting: no worker offers {wanted}"
         if text != self._warned:

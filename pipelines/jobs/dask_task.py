@@ -1,12 +1,7 @@
-"""Job on a worker of a Dask cluster: runs it as a process, and sends its messages and its end to the engine.
+"""Dask's side of a cluster: the job on a worker, which is a process of this program, and the nodes themselves.
 
-The payload is a document of names and paths. The program that runs is fixed.
-
-Nodes of a Dask cluster on this machine: scheduler and worker.
-
-Dask's own programs run; this module gives them the options that a safe cluster of this package needs.
-
-Tokens: files by which a worker recognises that it shares a folder, and not only its name.
+The payload is a document of names and paths. The program that runs is fixed. The nodes are Dask's own programs with
+the options that a safe cluster of this package needs.
 """
 
 from __future__ import annotations
@@ -66,9 +61,9 @@ def run_job(request: JobRequest) -> None:
 
     worker = get_worker()
     events = _Events(worker, request)
-    events.send(started=True)
+    events.flush(started=True)
     end = _obstacle(request) or _run_where_its_files_are(worker, request, events)
-    events.send(ended=dataclasses.asdict(end))
+    events.flush(ended=dataclasses.asdict(end))
 
 
 def _obstacle(request: JobRequest) -> ProcessEnd | None:
@@ -109,15 +104,11 @@ def _run(worker: Any, arguments: Sequence[str], events: _Events) -> ProcessEnd:
             return ends.get(timeout=_SEND_EVERY_S)
         except queue.Empty:
             events.flush()
-        if is_wanted and not _is_wanted(worker, key):
+        task = worker.state.tasks.get(key)
+        goes_on = worker.status.name in ("running", "paused") and task is not None and task.state == "executing"
+        if is_wanted and not goes_on:
             is_wanted = False
             running.interrupt()
-
-
-def _is_wanted(worker: Any, key: Any) -> bool:
-    """Return whether a worker is to go on with its task."""
-    task = worker.state.tasks.get(key)
-    return worker.status.name in ("running", "paused") and task is not None and task.state == "executing"
 
 
 class _Events:
@@ -144,20 +135,14 @@ class _Events:
                 self._messages.append(dict(message))
         return True
 
-    def flush(self) -> None:
-        """Send the messages that were kept."""
+    def flush(self, **content: Any) -> None:
+        """Send the messages that were kept, and one event with this content, if any."""
         with self._lock:
             messages, self._messages = self._messages, []
-        if messages:
-            self._log(messages=messages)
-
-    def send(self, **content: Any) -> None:
-        """Send what was kept, and one event."""
-        self.flush()
-        self._log(**content)
-
-    def _log(self, **content: Any) -> None:
-        self._worker.log_event(self._request["topic"], {"attempt": self._request["attempt"], **content})
+        events: list[dict[str, Any]] = [{"messages": messages}, content]
+        for event in events:
+            if any(event.values()):
+                self._worker.log_event(self._request["topic"], {"attempt": self._request["attempt"], **event})
 
 
 # The pages of the status servers are not encrypted and ask for no certificate.
@@ -186,8 +171,7 @@ def run_worker(
     Args:
         scheduler: its address.
         jobs: most jobs at a time.
-        cores: that they share.
-        memory_bytes: that they share.
+        cores, memory_bytes: that they share.
         gpus: number of GPUs; a job takes one.
         name: for people; None: its address.
 
@@ -219,8 +203,7 @@ def _call(main: object, arguments: Sequence[str]) -> None:
 def folder_tokens(folders: Iterable[Path | None]) -> Iterator[dict[Path | None, str]]:
     """Put a token into each folder while the context lasts, and return their paths by folder.
 
-    Raises:
-        OSError: a folder cannot be written.
+    By this file a worker recognises that it shares a folder, and not only its name.
     """
     name = f".georef-{uuid.uuid4().hex}"
     tokens: dict[Path | None, str] = {

@@ -1,7 +1,4 @@
-"""Jobs, their ends, and the interface of the engines that run them.
-
-Display of one job: the messages of its process as one line of the progress, and as records of the log.
-"""
+"""Jobs, their ends, their display as one line each, and the interface of the engines that run them."""
 
 from __future__ import annotations
 
@@ -52,7 +49,6 @@ class JobEnd:
     """End of a job.
 
     Attributes:
-        job: the job.
         code: exit code; below zero the signal that ended the process.
         seconds: from start to end.
         place: step that the job was at (`train`); empty if it named none.
@@ -89,7 +85,6 @@ class Engine(Protocol):
             title: what the jobs are, for the display: `missions`.
             jobs: in the order in which they begin where resources allow.
             ended: called in this thread at the end of each job.
-            progress: shows a task for all jobs, and one for each that runs.
 
         Raises:
             KeyboardInterrupt: the user stopped the run. The jobs that ran have saved their work, and `ended` was
@@ -139,7 +134,6 @@ class _InnerTask:
         self._done, self._note = 0, ""
 
     def advance(self, steps: int = 1, note: str = "", left_s: float | None = None) -> None:
-        """Add steps, and show their count as the note of the line."""
         self._done, self._note = self._done + steps, note.strip() or self._note
         count = f"{self._name} {self._done}" + ("" if self._total is None else f"/{self._total}")
         left = "" if not left_s or math.isinf(left_s) else f"{duration(left_s)} left"
@@ -151,10 +145,6 @@ class JobDisplay(MessageReceiver):
     """Receiver of a job's messages: its tasks are one line, and its log records name it.
 
     Only warnings are logged by default: many jobs say much.
-
-    Args:
-        progress: shows the line.
-        name: of the job.
     """
 
     def __init__(self, progress: Progress, name: str) -> None:
@@ -167,7 +157,6 @@ class JobDisplay(MessageReceiver):
         return self._line.place
 
     def log(self, name: str, level: int, text: str) -> None:
-        """Log a record of the job."""
         shown = level if level >= logging.WARNING else logging.DEBUG
         log.log(shown, "%s: %s", self._name, text)
 

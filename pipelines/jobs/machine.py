@@ -28,7 +28,7 @@ _LIBRARIES = (
 
 @dataclass(frozen=True)
 class Gpu:
-    """GPU that torch sees: its name, and its memory in bytes."""
+    """GPU that torch sees, and its memory."""
 
     name: str
     bytes: int
@@ -49,18 +49,12 @@ class Machine:
 
     Attributes:
         system: operating system, its release, and the processor's architecture.
-        python: version.
-        cores: that this process may use.
-        threads: that stages compute with (`--threads`).
+        cores, threads: cores that this process may use, and threads that stages compute with (`--threads`).
         memory_bytes, free_bytes: main memory; None: the system does not state it.
-        gpus: that torch sees.
-        backends: of the rasteriser.
         cuda_parts: what the cuda backend needs, and what compiles its kernels.
         cuda_kernels: place of the compiled kernels; None: the first use compiles them.
-        grid_folders: in which PROJ looks for grids.
-        grids: file names of the installed geoid models and datum shifts.
+        grid_folders, grids: where PROJ looks for grids; file names of the installed geoid models and datum shifts.
         chromium: path of Chromium or Chrome; None: not found.
-        versions: of this package and its libraries.
     """
 
     system: str
