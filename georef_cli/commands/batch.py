@@ -10,11 +10,11 @@ import click
 
 from georef_cli import job_tables, options
 from georef_cli.command import Command
-from georef_cli.commands.run import OWNERS, deliver_option, deliverables, slice_option
+from georef_cli.commands.run import DELIVER, OWNERS, deliverables, slice_option
 from georef_cli.display import progress_for
 from georef_cli.engines import engine_for, engine_options
 from georef_cli.forecast import RunForecast, checked_inputs, forecast_run
-from georef_cli.options import set_option, settings
+from georef_cli.options import SET, settings
 from georef_cli.output import print_json, print_rich
 from pipelines.core.errors import GeorefError
 from pipelines.core.options import input_paths, remembered
@@ -96,11 +96,11 @@ command = Command(
             help="Run at most this many missions at a time (default: as many as cores and predicted memory allow).",
         ),
         slice_option(["--to", "--end-with"], "last", "Last stage to run, of every mission."),
-        deliver_option(),
-        set_option(),
+        DELIVER,
+        SET,
         *engine_options(),
-        options.dry_run_option(),
-        options.json_option(),
+        options.DRY_RUN,
+        options.JSON,
     ],
     callback=click.pass_context(_batch),
     help="""Run many missions, several at a time, and put their results into one table.

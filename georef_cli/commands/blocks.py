@@ -186,7 +186,7 @@ command = Command(
         *options.stage_options(TRAIN.options),
         *engine_options(),
         options.force_option("Run even what is current, and start afresh."),
-        options.json_option(),
+        options.JSON,
     ],
     callback=click.pass_context(_blocks),
     help="""Train a large survey in blocks, and merge them into one model.

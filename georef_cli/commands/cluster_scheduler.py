@@ -31,7 +31,7 @@ command = Command(
             help="Where to listen (default: port 8786 of every network with --certificates, else of 127.0.0.1).",
         ),
         *certificates_options(),
-        options.json_option(),
+        options.JSON,
     ],
     callback=_scheduler,
     help="""Start the scheduler of a cluster (docs/cluster.md). It runs until Ctrl-C.

@@ -68,7 +68,7 @@ command = Command(
             ["--gpus"], type=click.IntRange(min=0), metavar="N", help="Number of GPUs (default: as found)."
         ),
         click.Option(["--name"], metavar="NAME", help="Name for messages (default: its address)."),
-        options.json_option(),
+        options.JSON,
     ],
     callback=_worker,
     help="""Lend this machine to a cluster (docs/cluster.md), until Ctrl-C or the end of the scheduler.

@@ -81,7 +81,7 @@ def _gib(count: int | None) -> str:
 command = Command(
     "doctor",
     params=[
-        options.json_option(),
+        options.JSON,
         click.Option(
             ["--compile-cuda"],
             is_flag=True,

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from georef_cli.stage import DeliverableCommand
+from georef_cli.stage import StageCommand
 
-command = DeliverableCommand(
+command = StageCommand(
     "export-cameras",
     """Write the trained cameras and lenses, placed on Earth.
 
@@ -17,5 +17,5 @@ command = DeliverableCommand(
       georef export-cameras flight
       georef export-cameras flight --crs EPSG:32632 --to handover/cameras
     """,
-    folder=True,
+    delivers="folder",
 )

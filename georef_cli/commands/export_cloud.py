@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from georef_cli.stage import DeliverableCommand
+from georef_cli.stage import StageCommand
 
-command = DeliverableCommand(
+command = StageCommand(
     "export-cloud",
     """Write the surface as a georeferenced point cloud (LAZ).
 
@@ -18,4 +18,5 @@ command = DeliverableCommand(
       georef export-cloud flight --crs EPSG:32632+3855 --spacing 0.1 --to flight.laz
       georef export-cloud flight --crs EPSG:25832 --vertical EPSG:7837 --ply
     """,
+    delivers="file",
 )

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from georef_cli.stage import DeliverableCommand
+from georef_cli.stage import StageCommand
 
-command = DeliverableCommand(
+command = StageCommand(
     "export-raster",
     """Write orthophoto, surface model (DSM) and their predicted σ as Cloud Optimized GeoTIFF in a CRS.
 
@@ -18,5 +18,5 @@ command = DeliverableCommand(
       georef export-raster flight --crs EPSG:32632+3855 --gsd 0.05 --contours 1
       georef export-raster flight --to delivery/raster
     """,
-    folder=True,
+    delivers="folder",
 )

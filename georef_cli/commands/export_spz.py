@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from georef_cli.stage import DeliverableCommand
+from georef_cli.stage import StageCommand
 
-command = DeliverableCommand(
+command = StageCommand(
     "export-spz",
     """Write the splat as SPZ, for viewers on the web.
 
@@ -16,4 +16,5 @@ command = DeliverableCommand(
       georef export-spz flight
       georef export-spz flight --to splat.spz --spz-version 4
     """,
+    delivers="file",
 )

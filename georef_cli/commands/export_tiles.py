@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from georef_cli.stage import DeliverableCommand
+from georef_cli.stage import StageCommand
 
-command = DeliverableCommand(
+command = StageCommand(
     "export-tiles",
     """Write the splat as 3D Tiles, for web globes such as CesiumJS.
 
@@ -18,5 +18,5 @@ command = DeliverableCommand(
       georef export-tiles flight --to www/flight --max-tile-gaussians 100000
       georef export-tiles flight --crs EPSG:2056 --cesium Cesium/
     """,
-    folder=True,
+    delivers="folder",
 )

@@ -61,7 +61,7 @@ def _overview() -> str:
 
 command = Command(
     "help",
-    params=[click.Argument(["topic"], required=False, type=TopicType(), metavar="[TOPIC]"), options.json_option()],
+    params=[click.Argument(["topic"], required=False, type=TopicType(), metavar="[TOPIC]"), options.JSON],
     callback=click.pass_context(_help),
     help="""Explain a topic or a command.
 

@@ -30,7 +30,7 @@ def _info(ctx: click.Context, workspace: Workspace, as_json: bool, **_values: An
 
 command = Command(
     "info",
-    params=[options.workspace_argument(), *options.stage_options(CrsOptions), options.json_option()],
+    params=[options.WORKSPACE, *options.stage_options(CrsOptions), options.JSON],
     callback=click.pass_context(_info),
     help="""Show where on Earth the result is, how good it is, what was made and what each file is for.
 

@@ -13,7 +13,7 @@ from georef_cli import boundary, options
 from georef_cli.command import Command
 from georef_cli.display import is_told, progress_for
 from georef_cli.forecast import RunTimeLeft, announce_training, forecast_run, print_dry_run
-from georef_cli.options import set_option, settings
+from georef_cli.options import SET, settings
 from georef_cli.output import print_outcomes
 from pipelines.core import runner
 from pipelines.core.errors import GeorefError
@@ -54,8 +54,13 @@ LATER: dict[str, tuple[str, ...]] = {
     "lidar_register": ("train",),
     "seed": ("sfm", "init-sim3", "train"),
 }
-_DELIVERABLE_NAMES = ", ".join(spec.name.removeprefix("export-") for spec in DELIVERABLES)
 OWNERS: dict[str, tuple[str, ...]] = {**dict.fromkeys(IngestOptions.model_fields, ("ingest",)), **LATER}
+DELIVER = click.Option(
+    ["--deliver"],
+    metavar="NAMES",
+    help=f"Make these as well: {', '.join(spec.name.removeprefix('export-') for spec in DELIVERABLES)}, with "
+    "commas, or all. Their options are set in georef.toml or with their own commands.",
+)
 
 
 def _run(ctx: click.Context, **values: Any) -> None:
@@ -205,16 +210,6 @@ def _flags(
     return flags
 
 
-def deliver_option() -> click.Option:
-    """Return the option `--deliver`."""
-    return click.Option(
-        ["--deliver"],
-        metavar="NAMES",
-        help=f"Make these as well: {_DELIVERABLE_NAMES}, with commas, or all. Their options are set in "
-        "georef.toml or with their own commands.",
-    )
-
-
 def slice_option(flags: list[str], dest: str, help_text: str) -> click.Option:
     """Return an option that names a stage of the pipeline."""
     return click.Option([*flags, dest], type=click.Choice([spec.name for spec in PIPELINE]), help=help_text)
@@ -223,17 +218,17 @@ def slice_option(flags: list[str], dest: str, help_text: str) -> click.Option:
 command = Command(
     "run",
     params=[
-        options.workspace_argument(),
+        options.WORKSPACE,
         slice_option(["--from"], "first", "First stage to run."),
         slice_option(["--rerun-from"], "rerun_from", "First stage to run, with --force."),
         slice_option(["--to", "--end-with"], "last", "Last stage to run."),
         *(options.stage_option(BY_NAME[owners[0]].options, name) for name, owners in OWNERS.items()),
-        deliver_option(),
-        set_option(),
-        options.forget_option(),
-        options.dry_run_option(),
+        DELIVER,
+        SET,
+        options.FORGET,
+        options.DRY_RUN,
         options.force_option("Run the stages even if their products are current."),
-        options.json_option(),
+        options.JSON,
     ],
     callback=click.pass_context(_run),
     help="""Run all stages, or some, skipping what is current.

@@ -41,13 +41,13 @@ def _status(workspace: Workspace, with_options: bool, as_json: bool) -> None:
 command = Command(
     "status",
     params=[
-        options.workspace_argument(),
+        options.WORKSPACE,
         click.Option(
             ["--options", "with_options"],
             is_flag=True,
             help="Show the options that are no defaults too: remembered from earlier commands, or of georef.toml.",
         ),
-        options.json_option(),
+        options.JSON,
     ],
     callback=_status,
     help="""Show the state of every stage: missing, current, stale (its inputs or options have changed since),
