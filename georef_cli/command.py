@@ -31,11 +31,7 @@ class Command(click.Command):
         super().__init__(name, help=inspect.cleandoc(help), params=[*params, *shared_options()], **more)
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run the command with the verbosity of its own line and of the group's options together.
-
-        Raises:
-            click.UsageError: both `--verbose` and `--quiet` are given.
-        """
+        """Run the command with the verbosity of its own line and of the group's options together."""
         ctx.obj = merged_verbosity(ctx)
         with boundary.logged_to_stderr(ctx.obj):
             return super().invoke(ctx)

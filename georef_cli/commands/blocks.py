@@ -113,7 +113,7 @@ def _print_plan(parts: Parts, outcome: runner.Outcome, values: dict[str, Any]) -
     if values["as_json"]:
         print_json({"stage": outcome.stage, "ran": outcome.ran, **plan.model_dump(mode="json")})
     else:
-        print_rich(*job_tables.plan(plan, parts.states(plan), _processor_s(parts, plan)))
+        print_rich(*job_tables.block_table(plan, parts.states(plan), _processor_s(parts, plan)))
 
 
 def _processor_s(parts: Parts, plan: BlockPlan) -> dict[int, float] | None:
@@ -152,7 +152,7 @@ def _train(ctx: click.Context, workspace: Workspace, given: dict[str, Any], valu
     if values["as_json"]:
         print_json({"blocks": [parts.training(block).model_dump(mode="json") for block in plan.blocks]})
     else:
-        print_rich(*job_tables.plan(plan, parts.states(plan)))
+        print_rich(*job_tables.block_table(plan, parts.states(plan)))
 
 
 def _all(

@@ -23,7 +23,7 @@ def _status(workspace: Workspace, with_options: bool, as_json: bool) -> None:
     accuracy = headline_of(workspace)
     origins = [row for spec in BY_NAME.values() for row in option_origins(workspace, spec)] if with_options else []
     if not as_json:
-        print_rich(tables.states(rows, cautions), *tables.accuracy(accuracy), *tables.cautions(cautions))
+        print_rich(tables.states(rows, cautions), *tables.accuracy_line(accuracy), *tables.cautions(cautions))
         if with_options:
             print_rich(*tables.origins(origins))
         return
