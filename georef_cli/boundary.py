@@ -221,8 +221,8 @@ class _StderrHandler(logging.StreamHandler[TextIO]):
 class _LateFileHandler(logging.Handler):
     """Handler that opens its file when the workspace has its first product, or else at the end of the command.
 
-    A command that is refused leaves neither file nor folder behind. Where the log cannot be written, nothing is
-    said: stderr has the same lines.
+    A command that is refused leaves neither file nor folder behind. A log that cannot be written is no error:
+    stderr has the same lines.
     """
 
     def __init__(self, workspace: Workspace, spec: StageSpec) -> None:
@@ -234,13 +234,11 @@ class _LateFileHandler(logging.Handler):
         self._failed = False
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Write a record, or hold it back."""
         self._held_back.append(self.format(record) + "\n")
         if self._file is not None or self._workspace.has_product():
             self._write()
 
     def _write(self) -> None:
-        """Write what was held back."""
         lines, self._held_back = self._held_back, []
         if self._failed:
             return
@@ -262,7 +260,6 @@ class _LateFileHandler(logging.Handler):
         super().close()
 
     def emit_end(self, error: BaseException) -> None:
-        """Record the error that ended a stage."""
         known = isinstance(error, GeorefError | KeyboardInterrupt)
         text = str(error) or type(error).__name__
         self.emit(

@@ -17,13 +17,9 @@ _VERBOSITY = tuple(field.name for field in fields(Verbosity))
 
 
 class Command(click.Command):
-    """Command of the program, with the options that all commands share.
+    """Command of the program: its arguments and options, and those that all commands share.
 
-    Args:
-        name: of the command.
-        help: text with examples; its indentation is removed.
-        params: arguments and options of its own.
-        more: see `click.Command`.
+    The indentation of its help is removed.
     """
 
     def __init__(self, name: str, *, help: str, params: Sequence[click.Parameter] = (), **more: Any) -> None:

@@ -67,8 +67,6 @@ def progress_for(verbosity: Verbosity) -> Progress:
 
 
 class _TextColumn(Column):
-    """Column of a text on the task."""
-
     def __init__(self, text: Callable[[Task], Text], *, no_wrap: bool = True) -> None:
         super().__init__(TableColumn(no_wrap=no_wrap))
         self._text = text
@@ -168,7 +166,6 @@ class LineProgress:
 
     @contextmanager
     def task(self, name: str, total: int | None = None) -> Iterator[ProgressTask]:
-        """Open a task that is logged in lines."""
         line = _Line(name, total)
         try:
             yield line

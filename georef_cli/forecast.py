@@ -110,11 +110,7 @@ def forecast_run(
 def checked_inputs(
     workspace: Workspace, planned: Sequence[PlannedStage], progress: Progress = SILENT
 ) -> Summary | None:
-    """Return the summary of the survey that `ingest` would make; None where it would not run. Nothing is written.
-
-    Raises:
-        InputError: as `ingest` itself would.
-    """
+    """Return the summary of the survey that `ingest` would make, unwritten; None where it would not run."""
     asked = _to_run(planned, IngestOptions)
     if asked is None:
         return None
@@ -168,11 +164,6 @@ def print_dry_run(
     progress: Progress,
 ) -> None:
     """Print what a run of the stages would do, and what `ingest` would find; nothing is written.
-
-    Args:
-        workspace, stages, flags, force: as for `forecast_run`.
-        as_json: print one document.
-        progress: shows the reading of the photographs' tags.
 
     Raises:
         GeorefError: the run would be refused for its options or its input.
@@ -239,14 +230,10 @@ def _document(workspace: Workspace, run: RunForecast, survey: Summary | None) ->
 
 
 class RunTimeLeft:
-    """Time that the remaining stages of a run will take.
+    """Time that the remaining stages of a run will take, from their forecast seconds; None: not known.
 
     Stages that the forecast knows no time for count as nothing: they take seconds. Stages that are done correct the
     forecast of the others, because one machine is slower than another by a factor.
-
-    Args:
-        seconds: forecast by stage, of those that take long; None: not known.
-        clock: returns seconds.
     """
 
     def __init__(self, seconds: Mapping[str, float | None], clock: Callable[[], float] = time.monotonic) -> None:
@@ -256,11 +243,9 @@ class RunTimeLeft:
         self._forecast_s = self._took_s = 0.0
 
     def begin(self) -> None:
-        """Begin to measure a stage."""
         self._began = self._clock()
 
     def end(self, stage: str) -> None:
-        """Note the end of a stage."""
         forecast_s = self._left.pop(stage, 0.0)
         if forecast_s:
             self._forecast_s += forecast_s

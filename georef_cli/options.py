@@ -57,11 +57,7 @@ def force_option(help_text: str = "Run even if the product is current.") -> clic
 
 
 def forgotten(options_type: type[StageOptions], names: Iterable[str]) -> list[str]:
-    """Return the fields that the user names with `--forget`; `all` stands for each of them.
-
-    Raises:
-        click.UsageError: a name is no option.
-    """
+    """Return the fields that the user names with `--forget`; `all` stands for each of them."""
     if "all" in (named := list(names)):
         return list(options_type.model_fields)
     try:
@@ -137,11 +133,9 @@ def _default_and_range(info: FieldInfo) -> str:
 
 
 def settings(texts: Iterable[str], stages: Iterable[StageSpec]) -> dict[str, dict[str, Any]]:
-    """Return the options that texts set, by stage and field.
+    """Return the options that texts set, by stage and field; only stages that will run have options.
 
-    Args:
-        texts: `stage.field=value`; the value is one of TOML, or else a plain text. Paths become absolute.
-        stages: that will run.
+    A text is `stage.field=value`; the value is one of TOML, or else a plain text. Paths become absolute.
 
     Raises:
         click.UsageError: no such form, stage or option.

@@ -132,7 +132,6 @@ def print_rich(*parts: RenderableType) -> None:
 
 
 def document_of(outcome: Outcome) -> dict[str, Any]:
-    """Return the JSON form of a stage's result."""
     manifest = outcome.manifest
     return {
         "stage": outcome.stage,
@@ -145,7 +144,6 @@ def document_of(outcome: Outcome) -> dict[str, Any]:
 
 
 def document_of_cautions(by_stage: Mapping[str, Sequence[Caution]]) -> list[dict[str, str]]:
-    """Return the JSON form of cautions by stage."""
     return [
         {"stage": stage, **caution.model_dump()} for stage, cautions in by_stage.items() for caution in cautions
     ]
@@ -174,12 +172,7 @@ def print_outcomes(
 ) -> None:
     """Print the results of several stages, the overview of the whole if there is one, and last the cautions.
 
-    Args:
-        workspace, outcomes: the workspace, and the outcomes of the stages in it.
-        result: the overview.
-        solved: evaluation of cameras without training; None: no part of the result.
-        as_json: print one document.
-        told: the log on the same terminal has shown the stages.
+    `solved` is the evaluation of cameras without training. `told`: the log on the same terminal has shown the rest.
     """
     cautions = cautions_by_stage(workspace)
     if solved is not None:

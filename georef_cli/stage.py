@@ -34,11 +34,8 @@ class StageCommand(Command):
     """Command `georef STAGE WS …`: the options of the stage, `--force` and `--json`.
 
     Args:
-        name: of the stage.
-        doc: help, with examples.
-        extra: further options, passed to `act`.
-        delivers: what the stage makes to hand over, which `--to` copies: the stage's whole folder, or one file with
-            its sidecars; None: nothing.
+        extra: further options.
+        delivers: what `--to` copies: the stage's whole folder, or one file with its sidecars; None: nothing.
         more: returns what is printed below the figures, from the workspace and the values of the options.
     """
 
@@ -76,7 +73,6 @@ class StageCommand(Command):
         )
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run the command, or show what it would do."""
         if not ctx.params.pop("dry_run"):
             return super().invoke(ctx)
         ctx.obj = merged_verbosity(ctx)

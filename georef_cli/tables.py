@@ -110,7 +110,6 @@ def accuracy_line(headline: Headline | None) -> list[Renderable]:
 
 
 def cautions(by_stage: Mapping[str, Sequence[Caution]]) -> list[Renderable]:
-    """Return the cautions, one line each."""
     return [
         f"[bold yellow]caution:[/] {shown(caution.sentence)} ({stage}, {caution.code})"
         for stage, of_stage in by_stage.items()

@@ -24,7 +24,6 @@ class Verbosity:
 
     @property
     def level(self) -> int:
-        """Least severe level that is shown on stderr."""
         return logging.DEBUG if self.verbose else logging.WARNING if self.quiet else logging.INFO
 
 
@@ -54,7 +53,6 @@ class StderrSender(MessageSender):
         self._has_reader = True
 
     def send(self, kind: str, **content: Any) -> None:
-        """Send one message, unless nobody reads any more."""
         if not self._has_reader:
             return
         try:

@@ -12,7 +12,7 @@ from georef_cli import job_tables, options
 from georef_cli.command import Command
 from georef_cli.commands.run import DELIVER, OWNERS, deliverables, slice_option
 from georef_cli.display import progress_for
-from georef_cli.engines import engine_for, engine_options
+from georef_cli.engines import ENGINE, engine_for
 from georef_cli.forecast import RunForecast, checked_inputs, forecast_run
 from georef_cli.options import SET, settings
 from georef_cli.output import print_json, print_rich
@@ -57,13 +57,7 @@ def _batch(ctx: click.Context, **values: Any) -> int:
 
 
 def _planned(mission: Mission, *, check: bool, progress: Progress) -> tuple[PlannedMission, RunForecast | None]:
-    """Return a mission with what its run needs; the forecast is None where the run will be refused, or unknown.
-
-    Args:
-        mission: the mission.
-        check: whether to read its inputs as `ingest` would.
-        progress: shows that reading.
-    """
+    """Return a mission with what its run needs; the forecast is None where the run will be refused, or unknown."""
     try:
         asked = remembered(mission.workspace.root, [spec.name for spec in mission.stages], mission.flags)
         rows = plan(mission.workspace, mission.stages, asked)
@@ -98,7 +92,7 @@ command = Command(
         slice_option(["--to", "--end-with"], "last", "Last stage to run, of every mission."),
         DELIVER,
         SET,
-        *engine_options(),
+        *ENGINE,
         options.DRY_RUN,
         options.JSON,
     ],

@@ -26,7 +26,6 @@ def _tables(workspace: Workspace, values: Mapping[str, Any]) -> tuple[Renderable
 
 
 def _estimates(calibration: RigCalibration) -> Table:
-    """Return the table of the estimates, a line for each component."""
     table = plain_table("", "estimated", "± σ", "ingest", "unit", "", right=(1, 2, 3))
     for estimate in calibration.estimates:
         applied = "applied" if estimate in calibration.applied else "[dim]not applied[/]"

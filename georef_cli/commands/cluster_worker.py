@@ -8,7 +8,7 @@ import click
 
 from georef_cli import options
 from georef_cli.command import Command
-from georef_cli.engines import certificates_options, cluster_address
+from georef_cli.engines import CERTIFICATES, cluster_address
 from georef_cli.output import print_json
 from pipelines.core.errors import ResourceError
 from pipelines.core.machine import free_main_memory_bytes, thread_count
@@ -50,7 +50,7 @@ command = Command(
     "cluster worker",
     params=[
         click.Argument(["address"], metavar="ADDRESS"),
-        *certificates_options(),
+        *CERTIFICATES,
         click.Option(
             ["--jobs"],
             type=click.IntRange(min=1),

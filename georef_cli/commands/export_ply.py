@@ -33,11 +33,6 @@ class PlyCommand(StageCommand):
     """Command of the stage `export-ply`, or with --measurable of `export-measurable`."""
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run the command of one of the two stages.
-
-        Raises:
-            click.UsageError: an option of --measurable without it.
-        """
         if ctx.params.pop("measurable"):
             return _MEASURABLE.invoke(ctx)
         if given := options.given(ctx, _OF_MEASURABLE):

@@ -18,7 +18,6 @@ class TopicType(click.ParamType[str]):
     name = "topic"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """Return the name."""
         if value not in _names(ctx):
             self.fail(f"{value!r} is no topic and no command; the topics are {', '.join(TOPICS)}", param, ctx)
         return str(value)
@@ -26,7 +25,6 @@ class TopicType(click.ParamType[str]):
     def shell_complete(
         self, ctx: click.Context, param: click.Parameter, incomplete: str
     ) -> list[click.shell_completion.CompletionItem]:
-        """Return the names that begin with a text."""
         return [click.shell_completion.CompletionItem(n) for n in _names(ctx) if n.startswith(incomplete)]
 
 

@@ -160,11 +160,7 @@ def _stages(first: str | None, last: str | None) -> tuple[StageSpec, ...]:
 
 
 def deliverables(text: str | None) -> tuple[StageSpec, ...]:
-    """Return the stages of the deliverables in a text, such as `raster,cloud` or `all`.
-
-    Raises:
-        click.UsageError: an unknown name.
-    """
+    """Return the stages of the deliverables in a text, such as `raster,cloud` or `all`."""
     try:
         return named_deliverables(text)
     except ValueError as error:
@@ -172,11 +168,7 @@ def deliverables(text: str | None) -> tuple[StageSpec, ...]:
 
 
 def _forgotten(names: Sequence[str], stages: Sequence[StageSpec]) -> dict[str, list[str]]:
-    """Return the fields that the user names with `--forget`, by stage.
-
-    Raises:
-        click.UsageError: a name is an option of none of the stages.
-    """
+    """Return the fields that the user names with `--forget`, by stage."""
     if "all" in names:
         return {spec.name: list(spec.options.model_fields) for spec in stages}
     by_stage: dict[str, list[str]] = {}
@@ -192,11 +184,7 @@ def _forgotten(names: Sequence[str], stages: Sequence[StageSpec]) -> dict[str, l
 def _flags(
     ctx: click.Context, stages: tuple[StageSpec, ...], flags: dict[str, dict[str, Any]]
 ) -> dict[str, dict[str, Any]]:
-    """Return the given options by stage, those of `--set` among them.
-
-    Raises:
-        click.UsageError: an option is for stages that do not run.
-    """
+    """Return the given options by stage, those of `--set` among them."""
     running = {spec.name for spec in stages}
     for name, value in options.given(ctx, OWNERS).items():
         owners = [owner for owner in OWNERS[name] if owner in running]

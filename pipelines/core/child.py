@@ -57,7 +57,6 @@ class MessageSender:
 
     @contextmanager
     def task(self, name: str, total: int | None = None) -> Iterator[ProgressTask]:
-        """Open a task that the receiver shows."""
         self.send("begin", name=name, total=total)
         try:
             yield self
@@ -70,8 +69,6 @@ class MessageSender:
 
 
 class SentRecords(logging.Handler):
-    """Handler that sends log records."""
-
     def __init__(self, sender: MessageSender) -> None:
         super().__init__()
         self._sender = sender
@@ -202,11 +199,7 @@ def run_in_child(
 
 
 def _follow(process: subprocess.Popen[str], arguments: Mapping[str, Any], progress: Progress) -> Any:
-    """Hand over the arguments, and follow the child's messages to its result.
-
-    Raises:
-        EOFError: the child ended without a result.
-    """
+    """Hand over the arguments, and follow the child's messages to its result; an EOFError: it ended without one."""
     assert process.stdin is not None
     assert process.stdout is not None
     document = {"arguments": arguments, "level": logging.getLogger(_LIBRARY).getEffectiveLevel()}

@@ -98,5 +98,4 @@ class Headline(Product):
 
     @property
     def sentence(self) -> str:
-        """Text with its subject, as a part of a line."""
         return f"accuracy {self.text}"

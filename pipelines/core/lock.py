@@ -35,10 +35,9 @@ class WriteLock:
 
     @contextmanager
     def hold(self, activity: str, patience_s: float = _PATIENCE_S) -> Iterator[None]:
-        """Hold the lock while the context lasts.
+        """Hold the lock while the context lasts; other processes are told the activity: the command that writes.
 
         Args:
-            activity: the command that writes, for the error message of other processes.
             patience_s: so long another process may still hold the lock.
 
         Raises:

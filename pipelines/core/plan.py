@@ -47,10 +47,7 @@ class OptionOrigin:
 def option_origins(workspace: Workspace, spec: StageSpec, flags: Flags | None = None) -> list[OptionOrigin]:
     """Return the options of a stage whose value is no default, with their origins.
 
-    Args:
-        workspace: holds `georef.toml` and the remembered options.
-        spec: the stage.
-        flags: the present request; None: what is remembered.
+    The flags are the present request; None: what is remembered.
 
     Raises:
         InputError: an option is unknown or invalid.
@@ -167,11 +164,8 @@ def _action(
 def photograph_folder(workspace: Workspace, image_dir: str) -> Path:
     """Return the folder of photographs that a survey names; if it is gone, the one that `ingest` is to read now.
 
-    Whoever reads a photograph compares its hash with that of the survey.
-
-    Args:
-        workspace: of the survey.
-        image_dir: of the survey: absolute, or inside the workspace.
+    The survey names an absolute folder, or one inside the workspace. Whoever reads a photograph compares its hash
+    with that of the survey.
     """
     home = workspace.base or workspace
     named = home.root / image_dir

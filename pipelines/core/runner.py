@@ -126,13 +126,10 @@ def run_stage(
     The flags are remembered for `run_pipeline`, unless the stage refuses its input.
 
     Args:
-        workspace: holds the products that the stage reads, and receives its product.
-        spec: the stage.
         flags: only the options that the user gave, by field.
         force: run even if the product is current, and start afresh.
         renew: run even if the product is current, with all that its parts have left.
         resume: whether to continue an interrupted run (see `Workspace.begin`), or to extend a finished product.
-        progress: shows the stage's tasks.
         place: place of the stage in a longer run, for the log: `stage 2 of 8`.
 
     Raises:
@@ -180,12 +177,9 @@ def run_pipeline(
     stage costs no hours, and a run that is killed early is later completed with the same options.
 
     Args:
-        workspace: holds the products of all stages.
-        stages: the stages, in the order of the pipeline.
         flags: options by stage; they override the remembered options of the stage.
         forget: remembered options by stage that no longer count.
         force: run also the stages whose product is current, and start all afresh.
-        progress: shows the tasks of the stages.
         around: makes the context in which a stage runs.
 
     Raises:
@@ -311,11 +305,7 @@ def _with_present_files(workspace: Workspace, asked: Request, manifest: Manifest
 
 
 def _run(workspace: Workspace, asked: Request, resume: Resume, progress: Progress, place: str) -> Summary:
-    """Run the module of a stage; afresh, if the partial product to be continued is damaged.
-
-    Raises:
-        GeorefError: a known failure, which is recorded.
-    """
+    """Run the module of a stage; afresh, if the partial product to be continued is damaged."""
     spec, token, afresh = asked.spec, asked.token, resume == "never"
     out, resumed = workspace.begin(spec, token, resume)
     extends = None if afresh else extendable_product(workspace, asked)

@@ -53,7 +53,6 @@ def printable(text: str) -> str:
 
 
 def printable_lines(text: str) -> str:
-    """Return a text of several lines with every line made printable."""
     return "\n".join(printable(line) for line in text.split("\n"))
 
 

@@ -274,18 +274,13 @@ def _why_stale_now(workspace: Workspace, spec: StageSpec, flags: Flags, manifest
 
 
 def producers(spec: StageSpec) -> list[StageSpec]:
-    """Return the stages whose products a stage reads."""
     return list(dict.fromkeys(producer_of(part.product) for part in spec.reads))
 
 
 def cautions_by_stage(workspace: Workspace, before: StageSpec | None = None) -> dict[str, tuple[Caution, ...]]:
     """Return the cautions of a workspace's products, each under the first stage that has it, in order.
 
-    A damaged manifest tells none; `status` names it.
-
-    Args:
-        workspace: holds the manifests.
-        before: stage of the pipeline; only the stages ahead of it are read.
+    Only the stages of the pipeline ahead of `before` are read, if it is given. A damaged manifest tells none.
     """
     by_stage: dict[str, tuple[Caution, ...]] = {}
     known: set[Caution] = set()

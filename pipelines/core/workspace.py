@@ -42,7 +42,6 @@ class PartialProduct:
     folder: Path
 
     def is_of(self, token: str) -> bool:
-        """Return whether the run was begun for the same request."""
         return _text(self.folder / TOKEN) == token
 
     def request(self) -> tuple[dict[str, Any], dict[str, str]] | None:
@@ -196,12 +195,10 @@ class Workspace:
         return path
 
     def has(self, product: str) -> bool:
-        """Return whether a product exists."""
         folder, _, inside = product.partition("/")
         return (self._folder(folder) / inside).exists()
 
     def command_of(self, spec: StageSpec) -> str:
-        """Return the command that makes a stage's product here."""
         home = (self.base or self).root
         return f"georef {self.command} {home}" if self.command else spec.command(home)
 
@@ -246,8 +243,7 @@ class Workspace:
     def lock(self, activity: str) -> Iterator[None]:
         """Hold the lock of the workspace, and complete or undo the renames of a killed writer.
 
-        Args:
-            activity: the command that writes, for the error message of other processes.
+        Other processes are told the activity: the command that writes.
 
         Raises:
             WorkspaceBusyError: another process holds the lock.
@@ -301,8 +297,7 @@ class Workspace:
             The folder, and whether it holds a run to be continued.
 
         Raises:
-            InputError: `resume` is `always`, and the interrupted run has another token; or the stage's folder is a
-                symbolic link or a file.
+            InputError: `resume` refuses the interrupted run, or the stage's folder is a symbolic link or a file.
         """
         partial = self.partial_product(spec)
         _refuse_what_is_no_folder(self.root / spec.folder)
@@ -321,7 +316,6 @@ class Workspace:
         self._swap(spec)
 
     def renew(self, spec: StageSpec, manifest: Manifest) -> None:
-        """Replace the manifest of a finished stage."""
         replace_text(self._folder(spec.folder) / MANIFEST, f"{manifest.model_dump_json(indent=1)}\n")
 
     def damaged(self, spec: StageSpec, manifest: Manifest, memo: Memo, *, by_content: bool) -> list[str]:

@@ -73,7 +73,6 @@ class BatchTable(Product):
 
     @property
     def counts(self) -> Counter[str]:
-        """Number of missions by state."""
         return Counter(row.state for row in self.missions)
 
     @property
@@ -98,7 +97,6 @@ def mission_row(mission: Mission, state: MissionState, end: JobEnd | None = None
 
 
 def _figures(mission: Mission) -> dict[str, object]:
-    """Return the figures of a mission's products, by field of the row."""
     workspace = mission.workspace
     manifests: dict[str, Manifest] = {}
     for spec in mission.stages:
@@ -128,7 +126,6 @@ def _count(manifests: dict[str, Manifest], stage: str, name: str) -> int | None:
 
 
 def page_file(folder: Path, batch: str) -> Path:
-    """Return the path of a batch's page."""
     return folder / f"{batch}.batch.html"
 
 
@@ -139,7 +136,6 @@ def write_batch(folder: Path, table: BatchTable) -> None:
 
 
 def batch_page(table: BatchTable) -> Page:
-    """Return the page of a batch."""
     links = {row.mission: quote(row.report) for row in table.missions if row.report is not None}
     remarks = [row for row in table.missions if row.warnings or row.cautions]
     failed = [row for row in table.missions if row.failure is not None]
@@ -183,12 +179,10 @@ class PlannedMission:
 
     @property
     def is_current(self) -> bool:
-        """Whether there is nothing to do."""
         return bool(self.actions) and all(action == "keep" for action in self.actions.values())
 
     @property
     def peak_bytes(self) -> int:
-        """Predicted peak of the memory of its run."""
         return BASE_BYTES + self.training_bytes
 
     def job(self, folder: Path) -> Job:
@@ -211,11 +205,7 @@ def run_batch(
     """Run the missions that are not current, and return the table of all; one that fails stops no other.
 
     The table is written beside the missions at the beginning and at the end of each mission, as JSON and as a page.
-
-    Args:
-        listed, planned: the missions, and the same with their forecasts, in the same order.
-        engine: runs them.
-        progress: shows all missions, and one line for each that runs.
+    `planned` are the missions of the list with their forecasts, in the same order.
 
     Raises:
         KeyboardInterrupt: the user stopped the batch; the missions that ran have saved their work.

@@ -53,8 +53,7 @@ def import_distributed() -> Any:
 def make_certificates(folder: Path) -> None:
     """Write a new certificate and its key, which are all that a machine needs to belong to a cluster.
 
-    The certificate is its own authority. It is valid for a year, as those that Dask makes for itself. Folder and
-    files are for their owner alone.
+    The certificate is its own authority. It is valid for a year, as those that Dask makes for itself.
 
     Raises:
         InputError: the folder has a certificate already.
@@ -197,7 +196,6 @@ class ClusterAddress:
 
     @property
     def url(self) -> str:
-        """Address as Dask writes it."""
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"{self._parts.scheme}://{host}:{self.port}"
 
@@ -292,13 +290,12 @@ def place_for(
 ) -> Place | None:
     """Return the worker for a job: the one with the fewest jobs that has room, or None.
 
-    A job that is too large for all workers runs alone on the largest.
+    A job that is too large for all workers runs alone on the largest. Workers on which it has failed are avoided,
+    unless there are no others.
 
     Args:
-        job: that waits.
-        places: workers by address.
-        running: jobs by address of their worker.
-        avoided: addresses of workers on which the job has failed; they are chosen if there are no others.
+        places, running: workers, and the jobs that run on them, by address.
+        avoided: addresses.
     """
     largest_bytes = max((place.memory_bytes for place in places.values()), default=0)
 

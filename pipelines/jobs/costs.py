@@ -36,7 +36,6 @@ class ReconstructionPace:
 
     @property
     def total_s(self) -> float:
-        """Seconds of one core for all steps."""
         return self.features_s + self.matching_s + self.mapping_s
 
 
@@ -138,7 +137,6 @@ class TimeLeft:
         self._begun: tuple[int, float] | None = None
 
     def start(self, iteration: int) -> None:
-        """Begin to measure the speed, after `iteration`."""
         self._begun = iteration, self._clock()
 
     def after(self, iteration: int) -> float | None:

@@ -63,8 +63,6 @@ class PendingJob:
 
 @dataclass
 class _Attempt:
-    """Attempt at a job, which runs on a worker."""
-
     pending: PendingJob
     place: Place
     future: Future[None]
@@ -77,13 +75,11 @@ class ClusterRun:
     """Jobs of one call of the engine: where they run, how they fare, and what comes after a failure.
 
     Args:
-        client: connected to the scheduler.
         waiting: jobs in the order in which they begin where resources allow.
         at_a_time: most jobs at a time.
         exchange: through which files go; None: they are shared.
         ended: called at the end of each job.
-        progress: shows a line for each job that runs.
-        task: counts the jobs that have ended.
+        progress, task: show a line for each job that runs, and count those that have ended.
     """
 
     def __init__(
@@ -147,7 +143,12 @@ class ClusterRun:
                 raise OSError
             workers = self._client.scheduler_info()["workers"]
         except (OSError, TimeoutError, RuntimeError) as error:
-            self._lose_scheduler(error)
+            for name, attempt in list(self._running.items()):
+                self._finish(name, ProcessEnd(INTERRUPTED, time.monotonic() - attempt.since))
+            raise ClusterError(
+                "the scheduler is lost: the jobs save their work and stop; start scheduler and workers, then "
+                "repeat the command, which goes on"
+            ) from error
         self._places = {
             address: place for address, place in places_of(workers).items() if address not in self._unfit
         }
@@ -161,17 +162,7 @@ class ClusterRun:
                 why = "its task was cancelled" if is_cancelled else "its worker was lost"
                 self._end(name, ProcessEnd(1, seconds, why, _LOST), is_stopping)
 
-    def _lose_scheduler(self, cause: Exception) -> None:
-        """Tell that the running jobs are interrupted, and raise."""
-        for name, attempt in list(self._running.items()):
-            self._finish(name, ProcessEnd(INTERRUPTED, time.monotonic() - attempt.since))
-        raise ClusterError(
-            "the scheduler is lost: the jobs save their work and stop; start scheduler and workers, then repeat "
-            "the command, which goes on"
-        ) from cause
-
     def _start(self) -> None:
-        """Start waiting jobs on workers that have room."""
         if self._unfit and not self._places and not self._running:
             raise ClusterError(f"no worker can run the jobs: {self._warned}")
         now = time.monotonic()
@@ -188,15 +179,11 @@ class ClusterRun:
                 self._waiting.remove(pending)
                 self._submit(pending, place)
         if self._waiting and not self._running and all(pending.not_before <= now for pending in self._waiting):
-            self._warn_of_waiting()
-
-    def _warn_of_waiting(self) -> None:
-        """Tell once why nothing runs."""
-        wanted = "a GPU" if self._places else f"{MEMORY}, as those of `georef cluster worker` do"
-        text = f"waiting: no worker offers {wanted}"
-        if text != self._warned:
-            self._warned = text
-            log.warning("%s", text)
+            wanted = "a GPU" if self._places else f"{MEMORY}, as those of `georef cluster worker` do"
+            text = f"waiting: no worker offers {wanted}"
+            if text != self._warned:
+                self._warned = text
+                log.warning("%s", text)
 
     def _submit(self, pending: PendingJob, place: Place) -> None:
         attempt = uuid.uuid4().hex
@@ -319,7 +306,6 @@ class DaskEngine:
     storage: Storage | None = None
 
     def together(self, jobs: Sequence[Job]) -> int:
-        """Return how many of the jobs run at a time at the beginning; see `Engine`."""
         with connected(self.cluster) as client:
             places = places_of(client.scheduler_info()["workers"])
         running: dict[str, list[Job]] = {}
@@ -336,7 +322,6 @@ class DaskEngine:
             ClusterError: there is no scheduler, it is lost, or no worker can run the jobs.
             InputError: a job needs files that cannot go through the storage.
             StorageError: the storage failed.
-            KeyboardInterrupt: see `Engine`.
         """
         exchange = None
         if self.storage is not None:

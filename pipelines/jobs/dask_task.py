@@ -76,7 +76,6 @@ def _obstacle(request: JobRequest) -> ProcessEnd | None:
 
 
 def _run_where_its_files_are(worker: Any, request: JobRequest, events: _Events) -> ProcessEnd:
-    """Run the job in the shared folder, or in a scratch folder with its parts."""
     parcel, arguments = request["parcel"], request["arguments"]
     if parcel is None:
         return _run(worker, arguments, events)
@@ -169,10 +168,7 @@ def run_worker(
     """Run a worker until it is interrupted, or its scheduler ends.
 
     Args:
-        scheduler: its address.
-        jobs: most jobs at a time.
-        cores, memory_bytes: that they share.
-        gpus: number of GPUs; a job takes one.
+        jobs: most jobs at a time; they share cores and memory, and each takes a GPU if it uses one.
         name: for people; None: its address.
 
     Raises:

@@ -106,7 +106,6 @@ class JobLine:
 
     @contextmanager
     def task(self, name: str, total: int | None = None) -> Iterator[ProgressTask]:
-        """Open a task of the job."""
         if self._outer is not None:
             yield _InnerTask(self, name, total)
             return
@@ -118,7 +117,6 @@ class JobLine:
                 self._outer = None
 
     def advance(self, steps: int = 1, note: str = "", left_s: float | None = None) -> None:
-        """Advance the outermost task."""
         self.place = note or self.place
         self.show(steps, self.place)
 
@@ -153,7 +151,6 @@ class JobDisplay(MessageReceiver):
 
     @property
     def place(self) -> str:
-        """Step that the job is at."""
         return self._line.place
 
     def log(self, name: str, level: int, text: str) -> None:
@@ -162,7 +159,6 @@ class JobDisplay(MessageReceiver):
 
 
 def tell_end(end: JobEnd) -> None:
-    """Log the end of a job."""
     if end.is_done:
         log.info("%s: done (%s)", end.job.name, duration(end.seconds))
     elif end.is_interrupted:

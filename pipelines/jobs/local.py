@@ -57,7 +57,6 @@ class JobProcess:
     Args:
         program: arguments of Python that start this program.
         arguments: of the program.
-        threads: that the job computes with.
         take: gets the messages in a thread; false: it was none of progress or log.
         ended: called at the end of the process, in the same thread.
 
@@ -164,9 +163,7 @@ class LocalEngine:
     """Engine that runs jobs as processes of this machine.
 
     Attributes:
-        at_a_time: most jobs at a time.
-        cores: that the jobs share.
-        free_bytes: memory that the jobs share; None: unknown, only their number is limited.
+        cores, free_bytes: that the jobs share; memory None: unknown, only the number of jobs is limited.
         program: arguments of Python that start this program.
     """
 
@@ -176,7 +173,6 @@ class LocalEngine:
     program: tuple[str, ...] = field(default_factory=lambda: child.THIS_PROGRAM)
 
     def together(self, jobs: Sequence[Job]) -> int:
-        """Return how many of the jobs run at a time at the beginning; see `Engine`."""
         return max(len(self._startable(jobs, [])), 1)
 
     def run(self, title: str, jobs: Sequence[Job], ended: Callable[[JobEnd], None], progress: Progress) -> None:

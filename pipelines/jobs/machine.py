@@ -74,7 +74,6 @@ class Machine:
 
 
 def inspect_machine() -> Machine:
-    """Return what was found on this machine."""
     return Machine(
         system=f"{platform.system()} {platform.release()} {platform.machine()}",
         python=platform.python_version(),

@@ -59,7 +59,6 @@ class Mission:
 
     @property
     def stages(self) -> tuple[StageSpec, ...]:
-        """Stages to run."""
         return (*stage_slice(None, self.last), *named_deliverables(self.deliver))
 
 
@@ -105,7 +104,6 @@ def load_missions(
 
 
 def _merged(flags: Mapping[str, Flags], more: Mapping[str, Flags]) -> dict[str, Flags]:
-    """Return options by stage and field, overridden by more of them."""
     return {stage: {**flags.get(stage, {}), **more.get(stage, {})} for stage in (*flags, *more)}
 
 
@@ -153,8 +151,6 @@ def _in_file(path: Path, owners: Owners) -> MissionList:
 
 @dataclass(frozen=True)
 class _Settings:
-    """Checked content of a table of the file."""
-
     own: Mapping[str, str]
     flags: Mapping[str, Flags]
 

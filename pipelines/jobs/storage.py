@@ -104,13 +104,8 @@ class Storage:
     def send(self, folder: Path, part: str, writer: Writer, attempt: str = "") -> PartIndex:
         """Copy a part of a folder into the store, and delete there what it has no more.
 
-        A file that vanishes meanwhile, as when a stage ends, makes the copy start anew.
-
-        Args:
-            folder: that holds the part.
-            part: relative path of a file or folder.
-            writer: whose copy it is.
-            attempt: at the job that it is for.
+        A file that vanishes meanwhile, as when a stage ends, makes the copy start anew. The copy is for one attempt
+        at the job.
 
         Raises:
             StorageError: the store cannot be written, or another attempt has taken over from this worker.
@@ -144,15 +139,10 @@ class Storage:
             return index
 
     def fetch(self, folder: Path, part: str, before: PartIndex | None = None) -> PartIndex | None:
-        """Copy a part from the store into a folder; a file that is newer there stays.
+        """Copy a part from the store into a folder, and return its index; a file that is newer there stays.
 
-        Args:
-            folder: that receives the part.
-            part: its relative path.
-            before: what the folder had sent: files that are no longer listed are deleted.
-
-        Returns:
-            The index; None: the store does not have the part.
+        Files that the folder had sent `before`, and that are no longer listed, are deleted. None: the store does
+        not have the part.
 
         Raises:
             StorageError: the store cannot be read.
@@ -251,7 +241,6 @@ def _batches(names: list[str]) -> Iterator[list[str]]:
 
 
 def _object(name: str, state: tuple[int, int]) -> str:
-    """Return the name of the object that holds a file in a state."""
     return _digest(f"{name}\0{state[0]}\0{state[1]}")
 
 
@@ -263,14 +252,9 @@ _SAVE_EVERY_S = 60.0
 
 
 class Parcel(TypedDict):
-    """Parts of a job, as a worker is told.
+    """Parts of a job, as a worker is told: those that it reads, and the one that it reads and writes.
 
-    Attributes:
-        url: of the storage.
-        folder: of the engine; it stands at the beginning of paths in the arguments.
-        attempt: at the job.
-        reads: parts that the job reads, relative to the folder.
-        writes: part that the job reads and writes.
+    The parts are relative to the folder of the engine, which stands at the beginning of paths in the arguments.
     """
 
     url: str
@@ -305,12 +289,7 @@ class EngineExchange:
         return Parcel(url=self._storage.url, folder=str(job.folder), attempt=attempt, reads=reads, writes=writes)
 
     def collect(self, job: Job) -> None:
-        """Take the results of a job into the folder of the engine.
-
-        Raises:
-            InputError: the index in the storage is damaged.
-            StorageError: the storage failed.
-        """
+        """Take the results of a job into the folder of the engine."""
         if job.folder is not None and job.writes is not None:
             self._collect(job.folder.resolve(), _part(job.folder.resolve(), job.writes))
 
@@ -363,7 +342,6 @@ def arguments_in(parcel: Parcel, arguments: Sequence[str], scratch: Path) -> lis
 
 
 def _part(folder: Path, path: Path) -> str:
-    """Return a path relative to a folder."""
     try:
         return path.resolve().relative_to(folder).as_posix()
     except ValueError:
