@@ -123,16 +123,13 @@ class BarProgress:
             yield _Bar(bars, bar)
         finally:
             bars.stop_task(bar)
-            self._make_room(bars)
+            # The height of the terminal has no room for the oldest of many finished bars.
+            finished = [task.id for task in bars.tasks if task.stop_time is not None]
+            for old in finished[: max(0, len(bars.tasks) + _MARGIN_LINES - self._console.height)]:
+                bars.remove_task(old)
             if outermost:
                 bars.stop()
                 self._bars = None
-
-    def _make_room(self, bars: Bars) -> None:
-        """Remove the oldest finished bars that the height of the terminal has no room for."""
-        finished = [task.id for task in bars.tasks if task.stop_time is not None]
-        for bar in finished[: max(0, len(bars.tasks) + _MARGIN_LINES - self._console.height)]:
-            bars.remove_task(bar)
 
     def _start(self) -> Bars:
         wide = self._console.width >= _WIDE

@@ -5,7 +5,6 @@ A dry run prints it; a run tells from it, and from the pace of the stages that a
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import logging
 import time
@@ -193,19 +192,20 @@ def print_dry_run(
     print_rich(*parts, "\n[dim]Nothing was run. Times are estimates for an idle machine.[/]")
 
 
-def announce_training(
+def announced_seconds(
     workspace: Workspace, stages: tuple[StageSpec, ...], flags: Mapping[str, Flags], *, force: bool
-) -> None:
-    """Log the forecast of the training that a run will come to, at its start: not after hours of other stages.
+) -> Mapping[str, float | None]:
+    """Return the forecast seconds of a run's stages that take long; none for a run that will be refused.
 
-    A run that will be refused is announced by nothing.
+    The forecast of the training is logged at the start: not after hours of other stages.
     """
-    if all(spec.options is not TrainOptions for spec in stages):
-        return
-    with contextlib.suppress(GeorefError):
-        training = forecast_run(workspace, stages, flags, force=force).training
-        for sentence in () if training is None else training.sentences():
+    try:
+        run = forecast_run(workspace, stages, flags, force=force)
+        for sentence in () if run.training is None else run.training.sentences():
             log.info("train: %s", sentence)
+    except GeorefError:
+        return {}
+    return run.seconds
 
 
 def _document(workspace: Workspace, run: RunForecast, survey: Summary | None) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from rich.console import RenderableType
 from georef_cli import boundary, options
 from georef_cli.command import Command, merged_verbosity
 from georef_cli.display import is_told, progress_for
-from georef_cli.forecast import announce_training, print_dry_run
+from georef_cli.forecast import announced_seconds, print_dry_run
 from georef_cli.output import print_outcome
 from pipelines.core import runner
 from pipelines.core.errors import InputError, storage_failures
@@ -106,10 +106,10 @@ class StageCommand(Command):
         """
         workspace, force, target = values["workspace"], values["force"], values.get("target")
         if target is not None:
-            refuse_other_format(target, self.spec, folder=self._delivers == "folder")
-            check_target(target, overwrite=force)
+            check_target(target, self.spec, folder=self._delivers == "folder", overwrite=force)
         flags = self._flags(ctx, values)
-        announce_training(workspace, (self.spec,), flags, force=force)
+        if self.spec.name == "train":
+            announced_seconds(workspace, (self.spec,), flags, force=force)
         with boundary.logged_to_file(workspace, self.spec):
             outcome = runner.run_stage(
                 workspace,
@@ -130,8 +130,12 @@ class StageCommand(Command):
         print_outcome(workspace, outcome, *more, as_json=values["as_json"], told=is_told(ctx.obj))
 
 
-def refuse_other_format(target: Path, spec: StageSpec, *, folder: bool) -> None:
-    """Refuse a target whose name says another format than the stage writes, or a folder with other content."""
+def check_target(target: Path, spec: StageSpec, *, folder: bool, overwrite: bool) -> None:
+    """Refuse, before the work begins, a target to which the result cannot be written, or may not.
+
+    Its name says another format than the stage writes; it is a folder with other content, or in a missing folder; or
+    it exists and may not be replaced.
+    """
     suffix = Path(spec.product).suffix
     if folder and target.is_dir() and not (target / Path(spec.product).name).exists():
         raise InputError(
@@ -142,10 +146,6 @@ def refuse_other_format(target: Path, spec: StageSpec, *, folder: bool) -> None:
     if not folder and target.suffix.lower() != suffix:
         named = f"a {target.suffix} file" if target.suffix else "a name without a suffix"
         raise InputError(f"{spec.name} writes {suffix}, not {named}: end the name with {suffix}", path=target)
-
-
-def check_target(target: Path, *, overwrite: bool) -> None:
-    """Refuse, before the work begins, a target in a missing folder, or one that exists and may not be replaced."""
     require_text(target)
     if not target.parent.is_dir():
         raise InputError("no such folder: make it first", path=target.parent)

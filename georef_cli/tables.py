@@ -127,7 +127,11 @@ def outcome(workspace: Workspace, result: Outcome, *, headline: bool = True) -> 
     if result.stage == "evaluate":
         parts += report(read_report(workspace.path(REPORT)))
     elif manifest.values:
-        parts.append(_figures(manifest.values))
+        table = plain_table("", "", header=False, right=[1])  # Nested values are shown by --json only.
+        for name, value in manifest.values.items():
+            if isinstance(value, str | int | float) or value is None:
+                table.add_row(shown(name), shown(_number(value)))
+        parts.append(table)
     if not result.ran:  # the warnings of a stage that just ran are on stderr already
         parts += [f"[yellow]warning:[/] {shown(text)}" for text in manifest.warnings]
     return parts
@@ -268,15 +272,6 @@ def _accuracy(ways: Mapping[str, CheckPointErrors]) -> Group | None:
         }
     columns = {head: head for row in rows.values() for head in row}
     return _rows("Accuracy with the check points' own survey (ASPRS), and their predicted σ, metres", rows, columns)
-
-
-def _figures(values: Mapping[str, Any]) -> Table:
-    """Return plain values as a table of two columns; nested values are shown by `--json` only."""
-    table = plain_table("", "", header=False, right=[1])
-    for name, value in values.items():
-        if isinstance(value, str | int | float) or value is None:
-            table.add_row(shown(name), shown(_number(value)))
-    return table
 
 
 def _number(value: Any) -> str:

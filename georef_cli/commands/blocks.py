@@ -11,7 +11,7 @@ from georef_cli import boundary, job_tables, options
 from georef_cli.command import Command
 from georef_cli.display import is_told, progress_for
 from georef_cli.engines import ENGINE, asked_engine
-from georef_cli.forecast import announce_training
+from georef_cli.forecast import announced_seconds
 from georef_cli.output import print_json, print_outcome, print_rich
 from pipelines.core import runner
 from pipelines.core.options import remembered
@@ -124,7 +124,7 @@ def _all(ctx: click.Context, parts: Parts, given: Flags, values: dict[str, Any],
     if only_merge:
         require_trained(parts, parts.plan())
     flags = _remembered(workspace, given)
-    announce_training(workspace, (TRAIN,), flags, force=values["force"])
+    announced_seconds(workspace, (TRAIN,), flags, force=values["force"])
     with boundary.logged_to_file(workspace, TRAIN):
         outcome = runner.run_stage(
             workspace,

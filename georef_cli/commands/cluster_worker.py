@@ -34,16 +34,13 @@ def _worker(
     if memory_gib is None and free is None:
         raise ResourceError("the free memory is not known here: give --memory")
     memory_bytes = int(memory_gib * _GIB) if memory_gib is not None else int(_USABLE * (free or 0))
-    count = _gpus() if gpus is None else gpus
-    run_worker(scheduler, jobs=jobs, cores=thread_count(), memory_bytes=memory_bytes, gpus=count, name=name)
+    if gpus is None:
+        from pipelines.jobs.machine import inspect_machine
+
+        gpus = len(inspect_machine().gpus)
+    run_worker(scheduler, jobs=jobs, cores=thread_count(), memory_bytes=memory_bytes, gpus=gpus, name=name)
     if as_json:
-        print_json({"scheduler": scheduler.url, "jobs": jobs, "memory_bytes": memory_bytes, "gpus": count})
-
-
-def _gpus() -> int:
-    from pipelines.jobs.machine import inspect_machine
-
-    return len(inspect_machine().gpus)
+        print_json({"scheduler": scheduler.url, "jobs": jobs, "memory_bytes": memory_bytes, "gpus": gpus})
 
 
 command = Command(

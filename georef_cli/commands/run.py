@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -12,7 +12,7 @@ import click
 from georef_cli import boundary, options
 from georef_cli.command import Command
 from georef_cli.display import is_told, progress_for
-from georef_cli.forecast import RunTimeLeft, announce_training, forecast_run, print_dry_run
+from georef_cli.forecast import RunTimeLeft, announced_seconds, print_dry_run
 from georef_cli.options import SET, settings
 from georef_cli.output import print_outcomes
 from pipelines.core import runner
@@ -21,7 +21,7 @@ from pipelines.core.options import names_of_flags, remembered
 from pipelines.core.progress import SILENT, ProgressTask
 from pipelines.core.sentences import about
 from pipelines.core.stages import BY_NAME, DELIVERABLES, MODEL, PIPELINE, StageSpec, named_deliverables, stage_slice
-from pipelines.core.staleness import Flags, must_exist
+from pipelines.core.staleness import must_exist
 from pipelines.core.workspace import Workspace
 from pipelines.ingest.options import IngestOptions
 from pipelines.survey.options import CrsOptions
@@ -67,7 +67,11 @@ def _run(ctx: click.Context, **values: Any) -> None:
     if values["first"] and values["rerun_from"]:
         raise click.UsageError("--from and --rerun-from exclude each other.")
     first = values["first"] or values["rerun_from"]
-    stages = (*_stages(first, values["last"]), *deliverables(values["deliver"]))
+    try:
+        stages = stage_slice(first, values["last"])
+    except GeorefError as error:
+        raise click.UsageError(str(error)) from error
+    stages += deliverables(values["deliver"])
     flags = _flags(ctx, stages, settings(values["settings"], stages))
     workspace = values["workspace"]
     forget, force = _forgotten(values["forget"], stages), values["force"] or values["rerun_from"] is not None
@@ -79,8 +83,7 @@ def _run(ctx: click.Context, **values: Any) -> None:
             workspace, stages, asked, force=force, as_json=values["as_json"], progress=progress_for(ctx.obj)
         )
         return
-    announce_training(workspace, stages, asked, force=force)
-    left = RunTimeLeft(_forecast_seconds(workspace, stages, asked, force=force))
+    left = RunTimeLeft(announced_seconds(workspace, stages, asked, force=force))
     progress = progress_for(ctx.obj)
     # A program that follows several runs shows how many stages of each are done; bars and lines name the stages.
     with (progress if ctx.obj.json_progress else SILENT).task("stages", len(stages)) as done:
@@ -112,16 +115,6 @@ def _counted(workspace: Workspace, spec: StageSpec, done: ProgressTask, left: Ru
     done.advance(1, spec.name, left.seconds)
 
 
-def _forecast_seconds(
-    workspace: Workspace, stages: tuple[StageSpec, ...], asked: Mapping[str, Flags], *, force: bool
-) -> Mapping[str, float | None]:
-    """Return the forecast seconds of the stages that take long; none for a run that will be refused."""
-    try:
-        return forecast_run(workspace, stages, asked, force=force).seconds
-    except GeorefError:
-        return {}
-
-
 def _overview(workspace: Workspace) -> Overview | None:
     """Return the overview of what the run has reached; None before training."""
     if not (workspace.root / MODEL).exists():
@@ -150,13 +143,6 @@ def _evaluated_cameras(workspace: Workspace) -> EvaluationReport | None:
     except GeorefError as error:  # The run has succeeded all the same.
         log.debug("no evaluation of the cameras: %s", error)
         return None
-
-
-def _stages(first: str | None, last: str | None) -> tuple[StageSpec, ...]:
-    try:
-        return stage_slice(first, last)
-    except GeorefError as error:
-        raise click.UsageError(str(error)) from error
 
 
 def deliverables(text: str | None) -> tuple[StageSpec, ...]:

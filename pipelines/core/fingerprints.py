@@ -103,7 +103,9 @@ def _hash_part(workspace: Workspace, part: ProductPart, memo: Memo) -> dict[str,
     except ValueError:  # not JSON: the stage that reads the product raises the error
         values = None
     if values is None or (_is_empty(values) and not part.optional):
-        return {part.product: _hash_product(path, memo)}
+        if path not in memo and path.is_dir():
+            memo[path] = _hash_listing({name: hash_file(file, memo) for name, file in _files(path).items()})
+        return {part.product: hash_file(path, memo)}
     if _is_empty(values):
         return {}
     text = json.dumps(values, sort_keys=True)
@@ -142,12 +144,6 @@ def _is_empty(value: Any) -> bool:
     if isinstance(value, dict):
         return all(_is_empty(item) for item in value.values())
     return value is None or (isinstance(value, list) and all(_is_empty(item) for item in value))
-
-
-def _hash_product(path: Path, memo: Memo) -> str:
-    if path not in memo and path.is_dir():
-        memo[path] = _hash_listing({name: hash_file(file, memo) for name, file in _files(path).items()})
-    return hash_file(path, memo)
 
 
 def _hash_listing(hashes: Mapping[str, str]) -> str:

@@ -76,8 +76,12 @@ def _free_in_system() -> int | None:
     if sys.platform == "win32":
         status = _WindowsMemory(length=ctypes.sizeof(_WindowsMemory))
         return status.free_bytes if ctypes.windll.kernel32.GlobalMemoryStatusEx(ctypes.byref(status)) else None
-    if (kib := _kib_of(Path("/proc/meminfo"), "MemAvailable:")) is not None:
-        return 1024 * kib
+    kib = _kib_of(Path("/proc/meminfo"), "MemAvailable:")
+    return total_main_memory_bytes() if kib is None else 1024 * kib
+
+
+def total_main_memory_bytes() -> int | None:
+    """Return the memory of the machine; None if the system does not state it."""
     try:
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, ValueError, OSError):

@@ -8,26 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from pipelines.core import staleness
 from pipelines.core.errors import InputError
 from pipelines.core.manifest import Memo
 from pipelines.core.options import StageOptions, flag_name, input_paths, load_toml
 from pipelines.core.stages import BY_NAME, StageSpec
-from pipelines.core.staleness import (
-    BY_HAND,
-    Flags,
-    changed_inputs,
-    changed_options,
-    finding,
-    found_interrupted,
-    is_unfinished,
-    producers,
-    refuse_loss,
-    refuse_loss_by_options,
-    request,
-    stage_config,
-    why_damaged,
-    why_stale,
-)
+from pipelines.core.staleness import BY_HAND, Flags
 from pipelines.core.workspace import Workspace
 
 Origin = Literal["default", "georef.toml", "remembered", "command line"]
@@ -54,7 +40,7 @@ def option_origins(workspace: Workspace, spec: StageSpec, flags: Flags | None = 
     """
     remembered = workspace.requests().get(spec.name, {})
     asked = remembered if flags is None else flags
-    options = stage_config(workspace, spec, asked)
+    options = staleness.stage_config(workspace, spec, asked)
     table = load_toml(workspace.config_file, BY_NAME).get(spec.name, {})
     plain = options.model_dump(mode="json")  # as options are remembered
     rows = []
@@ -105,8 +91,8 @@ def plan(
     planned = []
     for spec in stages:
         asked = flags.get(spec.name, {})
-        resolved = stage_config(workspace, spec, asked)
-        action, reason = _forced(workspace, spec) if force else _action(workspace, spec, asked, running, memo)
+        resolved = staleness.stage_config(workspace, spec, asked)
+        action, reason = _action(workspace, spec, asked, running, memo, force=force)
         if action != "keep":
             running.add(spec.name)
         origins = tuple(option_origins(workspace, spec, asked))
@@ -114,22 +100,22 @@ def plan(
     return planned
 
 
-def _forced(workspace: Workspace, spec: StageSpec) -> tuple[Action, str]:
-    if not spec.resumable or workspace.partial_product(spec).progress() is None:
-        return "run", "--force"
-    return "run", f"--force; drops an interrupted run: {found_interrupted(workspace, spec)}"
-
-
 def _action(
-    workspace: Workspace, spec: StageSpec, asked: Flags, running: Collection[str], memo: Memo
+    workspace: Workspace, spec: StageSpec, asked: Flags, running: Collection[str], memo: Memo, *, force: bool
 ) -> tuple[Action, str]:
     """Return what a run would do with a stage, after those that run before it."""
-    options, interrupted = stage_config(workspace, spec, asked), found_interrupted(workspace, spec)
+    options, interrupted = (
+        staleness.stage_config(workspace, spec, asked),
+        staleness.found_interrupted(workspace, spec),
+    )
+    if force:
+        loses = spec.resumable and workspace.partial_product(spec).progress() is not None
+        return "run", f"--force; drops an interrupted run: {interrupted}" if loses else "--force"
     try:
-        refuse_loss_by_options(workspace, spec, options)
+        staleness.refuse_loss_by_options(workspace, spec, options)
     except InputError as error:
         return "refuse", str(error)
-    found = finding(workspace, spec, memo)
+    found = staleness.finding(workspace, spec, memo)
     if found.by_hand:
         return "keep", BY_HAND
     if found.unreadable:
@@ -142,22 +128,24 @@ def _action(
         resumes = spec.resumable and workspace.partial(spec).exists()
         return ("resume", f"interrupted: {interrupted}") if resumes else ("run", "never run")
     if found.damaged:
-        return "run", why_damaged(found.damaged)
-    changed = changed_options(options, manifest.config)
-    if ahead := [producer.name for producer in producers(spec) if producer.name in running]:
+        return "run", staleness.why_damaged(found.damaged)
+    changed = staleness.changed_options(options, manifest.config)
+    if ahead := [producer.name for producer in staleness.producers(spec) if producer.name in running]:
         return ("run", changed) if changed else ("perhaps", f"after {', '.join(ahead)}")
-    present = request(workspace, spec, asked, memo)
-    reason = why_stale(workspace, present, manifest)
-    if is_unfinished(workspace, present):
+    present = staleness.request(workspace, spec, asked, memo)
+    reason = staleness.why_stale(workspace, present, manifest)
+    if staleness.is_unfinished(workspace, present):
         return "resume", f"interrupted beside the finished product: {interrupted}"
     if not reason:
         return "keep", manifest.key_figure
     try:
-        refuse_loss(workspace, present)
+        staleness.refuse_loss(workspace, present)
     except InputError as error:
         return "refuse", str(error)
-    inputs = changed_inputs(present.inputs.hashes, manifest.inputs)
-    grown = spec.growing and not inputs and not changed_options(options, manifest.config, but=spec.growing)
+    inputs = staleness.changed_inputs(present.inputs.hashes, manifest.inputs)
+    grown = (
+        spec.growing and not inputs and not staleness.changed_options(options, manifest.config, but=spec.growing)
+    )
     return ("extend" if grown else "run"), reason
 
 
@@ -173,7 +161,9 @@ def photograph_folder(workspace: Workspace, image_dir: str) -> Path:
         return named
     spec = BY_NAME["ingest"]
     with contextlib.suppress(InputError):
-        images: Path | None = getattr(stage_config(home, spec, home.requests().get(spec.name, {})), "images", None)
+        images: Path | None = getattr(
+            staleness.stage_config(home, spec, home.requests().get(spec.name, {})), "images", None
+        )
         if images is not None and images.is_dir():
             return images
     return named

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import ValidationError
 
+from pipelines.core import staleness
 from pipelines.core.errors import (
     ConvergenceError,
     DamagedPartialError,
@@ -33,26 +34,7 @@ from pipelines.core.products import AT_END, union
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.sentences import duration
 from pipelines.core.stages import STAGES, StageSpec, products_of
-from pipelines.core.staleness import (
-    BY_HAND,
-    Flags,
-    Request,
-    cautions_by_stage,
-    continuing_command,
-    extendable_product,
-    finding,
-    found_interrupted,
-    is_unfinished,
-    must_exist,
-    refuse_damaged_inputs,
-    refuse_loss,
-    refuse_loss_by_options,
-    request,
-    stage_config,
-    warn_of_stale_inputs,
-    why_damaged,
-    why_stale,
-)
+from pipelines.core.staleness import BY_HAND, Flags, Request
 from pipelines.core.workspace import Resume, StageRun, Summary, Workspace, now
 
 log = logging.getLogger(__name__)
@@ -137,17 +119,17 @@ def run_stage(
         GeorefError: any other known failure; the previous product stays whole.
     """
     if spec.reads:
-        must_exist(workspace)
+        staleness.must_exist(workspace)
     with no_traces_of_refusal(workspace), workspace.lock(spec.name):
         memo: Memo = {}
-        asked = request(workspace, spec, flags, memo, progress)
-        warn_of_stale_inputs(workspace, spec, memo)
-        refuse_damaged_inputs(workspace, spec, memo)
+        asked = staleness.request(workspace, spec, flags, memo, progress)
+        staleness.warn_of_stale_inputs(workspace, spec, memo)
+        staleness.refuse_damaged_inputs(workspace, spec, memo)
         previous = None if force or renew else _current(workspace, asked, memo)
         if previous is not None and resume != "never" and _goes_on(workspace, asked):
             previous = None
         if previous is None and not force:
-            refuse_loss(workspace, asked)
+            staleness.refuse_loss(workspace, asked)
         before = workspace.requests().get(spec.name, {})
         workspace.remember({spec.name: flags})
         if previous is not None:
@@ -186,13 +168,13 @@ def run_pipeline(
         GeorefError: the first failure.
     """
     if stages[0].reads:
-        must_exist(workspace)
+        staleness.must_exist(workspace)
     before = workspace.requests()
     asked = remembered(workspace.root, [spec.name for spec in stages], flags, forget)
     for spec in stages:
-        options = stage_config(workspace, spec, asked[spec.name])
+        options = staleness.stage_config(workspace, spec, asked[spec.name])
         if not force:
-            refuse_loss_by_options(workspace, spec, options)
+            staleness.refuse_loss_by_options(workspace, spec, options)
     outcomes: list[Outcome] = []
     with no_traces_of_refusal(workspace):
         with workspace.lock("run"):
@@ -228,12 +210,12 @@ def _goes_on(workspace: Workspace, asked: Request) -> bool:
     spec, partial = asked.spec, workspace.partial_product(asked.spec)
     if not partial.folder.exists() or workspace.placed_by_hand(spec):
         return False
-    found = found_interrupted(workspace, spec)
-    if is_unfinished(workspace, asked):
+    found = staleness.found_interrupted(workspace, spec)
+    if staleness.is_unfinished(workspace, asked):
         log.info("%s: an interrupted run lies beside the finished product: %s", spec.name, found)
         return True
     if spec.resumable and partial.progress() is not None:
-        command = continuing_command(workspace, spec)
+        command = staleness.continuing_command(workspace, spec)
         log.warning(
             "%s: beside this product lies an interrupted run: %s; `%s` goes on with it, --force drops it",
             spec.name, found, command,
@@ -255,7 +237,7 @@ def _execute(workspace: Workspace, asked: Request, resume: Resume, progress: Pro
             raise RuntimeError(f"{spec.module} did not write {product}")
     for warning in summary.warnings:
         log.warning("%s: %s", spec.name, warning)
-    carried = set(union(*cautions_by_stage(workspace, before=spec).values()))
+    carried = set(union(*staleness.cautions_by_stage(workspace, before=spec).values()))
     for caution in summary.cautions:
         if caution not in carried:
             log.warning("%s: %s", spec.name, caution.sentence, extra={AT_END: True})
@@ -274,7 +256,7 @@ def _execute(workspace: Workspace, asked: Request, resume: Resume, progress: Pro
         files=record_files(out, spec.working),
         input_files=asked.inputs.files,
     )
-    workspace.set_aside(finding(workspace, spec, {}).damaged)
+    workspace.set_aside(staleness.finding(workspace, spec, {}).damaged)
     workspace.commit(spec, manifest)
     log.info("%s: %s (%s)", spec.name, summary.key_figure, duration(manifest.duration_s))
     return manifest
@@ -285,7 +267,7 @@ def _tell_interrupted(workspace: Workspace, asked: Request, resume: Resume) -> N
     spec, partial = asked.spec, workspace.partial_product(asked.spec)
     if not spec.resumable or not partial.folder.exists():
         return
-    found = found_interrupted(workspace, spec)
+    found = staleness.found_interrupted(workspace, spec)
     if resume != "never" and partial.is_of(asked.token):
         log.info("%s: goes on with an interrupted run: %s", spec.name, found)
     else:
@@ -308,7 +290,7 @@ def _run(workspace: Workspace, asked: Request, resume: Resume, progress: Progres
     """Run the module of a stage; afresh, if the partial product to be continued is damaged."""
     spec, token, afresh = asked.spec, asked.token, resume == "never"
     out, resumed = workspace.begin(spec, token, resume)
-    extends = None if afresh else extendable_product(workspace, asked)
+    extends = None if afresh else staleness.extendable_product(workspace, asked)
     log.info("%s: %s%s", spec.name, "resumed" if resumed else "started", f", {place}" if place else "")
     try:
         with storage_failures(out):
@@ -341,7 +323,7 @@ def _run(workspace: Workspace, asked: Request, resume: Resume, progress: Progres
 def _current(workspace: Workspace, asked: Request, memo: Memo) -> Manifest | None:
     """Return the manifest of a product that need not be made again, or None."""
     spec = asked.spec
-    found = finding(workspace, spec, memo, by_content=True)
+    found = staleness.finding(workspace, spec, memo, by_content=True)
     if found.by_hand:
         log.info("%s: %s was %s and is kept; --force replaces it", spec.name, spec.product, BY_HAND)
         return Manifest(
@@ -358,9 +340,9 @@ def _current(workspace: Workspace, asked: Request, memo: Memo) -> Manifest | Non
     if found.unreadable:
         log.warning("%s: made again, because %s", spec.name, found.unreadable)
     elif found.damaged:
-        log.warning("%s: damaged, made again: %s", spec.name, why_damaged(found.damaged))
+        log.warning("%s: damaged, made again: %s", spec.name, staleness.why_damaged(found.damaged))
     elif (manifest := found.manifest) is not None:
-        reason = why_stale(workspace, asked, manifest)
+        reason = staleness.why_stale(workspace, asked, manifest)
         log.info("%s: %s", spec.name, f"made again: {reason}" if reason else f"current: {manifest.key_figure}")
         return None if reason else manifest
     return None

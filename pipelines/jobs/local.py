@@ -122,7 +122,8 @@ class JobProcess:
         said = next((line for line in reversed(self._plain) if line.strip()), "")
         text = said.removeprefix("error: ").removeprefix("Error: ")
         if code < 0:
-            ending = _KILLED if code == -_SIGKILL else f"it crashed ({_name(-code)})"
+            name = next((known.name for known in signal.Signals if known == -code), f"signal {-code}")
+            ending = _KILLED if code == -_SIGKILL else f"it crashed ({name})"
             return f"{ending}: {text}" if text else ending
         return text or f"it ended with exit code {code}"
 
@@ -134,13 +135,6 @@ def _message(line: str) -> dict[str, Any] | None:
     except (ValueError, RecursionError):
         return None
     return message if isinstance(message, dict) and "kind" in message else None
-
-
-def _name(number: int) -> str:
-    try:
-        return signal.Signals(number).name
-    except ValueError:
-        return f"signal {number}"
 
 
 _OWN_GROUP: dict[str, Any]
@@ -255,14 +249,11 @@ def chosen_engine(engine: Engine) -> Iterator[None]:
         _CHOSEN.reset(token)
 
 
-def engine_in_use() -> Engine:
-    """Return the engine of this context; by default, processes that share all cores and the free memory."""
-    cores = thread_count()
-    return _CHOSEN.get() or LocalEngine(cores, cores, free_main_memory_bytes())
-
-
 def failed_of(title: str, jobs: Sequence[Job], ended: Callable[[JobEnd], None], progress: Progress) -> list[JobEnd]:
-    """Run jobs on the engine in use, as `Engine.run` does, and return the ends of those that have failed."""
+    """Run jobs on the engine in use, as `Engine.run` does, and return the ends of those that have failed.
+
+    By default, they are processes that share all cores and the free memory.
+    """
     failed: list[JobEnd] = []
 
     def take(end: JobEnd) -> None:
@@ -270,6 +261,8 @@ def failed_of(title: str, jobs: Sequence[Job], ended: Callable[[JobEnd], None], 
             failed.append(end)
         ended(end)
 
+    cores = thread_count()
+    engine = _CHOSEN.get() or LocalEngine(cores, cores, free_main_memory_bytes())
     if jobs:
-        engine_in_use().run(title, jobs, take, progress)
+        engine.run(title, jobs, take, progress)
     return failed

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import platform
 from dataclasses import dataclass
 
@@ -10,7 +9,7 @@ import torch
 
 from pipelines.core.errors import BackendUnavailableError
 from pipelines.core.fingerprints import library_versions
-from pipelines.core.machine import available_cores, thread_count
+from pipelines.core.machine import available_cores, thread_count, total_main_memory_bytes
 from pipelines.core.progress import Progress
 from pipelines.geodesy.operations import grid_folders, installed_grids
 from pipelines.report.chromium import named_or_installed
@@ -79,7 +78,7 @@ def inspect_machine() -> Machine:
         python=platform.python_version(),
         cores=available_cores(),
         threads=thread_count(),
-        memory_bytes=_memory_bytes(),
+        memory_bytes=total_main_memory_bytes(),
         free_bytes=free_memory_bytes(torch.device("cpu")),
         gpus=_gpus(),
         backends=tuple(_backend(name) for name in BACKENDS),
@@ -116,10 +115,3 @@ def _gpus() -> tuple[Gpu, ...]:
         return ()
     found = (torch.cuda.get_device_properties(index) for index in range(torch.cuda.device_count()))
     return tuple(Gpu(properties.name, int(properties.total_memory)) for properties in found)
-
-
-def _memory_bytes() -> int | None:
-    try:
-        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, ValueError, OSError):
-        return None
