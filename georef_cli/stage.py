@@ -133,8 +133,8 @@ class StageCommand(Command):
 def check_target(target: Path, spec: StageSpec, *, folder: bool, overwrite: bool) -> None:
     """Refuse, before the work begins, a target to which the result cannot be written, or may not.
 
-    Its name says another format than the stage writes; it is a folder with other content, or in a missing folder; or
-    it exists and may not be replaced.
+    Its name says another format than the stage writes; it is a folder with other content, or in a missing folder;
+    or it exists and may not be replaced.
     """
     suffix = Path(spec.product).suffix
     if folder and target.is_dir() and not (target / Path(spec.product).name).exists():

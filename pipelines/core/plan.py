@@ -92,7 +92,7 @@ def plan(
     for spec in stages:
         asked = flags.get(spec.name, {})
         resolved = staleness.stage_config(workspace, spec, asked)
-        action, reason = _action(workspace, spec, asked, running, memo, force=force)
+        action, reason = _action(workspace, spec, asked, resolved, running, memo=memo, force=force)
         if action != "keep":
             running.add(spec.name)
         origins = tuple(option_origins(workspace, spec, asked))
@@ -101,13 +101,17 @@ def plan(
 
 
 def _action(
-    workspace: Workspace, spec: StageSpec, asked: Flags, running: Collection[str], memo: Memo, *, force: bool
+    workspace: Workspace,
+    spec: StageSpec,
+    asked: Flags,
+    options: StageOptions,
+    running: Collection[str],
+    *,
+    memo: Memo,
+    force: bool,
 ) -> tuple[Action, str]:
     """Return what a run would do with a stage, after those that run before it."""
-    options, interrupted = (
-        staleness.stage_config(workspace, spec, asked),
-        staleness.found_interrupted(workspace, spec),
-    )
+    interrupted = staleness.found_interrupted(workspace, spec)
     if force:
         loses = spec.resumable and workspace.partial_product(spec).progress() is not None
         return "run", f"--force; drops an interrupted run: {interrupted}" if loses else "--force"
@@ -143,10 +147,8 @@ def _action(
     except InputError as error:
         return "refuse", str(error)
     inputs = staleness.changed_inputs(present.inputs.hashes, manifest.inputs)
-    grown = (
-        spec.growing and not inputs and not staleness.changed_options(options, manifest.config, but=spec.growing)
-    )
-    return ("extend" if grown else "run"), reason
+    others = staleness.changed_options(options, manifest.config, but=spec.growing)
+    return ("extend" if spec.growing and not inputs and not others else "run"), reason
 
 
 def photograph_folder(workspace: Workspace, image_dir: str) -> Path:
@@ -161,9 +163,8 @@ def photograph_folder(workspace: Workspace, image_dir: str) -> Path:
         return named
     spec = BY_NAME["ingest"]
     with contextlib.suppress(InputError):
-        images: Path | None = getattr(
-            staleness.stage_config(home, spec, home.requests().get(spec.name, {})), "images", None
-        )
+        options = staleness.stage_config(home, spec, home.requests().get(spec.name, {}))
+        images: Path | None = getattr(options, "images", None)
         if images is not None and images.is_dir():
             return images
     return named

@@ -261,8 +261,8 @@ def failed_of(title: str, jobs: Sequence[Job], ended: Callable[[JobEnd], None], 
             failed.append(end)
         ended(end)
 
-    cores = thread_count()
-    engine = _CHOSEN.get() or LocalEngine(cores, cores, free_main_memory_bytes())
     if jobs:
+        cores = thread_count()
+        engine = _CHOSEN.get() or LocalEngine(cores, cores, free_main_memory_bytes())
         engine.run(title, jobs, take, progress)
     return failed
